@@ -1,0 +1,33 @@
+#!/usr/bin/env python3
+"""Make the paper's two meshes, tendon.msh (480 hexahedra) and artery.msh (1,536), again.
+
+    ./with-fenicsx python3 meshes/make.py [FOLDER]
+
+They are Gmsh files (4.1, ASCII) of the same builders that a scene uses, at refinement 1, with the faces and the volume
+as physical groups. Without FOLDER they replace the two files beside this script; a test holds these to the builders.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from remodel_fenicsx.geometry.model import write_msh
+from remodel_fenicsx.geometry.tendon import draw_tendon
+from remodel_fenicsx.geometry.tube import draw_tube
+
+# file -> what is in it, as in the paper: Figs. 6 and 7
+MESHES = {
+    "tendon.msh": lambda: draw_tendon(length=10.0, area=10.0),
+    "artery.msh": lambda: draw_tube(inner_radius=1.0, outer_radius=3.0, length=8.0),
+}
+
+
+def make(folder: Path) -> None:
+    """Write both files into `folder`."""
+    for name, draw in MESHES.items():
+        write_msh(folder / name, draw)
+
+
+if __name__ == "__main__":
+    make(Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).resolve().parent)

@@ -1,0 +1,60 @@
+"""Chain laws: the free energy of one collagen chain over its end-to-end length.
+
+Pure arithmetic on numbers, arrays or UFL expressions. All lengths are in link lengths of the chain (paper, Remark 1).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+BOLTZMANN_CONSTANT = 1.381e-23  # J/K, as printed in the paper
+
+
+def wormlike_energy(end_to_end_length: Any, contour_length: Any) -> Any:
+    """Energy of a wormlike chain over k theta / (4 A_p) (eq. 1).
+
+    Parameters
+    ----------
+    end_to_end_length
+        r, 0 <= r < L, in link lengths: number, array or UFL expression.
+    contour_length
+        L, in link lengths.
+
+    Returns
+    -------
+    L (2 x^2 + 1/(1-x) - x) / 4 with x = r/L, in link lengths; times the network modulus c = k theta n / (4 A_p) it is
+    the W_chn whose derivative is eq. (7b): a quarter of the printed eq. (4b), see docs/theory.md, erratum 1.
+    """
+    x = end_to_end_length / contour_length
+    return contour_length / 4 * (2 * x**2 + 1 / (1 - x) - x)
+
+
+def wormlike_stiffness(end_to_end_length: Any, contour_length: Any) -> Any:
+    """Secant stiffness g(r) = 1/L + 1/(4 r (1-r/L)^2) - 1/(4 r) of eq. (7): d(wormlike_energy)/dr = g r.
+
+    Written with the pole at r = 0 cancelled, so that short chains lose no digits.
+    """
+    x = end_to_end_length / contour_length
+    return (1 + (2 - x) / (4 * (1 - x) ** 2)) / contour_length
+
+
+def wormlike_force(end_to_end_length: Any, contour_length: Any, persistence_length: Any, k_theta: Any = 1.0) -> Any:
+    """Force that holds the ends of one chain apart (eq. 2): k theta / (4 A_p) (4 x + 1/(1-x)^2 - 1), x = r/L."""
+    x = end_to_end_length / contour_length
+    return k_theta / (4 * persistence_length) * (4 * x + 1 / (1 - x) ** 2 - 1)
+
+
+@dataclass(frozen=True)
+class Chain:
+    """A chain law: `energy(r, L)`, its secant `stiffness(r, L)` and one chain's `force(r, L, A_p, k_theta)`."""
+
+    energy: Callable[[Any, Any], Any]
+    stiffness: Callable[[Any, Any], Any]
+    force: Callable[..., Any]
+
+
+CHAINS: dict[str, Chain] = {
+    "wormlike": Chain(wormlike_energy, wormlike_stiffness, wormlike_force),
+}

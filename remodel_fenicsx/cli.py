@@ -1,0 +1,139 @@
+"""The command remodel-fenicsx: thin, no numerics."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import traceback
+from collections.abc import Sequence
+from pathlib import Path
+
+import remodel_fenicsx
+from remodel_fenicsx.parameters import PRESETS
+from remodel_fenicsx.scene import Scene, SceneError, preset_scene, read_scene
+
+BAD_INPUT, SOLVE_FAILED, BAD_ENVIRONMENT = 2, 3, 5
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    main_parser = argparse.ArgumentParser(
+        prog="remodel-fenicsx",
+        description="Predict how collagen in living tissue reorients under load (Kuhl & Holzapfel 2007).",
+        epilog="exit codes: 0 finished, 2 bad input, 3 the solve failed, 5 environment not usable, 130/143 interrupted",
+    )
+    main_parser.add_argument("--version", action="version", version=remodel_fenicsx.__version__)
+    commands = main_parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    def scene_command(name: str, text: str) -> argparse.ArgumentParser:
+        command = commands.add_parser(name, help=text, description=text)
+        command.add_argument("scene", type=Path, metavar="SCENE", help="scene file (TOML), see docs/scene.md")
+        command.add_argument(
+            "--set",
+            action="append",
+            default=[],
+            metavar="KEY=VALUE",
+            help="set a key of the scene, e.g. cells.seed=2 or time.end=10; may be repeated",
+        )
+        return command
+
+    run_command = scene_command("run", "Run a scene; mpirun -n N remodel-fenicsx run ... is the same run on N ranks.")
+    run_command.add_argument(
+        "-o", "--output", type=Path, metavar="DIR", help="new or empty folder for the results (default: results/NAME)"
+    )
+    run_command.add_argument("-q", "--quiet", action="store_true", help="no progress")
+    scene_command("validate", "Check a scene without running it.")
+    new = commands.add_parser("new", help="Print a scene of a preset.", description="Print a scene of a preset.")
+    new.add_argument("preset", metavar="PRESET", help=", ".join(PRESETS))
+    new.add_argument("--shape", default="tube", help="cube, tendon or tube (default: tube)")
+    commands.add_parser("info", help="Print versions, solvers and BLAS.", description="Print versions, solvers and BLAS.")
+    return main_parser
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit code of docs/contract (0, 2, 3, 5, 130, 143)."""
+    options = parser().parse_args(arguments)
+    try:
+        return COMMANDS[options.command](options)
+    except SceneError as error:
+        return _fail(str(error), BAD_INPUT)
+    except BrokenPipeError:
+        sys.stderr.close()
+        return 0
+
+
+def _rank() -> int:
+    from mpi4py import MPI
+
+    return MPI.COMM_WORLD.rank
+
+
+def _fail(message: str, code: int) -> int:
+    if _rank() == 0:
+        print(f"remodel-fenicsx: {message}", file=sys.stderr, flush=True)
+    return code
+
+
+def _run(options: argparse.Namespace) -> int:
+    scene = read_scene(options.scene, options.set)
+    try:
+        from remodel_fenicsx.interrupts import Interrupted
+        from remodel_fenicsx.record import FolderTaken
+        from remodel_fenicsx.simulation import run
+        from remodel_fenicsx.stepping import StepFailure
+    except ImportError as error:
+        return _fail(f"the environment is not usable: {error}; run through ./with-fenicsx", BAD_ENVIRONMENT)
+    try:
+        folder = run(scene, options.output, quiet=options.quiet)
+    except FolderTaken as error:
+        return _fail(str(error), BAD_INPUT)
+    except StepFailure as failure:
+        advice = "try a smaller time.step, a slower ramp or lower loads; every finished step is kept"
+        return _fail(f"{failure}. {advice}", SOLVE_FAILED)
+    except Interrupted as interruption:
+        return _fail(f"stopped by {interruption}; every finished step is kept", interruption.exit_code)
+    except OSError as error:
+        return _end_all(f"cannot write the results: {error}", BAD_ENVIRONMENT)
+    except Exception:
+        traceback.print_exc()
+        return _end_all("stopped by a defect of the program, see above", 1)
+    if _rank() == 0:
+        print(f"results in {folder}")
+    return 0
+
+
+def _end_all(message: str, code: int) -> int:
+    """End the run on all ranks: an error on one of them leaves the others waiting for ever."""
+    from mpi4py import MPI
+
+    print(f"remodel-fenicsx: {message}", file=sys.stderr, flush=True)
+    if MPI.COMM_WORLD.size > 1:
+        MPI.COMM_WORLD.Abort(code)
+    return code
+
+
+def _validate(options: argparse.Namespace) -> int:
+    scene = read_scene(options.scene, options.set)
+    print(f"{options.scene}: a valid scene ({scene.geometry.shape}, {round(scene.time.end / scene.time.step)} steps)")
+    return 0
+
+
+def _new(options: argparse.Namespace) -> int:
+    scene: Scene = preset_scene(options.preset, options.shape)
+    print(scene.to_toml(f"a scene of the preset {options.preset}"), end="")
+    return 0
+
+
+def _info(options: argparse.Namespace) -> int:
+    try:
+        from remodel_fenicsx.environment import versions
+        from remodel_fenicsx.solvers import PROFILES
+    except ImportError as error:
+        return _fail(f"the environment is not usable: {error}; run through ./with-fenicsx", BAD_ENVIRONMENT)
+    for name, version in versions().items():
+        print(f"{name:16} {version}")
+    print(f"{'solver profiles':16} {', '.join(PROFILES)}")
+    return 0
+
+
+COMMANDS = {"run": _run, "validate": _validate, "new": _new, "info": _info}

@@ -1,0 +1,42 @@
+"""Ctrl-C and SIGTERM, remembered until the run is at a place where it can stop cleanly."""
+
+from __future__ import annotations
+
+import signal
+from types import FrameType, TracebackType
+
+_EXIT_CODE_BASE = 128
+
+
+class Interrupted(Exception):
+    """The run was asked to stop; the step under way is dropped."""
+
+    def __init__(self, number: int):
+        super().__init__(signal.Signals(number).name)
+        self.exit_code = _EXIT_CODE_BASE + number
+
+
+class StopRequest:
+    """Context that turns the first SIGINT or SIGTERM into a request; a second one stops at once.
+
+    PETSc must not see an exception from a callback, so a handler that raises is not enough: the solver asks `number`.
+    """
+
+    def __init__(self) -> None:
+        self.number = 0
+        self._previous: dict[int, object] = {}
+
+    def __enter__(self) -> StopRequest:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            self._previous[number] = signal.signal(number, self._remember)
+        return self
+
+    def _remember(self, number: int, frame: FrameType | None) -> None:
+        self.number = number
+        signal.signal(number, signal.SIG_DFL)
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)  # type: ignore[arg-type]

@@ -1,0 +1,493 @@
+"""A scene: what to simulate, as TOML or as Python objects, validated before any solve.
+
+`read_scene` reads a file, `Scene(...)` and `scene_from_dict` take the same keys from Python. docs/scene.md lists all keys;
+``python3 -m remodel_fenicsx.scene`` prints that page.
+"""
+
+from __future__ import annotations
+
+import bisect
+import math
+import os
+import re
+import tomllib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal
+
+import tomlkit
+from pydantic import BaseModel, Field, model_validator
+
+from remodel_fenicsx.parameters import PRESET_NOTES, PRESETS, Cells, Material, Remodeling
+from remodel_fenicsx.tables import (
+    SceneError,
+    Table,
+    checked,
+    fault,
+    markdown_reference,
+    one_of,
+    quoted,
+    shown,
+    toml_text,
+)
+
+MOST_STEPS = 1_000_000
+SAME_TIME = 1e-9  # relative: times closer than this are the same
+
+# Defaults that a shape changes, under the keys of preset and scene: with global axes a tube of isotropic cells would not
+# stay round in the first step.
+SHAPE_DEFAULTS: dict[str, dict[str, Any]] = {"tube": {"cells": {"axes": "cylindrical"}}}
+
+
+# ---------------------------------------------------------------- geometry
+
+
+class Cube(Table):
+    """A cube, pulled along z: the homogeneous body of the paper's Fig. 5."""
+
+    load_names: ClassVar[tuple[str, ...]] = ("force",)
+    axis_kinds: ClassVar[tuple[str, ...]] = ("global",)
+
+    shape: Literal["cube"] = Field("cube", description="Which body it is.")
+    side: float = Field(1.0, gt=0, description="Length of an edge, in the scene's unit of length.")
+
+
+class Tendon(Table):
+    """A cylinder along z, held at its bottom and pulled at its top: the tendon of the paper's Fig. 6."""
+
+    load_names: ClassVar[tuple[str, ...]] = ("force",)
+    axis_kinds: ClassVar[tuple[str, ...]] = ("global", "cylindrical")
+
+    shape: Literal["tendon"] = Field("tendon", description="Which body it is.")
+    length: float = Field(10.0, gt=0, description="Length along z, in the scene's unit of length.")
+    area: float = Field(10.0, gt=0, description="Area of the cross-section, in the unit of length squared.")
+
+
+class Tube(Table):
+    """A thick-walled tube about the z axis, under inner pressure and axial stretch: the artery of the paper's Fig. 7."""
+
+    load_names: ClassVar[tuple[str, ...]] = ("pressure", "stretch")
+    axis_kinds: ClassVar[tuple[str, ...]] = ("global", "cylindrical")
+
+    shape: Literal["tube"] = Field("tube", description="Which body it is.")
+    inner_radius: float = Field(gt=0, description="Inner radius R_i, in the scene's unit of length.")
+    outer_radius: float = Field(gt=0, description="Outer radius R_o, in the scene's unit of length.")
+    length: float = Field(gt=0, description="Length along z, in the scene's unit of length.")
+
+    @model_validator(mode="after")
+    def _has_a_wall(self) -> Tube:
+        if self.inner_radius >= self.outer_radius:
+            limit = f"must be smaller than geometry.outer_radius = {shown(self.outer_radius)}"
+            raise fault(limit, "inner_radius", self.inner_radius)
+        return self
+
+
+Geometry = Annotated[Cube | Tendon | Tube, Field(discriminator="shape")]
+
+
+class Mesh(Table):
+    """The finite elements."""
+
+    refinement: int = Field(
+        1, ge=1, description="Factor on the paper's number of elements in every direction (1: its own meshes)."
+    )
+    cell: Literal["hexahedron", "tetrahedron"] = Field("hexahedron", description="Shape of the elements.")
+    degree: Annotated[int, one_of((1, 2))] = Field(
+        1, description="Polynomial degree of the displacement: 1 (the paper's) or 2."
+    )
+
+
+class Model(Table):
+    """Which unknowns describe the deformation."""
+
+    kinematics: Literal["full"] = Field("full", description="'full': the displacement in three dimensions.")
+
+
+# ---------------------------------------------------------------- loads and time
+
+
+def _number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _ramp(value: Any) -> tuple[tuple[float, float], ...]:
+    """Pairs (time, factor) whose times increase; anything else is a fault that names the entry."""
+    if not isinstance(value, (list, tuple)) or not value:
+        raise fault("must be a list of pairs [time, factor], at least one")
+    for index, entry in enumerate(value):
+        if not isinstance(entry, (list, tuple)) or len(entry) != 2 or not all(map(_number, entry)):
+            raise fault("must be a pair [time, factor] of finite numbers", f"[{index}]", entry)
+    for index, (time, _) in enumerate(value):
+        if time < 0:
+            raise fault("must be at least 0, where the simulation starts", f"[{index}][0]", time)
+        if index and time <= value[index - 1][0]:
+            rule = f"must be later than the time {shown(value[index - 1][0])} of the entry before"
+            raise fault(rule, f"[{index}][0]", time)
+    return tuple((float(time), float(factor)) for time, factor in value)
+
+
+class Load(Table):
+    """A load by name: `force` of cube and tendon, `pressure` and `stretch` of a tube. One that is not listed is zero.
+
+    `force` is the total dead force along z on the top; `pressure` acts on the deformed inner face; `stretch` is the
+    prescribed axial elongation over the length (0.1: 10 %).
+    """
+
+    value: float = Field(
+        description="Full value at factor 1: force in stress_unit times length squared, pressure in stress_unit, stretch "
+        "without unit (above -1)."
+    )
+    ramp: Annotated[tuple[tuple[float, float], ...], checked(_ramp)] = Field(
+        description="Factor on the value over time, as [time, factor] pairs with increasing times: linear in between, "
+        "held before the first and after the last pair. Times up to time.end must be multiples of time.step.",
+        json_schema_extra={"allowed": "a list of pairs [time, factor] with increasing times"},
+    )
+
+    def factor(self, time: float) -> float:
+        """Factor on the value at a time: piecewise linear, held before the first and after the last pair."""
+        after = bisect.bisect_right(self.ramp, time, key=lambda pair: pair[0])
+        if after == 0:
+            return self.ramp[0][1]
+        if after == len(self.ramp):
+            return self.ramp[-1][1]
+        (time0, factor0), (time1, factor1) = self.ramp[after - 1], self.ramp[after]
+        return factor0 + (factor1 - factor0) * (time - time0) / (time1 - time0)
+
+
+class Time(Table):
+    """Simulated time, in the unit of 1/kappa. It starts at 0 with the unloaded body."""
+
+    end: float = Field(gt=0, description="Last time; a whole number of steps.")
+    step: float = Field(1.0, gt=0, description="Time between two remodeling passes.")
+
+    @model_validator(mode="after")
+    def _whole_number_of_steps(self) -> Time:
+        if self.step > self.end:
+            raise fault(f"must be at most time.end = {shown(self.end)}", "step", self.step)
+        if self.end / self.step > MOST_STEPS:
+            rule = f"must be at least time.end / {MOST_STEPS} = {self.end / MOST_STEPS:.6g}"
+            raise fault(rule, "step", self.step)
+        if not _is_multiple(self.end, self.step):
+            raise fault(_nearest_multiples(self.end, self.step, "time.step"), "end", self.end)
+        return self
+
+    @property
+    def number_of_steps(self) -> int:
+        """Number of steps from 0 to the end."""
+        return round(self.end / self.step)
+
+
+def _is_multiple(time: float, step: float) -> bool:
+    return abs(time / step - round(time / step)) <= SAME_TIME * max(1.0, time / step)
+
+
+def _nearest_multiples(time: float, step: float, name: str) -> str:
+    below = math.floor(time / step)
+    return f"must be a multiple of {name} = {shown(step)}; the nearest are {below * step:.12g} and {(below + 1) * step:.12g}"
+
+
+# ---------------------------------------------------------------- solver and output
+
+
+def _petsc_options(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        for name, entry in value.items():
+            if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z]\w*", name):
+                raise fault("not a PETSc option; write its name without the leading '-'", quoted(str(name)), entry)
+            if not isinstance(entry, (str, bool)) and not _number(entry):
+                raise fault("must be a string, a finite number, true or false", name, entry)
+    return value
+
+
+class Solver(Table):
+    """Solution of the nonlinear problem of each step."""
+
+    profile: Literal["direct"] = Field("direct", description="'direct': Newton's method, each system factorised.")
+    absolute_tolerance: float = Field(
+        1e-12, gt=0, description="Converged when the residual norm is below this, whatever it was at first."
+    )
+    relative_tolerance: float = Field(
+        1e-10, ge=0, lt=1, description="Converged when the residual norm is below this share of the step's first one."
+    )
+    maximum_iterations: int = Field(25, ge=1, description="Newton iterations before a step counts as failed.")
+    maximum_halvings: int = Field(
+        12, ge=0, description="How often a failed step is halved before the run ends with an error."
+    )
+    petsc_options: Annotated[dict[str, Any], checked(_petsc_options)] = Field(
+        default_factory=dict,
+        description="PETSc options that override the profile's, without the leading '-': snes_..., ksp_..., pc_....",
+    )
+
+
+class Output(Table):
+    """What a run writes beside its history table."""
+
+    fields: bool = Field(True, description="Whether to write fields for ParaView.")
+    every: int = Field(1, ge=1, description="Write the fields of every n-th step; the last one always.")
+
+
+# ---------------------------------------------------------------- the scene
+
+
+def _name(value: Any) -> Any:
+    if not isinstance(value, str) or not re.fullmatch(r"\w(?:[\w .+-]{0,98}[\w+-])?", value):
+        raise fault("must be a file name: letters, digits, spaces and . + - _, at most 100, a letter or digit first")
+    return value
+
+
+class Scene(Table):
+    """A whole scene: all keys above the first table, and the tables."""
+
+    name: Annotated[str, checked(_name)] = Field(
+        "scene",
+        description="Name of the scene and of its results folder. Default: the file's name without its ending.",
+        json_schema_extra={"allowed": "a file name without a path"},
+    )
+    preset: str | None = Field(
+        None,
+        description="Named parameters that lie under the scene's own keys, table by table (see Presets below).",
+        json_schema_extra={"allowed": "one of " + ", ".join(map(repr, PRESETS))},
+    )
+    geometry: Geometry
+    mesh: Mesh = Field(default_factory=Mesh)
+    model: Model = Field(default_factory=Model)
+    material: Material = Field(default_factory=Material)
+    cells: Cells = Field(default_factory=Cells)
+    loads: dict[str, Load] = Field(default_factory=dict)
+    remodeling: Remodeling = Field(default_factory=Remodeling)
+    time: Time
+    solver: Solver = Field(default_factory=Solver)
+    output: Output = Field(default_factory=Output)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _merge_preset(cls, values: Any) -> Any:
+        """The scene's keys over those of its preset over those of its shape."""
+        if not isinstance(values, dict):
+            return values
+        plain = _plain(values)
+        preset, geometry = plain.get("preset"), plain.get("geometry", {})
+        if preset is not None and (not isinstance(preset, str) or preset not in PRESETS):
+            raise fault("allowed are " + ", ".join(map(repr, PRESETS)), "preset", preset)
+        shape = geometry.get("shape") if isinstance(geometry, dict) else None
+        if not isinstance(shape, str) or shape not in _SHAPES:
+            return plain  # the field's own error says which shapes there are
+        _check_load_names(shape, plain.get("loads"))
+        base = SHAPE_DEFAULTS.get(shape, {})
+        if preset is not None:
+            if shape not in PRESETS[preset]:
+                known = ", ".join(map(repr, PRESETS[preset]))
+                raise fault(f"the preset {preset!r} has {known}", "geometry.shape", shape)
+            base = merged(base, PRESETS[preset][shape])
+        return merged(base, plain)
+
+    @model_validator(mode="after")
+    def _tables_fit_together(self) -> Scene:
+        cells, material, geometry = self.cells, self.material, self.geometry
+        if cells.end_to_end_length >= material.contour_length:
+            rule = f"must be smaller than material.contour_length = {shown(material.contour_length)}"
+            raise fault(rule, "cells.end_to_end_length", cells.end_to_end_length)
+        if cells.axes not in geometry.axis_kinds:
+            rule = f"allowed for shape {geometry.shape!r} is " + ", ".join(map(repr, geometry.axis_kinds))
+            raise fault(rule, "cells.axes", cells.axes)
+        for name, load in self.loads.items():
+            self._check_load(name, load)
+        return self
+
+    def _check_load(self, name: str, load: Load) -> None:
+        step, key = self.time.step, f"loads.{name}"
+        for index, (time, factor) in enumerate(load.ramp):
+            if time <= self.time.end and not _is_multiple(time, step):
+                raise fault(_nearest_multiples(time, step, "time.step"), f"{key}.ramp[{index}][0]", time)
+            if name == "stretch" and load.value * factor <= -1:
+                rule = f"must be greater than -1 at every time; with the factor {shown(factor)} it is {load.value * factor:.6g}"
+                raise fault(rule, f"{key}.value", load.value)
+
+    def with_values(self, changes: Mapping[str, Any]) -> Scene:
+        """A validated copy with other values by dotted key: ``scene.with_values({"loads.pressure.value": 2.4})``.
+
+        Every value of the copy is its own: changing `preset` alone changes nothing.
+
+        Raises
+        ------
+        SceneError
+            One line: key, value, what is allowed.
+        """
+        values = _plain({name: getattr(self, name) for name in type(self).model_fields}, every_value=True)
+        for key, value in changes.items():
+            _set(values, key, value)
+        return Scene(**values)
+
+    def to_toml(self, header: str = "") -> str:
+        """The scene with all its values as TOML, each under its description; `read_scene` gives the same scene back.
+
+        Parameters
+        ----------
+        header
+            Lines for the top, each becomes a comment.
+        """
+        return toml_text(self, header)
+
+
+_SHAPES: dict[str, type[Cube] | type[Tendon] | type[Tube]] = {"cube": Cube, "tendon": Tendon, "tube": Tube}
+
+
+def _check_load_names(shape: str, loads: Any) -> None:
+    """A load that the shape does not have, before anything is said about what is missing in it."""
+    names = _SHAPES[shape].load_names
+    for name, load in loads.items() if isinstance(loads, Mapping) else ():
+        if name not in names:
+            listed = ", ".join(f"loads.{known}" for known in names)
+            raise fault(f"a {shape} has no such load; allowed: {listed}", f"loads.{quoted(str(name))}", load)
+
+
+def merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    """Nested dicts laid over each other, table by table; a list or a value of `over` replaces that of `base`."""
+    result = dict(base)
+    for name, value in over.items():
+        below = result.get(name)
+        result[name] = merged(below, value) if isinstance(below, Mapping) and isinstance(value, Mapping) else value
+    return result
+
+
+def _plain(value: Any, every_value: bool = False) -> Any:
+    """Tables as dicts of the values that were set (or of all), so that they merge as the same keys in TOML do."""
+    if isinstance(value, BaseModel):
+        kind = {"shape": value.shape} if isinstance(value, (Cube, Tendon, Tube)) else {}
+        names = type(value).model_fields if every_value else value.model_fields_set
+        return kind | {name: _plain(getattr(value, name), every_value) for name in names}
+    if isinstance(value, Mapping):
+        return {name: _plain(entry, every_value) for name, entry in value.items()}
+    return value
+
+
+# ---------------------------------------------------------------- reading
+
+
+def scene_from_dict(values: Mapping[str, Any]) -> Scene:
+    """A scene from nested dicts with the keys of the TOML file.
+
+    Raises
+    ------
+    SceneError
+        One line: key, value, what is allowed.
+    """
+    if not isinstance(values, Mapping) or not all(isinstance(name, str) for name in values):
+        raise SceneError(f"scene = {shown(values)}: must be a table")
+    return Scene(**values)
+
+
+def read_scene(path: str | os.PathLike[str], overrides: Iterable[str] = ()) -> Scene:
+    """A scene from a TOML file.
+
+    Parameters
+    ----------
+    path
+        The file, UTF-8.
+    overrides
+        "KEY=VALUE" with a dotted key and a TOML value (a bare word is a string): laid over the file's keys, before the
+        preset is.
+
+    Raises
+    ------
+    SceneError
+        One line: file and line, or key, value and what is allowed.
+    """
+    values = _read_toml(Path(path))
+    for override in overrides:
+        key, value = parse_override(override)
+        _set(values, key, value)
+    values.setdefault("name", re.sub(r"^[^\w]+|[^\w+-]+$|[^\w .+-]", "", Path(path).stem)[:100].rstrip(" .") or "scene")
+    return scene_from_dict(values)
+
+
+def _read_toml(path: Path) -> dict[str, Any]:
+    try:
+        text = path.read_bytes().decode("utf-8-sig")
+    except IsADirectoryError:
+        raise SceneError(f"{path}: is a folder; a scene is a TOML file") from None
+    except FileNotFoundError:
+        raise SceneError(f"{path}: no such file; a scene is a TOML file") from None
+    except UnicodeDecodeError as error:
+        line = error.object[: error.start].count(b"\n") + 1
+        raise SceneError(f"{path}: line {line}: not UTF-8 text; a scene is a TOML file in UTF-8") from None
+    except (OSError, ValueError) as error:
+        raise SceneError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
+    try:
+        return tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
+        place = re.search(r"^(.*) \(at (?:line (\d+), column \d+|(end of document))\)$", str(error), re.DOTALL)
+        line, problem = (place[2] or len(text.splitlines()), place[1]) if place else (0, str(error))
+        raise SceneError(f"{path}: {f'line {line}: ' if line else ''}not TOML: {problem}") from None
+
+
+def parse_override(text: str) -> tuple[str, Any]:
+    """Dotted key and value of "KEY=VALUE"; VALUE is TOML, or a bare word for a string.
+
+    Raises
+    ------
+    SceneError
+        If there is no '=', the key has an empty part or the value is neither.
+    """
+    key, equals, value = (part.strip() for part in text.partition("="))
+    if not equals:
+        raise SceneError(f"--set {shown(text)}: must be KEY=VALUE, as in cells.seed=2")
+    if not all(key.split(".")):
+        raise SceneError(f"--set {shown(text)}: the key must be a dotted path, as in cells.seed=2")
+    try:
+        parsed = tomllib.loads(f"value = {value}")
+    except (ValueError, RecursionError):
+        parsed = {}
+    if list(parsed) == ["value"]:
+        return key, parsed["value"]
+    if re.fullmatch(r"[\w.+/:-]+", value):
+        return key, value
+    raise SceneError(f"--set {key} = {shown(value)}: must be a TOML value or a bare word")
+
+
+def _set(values: dict[str, Any], key: str, value: Any) -> None:
+    """Put a value at a dotted key, making the tables on the way."""
+    *parents, name = (part.strip() for part in key.split("."))
+    for depth, parent in enumerate(parents):
+        table = values.setdefault(parent, {})
+        if not isinstance(table, dict):
+            place = ".".join(parents[: depth + 1])
+            raise SceneError(f"{key} = {shown(value)}: {place} = {shown(table)} is a value, not a table")
+        values = table
+    values[name] = value
+
+
+# ---------------------------------------------------------------- documentation
+
+_REFERENCE = """# Keys of a scene
+
+This page is made from the code: `./with-fenicsx python3 -m remodel_fenicsx.scene > docs/scene.md`.
+
+A scene is a TOML file. Every key is checked before anything is solved: an unknown key, a value of the wrong type (a string
+for a number, `true` for a number), NaN, or values that do not fit together give one line with key, value and what is allowed.
+Lengths of the geometry are in any one unit of length, chain lengths in link lengths of the chain, stresses in
+`material.stress_unit`, time in the unit of 1/`remodeling.kappa`.
+
+Where a key has several sources, the first of these wins: `--set KEY=VALUE` on the command line, the file, the preset for the
+shape, the defaults below. Tables are merged key by key, lists are replaced whole. A preset's load stays when the scene names
+only another one; to take it away set its `value` to 0.
+
+`--set` takes a dotted key and a TOML value; a bare word is a string: `--set cells.seed=2 --set remodeling.frame=spatial`,
+`--set 'loads.pressure.ramp=[[0, 0], [25, 1]]'`.
+
+"""
+
+
+def scene_reference() -> str:
+    """The page docs/scene.md: every key with default, what is allowed and meaning, and the presets."""
+    text = _REFERENCE + markdown_reference(Scene)
+    for name, shapes in PRESETS.items():
+        text += f"\n## Preset `{name}`\n\n{PRESET_NOTES[name]}\n"
+        bodies = {shape: tomlkit.dumps(merged({"geometry": {"shape": shape}}, values)) for shape, values in shapes.items()}
+        for shape, body in bodies.items():
+            text += f"\nShape `{shape}`:\n\n```toml\n{body.strip()}\n```\n"
+    return text
+
+
+if __name__ == "__main__":
+    print(scene_reference(), end="")

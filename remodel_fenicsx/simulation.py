@@ -1,0 +1,176 @@
+"""A scene brought to life: builds the parts in their order and steps them through time."""
+
+from __future__ import annotations
+
+import logging
+import time as clock
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import basix.ufl
+import dolfinx.fem
+from mpi4py import MPI
+
+from remodel_fenicsx import geometry
+from remodel_fenicsx.cells import UnitCells
+from remodel_fenicsx.environment import versions
+from remodel_fenicsx.interrupts import StopRequest
+from remodel_fenicsx.loads import LOADINGS, LoadValues
+from remodel_fenicsx.observables import Observer
+from remodel_fenicsx.quadrature import Quadrature
+from remodel_fenicsx.record import Fields, RunFolder, choose_folder
+from remodel_fenicsx.remodel import RemodelingPass
+from remodel_fenicsx.scene import Scene
+from remodel_fenicsx.stepping import Stepper, times
+#from remodel_fenicsx.terminal import Progress, run_log
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class StepRecord:
+    """An accepted step: its time and its row of the history."""
+
+    time: float
+    row: dict[str, float]
+
+
+class Simulation:
+    """Everything that a scene needs, built and ready to step.
+
+    Parameters
+    ----------
+    scene
+        The validated scene.
+    comm
+        MPI communicator of the mesh.
+
+    Attributes
+    ----------
+    domain, displacement, quadrature, cells, loading, remodeling, stepper, observer
+        The parts, each usable by itself (see demos/).
+    """
+
+    def __init__(self, scene: Scene, comm: MPI.Comm = MPI.COMM_WORLD):
+        self.scene = scene
+        self.domain = geometry.build(scene.geometry, scene.mesh, comm)
+        mesh = self.domain.mesh
+        element = basix.ufl.element("Lagrange", mesh.topology.cell_name(), scene.mesh.degree, shape=(3,))
+        self.displacement = dolfinx.fem.Function(dolfinx.fem.functionspace(mesh, element), name="displacement")
+        self.quadrature = Quadrature(mesh, scene.mesh.degree)
+        self.cells = UnitCells(self.quadrature, self.domain.cell_number, self.domain.number_of_cells, scene.cells)
+        self.loading = LOADINGS[self.domain.shape](self.domain, self.displacement)
+        self.remodeling = RemodelingPass(self.displacement, self.cells, scene.material, scene.remodeling)
+        self.stepper = Stepper(
+            self.displacement,
+            self.loading,
+            self.cells,
+            scene.material,
+            self.remodeling,
+            scene.solver,
+            self.load_values,
+        )
+        self.observer = Observer(self.domain, self.displacement, self.loading, self.cells, scene.material)
+
+    def load_values(self, time: float) -> LoadValues:
+        """Magnitude of every load at a time."""
+        return {name: load.value * load.factor(time) for name, load in self.scene.loads.items()}
+
+    def steps(self, fields: Fields | None = None) -> Iterator[StepRecord]:
+        """Solve and remodel step by step; what is yielded has been accepted.
+
+        The state seen at a yield is one pass ahead of the row: the row and the fields belong to the solved state, before
+        the remodeling pass (docs/theory.md).
+
+        Raises
+        ------
+        stepping.StepFailure
+            If a step has no admissible equilibrium.
+        """
+        if fields is not None:
+            fields.append(0.0)
+        every = self.scene.output.every
+        for number, time in enumerate(times(self.scene.time.end, self.scene.time.step), start=1):
+            start = clock.perf_counter()
+            solved = self.stepper.solve(time)
+            columns = self.observer.columns()
+            if fields is not None and (number % every == 0 or time >= self.scene.time.end * (1 - 1e-12)):
+                fields.append(time)
+            energy = self.stepper.problem.stored_energy()
+            passed = self.stepper.remodel(time)
+            yield StepRecord(
+                time,
+                {
+                    "time": time,
+                    **columns,
+                    "max_chain_extension": solved.extension.max_chain_extension,
+                    "min_jacobian": solved.extension.min_jacobian,
+                    "stored_energy": energy,
+                    "remodeling_power": passed.remodeling_power,
+                    "newton_iterations": solved.work.newton_iterations,
+                    "linear_iterations": solved.work.linear_iterations,
+                    "substeps": solved.work.substeps,
+                    "seconds": clock.perf_counter() - start,
+                },
+            )
+
+
+def run(scene: Scene, folder: Path | str | None = None, comm: MPI.Comm = MPI.COMM_WORLD, quiet: bool = True) -> Path:
+    """Run a scene and record it.
+
+    Parameters
+    ----------
+    scene
+        The validated scene.
+    folder
+        New or empty folder for the results; default: results/NAME, numbered when taken.
+    comm
+        MPI communicator.
+    quiet
+        No progress on the terminal.
+
+    Returns
+    -------
+    The folder with history.csv, fields.vtkhdf, fields_chains.vtkhdf, scene.toml and run.log.
+
+    Raises
+    ------
+    record.FolderTaken
+        If the folder is not empty.
+    stepping.StepFailure
+        If a step has no admissible equilibrium; all steps before it are recorded.
+    interrupts.Interrupted
+        On SIGINT or SIGTERM; all accepted steps are recorded.
+    OSError
+        If the results cannot be written.
+    """
+    place = choose_folder(None if folder is None else Path(folder), scene.name) if comm.rank == 0 else None
+    place = comm.bcast(place)
+    header = "\n".join(f"{name} {version}" for name, version in versions().items())
+    number_of_steps = round(scene.time.end / scene.time.step)
+    with (
+        RunFolder(place, scene.to_toml(header), comm.rank) as record,
+        run_log(place / "run.log" if comm.rank == 0 else None),
+        StopRequest() as stop,
+        Progress(number_of_steps, scene.name, comm.rank if not quiet else -1) as progress,
+    ):
+        log.info("scene %s on %d ranks, results in %s", scene.name, comm.size, place)
+        simulation = Simulation(scene, comm)
+        simulation.stepper.problem.stop_signal = lambda: stop.number
+        if scene.output.fields:
+            record.fields = Fields(place, simulation.domain, simulation.observer)
+        for step in simulation.steps(record.fields):
+            record.append(step.row)
+            log.info("%s", _summary(step.row))
+            progress.step(round(step.time / scene.time.step), step.time, _loads(step.row), step.row["newton_iterations"])
+    return place
+
+
+def _summary(row: dict[str, float]) -> str:
+    return ", ".join(f"{name} {value:.6g}" for name, value in row.items())
+
+
+def _loads(row: dict[str, float]) -> str:
+    names = ("force", "pressure", "axial_stretch")
+    return ", ".join(f"{name} {row[name]:.4g}" for name in names if name in row)

@@ -1,0 +1,45 @@
+"""Solver profiles: PETSc options by name, and the user's own on top."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from petsc4py import PETSc
+
+from remodel_fenicsx.scene import Solver
+
+OPTIONS_PREFIX = "remodel_"
+
+# MUMPS: robust for indefinite tangents too, one factorisation pattern for all steps, any number of ranks
+PROFILES: dict[str, dict[str, Any]] = {
+    "direct": {
+        "snes_type": "newtonls",
+        "snes_linesearch_type": "basic",
+        "ksp_type": "preonly",
+        "pc_type": "lu",
+        "pc_factor_mat_solver_type": "mumps",
+    },
+}
+
+
+_set_here: set[str] = set()
+
+
+def set_options(snes: Any, settings: Solver) -> None:
+    """Give SNES the profile's options, then the scene's, under those of the command line or PETSC_OPTIONS.
+
+    All carry the prefix `remodel_`: for instance ``PETSC_OPTIONS="-remodel_snes_monitor"``. They stay in PETSc's database
+    because the factorisation reads its own at the first solve.
+    """
+    database = PETSc.Options()
+    for stale in _set_here:
+        database.delValue(stale)
+    _set_here.clear()
+    for key, value in {**PROFILES[settings.profile], **settings.petsc_options}.items():
+        name = OPTIONS_PREFIX + key
+        if database.hasName(name) or value is False:
+            continue
+        database.setValue(name, None if value is True else value)
+        _set_here.add(name)
+    snes.setOptionsPrefix(OPTIONS_PREFIX)
+    snes.setFromOptions()

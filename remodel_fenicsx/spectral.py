@@ -1,0 +1,179 @@
+"""Principal values and axes of many symmetric tensors at once, safe at repeated and zero values.
+
+LAPACK's eigenvectors are arbitrary inside the eigenspace of a repeated value and arbitrary in sign, so they differ
+between machines and between numbers of ranks. The axes enter the stress (erratum 6 of docs/theory.md), hence every
+choice that the tensor itself does not make is made here by the previous axes.
+"""
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+
+ROUNDING = 64 * float(np.finfo(np.float64).eps)
+"""Relative size below which a principal value is rounding error (eigh is accurate to a few eps)."""
+
+DECISIVE = 1e-3
+"""Cosine below which a previous axis says nothing about a direction. Symmetric problems put this cosine at exactly
+zero, up to rounding; any threshold far above rounding gives the same choice on every machine."""
+
+
+def principal(tensors: npt.ArrayLike, previous: npt.ArrayLike, tolerance: float = 1e-8,
+              scale: float = 0.0) -> tuple[Array, Array]:
+    """Return the principal values, descending, and the principal axes of symmetric tensors.
+
+    Where neighbouring values agree (also in a chain: first with second, second with third), the tensor does not
+    determine the axes of these ranks. They are then the previous axes of the same ranks, projected onto the common
+    eigenspace and orthonormalised in the order of rank. A previous axis that is orthogonal to the eigenspace within
+    ``DECISIVE`` is passed over for the next previous axis (cyclic order of ranks), so that the outcome never
+    depends on LAPACK. The zero tensor keeps all three previous axes.
+
+    Signs: each axis has a positive cosine with the previous axis of its rank; where that cosine is not decisive
+    (the axes have swapped ranks), with the first of the next two that is. The triad may be left-handed.
+
+    Parameters
+    ----------
+    tensors : (n, 3, 3)
+        Symmetric tensors, any unit. Only the symmetric part is seen.
+    previous : (n, 3, 3)
+        Rows are the previous axes in the same (spatial or material) frame as the tensors. They need neither be
+        normalised nor orthogonal: F n_I will do.
+    tolerance : float
+        Values whose difference is at most `tolerance` times the largest absolute value are taken as equal.
+    scale : float
+        Typical size of the tensors in their unit (a stiffness, for stresses). Differences below rounding of `scale`
+        are taken as zero too. With the default 0 the axes do not depend on the unit.
+
+    Returns
+    -------
+    values : (n, 3)
+        Descending.
+    axes : (n, 3, 3)
+        Rows are orthonormal, row I belongs to value I.
+
+    Raises
+    ------
+    FloatingPointError
+        If a tensor or a previous axis holds NaN or infinity; names the first one.
+    """
+    tensors = np.asarray(tensors, dtype=np.float64)
+    previous = np.asarray(previous, dtype=np.float64)
+    _require_finite(tensors, "tensor")
+    _require_finite(previous, "triad of previous axes")
+
+    ascending, columns = np.linalg.eigh(0.5 * tensors + 0.5 * np.swapaxes(tensors, 1, 2))
+    values = ascending[:, ::-1].copy()
+    axes = np.swapaxes(columns, 1, 2)[:, ::-1].copy()
+
+    reference = _normalised(previous)
+    threshold = np.maximum(tolerance * _largest(values), ROUNDING * scale)
+    upper = values[:, 0] - values[:, 1] <= threshold
+    lower = values[:, 1] - values[:, 2] <= threshold
+    for cluster, normal_rank, first, second in (upper & ~lower, 2, 0, 1), (lower & ~upper, 0, 1, 2):
+        at = np.flatnonzero(cluster)
+        if at.size:
+            normal = axes[at, normal_rank]
+            axes[at, first] = _project(normal, _candidates(reference[at], first))
+            axes[at, second] = np.cross(normal, axes[at, first])
+    at = np.flatnonzero(upper & lower)
+    if at.size:
+        axes[at, 0] = _project(np.zeros((at.size, 3)), _candidates(reference[at], 0))
+        axes[at, 1] = _project(axes[at, 0], _candidates(reference[at], 1))
+        axes[at, 2] = np.cross(axes[at, 0], axes[at, 1])
+    return values, _with_signs_of(reference, axes)
+
+
+def positive_direction(values: npt.ArrayLike, scale: float = 0.0) -> tuple[Array, npt.NDArray[np.bool_]]:
+    """Return the direction e = lambda^+ / |lambda^+| of the positive principal values (eqs. 9 to 11).
+
+    Parameters
+    ----------
+    values : (n, 3)
+        Principal values of the driving tensor, any unit.
+    scale : float
+        Typical size of the driving tensor in its unit; a value within rounding of `scale`, or of the largest
+        absolute value at its point, is not positive.
+
+    Returns
+    -------
+    direction : (n, 3)
+        Unit vectors with non-negative components; zero where nothing is positive.
+    active : (n,) bool
+        False where no value is positive: nothing remodels there.
+
+    Raises
+    ------
+    FloatingPointError
+        If a value is NaN or infinite; names the first point.
+    """
+    values = np.asarray(values, dtype=np.float64)
+    _require_finite(values, "set of principal values")
+    largest = _largest(values)
+    rounding = ROUNDING * np.maximum(largest, scale)
+    # divided by the largest value first: the squares of very small or large values would underflow or overflow
+    positive = np.where(values > rounding[:, None], values, 0.0) / np.where(largest > 0.0, largest, 1.0)[:, None]
+    norm = _length(positive)
+    active = norm > 0.0
+    return positive / np.where(active, norm, 1.0)[:, None], active
+
+
+def _require_finite(values: Array, noun: str) -> None:
+    if not np.isfinite(values).all():
+        bad = ~np.isfinite(values).all(axis=tuple(range(1, values.ndim)))
+        first = int(np.argmax(bad))
+        raise FloatingPointError(f"{noun} {first} of {len(values)} is not finite ({int(bad.sum())} in all): "
+                                 f"{values[first].tolist()}")
+
+
+def _largest(vectors: Array) -> Array:
+    """Return the largest absolute component of vectors (..., 3); by columns, ten times faster than np.max."""
+    size = np.abs(vectors)
+    return np.maximum(np.maximum(size[..., 0], size[..., 1]), size[..., 2])
+
+
+def _length(vectors: Array) -> Array:
+    return np.sqrt(np.einsum("...a,...a->...", vectors, vectors))
+
+
+def _normalised(vectors: Array) -> Array:
+    """Return the vectors (..., 3) with length one; zero vectors stay zero."""
+    largest = _largest(vectors)
+    vectors = vectors / np.where(largest > 0.0, largest, 1.0)[..., None]  # squares must not overflow
+    length = _length(vectors)
+    return vectors / np.where(length > 0.0, length, 1.0)[..., None]
+
+
+def _candidates(reference: Array, rank: int) -> list[Array]:
+    """Return the directions (n, 3) that may stand for a rank, best first; the coordinate axes end the list."""
+    coordinate_axes = [np.broadcast_to(row, (len(reference), 3)) for row in np.eye(3)]
+    return [reference[:, (rank + shift) % 3] for shift in range(3)] + coordinate_axes
+
+
+def _project(normal: Array, candidates: list[Array]) -> Array:
+    """Return the first candidate that is not along the normal, projected onto the plane across it, normalised.
+
+    normal: (n, 3) unit vectors, or zero vectors for the whole space instead of a plane.
+    """
+    chosen = np.zeros_like(normal)
+    open_points = np.ones(len(normal), dtype=bool)
+    for candidate in candidates:
+        projected = candidate - np.einsum("na,na->n", candidate, normal)[:, None] * normal
+        usable = open_points & (_length(projected) > DECISIVE)
+        chosen[usable] = projected[usable]
+        open_points &= ~usable
+        if not open_points.any():
+            break
+    chosen = _normalised(chosen)
+    # once more: a candidate almost along the normal leaves a projection that is orthogonal to 1e-13 only
+    return _normalised(chosen - np.einsum("na,na->n", chosen, normal)[:, None] * normal)
+
+
+def _with_signs_of(reference: Array, axes: Array) -> Array:
+    """Return the axes with the signs that `principal` promises."""
+    decisive = np.einsum("nia,nia->ni", axes, reference)
+    for shift in (1, 2):
+        point, rank = np.nonzero(np.abs(decisive) <= DECISIVE)
+        if point.size:
+            next_previous = reference[point, (rank + shift) % 3]
+            decisive[point, rank] = np.einsum("na,na->n", axes[point, rank], next_previous)
+    return np.where(decisive[:, :, None] < 0.0, -axes, axes)

@@ -1,0 +1,130 @@
+"""A file below h5py that a full disk or a killed process cannot spoil."""
+
+from __future__ import annotations
+
+import io
+import os
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+
+@contextmanager
+def signals_held_back() -> Iterator[None]:
+    """Let Python's signal handlers (Ctrl-C, termination) run after the block: an exception inside a call-back that
+    HDF5 makes into `StagedFile` would crash it."""
+    if threading.current_thread() is not threading.main_thread():  # handlers run in the main thread only
+        yield
+        return
+    caught: list[int] = []
+    handlers = {int(number): signal.getsignal(number) for number in signal.valid_signals()}
+    try:
+        for number, handler in handlers.items():
+            if callable(handler):
+                signal.signal(number, lambda number, _: caught.append(number))
+        yield
+    finally:
+        for number, handler in handlers.items():
+            if callable(handler):
+                signal.signal(number, handler)
+        for number in caught:
+            signal.raise_signal(number)
+
+
+class StagedFile(io.RawIOBase):
+    """The file below h5py: keeps what HDF5 writes in memory until `commit`, which first writes what is new at the end.
+
+    HDF5 spoils a file when the disk fills up, or the process is killed, between its own writes. Here the disk can only
+    be full while the new end is written, which nothing refers to yet; then the few changed bytes of the old part follow
+    (those of the headers and chunk indices), in HDF5's order. HDF5 itself never meets an error.
+    """
+
+    def __init__(self, path: Path):
+        super().__init__()
+        self._path = path
+        self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
+        self._committed = 0  # bytes on the disk
+        self._changes: list[tuple[int, bytes]] = []  # to write over these, in order
+        self._tail = bytearray()  # to write after these
+        self._position = 0
+
+    def readable(self) -> bool:
+        return True
+
+    def writable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def tell(self) -> int:
+        return self._position
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        base = {os.SEEK_SET: 0, os.SEEK_CUR: self._position, os.SEEK_END: self._committed + len(self._tail)}[whence]
+        self._position = base + offset
+        return self._position
+
+    def readinto(self, buffer: Any) -> int:
+        start, size = self._position, len(buffer)
+        data = bytearray(os.pread(self._descriptor, max(0, min(size, self._committed - start)), start))
+        for offset, change in self._changes:
+            low, high = max(start, offset), min(start + len(data), offset + len(change))
+            if low < high:
+                data[low - start:high - start] = change[low - offset:high - offset]
+        from_tail = max(0, start - self._committed)
+        data += self._tail[from_tail:from_tail + size - len(data)]
+        buffer[:len(data)] = data
+        self._position += len(data)
+        return len(data)
+
+    def write(self, buffer: Any) -> int:
+        data = bytes(buffer)
+        old = max(0, min(len(data), self._committed - self._position))
+        if old:
+            self._changes.append((self._position, data[:old]))
+        if old < len(data):
+            start = self._position + old - self._committed
+            self._tail.extend(bytes(max(0, start - len(self._tail))))
+            self._tail[start:start + len(data) - old] = data[old:]
+        self._position += len(data)
+        return len(data)
+
+    def truncate(self, size: int | None = None) -> int:
+        size = self._position if size is None else size
+        # a file that is longer than its header says is valid: what is on the disk stays
+        wanted = max(0, size - self._committed)
+        self._tail[wanted:] = bytes(max(0, wanted - len(self._tail)))
+        return size
+
+    def commit(self) -> None:
+        """Bring everything to the disk, or raise OSError and keep it for the next time."""
+        try:
+            self._write_all(self._committed, self._tail)
+            os.fdatasync(self._descriptor)  # some file systems find out only now that they are full
+        except OSError:
+            os.ftruncate(self._descriptor, self._committed)
+            raise
+        for offset, change in self._changes:
+            self._write_all(offset, change)
+        self._committed += len(self._tail)
+        self._tail, self._changes = bytearray(), []
+
+    def discard(self) -> None:
+        """Close and remove a file that was not even begun."""
+        self.close()
+        self._path.unlink(missing_ok=True)
+
+    def close(self) -> None:
+        if not self.closed:
+            os.close(self._descriptor)
+        super().close()
+
+    def _write_all(self, offset: int, data: bytes | bytearray) -> None:
+        view = memoryview(data)
+        while view:
+            written = os.pwrite(self._descriptor, view, offset)
+            view, offset = view[written:], offset + written

@@ -1,0 +1,314 @@
+"""What all tables of a scene share: strict values, errors of one line, and their text as TOML and as documentation.
+
+A leaf: it knows no key of any scene. `parameters` and `scene` declare the keys.
+"""
+
+from __future__ import annotations
+
+import difflib
+import inspect
+import re
+import textwrap
+from collections.abc import Callable, Collection, Iterator, Mapping
+from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin
+
+import tomlkit
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, ValidationError
+from pydantic.fields import FieldInfo
+from pydantic_core import ErrorDetails, PydanticCustomError, PydanticUndefined
+
+LONGEST_VALUE = 60  # characters of a value in an error
+COMMENT_WIDTH = 100
+_MISSING = object()
+
+
+class SceneError(ValueError):
+    """Bad input. Its text is one line: the dotted key, the value, what is allowed."""
+
+    def __init__(self, message: str):
+        super().__init__(re.sub(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]+", " ", message))
+
+
+class Table(BaseModel):
+    """A table of a scene: immutable, no unknown keys, no conversion between types, no NaN and no infinity."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+    if not TYPE_CHECKING:  # the type checker reads the arguments from the fields
+
+        def __init__(self, /, **values):
+            try:
+                super().__init__(**values)
+            except ValidationError as error:
+                raise SceneError(one_line(error, type(self))) from None
+
+        # A table inside a table is then validated by pydantic directly, so that an error keeps its whole dotted key.
+        __init__.__pydantic_base_init__ = True
+
+
+class OneOf:
+    """Validator: the value is one of a registry's keys, those registered later included."""
+
+    def __init__(self, choices: Collection[Any]):
+        self.choices = choices
+
+    def __call__(self, value: Any) -> Any:
+        if value not in self.choices:
+            raise ValueError("not registered")
+        return value
+
+
+def one_of(choices: Collection[Any]) -> AfterValidator:
+    """Annotation of a field whose value is one of `choices`."""
+    return AfterValidator(OneOf(choices))
+
+
+def checked(check: Callable[[Any], Any]) -> BeforeValidator:
+    """Annotation of a field whose value goes through `check` before its type is looked at."""
+    return BeforeValidator(check)
+
+
+def fault(rule: str, key: str = "", value: Any = _MISSING) -> PydanticCustomError:
+    """Error to raise in a validator.
+
+    Parameters
+    ----------
+    rule
+        What is allowed.
+    key
+        The key at fault, relative to the table or field that is validated (dotted; "[2]" for an entry).
+    value
+        Its value, where that is not what is validated.
+    """
+    context = {"rule": rule, "key": key} | ({} if value is _MISSING else {"value": value})
+    return PydanticCustomError("fault", "{rule}", context)
+
+
+# ---------------------------------------------------------------- one line for an error
+
+
+def one_line(error: ValidationError, table: type[BaseModel]) -> str:
+    """`key = value: what is allowed` of the first fault, with the number of further ones."""
+    # a mistyped key is also a missing key: the mistyped one says more
+    details = sorted(error.errors(include_url=False), key=lambda detail: detail["type"] != "extra_forbidden")
+    text = _describe(details[0], table)
+    return text if len(details) == 1 else f"{text} (and {len(details) - 1} more)"
+
+
+def _describe(detail: ErrorDetails, table: type[BaseModel]) -> str:
+    key, owner, field = locate(table, detail["loc"])
+    kind, value, context = detail["type"], detail["input"], detail.get("ctx", {})
+    if kind == "fault":
+        key, rule = _joined(key, context["key"]), context["rule"]
+        value = context.get("value", value)
+        return f"{key}: {rule}" if value is None else f"{key} = {shown(value)}: {rule}"
+    if kind == "extra_forbidden":
+        return f"{key} = {shown(value)}: unknown key; {_suggestion(key, owner, table)}"
+    if field is not None and field.discriminator:
+        tag = str(field.discriminator)
+        if kind == "missing" or (isinstance(value, Mapping) and tag not in value):
+            return f"{key}.{tag}: missing; {allowed(field)}"
+        if isinstance(value, Mapping):
+            return f"{key}.{tag} = {shown(value[tag])}: {allowed(field)}"
+        return f"{key} = {shown(value)}: must be a table"
+    rule = detail["msg"] if field is None else allowed(field)
+    return f"{key}: missing; {rule}" if kind == "missing" else f"{key} = {shown(value)}: {rule}"
+
+
+def locate(table: type[BaseModel], location: tuple[int | str, ...]) -> tuple[str, type[BaseModel], FieldInfo | None]:
+    """Dotted key of a place in a table, the table class that owns it, and its field (None where there is none)."""
+    key, owner, field = "", table, None
+    annotation: Any = table
+    items = list(location)
+    while items:
+        item = items.pop(0)
+        key = _joined(key, f"[{item}]" if isinstance(item, int) else quoted(item))
+        if is_table(annotation):
+            owner, field = annotation, annotation.model_fields.get(str(item))
+            annotation = None if field is None else field.annotation
+            if field is not None and field.discriminator and items:
+                annotation = variants(field)[str(items.pop(0))]
+        elif get_origin(annotation) is dict:
+            annotation = get_args(annotation)[1]
+            if is_table(annotation):
+                owner, field = annotation, FieldInfo.from_annotation(annotation)
+    return key, owner, field
+
+
+def _joined(key: str, rest: str) -> str:
+    return key + rest if not key or not rest or rest.startswith("[") else f"{key}.{rest}"
+
+
+def quoted(key: str) -> str:
+    """A key as TOML writes it: bare, or in quotes."""
+    return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else shown(key)
+
+
+def shown(value: Any) -> str:
+    """A value as a scene writes it, on one line, cut where it is long."""
+    try:
+        text = _toml_text(value)
+    except (ValueError, RecursionError):  # an integer of thousands of digits, a list without end
+        text = f"a {type(value).__name__}"
+    return text if len(text) <= LONGEST_VALUE else text[: LONGEST_VALUE - 3] + "..."
+
+
+def _toml_text(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):
+        return repr(value)
+    if isinstance(value, BaseModel):
+        return _toml_text(value.model_dump(exclude_unset=True))
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{name} = {_toml_text(entry)}" for name, entry in value.items()) + "}"
+    if isinstance(value, (list, tuple)):
+        return "[" + ", ".join(_toml_text(entry) for entry in value) + "]"
+    return str(value)
+
+
+def _suggestion(key: str, owner: type[BaseModel], table: type[BaseModel]) -> str:
+    """The nearest key of the same table, else a key of the same name in another one, else all keys of the table."""
+    parent, _, name = key.rpartition(".")
+    near = difflib.get_close_matches(name, owner.model_fields, n=1, cutoff=0.6)
+    if near:
+        return f"did you mean {_joined(parent, near[0])}?"
+    elsewhere = {
+        known: _joined(other, known) for other, _, inner in sections(table) if other != parent for known in inner.model_fields
+    }
+    near = difflib.get_close_matches(name, elsewhere, n=1, cutoff=0.8)
+    if near:
+        return f"did you mean {elsewhere[near[0]]}?"
+    return "allowed are " + ", ".join(_joined(parent, known) for known in owner.model_fields)
+
+
+# ---------------------------------------------------------------- what a field allows
+
+
+def is_table(annotation: Any) -> bool:
+    """Whether an annotation is a table class."""
+    return isinstance(annotation, type) and issubclass(annotation, BaseModel)
+
+
+def variants(field: FieldInfo) -> dict[str, type[BaseModel]]:
+    """The table classes of a field that has several, by the value of the key that tells them apart."""
+    return {table.model_fields[str(field.discriminator)].default: table for table in get_args(field.annotation)}
+
+
+def choices(field: FieldInfo) -> list[Any]:
+    """The values of a field that has a closed list of them, else an empty list."""
+    if field.discriminator:
+        return list(variants(field))
+    for entry in field.metadata:
+        if isinstance(entry, AfterValidator) and isinstance(entry.func, OneOf):
+            return list(entry.func.choices)
+    return list(get_args(field.annotation)) if get_origin(field.annotation) is Literal else []
+
+
+def allowed(field: FieldInfo) -> str:
+    """What a field allows, as an error and the reference say it."""
+    if listed := choices(field):
+        return f"allowed {'is' if len(listed) == 1 else 'are'} " + ", ".join(shown(choice) for choice in listed)
+    if isinstance(field.json_schema_extra, dict):
+        return f"must be {field.json_schema_extra['allowed']}"
+    if is_table(field.annotation) or get_origin(field.annotation) is dict:
+        return "must be a table"
+    nouns: dict[Any, str] = {float: "a finite number", int: "a whole number", bool: "true or false", str: "a string"}
+    words = {"gt": "greater than", "ge": "at least", "lt": "less than", "le": "at most"}
+    bounds = [
+        f"{word} {getattr(entry, name)}" for entry in field.metadata for name, word in words.items() if hasattr(entry, name)
+    ]
+    return " ".join(filter(None, [f"must be {nouns[field.annotation]}", " and ".join(bounds)]))
+
+
+def sections(table: type[BaseModel], key: str = "", variant: str = "") -> Iterator[tuple[str, str, type[BaseModel]]]:
+    """(dotted key, variant, class) of a table and of all tables in it; NAME stands for a free name."""
+    yield key, variant, table
+    for name, field in table.model_fields.items():
+        path = _joined(key, name)
+        if field.discriminator:
+            for tag, inner in variants(field).items():
+                yield from sections(inner, path, tag)
+        elif is_table(field.annotation):
+            yield from sections(field.annotation, path)  # type: ignore[arg-type]
+        elif get_origin(field.annotation) is dict and is_table(get_args(field.annotation)[1]):
+            yield from sections(get_args(field.annotation)[1], f"{path}.NAME")
+
+
+# ---------------------------------------------------------------- TOML
+
+
+def toml_text(table: BaseModel, header: str = "") -> str:
+    """A table with all its values as TOML, each key under its description as a comment."""
+    document = tomlkit.document()
+    for line in header.splitlines():
+        document.add(tomlkit.comment(line) if line.strip() else tomlkit.nl())
+    if header:
+        document.add(tomlkit.nl())
+    _fill(document, table)
+    return tomlkit.dumps(document)
+
+
+def _fill(container: Any, table: BaseModel) -> None:
+    fields = type(table).model_fields
+    # TOML wants a table's own values before the tables in it
+    for name, field in sorted(fields.items(), key=lambda item: isinstance(getattr(table, item[0]), (BaseModel, dict))):
+        value = getattr(table, name)
+        if value is None:
+            continue
+        if isinstance(value, BaseModel):
+            inner = tomlkit.table()
+            _fill(inner, value)
+            container.add(name, inner)
+        elif isinstance(value, dict):
+            container.add(name, _toml_table(value))
+        else:
+            for line in textwrap.wrap(field.description or "", COMMENT_WIDTH):
+                container.add(tomlkit.comment(line))
+            container.add(name, _plain(value))
+
+
+def _toml_table(values: Mapping[str, Any]) -> Any:
+    table = tomlkit.table(is_super_table=any(isinstance(value, BaseModel) for value in values.values()))
+    for name, value in values.items():
+        if isinstance(value, BaseModel):
+            inner = tomlkit.table()
+            _fill(inner, value)
+            table.add(name, inner)
+        else:
+            table.add(name, value)
+    return table
+
+
+def _plain(value: Any) -> Any:
+    return [_plain(entry) for entry in value] if isinstance(value, (list, tuple)) else value
+
+
+# ---------------------------------------------------------------- documentation
+
+
+def markdown_reference(table: type[BaseModel]) -> str:
+    """One Markdown section for each table in a table: its keys with default, what is allowed, and description."""
+    return "\n".join(_section(key, variant, inner) for key, variant, inner in sections(table))
+
+
+def _section(key: str, variant: str, table: type[BaseModel]) -> str:
+    title = f"## `[{key}]`" + (f" of shape `{variant!r}`" if variant else "") if key else "## Top of the file"
+    rows = [
+        " | ".join([f"| `{name}`", _default(field), _cell(allowed(field)), _cell(field.description) + " |"])
+        for name, field in table.model_fields.items()
+        if field.description
+    ]
+    head = ["| key | default | allowed | meaning |", "|---|---|---|---|"]
+    return "\n".join([title, "", *inspect.cleandoc(table.__doc__ or "").splitlines(), "", *head, *rows, ""])
+
+
+def _cell(text: str) -> str:
+    """Text for a cell of a Markdown table, where a bar would end the cell."""
+    return re.sub(r"^(must be|allowed is|allowed are) ", "", text).replace("|", r"\|")
+
+
+def _default(field: FieldInfo) -> str:
+    if field.default is PydanticUndefined:
+        return "required" if field.default_factory is None else "empty"
+    return "none" if field.default is None else f"`{shown(field.default)}`"

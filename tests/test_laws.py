@@ -1,0 +1,119 @@
+"""Evolution laws: eqs. (10) and (11) and what they have in common."""
+
+import numpy as np
+import pytest
+
+from remodel_fenicsx.laws import LAWS, Array
+
+KAPPA = 0.025
+
+
+def octant(rng: np.random.Generator, count: int = 200) -> Array:
+    """Unit vectors with non-negative components."""
+    vectors = np.abs(rng.normal(size=(count, 3)))
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+def march(law: str, l0: Array, target: Array, times: Array, kappa: float = KAPPA) -> Array:
+    """Dimensions at the end of a series of steps with a constant target."""
+    l = l0  # noqa: E741
+    for old, new in zip(times[:-1], times[1:]):
+        l = LAWS[law](l, l0, target, kappa, float(old), float(new))  # noqa: E741
+    return l
+
+
+@pytest.fixture
+def cells() -> tuple[Array, Array]:
+    rng = np.random.default_rng(1)
+    return octant(rng), 1.3 * octant(rng)
+
+
+@pytest.mark.parametrize("law", ["rate", "relaxation"])
+@pytest.mark.parametrize("steps", [1, 7, 150])
+def test_laws_are_eq_11_when_the_target_is_constant(law: str, steps: int, cells: tuple[Array, Array]) -> None:
+    l0, target = cells
+    inner = np.sort(np.random.default_rng(steps).uniform(0.0, 150.0, steps - 1))
+    times = np.concatenate([[0.0], inner, [150.0]])
+    by_hand = l0 + (target - l0) * (1 - np.exp(-KAPPA * 150.0))
+    np.testing.assert_allclose(march(law, l0, target, times), by_hand, atol=1e-13)
+    np.testing.assert_allclose(march("explicit", l0, target, times), by_hand, atol=1e-14)
+
+
+def test_rate_integrates_eq_10_between_any_two_times(cells: tuple[Array, Array]) -> None:
+    l0, target = cells
+    start, end, count = 12.0, 13.5, 2000
+    middle = start + (np.arange(count) + 0.5) * (end - start) / count
+    slopes = [KAPPA * (target - l0) * np.exp(-KAPPA * t) for t in middle]
+    change = LAWS["rate"](target, l0, target, KAPPA, start, end) - target
+    np.testing.assert_allclose(change, np.sum(slopes, axis=0) * (end - start) / count, atol=1e-10)
+
+
+def test_laws_differ_when_the_target_changes() -> None:
+    """Erratum 7: eq. (11) forgets its past at once, eq. (10) keeps a memory that has died out before l = r0 e."""
+    l0 = np.array([[0.6, 0.8, 0.0]])
+    first, second = np.array([[1.0, 0.0, 0.0]]), np.array([[0.0, 1.0, 0.0]])
+    ends = {}
+    for law in ("explicit", "rate", "relaxation"):
+        half = LAWS[law](l0, l0, first, KAPPA, 0.0, 40.0)
+        ends[law] = LAWS[law](half, l0, second, KAPPA, 40.0, 1e5)[0]
+    np.testing.assert_allclose(ends["explicit"], second[0], atol=1e-14)
+    np.testing.assert_allclose(ends["relaxation"], second[0], atol=1e-14)
+    weight = 1 - np.exp(-1.0)  # of the first target: kappa times 40 is one
+    np.testing.assert_allclose(ends["rate"], weight * first[0] + (1 - weight) * second[0], atol=1e-14)
+
+
+def test_explicit_does_not_depend_on_the_previous_dimensions(cells: tuple[Array, Array]) -> None:
+    l0, target = cells
+    one = LAWS["explicit"](l0, l0, target, KAPPA, 3.0, 4.0)
+    np.testing.assert_array_equal(one, LAWS["explicit"](np.full_like(l0, np.nan), l0, target, KAPPA, 3.0, 4.0))
+
+
+def test_none_changes_nothing(cells: tuple[Array, Array]) -> None:
+    l0, target = cells
+    np.testing.assert_array_equal(LAWS["none"](l0, 2 * l0, target, KAPPA, 3.0, 4.0), l0)
+
+
+@pytest.mark.parametrize("law", ["explicit", "rate", "relaxation"])
+def test_no_remodeling_without_time_or_rate(law: str, cells: tuple[Array, Array]) -> None:
+    l0, target = cells
+    np.testing.assert_array_equal(LAWS[law](l0, l0, target, 0.0, 3.0, 4.0), l0)
+    np.testing.assert_array_equal(LAWS[law](l0, l0, target, KAPPA, 0.0, 0.0), l0)
+
+
+@pytest.mark.parametrize("law", sorted(LAWS))
+def test_arguments_are_left_alone(law: str, cells: tuple[Array, Array]) -> None:
+    l0, target = cells
+    copies = l0.copy(), target.copy()
+    LAWS[law](l0, l0, target, KAPPA, 1.0, 2.0)
+    np.testing.assert_array_equal(l0, copies[0])
+    np.testing.assert_array_equal(target, copies[1])
+
+
+def test_chain_length_of_eq_11_dips_along_the_chord() -> None:
+    """Erratum 3: |l|^2 = r0^2 (1 - 2 s (1-s)(1 - cos a)) between two points of the sphere, a the angle between them."""
+    rng = np.random.default_rng(2)
+    r0 = 1.2
+    l0, target = r0 * octant(rng, 2000), r0 * octant(rng, 2000)
+    cosine = np.sum(l0 * target, axis=1) / r0**2
+    for time in (1.0, 12.0, 27.7, 150.0):
+        s = 1 - np.exp(-KAPPA * time)
+        length = np.linalg.norm(LAWS["explicit"](l0, l0, target, KAPPA, time - 1.0, time), axis=1)
+        np.testing.assert_allclose(length**2, r0**2 * (1 - 2 * s * (1 - s) * (1 - cosine)), rtol=1e-12)
+        assert np.all(length >= r0 * np.sqrt(0.5) * (1 - 1e-12))
+
+
+def test_largest_dip_is_29_percent() -> None:
+    """From one axis to another, half way: at kappa t = ln 2 the chain is 1/sqrt 2 as long."""
+    l0, target = np.array([[0.0, 0.0, 1.0]]), np.array([[1.0, 0.0, 0.0]])
+    times = np.linspace(0.0, 150.0, 3001)
+    dips = [1 - np.linalg.norm(LAWS["explicit"](l0, l0, target, KAPPA, 0.0, float(t))) for t in times]
+    assert max(dips) == pytest.approx(1 - np.sqrt(0.5), abs=1e-6)
+    assert times[int(np.argmax(dips))] == pytest.approx(np.log(2) / KAPPA, abs=0.05)
+    assert round(100 * max(dips)) == 29
+
+
+def test_end_values_of_the_paper() -> None:
+    """At t = 150 a share exp(-3.75) = 0.0235 of the start is left, in directions without tension nothing else."""
+    l0, target = np.full((1, 3), 1 / np.sqrt(3)), np.array([[1.0, 0.0, 0.0]])
+    end = LAWS["explicit"](l0, l0, target, KAPPA, 149.0, 150.0)[0]
+    np.testing.assert_allclose(end, [0.9765 + 0.0235 / np.sqrt(3), 0.0235 / np.sqrt(3), 0.0235 / np.sqrt(3)], atol=5e-5)

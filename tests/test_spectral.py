@@ -1,0 +1,196 @@
+"""Principal values and axes: right where the tensor decides, the previous axes where it does not."""
+
+import numpy as np
+import pytest
+
+from remodel_fenicsx.spectral import Array, positive_direction, principal
+
+COUNT = 50
+
+
+def random_axes(rng: np.random.Generator, count: int = COUNT) -> Array:
+    return np.linalg.qr(rng.normal(size=(count, 3, 3)))[0]
+
+
+def tensor(values: list[float], axes: Array) -> Array:
+    """Symmetric tensors with the given values along the rows of `axes`."""
+    return np.swapaxes(axes, 1, 2) @ (np.asarray(values)[:, None] * axes)
+
+
+def absolute_cosines(a: Array, b: Array) -> Array:
+    return np.abs(np.sum(a * b, axis=-1))
+
+
+def assert_orthonormal(axes: Array) -> None:
+    np.testing.assert_allclose(axes @ np.swapaxes(axes, 1, 2), np.broadcast_to(np.eye(3), axes.shape), atol=1e-14)
+
+
+@pytest.mark.parametrize("size", [1.0, 1e-200, 1e200])
+def test_distinct_values(size: float) -> None:
+    rng = np.random.default_rng(1)
+    random = rng.normal(size=(COUNT, 3, 3))
+    tensors = size * (random + np.swapaxes(random, 1, 2))
+    previous = random_axes(rng)
+    values, axes = principal(tensors, previous)
+    assert np.all(np.diff(values, axis=1) <= 0)
+    assert_orthonormal(axes)
+    np.testing.assert_allclose(np.swapaxes(axes, 1, 2) @ (values[:, :, None] / size * axes), tensors / size, atol=1e-13)
+    cosines = np.sum(axes * previous, axis=2)
+    assert np.all(cosines[np.abs(cosines) > 1e-3] > 0)
+
+
+def test_only_the_symmetric_part_counts() -> None:
+    rng = np.random.default_rng(2)
+    tensors, previous = rng.normal(size=(COUNT, 3, 3)), random_axes(rng)
+    for one, other in zip(principal(tensors, previous), principal(np.swapaxes(tensors, 1, 2), previous)):
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("values, single, pair", [([5.0, 5.0, -2.0], 2, (0, 1)), ([5.0, -2.0, -2.0], 0, (1, 2))])
+def test_pair_of_equal_values_keeps_the_previous_axes_in_its_plane(
+    values: list[float], single: int, pair: tuple[int, int]
+) -> None:
+    rng = np.random.default_rng(3)
+    true, previous = random_axes(rng), random_axes(rng)
+    found, axes = principal(tensor(values, true), previous)
+    np.testing.assert_allclose(found, np.broadcast_to(values, found.shape), atol=1e-13)
+    assert_orthonormal(axes)
+    normal = true[:, single]
+    np.testing.assert_allclose(absolute_cosines(axes[:, single], normal), 1.0, atol=1e-14)
+    first, second = (previous[:, rank] - np.sum(previous[:, rank] * normal, axis=1)[:, None] * normal for rank in pair)
+    first /= np.linalg.norm(first, axis=1)[:, None]
+    second -= np.sum(first * second, axis=1)[:, None] * first
+    second /= np.linalg.norm(second, axis=1)[:, None]
+    np.testing.assert_allclose(axes[:, pair[0]], first, atol=1e-12)
+    np.testing.assert_allclose(axes[:, pair[1]], second, atol=1e-12)
+
+
+@pytest.mark.parametrize("values", [[3.0, 3.0, 1.0], [3.0, 1.0, 1.0], [2.0, 2.0, 2.0], [0.0, 0.0, 0.0],
+                                    [-1.0, -1.0, -1.0], [0.0, 0.0, -4.0]])
+def test_previous_axes_that_are_principal_stay(values: list[float]) -> None:
+    previous = random_axes(np.random.default_rng(4))
+    _, axes = principal(tensor(values, previous), previous)
+    np.testing.assert_allclose(axes, previous, atol=1e-14)
+
+
+@pytest.mark.parametrize("values", [[3.0, 3.0, 1.0], [3.0, 1.0, 1.0], [2.0, 2.0, 2.0]])
+def test_rounding_does_not_choose_the_axes(values: list[float]) -> None:
+    rng = np.random.default_rng(5)
+    true, previous = random_axes(rng), random_axes(rng)
+    exact = tensor(values, true)
+    noise = 1e-12 * rng.normal(size=exact.shape)
+    noise += np.swapaxes(noise, 1, 2)
+    # the noise does turn LAPACK's vectors, so there is something to be protected from
+    bare = np.linalg.eigh(exact)[1], np.linalg.eigh(exact + noise)[1]
+    assert np.min(np.abs(np.sum(bare[0] * bare[1], axis=1))) < 0.9
+    np.testing.assert_allclose(principal(exact + noise, previous)[1], principal(exact, previous)[1], atol=1e-9)
+
+
+def test_values_that_agree_in_a_chain_are_one_cluster() -> None:
+    rng = np.random.default_rng(6)
+    true, previous = random_axes(rng), random_axes(rng)
+    _, axes = principal(tensor([1.0, 1.0 - 0.8e-8, 1.0 - 1.6e-8], true), previous)
+    np.testing.assert_allclose(axes, previous, atol=1e-14)
+    _, axes = principal(tensor([1.0, 1.0 - 1.6e-8, 1.0 - 3.2e-8], true), previous)
+    np.testing.assert_allclose(absolute_cosines(axes, true), 1.0, atol=1e-12)
+
+
+def test_tolerance_is_relative_to_the_largest_absolute_value() -> None:
+    rng = np.random.default_rng(7)
+    true, previous = random_axes(rng), random_axes(rng)
+    _, axes = principal(tensor([1e-9, 0.0, -1.0], true), previous)
+    assert np.min(absolute_cosines(axes[:, 0], true[:, 0])) < 0.9
+    _, axes = principal(tensor([1e-9, 0.0, -1.0], true), previous, tolerance=1e-11)
+    np.testing.assert_allclose(absolute_cosines(axes, true), 1.0, atol=1e-10)
+
+
+def test_noise_below_the_scale_is_the_zero_tensor() -> None:
+    rng = np.random.default_rng(8)
+    true, previous = random_axes(rng), random_axes(rng)
+    noise = tensor([3e-16, 1e-16, -2e-16], true)
+    np.testing.assert_allclose(principal(noise, previous, scale=1.0)[1], previous, atol=1e-14)
+    np.testing.assert_allclose(absolute_cosines(principal(noise, previous)[1], true), 1.0, atol=1e-12)
+
+
+def test_previous_axis_across_the_eigenspace_is_passed_over() -> None:
+    previous = np.array([[[0.0, 0.0, 1.0], [0.6, 0.8, 0.0], [-0.8, 0.6, 0.0]]])
+    _, axes = principal(np.diag([2.0, 2.0, 1.0])[None], previous)
+    np.testing.assert_allclose(axes[0], [[0.6, 0.8, 0.0], [-0.8, 0.6, 0.0], [0.0, 0.0, 1.0]], atol=1e-15)
+    # almost across: the same choice, not a direction made of rounding
+    previous[0, 0] = [1e-9, -1e-9, 1.0]
+    np.testing.assert_allclose(principal(np.diag([2.0, 2.0, 1.0])[None], previous)[1][0], axes[0], atol=1e-9)
+    _, axes = principal(np.diag([1.0, 1.0, 2.0])[None], np.eye(3)[[0, 2, 1]][None])
+    np.testing.assert_array_equal(axes[0], [[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
+
+
+def test_swapped_ranks_take_their_sign_from_the_other_previous_axes() -> None:
+    for sign in (1.0, -1.0):
+        previous = sign * np.eye(3)[None]
+        _, axes = principal(np.diag([1.0, 2.0, 3.0])[None], previous)
+        np.testing.assert_array_equal(axes[0], sign * np.eye(3)[[2, 1, 0]])
+
+
+def test_previous_axes_need_not_be_orthonormal() -> None:
+    skew = np.array([[[2.0, 0.0, 0.0], [3.0, 0.1, 0.0], [1.0, 1.0, 5.0]]])
+    np.testing.assert_allclose(principal(np.zeros((1, 3, 3)), skew)[1], np.eye(3)[None], atol=1e-15)
+
+
+def test_without_previous_axes_the_coordinate_axes_decide() -> None:
+    nothing = np.zeros((2, 3, 3))
+    np.testing.assert_array_equal(principal(np.zeros((2, 3, 3)), nothing)[1], np.broadcast_to(np.eye(3), (2, 3, 3)))
+    for values in ([2.0, 2.0, 1.0], [2.0, 1.0, 1.0]):
+        true = random_axes(np.random.default_rng(9))
+        _, axes = principal(tensor(values, true), np.zeros_like(true))
+        assert_orthonormal(axes)
+
+
+def test_points_do_not_influence_each_other() -> None:
+    rng = np.random.default_rng(10)
+    true, previous = random_axes(rng, 4), random_axes(rng, 4)
+    tensors = np.concatenate([tensor(values, true[[i]]) for i, values in enumerate(
+        ([3.0, 2.0, 1.0], [2.0, 2.0, 1.0], [2.0, 1.0, 1.0], [1.0, 1.0, 1.0]))])
+    _, together = principal(tensors, previous)
+    for i in range(4):
+        np.testing.assert_array_equal(principal(tensors[[i]], previous[[i]])[1][0], together[i])
+    values, axes = principal(np.zeros((0, 3, 3)), np.zeros((0, 3, 3)))
+    assert values.shape == (0, 3) and axes.shape == (0, 3, 3)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_what_is_not_finite_is_named(bad: float) -> None:
+    tensors = np.zeros((5, 3, 3))
+    tensors[3, 0, 1] = tensors[4, 2, 2] = bad
+    with pytest.raises(FloatingPointError, match=r"^tensor 3 of 5 is not finite \(2 in all\): \[\[0\.0, -?(nan|inf), "):
+        principal(tensors, np.zeros((5, 3, 3)))
+    with pytest.raises(FloatingPointError, match=r"^triad of previous axes 3 of 5 is not finite \(2 in all\)"):
+        principal(np.zeros((5, 3, 3)), tensors)
+    with pytest.raises(FloatingPointError, match=r"^set of principal values 0 of 1 is not finite \(1 in all\)"):
+        positive_direction([[bad, 0.0, 0.0]])
+
+
+@pytest.mark.parametrize("values, direction", [
+    ([3.0, 4.0, 0.0], [0.6, 0.8, 0.0]),
+    ([4.0, 3.0, -100.0], [0.8, 0.6, 0.0]),
+    ([1.0, 1e-16, -1e-16], [1.0, 0.0, 0.0]),
+    ([3e-310, 4e-310, 0.0], [0.6, 0.8, 0.0]),
+    ([3e290, 4e290, -1e300], [0.6, 0.8, 0.0]),
+])
+def test_positive_direction(values: list[float], direction: list[float]) -> None:
+    with np.errstate(all="raise", under="ignore"):
+        found, active = positive_direction([values])
+    assert active.tolist() == [True]
+    np.testing.assert_allclose(found[0], direction, atol=1e-12)
+
+
+@pytest.mark.parametrize("values", [[0.0, 0.0, 0.0], [-1.0, -2.0, -3.0], [1e-16, -1.0, -1.0], [0.0, -1e-300, -1e-300]])
+def test_nothing_positive_is_inactive(values: list[float]) -> None:
+    with np.errstate(all="raise", under="ignore"):
+        found, active = positive_direction([values, [1.0, 0.0, 0.0]])
+    assert active.tolist() == [False, True]
+    np.testing.assert_array_equal(found, [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+
+
+def test_noise_below_the_scale_is_inactive() -> None:
+    noise = [[2e-16, 1e-16, -1e-16]]
+    assert positive_direction(noise)[1].tolist() == [True]
+    assert positive_direction(noise, scale=1.0)[1].tolist() == [False]
