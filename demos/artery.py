@@ -1,0 +1,118 @@
+# %% [markdown]
+# # A tube-like artery subject to axial stretch and internal pressure
+#
+# Kuhl & Holzapfel 2007, Figs. 7 and 8: an artery with randomly oriented collagen is stretched by 10 % and pressurised to
+# 4.8 in 25 steps, then held while its collagen reorients. `demos/artery.toml` is the same simulation as a scene.
+#
+#     ./with-fenicsx python3 demos/artery.py [END [FOLDER]]
+#     ./with-fenicsx mpirun -n 2 python3 demos/artery.py
+
+# %%
+import sys
+from pathlib import Path
+
+import dolfinx.fem
+from mpi4py import MPI
+
+from remodel_fenicsx.cells import UnitCells
+from remodel_fenicsx.geometry import tube
+from remodel_fenicsx.loads import Loading
+from remodel_fenicsx.observables import Observer
+from remodel_fenicsx.parameters import Cells, Material, Remodeling
+from remodel_fenicsx.quadrature import Quadrature
+from remodel_fenicsx.record import RunFolder, choose_folder
+from remodel_fenicsx.remodel import RemodelingPass
+from remodel_fenicsx.scene import Solver
+from remodel_fenicsx.stepping import Stepper, times
+
+end = float(sys.argv[1]) if len(sys.argv) > 1 else 150.0
+comm = MPI.COMM_WORLD
+folder = choose_folder(Path(sys.argv[2]) if len(sys.argv) > 2 else None, "artery-script") if comm.rank == 0 else None
+folder = comm.bcast(folder)
+
+# %% [markdown]
+# ## Geometry
+# Radii 1 and 3, length 8; 16 trilinear elements around, 8 through the wall, 12 along. The unknown is the displacement
+# $u$, the deformation gradient $F = I + \nabla u$, $C = F^T F$, $J = \det F$.
+
+# %%
+domain = tube(inner_radius=1.0, outer_radius=3.0, length=8.0, comm=comm)
+space = dolfinx.fem.functionspace(domain.mesh, ("Lagrange", 1, (3,)))
+displacement = dolfinx.fem.Function(space, name="displacement")
+
+# %% [markdown]
+# ## Tissue
+# An isotropic matrix and eight-chain cells with dimensions $l_I$ along orthonormal axes $n_I$:
+# $$W = \frac{\lambda}{2}\ln^2 J + \frac{\mu}{2}(\operatorname{tr} C - 3) - \mu \ln J
+#     + c\,\frac{L}{4}\Big(2\frac{r^2}{L^2} + \frac{1}{1-r/L} - \frac{r}{L}\Big)
+#     - \frac{c}{2}\,g(r_0) \sum_I l_I^2 \ln(n_I \cdot C n_I)$$
+# with the end-to-end length $r^2 = \sum_I l_I^2\, n_I \cdot C n_I$ and $c = k\theta n / (4 A_p)$. `energy.py` says it in UFL.
+# The cells live at the quadrature points; each element starts with random dimensions, $|l| = r_0$.
+
+# %%
+material = Material(
+    lame_lambda=27.293,
+    lame_mu=3.103,
+    chain_density=2.0e21,
+    contour_length=1.594,
+    persistence_length=1.365,
+    temperature=310.0,
+)
+quadrature = Quadrature(domain.mesh, element_degree=1)
+cells = UnitCells(
+    quadrature,
+    domain.cell_number,
+    domain.number_of_cells,
+    Cells(initial="random", axes="cylindrical", seed=1, end_to_end_length=1.0),
+)
+
+# %% [markdown]
+# ## Supports and loads
+# The ends slide in their planes; three inner nodes of the bottom hold the rigid motions without holding the section in
+# shape. The pressure follows the deformed inner face: $p \int \operatorname{cof}(F) N \cdot v\, \mathrm{d}A$.
+
+# %%
+loading = Loading(domain, displacement)
+loading.hold_face("bottom", component=2)
+loading.hold_node((1.0, 0.0, 0.0), component=1)
+loading.hold_node((-1.0, 0.0, 0.0), component=1)
+loading.hold_node((0.0, 1.0, 0.0), component=0)
+loading.add_prescribed_stretch("stretch", "top", component=2, length=8.0)
+loading.add_follower_pressure("pressure", "inner")
+
+
+def load_values(time: float) -> dict[str, float]:
+    """Up to t = 25, then held."""
+    factor = min(time / 25.0, 1.0)
+    return {"pressure": 4.8 * factor, "stretch": 0.1 * factor}
+
+
+# %% [markdown]
+# ## Remodeling
+# With the eigenvalues $\lambda_I$ of the Cauchy stress, their positive parts and $e = \lambda^+ / |\lambda^+|$, every point
+# turns its axes to the principal directions at once and its dimensions gradually (eq. 11):
+# $$l = l^0 + (r_0\, e - l^0)\,(1 - e^{-\kappa t})$$
+
+# %%
+remodeling = RemodelingPass(
+    displacement, cells, material, Remodeling(driver="cauchy", law="explicit", frame="spatial", kappa=0.025)
+)
+
+# %% [markdown]
+# ## Through time
+# Each step sets the loads of its time, finds $u$ in equilibrium with the cells as they are, and then lets them remodel.
+
+# %%
+stepper = Stepper(displacement, loading, cells, material, remodeling, Solver(), load_values)
+observer = Observer(domain, displacement, loading, cells, material)
+
+with RunFolder(folder, "# made by demos/artery.py\n", comm.rank) as record:
+    for time in times(end, step=1.0):
+        step = stepper.solve(time)
+        columns = observer.columns()
+        record.append({"time": time, **columns, "max_chain_extension": step.extension.max_chain_extension})
+        if comm.rank == 0:
+            print(f"t = {time:5.1f}  outer radius {columns['outer_radius']:.4f}  "
+                  f"angles {columns['fibre_angle_inner']:5.1f} {columns['fibre_angle_middle']:5.1f} "
+                  f"{columns['fibre_angle_outer']:5.1f}")  # fmt: skip
+        stepper.remodel(time)

@@ -1,0 +1,98 @@
+# %% [markdown]
+# # The speed of remodeling: a unit cube in uniaxial tension
+#
+# Kuhl & Holzapfel 2007, Fig. 5 (Remark 7): an isotropic cube is pulled with a force of 10 in 10 steps and held to t = 100.
+# The angle between chains and load falls from 54.7 degrees; how fast is a matter of $\kappa$ alone:
+# $$\tan\alpha(t) = \frac{\sqrt2\,(1-s)}{1 - s + \sqrt3\, s}, \qquad s = 1 - e^{-\kappa t}$$
+# `demos/cube.toml` is the same simulation as a scene.
+#
+#     ./with-fenicsx python3 demos/cube.py [END [FOLDER]]
+
+# %%
+import sys
+from pathlib import Path
+
+import dolfinx.fem
+import numpy as np
+from mpi4py import MPI
+
+from remodel_fenicsx.cells import UnitCells
+from remodel_fenicsx.geometry import cube
+from remodel_fenicsx.loads import Loading
+from remodel_fenicsx.observables import Observer
+from remodel_fenicsx.parameters import Cells, Material, Remodeling
+from remodel_fenicsx.quadrature import Quadrature
+from remodel_fenicsx.record import RunFolder, choose_folder
+from remodel_fenicsx.remodel import RemodelingPass
+from remodel_fenicsx.scene import Solver
+from remodel_fenicsx.stepping import Stepper, times
+
+end = float(sys.argv[1]) if len(sys.argv) > 1 else 100.0
+comm = MPI.COMM_WORLD
+folder = choose_folder(Path(sys.argv[2]) if len(sys.argv) > 2 else None, "cube-script") if comm.rank == 0 else None
+folder = comm.bcast(folder)
+
+# %% [markdown]
+# ## Geometry and tissue
+# One element. Isotropic cells: $l_1 = l_2 = l_3 = r_0 / \sqrt3$.
+
+# %%
+domain = cube(side=1.0, comm=comm)
+space = dolfinx.fem.functionspace(domain.mesh, ("Lagrange", 1, (3,)))
+displacement = dolfinx.fem.Function(space, name="displacement")
+material = Material(
+    lame_lambda=27.293,
+    lame_mu=3.103,
+    chain_density=7.0e21,
+    contour_length=2.125,
+    persistence_length=1.82,
+    temperature=310.0,
+)
+quadrature = Quadrature(domain.mesh, element_degree=1)
+cells = UnitCells(
+    quadrature,
+    domain.cell_number,
+    domain.number_of_cells,
+    Cells(initial="isotropic", axes="global", end_to_end_length=1.0),
+)
+
+# %% [markdown]
+# ## Supports and loads
+# Three symmetry planes, a dead force along z on the face z = 1.
+
+# %%
+loading = Loading(domain, displacement)
+loading.hold_face("x0", component=0)
+loading.hold_face("y0", component=1)
+loading.hold_face("z0", component=2)
+loading.add_dead_force("force", "z1", component=2)
+
+
+def load_values(time: float) -> dict[str, float]:
+    """Up to t = 10, then held."""
+    return {"force": 10.0 * min(time / 10.0, 1.0)}
+
+
+# %% [markdown]
+# ## Remodeling and the way through time
+# The row of a time belongs to the solved state, before the cells remodel: its cells are those of the step before.
+
+# %%
+kappa = 0.025
+remodeling = RemodelingPass(
+    displacement, cells, material, Remodeling(driver="cauchy", law="explicit", frame="spatial", kappa=kappa)
+)
+stepper = Stepper(displacement, loading, cells, material, remodeling, Solver(), load_values)
+observer = Observer(domain, displacement, loading, cells, material)
+
+with RunFolder(folder, "# made by demos/cube.py\n", comm.rank) as record:
+    for time in times(end, step=1.0):
+        step = stepper.solve(time)
+        columns = observer.columns()
+        record.append({"time": time, **columns, "max_chain_extension": step.extension.max_chain_extension})
+        s = 1 - np.exp(-kappa * (time - 1.0))
+        closed_form = np.degrees(np.arctan2(np.sqrt(2) * (1 - s), 1 - s + np.sqrt(3) * s))
+        if comm.rank == 0:
+            print(f"t = {time:5.1f}  stretch {columns['mean_stretch']:.4f}  "
+                  f"angle {columns['mean_fibre_angle']:8.5f}, in closed form {closed_form:8.5f}")  # fmt: skip
+        stepper.remodel(time)

@@ -1,0 +1,108 @@
+# %% [markdown]
+# # A cylindrical tendon under uniaxial tension
+#
+# Kuhl & Holzapfel 2007, Fig. 6: a tendon of length 10 and cross-section 10 with randomly oriented collagen is pulled with
+# a force of 300 in 12 steps, then held. At first it stretches to about 175 %; while its collagen turns into the direction
+# of the load it stiffens, down to about 140 %. `demos/tendon.toml` is the same simulation as a scene.
+#
+#     ./with-fenicsx python3 demos/tendon.py [END [FOLDER]]
+#     ./with-fenicsx mpirun -n 2 python3 demos/tendon.py
+
+# %%
+import sys
+from pathlib import Path
+
+import dolfinx.fem
+from mpi4py import MPI
+
+from remodel_fenicsx.cells import UnitCells
+from remodel_fenicsx.geometry import tendon
+from remodel_fenicsx.loads import Loading
+from remodel_fenicsx.observables import Observer
+from remodel_fenicsx.parameters import Cells, Material, Remodeling
+from remodel_fenicsx.quadrature import Quadrature
+from remodel_fenicsx.record import RunFolder, choose_folder
+from remodel_fenicsx.remodel import RemodelingPass
+from remodel_fenicsx.scene import Solver
+from remodel_fenicsx.stepping import Stepper, times
+
+end = float(sys.argv[1]) if len(sys.argv) > 1 else 150.0
+comm = MPI.COMM_WORLD
+folder = choose_folder(Path(sys.argv[2]) if len(sys.argv) > 2 else None, "tendon-script") if comm.rank == 0 else None
+folder = comm.bcast(folder)
+
+# %% [markdown]
+# ## Geometry
+# 48 trilinear elements in the cross-section, 10 along the axis z.
+
+# %%
+domain = tendon(length=10.0, area=10.0, comm=comm)
+space = dolfinx.fem.functionspace(domain.mesh, ("Lagrange", 1, (3,)))
+displacement = dolfinx.fem.Function(space, name="displacement")
+
+# %% [markdown]
+# ## Tissue
+# The energy of `energy.py`; a unit cell at every quadrature point with one random draw of $l_I$ per element, $|l| = r_0$.
+# A cell whose long side lies along z is stiff, one that lies across is soft: the body is not homogeneous.
+
+# %%
+material = Material(
+    lame_lambda=27.293,
+    lame_mu=3.103,
+    chain_density=2.0e21,
+    contour_length=1.594,
+    persistence_length=1.365,
+    temperature=310.0,
+)
+quadrature = Quadrature(domain.mesh, element_degree=1)
+cells = UnitCells(
+    quadrature,
+    domain.cell_number,
+    domain.number_of_cells,
+    Cells(initial="random", axes="global", seed=1, end_to_end_length=1.0),
+)
+
+# %% [markdown]
+# ## Supports and loads
+# The bottom slides in its plane; its centre and one further node hold the rigid motions. On the top a dead traction
+# $T = F / A_0$ along z; the top is free to deform.
+
+# %%
+loading = Loading(domain, displacement)
+loading.hold_face("bottom", component=2)
+loading.hold_node((0.0, 0.0, 0.0), component=0)
+loading.hold_node((0.0, 0.0, 0.0), component=1)
+loading.hold_node((domain.dimensions["radius"], 0.0, 0.0), component=1)
+loading.add_dead_force("force", "top", component=2)
+
+
+def load_values(time: float) -> dict[str, float]:
+    """Up to t = 12, then held."""
+    return {"force": 300.0 * min(time / 12.0, 1.0)}
+
+
+# %% [markdown]
+# ## Remodeling
+# Under uniaxial tension only the first eigenvalue of the Cauchy stress is positive, so $e \to (1, 0, 0)$ and eq. (11) lets
+# $l_1 \to r_0$, $l_2, l_3 \to 0$ with $n_1$ along the load.
+
+# %%
+remodeling = RemodelingPass(
+    displacement, cells, material, Remodeling(driver="cauchy", law="explicit", frame="spatial", kappa=0.025)
+)
+
+# %% [markdown]
+# ## Through time
+
+# %%
+stepper = Stepper(displacement, loading, cells, material, remodeling, Solver(), load_values)
+observer = Observer(domain, displacement, loading, cells, material)
+
+with RunFolder(folder, "# made by demos/tendon.py\n", comm.rank) as record:
+    for time in times(end, step=1.0):
+        step = stepper.solve(time)
+        columns = observer.columns()
+        record.append({"time": time, **columns, "max_chain_extension": step.extension.max_chain_extension})
+        if comm.rank == 0:
+            print(f"t = {time:5.1f}  stretch {columns['mean_stretch']:.4f}  angle {columns['mean_fibre_angle']:5.1f}")
+        stepper.remodel(time)
