@@ -106,7 +106,7 @@ def test_largest_dip_is_29_percent() -> None:
     """From one axis to another, half way: at kappa t = ln 2 the chain is 1/sqrt 2 as long."""
     l0, target = np.array([[0.0, 0.0, 1.0]]), np.array([[1.0, 0.0, 0.0]])
     times = np.linspace(0.0, 150.0, 3001)
-    dips = [1 - np.linalg.norm(LAWS["explicit"](l0, l0, target, KAPPA, 0.0, float(t))) for t in times]
+    dips = [1 - float(np.linalg.norm(LAWS["explicit"](l0, l0, target, KAPPA, 0.0, float(t)))) for t in times]
     assert max(dips) == pytest.approx(1 - np.sqrt(0.5), abs=1e-6)
     assert times[int(np.argmax(dips))] == pytest.approx(np.log(2) / KAPPA, abs=0.05)
     assert round(100 * max(dips)) == 29

@@ -10,10 +10,22 @@ from typing import Any
 
 import pytest
 
-from remodel_fenicsx import parameters, scene as scene_module
+from remodel_fenicsx import parameters
 from remodel_fenicsx.parameters import PRESET_NOTES, PRESETS, SHAPES, Cells, Material, Remodeling
-from remodel_fenicsx.scene import Cube, Load, Scene, Solver, Tendon, Time, Tube, read_scene, scene_from_dict, scene_reference
-from remodel_fenicsx.tables import SceneError
+from remodel_fenicsx.scene import (
+    Cube,
+    Load,
+    Scene,
+    Solver,
+    Tendon,
+    Time,
+    Tube,
+    preset_scene,
+    read_scene,
+    scene_from_dict,
+    scene_reference,
+)
+from remodel_fenicsx.tables import SceneError, sections
 
 ROOT = Path(__file__).resolve().parent.parent
 DEMOS = sorted((ROOT / "demos").glob("*.toml"))
@@ -48,8 +60,10 @@ def refusal(values: dict[str, Any]) -> str:
 # (base, changes, the one line)
 BAD_SCENES = [
     # geometry
-    (TUBE, {"geometry.inner_radius": 3.0}, "geometry.inner_radius = 3.0: must be smaller than geometry.outer_radius = 3.0"),
-    (TUBE, {"geometry.inner_radius": 5}, "geometry.inner_radius = 5.0: must be smaller than geometry.outer_radius = 3.0"),
+    (TUBE, {"geometry.inner_radius": 3.0},
+     "geometry.inner_radius = 3.0: must be smaller than geometry.outer_radius = 3.0"),
+    (TUBE, {"geometry.inner_radius": 5},
+     "geometry.inner_radius = 5.0: must be smaller than geometry.outer_radius = 3.0"),
     (TUBE, {"geometry.length": 0.0}, "geometry.length = 0.0: must be a finite number greater than 0"),
     (TUBE, {"geometry.shape": "sphere"}, "geometry.shape = 'sphere': allowed are 'cube', 'tendon', 'tube'"),
     (TUBE, {"geometry.shape": 1}, "geometry.shape = 1: allowed are 'cube', 'tendon', 'tube'"),
@@ -66,16 +80,19 @@ BAD_SCENES = [
     (TUBE, {"cells.sed": 3}, "cells.sed = 3: unknown key; did you mean cells.seed?"),
     (TUBE, {"kappa": 0.1}, "kappa = 0.1: unknown key; did you mean remodeling.kappa?"),
     (TUBE, {"remodelling": {"kappa": 1.0}}, "remodelling = {kappa = 1.0}: unknown key; did you mean remodeling?"),
-    (TUBE, {"output.pictures!": True}, "output.'pictures!' = true: unknown key; allowed are output.fields, output.every"),
+    (TUBE, {"output.pictures!": True},
+     "output.'pictures!' = true: unknown key; allowed are output.fields, output.every"),
     (TUBE, {"time.x\ny": 1}, "time.'x\\ny' = 1: unknown key; allowed are time.end, time.step"),
     # material
     (CUBE, {"material.lame_mu": -3.0}, "material.lame_mu = -3.0: must be a finite number greater than 0"),
     (CUBE, {"material.lame_lambda": -0.1}, "material.lame_lambda = -0.1: must be a finite number at least 0"),
     (CUBE, {"material.lame_mu": float("nan")}, "material.lame_mu = nan: must be a finite number greater than 0"),
-    (CUBE, {"material.temperature": float("inf")}, "material.temperature = inf: must be a finite number greater than 0"),
+    (CUBE, {"material.temperature": float("inf")},
+     "material.temperature = inf: must be a finite number greater than 0"),
     (CUBE, {"material.lame_mu": "3.1"}, "material.lame_mu = '3.1': must be a finite number greater than 0"),
     (CUBE, {"material.lame_mu": True}, "material.lame_mu = true: must be a finite number greater than 0"),
-    (CUBE, {"material.lame_mu": 10**400}, re.compile(r"material\.lame_mu = 10+\.\.\.: must be a finite number greater than 0")),
+    (CUBE, {"material.lame_mu": 10**400},
+     re.compile(r"material\.lame_mu = 10+\.\.\.: must be a finite number greater than 0")),
     (CUBE, {"material.lame_mu": [1.0]}, "material.lame_mu = [1.0]: must be a finite number greater than 0"),
     (CUBE, {"material.energy_factor": 2}, "material.energy_factor = 2: allowed are 1, 4"),
     (CUBE, {"material.energy_factor": True}, "material.energy_factor = true: allowed are 1, 4"),
@@ -98,24 +115,29 @@ BAD_SCENES = [
      "cells.initial = 'raindrop': allowed are 'random', 'isotropic', 'aligned' or three lengths [l1, l2, l3]"),
     (CUBE, {"cells.initial": 1.0},
      "cells.initial = 1.0: allowed are 'random', 'isotropic', 'aligned' or three lengths [l1, l2, l3]"),
-    (CUBE, {"cells.initial": [0.6, 0.8]}, "cells.initial = [0.6, 0.8]: must be three lengths [l1, l2, l3], each at least 0"),
+    (CUBE, {"cells.initial": [0.6, 0.8]},
+     "cells.initial = [0.6, 0.8]: must be three lengths [l1, l2, l3], each at least 0"),
     (CUBE, {"cells.initial": [0.6, -0.8, 0.0]},
      "cells.initial = [0.6, -0.8, 0.0]: must be three lengths [l1, l2, l3], each at least 0"),
     (CUBE, {"cells.initial": [1, 1, 1]},
-     "cells.initial = [1.0, 1.0, 1.0]: the root of the sum of squares is 1.732051, it must be cells.end_to_end_length = 1.0"),
+     "cells.initial = [1.0, 1.0, 1.0]: the root of the sum of squares is 1.732051, "
+     "it must be cells.end_to_end_length = 1.0"),
     (CUBE, {"cells.aligned_axis": 0}, "cells.aligned_axis = 0: allowed are 1, 2, 3"),
     # loads
     (TUBE, {"loads.force": {"value": 1.0}},
      "loads.force = {value = 1.0}: a tube has no such load; allowed: loads.pressure, loads.stretch"),
-    (CUBE, {"loads.presure": {"value": 1.0}}, "loads.presure = {value = 1.0}: a cube has no such load; allowed: loads.force"),
-    (CUBE, {"loads.force": 10.0}, "loads.force = 10.0: must be a table"),
+    (CUBE, {"loads.presure": {"value": 1.0}},
+     "loads.presure = {value = 1.0}: a cube has no such load; allowed: loads.force"),
+    (CUBE, {"loads.force": 10.0}, "loads.force = 10.0: must be a table with value, ramp"),
     (CUBE, {"loads": 10.0}, "loads = 10.0: must be a table"),
     (CUBE, {"loads.force": {"value": 1.0}},
      "loads.force.ramp: missing; must be a list of pairs [time, factor] with increasing times"),
     (TUBE, {"loads.pressure.value": "high"}, "loads.pressure.value = 'high': must be a finite number"),
     (TUBE, {"loads.pressure.rmp": []}, "loads.pressure.rmp = []: unknown key; did you mean loads.pressure.ramp?"),
-    (TUBE, {"loads.pressure.ramp": []}, "loads.pressure.ramp = []: must be a list of pairs [time, factor], at least one"),
-    (TUBE, {"loads.pressure.ramp": 25.0}, "loads.pressure.ramp = 25.0: must be a list of pairs [time, factor], at least one"),
+    (TUBE, {"loads.pressure.ramp": []},
+     "loads.pressure.ramp = []: must be a list of pairs [time, factor], at least one"),
+    (TUBE, {"loads.pressure.ramp": 25.0},
+     "loads.pressure.ramp = 25.0: must be a list of pairs [time, factor], at least one"),
     (TUBE, {"loads.pressure.ramp": [[0.0, 0.0], [1.0]]},
      "loads.pressure.ramp[1] = [1.0]: must be a pair [time, factor] of finite numbers"),
     (TUBE, {"loads.pressure.ramp": [[0.0, 0.0, 1.0]]},
@@ -150,7 +172,7 @@ BAD_SCENES = [
     (CUBE, {"mesh.degree": 3}, "mesh.degree = 3: allowed are 1, 2"),
     (CUBE, {"mesh.degree": True}, "mesh.degree = true: allowed are 1, 2"),
     # time
-    ({"geometry": {"shape": "cube"}}, {}, "time: missing; must be a table"),
+    ({"geometry": {"shape": "cube"}}, {}, "time: missing; must be a table with end"),
     (CUBE, {"time": {"step": 1.0}}, "time.end: missing; must be a finite number greater than 0"),
     (CUBE, {"time.end": 0.0}, "time.end = 0.0: must be a finite number greater than 0"),
     (CUBE, {"time.step": -1.0}, "time.step = -1.0: must be a finite number greater than 0"),
@@ -158,7 +180,8 @@ BAD_SCENES = [
     (CUBE, {"time.step": 3.0}, "time.end = 10.0: must be a multiple of time.step = 3.0; the nearest are 9 and 12"),
     (CUBE, {"time.step": 1e-6}, "time.step = 1e-06: must be at least time.end / 1000000 = 1e-05"),
     # solver and output
-    (CUBE, {"solver.absolute_tolerance": 0.0}, "solver.absolute_tolerance = 0.0: must be a finite number greater than 0"),
+    (CUBE, {"solver.absolute_tolerance": 0.0},
+     "solver.absolute_tolerance = 0.0: must be a finite number greater than 0"),
     (CUBE, {"solver.relative_tolerance": 1.0},
      "solver.relative_tolerance = 1.0: must be a finite number at least 0 and less than 1"),
     (CUBE, {"solver.profile": "magic"}, "solver.profile = 'magic': allowed is 'direct'"),
@@ -201,8 +224,8 @@ def test_the_bases_of_the_bad_scenes_are_good():
 
 
 def test_a_preset_without_the_shape(monkeypatch):
-    monkeypatch.delitem(PRESETS["sun-2002"], "cube")
-    assert refusal({**CUBE, "preset": "sun-2002"}) == "geometry.shape = 'cube': the preset 'sun-2002' has 'tendon', 'tube'"
+    monkeypatch.setitem(PRESETS, "bent", {"tendon": {}, "tube": {}})
+    assert refusal({**CUBE, "preset": "bent"}) == "geometry.shape = 'cube': the preset 'bent' has 'tendon', 'tube'"
 
 
 def test_a_law_registered_later_is_allowed(monkeypatch):
@@ -272,7 +295,7 @@ BAD_OVERRIDES = [
     ("mesh.refinement.x=3", "mesh.refinement = {x = 3}: must be a whole number at least 1"),
     ("loads.pressure.value=3", "loads.pressure = {value = 3}: a cube has no such load; allowed: loads.force"),
     ("time.end=nan", "time.end = nan: must be a finite number greater than 0"),
-    ("time=3", "time = 3: must be a table"),
+    ("time=3", "time = 3: must be a table with end"),
     ("cells.initial=[1,", "--set cells.initial = '[1,': must be a TOML value or a bare word"),
     ("time.end=2007-01-01", "time.end = 2007-01-01: must be a finite number greater than 0"),
 ]
@@ -357,11 +380,12 @@ def test_collagen_as_measured():
 
 def test_the_presets_keys_lie_under_the_scenes():
     values = {"preset": PAPER, "geometry": {"shape": "tube", "length": 4.0}, "loads": {"pressure": {"value": 2.4}}}
+    before = copy.deepcopy(values)
     built = scene_from_dict(values)
     assert built.geometry == Tube(inner_radius=1.0, outer_radius=3.0, length=4.0)
     assert built.loads["pressure"] == Load(value=2.4, ramp=[[0.0, 0.0], [25.0, 1.0]])
     assert built.loads["stretch"].value == 0.1
-    assert values == {"preset": PAPER, "geometry": {"shape": "tube", "length": 4.0}, "loads": {"pressure": {"value": 2.4}}}
+    assert values == before
     assert PRESETS[PAPER]["tube"]["geometry"]["length"] == 8.0
 
 
@@ -372,7 +396,8 @@ def test_a_tube_starts_with_cylindrical_axes_unless_the_scene_says_otherwise():
 
 
 def test_without_a_preset_the_frame_is_material():
-    assert scene_from_dict(CUBE).remodeling == Remodeling(driver="cauchy", law="explicit", frame="material", kappa=0.025)
+    printed_but_for_the_frame = Remodeling(driver="cauchy", law="explicit", frame="material", kappa=0.025)
+    assert scene_from_dict(CUBE).remodeling == printed_but_for_the_frame
 
 
 def test_the_network_modulus():
@@ -401,6 +426,14 @@ def test_the_demos_are_the_preset():
     for path, shape in zip(DEMOS, ("tube", "cube", "tendon"), strict=True):
         printed = scene_from_dict({"name": path.stem, "preset": PAPER, "geometry": {"shape": shape}})
         assert read_scene(path) == printed
+
+
+def test_a_preset_by_name():
+    assert preset_scene(PAPER, "tube") == read_scene(ROOT / "demos" / "artery.toml", ["name=tube"])
+    with pytest.raises(SceneError, match=r"^preset = 'none': allowed are 'kuhl-holzapfel-2007', 'sun-2002'$"):
+        preset_scene("none", "tube")
+    with pytest.raises(SceneError, match=r"^geometry\.shape = 'heart': allowed are 'cube', 'tendon', 'tube' \(and"):
+        preset_scene(PAPER, "heart")
 
 
 def test_python_says_what_toml_says():
@@ -432,7 +465,7 @@ def test_a_changed_copy_is_validated():
     assert (changed_scene.loads["pressure"].value, changed_scene.remodeling.frame) == (0.0, "material")
     assert changed_scene.loads["stretch"] == artery.loads["stretch"]
     assert artery.loads["pressure"].value == 4.8
-    with pytest.raises(SceneError, match=r"^time\.end = 0\.5: must be .*|^time\.step = 1\.0: must be at most time\.end = 0\.5$"):
+    with pytest.raises(SceneError, match=r"^time\.step = 1\.0: must be at most time\.end = 0\.5$"):
         artery.with_values({"time.end": 0.5})
 
 
@@ -454,7 +487,8 @@ def test_good_ramps_and_times():
     assert Time(end=0.3, step=0.1).number_of_steps == 3
     assert Time(end=150).number_of_steps == 150
     # a kink on a step that binary fractions miss by rounding, and one beyond the end
-    values = changed(TUBE, {"time": {"end": 1.2, "step": 0.1}, "loads.pressure.ramp": [[0.3, 0.0], [0.7, 1.0], [25.05, 2.0]]})
+    ramp = [[0.3, 0.0], [0.7, 1.0], [25.05, 2.0]]
+    values = changed(TUBE, {"time": {"end": 1.2, "step": 0.1}, "loads.pressure.ramp": ramp})
     assert scene_from_dict(values).loads["pressure"].factor(0.5) == pytest.approx(0.5)
     held = changed(TUBE, {"loads.stretch": {"value": -0.5, "ramp": [[0, 1]]}})
     assert scene_from_dict(held).loads["stretch"].factor(17.0) == 1.0
@@ -477,8 +511,12 @@ def test_the_reference_page_is_the_one_that_the_code_makes():
 
 
 def test_every_key_is_described():
-    for key, _, table in scene_module.sections(Scene):
+    page = scene_reference()
+    tables = {"geometry", "mesh", "model", "material", "cells", "loads", "remodeling", "time", "solver", "output"}
+    for key, _, table in sections(Scene):
         for name, field in table.model_fields.items():
-            if not scene_module.holds_tables(field):
-                assert field.description and field.description.endswith("."), (key, name)
-                assert f"| `{name}` |" in scene_reference()
+            if not key and name in tables:
+                assert f"## `[{name}" in page
+            else:
+                assert field.description is not None and field.description.endswith("."), (key, name)
+                assert f"| `{name}` |" in page

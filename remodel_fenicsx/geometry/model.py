@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from numbers import Integral
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,7 +24,7 @@ def check_arguments(lengths: Mapping[str, float], refinement: Any, cell: str, de
     for name, value in lengths.items():
         if not (np.isfinite(value) and value > 0.0):
             raise ValueError(f"{name} = {value}: must be a positive number")
-    if not (isinstance(refinement, Integral) and refinement >= 1):
+    if not (isinstance(refinement, (int, np.integer)) and refinement >= 1):
         raise ValueError(f"refinement = {refinement}: must be a whole number of at least 1")
     if cell not in CELLS:
         raise ValueError(f"cell = {cell!r}: allowed are {', '.join(CELLS)}")

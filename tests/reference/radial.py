@@ -7,8 +7,8 @@ diagonal in the directions circumferential, axial, radial:
     lambda_t = r/R,   lambda_z = given,   lambda_r = dr/dR.
 
 The cells start equal in all directions, so their axes stay along these three directions for ever and a remodeling pass
-only decides which direction has which rank. The stresses are typed from eq. (7) of the paper with erratum 5 (1/J also on
-mu b), the weak form is
+only decides which direction has which rank. The stresses are typed from eq. (7) of the paper with erratum 5 (1/J also
+on mu b), the weak form is
 
     int (P_r dv/dR + P_t v/R) R dR = p lambda_z r(R_i) v(R_i),
 
@@ -18,12 +18,13 @@ quadratic elements, three Gauss points, tangents by complex steps.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from scipy.linalg import solve_banded
 
-Array = npt.NDArray[np.float64]
+Array = npt.NDArray[Any]
 
 CIRCUMFERENTIAL, AXIAL, RADIAL = 0, 1, 2
 
@@ -82,7 +83,7 @@ class RadialHistory:
     stretches: Array
     cauchy: Array
     dimensions: Array
-    ranks: npt.NDArray[np.int64]
+    ranks: Array
     newton_iterations: int = 0
     substeps: int = 0
 
@@ -104,12 +105,12 @@ class RadialHistory:
         return float(np.average(self.fibre_angle(row)[layer], weights=self.areas[layer]))
 
 
-def secant_stiffness(r: npt.NDArray, contour_length: float) -> npt.NDArray:
+def secant_stiffness(r: Array, contour_length: float) -> Array:
     """Return the bracket of eqs. (7b) and (7c)."""
     return 1 / contour_length + 1 / (4 * r * (1 - r / contour_length) ** 2) - 1 / (4 * r)
 
 
-def cauchy_stress(stretches: npt.NDArray, squares: Array, material: RadialMaterial) -> npt.NDArray:
+def cauchy_stress(stretches: Array, squares: Array, material: RadialMaterial) -> Array:
     """Return the principal Cauchy stresses of eq. (7), erratum 5 mended.
 
     stretches: (n, 3), real or complex; squares: (n, 3), l_d^2 by direction.
@@ -125,7 +126,7 @@ def cauchy_stress(stretches: npt.NDArray, squares: Array, material: RadialMateri
     return matrix + chains + repulsion
 
 
-def first_piola_kirchhoff(stretches: npt.NDArray, squares: Array, material: RadialMaterial) -> npt.NDArray:
+def first_piola_kirchhoff(stretches: Array, squares: Array, material: RadialMaterial) -> Array:
     """Return P_d = J sigma_d / lambda_d, (n, 3)."""
     jacobian = (stretches[:, 0] * stretches[:, 1] * stretches[:, 2])[:, None]
     return jacobian * cauchy_stress(stretches, squares, material) / stretches
@@ -144,11 +145,11 @@ class Tube:
 
     def __post_init__(self) -> None:
         n = self.elements
-        self.nodes = np.linspace(self.inner_radius, self.outer_radius, 2 * n + 1)
+        self.nodes: Array = np.linspace(self.inner_radius, self.outer_radius, 2 * n + 1)
         self.connectivity = 2 * np.arange(n)[:, None] + np.arange(3)
         self.length = (self.outer_radius - self.inner_radius) / n
-        self.points = (self.nodes[:-1:2, None] + self.length * POINTS).ravel()
-        self.areas = np.tile(WEIGHTS * self.length, n) * self.points
+        self.points: Array = (self.nodes[:-1:2, None] + self.length * POINTS).ravel()
+        self.areas: Array = np.tile(WEIGHTS * self.length, n) * self.points
 
     def stretches(self, radii: Array, axial: float) -> Array:
         """Return (points, 3) principal stretches of nodal radii r."""
@@ -186,8 +187,8 @@ class Tube:
         gradients = np.zeros((self.elements, 3, 2, 3))  # element, point, (radial, circumferential), node
         gradients[:, :, 0] = SLOPES / self.length
         gradients[:, :, 1] = SHAPES / self.points.reshape(-1, 3, 1)
-        moduli = moduli.reshape(self.elements, 3, 2, 2)
-        local = np.sum(np.swapaxes(gradients, 2, 3) @ moduli @ gradients, axis=1)
+        at_points = moduli.reshape(self.elements, 3, 2, 2)
+        local = np.sum(np.swapaxes(gradients, 2, 3) @ at_points @ gradients, axis=1)
         banded = np.zeros((5, len(self.nodes)))
         for a in range(3):
             for b in range(3):
@@ -225,15 +226,16 @@ class Tube:
             done, part = 0.0, 0.5
             while done < 1.0:
                 share = min(1.0, done + part)
-                mixed = [(1 - share) * a + share * b for a, b in zip(start, end)]
-                found = self.newton(radii, *mixed)  # type: ignore[arg-type]
+                squares = (1 - share) * start[0] + share * end[0]
+                pressure, axial = ((1 - share) * np.array(start[1:]) + share * np.array(end[1:])).tolist()
+                found = self.newton(radii, squares, pressure, axial)
                 if found is not None:
                     radii, done, part = found, share, 2 * part
                     self.substeps += 1
                 else:
                     part /= 2
                     if part < 1e-6:
-                        raise RuntimeError(f"no equilibrium: p = {mixed[1]}, axial stretch {mixed[2]}")
+                        raise RuntimeError(f"no equilibrium: p = {pressure}, axial stretch {axial}")
         return radii
 
 
@@ -243,7 +245,7 @@ def driving_values(driver: str, stretches: Array, cauchy: Array) -> Array:
     return {"cauchy": cauchy, "pk2": jacobian * cauchy / stretches**2, "finger": stretches**2}[driver]
 
 
-def sorted_directions(values: Array, previous: npt.NDArray[np.int64], tolerance: float = 1e-8) -> npt.NDArray[np.int64]:
+def sorted_directions(values: Array, previous: Array, tolerance: float = 1e-8) -> Array:
     """Return the directions by descending value; values that agree keep their previous order."""
     ranks = previous.copy()
     rows = np.arange(len(ranks))
@@ -268,8 +270,8 @@ def updated(law: str, old: Array, start: Array, target: Array, kappa: float, tim
     raise ValueError(law)
 
 
-def remodel(ranked: Array, values: Array, ranks: npt.NDArray[np.int64], start: Array, law: str, kappa: float,
-            time: float, step: float, r0: float) -> tuple[Array, npt.NDArray[np.int64]]:
+def remodel(ranked: Array, values: Array, ranks: Array, start: Array, law: str, kappa: float,
+            time: float, step: float, r0: float) -> tuple[Array, Array]:
     """Return the dimensions by rank and the direction of each rank after one remodeling pass."""
     if law == "none":
         return ranked, ranks
@@ -311,10 +313,11 @@ def solve_radial(pressure: float = 4.8, stretch: float = 0.1, ramp_time: float =
     number_of_steps = round(end / step)
     start = np.full((count, 3), material.end_to_end_length / np.sqrt(3))
     ranked = start.copy()
-    ranks = np.tile(np.array([CIRCUMFERENTIAL, AXIAL, RADIAL]), (count, 1))
+    ranks: Array = np.tile(np.array([CIRCUMFERENTIAL, AXIAL, RADIAL]), (count, 1))
     radii = tube.nodes.copy()
     state: tuple[Array, float, float] = (start**2, 0.0, 1.0)
-    dimensions, all_ranks, all_radii, all_stretches, all_stresses = [start.copy()], [ranks], [], [], []
+    dimensions, all_ranks = [start.copy()], [ranks]
+    solved: list[tuple[Array, Array, Array]] = []
     times = step * np.arange(1, number_of_steps + 1)
     factors = np.minimum(times / ramp_time, 1.0)
     for time, factor in zip(times, factors):
@@ -328,10 +331,9 @@ def solve_radial(pressure: float = 4.8, stretch: float = 0.1, ramp_time: float =
         by_direction = np.empty_like(ranked)
         np.put_along_axis(by_direction, ranks, ranked, axis=1)
         dimensions.append(by_direction)
-        for record, value in (all_ranks, ranks), (all_radii, radii), (all_stretches, stretches), \
-                (all_stresses, stresses):
-            record.append(value)
-    deformed = np.array(all_radii)
-    return RadialHistory(times, pressure * factors, 1 + stretch * factors, deformed[:, 0], deformed[:, -1], tube.nodes,
-                         deformed, tube.points, tube.areas, np.array(all_stretches), np.array(all_stresses),
+        all_ranks.append(ranks)
+        solved.append((radii, stretches, stresses))
+    all_radii, all_stretches, all_stresses = (np.array(column) for column in zip(*solved))
+    return RadialHistory(times, pressure * factors, 1 + stretch * factors, all_radii[:, 0], all_radii[:, -1],
+                         tube.nodes, all_radii, tube.points, tube.areas, all_stretches, all_stresses,
                          np.array(dimensions), np.array(all_ranks), tube.newton_iterations, tube.substeps)

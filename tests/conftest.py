@@ -1,0 +1,48 @@
+"""Runs that several tests look at are made once for a whole test session, also when pytest runs on several processes."""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+CASE = Path(__file__).with_name("run_case.py")
+Case = Callable[..., dict[str, Any]]
+
+
+def mpirun(ranks: int, *command: str) -> list[str]:
+    """A command on so many ranks; --oversubscribe, because a test machine may have fewer cores."""
+    return [*command] if ranks == 1 else ["mpirun", "--oversubscribe", "-n", str(ranks), *command]
+
+
+@pytest.fixture(scope="session")
+def case(tmp_path_factory: pytest.TempPathFactory) -> Case:
+    """case(scene, ranks=1, snapshots=()) -> what tests/run_case.py saved, by name."""
+    base = tmp_path_factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "cases"
+    folder.mkdir(exist_ok=True)
+
+    def run(scene: dict[str, Any], ranks: int = 1, snapshots: tuple[float, ...] = ()) -> dict[str, Any]:
+        request = json.dumps({"scene": scene, "snapshots": list(snapshots)}, sort_keys=True)
+        out = folder / (hashlib.sha256(f"{ranks} {request}".encode()).hexdigest()[:16] + ".npz")
+        with out.with_suffix(".lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if not out.exists():
+                part = out.with_suffix(".part.npz")
+                command = mpirun(ranks, sys.executable, "-m", "mpi4py", str(CASE), str(part), request)
+                done = subprocess.run(command, capture_output=True, text=True, timeout=900)
+                assert done.returncode == 0, done.stderr[-3000:]
+                part.rename(out)
+        with np.load(out) as data:
+            return dict(data)
+
+    return run

@@ -1,0 +1,264 @@
+"""The strain energy in UFL: its stresses against eq. (7) typed by hand, its invariances, its derivatives."""
+
+from __future__ import annotations
+
+import basix.ufl
+import dolfinx.fem
+import dolfinx.fem.petsc
+import dolfinx.mesh
+import numpy as np
+import numpy.typing as npt
+import pytest
+import ufl
+from mpi4py import MPI
+
+from remodel_fenicsx import jit
+from remodel_fenicsx.energy import Cell, strain_energy, stresses
+from remodel_fenicsx.kinematics import deformation_gradient
+from remodel_fenicsx.parameters import Material
+
+Array = npt.NDArray[np.float64]
+
+R0 = 1.0
+MATERIAL = Material()
+AS_PRINTED = Material(energy_factor=4)
+POINTS_PER_CELL = 8
+CASES = ["isotropic", "transversely isotropic", "orthotropic", "shorter than r0"]
+QUARTER_TURN = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+
+
+def bracket(end_to_end_length: npt.ArrayLike) -> Array:
+    """The bracket of eqs. (7b) and (7c)."""
+    r, big_l = np.asarray(end_to_end_length, dtype=float), 1.594
+    return 1 / big_l + 1 / (4 * r * (1 - r / big_l) ** 2) - 1 / (4 * r)
+
+
+def stress_by_hand(F: Array, l: Array, n: Array, omega: int = 1) -> Array:  # noqa: E741
+    """Eq. (7) with erratum 5, parameters of the tendon; F, n (points, 3, 3), rows of n are the axes; l (points, 3)."""
+    lame_lambda, lame_mu, k, theta, chains, persistence_length = 27.293, 3.103, 1.381e-23, 310.0, 2e21, 1.365
+    J = np.linalg.det(F)[:, None, None]
+    b = F @ np.swapaxes(F, 1, 2)
+    deformed = n @ np.swapaxes(F, 1, 2)
+    dyads = deformed[:, :, :, None] * deformed[:, :, None, :]
+    invariants = np.sum(deformed**2, axis=2)
+    r = np.sqrt(np.sum(l**2 * invariants, axis=1))[:, None, None]
+    c = omega * k * theta * chains / (4 * persistence_length)
+    matrix = ((lame_lambda * np.log(J) - lame_mu) * np.eye(3) + lame_mu * b) / J
+    chain = c / J * bracket(r) * np.sum((l**2)[:, :, None, None] * dyads, axis=1)
+    repulsion = -c / J * bracket(R0) * np.sum((l**2 / invariants)[:, :, None, None] * dyads, axis=1)
+    return matrix + chain + repulsion
+
+
+class Points:
+    """W, S and the Cauchy stress for omega = 1 and 4 at the 64 quadrature points of eight cells, F, l, n free."""
+
+    def __init__(self) -> None:
+        self.mesh = dolfinx.mesh.create_unit_cube(MPI.COMM_SELF, 2, 2, 2, dolfinx.mesh.CellType.hexahedron)
+        self.count = 8 * POINTS_PER_CELL
+        self.F, self.l, self.n = self.function((3, 3)), self.function((3,)), self.function((3, 3))
+        outputs = []
+        for material in (MATERIAL, AS_PRINTED):
+            cell = [Cell(self.l, self.n)]
+            tensors = stresses(self.F, cell, material, R0)
+            outputs.append(strain_energy(self.F, cell, material, R0))
+            outputs += [t[i, j] for t in (tensors.second_piola_kirchhoff, tensors.cauchy)
+                        for i in range(3) for j in range(3)]
+        points, _ = basix.make_quadrature(basix.CellType.hexahedron, 2)
+        self.expression = jit.expression(ufl.as_vector(outputs), points)
+
+    def function(self, shape: tuple[int, ...]) -> dolfinx.fem.Function:
+        element = basix.ufl.quadrature_element("hexahedron", value_shape=shape, degree=2)
+        return dolfinx.fem.Function(dolfinx.fem.functionspace(self.mesh, element))
+
+    def evaluate(self, F: Array, l: Array, n: Array) -> dict[int, tuple[Array, Array, Array]]:  # noqa: E741
+        """omega -> (W, S, sigma); fewer points than there are are repeated."""
+        for function, values in (self.F, F), (self.l, l), (self.n, n):
+            function.x.array[:] = np.resize(values, (self.count, *values.shape[1:])).ravel()
+        result = self.expression.eval(self.mesh, np.arange(8, dtype=np.int32)).reshape(self.count, 2, 19)[:len(F)]
+        return {omega: (result[:, i, 0], result[:, i, 1:10].reshape(-1, 3, 3), result[:, i, 10:].reshape(-1, 3, 3))
+                for i, omega in enumerate((1, 4))}
+
+
+@pytest.fixture(scope="module")
+def points() -> Points:
+    return Points()
+
+
+def random_state(case: str, count: int = 64) -> tuple[Array, Array, Array]:
+    """Random F with J > 0 and r < L, cell dimensions of the case, random orthonormal axes."""
+    rng = np.random.default_rng(CASES.index(case))
+    F = np.eye(3) + 0.15 * rng.normal(size=(10 * count, 3, 3))
+    n = np.linalg.qr(rng.normal(size=(10 * count, 3, 3)))[0]
+    l = np.abs(rng.normal(size=(10 * count, 3)))  # noqa: E741
+    l /= np.linalg.norm(l, axis=1, keepdims=True)  # noqa: E741
+    if case == "isotropic":
+        l[:] = 1 / np.sqrt(3)
+    elif case == "transversely isotropic":
+        l[:] = [1.0, 0.0, 0.0]
+    elif case == "shorter than r0":
+        l *= rng.uniform(0.71, 1.0, (10 * count, 1))  # noqa: E741
+    r = np.sqrt(np.sum((l[:, :, None] * n @ np.swapaxes(F, 1, 2)) ** 2, axis=(1, 2)))
+    good = (np.linalg.det(F) > 0.4) & (r < 0.95 * 1.594)
+    assert np.sum(good) > count
+    return F[good][:count], l[good][:count], n[good][:count]
+
+
+def random_rotations(count: int) -> Array:
+    q = np.linalg.qr(np.random.default_rng(9).normal(size=(count, 3, 3)))[0]
+    return q * np.linalg.det(q)[:, None, None]
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("omega", [1, 4])
+def test_stress_is_eq_7(points: Points, case: str, omega: int) -> None:
+    F, l, n = random_state(case)  # noqa: E741
+    _, second, cauchy = points.evaluate(F, l, n)[omega]
+    expected = stress_by_hand(F, l, n, omega)
+    size = np.max(np.abs(expected), axis=(1, 2))
+    assert np.max(np.max(np.abs(cauchy - expected), axis=(1, 2)) / size) < 1e-12
+    pushed = F @ second @ np.swapaxes(F, 1, 2) / np.linalg.det(F)[:, None, None]
+    assert np.max(np.max(np.abs(pushed - expected), axis=(1, 2)) / size) < 1e-12
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_energy_factor_multiplies_chains_and_repulsion_only(points: Points, case: str) -> None:
+    F, l, n = random_state(case)  # noqa: E741
+    results = points.evaluate(F, l, n)
+    no_chains = stress_by_hand(F, 0 * l + 1e-150, n, omega=0)
+    np.testing.assert_allclose(results[4][2] - no_chains, 4 * (results[1][2] - no_chains), atol=1e-11)
+    J = np.linalg.det(F)
+    matrix = 27.293 / 2 * np.log(J) ** 2 + 3.103 / 2 * (np.sum(F**2, axis=(1, 2)) - 3) - 3.103 * np.log(J)
+    np.testing.assert_allclose(results[4][0] - matrix, 4 * (results[1][0] - matrix), rtol=1e-12, atol=1e-12)
+
+
+def test_reference_is_free_of_stress_when_the_chain_has_its_initial_length(points: Points) -> None:
+    _, l, n = random_state("orthotropic")  # noqa: E741
+    F = np.broadcast_to(np.eye(3), n.shape)
+    for _, second, cauchy in points.evaluate(F, l, n).values():
+        np.testing.assert_allclose(cauchy, 0.0, atol=1e-13)
+        np.testing.assert_allclose(second, 0.0, atol=1e-13)
+
+
+def test_shorter_chain_leaves_a_residual_stress(points: Points) -> None:
+    """Erratum 3: c (g(r) - g(r0)) sum l_I^2 n n, a push along the chains because g rises with r."""
+    _, l, n = random_state("shorter than r0")  # noqa: E741
+    F = np.broadcast_to(np.eye(3), n.shape)
+    cauchy = points.evaluate(F, l, n)[1][2]
+    structure = np.sum((l**2)[:, :, None, None] * n[:, :, :, None] * n[:, :, None, :], axis=1)
+    lengths = np.linalg.norm(l, axis=1)
+    c = 1.381e-23 * 310 * 2e21 / (4 * 1.365)
+    expected = c * (bracket(lengths) - bracket(R0))[:, None, None] * structure
+    np.testing.assert_allclose(cauchy, expected, atol=1e-13)
+    assert np.max(np.trace(cauchy, axis1=1, axis2=2)) < 0 and np.min(np.trace(cauchy, axis1=1, axis2=2)) < -0.5
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_objectivity(points: Points, case: str) -> None:
+    """W(QF) = W(F), sigma(QF) = Q sigma Q^T, S(QF) = S(F)."""
+    F, l, n = random_state(case)  # noqa: E741
+    Q = random_rotations(len(F))
+    for one, turned in zip(points.evaluate(F, l, n).values(), points.evaluate(Q @ F, l, n).values()):
+        np.testing.assert_allclose(turned[0], one[0], rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(turned[1], one[1], rtol=1e-11, atol=1e-11)
+        np.testing.assert_allclose(turned[2], Q @ one[2] @ np.swapaxes(Q, 1, 2), rtol=1e-11, atol=1e-11)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_turning_the_reference_with_its_axes_changes_nothing(points: Points, case: str) -> None:
+    """W(F Q^T; Q n) = W(F; n): the axes are the only directions that the material knows."""
+    F, l, n = random_state(case)  # noqa: E741
+    Q = random_rotations(len(F))
+    one = points.evaluate(F, l, n)[1]
+    turned = points.evaluate(F @ np.swapaxes(Q, 1, 2), l, n @ np.swapaxes(Q, 1, 2))[1]
+    np.testing.assert_allclose(turned[0], one[0], rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(turned[2], one[2], rtol=1e-11, atol=1e-11)
+
+
+def test_signs_of_axes_do_not_matter(points: Points) -> None:
+    F, l, n = random_state("orthotropic")  # noqa: E741
+    signs = np.random.default_rng(3).choice([-1.0, 1.0], (len(F), 3, 1))
+    np.testing.assert_allclose(points.evaluate(F, l, signs * n)[1][2], points.evaluate(F, l, n)[1][2], atol=1e-13)
+
+
+def test_transverse_isotropy_does_not_see_the_cross_axes(points: Points) -> None:
+    F, l, n = random_state("transversely isotropic")  # noqa: E741
+    angle = np.random.default_rng(4).uniform(0.0, np.pi, (len(F), 1))
+    turned = n.copy()
+    turned[:, 1] = np.cos(angle) * n[:, 1] + np.sin(angle) * n[:, 2]
+    turned[:, 2] = -np.sin(angle) * n[:, 1] + np.cos(angle) * n[:, 2]
+    np.testing.assert_allclose(points.evaluate(F, l, turned)[1][2], points.evaluate(F, l, n)[1][2], atol=1e-11)
+
+
+def test_equal_dimensions_are_isotropic_only_along_the_principal_axes(points: Points) -> None:
+    """Erratum 6: in simple shear of 0.1 the shear stress is 0.312 on the given axes, 0.424 on axes turned by 45 deg."""
+    F = np.eye(3)[None] + 0.1 * np.outer([1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
+    h = np.sqrt(0.5)
+    turned = np.array([[[h, h, 0.0], [-h, h, 0.0], [0.0, 0.0, 1.0]]])
+    l = np.full((1, 3), 1 / np.sqrt(3))  # noqa: E741
+    shear = [points.evaluate(F, l, n)[1][2][0, 0, 1] for n in (np.eye(3)[None], turned)]
+    np.testing.assert_allclose(shear, [0.312, 0.424], atol=5e-4)
+    # where C is diagonal in the axes, exchanging them does nothing
+    F = np.diag([1.2, 0.9, 1.05])[None]
+    exchanged = np.array([QUARTER_TURN])
+    np.testing.assert_allclose(points.evaluate(F, l, exchanged)[1][2], points.evaluate(F, l, np.eye(3)[None])[1][2],
+                               atol=1e-14)
+
+
+@pytest.fixture(scope="module")
+def forms() -> tuple:
+    """Energy, residual and tangent of a cube of eight hexes with random, blended cells."""
+    mesh = dolfinx.mesh.create_unit_cube(MPI.COMM_SELF, 2, 2, 2, dolfinx.mesh.CellType.hexahedron)
+    space = dolfinx.fem.functionspace(mesh, ("Lagrange", 1, (3,)))
+    u = dolfinx.fem.Function(space)
+    cells, rng = [], np.random.default_rng(5)
+    for weight in (0.3, 0.7):
+        functions = []
+        for shape in ((3,), (3, 3)):
+            element = basix.ufl.quadrature_element("hexahedron", value_shape=shape, degree=2)
+            functions.append(dolfinx.fem.Function(dolfinx.fem.functionspace(mesh, element)))
+        _, l, n = random_state("orthotropic")  # noqa: E741
+        order = rng.permutation(len(l))
+        functions[0].x.array[:], functions[1].x.array[:] = l[order].ravel(), n[order].ravel()
+        cells.append(Cell(functions[0], functions[1], weight))
+    energy = strain_energy(deformation_gradient(u), cells, MATERIAL, R0) * ufl.dx(metadata={"quadrature_degree": 2})
+    residual = ufl.derivative(energy, u)
+    return u, jit.form(energy), jit.form(residual), jit.form(ufl.derivative(residual, u))
+
+
+def assembled(forms: tuple, values: Array) -> tuple[float, Array, Array]:
+    """Energy, residual and dense tangent at nodal displacements."""
+    u, energy, residual, tangent = forms
+    u.x.array[:] = values
+    matrix = dolfinx.fem.assemble_matrix(tangent)
+    matrix.scatter_reverse()
+    total = float(np.real(dolfinx.fem.assemble_scalar(energy)))
+    return total, dolfinx.fem.assemble_vector(residual).array.copy(), matrix.to_dense()
+
+
+def test_taylor_remainders_of_energy_residual_and_tangent(forms: tuple) -> None:
+    """|W(u+hv) - W - h R.v| = O(h^2), - h^2/2 v.K v = O(h^3); |R(u+hv) - R - h K v| = O(h^2)."""
+    rng = np.random.default_rng(6)
+    size = len(forms[0].x.array)
+    state, direction = rng.uniform(-0.04, 0.04, size), rng.uniform(-0.04, 0.04, size)
+    energy, residual, tangent = assembled(forms, state)
+    steps = 2.0 ** -np.arange(2, 7)
+    first, second, third = [], [], []
+    for h in steps:
+        new_energy, new_residual, _ = assembled(forms, state + h * direction)
+        first.append(abs(new_energy - energy - h * residual @ direction))
+        second.append(abs(new_energy - energy - h * residual @ direction - h**2 / 2 * direction @ tangent @ direction))
+        third.append(np.linalg.norm(new_residual - residual - h * tangent @ direction))
+    orders = [np.log2(np.array(r[:-1]) / np.array(r[1:])) for r in (first, second, third)]
+    np.testing.assert_allclose(orders[0][-2:], 2.0, atol=0.05)
+    np.testing.assert_allclose(orders[1][-2:], 3.0, atol=0.1)
+    np.testing.assert_allclose(orders[2][-2:], 2.0, atol=0.05)
+    np.testing.assert_allclose(tangent, tangent.T, atol=1e-12 * np.max(np.abs(tangent)))
+
+
+def test_rigid_motion_has_no_force(forms: tuple) -> None:
+    u = forms[0]
+    x = u.function_space.tabulate_dof_coordinates()
+    motion = x @ np.array(QUARTER_TURN).T - x + [0.3, -0.2, 0.1]
+    energy, residual, _ = assembled(forms, motion.ravel())
+    np.testing.assert_allclose(residual, 0.0, atol=1e-13)
+    assert energy == pytest.approx(assembled(forms, np.zeros(x.size))[0], rel=1e-13)
