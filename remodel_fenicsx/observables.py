@@ -11,7 +11,7 @@ import ufl
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from remodel_fenicsx import jit, parameters, spectral
+from remodel_fenicsx import compat, jit, parameters, spectral
 from remodel_fenicsx.cells import UnitCells, angle_to_axis, pitch_angle, structure_tensor
 from remodel_fenicsx.energy import stresses
 from remodel_fenicsx.geometry import Domain
@@ -104,7 +104,7 @@ class Observer:
 
     def cells_touching_radius(self, radius: float) -> NDArray[np.bool_]:
         """Mask of the local cells with a reference point at this distance from the z axis, shape (cells,)."""
-        nodes = self.domain.mesh.geometry.x[self.domain.mesh.geometry.dofmap[: self.quadrature.shape[0]]]
+        nodes = self.domain.mesh.geometry.x[compat.geometry_dofmap(self.domain.mesh)]
         radii = np.linalg.norm(nodes[..., :2], axis=-1)
         tolerance = 1e-6 * self.domain.size
         return (radii.min(axis=1) <= radius + tolerance) & (radii.max(axis=1) >= radius - tolerance)

@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 
 from remodel_fenicsx.chains import BOLTZMANN_CONSTANT, CHAINS
 from remodel_fenicsx.laws import LAWS
-from remodel_fenicsx.tables import Table, checked, fault, one_of, shown
+from remodel_fenicsx.tables import Table, checked, fault, is_number, one_of, shown
 
 DRIVERS = ("cauchy", "pk2", "finger")
 FRAMES = ("material", "spatial")
@@ -23,29 +23,35 @@ INITIAL_CELLS = ("random", "isotropic", "aligned")
 class Material(Table):
     """The tissue: an isotropic matrix (Lame constants) with a network of collagen chains."""
 
-    lame_lambda: float = Field(27.293, ge=0, description="First Lame constant lambda of the matrix, in stress_unit.")
-    lame_mu: float = Field(3.103, gt=0, description="Second Lame constant mu of the matrix, in stress_unit.")
-    chain_density: float = Field(2.0e21, ge=0, description="Number of chains n_chn per volume, in 1/m^3; 0: no chains.")
+    lame_lambda: float = Field(
+        default=27.293, ge=0, description="First Lame constant lambda of the matrix, in stress_unit."
+    )
+    lame_mu: float = Field(default=3.103, gt=0, description="Second Lame constant mu of the matrix, in stress_unit.")
+    chain_density: float = Field(
+        default=2.0e21, ge=0, description="Number of chains n_chn per volume, in 1/m^3; 0: no chains."
+    )
     contour_length: float = Field(
-        1.594, gt=0, description="Contour length L of a chain, at which it locks, in link lengths."
+        default=1.594, gt=0, description="Contour length L of a chain, at which it locks, in link lengths."
     )
     persistence_length: float = Field(
-        1.365, gt=0, description="Persistence length A_p of a chain, its bending stiffness over k theta, in link lengths."
+        default=1.365,
+        gt=0,
+        description="Persistence length A_p of a chain, its bending stiffness over k theta, in link lengths.",
     )
-    temperature: float = Field(310.0, gt=0, description="Absolute temperature theta, in K.")
+    temperature: float = Field(default=310.0, gt=0, description="Absolute temperature theta, in K.")
     energy_factor: Annotated[int, one_of((1, 4))] = Field(
-        1,
+        default=1,
         description="Factor omega of the chain energy: 1 is the stress as printed (eq. 7; reproduces Fig. 6), "
         "4 the energy as printed (eq. 4b).",
     )
-    chain: Annotated[str, one_of(CHAINS)] = Field("wormlike", description="Force law of a single chain.")
+    chain: Annotated[str, one_of(CHAINS)] = Field(default="wormlike", description="Force law of a single chain.")
     repulsion: Literal["axes"] = Field(
-        "axes",
+        default="axes",
         description="Form of the repulsive energy that makes the reference state stress-free: 'axes' is the paper's, "
         "in the stretches along the three cell axes.",
     )
     stress_unit: Literal["Pa", "kPa", "MPa"] = Field(
-        "Pa",
+        default="Pa",
         description="Unit of every stress, pressure and Lame constant of the scene; forces are in it times the unit of "
         "length squared.",
     )
@@ -60,10 +66,9 @@ class Material(Table):
 def _initial_cells(value: Any) -> Any:
     """A list of three lengths becomes a tuple of floats; names pass."""
     if isinstance(value, (list, tuple)):
-        lengths = [entry for entry in value if isinstance(entry, (int, float)) and not isinstance(entry, bool)]
-        if len(value) != 3 or len(lengths) != 3 or not all(0 <= length < math.inf for length in lengths):
+        if len(value) != 3 or not all(is_number(length) and length >= 0 for length in value):
             raise fault("must be three lengths [l1, l2, l3], each at least 0")
-        return tuple(float(length) for length in lengths)
+        return tuple(float(length) for length in value)
     if not isinstance(value, str) or value not in INITIAL_CELLS:
         raise fault("allowed are " + ", ".join(map(repr, INITIAL_CELLS)) + " or three lengths [l1, l2, l3]")
     return value
@@ -73,29 +78,29 @@ class Cells(Table):
     """The orthotropic unit cells of the collagen network before the first remodeling pass."""
 
     initial: Annotated[str | tuple[float, float, float], checked(_initial_cells)] = Field(
-        "random",
-        description="Cell dimensions l_I at t = 0, with |l| = end_to_end_length: 'random' (one draw per element, uniform "
-        "on the positive octant of the sphere), 'isotropic' (three equal ones), 'aligned' (all of it along aligned_axis), "
-        "or [l1, l2, l3] in link lengths.",
+        default="random",
+        description="Cell dimensions l_I at t = 0, with |l| = end_to_end_length: 'random' (one draw per element, "
+        "uniform on the positive octant of the sphere), 'isotropic' (three equal ones), 'aligned' (all of it along "
+        "aligned_axis), or [l1, l2, l3] in link lengths.",
         json_schema_extra={"allowed": "'random', 'isotropic', 'aligned' or three lengths [l1, l2, l3]"},
     )
     axes: Literal["global", "cylindrical"] = Field(
-        "global",
+        default="global",
         description="Cell axes n_I before the first pass: 'global' (x, y, z) or 'cylindrical' (circumferential, axial, "
         "radial, about the z axis). Where neither scene nor preset says it: a tube starts with 'cylindrical'.",
     )
     aligned_axis: Annotated[int, one_of((1, 2, 3))] = Field(
-        3,
-        description="Number of the axis that 'aligned' cells lie along: with global axes 3 is z, the load axis of cube and "
-        "tendon; with cylindrical axes 1 is circumferential, 2 axial, 3 radial.",
+        default=3,
+        description="Number of the axis that 'aligned' cells lie along: with global axes 3 is z, the load axis of cube "
+        "and tendon; with cylindrical axes 1 is circumferential, 2 axial, 3 radial.",
     )
     seed: int = Field(
-        1,
+        default=1,
         ge=0,
         description="Seed of the random cells. The same seed and mesh give the same cells on any number of processes.",
     )
     end_to_end_length: float = Field(
-        1.0,
+        default=1.0,
         gt=0,
         description="Length r0 of a chain at t = 0, in link lengths; smaller than material.contour_length. A material "
         "constant: it keeps its value in the repulsive energy while the cells remodel.",
@@ -119,26 +124,26 @@ class Remodeling(Table):
     """How the cells follow the load: driving tensor, evolution law, frame and speed."""
 
     driver: Annotated[str, one_of(DRIVERS)] = Field(
-        "cauchy",
-        description="Tensor whose positive eigenvalues the cells follow: 'cauchy' stress, second Piola-Kirchhoff stress "
-        "'pk2', or 'finger' tensor b (it remodels even a body without load, and l_3 does not vanish).",
+        default="cauchy",
+        description="Tensor whose positive eigenvalues the cells follow: 'cauchy' stress, second Piola-Kirchhoff "
+        "stress 'pk2', or 'finger' tensor b (it remodels even a body without load, and l_3 does not vanish).",
     )
     law: Annotated[str, one_of(LAWS)] = Field(
-        "explicit",
-        description="Evolution of the cell dimensions: 'explicit' is eq. (11), in absolute time; 'rate' integrates eq. (10);"
-        " 'relaxation' is dl/dt = kappa (r0 e - l), right for changing loads; 'none' leaves the cells alone.",
+        default="explicit",
+        description="Evolution of the cell dimensions: 'explicit' is eq. (11), in absolute time; 'rate' integrates eq. "
+        "(10); 'relaxation' is dl/dt = kappa (r0 e - l), right for changing loads; 'none' leaves the cells alone.",
     )
     frame: Annotated[str, one_of(FRAMES)] = Field(
-        "material",
-        description="Axes of the remodeled cells, for the drivers 'cauchy' and 'finger': 'material' takes the fibres that "
-        "the deformation carries onto the principal directions (objective), 'spatial' the principal directions "
+        default="material",
+        description="Axes of the remodeled cells, for the drivers 'cauchy' and 'finger': 'material' takes the fibres "
+        "that the deformation carries onto the principal directions (objective), 'spatial' the principal directions "
         "themselves, as printed. The driver 'pk2' has material eigenvectors of its own.",
     )
     coupling: Literal["staggered"] = Field(
-        "staggered", description="'staggered': solve with the cells of the step before, then remodel once."
+        default="staggered", description="'staggered': solve with the cells of the step before, then remodel once."
     )
     kappa: float = Field(
-        0.025, ge=0, description="Speed of remodeling kappa, in 1/time; a difference fades like exp(-kappa t)."
+        default=0.025, ge=0, description="Speed of remodeling kappa, in 1/time; a difference fades like exp(-kappa t)."
     )
 
 
@@ -216,6 +221,6 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
 PRESET_NOTES = {
     "kuhl-holzapfel-2007": "The printed method on the three bodies of the paper: Fig. 5 (cube), Fig. 6 (tendon), "
     "Figs. 7 to 11 (tube). The frame is 'spatial', as printed in eq. (9).",
-    "sun-2002": "Collagen I as measured with optical tweezers (paper, Remark 2): the link length is 1 nm here. Only these "
-    "two values: the chain density and the end-to-end length (in nm) are the scene's to choose.",
+    "sun-2002": "Collagen I as measured with optical tweezers (paper, Remark 2): the link length is 1 nm here. Only "
+    "these two values: the chain density and the end-to-end length (in nm) are the scene's to choose.",
 }

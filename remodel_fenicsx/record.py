@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from remodel_fenicsx import compat
 from remodel_fenicsx.geometry import Domain
 from remodel_fenicsx.observables import Observer
 from remodel_fenicsx.vtkhdf import (
@@ -157,7 +158,7 @@ class NodalGather:
     def __init__(self, domain: Domain, function: Any):
         self.domain, self.function = domain, function
         dofs = function.function_space.dofmap.list.reshape(-1)
-        nodes = domain.mesh.geometry.dofmap.reshape(-1)
+        nodes = compat.geometry_dofmap(domain.mesh).reshape(-1)
         # the element and the geometry have the same degree: node k of a cell is dof k of that cell
         self._dof_of_node = np.zeros(len(domain.node_number), dtype=np.int64)
         self._dof_of_node[nodes] = dofs

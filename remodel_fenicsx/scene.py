@@ -1,7 +1,7 @@
 """A scene: what to simulate, as TOML or as Python objects, validated before any solve.
 
-`read_scene` reads a file, `Scene(...)` and `scene_from_dict` take the same keys from Python. docs/scene.md lists all keys;
-``python3 -m remodel_fenicsx.scene`` prints that page.
+`read_scene` reads a file, `Scene(...)` and `scene_from_dict` take the same keys from Python. docs/scene.md lists all
+keys; ``python3 -m remodel_fenicsx.scene`` prints that page.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ import bisect
 import math
 import os
 import re
-import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -24,18 +23,19 @@ from remodel_fenicsx.tables import (
     Table,
     checked,
     fault,
+    is_number,
     markdown_reference,
     one_of,
     quoted,
     shown,
-    toml_text,
 )
+from remodel_fenicsx.toml_files import merged, parse_override, put, read_toml, toml_text
 
 MOST_STEPS = 1_000_000
 SAME_TIME = 1e-9  # relative: times closer than this are the same
 
-# Defaults that a shape changes, under the keys of preset and scene: with global axes a tube of isotropic cells would not
-# stay round in the first step.
+# Defaults that a shape changes, under the keys of preset and scene: with global axes a tube of isotropic cells would
+# not stay round in the first step.
 SHAPE_DEFAULTS: dict[str, dict[str, Any]] = {"tube": {"cells": {"axes": "cylindrical"}}}
 
 
@@ -48,8 +48,8 @@ class Cube(Table):
     load_names: ClassVar[tuple[str, ...]] = ("force",)
     axis_kinds: ClassVar[tuple[str, ...]] = ("global",)
 
-    shape: Literal["cube"] = Field("cube", description="Which body it is.")
-    side: float = Field(1.0, gt=0, description="Length of an edge, in the scene's unit of length.")
+    shape: Literal["cube"] = Field(default="cube", description="Which body it is.")
+    side: float = Field(default=1.0, gt=0, description="Length of an edge, in the scene's unit of length.")
 
 
 class Tendon(Table):
@@ -58,18 +58,18 @@ class Tendon(Table):
     load_names: ClassVar[tuple[str, ...]] = ("force",)
     axis_kinds: ClassVar[tuple[str, ...]] = ("global", "cylindrical")
 
-    shape: Literal["tendon"] = Field("tendon", description="Which body it is.")
-    length: float = Field(10.0, gt=0, description="Length along z, in the scene's unit of length.")
-    area: float = Field(10.0, gt=0, description="Area of the cross-section, in the unit of length squared.")
+    shape: Literal["tendon"] = Field(default="tendon", description="Which body it is.")
+    length: float = Field(default=10.0, gt=0, description="Length along z, in the scene's unit of length.")
+    area: float = Field(default=10.0, gt=0, description="Area of the cross-section, in the unit of length squared.")
 
 
 class Tube(Table):
-    """A thick-walled tube about the z axis, under inner pressure and axial stretch: the artery of the paper's Fig. 7."""
+    """A thick-walled tube about z under inner pressure and axial stretch: the artery of the paper's Fig. 7."""
 
     load_names: ClassVar[tuple[str, ...]] = ("pressure", "stretch")
     axis_kinds: ClassVar[tuple[str, ...]] = ("global", "cylindrical")
 
-    shape: Literal["tube"] = Field("tube", description="Which body it is.")
+    shape: Literal["tube"] = Field(default="tube", description="Which body it is.")
     inner_radius: float = Field(gt=0, description="Inner radius R_i, in the scene's unit of length.")
     outer_radius: float = Field(gt=0, description="Outer radius R_o, in the scene's unit of length.")
     length: float = Field(gt=0, description="Length along z, in the scene's unit of length.")
@@ -89,25 +89,21 @@ class Mesh(Table):
     """The finite elements."""
 
     refinement: int = Field(
-        1, ge=1, description="Factor on the paper's number of elements in every direction (1: its own meshes)."
+        default=1, ge=1, description="Factor on the paper's number of elements in every direction (1: its own meshes)."
     )
-    cell: Literal["hexahedron", "tetrahedron"] = Field("hexahedron", description="Shape of the elements.")
+    cell: Literal["hexahedron", "tetrahedron"] = Field(default="hexahedron", description="Shape of the elements.")
     degree: Annotated[int, one_of((1, 2))] = Field(
-        1, description="Polynomial degree of the displacement: 1 (the paper's) or 2."
+        default=1, description="Polynomial degree of the displacement: 1 (the paper's) or 2."
     )
 
 
 class Model(Table):
     """Which unknowns describe the deformation."""
 
-    kinematics: Literal["full"] = Field("full", description="'full': the displacement in three dimensions.")
+    kinematics: Literal["full"] = Field(default="full", description="'full': the displacement in three dimensions.")
 
 
 # ---------------------------------------------------------------- loads and time
-
-
-def _number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def _ramp(value: Any) -> tuple[tuple[float, float], ...]:
@@ -115,7 +111,7 @@ def _ramp(value: Any) -> tuple[tuple[float, float], ...]:
     if not isinstance(value, (list, tuple)) or not value:
         raise fault("must be a list of pairs [time, factor], at least one")
     for index, entry in enumerate(value):
-        if not isinstance(entry, (list, tuple)) or len(entry) != 2 or not all(map(_number, entry)):
+        if not isinstance(entry, (list, tuple)) or len(entry) != 2 or not all(map(is_number, entry)):
             raise fault("must be a pair [time, factor] of finite numbers", f"[{index}]", entry)
     for index, (time, _) in enumerate(value):
         if time < 0:
@@ -134,8 +130,8 @@ class Load(Table):
     """
 
     value: float = Field(
-        description="Full value at factor 1: force in stress_unit times length squared, pressure in stress_unit, stretch "
-        "without unit (above -1)."
+        description="Full value at factor 1: force in stress_unit times length squared, pressure in stress_unit, "
+        "stretch without unit (above -1)."
     )
     ramp: Annotated[tuple[tuple[float, float], ...], checked(_ramp)] = Field(
         description="Factor on the value over time, as [time, factor] pairs with increasing times: linear in between, "
@@ -158,7 +154,7 @@ class Time(Table):
     """Simulated time, in the unit of 1/kappa. It starts at 0 with the unloaded body."""
 
     end: float = Field(gt=0, description="Last time; a whole number of steps.")
-    step: float = Field(1.0, gt=0, description="Time between two remodeling passes.")
+    step: float = Field(default=1.0, gt=0, description="Time between two remodeling passes.")
 
     @model_validator(mode="after")
     def _whole_number_of_steps(self) -> Time:
@@ -183,7 +179,8 @@ def _is_multiple(time: float, step: float) -> bool:
 
 def _nearest_multiples(time: float, step: float, name: str) -> str:
     below = math.floor(time / step)
-    return f"must be a multiple of {name} = {shown(step)}; the nearest are {below * step:.12g} and {(below + 1) * step:.12g}"
+    nearest = f"{below * step:.12g} and {(below + 1) * step:.12g}"
+    return f"must be a multiple of {name} = {shown(step)}; the nearest are {nearest}"
 
 
 # ---------------------------------------------------------------- solver and output
@@ -194,7 +191,7 @@ def _petsc_options(value: Any) -> Any:
         for name, entry in value.items():
             if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z]\w*", name):
                 raise fault("not a PETSc option; write its name without the leading '-'", quoted(str(name)), entry)
-            if not isinstance(entry, (str, bool)) and not _number(entry):
+            if not isinstance(entry, (str, bool)) and not is_number(entry):
                 raise fault("must be a string, a finite number, true or false", name, entry)
     return value
 
@@ -202,16 +199,25 @@ def _petsc_options(value: Any) -> Any:
 class Solver(Table):
     """Solution of the nonlinear problem of each step."""
 
-    profile: Literal["direct"] = Field("direct", description="'direct': Newton's method, each system factorised.")
+    profile: Literal["direct"] = Field(
+        default="direct", description="'direct': Newton's method, each system factorised."
+    )
     absolute_tolerance: float = Field(
-        1e-12, gt=0, description="Converged when the residual norm is below this, whatever it was at first."
+        default=1e-12,
+        gt=0,
+        description="A step is solved when |R| <= absolute_tolerance + relative_tolerance |nodal forces|, R the "
+        "vector of out-of-balance nodal forces; in the unit of force.",
     )
     relative_tolerance: float = Field(
-        1e-10, ge=0, lt=1, description="Converged when the residual norm is below this share of the step's first one."
+        default=1e-10,
+        ge=0,
+        lt=1,
+        description="See absolute_tolerance; relative to the norm of the internal nodal forces, which stays when the "
+        "load is held.",
     )
-    maximum_iterations: int = Field(25, ge=1, description="Newton iterations before a step counts as failed.")
+    maximum_iterations: int = Field(default=25, ge=1, description="Newton iterations before a step counts as failed.")
     maximum_halvings: int = Field(
-        12, ge=0, description="How often a failed step is halved before the run ends with an error."
+        default=12, ge=0, description="How often a failed step is halved before the run ends with an error."
     )
     petsc_options: Annotated[dict[str, Any], checked(_petsc_options)] = Field(
         default_factory=dict,
@@ -222,8 +228,8 @@ class Solver(Table):
 class Output(Table):
     """What a run writes beside its history table."""
 
-    fields: bool = Field(True, description="Whether to write fields for ParaView.")
-    every: int = Field(1, ge=1, description="Write the fields of every n-th step; the last one always.")
+    fields: bool = Field(default=True, description="Whether to write fields for ParaView.")
+    every: int = Field(default=1, ge=1, description="Write the fields of every n-th step; the last one always.")
 
 
 # ---------------------------------------------------------------- the scene
@@ -239,25 +245,25 @@ class Scene(Table):
     """A whole scene: all keys above the first table, and the tables."""
 
     name: Annotated[str, checked(_name)] = Field(
-        "scene",
+        default="scene",
         description="Name of the scene and of its results folder. Default: the file's name without its ending.",
         json_schema_extra={"allowed": "a file name without a path"},
     )
     preset: str | None = Field(
-        None,
+        default=None,
         description="Named parameters that lie under the scene's own keys, table by table (see Presets below).",
         json_schema_extra={"allowed": "one of " + ", ".join(map(repr, PRESETS))},
     )
     geometry: Geometry
-    mesh: Mesh = Field(default_factory=Mesh)
-    model: Model = Field(default_factory=Model)
-    material: Material = Field(default_factory=Material)
-    cells: Cells = Field(default_factory=Cells)
-    loads: dict[str, Load] = Field(default_factory=dict)
-    remodeling: Remodeling = Field(default_factory=Remodeling)
+    mesh: Mesh = Mesh()
+    model: Model = Model()
+    material: Material = Material()
+    cells: Cells = Cells()
+    loads: dict[str, Load] = {}
+    remodeling: Remodeling = Remodeling()
     time: Time
-    solver: Solver = Field(default_factory=Solver)
-    output: Output = Field(default_factory=Output)
+    solver: Solver = Solver()
+    output: Output = Output()
 
     @model_validator(mode="before")
     @classmethod
@@ -299,8 +305,9 @@ class Scene(Table):
         for index, (time, factor) in enumerate(load.ramp):
             if time <= self.time.end and not _is_multiple(time, step):
                 raise fault(_nearest_multiples(time, step, "time.step"), f"{key}.ramp[{index}][0]", time)
-            if name == "stretch" and load.value * factor <= -1:
-                rule = f"must be greater than -1 at every time; with the factor {shown(factor)} it is {load.value * factor:.6g}"
+            stretch = load.value * factor
+            if name == "stretch" and stretch <= -1:
+                rule = f"must be greater than -1 at every time; with the factor {shown(factor)} it is {stretch:.6g}"
                 raise fault(rule, f"{key}.value", load.value)
 
     def with_values(self, changes: Mapping[str, Any]) -> Scene:
@@ -315,7 +322,7 @@ class Scene(Table):
         """
         values = _plain({name: getattr(self, name) for name in type(self).model_fields}, every_value=True)
         for key, value in changes.items():
-            _set(values, key, value)
+            put(values, key, value)
         return Scene(**values)
 
     def to_toml(self, header: str = "") -> str:
@@ -341,20 +348,11 @@ def _check_load_names(shape: str, loads: Any) -> None:
             raise fault(f"a {shape} has no such load; allowed: {listed}", f"loads.{quoted(str(name))}", load)
 
 
-def merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    """Nested dicts laid over each other, table by table; a list or a value of `over` replaces that of `base`."""
-    result = dict(base)
-    for name, value in over.items():
-        below = result.get(name)
-        result[name] = merged(below, value) if isinstance(below, Mapping) and isinstance(value, Mapping) else value
-    return result
-
-
 def _plain(value: Any, every_value: bool = False) -> Any:
     """Tables as dicts of the values that were set (or of all), so that they merge as the same keys in TOML do."""
     if isinstance(value, BaseModel):
         kind = {"shape": value.shape} if isinstance(value, (Cube, Tendon, Tube)) else {}
-        names = type(value).model_fields if every_value else value.model_fields_set
+        names = [name for name in type(value).model_fields if every_value or name in value.model_fields_set]
         return kind | {name: _plain(getattr(value, name), every_value) for name in names}
     if isinstance(value, Mapping):
         return {name: _plain(entry, every_value) for name, entry in value.items()}
@@ -377,6 +375,17 @@ def scene_from_dict(values: Mapping[str, Any]) -> Scene:
     return Scene(**values)
 
 
+def preset_scene(preset: str, shape: str) -> Scene:
+    """The scene of a preset on one of its shapes, named after the shape.
+
+    Raises
+    ------
+    SceneError
+        If there is no such preset or shape, or if the preset leaves something for a scene to choose.
+    """
+    return scene_from_dict({"name": shape, "preset": preset, "geometry": {"shape": shape}})
+
+
 def read_scene(path: str | os.PathLike[str], overrides: Iterable[str] = ()) -> Scene:
     """A scene from a TOML file.
 
@@ -393,68 +402,12 @@ def read_scene(path: str | os.PathLike[str], overrides: Iterable[str] = ()) -> S
     SceneError
         One line: file and line, or key, value and what is allowed.
     """
-    values = _read_toml(Path(path))
+    values = read_toml(Path(path))
     for override in overrides:
         key, value = parse_override(override)
-        _set(values, key, value)
+        put(values, key, value)
     values.setdefault("name", re.sub(r"^[^\w]+|[^\w+-]+$|[^\w .+-]", "", Path(path).stem)[:100].rstrip(" .") or "scene")
     return scene_from_dict(values)
-
-
-def _read_toml(path: Path) -> dict[str, Any]:
-    try:
-        text = path.read_bytes().decode("utf-8-sig")
-    except IsADirectoryError:
-        raise SceneError(f"{path}: is a folder; a scene is a TOML file") from None
-    except FileNotFoundError:
-        raise SceneError(f"{path}: no such file; a scene is a TOML file") from None
-    except UnicodeDecodeError as error:
-        line = error.object[: error.start].count(b"\n") + 1
-        raise SceneError(f"{path}: line {line}: not UTF-8 text; a scene is a TOML file in UTF-8") from None
-    except (OSError, ValueError) as error:
-        raise SceneError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
-    try:
-        return tomllib.loads(text)
-    except (ValueError, RecursionError) as error:
-        place = re.search(r"^(.*) \(at (?:line (\d+), column \d+|(end of document))\)$", str(error), re.DOTALL)
-        line, problem = (place[2] or len(text.splitlines()), place[1]) if place else (0, str(error))
-        raise SceneError(f"{path}: {f'line {line}: ' if line else ''}not TOML: {problem}") from None
-
-
-def parse_override(text: str) -> tuple[str, Any]:
-    """Dotted key and value of "KEY=VALUE"; VALUE is TOML, or a bare word for a string.
-
-    Raises
-    ------
-    SceneError
-        If there is no '=', the key has an empty part or the value is neither.
-    """
-    key, equals, value = (part.strip() for part in text.partition("="))
-    if not equals:
-        raise SceneError(f"--set {shown(text)}: must be KEY=VALUE, as in cells.seed=2")
-    if not all(key.split(".")):
-        raise SceneError(f"--set {shown(text)}: the key must be a dotted path, as in cells.seed=2")
-    try:
-        parsed = tomllib.loads(f"value = {value}")
-    except (ValueError, RecursionError):
-        parsed = {}
-    if list(parsed) == ["value"]:
-        return key, parsed["value"]
-    if re.fullmatch(r"[\w.+/:-]+", value):
-        return key, value
-    raise SceneError(f"--set {key} = {shown(value)}: must be a TOML value or a bare word")
-
-
-def _set(values: dict[str, Any], key: str, value: Any) -> None:
-    """Put a value at a dotted key, making the tables on the way."""
-    *parents, name = (part.strip() for part in key.split("."))
-    for depth, parent in enumerate(parents):
-        table = values.setdefault(parent, {})
-        if not isinstance(table, dict):
-            place = ".".join(parents[: depth + 1])
-            raise SceneError(f"{key} = {shown(value)}: {place} = {shown(table)} is a value, not a table")
-        values = table
-    values[name] = value
 
 
 # ---------------------------------------------------------------- documentation
@@ -463,17 +416,17 @@ _REFERENCE = """# Keys of a scene
 
 This page is made from the code: `./with-fenicsx python3 -m remodel_fenicsx.scene > docs/scene.md`.
 
-A scene is a TOML file. Every key is checked before anything is solved: an unknown key, a value of the wrong type (a string
-for a number, `true` for a number), NaN, or values that do not fit together give one line with key, value and what is allowed.
-Lengths of the geometry are in any one unit of length, chain lengths in link lengths of the chain, stresses in
-`material.stress_unit`, time in the unit of 1/`remodeling.kappa`.
+A scene is a TOML file. Every key is checked before anything is solved: an unknown key, a value of the wrong type (a
+string for a number, `true` for a number), NaN, or values that do not fit together give one line with key, value and
+what is allowed. Lengths of the geometry are in any one unit of length, chain lengths in link lengths of the chain,
+stresses in `material.stress_unit`, time in the unit of 1/`remodeling.kappa`.
 
-Where a key has several sources, the first of these wins: `--set KEY=VALUE` on the command line, the file, the preset for the
-shape, the defaults below. Tables are merged key by key, lists are replaced whole. A preset's load stays when the scene names
-only another one; to take it away set its `value` to 0.
+Where a key has several sources, the first of these wins: `--set KEY=VALUE` on the command line, the file, the preset
+for the shape, the defaults below. Tables are merged key by key, lists are replaced whole. A preset's load stays when
+the scene names only another one; to take it away set its `value` to 0.
 
-`--set` takes a dotted key and a TOML value; a bare word is a string: `--set cells.seed=2 --set remodeling.frame=spatial`,
-`--set 'loads.pressure.ramp=[[0, 0], [25, 1]]'`.
+`--set` takes a dotted key and a TOML value; a bare word is a string: `--set cells.seed=2`,
+`--set remodeling.frame=spatial`, `--set 'loads.pressure.ramp=[[0, 0], [25, 1]]'`.
 
 """
 
@@ -483,8 +436,8 @@ def scene_reference() -> str:
     text = _REFERENCE + markdown_reference(Scene)
     for name, shapes in PRESETS.items():
         text += f"\n## Preset `{name}`\n\n{PRESET_NOTES[name]}\n"
-        bodies = {shape: tomlkit.dumps(merged({"geometry": {"shape": shape}}, values)) for shape, values in shapes.items()}
-        for shape, body in bodies.items():
+        for shape, values in shapes.items():
+            body = tomlkit.dumps(merged({"geometry": {"shape": shape}}, values))
             text += f"\nShape `{shape}`:\n\n```toml\n{body.strip()}\n```\n"
     return text
 

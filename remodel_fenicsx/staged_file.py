@@ -108,7 +108,8 @@ class StagedFile(io.RawIOBase):
         except OSError:
             os.ftruncate(self._descriptor, self._committed)
             raise
-        for offset, change in self._changes:
+        # HDF5's superblock, at offset 0, says how long the file is: first, for chunk indices will name the new end
+        for offset, change in sorted(self._changes, key=lambda item: item[0] > 0):
             self._write_all(offset, change)
         self._committed += len(self._tail)
         self._tail, self._changes = bytearray(), []

@@ -1,4 +1,4 @@
-"""What all tables of a scene share: strict values, errors of one line, and their text as TOML and as documentation.
+"""What all tables of a scene share: strict values, errors of one line, and the reference of their keys.
 
 A leaf: it knows no key of any scene. `parameters` and `scene` declare the keys.
 """
@@ -7,18 +7,16 @@ from __future__ import annotations
 
 import difflib
 import inspect
+import math
 import re
-import textwrap
 from collections.abc import Callable, Collection, Iterator, Mapping
 from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin
 
-import tomlkit
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails, PydanticCustomError, PydanticUndefined
 
 LONGEST_VALUE = 60  # characters of a value in an error
-COMMENT_WIDTH = 100
 _MISSING = object()
 
 
@@ -26,7 +24,7 @@ class SceneError(ValueError):
     """Bad input. Its text is one line: the dotted key, the value, what is allowed."""
 
     def __init__(self, message: str):
-        super().__init__(re.sub(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]+", " ", message))
+        super().__init__(printable(message))
 
 
 class Table(BaseModel):
@@ -84,7 +82,22 @@ def fault(rule: str, key: str = "", value: Any = _MISSING) -> PydanticCustomErro
     return PydanticCustomError("fault", "{rule}", context)
 
 
+def is_number(value: Any) -> bool:
+    """Whether a value is a finite number that a float can hold; true and false are not."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return False
+    try:
+        return math.isfinite(value)
+    except OverflowError:
+        return False
+
+
 # ---------------------------------------------------------------- one line for an error
+
+
+def printable(text: str) -> str:
+    """Text on one line: control characters and line ends become spaces."""
+    return re.sub(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]+", " ", text)
 
 
 def one_line(error: ValidationError, table: type[BaseModel]) -> str:
@@ -173,9 +186,8 @@ def _suggestion(key: str, owner: type[BaseModel], table: type[BaseModel]) -> str
     near = difflib.get_close_matches(name, owner.model_fields, n=1, cutoff=0.6)
     if near:
         return f"did you mean {_joined(parent, near[0])}?"
-    elsewhere = {
-        known: _joined(other, known) for other, _, inner in sections(table) if other != parent for known in inner.model_fields
-    }
+    others = [(other, inner) for other, _, inner in sections(table) if other != parent]
+    elsewhere = {known: _joined(other, known) for other, inner in others for known in inner.model_fields}
     near = difflib.get_close_matches(name, elsewhere, n=1, cutoff=0.8)
     if near:
         return f"did you mean {elsewhere[near[0]]}?"
@@ -188,6 +200,10 @@ def _suggestion(key: str, owner: type[BaseModel], table: type[BaseModel]) -> str
 def is_table(annotation: Any) -> bool:
     """Whether an annotation is a table class."""
     return isinstance(annotation, type) and issubclass(annotation, BaseModel)
+
+
+def _fields(annotation: Any) -> dict[str, FieldInfo]:
+    return annotation.model_fields if is_table(annotation) else {}
 
 
 def variants(field: FieldInfo) -> dict[str, type[BaseModel]]:
@@ -212,12 +228,12 @@ def allowed(field: FieldInfo) -> str:
     if isinstance(field.json_schema_extra, dict):
         return f"must be {field.json_schema_extra['allowed']}"
     if is_table(field.annotation) or get_origin(field.annotation) is dict:
-        return "must be a table"
+        required = [name for name, inner in _fields(field.annotation).items() if inner.is_required()]
+        return "must be a table" + (f" with {', '.join(required)}" if required else "")
     nouns: dict[Any, str] = {float: "a finite number", int: "a whole number", bool: "true or false", str: "a string"}
     words = {"gt": "greater than", "ge": "at least", "lt": "less than", "le": "at most"}
-    bounds = [
-        f"{word} {getattr(entry, name)}" for entry in field.metadata for name, word in words.items() if hasattr(entry, name)
-    ]
+    limits = [(word, getattr(entry, name, None)) for entry in field.metadata for name, word in words.items()]
+    bounds = [f"{word} {limit}" for word, limit in limits if limit is not None]
     return " ".join(filter(None, [f"must be {nouns[field.annotation]}", " and ".join(bounds)]))
 
 
@@ -233,55 +249,6 @@ def sections(table: type[BaseModel], key: str = "", variant: str = "") -> Iterat
             yield from sections(field.annotation, path)  # type: ignore[arg-type]
         elif get_origin(field.annotation) is dict and is_table(get_args(field.annotation)[1]):
             yield from sections(get_args(field.annotation)[1], f"{path}.NAME")
-
-
-# ---------------------------------------------------------------- TOML
-
-
-def toml_text(table: BaseModel, header: str = "") -> str:
-    """A table with all its values as TOML, each key under its description as a comment."""
-    document = tomlkit.document()
-    for line in header.splitlines():
-        document.add(tomlkit.comment(line) if line.strip() else tomlkit.nl())
-    if header:
-        document.add(tomlkit.nl())
-    _fill(document, table)
-    return tomlkit.dumps(document)
-
-
-def _fill(container: Any, table: BaseModel) -> None:
-    fields = type(table).model_fields
-    # TOML wants a table's own values before the tables in it
-    for name, field in sorted(fields.items(), key=lambda item: isinstance(getattr(table, item[0]), (BaseModel, dict))):
-        value = getattr(table, name)
-        if value is None:
-            continue
-        if isinstance(value, BaseModel):
-            inner = tomlkit.table()
-            _fill(inner, value)
-            container.add(name, inner)
-        elif isinstance(value, dict):
-            container.add(name, _toml_table(value))
-        else:
-            for line in textwrap.wrap(field.description or "", COMMENT_WIDTH):
-                container.add(tomlkit.comment(line))
-            container.add(name, _plain(value))
-
-
-def _toml_table(values: Mapping[str, Any]) -> Any:
-    table = tomlkit.table(is_super_table=any(isinstance(value, BaseModel) for value in values.values()))
-    for name, value in values.items():
-        if isinstance(value, BaseModel):
-            inner = tomlkit.table()
-            _fill(inner, value)
-            table.add(name, inner)
-        else:
-            table.add(name, value)
-    return table
-
-
-def _plain(value: Any) -> Any:
-    return [_plain(entry) for entry in value] if isinstance(value, (list, tuple)) else value
 
 
 # ---------------------------------------------------------------- documentation

@@ -259,7 +259,7 @@ def cell_type_and_permutation(cell_name: str, degree: int) -> tuple[int, NDArray
         If there is no such cell or degree.
     """
     if cell_name not in CELL_TYPES or degree < 1:
-        raise ValueError(f"no VTK cell for {cell_name!r} of degree {degree}: cells {', '.join(CELL_TYPES)}, degree >= 1")
+        raise ValueError(f"no VTK cell {cell_name!r} of degree {degree}: cells {', '.join(CELL_TYPES)}, degree >= 1")
     # here and not above: whoever reads or writes lines alone need not wait for dolfinx
     import basix
     from dolfinx import cpp

@@ -83,14 +83,15 @@ class Clone:
         self.stubs = stubs
         script(stubs / "mmdebstrap", MMDEBSTRAP)
         script(stubs / "newuidmap", "#!/bin/sh\nexit 1\n")
-        script(stubs / "apt-get", '#!/bin/sh\necho "apt-get $*" >> "$RECORD/apt-get"; echo "E: no network" >&2; exit 100\n')
+        script(stubs / "apt-get", '#!/bin/sh\necho "$*" >> "$RECORD/apt-get"; echo "E: no network" >&2; exit 100\n')
         for engine in ("docker", "podman"):
             script(stubs / engine, ENGINE)
         if not shutil.which("mount", path=SYSTEM_PATH):
             script(self.folder / "bin" / "mount", MOUNT.format(python=sys.executable))
         self.environment = {
             "PATH": f"{stubs}:{self.folder}/bin:{SYSTEM_PATH}", "HOME": str(folder / "home"), "LANG": "C.UTF-8",
-            "XDG_CACHE_HOME": str(self.cache), "RECORD": str(self.record), "WITH_FENICSX": "root", "STUB_ENGINE": "none"}
+            "XDG_CACHE_HOME": str(self.cache), "RECORD": str(self.record), "WITH_FENICSX": "root",
+            "STUB_ENGINE": "none"}
 
     def start(self, *command: str, **options):
         environment = self.environment | options.pop("environment", {})
@@ -285,7 +286,8 @@ def test_build_ends_with_the_launcher(rooted, number, group):
 
 
 def test_killed_launcher_leaves_a_build_that_the_next_run_takes(rooted):
-    process = rooted.start("true", environment={"STUB_BUILD": "slow"}, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    process = rooted.start("true", environment={"STUB_BUILD": "slow"},
+                           stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     wait_for((rooted.record / "begun").exists, "the build")
     process.kill()
     process.wait()
@@ -296,16 +298,18 @@ def test_killed_launcher_leaves_a_build_that_the_next_run_takes(rooted):
 
 
 def test_killed_build_is_never_used(rooted):
-    process = rooted.start("true", environment={"STUB_BUILD": "hang"}, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    process = rooted.start("true", environment={"STUB_BUILD": "hang"},
+                           stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     wait_for((rooted.record / "begun").exists, "the build")
     process.kill()
     process.wait()
     os.killpg(os.getpgid(int((rooted.record / "pid").read_text())), signal.SIGKILL)
     (part,) = rooted.roots()
     assert part.endswith(".part")
+    (rooted.cache / "remodel-fenicsx" / part / "left over").touch()
     assert rooted.run("true").returncode == 0
     assert rooted.roots() == [part.removesuffix(".part")]
-    assert not (rooted.cache / "remodel-fenicsx" / rooted.roots()[0] / "half").exists()
+    assert not (rooted.cache / "remodel-fenicsx" / rooted.roots()[0] / "left over").exists()
     assert len(rooted.builds()) == 2
 
 

@@ -170,6 +170,19 @@ def test_parts_of_a_step_end_in_the_same_state(monkeypatch: pytest.MonkeyPatch) 
     np.testing.assert_allclose(parts, direct, rtol=1e-10)
 
 
+def test_tangent_is_the_slope_of_the_residual() -> None:
+    tube = radial.Tube(1.0, 3.0, 3, MATERIAL)
+    rng = np.random.default_rng(2)
+    squares = rng.dirichlet([1.0, 1.0, 1.0], 9)
+    radii = 1.1 * tube.nodes + rng.uniform(-0.02, 0.02, 7)
+    banded = tube.tangent(radii, squares, 3.0, 1.05)
+    dense = sum(np.diag(banded[2 - k, max(k, 0):7 + min(k, 0)], k) for k in range(-2, 3))
+    shifts = 1e-6 * np.eye(7)
+    slopes = [(tube.residual(radii + h, squares, 3.0, 1.05) - tube.residual(radii - h, squares, 3.0, 1.05)) / 2e-6
+              for h in shifts]
+    np.testing.assert_allclose(dense, np.array(slopes).T, atol=1e-6)
+
+
 def test_order_of_directions() -> None:
     previous = np.array([[1, 0, 2], [1, 0, 2], [2, 1, 0], [0, 1, 2]])
     values = np.array([[1.0, 1.0, 3.0], [1.0 + 1e-10, 1.0, 3.0], [-1.0, 0.0, 1.0], [1.0, 2.0, 3.0]])

@@ -25,7 +25,7 @@ from remodel_fenicsx.scene import (
     scene_from_dict,
     scene_reference,
 )
-from remodel_fenicsx.tables import SceneError, sections
+from remodel_fenicsx.tables import SceneError, choices, sections
 
 ROOT = Path(__file__).resolve().parent.parent
 DEMOS = sorted((ROOT / "demos").glob("*.toml"))
@@ -158,6 +158,10 @@ BAD_SCENES = [
      "loads.stretch.value = -1.0: must be greater than -1 at every time; with the factor 1.0 it is -1"),
     (TUBE, {"loads.stretch": {"value": 0.5, "ramp": [[0.0, 0.0], [5.0, -3.0]]}},
      "loads.stretch.value = 0.5: must be greater than -1 at every time; with the factor -3.0 it is -1.5"),
+    (TUBE, {"loads.pressure.ramp": [[0.0, 0.0], [True, 1.0]]},
+     "loads.pressure.ramp[1] = [true, 1.0]: must be a pair [time, factor] of finite numbers"),
+    (TUBE, {"loads.pressure.ramp": [[10**400, 0.0]]},
+     re.compile(r"loads\.pressure\.ramp\[0\] = \[10+\.\.\.: must be a pair \[time, factor\] of finite numbers")),
     # remodeling, model, mesh
     (CUBE, {"remodeling.kappa": -0.1}, "remodeling.kappa = -0.1: must be a finite number at least 0"),
     (CUBE, {"remodeling.law": "foo"}, "remodeling.law = 'foo': allowed are 'explicit', 'rate', 'relaxation', 'none'"),
@@ -400,6 +404,14 @@ def test_without_a_preset_the_frame_is_material():
     assert scene_from_dict(CUBE).remodeling == printed_but_for_the_frame
 
 
+def test_the_names_that_a_scene_allows_are_those_that_the_code_has():
+    from remodel_fenicsx import remodel, solvers
+
+    assert list(remodel.DRIVERS) == list(parameters.DRIVERS)
+    assert list(remodel.FRAMES) == list(parameters.FRAMES)
+    assert list(solvers.PROFILES) == choices(Solver.model_fields["profile"])
+
+
 def test_the_network_modulus():
     # c = k theta n / (4 A_p) by hand: 1.381e-23 * 310 * 2e21 / 5.46
     assert Material().network_modulus == pytest.approx(1.56817, rel=1e-5)
@@ -413,7 +425,7 @@ def test_the_network_modulus():
 @pytest.mark.parametrize("path", DEMOS, ids=lambda path: path.stem)
 def test_a_scene_as_run_reads_back_as_the_same_scene(tmp_path, path):
     read = read_scene(path, ["solver.petsc_options.ksp_type=preonly", "cells.initial=[0.6, 0.8, 0.0]"])
-    text = read.to_toml(f"remodel-fenicsx, from {path.name}\n\nsecond line")
+    text = read.to_toml(f"remodel-fenicsx, from {path.name}\n\nsecond\x1bline")
     again = tmp_path / "again.toml"
     again.write_text(text, encoding="utf-8")
     assert read_scene(again) == read

@@ -227,7 +227,8 @@ class Tube:
             while done < 1.0:
                 share = min(1.0, done + part)
                 squares = (1 - share) * start[0] + share * end[0]
-                pressure, axial = ((1 - share) * np.array(start[1:]) + share * np.array(end[1:])).tolist()
+                pressure = (1 - share) * start[1] + share * end[1]
+                axial = (1 - share) * start[2] + share * end[2]
                 found = self.newton(radii, squares, pressure, axial)
                 if found is not None:
                     radii, done, part = found, share, 2 * part
@@ -312,11 +313,12 @@ def solve_radial(pressure: float = 4.8, stretch: float = 0.1, ramp_time: float =
     count = len(tube.points)
     number_of_steps = round(end / step)
     start = np.full((count, 3), material.end_to_end_length / np.sqrt(3))
-    ranked = start.copy()
+    ranked: Array = start.copy()
     ranks: Array = np.tile(np.array([CIRCUMFERENTIAL, AXIAL, RADIAL]), (count, 1))
     radii = tube.nodes.copy()
     state: tuple[Array, float, float] = (start**2, 0.0, 1.0)
-    dimensions, all_ranks = [start.copy()], [ranks]
+    dimensions: list[Array] = [start.copy()]
+    all_ranks: list[Array] = [ranks]
     solved: list[tuple[Array, Array, Array]] = []
     times = step * np.arange(1, number_of_steps + 1)
     factors = np.minimum(times / ramp_time, 1.0)

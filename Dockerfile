@@ -1,0 +1,24 @@
+# The same Debian packages as ./with-fenicsx, and the remodel-fenicsx command.  docs/environment.md tells more.
+#   docker build -t remodel-fenicsx .
+#   docker run --rm --user "$(id -u):$(id -g)" -v "$PWD:/work" remodel-fenicsx run demos/artery.toml
+
+# what ./with-fenicsx runs its commands in when it finds only a container engine: the packages, without the project
+FROM debian:trixie-slim AS environment
+COPY environment/debian-packages.txt /usr/local/share/remodel-fenicsx/debian-packages.txt
+RUN apt-get update \
+    && sed -e 's/#.*//' /usr/local/share/remodel-fenicsx/debian-packages.txt \
+       | DEBIAN_FRONTEND=noninteractive xargs apt-get install --yes --no-install-recommends \
+    && rm -rf /var/lib/apt/lists/*
+ENV LANG=C.UTF-8 OMPI_MCA_btl=self,sm OMPI_ALLOW_RUN_AS_ROOT=1 OMPI_ALLOW_RUN_AS_ROOT_CONFIRM=1
+
+FROM environment
+COPY . /opt/remodel-fenicsx
+ENV PATH=/opt/remodel-fenicsx/bin:$PATH PYTHONPATH=/opt/remodel-fenicsx HOME=/home/remodel
+# --user makes the results the caller's own; home, where compiled forms are kept, is anybody's then
+RUN python3 -m compileall -q /opt/remodel-fenicsx/remodel_fenicsx \
+    && useradd --create-home --uid 1000 remodel \
+    && mkdir -p /work && chmod 1777 /home/remodel /work
+USER remodel
+WORKDIR /work
+ENTRYPOINT ["remodel-fenicsx"]
+CMD ["--help"]

@@ -1,0 +1,205 @@
+"""What a run says while it runs: a progress bar or plain lines, and the log file. Only rank 0 speaks."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+import time as clock
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import TracebackType
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress as RichProgress, TaskID, TextColumn, TimeElapsedColumn
+from rich.text import Text
+
+LOGGER = "remodel_fenicsx"
+LOG_FORMAT = "%(asctime)s %(levelname)s %(message)s"
+
+
+class Progress:
+    """The progress of a run on stderr: a bar on a terminal, otherwise a plain line now and then.
+
+    Use it in a `with` statement: the terminal is put right again however the run ends, by Ctrl-C too.
+
+    Parameters
+    ----------
+    total_steps
+        Number of the last step.
+    title
+        Name of the run.
+    comm_rank
+        Rank of this process; all but 0 are silent.
+    first_step
+        Steps that an earlier run has done (a resumed run), so that the time left is right.
+    interval
+        Seconds between plain lines, at least. The first and the last step always get one.
+    """
+
+    def __init__(
+        self, total_steps: int, title: str, comm_rank: int = 0, *, first_step: int = 0, interval: float = 5.0
+    ):
+        self._total, self._title, self._first = total_steps, title, first_step
+        self._interval = interval
+        self._start = self._last_line = clock.monotonic()
+        self._started = False
+        self._pending: str | None = None  # the newest line that was not printed
+        self._silent = comm_rank != 0
+        self._bar: RichProgress | None = None
+        self._task = TaskID(0)
+
+    def __enter__(self) -> Progress:
+        self._start = clock.monotonic()
+        if not self._silent and _is_terminal():
+            # rich leads what others print, warnings of the log for one, around the bar; what goes to a file stays there
+            self._bar = RichProgress(
+                TextColumn("{task.description}"), BarColumn(bar_width=24), TextColumn("{task.completed}/{task.total}"),
+                TextColumn("{task.fields[state]}"), TimeElapsedColumn(), TextColumn("{task.fields[left]}"),
+                console=Console(stderr=True), refresh_per_second=4, redirect_stdout=sys.stdout.isatty(),
+            )  # fmt: skip
+            self._task = self._bar.add_task(
+                Text(self._title).markup, total=self._total, completed=self._first, state="starting", left=""
+            )
+            self._bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+        elif self._pending is not None:
+            self._print(self._pending)
+        self._bar, self._pending = None, None
+
+    def step(
+        self, index: int, time: float, load_text: str = "", newton_iterations: int = 0, message: str | None = None
+    ) -> None:
+        """Step `index` (1 to total_steps) is done.
+
+        Parameters
+        ----------
+        index, time
+            Number and time of the step.
+        load_text
+            The loads as they stand, such as "pressure 2.40, stretch 0.05".
+        newton_iterations
+            Iterations of this step.
+        message
+            Something out of the ordinary; it gets a line of its own at once and stays.
+        """
+        if self._silent:
+            return
+        state = ", ".join(filter(None, [f"t = {time:g}", load_text, f"{newton_iterations} Newton"]))
+        left = self._time_left(index)
+        if message is not None:
+            self.message(message)
+        if self._bar is not None:
+            self._bar.update(self._task, completed=index, state=Text(state).markup, left=left)
+            return
+        self._pending = f"{self._title}: step {index}/{self._total}, {state}" + (f", {left}" if left else "")
+        now = clock.monotonic()
+        if not self._started or index >= self._total or now - self._last_line >= self._interval:
+            self._print(self._pending)
+            self._started, self._last_line, self._pending = True, now, None
+
+    def message(self, text: str) -> None:
+        """Print a line above the bar, or between the plain lines."""
+        if self._bar is not None:
+            self._bar.console.print(Text(text), soft_wrap=True)
+        elif not self._silent:
+            self._print(f"{self._title}: {text}")
+
+    def _time_left(self, index: int) -> str:
+        """The mean of this run's steps so far, times the steps that are left; steps alike take alike long."""
+        done, remaining = index - self._first, self._total - index
+        if done < 1 or remaining < 1:
+            return ""
+        return f"{_duration((clock.monotonic() - self._start) / done * remaining)} left"
+
+    def _print(self, line: str) -> None:
+        try:
+            print(line, file=sys.stderr, flush=True)
+        except OSError:  # whoever read the lines is gone (a closed pipe): no reason to lose a long run
+            self._silent = True
+
+
+@contextmanager
+def open_log(path: str | os.PathLike[str], comm_rank: int = 0) -> Iterator[logging.Logger]:
+    """Write what the package logs, with times, to the end of `path`, and warnings to the terminal too.
+
+    Python's warnings go the same way. Without this, logging is as the calling script has set it up. On ranks other
+    than 0 nothing is written or shown.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be opened; later, out of the logging call, if it cannot be written (disk full).
+    """
+    logger, python_warnings = logging.getLogger(LOGGER), logging.getLogger("py.warnings")
+    handlers = _handlers(path) if comm_rank == 0 else [logging.NullHandler()]
+    before = logger.level, logger.propagate, python_warnings.propagate
+    logger.setLevel(logging.INFO)
+    logger.propagate = python_warnings.propagate = False
+    for handler in handlers:
+        logger.addHandler(handler)
+        python_warnings.addHandler(handler)
+    logging.captureWarnings(True)
+    try:
+        yield logger
+    finally:
+        logging.captureWarnings(False)
+        for handler in handlers:
+            logger.removeHandler(handler)
+            python_warnings.removeHandler(handler)
+            handler.close()
+        logger.setLevel(before[0])
+        logger.propagate, python_warnings.propagate = before[1:]
+
+
+def _handlers(path: str | os.PathLike[str]) -> list[logging.Handler]:
+    file = _LogFile(path, encoding="utf-8")
+    file.setFormatter(_OneBlock(LOG_FORMAT))
+    screen = _Screen(logging.WARNING)
+    screen.setFormatter(_OneBlock("%(levelname)s: %(message)s"))
+    return [file, screen]
+
+
+class _OneBlock(logging.Formatter):
+    """No empty line after Python's warnings, which end in a newline."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return super().format(record).rstrip()
+
+
+class _LogFile(logging.FileHandler):
+    """A log whose write errors are errors."""
+
+    def handleError(self, record: logging.LogRecord) -> None:
+        # called inside logging's own `except`: logging would print a traceback for every line and go on
+        raise
+
+
+class _Screen(logging.Handler):
+    """Lines on what is stderr at that moment: under a bar rich has put a stream there that prints above it."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        try:
+            print(self.format(record), file=sys.stderr, flush=True)
+        except OSError:  # a closed pipe: the log file has the line
+            pass
+
+
+def _is_terminal() -> bool:
+    return sys.stderr is not None and sys.stderr.isatty() and os.environ.get("TERM", "dumb") not in ("dumb", "unknown")
+
+
+def _duration(seconds: float) -> str:
+    """Seconds as people say them: 42 s, 3:05 min, 2:10 h."""
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
+    if whole < 3600:
+        return f"{whole // 60}:{whole % 60:02d} min"
+    return f"{whole // 3600}:{whole % 3600 // 60:02d} h"

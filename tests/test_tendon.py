@@ -1,0 +1,82 @@
+"""Fig. 6: the tendon under uniaxial tension, with the preset's random cells and with isotropic ones."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.optimize import fsolve
+
+from tests.conftest import Case
+
+L, A_P, DENSITY, LAMBDA, MU, KAPPA = 1.594, 1.365, 2.0e21, 27.293, 3.103, 0.025
+C_NETWORK = 1.381e-23 * 310.0 * DENSITY / (4 * A_P)
+SNAPSHOTS = (12.0, 150.0)
+
+
+def tendon_scene(**cells: object) -> dict:
+    """The preset's tendon."""
+    return {"preset": "kuhl-holzapfel-2007", "geometry": {"shape": "tendon"}, "cells": cells}
+
+
+@pytest.fixture(scope="module", params=[1, 2, 3])
+def random_tendon(request: pytest.FixtureRequest, case: Case) -> dict:
+    """150 steps of a seed."""
+    return case(tendon_scene(seed=request.param), snapshots=SNAPSHOTS)
+
+
+def test_stretch_rises_to_175_and_falls_to_140_percent(random_tendon: dict) -> None:
+    stretch = dict(zip(random_tendon["time"], random_tendon["mean_stretch"], strict=True))
+    assert 1.70 <= stretch[12.0] <= 1.80
+    assert 1.41 <= stretch[150.0] <= 1.43
+    # narrower: what five seeds gave with this method (docs/verification.md)
+    assert 1.735 <= stretch[12.0] <= 1.750
+    assert 1.4243 <= stretch[150.0] <= 1.4251
+
+
+def test_aligned_elements_are_stiff_and_unaligned_ones_soft(random_tendon: dict) -> None:
+    order = np.argsort(random_tendon["angle_12"])
+    stretch = random_tendon["stretch_12"][order]
+    tenth = len(stretch) // 10
+    assert 1.49 <= stretch[:tenth].mean() <= 1.53
+    assert 1.80 <= stretch[-tenth:].mean() <= 1.89
+
+
+def test_first_dimension_follows_the_closed_form(random_tendon: dict) -> None:
+    """Uniaxial tension to the end: l_1 -> r0 (1 - exp(-kappa t)) + l0_1 exp(-kappa t), up to small other tensions."""
+    left = np.exp(-KAPPA * 150.0)
+    expected = (1 - left) + left * random_tendon["l0"][..., 0]
+    assert np.quantile(np.abs(random_tendon["l"][..., 0] - expected), 0.95) < 2e-3
+    assert left == pytest.approx(0.0235, abs=5e-5)
+
+
+def test_no_accepted_state_passes_the_contour_length(random_tendon: dict) -> None:
+    assert np.all(random_tendon["max_chain_extension"] < 1.0)
+    assert random_tendon["max_chain_extension"].max() > 0.9  # it comes close: the guard is of use
+    assert np.all(random_tendon["min_jacobian"] > 0.0)
+
+
+def point_stretch(force_per_area: float, dimensions: np.ndarray) -> float:
+    """Axial stretch of a point in uniaxial tension, eq. (7) typed by hand; dimensions: along the load, across, across."""
+
+    def g(r: float) -> float:
+        return 1 / L + 1 / (4 * r * (1 - r / L) ** 2) - 1 / (4 * r)
+
+    def balance(stretch: np.ndarray) -> np.ndarray:
+        volume = np.prod(stretch)
+        r = np.sqrt(np.sum((dimensions * stretch) ** 2))
+        matrix = LAMBDA * np.log(volume) - MU + MU * stretch**2
+        cauchy = (matrix + C_NETWORK * dimensions**2 * (g(r) * stretch**2 - g(1.0))) / volume
+        return cauchy * volume / stretch - np.array([force_per_area, 0.0, 0.0])
+
+    return float(fsolve(balance, [1.4, 0.85, 0.85], xtol=1e-13)[0])
+
+
+def test_isotropic_cells_stay_homogeneous_and_follow_the_point_solution(case: Case) -> None:
+    result = case(tendon_scene(initial="isotropic"), snapshots=SNAPSHOTS)
+    np.testing.assert_allclose(result["max_stretch"], result["min_stretch"], rtol=0, atol=1e-8)
+    for time in (1.0, 6.0, 12.0, 13.0, 50.0, 150.0):
+        row = int(np.flatnonzero(result["time"] == time)[0])
+        s = 1 - np.exp(-KAPPA * (time - 1.0))
+        across = (1 - s) / np.sqrt(3)
+        expected = point_stretch(result["force"][row] / 10.0, np.array([across + s, across, across]))
+        assert result["mean_stretch"][row] == pytest.approx(expected, abs=1e-8), f"t = {time}"
