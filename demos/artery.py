@@ -1,8 +1,8 @@
 # %% [markdown]
 # # A tube-like artery subject to axial stretch and internal pressure
 #
-# Kuhl & Holzapfel 2007, Figs. 7 and 8: an artery with randomly oriented collagen is stretched by 10 % and pressurised to
-# 4.8 in 25 steps, then held while its collagen reorients. `demos/artery.toml` is the same simulation as a scene.
+# Kuhl & Holzapfel 2007, Figs. 7 and 8: an artery with randomly oriented collagen is stretched by 10 % and pressurised
+# to 4.8 in 25 steps, then held while its collagen reorients. `demos/artery.toml` is the same simulation as a scene.
 #
 #     ./with-fenicsx python3 demos/artery.py [END [FOLDER]]
 #     ./with-fenicsx mpirun -n 2 python3 demos/artery.py
@@ -46,8 +46,8 @@ displacement = dolfinx.fem.Function(space, name="displacement")
 # $$W = \frac{\lambda}{2}\ln^2 J + \frac{\mu}{2}(\operatorname{tr} C - 3) - \mu \ln J
 #     + c\,\frac{L}{4}\Big(2\frac{r^2}{L^2} + \frac{1}{1-r/L} - \frac{r}{L}\Big)
 #     - \frac{c}{2}\,g(r_0) \sum_I l_I^2 \ln(n_I \cdot C n_I)$$
-# with the end-to-end length $r^2 = \sum_I l_I^2\, n_I \cdot C n_I$ and $c = k\theta n / (4 A_p)$. `energy.py` says it in UFL.
-# The cells live at the quadrature points; each element starts with random dimensions, $|l| = r_0$.
+# with the end-to-end length $r^2 = \sum_I l_I^2\, n_I \cdot C n_I$ and $c = k\theta n / (4 A_p)$; `energy.py` says it
+# in UFL. The cells live at the quadrature points; each element starts with random dimensions, $|l| = r_0$.
 
 # %%
 material = Material(
@@ -89,8 +89,8 @@ def load_values(time: float) -> dict[str, float]:
 
 # %% [markdown]
 # ## Remodeling
-# With the eigenvalues $\lambda_I$ of the Cauchy stress, their positive parts and $e = \lambda^+ / |\lambda^+|$, every point
-# turns its axes to the principal directions at once and its dimensions gradually (eq. 11):
+# With the eigenvalues $\lambda_I$ of the Cauchy stress, their positive parts and $e = \lambda^+ / |\lambda^+|$, every
+# point turns its axes to the principal directions at once and its dimensions gradually (eq. 11):
 # $$l = l^0 + (r_0\, e - l^0)\,(1 - e^{-\kappa t})$$
 
 # %%

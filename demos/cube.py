@@ -1,8 +1,8 @@
 # %% [markdown]
 # # The speed of remodeling: a unit cube in uniaxial tension
 #
-# Kuhl & Holzapfel 2007, Fig. 5 (Remark 7): an isotropic cube is pulled with a force of 10 in 10 steps and held to t = 100.
-# The angle between chains and load falls from 54.7 degrees; how fast is a matter of $\kappa$ alone:
+# Kuhl & Holzapfel 2007, Fig. 5 (Remark 7): an isotropic cube is pulled with a force of 10 in 10 steps and held to
+# t = 100. The angle between chains and load falls from 54.7 degrees; how fast is a matter of $\kappa$ alone:
 # $$\tan\alpha(t) = \frac{\sqrt2\,(1-s)}{1 - s + \sqrt3\, s}, \qquad s = 1 - e^{-\kappa t}$$
 # `demos/cube.toml` is the same simulation as a scene.
 #

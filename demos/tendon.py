@@ -1,9 +1,9 @@
 # %% [markdown]
 # # A cylindrical tendon under uniaxial tension
 #
-# Kuhl & Holzapfel 2007, Fig. 6: a tendon of length 10 and cross-section 10 with randomly oriented collagen is pulled with
-# a force of 300 in 12 steps, then held. At first it stretches to about 175 %; while its collagen turns into the direction
-# of the load it stiffens, down to about 140 %. `demos/tendon.toml` is the same simulation as a scene.
+# Kuhl & Holzapfel 2007, Fig. 6: a tendon of length 10 and cross-section 10 with randomly oriented collagen is pulled
+# with a force of 300 in 12 steps, then held. At first it stretches to about 175 %; while its collagen turns into the
+# direction of the load it stiffens, down to about 140 %. `demos/tendon.toml` is the same simulation as a scene.
 #
 #     ./with-fenicsx python3 demos/tendon.py [END [FOLDER]]
 #     ./with-fenicsx mpirun -n 2 python3 demos/tendon.py
@@ -42,8 +42,8 @@ displacement = dolfinx.fem.Function(space, name="displacement")
 
 # %% [markdown]
 # ## Tissue
-# The energy of `energy.py`; a unit cell at every quadrature point with one random draw of $l_I$ per element, $|l| = r_0$.
-# A cell whose long side lies along z is stiff, one that lies across is soft: the body is not homogeneous.
+# The energy of `energy.py`; a unit cell at every quadrature point with one random draw of $l_I$ per element,
+# $|l| = r_0$. A cell whose long side lies along z is stiff, one that lies across is soft: the body is not homogeneous.
 
 # %%
 material = Material(
@@ -83,8 +83,8 @@ def load_values(time: float) -> dict[str, float]:
 
 # %% [markdown]
 # ## Remodeling
-# Under uniaxial tension only the first eigenvalue of the Cauchy stress is positive, so $e \to (1, 0, 0)$ and eq. (11) lets
-# $l_1 \to r_0$, $l_2, l_3 \to 0$ with $n_1$ along the load.
+# Under uniaxial tension only the first eigenvalue of the Cauchy stress is positive, so $e \to (1, 0, 0)$ and eq. (11)
+# lets $l_1 \to r_0$, $l_2, l_3 \to 0$ with $n_1$ along the load.
 
 # %%
 remodeling = RemodelingPass(

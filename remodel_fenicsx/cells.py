@@ -89,11 +89,11 @@ def initial_dimensions(settings: parameters.Cells, number_of_cells: int) -> Arra
         draws = np.abs(np.random.default_rng(settings.seed).standard_normal((number_of_cells, 3)))
         return r0 * draws / np.linalg.norm(draws, axis=1, keepdims=True)
     if settings.initial == "isotropic":
-        lengths = np.full(3, r0 / np.sqrt(3))
+        lengths = [r0 / np.sqrt(3)] * 3
     elif settings.initial == "aligned":
-        lengths = np.where(np.arange(1, 4) == settings.aligned_axis, r0, 0.0)
+        lengths = [r0 if axis == settings.aligned_axis else 0.0 for axis in (1, 2, 3)]
     else:
-        lengths = np.asarray(settings.initial, dtype=float)
+        lengths = [float(length) for length in settings.initial]
     return np.tile(lengths, (number_of_cells, 1))
 
 
@@ -132,7 +132,8 @@ def angle_to_axis(dimensions: Array, axes: Array, direction: Array) -> Array:
     across d is summed by itself, so that small angles keep their digits.
     """
     along = np.einsum("...ij,...j->...i", axes, np.broadcast_to(direction, dimensions.shape))
-    across = np.linalg.norm(axes - along[..., None] * np.broadcast_to(direction, dimensions.shape)[..., None, :], axis=-1)
+    parallel = along[..., None] * np.broadcast_to(direction, dimensions.shape)[..., None, :]
+    across = _norm(axes - parallel)
     return np.degrees(np.arctan2(_norm(dimensions * across), _norm(dimensions * along)))
 
 

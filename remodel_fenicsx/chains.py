@@ -13,7 +13,7 @@ BOLTZMANN_CONSTANT = 1.381e-23  # J/K, as printed in the paper
 
 
 def wormlike_energy(end_to_end_length: Any, contour_length: Any) -> Any:
-    """Energy of a wormlike chain over k theta / (4 A_p) (eq. 1).
+    """Energy of a wormlike chain over k theta / A_p (eq. 1).
 
     Parameters
     ----------

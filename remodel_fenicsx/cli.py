@@ -46,12 +46,13 @@ def parser() -> argparse.ArgumentParser:
     new = commands.add_parser("new", help="Print a scene of a preset.", description="Print a scene of a preset.")
     new.add_argument("preset", metavar="PRESET", help=", ".join(PRESETS))
     new.add_argument("--shape", default="tube", help="cube, tendon or tube (default: tube)")
-    commands.add_parser("info", help="Print versions, solvers and BLAS.", description="Print versions, solvers and BLAS.")
+    text = "Print versions, solvers and BLAS."
+    commands.add_parser("info", help=text, description=text)
     return main_parser
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit code of docs/contract (0, 2, 3, 5, 130, 143)."""
+    """Run the command line; returns the exit code of docs/commands.md (0, 2, 3, 5, 130, 143)."""
     options = parser().parse_args(arguments)
     try:
         return COMMANDS[options.command](options)
@@ -114,7 +115,7 @@ def _end_all(message: str, code: int) -> int:
 
 def _validate(options: argparse.Namespace) -> int:
     scene = read_scene(options.scene, options.set)
-    print(f"{options.scene}: a valid scene ({scene.geometry.shape}, {round(scene.time.end / scene.time.step)} steps)")
+    print(f"{options.scene}: a valid scene ({scene.geometry.shape}, {scene.time.number_of_steps} steps)")
     return 0
 
 
@@ -137,3 +138,7 @@ def _info(options: argparse.Namespace) -> int:
 
 
 COMMANDS = {"run": _run, "validate": _validate, "new": _new, "info": _info}
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import platform
+import re
 from pathlib import Path
 
 import remodel_fenicsx
@@ -37,5 +38,6 @@ def blas_library() -> str:
         maps = Path("/proc/self/maps").read_text().splitlines()
     except OSError:
         return "unknown"
-    found = sorted({line.split()[-1] for line in maps if "blas" in line.rsplit("/", 1)[-1].lower()})
+    names = {line.split()[-1] for line in maps}
+    found = sorted(name for name in names if re.match(r"lib(open)?blas", name.rsplit("/", 1)[-1]))
     return ", ".join(found) or "unknown"

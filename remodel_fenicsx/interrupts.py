@@ -8,7 +8,7 @@ from types import FrameType, TracebackType
 _EXIT_CODE_BASE = 128
 
 
-class Interrupted(Exception):
+class Interrupted(Exception):  # noqa: N818 - no error: somebody asked for it
     """The run was asked to stop; the step under way is dropped."""
 
     def __init__(self, number: int):

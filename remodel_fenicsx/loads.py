@@ -93,6 +93,17 @@ class Loading:
         displacement = self._magnitude(name, length)
         self._prescribe(component, self._face_dofs(face, component), displacement)
 
+    def add_term(self, term: Callable[[Any, Any], Any]) -> None:
+        """Any other load, as a term of the residual: minus its virtual work.
+
+        Parameters
+        ----------
+        term
+            Function of displacement and test function that returns a UFL form: ``lambda u, v: -ufl.inner(b, v) * dx``
+            is a body force b per reference volume. Its derivative with respect to the displacement enters the tangent.
+        """
+        self._terms.append(term)
+
     def external_residual(self, displacement: Any, test: Any) -> list[Any]:
         """Terms of the residual from the loads: minus the virtual work of the external forces (UFL)."""
         return [term(displacement, test) for term in self._terms]
@@ -128,7 +139,8 @@ class Loading:
 
     def _surface_measure(self, face: str) -> Any:
         measure = ufl.Measure("ds", domain=self.domain.mesh, subdomain_data=self.domain.facet_tags)
-        return measure(self.domain.faces[face], metadata={"quadrature_degree": 2 * self.space.element.basix_element.degree})
+        degree = self.space.element.basix_element.degree
+        return measure(self.domain.faces[face], metadata={"quadrature_degree": 2 * degree})
 
     def _face_dofs(self, face: str, component: int) -> Any:
         facets = self.domain.facet_tags.find(self.domain.faces[face])

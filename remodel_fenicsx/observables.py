@@ -45,16 +45,16 @@ class Observer:
         self._columns = COLUMNS[domain.shape](self)
 
     def columns(self) -> dict[str, float]:
-        """The columns that belong to the shape (docs/contract: `force, mean_stretch, ...` or `pressure, ...`)."""
+        """The columns that belong to the shape (docs/commands.md)."""
         return self._columns()
 
     # ------------------------------------------------------------ fields
     def cell_fields(self) -> dict[str, Array]:
         """Element means for pictures, one row per local cell.
 
-        `deformation_gradient`, `cauchy_stress` (9, row by row); `cell_dimensions` (3) and `axis_1..3`: the cell whose structure tensor is the element's mean,
-        longest first; `fibre_angle`, `fibre_angle_deformed` (degrees, to the load axis or from circumferential to axial);
-        `chain_extension` (largest r/L in the element).
+        `deformation_gradient` and `cauchy_stress` (9, row by row); `cell_dimensions` (3) and `axis_1..3`: the cell
+        whose structure tensor is the element's mean, longest first; `fibre_angle` and `fibre_angle_deformed` (degrees,
+        to the load axis, or in a tube from circumferential to axial); `chain_extension` (largest r/L in the element).
         """
         values = self.quadrature.evaluate(self._state, (21,))
         F, cauchy = values[..., :9].reshape(*values.shape[:2], 3, 3), values[..., 9:18]

@@ -154,7 +154,7 @@ SHAPES = ("cube", "tendon", "tube")
 
 def _printed_method(
     geometry: dict[str, Any], loads: dict[str, Any], end: float, material: dict[str, Any], cells: dict[str, Any]
-) -> dict[str, Any]:
+) -> dict[str, dict[str, Any]]:
     """The paper's method on one of its bodies, every choice spelled out."""
     common_material = {
         "lame_lambda": 27.293,
@@ -170,7 +170,7 @@ def _printed_method(
         "mesh": {"refinement": 1, "cell": "hexahedron", "degree": 1},
         "model": {"kinematics": "full"},
         "material": common_material | material,
-        "cells": cells | {"end_to_end_length": 1.0},
+        "cells": {"end_to_end_length": 1.0} | cells,
         "loads": loads,
         "remodeling": {
             "driver": "cauchy",
@@ -190,37 +190,54 @@ def _load(value: float, end_of_ramp: float) -> dict[str, Any]:
 _STIFFER_CHAINS = {"chain_density": 7.0e21, "contour_length": 2.125, "persistence_length": 1.82}
 _CHAINS = {"chain_density": 2.0e21, "contour_length": 1.594, "persistence_length": 1.365}
 
+_PAPER = {
+    "cube": _printed_method(
+        {"side": 1.0},
+        {"force": _load(10.0, 10.0)},
+        100.0,
+        _STIFFER_CHAINS,
+        {"initial": "isotropic", "axes": "global"},
+    ),
+    "tendon": _printed_method(
+        {"length": 10.0, "area": 10.0},
+        {"force": _load(300.0, 12.0)},
+        150.0,
+        _CHAINS,
+        {"initial": "random", "axes": "global", "seed": 1},
+    ),
+    "tube": _printed_method(
+        {"inner_radius": 1.0, "outer_radius": 3.0, "length": 8.0},
+        {"pressure": _load(4.8, 25.0), "stretch": _load(0.1, 25.0)},
+        150.0,
+        _CHAINS,
+        {"initial": "random", "axes": "cylindrical", "seed": 1},
+    ),
+}
+
+# Lengths in nm. r0 is the root mean square end-to-end length of the free chain,
+# sqrt(2 A_p L (1 - A_p/L (1 - e^(-L/A_p)))), and the density makes c g(r0) r0^2, the initial stiffness of
+# the network, that of the paper's tendon and artery.
+_MEASURED_COLLAGEN = {"chain_density": 9.0e20, "contour_length": 309.0, "persistence_length": 14.5}
+_FREE_CHAIN = 92.4
+
+
+def _with_measured_collagen(scene: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    return scene | {
+        "material": scene["material"] | _MEASURED_COLLAGEN,
+        "cells": scene["cells"] | {"end_to_end_length": _FREE_CHAIN},
+    }
+
+
 PRESETS: dict[str, dict[str, dict[str, Any]]] = {
-    "kuhl-holzapfel-2007": {
-        "cube": _printed_method(
-            {"side": 1.0},
-            {"force": _load(10.0, 10.0)},
-            100.0,
-            _STIFFER_CHAINS,
-            {"initial": "isotropic", "axes": "global"},
-        ),
-        "tendon": _printed_method(
-            {"length": 10.0, "area": 10.0},
-            {"force": _load(300.0, 12.0)},
-            150.0,
-            _CHAINS,
-            {"initial": "random", "axes": "global", "seed": 1},
-        ),
-        "tube": _printed_method(
-            {"inner_radius": 1.0, "outer_radius": 3.0, "length": 8.0},
-            {"pressure": _load(4.8, 25.0), "stretch": _load(0.1, 25.0)},
-            150.0,
-            _CHAINS,
-            {"initial": "random", "axes": "cylindrical", "seed": 1},
-        ),
-    },
-    "sun-2002": {shape: {"material": {"contour_length": 309.0, "persistence_length": 14.5}} for shape in SHAPES},
+    "kuhl-holzapfel-2007": _PAPER,
+    "sun-2002": {shape: _with_measured_collagen(scene) for shape, scene in _PAPER.items()},
 }
 """Preset name -> shape -> scene keys; they lie under the keys of the scene that names the preset."""
 
 PRESET_NOTES = {
     "kuhl-holzapfel-2007": "The printed method on the three bodies of the paper: Fig. 5 (cube), Fig. 6 (tendon), "
     "Figs. 7 to 11 (tube). The frame is 'spatial', as printed in eq. (9).",
-    "sun-2002": "Collagen I as measured with optical tweezers (paper, Remark 2): the link length is 1 nm here. Only "
-    "these two values: the chain density and the end-to-end length (in nm) are the scene's to choose.",
+    "sun-2002": "The same with collagen I as measured with optical tweezers (paper, Remark 2): contour length 309 nm, "
+    "persistence length 14.5 nm, all chain lengths in nm. End-to-end length (that of a free chain) and chain density "
+    "(the same initial stiffness of the network) are choices of this project, not of the paper.",
 }

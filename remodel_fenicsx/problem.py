@@ -181,14 +181,14 @@ class EquilibriumProblem:
         self._matrix = dolfinx.fem.petsc.create_matrix(self.tangent_form)
         self._force_scale = 0.0
         self._lost = False
-        snes = PETSc.SNES().create(self.comm)
+        snes: Any = PETSc.SNES().create(self.comm)
         snes.setFunction(self._assemble_residual, self._residual)
         snes.setJacobian(self._assemble_tangent, self._matrix)
         snes.setTolerances(rtol=0.0, atol=0.0, stol=0.0, max_it=self.settings.maximum_iterations)
         snes.setLineSearchPreCheck(self._keep_admissible)
         set_options(snes, self.settings)
         snes.setConvergenceTest(self._converged)
-        self._snes = snes
+        self._snes: Any = snes
 
     def _pull(self, x: Any) -> None:
         """Copy the displacement into a PETSc vector."""
@@ -241,7 +241,10 @@ class EquilibriumProblem:
 
     def _assemble_tangent(self, snes: Any, x: Any, matrix: Any, preconditioner: Any) -> None:
         matrix.zeroEntries()
-        dolfinx.fem.petsc.assemble_matrix(matrix, self.tangent_form, bcs=self.loading.boundary_conditions)
+        # mypy sees the other overload of a single-dispatch function
+        dolfinx.fem.petsc.assemble_matrix(
+            matrix, self.tangent_form, bcs=self.loading.boundary_conditions  # type: ignore[misc]
+        )
         matrix.assemble()
 
     def _keep_admissible(self, x: Any, step: Any) -> bool:

@@ -36,7 +36,9 @@ class Quadrature:
         self.mesh = mesh
         self.cell_name = mesh.topology.cell_name()
         self.degree = DEGREES[self.cell_name, element_degree]
-        self.points, self.weights = basix.make_quadrature(basix.CellType[self.cell_name], self.degree)
+        points, weights = basix.make_quadrature(basix.CellType[self.cell_name], self.degree)
+        self.points: NDArray[np.float64] = np.asarray(points, dtype=np.float64)
+        self.weights: NDArray[np.float64] = np.asarray(weights, dtype=np.float64)
         self.number_of_owned_cells = mesh.topology.index_map(mesh.topology.dim).size_local
         self.cells = np.arange(
             self.number_of_owned_cells + mesh.topology.index_map(mesh.topology.dim).num_ghosts, dtype=np.int32

@@ -103,8 +103,8 @@ def read_history(folder: Path) -> dict[str, Array]:
 class Fields:
     """Time series of fields: fields.vtkhdf (the mesh) and fields_chains.vtkhdf (four chain lines per element).
 
-    Both open in ParaView (5.12 or later) and PyVista as one time series. Nodes and cells stand in the mesh file's order,
-    whatever the number of ranks.
+    Both open in ParaView (5.12 or later) and PyVista as one time series. Nodes and cells stand in the mesh file's
+    order, whatever the number of ranks.
     """
 
     def __init__(self, folder: Path, domain: Domain, observer: Observer):
@@ -126,13 +126,14 @@ class Fields:
     def append(self, time: float) -> None:
         """Write the present state as the state of `time`."""
         displacement = self._displacement()
-        fields = {name: self.domain.gather_cells(values) for name, values in self.observer.cell_fields().items()}
+        gathered = {name: self.domain.gather_cells(values) for name, values in self.observer.cell_fields().items()}
         if self._grid is None or displacement is None:
             return
+        fields = {name: values for name, values in gathered.items() if values is not None}
         self._grid.append(time, {"displacement": displacement}, fields)
         self._append_chains(time, displacement, fields)
 
-    def _append_chains(self, time: float, displacement: Array, fields: dict[str, Any]) -> None:
+    def _append_chains(self, time: float, displacement: Array, fields: dict[str, Array]) -> None:
         axes = np.stack([fields[f"axis_{i + 1}"] for i in range(3)], axis=1)
         points, lines = chain_lines(self._centres, fields["cell_dimensions"], axes, self._scale)
         gradient = fields["deformation_gradient"].reshape(-1, 3, 3)

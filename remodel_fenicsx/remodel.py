@@ -22,16 +22,28 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Driver:
-    """A driving tensor: its UFL expression from (F, stresses), and whether its eigenvectors are material vectors."""
+    """A driving tensor.
+
+    Attributes
+    ----------
+    tensor
+        Its UFL expression from (F, stresses).
+    material
+        Whether its eigenvectors are material vectors.
+    scale
+        A typical size from the material, below whose rounding an eigenvalue is zero: the 1e-16 of an unloaded body is
+        no tension.
+    """
 
     tensor: Callable[[Any, Stresses], Any]
     material: bool
+    scale: Callable[[parameters.Material], float]
 
 
 DRIVERS: dict[str, Driver] = {
-    "cauchy": Driver(lambda F, s: s.cauchy, material=False),
-    "pk2": Driver(lambda F, s: s.second_piola_kirchhoff, material=True),
-    "finger": Driver(lambda F, s: ufl.dot(F, F.T), material=False),
+    "cauchy": Driver(lambda F, s: s.cauchy, material=False, scale=lambda m: m.lame_mu),
+    "pk2": Driver(lambda F, s: s.second_piola_kirchhoff, material=True, scale=lambda m: m.lame_mu),
+    "finger": Driver(lambda F, s: ufl.dot(F, F.T), material=False, scale=lambda m: 1.0),
 }
 
 
@@ -99,7 +111,7 @@ class RemodelingPass:
         driver = values[:, 1]
         return values[:, 0], (driver + np.swapaxes(driver, 1, 2)) / 2
 
-    def updated_cells(self, time_old: float, time_new: float) -> tuple[Array, Array, Array, Array]:
+    def updated_cells(self, time_old: float, time_new: float) -> tuple[Array, Array, NDArray[np.bool_], Array]:
         """New dimensions (n, 3) and axes (n, 3, 3), which points remodel (n,), and F (n, 3, 3). Changes nothing."""
         cells, r0 = self.cells, self.cells.settings.end_to_end_length
         F, driver = self.driving_tensor()
@@ -109,8 +121,9 @@ class RemodelingPass:
         # the axes to keep where eigenvalues agree, as vectors of the space in which the driver lives
         carried = spatial and self.settings.frame == "material"
         previous = _unit(axes @ np.swapaxes(F, 1, 2)) if carried else axes
-        values, principal_axes = spectral.principal(driver, previous)
-        direction, active = spectral.positive_direction(values)
+        scale = self.driver.scale(self.material)
+        values, principal_axes = spectral.principal(driver, previous, scale=scale)
+        direction, active = spectral.positive_direction(values, scale=scale)
         new_axes = self.frame(F, principal_axes) if spatial else principal_axes
         initial = cells.initial_dimensions.reshape(-1, 3)
         new_dimensions = self.law(dimensions, initial, r0 * direction, self.settings.kappa, time_old, time_new)
@@ -131,8 +144,8 @@ class RemodelingPass:
         cells = self.cells
         quadrature = cells.quadrature
         dimensions, axes, active, F = self.updated_cells(time_old, time_new)
-        energy_rate = self.energy_increment(F, dimensions, axes) / (time_new - time_old)
-        power = -quadrature.integral(energy_rate.reshape(quadrature.shape))
+        increment = self.energy_increment(F, dimensions, axes).reshape(quadrature.shape)
+        power = -quadrature.integral(increment) / (time_new - time_old)
         cells.set(dimensions.reshape(*quadrature.shape, 3), axes.reshape(*quadrature.shape, 3, 3))
         return PassResult(power, quadrature.mean(active.reshape(quadrature.shape).astype(float)))
 
@@ -152,7 +165,8 @@ class RemodelingPass:
         repulsion_change = _repulsion_sum(dimensions, axes, C) - _repulsion_sum(old_dimensions, old_axes, C)
         stiffness = chain.stiffness(np.sqrt(squared), L)
         stiffness0 = chain.stiffness(cells.settings.end_to_end_length, L)
-        return material.network_modulus / 2 * (stiffness * squared_change - stiffness0 * repulsion_change)
+        change: Array = material.network_modulus / 2 * (stiffness * squared_change - stiffness0 * repulsion_change)
+        return change
 
 
 def _repulsion_sum(dimensions: Array, axes: Array, C: Array) -> Array:

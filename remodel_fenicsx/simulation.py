@@ -15,15 +15,15 @@ from mpi4py import MPI
 from remodel_fenicsx import geometry
 from remodel_fenicsx.cells import UnitCells
 from remodel_fenicsx.environment import versions
-from remodel_fenicsx.interrupts import StopRequest
+from remodel_fenicsx.interrupts import Interrupted, StopRequest
 from remodel_fenicsx.loads import LOADINGS, LoadValues
 from remodel_fenicsx.observables import Observer
 from remodel_fenicsx.quadrature import Quadrature
 from remodel_fenicsx.record import Fields, RunFolder, choose_folder
 from remodel_fenicsx.remodel import RemodelingPass
 from remodel_fenicsx.scene import Scene
-from remodel_fenicsx.stepping import Stepper, times
-#from remodel_fenicsx.terminal import Progress, run_log
+from remodel_fenicsx.stepping import StepFailure, Stepper, times
+from remodel_fenicsx.terminal import Progress, open_log
 
 log = logging.getLogger(__name__)
 
@@ -45,6 +45,9 @@ class Simulation:
         The validated scene.
     comm
         MPI communicator of the mesh.
+    domain
+        A mesh of the scene's body to take in place of the one that the scene asks for; its cell type and degree must
+        be the scene's.
 
     Attributes
     ----------
@@ -52,7 +55,7 @@ class Simulation:
         The parts, each usable by itself (see demos/).
     """
 
-    def __init__(self, scene: Scene, comm: MPI.Comm = MPI.COMM_WORLD):
+    def __init__(self, scene: Scene, comm: MPI.Intracomm = MPI.COMM_WORLD):
         self.scene = scene
         self.domain = geometry.build(scene.geometry, scene.mesh, comm)
         mesh = self.domain.mesh
@@ -80,8 +83,8 @@ class Simulation:
     def steps(self, fields: Fields | None = None) -> Iterator[StepRecord]:
         """Solve and remodel step by step; what is yielded has been accepted.
 
-        The state seen at a yield is one pass ahead of the row: the row and the fields belong to the solved state, before
-        the remodeling pass (docs/theory.md).
+        The state seen at a yield is one pass ahead of the row: the row and the fields belong to the solved state,
+        before the remodeling pass (docs/theory.md).
 
         Raises
         ------
@@ -116,7 +119,9 @@ class Simulation:
             )
 
 
-def run(scene: Scene, folder: Path | str | None = None, comm: MPI.Comm = MPI.COMM_WORLD, quiet: bool = True) -> Path:
+def run(
+    scene: Scene, folder: Path | str | None = None, comm: MPI.Intracomm = MPI.COMM_WORLD, quiet: bool = True
+) -> Path:
     """Run a scene and record it.
 
     Parameters
@@ -145,30 +150,38 @@ def run(scene: Scene, folder: Path | str | None = None, comm: MPI.Comm = MPI.COM
     OSError
         If the results cannot be written.
     """
-    place = choose_folder(None if folder is None else Path(folder), scene.name) if comm.rank == 0 else None
-    place = comm.bcast(place)
-    header = "\n".join(f"{name} {version}" for name, version in versions().items())
-    number_of_steps = round(scene.time.end / scene.time.step)
+    place = comm.bcast(choose_folder(None if folder is None else Path(folder), scene.name) if comm.rank == 0 else None)
+    header = "as run: all values, also those of preset and defaults\n" + "\n".join(
+        f"{name} {version}" for name, version in versions().items()
+    )
     with (
         RunFolder(place, scene.to_toml(header), comm.rank) as record,
-        run_log(place / "run.log" if comm.rank == 0 else None),
+        open_log(place / "run.log", comm.rank),
         StopRequest() as stop,
-        Progress(number_of_steps, scene.name, comm.rank if not quiet else -1) as progress,
+        Progress(scene.time.number_of_steps, scene.name, -1 if quiet else comm.rank) as progress,
     ):
         log.info("scene %s on %d ranks, results in %s", scene.name, comm.size, place)
-        simulation = Simulation(scene, comm)
-        simulation.stepper.problem.stop_signal = lambda: stop.number
-        if scene.output.fields:
-            record.fields = Fields(place, simulation.domain, simulation.observer)
-        for step in simulation.steps(record.fields):
-            record.append(step.row)
-            log.info("%s", _summary(step.row))
-            progress.step(round(step.time / scene.time.step), step.time, _loads(step.row), step.row["newton_iterations"])
+        try:
+            _record_steps(Simulation(scene, comm), record, progress, stop)
+        except (StepFailure, Interrupted) as reason:
+            log.error("%s", reason)
+            raise
+        log.info("finished")
     return place
 
 
-def _summary(row: dict[str, float]) -> str:
-    return ", ".join(f"{name} {value:.6g}" for name, value in row.items())
+def _record_steps(simulation: Simulation, record: RunFolder, progress: Progress, stop: StopRequest) -> None:
+    """Step through the scene; each accepted step is on disk before the next one starts."""
+    scene = simulation.scene
+    simulation.stepper.problem.stop_signal = lambda: stop.number
+    if scene.output.fields:
+        record.fields = Fields(record.folder, simulation.domain, simulation.observer)
+    for number, step in enumerate(simulation.steps(record.fields), start=1):
+        record.append(step.row)
+        log.info("%s", ", ".join(f"{name} {value:.6g}" for name, value in step.row.items()))
+        parts = int(step.row["substeps"])
+        message = f"time {step.time:g} solved in {parts} parts" if parts > 1 else None
+        progress.step(number, step.time, _loads(step.row), int(step.row["newton_iterations"]), message)
 
 
 def _loads(row: dict[str, float]) -> str:

@@ -28,8 +28,8 @@ _set_here: set[str] = set()
 def set_options(snes: Any, settings: Solver) -> None:
     """Give SNES the profile's options, then the scene's, under those of the command line or PETSC_OPTIONS.
 
-    All carry the prefix `remodel_`: for instance ``PETSC_OPTIONS="-remodel_snes_monitor"``. They stay in PETSc's database
-    because the factorisation reads its own at the first solve.
+    All carry the prefix `remodel_`: for instance ``PETSC_OPTIONS="-remodel_snes_monitor"``. They stay in PETSc's
+    database because the factorisation reads its own at the first solve.
     """
     database = PETSc.Options()
     for stale in _set_here:

@@ -43,6 +43,7 @@ class StagedFile(io.RawIOBase):
     """
 
     def __init__(self, path: Path):
+        self._descriptor = -1
         super().__init__()
         self._path = path
         self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
@@ -120,8 +121,9 @@ class StagedFile(io.RawIOBase):
         self._path.unlink(missing_ok=True)
 
     def close(self) -> None:
-        if not self.closed:
-            os.close(self._descriptor)
+        descriptor, self._descriptor = self._descriptor, -1
+        if descriptor >= 0:
+            os.close(descriptor)
         super().close()
 
     def _write_all(self, offset: int, data: bytes | bytearray) -> None:

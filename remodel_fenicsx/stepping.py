@@ -1,8 +1,8 @@
 """From one time of the scene to the next: loads, equilibrium, remodeling pass, and the cure where a step is too large.
 
-A step to t sets the loads of t, solves with the cells of t - dt, and lets the remodeling pass make the cells of t. Where
-Newton's method cannot go that way in one piece, the change of the cells and then the change of the loads are applied in
-parts (docs/theory.md, "Steps that are too large"): the state at t is the same.
+A step to t sets the loads of t, solves with the cells of t - dt, and lets the remodeling pass make the cells of t.
+Where Newton's method cannot go that way in one piece, the change of the cells and then the change of the loads are
+applied in parts (docs/theory.md, "Steps that are too large"): the state at t is the same.
 """
 
 from __future__ import annotations
@@ -116,7 +116,8 @@ class Stepper:
         start = self.displacement.x.array.copy()
         work = Work()
         try:
-            self._solve_in_one(new_loads, work) or self._solve_in_parts(time, old_loads, new_loads, work)
+            if not self._solve_in_one(new_loads, work):
+                self._solve_in_parts(time, old_loads, new_loads, work)
         except StepFailure:
             self.displacement.x.array[:] = start
             self.loading.set(old_loads)
@@ -212,6 +213,7 @@ class _Blend:
         self.problem = EquilibriumProblem(
             stepper.displacement, stepper.loading, cells, stepper.material, stepper.settings, shares
         )
+        self.problem.stop_signal = lambda: stepper.problem.stop_signal()
 
     def load_cells(self) -> None:
         """Take over the cells with which the displacement is in equilibrium."""

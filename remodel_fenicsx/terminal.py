@@ -153,9 +153,10 @@ def open_log(path: str | os.PathLike[str], comm_rank: int = 0) -> Iterator[loggi
         for handler in handlers:
             logger.removeHandler(handler)
             python_warnings.removeHandler(handler)
-            handler.close()
         logger.setLevel(before[0])
         logger.propagate, python_warnings.propagate = before[1:]
+        for handler in handlers:
+            handler.close()  # last: a full disk makes this an error
 
 
 def _handlers(path: str | os.PathLike[str]) -> list[logging.Handler]:

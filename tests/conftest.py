@@ -1,4 +1,4 @@
-"""Runs that several tests look at are made once for a whole test session, also when pytest runs on several processes."""
+"""Runs that several tests look at are made once for a test session, also when pytest runs on several processes."""
 
 from __future__ import annotations
 

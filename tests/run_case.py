@@ -1,7 +1,7 @@
 """Runs a scene on the ranks of this process group and saves what tests look at: python3 run_case.py OUT.npz JSON.
 
-JSON: {"scene": {...}, "snapshots": [times]}. Saved: the history's columns; at each snapshot the state after the solve of
-that time (u_T by node, stretch_T and angle_T by element); at the end l, n by element and point, the reference
+JSON: {"scene": {...}, "snapshots": [times]}. Saved: the history's columns; at each snapshot the state after the solve
+of that time (u_T by node, stretch_T and angle_T by element); at the end l, n by element and point, the reference
 coordinates of the points, the initial l, and whether the third principal Cauchy stress was ever positive.
 """
 

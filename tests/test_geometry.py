@@ -14,18 +14,21 @@ from types import SimpleNamespace
 import basix
 import dolfinx
 import numpy as np
-import parallel_geometry
 import pytest
 import ufl
 from mpi4py import MPI
 from scipy.spatial import cKDTree
 
 from remodel_fenicsx.geometry import SHAPES, build, cube, tendon, tube
+from tests import parallel_geometry
 
 ROOT = Path(__file__).resolve().parents[1]
 BUILDERS = {"cube": cube, "tendon": tendon, "tube": tube}
 SIDES = {"cube": 1.0, "tendon": 10.0, "tube": 8.0}  # height of each shape
 KINDS = [(cell, degree) for cell in ("hexahedron", "tetrahedron") for degree in (1, 2)]
+DIVISIONS = (
+    "must be three whole numbers of at least 1 (elements around, through the wall, along), the first a multiple of 4"
+)
 _built = {}
 
 
@@ -213,6 +216,32 @@ def test_the_tube_is_equally_divided_through_the_wall_around_and_along(cell, deg
     assert np.abs(steps - np.round(steps)).max() < 1e-12
 
 
+@pytest.mark.parametrize(("cell", "degree", "refinement"), [*((*kind, 1) for kind in KINDS), ("hexahedron", 1, 2)])
+def test_a_tube_with_divisions_of_its_own(cell, degree, refinement):
+    body = tube(
+        1.0, 2.0, 0.25, cell=cell, degree=degree, refinement=refinement, divisions=(12, 3, 1), comm=MPI.COMM_SELF
+    )
+    around, through, along = 12 * refinement, 3 * refinement, refinement
+    assert body.number_of_cells == around * through * along * (6 if cell == "tetrahedron" else 1)
+    points = body.gather_mesh()[0]
+    radii = np.hypot(points[:, 0], points[:, 1])
+    corners = np.isclose(radii * through, np.round(radii * through), rtol=0, atol=1e-12)
+    assert len(np.unique(np.round(radii[corners], 9))) == through + 1
+    assert all(has_node(points, (1, 0, 0), (-1, 0, 0), (0, 1, 0)))
+    assert np.array_equal(np.unique(points[:, 2]), np.linspace(0.0, 0.25, along * degree + 1))
+    on_the_inner_circle = (np.abs(radii - 1.0) < 1e-12) & (points[:, 2] == 0.0)
+    assert np.count_nonzero(on_the_inner_circle) == around * degree
+    assert area(body, "inner") == pytest.approx(
+        0.25 * (2 * around * np.sin(np.pi / around) if degree == 1 else 2 * np.pi), rel=1e-3 if degree == 2 else 1e-12
+    )
+
+
+def test_the_papers_divisions_are_the_default():
+    points, cells = tube(divisions=(16, 8, 12), comm=MPI.COMM_SELF).gather_mesh()
+    default_points, default_cells = domain_of("tube").gather_mesh()
+    assert np.array_equal(points, default_points) and np.array_equal(cells, default_cells)
+
+
 # ---------------------------------------------------------------- arguments
 def test_dimensions_and_the_scale_of_lengths():
     assert tendon(length=2.0, area=50.0, comm=MPI.COMM_SELF).size == pytest.approx(4.04, abs=0.01)
@@ -239,6 +268,10 @@ def test_build_reads_a_scenes_geometry_and_mesh(shape):
     (lambda: tube(2.0, 2.0, 1.0), "inner_radius = 2.0: must be smaller than outer_radius = 2.0"),
     (lambda: tube(refinement=0), "refinement = 0: must be a whole number of at least 1"),
     (lambda: cube(refinement=1.5), "refinement = 1.5: must be a whole number of at least 1"),
+    (lambda: tube(divisions=(10, 1, 1)), f"divisions = (10, 1, 1): {DIVISIONS}"),
+    (lambda: tube(divisions=(8, 0, 1)), f"divisions = (8, 0, 1): {DIVISIONS}"),
+    (lambda: tube(divisions=(8, 2.0, 1)), f"divisions = (8, 2.0, 1): {DIVISIONS}"),
+    (lambda: tube(divisions=(8, 2)), f"divisions = (8, 2): {DIVISIONS}"),
     (lambda: cube(cell="prism"), "cell = 'prism': allowed are hexahedron, tetrahedron"),
     (lambda: cube(degree=3), "degree = 3: allowed are 1 and 2"),
     (lambda: build(SimpleNamespace(shape="sphere"), None), "shape = 'sphere': allowed are cube, tendon, tube"),

@@ -27,6 +27,7 @@ target=${!#}
 [ "$target" != - ] || target=$(mktemp -d)
 mkdir -p "$target"
 touch "$target/half"
+timeout 2 cat > /dev/null
 case ${STUB_BUILD:-} in
     fail) echo "E: no such mirror" >&2; exit 1 ;;
     slow) touch "$RECORD/begun"; sleep 4 ;;
@@ -235,7 +236,7 @@ def test_ranks_must_start_inside(ready):
 
 # ---------------------------------------------------------------- making the root
 def test_made_once_from_the_list(rooted):
-    first = rooted.run("echo", "made")
+    first = rooted.run("cat", send="made\n")
     assert (first.returncode, first.stdout) == (0, "made\n")
     assert "making a Debian trixie environment" in first.stderr and "downloading packages" in first.stderr
     second = rooted.run("echo", "again")
@@ -429,6 +430,13 @@ def test_container(clone, tmp_path):
     for folder in (tmp_path, clone.folder, clone.environment["HOME"]):
         assert ("--volume", f"{folder}:{folder}") in pairs
     assert ("--env", "KEPT") in pairs and ("--env", "LD_LIBRARY_PATH") not in pairs
+
+
+def test_container_names_no_mount_point_twice(clone):
+    clone.run("true", cwd=clone.folder, environment={
+        "WITH_FENICSX": "container", "STUB_ENGINE": "built", "HOME": str(clone.folder), "XDG_CACHE_HOME": "/nowhere"})
+    run = clone.engine_calls()[-1]
+    assert [value for option, value in zip(run, run[1:]) if option == "--volume"] == [f"{clone.folder}:{clone.folder}"]
 
 
 def test_container_made_already(clone):

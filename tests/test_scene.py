@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 import pickle
 import re
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any
 import pytest
 
 from remodel_fenicsx import parameters
+from remodel_fenicsx.chains import wormlike_stiffness
 from remodel_fenicsx.parameters import PRESET_NOTES, PRESETS, SHAPES, Cells, Material, Remodeling
 from remodel_fenicsx.scene import (
     Cube,
@@ -377,9 +379,18 @@ def test_every_preset_gives_good_scenes_and_is_explained():
 
 
 def test_collagen_as_measured():
-    built = scene_from_dict({**CUBE, "preset": "sun-2002"})
-    assert (built.material.contour_length, built.material.persistence_length) == (309.0, 14.5)
-    assert built.remodeling.frame == "material"
+    built = preset_scene("sun-2002", "tendon")
+    lengths = (built.material.contour_length, built.material.persistence_length, built.cells.end_to_end_length)
+    assert lengths == (309.0, 14.5, 92.4)  # nm
+    free_chain = math.sqrt(2 * 14.5 * 309.0 * (1 - 14.5 / 309.0 * (1 - math.exp(-309.0 / 14.5))))
+    assert built.cells.end_to_end_length == pytest.approx(free_chain, abs=0.05)
+    paper = preset_scene("kuhl-holzapfel-2007", "tendon")
+
+    def initial_stiffness(scene):
+        material, r0 = scene.material, scene.cells.end_to_end_length
+        return material.network_modulus * wormlike_stiffness(r0, material.contour_length) * r0**2
+
+    assert initial_stiffness(built) == pytest.approx(initial_stiffness(paper), rel=0.01)
 
 
 def test_the_presets_keys_lie_under_the_scenes():

@@ -56,7 +56,7 @@ def test_no_accepted_state_passes_the_contour_length(random_tendon: dict) -> Non
 
 
 def point_stretch(force_per_area: float, dimensions: np.ndarray) -> float:
-    """Axial stretch of a point in uniaxial tension, eq. (7) typed by hand; dimensions: along the load, across, across."""
+    """Axial stretch of a point in uniaxial tension, eq. (7) typed by hand; dimensions: along the load, then across."""
 
     def g(r: float) -> float:
         return 1 / L + 1 / (4 * r * (1 - r / L) ** 2) - 1 / (4 * r)

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from mpi4py import MPI
 
 from remodel_fenicsx.geometry import model
 from remodel_fenicsx.geometry.domain import Domain
 
-AROUND, THROUGH, ALONG = 16, 8, 12  # the paper's elements around, through the wall, and along
+PAPER = (16, 8, 12)  # the paper's elements around, through the wall, and along
 
 
 def tube(
     inner_radius: float = 1.0, outer_radius: float = 3.0, length: float = 8.0, refinement: int = 1,
     cell: str = "hexahedron", degree: int = 1, comm: MPI.Intracomm = MPI.COMM_WORLD,
+    divisions: tuple[int, int, int] | None = None,
 ) -> Domain:
     """Tube around the z axis, 0 <= z <= length, with the faces bottom, top, inner, outer. Collective.
 
@@ -32,6 +35,9 @@ def tube(
         Of the geometry, 1 or 2 (curved).
     comm
         Ranks that share the mesh.
+    divisions
+        Elements around (a multiple of 4), through the wall and along, in place of the paper's 16, 8, 12; `refinement`
+        multiplies them too.
 
     Raises
     ------
@@ -44,23 +50,25 @@ def tube(
     model.check_arguments(dimensions, refinement, cell, degree)
     if not inner_radius < outer_radius:
         raise ValueError(f"inner_radius = {inner_radius}: must be smaller than outer_radius = {outer_radius}")
+    counts = PAPER if divisions is None else _checked(divisions)
     return model.build_domain(
-        lambda: draw_tube(inner_radius, outer_radius, length, refinement, cell, degree),
+        lambda: draw_tube(inner_radius, outer_radius, length, refinement, cell, degree, counts),
         "tube", {name: float(value) for name, value in dimensions.items()}, comm,
     )
 
 
 def draw_tube(
     inner_radius: float, outer_radius: float, length: float,
-    refinement: int = 1, cell: str = "hexahedron", degree: int = 1,
+    refinement: int = 1, cell: str = "hexahedron", degree: int = 1, divisions: tuple[int, int, int] = PAPER,
 ) -> None:
     """Draw and mesh the tube in the current Gmsh model: four quarters, swept along z."""
-    number, quarter = AROUND * refinement, AROUND * refinement // 4
+    number, through, along = (refinement * count for count in divisions)
+    quarter = number // 4
     inner = model.points(model.circle(inner_radius, number))
     outer = model.points(model.circle(outer_radius, number))
     inner_lines, outer_lines = model.polygon(inner), model.polygon(outer)
     corners = range(0, number, quarter)
-    spokes = [model.line(inner[k], outer[k], THROUGH * refinement) for k in corners]
+    spokes = [model.line(inner[k], outer[k], through) for k in corners]
     section = []
     for i, k in enumerate(corners):
         j, m = (i + 1) % 4, (k + quarter) % number
@@ -69,5 +77,17 @@ def draw_tube(
             model.reverse(spokes[j]), model.reverse(inner_lines[k:k + quarter]),
         ]
         section.append(model.block(edges, [inner[k], outer[k], outer[m], inner[m]], cell))
-    model.extrude(section, length, ALONG * refinement, cell, {"inner": inner_lines, "outer": outer_lines})
+    model.extrude(section, length, along, cell, {"inner": inner_lines, "outer": outer_lines})
     model.raise_degree(degree, np.ones_like)
+
+
+def _checked(divisions: Sequence[int]) -> tuple[int, int, int]:
+    """The three counts, or the ValueError that says what they must be."""
+    whole = all(isinstance(count, (int, np.integer)) and count >= 1 for count in divisions)
+    if len(divisions) != 3 or not whole or divisions[0] % 4:
+        raise ValueError(
+            f"divisions = {tuple(divisions)}: must be three whole numbers of at least 1 (elements around, through the "
+            "wall, along), the first a multiple of 4"
+        )
+    around, through, along = divisions
+    return around, through, along

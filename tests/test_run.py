@@ -1,0 +1,322 @@
+"""The command line as a user meets it: what a run leaves behind, exit codes, signals, bad input, the demos."""
+
+from __future__ import annotations
+
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from remodel_fenicsx import cli
+from remodel_fenicsx.record import COMMON_COLUMNS, read_history
+from remodel_fenicsx.scene import read_scene
+from tests.conftest import mpirun
+
+PROJECT = Path(__file__).parents[1]
+COMMAND = [sys.executable, "-m", "remodel_fenicsx.cli"]
+
+
+def run(*arguments: str | Path, ranks: int = 1, **options: object) -> subprocess.CompletedProcess[str]:
+    """remodel-fenicsx ARGUMENTS on so many ranks."""
+    command = mpirun(ranks, *COMMAND, *map(str, arguments))
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, **options)  # type: ignore
+
+
+def demo(name: str) -> Path:
+    """Path of a demo's scene."""
+    return PROJECT / "demos" / f"{name}.toml"
+
+
+# ---------------------------------------------------------------- what a run leaves
+
+
+@pytest.fixture(scope="module")
+def tendon_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three steps of the tendon demo."""
+    folder = tmp_path_factory.mktemp("runs") / "tendon"
+    done = run("run", demo("tendon"), "--set", "time.end=3", "-o", folder)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == f"results in {folder}\n"
+    return folder
+
+
+def test_folder_holds_history_fields_scene_and_log(tendon_run: Path) -> None:
+    names = {path.name for path in tendon_run.iterdir()}
+    assert names == {"history.csv", "fields.vtkhdf", "fields_chains.vtkhdf", "scene.toml", "run.log"}
+    assert "finished" in (tendon_run / "run.log").read_text()
+
+
+def test_history_has_the_columns_of_the_contract(tendon_run: Path) -> None:
+    history = read_history(tendon_run)
+    uniaxial = {"force", "mean_stretch", "min_stretch", "max_stretch", "mean_fibre_angle"}
+    assert set(history) == set(COMMON_COLUMNS) | uniaxial
+    np.testing.assert_array_equal(history["time"], [1.0, 2.0, 3.0])
+    np.testing.assert_allclose(history["force"], [25.0, 50.0, 75.0], rtol=1e-14)
+    assert np.all(history["min_stretch"] < history["mean_stretch"])
+    assert np.all(history["mean_stretch"] < history["max_stretch"])
+
+
+def test_scene_as_run_reads_back_as_the_same_scene(tendon_run: Path) -> None:
+    again = read_scene(tendon_run / "scene.toml")
+    assert again == read_scene(demo("tendon"), ["time.end=3"])
+    text = (tendon_run / "scene.toml").read_text()
+    assert "dolfinx" in text and "PETSc" in text
+
+
+def test_fields_are_those_of_the_history(tendon_run: Path) -> None:
+    """Top displacement, stress balance and r/L of the last step, read as ParaView reads the file."""
+    history = read_history(tendon_run)
+    with h5py.File(tendon_run / "fields.vtkhdf") as file:
+        root = file["VTKHDF"]
+        np.testing.assert_array_equal(root["Steps/Values"][:], [0.0, 1.0, 2.0, 3.0])
+        points = root["Points"][:]
+        last = root["Steps/PointDataOffsets/displacement"][-1]
+        displacement = root["PointData/displacement"][last : last + len(points)]
+        cells = int(root["NumberOfCells"][0])
+
+        def cell_data(name: str) -> np.ndarray:
+            start = root[f"Steps/CellDataOffsets/{name}"][-1]
+            return root[f"CellData/{name}"][start : start + cells]
+
+        top = points[:, 2] > 10.0 - 1e-9
+        assert top.sum() == 57  # 16 on each of three rings, 9 inside
+        assert displacement[top, 2].mean() == pytest.approx(10 * (history["mean_stretch"][-1] - 1), rel=0.02)
+        assert cell_data("chain_extension").max() == pytest.approx(history["max_chain_extension"][-1], rel=1e-6)
+        assert cell_data("deformation_gradient")[:, 8].max() == pytest.approx(history["max_stretch"][-1], rel=1e-6)
+        axes = np.stack([cell_data(f"axis_{i}") for i in (1, 2, 3)], axis=1)
+        np.testing.assert_allclose(axes @ axes.transpose(0, 2, 1), np.broadcast_to(np.eye(3), axes.shape), atol=1e-6)
+        lengths = np.linalg.norm(cell_data("cell_dimensions"), axis=1)
+        assert np.all((lengths > 0.7) & (lengths < 1.0 + 1e-6))
+        stress = cell_data("cauchy_stress").reshape(-1, 3, 3)
+        np.testing.assert_allclose(stress, stress.transpose(0, 2, 1), atol=1e-4)
+        assert stress[:, 2, 2].mean() > 5 * np.abs(stress[:, 0, 0]).mean()
+
+
+def test_one_and_two_ranks_write_the_same_files(tendon_run: Path, tmp_path: Path) -> None:
+    done = run("run", demo("tendon"), "--set", "time.end=3", "-o", tmp_path / "two", ranks=2)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("results in") == 1  # only rank 0 speaks
+    one, two = read_history(tendon_run), read_history(tmp_path / "two")
+    for name in ("mean_stretch", "max_stretch", "mean_fibre_angle", "stored_energy"):
+        np.testing.assert_allclose(two[name], one[name], rtol=1e-7, err_msg=name)
+    for name in ("fields.vtkhdf", "fields_chains.vtkhdf"):
+        with h5py.File(tendon_run / name) as first, h5py.File(tmp_path / "two" / name) as second:
+            np.testing.assert_array_equal(first["VTKHDF/Connectivity"][:], second["VTKHDF/Connectivity"][:])
+            a, b = (file["VTKHDF/PointData/displacement"][:] for file in (first, second))
+            np.testing.assert_allclose(a, b, rtol=0, atol=1e-5)
+
+
+def test_a_tube_run_has_the_columns_of_the_contract(tmp_path: Path) -> None:
+    done = run("run", demo("artery"), "--set", "time.end=1", "-o", tmp_path / "tube", "-q")
+    assert done.returncode == 0 and done.stderr == "", done.stderr
+    history = read_history(tmp_path / "tube")
+    radii = {"inner_radius", "outer_radius", "fibre_angle_inner", "fibre_angle_middle", "fibre_angle_outer"}
+    assert set(history) == set(COMMON_COLUMNS) | radii | {"pressure", "axial_stretch"}
+    assert history["pressure"][0] == pytest.approx(0.192)
+    assert history["axial_stretch"][0] == pytest.approx(0.004)
+    assert 1.0 < history["inner_radius"][0] < 1.05 and 3.0 < history["outer_radius"][0] < 3.01
+
+
+@pytest.mark.parametrize("mesh", ["cell='tetrahedron'", "degree=2"])
+def test_other_elements_run_and_write_fields(mesh: str, tmp_path: Path) -> None:
+    done = run("run", demo("tendon"), "--set", "time.end=1", "--set", f"mesh.{mesh}", "-o", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    # 25 on an area of 10: the stiffer tetrahedra and the softer quadratic elements stay near 1.203
+    assert read_history(tmp_path / "out")["mean_stretch"][0] == pytest.approx(1.203, abs=0.02)
+    pyvista = pytest.importorskip("pyvista")
+    reader = pyvista.HDFReader(str(tmp_path / "out" / "fields.vtkhdf"))
+    reader.reader.SetStep(1)
+    grid = reader.read()
+    # VTK measures curved cells by straight pieces: a polygon of 32 corners has 0.64 % less than its circle
+    assert grid.compute_cell_sizes()["Volume"].sum() == pytest.approx(100.0, rel=7e-3)
+
+
+# ---------------------------------------------------------------- folders
+
+
+def test_default_folder_is_numbered_when_taken(tmp_path: Path) -> None:
+    for name in ("results/cube", "results/cube-2"):
+        done = run("run", demo("cube"), "--set", "time.end=1", "-q", cwd=tmp_path)
+        assert done.stdout == f"results in {name}\n", done.stderr
+        assert (tmp_path / name / "history.csv").exists()
+
+
+def test_a_folder_with_files_is_never_touched(tmp_path: Path) -> None:
+    (tmp_path / "mine.txt").write_text("dear")
+    done = run("run", demo("cube"), "-o", tmp_path)
+    assert done.returncode == 2
+    assert done.stderr == f"remodel-fenicsx: -o {tmp_path}: is not empty; allowed is a new or an empty folder\n"
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
+
+
+def test_output_that_cannot_be_written_is_exit_code_5(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    done = run("run", demo("cube"), "-o", tmp_path / "file" / "below")
+    assert done.returncode == 5
+    assert done.stderr.count("\n") == 1 and "cannot write the results" in done.stderr
+
+
+def test_a_full_disk_is_exit_code_5_and_keeps_finished_steps(tmp_path: Path, tendon_run: Path) -> None:
+    """A limit on file sizes stands for the disk; the kernels are compiled already (tendon_run)."""
+    size = 400_000
+    assert (tendon_run / "fields_chains.vtkhdf").stat().st_size < size
+
+    def limit() -> None:
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
+
+    done = run("run", demo("tendon"), "-o", tmp_path / "out", preexec_fn=limit)
+    assert done.returncode == 5, done.stderr
+    assert "cannot write the results" in done.stderr
+    assert len(read_history(tmp_path / "out")["time"]) >= 3
+
+
+# ---------------------------------------------------------------- failures and signals
+
+
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_an_impossible_load_is_exit_code_3_and_says_where(tmp_path: Path, ranks: int) -> None:
+    # axial chains lock at a stretch of L / r0 = 1.594: reached between t = 2 and t = 3
+    settings = ["cells.initial=aligned", "cells.aligned_axis=2", "loads.stretch.value=1.0", "loads.pressure.value=0"]
+    settings += ["loads.stretch.ramp=[[0.0, 0.0], [5.0, 1.0]]", "remodeling.law=none", "solver.maximum_halvings=3"]
+    change = [word for setting in settings for word in ("--set", setting)]
+    done = run("run", demo("artery"), *change, "-o", tmp_path / "out", "-q", ranks=ranks)
+    assert done.returncode == 3, done.stderr
+    line = next(line for line in done.stderr.splitlines() if line.startswith("remodel-fenicsx:"))
+    assert "no equilibrium at time 3: " in line and "largest r/L = " in line and "try a smaller time.step" in line
+    np.testing.assert_array_equal(read_history(tmp_path / "out")["time"], [1.0, 2.0])
+    assert (tmp_path / "out" / "scene.toml").exists()
+
+
+@pytest.mark.parametrize("ranks", [1, 2])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_run_and_keeps_finished_steps(tmp_path: Path, number: signal.Signals, ranks: int) -> None:
+    folder = tmp_path / "out"
+    command = mpirun(ranks, *COMMAND, "run", str(demo("tendon")), "-o", str(folder))
+    # in a group of its own, which gets the signal as a terminal gives it
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, process_group=0)
+    history = folder / "history.csv"
+    deadline = time.monotonic() + 200
+    while time.monotonic() < deadline and not (history.exists() and history.read_text().count("\n") > 3):
+        time.sleep(0.05)
+        assert process.poll() is None, process.communicate()[1]
+    os.killpg(process.pid, number)
+    _, errors = process.communicate(timeout=60)
+    if ranks == 1:
+        assert process.returncode == 128 + number
+        assert errors.endswith(f"stopped by {number.name}; every finished step is kept\n")
+    else:
+        assert process.returncode != 0  # mpirun's own code
+    rows = read_history(folder)
+    assert len(rows["time"]) >= 3 and rows["time"][-1] == len(rows["time"])
+    assert history.read_text().endswith("\n")
+    with h5py.File(folder / "fields.vtkhdf") as file:
+        assert file["VTKHDF/Steps"].attrs["NSteps"] >= len(rows["time"])
+
+
+# ---------------------------------------------------------------- bad input and the small commands
+
+BAD_SETTINGS = """
+geometry.inner_radius=3.0 | geometry.inner_radius = 3.0
+geometry.inner_radius=-1.0 | geometry.inner_radius = -1.0
+geometry.outer_radius=0.5 | geometry.inner_radius = 1.0
+geometry.length=0 | geometry.length = 0
+geometry.length=nan | geometry.length = nan
+geometry.shape=sphere | geometry.shape = 'sphere'
+geometry.radius=1.0 | geometry.radius
+mesh.refinement=0 | mesh.refinement = 0
+mesh.refinement=1.5 | mesh.refinement = 1.5
+mesh.cell=prism | mesh.cell = 'prism'
+mesh.degree=3 | mesh.degree = 3
+model.kinematics=plane | model.kinematics = 'plane'
+material.lame_lambda=-1.0 | material.lame_lambda = -1.0
+material.lame_mu=0 | material.lame_mu = 0
+material.chain_density=-2e21 | material.chain_density = -2e+21
+material.contour_length=0.9 | cells.end_to_end_length = 1.0: must be smaller than material.contour_length = 0.9
+material.persistence_length=inf | material.persistence_length = inf
+material.energy_factor=2 | material.energy_factor = 2
+material.chain=spring | material.chain = 'spring'
+cells.initial=mixed | cells.initial = 'mixed'
+cells.initial=[1.0, 1.0, 1.0] | cells.initial
+cells.end_to_end_length=1.7 | cells.end_to_end_length = 1.7
+cells.seed=-1 | cells.seed = -1
+cells.seed="one" | cells.seed = 'one'
+loads.pressure.ramp=[[0.0, 0.0], [25.0, 1.0], [20.0, 0.5]] | loads.pressure.ramp[2][0] = 20.0
+loads.pressure.ramp=[] | loads.pressure.ramp
+loads.stretch.value=-1.5 | loads.stretch
+loads.force.value=1.0 | loads.force
+remodeling.kappa=-0.1 | remodeling.kappa = -0.1
+remodeling.driver=strain | remodeling.driver = 'strain'
+remodeling.law=eq12 | remodeling.law = 'eq12'
+remodeling.frame=eulerian | remodeling.frame = 'eulerian'
+time.end=0 | time.end = 0
+time.step=0.4 | loads
+time.step=-1.0 | time.step = -1.0
+solver.profile=magic | solver.profile = 'magic'
+solver.relative_tolerance=-1e-8 | solver.relative_tolerance
+output.every=0 | output.every = 0
+preset=paper | preset = 'paper'
+remodelling.kappa=0.1 | remodelling
+"""
+
+
+@pytest.mark.parametrize("line", BAD_SETTINGS.strip().splitlines())
+def test_a_bad_scene_is_one_line_exit_code_2_and_nothing_written(
+    line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    setting, beginning = line.split(" | ")
+    monkeypatch.chdir(tmp_path)
+    if setting == "time.step=0.4":
+        setting = "time.step=0.6"  # 150 is a multiple of it, the kink at 25 is not
+    assert cli.main(["run", str(demo("artery")), "--set", setting]) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and err.count("\n") == 1
+    assert err.startswith(f"remodel-fenicsx: {beginning}"), err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_bad_input_ends_two_ranks_with_one_line(tmp_path: Path) -> None:
+    done = run("run", demo("artery"), "--set", "remodeling.kappa=-1", ranks=2, cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr.count("remodeling.kappa = -1") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_validate_new_and_info(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["validate", str(demo("artery"))]) == 0
+    assert capsys.readouterr().out.endswith("a valid scene (tube, 150 steps)\n")
+    for preset in ("kuhl-holzapfel-2007", "sun-2002"):
+        for shape in ("cube", "tendon", "tube"):
+            assert cli.main(["new", preset, "--shape", shape]) == 0
+            scene = tmp_path / f"{preset}-{shape}.toml"
+            scene.write_text(capsys.readouterr().out)
+            assert cli.main(["validate", str(scene)]) == 0, capsys.readouterr().err
+            capsys.readouterr()
+    assert cli.main(["info"]) == 0
+    out = capsys.readouterr().out
+    assert "dolfinx" in out and "blas" in out
+
+
+# ---------------------------------------------------------------- demos
+
+
+@pytest.mark.parametrize("name", ["cube", "tendon", "artery"])
+def test_the_script_and_the_scene_of_a_demo_are_the_same_simulation(name: str, tmp_path: Path) -> None:
+    script = subprocess.run(
+        [sys.executable, str(PROJECT / "demos" / f"{name}.py"), "3", str(tmp_path / "script")],
+        capture_output=True, text=True, timeout=300, env={**os.environ, "PYTHONPATH": str(PROJECT)},
+    )  # fmt: skip
+    assert script.returncode == 0, script.stderr
+    scene = run("run", demo(name), "--set", "time.end=3", "--set", "output.fields=false", "-o", tmp_path / "scene")
+    assert scene.returncode == 0, scene.stderr
+    ours, theirs = read_history(tmp_path / "script"), read_history(tmp_path / "scene")
+    assert len(ours["time"]) == 3
+    for column in ours:
+        np.testing.assert_allclose(ours[column], theirs[column], rtol=1e-10, err_msg=column)

@@ -1,0 +1,178 @@
+"""Progress and log: on a terminal (a pseudo terminal stands for it), in a pipe, on other ranks."""
+
+from __future__ import annotations
+
+import logging
+import os
+import pty
+import re
+import subprocess
+import sys
+import warnings
+
+import pytest
+
+from remodel_fenicsx import terminal
+from remodel_fenicsx.terminal import Progress, open_log
+
+SCRIPT = """
+import sys, time, logging
+from remodel_fenicsx.terminal import Progress, open_log
+with open_log(sys.argv[1]), Progress(8, "artery [4]", 0) as progress:
+    for k in range(1, 9):
+        time.sleep(0.06)
+        progress.step(k, 1.0 * k, "pressure [0.5]", 3, "two substeps" if k == 4 else None)
+        if k == 5:
+            logging.getLogger("remodel_fenicsx.stepping").warning("careful")
+        if k == int(sys.argv[2]):
+            raise KeyboardInterrupt
+print("the end")
+"""
+
+
+def run_in_terminal(arguments: list[str], columns: int = 100) -> tuple[int, str]:
+    """Exit status and everything that a terminal got."""
+    leader, follower = pty.openpty()
+    environment = {**os.environ, "TERM": "xterm-256color", "COLUMNS": str(columns)}
+    environment.pop("NO_COLOR", None)
+    with subprocess.Popen(arguments, stdin=follower, stdout=follower, stderr=follower, env=environment) as run:
+        os.close(follower)
+        received = bytearray()
+        while True:
+            try:
+                data = os.read(leader, 4096)
+            except OSError:  # Linux: nobody holds the other end any more
+                break
+            if not data:
+                break
+            received += data
+    os.close(leader)
+    return run.returncode, received.decode()
+
+
+def plain(text: str) -> str:
+    """Without colours and cursor movements."""
+    return re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", text)
+
+
+def test_a_terminal_gets_a_bar(tmp_path):
+    status, text = run_in_terminal([sys.executable, "-c", SCRIPT, str(tmp_path / "run.log"), "0"])
+    assert status == 0, text
+    lines = [line.strip() for line in re.split(r"[\r\n]+", plain(text))]
+    bars = [line for line in lines if "━" in line]
+    assert re.match(r"artery \[4\] ━+ 8/8 t = 8, pressure \[0.5\], 3 Newton 0:00:0\d", bars[-1]), bars[-1]
+    assert any(re.search(r"[2-7]/8 .* left$", line) for line in bars)
+    assert "two substeps" in lines and "WARNING: careful" in lines  # lines of their own, above the bar
+    assert lines[-2:] == ["the end", ""]
+    assert text.count("\x1b[?25l") == text.count("\x1b[?25h") == 1  # the cursor came back
+    assert "WARNING careful" in (tmp_path / "run.log").read_text()
+
+
+def test_ctrl_c_puts_the_terminal_right(tmp_path):
+    status, text = run_in_terminal([sys.executable, "-c", SCRIPT, str(tmp_path / "run.log"), "6"])
+    assert status != 0 and "KeyboardInterrupt" in text
+    assert text.rindex("\x1b[?25h") < text.index("Traceback")
+
+
+def test_a_narrow_terminal_gets_one_line(tmp_path):
+    _, text = run_in_terminal([sys.executable, "-c", SCRIPT, str(tmp_path / "run.log"), "0"], columns=50)
+    assert max(len(line) for line in re.split(r"[\r\n]+", plain(text))) <= 50
+
+
+def test_output_that_goes_to_a_file_stays_there(tmp_path):
+    command = f'{sys.executable} -c "$0" {tmp_path}/run.log 0 > {tmp_path}/out'
+    script = SCRIPT.replace("time.sleep(0.06)", "print(k)")
+    status, text = run_in_terminal(["sh", "-c", command, script])
+    assert status == 0 and "━" in text
+    assert (tmp_path / "out").read_text().split("\n") == [*"12345678", "the end", ""]
+
+
+@pytest.fixture
+def time_passes(monkeypatch):
+    """A clock that tests set."""
+    now = [100.0]
+    monkeypatch.setattr(terminal.clock, "monotonic", lambda: now[0])
+    return now
+
+
+def test_a_pipe_gets_plain_lines_now_and_then(capsys, time_passes):
+    with Progress(20, "tendon", 0, interval=5.0) as progress:
+        for k in range(1, 21):
+            time_passes[0] += 2.0
+            progress.step(k, 0.5 * k, "force 25", 4, "halved the step" if k == 3 else None)
+    out, err = capsys.readouterr()
+    assert out == ""
+    lines = err.splitlines()
+    assert lines[0] == "tendon: step 1/20, t = 0.5, force 25, 4 Newton, 38 s left"
+    assert lines[1] == "tendon: halved the step"
+    assert lines[2] == "tendon: step 4/20, t = 2, force 25, 4 Newton, 32 s left"
+    steps = [int(re.search(r"step (\d+)", line).group(1)) for line in lines if "step " in line and "/20" in line]
+    assert steps == [1, 4, 7, 10, 13, 16, 19, 20]
+    assert lines[-1] == "tendon: step 20/20, t = 10, force 25, 4 Newton"
+
+
+def test_the_last_step_of_an_interrupted_run_is_said(capsys, time_passes):
+    with pytest.raises(KeyboardInterrupt), Progress(20, "tendon", 0) as progress:
+        for k in (1, 2, 3):
+            progress.step(k, float(k), "", 4)
+        raise KeyboardInterrupt
+    assert [line.split(",")[0] for line in capsys.readouterr().err.splitlines()] == [
+        "tendon: step 1/20", "tendon: step 3/20",
+    ]  # fmt: skip
+
+
+def test_time_left_of_a_resumed_run(capsys, time_passes):
+    with Progress(150, "artery", 0, first_step=100) as progress:
+        time_passes[0] += 10.0
+        progress.step(101, 101.0)
+    assert capsys.readouterr().err.splitlines() == ["artery: step 101/150, t = 101, 0 Newton, 8:10 min left"]
+
+
+def test_other_ranks_are_silent(capsys, tmp_path):
+    with open_log(tmp_path / "run.log", 1) as log, Progress(2, "artery", 1) as progress:
+        progress.step(1, 1.0, "", 3, "something")
+        progress.message("something")
+        log.warning("something")
+    assert capsys.readouterr() == ("", "") and not list(tmp_path.iterdir())
+
+
+def test_a_closed_pipe_does_not_end_the_run():
+    script = SCRIPT.replace("open_log(sys.argv[1])", "open_log('/dev/null')").replace("time.sleep(0.06)", "pass")
+    script = script.replace('Progress(8, "artery [4]", 0)', 'Progress(8, "artery", 0, interval=0.0)')
+    reading, writing = os.pipe()
+    with subprocess.Popen([sys.executable, "-c", script, "", "0"], stdout=subprocess.PIPE, stderr=writing) as run:
+        os.close(writing)
+        os.close(reading)  # nobody will read what it says
+        assert run.stdout.read() == b"the end\n"
+    assert run.returncode in (0, 120)  # 120: Python could not flush stderr at exit
+
+
+def test_log_has_times_and_the_terminal_only_warnings(tmp_path, capsys):
+    path = tmp_path / "run.log"
+    path.write_text("an earlier run\n")
+    with open_log(path) as log:
+        log.info("step 1: 3 iterations")
+        logging.getLogger("remodel_fenicsx.jit").warning("slow")
+        log.debug("not wanted")
+        with warnings.catch_warnings():
+            warnings.simplefilter("always")
+            warnings.warn("from Python", stacklevel=1)
+    log.warning("after the run")
+    lines = path.read_text().splitlines()
+    time = r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d,\d{3} "
+    assert lines[0] == "an earlier run"
+    assert re.fullmatch(time + "INFO step 1: 3 iterations", lines[1])
+    assert re.fullmatch(time + "WARNING slow", lines[2])
+    assert re.fullmatch(time + "WARNING .*UserWarning: from Python", lines[3])
+    assert "after the run" not in path.read_text() and "not wanted" not in path.read_text()
+    err = capsys.readouterr().err
+    assert err.startswith("WARNING: slow\nWARNING: ") and "from Python" in err and "iterations" not in err
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="Linux has a disk that is always full")
+def test_a_log_that_cannot_be_written_is_an_error(tmp_path):
+    with pytest.raises(OSError), open_log("/dev/full") as log:
+        log.info("a line")
+    with pytest.raises(OSError), open_log(tmp_path / "no" / "run.log"):
+        pass
+    assert not logging.getLogger(terminal.LOGGER).handlers
