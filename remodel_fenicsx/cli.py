@@ -46,6 +46,12 @@ def parser() -> argparse.ArgumentParser:
     new = commands.add_parser("new", help="Print a scene of a preset.", description="Print a scene of a preset.")
     new.add_argument("preset", metavar="PRESET", help=", ".join(PRESETS))
     new.add_argument("--shape", default="tube", help="cube, tendon or tube (default: tube)")
+    text = "Draw the paper's figures from own runs, each with its data as CSV; runs still valid are used again."
+    figures = commands.add_parser("figures", help="Draw the paper's figures.", description=text)
+    figures.add_argument("names", nargs="*", metavar="NAME", help="fig1, fig5 to fig11, rate, energy (default: all)")
+    figures.add_argument("-o", "--output", type=Path, metavar="DIR", help="folder for the figures (default: figures)")
+    figures.add_argument("--runs", type=Path, metavar="DIR", help="recorded runs (default: results/figures-cache)")
+    figures.add_argument("--jobs", type=int, metavar="N", help="runs at a time (default: as many as there are cores)")
     text = "Print versions, solvers and BLAS."
     commands.add_parser("info", help=text, description=text)
     return main_parser
@@ -125,6 +131,24 @@ def _new(options: argparse.Namespace) -> int:
     return 0
 
 
+def _figures(options: argparse.Namespace) -> int:
+    try:
+        from remodel_fenicsx import figures
+    except ImportError as error:
+        return _fail(f"the environment is not usable: {error}; run through ./with-fenicsx", BAD_ENVIRONMENT)
+    folder, runs = options.output or figures.DEFAULT_FOLDER, options.runs or figures.DEFAULT_RUNS
+    try:
+        written = figures.draw(options.names, folder, runs, options.jobs)
+    except figures.FigureError as error:
+        return _fail(str(error), error.exit_code)
+    except KeyboardInterrupt:
+        return _fail("stopped; finished runs and figures are kept", 130)
+    except OSError as error:
+        return _fail(f"cannot write the figures: {error}", BAD_ENVIRONMENT)
+    print("\n".join(map(str, written)))
+    return 0
+
+
 def _info(options: argparse.Namespace) -> int:
     try:
         from remodel_fenicsx.environment import versions
@@ -137,7 +161,7 @@ def _info(options: argparse.Namespace) -> int:
     return 0
 
 
-COMMANDS = {"run": _run, "validate": _validate, "new": _new, "info": _info}
+COMMANDS = {"run": _run, "validate": _validate, "new": _new, "figures": _figures, "info": _info}
 
 
 if __name__ == "__main__":

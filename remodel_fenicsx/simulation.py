@@ -55,9 +55,11 @@ class Simulation:
         The parts, each usable by itself (see demos/).
     """
 
-    def __init__(self, scene: Scene, comm: MPI.Intracomm = MPI.COMM_WORLD):
+    def __init__(
+        self, scene: Scene, comm: MPI.Intracomm = MPI.COMM_WORLD, domain: geometry.Domain | None = None
+    ):
         self.scene = scene
-        self.domain = geometry.build(scene.geometry, scene.mesh, comm)
+        self.domain = domain or geometry.build(scene.geometry, scene.mesh, comm)
         mesh = self.domain.mesh
         element = basix.ufl.element("Lagrange", mesh.topology.cell_name(), scene.mesh.degree, shape=(3,))
         self.displacement = dolfinx.fem.Function(dolfinx.fem.functionspace(mesh, element), name="displacement")
