@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import remodel_fenicsx
+from remodel_fenicsx.environment import reason_unusable, versions
 from remodel_fenicsx.parameters import PRESETS
 from remodel_fenicsx.scene import Scene, SceneError, preset_scene, read_scene
 
@@ -70,8 +71,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _rank() -> int:
-    from mpi4py import MPI
-
+    try:
+        from mpi4py import MPI
+    except ImportError:  # then there is one process, and what is missing is about to be said
+        return 0
     return MPI.COMM_WORLD.rank
 
 
@@ -83,13 +86,14 @@ def _fail(message: str, code: int) -> int:
 
 def _run(options: argparse.Namespace) -> int:
     scene = read_scene(options.scene, options.set)
-    try:
-        from remodel_fenicsx.interrupts import Interrupted
-        from remodel_fenicsx.record import FolderTaken
-        from remodel_fenicsx.simulation import run
-        from remodel_fenicsx.stepping import StepFailure
-    except ImportError as error:
-        return _fail(f"the environment is not usable: {error}; run through ./with-fenicsx", BAD_ENVIRONMENT)
+    reason = reason_unusable()
+    if reason is not None:
+        return _fail(f"the environment is not usable: {reason}; run through ./with-fenicsx", BAD_ENVIRONMENT)
+    from remodel_fenicsx.interrupts import Interrupted
+    from remodel_fenicsx.record import FolderTaken
+    from remodel_fenicsx.simulation import run
+    from remodel_fenicsx.stepping import StepFailure
+
     try:
         folder = run(scene, options.output, quiet=options.quiet)
     except FolderTaken as error:
@@ -150,11 +154,11 @@ def _figures(options: argparse.Namespace) -> int:
 
 
 def _info(options: argparse.Namespace) -> int:
-    try:
-        from remodel_fenicsx.environment import versions
-        from remodel_fenicsx.solvers import PROFILES
-    except ImportError as error:
-        return _fail(f"the environment is not usable: {error}; run through ./with-fenicsx", BAD_ENVIRONMENT)
+    reason = reason_unusable()
+    if reason is not None:
+        return _fail(f"the environment is not usable: {reason}; run through ./with-fenicsx", BAD_ENVIRONMENT)
+    from remodel_fenicsx.solvers import PROFILES
+
     for name, version in versions().items():
         print(f"{name:16} {version}")
     print(f"{'solver profiles':16} {', '.join(PROFILES)}")

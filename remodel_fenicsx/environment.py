@@ -9,6 +9,8 @@ from pathlib import Path
 
 import remodel_fenicsx
 
+OLDEST_DOLFINX = (0, 9)
+
 
 def versions() -> dict[str, str]:
     """Names and versions of everything that the numbers depend on."""
@@ -30,6 +32,23 @@ def versions() -> dict[str, str]:
         "BLAS": blas_library(),
         "system": platform.platform(),
     }
+
+
+def reason_unusable() -> str | None:
+    """Why this environment cannot run a scene, or None: dolfinx missing or too old, PETSc with complex numbers."""
+    try:
+        import dolfinx
+        import numpy
+        from petsc4py import PETSc
+    except ImportError as error:
+        return str(error)
+    major, minor = (int(part) for part in dolfinx.__version__.split(".")[:2])
+    if (major, minor) < OLDEST_DOLFINX:
+        oldest = ".".join(map(str, OLDEST_DOLFINX))
+        return f"dolfinx {dolfinx.__version__} is too old, {oldest} is the oldest that works"
+    if numpy.issubdtype(PETSc.ScalarType, numpy.complexfloating):
+        return "PETSc is built with complex numbers, real ones are needed (Debian: python3-dolfinx-real)"
+    return None
 
 
 def blas_library() -> str:

@@ -19,7 +19,7 @@ from remodel_fenicsx.interrupts import Interrupted, StopRequest
 from remodel_fenicsx.loads import LOADINGS, LoadValues
 from remodel_fenicsx.observables import Observer
 from remodel_fenicsx.quadrature import Quadrature
-from remodel_fenicsx.record import Fields, RunFolder, choose_folder
+from remodel_fenicsx.record import Fields, FolderTaken, RunFolder, choose_folder
 from remodel_fenicsx.remodel import RemodelingPass
 from remodel_fenicsx.scene import Scene
 from remodel_fenicsx.stepping import StepFailure, Stepper, times
@@ -152,7 +152,7 @@ def run(
     OSError
         If the results cannot be written.
     """
-    place = comm.bcast(choose_folder(None if folder is None else Path(folder), scene.name) if comm.rank == 0 else None)
+    place = _chosen_folder(scene, folder, comm)
     header = "as run: all values, also those of preset and defaults\n" + "\n".join(
         f"{name} {version}" for name, version in versions().items()
     )
@@ -170,6 +170,21 @@ def run(
             raise
         log.info("finished")
     return place
+
+
+def _chosen_folder(scene: Scene, folder: Path | str | None, comm: MPI.Intracomm) -> Path:
+    """The folder that rank 0 finds free; its refusal is raised on all ranks."""
+    verdict: Path | FolderTaken | None = None
+    if comm.rank == 0:
+        try:
+            verdict = choose_folder(None if folder is None else Path(folder), scene.name)
+        except FolderTaken as refusal:
+            verdict = refusal
+    verdict = comm.bcast(verdict)
+    if isinstance(verdict, FolderTaken):
+        raise verdict
+    assert verdict is not None
+    return verdict
 
 
 def _record_steps(simulation: Simulation, record: RunFolder, progress: Progress, stop: StopRequest) -> None:

@@ -148,19 +148,22 @@ def test_default_folder_is_numbered_when_taken(tmp_path: Path) -> None:
         assert (tmp_path / name / "history.csv").exists()
 
 
-def test_a_folder_with_files_is_never_touched(tmp_path: Path) -> None:
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_a_folder_with_files_is_never_touched(tmp_path: Path, ranks: int) -> None:
     (tmp_path / "mine.txt").write_text("dear")
-    done = run("run", demo("cube"), "-o", tmp_path)
+    done = run("run", demo("cube"), "-o", tmp_path, ranks=ranks)
     assert done.returncode == 2
-    assert done.stderr == f"remodel-fenicsx: -o {tmp_path}: is not empty; allowed is a new or an empty folder\n"
+    line = f"remodel-fenicsx: -o {tmp_path}: is not empty; allowed is a new or an empty folder\n"
+    assert done.stderr.count(line) == 1 and (done.stderr == line or ranks == 2)  # mpirun adds words of its own
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
 
 
-def test_output_that_cannot_be_written_is_exit_code_5(tmp_path: Path) -> None:
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_output_that_cannot_be_written_is_exit_code_5(tmp_path: Path, ranks: int) -> None:
     (tmp_path / "file").touch()
-    done = run("run", demo("cube"), "-o", tmp_path / "file" / "below")
+    done = run("run", demo("cube"), "-o", tmp_path / "file" / "below", ranks=ranks)
     assert done.returncode == 5
-    assert done.stderr.count("\n") == 1 and "cannot write the results" in done.stderr
+    assert done.stderr.count("cannot write the results") == 1 and (done.stderr.count("\n") == 1 or ranks == 2)
 
 
 def test_a_full_disk_is_exit_code_5_and_keeps_finished_steps(tmp_path: Path, tendon_run: Path) -> None:
@@ -219,6 +222,37 @@ def test_a_signal_ends_the_run_and_keeps_finished_steps(tmp_path: Path, number: 
     assert history.read_text().endswith("\n")
     with h5py.File(folder / "fields.vtkhdf") as file:
         assert file["VTKHDF/Steps"].attrs["NSteps"] >= len(rows["time"])
+
+
+def test_an_exception_on_one_rank_ends_all(tmp_path: Path) -> None:
+    program = tmp_path / "program.py"
+    program.write_text(
+        "import sys\n"
+        "from mpi4py import MPI\n"
+        "from remodel_fenicsx import cli, remodel\n"
+        "def broken(self, time_old, time_new):\n"
+        "    if MPI.COMM_WORLD.rank == 1: raise RuntimeError('rank 1 has had enough')\n"
+        "    MPI.COMM_WORLD.Barrier()\n"
+        "remodel.RemodelingPass.apply = broken\n"
+        f"sys.exit(cli.main(['run', {str(demo('tendon'))!r}, '-o', {str(tmp_path / 'out')!r}]))\n"
+    )
+    command = mpirun(2, sys.executable, str(program))
+    environment = {**os.environ, "PYTHONPATH": str(PROJECT)}
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, env=environment)
+    assert done.returncode == 1
+    assert "rank 1 has had enough" in done.stderr and "stopped by a defect" in done.stderr
+
+
+@pytest.mark.parametrize("version", ["0.5.2", "0.8.0"])
+def test_an_old_dolfinx_is_exit_code_5(
+    version: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import dolfinx
+
+    monkeypatch.setattr(dolfinx, "__version__", version)
+    assert cli.main(["run", str(demo("cube")), "-o", str(tmp_path / "out")]) == 5
+    assert f"dolfinx {version} is too old" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
 
 
 # ---------------------------------------------------------------- bad input and the small commands
