@@ -41,8 +41,10 @@ class Driver:
 
 
 DRIVERS: dict[str, Driver] = {
-    "cauchy": Driver(lambda F, s: s.cauchy, material=False, scale=lambda m: m.lame_mu),
-    "pk2": Driver(lambda F, s: s.second_piola_kirchhoff, material=True, scale=lambda m: m.lame_mu),
+    "cauchy": Driver(lambda F, s: s.cauchy, material=False, scale=lambda m: m.lame_lambda + 2 * m.lame_mu),
+    "pk2": Driver(
+        lambda F, s: s.second_piola_kirchhoff, material=True, scale=lambda m: m.lame_lambda + 2 * m.lame_mu
+    ),
     "finger": Driver(lambda F, s: ufl.dot(F, F.T), material=False, scale=lambda m: 1.0),
 }
 
