@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from remodel_fenicsx.kinematics import deformation_gradient
 from remodel_fenicsx.laws import LAWS
 
 Array = NDArray[np.float64]
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -38,14 +40,29 @@ class Driver:
     tensor: Callable[[Any, Stresses], Any]
     material: bool
     scale: Callable[[parameters.Material], float]
+    # by frame: factor by which a pass multiplies a small tilt of the axes, where it is below -1 (docs/theory.md)
+    overcorrection: dict[str, float] = field(default_factory=dict)
+
+
+def _stiffness(material: parameters.Material) -> float:
+    """lambda + 2 mu: a stress per strain."""
+    return material.lame_lambda + 2 * material.lame_mu
 
 
 DRIVERS: dict[str, Driver] = {
-    "cauchy": Driver(lambda F, s: s.cauchy, material=False, scale=lambda m: m.lame_lambda + 2 * m.lame_mu),
+    "cauchy": Driver(lambda F, s: s.cauchy, material=False, scale=_stiffness),
     "pk2": Driver(
-        lambda F, s: s.second_piola_kirchhoff, material=True, scale=lambda m: m.lame_lambda + 2 * m.lame_mu
+        lambda F, s: s.second_piola_kirchhoff,
+        material=True,
+        scale=_stiffness,
+        overcorrection={"material": -1.5, "spatial": -1.5},
     ),
-    "finger": Driver(lambda F, s: ufl.dot(F, F.T), material=False, scale=lambda m: 1.0),
+    "finger": Driver(
+        lambda F, s: ufl.dot(F, F.T),
+        material=False,
+        scale=lambda m: 1.0,
+        overcorrection={"material": -2.6, "spatial": -1.9},
+    ),
 }
 
 
@@ -101,11 +118,23 @@ class RemodelingPass:
     ):
         self.cells, self.material, self.settings = cells, material, settings
         self.driver, self.law, self.frame = DRIVERS[settings.driver], LAWS[settings.law], FRAMES[settings.frame]
+        self._warn_of_overcorrection()
         F = deformation_gradient(displacement)
         tensor = self.driver.tensor(F, stresses(F, [cells.ufl_cell], material, cells.settings.end_to_end_length))
         # one stacked expression: the deformation gradient comes at no cost with the driver
         stacked = ufl.as_vector([t[i, j] for t in (F, tensor) for i in range(3) for j in range(3)])
         self._expression = jit.expression(stacked, cells.quadrature.points)
+
+    def _warn_of_overcorrection(self) -> None:
+        factor = self.driver.overcorrection.get(self.settings.frame)
+        if factor is not None and self.settings.law != "none" and self.cells.quadrature.mesh.comm.rank == 0:
+            log.warning(
+                "remodeling.driver = %r with frame = %r over-corrects: a pass multiplies small tilts of the axes by "
+                "about %g, so late results may drift (docs/theory.md, Stability of the pass)",
+                self.settings.driver,
+                self.settings.frame,
+                factor,
+            )
 
     def driving_tensor(self) -> tuple[Array, Array]:
         """F and the symmetric driving tensor at all points, each (cells * points, 3, 3)."""

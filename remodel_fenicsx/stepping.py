@@ -116,8 +116,11 @@ class Stepper:
         start = self.displacement.x.array.copy()
         work = Work()
         try:
-            if not self._solve_in_one(new_loads, work):
-                self._solve_in_parts(time, old_loads, new_loads, work)
+            if not self.problem.extension().admissible:
+                log.info("solving in parts: the remodeled cells have r >= L at the old displacement")
+                self._solve_in_parts(time, old_loads, new_loads, work, failure=None)
+            else:
+                self._solve_in_one(time, old_loads, new_loads, work)
         except StepFailure:
             self.displacement.x.array[:] = start
             self.loading.set(old_loads)
@@ -133,24 +136,21 @@ class Stepper:
         return result
 
     # ------------------------------------------------------------ in one piece: the paper's step
-    def _solve_in_one(self, loads: LoadValues, work: Work) -> bool:
-        start_is_admissible = self.problem.extension().admissible
-        if start_is_admissible:
-            self.loading.set(loads)
-            try:
-                work.add(self.problem.solve())
-            except SolveFailure as failure:
-                work.add(failure)
-                log.info("solving in parts: %s", failure.reason)
-            else:
-                work.substeps = 1
-                return True
-        else:
-            log.info("solving in parts: the remodeled cells have r >= L at the old displacement")
-        return False
+    def _solve_in_one(self, time: float, old_loads: LoadValues, new_loads: LoadValues, work: Work) -> None:
+        self.loading.set(new_loads)
+        try:
+            work.add(self.problem.solve())
+            work.substeps = 1
+        except SolveFailure as failure:
+            work.add(failure)
+            log.info("solving in parts: %s", failure.reason)
+            self._solve_in_parts(time, old_loads, new_loads, work, failure)
 
     # ------------------------------------------------------------ in parts
-    def _solve_in_parts(self, time: float, old_loads: LoadValues, new_loads: LoadValues, work: Work) -> None:
+    def _solve_in_parts(
+        self, time: float, old_loads: LoadValues, new_loads: LoadValues, work: Work, failure: SolveFailure | None
+    ) -> None:
+        """First the change of the cells, then that of the loads; `failure`: that of the whole step, if it was tried."""
         self.loading.set(old_loads)
         if self._cells_changed():
             if self._blend is None:
@@ -158,11 +158,12 @@ class Stepper:
             blend = self._blend
             blend.load_cells()
             self._advance(time, "the change of the cells", blend.set, blend.problem, work, blend.largest_part)
+            failure = None  # the loads have not been tried from here
 
         def set_load_fraction(fraction: float) -> None:
             self.loading.set({k: old_loads[k] + fraction * (new_loads[k] - old_loads[k]) for k in new_loads})
 
-        self._advance(time, "the change of the loads", set_load_fraction, self.problem, work)
+        self._advance(time, "the change of the loads", set_load_fraction, self.problem, work, failure=failure)
         self.loading.set(new_loads)
         log.info("time %g solved in %d parts", time, work.substeps)
 
@@ -180,9 +181,12 @@ class Stepper:
         problem: EquilibriumProblem,
         work: Work,
         largest_part: Callable[[float], float] = lambda done: 1.0,
+        failure: SolveFailure | None = None,
     ) -> None:
-        """Go from fraction 0 to 1: halve the part after a failure, double it after a success."""
+        """Go from fraction 0 to 1: halve the part after a failure (`failure`: of the whole), double it after a success."""
         done, part = 0.0, 1.0
+        if failure is not None:
+            part = self._halved(part, time, stage, done, failure)
         while done < 1.0:
             part = min(part, largest_part(done), 1.0 - done)
             set_fraction(1.0 if done + part > 1.0 - 1e-12 else done + part)
@@ -190,14 +194,17 @@ class Stepper:
                 work.add(problem.solve())
             except SolveFailure as failure:
                 work.add(failure)
-                part /= 2
-                log.debug("%s: %s; next part %g", stage, failure.reason, part)
-                if part < 2.0**-self.settings.maximum_halvings:
-                    raise StepFailure(time, stage, done, failure) from failure
+                part = self._halved(part, time, stage, done, failure)
             else:
                 done = 1.0 if done + part > 1.0 - 1e-12 else done + part
                 part *= 2
                 work.substeps += 1
+
+    def _halved(self, part: float, time: float, stage: str, done: float, failure: SolveFailure) -> float:
+        if part / 2 < 2.0**-self.settings.maximum_halvings:
+            raise StepFailure(time, stage, done, failure) from failure
+        log.debug("%s: %s; next part %g", stage, failure.reason, part / 2)
+        return part / 2
 
 
 class _Blend:

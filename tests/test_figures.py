@@ -1,0 +1,403 @@
+"""The command `figures`: names, validity of recorded runs, data against closed forms, pictures in space."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.util
+import math
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import remodel_fenicsx
+from remodel_fenicsx import cli
+from remodel_fenicsx.figures import FIGURES, bodies, output, recordings, rendering, runs
+from remodel_fenicsx.scene import Scene, scene_from_dict
+from tests.conftest import mpirun
+
+PACKAGE = Path(remodel_fenicsx.__file__).parent
+TINY = {
+    "name": "tiny",
+    "preset": "kuhl-holzapfel-2007",
+    "geometry": {"shape": "tendon"},
+    "time": {"end": 2.0},
+}
+
+
+# ---------------------------------------------------------------- bad input
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["fig12"], "figures fig12: no such figure; allowed are fig1, fig5, fig6, fig7, fig8, fig9, fig10, fig11, "),
+        (["fig1", "Fig5"], "figures Fig5: no such figure; allowed are fig1, "),
+        (["fig1", "--jobs", "0"], "--jobs 0: must be at least 1"),
+        (["fig1", "-o", "taken"], "-o taken: is a file; allowed is a folder"),
+        (["fig1", "--runs", "taken"], "--runs taken: is a file; allowed is a folder"),
+    ],
+)
+def test_bad_input_is_one_line_and_writes_nothing(
+    arguments: list[str], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("taken").write_text("")
+    assert cli.main(["figures", *arguments]) == 2
+    message = capsys.readouterr().err
+    assert message.startswith(f"remodel-fenicsx: {said}") and message.count("\n") == 1
+    assert os.listdir() == ["taken"]
+
+
+def test_every_name_of_the_contract_is_there() -> None:
+    assert list(FIGURES) == ["fig1", *(f"fig{n}" for n in range(5, 12)), "rate", "energy"]
+    known = runs.scenes()
+    assert {run for figure in FIGURES.values() for run in figure.runs} == set(known)
+    assert all(scene.name == name for name, scene in known.items())
+
+
+def test_ranks_are_refused(tmp_path: Path) -> None:
+    command = mpirun(2, sys.executable, "-m", "remodel_fenicsx.cli", "figures", "fig1", "-o", str(tmp_path / "drawn"))
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 2
+    assert done.stderr.count("figures: uses all cores by itself (--jobs); start it without mpirun") == 1
+    assert not (tmp_path / "drawn").exists()
+
+
+@pytest.mark.parametrize("name", ["fig1.png", "fig1.csv", "fig1-mine.csv"])
+def test_a_file_of_somebody_else_is_not_overwritten(name: str, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    theirs = tmp_path / name
+    theirs.write_text("a year of work")
+    assert cli.main(["figures", "fig1", "-o", str(tmp_path)]) == 2
+    assert f"{theirs}: is not a figure of this command" in capsys.readouterr().err
+    assert theirs.read_text() == "a year of work" and os.listdir(tmp_path) == [name]
+
+
+# ---------------------------------------------------------------- which recorded runs are valid
+
+
+def tiny(**changes: float | str) -> Scene:
+    """Two steps of the tendon."""
+    return scene_from_dict(TINY).with_values({key.replace("__", "."): value for key, value in changes.items()})
+
+
+def record(cache: runs.RunCache, scene: Scene, last: float | None = None) -> Path:
+    """What a run leaves, as far as the cache looks."""
+    folder = cache.path(scene)
+    folder.mkdir(parents=True)
+    (folder / "scene.toml").write_text(scene.to_toml("as run\ndolfinx 0.0"))
+    (folder / "fields.vtkhdf").write_text("")
+    times = np.arange(1.0, (scene.time.end if last is None else last) + 0.5)
+    (folder / "history.csv").write_text("time,force\n" + "".join(f"{time},1.0\n" for time in times))
+    return folder
+
+
+def test_a_recorded_run_is_valid_until_scene_source_or_libraries_change(tmp_path: Path) -> None:
+    cache = runs.RunCache(tmp_path, "source", {"fenics-dolfinx": "0.9.0"})
+    scene = tiny()
+    assert not cache.is_valid(scene)
+    record(cache, scene)
+    assert cache.is_valid(scene)
+    assert runs.RunCache(tmp_path, "source", {"fenics-dolfinx": "0.9.0"}).is_valid(tiny())
+    assert not cache.is_valid(tiny(remodeling__kappa=0.03))
+    assert not cache.is_valid(tiny(solver__maximum_halvings=11))  # a default that the scene does not name
+    assert not runs.RunCache(tmp_path, "other source", cache.libraries).is_valid(scene)
+    assert not runs.RunCache(tmp_path, "source", {"fenics-dolfinx": "0.11.0"}).is_valid(scene)
+
+
+def test_a_run_that_is_not_whole_is_not_valid(tmp_path: Path) -> None:
+    cache = runs.RunCache(tmp_path, "source", {})
+    record(cache, tiny(time__end=5.0), last=4.0)
+    assert not cache.is_valid(tiny(time__end=5.0))
+    changed = record(cache, tiny())
+    (changed / "scene.toml").write_text(tiny(cells__seed=2).to_toml())
+    assert not cache.is_valid(tiny())
+    (changed / "scene.toml").write_text(tiny().to_toml())
+    assert cache.is_valid(tiny())
+    (changed / "fields.vtkhdf").unlink()
+    assert not cache.is_valid(tiny())
+    without = tiny(output__fields=False)
+    (record(cache, without) / "fields.vtkhdf").unlink()
+    assert cache.is_valid(without)
+
+
+def test_only_source_that_decides_numbers_makes_runs_stale(tmp_path: Path) -> None:
+    copy = tmp_path / "package"
+    shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
+    before = runs.source_fingerprint(copy)
+    assert before == runs.source_fingerprint()
+    laws, text = copy / "laws.py", (copy / "laws.py").read_text()
+    laws.write_text("# a remark\n" + text.replace('"""', '"""Said better. ', 1))
+    (copy / "figures" / "curves.py").write_text("X = 1\n")
+    (copy / "cli.py").write_text("Y = 2\n")
+    assert runs.source_fingerprint(copy) == before
+    laws.write_text(text + "\nLAWS.pop('rate')\n")
+    assert runs.source_fingerprint(copy) != before
+    laws.write_text(text)
+    assert runs.source_fingerprint(copy) == before
+    (copy / "geometry" / "more.py").write_text("Z = 3\n")
+    assert runs.source_fingerprint(copy) != before
+
+
+def test_a_failing_run_ends_with_its_own_code_and_leaves_nothing_that_looks_valid(tmp_path: Path) -> None:
+    # more than any chain can bear at once, and no part of the step is tried
+    scene = tiny(name="torn", loads__force__value=1e9, solver__maximum_halvings=0)
+    cache = runs.RunCache(tmp_path)
+    with pytest.raises(runs.FigureError, match="the run torn in .*torn-.*: .*time") as failure:
+        cache.obtain([scene], jobs=1)
+    assert failure.value.exit_code == 3
+    assert not cache.is_valid(scene) and not cache.path(scene).exists()
+
+
+def test_a_run_whose_source_changed_meanwhile_is_not_kept(tmp_path: Path) -> None:
+    cache = runs.RunCache(tmp_path, source="of another time")
+    scene = tiny(output__fields=False, time__end=1.0)
+    with pytest.raises(runs.FigureError, match="the package's source changed during the run tiny: start again"):
+        cache.obtain([scene], jobs=1)
+    assert not cache.is_valid(scene)
+
+
+def test_a_stopped_command_ends_its_runs(tmp_path: Path) -> None:
+    code = "import sys; from remodel_fenicsx.cli import main; sys.exit(main(sys.argv[1:]))"
+    command = [sys.executable, "-c", code, "figures", "fig7", "--jobs", "1", "--runs", str(tmp_path / "runs")]
+    with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        first = process.stderr.readline()
+        assert first.startswith("figures: 0 % of the runs: artery 0/150")
+        process.terminate()
+        rest = process.stderr.read()
+    assert process.returncode == 143
+    assert rest.splitlines()[-1] == "remodel-fenicsx: stopped; finished runs are kept"
+    assert os.listdir(tmp_path / "runs") == [] and not (tmp_path / "figures").exists()
+
+
+# ---------------------------------------------------------------- figures 1 and 5 against closed forms
+
+
+@pytest.fixture(scope="module")
+def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with figs. 1 and 5, drawn by the command from runs of its own."""
+    folder = tmp_path_factory.mktemp("drawn")
+    assert cli.main(["figures", "fig1", "fig5", "-o", str(folder), "--runs", str(folder / "runs")]) == 0
+    return folder
+
+
+def numbers(path: Path) -> dict[str, np.ndarray]:
+    """Columns of a figure's table."""
+    return {name: np.array(values, dtype=float) for name, values in output.read_table(path).items()}
+
+
+def test_fig1_is_eq_2(drawn: Path) -> None:
+    table = numbers(drawn / "fig1.csv")
+    x = table["extension"]
+    assert len(x) > 100 and x[0] == 0 and 0.9 < x[-1] < 1
+    for A in (0.1, 0.4, 0.8):
+        np.testing.assert_allclose(table[f"force_A_{A}"], (4 * x + (1 - x) ** -2 - 1) / (4 * A), rtol=1e-6, atol=1e-12)
+
+
+def test_fig5_is_the_closed_form_of_the_cells_before_the_pass(drawn: Path) -> None:
+    table = numbers(drawn / "fig5.csv")
+    np.testing.assert_array_equal(table["time"], np.arange(1.0, 101.0))
+    for kappa in (0.01, 0.025, 0.05, 0.1):
+        s = 1 - np.exp(-kappa * (table["time"] - 1.0))
+        exact = np.degrees(np.arctan2(math.sqrt(2) * (1 - s), 1 - s + math.sqrt(3) * s))
+        np.testing.assert_allclose(table[f"angle_kappa_{kappa:g}"], exact, rtol=0, atol=1e-3)
+        np.testing.assert_allclose(table[f"exact_kappa_{kappa:g}"], exact, rtol=1e-6)
+
+
+def test_figures_say_with_what_they_were_made(drawn: Path) -> None:
+    with Image.open(drawn / "fig5.png") as picture:
+        assert picture.size[0] > 800
+        made_with = picture.text["Source"]  # type: ignore[attr-defined]
+        assert picture.text["Comment"] == "remodel-fenicsx figures fig5"  # type: ignore[attr-defined]
+    version = runs.library_versions()["fenics-dolfinx"].split(".post")[0]
+    for text in (made_with, (drawn / "fig5.csv").read_text().splitlines()[1]):
+        assert f"remodel_fenicsx {remodel_fenicsx.__version__}, dolfinx {version}" in text
+        assert "preset kuhl-holzapfel-2007, frame spatial, isotropic cells" in text
+
+
+def test_valid_runs_are_used_again_and_own_figures_drawn_anew(drawn: Path) -> None:
+    histories = sorted((drawn / "runs").glob("cube-*/history.csv"))
+    assert len(histories) == 4
+    before = [path.stat().st_mtime_ns for path in histories]
+    (drawn / "fig5.png").write_bytes((drawn / "fig5.png").read_bytes()[:4096])
+    assert cli.main(["figures", "fig5", "-o", str(drawn), "--runs", str(drawn / "runs")]) == 0
+    assert [path.stat().st_mtime_ns for path in sorted((drawn / "runs").glob("cube-*/history.csv"))] == before
+    with Image.open(drawn / "fig5.png") as picture:
+        picture.load()
+
+
+# ---------------------------------------------------------------- pictures in space
+
+
+def two_hexahedra() -> recordings.Snapshot:
+    """Two unit cubes side by side in x, beginning at x = 1; all chains along z, stretched to twice in z."""
+    x, y, z = np.meshgrid([1.0, 2.0, 3.0], [-0.5, 0.5], [0.0, 1.0], indexing="ij")
+    points = np.stack([x, y, z], axis=-1).reshape(-1, 3)
+    first = np.array([0, 4, 6, 2, 1, 5, 7, 3])  # VTK's order, node number 4 i + 2 j + k
+    fields = {
+        "cell_dimensions": np.tile([1.0, 0.0, 0.0], (2, 1)),
+        "axis_1": np.tile([0.0, 0.0, 1.0], (2, 1)),
+        "axis_2": np.tile([1.0, 0.0, 0.0], (2, 1)),
+        "axis_3": np.tile([0.0, 1.0, 0.0], (2, 1)),
+        "deformation_gradient": np.tile(np.diag([1.0, 1.0, 2.0]).ravel(), (2, 1)),
+        "fibre_angle_deformed": np.array([0.0, 90.0]),
+    }
+    return recordings.Snapshot(0.0, points, np.array([first, first + 4]), points * [0.0, 0.0, 1.0], fields)
+
+
+def test_exterior_has_the_faces_that_no_other_element_covers() -> None:
+    snapshot = two_hexahedra()
+    faces, elements = snapshot.exterior(np.array([True, True]))
+    assert len(faces) == 10 and np.array_equal(np.bincount(elements), [5, 5])
+    centres = snapshot.points[faces].mean(axis=1)
+    assert not np.any(np.all(np.isclose(centres, [2.0, 0.0, 0.5]), axis=1))
+    alone, _ = snapshot.exterior(np.array([True, False]))
+    assert len(alone) == 6
+
+
+def test_chains_lie_on_the_deformed_face_along_their_deformed_direction() -> None:
+    snapshot = two_hexahedra()
+    surface, ribbons = bodies.body(snapshot)
+    assert len(surface.corners) == 10
+    np.testing.assert_allclose(surface.corners[..., 2].max(), 2.0)
+    # of the faces only the one at x = 3 looks away from the z axis
+    assert len(ribbons.corners) == 4
+    ends = np.stack([ribbons.corners[:, [0, 3]].mean(axis=1), ribbons.corners[:, [1, 2]].mean(axis=1)], axis=1)
+    np.testing.assert_allclose(ends.mean(axis=1)[:, 1:], [[0.0, 1.0]] * 4, atol=1e-12)
+    lengths = np.abs(ends[:, 1] - ends[:, 0])
+    np.testing.assert_allclose(lengths, [[0.0, 0.0, 2 * 2 * bodies.CHAIN_REACH]] * 4, atol=1e-12)
+    assert np.all(ribbons.corners[..., 0] > 3.0) and np.all(ribbons.corners[..., 0] < 3.1)
+
+
+def test_colours_go_from_red_along_to_blue_across() -> None:
+    red, middle, blue = bodies.coloured(np.array([0.0, 45.0, 90.0]))
+    assert red[0] > 0.6 and red[1:].max() < 0.2
+    assert blue[2] > 0.5 and blue[:2].max() < 0.3
+    assert middle.min() > 0.7
+    assert np.all(np.isfinite(bodies.coloured(np.array([-1e-9, 90.0 + 1e-9]))))
+
+
+@pytest.fixture(scope="module")
+def tiny_run(tmp_path_factory: pytest.TempPathFactory) -> recordings.Recording:
+    """Two steps of the tendon, run by the cache."""
+    cache = runs.RunCache(tmp_path_factory.mktemp("runs"))
+    return recordings.Recording(cache.obtain([tiny()], jobs=1)["tiny"])
+
+
+def test_a_recording_gives_back_what_was_run(tiny_run: recordings.Recording) -> None:
+    assert tiny_run.scene == tiny()
+    assert tiny_run.value("force", 2.0) == pytest.approx(50.0)
+    with pytest.raises(KeyError, match="no row at time 1.5"):
+        tiny_run.value("force", 1.5)
+    with pytest.raises(KeyError, match="no fields at time 7"):
+        tiny_run.snapshot(7.0)
+    snapshot = tiny_run.snapshot(2.0)
+    assert snapshot.cells.shape == (480, 8)
+    top = snapshot.points[:, 2] > 10.0 - 1e-9
+    assert np.all(snapshot.displacement[snapshot.points[:, 2] < 1e-9, 2] == 0)
+    # nodes stand for unequal areas: the means agree roughly
+    assert 1 + snapshot.displacement[top, 2].mean() / 10 == pytest.approx(tiny_run.value("mean_stretch", 2.0), abs=0.02)
+    assert np.all(snapshot.fields["cell_dimensions"][:, 0] >= snapshot.fields["cell_dimensions"][:, 1])
+
+
+def test_a_snapshot_is_really_drawn(tiny_run: recordings.Recording) -> None:
+    snapshot = tiny_run.snapshot(2.0)
+    middle = (0.0, 0.0, snapshot.deformed[:, 2].max() / 2)
+    view = rendering.View((0.3, -1.0, 0.14), middle, 14.0, (120, 320))
+    patches = bodies.body(snapshot)
+    both, bare = rendering.render([rendering.Picture(view, patches), rendering.Picture(view, patches[:1])])
+    assert both.shape == bare.shape == (320, 120, 3)
+    assert np.all(both[0, 0] == 255)
+    body = np.any(bare < 245, axis=2)
+    # length along z of the body over the height of the picture, its width over the same; seen nearly from the side
+    rows, columns = np.flatnonzero(body.any(axis=1)), np.flatnonzero(body.any(axis=0))
+    assert np.ptp(rows) / 320 == pytest.approx(2 * middle[2] / 14.0, abs=0.06)
+    assert np.ptp(columns) / 320 == pytest.approx(2 * math.sqrt(10 / math.pi) / 14.0, abs=0.03)
+    red, green, blue = np.moveaxis(bare[body].astype(int), -1, 0)
+    assert np.mean(red - blue > 60) > 0.1 and np.mean(blue - red > 40) > 0.1
+    dark = np.all(both < 70, axis=2)
+    assert 0.02 < dark.sum() / body.sum() < 0.4 and not np.any(np.all(bare < 70, axis=2))
+
+
+def test_what_the_child_says_reaches_the_user(monkeypatch: pytest.MonkeyPatch) -> None:
+    view = rendering.View((1.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0, (10, 10))
+    with pytest.raises(runs.FigureError, match="no picture in space: pyvista ended with 1: .*boom") as failure:
+        rendering.render([dataclasses.replace(rendering.Picture(view), patches=[Boom()])])  # type: ignore[list-item]
+    assert failure.value.exit_code == 5
+
+
+class Boom:
+    """Cannot be read back."""
+
+    def __reduce__(self) -> tuple:
+        return (_raise, ())
+
+
+def _raise() -> None:
+    raise RuntimeError("boom")
+
+
+# ---------------------------------------------------------------- all of it
+
+
+@pytest.fixture(scope="module")
+def everything(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Every figure, drawn by the command."""
+    folder = tmp_path_factory.mktemp("everything")
+    assert cli.main(["figures", "-o", str(folder), "--runs", str(folder / "runs")]) == 0
+    return folder
+
+
+@pytest.mark.slow
+def test_every_figure_has_a_picture_and_its_data(everything: Path) -> None:
+    for name in FIGURES:
+        with Image.open(everything / f"{name}.png") as picture:
+            colours = picture.convert("RGB").getcolors(100_000)
+        assert colours is not None and len(colours) > 50
+        assert len(next(iter(output.read_table(everything / f"{name}.csv").values()))) >= 5
+        assert (everything / f"{name}.png").stat().st_size < 300_000
+
+
+@pytest.mark.slow
+def test_the_figures_show_what_the_design_says(everything: Path) -> None:
+    tendon = numbers(everything / "fig6.csv")
+    assert 1.735 <= tendon["mean_stretch"][tendon["time"] == 12.0].item() <= 1.750
+    assert 1.4244 <= tendon["mean_stretch"][-1] <= 1.4250
+    layers = numbers(everything / "fig8.csv")
+    target = [1.1, 4.2, 14.0, 36.9, 60.2, 66.7, 70.3, 72.7]
+    np.testing.assert_allclose(layers["fibre_angle"], target, rtol=0, atol=1.5)
+    cases = numbers(everything / "fig9.csv")
+    stretched, pressed = (cases["pressure"] == 0.0, cases["stretch"] == 0.0)
+    assert np.all(cases["fibre_angle"][stretched] > 89.0)
+    assert np.all(cases["fibre_angle"][pressed][:4] < 1.5) and np.all(cases["fibre_angle"][pressed] < 13.0)
+    second, strain = numbers(everything / "fig10.csv"), numbers(everything / "fig11.csv")
+    variation = {name: np.ptp(table[f"fibre_angle_{name}"]) for name, table in
+                 (("cauchy", second), ("pk2", second), ("finger", strain))}  # fmt: skip
+    assert variation["finger"] < 25 < 60 < variation["pk2"] < variation["cauchy"] < variation["pk2"] + 6
+    rate = numbers(everything / "rate.csv")
+    assert 15 < rate["fibre_angle_explicit"][-1] - rate["fibre_angle_rate"][-1] < 25
+
+
+# ---------------------------------------------------------------- docs/verification.md
+
+
+def test_the_verification_page_is_what_its_data_says() -> None:
+    """Whoever draws anew and forgets the page, or edits it by hand, is told: run docs/make_verification.py."""
+    docs = PACKAGE.parent / "docs"
+    spec = importlib.util.spec_from_file_location("make_verification", docs / "make_verification.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    text = (docs / "verification.md").read_text(encoding="utf-8")
+    assert module.page() == text
+    shown = re.findall(r"!\[.*\]\((.*)\)", text)
+    assert {f"figures/{name}.png" for name in FIGURES} < set(shown)
+    for name in shown:
+        assert 5_000 < (docs / name).stat().st_size < 300_000
