@@ -183,7 +183,7 @@ class Stepper:
         largest_part: Callable[[float], float] = lambda done: 1.0,
         failure: SolveFailure | None = None,
     ) -> None:
-        """Go from fraction 0 to 1: halve the part after a failure (`failure`: of the whole), double it after a success."""
+        """Go from fraction 0 to 1: half the part after a failure (`failure`: of the whole), twice after a success."""
         done, part = 0.0, 1.0
         if failure is not None:
             part = self._halved(part, time, stage, done, failure)
