@@ -295,7 +295,7 @@ def test_gmsh_is_left_as_it_was(capfd):
     handler = signal.getsignal(signal.SIGINT)
     cube(comm=MPI.COMM_SELF)
     assert not gmsh.isInitialized() and signal.getsignal(signal.SIGINT) is handler
-    gmsh.initialize()
+    gmsh.initialize(interruptible=False)  # else Gmsh would leave Ctrl-C deadly for all tests that follow
     try:
         gmsh.model.add("somebody's")
         gmsh.model.geo.addPoint(0.0, 0.0, 0.0, tag=7)
