@@ -113,6 +113,23 @@ def test_one_and_two_ranks_write_the_same_files(tendon_run: Path, tmp_path: Path
             np.testing.assert_allclose(a, b, rtol=0, atol=1e-5)
 
 
+def test_petsc_options_from_scene_and_environment(tmp_path: Path) -> None:
+    """The scene's lie over the profile's, those of PETSC_OPTIONS over the scene's."""
+    one = ["run", demo("cube"), "--set", "time.end=1", "-q", "-o"]
+    quiet = run(*one, tmp_path / "quiet")
+    assert quiet.returncode == 0 and "SNES Function norm" not in quiet.stdout
+    monitored = run(*one, tmp_path / "scene", "--set", "solver.petsc_options.snes_monitor=true")
+    assert monitored.returncode == 0 and "SNES Function norm" in monitored.stdout
+    # LU of MUMPS is exact: one linear iteration a Newton iteration; GMRES with Jacobi needs more
+    loose = {**os.environ, "PETSC_OPTIONS": "-remodel_ksp_type gmres -remodel_ksp_rtol 1e-12 -remodel_pc_type jacobi"}
+    other = run(*one, tmp_path / "other", "--set", "solver.petsc_options.pc_type=cholesky", env=loose)
+    assert other.returncode == 0, other.stderr
+    direct, iterative = read_history(tmp_path / "quiet"), read_history(tmp_path / "other")
+    assert direct["linear_iterations"][0] == direct["newton_iterations"][0]
+    assert iterative["linear_iterations"][0] > 2 * iterative["newton_iterations"][0]
+    np.testing.assert_allclose(iterative["mean_stretch"], direct["mean_stretch"], rtol=1e-9)
+
+
 def test_a_tube_run_has_the_columns_of_the_contract(tmp_path: Path) -> None:
     done = run("run", demo("artery"), "--set", "time.end=1", "-o", tmp_path / "tube", "-q")
     assert done.returncode == 0 and done.stderr == "", done.stderr

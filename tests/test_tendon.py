@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import fsolve
 
+from remodel_fenicsx.scene import preset_scene
 from tests.conftest import Case
 
 L, A_P, DENSITY, LAMBDA, MU, KAPPA = 1.594, 1.365, 2.0e21, 27.293, 3.103, 0.025
@@ -69,6 +70,23 @@ def point_stretch(force_per_area: float, dimensions: np.ndarray) -> float:
         return cauchy * volume / stretch - np.array([force_per_area, 0.0, 0.0])
 
     return float(fsolve(balance, [1.4, 0.85, 0.85], xtol=1e-13)[0])
+
+
+def test_only_the_stress_as_printed_ends_near_140_percent(case: Case) -> None:
+    """Erratum 1: energy_factor 1 against 4, one element of isotropic cells with the tendon's material and traction."""
+    preset = preset_scene("kuhl-holzapfel-2007", "tendon")
+    final = {}
+    for factor in (1, 4):
+        scene = {
+            "preset": "kuhl-holzapfel-2007",
+            "geometry": {"shape": "cube"},
+            "material": preset.material.model_dump() | {"energy_factor": factor},
+            "loads": {"force": {"value": 30.0, "ramp": [[0.0, 0.0], [12.0, 1.0]]}},
+            "time": {"end": 150.0},
+        }
+        final[factor] = case(scene)["mean_stretch"][-1]
+    assert final[1] == pytest.approx(1.424, abs=2e-3)
+    assert final[4] == pytest.approx(1.27, abs=5e-3)
 
 
 def test_isotropic_cells_stay_homogeneous_and_follow_the_point_solution(case: Case) -> None:
