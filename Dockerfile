@@ -1,6 +1,6 @@
 # The same Debian packages as ./with-fenicsx, and the remodel-fenicsx command.  docs/environment.md tells more.
 #   docker build -t remodel-fenicsx .
-#   docker run --rm --user "$(id -u):$(id -g)" -v "$PWD:/work" remodel-fenicsx run demos/artery.toml
+#   docker run --rm --user "$(id -u):$(id -g)" -v "$PWD:/data" remodel-fenicsx run demos/artery.toml
 
 # what ./with-fenicsx runs its commands in when it finds only a container engine: the packages, without the project
 FROM debian:trixie-slim AS environment
@@ -17,8 +17,8 @@ ENV PATH=/opt/remodel-fenicsx/bin:$PATH PYTHONPATH=/opt/remodel-fenicsx HOME=/ho
 # --user makes the results the caller's own; home, where compiled forms are kept, is anybody's then
 RUN python3 -m compileall -q /opt/remodel-fenicsx/remodel_fenicsx \
     && useradd --create-home --uid 1000 remodel \
-    && mkdir -p /work && chmod 1777 /home/remodel /work
+    && mkdir -p /data && chmod 1777 /home/remodel /data
 USER remodel
-WORKDIR /work
+WORKDIR /data
 ENTRYPOINT ["remodel-fenicsx"]
 CMD ["--help"]
