@@ -10,26 +10,26 @@
 
 # %%
 import sys
-from pathlib import Path
 
 import dolfinx.fem
 from mpi4py import MPI
 
 from remodel_fenicsx.cells import UnitCells
 from remodel_fenicsx.geometry import tendon
+from remodel_fenicsx.interrupts import end_all_ranks_on_exception
 from remodel_fenicsx.loads import Loading
 from remodel_fenicsx.observables import Observer
 from remodel_fenicsx.parameters import Cells, Material, Remodeling
 from remodel_fenicsx.quadrature import Quadrature
-from remodel_fenicsx.record import RunFolder, choose_folder
+from remodel_fenicsx.record import RunFolder, chosen_folder
 from remodel_fenicsx.remodel import RemodelingPass
 from remodel_fenicsx.scene import Solver
 from remodel_fenicsx.stepping import Stepper, times
 
 end = float(sys.argv[1]) if len(sys.argv) > 1 else 150.0
 comm = MPI.COMM_WORLD
-folder = choose_folder(Path(sys.argv[2]) if len(sys.argv) > 2 else None, "tendon-script") if comm.rank == 0 else None
-folder = comm.bcast(folder)
+folder = chosen_folder(sys.argv[2] if len(sys.argv) > 2 else None, "tendon-script", comm)
+end_all_ranks_on_exception()
 
 # %% [markdown]
 # ## Geometry

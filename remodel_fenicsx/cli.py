@@ -78,6 +78,11 @@ def _rank() -> int:
     return MPI.COMM_WORLD.rank
 
 
+def _say(text: str) -> None:
+    if _rank() == 0:
+        print(text)
+
+
 def _fail(message: str, code: int) -> int:
     if _rank() == 0:
         print(f"remodel-fenicsx: {message}", file=sys.stderr, flush=True)
@@ -89,6 +94,7 @@ def _run(options: argparse.Namespace) -> int:
     reason = reason_unusable()
     if reason is not None:
         return _fail(f"the environment is not usable: {reason}; run through ./with-fenicsx", BAD_ENVIRONMENT)
+    from remodel_fenicsx.geometry import GeometryError
     from remodel_fenicsx.interrupts import Interrupted
     from remodel_fenicsx.record import FolderTaken
     from remodel_fenicsx.simulation import run
@@ -96,8 +102,10 @@ def _run(options: argparse.Namespace) -> int:
 
     try:
         folder = run(scene, options.output, quiet=options.quiet)
-    except FolderTaken as error:
-        return _fail(str(error), BAD_INPUT)
+    except (FolderTaken, SceneError, GeometryError) as error:
+        return _fail(" ".join(str(error).split()), BAD_INPUT)
+    except KeyboardInterrupt:  # before the first step
+        return _fail("stopped by SIGINT; nothing was computed", 130)
     except StepFailure as failure:
         advice = "try a smaller time.step, a slower ramp or lower loads; every finished step is kept"
         return _fail(f"{failure}. {advice}", SOLVE_FAILED)
@@ -108,8 +116,7 @@ def _run(options: argparse.Namespace) -> int:
     except Exception:
         traceback.print_exc()
         return _end_all("stopped by a defect of the program, see above", 1)
-    if _rank() == 0:
-        print(f"results in {folder}")
+    _say(f"results in {folder}")
     return 0
 
 
@@ -125,13 +132,13 @@ def _end_all(message: str, code: int) -> int:
 
 def _validate(options: argparse.Namespace) -> int:
     scene = read_scene(options.scene, options.set)
-    print(f"{options.scene}: a valid scene ({scene.geometry.shape}, {scene.time.number_of_steps} steps)")
+    _say(f"{options.scene}: a valid scene ({scene.geometry.shape}, {scene.time.number_of_steps} steps)")
     return 0
 
 
 def _new(options: argparse.Namespace) -> int:
     scene: Scene = preset_scene(options.preset, options.shape)
-    print(scene.to_toml(f"a scene of the preset {options.preset}"), end="")
+    _say(scene.to_toml(f"a scene of the preset {options.preset}").rstrip("\n"))
     return 0
 
 
@@ -160,8 +167,8 @@ def _info(options: argparse.Namespace) -> int:
     from remodel_fenicsx.solvers import PROFILES
 
     for name, version in versions().items():
-        print(f"{name:16} {version}")
-    print(f"{'solver profiles':16} {', '.join(PROFILES)}")
+        _say(f"{name:16} {version}")
+    _say(f"{'solver profiles':16} {', '.join(PROFILES)}")
     return 0
 
 

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import importlib.metadata
+import importlib.util
+import os
 import platform
 import re
+import shutil
 from pathlib import Path
 
 import remodel_fenicsx
 
 OLDEST_DOLFINX = (0, 9)
+NEEDED = ("basix", "dolfinx", "gmsh", "h5py", "mpi4py", "petsc4py", "rich", "ufl")
 
 
 def versions() -> dict[str, str]:
@@ -36,6 +40,11 @@ def versions() -> dict[str, str]:
 
 def reason_unusable() -> str | None:
     """Why this environment cannot run a scene, or None: dolfinx missing or too old, PETSc with complex numbers."""
+    missing = [name for name in NEEDED if importlib.util.find_spec(name) is None]
+    if missing:
+        return f"{', '.join(missing)} is missing"
+    if not any(shutil.which(name) for name in (os.environ.get("CC", "cc").split()[0], "gcc", "clang")):
+        return "there is no C compiler"
     try:
         import dolfinx
         import numpy

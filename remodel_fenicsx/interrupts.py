@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import signal
+import sys
+import traceback
 from types import FrameType, TracebackType
+
+from mpi4py import MPI
 
 _EXIT_CODE_BASE = 128
 
@@ -14,6 +18,22 @@ class Interrupted(Exception):  # noqa: N818 - no error: somebody asked for it
     def __init__(self, number: int):
         super().__init__(signal.Signals(number).name)
         self.exit_code = _EXIT_CODE_BASE + number
+
+
+def end_all_ranks_on_exception() -> None:
+    """From now on an exception that nobody catches ends every rank of the run, not only the one that raised it.
+
+    The others would wait for it for ever. (``python3 -m mpi4py`` is not enough once PETSc is there: its own end is
+    collective and comes first.) On one rank nothing changes.
+    """
+    if MPI.COMM_WORLD.size > 1:
+        sys.excepthook = _print_and_abort
+
+
+def _print_and_abort(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+    traceback.print_exception(kind, error, trace)
+    sys.stderr.flush()
+    MPI.COMM_WORLD.Abort(1)
 
 
 class StopRequest:

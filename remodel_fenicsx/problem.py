@@ -17,6 +17,7 @@ from petsc4py import PETSc
 
 from remodel_fenicsx import jit, parameters
 from remodel_fenicsx.cells import UnitCells
+from remodel_fenicsx.chains import CHAINS
 from remodel_fenicsx.energy import Cell, squared_end_to_end_length, strain_energy
 from remodel_fenicsx.interrupts import Interrupted
 from remodel_fenicsx.kinematics import deformation_gradient
@@ -180,6 +181,11 @@ class EquilibriumProblem:
         self._external = self._x.duplicate()
         self._matrix = dolfinx.fem.petsc.create_matrix(self.tangent_form)
         self._force_scale = 0.0
+        # an unloaded body has no forces but rounding: 1e-5 of stiffness times area is a scale in any unit of stress
+        chain, r0 = CHAINS[self.material.chain], self.cells.settings.end_to_end_length
+        network = self.material.network_modulus * chain.stiffness(r0, self.material.contour_length) * r0**2
+        stiffness = self.material.lame_lambda + 2 * self.material.lame_mu + network
+        self._rounding_scale = 1e-5 * stiffness * self.loading.domain.size**2
         self._lost = False
         snes: Any = PETSc.SNES().create(self.comm)
         snes.setFunction(self._assemble_residual, self._residual)
@@ -269,7 +275,8 @@ class EquilibriumProblem:
         norm = norms[2]
         if not np.isfinite(norm):
             return PETSc.SNES.ConvergedReason.DIVERGED_FNORM_NAN
-        if norm <= self.settings.absolute_tolerance + self.settings.relative_tolerance * self._force_scale:
+        scale = max(self._force_scale, self._rounding_scale)
+        if norm <= self.settings.absolute_tolerance + self.settings.relative_tolerance * scale:
             return PETSc.SNES.ConvergedReason.CONVERGED_FNORM_ABS
         if iteration >= snes.getTolerances()[3]:
             return PETSc.SNES.ConvergedReason.DIVERGED_MAX_IT

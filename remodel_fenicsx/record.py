@@ -12,6 +12,7 @@ from types import TracebackType
 from typing import Any
 
 import numpy as np
+from mpi4py import MPI
 from numpy.typing import NDArray
 
 from remodel_fenicsx import compat
@@ -47,7 +48,7 @@ class FolderTaken(ValueError):
 def choose_folder(requested: Path | None, name: str) -> Path:
     """The folder of a run: the one asked for, which must be new or empty, or the first free results/NAME[-2, -3, ...].
 
-    Creates nothing.
+    The one asked for is not made yet; a default one is, so that two runs started at once take two.
 
     Raises
     ------
@@ -61,10 +62,35 @@ def choose_folder(requested: Path | None, name: str) -> Path:
             raise FolderTaken(f"-o {requested}: is not empty; allowed is a new or an empty folder")
         return requested
     number, folder = 1, Path("results") / name
-    while folder.exists():
-        number += 1
-        folder = Path("results") / f"{name}-{number}"
-    return folder
+    while True:
+        try:
+            folder.mkdir(parents=True)
+        except FileExistsError:
+            number += 1
+            folder = Path("results") / f"{name}-{number}"
+        else:
+            return folder
+
+
+def chosen_folder(requested: Path | str | None, name: str, comm: MPI.Intracomm) -> Path:
+    """`choose_folder` on rank 0, its folder or its refusal on all ranks. Collective.
+
+    Raises
+    ------
+    FolderTaken, OSError
+        As `choose_folder` does, on all ranks.
+    """
+    verdict: Path | FolderTaken | OSError | None = None
+    if comm.rank == 0:
+        try:
+            verdict = choose_folder(None if requested is None else Path(requested), name)
+        except (FolderTaken, OSError) as refusal:
+            verdict = refusal
+    verdict = comm.bcast(verdict)
+    if isinstance(verdict, Exception):
+        raise verdict
+    assert verdict is not None
+    return verdict
 
 
 class History:
@@ -206,9 +232,12 @@ class RunFolder:
 
     def close(self) -> None:
         """Close all files."""
-        for part in (self.history, self.fields):
-            if part is not None:
-                part.close()
+        try:
+            if self.history is not None:
+                self.history.close()
+        finally:
+            if self.fields is not None:
+                self.fields.close()
 
     def __enter__(self) -> RunFolder:
         return self

@@ -118,14 +118,14 @@ class RemodelingPass:
     ):
         self.cells, self.material, self.settings = cells, material, settings
         self.driver, self.law, self.frame = DRIVERS[settings.driver], LAWS[settings.law], FRAMES[settings.frame]
-        self._warn_of_overcorrection()
         F = deformation_gradient(displacement)
         tensor = self.driver.tensor(F, stresses(F, [cells.ufl_cell], material, cells.settings.end_to_end_length))
         # one stacked expression: the deformation gradient comes at no cost with the driver
         stacked = ufl.as_vector([t[i, j] for t in (F, tensor) for i in range(3) for j in range(3)])
         self._expression = jit.expression(stacked, cells.quadrature.points)
 
-    def _warn_of_overcorrection(self) -> None:
+    def warn_of_overcorrection(self) -> None:
+        """Log a warning where driver and frame are known to over-correct (docs/theory.md, Stability of the pass)."""
         factor = self.driver.overcorrection.get(self.settings.frame)
         if factor is not None and self.settings.law != "none" and self.cells.quadrature.mesh.comm.rank == 0:
             log.warning(

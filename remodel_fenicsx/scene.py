@@ -191,6 +191,8 @@ def _petsc_options(value: Any) -> Any:
         for name, entry in value.items():
             if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z]\w*", name):
                 raise fault("not a PETSc option; write its name without the leading '-'", quoted(str(name)), entry)
+            if name in ("snes_rtol", "snes_atol", "snes_stol"):
+                raise fault("has no effect; use solver.relative_tolerance, solver.absolute_tolerance", name, entry)
             if not isinstance(entry, (str, bool)) and not is_number(entry):
                 raise fault("must be a string, a finite number, true or false", name, entry)
     return value

@@ -15,11 +15,11 @@ from mpi4py import MPI
 from remodel_fenicsx import geometry
 from remodel_fenicsx.cells import UnitCells
 from remodel_fenicsx.environment import versions
-from remodel_fenicsx.interrupts import Interrupted, StopRequest
+from remodel_fenicsx.interrupts import Interrupted, StopRequest, end_all_ranks_on_exception
 from remodel_fenicsx.loads import LOADINGS, LoadValues
 from remodel_fenicsx.observables import Observer
 from remodel_fenicsx.quadrature import Quadrature
-from remodel_fenicsx.record import Fields, FolderTaken, RunFolder, choose_folder
+from remodel_fenicsx.record import Fields, RunFolder, chosen_folder
 from remodel_fenicsx.remodel import RemodelingPass
 from remodel_fenicsx.scene import Scene
 from remodel_fenicsx.stepping import StepFailure, Stepper, times
@@ -93,6 +93,7 @@ class Simulation:
         stepping.StepFailure
             If a step has no admissible equilibrium.
         """
+        self.remodeling.warn_of_overcorrection()
         if fields is not None:
             fields.append(0.0)
         every = self.scene.output.every
@@ -152,7 +153,11 @@ def run(
     OSError
         If the results cannot be written.
     """
-    place = _chosen_folder(scene, folder, comm)
+    end_all_ranks_on_exception()
+    # what the scene asks for is built before anything is written
+    place = None if folder is None else chosen_folder(folder, scene.name, comm)
+    simulation = Simulation(scene, comm)
+    place = place or chosen_folder(None, scene.name, comm)
     header = "as run: all values, also those of preset and defaults\n" + "\n".join(
         f"{name} {version}" for name, version in versions().items()
     )
@@ -164,27 +169,12 @@ def run(
     ):
         log.info("scene %s on %d ranks, results in %s", scene.name, comm.size, place)
         try:
-            _record_steps(Simulation(scene, comm), record, progress, stop)
+            _record_steps(simulation, record, progress, stop)
         except (StepFailure, Interrupted) as reason:
-            log.error("%s", reason)
+            log.info("ended: %s", reason)
             raise
         log.info("finished")
     return place
-
-
-def _chosen_folder(scene: Scene, folder: Path | str | None, comm: MPI.Intracomm) -> Path:
-    """The folder that rank 0 finds free; its refusal is raised on all ranks."""
-    verdict: Path | FolderTaken | None = None
-    if comm.rank == 0:
-        try:
-            verdict = choose_folder(None if folder is None else Path(folder), scene.name)
-        except FolderTaken as refusal:
-            verdict = refusal
-    verdict = comm.bcast(verdict)
-    if isinstance(verdict, FolderTaken):
-        raise verdict
-    assert verdict is not None
-    return verdict
 
 
 def _record_steps(simulation: Simulation, record: RunFolder, progress: Progress, stop: StopRequest) -> None:

@@ -6,7 +6,7 @@ from typing import Any
 
 from petsc4py import PETSc
 
-from remodel_fenicsx.scene import Solver
+from remodel_fenicsx.scene import SceneError, Solver
 
 OPTIONS_PREFIX = "remodel_"
 
@@ -42,4 +42,11 @@ def set_options(snes: Any, settings: Solver) -> None:
         database.setValue(name, None if value is True else value)
         _set_here.add(name)
     snes.setOptionsPrefix(OPTIONS_PREFIX)
-    snes.setFromOptions()
+    try:
+        snes.setFromOptions()
+    except PETSc.Error as error:
+        given = ", ".join(f"{key} = {value!r}" for key, value in settings.petsc_options.items())
+        raise SceneError(
+            f"solver.petsc_options: {given or 'those of PETSC_OPTIONS'}: PETSc refuses them (error {error.ierr}); "
+            "allowed are the options of its manual pages"
+        ) from error

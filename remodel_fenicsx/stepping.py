@@ -22,7 +22,7 @@ from remodel_fenicsx.cells import UnitCells
 from remodel_fenicsx.energy import Cell
 from remodel_fenicsx.loads import Loading, LoadValues
 from remodel_fenicsx.problem import EquilibriumProblem, Extension, Solution, SolveFailure
-from remodel_fenicsx.remodel import RemodelingPass
+from remodel_fenicsx.remodel import PassResult, RemodelingPass
 from remodel_fenicsx.scene import Solver
 
 log = logging.getLogger(__name__)
@@ -98,7 +98,8 @@ class Stepper:
         self.load_values = load_values
         self.time = 0.0
         self.problem = EquilibriumProblem(displacement, loading, cells, material, settings)
-        loading.set(load_values(0.0))
+        # the body starts unloaded; a load that is there from t = 0 on comes with the first step
+        loading.set(dict.fromkeys(loading.values, 0.0))
         # cells with which `displacement` is in equilibrium; the cells themselves are one pass ahead of it
         self._solved_dimensions = cells.dimension_values.copy()
         self._solved_axes = cells.axis_values.copy()
@@ -121,7 +122,7 @@ class Stepper:
                 self._solve_in_parts(time, old_loads, new_loads, work, failure=None)
             else:
                 self._solve_in_one(time, old_loads, new_loads, work)
-        except StepFailure:
+        except BaseException:
             self.displacement.x.array[:] = start
             self.loading.set(old_loads)
             raise
@@ -129,7 +130,7 @@ class Stepper:
         self._solved_axes[:] = self.cells.axis_values
         return SolvedStep(time, new_loads, self.problem.extension(), work)
 
-    def remodel(self, time: float) -> Any:
+    def remodel(self, time: float) -> PassResult:
         """The remodeling pass with the solved state at `time`; returns its PassResult."""
         result = self.remodeling.apply(self.time, time)
         self.time = time

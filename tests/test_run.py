@@ -260,6 +260,39 @@ def test_an_exception_on_one_rank_ends_all(tmp_path: Path) -> None:
     assert "rank 1 has had enough" in done.stderr and "stopped by a defect" in done.stderr
 
 
+@pytest.mark.parametrize("kind", ["script", "demo"])
+def test_an_exception_in_a_script_on_two_ranks_ends_both(kind: str, tmp_path: Path) -> None:
+    """A place that cannot be written is found by rank 0 alone; nobody may wait for it."""
+    (tmp_path / "file").touch()
+    program = tmp_path / "program.py"
+    program.write_text(
+        "from remodel_fenicsx.scene import preset_scene\n"
+        "from remodel_fenicsx.simulation import run\n"
+        f"run(preset_scene('kuhl-holzapfel-2007', 'cube'), {str(tmp_path / 'file' / 'below')!r})\n"
+    )
+    words = [str(program)] if kind == "script" else [str(PROJECT / "demos" / "cube.py"), "2", str(tmp_path)]
+    environment = {**os.environ, "PYTHONPATH": str(PROJECT)}
+    command = mpirun(2, sys.executable, *words)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=100, env=environment)
+    assert done.returncode != 0
+    assert ("Not a directory" if kind == "script" else "is not empty") in done.stderr
+
+
+def test_two_runs_at_once_take_two_folders(tmp_path: Path) -> None:
+    command = [*COMMAND, "run", str(demo("cube")), "--set", "time.end=2", "-q"]
+    started = [subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, text=True) for _ in range(2)]
+    said = sorted(process.communicate(timeout=200)[0] for process in started)
+    assert said == ["results in results/cube\n", "results in results/cube-2\n"]
+
+
+@pytest.mark.parametrize("setting", ["solver.petsc_options.pc_type=foo", "solver.petsc_options.snes_rtol=0.5"])
+def test_petsc_options_that_cannot_be(setting: str, tmp_path: Path) -> None:
+    done = run("run", demo("cube"), "--set", setting, cwd=tmp_path)
+    assert done.returncode == 2, done.stderr
+    assert done.stderr.count("\n") == 1 and "solver.petsc_options" in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize("version", ["0.5.2", "0.8.0"])
 def test_an_old_dolfinx_is_exit_code_5(
     version: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

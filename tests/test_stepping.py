@@ -13,6 +13,9 @@ from remodel_fenicsx.parameters import Cells, Remodeling
 from remodel_fenicsx.problem import EquilibriumProblem, Extension, Solution, SolveFailure
 from remodel_fenicsx.remodel import RemodelingPass
 from remodel_fenicsx.scene import Solver
+from remodel_fenicsx import stepping
+from remodel_fenicsx.scene import preset_scene
+from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.stepping import KEPT_RESERVE, StepFailure, Stepper, times
 from tests import parts
 
@@ -248,3 +251,48 @@ def test_times_are_computed_from_their_numbers() -> None:
     tenths = list(times(100.0, 0.1))
     assert len(tenths) == 1000 and tenths[-1] == 100.0
     np.testing.assert_allclose(tenths, np.arange(1, 1001) / 10, rtol=3e-16)
+
+
+def test_a_load_that_is_there_from_the_start_can_be_solved_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The body at t = 0 is unloaded: the first step goes from nothing to the load, whatever the ramp says of t = 0."""
+    made = clamped_cube()
+    stepper = stepper_of(made, lambda t: {"force": 8.0})
+    assert made.loading.values == {"force": 0.0}
+    refusing = Refusing(made, 5.0)
+    monkeypatch.setattr(stepper.problem, "solve", refusing)
+    assert stepper.solve(1.0).work.substeps == 2
+    assert refusing.tried == [8.0, 4.0, 8.0]
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e3, 1e6])
+def test_an_unloaded_step_converges_in_any_unit_of_stress(unit: float) -> None:
+    scene = preset_scene("kuhl-holzapfel-2007", "tendon").with_values(
+        {
+            "material.lame_lambda": 27.293 * unit,
+            "material.lame_mu": 3.103 * unit,
+            "material.chain_density": 2e21 * unit,
+            "loads.force.ramp": [[0.0, 0.0], [1.0, 0.0], [2.0, unit / 12]],
+            "time.end": 2.0,
+        }
+    )
+    first, second = Simulation(scene).steps()
+    assert first.row["substeps"] == 1 and first.row["mean_stretch"] == pytest.approx(1.0, abs=1e-12)
+    assert second.row["mean_stretch"] == pytest.approx(1.2034, abs=1e-3)  # as with the paper's numbers
+
+
+def test_power_of_remodeling_is_the_derivative_of_the_stored_energy() -> None:
+    """-dE/dtheta / dt of the blend of old and new cells at frozen displacement, by central differences."""
+    scene = preset_scene("kuhl-holzapfel-2007", "cube").with_values({"cells.initial": "random", "mesh.refinement": 2})
+    simulation = Simulation(scene)
+    stepper = simulation.stepper
+    for time in (1.0, 2.0, 3.0):
+        stepper.solve(time)
+        passed = stepper.remodel(time)
+        blend = stepping._Blend(stepper)
+        blend.load_cells()
+        energy = {}
+        for theta in (1e-4, -1e-4):
+            blend.set(theta)
+            energy[theta] = blend.problem.stored_energy()
+        assert abs(passed.remodeling_power) > 1e-3
+        assert passed.remodeling_power == pytest.approx(-(energy[1e-4] - energy[-1e-4]) / 2e-4, rel=1e-6)
