@@ -63,17 +63,17 @@ def _compiled(compile_it: Callable[[], T]) -> T:
     try:
         return compile_it()
     except (TimeoutError, RuntimeError):  # on several ranks dolfinx turns rank 0's TimeoutError into another one
-        removed = _remove_stale_sources() if MPI.COMM_WORLD.rank == 0 else 0
+        removed = _remove_unfinished() if MPI.COMM_WORLD.rank == 0 else 0
         if not MPI.COMM_WORLD.bcast(removed):
             raise
         return compile_it()
 
 
-def _remove_stale_sources() -> int:
-    """A process that was killed while compiling leaves its .c file as a lock that nobody will open again."""
+def _remove_unfinished() -> int:
+    """Remove what a killed compilation left: a .c file (FFCx's lock) that no .c.cached (its end mark) follows."""
     removed = 0
     for source in cache_folder().glob("libffcx_*.c"):
-        finished = any(source.parent.glob(source.stem + "*.so"))
+        finished = source.with_suffix(".c.cached").exists()
         if not finished and clock.time() - source.stat().st_mtime > TIMEOUT:
             log.warning("removing a compilation that was cut off: %s", source.name)
             source.unlink(missing_ok=True)
