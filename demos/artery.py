@@ -9,6 +9,7 @@
 
 # %%
 import sys
+import time as clock
 
 import dolfinx.fem
 from mpi4py import MPI
@@ -20,7 +21,7 @@ from remodel_fenicsx.loads import Loading
 from remodel_fenicsx.observables import Observer
 from remodel_fenicsx.parameters import Cells, Material, Remodeling
 from remodel_fenicsx.quadrature import Quadrature
-from remodel_fenicsx.record import RunFolder, chosen_folder
+from remodel_fenicsx.record import RunFolder, chosen_folder, history_row
 from remodel_fenicsx.remodel import RemodelingPass
 from remodel_fenicsx.scene import Solver
 from remodel_fenicsx.stepping import Stepper, times
@@ -108,11 +109,12 @@ observer = Observer(domain, displacement, loading, cells, material)
 
 with RunFolder(folder, "# made by demos/artery.py\n", comm.rank) as record:
     for time in times(end, step=1.0):
-        step = stepper.solve(time)
-        columns = observer.columns()
-        record.append({"time": time, **columns, "max_chain_extension": step.extension.max_chain_extension})
+        start = clock.perf_counter()
+        solved = stepper.solve(time)
+        columns, energy = observer.columns(), stepper.problem.stored_energy()
+        power = stepper.remodel(time)
+        record.append(history_row(solved, columns, energy, power, clock.perf_counter() - start))
         if comm.rank == 0:
             print(f"t = {time:5.1f}  outer radius {columns['outer_radius']:.4f}  "
                   f"angles {columns['fibre_angle_inner']:5.1f} {columns['fibre_angle_middle']:5.1f} "
                   f"{columns['fibre_angle_outer']:5.1f}")  # fmt: skip
-        stepper.remodel(time)

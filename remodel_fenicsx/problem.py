@@ -50,12 +50,10 @@ class Extension:
 
 @dataclass(frozen=True)
 class Solution:
-    """Work and accuracy of a solved step: Newton and linear iterations, |R| and the internal forces it is judged by."""
+    """Work of a solve."""
 
     newton_iterations: int
     linear_iterations: int
-    residual_norm: float
-    force_scale: float
 
 
 class SolveFailure(RuntimeError):
@@ -144,7 +142,7 @@ class EquilibriumProblem:
                 raise Interrupted(extension.stop_signal)
             text = self._failure_text(reason, extension)
             raise SolveFailure(text, newton, linear, extension)
-        return Solution(newton, linear, self._snes.getFunctionNorm(), self._force_scale)
+        return Solution(newton, linear)
 
     def extension(self) -> Extension:
         """Largest r/L and smallest J of the present displacement over all points of all ranks."""

@@ -6,6 +6,7 @@ A checkpoint of displacement, cells and time belongs here too, beside `Fields`; 
 from __future__ import annotations
 
 import csv
+import io
 import os
 from pathlib import Path
 from types import TracebackType
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 from remodel_fenicsx import compat
 from remodel_fenicsx.geometry import Domain
 from remodel_fenicsx.observables import Observer
+from remodel_fenicsx.stepping import SolvedStep
 from remodel_fenicsx.vtkhdf import (
     LINE,
     TransientGrid,
@@ -39,6 +41,39 @@ COMMON_COLUMNS = (
     "substeps",
     "seconds",
 )
+
+
+def history_row(
+    solved: SolvedStep, columns: dict[str, float], stored_energy: float, remodeling_power: float, seconds: float
+) -> dict[str, float]:
+    """A whole row of the history, in the order of its columns (docs/commands.md).
+
+    Parameters
+    ----------
+    solved
+        The accepted state.
+    columns
+        Those of the shape (`observables.Observer.columns`).
+    stored_energy
+        Energy of the solved state.
+    remodeling_power
+        Energy per time that the remodeling pass released.
+    seconds
+        Wall time of the step.
+    """
+    common = (
+        solved.time,
+        solved.extension.max_chain_extension,
+        solved.extension.min_jacobian,
+        stored_energy,
+        remodeling_power,
+        solved.work.newton_iterations,
+        solved.work.linear_iterations,
+        solved.work.substeps,
+        seconds,
+    )
+    row = dict(zip(COMMON_COLUMNS, common, strict=True))
+    return {"time": row.pop("time"), **columns, **row}
 
 
 class FolderTaken(ValueError):
@@ -97,17 +132,40 @@ class History:
     """history.csv: one row per accepted step, complete on disk as soon as the step is accepted."""
 
     def __init__(self, path: Path):
-        self._path = path
-        self._file = path.open("x", newline="", encoding="utf-8")
-        self._writer: Any = None
+        self._file = path.open("xb", buffering=0)
+        self._columns: list[str] | None = None
+        self._size = 0  # bytes of whole rows
 
     def append(self, row: dict[str, float]) -> None:
-        """Write one row; the first one decides the columns."""
-        if self._writer is None:
-            self._writer = csv.DictWriter(self._file, fieldnames=list(row), lineterminator="\n")
-            self._writer.writeheader()
-        self._writer.writerow({key: _number(value) for key, value in row.items()})
-        self._file.flush()
+        """Write one row; the first one decides the columns.
+
+        Raises
+        ------
+        OSError
+            If the row could not be written (disk full); the file then ends with the row before.
+        ValueError
+            If the row has other columns than the first one.
+        """
+        text = io.StringIO(newline="")
+        writer = csv.DictWriter(text, fieldnames=self._columns or list(row), lineterminator="\n")
+        if self._columns is None:
+            writer.writeheader()
+        writer.writerow({key: _number(value) for key, value in row.items()})
+        self._write(text.getvalue().encode())
+        self._columns = list(writer.fieldnames)
+
+    def _write(self, data: bytes) -> None:
+        """All of it or nothing: a number that was cut short would read as another number."""
+        view = memoryview(data)
+        try:
+            while view:
+                view = view[self._file.write(view):]
+            os.fsync(self._file.fileno())
+        except OSError:
+            self._file.truncate(self._size)
+            self._file.seek(self._size)
+            raise
+        self._size += len(data)
 
     def close(self) -> None:
         """Close the file."""

@@ -90,14 +90,6 @@ def _unit(vectors: Array) -> Array:
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
-@dataclass(frozen=True)
-class PassResult:
-    """What a pass did: the power of remodeling (energy per time) and the share of points with a tensile driver."""
-
-    remodeling_power: float
-    active_fraction: float
-
-
 class RemodelingPass:
     """Updates the unit cells of a solved state.
 
@@ -162,8 +154,11 @@ class RemodelingPass:
         new_axes = np.where(active[:, None, None], new_axes, axes)
         return new_dimensions, new_axes, active, F
 
-    def apply(self, time_old: float, time_new: float) -> PassResult:
-        """Remodel over a step with the stress of the solved state at time_new.
+    def apply(self, time_old: float, time_new: float) -> float:
+        """Remodel over a step with the stress of the solved state at time_new; returns the power of remodeling.
+
+        The power is the stored energy that the pass releases at frozen deformation, per time, to first order
+        (`energy_increment`; Remark 6).
 
         Raises
         ------
@@ -171,14 +166,14 @@ class RemodelingPass:
             If the driving tensor is not finite anywhere.
         """
         if self.settings.law == "none":
-            return PassResult(0.0, 0.0)
+            return 0.0
         cells = self.cells
         quadrature = cells.quadrature
-        dimensions, axes, active, F = self.updated_cells(time_old, time_new)
+        dimensions, axes, _, F = self.updated_cells(time_old, time_new)
         increment = self.energy_increment(F, dimensions, axes).reshape(quadrature.shape)
-        power = -quadrature.integral(increment) / (time_new - time_old)
+        power: float = -quadrature.integral(increment) / (time_new - time_old)
         cells.set(dimensions.reshape(*quadrature.shape, 3), axes.reshape(*quadrature.shape, 3, 3))
-        return PassResult(power, quadrature.mean(active.reshape(quadrature.shape).astype(float)))
+        return power
 
     def energy_increment(self, F: Array, dimensions: Array, axes: Array) -> Array:
         """First-order change of W at frozen F when the cells take new values, per reference volume, shape (n,).

@@ -19,7 +19,7 @@ from remodel_fenicsx.interrupts import Interrupted, StopRequest, end_all_ranks_o
 from remodel_fenicsx.loads import LOADINGS, LoadValues
 from remodel_fenicsx.observables import Observer
 from remodel_fenicsx.quadrature import Quadrature
-from remodel_fenicsx.record import Fields, RunFolder, chosen_folder
+from remodel_fenicsx.record import Fields, RunFolder, chosen_folder, history_row
 from remodel_fenicsx.remodel import RemodelingPass
 from remodel_fenicsx.scene import Scene
 from remodel_fenicsx.stepping import StepFailure, Stepper, times
@@ -104,22 +104,8 @@ class Simulation:
             if fields is not None and (number % every == 0 or time >= self.scene.time.end * (1 - 1e-12)):
                 fields.append(time)
             energy = self.stepper.problem.stored_energy()
-            passed = self.stepper.remodel(time)
-            yield StepRecord(
-                time,
-                {
-                    "time": time,
-                    **columns,
-                    "max_chain_extension": solved.extension.max_chain_extension,
-                    "min_jacobian": solved.extension.min_jacobian,
-                    "stored_energy": energy,
-                    "remodeling_power": passed.remodeling_power,
-                    "newton_iterations": solved.work.newton_iterations,
-                    "linear_iterations": solved.work.linear_iterations,
-                    "substeps": solved.work.substeps,
-                    "seconds": clock.perf_counter() - start,
-                },
-            )
+            power = self.stepper.remodel(time)
+            yield StepRecord(time, history_row(solved, columns, energy, power, clock.perf_counter() - start))
 
 
 def run(

@@ -22,7 +22,7 @@ from remodel_fenicsx.cells import UnitCells
 from remodel_fenicsx.energy import Cell
 from remodel_fenicsx.loads import Loading, LoadValues
 from remodel_fenicsx.problem import EquilibriumProblem, Extension, Solution, SolveFailure
-from remodel_fenicsx.remodel import PassResult, RemodelingPass
+from remodel_fenicsx.remodel import RemodelingPass
 from remodel_fenicsx.scene import Solver
 
 log = logging.getLogger(__name__)
@@ -130,11 +130,11 @@ class Stepper:
         self._solved_axes[:] = self.cells.axis_values
         return SolvedStep(time, new_loads, self.problem.extension(), work)
 
-    def remodel(self, time: float) -> PassResult:
-        """The remodeling pass with the solved state at `time`; returns its PassResult."""
-        result = self.remodeling.apply(self.time, time)
+    def remodel(self, time: float) -> float:
+        """The remodeling pass with the solved state at `time`; returns its power (`RemodelingPass.apply`)."""
+        power = self.remodeling.apply(self.time, time)
         self.time = time
-        return result
+        return power
 
     # ------------------------------------------------------------ in one piece: the paper's step
     def _solve_in_one(self, time: float, old_loads: LoadValues, new_loads: LoadValues, work: Work) -> None:

@@ -31,16 +31,12 @@ class Progress:
         Name of the run.
     comm_rank
         Rank of this process; all but 0 are silent.
-    first_step
-        Steps that an earlier run has done (a resumed run), so that the time left is right.
     interval
         Seconds between plain lines, at least. The first and the last step always get one.
     """
 
-    def __init__(
-        self, total_steps: int, title: str, comm_rank: int = 0, *, first_step: int = 0, interval: float = 5.0
-    ):
-        self._total, self._title, self._first = total_steps, title, first_step
+    def __init__(self, total_steps: int, title: str, comm_rank: int = 0, *, interval: float = 5.0):
+        self._total, self._title = total_steps, title
         self._interval = interval
         self._start = self._last_line = clock.monotonic()
         self._started = False
@@ -59,7 +55,7 @@ class Progress:
                 console=Console(stderr=True), refresh_per_second=4, redirect_stdout=sys.stdout.isatty(),
             )  # fmt: skip
             self._task = self._bar.add_task(
-                Text(self._title).markup, total=self._total, completed=self._first, state="starting", left=""
+                Text(self._title).markup, total=self._total, state="starting", left=""
             )
             self._bar.start()
         return self
@@ -113,10 +109,10 @@ class Progress:
 
     def _time_left(self, index: int) -> str:
         """The mean of this run's steps so far, times the steps that are left; steps alike take alike long."""
-        done, remaining = index - self._first, self._total - index
-        if done < 1 or remaining < 1:
+        remaining = self._total - index
+        if remaining < 1:
             return ""
-        return f"{_duration((clock.monotonic() - self._start) / done * remaining)} left"
+        return f"{_duration((clock.monotonic() - self._start) / index * remaining)} left"
 
     def _print(self, line: str) -> None:
         try:

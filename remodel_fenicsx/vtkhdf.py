@@ -51,14 +51,11 @@ class TransientGrid:
         Node numbers of each cell in VTK's order, shape (cells, nodes): see `cell_type_and_permutation`.
     cell_type
         VTK's number, one for all cells.
-    attributes
-        Comments (strings or numbers) for people who look into the file: attributes of the HDF5 root group.
     point_dtype
         How coordinates are stored; float32 makes sense where they move (`append`).
     field_dtype
         How floating-point fields are stored. The default, float32, keeps 7 digits and needs half the room: 150 steps of
-        the artery's 1,536 cells take 21 MB. Exact values belong in the history and the restart file. Integers stay
-        integers.
+        the artery's 1,536 cells take 21 MB. Integers stay integers.
 
     Raises
     ------
@@ -76,7 +73,6 @@ class TransientGrid:
         points: ArrayLike,
         cells: ArrayLike,
         cell_type: int,
-        attributes: Mapping[str, str | int | float] | None = None,
         *,
         point_dtype: DTypeLike = np.float64,
         field_dtype: DTypeLike = np.float32,
@@ -94,7 +90,6 @@ class TransientGrid:
             # with these bounds HDF5 sets no "open for writing" mark, which a killed process would leave for ever
             self._file = h5py.File(self._staged, "w", libver=("earliest", "v110"))
             try:
-                self._file.attrs.update(attributes or {})
                 self._root = self._file.create_group("VTKHDF")
                 self._write_mesh(coordinates, connectivity, cell_type)
                 self._create_steps()

@@ -78,7 +78,7 @@ def test_reader_finds_every_step(tmp_path):
         for k in range(3)
     ]  # fmt: skip
     path = tmp_path / "fields.vtkhdf"
-    with TransientGrid(path, points, cells, 12, {"scene": "artery", "kappa": 0.025}) as grid:
+    with TransientGrid(path, points, cells, 12) as grid:
         for k, (point_data, cell_data) in enumerate(steps):
             grid.append(0.5 * k, point_data, cell_data)
         found = read(path)  # while the writer has it open
@@ -93,8 +93,6 @@ def test_reader_finds_every_step(tmp_path):
         assert np.array_equal(found[f"{k} cell l"], cell_data["l"].astype(np.float32))
         assert np.array_equal(found[f"{k} cell number"], cell_data["number"])
         assert np.array_equal(found[f"{k} cell active"], [1, 0])
-    with h5py.File(path) as file:
-        assert dict(file.attrs) == {"scene": "artery", "kappa": 0.025}
 
 
 def test_double_precision_is_exact(tmp_path):

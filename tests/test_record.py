@@ -1,0 +1,67 @@
+"""The history file by itself: rows that read back, and what a full disk leaves."""
+
+from __future__ import annotations
+
+import resource
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from remodel_fenicsx.problem import Extension
+from remodel_fenicsx.record import COMMON_COLUMNS, History, history_row, read_history
+from remodel_fenicsx.stepping import SolvedStep, Work
+
+
+def test_rows_read_back_as_the_same_numbers(tmp_path: Path) -> None:
+    history = History(tmp_path / "history.csv")
+    rows = [{"time": 0.1 * k, "energy": np.float64(k) / 3, "substeps": k} for k in range(1, 4)]
+    for number, row in enumerate(rows, start=1):
+        history.append(row)
+        assert len(read_history(tmp_path)["time"]) == number  # on disk without a close
+    history.close()
+    columns = read_history(tmp_path)
+    assert list(columns) == ["time", "energy", "substeps"]
+    for name, values in columns.items():
+        assert values.tolist() == [float(row[name]) for row in rows]
+
+
+def test_a_row_with_other_columns_is_refused(tmp_path: Path) -> None:
+    history = History(tmp_path / "history.csv")
+    history.append({"time": 1.0})
+    with pytest.raises(ValueError, match="radius"):
+        history.append({"time": 2.0, "radius": 1.0})
+    history.append({"time": 3.0})
+    history.close()
+    assert read_history(tmp_path)["time"].tolist() == [1.0, 3.0]
+
+
+@pytest.mark.parametrize("room", [1, 5, 12, 17])
+def test_a_full_disk_leaves_whole_rows(room: int, tmp_path: Path) -> None:
+    """A limit on the size of files stands for the full disk: the same error from the same system call."""
+    path = tmp_path / "history.csv"
+    history = History(path)
+    history.append({"time": 1.0, "stretch": 1.0123456789})
+    before = path.read_bytes()
+    old = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (len(before) + room, old[1]))
+    try:
+        with pytest.raises(OSError):
+            history.append({"time": 2.0, "stretch": 1.9876543210123})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, old)
+    assert path.read_bytes() == before
+    history.append({"time": 2.0, "stretch": 1.9876543210123})
+    history.close()
+    np.testing.assert_array_equal(read_history(tmp_path)["stretch"], [1.0123456789, 1.9876543210123])
+
+
+def test_a_row_holds_each_number_under_its_own_name() -> None:
+    solved = SolvedStep(3.0, {"force": 2.0}, Extension(0.9, 0.8, (0.0, 0.0, 0.0)), Work(5, 6, 7))
+    row = history_row(solved, {"mean_stretch": 1.5}, stored_energy=10.0, remodeling_power=11.0, seconds=12.0)
+    assert set(row) == {*COMMON_COLUMNS, "mean_stretch"}
+    assert row == {
+        "time": 3.0, "mean_stretch": 1.5, "max_chain_extension": 0.9, "min_jacobian": 0.8, "stored_energy": 10.0,
+        "remodeling_power": 11.0, "newton_iterations": 5, "linear_iterations": 6, "substeps": 7, "seconds": 12.0,
+    }  # fmt: skip
+    assert next(iter(row)) == "time"
