@@ -6,6 +6,7 @@ Source: E. Kuhl, G. A. Holzapfel, J. Mater. Sci. 42 (2007) 8811-8823; docs/theor
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
@@ -18,6 +19,28 @@ DRIVERS = ("cauchy", "pk2", "finger")
 FRAMES = ("material", "spatial")
 STRESS_UNITS = {"Pa": 1.0, "kPa": 1.0e3, "MPa": 1.0e6}  # in Pa
 INITIAL_CELLS = ("random", "isotropic", "aligned")
+# Gmsh takes points that are closer than 1e-8 for one, and crashes on much longer or flatter bodies
+SMALLEST_LENGTH, LARGEST_LENGTH, LARGEST_LENGTH_RATIO = 1e-6, 1e6, 1e4
+
+
+def length_fault(lengths: Mapping[str, float]) -> tuple[str, str] | None:
+    """What keeps a body from being meshed: the name of one of its lengths, and what is allowed; None if nothing does.
+
+    Parameters
+    ----------
+    lengths
+        Lengths, radii and wall thickness of the body by the key that decides each of them, in any unit.
+    """
+    for name, length in lengths.items():
+        if not SMALLEST_LENGTH <= length <= LARGEST_LENGTH:
+            return name, f"a length of {length:g} here; allowed are {SMALLEST_LENGTH:g} to {LARGEST_LENGTH:g}"
+    smallest, largest = min(lengths, key=lambda k: lengths[k]), max(lengths, key=lambda k: lengths[k])
+    if lengths[largest] <= LARGEST_LENGTH_RATIO * lengths[smallest]:
+        return None
+    return smallest, (
+        f"a length of {lengths[smallest]:g} is too small beside one of {lengths[largest]:g}; "
+        f"allowed is a ratio up to {LARGEST_LENGTH_RATIO:g}"
+    )
 
 
 class Material(Table):

@@ -17,7 +17,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import tomlkit
 from pydantic import BaseModel, Field, model_validator
 
-from remodel_fenicsx.parameters import PRESET_NOTES, PRESETS, Cells, Material, Remodeling
+from remodel_fenicsx.parameters import PRESET_NOTES, PRESETS, Cells, Material, Remodeling, length_fault
 from remodel_fenicsx.tables import (
     SceneError,
     Table,
@@ -42,14 +42,30 @@ SHAPE_DEFAULTS: dict[str, dict[str, Any]] = {"tube": {"cells": {"axes": "cylindr
 # ---------------------------------------------------------------- geometry
 
 
+LARGEST_MESH = 10_000_000  # elements; Gmsh, which is serial, needs about 10 GB for them
+
+
+def _check_lengths(body: Table, lengths: dict[str, float]) -> None:
+    """Raise the fault of `length_fault` at its key."""
+    found = length_fault(lengths)
+    if found is not None:
+        raise fault(found[1], found[0], getattr(body, found[0]))
+
+
 class Cube(Table):
     """A cube, pulled along z: the homogeneous body of the paper's Fig. 5."""
 
     load_names: ClassVar[tuple[str, ...]] = ("force",)
     axis_kinds: ClassVar[tuple[str, ...]] = ("global",)
+    number_of_elements: ClassVar[int] = 1
 
     shape: Literal["cube"] = Field(default="cube", description="Which body it is.")
     side: float = Field(default=1.0, gt=0, description="Length of an edge, in the scene's unit of length.")
+
+    @model_validator(mode="after")
+    def _can_be_meshed(self) -> Cube:
+        _check_lengths(self, {"side": self.side})
+        return self
 
 
 class Tendon(Table):
@@ -57,10 +73,16 @@ class Tendon(Table):
 
     load_names: ClassVar[tuple[str, ...]] = ("force",)
     axis_kinds: ClassVar[tuple[str, ...]] = ("global", "cylindrical")
+    number_of_elements: ClassVar[int] = 480
 
     shape: Literal["tendon"] = Field(default="tendon", description="Which body it is.")
     length: float = Field(default=10.0, gt=0, description="Length along z, in the scene's unit of length.")
     area: float = Field(default=10.0, gt=0, description="Area of the cross-section, in the unit of length squared.")
+
+    @model_validator(mode="after")
+    def _can_be_meshed(self) -> Tendon:
+        _check_lengths(self, {"length": self.length, "area": math.sqrt(self.area)})
+        return self
 
 
 class Tube(Table):
@@ -68,6 +90,7 @@ class Tube(Table):
 
     load_names: ClassVar[tuple[str, ...]] = ("pressure", "stretch")
     axis_kinds: ClassVar[tuple[str, ...]] = ("global", "cylindrical")
+    number_of_elements: ClassVar[int] = 1536
 
     shape: Literal["tube"] = Field(default="tube", description="Which body it is.")
     inner_radius: float = Field(gt=0, description="Inner radius R_i, in the scene's unit of length.")
@@ -79,6 +102,8 @@ class Tube(Table):
         if self.inner_radius >= self.outer_radius:
             limit = f"must be smaller than geometry.outer_radius = {shown(self.outer_radius)}"
             raise fault(limit, "inner_radius", self.inner_radius)
+        wall = self.outer_radius - self.inner_radius
+        _check_lengths(self, {"inner_radius": self.inner_radius, "outer_radius": wall, "length": self.length})
         return self
 
 
@@ -298,6 +323,11 @@ class Scene(Table):
         if cells.axes not in geometry.axis_kinds:
             rule = f"allowed for shape {geometry.shape!r} is " + ", ".join(map(repr, geometry.axis_kinds))
             raise fault(rule, "cells.axes", cells.axes)
+        elements = geometry.number_of_elements * self.mesh.refinement**3
+        if elements > LARGEST_MESH:
+            largest = math.floor((LARGEST_MESH / geometry.number_of_elements) ** (1 / 3))
+            rule = f"must be at most {largest} for a {geometry.shape}: more makes over {LARGEST_MESH:g} elements"
+            raise fault(rule, "mesh.refinement", self.mesh.refinement)
         for name, load in self.loads.items():
             self._check_load(name, load)
         return self

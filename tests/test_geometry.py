@@ -266,6 +266,11 @@ def test_build_reads_a_scenes_geometry_and_mesh(shape):
     (lambda: tendon(area=float("nan")), "area = nan: must be a positive number"),
     (lambda: tube(length=float("inf")), "length = inf: must be a positive number"),
     (lambda: tube(2.0, 2.0, 1.0), "inner_radius = 2.0: must be smaller than outer_radius = 2.0"),
+    (lambda: cube(side=1e-7), "side: a length of 1e-07 here; allowed are 1e-06 to 1e+06"),
+    (lambda: tendon(area=1e-10),
+     "area: a length of 1e-05 is too small beside one of 10; allowed is a ratio up to 10000"),
+    (lambda: tube(1.0, 1.0001, 8.0),
+     "outer_radius: a length of 0.0001 is too small beside one of 8; allowed is a ratio up to 10000"),
     (lambda: tube(refinement=0), "refinement = 0: must be a whole number of at least 1"),
     (lambda: cube(refinement=1.5), "refinement = 1.5: must be a whole number of at least 1"),
     (lambda: tube(divisions=(10, 1, 1)), f"divisions = (10, 1, 1): {DIVISIONS}"),
@@ -280,6 +285,20 @@ def test_what_cannot_be_meshed_is_refused_in_one_line(call, message):
     with pytest.raises(ValueError) as caught:
         call()
     assert str(caught.value) == message
+
+
+@pytest.mark.parametrize("unit", [1e-2, 1e2])
+@pytest.mark.parametrize(("shape", "lengths"), [
+    ("cube", (1.0,)), ("tendon", (1.0, 1.02e-8)), ("tendon", (1.01e-4, 1.0)), ("tube", (1.01e-4, 1.0, 1.0)),
+    ("tube", (1.0, 1.000101, 1.0)), ("tube", (0.5, 1.0, 1.01e-4)), ("tube", (1.01e-4, 2.02e-4, 1.0)),
+])
+def test_bodies_of_extreme_proportions_are_meshed(shape, lengths, unit):
+    """At the limits that are allowed no two nodes become one, in any unit of length."""
+    powers = (1, 2) if shape == "tendon" else (1, 1, 1)
+    scaled = [length * unit**power for length, power in zip(lengths, powers, strict=False)]
+    domain, ordinary = BUILDERS[shape](*scaled, refinement=2, comm=MPI.COMM_SELF), domain_of(shape, refinement=2)
+    assert domain.number_of_cells == ordinary.number_of_cells
+    assert domain.number_of_nodes == ordinary.number_of_nodes
 
 
 def test_gathering_too_few_rows_is_refused():

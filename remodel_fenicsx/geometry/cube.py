@@ -36,6 +36,7 @@ def cube(
         On all ranks, if Gmsh fails on rank 0.
     """
     model.check_arguments({"side": side}, refinement, cell, degree)
+    model.check_lengths({"side": side})
     return model.build_domain(lambda: draw_cube(side, refinement, cell, degree), "cube", {"side": float(side)}, comm)
 
 

@@ -13,6 +13,7 @@ from mpi4py import MPI
 
 from remodel_fenicsx import compat
 from remodel_fenicsx.geometry.domain import Domain, GeometryError
+from remodel_fenicsx.parameters import length_fault
 
 CELLS = ("hexahedron", "tetrahedron")
 DEGREES = (1, 2)
@@ -20,7 +21,7 @@ Draw = Callable[[], None]
 
 
 def check_arguments(lengths: Mapping[str, float], refinement: Any, cell: str, degree: int) -> None:
-    """Refuse what cannot be meshed, by the same one-line ValueError on every rank."""
+    """Refuse what is no body or no mesh, by the same one-line ValueError on every rank."""
     for name, value in lengths.items():
         if not (np.isfinite(value) and value > 0.0):
             raise ValueError(f"{name} = {value}: must be a positive number")
@@ -30,6 +31,13 @@ def check_arguments(lengths: Mapping[str, float], refinement: Any, cell: str, de
         raise ValueError(f"cell = {cell!r}: allowed are {', '.join(CELLS)}")
     if degree not in DEGREES:
         raise ValueError(f"degree = {degree}: allowed are 1 and 2")
+
+
+def check_lengths(lengths: Mapping[str, float]) -> None:
+    """Refuse lengths and thicknesses, by the argument that decides them, with which Gmsh fails (`length_fault`)."""
+    found = length_fault(lengths)
+    if found is not None:
+        raise ValueError(f"{found[0]}: {found[1]}")
 
 
 @contextmanager

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
@@ -48,6 +50,7 @@ def tendon(
         On all ranks, if Gmsh fails on rank 0.
     """
     model.check_arguments({"length": length, "area": area}, refinement, cell, degree)
+    model.check_lengths({"length": length, "area": math.sqrt(area)})
     dimensions = {"length": float(length), "area": float(area), "radius": outer_radius(area, refinement, degree)}
     return model.build_domain(lambda: draw_tendon(length, area, refinement, cell, degree), "tendon", dimensions, comm)
 

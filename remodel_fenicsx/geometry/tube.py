@@ -50,6 +50,7 @@ def tube(
     model.check_arguments(dimensions, refinement, cell, degree)
     if not inner_radius < outer_radius:
         raise ValueError(f"inner_radius = {inner_radius}: must be smaller than outer_radius = {outer_radius}")
+    model.check_lengths({"inner_radius": inner_radius, "outer_radius": outer_radius - inner_radius, "length": length})
     counts = PAPER if divisions is None else _checked(divisions)
     return model.build_domain(
         lambda: draw_tube(inner_radius, outer_radius, length, refinement, cell, degree, counts),
