@@ -48,6 +48,15 @@ class Extension:
         return self.max_chain_extension < 1.0 and self.min_jacobian > 0.0
 
 
+# by PETSc's SNESConvergedReason; numbers, for the names differ between its versions
+FAILURES = {
+    -3: "the linear solver failed",
+    -4: "forces or parameters are too large or too small for floating-point numbers",
+    -6: "the line search found no better state",
+    -9: "the residual grew beyond all bounds",
+}
+
+
 @dataclass(frozen=True)
 class Solution:
     """Work of a solve."""
@@ -290,6 +299,4 @@ class EquilibriumProblem:
             return f"reached r/L = {extension.max_chain_extension:.4f}, J = {extension.min_jacobian:.4g}"
         if reason == PETSc.SNES.ConvergedReason.DIVERGED_MAX_IT:
             return f"no equilibrium within {self.settings.maximum_iterations} Newton iterations"
-        if reason == PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE:
-            return "the linear solver failed"
-        return f"SNES stopped with reason {reason}"
+        return FAILURES.get(reason, f"SNES stopped with reason {reason}")

@@ -201,6 +201,12 @@ def test_a_full_disk_is_exit_code_5_and_keeps_finished_steps(tmp_path: Path, ten
 # ---------------------------------------------------------------- failures and signals
 
 
+def test_a_load_beyond_floating_point_is_exit_code_3_and_said_in_words(tmp_path: Path) -> None:
+    done = run("run", demo("cube"), "--set", "loads.force.value=1e300", "-o", tmp_path / "out", "-q")
+    assert done.returncode == 3, done.stderr
+    assert "no equilibrium at time 1: " in done.stderr and "too large or too small for floating-point" in done.stderr
+
+
 @pytest.mark.parametrize("ranks", [1, 2])
 def test_an_impossible_load_is_exit_code_3_and_says_where(tmp_path: Path, ranks: int) -> None:
     # axial chains lock at a stretch of L / r0 = 1.594: reached between t = 2 and t = 3
