@@ -69,7 +69,10 @@ class Cube(Table):
 
 
 class Tendon(Table):
-    """A cylinder along z, held at its bottom and pulled at its top: the tendon of the paper's Fig. 6."""
+    """A cylinder along z, held at its bottom and pulled at its top: the tendon of the paper's Fig. 6.
+
+    Length and square root of the area: 1e-6 to 1e6, one up to 10,000 times the other.
+    """
 
     load_names: ClassVar[tuple[str, ...]] = ("force",)
     axis_kinds: ClassVar[tuple[str, ...]] = ("global", "cylindrical")
@@ -86,7 +89,10 @@ class Tendon(Table):
 
 
 class Tube(Table):
-    """A thick-walled tube about z under inner pressure and axial stretch: the artery of the paper's Fig. 7."""
+    """A thick-walled tube about z under inner pressure and axial stretch: the artery of the paper's Fig. 7.
+
+    Inner radius, wall thickness and length: 1e-6 to 1e6, one up to 10,000 times the other.
+    """
 
     load_names: ClassVar[tuple[str, ...]] = ("pressure", "stretch")
     axis_kinds: ClassVar[tuple[str, ...]] = ("global", "cylindrical")
@@ -114,7 +120,10 @@ class Mesh(Table):
     """The finite elements."""
 
     refinement: int = Field(
-        default=1, ge=1, description="Factor on the paper's number of elements in every direction (1: its own meshes)."
+        default=1,
+        ge=1,
+        description="Factor on the paper's number of elements in every direction (1: its own meshes). More than 10 "
+        "million elements are refused.",
     )
     cell: Literal["hexahedron", "tetrahedron"] = Field(default="hexahedron", description="Shape of the elements.")
     degree: Annotated[int, one_of((1, 2))] = Field(
