@@ -1,7 +1,7 @@
 """A scene: what to simulate, as TOML or as Python objects, validated before any solve.
 
 `read_scene` reads a file, `Scene(...)` and `scene_from_dict` take the same keys from Python. docs/scene.md lists all
-keys; ``python3 -m remodel_fenicsx.scene`` prints that page.
+keys (`scene_reference`).
 """
 
 from __future__ import annotations
@@ -14,21 +14,10 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
-import tomlkit
 from pydantic import BaseModel, Field, model_validator
 
-from remodel_fenicsx.parameters import PRESET_NOTES, PRESETS, Cells, Material, Remodeling, length_fault
-from remodel_fenicsx.tables import (
-    SceneError,
-    Table,
-    checked,
-    fault,
-    is_number,
-    markdown_reference,
-    one_of,
-    quoted,
-    shown,
-)
+from remodel_fenicsx.parameters import PRESETS, Cells, Material, Remodeling, length_fault
+from remodel_fenicsx.tables import SceneError, Table, checked, fault, is_number, one_of, quoted, shown
 from remodel_fenicsx.toml_files import merged, parse_override, put, read_toml, toml_text
 
 MOST_STEPS = 1_000_000
@@ -449,39 +438,3 @@ def read_scene(path: str | os.PathLike[str], overrides: Iterable[str] = ()) -> S
         put(values, key, value)
     values.setdefault("name", re.sub(r"^[^\w]+|[^\w+-]+$|[^\w .+-]", "", Path(path).stem)[:100].rstrip(" .") or "scene")
     return scene_from_dict(values)
-
-
-# ---------------------------------------------------------------- documentation
-
-_REFERENCE = """# Keys of a scene
-
-This page is made from the code: `./with-fenicsx python3 -m remodel_fenicsx.scene > docs/scene.md`.
-
-A scene is a TOML file. Every key is checked before anything is solved: an unknown key, a value of the wrong type (a
-string for a number, `true` for a number), NaN, or values that do not fit together give one line with key, value and
-what is allowed. Lengths of the geometry are in any one unit of length, chain lengths in link lengths of the chain,
-stresses in `material.stress_unit`, time in the unit of 1/`remodeling.kappa`.
-
-Where a key has several sources, the first of these wins: `--set KEY=VALUE` on the command line, the file, the preset
-for the shape, the defaults below. Tables are merged key by key, lists are replaced whole. A preset's load stays when
-the scene names only another one; to take it away set its `value` to 0.
-
-`--set` takes a dotted key and a TOML value; a bare word is a string: `--set cells.seed=2`,
-`--set remodeling.frame=spatial`, `--set 'loads.pressure.ramp=[[0, 0], [25, 1]]'`.
-
-"""
-
-
-def scene_reference() -> str:
-    """The page docs/scene.md: every key with default, what is allowed and meaning, and the presets."""
-    text = _REFERENCE + markdown_reference(Scene)
-    for name, shapes in PRESETS.items():
-        text += f"\n## Preset `{name}`\n\n{PRESET_NOTES[name]}\n"
-        for shape, values in shapes.items():
-            body = tomlkit.dumps(merged({"geometry": {"shape": shape}}, values))
-            text += f"\nShape `{shape}`:\n\n```toml\n{body.strip()}\n```\n"
-    return text
-
-
-if __name__ == "__main__":
-    print(scene_reference(), end="")

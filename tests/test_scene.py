@@ -25,8 +25,8 @@ from remodel_fenicsx.scene import (
     preset_scene,
     read_scene,
     scene_from_dict,
-    scene_reference,
 )
+from remodel_fenicsx.scene_reference import scene_reference
 from remodel_fenicsx.tables import SceneError, choices, sections
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -538,7 +538,7 @@ def test_good_cells():
 
 
 def test_the_reference_page_is_the_one_that_the_code_makes():
-    remedy = "./with-fenicsx python3 -m remodel_fenicsx.scene > docs/scene.md"
+    remedy = "./with-fenicsx python3 -m remodel_fenicsx.scene_reference > docs/scene.md"
     assert (ROOT / "docs" / "scene.md").read_text(encoding="utf-8") == scene_reference(), f"make it again: {remedy}"
 
 
