@@ -298,5 +298,5 @@ class EquilibriumProblem:
         if reason >= 0 or self._lost:
             return f"reached r/L = {extension.max_chain_extension:.4f}, J = {extension.min_jacobian:.4g}"
         if reason == PETSc.SNES.ConvergedReason.DIVERGED_MAX_IT:
-            return f"no equilibrium within {self.settings.maximum_iterations} Newton iterations"
+            return f"no equilibrium within {self._snes.getTolerances()[3]} Newton iterations"
         return FAILURES.get(reason, f"SNES stopped with reason {reason}")

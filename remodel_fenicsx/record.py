@@ -89,6 +89,8 @@ def choose_folder(requested: Path | None, name: str) -> Path:
     ------
     FolderTaken
         If the requested folder is not empty or is no folder.
+    OSError
+        If the default folder cannot be made.
     """
     if requested is not None:
         if requested.exists() and not requested.is_dir():
@@ -96,10 +98,11 @@ def choose_folder(requested: Path | None, name: str) -> Path:
         if requested.is_dir() and any(requested.iterdir()):
             raise FolderTaken(f"-o {requested}: is not empty; allowed is a new or an empty folder")
         return requested
+    Path("results").mkdir(exist_ok=True)
     number, folder = 1, Path("results") / name
     while True:
         try:
-            folder.mkdir(parents=True)
+            folder.mkdir()
         except FileExistsError:
             number += 1
             folder = Path("results") / f"{name}-{number}"

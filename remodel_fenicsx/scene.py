@@ -164,6 +164,9 @@ class Load(Table):
 
     def factor(self, time: float) -> float:
         """Factor on the value at a time: piecewise linear, held before the first and after the last pair."""
+        for ramp_time, factor in self.ramp:  # exact at its own times
+            if abs(time - ramp_time) <= SAME_TIME * abs(ramp_time):
+                return factor
         after = bisect.bisect_right(self.ramp, time, key=lambda pair: pair[0])
         if after == 0:
             return self.ramp[0][1]
@@ -228,10 +231,10 @@ class Solver(Table):
         default="direct", description="'direct': Newton's method, each system factorised."
     )
     absolute_tolerance: float = Field(
-        default=1e-12,
-        gt=0,
+        default=0.0,
+        ge=0,
         description="A step is solved when |R| <= absolute_tolerance + relative_tolerance |nodal forces|, R the "
-        "vector of out-of-balance nodal forces; in the unit of force.",
+        "vector of out-of-balance nodal forces; in the unit of force, so that it depends on the units of the scene.",
     )
     relative_tolerance: float = Field(
         default=1e-10,
@@ -248,6 +251,12 @@ class Solver(Table):
         default_factory=dict,
         description="PETSc options that override the profile's, without the leading '-': snes_..., ksp_..., pc_....",
     )
+
+    @model_validator(mode="after")
+    def _has_a_tolerance(self) -> Solver:
+        if self.absolute_tolerance == 0.0 and self.relative_tolerance == 0.0:
+            raise fault("must be greater than 0 where absolute_tolerance is 0", "relative_tolerance", 0.0)
+        return self
 
 
 class Output(Table):

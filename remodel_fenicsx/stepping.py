@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from decimal import Decimal
 from typing import Any
 
 import dolfinx.fem
@@ -251,6 +252,8 @@ class _Blend:
 
 
 def times(end: float, step: float) -> Iterator[float]:
-    """Times of the scene after t = 0, each computed from its number so that rounding does not add up."""
-    for number in range(1, round(end / step) + 1):
-        yield number * step
+    """Times of the scene after t = 0: multiples of step as decimal numbers (3 * 0.1 is 0.3); the last one is end."""
+    number_of_steps = round(end / step)
+    for number in range(1, number_of_steps):
+        yield float(number * Decimal(repr(step)))
+    yield end

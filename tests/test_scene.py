@@ -195,8 +195,10 @@ BAD_SCENES = [
     (CUBE, {"time.step": 3.0}, "time.end = 10.0: must be a multiple of time.step = 3.0; the nearest are 9 and 12"),
     (CUBE, {"time.step": 1e-6}, "time.step = 1e-06: must be at least time.end / 1000000 = 1e-05"),
     # solver and output
-    (CUBE, {"solver.absolute_tolerance": 0.0},
-     "solver.absolute_tolerance = 0.0: must be a finite number greater than 0"),
+    (CUBE, {"solver.absolute_tolerance": -1.0},
+     "solver.absolute_tolerance = -1.0: must be a finite number at least 0"),
+    (CUBE, {"solver.relative_tolerance": 0.0},
+     "solver.relative_tolerance = 0.0: must be greater than 0 where absolute_tolerance is 0"),
     (CUBE, {"solver.relative_tolerance": 1.0},
      "solver.relative_tolerance = 1.0: must be a finite number at least 0 and less than 1"),
     (CUBE, {"solver.profile": "magic"}, "solver.profile = 'magic': allowed is 'direct'"),
