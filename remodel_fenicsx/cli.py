@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
+import os
+import signal
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import remodel_fenicsx
@@ -21,7 +24,8 @@ def parser() -> argparse.ArgumentParser:
     main_parser = argparse.ArgumentParser(
         prog="remodel-fenicsx",
         description="Predict how collagen in living tissue reorients under load (Kuhl & Holzapfel 2007).",
-        epilog="exit codes: 0 finished, 2 bad input, 3 the solve failed, 5 environment not usable, 130/143 interrupted",
+        epilog="exit codes: 0 finished, 2 bad input, 3 the solve failed, 5 environment not usable, "
+        "129/130/143 interrupted",
     )
     main_parser.add_argument("--version", action="version", version=remodel_fenicsx.__version__)
     commands = main_parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
@@ -59,15 +63,49 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit code of docs/commands.md (0, 2, 3, 5, 130, 143)."""
-    options = parser().parse_args(arguments)
+    """Run the command line; returns the exit code of docs/commands.md (0, 2, 3, 5, 129, 130, 143)."""
+    with _ctrl_c_ends_at_once():
+        options = _parsed(arguments)
+        try:
+            code = COMMANDS[options.command](options)
+            sys.stdout.flush()
+        except SceneError as error:
+            return _fail(str(error), BAD_INPUT)
+        except OSError as error:  # all others are caught where files are written
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python will flush once more
+            if isinstance(error, BrokenPipeError):  # whoever read the output has seen enough
+                return 0
+            return _fail(f"cannot write to the standard output: {error.strerror}", BAD_ENVIRONMENT)
+        return code
+
+
+@contextlib.contextmanager
+def _ctrl_c_ends_at_once() -> Iterator[None]:
+    """Until `_let_ctrl_c_raise`: a KeyboardInterrupt out of half-imported libraries would be pages of traceback."""
+    before = signal.getsignal(signal.SIGINT)
+    if before == signal.default_int_handler:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
     try:
-        return COMMANDS[options.command](options)
-    except SceneError as error:
-        return _fail(str(error), BAD_INPUT)
-    except BrokenPipeError:
-        sys.stderr.close()
-        return 0
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _let_ctrl_c_raise() -> None:
+    if signal.getsignal(signal.SIGINT) == signal.SIG_DFL:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """The options; of several ranks only the first says what is wrong with them."""
+    # MPI itself would have to be started to ask it
+    rank = os.environ.get("OMPI_COMM_WORLD_RANK") or os.environ.get("PMI_RANK") or "0"
+    with contextlib.ExitStack() as stack:
+        if rank != "0":
+            silence = stack.enter_context(open(os.devnull, "w"))
+            stack.enter_context(contextlib.redirect_stdout(silence))
+            stack.enter_context(contextlib.redirect_stderr(silence))
+        return parser().parse_args(arguments)
 
 
 def _rank() -> int:
@@ -85,7 +123,8 @@ def _say(text: str) -> None:
 
 def _fail(message: str, code: int) -> int:
     if _rank() == 0:
-        print(f"remodel-fenicsx: {message}", file=sys.stderr, flush=True)
+        with contextlib.suppress(OSError):  # nobody is there to read it
+            print(f"remodel-fenicsx: {message}", file=sys.stderr, flush=True)
     return code
 
 
@@ -100,6 +139,7 @@ def _run(options: argparse.Namespace) -> int:
     from remodel_fenicsx.simulation import run
     from remodel_fenicsx.stepping import StepFailure
 
+    _let_ctrl_c_raise()
     try:
         folder = run(scene, options.output, quiet=options.quiet)
     except (FolderTaken, SceneError, GeometryError) as error:
@@ -111,6 +151,9 @@ def _run(options: argparse.Namespace) -> int:
         return _fail(f"{failure}. {advice}", SOLVE_FAILED)
     except Interrupted as interruption:
         return _fail(f"stopped by {interruption}; every finished step is kept", interruption.exit_code)
+    except (FileExistsError, NotADirectoryError) as error:  # another run has taken it meanwhile, or it lies in a file
+        text = f"-o {options.output}: {error.filename}: {error.strerror}; allowed is a new or an empty folder"
+        return _end_all(text, BAD_INPUT)
     except OSError as error:
         return _end_all(f"cannot write the results: {error}", BAD_ENVIRONMENT)
     except Exception:
@@ -124,7 +167,8 @@ def _end_all(message: str, code: int) -> int:
     """End the run on all ranks: an error on one of them leaves the others waiting for ever."""
     from mpi4py import MPI
 
-    print(f"remodel-fenicsx: {message}", file=sys.stderr, flush=True)
+    with contextlib.suppress(OSError):
+        print(f"remodel-fenicsx: {message}", file=sys.stderr, flush=True)
     if MPI.COMM_WORLD.size > 1:
         MPI.COMM_WORLD.Abort(code)
     return code
@@ -148,6 +192,7 @@ def _figures(options: argparse.Namespace) -> int:
     except ImportError as error:
         return _fail(f"the environment is not usable: {error}; run through ./with-fenicsx", BAD_ENVIRONMENT)
     folder, runs = options.output or figures.DEFAULT_FOLDER, options.runs or figures.DEFAULT_RUNS
+    _let_ctrl_c_raise()
     try:
         written = figures.draw(options.names, folder, runs, options.jobs)
     except figures.FigureError as error:

@@ -1,15 +1,33 @@
-"""Ctrl-C and SIGTERM, remembered until the run is at a place where it can stop cleanly."""
+"""Signals: Ctrl-C, SIGTERM and SIGHUP, remembered until the run is at a place where it can stop cleanly."""
 
 from __future__ import annotations
 
 import signal
 import sys
+import threading
 import traceback
 from types import FrameType, TracebackType
 
+import petsc4py.PETSc  # noqa: F401 - before its signals can be taken back
 from mpi4py import MPI
 
 _EXIT_CODE_BASE = 128
+
+# PETSc aborts on all of these, and on some that a run outlives: a closed pipe, the hang-up that nohup ignores
+_NOT_PETSCS = (signal.SIGHUP, signal.SIGINT, signal.SIGPIPE, signal.SIGQUIT, signal.SIGTERM, signal.SIGURG)
+
+
+def _take_back_signals() -> None:
+    """What Python had set before PETSc was loaded: a closed pipe is a BrokenPipeError, an ignored signal is ignored."""
+    if threading.current_thread() is not threading.main_thread():  # others may not
+        return
+    for number in _NOT_PETSCS:
+        handler = signal.getsignal(number)  # what Python remembers: it does not see that PETSc has replaced it
+        if handler is not None:
+            signal.signal(number, handler)
+
+
+_take_back_signals()
 
 
 class Interrupted(Exception):  # noqa: N818 - no error: somebody asked for it
@@ -37,9 +55,10 @@ def _print_and_abort(kind: type[BaseException], error: BaseException, trace: Tra
 
 
 class StopRequest:
-    """Context that turns the first SIGINT or SIGTERM into a request; a second one stops at once.
+    """Context that turns the first SIGINT, SIGTERM or SIGHUP into a request; a second one stops at once.
 
     PETSc must not see an exception from a callback, so a handler that raises is not enough: the solver asks `number`.
+    A signal that is ignored (a background job of a script, nohup) stays ignored.
     """
 
     def __init__(self) -> None:
@@ -47,8 +66,9 @@ class StopRequest:
         self._previous: dict[int, object] = {}
 
     def __enter__(self) -> StopRequest:
-        for number in (signal.SIGINT, signal.SIGTERM):
-            self._previous[number] = signal.signal(number, self._remember)
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            if signal.getsignal(number) != signal.SIG_IGN:
+                self._previous[number] = signal.signal(number, self._remember)
         return self
 
     def _remember(self, number: int, frame: FrameType | None) -> None:

@@ -7,7 +7,7 @@ import os
 import sys
 import time as clock
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import TracebackType
 
 from rich.console import Console
@@ -64,7 +64,8 @@ class Progress:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if self._bar is not None:
-            self._bar.stop()
+            with suppress(OSError):  # the terminal is gone
+                self._bar.stop()
         elif self._pending is not None:
             self._print(self._pending)
         self._bar, self._pending = None, None
@@ -103,7 +104,8 @@ class Progress:
     def message(self, text: str) -> None:
         """Print a line above the bar, or between the plain lines."""
         if self._bar is not None:
-            self._bar.console.print(Text(text), soft_wrap=True)
+            with suppress(OSError):
+                self._bar.console.print(Text(text), soft_wrap=True)
         elif not self._silent:
             self._print(f"{self._title}: {text}")
 

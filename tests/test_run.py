@@ -176,11 +176,25 @@ def test_a_folder_with_files_is_never_touched(tmp_path: Path, ranks: int) -> Non
 
 
 @pytest.mark.parametrize("ranks", [1, 2])
-def test_output_that_cannot_be_written_is_exit_code_5(tmp_path: Path, ranks: int) -> None:
-    (tmp_path / "file").touch()
-    done = run("run", demo("cube"), "-o", tmp_path / "file" / "below", ranks=ranks)
+def test_output_that_cannot_be_written_is_exit_code_5(ranks: int) -> None:
+    done = run("run", demo("cube"), "-o", "/proc/below", ranks=ranks)
     assert done.returncode == 5
     assert done.stderr.count("cannot write the results") == 1 and (done.stderr.count("\n") == 1 or ranks == 2)
+
+
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_a_folder_below_a_file_is_exit_code_2(tmp_path: Path, ranks: int) -> None:
+    (tmp_path / "file").touch()
+    done = run("run", demo("cube"), "-o", tmp_path / "file" / "below", ranks=ranks)
+    assert done.returncode == 2
+    assert done.stderr.count("allowed is a new or an empty folder") == 1 and (done.stderr.count("\n") == 1 or ranks == 2)
+
+
+def test_a_default_folder_that_cannot_be_made_is_exit_code_5(tmp_path: Path) -> None:
+    (tmp_path / "results").symlink_to(tmp_path / "a disk that is not mounted")
+    done = run("run", demo("cube"), cwd=tmp_path)
+    assert done.returncode == 5
+    assert "cannot write the results" in done.stderr and done.stderr.count("\n") == 1
 
 
 def test_a_full_disk_is_exit_code_5_and_keeps_finished_steps(tmp_path: Path, tendon_run: Path) -> None:
@@ -222,7 +236,7 @@ def test_an_impossible_load_is_exit_code_3_and_says_where(tmp_path: Path, ranks:
 
 
 @pytest.mark.parametrize("ranks", [1, 2])
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_ends_the_run_and_keeps_finished_steps(tmp_path: Path, number: signal.Signals, ranks: int) -> None:
     folder = tmp_path / "out"
     command = mpirun(ranks, *COMMAND, "run", str(demo("tendon")), "-o", str(folder))
