@@ -151,10 +151,10 @@ def _run(options: argparse.Namespace) -> int:
         return _fail(f"{failure}. {advice}", SOLVE_FAILED)
     except Interrupted as interruption:
         return _fail(f"stopped by {interruption}; every finished step is kept", interruption.exit_code)
-    except (FileExistsError, NotADirectoryError) as error:  # another run has taken it meanwhile, or it lies in a file
-        text = f"-o {options.output}: {error.filename}: {error.strerror}; allowed is a new or an empty folder"
-        return _end_all(text, BAD_INPUT)
     except OSError as error:
+        if options.output and isinstance(error, (FileExistsError, NotADirectoryError)):  # lies in a file, or just taken
+            text = f"-o {options.output}: {error.filename}: {error.strerror}; allowed is a new or an empty folder"
+            return _end_all(text, BAD_INPUT)
         return _end_all(f"cannot write the results: {error}", BAD_ENVIRONMENT)
     except Exception:
         traceback.print_exc()

@@ -12,7 +12,7 @@ import basix.ufl
 import dolfinx.fem
 from mpi4py import MPI
 
-from remodel_fenicsx import geometry
+from remodel_fenicsx import geometry, jit
 from remodel_fenicsx.cells import UnitCells
 from remodel_fenicsx.environment import versions
 from remodel_fenicsx.interrupts import Interrupted, StopRequest, end_all_ranks_on_exception
@@ -23,7 +23,7 @@ from remodel_fenicsx.record import Fields, RunFolder, chosen_folder, history_row
 from remodel_fenicsx.remodel import RemodelingPass
 from remodel_fenicsx.scene import Scene
 from remodel_fenicsx.stepping import StepFailure, Stepper, times
-from remodel_fenicsx.terminal import Progress, open_log
+from remodel_fenicsx.terminal import Progress, announce, open_log
 
 log = logging.getLogger(__name__)
 
@@ -142,6 +142,8 @@ def run(
     end_all_ranks_on_exception()
     # what the scene asks for is built before anything is written
     place = None if folder is None else chosen_folder(folder, scene.name, comm)
+    if not quiet and comm.rank == 0 and jit.is_cold():
+        announce("compiling the forms of the model, once on this machine: about half a minute")
     simulation = Simulation(scene, comm)
     place = place or chosen_folder(None, scene.name, comm)
     header = "as run: all values, also those of preset and defaults\n" + "\n".join(

@@ -117,10 +117,13 @@ class Progress:
         return f"{_duration((clock.monotonic() - self._start) / index * remaining)} left"
 
     def _print(self, line: str) -> None:
-        try:
-            print(line, file=sys.stderr, flush=True)
-        except OSError:  # whoever read the lines is gone (a closed pipe): no reason to lose a long run
-            self._silent = True
+        announce(line)
+
+
+def announce(line: str) -> None:
+    """Print a line on stderr; if whoever read it is gone (a closed pipe), that is no reason to lose a long run."""
+    with suppress(OSError):
+        print(line, file=sys.stderr, flush=True)
 
 
 @contextmanager
@@ -184,10 +187,7 @@ class _Screen(logging.Handler):
     """Lines on what is stderr at that moment: under a bar rich has put a stream there that prints above it."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        try:
-            print(self.format(record), file=sys.stderr, flush=True)
-        except OSError:  # a closed pipe: the log file has the line
-            pass
+        announce(self.format(record))
 
 
 def _is_terminal() -> bool:

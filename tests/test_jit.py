@@ -1,10 +1,11 @@
-"""A compilation that was cut off does not stop later runs."""
+"""The cache of compiled forms: compilations that were cut off, runs at once, folders that cannot be written."""
 
 from __future__ import annotations
 
 import os
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -12,9 +13,10 @@ import pytest
 from tests.conftest import mpirun
 
 PROGRAM = """
-import sys, ufl, dolfinx
+import logging, sys, ufl, dolfinx
 from mpi4py import MPI
 from remodel_fenicsx import jit
+logging.basicConfig(level=logging.INFO)
 jit.TIMEOUT = 2
 mesh = dolfinx.mesh.create_unit_cube(MPI.COMM_WORLD, 2, 2, 2)
 x = ufl.SpatialCoordinate(mesh)
@@ -24,26 +26,38 @@ assert abs(total - 0.25) < 1e-12, total
 """
 
 
+def compile_and_use(cache: Path, ranks: int = 1, **variables: str) -> subprocess.CompletedProcess[str]:
+    own = {"PYTHONPATH": str(Path(__file__).parents[1]), "XDG_CACHE_HOME": str(cache), **variables}
+    command = mpirun(ranks, sys.executable, "-c", PROGRAM)
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, env=os.environ | own)
+
+
 @pytest.mark.parametrize("ranks", [1, 2])
-def test_a_compilation_that_was_cut_off_is_done_again(ranks: int, tmp_path: Path) -> None:
-    environment = {
-        **os.environ,
-        "PYTHONPATH": str(Path(__file__).parents[1]),
-        "XDG_CACHE_HOME": str(tmp_path),
-    }
-
-    def compile_and_use() -> subprocess.CompletedProcess[str]:
-        command = mpirun(ranks, sys.executable, "-c", PROGRAM)
-        return subprocess.run(command, capture_output=True, text=True, timeout=120, env=environment)
-
-    assert compile_and_use().returncode == 0
-    libraries = list(tmp_path.rglob("libffcx_forms_*.so"))
-    assert len(libraries) == 1
+def test_a_compilation_that_was_cut_off_is_done_again_at_once(ranks: int, tmp_path: Path) -> None:
+    assert compile_and_use(tmp_path, ranks).returncode == 0
+    (library,) = tmp_path.rglob("libffcx_forms_*.so")
     (source,) = tmp_path.rglob("libffcx_forms_*.c")
-    libraries[0].unlink()  # as if the compiler had been killed: its .c file, the lock, stays without the end mark
+    library.unlink()  # as if the compiler had been killed: its .c file, the lock, stays without the end mark
     source.with_suffix(".c.cached").unlink()
-    os.utime(source, (0, 0))
-    again = compile_and_use()
+    again = compile_and_use(tmp_path, ranks)
     assert again.returncode == 0, again.stderr[-2000:]
     assert "removing a compilation that was cut off" in again.stderr
-    assert list(tmp_path.rglob("libffcx_forms_*.so"))
+    assert library.exists()
+    assert "removing" not in compile_and_use(tmp_path, ranks).stderr
+
+
+def test_runs_at_once_compile_one_after_the_other(tmp_path: Path) -> None:
+    with ThreadPoolExecutor(3) as pool:
+        done = list(pool.map(lambda _: compile_and_use(tmp_path), range(3)))
+    assert [run.returncode for run in done] == [0, 0, 0], [run.stderr[-500:] for run in done]
+    assert not any("removing a compilation" in run.stderr for run in done)  # none takes another's work for cut off
+
+
+def test_a_cache_that_cannot_be_written_is_replaced_with_a_warning(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    done = compile_and_use(tmp_path / "file" / "cache", TMPDIR=str(temporary))
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert done.stderr.count("cannot write to") == 1 and str(temporary) in done.stderr
+    assert list(temporary.rglob("libffcx_forms_*.so"))
