@@ -23,7 +23,7 @@ from remodel_fenicsx.interrupts import Interrupted
 from remodel_fenicsx.kinematics import deformation_gradient
 from remodel_fenicsx.loads import Loading
 from remodel_fenicsx.scene import Solver
-from remodel_fenicsx.solvers import set_options
+from remodel_fenicsx.solvers import set_options, unused_options
 
 log = logging.getLogger(__name__)
 
@@ -141,6 +141,7 @@ class EquilibriumProblem:
         self._pull(self._x)
         self._lost = False
         self._snes.solve(None, self._x)
+        self._warn_of_unused_options()
         reason = self._snes.getConvergedReason()
         newton, linear = self._snes.getIterationNumber(), self._snes.getLinearSolveIterations()
         self._push(self._x)
@@ -193,7 +194,7 @@ class EquilibriumProblem:
         network = self.material.network_modulus * chain.stiffness(r0, self.material.contour_length) * r0**2
         stiffness = self.material.lame_lambda + 2 * self.material.lame_mu + network
         self._rounding_scale = 1e-5 * stiffness * self.loading.domain.size**2
-        self._lost = False
+        self._lost = self._options_checked = False
         snes: Any = PETSc.SNES().create(self.comm)
         snes.setFunction(self._assemble_residual, self._residual)
         snes.setJacobian(self._assemble_tangent, self._matrix)
@@ -202,6 +203,15 @@ class EquilibriumProblem:
         set_options(snes, self.settings)
         snes.setConvergenceTest(self._converged)
         self._snes: Any = snes
+
+    def _warn_of_unused_options(self) -> None:
+        """Once, after the first solve; on all ranks, for each has a database of options."""
+        if self._options_checked:
+            return
+        self._options_checked = True
+        unused = unused_options(self.settings)
+        if unused and self.comm.rank == 0:
+            log.warning("solver.petsc_options: without effect (misspelt?): %s", ", ".join(unused))
 
     def _pull(self, x: Any) -> None:
         """Copy the displacement into a PETSc vector."""

@@ -306,9 +306,30 @@ def test_two_runs_at_once_take_two_folders(tmp_path: Path) -> None:
     assert said == ["results in results/cube\n", "results in results/cube-2\n"]
 
 
-@pytest.mark.parametrize("setting", ["solver.petsc_options.pc_type=foo", "solver.petsc_options.snes_rtol=0.5"])
+def test_a_misspelt_petsc_option_is_said_and_logged(tmp_path: Path) -> None:
+    options = ["--set", "solver.petsc_options.snes_linesearch_typ=bt", "--set", "solver.petsc_options.ksp_type=preonly"]
+    done = run("run", demo("cube"), *options, "--set", "time.end=2", "-q", "-o", tmp_path / "out")
+    assert done.returncode == 0
+    warning = "WARNING: solver.petsc_options: without effect (misspelt?): snes_linesearch_typ\n"
+    assert done.stderr == warning  # once, and nothing about the options that were used
+    assert warning.removeprefix("WARNING: ") in (tmp_path / "out" / "run.log").read_text()
+
+
+def test_options_of_the_profile_that_the_scene_makes_needless_are_no_news(tmp_path: Path) -> None:
+    options = [f"--set=solver.petsc_options.{option}" for option in ("ksp_type=cg", "pc_type=none")]
+    done = run("run", demo("cube"), *options, "--set=time.end=2", "-q", "-o", tmp_path / "out")
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_the_limit_of_iterations_that_was_reached_is_named(tmp_path: Path) -> None:
+    options = ["--set=solver.petsc_options.snes_max_it=2", "--set=solver.maximum_halvings=0"]
+    done = run("run", demo("cube"), *options, "-q", "-o", tmp_path / "out")
+    assert done.returncode == 3 and "no equilibrium within 2 Newton iterations" in done.stderr
+
+
+@pytest.mark.parametrize("setting", ["pc_type=foo", "snes_rtol=0.5", "snes_type=foo"])
 def test_petsc_options_that_cannot_be(setting: str, tmp_path: Path) -> None:
-    done = run("run", demo("cube"), "--set", setting, cwd=tmp_path)
+    done = run("run", demo("cube"), "--set", f"solver.petsc_options.{setting}", cwd=tmp_path)
     assert done.returncode == 2, done.stderr
     assert done.stderr.count("\n") == 1 and "solver.petsc_options" in done.stderr
     assert list(tmp_path.iterdir()) == []
