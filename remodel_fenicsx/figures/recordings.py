@@ -50,12 +50,17 @@ class Recording:
         comments = [line[1:].strip() for line in lines[: lines.index("")]]
         return dict(line.split(" ", 1) for line in comments[1:] if " " in line)
 
-    def made_with(self) -> str:
-        """Package, library and scene of the run, in a line."""
+    @property
+    def first_cells(self) -> str:
+        """How the cells were at first, in words."""
+        cells = self.scene.cells
+        return f"random cells of seed {cells.seed}" if cells.initial == "random" else f"{cells.initial} cells"
+
+    def made_with(self, cells: str | None = None) -> str:
+        """Package, library and scene of the run, in a line; `cells` says more than `first_cells` of this run alone."""
         scene, versions = self.scene, self.versions
         libraries = ", ".join(f"{name} {versions.get(name, '?')}" for name in ("remodel_fenicsx", "dolfinx"))
-        cells = f"seed {scene.cells.seed}" if scene.cells.initial == "random" else f"{scene.cells.initial} cells"
-        return f"{libraries}; preset {scene.preset}, frame {scene.remodeling.frame}, {cells}"
+        return f"{libraries}; preset {scene.preset}, frame {scene.remodeling.frame}, {cells or self.first_cells}"
 
     def value(self, column: str, time: float) -> float:
         """A column of the history at a recorded time."""
