@@ -46,7 +46,7 @@ class Setting:
 
 LOAD_CASES = tuple(Setting(*loads) for loads in ((0.1, 0.0), (0.1, 2.4), (0.1, 4.8), (0.05, 4.8), (0.0, 4.8)))  # Fig. 9
 # Which supports, elements and times, and why: tests/test_radial_comparison.py
-PK2 = Setting(driver="pk2", planes=True)
+PK2 = Setting(driver="pk2", planes=True, divisions=(8, 8, 1))
 FINGER = Setting(driver="finger", planes=True, divisions=(48, 16, 1), degree=1)
 PK2_FREE = Setting(driver="pk2", divisions=CURVED, end=60.0)
 FINGER_FREE = Setting(driver="finger", divisions=CURVED, end=75.0)

@@ -8,7 +8,8 @@ where the remodeling pass amplifies a small tilt of the axes (docs/theory.md, St
 - drivers `pk2` and `finger`: the pass over-corrects. A swirl (pk2) or a twist (finger, frame `spatial`) changes its
   sign and grows by 1.5 and 1.9 in every pass, from rounding on, also with half the time step, and shows from about
   t = 80. These runs are held in the planes of symmetry x = 0 and y = 0, which the reference has too; `finger` also
-  takes elements of degree 1, whose mesh has no difference between its nodes that would feed the next mode;
+  takes elements of degree 1, whose mesh has no difference between its nodes that would feed the next mode, and
+  `pk2` no finer mesh, which would have room for the next mode too;
 - law `rate`: l_1 and l_2 differ where the eigenvalues cross, so the axes there turn steadily (a tilt doubles in every
   pass) before the reference, which can only exchange them, does so: around the front these are two solutions.
 """
