@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import os
+import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -126,18 +127,23 @@ def _cell(value: Any) -> str:
 
 
 def check_folder(folder: Path, names: Sequence[str]) -> None:
-    """That the folder can take these figures without touching anything of anybody else's.
+    """That the folder can take these figures without touching anything of anybody else's; nothing is left in it.
 
     Raises
     ------
     FigureError
         Exit code 2, one line.
+    OSError
+        If nothing can be written there.
     """
     if folder.exists() and not folder.is_dir():
         raise FigureError(f"-o {folder}: is a file; allowed is a folder", 2)
     for name in names:
         for path in (folder / f"{name}.png", folder / f"{name}.csv", *folder.glob(f"{name}-*.csv")):
             _check_ours(path)
+    there = next(place for place in (folder, *folder.absolute().parents) if place.exists())
+    with tempfile.TemporaryDirectory(prefix=".remodel-fenicsx-", dir=there):
+        pass
 
 
 def _check_ours(path: Path) -> None:

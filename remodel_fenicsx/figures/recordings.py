@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from remodel_fenicsx.record import read_history
-from remodel_fenicsx.scene import Scene, read_scene
+from remodel_fenicsx.scene import Scene, SceneError, read_scene
 
 Array = NDArray[np.float64]
 Table = dict[str, NDArray[Any]]  # columns by name, all of one length
@@ -61,6 +61,34 @@ class Recording:
         scene, versions = self.scene, self.versions
         libraries = ", ".join(f"{name} {versions.get(name, '?')}" for name in ("remodel_fenicsx", "dolfinx"))
         return f"{libraries}; preset {scene.preset}, frame {scene.remodeling.frame}, {cells or self.first_cells}"
+
+    def fault(self, scene: Scene) -> str | None:
+        """Why this is not the whole record of a scene, in words; None: it is."""
+        try:
+            if self.scene != scene:
+                return "it is of another scene"
+            step, steps = scene.time.step, scene.time.number_of_steps
+            if not _same_times(self.history["time"], step * np.arange(1, steps + 1)):
+                return "history.csv has not the rows of all steps"
+            if scene.output.fields:
+                every = scene.output.every
+                recorded = sorted({*range(0, steps + 1, every), steps})
+                return self._fault_of_fields(step * np.array(recorded))
+        except (SceneError, OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
+            return " ".join(f"{type(error).__name__}: {error}".split())
+        return None
+
+    def _fault_of_fields(self, times: NDArray[Any]) -> str | None:
+        with h5py.File(self.folder / "fields.vtkhdf") as file:
+            root, steps = file["VTKHDF"], file["VTKHDF/Steps"]
+            if not _same_times(steps["Values"][:], times):
+                return "fields.vtkhdf has not all times"
+            for kind, unit in (("PointData", "Points"), ("CellData", "Types")):
+                for name, values in root[kind].items():
+                    if len(values) < int(steps[f"{kind}Offsets"][name][-1]) + len(root[unit]):
+                        return f"fields.vtkhdf lacks values of {name}"
+        self.snapshot(float(times[-1]))
+        return None
 
     def value(self, column: str, time: float) -> float:
         """A column of the history at a recorded time."""
@@ -132,6 +160,10 @@ class Snapshot:
         _, number, count = np.unique(np.sort(faces, axis=1), axis=0, return_inverse=True, return_counts=True)
         alone = count[np.ravel(number)] == 1
         return faces[alone], np.repeat(elements, len(_FACES))[alone]
+
+
+def _same_times(found: NDArray[Any], wanted: NDArray[Any]) -> bool:
+    return found.shape == wanted.shape and bool(np.allclose(found, wanted, rtol=1e-9, atol=0.0))
 
 
 def rank_of(values: Array) -> NDArray[np.int64]:
