@@ -136,11 +136,11 @@ class RunCache:
         OSError
             If the folder cannot be written.
         """
+        _remove_litter(self.folder)
         wanted = list(wanted)
         missing = [scene for scene in wanted if not self.is_valid(scene)]
         if missing:
             self.folder.mkdir(parents=True, exist_ok=True)
-            _remove_litter(self.folder)
             for folder, scene in ((self.path(scene), scene) for scene in missing):
                 if folder.exists():
                     line = Line()
