@@ -1,30 +1,33 @@
 """Makes docs/verification.md and docs/figures/ anew: ./with-fenicsx python3 docs/make_verification.py
 
-Draws every figure (runs that are still valid are used again), solves the independent radial reference of tests/, keeps
-the pictures and the small tables in docs/figures/, and writes the page from docs/verification.template.md, where {name}
-pictures and the small tables in docs/figures/, and writes the page from make_verification.template.md, where {name}
-run could change.
+Draws every figure (runs that are still valid are used again), solves the independent radial reference of tests/, makes
+the studies of verification_studies.py, and keeps the pictures and the small tables in docs/figures/. The page is
+make_verification.template.md; each {name} in it is computed from the tables in docs/figures/, so that a test can do the
+same without a run.
 """
 
 from __future__ import annotations
 
-import csv
 import shutil
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
 DOCS = Path(__file__).resolve().parent
-sys.path.insert(0, str(DOCS.parent))
+sys.path[:0] = [str(DOCS), str(DOCS.parent)]
 
 from remodel_fenicsx import figures  # noqa: E402
 from remodel_fenicsx.figures.output import COLOURS, STYLE, Page, read_table  # noqa: E402
-from tests.reference.radial import solve_radial  # noqa: E402
+from tests.reference.radial import RadialHistory, solve_radial  # noqa: E402
+from verification_studies import study  # noqa: E402
 
 KEPT = DOCS / "figures"
+MORE_TABLES = ("fig6-snapshots", "fig7-history", "fig10-history", "fig11-history", "radial-reference-radii")
 EDGES = np.linspace(1.0, 3.0, 9)  # of the eight element layers
 REFERENCE = {
     "cauchy": {"driver": "cauchy"},
@@ -52,18 +55,28 @@ def numbers_of(path: Path) -> Columns:
 
 
 def radial_reference(page: Page) -> None:
-    """Layer means of the one-dimensional reference, and the picture that compares them with the runs."""
-    table: dict[str, np.ndarray] = {"layer": np.arange(1, 9), "radius": (EDGES[1:] + EDGES[:-1]) / 2}
-    curves = {}
-    for name, settings in REFERENCE.items():
-        history = solve_radial(**settings)  # type: ignore[arg-type]
-        # row -2: the cells with which the last step was solved, as in a run's last row
-        curves[name] = history.points, history.fibre_angle(-2)
-        table[name] = np.array([history.mean_fibre_angle(a, b, -2) for a, b in zip(EDGES, EDGES[1:], strict=False)])
+    """Layer means and final radii of the one-dimensional reference, and the picture that compares it with the runs."""
+    histories = {name: solve_radial(**settings) for name, settings in REFERENCE.items()}  # type: ignore[arg-type]
+    curves = {name: (history.points, history.fibre_angle(-2)) for name, history in histories.items()}
     for stretch, pressure in CASES:
-        history = solve_radial(pressure=pressure, stretch=stretch / 100)
-        name = f"case_{stretch:g}_{pressure:g}"
-        table[name] = np.array([history.mean_fibre_angle(a, b, -2) for a, b in zip(EDGES, EDGES[1:], strict=False)])
+        histories[f"case_{stretch:g}_{pressure:g}"] = solve_radial(pressure=pressure, stretch=stretch / 100)
+    middle = (EDGES[1:] + EDGES[:-1]) / 2
+    table = {"layer": np.arange(1, 9), "radius": middle}
+    table |= {name: layer_means(history) for name, history in histories.items()}
+    _draw_reference(page, curves, middle)
+    page.save_table(table, ["tests/reference/radial.py: means over the element layers at t = 150, degrees"])
+    inner, outer = (np.array([getattr(history, f"{face}_radii")[-1] for history in histories.values()])
+                    for face in ("inner", "outer"))  # fmt: skip
+    radii = {"name": list(histories), "inner_radius": inner, "outer_radius": outer}
+    page.save_table(radii, ["tests/reference/radial.py: deformed radii at t = 150"], "radii")
+
+
+def layer_means(history: RadialHistory) -> np.ndarray:
+    """Fibre angles; row -2: the cells with which the last step was solved, as in a run's last row."""
+    return np.array([history.mean_fibre_angle(a, b, -2) for a, b in zip(EDGES, EDGES[1:], strict=False)])
+
+
+def _draw_reference(page: Page, curves: dict[str, tuple[np.ndarray, np.ndarray]], middle: np.ndarray) -> None:
     runs = layer_angles(page.folder)
     figure = Figure(figsize=(5.4, 3.6))
     axes = figure.add_axes((0.11, 0.14, 0.86, 0.83))
@@ -71,14 +84,14 @@ def radial_reference(page: Page) -> None:
               "rate": r"$\sigma$, eq. (10)"}  # fmt: skip
     for (name, (radius, angle)), colour in zip(curves.items(), COLOURS, strict=False):
         axes.plot(radius, angle, color=colour, lw=1.2)
-        axes.plot(table["radius"], runs[name], "o", ms=4, color=colour, label=labels[name])
+        axes.plot(middle, runs[name], "o", ms=4, color=colour, label=labels[name])
     axes.plot([], [], color="0.3", lw=1.2, label="radial reference")
-    axes.set(xlabel="reference radius $R$", ylabel="fibre angle at $t$ = 150 (degrees)", xlim=(1, 3), ylim=(-2, 92))
+    axes.set(xlabel="reference radius $R$", ylabel="reference fibre angle at $t$ = 150 (degrees)", xlim=(1, 3))
+    axes.set_ylim(-2, 92)
     axes.set_yticks(range(0, 91, 15))
     axes.legend(loc="upper left")
     made_with = "points: layer means of the runs, random cells; lines: tests/reference/radial.py, isotropic cells"
     page.save_figure(figure, "The artery against the independent radial reference", made_with)
-    page.save_table(table, ["tests/reference/radial.py: means over the element layers at t = 150, degrees"])
 
 
 def layer_angles(folder: Path) -> Columns:
@@ -113,35 +126,35 @@ def _cube(folder: Path) -> dict[str, str]:
 
 
 def _tendon(folder: Path) -> dict[str, str]:
-    table, elements = numbers_of(folder / "fig6.csv"), numbers_of(folder / "fig6-elements.csv")
-    first = elements["time"] == 1.0
-    loaded, end = elements["time"] == 12.0, elements["time"] == 150.0
+    table, seen = numbers_of(folder / "fig6.csv"), numbers_of(folder / "fig6-snapshots.csv")
     row = table["time"] == 12.0
-    order = np.argsort(elements["fibre_angle"][loaded])
-    stretch = elements["axial_stretch"][loaded][order]
-    tenth = len(order) // 10
+
+    def value(name: str, time: float) -> float:
+        return float(seen[name][seen["time"] == time].item())
+
     return {
         "tendon_peak": f"{100 * table['mean_stretch'][row].item():.1f}",
         "tendon_end": f"{100 * table['mean_stretch'][-1]:.1f}",
         "tendon_least": f"{table['min_stretch'][row].item():.2f}",
         "tendon_most": f"{table['max_stretch'][row].item():.2f}",
         "tendon_spread_end": f"{table['max_stretch'][-1] - table['min_stretch'][-1]:.3f}",
-        "tendon_aligned": f"{stretch[:tenth].mean():.2f}",
-        "tendon_across": f"{stretch[-tenth:].mean():.2f}",
-        "tendon_angle_1": f"{elements['fibre_angle'][first].max():.0f}",
-        "tendon_angle_12": f"{elements['fibre_angle'][loaded].max():.0f}",
-        "tendon_deformed_12": f"{elements['fibre_angle_deformed'][loaded].max():.0f}",
-        "tendon_deformed_mean_12": f"{elements['fibre_angle_deformed'][loaded].mean():.0f}",
-        "tendon_angle_end": f"{elements['fibre_angle'][end].mean():.1f}",
-        "tendon_l1": f"{elements['l_1'][end].min():.4f}",
+        "tendon_aligned": f"{value('stretch_most_aligned_tenth', 12.0):.2f}",
+        "tendon_across": f"{value('stretch_least_aligned_tenth', 12.0):.2f}",
+        "tendon_angle_1": f"{value('max_fibre_angle', 1.0):.0f}",
+        "tendon_angle_12": f"{value('max_fibre_angle', 12.0):.0f}",
+        "tendon_deformed_12": f"{value('max_fibre_angle_deformed', 12.0):.0f}",
+        "tendon_deformed_mean_12": f"{value('mean_fibre_angle_deformed', 12.0):.0f}",
+        "tendon_angle_end": f"{value('mean_fibre_angle', 150.0):.1f}",
+        "tendon_l1": f"{value('min_l_1', 150.0):.4f}",
+        "tendon_stiff_end": f"{100 * numbers_of(folder / 'stiff-tendon.csv')['mean_stretch'].item():.0f}",
+        "left_of_start": f"{100 * np.exp(-0.025 * 149):.1f}",
     }
 
 
 def _artery(folder: Path) -> dict[str, str]:
-    history, elements = numbers_of(folder / "fig7-history.csv"), numbers_of(folder / "fig7-elements.csv")
+    history, seen = numbers_of(folder / "fig7-history.csv"), numbers_of(folder / "fig7.csv")
     outer, inner, time = history["outer_radius"], history["inner_radius"], history["time"]
     peak, at_24 = int(outer.argmax()), int(np.argmin(np.abs(time - 24.0)))
-    first, end = elements["time"] == 1.0, elements["time"] == 150.0
     layers = numbers_of(folder / "fig8.csv")
     return {
         "artery_peak": f"{outer[peak]:.3f}",
@@ -153,12 +166,15 @@ def _artery(folder: Path) -> dict[str, str]:
         "artery_stretch_outside": f"{outer[-1] / 3.0:.2f}",
         "artery_wall_24": f"{outer[at_24] - inner[at_24]:.2f}",
         "artery_wall_end": f"{outer[-1] - inner[-1]:.2f}",
-        "artery_l3_start": f"{elements['l_3'][first].mean():.2f}",
-        "artery_l3_end": f"{elements['l_3'][end].mean():.3f}",
+        "artery_radial_start": f"{seen['mean_l_radial'][0]:.2f}",
+        "artery_radial_end": f"{seen['mean_l_radial'][-1]:.3f}",
         "artery_middle_end": f"{history['fibre_angle_middle'][-1]:.1f}",
         "intima": f"{layers['fibre_angle'][0]:.1f}",
         "media": f"{layers['fibre_angle'][3]:.1f}",
         "adventitia": f"{layers['fibre_angle'][-1]:.1f}",
+        "intima_deformed": f"{layers['fibre_angle_deformed'][0]:.1f}",
+        "media_deformed": f"{layers['fibre_angle_deformed'][3]:.1f}",
+        "adventitia_deformed": f"{layers['fibre_angle_deformed'][-1]:.1f}",
     }
 
 
@@ -170,12 +186,30 @@ def _cases(folder: Path) -> dict[str, str]:
         return table[name][chosen]
 
     stretched, pressed = angles(0.1, 0.0), angles(0.0, 4.8)
+    most, least = (angles(*case, f"fibre_angle_{name}") for case, name in (((0.0, 4.8), "most"), ((0.1, 0.0), "least")))
+    reference = numbers_of(folder / "radial-reference.csv")["case_0_4.8"]
+    stopped = numbers_of(folder / "stopped-points.csv")
+    coarse, fine = numbers_of(folder / "pressure-meshes.csv")["fibre_angle_4"]
+    first = stopped["radius"] < EDGES[1]
     return {
         "stretch_least": f"{stretched.min():.1f}",
         "stretch_most": f"{stretched.max():.1f}",
-        "pressure_inside": f"{pressed[:4].max():.1f}",
+        "stretch_single": f"{least.min():.1f}",
+        "pressure_1": f"{pressed[0]:.1f}",
+        "pressure_3": f"{pressed[:3].max():.1f}",
+        "pressure_4": f"{pressed[3]:.1f}",
+        "pressure_reference_4": f"{reference[3]:.1f}",
+        "pressure_coarse_4": f"{coarse:.1f}",
+        "pressure_fine_4": f"{fine:.1f}",
+        "pressure_single_1": f"{most[0]:.1f}",
+        "pressure_single_4": f"{most[1:4].max():.1f}",
         "pressure_outside": f"{pressed[-1]:.1f}",
-        "pressure_most": f"{angles(0.0, 4.8, 'fibre_angle_most')[-1]:.1f}",
+        "pressure_reference_outside": f"{reference[-1]:.1f}",
+        "pressure_most": f"{most[-1]:.1f}",
+        "stopped_points": f"{len(first)}",
+        "stopped_inside": f"{first.sum()}",
+        "stopped_passes": f"{stopped['passes'].min():.0f} to {stopped['passes'].max():.0f}",
+        "stopped_angle": f"{stopped['fibre_angle'].max():.0f}",
     }
 
 
@@ -184,11 +218,22 @@ def _drivers(folder: Path) -> dict[str, str]:
     second, strain = numbers_of(folder / "fig10.csv"), numbers_of(folder / "fig11.csv")
     reference = numbers_of(folder / "radial-reference.csv")
     drivers = ("cauchy", "pk2", "finger")
+    radii = numbers_of(folder / "radial-reference-radii.csv")
+    exact = {face: radii[f"{face}_radius"][radii["name"] == "finger"].item() for face in ("inner", "outer")}
+    drifted = numbers_of(folder / "fig11-history.csv")
+    inner, outer = (drifted[f"{face}_radius_finger"][-1] for face in ("inner", "outer"))
     found = {f"variation_{name}": f"{np.ptp(angles[name]):.1f}" for name in drivers}
     found |= {f"reference_variation_{name}": f"{np.ptp(reference[name]):.1f}" for name in drivers}
     found |= {f"mean_difference_{name}": f"{np.abs(angles[name] - reference[name]).mean():.1f}" for name in angles}
     return found | {
         "largest_difference_pk2": f"{np.abs(angles['cauchy'] - angles['pk2']).max():.1f}",
+        "finger_inner_radius": f"{inner:.3f}",
+        "finger_exact_inner_radius": f"{exact['inner']:.3f}",
+        "finger_inner_error": f"{100 * (inner / exact['inner'] - 1):+.0f}",
+        "finger_outer_radius": f"{outer:.3f}",
+        "finger_exact_outer_radius": f"{exact['outer']:.3f}",
+        "finger_outer_error": f"{100 * (outer / exact['outer'] - 1):+.1f}",
+        "finger_parts": f"{drifted['substeps_finger'].max():.0f}",
         "finger_inside": f"{angles['finger'][0]:.1f}",
         "finger_outside": f"{angles['finger'][-1]:.1f}",
         "finger_reference_inside": f"{reference['finger'][0]:.1f}",
@@ -231,7 +276,7 @@ def _energy(folder: Path) -> dict[str, str]:
 
 def markdown(header: list[str], rows: list[list[str]]) -> str:
     """A table in Markdown."""
-    lines = [header, ["---"] * len(header), *rows]
+    lines = [header, ["---"] * (" | ".join(header).count("|") + 1), *rows]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
@@ -261,34 +306,115 @@ def case_table(folder: Path) -> str:
     return markdown(header, [[str(k + 1), *(f"{column[k]:.1f}" for column in columns)] for k in range(8)])
 
 
+def error_table(folder: Path, name: str, label: str, what: Callable[[dict[str, Any]], str]) -> str:
+    """Finite elements against the reference, a row for each run."""
+    header = [label, "to t =", "radii", "angle, mean", "outside the front", "largest"]
+    return markdown(header, [
+        [what(row), f"{row['end']:g}", percent(row["radii_percent"]), *(
+            degrees(row[f"angle_{key}"]) for key in ("mean", "outside", "largest")
+        )] for row in rows_of(folder / f"{name}.csv")
+    ])  # fmt: skip
+
+
+def percent(value: float) -> str:
+    """Two significant digits; what is rounding is no number."""
+    return "< 10⁻⁶ %" if value < 1e-6 else f"{value:.2g} %"
+
+
+def degrees(value: float) -> str:
+    """Two digits, or what is rounding."""
+    return "< 10⁻⁶°" if value < 1e-6 else f"{value:.2f}°" if value >= 0.01 else f"{value:.1g}°"
+
+
+def rows_of(path: Path) -> list[dict[str, Any]]:
+    """Rows of a table, numbers where they are."""
+    columns = numbers_of(path)
+    return [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
+
+
+def elements_of(row: dict[str, Any]) -> str:
+    """The elements of a comparison in words."""
+    return f"{row['around']:.0f} × {row['through']:.0f}, degree {row['degree']:.0f}"
+
+
+def driver_of(row: dict[str, Any]) -> str:
+    """Driver, supports and elements of a comparison, as cells of a table."""
+    symbol = {"cauchy": "σ", "pk2": "S", "finger": "b"}[row["driver"]]
+    law = {"explicit": "(11)", "rate": f"(10), front {row['front_from']:g} < R < {row['front_to']:g}"}[row["law"]]
+    return f"{symbol}, eq. {law} | {row['supports']} | {elements_of(row)}"
+
+
+def mesh_table(folder: Path) -> str:
+    """Errors over the size of the elements, and the orders between one mesh and the next."""
+    found, before = [], None
+    keys = ("inner_radius_error", "outer_radius_error", "angle_mean")
+    for row in rows_of(folder / "comparison-meshes.csv"):
+        same = before is not None and before["degree"] == row["degree"]
+        orders = [f" ({np.log2(before[key] / row[key]):.2f})" if same and before else "" for key in keys]
+        size = f"{2.0 / row['through']:g}"
+        found.append([f"{row['degree']:.0f}", elements_of(row).split(",")[0], size, *(
+            f"{row[key]:.2e}{order}" for key, order in zip(keys, orders, strict=True)
+        )])  # fmt: skip
+        before = row
+    header = ["degree", "around × through the wall", "h", "inner radius", "outer radius", "angle, mean (degrees)"]
+    return markdown(header, found)
+
+
+def invariance_table(folder: Path, turned: str) -> str:
+    """What a turned body differs by."""
+    header = ["driver", "frame", "l / r₀", "A / r₀²", "place", "energy", "mean reference angle"]
+    found = []
+    for row in rows_of(folder / "invariance.csv"):
+        if row["turned"] == turned:
+            angles = f"{row['angle_still']:.1f}° → {row['angle_turned']:.1f}°"
+            found.append([row["driver"], f"`{row['frame']}`", *(
+                small(row[key]) for key in ("lengths", "tensor", "position", "energy")
+            ), angles])  # fmt: skip
+    return markdown(header, found)
+
+
+def small(value: float) -> str:
+    """A difference: two digits, or its order of magnitude."""
+    return f"{value:.2g}" if value > 1e-6 else f"10{str(int(np.ceil(np.log10(max(value, 1e-16))))).translate(RAISED)}"
+
+
+RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
 def made_with(folder: Path) -> str:
     """The line of Fig. 7 that says what it was made with."""
     return (folder / "fig7.csv").read_text(encoding="utf-8").splitlines()[1].removeprefix("# ").split(";")[0]
 
 
 def page(kept: Path = KEPT) -> str:
-    """docs/verification.md from what is in docs/figures."""
-    with (kept / "numbers.csv").open(newline="", encoding="utf-8") as file:
-        values = {row["name"]: row["value"] for row in csv.DictReader(file)}
-    values |= {"table_layers": layer_table(kept), "table_cases": case_table(kept), "made_with": made_with(kept)}
+    """docs/verification.md from the tables in docs/figures."""
+    values = all_numbers(kept) | {
+        "table_layers": layer_table(kept),
+        "table_cases": case_table(kept),
+        "table_errors_cases": error_table(kept, "comparison-cases", "stretch, pressure",
+                                          lambda row: f"{100 * row['stretch']:g} %, {row['pressure']:g}"),
+        "table_errors_drivers": error_table(kept, "comparison-drivers", "driver | supports | elements", driver_of),
+        "table_meshes": mesh_table(kept),
+        "table_turned": invariance_table(kept, "deformed body"),
+        "table_everything": invariance_table(kept, "everything"),
+        "made_with": made_with(kept),
+    }  # fmt: skip
     return (DOCS / "make_verification.template.md").read_text(encoding="utf-8").format_map(values)
 
 
 def main() -> None:
-    """Draw, keep, write."""
+    """Draw, compare, keep, write."""
     drawn = figures.DEFAULT_FOLDER
     figures.draw(folder=drawn)
-    reference = Page(drawn, "radial-reference")
     with matplotlib.rc_context(STYLE):
-        radial_reference(reference)
+        radial_reference(Page(drawn, "radial-reference"))
+    studies = study(drawn)
     KEPT.mkdir(exist_ok=True)
-    for name in (*figures.FIGURES, "radial-reference"):
-        for ending in ("png", "csv"):
-            shutil.copyfile(drawn / f"{name}.{ending}", KEPT / f"{name}.{ending}")
-    with (KEPT / "numbers.csv").open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["name", "value"])
-        writer.writerows(all_numbers(drawn).items())
+    pictures = (*figures.FIGURES, "radial-reference")
+    for name in pictures:
+        shutil.copyfile(drawn / f"{name}.png", KEPT / f"{name}.png")
+    for name in (*pictures, *MORE_TABLES, *studies):
+        shutil.copyfile(drawn / f"{name}.csv", KEPT / f"{name}.csv")
     (DOCS / "verification.md").write_text(page(), encoding="utf-8")
 
 

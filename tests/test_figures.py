@@ -10,14 +10,17 @@ import re
 import shutil
 import subprocess
 import sys
+import time as clock
+from collections.abc import Callable
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 from PIL import Image
 
 import remodel_fenicsx
-from remodel_fenicsx import cli
+from remodel_fenicsx import cli, vtkhdf
 from remodel_fenicsx.figures import FIGURES, bodies, output, recordings, rendering, runs
 from remodel_fenicsx.scene import Scene, scene_from_dict
 from tests.conftest import mpirun
@@ -88,11 +91,14 @@ def tiny(**changes: float | str) -> Scene:
 
 
 def record(cache: runs.RunCache, scene: Scene, last: float | None = None) -> Path:
-    """What a run leaves, as far as the cache looks."""
+    """What a run leaves, as far as the cache looks: one hexahedron that does not move."""
     folder = cache.path(scene)
     folder.mkdir(parents=True)
     (folder / "scene.toml").write_text(scene.to_toml("as run\ndolfinx 0.0"))
-    (folder / "fields.vtkhdf").write_text("")
+    corners = np.array([(x, y, z) for z in (0.0, 1.0) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))])
+    with vtkhdf.TransientGrid(folder / "fields.vtkhdf", corners, np.arange(8).reshape(1, 8), 12) as grid:
+        for time in np.arange(scene.time.number_of_steps + 1.0):
+            grid.append(time, {"displacement": 0 * corners}, {"fibre_angle": np.array([1.0])})
     times = np.arange(1.0, (scene.time.end if last is None else last) + 0.5)
     (folder / "history.csv").write_text("time,force\n" + "".join(f"{time},1.0\n" for time in times))
     return folder
@@ -125,6 +131,57 @@ def test_a_run_that_is_not_whole_is_not_valid(tmp_path: Path) -> None:
     without = tiny(output__fields=False)
     (record(cache, without) / "fields.vtkhdf").unlink()
     assert cache.is_valid(without)
+
+
+def history_without_its_second_row(folder: Path) -> None:
+    lines = (folder / "history.csv").read_text().splitlines(keepends=True)
+    (folder / "history.csv").write_text("".join(lines[:2] + lines[3:]))
+
+
+def history_with_half_a_row(folder: Path) -> None:
+    (folder / "history.csv").write_text((folder / "history.csv").read_text()[:-4])
+
+
+def fields_cut_short(folder: Path) -> None:
+    os.truncate(folder / "fields.vtkhdf", os.path.getsize(folder / "fields.vtkhdf") - 100)
+
+
+def fields_that_are_none(folder: Path) -> None:
+    (folder / "fields.vtkhdf").write_text("")
+
+
+def fields_without_their_last_values(folder: Path) -> None:
+    with h5py.File(folder / "fields.vtkhdf", "r+") as file:
+        file["VTKHDF/CellData/fibre_angle"].resize(2, axis=0)
+
+
+def fields_without_their_last_time(folder: Path) -> None:
+    with h5py.File(folder / "fields.vtkhdf", "r+") as file:
+        file["VTKHDF/Steps/Values"].resize(5, axis=0)
+
+
+@pytest.mark.parametrize("damage", [
+    history_without_its_second_row, history_with_half_a_row, fields_cut_short, fields_that_are_none,
+    fields_without_their_last_values, fields_without_their_last_time,
+])  # fmt: skip
+def test_a_damaged_run_is_not_valid(damage: Callable[[Path], None], tmp_path: Path) -> None:
+    cache, scene = runs.RunCache(tmp_path, "source", {}), tiny(time__end=5.0)
+    folder = record(cache, scene)
+    assert recordings.Recording(folder).fault(scene) is None
+    damage(folder)
+    assert not cache.is_valid(scene)
+    fault = recordings.Recording(folder).fault(scene)
+    assert fault is not None and "\n" not in fault
+
+
+def test_a_damaged_run_is_made_again_and_that_is_said(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    cache, scene = runs.RunCache(tmp_path), tiny(output__fields=False, time__end=1.0)
+    folder = cache.path(scene)
+    folder.mkdir()
+    (folder / "history.csv").write_text("time\n")
+    cache.obtain([scene], jobs=1)
+    assert cache.is_valid(scene) and os.listdir(tmp_path) == [folder.name]
+    assert f"figures: run again: {folder}: " in capsys.readouterr().err
 
 
 def test_only_source_that_decides_numbers_makes_runs_stale(tmp_path: Path) -> None:
@@ -175,6 +232,49 @@ def test_a_stopped_command_ends_its_runs(tmp_path: Path) -> None:
     assert process.returncode == 143
     assert rest.splitlines()[-1] == "remodel-fenicsx: stopped; finished runs are kept"
     assert os.listdir(tmp_path / "runs") == [] and not (tmp_path / "figures").exists()
+
+
+def children_of(number: int) -> list[int]:
+    """Process numbers of the children of a process."""
+    return [int(text) for text in Path(f"/proc/{number}/task/{number}/children").read_text().split()]
+
+
+def is_alive(number: int) -> bool:
+    """Whether a process runs; one that has ended and that nobody asks for does not."""
+    try:
+        return Path(f"/proc/{number}/stat").read_text().rsplit(")", 1)[1].split()[0] not in "ZX"
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
+def test_runs_do_not_outlive_a_killed_command_and_what_they_leave_is_removed(tmp_path: Path) -> None:
+    code = "import sys; from remodel_fenicsx.cli import main; sys.exit(main(sys.argv[1:]))"
+    command = [sys.executable, "-c", code, "figures", "fig7", "--jobs", "1", "--runs", str(tmp_path / "runs")]
+    with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None and "artery 0/150" in process.stderr.readline()
+        (run,) = children_of(process.pid)
+        litter = set(os.listdir(tmp_path / "runs"))
+        assert litter
+        # another command at the same time takes nothing away
+        runs._remove_litter(tmp_path / "runs")
+        assert litter <= set(os.listdir(tmp_path / "runs"))
+        process.kill()
+    for _ in range(300):
+        if not is_alive(run):
+            break
+        clock.sleep(0.1)
+    assert not is_alive(run)
+    runs._remove_litter(tmp_path / "runs")
+    assert os.listdir(tmp_path / "runs") == []
+
+
+def test_a_folder_that_cannot_be_written_is_refused_before_any_run(
+    tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    assert cli.main(["figures", "fig7", "-o", "/proc/nope", "--runs", str(tmp_path / "runs")]) == 5
+    message = capsys.readouterr().err
+    assert message.startswith("remodel-fenicsx: cannot write the figures: ") and message.count("\n") == 1
+    assert os.listdir(tmp_path) == []
 
 
 # ---------------------------------------------------------------- figures 1 and 5 against closed forms
@@ -282,6 +382,19 @@ def test_colours_go_from_red_along_to_blue_across() -> None:
     assert blue[2] > 0.5 and blue[:2].max() < 0.3
     assert middle.min() > 0.7
     assert np.all(np.isfinite(bodies.coloured(np.array([-1e-9, 90.0 + 1e-9]))))
+
+
+def test_every_colour_of_the_scale_stays_as_it_is_in_the_palette() -> None:
+    scale = np.rint(255 * bodies.scale_colours()).astype(np.uint8)
+    rng = np.random.default_rng(1)
+    # beside them many other colours, among them the grey that Pillow alone takes for one of the scale
+    others = np.concatenate([np.tile([[234, 234, 234]], (500, 1)), rng.integers(0, 256, (18_000, 3))]).astype(np.uint8)
+    pixels = np.concatenate([scale, others[: 10_000 - len(scale)]]).reshape(100, 100, 3)
+    drawn = output.with_palette(Image.fromarray(pixels), bodies.scale_colours())
+    assert drawn.mode == "P"
+    found = np.asarray(drawn.convert("RGB")).reshape(-1, 3)
+    np.testing.assert_array_equal(found[: len(scale)], scale)
+    assert np.abs(found.astype(int) - pixels.reshape(-1, 3).astype(int)).mean() < 25
 
 
 @pytest.fixture(scope="module")

@@ -29,7 +29,7 @@ def test_stretch_rises_to_175_and_falls_to_140_percent(random_tendon: dict) -> N
     stretch = dict(zip(random_tendon["time"], random_tendon["mean_stretch"], strict=True))
     assert 1.70 <= stretch[12.0] <= 1.80
     assert 1.41 <= stretch[150.0] <= 1.43
-    # narrower: what five seeds gave with this method (docs/verification.md)
+    # narrower: what five seeds gave with this method
     assert 1.735 <= stretch[12.0] <= 1.750
     assert 1.4243 <= stretch[150.0] <= 1.4251
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import matplotlib
 from mpi4py import MPI
 
-from remodel_fenicsx.figures import curves, structures
+from remodel_fenicsx.figures import bodies, curves, structures
 from remodel_fenicsx.figures.output import STYLE, Page, check_folder
 from remodel_fenicsx.figures.recordings import Recording
 from remodel_fenicsx.figures.runs import KAPPAS, LOAD_CASES, FigureError, Line, RunCache, cores, load_case_name, scenes
@@ -90,7 +90,7 @@ def draw(
     progress, written = Line(), []
     for number, name in enumerate(chosen, start=1):
         progress.show(f"figures: drawing {name} ({number}/{len(chosen)})", at_once=True)
-        page = Page(folder, name)
+        page = Page(folder, name, bodies.scale_colours())
         with matplotlib.rc_context(STYLE):
             FIGURES[name].draw(recordings, page)
         written += page.written

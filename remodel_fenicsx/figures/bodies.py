@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from remodel_fenicsx.figures.recordings import Snapshot
-from remodel_fenicsx.figures.rendering import Patch, Pixels
+from remodel_fenicsx.figures.rendering import AMBIENT, Patch, Pixels
 from remodel_fenicsx.vtkhdf import chain_displacement, chain_lines
 
 Array = NDArray[np.float64]
@@ -33,6 +33,12 @@ def coloured(angle: Array) -> Array:
     """Colours (m, 3) of angles in degrees (m,)."""
     colours, steps = scale()
     return colours(steps(angle))[:, :3]
+
+
+def scale_colours() -> Array:
+    """Every colour of the scale, also as a face shows it that is turned away from the eye, (n, 3) in 0..1."""
+    middle = (np.arange(LEVELS) + 0.5) * (90.0 / LEVELS)
+    return np.concatenate([share * coloured(middle) for share in np.linspace(1.0, AMBIENT, 5)])
 
 
 def body(snapshot: Snapshot, shown: NDArray[np.bool_] | None = None, chains_on: str = "side") -> list[Patch]:

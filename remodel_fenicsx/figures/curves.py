@@ -9,17 +9,23 @@ from matplotlib.figure import Figure
 from remodel_fenicsx.chains import CHAINS
 from remodel_fenicsx.figures.bodies import angle_scale, place
 from remodel_fenicsx.figures.output import COLOURS, Page
-from remodel_fenicsx.figures.recordings import Array, Recording, Table
+from remodel_fenicsx.figures.recordings import Array, Recording, Snapshot, Table
 from remodel_fenicsx.figures.rendering import render
 from remodel_fenicsx.figures.runs import KAPPAS
-from remodel_fenicsx.figures.structures import SOLVED, layer_table, peeled, tube_picture
+from remodel_fenicsx.figures.structures import SOLVED, at, joined, layer_table, peeled, tube_picture, wall_table
 
 PERSISTENCE_LENGTHS = (0.1, 0.4, 0.8)  # Remark 1
-ANGLE_LABEL = "fibre angle (degrees)"
+ANGLE_LABEL = "reference fibre angle{} (degrees)"
 DRIVER_NAMES = {
     "cauchy": r"Cauchy stress $\sigma$",
     "pk2": "second Piola-Kirchhoff stress $S$",
     "finger": "Finger tensor $b$",
+}
+PLACES = {"inner": ":", "middle": "--", "outer": "-"}
+# what must not be read out of a picture without being told
+WARNINGS = {
+    "finger": "$b$: the printed pass over-corrects and\nshears these elements to and fro, see\n"
+    "Fig. 11 in docs/verification.md\n"
 }
 
 
@@ -81,30 +87,53 @@ def draw_drivers(runs: dict[str, Recording], page: Page, other: str) -> None:
     ends = {driver: run.snapshot(run.scene.time.end) for driver, run in pair.items()}
     tallest = max(snapshot.deformed[:, 2].max() for snapshot in ends.values())
     images = render([tube_picture(s, peeled(s), 1.25 * tallest, (390, 560)) for s in ends.values()])
-    tables = {driver: layer_table(snapshot) for driver, snapshot in ends.items()}
+    when = at(ends["cauchy"])
     figure = Figure(figsize=(8.2, 3.5))
     axes = figure.add_axes((0.065, 0.145, 0.40, 0.81))
-    for (driver, table), colour in zip(tables.items(), COLOURS, strict=False):
-        axes.fill_between(table["radius"], table["fibre_angle_least"], table["fibre_angle_most"], color=colour,
-                          alpha=0.15, lw=0)  # fmt: skip
-        axes.plot(table["radius"], table["fibre_angle"], "o-", ms=3.5, color=colour, label=DRIVER_NAMES[driver])
-    axes.set(xlabel="reference radius $R$", ylabel=ANGLE_LABEL, xlim=(1, 3), ylim=(-2, 92))
-    axes.set_yticks(range(0, 91, 15))
+    _draw_profiles(axes, {DRIVER_NAMES[driver]: layer_table(snapshot) for driver, snapshot in ends.items()})
+    axes.set(xlabel="reference radius $R$", ylabel=ANGLE_LABEL.format(when))
     axes.legend(loc="upper left", title="driven by", alignment="left")
-    axes.text(0.985, 0.02, "lines: means of the element layers; bands: all elements", transform=axes.transAxes,
-              ha="right", fontsize=6.5, color="0.4")  # fmt: skip
-    for number, (driver, image) in enumerate(zip(tables, images, strict=True)):
+    notes = [*filter(None, [WARNINGS.get(other)]), "lines: means of the element layers; bands: all elements"]
+    axes.text(0.985, 0.02, "\n".join(notes), transform=axes.transAxes, ha="right", fontsize=6.5, color="0.35")
+    for number, (driver, image) in enumerate(zip(ends, images, strict=True)):
         picture = figure.add_axes((0.50 + 0.245 * number, 0.215, 0.24, 0.71))
         place(picture, image)
         picture.set_title(DRIVER_NAMES[driver], pad=3, fontsize=8.5)
-    angle_scale(figure, (0.545, 0.15, 0.40, 0.026), "deformed angle: 0° circumferential, 90° axial")
-    title = f"Remodeling driven by {' and '.join(tables)} (Fig. {10 if other == 'pk2' else 11})"
+    angle_scale(figure, (0.545, 0.15, 0.40, 0.026), f"deformed angle{when}: 0° circumferential, 90° axial")
+    title = f"Remodeling driven by {' and '.join(ends)} (Fig. {10 if other == 'pk2' else 11})"
     page.save_figure(figure, title, pair["cauchy"].made_with())
-    columns = {name: tables["cauchy"][name] for name in ("layer", "radius")}
-    shown = ("fibre_angle", "fibre_angle_least", "fibre_angle_most", "fibre_angle_deformed", "l_3", "shear")
-    for driver, table in tables.items():
-        columns |= {f"{name}_{driver}": table[name] for name in shown}
-    page.save_table(columns, [pair["cauchy"].made_with(), f"element layers, reference angles in degrees; {SOLVED}"])
+    _save_drivers(pair, ends, page)
+
+
+def _draw_profiles(axes: Axes, tables: dict[str, Table]) -> None:
+    """Angle over reference radius by label: means of the layers, and bands of all elements."""
+    for (label, table), colour in zip(tables.items(), COLOURS, strict=False):
+        least, most = table["fibre_angle_least"], table["fibre_angle_most"]
+        axes.fill_between(table["radius"], least, most, color=colour, alpha=0.15, lw=0)
+        axes.plot(table["radius"], table["fibre_angle"], "o-", ms=3.5, color=colour, label=label)
+    axes.set(xlim=(1, 3.02), ylim=(-2, 92))
+    axes.set_xticks(np.arange(1.0, 3.1, 0.5))
+    axes.set_yticks(range(0, 91, 15))
+
+
+def _save_drivers(pair: dict[str, Recording], ends: dict[str, Snapshot], page: Page) -> None:
+    """Layers, histories and every element that is drawn, of both drivers."""
+    made_with = pair["cauchy"].made_with()
+    layers: Table = {}
+    history: Table = {}
+    elements = []
+    shown = ("fibre_angle", "fibre_angle_least", "fibre_angle_most", "fibre_angle_deformed", "l_3", "l_radial", "shear")
+    recorded = ("inner_radius", "outer_radius", *(f"fibre_angle_{name}" for name in PLACES), "substeps")
+    for driver, snapshot in ends.items():
+        table, rows = layer_table(snapshot), pair[driver].history
+        layers |= {name: table[name] for name in ("layer", "radius")}
+        layers |= {f"{name}_{driver}": table[name] for name in shown}
+        history |= {"time": rows["time"]} | {f"{name}_{driver}": rows[name] for name in recorded}
+        drawn = wall_table(snapshot, peeled(snapshot))
+        elements.append({"driver": np.full(len(drawn["time"]), driver)} | drawn)
+    page.save_table(layers, [made_with, f"element layers, reference angles in degrees; {SOLVED}"])
+    page.save_table(history, [made_with, "rows of the two histories, reference angles in degrees"], "history")
+    page.save_table(joined(elements), [made_with, f"the elements that are drawn; {SOLVED}"], "elements")
 
 
 def draw_rate(runs: dict[str, Recording], page: Page) -> None:
@@ -112,32 +141,40 @@ def draw_rate(runs: dict[str, Recording], page: Page) -> None:
     pair = {"eq. (11), explicit": runs["artery"], "eq. (10), rate": runs["artery-rate"]}
     figure = Figure(figsize=(7.6, 3.2))
     over_time, over_radius = figure.add_axes((0.065, 0.15, 0.42, 0.80)), figure.add_axes((0.56, 0.15, 0.415, 0.80))
-    places = {"inner": ":", "middle": "--", "outer": "-"}
+    ends = {label: run.snapshot(run.scene.time.end) for label, run in pair.items()}
+    tables = {label: layer_table(snapshot) for label, snapshot in ends.items()}
+    _draw_rate_histories(over_time, pair)
+    _draw_profiles(over_radius, tables)
+    when = at(ends["eq. (10), rate"])
+    over_radius.set(xlabel="reference radius $R$", ylabel=ANGLE_LABEL.format(when))
+    over_radius.legend(loc="upper left")
     columns: Table = {}
     profile: Table = {}
-    for (label, run), colour in zip(pair.items(), COLOURS, strict=False):
-        law = run.scene.remodeling.law
-        for name, dashes in places.items():
-            angle = run.history[f"fibre_angle_{name}"]
-            columns |= {"time": run.history["time"], f"fibre_angle_{name}_{law}": angle}
-            over_time.plot(run.history["time"], angle, dashes, color=colour, lw=1.4)
-        table = layer_table(run.snapshot(run.scene.time.end))
+    for label, run in pair.items():
+        law, table = run.scene.remodeling.law, tables[label]
+        angles = {f"fibre_angle_{name}_{law}": run.history[f"fibre_angle_{name}"] for name in PLACES}
+        columns |= {"time": run.history["time"]} | angles
         profile |= {"layer": table["layer"], "radius": table["radius"]}
         profile |= {f"{name}_{law}": table[name] for name in ("fibre_angle", "fibre_angle_least", "fibre_angle_most")}
-        over_radius.fill_between(table["radius"], table["fibre_angle_least"], table["fibre_angle_most"], color=colour,
-                                 alpha=0.15, lw=0)  # fmt: skip
-        over_radius.plot(table["radius"], table["fibre_angle"], "o-", ms=3.5, color=colour, label=label)
-    for name, dashes in places.items():
-        over_time.plot([], [], dashes, color="0.3", lw=1.4, label=f"{name} wall")
-    over_time.set(xlabel="time", ylabel=ANGLE_LABEL, xlim=(0, 150), ylim=(-2, 92))
-    over_radius.set(xlabel="reference radius $R$ (at $t$ = 150)", xlim=(1, 3.02), ylim=(-2, 92))
-    for axes in (over_time, over_radius):
-        axes.set_yticks(range(0, 91, 15))
-        axes.legend(loc="upper left")
     made_with = pair["eq. (11), explicit"].made_with()
     page.save_figure(figure, "Eqs. (10) and (11) on the same artery (erratum 7)", made_with)
     page.save_table(profile, [made_with, f"element layers at the end, reference angles in degrees; {SOLVED}"])
     page.save_table(columns, [made_with, "rows of the two histories, reference angles in degrees"], "history")
+
+
+def _draw_rate_histories(axes: Axes, pair: dict[str, Recording]) -> None:
+    """Angle over time at three places of the wall; a colour for each law, dashes for each place."""
+    for (label, run), colour in zip(pair.items(), COLOURS, strict=False):
+        for name, dashes in PLACES.items():
+            axes.plot(run.history["time"], run.history[f"fibre_angle_{name}"], dashes, color=colour, lw=1.4)
+        axes.plot([], [], color=colour, lw=1.4, label=label)
+    axes.plot([], [], " ", label=" ")  # fills the legend's first column
+    for name, dashes in PLACES.items():
+        axes.plot([], [], dashes, color="0.3", lw=1.4, label=f"{name} wall")
+    end = next(iter(pair.values())).scene.time.end
+    axes.set(xlabel="time", ylabel=ANGLE_LABEL.format(""), xlim=(0, end), ylim=(-2, 92))
+    axes.set_yticks(range(0, 91, 15))
+    axes.legend(loc="upper left", ncols=2, columnspacing=1.2)
 
 
 # ---------------------------------------------------------------- Remark 6
@@ -146,37 +183,43 @@ def draw_rate(runs: dict[str, Recording], page: Page) -> None:
 def draw_energy(runs: dict[str, Recording], page: Page) -> None:
     """Remark 6: stored energy and power of remodeling over time for cube, tendon and artery."""
     demos = {"cube": runs["cube-0.025"], "tendon": runs["tendon"], "artery": runs["artery"]}
-    figure = Figure(figsize=(8.2, 4.0))
-    tables = []
+    figure = Figure(figsize=(8.2, 4.2))
+    unit = demos["cube"].scene.material.stress_unit
+    labels = f"stored energy\n({unit} · length³)", f"power of remodeling\n({unit} · length³ / time)"
     for number, (name, run) in enumerate(demos.items()):
-        columns = run.history
-        time, energy, power = columns["time"], columns["stored_energy"], columns["remodeling_power"]
-        left = 0.085 + 0.322 * number
-        above, below = figure.add_axes((left, 0.57, 0.25, 0.37)), figure.add_axes((left, 0.14, 0.25, 0.37))
-        above.plot(time, energy, color=COLOURS[0])
-        below.plot(time, power, color=COLOURS[1])
-        _shade_sign(below, time, power)
-        ramp_end = max(load.ramp[-1][0] for load in run.scene.loads.values())
-        for axes in (above, below):
-            axes.axvline(ramp_end, color="0.6", lw=0.8, ls=":")
-            axes.set_xlim(0, run.scene.time.end)
-        above.set_title(name)
-        above.set_xticklabels([])
-        above.set_ylim(0, None)
-        below.set_xlabel("time")
+        left = 0.11 + 0.313 * number
+        above, below = figure.add_axes((left, 0.585, 0.245, 0.36)), figure.add_axes((left, 0.17, 0.245, 0.36))
+        _draw_energy(above, below, run)
+        above.set_title(f"{name}, {run.first_cells}", fontsize=8.5)
         if number == 0:
-            for axes, label in ((above, "stored energy"), (below, "power of remodeling")):
+            for axes, label in zip((above, below), labels, strict=True):
                 axes.set_ylabel(label)
-                axes.yaxis.set_label_coords(-0.25, 0.5)
-        tables.append({"demo": np.full(len(time), name), "time": time, "stored_energy": energy,
-                       "remodeling_power": power})  # fmt: skip
+                axes.yaxis.set_label_coords(-0.26, 0.5)
     explanation = "green: the passes release stored energy; red: they take energy in; dotted: end of the ramp"
-    figure.text(0.99, 0.01, explanation, fontsize=6.5, color="0.35", ha="right")
-    made_with = demos["artery"].made_with()
+    figure.text(0.985, 0.03, explanation, fontsize=6.5, color="0.35", ha="right")
+    made_with = demos["artery"].made_with(", ".join(f"{run.first_cells} ({name})" for name, run in demos.items()))
     page.save_figure(figure, "Stored energy and power of remodeling (Remark 6)", made_with)
     meaning = "remodeling_power = -dW/dl . dl/dt - dW/dn . dn/dt, over the body: positive where a pass releases"
-    notes = [made_with, f"{meaning} stored energy at frozen deformation"]
-    page.save_table({key: np.concatenate([table[key] for table in tables]) for key in tables[0]}, notes)
+    notes = [made_with, f"{meaning} stored energy at frozen deformation; in {unit}, the scene's length and time"]
+    names = ("time", "stored_energy", "remodeling_power")
+    tables = [{"demo": np.full(len(run.history["time"]), demo)} | {name: run.history[name] for name in names}
+              for demo, run in demos.items()]  # fmt: skip
+    page.save_table(joined(tables), notes)
+
+
+def _draw_energy(above: Axes, below: Axes, run: Recording) -> None:
+    """Stored energy above, power of remodeling below."""
+    time, power = run.history["time"], run.history["remodeling_power"]
+    above.plot(time, run.history["stored_energy"], color=COLOURS[0])
+    below.plot(time, power, color=COLOURS[1])
+    _shade_sign(below, time, power)
+    ramp_end = max(load.ramp[-1][0] for load in run.scene.loads.values())
+    for axes in (above, below):
+        axes.axvline(ramp_end, color="0.6", lw=0.8, ls=":")
+        axes.set_xlim(0, run.scene.time.end)
+    above.set_xticklabels([])
+    above.set_ylim(0, None)
+    below.set_xlabel("time")
 
 
 def _shade_sign(axes: Axes, time: Array, power: Array) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import os
+import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ import matplotlib
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
@@ -49,10 +50,13 @@ class Page:
         Where they go.
     name
         Name of the figure: NAME.png, NAME.csv, NAME-PART.csv.
+    colours
+        Colours (n, 3) in 0..1 that the picture must show as they are.
     """
 
-    def __init__(self, folder: Path, name: str):
+    def __init__(self, folder: Path, name: str, colours: NDArray[np.float64] | None = None):
         self.folder, self.name = folder, name
+        self.colours = np.zeros((0, 3)) if colours is None else colours
         self.written: list[Path] = []
 
     def save_figure(self, figure: Figure, title: str, made_with: str) -> None:
@@ -68,12 +72,9 @@ class Page:
         for key, value in entries.items():
             notes.add_text(key, value)
         small = io.BytesIO()
-        with Image.open(buffer) as picture:
-            # a palette makes it a quarter as large; this method keeps every colour of the scale as it is
-            palette = picture.convert("RGB").quantize(
-                256, method=Image.Quantize.MAXCOVERAGE, kmeans=2, dither=Image.Dither.NONE
-            )
-            palette.save(small, "png", pnginfo=notes, optimize=True, dpi=(DOTS_PER_INCH, DOTS_PER_INCH))
+        with Image.open(buffer) as drawn:
+            picture = with_palette(drawn.convert("RGB"), self.colours)
+            picture.save(small, "png", pnginfo=notes, optimize=True, dpi=(DOTS_PER_INCH, DOTS_PER_INCH))
         self._write(f"{self.name}.png", small.getvalue())
 
     def save_table(self, columns: Mapping[str, ArrayLike], notes: Sequence[str], part: str = "") -> None:
@@ -101,23 +102,48 @@ class Page:
         self.written.append(path)
 
 
+def with_palette(picture: Image.Image, colours: NDArray[np.float64]) -> Image.Image:
+    """A picture of 256 colours, a quarter as large: these (n, 3) in 0..1 as they are, the rest chosen for the picture.
+
+    Pillow alone takes neighbours on the scale for one colour, and looks for the nearest colour only roughly.
+    """
+    kept = np.rint(255 * colours).astype(np.uint8)
+    chosen = picture.quantize(256 - len(kept), method=Image.Quantize.MAXCOVERAGE, kmeans=2, dither=Image.Dither.NONE)
+    found = np.array(chosen.getpalette(), dtype=np.uint8).reshape(-1, 3)[: 256 - len(kept)]
+    palette = np.concatenate([kept, found])
+    pixels = np.asarray(picture)
+    distinct, where = np.unique(pixels.reshape(-1, 3), axis=0, return_inverse=True)
+    nearest = np.concatenate([
+        np.abs(part[:, None].astype(int) - palette.astype(int)).sum(axis=2).argmin(axis=1)
+        for part in np.array_split(distinct, 1 + len(distinct) // 5000)
+    ])  # fmt: skip
+    result = Image.fromarray(nearest[np.ravel(where)].reshape(pixels.shape[:2]).astype(np.uint8), mode="P")
+    result.putpalette(palette.tobytes())
+    return result
+
+
 def _cell(value: Any) -> str:
     return str(value) if isinstance(value, (str, int, np.integer)) else f"{float(value):.7g}"
 
 
 def check_folder(folder: Path, names: Sequence[str]) -> None:
-    """That the folder can take these figures without touching anything of anybody else's.
+    """That the folder can take these figures without touching anything of anybody else's; nothing is left in it.
 
     Raises
     ------
     FigureError
         Exit code 2, one line.
+    OSError
+        If nothing can be written there.
     """
     if folder.exists() and not folder.is_dir():
         raise FigureError(f"-o {folder}: is a file; allowed is a folder", 2)
     for name in names:
         for path in (folder / f"{name}.png", folder / f"{name}.csv", *folder.glob(f"{name}-*.csv")):
             _check_ours(path)
+    there = next(place for place in (folder, *folder.absolute().parents) if place.exists())
+    with tempfile.TemporaryDirectory(prefix=".remodel-fenicsx-", dir=there):
+        pass
 
 
 def _check_ours(path: Path) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from remodel_fenicsx.record import read_history
-from remodel_fenicsx.scene import Scene, read_scene
+from remodel_fenicsx.scene import Scene, SceneError, read_scene
 
 Array = NDArray[np.float64]
 Table = dict[str, NDArray[Any]]  # columns by name, all of one length
@@ -50,12 +50,45 @@ class Recording:
         comments = [line[1:].strip() for line in lines[: lines.index("")]]
         return dict(line.split(" ", 1) for line in comments[1:] if " " in line)
 
-    def made_with(self) -> str:
-        """Package, library and scene of the run, in a line."""
+    @property
+    def first_cells(self) -> str:
+        """How the cells were at first, in words."""
+        cells = self.scene.cells
+        return f"random cells of seed {cells.seed}" if cells.initial == "random" else f"{cells.initial} cells"
+
+    def made_with(self, cells: str | None = None) -> str:
+        """Package, library and scene of the run, in a line; `cells` says more than `first_cells` of this run alone."""
         scene, versions = self.scene, self.versions
         libraries = ", ".join(f"{name} {versions.get(name, '?')}" for name in ("remodel_fenicsx", "dolfinx"))
-        cells = f"seed {scene.cells.seed}" if scene.cells.initial == "random" else f"{scene.cells.initial} cells"
-        return f"{libraries}; preset {scene.preset}, frame {scene.remodeling.frame}, {cells}"
+        return f"{libraries}; preset {scene.preset}, frame {scene.remodeling.frame}, {cells or self.first_cells}"
+
+    def fault(self, scene: Scene) -> str | None:
+        """Why this is not the whole record of a scene, in words; None: it is."""
+        try:
+            if self.scene != scene:
+                return "it is of another scene"
+            step, steps = scene.time.step, scene.time.number_of_steps
+            if not _same_times(self.history["time"], step * np.arange(1, steps + 1)):
+                return "history.csv has not the rows of all steps"
+            if scene.output.fields:
+                every = scene.output.every
+                recorded = sorted({*range(0, steps + 1, every), steps})
+                return self._fault_of_fields(step * np.array(recorded))
+        except (SceneError, OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
+            return " ".join(f"{type(error).__name__}: {error}".split())
+        return None
+
+    def _fault_of_fields(self, times: NDArray[Any]) -> str | None:
+        with h5py.File(self.folder / "fields.vtkhdf") as file:
+            root, steps = file["VTKHDF"], file["VTKHDF/Steps"]
+            if not _same_times(steps["Values"][:], times):
+                return "fields.vtkhdf has not all times"
+            for kind, unit in (("PointData", "Points"), ("CellData", "Types")):
+                for name, values in root[kind].items():
+                    if len(values) < int(steps[f"{kind}Offsets"][name][-1]) + len(root[unit]):
+                        return f"fields.vtkhdf lacks values of {name}"
+        self.snapshot(float(times[-1]))
+        return None
 
     def value(self, column: str, time: float) -> float:
         """A column of the history at a recorded time."""
@@ -127,6 +160,10 @@ class Snapshot:
         _, number, count = np.unique(np.sort(faces, axis=1), axis=0, return_inverse=True, return_counts=True)
         alone = count[np.ravel(number)] == 1
         return faces[alone], np.repeat(elements, len(_FACES))[alone]
+
+
+def _same_times(found: NDArray[Any], wanted: NDArray[Any]) -> bool:
+    return found.shape == wanted.shape and bool(np.allclose(found, wanted, rtol=1e-9, atol=0.0))
 
 
 def rank_of(values: Array) -> NDArray[np.int64]:

@@ -24,6 +24,7 @@ from remodel_fenicsx.figures.runs import FigureError
 Array = NDArray[np.float64]
 Pixels = NDArray[np.uint8]
 
+AMBIENT = 0.8  # share of a colour that does not depend on where its face looks: it must mean the same everywhere
 SAMPLES = 2  # pictures are drawn this much larger and made smaller: smooth edges with every VTK
 
 
@@ -104,10 +105,9 @@ def _draw(picture: Picture) -> Pixels:
         faces = np.column_stack([np.full(count, 4), np.arange(4 * count).reshape(-1, 4)]).ravel()
         surface = pyvista.PolyData(patch.corners.reshape(-1, 3), faces)
         surface.cell_data["colour"] = np.rint(255 * patch.colours).astype(np.uint8)
-        # mostly ambient: a colour must mean the same wherever it stands
         plotter.add_mesh(
             surface, scalars="colour", rgb=True, show_edges=patch.edges, edge_color="#777777", line_width=SAMPLES * 0.5,
-            ambient=0.8, diffuse=0.2, specular=0.0, smooth_shading=False, show_scalar_bar=False,
+            ambient=AMBIENT, diffuse=1 - AMBIENT, specular=0.0, smooth_shading=False, show_scalar_bar=False,
         )  # fmt: skip
     view = picture.view
     direction = np.array(view.direction) / np.linalg.norm(view.direction)

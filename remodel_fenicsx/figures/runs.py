@@ -3,21 +3,27 @@
 from __future__ import annotations
 
 import ast
+import ctypes
+import fcntl
 import hashlib
 import importlib.metadata
 import json
 import os
 import shutil
+import secrets
+import signal
 import subprocess
 import sys
 import time as clock
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TextIO
 
 import remodel_fenicsx
+from remodel_fenicsx.figures.recordings import Recording
 from remodel_fenicsx.interrupts import StopRequest
-from remodel_fenicsx.scene import Scene, SceneError, preset_scene, read_scene
+from remodel_fenicsx.scene import Scene, preset_scene
 
 PRESET = "kuhl-holzapfel-2007"
 KAPPAS = (0.01, 0.025, 0.05, 0.1)  # those of the printed Fig. 5 cannot be read
@@ -26,6 +32,7 @@ LOAD_CASES = ((0.10, 0.0), (0.10, 2.4), (0.10, 4.8), (0.05, 4.8), (0.0, 4.8))  #
 # parts of the package that change no number of a run
 _NOT_NUMBERS = ("figures", "cli.py", "terminal.py", "interrupts.py", "environment.py")
 _DISTRIBUTIONS = ("fenics-dolfinx", "fenics-ufl", "fenics-ffcx", "petsc4py", "gmsh", "numpy")
+_PART = ".part-"  # and numbers: an unfinished run
 _POLL, _LINE_EVERY = 0.25, 10.0  # seconds
 
 
@@ -117,16 +124,7 @@ class RunCache:
 
     def is_valid(self, scene: Scene) -> bool:
         """Whether a whole run of this very scene with the present source and libraries is recorded."""
-        folder = self.path(scene)
-        try:
-            recorded = read_scene(folder / "scene.toml")
-            rows = (folder / "history.csv").read_text(encoding="utf-8").splitlines()
-            last_time = float(rows[-1].split(",")[0])
-        except (SceneError, OSError, ValueError, IndexError):
-            return False
-        complete = abs(last_time - scene.time.end) <= 1e-9 * scene.time.end
-        fields = not scene.output.fields or (folder / "fields.vtkhdf").is_file()
-        return recorded == scene and complete and fields
+        return Recording(self.path(scene)).fault(scene) is None
 
     def obtain(self, wanted: Iterable[Scene], jobs: int) -> dict[str, Path]:
         """Folders by name of scene; what is not valid is run first, so many at a time.
@@ -138,10 +136,16 @@ class RunCache:
         OSError
             If the folder cannot be written.
         """
+        _remove_litter(self.folder)
         wanted = list(wanted)
         missing = [scene for scene in wanted if not self.is_valid(scene)]
         if missing:
             self.folder.mkdir(parents=True, exist_ok=True)
+            for folder, scene in ((self.path(scene), scene) for scene in missing):
+                if folder.exists():
+                    line = Line()
+                    line.show(f"figures: run again: {folder}: {Recording(folder).fault(scene)}", at_once=True)
+                    line.end()
             _Pool(self, missing, jobs).run()
         return {scene.name: self.path(scene) for scene in wanted}
 
@@ -191,21 +195,25 @@ class _Pool:
 
 
 class _Run:
-    """One scene in one process; its folder gets its name only when it is whole."""
+    """One scene in one process; its folder gets its name only when it is whole.
+
+    What the process says goes to `messages`, which is locked by this process and by that one, whose output it is: as
+    long as one of them lives, nobody takes the unfinished folder for litter (`_remove_litter`).
+    """
 
     def __init__(self, cache: RunCache, scene: Scene):
         self.scene, self.source, self.target = scene, cache.source, cache.path(scene)
-        self.part = self.target.with_name(f"{self.target.name}.part-{os.getpid()}")
-        shutil.rmtree(self.part, ignore_errors=True)  # of a process that had our number before and is gone
+        self.part = self.target.with_name(f"{self.target.name}{_PART}{os.getpid()}-{secrets.token_hex(3)}")
         self.scene_file, self.messages = (Path(f"{self.part}{ending}") for ending in (".toml", ".txt"))
+        self.lock = _locked(self.messages)
         self.scene_file.write_text(scene.to_toml(), encoding="utf-8")
         command = [sys.executable, "-m", "remodel_fenicsx.cli", "run", str(self.scene_file)]
         command += ["-o", str(self.part), "--quiet"]
         # this very package, wherever it was imported from; one thread each, as there are jobs for the cores
         paths = [str(Path(remodel_fenicsx.__file__).parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])]
         environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"}
-        with self.messages.open("w") as messages:
-            self.process = subprocess.Popen(command, stdout=messages, stderr=messages, env=environment)
+        self.process = subprocess.Popen(command, stdout=self.lock, stderr=self.lock, stdin=subprocess.DEVNULL,
+                                        env=environment, preexec_fn=_EndWithParent())  # fmt: skip
 
     def steps_done(self) -> int:
         try:
@@ -217,8 +225,18 @@ class _Run:
         """Give the folder its name, or say why there is none."""
         said = self.messages.read_text(errors="replace").strip().splitlines()
         code = self.process.returncode
+        try:
+            self._name_folder(said, code)
+        finally:
+            self._remove_files()
+
+    def _remove_files(self) -> None:
+        """The lock goes last."""
         self.scene_file.unlink(missing_ok=True)
         self.messages.unlink(missing_ok=True)
+        self.lock.close()
+
+    def _name_folder(self, said: list[str], code: int) -> None:
         if code != 0:
             last = said[-1].removeprefix("remodel-fenicsx: ") if said else "it said nothing"
             message = f"the run {self.scene.name} in {self.part}: {last}"
@@ -244,8 +262,53 @@ class _Run:
             self.process.kill()
             self.process.wait()
         shutil.rmtree(self.part, ignore_errors=True)
-        for path in (self.scene_file, self.messages):
-            path.unlink(missing_ok=True)
+        self._remove_files()
+
+
+class _EndWithParent:
+    """Called in a child before it starts its program: the kernel ends it with the process that made it, even killed.
+
+    (Linux only; elsewhere such a run goes on to its end.) What it needs is loaded before the fork.
+    """
+
+    _SET_SIGNAL = 1  # PR_SET_PDEATHSIG
+
+    def __init__(self) -> None:
+        self.parent, self.control = os.getpid(), None
+        if sys.platform == "linux":
+            self.control = ctypes.CDLL(None).prctl
+
+    def __call__(self) -> None:
+        if self.control is not None:
+            self.control(self._SET_SIGNAL, int(signal.SIGTERM), 0, 0, 0)
+            if os.getppid() != self.parent:  # it was gone before
+                os._exit(128 + int(signal.SIGTERM))
+
+
+def _locked(path: Path) -> TextIO:
+    """A file that is locked until it is closed, here and in every child that has it for its output."""
+    while True:
+        file = path.open("a")
+        fcntl.flock(file, fcntl.LOCK_EX)
+        if path.exists():
+            return file
+        file.close()  # another command took it for litter before it was locked
+
+
+def _remove_litter(folder: Path) -> None:
+    """Remove what failed runs and killed commands have left: unfinished runs whose messages nobody locks any more."""
+    for messages in folder.glob(f"*{_PART}*.txt"):
+        with messages.open("a") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:  # a run under way
+                continue
+            shutil.rmtree(messages.with_suffix(""), ignore_errors=True)
+            messages.with_suffix(".toml").unlink(missing_ok=True)
+            messages.unlink(missing_ok=True)
+    for part in folder.glob(f"*{_PART}*/"):
+        if not Path(f"{part}.txt").exists():  # made before the folder, removed after it
+            shutil.rmtree(part, ignore_errors=True)
 
 
 class Line:

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from remodel_fenicsx.cells import initial_axes
+from remodel_fenicsx.cells import initial_axes, radial_direction
 from remodel_fenicsx.figures.bodies import angle_scale, body, place
 from remodel_fenicsx.figures.output import COLOURS, Page
 from remodel_fenicsx.figures.recordings import Array, Recording, Snapshot, Table, layers, radii, rank_of
@@ -20,7 +20,7 @@ ARTERY_TIMES = (1.0, 24.0, 50.0, 100.0, 150.0)
 WALL_LAYERS = {"intima": 0, "media": 3, "adventitia": 7}  # element layers of eight, from the inside
 
 TO_LOAD = "deformed angle between chains and load axis: 0° along it, 90° across"
-IN_WALL = "deformed angle of the chains in the wall: 0° circumferential, 90° axial"
+IN_WALL = "deformed angle of the chains in the wall{}: 0° circumferential, 90° axial"
 SOLVED = "fields belong to the solved state of their time, before that time's remodeling pass"
 
 FROM_ABOVE = (0.35, -1.0, 0.42)  # the direction from which tubes are seen
@@ -46,9 +46,28 @@ def element_table(snapshot: Snapshot, shown: NDArray[np.bool_] | None = None) ->
     }
 
 
+def wall_table(snapshot: Snapshot, shown: NDArray[np.bool_] | None = None) -> Table:
+    """`element_table` of a tube, with the radial component of its cells."""
+    shown = np.ones(len(snapshot.cells), dtype=bool) if shown is None else shown
+    return element_table(snapshot, shown) | {"l_radial": radial_dimension(snapshot)[shown]}
+
+
+def radial_dimension(snapshot: Snapshot) -> Array:
+    """The radial component sqrt(e_r . A e_r) of each element's cell, A = sum l_I^2 n_I n_I^T its mean, (elements,)."""
+    radial = radial_direction(snapshot.centres)
+    axes = np.stack([snapshot.fields[f"axis_{i + 1}"] for i in range(3)], axis=1)
+    components = snapshot.fields["cell_dimensions"] * np.einsum("mij,mj->mi", axes, radial)
+    return np.linalg.norm(components, axis=1)
+
+
 def joined(tables: Sequence[Table]) -> Table:
     """Tables of the same columns, one under the other."""
     return {name: np.concatenate([table[name] for table in tables]) for name in tables[0]}
+
+
+def at(snapshot: Snapshot) -> str:
+    """The time, to stand in a label."""
+    return f" at $t$ = {snapshot.time:g}"
 
 
 def tube_picture(
@@ -94,6 +113,28 @@ def draw_tendon(runs: dict[str, Recording], page: Page) -> None:
     page.save_table({name: columns[name] for name in names}, notes)
     page.save_table(joined([element_table(s) for s in snapshots]), [run.made_with(), f"fig6, right; {SOLVED}"],
                     "elements")  # fmt: skip
+    page.save_table(snapshot_summary(snapshots), [run.made_with(), f"over all elements; {SOLVED}"], "snapshots")
+
+
+def snapshot_summary(snapshots: Sequence[Snapshot]) -> Table:
+    """What the paper says of the tendon's elements, by time: angles, least l_1, stretch of the extreme tenths."""
+    rows = []
+    for snapshot in snapshots:
+        fields = snapshot.fields
+        reference, deformed = fields["fibre_angle"], fields["fibre_angle_deformed"]
+        stretch = fields["deformation_gradient"][np.argsort(reference), 8]
+        tenth = len(stretch) // 10
+        rows.append({
+            "time": snapshot.time,
+            "mean_fibre_angle": reference.mean(),
+            "max_fibre_angle": reference.max(),
+            "mean_fibre_angle_deformed": deformed.mean(),
+            "max_fibre_angle_deformed": deformed.max(),
+            "stretch_most_aligned_tenth": stretch[:tenth].mean(),
+            "stretch_least_aligned_tenth": stretch[-tenth:].mean(),
+            "min_l_1": fields["cell_dimensions"][:, 0].min(),
+        })  # fmt: skip
+    return {name: np.array([row[name] for row in rows]) for name in rows[0]}
 
 
 # ---------------------------------------------------------------- the artery
@@ -112,15 +153,17 @@ def draw_artery(runs: dict[str, Recording], page: Page) -> None:
         axes.set_title(f"$t$ = {time:g}", pad=3)
         loads = f"$p$ = {run.value('pressure', time):.3g},  stretch {100 * run.value('axial_stretch', time):.2g} %"
         axes.text(0.5, -0.015, loads, transform=axes.transAxes, ha="center", va="top", fontsize=7, color="0.35")
-    angle_scale(figure, (0.25, 0.15, 0.5, 0.026), IN_WALL)
+    angle_scale(figure, (0.25, 0.15, 0.5, 0.026), IN_WALL.format(""))
     page.save_figure(figure, "Artery under axial stretch and inner pressure (Fig. 7)", run.made_with())
     names = ("pressure", "axial_stretch", "inner_radius", "outer_radius",
              "fibre_angle_inner", "fibre_angle_middle", "fibre_angle_outer")  # fmt: skip
     summary = {"time": list(ARTERY_TIMES)} | {name: [run.value(name, t) for t in ARTERY_TIMES] for name in names}
-    page.save_table(summary, [run.made_with(), "rows of the run's history; reference angles in degrees"])
+    summary["mean_l_radial"] = [radial_dimension(s).mean() for s in snapshots]
+    meaning = "rows of the run's history; reference angles in degrees; mean_l_radial: radial component, all elements"
+    page.save_table(summary, [run.made_with(), meaning])
     history = {name: run.history[name] for name in ("time", *names)}
     page.save_table(history, [run.made_with(), "the whole history"], "history")
-    tables = [element_table(s) for s in snapshots]
+    tables = [wall_table(s) for s in snapshots]
     page.save_table(joined(tables), [run.made_with(), f"what is drawn; {SOLVED}"], "elements")
 
 
@@ -151,6 +194,7 @@ def layer_table(snapshot: Snapshot) -> Table:
         "fibre_angle_most": np.array([reference[number == k].max() for k in range(len(count))]),
         "fibre_angle_deformed": per_layer("fibre_angle_deformed"),
         **{f"l_{i + 1}": values for i, values in enumerate(dimensions)},
+        "l_radial": np.bincount(number, radial_dimension(snapshot)) / count,
         "shear": np.array([np.sqrt(np.mean(shear[number == k] ** 2, axis=0)).max() for k in range(len(count))]),
     }
 
@@ -170,18 +214,19 @@ def draw_layers(runs: dict[str, Recording], page: Page) -> None:
     number, table = layers(snapshot), layer_table(snapshot)
     tallest = snapshot.deformed[:, 2].max()
     images = render([tube_picture(snapshot, number == k, 1.27 * tallest, (440, 600)) for k in WALL_LAYERS.values()])
-    figure = Figure(figsize=(6.4, 3.75))
+    figure = Figure(figsize=(6.4, 3.95))
     for place_number, ((name, k), image) in enumerate(zip(WALL_LAYERS.items(), images, strict=True)):
-        axes = figure.add_axes((0.01 + 0.33 * place_number, 0.22, 0.32, 0.72))
+        axes = figure.add_axes((0.01 + 0.33 * place_number, 0.255, 0.32, 0.69))
         place(axes, image)
         axes.set_title(name, pad=3)
-        text = f"layer {k + 1} of {len(table['layer'])}, mean {table['fibre_angle_deformed'][k]:.1f} degrees"
+        means = f"{table['fibre_angle'][k]:.1f}° reference, {table['fibre_angle_deformed'][k]:.1f}° deformed"
+        text = f"layer {k + 1} of {len(table['layer'])}; mean angle\n{means}"
         axes.text(0.5, -0.015, text, transform=axes.transAxes, ha="center", va="top", fontsize=7.5, color="0.35")
-    angle_scale(figure, (0.2, 0.14, 0.6, 0.026), IN_WALL)
+    angle_scale(figure, (0.2, 0.125, 0.6, 0.025), IN_WALL.format(at(snapshot)))
     page.save_figure(figure, "Chains in the layers of the artery's wall (Fig. 8)", run.made_with())
     page.save_table(table, [run.made_with(), f"means over element layers; time {run.scene.time.end:g}; {SOLVED}"])
     drawn = np.isin(number, list(WALL_LAYERS.values()))
-    page.save_table(element_table(snapshot, drawn), [run.made_with(), "the elements that are drawn"], "elements")
+    page.save_table(wall_table(snapshot, drawn), [run.made_with(), "the elements that are drawn"], "elements")
 
 
 def peeled(snapshot: Snapshot) -> NDArray[np.bool_]:
@@ -201,7 +246,7 @@ def draw_load_cases(runs: dict[str, Recording], page: Page) -> None:
         axes = figure.add_axes((0.005 + 0.198 * number, 0.215, 0.198, 0.73))
         place(axes, image)
         axes.set_title(f"stretch {100 * stretch:g} %,  $p$ = {pressure:g}", pad=3, fontsize=8)
-    angle_scale(figure, (0.25, 0.15, 0.5, 0.026), IN_WALL)
+    angle_scale(figure, (0.25, 0.15, 0.5, 0.026), IN_WALL.format(at(snapshots[0])))
     made_with = cases[0].made_with()
     page.save_figure(figure, "Load cases from pure stretch to pure pressure (Fig. 9)", made_with)
     tables = []
@@ -212,7 +257,7 @@ def draw_load_cases(runs: dict[str, Recording], page: Page) -> None:
     page.save_table(joined(tables), [made_with, f"means over element layers; {SOLVED}"])
     elements = []
     for (stretch, pressure), snapshot in zip(LOAD_CASES, snapshots, strict=True):
-        table = element_table(snapshot, peeled(snapshot))
+        table = wall_table(snapshot, peeled(snapshot))
         loads = {"stretch": np.full(len(table["x"]), stretch), "pressure": np.full(len(table["x"]), pressure)}
         elements.append(loads | table)
     page.save_table(joined(elements), [made_with, f"the elements that are drawn; {SOLVED}"], "elements")

@@ -1,0 +1,210 @@
+"""What docs/make_verification.py computes beside the figures: comparisons with the radial reference, invariance.
+
+Each study is a table, NAME.csv. They take minutes, so a table is used again while the source it depends on stays.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import multiprocessing
+import os
+import sys
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+from remodel_fenicsx.figures.output import Page, read_table  # noqa: E402
+from remodel_fenicsx.figures.runs import cores, library_versions, scenes, source_fingerprint  # noqa: E402
+
+Row = dict[str, Any]
+USED_BY_STUDIES = (
+    "docs/verification_studies.py",
+    "tests/radial_comparison.py",
+    "tests/reference/radial.py",
+    "tests/test_invariance.py",
+    "tests/parts.py",
+)
+
+
+# ---------------------------------------------------------------- against the radial reference
+
+
+def comparison(setting: Any) -> Row:
+    """A setting of tests/radial_comparison.py and its errors; radii in percent, angles in degrees."""
+    from tests import radial_comparison
+
+    found = radial_comparison.errors(setting)
+    return {
+        "stretch": setting.stretch,
+        "pressure": setting.pressure,
+        "driver": setting.driver,
+        "law": setting.law,
+        "supports": "symmetry planes" if setting.planes else "the scene's",
+        "degree": setting.degree,
+        "around": setting.divisions[0],
+        "through": setting.divisions[1],
+        "end": setting.end,
+        "front_from": setting.front[0],
+        "front_to": setting.front[1],
+        "radii_percent": 100 * max(found.inner_radius, found.outer_radius),
+        **{f"angle_{name}": value for name, value in asdict(found).items() if name in _ANGLES},
+        "inner_radius_error": found.inner_radius,
+        "outer_radius_error": found.outer_radius,
+    }
+
+
+def layer_mean(setting: Any) -> Row:
+    """The mean angle in the fourth of eight layers of the wall, the last before its middle."""
+    from tests import radial_comparison
+
+    run, exact = radial_comparison.finite_elements(setting), radial_comparison.reference(setting)
+    layer = (run.R > 1.75) & (run.R < 2.0)
+    mean = float(np.average(run.angle[layer], weights=run.volume[layer]))
+    return {"around": setting.divisions[0], "through": setting.divisions[1], "degree": setting.degree,
+            "fibre_angle_4": mean, "reference_4": exact.mean_fibre_angle(1.75, 2.0)}  # fmt: skip
+
+
+_ANGLES = ("mean", "largest", "mean_outside", "outside")
+
+
+def comparison_jobs() -> dict[str, list[tuple[Callable[[Any], Row], Any]]]:
+    """By table, what gives its rows."""
+    from tests import radial_comparison as compared
+
+    meshes = [setting for settings in compared.CONVERGENCE.values() for setting in settings]
+    # Fig. 9's pure pressure on the paper's mesh, in one layer along z, and on one twice as fine
+    coarse, fine = (compared.Setting(0.0, 4.8, divisions=(12 * n, 8 * n, 1), degree=1) for n in (1, 2))
+    return {
+        "comparison-cases": [(comparison, setting) for setting in compared.LOAD_CASES],
+        "comparison-drivers": [(comparison, setting) for setting in compared.DRIVERS],
+        "pressure-meshes": [(layer_mean, setting) for setting in (coarse, fine)],
+        "comparison-meshes": [(comparison, setting) for setting in meshes],
+    }
+
+
+# ---------------------------------------------------------------- invariance
+
+
+def invariance(case: tuple[str, str, str]) -> Row:
+    """The bar of tests/test_invariance.py twice, once turned: what differs, measured by r0, the side and the energy."""
+    from remodel_fenicsx.cells import angle_to_axis
+    from tests import test_invariance as bars
+
+    driver, frame, turned = case
+    if turned == "deformed body":
+        turn = np.eye(3)
+        still, other = bars.pair(driver, frame, bars.QUARTER)
+    else:
+        turn = bars.OBLIQUE
+        still, other = bars.Bar(driver, frame), bars.Bar(driver, frame, turned_reference=turn)
+        for bar in (still, other):
+            bar.march(0, bars.END)
+    axis = np.array([0.0, 0.0, 1.0])
+    angles = [np.mean(angle_to_axis(bar.lengths, bar.body.cells.axis_values, axes @ axis))
+              for bar, axes in ((still, np.eye(3)), (other, turn))]  # fmt: skip
+    return {
+        "driver": driver,
+        "frame": frame,
+        "turned": turned,
+        "lengths": np.abs(other.lengths - still.lengths).max(),
+        "tensor": np.abs(other.tensor - turn @ still.tensor @ turn.T).max(),
+        "position": np.abs(other.position - still.position).max(),
+        "energy": abs(other.problem.stored_energy() / still.problem.stored_energy() - 1),
+        "angle_still": angles[0],
+        "angle_turned": angles[1],
+    }
+
+
+def invariance_jobs() -> dict[str, list[tuple[Callable[[Any], Row], Any]]]:
+    """All drivers and frames: the deformed body turned by 90 degrees, and everything turned about an oblique axis."""
+    cases = [(driver, frame, turned) for turned in ("deformed body", "everything")
+             for frame in ("material", "spatial") for driver in ("cauchy", "pk2", "finger")]  # fmt: skip
+    return {"invariance": [(invariance, case) for case in cases]}
+
+
+# ---------------------------------------------------------------- single runs
+
+
+def stopped_points(name: str) -> list[Row]:
+    """Points of a run of the figures where no principal stress is positive in the last pass, so that it does nothing.
+
+    `passes`: in how many passes the point did remodel before.
+    """
+    from remodel_fenicsx.simulation import Simulation
+
+    simulation = Simulation(scenes()[name].with_values({"output.fields": False}))
+    remodeling, shape = simulation.remodeling, simulation.quadrature.shape
+    passes, active = np.zeros(shape, dtype=int), np.ones(shape, dtype=bool)
+    update = remodeling.updated_cells
+
+    def watched(time_old: float, time_new: float) -> Any:
+        found = update(time_old, time_new)
+        active[...] = found[2].reshape(shape)
+        passes[...] += active
+        return found
+
+    remodeling.updated_cells = watched  # type: ignore[method-assign]
+    for _ in simulation.steps():
+        pass
+    stress = np.linalg.eigvalsh(remodeling.driving_tensor()[1]).reshape(*shape, 3)
+    x, angle = simulation.quadrature.coordinates, simulation.observer.reference_fibre_angle()
+    return [
+        {"element": element, "radius": np.hypot(*x[element, point, :2]), "passes": passes[element, point],
+         "largest_stress": stress[element, point, 2], "fibre_angle": angle[element, point]}
+        for element, point in np.argwhere(~active)
+    ]  # fmt: skip
+
+
+def stiff_tendon(name: str) -> list[Row]:
+    """The tendon with four times the energy of its chains (erratum 1): its stretch at the end."""
+    from remodel_fenicsx.simulation import Simulation
+
+    scene = scenes()[name].with_values({"output.fields": False, "material.energy_factor": 4})
+    *_, last = Simulation(scene).steps()
+    return [{"time": last.time, "mean_stretch": last.row["mean_stretch"]}]
+
+
+# ---------------------------------------------------------------- all of them
+
+
+def _called(job: tuple[Callable[[Any], Any], Any]) -> Any:
+    return job[0](job[1])
+
+
+def study(folder: Path) -> list[str]:
+    """Write the tables that are not there or no longer valid; returns the names of all."""
+    key = f"key {_key()}"
+    single = {"stopped-points": (stopped_points, "artery-0-4.8"), "stiff-tendon": (stiff_tendon, "tendon")}
+    tables: dict[str, Any] = {**single, **comparison_jobs(), **invariance_jobs()}
+    wanted = [name for name in tables if not _is_valid(folder / f"{name}.csv", key)]
+    os.environ["OMP_NUM_THREADS"] = "1"  # of the processes below, one for each core
+    with ProcessPoolExecutor(cores(), multiprocessing.get_context("spawn")) as pool:
+        pending = {
+            name: [pool.submit(_called, job) for job in ([single[name]] if name in single else tables[name])]
+            for name in wanted
+        }
+        for name, jobs in pending.items():
+            print(f"verification: {name}", file=sys.stderr, flush=True)
+            rows = jobs[0].result() if name in single else [job.result() for job in jobs]
+            columns = {column: [row[column] for row in rows] for column in rows[0]}
+            Page(folder, name).save_table(columns, ["docs/verification_studies.py", key])
+    return list(tables)
+
+
+def _key() -> str:
+    """Hash of what the tables depend on."""
+    digest = hashlib.sha256(f"{source_fingerprint()} {library_versions()}".encode())
+    for name in USED_BY_STUDIES:
+        digest.update((ROOT / name).read_bytes())
+    return digest.hexdigest()[:12]
+
+
+def _is_valid(path: Path, key: str) -> bool:
+    return path.is_file() and f"# {key}\n" in path.read_text(encoding="utf-8") and len(read_table(path)) > 0

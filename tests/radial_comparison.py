@@ -1,0 +1,182 @@
+"""Finite elements held against the one-dimensional tube of tests/reference: for the tests and docs/verification.md.
+
+Isotropic cells with cylindrical axes, one layer of elements along z, else the preset.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import dolfinx.fem
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from remodel_fenicsx.geometry import tube
+from remodel_fenicsx.scene import Scene, scene_from_dict
+from remodel_fenicsx.simulation import Simulation
+from tests.reference.radial import RadialHistory, solve_radial
+
+LENGTH = 0.5
+Divisions = tuple[int, int, int]
+FINE: Divisions = (8, 12, 1)  # around, through the wall, along; of degree 2
+CURVED: Divisions = (8, 6, 1)  # the same, cheaper
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A run that is compared: loads, remodeling, elements, supports (with planes of symmetry or the scene's) and end.
+
+    `front` are the radii between which the angle is a steep function of the radius, pointwise errors left out.
+    """
+
+    stretch: float = 0.1
+    pressure: float = 4.8
+    driver: str = "cauchy"
+    law: str = "explicit"
+    frame: str = "spatial"
+    divisions: Divisions = FINE
+    degree: int = 2
+    planes: bool = False
+    end: float = 150.0
+    front: tuple[float, float] = (1.7, 2.0)
+
+
+LOAD_CASES = tuple(Setting(*loads) for loads in ((0.1, 0.0), (0.1, 2.4), (0.1, 4.8), (0.05, 4.8), (0.0, 4.8)))  # Fig. 9
+# Which supports, elements and times, and why: tests/test_radial_comparison.py
+PK2 = Setting(driver="pk2", planes=True, divisions=(8, 8, 1))
+FINGER = Setting(driver="finger", planes=True, divisions=(48, 16, 1), degree=1)
+PK2_FREE = Setting(driver="pk2", divisions=CURVED, end=60.0)
+FINGER_FREE = Setting(driver="finger", divisions=CURVED, end=75.0)
+RATE = Setting(law="rate", planes=True, divisions=CURVED, front=(1.9, 2.35))
+DRIVERS = (Setting(), PK2, PK2_FREE, FINGER, FINGER_FREE, RATE)
+MESHES: dict[int, tuple[Divisions, ...]] = {
+    1: ((8, 4, 1), (16, 8, 1), (32, 16, 1)),
+    2: ((4, 2, 1), (8, 4, 1), (16, 8, 1)),
+}
+CONVERGENCE = {
+    degree: tuple(Setting(divisions=mesh, degree=degree, end=40.0) for mesh in meshes)
+    for degree, meshes in MESHES.items()
+}
+
+
+@dataclass(frozen=True)
+class Run:
+    """Radii by step; reference radius, final fibre angle and volume by quadrature point; columns of the history."""
+
+    inner: np.ndarray
+    outer: np.ndarray
+    R: np.ndarray
+    angle: np.ndarray
+    volume: np.ndarray
+    columns: dict[str, np.ndarray]
+
+
+def scene(setting: Setting) -> Scene:
+    """The preset's artery, short, with isotropic cells."""
+    return scene_from_dict({
+        "preset": "kuhl-holzapfel-2007",
+        "geometry": {"shape": "tube", "inner_radius": 1.0, "outer_radius": 3.0, "length": LENGTH},
+        "mesh": {"degree": setting.degree},
+        "cells": {"initial": "isotropic", "axes": "cylindrical"},
+        "loads": {"pressure": {"value": setting.pressure}, "stretch": {"value": setting.stretch}},
+        "remodeling": {"driver": setting.driver, "law": setting.law, "frame": setting.frame},
+        "time": {"end": setting.end},
+    })  # fmt: skip
+
+
+def hold_symmetry_planes(simulation: Simulation) -> None:
+    """u_x = 0 on x = 0 and u_y = 0 on y = 0: no swirl, no twist of the whole tube."""
+    space, zero = simulation.displacement.function_space, PETSc.ScalarType(0.0)  # type: ignore[attr-defined]
+    for component in (0, 1):
+        subspace = space.sub(component)
+        dofs = dolfinx.fem.locate_dofs_geometrical(
+            (subspace, subspace.collapse()[0]), lambda x, i=component: np.abs(x[i]) < 1e-9
+        )
+        value = dolfinx.fem.Constant(simulation.domain.mesh, zero)
+        simulation.loading.boundary_conditions.append(dolfinx.fem.dirichletbc(value, dofs[0], subspace))
+
+
+@lru_cache(maxsize=None)
+def finite_elements(setting: Setting) -> Run:
+    """The run of a setting."""
+    domain = tube(1.0, 3.0, LENGTH, degree=setting.degree, divisions=setting.divisions, comm=MPI.COMM_SELF)
+    simulation = Simulation(scene(setting), MPI.COMM_SELF, domain)
+    if setting.planes:
+        hold_symmetry_planes(simulation)
+    rows = [step.row for step in simulation.steps()]
+    columns = {name: np.array([row[name] for row in rows]) for name in rows[0]}
+    x = simulation.quadrature.coordinates
+    return Run(
+        columns["inner_radius"], columns["outer_radius"], np.hypot(x[..., 0], x[..., 1]).ravel(),
+        simulation.observer.reference_fibre_angle().ravel(), simulation.quadrature.volumes.ravel(), columns,
+    )  # fmt: skip
+
+
+@lru_cache(maxsize=None)
+def _solve_radial(**arguments: Any) -> RadialHistory:
+    return solve_radial(elements=150, **arguments)
+
+
+def reference(setting: Setting) -> RadialHistory:
+    """The same by the one-dimensional solver."""
+    return _solve_radial(
+        stretch=setting.stretch, pressure=setting.pressure, driver=setting.driver, law=setting.law, end=setting.end
+    )
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Largest relative error of a radius over all steps; errors of the final fibre angle in degrees.
+
+    `mean` is the volume mean over the wall of the absolute difference at the same radius, `largest` the largest one,
+    `mean_outside` and `outside` the same for the points outside of the setting's front; `points_outside` is their
+    share.
+    """
+
+    inner_radius: float
+    outer_radius: float
+    mean: float
+    largest: float
+    mean_outside: float
+    outside: float
+    points_outside: float
+
+
+@lru_cache(maxsize=None)
+def errors(setting: Setting) -> Errors:
+    """Run, solve, compare."""
+    run, exact = finite_elements(setting), reference(setting)
+    angle = np.abs(angle_errors(run, exact))
+    outside = (run.R < setting.front[0]) | (run.R > setting.front[1])
+    return Errors(
+        float(np.max(np.abs(run.inner / exact.inner_radii - 1))),
+        float(np.max(np.abs(run.outer / exact.outer_radii - 1))),
+        float(np.average(angle, weights=run.volume)),
+        float(angle.max()),
+        float(np.average(angle[outside], weights=run.volume[outside])),
+        float(angle[outside].max()),
+        float(outside.mean()),
+    )
+
+
+def angle_errors(run: Run, exact: RadialHistory) -> np.ndarray:
+    """Fibre angle minus the reference's at the same radius, by quadrature point, degrees."""
+    return run.angle - np.interp(run.R, exact.points, exact.fibre_angle())
+
+
+def beyond_a_shift(setting: Setting, shift: float) -> float:
+    """By how much the angle at any point lies outside of all the reference's angles within a distance."""
+    run, exact = finite_elements(setting), reference(setting)
+    near = run.R[:, None] + np.linspace(-shift, shift, 41)
+    band = np.interp(near, exact.points, exact.fibre_angle())
+    return float(np.max(np.maximum(run.angle - band.max(axis=1), band.min(axis=1) - run.angle)))
+
+
+def convergence(degree: int) -> tuple[np.ndarray, np.ndarray]:
+    """Errors of inner radius, outer radius and mean angle by mesh, (3, 3), and the orders between them, (2, 3)."""
+    found = [errors(setting) for setting in CONVERGENCE[degree]]
+    table = np.array([[error.inner_radius, error.outer_radius, error.mean] for error in found])
+    return table, np.log2(table[:-1] / table[1:])
