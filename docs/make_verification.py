@@ -225,7 +225,9 @@ def _drivers(folder: Path) -> dict[str, str]:
     found = {f"variation_{name}": f"{np.ptp(angles[name]):.1f}" for name in drivers}
     found |= {f"reference_variation_{name}": f"{np.ptp(reference[name]):.1f}" for name in drivers}
     found |= {f"mean_difference_{name}": f"{np.abs(angles[name] - reference[name]).mean():.1f}" for name in angles}
+    rate = next(row for row in rows_of(folder / "comparison-drivers.csv") if row["law"] == "rate")
     return found | {
+        "rate_mean_outside": f"{rate['angle_mean_outside']:.2f}",
         "largest_difference_pk2": f"{np.abs(angles['cauchy'] - angles['pk2']).max():.1f}",
         "finger_inner_radius": f"{inner:.3f}",
         "finger_exact_inner_radius": f"{exact['inner']:.3f}",

@@ -185,7 +185,8 @@ def study(folder: Path) -> list[str]:
     tables: dict[str, Any] = {**single, **comparison_jobs(), **invariance_jobs()}
     wanted = [name for name in tables if not _is_valid(folder / f"{name}.csv", key)]
     os.environ["OMP_NUM_THREADS"] = "1"  # of the processes below, one for each core
-    with ProcessPoolExecutor(cores(), multiprocessing.get_context("spawn")) as pool:
+    pool = ProcessPoolExecutor(cores(), multiprocessing.get_context("spawn"))
+    try:
         pending = {
             name: [pool.submit(_called, job) for job in ([single[name]] if name in single else tables[name])]
             for name in wanted
@@ -195,6 +196,8 @@ def study(folder: Path) -> list[str]:
             rows = jobs[0].result() if name in single else [job.result() for job in jobs]
             columns = {column: [row[column] for row in rows] for column in rows[0]}
             Page(folder, name).save_table(columns, ["docs/verification_studies.py", key])
+    finally:
+        pool.shutdown(cancel_futures=True)  # after a failure the rest is not waited for
     return list(tables)
 
 

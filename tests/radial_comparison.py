@@ -48,7 +48,7 @@ LOAD_CASES = tuple(Setting(*loads) for loads in ((0.1, 0.0), (0.1, 2.4), (0.1, 4
 # Which supports, elements and times, and why: tests/test_radial_comparison.py
 PK2 = Setting(driver="pk2", planes=True, divisions=(8, 8, 1))
 FINGER = Setting(driver="finger", planes=True, divisions=(48, 16, 1), degree=1)
-PK2_FREE = Setting(driver="pk2", divisions=CURVED, end=60.0)
+PK2_FREE = Setting(driver="pk2", divisions=(8, 8, 1), end=60.0)
 FINGER_FREE = Setting(driver="finger", divisions=CURVED, end=75.0)
 RATE = Setting(law="rate", planes=True, divisions=CURVED, front=(1.9, 2.35))
 DRIVERS = (Setting(), PK2, PK2_FREE, FINGER, FINGER_FREE, RATE)
