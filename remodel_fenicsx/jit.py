@@ -113,9 +113,11 @@ def _take(lock: IO[str]) -> None:
 
 
 def _remove_unfinished() -> None:
-    """Remove what a killed compilation left: a .c file (FFCx's lock) that no .c.cached (its end mark) follows."""
-    names = set(os.listdir(cache_folder()))
-    for name in names:
-        if name.startswith("libffcx_") and name.endswith(".c") and name + ".cached" not in names:
-            log.info("removing a compilation that was cut off: %s", name)
-            (cache_folder() / name).unlink(missing_ok=True)
+    """Remove what a killed compilation left: a .c file (FFCx's lock) without .c.cached (its end mark), or the reverse."""
+    names = {name for name in os.listdir(cache_folder()) if name.startswith("libffcx_")}
+    sources = {name for name in names if name.endswith(".c")}
+    finished = {name.removesuffix(".cached") for name in names if name.endswith(".c.cached")}
+    for name in sources ^ finished:
+        log.info("removing a compilation that was cut off: %s", name)
+        for path in (cache_folder() / name, cache_folder() / f"{name}.cached"):
+            path.unlink(missing_ok=True)

@@ -32,13 +32,14 @@ def compile_and_use(cache: Path, ranks: int = 1, **variables: str) -> subprocess
     return subprocess.run(command, capture_output=True, text=True, timeout=120, env=os.environ | own)
 
 
+@pytest.mark.parametrize("lost", [".c", ".c.cached"])
 @pytest.mark.parametrize("ranks", [1, 2])
-def test_a_compilation_that_was_cut_off_is_done_again_at_once(ranks: int, tmp_path: Path) -> None:
+def test_a_compilation_that_was_cut_off_is_done_again_at_once(ranks: int, lost: str, tmp_path: Path) -> None:
     assert compile_and_use(tmp_path, ranks).returncode == 0
     (library,) = tmp_path.rglob("libffcx_forms_*.so")
     (source,) = tmp_path.rglob("libffcx_forms_*.c")
-    library.unlink()  # as if the compiler had been killed: its .c file, the lock, stays without the end mark
-    source.with_suffix(".c.cached").unlink()
+    library.unlink()  # as if the compiler had been killed: mostly .c, the lock, stays without the end mark
+    source.with_suffix(lost).unlink()
     again = compile_and_use(tmp_path, ranks)
     assert again.returncode == 0, again.stderr[-2000:]
     assert "removing a compilation that was cut off" in again.stderr

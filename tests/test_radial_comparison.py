@@ -45,7 +45,7 @@ def names(settings: tuple[Setting, ...]) -> list[str]:
 
 
 def checked(setting: Setting) -> Errors:
-    """What the issue asks of every comparison: radii within 0.2 %, the mean angle within 1 degree."""
+    """What is asked of every comparison: radii within 0.2 %, the mean angle within 1 degree."""
     found = errors(setting)
     print(found)
     assert max(found.inner_radius, found.outer_radius) < 2e-3
