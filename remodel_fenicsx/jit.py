@@ -113,7 +113,7 @@ def _take(lock: IO[str]) -> None:
 
 
 def _remove_unfinished() -> None:
-    """Remove what a killed compilation left: a .c file (FFCx's lock) without .c.cached (its end mark), or the reverse."""
+    """Remove what a killed compilation left: a .c file (FFCx's lock) without .c.cached (its end mark), or it alone."""
     names = {name for name in os.listdir(cache_folder()) if name.startswith("libffcx_")}
     sources = {name for name in names if name.endswith(".c")}
     finished = {name.removesuffix(".cached") for name in names if name.endswith(".c.cached")}
