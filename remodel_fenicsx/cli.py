@@ -121,10 +121,14 @@ def _say(text: str) -> None:
         print(text)
 
 
+def _complain(message: str) -> None:
+    with contextlib.suppress(OSError):  # nobody is there to read it
+        print(f"remodel-fenicsx: {message}", file=sys.stderr, flush=True)
+
+
 def _fail(message: str, code: int) -> int:
     if _rank() == 0:
-        with contextlib.suppress(OSError):  # nobody is there to read it
-            print(f"remodel-fenicsx: {message}", file=sys.stderr, flush=True)
+        _complain(message)
     return code
 
 
@@ -167,8 +171,7 @@ def _end_all(message: str, code: int) -> int:
     """End the run on all ranks: an error on one of them leaves the others waiting for ever."""
     from mpi4py import MPI
 
-    with contextlib.suppress(OSError):
-        print(f"remodel-fenicsx: {message}", file=sys.stderr, flush=True)
+    _complain(message)
     if MPI.COMM_WORLD.size > 1:
         MPI.COMM_WORLD.Abort(code)
     return code

@@ -20,7 +20,7 @@ from ufl.domain import extract_unique_domain
 
 log = logging.getLogger(__name__)
 
-TIMEOUT = 600  # seconds that other ranks' processes wait for a form; nobody waits for one that was cut off (_alone)
+TIMEOUT = 600  # seconds that FFCx waits for another process to compile a form; none was cut off (_alone)
 
 # Faster than -O2 by a third for this energy, and NaN and infinity keep their meaning: the guards rely on them.
 COMPILER_FLAGS = [

@@ -31,7 +31,7 @@ SHAPE_DEFAULTS: dict[str, dict[str, Any]] = {"tube": {"cells": {"axes": "cylindr
 # ---------------------------------------------------------------- geometry
 
 
-LARGEST_MESH = 10_000_000  # elements; Gmsh, which is serial, needs about 10 GB for them
+LARGEST_MESH = 10_000_000  # hexahedra; Gmsh, which is serial, needs about 10 GB for them
 
 
 def _check_lengths(body: Table, lengths: dict[str, float]) -> None:
@@ -112,7 +112,7 @@ class Mesh(Table):
         default=1,
         ge=1,
         description="Factor on the paper's number of elements in every direction (1: its own meshes). More than 10 "
-        "million elements are refused.",
+        "million hexahedra, or those split into tetrahedra, are refused.",
     )
     cell: Literal["hexahedron", "tetrahedron"] = Field(default="hexahedron", description="Shape of the elements.")
     degree: Annotated[int, one_of((1, 2))] = Field(

@@ -120,10 +120,10 @@ class Progress:
         announce(line)
 
 
-def announce(line: str) -> None:
+def announce(line: str, end: str = "\n") -> None:
     """Print a line on stderr; if whoever read it is gone (a closed pipe), that is no reason to lose a long run."""
     with suppress(OSError):
-        print(line, file=sys.stderr, flush=True)
+        print(line, end=end, file=sys.stderr, flush=True)
 
 
 @contextmanager

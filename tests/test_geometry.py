@@ -20,6 +20,7 @@ from mpi4py import MPI
 from scipy.spatial import cKDTree
 
 from remodel_fenicsx.geometry import SHAPES, build, cube, tendon, tube
+from remodel_fenicsx.scene import Cube, Tendon, Tube
 from tests import parallel_geometry
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -73,6 +74,8 @@ def has_node(points, *wanted):
 def test_hexahedra_are_the_papers_times_the_refinement_in_every_direction(shape, cells, nodes, refinement):
     domain = domain_of(shape, refinement=refinement)
     assert domain.number_of_cells == cells * refinement**3
+    tables = {"cube": Cube, "tendon": Tendon, "tube": Tube}
+    assert tables[shape].number_of_elements == cells  # by which a scene refuses a mesh before it is made
     refined = {"cube": 27, "tendon": (81 + 4 * 32) * 21, "tube": 32 * 17 * 25}
     assert domain.number_of_nodes == (nodes if refinement == 1 else refined[shape])
     assert domain.mesh.topology.cell_name() == "hexahedron"

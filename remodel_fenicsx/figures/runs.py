@@ -24,6 +24,7 @@ import remodel_fenicsx
 from remodel_fenicsx.figures.recordings import Recording
 from remodel_fenicsx.interrupts import StopRequest
 from remodel_fenicsx.scene import Scene, preset_scene
+from remodel_fenicsx.terminal import announce
 
 PRESET = "kuhl-holzapfel-2007"
 KAPPAS = (0.01, 0.025, 0.05, 0.1)  # those of the printed Fig. 5 cannot be read
@@ -321,25 +322,17 @@ class Line:
         """Show a line; where lines stay, only now and then unless it is wanted at once."""
         if self._terminal:
             text = text[: max(20, shutil.get_terminal_size().columns - 1)]
-            self._write(f"\r{text:{self._width}}")
+            announce(f"\r{text:{self._width}}", end="")
             self._width = len(text)
         elif at_once or clock.monotonic() - self._last >= _LINE_EVERY:
-            self._write(f"{text}\n")
+            announce(text)
             self._last = clock.monotonic()
 
     def end(self) -> None:
         """Leave the last line as it is."""
         if self._width:
-            self._write("\n")
+            announce("")
             self._width = 0
-
-    @staticmethod
-    def _write(text: str) -> None:
-        try:
-            sys.stderr.write(text)
-            sys.stderr.flush()
-        except OSError:  # whoever read the lines is gone: no reason to lose the runs
-            pass
 
 
 def cores() -> int:
