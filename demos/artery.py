@@ -14,17 +14,17 @@ import time as clock
 import dolfinx.fem
 from mpi4py import MPI
 
-from remodel_fenicsx.cells import UnitCells
-from remodel_fenicsx.geometry import tube
-from remodel_fenicsx.interrupts import end_all_ranks_on_exception
-from remodel_fenicsx.loads import Loading
-from remodel_fenicsx.observables import Observer
-from remodel_fenicsx.parameters import Cells, Material, Remodeling
-from remodel_fenicsx.quadrature import Quadrature
-from remodel_fenicsx.record import RunFolder, chosen_folder, history_row
-from remodel_fenicsx.remodel import RemodelingPass
-from remodel_fenicsx.scene import Solver
-from remodel_fenicsx.stepping import Stepper, times
+from remodel_fenicsx.tissue.cells import UnitCells
+from remodel_fenicsx.body import tube
+from remodel_fenicsx.system.interrupts import end_all_ranks_on_exception
+from remodel_fenicsx.body.loading import Loading
+from remodel_fenicsx.results.columns import Observer
+from remodel_fenicsx.scene.parameters import Cells, Material, Remodeling
+from remodel_fenicsx.fem.quadrature import Quadrature
+from remodel_fenicsx.results.run_folder import RunFolder, chosen_folder, history_row
+from remodel_fenicsx.evolution.remodeling import RemodelingPass
+from remodel_fenicsx.scene.scene import Solver
+from remodel_fenicsx.evolution.stepper import Stepper, times
 
 end = float(sys.argv[1]) if len(sys.argv) > 1 else 150.0
 comm = MPI.COMM_WORLD

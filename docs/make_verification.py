@@ -21,8 +21,8 @@ from matplotlib.figure import Figure
 DOCS = Path(__file__).resolve().parent
 sys.path[:0] = [str(DOCS), str(DOCS.parent)]
 
-from remodel_fenicsx import figures  # noqa: E402
-from remodel_fenicsx.figures.output import COLOURS, STYLE, Page, read_table  # noqa: E402
+from remodel_fenicsx import paper as figures  # noqa: E402
+from remodel_fenicsx.paper.output import COLOURS, STYLE, Page, read_table  # noqa: E402
 from tests.reference.radial import RadialHistory, solve_radial  # noqa: E402
 from verification_studies import study  # noqa: E402
 

@@ -20,8 +20,8 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from remodel_fenicsx.figures.output import Page, read_table  # noqa: E402
-from remodel_fenicsx.figures.runs import cores, library_versions, scenes, source_fingerprint  # noqa: E402
+from remodel_fenicsx.paper.output import Page, read_table  # noqa: E402
+from remodel_fenicsx.paper.runs import cores, library_versions, scenes, source_fingerprint  # noqa: E402
 
 Row = dict[str, Any]
 USED_BY_STUDIES = (
@@ -94,7 +94,7 @@ def comparison_jobs() -> dict[str, list[tuple[Callable[[Any], Row], Any]]]:
 
 def invariance(case: tuple[str, str, str]) -> Row:
     """The bar of tests/test_invariance.py twice, once turned: what differs, measured by r0, the side and the energy."""
-    from remodel_fenicsx.cells import angle_to_axis
+    from remodel_fenicsx.tissue.cells import angle_to_axis
     from tests import test_invariance as bars
 
     driver, frame, turned = case

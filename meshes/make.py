@@ -12,9 +12,9 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from remodel_fenicsx.geometry.model import write_msh
-from remodel_fenicsx.geometry.tendon import draw_tendon
-from remodel_fenicsx.geometry.tube import draw_tube
+from remodel_fenicsx.body.gmsh_model import write_msh
+from remodel_fenicsx.body.tendon import draw_tendon
+from remodel_fenicsx.body.tube import draw_tube
 
 # file -> what is in it, as in the paper: Figs. 6 and 7
 MESHES = {

@@ -12,9 +12,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import remodel_fenicsx
-from remodel_fenicsx.environment import reason_unusable, versions
-from remodel_fenicsx.parameters import PRESETS
-from remodel_fenicsx.scene import Scene, SceneError, preset_scene, read_scene
+from remodel_fenicsx.system.environment import reason_unusable, versions
+from remodel_fenicsx.scene.parameters import PRESETS
+from remodel_fenicsx.scene.scene import Scene, SceneError, preset_scene, read_scene
 
 BAD_INPUT, SOLVE_FAILED, BAD_ENVIRONMENT = 2, 3, 5
 
@@ -137,11 +137,11 @@ def _run(options: argparse.Namespace) -> int:
     reason = reason_unusable()
     if reason is not None:
         return _fail(f"the environment is not usable: {reason}; run through ./with-fenicsx", BAD_ENVIRONMENT)
-    from remodel_fenicsx.geometry import GeometryError
-    from remodel_fenicsx.interrupts import Interrupted
-    from remodel_fenicsx.record import FolderTaken
+    from remodel_fenicsx.body import GeometryError
+    from remodel_fenicsx.system.interrupts import Interrupted
+    from remodel_fenicsx.results.run_folder import FolderTaken
     from remodel_fenicsx.simulation import run
-    from remodel_fenicsx.stepping import StepFailure
+    from remodel_fenicsx.evolution.stepper import StepFailure
 
     _let_ctrl_c_raise()
     try:
@@ -191,7 +191,7 @@ def _new(options: argparse.Namespace) -> int:
 
 def _figures(options: argparse.Namespace) -> int:
     try:
-        from remodel_fenicsx import figures
+        from remodel_fenicsx import paper as figures
     except ImportError as error:
         return _fail(f"the environment is not usable: {error}; run through ./with-fenicsx", BAD_ENVIRONMENT)
     folder, runs = options.output or figures.DEFAULT_FOLDER, options.runs or figures.DEFAULT_RUNS
@@ -212,7 +212,7 @@ def _info(options: argparse.Namespace) -> int:
     reason = reason_unusable()
     if reason is not None:
         return _fail(f"the environment is not usable: {reason}; run through ./with-fenicsx", BAD_ENVIRONMENT)
-    from remodel_fenicsx.solvers import PROFILES
+    from remodel_fenicsx.fem.petsc_options import PROFILES
 
     for name, version in versions().items():
         _say(f"{name:16} {version}")

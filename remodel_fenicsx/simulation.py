@@ -12,18 +12,19 @@ import basix.ufl
 import dolfinx.fem
 from mpi4py import MPI
 
-from remodel_fenicsx import geometry, jit
-from remodel_fenicsx.cells import UnitCells
-from remodel_fenicsx.environment import versions
-from remodel_fenicsx.interrupts import Interrupted, StopRequest, end_all_ranks_on_exception
-from remodel_fenicsx.loads import LOADINGS, LoadValues
-from remodel_fenicsx.observables import Observer
-from remodel_fenicsx.quadrature import Quadrature
-from remodel_fenicsx.record import Fields, RunFolder, chosen_folder, history_row
-from remodel_fenicsx.remodel import RemodelingPass
-from remodel_fenicsx.scene import Scene
-from remodel_fenicsx.stepping import StepFailure, Stepper, times
-from remodel_fenicsx.terminal import Progress, announce, open_log
+from remodel_fenicsx import body as geometry
+from remodel_fenicsx.fem import jit
+from remodel_fenicsx.tissue.cells import UnitCells
+from remodel_fenicsx.system.environment import versions
+from remodel_fenicsx.system.interrupts import Interrupted, StopRequest, end_all_ranks_on_exception
+from remodel_fenicsx.body.loading import LOADINGS, LoadValues
+from remodel_fenicsx.results.columns import Observer
+from remodel_fenicsx.fem.quadrature import Quadrature
+from remodel_fenicsx.results.run_folder import Fields, RunFolder, chosen_folder, history_row
+from remodel_fenicsx.evolution.remodeling import RemodelingPass
+from remodel_fenicsx.scene.scene import Scene
+from remodel_fenicsx.evolution.stepper import StepFailure, Stepper, times
+from remodel_fenicsx.system.terminal import Progress, announce, open_log
 
 log = logging.getLogger(__name__)
 

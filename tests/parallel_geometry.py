@@ -8,8 +8,8 @@ import json
 import numpy as np
 from mpi4py import MPI
 
-from remodel_fenicsx import geometry
-from remodel_fenicsx.geometry import model
+from remodel_fenicsx import body as geometry
+from remodel_fenicsx.body import gmsh_model as model
 
 
 def digest(domain):

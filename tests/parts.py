@@ -9,13 +9,13 @@ import basix.ufl
 import dolfinx.fem
 import numpy as np
 
-from remodel_fenicsx.cells import UnitCells
-from remodel_fenicsx.geometry import Domain
-from remodel_fenicsx.loads import Loading
-from remodel_fenicsx.parameters import Cells, Material
-from remodel_fenicsx.problem import EquilibriumProblem
-from remodel_fenicsx.quadrature import Quadrature
-from remodel_fenicsx.scene import Solver
+from remodel_fenicsx.tissue.cells import UnitCells
+from remodel_fenicsx.body import Domain
+from remodel_fenicsx.body.loading import Loading
+from remodel_fenicsx.scene.parameters import Cells, Material
+from remodel_fenicsx.evolution.equilibrium import EquilibriumProblem
+from remodel_fenicsx.fem.quadrature import Quadrature
+from remodel_fenicsx.scene.scene import Solver
 
 MATERIAL = Material()
 TIGHT = Solver(absolute_tolerance=1e-11, relative_tolerance=1e-13)

@@ -14,8 +14,8 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from remodel_fenicsx.geometry import tube
-from remodel_fenicsx.scene import Scene, scene_from_dict
+from remodel_fenicsx.body import tube
+from remodel_fenicsx.scene.scene import Scene, scene_from_dict
 from remodel_fenicsx.simulation import Simulation
 from tests.reference.radial import RadialHistory, solve_radial
 

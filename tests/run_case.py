@@ -13,8 +13,8 @@ import sys
 import numpy as np
 from mpi4py import MPI
 
-from remodel_fenicsx.record import NodalGather
-from remodel_fenicsx.scene import scene_from_dict
+from remodel_fenicsx.results.run_folder import NodalGather
+from remodel_fenicsx.scene.scene import scene_from_dict
 from remodel_fenicsx.simulation import Simulation
 
 

@@ -12,10 +12,10 @@ import pytest
 import ufl
 from mpi4py import MPI
 
-from remodel_fenicsx import jit
-from remodel_fenicsx.energy import Cell, strain_energy, stresses
-from remodel_fenicsx.kinematics import deformation_gradient
-from remodel_fenicsx.parameters import Material
+from remodel_fenicsx.fem import jit
+from remodel_fenicsx.tissue.energy import Cell, strain_energy, stresses
+from remodel_fenicsx.fem.kinematics import deformation_gradient
+from remodel_fenicsx.scene.parameters import Material
 
 Array = npt.NDArray[np.float64]
 

@@ -21,9 +21,10 @@ import pytest
 from PIL import Image
 
 import remodel_fenicsx
-from remodel_fenicsx import cli, vtkhdf
-from remodel_fenicsx.figures import FIGURES, bodies, output, recordings, rendering, runs
-from remodel_fenicsx.scene import Scene, scene_from_dict
+from remodel_fenicsx import cli
+from remodel_fenicsx.results import vtkhdf
+from remodel_fenicsx.paper import FIGURES, bodies, output, recordings, rendering, runs
+from remodel_fenicsx.scene.scene import Scene, scene_from_dict
 from tests.conftest import mpirun
 
 PACKAGE = Path(remodel_fenicsx.__file__).parent
@@ -190,16 +191,16 @@ def test_only_source_that_decides_numbers_makes_runs_stale(tmp_path: Path) -> No
     shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
     before = runs.source_fingerprint(copy)
     assert before == runs.source_fingerprint()
-    laws, text = copy / "laws.py", (copy / "laws.py").read_text()
+    laws, text = copy / "tissue" / "laws.py", (copy / "tissue" / "laws.py").read_text()
     laws.write_text("# a remark\n" + text.replace('"""', '"""Said better. ', 1))
-    (copy / "figures" / "curves.py").write_text("X = 1\n")
+    (copy / "paper" / "curves.py").write_text("X = 1\n")
     (copy / "cli.py").write_text("Y = 2\n")
     assert runs.source_fingerprint(copy) == before
     laws.write_text(text + "\nLAWS.pop('rate')\n")
     assert runs.source_fingerprint(copy) != before
     laws.write_text(text)
     assert runs.source_fingerprint(copy) == before
-    (copy / "geometry" / "more.py").write_text("Z = 3\n")
+    (copy / "body" / "more.py").write_text("Z = 3\n")
     assert runs.source_fingerprint(copy) != before
 
 

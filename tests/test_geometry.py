@@ -19,8 +19,8 @@ import ufl
 from mpi4py import MPI
 from scipy.spatial import cKDTree
 
-from remodel_fenicsx.geometry import SHAPES, build, cube, tendon, tube
-from remodel_fenicsx.scene import Cube, Tendon, Tube
+from remodel_fenicsx.body import SHAPES, build, cube, tendon, tube
+from remodel_fenicsx.scene.scene import Cube, Tendon, Tube
 from tests import parallel_geometry
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -16,12 +16,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from remodel_fenicsx import parameters
-from remodel_fenicsx.cells import UnitCells, angle_to_axis, structure_tensor
-from remodel_fenicsx.geometry import cube
-from remodel_fenicsx.parameters import Cells, Remodeling
-from remodel_fenicsx.quadrature import Quadrature
-from remodel_fenicsx.remodel import DRIVERS, FRAMES, RemodelingPass, material_frame, spatial_frame
+from remodel_fenicsx.scene import parameters
+from remodel_fenicsx.tissue.cells import UnitCells, angle_to_axis, structure_tensor
+from remodel_fenicsx.body import cube
+from remodel_fenicsx.scene.parameters import Cells, Remodeling
+from remodel_fenicsx.fem.quadrature import Quadrature
+from remodel_fenicsx.evolution.remodeling import DRIVERS, FRAMES, RemodelingPass, material_frame, spatial_frame
 from tests import parts
 
 QUARTER = parts.rotation((1.0, 0.0, 0.0), 90.0)  # carries the load axis z to -y

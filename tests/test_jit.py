@@ -15,7 +15,7 @@ from tests.conftest import mpirun
 PROGRAM = """
 import logging, sys, ufl, dolfinx
 from mpi4py import MPI
-from remodel_fenicsx import jit
+from remodel_fenicsx.fem import jit
 logging.basicConfig(level=logging.INFO)
 jit.TIMEOUT = 2
 mesh = dolfinx.mesh.create_unit_cube(MPI.COMM_WORLD, 2, 2, 2)

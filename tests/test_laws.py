@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from remodel_fenicsx.laws import LAWS, Array
+from remodel_fenicsx.tissue.laws import LAWS, Array
 
 KAPPA = 0.025
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from remodel_fenicsx.scene import read_scene
+from remodel_fenicsx.scene.scene import read_scene
 from tests.conftest import Case
 from tests.test_artery import ARTERY
 
@@ -42,7 +42,7 @@ def test_one_and_two_ranks_agree(case: Case, name: str) -> None:
 @pytest.mark.parametrize("name", SCENES)
 def test_scenes_here_are_the_demos(name: str) -> None:
     """But for the tolerance, and the cube's mesh and cells: one isotropic element would say nothing about ranks."""
-    from remodel_fenicsx.scene import scene_from_dict
+    from remodel_fenicsx.scene.scene import scene_from_dict
 
     demo = read_scene(Path(__file__).parents[1] / "demos" / f"{name}.toml")
     here = scene_from_dict(SCENES[name])

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import ufl
 
-from remodel_fenicsx import jit, quadrature
-from remodel_fenicsx.geometry import cube, tube
-from remodel_fenicsx.loads import cube_loading, tube_loading
-from remodel_fenicsx.parameters import Cells, Material
-from remodel_fenicsx.problem import EquilibriumProblem, Extension, SolveFailure
+from remodel_fenicsx.fem import jit, quadrature
+from remodel_fenicsx.body import cube, tube
+from remodel_fenicsx.body.loading import cube_loading, tube_loading
+from remodel_fenicsx.scene.parameters import Cells, Material
+from remodel_fenicsx.evolution.equilibrium import EquilibriumProblem, Extension, SolveFailure
 from tests import parts
 
 RANDOM = Cells(initial="random", seed=3)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from remodel_fenicsx.geometry import tube
-from remodel_fenicsx.scene import scene_from_dict
+from remodel_fenicsx.body import tube
+from remodel_fenicsx.scene.scene import scene_from_dict
 from remodel_fenicsx.simulation import Simulation
 
 LENGTH = 1.5

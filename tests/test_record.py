@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from remodel_fenicsx.problem import Extension
-from remodel_fenicsx.record import COMMON_COLUMNS, History, history_row, read_history
-from remodel_fenicsx.stepping import SolvedStep, Work
+from remodel_fenicsx.evolution.equilibrium import Extension
+from remodel_fenicsx.results.run_folder import COMMON_COLUMNS, History, history_row, read_history
+from remodel_fenicsx.evolution.stepper import SolvedStep, Work
 
 
 def test_rows_read_back_as_the_same_numbers(tmp_path: Path) -> None:

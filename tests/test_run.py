@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from remodel_fenicsx import cli
-from remodel_fenicsx.record import COMMON_COLUMNS, read_history
-from remodel_fenicsx.scene import read_scene
+from remodel_fenicsx.results.run_folder import COMMON_COLUMNS, read_history
+from remodel_fenicsx.scene.scene import read_scene
 from tests.conftest import mpirun
 
 PROJECT = Path(__file__).parents[1]
@@ -267,7 +267,8 @@ def test_an_exception_on_one_rank_ends_all(tmp_path: Path) -> None:
     program.write_text(
         "import sys\n"
         "from mpi4py import MPI\n"
-        "from remodel_fenicsx import cli, remodel\n"
+        "from remodel_fenicsx import cli\n"
+        "from remodel_fenicsx.evolution import remodeling as remodel\n"
         "def broken(self, time_old, time_new):\n"
         "    if MPI.COMM_WORLD.rank == 1: raise RuntimeError('rank 1 has had enough')\n"
         "    MPI.COMM_WORLD.Barrier()\n"
@@ -287,7 +288,7 @@ def test_an_exception_in_a_script_on_two_ranks_ends_both(kind: str, tmp_path: Pa
     (tmp_path / "file").touch()
     program = tmp_path / "program.py"
     program.write_text(
-        "from remodel_fenicsx.scene import preset_scene\n"
+        "from remodel_fenicsx.scene.scene import preset_scene\n"
         "from remodel_fenicsx.simulation import run\n"
         f"run(preset_scene('kuhl-holzapfel-2007', 'cube'), {str(tmp_path / 'file' / 'below')!r})\n"
     )

@@ -11,10 +11,10 @@ from typing import Any
 
 import pytest
 
-from remodel_fenicsx import parameters
-from remodel_fenicsx.chains import wormlike_stiffness
-from remodel_fenicsx.parameters import PRESET_NOTES, PRESETS, SHAPES, Cells, Material, Remodeling
-from remodel_fenicsx.scene import (
+from remodel_fenicsx.scene import parameters
+from remodel_fenicsx.tissue.chains import wormlike_stiffness
+from remodel_fenicsx.scene.parameters import PRESET_NOTES, PRESETS, SHAPES, Cells, Material, Remodeling
+from remodel_fenicsx.scene.scene import (
     Cube,
     Load,
     Scene,
@@ -26,8 +26,8 @@ from remodel_fenicsx.scene import (
     read_scene,
     scene_from_dict,
 )
-from remodel_fenicsx.scene_reference import scene_reference
-from remodel_fenicsx.tables import SceneError, choices, sections
+from remodel_fenicsx.scene.reference import scene_reference
+from remodel_fenicsx.schema.tables import SceneError, choices, sections
 
 ROOT = Path(__file__).resolve().parent.parent
 DEMOS = sorted((ROOT / "demos").glob("*.toml"))
@@ -427,7 +427,8 @@ def test_without_a_preset_the_frame_is_material():
 
 
 def test_the_names_that_a_scene_allows_are_those_that_the_code_has():
-    from remodel_fenicsx import remodel, solvers
+    from remodel_fenicsx.evolution import remodeling as remodel
+    from remodel_fenicsx.fem import petsc_options as solvers
 
     assert list(remodel.DRIVERS) == list(parameters.DRIVERS)
     assert list(remodel.FRAMES) == list(parameters.FRAMES)
@@ -540,7 +541,7 @@ def test_good_cells():
 
 
 def test_the_reference_page_is_the_one_that_the_code_makes():
-    remedy = "./with-fenicsx python3 -m remodel_fenicsx.scene_reference > docs/scene.md"
+    remedy = "./with-fenicsx python3 -m remodel_fenicsx.scene.reference > docs/scene.md"
     assert (ROOT / "docs" / "scene.md").read_text(encoding="utf-8") == scene_reference(), f"make it again: {remedy}"
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from remodel_fenicsx.spectral import Array, positive_direction, principal
+from remodel_fenicsx.tissue.spectral import Array, positive_direction, principal
 
 COUNT = 50
 

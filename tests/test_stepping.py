@@ -7,15 +7,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from remodel_fenicsx.geometry import cube, tube
-from remodel_fenicsx.loads import tube_loading
-from remodel_fenicsx.parameters import Cells, Remodeling
-from remodel_fenicsx.problem import EquilibriumProblem, Extension, Solution, SolveFailure
-from remodel_fenicsx.remodel import RemodelingPass
-from remodel_fenicsx.scene import Load, Solver, preset_scene
-from remodel_fenicsx import stepping
+from remodel_fenicsx.body import cube, tube
+from remodel_fenicsx.body.loading import tube_loading
+from remodel_fenicsx.scene.parameters import Cells, Remodeling
+from remodel_fenicsx.evolution.equilibrium import EquilibriumProblem, Extension, Solution, SolveFailure
+from remodel_fenicsx.evolution.remodeling import RemodelingPass
+from remodel_fenicsx.scene.scene import Load, Solver, preset_scene
+from remodel_fenicsx.evolution import stepper as stepping
 from remodel_fenicsx.simulation import Simulation
-from remodel_fenicsx.stepping import KEPT_RESERVE, StepFailure, Stepper, times
+from remodel_fenicsx.evolution.stepper import KEPT_RESERVE, StepFailure, Stepper, times
 from tests import parts
 
 FORCE = 14.0

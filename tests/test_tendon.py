@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import fsolve
 
-from remodel_fenicsx.scene import preset_scene
+from remodel_fenicsx.scene.scene import preset_scene
 from tests.conftest import Case
 
 L, A_P, DENSITY, LAMBDA, MU, KAPPA = 1.594, 1.365, 2.0e21, 27.293, 3.103, 0.025

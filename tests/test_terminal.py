@@ -12,18 +12,18 @@ import warnings
 
 import pytest
 
-from remodel_fenicsx import terminal
-from remodel_fenicsx.terminal import Progress, open_log
+from remodel_fenicsx.system import terminal
+from remodel_fenicsx.system.terminal import Progress, open_log
 
 SCRIPT = """
 import sys, time, logging
-from remodel_fenicsx.terminal import Progress, open_log
+from remodel_fenicsx.system.terminal import Progress, open_log
 with open_log(sys.argv[1]), Progress(8, "artery [4]", 0) as progress:
     for k in range(1, 9):
         time.sleep(0.06)
         progress.step(k, 1.0 * k, "pressure [0.5]", 3, "two substeps" if k == 4 else None)
         if k == 5:
-            logging.getLogger("remodel_fenicsx.stepping").warning("careful")
+            logging.getLogger("remodel_fenicsx.evolution.stepper").warning("careful")
         if k == int(sys.argv[2]):
             raise KeyboardInterrupt
 print("the end")
@@ -139,7 +139,7 @@ def test_other_ranks_are_silent(capsys, tmp_path):
 def test_a_closed_pipe_does_not_end_the_run():
     script = SCRIPT.replace("open_log(sys.argv[1])", "open_log('/dev/null')").replace("time.sleep(0.06)", "pass")
     script = script.replace('Progress(8, "artery [4]", 0)', 'Progress(8, "artery", 0, interval=0.0)')
-    script = "import remodel_fenicsx.problem\n" + script  # with PETSc, which would end the process
+    script = "import remodel_fenicsx.evolution.equilibrium\n" + script  # with PETSc, which would end the process
     reading, writing = os.pipe()
     with subprocess.Popen([sys.executable, "-c", script, "", "0"], stdout=subprocess.PIPE, stderr=writing) as run:
         os.close(writing)
@@ -153,7 +153,7 @@ def test_log_has_times_and_the_terminal_only_warnings(tmp_path, capsys):
     path.write_text("an earlier run\n")
     with open_log(path) as log:
         log.info("step 1: 3 iterations")
-        logging.getLogger("remodel_fenicsx.jit").warning("slow")
+        logging.getLogger("remodel_fenicsx.fem.jit").warning("slow")
         log.debug("not wanted")
         with warnings.catch_warnings():
             warnings.simplefilter("always")

@@ -15,8 +15,8 @@ import h5py
 import numpy as np
 import pytest
 
-from remodel_fenicsx.staged_file import StagedFile
-from remodel_fenicsx.vtkhdf import LINE, TransientGrid, cell_type_and_permutation, chain_displacement, chain_lines
+from remodel_fenicsx.results.staged_file import StagedFile
+from remodel_fenicsx.results.vtkhdf import LINE, TransientGrid, cell_type_and_permutation, chain_displacement, chain_lines
 
 # In a process of its own, as users do. Steps are read forwards and backwards: VTK keeps the meshes of earlier steps.
 READER = """
@@ -304,7 +304,7 @@ def test_a_file_cut_off_between_any_two_writes_is_whole(tmp_path, monkeypatch, s
 def test_a_killed_run_leaves_a_series(tmp_path):
     script = """
 import sys, numpy as np
-from remodel_fenicsx.vtkhdf import TransientGrid
+from remodel_fenicsx.results.vtkhdf import TransientGrid
 grid = TransientGrid(sys.argv[1], np.eye(4, 3), [[0, 1, 2, 3]], 10)
 for k in range(10**6):
     grid.append(k, {"u": np.full((4, 3), k)})

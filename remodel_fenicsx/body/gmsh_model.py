@@ -1,0 +1,281 @@
+"""Gmsh on rank 0: plane section, extrusion, named faces, curved elements; from there to every rank's `Domain`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from mpi4py import MPI
+
+from remodel_fenicsx.fem import compat
+from remodel_fenicsx.body.domain import Domain, GeometryError
+from remodel_fenicsx.scene.parameters import length_fault
+
+CELLS = ("hexahedron", "tetrahedron")
+DEGREES = (1, 2)
+Draw = Callable[[], None]
+
+
+def check_arguments(lengths: Mapping[str, float], refinement: Any, cell: str, degree: int) -> None:
+    """Refuse what is no body or no mesh, by the same one-line ValueError on every rank."""
+    for name, value in lengths.items():
+        if not (np.isfinite(value) and value > 0.0):
+            raise ValueError(f"{name} = {value}: must be a positive number")
+    if not (isinstance(refinement, (int, np.integer)) and refinement >= 1):
+        raise ValueError(f"refinement = {refinement}: must be a whole number of at least 1")
+    if cell not in CELLS:
+        raise ValueError(f"cell = {cell!r}: allowed are {', '.join(CELLS)}")
+    if degree not in DEGREES:
+        raise ValueError(f"degree = {degree}: allowed are 1 and 2")
+
+
+def check_lengths(lengths: Mapping[str, float]) -> None:
+    """Refuse lengths and thicknesses, by the argument that decides them, with which Gmsh fails (`length_fault`)."""
+    found = length_fault(lengths)
+    if found is not None:
+        raise ValueError(f"{found[0]}: {found[1]}")
+
+
+@contextmanager
+def gmsh_model(name: str) -> Iterator[Any]:
+    """A fresh, silent Gmsh model; whatever happens, Gmsh is left as it was found."""
+    import gmsh  # late: it takes 0.2 s and only rank 0 needs it
+
+    foreign = gmsh.isInitialized()
+    if not foreign:
+        # no ~/.gmshrc, which could change the mesh; not interruptible: Ctrl-C stays Python's
+        gmsh.initialize(readConfigFiles=False, interruptible=False)
+    terminal = gmsh.option.getNumber("General.Terminal")
+    gmsh.option.setNumber("General.Terminal", 0)
+    previous = gmsh.model.getCurrent() if foreign else ""
+    gmsh.model.add(name)
+    try:
+        yield gmsh
+    finally:
+        if foreign:  # a script that uses Gmsh itself keeps its models
+            gmsh.model.remove()
+            gmsh.model.setCurrent(previous)
+            gmsh.option.setNumber("General.Terminal", terminal)
+        else:
+            gmsh.finalize()
+
+
+def build_domain(draw: Draw, shape: str, dimensions: dict[str, float], comm: MPI.Intracomm) -> Domain:
+    """Draw and mesh on rank 0, then share the mesh. Collective.
+
+    Parameters
+    ----------
+    draw
+        Draws and meshes the body in the current Gmsh model, with physical groups for the volume and the faces.
+    shape, dimensions
+        As in `Domain`.
+    comm
+        Ranks that share the mesh.
+
+    Raises
+    ------
+    GeometryError
+        On all ranks, if `draw` fails on rank 0.
+    """
+    if comm.rank != 0:
+        verdict, faces = comm.bcast(None, root=0)
+        if verdict:
+            raise GeometryError(verdict)
+        return Domain(*compat.mesh_from_gmsh(None, comm), faces, shape, dimensions)
+    # the verdict goes out exactly once, whether Gmsh is missing, fails or is interrupted: nobody waits for ever
+    told = False
+    try:
+        with gmsh_model(shape) as gmsh:
+            draw()
+            faces = named_faces()
+            told = True
+            comm.bcast(("", faces), root=0)
+            return Domain(*compat.mesh_from_gmsh(gmsh.model, comm), faces, shape, dimensions)
+    except BaseException as error:
+        if told:
+            raise
+        verdict = f"Gmsh could not mesh the {shape}: {str(error) or type(error).__name__}"
+        comm.bcast((verdict, {}), root=0)
+        if not isinstance(error, Exception):  # Ctrl-C on rank 0 stays what it is there
+            raise
+        raise GeometryError(verdict) from error
+
+
+def named_faces() -> dict[str, int]:
+    """Names and numbers of the faces of the current model, once it is sure that dolfinx can take the model.
+
+    dolfinx looks at these things on rank 0 only, where a failure would leave the other ranks waiting.
+
+    Raises
+    ------
+    GeometryError
+        If there is not exactly one named volume with exactly one type of cell, or no face.
+    """
+    import gmsh
+
+    volumes, faces = gmsh.model.getPhysicalGroups(3), gmsh.model.getPhysicalGroups(2)
+    kinds = gmsh.model.mesh.getElements(3)[0]
+    if len(volumes) != 1 or len(kinds) != 1 or not faces:
+        raise GeometryError(f"{len(volumes)} named volumes, {len(kinds)} types of cells, {len(faces)} named faces")
+    return {gmsh.model.getPhysicalName(2, tag): tag for _, tag in faces}
+
+
+def write_msh(path: str | Path, draw: Draw) -> None:
+    """Write what `draw` makes as a Gmsh file (format 4.1, ASCII); call it on one rank only."""
+    with gmsh_model(Path(path).stem) as gmsh:
+        draw()
+        gmsh.option.setNumber("Mesh.MshFileVersion", 4.1)
+        gmsh.option.setNumber("Mesh.Binary", 0)
+        gmsh.write(str(path))
+
+
+# ---------------------------------------------------------------- what the shapes are made of
+def circle(radius: float, number: int, start: int = 0) -> npt.NDArray[np.float64]:
+    """Corners of a regular polygon around the origin, (number, 2); corner `start` first, corner 0 on the x axis."""
+    angle = 2.0 * np.pi * (start + np.arange(number)) / number
+    corners = np.column_stack((np.cos(angle), np.sin(angle)))
+    corners[np.abs(corners) < 1e-15] = 0.0  # nodes on the axes are exactly on them
+    return radius * corners
+
+
+class Point(NamedTuple):
+    """A point of the plane z = 0 that is a node of the mesh."""
+
+    tag: int
+    x: float
+    y: float
+
+
+def points(coordinates: npt.NDArray[np.float64]) -> list[Point]:
+    """Points at (n, 2)."""
+    import gmsh
+
+    pairs = [(float(x), float(y)) for x, y in coordinates]
+    return [Point(gmsh.model.geo.addPoint(x, y, 0.0), x, y) for x, y in pairs]
+
+
+def line(start: Point, stop: Point, elements: int = 1) -> list[int]:
+    """Straight chain of equal curves of one element each.
+
+    So every node is given, as on the circles: the places that Gmsh finds along a curve are good to 1e-12 on straight
+    lines and to 1e-9 on arcs only.
+    """
+    import gmsh
+
+    geo = gmsh.model.geo
+    fraction = np.arange(1, elements)[:, None] / elements
+    between = points((1.0 - fraction) * np.array(start[1:]) + fraction * np.array(stop[1:]))
+    chain = [start, *between, stop]
+    curves = [geo.addLine(a.tag, b.tag) for a, b in zip(chain[:-1], chain[1:], strict=True)]
+    for curve in curves:
+        geo.mesh.setTransfiniteCurve(curve, 2)
+    return curves
+
+
+def polygon(corners: Sequence[Point]) -> list[int]:
+    """Closed chain of straight curves of one element each; curve i starts at corner i."""
+    return [line(start, stop)[0] for start, stop in zip(corners, [*corners[1:], corners[0]], strict=True)]
+
+
+def block(edges: Sequence[Sequence[int]], corners: Sequence[Point], cell: str) -> int:
+    """Structured plane surface between four sides (each a chain of curves, a closed loop in all) and four corners."""
+    import gmsh
+
+    geo = gmsh.model.geo
+    surface = geo.addPlaneSurface([geo.addCurveLoop([curve for side in edges for curve in side])])
+    geo.mesh.setTransfiniteSurface(surface, cornerTags=[corner.tag for corner in corners])
+    if cell == "hexahedron":
+        geo.mesh.setRecombine(2, surface)
+    return surface
+
+
+def reverse(curves: Sequence[int]) -> list[int]:
+    """The same chain of curves, run through backwards."""
+    return [-curve for curve in reversed(curves)]
+
+
+def extrude(
+    section: Sequence[int], length: float, layers: int, cell: str, sides: Mapping[str, Sequence[int]],
+    ends: tuple[str, str] = ("bottom", "top"),
+) -> None:
+    """Extrude a plane section along z, mesh it, and name the volume and the faces.
+
+    Parameters
+    ----------
+    section
+        Surfaces in the plane z = 0.
+    length, layers
+        Height, and number of equal element layers.
+    cell
+        "hexahedron" or "tetrahedron".
+    sides
+        Name of a face -> the section's boundary curves that sweep it.
+    ends
+        Names of the faces z = 0 and z = length.
+    """
+    import gmsh
+
+    made = gmsh.model.geo.extrude(
+        [(2, surface) for surface in section], 0.0, 0.0, length, numElements=[layers], recombine=cell == "hexahedron"
+    )
+    gmsh.model.geo.synchronize()
+    volumes = [tag for dimension, tag in made if dimension == 3]
+    tops = [made[i - 1][1] for i, (dimension, _) in enumerate(made) if dimension == 3]
+    groups = {ends[0]: list(section), ends[1]: tops}
+    for name, curves in sides.items():
+        # besides the section itself, the face swept by a boundary curve is the only one that the curve bounds
+        swept = {int(face) for curve in curves for face in gmsh.model.getAdjacencies(1, abs(curve))[0]}
+        groups[name] = sorted(swept - set(section))
+    for name, surfaces in groups.items():
+        gmsh.model.addPhysicalGroup(2, surfaces, name=name)
+    gmsh.model.addPhysicalGroup(3, volumes, name="body")
+    gmsh.model.mesh.generate(3)
+
+
+def raise_degree(degree: int, bulge: Callable[[npt.NDArray[np.float64]], npt.NDArray[Any]]) -> None:
+    """Give the straight elements nodes between their corners, and curve them around the z axis.
+
+    Parameters
+    ----------
+    degree
+        1 leaves the mesh as it is.
+    bulge
+        A new node lies between the corners of an edge, a face or a cell. It goes outwards from their mean towards
+        their mean radius, by the fraction bulge(mean radius): 1 puts it on the circle, 0 leaves the edge straight.
+    """
+    if degree == 1:
+        return
+    import gmsh
+
+    mesh = gmsh.model.mesh
+    mesh.setOrder(degree)
+    tags, coordinates, _ = mesh.getNodes()
+    old = coordinates.reshape(-1, 3)
+    row = np.zeros(int(tags.max()) + 1, dtype=np.int64)
+    row[tags] = np.arange(len(tags))
+    (kind,), _, (nodes,) = mesh.getElements(3)
+    _, _, _, count, local, corners = mesh.getElementProperties(kind)
+    cells = row[nodes].reshape(-1, count)
+    weights = _corner_weights(local.reshape(count, 3)[corners:], corners)
+    mean = np.einsum("kc,ncd->nkd", weights, old[cells[:, :corners]])
+    radius = np.hypot(*np.moveaxis(old[cells[:, :corners], :2], 2, 0)) @ weights.T
+    chord = np.hypot(mean[..., 0], mean[..., 1])
+    off_axis = chord > 1e-12 * radius.max()
+    outwards = np.where(off_axis, radius / np.where(off_axis, chord, 1.0) - 1.0, 0.0)
+    mean[..., :2] *= (1.0 + bulge(radius) * outwards)[..., None]
+    between, first = np.unique(cells[:, corners:], return_index=True)
+    for index, point in zip(between, mean.reshape(-1, 3)[first], strict=True):
+        mesh.setNode(tags[index], point, [])
+
+
+def _corner_weights(local: npt.NDArray[np.float64], corners: int) -> npt.NDArray[np.float64]:
+    """Linear shape functions of the corners at Gmsh's reference coordinates (n, 3), (n, corners)."""
+    if corners == 4:
+        return np.column_stack((1.0 - local.sum(axis=1), local))
+    face = [(-1, -1), (1, -1), (1, 1), (-1, 1)]
+    signs = np.array([(*corner, height) for height in (-1, 1) for corner in face])
+    return np.prod(0.5 * (1.0 + signs[None] * local[:, None]), axis=2)

@@ -1,0 +1,1 @@
+"""dolfinx, and nothing of the tissue: versions, compilation, quadrature points, kinematics, PETSc options."""

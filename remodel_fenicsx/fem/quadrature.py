@@ -1,0 +1,100 @@
+"""Quadrature points as a place where state lives: one rule for the cells, the forms and the stress evaluation."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import basix
+import basix.ufl
+import dolfinx.fem
+import numpy as np
+import ufl
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from remodel_fenicsx.fem import jit
+
+# the rule that the element wants; UFL's estimate for this energy is huge
+DEGREES = {("hexahedron", 1): 2, ("hexahedron", 2): 4, ("tetrahedron", 1): 1, ("tetrahedron", 2): 2}
+
+
+class Quadrature:
+    """The quadrature points of a mesh, and functions and reductions over them.
+
+    Arrays over the points have shape (cells, points, ...): all cells this rank knows, owned first, then ghosts. Nothing
+    at a point depends on another point, so updates need no communication.
+
+    Parameters
+    ----------
+    mesh
+        dolfinx mesh.
+    element_degree
+        Degree of the displacement element (1 or 2); decides the rule.
+    """
+
+    def __init__(self, mesh: Any, element_degree: int):
+        self.mesh = mesh
+        self.cell_name = mesh.topology.cell_name()
+        self.degree = DEGREES[self.cell_name, element_degree]
+        points, weights = basix.make_quadrature(basix.CellType[self.cell_name], self.degree)
+        self.points: NDArray[np.float64] = np.asarray(points, dtype=np.float64)
+        self.weights: NDArray[np.float64] = np.asarray(weights, dtype=np.float64)
+        self.number_of_owned_cells = mesh.topology.index_map(mesh.topology.dim).size_local
+        self.cells = np.arange(
+            self.number_of_owned_cells + mesh.topology.index_map(mesh.topology.dim).num_ghosts, dtype=np.int32
+        )
+        x = ufl.SpatialCoordinate(mesh)
+        geometry = self.evaluate(jit.expression(ufl.as_vector([*x, ufl.JacobianDeterminant(mesh)]), self.points), (4,))
+        self.coordinates: NDArray[np.float64] = geometry[..., :3]
+        self.volumes: NDArray[np.float64] = np.abs(geometry[..., 3]) * self.weights
+
+    @property
+    def dx(self) -> ufl.Measure:
+        """Volume measure at exactly these points."""
+        return ufl.Measure("dx", domain=self.mesh, metadata={"quadrature_degree": self.degree})
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(cells of this rank with ghosts, points per cell)."""
+        return len(self.cells), len(self.weights)
+
+    def function(self, name: str, value_shape: tuple[int, ...]) -> Any:
+        """A dolfinx function with values of `value_shape` at the points."""
+        element = basix.ufl.quadrature_element(self.cell_name, value_shape=value_shape, degree=self.degree)
+        return dolfinx.fem.Function(dolfinx.fem.functionspace(self.mesh, element), name=name)
+
+    def values(self, function: Any, value_shape: tuple[int, ...]) -> NDArray[np.float64]:
+        """The function's own memory as an array (cells, points, *value_shape)."""
+        return function.x.array.reshape(*self.shape, *value_shape)
+
+    def evaluate(self, expression: Any, value_shape: tuple[int, ...]) -> NDArray[np.float64]:
+        """Values (cells, points, *value_shape) of a compiled expression at the points."""
+        return expression.eval(self.mesh, self.cells).reshape(*self.shape, *value_shape)
+
+    def owned(self, values: NDArray[Any]) -> NDArray[Any]:
+        """The rows of the cells that this rank owns."""
+        return values[: self.number_of_owned_cells]
+
+    def integral(self, values: NDArray[np.float64]) -> float:
+        """Integral over the body of values (cells, points), over all ranks."""
+        local = float(np.sum(self.owned(values) * self.owned(self.volumes)))
+        return self.mesh.comm.allreduce(local, MPI.SUM)
+
+    def mean(self, values: NDArray[np.float64], cells: NDArray[np.bool_] | None = None) -> float:
+        """Volume mean of values (cells, points), over all cells or those selected by a mask (cells,), on all ranks."""
+        chosen = np.ones(self.shape) if cells is None else np.broadcast_to(cells[:, None], self.shape).astype(float)
+        return self.integral(values * chosen) / self.integral(chosen)
+
+    def cell_mean(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Volume mean over each cell: (cells, points, ...) to (cells, ...)."""
+        share = self.volumes / self.volumes.sum(axis=1, keepdims=True)
+        return np.einsum("cp,cp...->c...", share, values)
+
+    def maximum(self, values: NDArray[np.float64]) -> float:
+        """Largest value over all points of all ranks."""
+        local = float(np.max(self.owned(values), initial=-np.inf))
+        return self.mesh.comm.allreduce(local, MPI.MAX)
+
+    def minimum(self, values: NDArray[np.float64]) -> float:
+        """Smallest value over all points of all ranks."""
+        return -self.maximum(-values)

@@ -1,0 +1,127 @@
+"""Bodies in space as pictures: elements coloured by their fibre angle, with the chains of each on the surface."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import BoundaryNorm, Colormap
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from remodel_fenicsx.paper.recordings import Snapshot
+from remodel_fenicsx.paper.rendering import AMBIENT, Patch, Pixels
+from remodel_fenicsx.results.vtkhdf import chain_displacement, chain_lines
+
+Array = NDArray[np.float64]
+
+LEVELS = 18  # steps of 5 degrees: a colour can be read off the scale
+CHAIN_COLOUR = (0.08, 0.08, 0.10)
+CHAIN_REACH = 0.5  # half a chain's length over the shorter side of its face, both undeformed
+CHAIN_WIDTH = 0.07  # over the same
+
+
+def scale() -> tuple[Colormap, BoundaryNorm]:
+    """Colours from red (0 degrees, aligned) over yellow to blue (90 degrees, orthogonal), in equal steps."""
+    return matplotlib.colormaps["RdYlBu"], BoundaryNorm(np.linspace(0.0, 90.0, LEVELS + 1), 256, clip=True)
+
+
+def coloured(angle: Array) -> Array:
+    """Colours (m, 3) of angles in degrees (m,)."""
+    colours, steps = scale()
+    return colours(steps(angle))[:, :3]
+
+
+def scale_colours() -> Array:
+    """Every colour of the scale, also as a face shows it that is turned away from the eye, (n, 3) in 0..1."""
+    middle = (np.arange(LEVELS) + 0.5) * (90.0 / LEVELS)
+    return np.concatenate([share * coloured(middle) for share in np.linspace(1.0, AMBIENT, 5)])
+
+
+def body(snapshot: Snapshot, shown: NDArray[np.bool_] | None = None, chains_on: str = "side") -> list[Patch]:
+    """The surface of the shown elements in the deformed configuration, and their chains on it.
+
+    Parameters
+    ----------
+    snapshot
+        The body.
+    shown
+        Which elements, (elements,); default: all.
+    chains_on
+        "side": chains on faces that look away from the z axis; "none".
+    """
+    shown = np.ones(len(snapshot.cells), dtype=bool) if shown is None else shown
+    faces, elements = snapshot.exterior(shown)
+    angle = snapshot.fields["fibre_angle_deformed"][elements]
+    patches = [Patch(snapshot.deformed[faces], coloured(angle), edges=True)]
+    if chains_on == "side":
+        centres, outward = snapshot.points[faces].mean(axis=1), _normals(snapshot.points[faces])
+        outward *= np.sign(np.sum(outward * (centres - snapshot.centres[elements]), axis=1))[:, None]
+        away = np.sum(outward[:, :2] * centres[:, :2], axis=1) > 0.5 * np.linalg.norm(centres[:, :2], axis=1)
+        patches.append(chains(snapshot, faces[away], elements[away]))
+    return patches
+
+
+def chains(snapshot: Snapshot, faces: NDArray[np.int64], elements: NDArray[np.int64]) -> Patch:
+    """The four chains of each element, deformed, projected on one of its faces: narrow ribbons a little outside of it.
+
+    Parameters
+    ----------
+    snapshot
+        The body.
+    faces
+        Nodes of the faces, (m, 4).
+    elements
+        The element of each, (m,).
+    """
+    fields, reference, deformed = snapshot.fields, snapshot.points[faces], snapshot.deformed[faces]
+    centres = reference.mean(axis=1)
+    axes = np.stack([fields[f"axis_{i + 1}"][elements] for i in range(3)], axis=1)
+    gradient = fields["deformation_gradient"][elements].reshape(-1, 3, 3)
+    ends, _ = chain_lines(centres, fields["cell_dimensions"][elements], axes, 1.0)
+    size = np.linalg.norm(reference - np.roll(reference, 1, axis=1), axis=2).min(axis=1)
+    ends = (centres[:, None] + (CHAIN_REACH * size)[:, None, None] * (ends.reshape(-1, 8, 3) - centres[:, None]))
+    moved = chain_displacement(ends.reshape(-1, 3), centres, snapshot.displacement[faces].mean(axis=1), gradient)
+    normal, middle = _normals(deformed), deformed.mean(axis=1)
+    inner = np.einsum("mij,mj->mi", gradient, snapshot.centres[elements] - centres)
+    normal *= -np.sign(np.sum(normal * inner, axis=1))[:, None]
+    arms = ends + moved.reshape(-1, 8, 3) - middle[:, None]
+    arms = arms[:, ::2]  # (m, 4, 3): one half of each chain
+    arms = arms - np.einsum("mki,mi->mk", arms, normal)[..., None] * normal[:, None]
+    across = np.cross(normal[:, None], arms)
+    length = np.linalg.norm(across, axis=-1, keepdims=True)
+    across *= (CHAIN_WIDTH / 2 * size)[:, None, None] / np.where(length > 0, length, 1.0)
+    # outside of a face that need not be plane, and each chain above the one before
+    lift = (0.03 + 0.002 * np.arange(4))[None, :, None] * size[:, None, None] * normal[:, None]
+    start, end = middle[:, None] - arms + lift, middle[:, None] + arms + lift
+    corners = np.stack([start - across, end - across, end + across, start + across], axis=2).reshape(-1, 4, 3)
+    return Patch(corners, np.tile(CHAIN_COLOUR, (len(corners), 1)))
+
+
+def _normals(corners: Array) -> Array:
+    """Unit normals of quadrilaterals (m, 4, 3)."""
+    normal = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
+    return normal / np.linalg.norm(normal, axis=1, keepdims=True)
+
+
+# ---------------------------------------------------------------- on the page
+
+
+def place(axes: Axes, image: Pixels) -> None:
+    """Put a picture into axes that show nothing else."""
+    axes.imshow(image, interpolation="lanczos")
+    axes.set_axis_off()
+
+
+def angle_scale(figure: Figure, place_at: tuple[float, float, float, float], label: str) -> None:
+    """The scale of all angles: 0 to 90 degrees, red to blue; `label` says from which direction to which."""
+    axes = figure.add_axes(place_at)
+    colours, steps = scale()
+    bar: Any = figure.colorbar(ScalarMappable(steps, colours), cax=axes, orientation="horizontal")
+    bar.set_ticks(range(0, 91, 15), labels=[f"{angle}°" for angle in range(0, 91, 15)])
+    bar.ax.tick_params(length=2.5, labelsize=8, pad=2)
+    bar.outline.set_linewidth(0.5)
+    bar.set_label(label, fontsize=8.5, labelpad=2)

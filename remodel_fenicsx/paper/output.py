@@ -1,0 +1,163 @@
+"""What a figure leaves in its folder: a picture and its data, each saying what it was made with."""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from numpy.typing import ArrayLike, NDArray
+from PIL import Image
+from PIL.PngImagePlugin import PngInfo
+
+import remodel_fenicsx
+from remodel_fenicsx.paper.runs import FigureError
+
+MARK = "remodel_fenicsx figures"  # in every file: what bears it may be drawn anew
+DOTS_PER_INCH = 200
+STYLE = {
+    "font.family": "DejaVu Sans",
+    "font.size": 8.5,
+    "axes.titlesize": 9,
+    "axes.labelsize": 9,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.linewidth": 0.8,
+    "axes.grid": True,
+    "grid.color": "0.9",
+    "grid.linewidth": 0.6,
+    "lines.linewidth": 1.6,
+    "legend.frameon": False,
+    "figure.facecolor": "white",
+}
+COLOURS = ("#1b4f9c", "#d1495b", "#2a9d6f", "#e09f3e", "#6c4f9c")  # apart in lightness too
+
+
+class Page:
+    """Collects the picture and the tables of one figure, and writes them.
+
+    Parameters
+    ----------
+    folder
+        Where they go.
+    name
+        Name of the figure: NAME.png, NAME.csv, NAME-PART.csv.
+    colours
+        Colours (n, 3) in 0..1 that the picture must show as they are.
+    """
+
+    def __init__(self, folder: Path, name: str, colours: NDArray[np.float64] | None = None):
+        self.folder, self.name = folder, name
+        self.colours = np.zeros((0, 3)) if colours is None else colours
+        self.written: list[Path] = []
+
+    def save_figure(self, figure: Figure, title: str, made_with: str) -> None:
+        """Write NAME.png with a line at its foot that says what it was made with."""
+        made_with = f"{made_with}; matplotlib {matplotlib.__version__}"
+        figure.text(0.004, 0.004, made_with, fontsize=4.5, color="0.55", ha="left", va="bottom")
+        FigureCanvasAgg(figure)
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format="png", dpi=DOTS_PER_INCH, facecolor="white")
+        notes = PngInfo()
+        entries = {"Software": f"{MARK} {remodel_fenicsx.__version__}", "Title": title, "Source": made_with,
+                   "Comment": f"remodel-fenicsx figures {self.name}"}  # fmt: skip
+        for key, value in entries.items():
+            notes.add_text(key, value)
+        small = io.BytesIO()
+        with Image.open(buffer) as drawn:
+            picture = with_palette(drawn.convert("RGB"), self.colours)
+            picture.save(small, "png", pnginfo=notes, optimize=True, dpi=(DOTS_PER_INCH, DOTS_PER_INCH))
+        self._write(f"{self.name}.png", small.getvalue())
+
+    def save_table(self, columns: Mapping[str, ArrayLike], notes: Sequence[str], part: str = "") -> None:
+        """Write NAME.csv or NAME-PART.csv: notes as comments, then the columns, all of one length."""
+        names, values = list(columns), [np.asarray(column) for column in columns.values()]
+        text = io.StringIO()
+        for note in (f"{MARK} {remodel_fenicsx.__version__}: {self.name}", *notes):
+            text.write(f"# {note}\n")
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow(names)
+        for row in zip(*values, strict=True):
+            writer.writerow([_cell(value) for value in row])
+        self._write(f"{self.name}-{part}.csv" if part else f"{self.name}.csv", text.getvalue().encode())
+
+    def _write(self, name: str, content: bytes) -> None:
+        path = self.folder / name
+        _check_ours(path)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        part = path.with_name(f".{name}.part-{os.getpid()}")
+        try:
+            part.write_bytes(content)
+            part.replace(path)
+        finally:
+            part.unlink(missing_ok=True)
+        self.written.append(path)
+
+
+def with_palette(picture: Image.Image, colours: NDArray[np.float64]) -> Image.Image:
+    """A picture of 256 colours, a quarter as large: these (n, 3) in 0..1 as they are, the rest chosen for the picture.
+
+    Pillow alone takes neighbours on the scale for one colour, and looks for the nearest colour only roughly.
+    """
+    kept = np.rint(255 * colours).astype(np.uint8)
+    chosen = picture.quantize(256 - len(kept), method=Image.Quantize.MAXCOVERAGE, kmeans=2, dither=Image.Dither.NONE)
+    found = np.array(chosen.getpalette(), dtype=np.uint8).reshape(-1, 3)[: 256 - len(kept)]
+    palette = np.concatenate([kept, found])
+    pixels = np.asarray(picture)
+    distinct, where = np.unique(pixels.reshape(-1, 3), axis=0, return_inverse=True)
+    nearest = np.concatenate([
+        np.abs(part[:, None].astype(int) - palette.astype(int)).sum(axis=2).argmin(axis=1)
+        for part in np.array_split(distinct, 1 + len(distinct) // 5000)
+    ])  # fmt: skip
+    result = Image.fromarray(nearest[np.ravel(where)].reshape(pixels.shape[:2]).astype(np.uint8), mode="P")
+    result.putpalette(palette.tobytes())
+    return result
+
+
+def _cell(value: Any) -> str:
+    return str(value) if isinstance(value, (str, int, np.integer)) else f"{float(value):.7g}"
+
+
+def check_folder(folder: Path, names: Sequence[str]) -> None:
+    """That the folder can take these figures without touching anything of anybody else's; nothing is left in it.
+
+    Raises
+    ------
+    FigureError
+        Exit code 2, one line.
+    OSError
+        If nothing can be written there.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise FigureError(f"-o {folder}: is a file; allowed is a folder", 2)
+    for name in names:
+        for path in (folder / f"{name}.png", folder / f"{name}.csv", *folder.glob(f"{name}-*.csv")):
+            _check_ours(path)
+    there = next(place for place in (folder, *folder.absolute().parents) if place.exists())
+    with tempfile.TemporaryDirectory(prefix=".remodel-fenicsx-", dir=there):
+        pass
+
+
+def _check_ours(path: Path) -> None:
+    if not path.exists():
+        return
+    with path.open("rb") as file:
+        start = file.read(4096)
+    if MARK.encode() not in start:
+        message = f"{path}: is not a figure of this command and is not overwritten; choose another folder with -o"
+        raise FigureError(message, 2)
+
+
+def read_table(path: Path) -> dict[str, list[str]]:
+    """Columns of a table that `Page.save_table` wrote, as text."""
+    with path.open(newline="", encoding="utf-8") as file:
+        rows = list(csv.reader(line for line in file if not line.startswith("#")))
+    return {name: [row[index] for row in rows[1:]] for index, name in enumerate(rows[0])}

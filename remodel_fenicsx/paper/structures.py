@@ -1,0 +1,263 @@
+"""Figs. 6 to 9: tendon and artery as they deform and remodel, in the paper's arrangement."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from remodel_fenicsx.tissue.cells import initial_axes, radial_direction
+from remodel_fenicsx.paper.bodies import angle_scale, body, place
+from remodel_fenicsx.paper.output import COLOURS, Page
+from remodel_fenicsx.paper.recordings import Array, Recording, Snapshot, Table, layers, radii, rank_of
+from remodel_fenicsx.paper.rendering import Picture, View, render
+from remodel_fenicsx.paper.runs import LOAD_CASES, load_case_name
+
+TENDON_TIMES = (1.0, 12.0, 25.0, 50.0, 150.0)
+ARTERY_TIMES = (1.0, 24.0, 50.0, 100.0, 150.0)
+WALL_LAYERS = {"intima": 0, "media": 3, "adventitia": 7}  # element layers of eight, from the inside
+
+TO_LOAD = "deformed angle between chains and load axis: 0° along it, 90° across"
+IN_WALL = "deformed angle of the chains in the wall{}: 0° circumferential, 90° axial"
+SOLVED = "fields belong to the solved state of their time, before that time's remodeling pass"
+
+FROM_ABOVE = (0.35, -1.0, 0.42)  # the direction from which tubes are seen
+
+
+def element_table(snapshot: Snapshot, shown: NDArray[np.bool_] | None = None) -> Table:
+    """What is drawn of each element: reference centre, angles in degrees, cell dimensions, r/L."""
+    shown = np.ones(len(snapshot.cells), dtype=bool) if shown is None else shown
+    x, y, z = snapshot.centres[shown].T
+    fields = {name: values[shown] for name, values in snapshot.fields.items()}
+    lengths = {f"l_{i + 1}": fields["cell_dimensions"][:, i] for i in range(3)}
+    return {
+        "time": np.full(shown.sum(), snapshot.time),
+        "element": np.flatnonzero(shown),
+        "x": x,
+        "y": y,
+        "z": z,
+        "fibre_angle_deformed": fields["fibre_angle_deformed"],
+        "fibre_angle": fields["fibre_angle"],
+        **lengths,
+        "axial_stretch": fields["deformation_gradient"][:, 8],
+        "chain_extension": fields["chain_extension"],
+    }
+
+
+def wall_table(snapshot: Snapshot, shown: NDArray[np.bool_] | None = None) -> Table:
+    """`element_table` of a tube, with the radial component of its cells."""
+    shown = np.ones(len(snapshot.cells), dtype=bool) if shown is None else shown
+    return element_table(snapshot, shown) | {"l_radial": radial_dimension(snapshot)[shown]}
+
+
+def radial_dimension(snapshot: Snapshot) -> Array:
+    """The radial component sqrt(e_r . A e_r) of each element's cell, A = sum l_I^2 n_I n_I^T its mean, (elements,)."""
+    radial = radial_direction(snapshot.centres)
+    axes = np.stack([snapshot.fields[f"axis_{i + 1}"] for i in range(3)], axis=1)
+    components = snapshot.fields["cell_dimensions"] * np.einsum("mij,mj->mi", axes, radial)
+    return np.linalg.norm(components, axis=1)
+
+
+def joined(tables: Sequence[Table]) -> Table:
+    """Tables of the same columns, one under the other."""
+    return {name: np.concatenate([table[name] for table in tables]) for name in tables[0]}
+
+
+def at(snapshot: Snapshot) -> str:
+    """The time, to stand in a label."""
+    return f" at $t$ = {snapshot.time:g}"
+
+
+def tube_picture(
+    snapshot: Snapshot, shown: NDArray[np.bool_] | None, height: float, pixels: tuple[int, int]
+) -> Picture:
+    """A tube seen obliquely from above, its middle in the middle."""
+    top = snapshot.deformed[:, 2].max()
+    return Picture(View(FROM_ABOVE, (0.0, 0.0, top / 2), height, pixels), body(snapshot, shown))
+
+
+# ---------------------------------------------------------------- the tendon
+
+
+def draw_tendon(runs: dict[str, Recording], page: Page) -> None:
+    """Fig. 6: stretch over time, and snapshots coloured by the angle to the load axis."""
+    run = runs["tendon"]
+    snapshots = [run.snapshot(time) for time in TENDON_TIMES]
+    longest = max(snapshot.deformed[:, 2].max() for snapshot in snapshots)
+    height, pixels = 1.1 * longest, (270, 1000)
+    pictures = [
+        Picture(View((0.3, -1.0, 0.14), (0.0, 0.0, 0.495 * longest), height, pixels), body(snapshot))
+        for snapshot in snapshots
+    ]
+    images = render(pictures)
+    figure = Figure(figsize=(8.2, 4.3))
+    axes = figure.add_axes((0.065, 0.145, 0.36, 0.775))
+    columns = run.history
+    axes.fill_between(columns["time"], columns["min_stretch"], columns["max_stretch"], color="0.88", lw=0,
+                      label="elements, least to most")  # fmt: skip
+    axes.plot(columns["time"], columns["mean_stretch"], color=COLOURS[0], label="mean")
+    marks = [run.value("mean_stretch", time) for time in TENDON_TIMES]
+    axes.plot(TENDON_TIMES, marks, "o", ms=4, color=COLOURS[0], clip_on=False)
+    axes.set(xlabel="time", ylabel="stretch", xlim=(0, run.scene.time.end), ylim=(1.0, None))
+    axes.legend(loc="upper right")
+    for number, (time, image) in enumerate(zip(TENDON_TIMES, images, strict=True)):
+        picture = figure.add_axes((0.45 + 0.109 * number, 0.175, 0.109, 0.765))
+        place(picture, image)
+        picture.set_title(f"$t$ = {time:g}", pad=2)
+    angle_scale(figure, (0.50, 0.145, 0.44, 0.022), TO_LOAD)
+    page.save_figure(figure, "Cylindrical tendon under uniaxial tension (Fig. 6)", run.made_with())
+    notes = [run.made_with(), "fig6, left; stretches 1 = undeformed, angle in degrees to the load axis (reference)"]
+    names = ("time", "force", "mean_stretch", "min_stretch", "max_stretch", "mean_fibre_angle")
+    page.save_table({name: columns[name] for name in names}, notes)
+    page.save_table(joined([element_table(s) for s in snapshots]), [run.made_with(), f"fig6, right; {SOLVED}"],
+                    "elements")  # fmt: skip
+    page.save_table(snapshot_summary(snapshots), [run.made_with(), f"over all elements; {SOLVED}"], "snapshots")
+
+
+def snapshot_summary(snapshots: Sequence[Snapshot]) -> Table:
+    """What the paper says of the tendon's elements, by time: angles, least l_1, stretch of the extreme tenths."""
+    rows = []
+    for snapshot in snapshots:
+        fields = snapshot.fields
+        reference, deformed = fields["fibre_angle"], fields["fibre_angle_deformed"]
+        stretch = fields["deformation_gradient"][np.argsort(reference), 8]
+        tenth = len(stretch) // 10
+        rows.append({
+            "time": snapshot.time,
+            "mean_fibre_angle": reference.mean(),
+            "max_fibre_angle": reference.max(),
+            "mean_fibre_angle_deformed": deformed.mean(),
+            "max_fibre_angle_deformed": deformed.max(),
+            "stretch_most_aligned_tenth": stretch[:tenth].mean(),
+            "stretch_least_aligned_tenth": stretch[-tenth:].mean(),
+            "min_l_1": fields["cell_dimensions"][:, 0].min(),
+        })  # fmt: skip
+    return {name: np.array([row[name] for row in rows]) for name in rows[0]}
+
+
+# ---------------------------------------------------------------- the artery
+
+
+def draw_artery(runs: dict[str, Recording], page: Page) -> None:
+    """Fig. 7: five snapshots of the artery."""
+    run = runs["artery"]
+    snapshots = [run.snapshot(time) for time in ARTERY_TIMES]
+    tallest = max(snapshot.deformed[:, 2].max() for snapshot in snapshots)
+    images = render([tube_picture(s, None, 1.25 * tallest, (360, 560)) for s in snapshots])
+    figure = Figure(figsize=(8.2, 3.5))
+    for number, (time, image) in enumerate(zip(ARTERY_TIMES, images, strict=True)):
+        axes = figure.add_axes((0.005 + 0.198 * number, 0.225, 0.198, 0.72))
+        place(axes, image)
+        axes.set_title(f"$t$ = {time:g}", pad=3)
+        loads = f"$p$ = {run.value('pressure', time):.3g},  stretch {100 * run.value('axial_stretch', time):.2g} %"
+        axes.text(0.5, -0.015, loads, transform=axes.transAxes, ha="center", va="top", fontsize=7, color="0.35")
+    angle_scale(figure, (0.25, 0.15, 0.5, 0.026), IN_WALL.format(""))
+    page.save_figure(figure, "Artery under axial stretch and inner pressure (Fig. 7)", run.made_with())
+    names = ("pressure", "axial_stretch", "inner_radius", "outer_radius",
+             "fibre_angle_inner", "fibre_angle_middle", "fibre_angle_outer")  # fmt: skip
+    summary = {"time": list(ARTERY_TIMES)} | {name: [run.value(name, t) for t in ARTERY_TIMES] for name in names}
+    summary["mean_l_radial"] = [radial_dimension(s).mean() for s in snapshots]
+    meaning = "rows of the run's history; reference angles in degrees; mean_l_radial: radial component, all elements"
+    page.save_table(summary, [run.made_with(), meaning])
+    history = {name: run.history[name] for name in ("time", *names)}
+    page.save_table(history, [run.made_with(), "the whole history"], "history")
+    tables = [wall_table(s) for s in snapshots]
+    page.save_table(joined(tables), [run.made_with(), f"what is drawn; {SOLVED}"], "elements")
+
+
+def layer_table(snapshot: Snapshot) -> Table:
+    """Means and extremes over each element layer of a tube's wall, from the inside; angles in degrees.
+
+    `shear` is the largest root mean square of a shear component of F in the local directions: nearly 0 in a tube that
+    stays round, large where it swirls or where elements are sheared to and fro.
+    """
+    number = layers(snapshot)
+    radius = radii(snapshot.points, snapshot.cells)
+    count = np.bincount(number)
+
+    def per_layer(name: str) -> Array:
+        # the elements of a layer are alike: their mean is the volume mean
+        return np.bincount(number, snapshot.fields[name]) / count
+
+    reference = snapshot.fields["fibre_angle"]
+    shear = local_shear(snapshot)
+    dimensions = [np.bincount(number, snapshot.fields["cell_dimensions"][:, i]) / count for i in range(3)]
+    deformed = radii(snapshot.deformed, snapshot.cells)
+    return {
+        "layer": np.arange(1, len(count) + 1),
+        "radius": np.bincount(number, radius) / count,
+        "deformed_radius": np.bincount(number, deformed) / count,
+        "fibre_angle": per_layer("fibre_angle"),
+        "fibre_angle_least": np.array([reference[number == k].min() for k in range(len(count))]),
+        "fibre_angle_most": np.array([reference[number == k].max() for k in range(len(count))]),
+        "fibre_angle_deformed": per_layer("fibre_angle_deformed"),
+        **{f"l_{i + 1}": values for i, values in enumerate(dimensions)},
+        "l_radial": np.bincount(number, radial_dimension(snapshot)) / count,
+        "shear": np.array([np.sqrt(np.mean(shear[number == k] ** 2, axis=0)).max() for k in range(len(count))]),
+    }
+
+
+def local_shear(snapshot: Snapshot) -> Array:
+    """The six off-diagonal components of F in circumferential, axial and radial direction, (elements, 6)."""
+    directions = initial_axes("cylindrical", snapshot.centres)
+    gradient = snapshot.fields["deformation_gradient"].reshape(-1, 3, 3)
+    local = directions @ gradient @ np.swapaxes(directions, 1, 2)
+    return local[:, ~np.eye(3, dtype=bool)]
+
+
+def draw_layers(runs: dict[str, Recording], page: Page) -> None:
+    """Fig. 8: the end of Fig. 7, three layers of its wall apart."""
+    run = runs["artery"]
+    snapshot = run.snapshot(run.scene.time.end)
+    number, table = layers(snapshot), layer_table(snapshot)
+    tallest = snapshot.deformed[:, 2].max()
+    images = render([tube_picture(snapshot, number == k, 1.27 * tallest, (440, 600)) for k in WALL_LAYERS.values()])
+    figure = Figure(figsize=(6.4, 3.95))
+    for place_number, ((name, k), image) in enumerate(zip(WALL_LAYERS.items(), images, strict=True)):
+        axes = figure.add_axes((0.01 + 0.33 * place_number, 0.255, 0.32, 0.69))
+        place(axes, image)
+        axes.set_title(name, pad=3)
+        means = f"{table['fibre_angle'][k]:.1f}° reference, {table['fibre_angle_deformed'][k]:.1f}° deformed"
+        text = f"layer {k + 1} of {len(table['layer'])}; mean angle\n{means}"
+        axes.text(0.5, -0.015, text, transform=axes.transAxes, ha="center", va="top", fontsize=7.5, color="0.35")
+    angle_scale(figure, (0.2, 0.125, 0.6, 0.025), IN_WALL.format(at(snapshot)))
+    page.save_figure(figure, "Chains in the layers of the artery's wall (Fig. 8)", run.made_with())
+    page.save_table(table, [run.made_with(), f"means over element layers; time {run.scene.time.end:g}; {SOLVED}"])
+    drawn = np.isin(number, list(WALL_LAYERS.values()))
+    page.save_table(wall_table(snapshot, drawn), [run.made_with(), "the elements that are drawn"], "elements")
+
+
+def peeled(snapshot: Snapshot) -> NDArray[np.bool_]:
+    """The elements that stay when each layer of the wall but the innermost is cut shorter than the one inside it."""
+    row = rank_of(snapshot.centres[:, 2])
+    return row < row.max() + 1 - layers(snapshot)
+
+
+def draw_load_cases(runs: dict[str, Recording], page: Page) -> None:
+    """Fig. 9: the ends of five load cases, the layers virtually peeled off."""
+    cases = [runs[load_case_name(*case)] for case in LOAD_CASES]
+    snapshots = [run.snapshot(run.scene.time.end) for run in cases]
+    tallest = max(snapshot.deformed[:, 2].max() for snapshot in snapshots)
+    images = render([tube_picture(s, peeled(s), 1.25 * tallest, (360, 560)) for s in snapshots])
+    figure = Figure(figsize=(8.2, 3.4))
+    for number, ((stretch, pressure), image) in enumerate(zip(LOAD_CASES, images, strict=True)):
+        axes = figure.add_axes((0.005 + 0.198 * number, 0.215, 0.198, 0.73))
+        place(axes, image)
+        axes.set_title(f"stretch {100 * stretch:g} %,  $p$ = {pressure:g}", pad=3, fontsize=8)
+    angle_scale(figure, (0.25, 0.15, 0.5, 0.026), IN_WALL.format(at(snapshots[0])))
+    made_with = cases[0].made_with()
+    page.save_figure(figure, "Load cases from pure stretch to pure pressure (Fig. 9)", made_with)
+    tables = []
+    for (stretch, pressure), snapshot in zip(LOAD_CASES, snapshots, strict=True):
+        table = layer_table(snapshot)
+        loads = {"stretch": np.full(len(table["layer"]), stretch), "pressure": np.full(len(table["layer"]), pressure)}
+        tables.append(loads | table)
+    page.save_table(joined(tables), [made_with, f"means over element layers; {SOLVED}"])
+    elements = []
+    for (stretch, pressure), snapshot in zip(LOAD_CASES, snapshots, strict=True):
+        table = wall_table(snapshot, peeled(snapshot))
+        loads = {"stretch": np.full(len(table["x"]), stretch), "pressure": np.full(len(table["x"]), pressure)}
+        elements.append(loads | table)
+    page.save_table(joined(elements), [made_with, f"the elements that are drawn; {SOLVED}"], "elements")

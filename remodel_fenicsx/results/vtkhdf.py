@@ -1,0 +1,346 @@
+"""Fields on an unstructured grid over time in one VTKHDF file, which ParaView (from 5.12) and PyVista open as a series.
+
+The format: https://docs.vtk.org/en/latest/vtk_file_formats/vtkhdf_file_format, version 2.2, type UnstructuredGrid, one
+partition. The mesh is written once; each step appends its point and cell data, and its points if they move. Serial: in
+a parallel run rank 0 writes arrays that were gathered in the mesh file's order.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import ArrayLike, DTypeLike, NDArray
+
+from remodel_fenicsx.results.staged_file import StagedFile, signals_held_back
+
+Array = NDArray[Any]
+Fields = Mapping[str, ArrayLike]
+
+VERSION = (2, 2)
+# cell name of dolfinx: type of VTK for degree 1, for any higher degree ("Lagrange")
+CELL_TYPES = {
+    "interval": (3, 68),
+    "triangle": (5, 69),
+    "quadrilateral": (9, 70),
+    "tetrahedron": (10, 71),
+    "hexahedron": (12, 72),
+}
+LINE = 3
+_NODES = {3: 2, 5: 3, 9: 4, 10: 4, 12: 8}
+_STEPS_PER_CHUNK = 256
+# shuffle and deflate are built into every HDF5; on noisy floats level 1 saves as much as level 9
+_COMPRESSION: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
+
+
+class TransientGrid:
+    """A time series on one grid; the file is whole after the constructor and after every `append`.
+
+    Parameters
+    ----------
+    path
+        A new file (suffix .vtkhdf, or readers will not know it).
+    points
+        Reference coordinates, shape (points, 3).
+    cells
+        Node numbers of each cell in VTK's order, shape (cells, nodes): see `cell_type_and_permutation`.
+    cell_type
+        VTK's number, one for all cells.
+    point_dtype
+        How coordinates are stored; float32 makes sense where they move (`append`).
+    field_dtype
+        How floating-point fields are stored. The default, float32, keeps 7 digits and needs half the room: 150 steps of
+        the artery's 1,536 cells take 21 MB. Integers stay integers.
+
+    Raises
+    ------
+    FileExistsError
+        If `path` exists: nothing is overwritten.
+    OSError
+        If the file cannot be written (disk full, no permission).
+    ValueError
+        If the arrays do not describe a grid.
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        points: ArrayLike,
+        cells: ArrayLike,
+        cell_type: int,
+        *,
+        point_dtype: DTypeLike = np.float64,
+        field_dtype: DTypeLike = np.float32,
+    ):
+        coordinates = np.asarray(points, dtype=point_dtype)
+        connectivity = _checked_cells(np.asarray(cells), cell_type, _checked_points(coordinates))
+        self.path = Path(path)
+        self.number_of_points, self.number_of_cells = len(coordinates), len(connectivity)
+        self.number_of_steps = 0
+        self._field_dtype, self._point_dtype = field_dtype, coordinates.dtype
+        self._last_time = -np.inf
+        self._point_blocks = 1  # block 0 of Points is the reference configuration
+        with signals_held_back():
+            self._staged = StagedFile(self.path)
+            # with these bounds HDF5 sets no "open for writing" mark, which a killed process would leave for ever
+            self._file = h5py.File(self._staged, "w", libver=("earliest", "v110"))
+            try:
+                self._root = self._file.create_group("VTKHDF")
+                self._write_mesh(coordinates, connectivity, cell_type)
+                self._create_steps()
+                self._file.flush()
+                self._staged.commit()
+            except BaseException:
+                self._file.close()
+                self._staged.discard()
+                raise
+
+    def __enter__(self) -> TransientGrid:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def append(
+        self,
+        time: float,
+        point_data: Fields | None = None,
+        cell_data: Fields | None = None,
+        points: ArrayLike | None = None,
+    ) -> None:
+        """Add one step and bring it to the disk.
+
+        Parameters
+        ----------
+        time
+            Later than the step before.
+        point_data, cell_data
+            Arrays by name: scalars (n,), vectors (n, 3), tensors (n, 9) or (n, 3, 3), rows first. The first step says
+            which names and shapes there are, the others bring the same.
+        points
+            Coordinates from this step on, shape (points, 3), if they move.
+
+        Raises
+        ------
+        OSError
+            If the step could not be written (disk full). The file then ends with the step before, and is whole; the
+            next `append`, or `close`, tries to write this step again.
+        ValueError
+            If times, names or shapes do not fit; nothing has changed then.
+        """
+        if not (np.isfinite(time) and time > self._last_time):
+            raise ValueError(f"{self.path.name}: time {time} does not come after {self._last_time}")
+        blocks = {
+            "PointData": self._checked_fields("PointData", point_data or {}, self.number_of_points),
+            "CellData": self._checked_fields("CellData", cell_data or {}, self.number_of_cells),
+        }
+        moved = None if points is None else np.asarray(points, dtype=self._point_dtype)
+        if moved is not None and _checked_points(moved) != self.number_of_points:
+            raise ValueError(f"{self.path.name}: {len(moved)} points where the grid has {self.number_of_points}")
+        with signals_held_back():
+            if moved is not None:
+                _write_block(self._root["Points"], self._point_blocks, moved)
+                self._point_blocks += 1
+            self._write_step(time, blocks)
+            self._file.flush()
+            # the number of steps comes last: until then a reader sees the series without this step
+            self.number_of_steps, self._last_time = self.number_of_steps + 1, time
+            self._root["Steps"].attrs.modify("NSteps", np.int64(self.number_of_steps))
+            self._file.flush()
+            self._staged.commit()
+
+    def close(self) -> None:
+        """Write what is not yet on the disk and close; more than once does no harm.
+
+        Raises
+        ------
+        OSError
+            If a step that `append` could not write cannot be written now either.
+        """
+        if self._staged.closed:
+            return
+        with signals_held_back():
+            try:
+                self._file.close()
+                self._staged.commit()
+            finally:
+                self._staged.close()
+
+    def _write_mesh(self, points: Array, cells: Array, cell_type: int) -> None:
+        root = self._root
+        root.attrs["Version"] = np.array(VERSION, dtype=np.int64)
+        root.attrs["Type"] = np.bytes_("UnstructuredGrid")  # VTK takes fixed-length ASCII only
+        root["NumberOfPoints"] = np.array([len(points)], dtype=np.int64)
+        root["NumberOfCells"] = np.array([len(cells)], dtype=np.int64)
+        root["NumberOfConnectivityIds"] = np.array([cells.size], dtype=np.int64)
+        _write_block(_create(root, "Points", points), 0, points)
+        root.create_dataset("Connectivity", data=cells.ravel(), **_COMPRESSION)
+        root.create_dataset("Offsets", data=cells.shape[1] * np.arange(len(cells) + 1), **_COMPRESSION)
+        root.create_dataset("Types", data=np.full(len(cells), cell_type, dtype=np.uint8), **_COMPRESSION)
+        root.create_group("PointData")
+        root.create_group("CellData")
+
+    def _create_steps(self) -> None:
+        steps = self._root.create_group("Steps")
+        steps.attrs["NSteps"] = np.int64(0)
+        _create_row_dataset(steps, "Values", np.float64)
+        for name in ("PartOffsets", "NumberOfParts", "PointOffsets"):
+            _create_row_dataset(steps, name, np.int64)
+        for name in ("CellOffsets", "ConnectivityIdOffsets"):
+            _create_row_dataset(steps, name, np.int64, (1,))  # one column for each kind of topology
+        steps.create_group("PointDataOffsets")
+        steps.create_group("CellDataOffsets")
+
+    def _write_step(self, time: float, blocks: Mapping[str, Mapping[str, Array]]) -> None:
+        """Write rows and blocks number `number_of_steps`."""
+        step, steps = self.number_of_steps, self._root["Steps"]
+        for kind, fields in blocks.items():
+            for name, values in fields.items():
+                if step == 0:
+                    _create(self._root[kind], name, values)
+                    _create_row_dataset(steps[f"{kind}Offsets"], name, np.int64)
+                _write_block(self._root[kind][name], step, values)
+                _write_block(steps[f"{kind}Offsets"][name], step, np.array([step * len(values)]))
+        # offsets that stay 0 say that the mesh is the one of the first step
+        rows = {
+            "Values": time, "PartOffsets": 0, "NumberOfParts": 1, "CellOffsets": 0, "ConnectivityIdOffsets": 0,
+            "PointOffsets": (self._point_blocks - 1) * self.number_of_points,
+        }  # fmt: skip
+        for name, value in rows.items():
+            _write_block(steps[name], step, np.full((1, *steps[name].shape[1:]), value))
+
+    def _checked_fields(self, kind: str, fields: Fields, length: int) -> dict[str, Array]:
+        """The arrays as they will be stored, or ValueError."""
+        group = self._root[kind]
+        if self.number_of_steps and set(fields) != set(group):
+            raise ValueError(f"{self.path.name}: {kind} has {sorted(fields)}, the first step had {sorted(group)}")
+        stored = {}
+        for name, values in fields.items():
+            array = np.asarray(values)
+            if array.shape[1:] == (3, 3):
+                array = array.reshape(len(array), 9)
+            if array.ndim not in (1, 2) or len(array) != length or not array.size or "/" in name or name in ("", "."):
+                raise ValueError(f"{self.path.name}: {kind} {name!r} of shape {array.shape}, wanted ({length}, ...)")
+            if self.number_of_steps and array.shape[1:] != group[name].shape[1:]:
+                raise ValueError(f"{self.path.name}: {kind} {name!r} has another number of components than at first")
+            if array.dtype.kind not in "fiub":
+                raise ValueError(f"{self.path.name}: {kind} {name!r} holds {array.dtype}, not real numbers")
+            stored[name] = array.astype({"f": self._field_dtype, "b": np.uint8}.get(array.dtype.kind, array.dtype))
+        return stored
+
+
+def cell_type_and_permutation(cell_name: str, degree: int) -> tuple[int, NDArray[np.intp]]:
+    """VTK's cell type, and the permutation p from dolfinx's order of nodes to VTK's: `cells[:, p]`.
+
+    The two orders differ from degree 1 on for hexahedra: dolfinx counts them like a tensor product, VTK goes round.
+
+    Parameters
+    ----------
+    cell_name
+        "interval", "triangle", "quadrilateral", "tetrahedron" or "hexahedron".
+    degree
+        Degree of the geometry or of the Lagrange space, 1 or more.
+
+    Raises
+    ------
+    ValueError
+        If there is no such cell or degree.
+    """
+    if cell_name not in CELL_TYPES or degree < 1:
+        raise ValueError(f"no VTK cell {cell_name!r} of degree {degree}: cells {', '.join(CELL_TYPES)}, degree >= 1")
+    # here and not above: whoever reads or writes lines alone need not wait for dolfinx
+    import basix
+    from dolfinx import cpp
+    from dolfinx.mesh import to_type
+
+    nodes = basix.create_element(basix.ElementFamily.P, basix.CellType[cell_name], degree,
+                                 basix.LagrangeVariant.equispaced).dim  # fmt: skip
+    from_vtk = np.asarray(cpp.io.perm_vtk(to_type(cell_name), nodes))
+    return CELL_TYPES[cell_name][degree > 1], np.argsort(from_vtk)
+
+
+def chain_lines(
+    centres: ArrayLike, lengths: ArrayLike, axes: ArrayLike, scale: float
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """The four chains of unit cells, +-l_1 n_1 +-l_2 n_2 +-l_3 n_3 through each centre (paper, Fig. 2).
+
+    Eight corners do not depend on the order or the sign of the axes. Where l_3 = 0 the four lines lie on two.
+
+    Parameters
+    ----------
+    centres
+        Reference coordinates, shape (m, 3).
+    lengths
+        l_I in link lengths, shape (m, 3).
+    axes
+        n_I as rows, shape (m, 3, 3).
+    scale
+        Length in the mesh's unit that one link length is drawn with; a line is 2 |l| scale long.
+
+    Returns
+    -------
+    points
+        Ends, shape (8 m, 3): element by element, line by line, the two ends of a line after one another.
+    lines
+        Numbers of the two ends, shape (4 m, 2). Data of the elements go with `numpy.repeat(values, 4, axis=0)`.
+    """
+    middle = np.asarray(centres, dtype=np.float64)
+    edges = np.asarray(lengths, dtype=np.float64)[:, :, None] * np.asarray(axes, dtype=np.float64)
+    signs = np.array([(1, 1, 1), (1, 1, -1), (1, -1, 1), (1, -1, -1)])
+    half = scale * np.einsum("kI,mIi->mki", signs, edges)
+    ends = middle[:, None, None, :] + np.stack([half, -half], axis=2)
+    return ends.reshape(-1, 3), np.arange(8 * len(middle)).reshape(-1, 2)
+
+
+def chain_displacement(
+    points: ArrayLike, centres: ArrayLike, displacement: ArrayLike, deformation_gradient: ArrayLike
+) -> NDArray[np.float64]:
+    """Displacement of the ends that `chain_lines` gives, shape (8 m, 3): u + (F - I)(X_end - X_centre).
+
+    With u (m, 3) and F (m, 3, 3) of the centres. ParaView's "Warp By Vector" then shows the deformed chains.
+    """
+    ends = np.asarray(points, dtype=np.float64).reshape(-1, 8, 3) - np.asarray(centres)[:, None, :]
+    gradient = np.asarray(deformation_gradient) - np.eye(3)
+    return (np.asarray(displacement)[:, None, :] + np.einsum("mij,mkj->mki", gradient, ends)).reshape(-1, 3)
+
+
+def _checked_points(points: Array) -> int:
+    if points.ndim != 2 or points.shape[1] != 3 or not len(points):
+        raise ValueError(f"points have shape {points.shape}, wanted (n, 3)")
+    return len(points)
+
+
+def _checked_cells(cells: Array, cell_type: int, number_of_points: int) -> NDArray[np.int64]:
+    if cells.ndim != 2 or not cells.size or cells.dtype.kind not in "iu":
+        raise ValueError(f"cells have shape {cells.shape} and type {cells.dtype}, wanted (n, nodes) and integers")
+    if cells.shape[1] != _NODES.get(cell_type, cells.shape[1]):
+        raise ValueError(f"cells have {cells.shape[1]} nodes, VTK's type {cell_type} has {_NODES[cell_type]}")
+    if cells.min() < 0 or cells.max() >= number_of_points:
+        raise ValueError(f"cells name point {cells.min()} to {cells.max()}, there are {number_of_points}")
+    return cells.astype(np.int64)
+
+
+def _create(group: h5py.Group, name: str, block: Array) -> h5py.Dataset:
+    """A dataset to which blocks like this one are added: a chunk is a step, which readers take as a whole."""
+    trailing = block.shape[1:]
+    return group.create_dataset(
+        name, (0, *trailing), block.dtype, maxshape=(None, *trailing), chunks=block.shape, **_COMPRESSION
+    )
+
+
+def _create_row_dataset(group: h5py.Group, name: str, dtype: DTypeLike, trailing: tuple[int, ...] = ()) -> None:
+    group.create_dataset(name, (0, *trailing), dtype, maxshape=(None, *trailing), chunks=(_STEPS_PER_CHUNK, *trailing))
+
+
+def _write_block(dataset: h5py.Dataset, number: int, block: Array) -> None:
+    """Write block `number` of a dataset whose blocks have this one's length."""
+    start = number * len(block)
+    dataset.resize(start + len(block), axis=0)
+    dataset[start:] = block

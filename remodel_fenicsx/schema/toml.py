@@ -1,0 +1,138 @@
+"""TOML in and out: a scene file, overrides of the command line, and a table's values with their descriptions.
+
+A leaf: it knows no key of any scene.
+"""
+
+from __future__ import annotations
+
+import re
+import textwrap
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import tomlkit
+from pydantic import BaseModel
+
+from remodel_fenicsx.schema.tables import SceneError, printable, shown
+
+COMMENT_WIDTH = 100  # characters of a line of comment
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """The nested dicts of a TOML file.
+
+    Raises
+    ------
+    SceneError
+        If it cannot be read; one line with the file and, where it is not TOML, the line in it.
+    """
+    try:
+        text = path.read_bytes().decode("utf-8-sig")
+    except IsADirectoryError:
+        raise SceneError(f"{path}: is a folder; a scene is a TOML file") from None
+    except FileNotFoundError:
+        raise SceneError(f"{path}: no such file; a scene is a TOML file") from None
+    except UnicodeDecodeError as error:
+        line = error.object[: error.start].count(b"\n") + 1
+        raise SceneError(f"{path}: line {line}: not UTF-8 text; a scene is a TOML file in UTF-8") from None
+    except (OSError, ValueError) as error:
+        raise SceneError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
+    try:
+        return tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
+        place = re.search(r"^(.*) \(at (?:line (\d+), column \d+|(end of document))\)$", str(error), re.DOTALL)
+        where = f"line {place[2] or len(text.splitlines())}: " if place else ""
+        raise SceneError(f"{path}: {where}not TOML: {place[1] if place else error}") from None
+
+
+def parse_override(text: str) -> tuple[str, Any]:
+    """Dotted key and value of "KEY=VALUE"; VALUE is TOML, or a bare word for a string.
+
+    Raises
+    ------
+    SceneError
+        If there is no '=', the key has an empty part or the value is neither.
+    """
+    key, equals, value = (part.strip() for part in text.partition("="))
+    if not equals:
+        raise SceneError(f"--set {shown(text)}: must be KEY=VALUE, as in cells.seed=2")
+    if not all(key.split(".")):
+        raise SceneError(f"--set {shown(text)}: the key must be a dotted path, as in cells.seed=2")
+    try:
+        parsed = tomllib.loads(f"value = {value}")
+    except (ValueError, RecursionError):
+        parsed = {}
+    if list(parsed) == ["value"]:
+        return key, parsed["value"]
+    if re.fullmatch(r"[\w.+/:-]+", value):
+        return key, value
+    raise SceneError(f"--set {key} = {shown(value)}: must be a TOML value or a bare word")
+
+
+def put(values: dict[str, Any], key: str, value: Any) -> None:
+    """Put a value at a dotted key, making the tables on the way."""
+    *parents, name = (part.strip() for part in key.split("."))
+    for depth, parent in enumerate(parents):
+        table = values.setdefault(parent, {})
+        if not isinstance(table, dict):
+            place = ".".join(parents[: depth + 1])
+            raise SceneError(f"{key} = {shown(value)}: {place} = {shown(table)} is a value, not a table")
+        values = table
+    values[name] = value
+
+
+def merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    """Nested dicts laid over each other, table by table; a list or a value of `over` replaces that of `base`."""
+    result = dict(base)
+    for name, value in over.items():
+        below = result.get(name)
+        result[name] = merged(below, value) if isinstance(below, Mapping) and isinstance(value, Mapping) else value
+    return result
+
+
+def toml_text(table: BaseModel, header: str = "") -> str:
+    """A table with all its values as TOML, each key under its description as a comment."""
+    document = tomlkit.document()
+    for line in header.splitlines():
+        document.add(tomlkit.comment(printable(line)) if line.strip() else tomlkit.nl())
+    if header:
+        document.add(tomlkit.nl())
+    _fill(document, table)
+    return tomlkit.dumps(document)
+
+
+def _fill(container: Any, table: BaseModel) -> None:
+    fields = type(table).model_fields
+    # TOML wants a table's own values before the tables in it
+    for name, field in sorted(fields.items(), key=lambda item: isinstance(getattr(table, item[0]), (BaseModel, dict))):
+        value = getattr(table, name)
+        if value is None:
+            continue
+        if isinstance(value, BaseModel):
+            inner = tomlkit.table()
+            _fill(inner, value)
+            container.add(name, inner)
+        elif isinstance(value, dict):
+            container.add(name, _toml_table(value))
+        else:
+            for line in textwrap.wrap(field.description or "", COMMENT_WIDTH):
+                container.add(tomlkit.comment(line))
+            container.add(name, _plain(value))
+
+
+def _toml_table(values: Mapping[str, Any]) -> Any:
+    table = tomlkit.table(is_super_table=any(isinstance(value, BaseModel) for value in values.values()))
+    for name, value in values.items():
+        if isinstance(value, BaseModel):
+            inner = tomlkit.table()
+            _fill(inner, value)
+            table.add(name, inner)
+        else:
+            table.add(name, value)
+    return table
+
+
+def _plain(value: Any) -> Any:
+    return [_plain(entry) for entry in value] if isinstance(value, (list, tuple)) else value

@@ -1,0 +1,1 @@
+"""What the paper says: chains, energy, drivers, laws, unit cells. Plain functions on arrays or UFL, no mesh."""
