@@ -56,9 +56,7 @@ class Simulation:
         The parts, each usable by itself (see demos/).
     """
 
-    def __init__(
-        self, scene: Scene, comm: MPI.Intracomm = MPI.COMM_WORLD, domain: geometry.Domain | None = None
-    ):
+    def __init__(self, scene: Scene, comm: MPI.Intracomm = MPI.COMM_WORLD, domain: geometry.Domain | None = None):
         self.scene = scene
         self.domain = domain or geometry.build(scene.geometry, scene.mesh, comm)
         mesh = self.domain.mesh

@@ -49,8 +49,9 @@ def test_stiffness_has_no_pole_at_zero_length() -> None:
     assert WORMLIKE.stiffness(1e-12, 2.0) == pytest.approx(1.5 / 2.0, rel=1e-11)
 
 
-@pytest.mark.parametrize("persistence_length, at_half, at_nine_tenths", [
-    (0.1, 12.5, 256.5), (0.4, 3.125, 64.125), (0.8, 1.5625, 32.0625)])
+@pytest.mark.parametrize(
+    "persistence_length, at_half, at_nine_tenths", [(0.1, 12.5, 256.5), (0.4, 3.125, 64.125), (0.8, 1.5625, 32.0625)]
+)
 def test_figure_1(persistence_length: float, at_half: float, at_nine_tenths: float) -> None:
     """Force over r/L for k theta = 1: (4 x + 1/(1-x)^2 - 1)/(4 A_p) by hand, whatever L is."""
     for contour_length in (1.0, 1.594):

@@ -61,8 +61,9 @@ class Points:
             cell = [Cell(self.l, self.n)]
             tensors = stresses(self.F, cell, material, R0)
             outputs.append(strain_energy(self.F, cell, material, R0))
-            outputs += [t[i, j] for t in (tensors.second_piola_kirchhoff, tensors.cauchy)
-                        for i in range(3) for j in range(3)]
+            outputs += [
+                t[i, j] for t in (tensors.second_piola_kirchhoff, tensors.cauchy) for i in range(3) for j in range(3)
+            ]
         points, _ = basix.make_quadrature(basix.CellType.hexahedron, 2)
         self.expression = jit.expression(ufl.as_vector(outputs), points)
 
@@ -74,9 +75,11 @@ class Points:
         """omega -> (W, S, sigma); fewer points than there are are repeated."""
         for function, values in (self.F, F), (self.l, l), (self.n, n):
             function.x.array[:] = np.resize(values, (self.count, *values.shape[1:])).ravel()
-        result = self.expression.eval(self.mesh, np.arange(8, dtype=np.int32)).reshape(self.count, 2, 19)[:len(F)]
-        return {omega: (result[:, i, 0], result[:, i, 1:10].reshape(-1, 3, 3), result[:, i, 10:].reshape(-1, 3, 3))
-                for i, omega in enumerate((1, 4))}
+        result = self.expression.eval(self.mesh, np.arange(8, dtype=np.int32)).reshape(self.count, 2, 19)[: len(F)]
+        return {
+            omega: (result[:, i, 0], result[:, i, 1:10].reshape(-1, 3, 3), result[:, i, 10:].reshape(-1, 3, 3))
+            for i, omega in enumerate((1, 4))
+        }
 
 
 @pytest.fixture(scope="module")
@@ -200,8 +203,9 @@ def test_equal_dimensions_are_isotropic_only_along_the_principal_axes(points: Po
     # where C is diagonal in the axes, exchanging them does nothing
     F = np.diag([1.2, 0.9, 1.05])[None]
     exchanged = np.array([QUARTER_TURN])
-    np.testing.assert_allclose(points.evaluate(F, l, exchanged)[1][2], points.evaluate(F, l, np.eye(3)[None])[1][2],
-                               atol=1e-14)
+    np.testing.assert_allclose(
+        points.evaluate(F, l, exchanged)[1][2], points.evaluate(F, l, np.eye(3)[None])[1][2], atol=1e-14
+    )
 
 
 @pytest.fixture(scope="module")

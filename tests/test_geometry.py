@@ -67,9 +67,14 @@ def has_node(points, *wanted):
 
 
 # ---------------------------------------------------------------- counts
-@pytest.mark.parametrize(("shape", "cells", "nodes"), [
-    ("cube", 1, 8), ("tendon", 480, 57 * 11), ("tube", 1536, 16 * 9 * 13),
-])
+@pytest.mark.parametrize(
+    ("shape", "cells", "nodes"),
+    [
+        ("cube", 1, 8),
+        ("tendon", 480, 57 * 11),
+        ("tube", 1536, 16 * 9 * 13),
+    ],
+)
 @pytest.mark.parametrize("refinement", [1, 2])
 def test_hexahedra_are_the_papers_times_the_refinement_in_every_direction(shape, cells, nodes, refinement):
     domain = domain_of(shape, refinement=refinement)
@@ -121,9 +126,14 @@ def test_face_areas_of_the_cube(cell, degree):
     assert [area(domain, face) for face in domain.faces] == pytest.approx([1.0] * 6, rel=1e-12)
 
 
-@pytest.mark.parametrize(("cell", "degree", "refinement"), [
-    *((cell, degree, 1) for cell, degree in KINDS), ("hexahedron", 1, 2), ("hexahedron", 2, 2),
-])
+@pytest.mark.parametrize(
+    ("cell", "degree", "refinement"),
+    [
+        *((cell, degree, 1) for cell, degree in KINDS),
+        ("hexahedron", 1, 2),
+        ("hexahedron", 2, 2),
+    ],
+)
 def test_the_area_of_the_meshed_tendon_is_the_scenes(cell, degree, refinement):
     domain = domain_of("tendon", cell, degree, refinement)
     assert set(domain.faces) == {"bottom", "top", "side"}
@@ -174,9 +184,15 @@ def on_faces(shape, domain):
     """name -> largest distance of the face's corners from the surface it should lie on."""
     height, inner, outer = SIDES[shape], 1.0, 3.0
     where = {
-        "x0": lambda x: x[:, 0], "x1": lambda x: x[:, 0] - 1, "y0": lambda x: x[:, 1], "y1": lambda x: x[:, 1] - 1,
-        "z0": lambda x: x[:, 2], "z1": lambda x: x[:, 2] - 1, "bottom": lambda x: x[:, 2],
-        "top": lambda x: x[:, 2] - height, "inner": lambda x: np.hypot(x[:, 0], x[:, 1]) - inner,
+        "x0": lambda x: x[:, 0],
+        "x1": lambda x: x[:, 0] - 1,
+        "y0": lambda x: x[:, 1],
+        "y1": lambda x: x[:, 1] - 1,
+        "z0": lambda x: x[:, 2],
+        "z1": lambda x: x[:, 2] - 1,
+        "bottom": lambda x: x[:, 2],
+        "top": lambda x: x[:, 2] - height,
+        "inner": lambda x: np.hypot(x[:, 0], x[:, 1]) - inner,
         "outer": lambda x: np.hypot(x[:, 0], x[:, 1]) - outer,
         "side": lambda x: np.hypot(x[:, 0], x[:, 1]) - domain.dimensions["radius"],
     }
@@ -195,9 +211,14 @@ def test_each_named_face_lies_where_its_name_says(shape, refinement):
     assert max(distances.values()) < 1e-14
 
 
-@pytest.mark.parametrize(("cell", "degree", "refinement"), [
-    *((cell, degree, 1) for cell, degree in KINDS), ("hexahedron", 1, 2), ("hexahedron", 1, 3),
-])
+@pytest.mark.parametrize(
+    ("cell", "degree", "refinement"),
+    [
+        *((cell, degree, 1) for cell, degree in KINDS),
+        ("hexahedron", 1, 2),
+        ("hexahedron", 1, 3),
+    ],
+)
 def test_nodes_for_the_supports(cell, degree, refinement):
     body = domain_of("tendon", cell, degree, refinement)
     assert all(has_node(body.gather_mesh()[0], (0, 0, 0), (body.dimensions["radius"], 0, 0)))
@@ -209,11 +230,16 @@ def test_nodes_for_the_supports(cell, degree, refinement):
 @pytest.mark.parametrize(("cell", "degree"), KINDS)
 def test_the_tube_is_equally_divided_through_the_wall_around_and_along(cell, degree):
     points, _ = domain_of("tube", cell, degree).gather_mesh()
-    steps = np.column_stack((
-        (np.hypot(points[:, 0], points[:, 1]) - 1) * 4,
-        np.arctan2(points[:, 1], points[:, 0]) * 8 / np.pi,
-        points[:, 2] * 1.5,
-    )) * degree
+    steps = (
+        np.column_stack(
+            (
+                (np.hypot(points[:, 0], points[:, 1]) - 1) * 4,
+                np.arctan2(points[:, 1], points[:, 0]) * 8 / np.pi,
+                points[:, 2] * 1.5,
+            )
+        )
+        * degree
+    )
     if (cell, degree) == ("tetrahedron", 2):
         steps = steps[:, [0, 2]]  # the middle of a diagonal is not quite half-way around
     assert np.abs(steps - np.round(steps)).max() < 1e-12
@@ -264,26 +290,33 @@ def test_build_reads_a_scenes_geometry_and_mesh(shape):
         assert domain.dimensions[name] == getattr(geometry, name)
 
 
-@pytest.mark.parametrize(("call", "message"), [
-    (lambda: cube(side=-1.0), "side = -1.0: must be a positive number"),
-    (lambda: tendon(area=float("nan")), "area = nan: must be a positive number"),
-    (lambda: tube(length=float("inf")), "length = inf: must be a positive number"),
-    (lambda: tube(2.0, 2.0, 1.0), "inner_radius = 2.0: must be smaller than outer_radius = 2.0"),
-    (lambda: cube(side=1e-7), "side: a length of 1e-07 here; allowed are 1e-06 to 1e+06"),
-    (lambda: tendon(area=1e-10),
-     "area: a length of 1e-05 is too small beside one of 10; allowed is a ratio up to 10000"),
-    (lambda: tube(1.0, 1.0001, 8.0),
-     "outer_radius: a length of 0.0001 is too small beside one of 8; allowed is a ratio up to 10000"),
-    (lambda: tube(refinement=0), "refinement = 0: must be a whole number of at least 1"),
-    (lambda: cube(refinement=1.5), "refinement = 1.5: must be a whole number of at least 1"),
-    (lambda: tube(divisions=(10, 1, 1)), f"divisions = (10, 1, 1): {DIVISIONS}"),
-    (lambda: tube(divisions=(8, 0, 1)), f"divisions = (8, 0, 1): {DIVISIONS}"),
-    (lambda: tube(divisions=(8, 2.0, 1)), f"divisions = (8, 2.0, 1): {DIVISIONS}"),
-    (lambda: tube(divisions=(8, 2)), f"divisions = (8, 2): {DIVISIONS}"),
-    (lambda: cube(cell="prism"), "cell = 'prism': allowed are hexahedron, tetrahedron"),
-    (lambda: cube(degree=3), "degree = 3: allowed are 1 and 2"),
-    (lambda: build(SimpleNamespace(shape="sphere"), None), "shape = 'sphere': allowed are cube, tendon, tube"),
-])
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: cube(side=-1.0), "side = -1.0: must be a positive number"),
+        (lambda: tendon(area=float("nan")), "area = nan: must be a positive number"),
+        (lambda: tube(length=float("inf")), "length = inf: must be a positive number"),
+        (lambda: tube(2.0, 2.0, 1.0), "inner_radius = 2.0: must be smaller than outer_radius = 2.0"),
+        (lambda: cube(side=1e-7), "side: a length of 1e-07 here; allowed are 1e-06 to 1e+06"),
+        (
+            lambda: tendon(area=1e-10),
+            "area: a length of 1e-05 is too small beside one of 10; allowed is a ratio up to 10000",
+        ),
+        (
+            lambda: tube(1.0, 1.0001, 8.0),
+            "outer_radius: a length of 0.0001 is too small beside one of 8; allowed is a ratio up to 10000",
+        ),
+        (lambda: tube(refinement=0), "refinement = 0: must be a whole number of at least 1"),
+        (lambda: cube(refinement=1.5), "refinement = 1.5: must be a whole number of at least 1"),
+        (lambda: tube(divisions=(10, 1, 1)), f"divisions = (10, 1, 1): {DIVISIONS}"),
+        (lambda: tube(divisions=(8, 0, 1)), f"divisions = (8, 0, 1): {DIVISIONS}"),
+        (lambda: tube(divisions=(8, 2.0, 1)), f"divisions = (8, 2.0, 1): {DIVISIONS}"),
+        (lambda: tube(divisions=(8, 2)), f"divisions = (8, 2): {DIVISIONS}"),
+        (lambda: cube(cell="prism"), "cell = 'prism': allowed are hexahedron, tetrahedron"),
+        (lambda: cube(degree=3), "degree = 3: allowed are 1 and 2"),
+        (lambda: build(SimpleNamespace(shape="sphere"), None), "shape = 'sphere': allowed are cube, tendon, tube"),
+    ],
+)
 def test_what_cannot_be_meshed_is_refused_in_one_line(call, message):
     with pytest.raises(ValueError) as caught:
         call()
@@ -291,10 +324,18 @@ def test_what_cannot_be_meshed_is_refused_in_one_line(call, message):
 
 
 @pytest.mark.parametrize("unit", [1e-2, 1e2])
-@pytest.mark.parametrize(("shape", "lengths"), [
-    ("cube", (1.0,)), ("tendon", (1.0, 1.02e-8)), ("tendon", (1.01e-4, 1.0)), ("tube", (1.01e-4, 1.0, 1.0)),
-    ("tube", (1.0, 1.000101, 1.0)), ("tube", (0.5, 1.0, 1.01e-4)), ("tube", (1.01e-4, 2.02e-4, 1.0)),
-])
+@pytest.mark.parametrize(
+    ("shape", "lengths"),
+    [
+        ("cube", (1.0,)),
+        ("tendon", (1.0, 1.02e-8)),
+        ("tendon", (1.01e-4, 1.0)),
+        ("tube", (1.01e-4, 1.0, 1.0)),
+        ("tube", (1.0, 1.000101, 1.0)),
+        ("tube", (0.5, 1.0, 1.01e-4)),
+        ("tube", (1.01e-4, 2.02e-4, 1.0)),
+    ],
+)
 def test_bodies_of_extreme_proportions_are_meshed(shape, lengths, unit):
     """At the limits that are allowed no two nodes become one, in any unit of length."""
     powers = (1, 2) if shape == "tendon" else (1, 1, 1)
@@ -391,7 +432,10 @@ def test_two_ranks_gather_what_one_rank_has_and_fail_together():
     environment = {k: v for k, v in os.environ.items() if not k.startswith(("OMPI_COMM_", "PMIX_", "PRTE_JOB"))}
     run = subprocess.run(
         ["mpirun", "-n", "2", "--oversubscribe", sys.executable, "-m", "mpi4py", parallel_geometry.__file__],
-        capture_output=True, text=True, timeout=120, env=environment,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        env=environment,
     )
     assert run.returncode == 0, run.stderr
     together = json.loads(run.stdout)

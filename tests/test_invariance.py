@@ -122,9 +122,7 @@ def test_turning_the_body_during_the_hold_changes_everything_in_the_spatial_fram
     assert abs(turned.problem.stored_energy() / still.problem.stored_energy() - 1) > 0.05
     # the chains follow the observer: their mean reference angle to the axis of the bar goes from 50 to 64 degrees
     axis = np.array([0.0, 0.0, 1.0])
-    angles = [
-        float(np.mean(angle_to_axis(bar.lengths, bar.body.cells.axis_values, axis))) for bar in (still, turned)
-    ]
+    angles = [float(np.mean(angle_to_axis(bar.lengths, bar.body.cells.axis_values, axis))) for bar in (still, turned)]
     assert angles[0] == pytest.approx(50.1, abs=1.0) and angles[1] == pytest.approx(64.3, abs=1.0)
 
 
@@ -290,8 +288,7 @@ def test_material_frame(seed: int) -> None:
     turned = material_frame(turn @ F, spatial @ np.swapaxes(turn, 1, 2))
     np.testing.assert_allclose(turned, axes, atol=1e-10)
     # a rotation alone is undone
-    np.testing.assert_allclose(material_frame(turn, spatial @ np.swapaxes(turn, 1, 2)),
-                               spatial, atol=1e-12)
+    np.testing.assert_allclose(material_frame(turn, spatial @ np.swapaxes(turn, 1, 2)), spatial, atol=1e-12)
 
 
 def test_material_frame_does_not_ask_for_the_sign_or_the_hand() -> None:

@@ -3,6 +3,7 @@
 The stand-in's root holds links to this machine's own /usr and /etc, so that the real enter-root has real work to do.
 No stand-in reaches the network, installs anything, or starts a container.
 """
+
 import json
 import os
 import shutil
@@ -90,16 +91,26 @@ class Clone:
         if not shutil.which("mount", path=SYSTEM_PATH):
             script(self.folder / "bin" / "mount", MOUNT.format(python=sys.executable))
         self.environment = {
-            "PATH": f"{stubs}:{self.folder}/bin:{SYSTEM_PATH}", "HOME": str(folder / "home"), "LANG": "C.UTF-8",
-            "XDG_CACHE_HOME": str(self.cache), "RECORD": str(self.record), "WITH_FENICSX": "root",
-            "STUB_ENGINE": "none"}
+            "PATH": f"{stubs}:{self.folder}/bin:{SYSTEM_PATH}",
+            "HOME": str(folder / "home"),
+            "LANG": "C.UTF-8",
+            "XDG_CACHE_HOME": str(self.cache),
+            "RECORD": str(self.record),
+            "WITH_FENICSX": "root",
+            "STUB_ENGINE": "none",
+        }
 
     def start(self, *command: str, **options):
         environment = self.environment | options.pop("environment", {})
         environment = {name: value for name, value in environment.items() if value is not None}
         options = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE} | options
-        return subprocess.Popen([options.pop("launcher", self.launcher), *command], env=environment, text=True,
-                                start_new_session=True, **options)
+        return subprocess.Popen(
+            [options.pop("launcher", self.launcher), *command],
+            env=environment,
+            text=True,
+            start_new_session=True,
+            **options,
+        )
 
     def run(self, *command: str, send: str | None = None, **options):
         if send is not None:
@@ -129,9 +140,15 @@ def wait_for(condition, what: str) -> None:
 
 def namespaces_work(clone: Clone) -> bool:
     mapped = [] if os.getuid() == 0 else ["--user", "--map-root-user"]
-    return shutil.which("unshare") is not None and subprocess.run(
-        ["unshare", *mapped, "--mount", "--propagation", "private", "mount", "--bind", "/usr", "/usr"],
-        env=clone.environment, capture_output=True).returncode == 0
+    return (
+        shutil.which("unshare") is not None
+        and subprocess.run(
+            ["unshare", *mapped, "--mount", "--propagation", "private", "mount", "--bind", "/usr", "/usr"],
+            env=clone.environment,
+            capture_output=True,
+        ).returncode
+        == 0
+    )
 
 
 @pytest.fixture
@@ -169,8 +186,13 @@ def test_unknown_command(ready):
 
 def test_arguments_and_standard_input(ready):
     arguments = ["a b", "", "line\nbreak", "*", "-v", "$HOME", "q'\"\\"]
-    result = ready.run("python3", "-c", "import json, sys; print(json.dumps([sys.argv[1:], sys.stdin.read()]))",
-                       *arguments, send="one\n\ntwo")
+    result = ready.run(
+        "python3",
+        "-c",
+        "import json, sys; print(json.dumps([sys.argv[1:], sys.stdin.read()]))",
+        *arguments,
+        send="one\n\ntwo",
+    )
     assert json.loads(result.stdout) == [arguments, "one\n\ntwo"]
     assert result.stderr == ""
 
@@ -210,17 +232,33 @@ def test_nothing_stays_mounted(ready):
 
 
 def test_another_python_does_not_reach_in(ready):
-    foreign = {name: "/nowhere" for name in ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV", "CONDA_PREFIX",
-                                             "LD_LIBRARY_PATH", "CC", "CFLAGS", "PETSC_DIR", "BASH_ENV")}
+    foreign = {
+        name: "/nowhere"
+        for name in (
+            "PYTHONPATH",
+            "PYTHONHOME",
+            "VIRTUAL_ENV",
+            "CONDA_PREFIX",
+            "LD_LIBRARY_PATH",
+            "CC",
+            "CFLAGS",
+            "PETSC_DIR",
+            "BASH_ENV",
+        )
+    }
     fake = ready.stubs.parent / "conda"
     script(fake / "python3", "#!/bin/sh\nexit 99\n")
-    result = ready.run("python3", "-c", "import json, os; print(json.dumps(dict(os.environ)))",
-                       environment=foreign | {"PATH": f"{fake}:{ready.environment['PATH']}", "KEPT": "yes"})
+    result = ready.run(
+        "python3",
+        "-c",
+        "import json, os; print(json.dumps(dict(os.environ)))",
+        environment=foreign | {"PATH": f"{fake}:{ready.environment['PATH']}", "KEPT": "yes"},
+    )
     inside = json.loads(result.stdout)
     assert inside["KEPT"] == "yes"
     assert inside["PYTHONPATH"] == str(ready.folder)
     assert [name for name in foreign if name != "PYTHONPATH" and name in inside] == []
-    assert "WITH_FENICSX" not in inside     # a command that calls the launcher again is inside already
+    assert "WITH_FENICSX" not in inside  # a command that calls the launcher again is inside already
 
 
 def test_session_folder_is_private(ready):
@@ -231,7 +269,9 @@ def test_session_folder_is_private(ready):
 def test_ranks_must_start_inside(ready):
     result = ready.run("true", environment={"OMPI_COMM_WORLD_SIZE": "2"})
     assert (result.returncode, result.stderr) == (
-        5, "with-fenicsx: the ranks must start inside: ./with-fenicsx mpirun -n 2 true\n")
+        5,
+        "with-fenicsx: the ranks must start inside: ./with-fenicsx mpirun -n 2 true\n",
+    )
 
 
 # ---------------------------------------------------------------- making the root
@@ -287,8 +327,9 @@ def test_build_ends_with_the_launcher(rooted, number, group):
 
 
 def test_killed_launcher_leaves_a_build_that_the_next_run_takes(rooted):
-    process = rooted.start("true", environment={"STUB_BUILD": "slow"},
-                           stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    process = rooted.start(
+        "true", environment={"STUB_BUILD": "slow"}, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
     wait_for((rooted.record / "begun").exists, "the build")
     process.kill()
     process.wait()
@@ -299,8 +340,9 @@ def test_killed_launcher_leaves_a_build_that_the_next_run_takes(rooted):
 
 
 def test_killed_build_is_never_used(rooted):
-    process = rooted.start("true", environment={"STUB_BUILD": "hang"},
-                           stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    process = rooted.start(
+        "true", environment={"STUB_BUILD": "hang"}, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
     wait_for((rooted.record / "begun").exists, "the build")
     process.kill()
     process.wait()
@@ -350,7 +392,7 @@ def test_older_roots_are_pruned_unless_in_use(rooted):
         rooted.packages.write_text(f"{original}package-{number}\n")
         assert rooted.run("true").returncode == 0
         keys += [name for name in rooted.roots() if name not in [used, *keys]]
-    assert rooted.roots() == sorted([used, *keys[1:]])     # four were made; the oldest is old, but in use
+    assert rooted.roots() == sorted([used, *keys[1:]])  # four were made; the oldest is old, but in use
     busy.communicate("\n")
     assert busy.returncode == 0
     rooted.packages.write_text(f"{original}package-4\n")
@@ -359,14 +401,17 @@ def test_older_roots_are_pruned_unless_in_use(rooted):
 
 
 # ---------------------------------------------------------------- what cannot work says so in one line
-@pytest.mark.parametrize("environment, words", [
-    ({"XDG_CACHE_HOME": "some/where"}, "XDG_CACHE_HOME=some/where: must be an absolute path"),
-    ({"XDG_CACHE_HOME": "/dev/null"}, "cannot write to /dev/null/remodel-fenicsx: set XDG_CACHE_HOME"),
-    ({"XDG_CACHE_HOME": None, "HOME": "/dev/null"}, "cannot write to /dev/null/.cache/remodel-fenicsx"),
-    ({"WITH_FENICSX": "magic"}, "WITH_FENICSX=magic: allowed are native, root and container"),
-    ({"WITH_FENICSX_SUITE": "sid"}, "WITH_FENICSX_SUITE=sid: allowed are trixie and unstable"),
-    ({"WITH_FENICSX": "container"}, "WITH_FENICSX=container: neither docker nor podman can start a container"),
-])
+@pytest.mark.parametrize(
+    "environment, words",
+    [
+        ({"XDG_CACHE_HOME": "some/where"}, "XDG_CACHE_HOME=some/where: must be an absolute path"),
+        ({"XDG_CACHE_HOME": "/dev/null"}, "cannot write to /dev/null/remodel-fenicsx: set XDG_CACHE_HOME"),
+        ({"XDG_CACHE_HOME": None, "HOME": "/dev/null"}, "cannot write to /dev/null/.cache/remodel-fenicsx"),
+        ({"WITH_FENICSX": "magic"}, "WITH_FENICSX=magic: allowed are native, root and container"),
+        ({"WITH_FENICSX_SUITE": "sid"}, "WITH_FENICSX_SUITE=sid: allowed are trixie and unstable"),
+        ({"WITH_FENICSX": "container"}, "WITH_FENICSX=container: neither docker nor podman can start a container"),
+    ],
+)
 def test_one_line_and_exit_5(rooted, environment, words):
     result = rooted.run("true", environment=environment)
     assert result.returncode == 5
@@ -384,23 +429,38 @@ def test_no_namespaces(clone, way):
 
 
 # ---------------------------------------------------------------- native
-@pytest.mark.parametrize("version, suite, usable", [
-    ("0.9.0", None, True), ("0.9.0", "trixie", True), ("0.9.0", "unstable", False),
-    ("0.11.0.post0", None, True), ("0.11.0.post0", "trixie", False), ("0.11.0.post0", "unstable", True),
-    ("0.5.2", None, False), ("1.0.0", None, True)])
+@pytest.mark.parametrize(
+    "version, suite, usable",
+    [
+        ("0.9.0", None, True),
+        ("0.9.0", "trixie", True),
+        ("0.9.0", "unstable", False),
+        ("0.11.0.post0", None, True),
+        ("0.11.0.post0", "trixie", False),
+        ("0.11.0.post0", "unstable", True),
+        ("0.5.2", None, False),
+        ("1.0.0", None, True),
+    ],
+)
 def test_native_version(clone, tmp_path, version, suite, usable):
     for name in ("dolfinx", "mpi4py", "petsc4py", "gmsh", "pydantic", "tomlkit", "h5py", "rich"):
         script(tmp_path / "site" / name / "__init__.py", "raise SystemExit('the launcher must not import this')")
-    script(tmp_path / "site" / f"fenics_dolfinx-{version}.dist-info" / "METADATA",
-           f"Metadata-Version: 2.1\nName: fenics-dolfinx\nVersion: {version}\n")
-    result = clone.run("sh", "-c", 'echo "$PYTHONPATH"; exit 7', environment={
-        "WITH_FENICSX": "native", "PYTHONPATH": str(tmp_path / "site"), "WITH_FENICSX_SUITE": suite})
+    script(
+        tmp_path / "site" / f"fenics_dolfinx-{version}.dist-info" / "METADATA",
+        f"Metadata-Version: 2.1\nName: fenics-dolfinx\nVersion: {version}\n",
+    )
+    result = clone.run(
+        "sh",
+        "-c",
+        'echo "$PYTHONPATH"; exit 7',
+        environment={"WITH_FENICSX": "native", "PYTHONPATH": str(tmp_path / "site"), "WITH_FENICSX_SUITE": suite},
+    )
     assert result.returncode == (7 if usable else 5)
     assert result.stdout == (f"{clone.folder}:{tmp_path / 'site'}\n" if usable else "")
 
 
 def test_native_lacks_a_package(clone):
-    script(clone.stubs / "python3", f"#!/bin/sh\nexec {sys.executable} -I -S \"$@\"\n")
+    script(clone.stubs / "python3", f'#!/bin/sh\nexec {sys.executable} -I -S "$@"\n')
     result = clone.run("true", environment={"WITH_FENICSX": "native"})
     assert result.returncode == 5 and result.stderr.count("\n") == 1
 
@@ -408,16 +468,21 @@ def test_native_lacks_a_package(clone):
 def test_inside_an_environment_it_is_native():
     """This very test runs where dolfinx is: the launcher must take it as it is, silently."""
     environment = {name: value for name, value in os.environ.items() if not name.startswith("WITH_FENICSX")}
-    result = subprocess.run([PROJECT / "with-fenicsx", "-v", "sh", "-c", "echo inside"], env=environment,
-                            capture_output=True, text=True)
+    result = subprocess.run(
+        [PROJECT / "with-fenicsx", "-v", "sh", "-c", "echo inside"], env=environment, capture_output=True, text=True
+    )
     assert (result.returncode, result.stdout) == (0, "inside\n")
     assert result.stderr == f"with-fenicsx: running in this machine's own Python ({shutil.which('python3')})\n"
 
 
 # ---------------------------------------------------------------- a container engine
 def test_container(clone, tmp_path):
-    result = clone.run("some", "a b", cwd=tmp_path, environment={
-        "WITH_FENICSX": "container", "STUB_ENGINE": "able", "KEPT": "yes", "LD_LIBRARY_PATH": "/x"})
+    result = clone.run(
+        "some",
+        "a b",
+        cwd=tmp_path,
+        environment={"WITH_FENICSX": "container", "STUB_ENGINE": "able", "KEPT": "yes", "LD_LIBRARY_PATH": "/x"},
+    )
     assert result.returncode == 0
     calls = clone.engine_calls()
     assert [call[:2] for call in calls] == [["docker", word] for word in ("image", "run", "build", "run")]
@@ -433,8 +498,16 @@ def test_container(clone, tmp_path):
 
 
 def test_container_names_no_mount_point_twice(clone):
-    clone.run("true", cwd=clone.folder, environment={
-        "WITH_FENICSX": "container", "STUB_ENGINE": "built", "HOME": str(clone.folder), "XDG_CACHE_HOME": "/nowhere"})
+    clone.run(
+        "true",
+        cwd=clone.folder,
+        environment={
+            "WITH_FENICSX": "container",
+            "STUB_ENGINE": "built",
+            "HOME": str(clone.folder),
+            "XDG_CACHE_HOME": "/nowhere",
+        },
+    )
     run = clone.engine_calls()[-1]
     assert [value for option, value in zip(run, run[1:]) if option == "--volume"] == [f"{clone.folder}:{clone.folder}"]
 

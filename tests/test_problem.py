@@ -289,8 +289,10 @@ def body_force(x: np.ndarray) -> np.ndarray:
 def errors(refinement: int, cell: str, degree: int) -> tuple[float, float]:
     """L2 and H1 (semi-norm) errors of the solution on a uniform mesh."""
     made = parts.body(cube(refinement=refinement, cell=cell, degree=degree), Cells(initial="isotropic"), degree)
-    made.cells.set(np.broadcast_to(DIMENSIONS, made.cells.dimension_values.shape),
-                   np.broadcast_to(TURNED, made.cells.axis_values.shape))
+    made.cells.set(
+        np.broadcast_to(DIMENSIONS, made.cells.dimension_values.shape),
+        np.broadcast_to(TURNED, made.cells.axis_values.shape),
+    )
     for face in made.domain.faces:
         for component in range(3):
             made.loading.hold_face(face, component)

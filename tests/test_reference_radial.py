@@ -28,8 +28,9 @@ def energy(stretches: np.ndarray, squares: np.ndarray) -> float:
     x = np.sqrt(squares @ stretches**2) / big_l
     matrix = m.lame_lambda / 2 * log_jacobian**2 + m.lame_mu * ((stretches @ stretches - 3) / 2 - log_jacobian)
     g0 = 1 / big_l + 1 / (4 * (1 - 1 / big_l) ** 2) - 0.25
-    return matrix + m.network_modulus * (big_l / 4 * (2 * x**2 + 1 / (1 - x) - x)
-                                         - g0 / 2 * squares @ np.log(stretches**2))
+    return matrix + m.network_modulus * (
+        big_l / 4 * (2 * x**2 + 1 / (1 - x) - x) - g0 / 2 * squares @ np.log(stretches**2)
+    )
 
 
 def test_stress_is_the_slope_of_the_energy() -> None:
@@ -69,8 +70,16 @@ def test_thin_wall_is_laplaces_membrane() -> None:
     assert membrane > 1.1
     errors = []
     for thickness in (0.01, 0.005, 0.0025):
-        history = radial.solve_radial(pressure=ratio * thickness, stretch=axial - 1, end=1.0, ramp_time=1.0, law="none",
-                                      inner_radius=1 - thickness / 2, outer_radius=1 + thickness / 2, elements=4)
+        history = radial.solve_radial(
+            pressure=ratio * thickness,
+            stretch=axial - 1,
+            end=1.0,
+            ramp_time=1.0,
+            law="none",
+            inner_radius=1 - thickness / 2,
+            outer_radius=1 + thickness / 2,
+            elements=4,
+        )
         errors.append(np.interp(1.0, history.nodes, history.radii[-1]) - membrane)
     assert abs(errors[-1]) < 0.005
     np.testing.assert_allclose(np.array(errors[:-1]) / errors[1:], 2.0, atol=0.1)
@@ -128,8 +137,7 @@ def test_hoop_stress_carries_the_pressure_while_remodeling() -> None:
 
 def test_mesh_convergence() -> None:
     """Radii: fourth order without remodeling, and far below the tolerance of any comparison with it."""
-    radii = [radial.solve_radial(end=25.0, law="none", elements=n).inner_radii[-1]
-             for n in (40, 80, 160, 320)]
+    radii = [radial.solve_radial(end=25.0, law="none", elements=n).inner_radii[-1] for n in (40, 80, 160, 320)]
     differences = np.abs(np.diff(radii))
     assert differences[-1] < 1e-8
     assert 9 < differences[0] / differences[1] < differences[1] / differences[2] < 16
@@ -176,10 +184,12 @@ def test_tangent_is_the_slope_of_the_residual() -> None:
     squares = rng.dirichlet([1.0, 1.0, 1.0], 9)
     radii = 1.1 * tube.nodes + rng.uniform(-0.02, 0.02, 7)
     banded = tube.tangent(radii, squares, 3.0, 1.05)
-    dense = sum(np.diag(banded[2 - k, max(k, 0):7 + min(k, 0)], k) for k in range(-2, 3))
+    dense = sum(np.diag(banded[2 - k, max(k, 0) : 7 + min(k, 0)], k) for k in range(-2, 3))
     shifts = 1e-6 * np.eye(7)
-    slopes = [(tube.residual(radii + h, squares, 3.0, 1.05) - tube.residual(radii - h, squares, 3.0, 1.05)) / 2e-6
-              for h in shifts]
+    slopes = [
+        (tube.residual(radii + h, squares, 3.0, 1.05) - tube.residual(radii - h, squares, 3.0, 1.05)) / 2e-6
+        for h in shifts
+    ]
     np.testing.assert_allclose(dense, np.array(slopes).T, atol=1e-6)
 
 
@@ -221,13 +231,16 @@ def test_laws_agree_while_nothing_turns() -> None:
         np.testing.assert_allclose(other.dimensions[-1], ends[0].dimensions[-1], atol=1e-9)
 
 
-@pytest.mark.parametrize("stretch, pressure, inner, middle, outer", [
-    (0.1, 0.0, (89.0, 90.0), (89.0, 90.0), (89.0, 90.0)),
-    (0.1, 2.4, (0.0, 1.0), (70.0, 72.0), (78.0, 80.0)),
-    (0.1, 4.8, (0.0, 1.0), (53.0, 54.0), (73.5, 74.5)),
-    (0.05, 4.8, (0.0, 1.0), (15.0, 16.0), (56.0, 58.0)),
-    (0.0, 4.8, (0.0, 1.0), (0.0, 1.0), (12.0, 13.0)),
-])
+@pytest.mark.parametrize(
+    "stretch, pressure, inner, middle, outer",
+    [
+        (0.1, 0.0, (89.0, 90.0), (89.0, 90.0), (89.0, 90.0)),
+        (0.1, 2.4, (0.0, 1.0), (70.0, 72.0), (78.0, 80.0)),
+        (0.1, 4.8, (0.0, 1.0), (53.0, 54.0), (73.5, 74.5)),
+        (0.05, 4.8, (0.0, 1.0), (15.0, 16.0), (56.0, 58.0)),
+        (0.0, 4.8, (0.0, 1.0), (0.0, 1.0), (12.0, 13.0)),
+    ],
+)
 def test_figure_9(stretch: float, pressure: float, inner: tuple, middle: tuple, outer: tuple) -> None:
     history = run(stretch=stretch, pressure=pressure)
     for place, (low, high) in zip((1.0, 2.0, 3.0), (inner, middle, outer)):

@@ -65,8 +65,9 @@ def test_pair_of_equal_values_keeps_the_previous_axes_in_its_plane(
     np.testing.assert_allclose(axes[:, pair[1]], second, atol=1e-12)
 
 
-@pytest.mark.parametrize("values", [[3.0, 3.0, 1.0], [3.0, 1.0, 1.0], [2.0, 2.0, 2.0], [0.0, 0.0, 0.0],
-                                    [-1.0, -1.0, -1.0], [0.0, 0.0, -4.0]])
+@pytest.mark.parametrize(
+    "values", [[3.0, 3.0, 1.0], [3.0, 1.0, 1.0], [2.0, 2.0, 2.0], [0.0, 0.0, 0.0], [-1.0, -1.0, -1.0], [0.0, 0.0, -4.0]]
+)
 def test_previous_axes_that_are_principal_stay(values: list[float]) -> None:
     previous = random_axes(np.random.default_rng(4))
     _, axes = principal(tensor(values, previous), previous)
@@ -147,8 +148,12 @@ def test_without_previous_axes_the_coordinate_axes_decide() -> None:
 def test_points_do_not_influence_each_other() -> None:
     rng = np.random.default_rng(10)
     true, previous = random_axes(rng, 4), random_axes(rng, 4)
-    tensors = np.concatenate([tensor(values, true[[i]]) for i, values in enumerate(
-        ([3.0, 2.0, 1.0], [2.0, 2.0, 1.0], [2.0, 1.0, 1.0], [1.0, 1.0, 1.0]))])
+    tensors = np.concatenate(
+        [
+            tensor(values, true[[i]])
+            for i, values in enumerate(([3.0, 2.0, 1.0], [2.0, 2.0, 1.0], [2.0, 1.0, 1.0], [1.0, 1.0, 1.0]))
+        ]
+    )
     _, together = principal(tensors, previous)
     for i in range(4):
         np.testing.assert_array_equal(principal(tensors[[i]], previous[[i]])[1][0], together[i])
@@ -168,13 +173,16 @@ def test_what_is_not_finite_is_named(bad: float) -> None:
         positive_direction([[bad, 0.0, 0.0]])
 
 
-@pytest.mark.parametrize("values, direction", [
-    ([3.0, 4.0, 0.0], [0.6, 0.8, 0.0]),
-    ([4.0, 3.0, -100.0], [0.8, 0.6, 0.0]),
-    ([1.0, 1e-16, -1e-16], [1.0, 0.0, 0.0]),
-    ([3e-310, 4e-310, 0.0], [0.6, 0.8, 0.0]),
-    ([3e290, 4e290, -1e300], [0.6, 0.8, 0.0]),
-])
+@pytest.mark.parametrize(
+    "values, direction",
+    [
+        ([3.0, 4.0, 0.0], [0.6, 0.8, 0.0]),
+        ([4.0, 3.0, -100.0], [0.8, 0.6, 0.0]),
+        ([1.0, 1e-16, -1e-16], [1.0, 0.0, 0.0]),
+        ([3e-310, 4e-310, 0.0], [0.6, 0.8, 0.0]),
+        ([3e290, 4e290, -1e300], [0.6, 0.8, 0.0]),
+    ],
+)
 def test_positive_direction(values: list[float], direction: list[float]) -> None:
     with np.errstate(all="raise", under="ignore"):
         found, active = positive_direction([values])

@@ -33,9 +33,7 @@ def clamped_cube() -> parts.Body:
 def stepper_of(made: parts.Body, load_values: Any, solver: Solver = parts.TIGHT, **remodeling: Any) -> Stepper:
     """The body's way through time."""
     remodeling_pass = RemodelingPass(made.displacement, made.cells, parts.MATERIAL, Remodeling(**remodeling))
-    return Stepper(
-        made.displacement, made.loading, made.cells, parts.MATERIAL, remodeling_pass, solver, load_values
-    )
+    return Stepper(made.displacement, made.loading, made.cells, parts.MATERIAL, remodeling_pass, solver, load_values)
 
 
 def state(made: parts.Body) -> dict[str, np.ndarray]:

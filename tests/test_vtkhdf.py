@@ -16,7 +16,13 @@ import numpy as np
 import pytest
 
 from remodel_fenicsx.results.staged_file import StagedFile
-from remodel_fenicsx.results.vtkhdf import LINE, TransientGrid, cell_type_and_permutation, chain_displacement, chain_lines
+from remodel_fenicsx.results.vtkhdf import (
+    LINE,
+    TransientGrid,
+    cell_type_and_permutation,
+    chain_displacement,
+    chain_lines,
+)
 
 # In a process of its own, as users do. Steps are read forwards and backwards: VTK keeps the meshes of earlier steps.
 READER = """
@@ -62,7 +68,7 @@ def raw_series(path: Path, field: str, points: int) -> list[np.ndarray]:
         root = file["VTKHDF"]
         steps = int(root["Steps"].attrs["NSteps"])
         offsets = root["Steps/PointDataOffsets"][field][:steps] if steps else []
-        return [root["PointData"][field][start:start + points] for start in offsets]
+        return [root["PointData"][field][start : start + points] for start in offsets]
 
 
 def test_reader_finds_every_step(tmp_path):
@@ -287,7 +293,7 @@ def test_a_file_cut_off_between_any_two_writes_is_whole(tmp_path, monkeypatch, s
     def copy_and_write(descriptor, data, offset):
         shutil.copy(path, copy)  # what a process that is killed here leaves behind
         series = raw_series(copy, "u", 8)
-        assert np.array_equal(series, field[:len(series)]) or not series
+        assert np.array_equal(series, field[: len(series)]) or not series
         cuts.append(len(series))
         return write(descriptor, data, offset)
 
@@ -352,7 +358,7 @@ def test_what_was_staged_can_be_read_back(tmp_path):
     for turn in range(200):
         start, data = int(random.integers(0, len(expected) + 20)), random.bytes(int(random.integers(1, 60)))
         expected.extend(bytes(max(0, start + len(data) - len(expected))))
-        expected[start:start + len(data)] = data
+        expected[start : start + len(data)] = data
         staged.seek(start)
         assert staged.write(data) == len(data)
         if turn % 7 == 0:
@@ -362,6 +368,6 @@ def test_what_was_staged_can_be_read_back(tmp_path):
         buffer = bytearray(size)
         staged.seek(start)
         count = staged.readinto(buffer)
-        assert count == min(size, len(expected) - start) and buffer[:count] == expected[start:start + size]
+        assert count == min(size, len(expected) - start) and buffer[:count] == expected[start : start + size]
     assert staged.seek(0, os.SEEK_END) == len(expected)
     staged.close()

@@ -10,7 +10,10 @@ from remodel_fenicsx.body.domain import Domain
 
 
 def cube(
-    side: float = 1.0, refinement: int = 1, cell: str = "hexahedron", degree: int = 1,
+    side: float = 1.0,
+    refinement: int = 1,
+    cell: str = "hexahedron",
+    degree: int = 1,
     comm: MPI.Intracomm = MPI.COMM_WORLD,
 ) -> Domain:
     """Cube [0, side]^3 with the faces x0, x1, y0, y1, z0, z1. Collective.

@@ -199,7 +199,11 @@ def reverse(curves: Sequence[int]) -> list[int]:
 
 
 def extrude(
-    section: Sequence[int], length: float, layers: int, cell: str, sides: Mapping[str, Sequence[int]],
+    section: Sequence[int],
+    length: float,
+    layers: int,
+    cell: str,
+    sides: Mapping[str, Sequence[int]],
     ends: tuple[str, str] = ("bottom", "top"),
 ) -> None:
     """Extrude a plane section along z, mesh it, and name the volume and the faces.

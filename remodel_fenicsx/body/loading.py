@@ -84,9 +84,7 @@ class Loading:
         pressure = self._magnitude(name)
         normal = ufl.FacetNormal(self.domain.mesh)
         measure = self._surface_measure(face)
-        self._terms.append(
-            lambda u, v: pressure * ufl.inner(ufl.cofac(deformation_gradient(u)) * normal, v) * measure
-        )
+        self._terms.append(lambda u, v: pressure * ufl.inner(ufl.cofac(deformation_gradient(u)) * normal, v) * measure)
 
     def add_prescribed_stretch(self, name: str, face: str, component: int, length: float) -> None:
         """u_component = stretch * length on a face: the engineering strain of the whole length."""

@@ -18,8 +18,12 @@ CORE_RADIUS, CORE_ROUNDNESS = 0.65, 0.4
 
 
 def tendon(
-    length: float = 10.0, area: float = 10.0, refinement: int = 1,
-    cell: str = "hexahedron", degree: int = 1, comm: MPI.Intracomm = MPI.COMM_WORLD,
+    length: float = 10.0,
+    area: float = 10.0,
+    refinement: int = 1,
+    cell: str = "hexahedron",
+    degree: int = 1,
+    comm: MPI.Intracomm = MPI.COMM_WORLD,
 ) -> Domain:
     """Tendon around the z axis, 0 <= z <= length, with the faces bottom, top, side. Collective.
 
@@ -78,8 +82,10 @@ def draw_tendon(length: float, area: float, refinement: int = 1, cell: str = "he
     for i, k in enumerate(corners):
         j, m = (i + 1) % 4, (k + quarter) % number
         edges = [
-            spokes[i], outer_lines[k:k + quarter],
-            model.reverse(spokes[j]), model.reverse(inner_lines[k:k + quarter]),
+            spokes[i],
+            outer_lines[k : k + quarter],
+            model.reverse(spokes[j]),
+            model.reverse(inner_lines[k : k + quarter]),
         ]
         section.append(model.block(edges, [inner[k], outer[k], outer[m], inner[m]], cell))
     model.extrude(section, length, ALONG * refinement, cell, {"side": outer_lines})

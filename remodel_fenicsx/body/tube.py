@@ -14,8 +14,13 @@ PAPER = (16, 8, 12)  # the paper's elements around, through the wall, and along
 
 
 def tube(
-    inner_radius: float = 1.0, outer_radius: float = 3.0, length: float = 8.0, refinement: int = 1,
-    cell: str = "hexahedron", degree: int = 1, comm: MPI.Intracomm = MPI.COMM_WORLD,
+    inner_radius: float = 1.0,
+    outer_radius: float = 3.0,
+    length: float = 8.0,
+    refinement: int = 1,
+    cell: str = "hexahedron",
+    degree: int = 1,
+    comm: MPI.Intracomm = MPI.COMM_WORLD,
     divisions: tuple[int, int, int] | None = None,
 ) -> Domain:
     """Tube around the z axis, 0 <= z <= length, with the faces bottom, top, inner, outer. Collective.
@@ -54,13 +59,20 @@ def tube(
     counts = PAPER if divisions is None else _checked(divisions)
     return model.build_domain(
         lambda: draw_tube(inner_radius, outer_radius, length, refinement, cell, degree, counts),
-        "tube", {name: float(value) for name, value in dimensions.items()}, comm,
+        "tube",
+        {name: float(value) for name, value in dimensions.items()},
+        comm,
     )
 
 
 def draw_tube(
-    inner_radius: float, outer_radius: float, length: float,
-    refinement: int = 1, cell: str = "hexahedron", degree: int = 1, divisions: tuple[int, int, int] = PAPER,
+    inner_radius: float,
+    outer_radius: float,
+    length: float,
+    refinement: int = 1,
+    cell: str = "hexahedron",
+    degree: int = 1,
+    divisions: tuple[int, int, int] = PAPER,
 ) -> None:
     """Draw and mesh the tube in the current Gmsh model: four quarters, swept along z."""
     number, through, along = (refinement * count for count in divisions)
@@ -74,8 +86,10 @@ def draw_tube(
     for i, k in enumerate(corners):
         j, m = (i + 1) % 4, (k + quarter) % number
         edges = [
-            spokes[i], outer_lines[k:k + quarter],
-            model.reverse(spokes[j]), model.reverse(inner_lines[k:k + quarter]),
+            spokes[i],
+            outer_lines[k : k + quarter],
+            model.reverse(spokes[j]),
+            model.reverse(inner_lines[k : k + quarter]),
         ]
         section.append(model.block(edges, [inner[k], outer[k], outer[m], inner[m]], cell))
     model.extrude(section, length, along, cell, {"inner": inner_lines, "outer": outer_lines})

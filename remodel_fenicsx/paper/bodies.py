@@ -83,7 +83,7 @@ def chains(snapshot: Snapshot, faces: NDArray[np.int64], elements: NDArray[np.in
     gradient = fields["deformation_gradient"][elements].reshape(-1, 3, 3)
     ends, _ = chain_lines(centres, fields["cell_dimensions"][elements], axes, 1.0)
     size = np.linalg.norm(reference - np.roll(reference, 1, axis=1), axis=2).min(axis=1)
-    ends = (centres[:, None] + (CHAIN_REACH * size)[:, None, None] * (ends.reshape(-1, 8, 3) - centres[:, None]))
+    ends = centres[:, None] + (CHAIN_REACH * size)[:, None, None] * (ends.reshape(-1, 8, 3) - centres[:, None])
     moved = chain_displacement(ends.reshape(-1, 3), centres, snapshot.displacement[faces].mean(axis=1), gradient)
     normal, middle = _normals(deformed), deformed.mean(axis=1)
     inner = np.einsum("mij,mj->mi", gradient, snapshot.centres[elements] - centres)

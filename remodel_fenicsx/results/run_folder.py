@@ -162,7 +162,7 @@ class History:
         view = memoryview(data)
         try:
             while view:
-                view = view[self._file.write(view):]
+                view = view[self._file.write(view) :]
             os.fsync(self._file.fileno())
         except OSError:
             self._file.truncate(self._size)

@@ -75,10 +75,10 @@ class StagedFile(io.RawIOBase):
         for offset, change in self._changes:
             low, high = max(start, offset), min(start + len(data), offset + len(change))
             if low < high:
-                data[low - start:high - start] = change[low - offset:high - offset]
+                data[low - start : high - start] = change[low - offset : high - offset]
         from_tail = max(0, start - self._committed)
-        data += self._tail[from_tail:from_tail + size - len(data)]
-        buffer[:len(data)] = data
+        data += self._tail[from_tail : from_tail + size - len(data)]
+        buffer[: len(data)] = data
         self._position += len(data)
         return len(data)
 
@@ -90,7 +90,7 @@ class StagedFile(io.RawIOBase):
         if old < len(data):
             start = self._position + old - self._committed
             self._tail.extend(bytes(max(0, start - len(self._tail))))
-            self._tail[start:start + len(data) - old] = data[old:]
+            self._tail[start : start + len(data) - old] = data[old:]
         self._position += len(data)
         return len(data)
 

@@ -54,9 +54,7 @@ class Progress:
                 TextColumn("{task.fields[state]}"), TimeElapsedColumn(), TextColumn("{task.fields[left]}"),
                 console=Console(stderr=True), refresh_per_second=4, redirect_stdout=sys.stdout.isatty(),
             )  # fmt: skip
-            self._task = self._bar.add_task(
-                Text(self._title).markup, total=self._total, state="starting", left=""
-            )
+            self._task = self._bar.add_task(Text(self._title).markup, total=self._total, state="starting", left="")
             self._bar.start()
         return self
 

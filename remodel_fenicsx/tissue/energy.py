@@ -77,10 +77,14 @@ def strain_energy(
         - material.lame_mu * log_jacobian
     )
     chains = chain.energy(ufl.sqrt(squared_end_to_end_length(F, cells)), material.contour_length)
-    repulsion = -chain.stiffness(end_to_end_length, material.contour_length) / 2 * sum(
-        cell.weight * cell.dimensions[i] ** 2 * ufl.ln(stretch)
-        for cell in cells
-        for i, stretch in enumerate(cell.squared_stretches(F))
+    repulsion = (
+        -chain.stiffness(end_to_end_length, material.contour_length)
+        / 2
+        * sum(
+            cell.weight * cell.dimensions[i] ** 2 * ufl.ln(stretch)
+            for cell in cells
+            for i, stretch in enumerate(cell.squared_stretches(F))
+        )
     )
     return matrix + material.network_modulus * (chains + repulsion)
 

@@ -18,8 +18,9 @@ DECISIVE = 1e-3
 zero, up to rounding; any threshold far above rounding gives the same choice on every machine."""
 
 
-def principal(tensors: npt.ArrayLike, previous: npt.ArrayLike, tolerance: float = 1e-8,
-              scale: float = 0.0) -> tuple[Array, Array]:
+def principal(
+    tensors: npt.ArrayLike, previous: npt.ArrayLike, tolerance: float = 1e-8, scale: float = 0.0
+) -> tuple[Array, Array]:
     """Return the principal values, descending, and the principal axes of symmetric tensors.
 
     Where neighbouring values agree (also in a chain: first with second, second with third), the tensor does not
@@ -121,8 +122,9 @@ def _require_finite(values: Array, noun: str) -> None:
     if not np.isfinite(values).all():
         bad = ~np.isfinite(values).all(axis=tuple(range(1, values.ndim)))
         first = int(np.argmax(bad))
-        raise FloatingPointError(f"{noun} {first} of {len(values)} is not finite ({int(bad.sum())} in all): "
-                                 f"{values[first].tolist()}")
+        raise FloatingPointError(
+            f"{noun} {first} of {len(values)} is not finite ({int(bad.sum())} in all): " f"{values[first].tolist()}"
+        )
 
 
 def _largest(vectors: Array) -> Array:

@@ -121,8 +121,9 @@ def cauchy_stress(stretches: Array, squares: Array, material: RadialMaterial) ->
     matrix = (m.lame_lambda * np.log(jacobian) - m.lame_mu + m.lame_mu * stretches**2) / jacobian
     chains = m.network_modulus / jacobian * secant_stiffness(r, m.contour_length) * squares * stretches**2
     # n(x)n / I_I is the unit dyad along the direction: the stretch cancels
-    repulsion = -m.network_modulus / jacobian * secant_stiffness(np.array(m.end_to_end_length),
-                                                                 m.contour_length) * squares
+    repulsion = (
+        -m.network_modulus / jacobian * secant_stiffness(np.array(m.end_to_end_length), m.contour_length) * squares
+    )
     return matrix + chains + repulsion
 
 
@@ -271,8 +272,17 @@ def updated(law: str, old: Array, start: Array, target: Array, kappa: float, tim
     raise ValueError(law)
 
 
-def remodel(ranked: Array, values: Array, ranks: Array, start: Array, law: str, kappa: float,
-            time: float, step: float, r0: float) -> tuple[Array, Array]:
+def remodel(
+    ranked: Array,
+    values: Array,
+    ranks: Array,
+    start: Array,
+    law: str,
+    kappa: float,
+    time: float,
+    step: float,
+    r0: float,
+) -> tuple[Array, Array]:
     """Return the dimensions by rank and the direction of each rank after one remodeling pass."""
     if law == "none":
         return ranked, ranks
@@ -286,10 +296,20 @@ def remodel(ranked: Array, values: Array, ranks: Array, start: Array, law: str, 
     return np.where(active, new, ranked), new_ranks
 
 
-def solve_radial(pressure: float = 4.8, stretch: float = 0.1, ramp_time: float = 25.0, end: float = 150.0,
-                 step: float = 1.0, driver: str = "cauchy", law: str = "explicit", kappa: float = 0.025,
-                 inner_radius: float = 1.0, outer_radius: float = 3.0, elements: int = 200,
-                 material: RadialMaterial = RadialMaterial()) -> RadialHistory:
+def solve_radial(
+    pressure: float = 4.8,
+    stretch: float = 0.1,
+    ramp_time: float = 25.0,
+    end: float = 150.0,
+    step: float = 1.0,
+    driver: str = "cauchy",
+    law: str = "explicit",
+    kappa: float = 0.025,
+    inner_radius: float = 1.0,
+    outer_radius: float = 3.0,
+    elements: int = 200,
+    material: RadialMaterial = RadialMaterial(),
+) -> RadialHistory:
     """Remodel the tube with initially isotropic cells; staggered in time as the paper does it.
 
     Each step to t: set pressure and stretch of t; solve with the cells of t - step; the stress and the time t then give
@@ -328,14 +348,37 @@ def solve_radial(pressure: float = 4.8, stretch: float = 0.1, ramp_time: float =
         state = new_state
         stretches = tube.stretches(radii, state[2])
         stresses = cauchy_stress(stretches, state[0], material)
-        ranked, ranks = remodel(ranked, driving_values(driver, stretches, stresses), ranks, start, law, kappa,
-                                float(time), step, material.end_to_end_length)
+        ranked, ranks = remodel(
+            ranked,
+            driving_values(driver, stretches, stresses),
+            ranks,
+            start,
+            law,
+            kappa,
+            float(time),
+            step,
+            material.end_to_end_length,
+        )
         by_direction = np.empty_like(ranked)
         np.put_along_axis(by_direction, ranks, ranked, axis=1)
         dimensions.append(by_direction)
         all_ranks.append(ranks)
         solved.append((radii, stretches, stresses))
     all_radii, all_stretches, all_stresses = (np.array(column) for column in zip(*solved))
-    return RadialHistory(times, pressure * factors, 1 + stretch * factors, all_radii[:, 0], all_radii[:, -1],
-                         tube.nodes, all_radii, tube.points, tube.areas, all_stretches, all_stresses,
-                         np.array(dimensions), np.array(all_ranks), tube.newton_iterations, tube.substeps)
+    return RadialHistory(
+        times,
+        pressure * factors,
+        1 + stretch * factors,
+        all_radii[:, 0],
+        all_radii[:, -1],
+        tube.nodes,
+        all_radii,
+        tube.points,
+        tube.areas,
+        all_stretches,
+        all_stresses,
+        np.array(dimensions),
+        np.array(all_ranks),
+        tube.newton_iterations,
+        tube.substeps,
+    )
