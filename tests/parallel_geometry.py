@@ -15,8 +15,8 @@ from remodel_fenicsx.body import gmsh_model as model
 def digest(domain):
     """Digest of the gathered mesh, of cell and node values drawn locally by number, and of the named faces' sizes."""
     points, cells = domain.gather_mesh()
-    table = np.random.default_rng(1).random((max(domain.number_of_cells, domain.number_of_nodes), 3))
-    values = domain.gather_cells(table[domain.cell_number]), domain.gather_nodes(table[domain.node_number])
+    table = np.random.default_rng(1).random((max(domain.number_of_elements, domain.number_of_nodes), 3))
+    values = domain.gather_elements(table[domain.element_number]), domain.gather_nodes(table[domain.node_number])
     parts = [points, cells, *values]
     facets = domain.mesh.topology.index_map(2)
     sizes = [

@@ -78,7 +78,7 @@ def has_node(points, *wanted):
 @pytest.mark.parametrize("refinement", [1, 2])
 def test_hexahedra_are_the_papers_times_the_refinement_in_every_direction(shape, cells, nodes, refinement):
     domain = domain_of(shape, refinement=refinement)
-    assert domain.number_of_cells == cells * refinement**3
+    assert domain.number_of_elements == cells * refinement**3
     tables = {"cube": Cube, "tendon": Tendon, "tube": Tube}
     assert tables[shape].number_of_elements == cells  # by which a scene refuses a mesh before it is made
     refined = {"cube": 27, "tendon": (81 + 4 * 32) * 21, "tube": 32 * 17 * 25}
@@ -90,7 +90,7 @@ def test_hexahedra_are_the_papers_times_the_refinement_in_every_direction(shape,
 def test_each_hexahedron_makes_six_tetrahedra_on_the_same_nodes(shape):
     hexahedra, tetrahedra = domain_of(shape), domain_of(shape, "tetrahedron")
     assert tetrahedra.mesh.topology.cell_name() == "tetrahedron"
-    assert tetrahedra.number_of_cells == 6 * hexahedra.number_of_cells
+    assert tetrahedra.number_of_elements == 6 * hexahedra.number_of_elements
     distance, match = cKDTree(hexahedra.gather_mesh()[0]).query(tetrahedra.gather_mesh()[0])
     assert distance.max() < 1e-13 and len(set(match)) == hexahedra.number_of_nodes
 
@@ -251,7 +251,7 @@ def test_a_tube_with_divisions_of_its_own(cell, degree, refinement):
         1.0, 2.0, 0.25, cell=cell, degree=degree, refinement=refinement, divisions=(12, 3, 1), comm=MPI.COMM_SELF
     )
     around, through, along = 12 * refinement, 3 * refinement, refinement
-    assert body.number_of_cells == around * through * along * (6 if cell == "tetrahedron" else 1)
+    assert body.number_of_elements == around * through * along * (6 if cell == "tetrahedron" else 1)
     points = body.gather_mesh()[0]
     radii = np.hypot(points[:, 0], points[:, 1])
     corners = np.isclose(radii * through, np.round(radii * through), rtol=0, atol=1e-12)
@@ -341,14 +341,14 @@ def test_bodies_of_extreme_proportions_are_meshed(shape, lengths, unit):
     powers = (1, 2) if shape == "tendon" else (1, 1, 1)
     scaled = [length * unit**power for length, power in zip(lengths, powers, strict=False)]
     domain, ordinary = BUILDERS[shape](*scaled, refinement=2, comm=MPI.COMM_SELF), domain_of(shape, refinement=2)
-    assert domain.number_of_cells == ordinary.number_of_cells
+    assert domain.number_of_elements == ordinary.number_of_elements
     assert domain.number_of_nodes == ordinary.number_of_nodes
 
 
 def test_gathering_too_few_rows_is_refused():
     domain = domain_of("tendon")
     with pytest.raises(ValueError, match="479 rows for 480 owned entities on rank 0"):
-        domain.gather_cells(np.zeros(479))
+        domain.gather_elements(np.zeros(479))
 
 
 # ---------------------------------------------------------------- Gmsh's manners
@@ -410,7 +410,7 @@ def test_the_mesh_files_are_what_the_builders_make(name, shape):
     distance, match = cKDTree(built).query(points)
     assert distance.max() < 1e-12 and sorted(match) == list(range(domain.number_of_nodes))
     assert {frozenset(cell) for cell in match[hexahedra].tolist()} == {frozenset(cell) for cell in cells.tolist()}
-    assert len(hexahedra) == domain.number_of_cells
+    assert len(hexahedra) == domain.number_of_elements
     domain.mesh.topology.create_connectivity(2, 3)
     for face, tag in domain.faces.items():
         nodes = dolfinx.mesh.entities_to_geometry(domain.mesh, 2, domain.facet_tags.find(tag))

@@ -12,97 +12,30 @@ import os
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, Field, model_validator
+from pydantic import BaseModel, Field, SerializeAsAny, model_validator
 
-from remodel_fenicsx.scene.parameters import PRESETS, Cells, Material, Remodeling, length_fault
-from remodel_fenicsx.schema.tables import SceneError, Table, checked, fault, is_number, one_of, quoted, shown
+from remodel_fenicsx.body import SHAPES, Shape
+from remodel_fenicsx.fem.solver_methods import METHODS
+from remodel_fenicsx.scene.parameters import PRESETS, Cells, Material, Remodeling
+from remodel_fenicsx.schema.tables import (
+    SceneError,
+    Table,
+    checked,
+    fault,
+    is_number,
+    one_of,
+    quoted,
+    shown,
+    variant_of,
+)
 from remodel_fenicsx.schema.toml import merged, parse_override, put, read_toml, toml_text
 
 MOST_STEPS = 1_000_000
 SAME_TIME = 1e-9  # relative: times closer than this are the same
 
-# Defaults that a shape changes, under the keys of preset and scene: with global axes a tube of isotropic cells would
-# not stay round in the first step.
-SHAPE_DEFAULTS: dict[str, dict[str, Any]] = {"tube": {"cells": {"axes": "cylindrical"}}}
-
-
-# ---------------------------------------------------------------- geometry
-
-
 LARGEST_MESH = 10_000_000  # hexahedra; Gmsh, which is serial, needs about 10 GB for them
-
-
-def _check_lengths(body: Table, lengths: dict[str, float]) -> None:
-    """Raise the fault of `length_fault` at its key."""
-    found = length_fault(lengths)
-    if found is not None:
-        raise fault(found[1], found[0], getattr(body, found[0]))
-
-
-class Cube(Table):
-    """A cube, pulled along z: the homogeneous body of the paper's Fig. 5."""
-
-    load_names: ClassVar[tuple[str, ...]] = ("force",)
-    axis_kinds: ClassVar[tuple[str, ...]] = ("global",)
-    number_of_elements: ClassVar[int] = 1
-
-    shape: Literal["cube"] = Field(default="cube", description="Which body it is.")
-    side: float = Field(default=1.0, gt=0, description="Length of an edge, in the scene's unit of length.")
-
-    @model_validator(mode="after")
-    def _can_be_meshed(self) -> Cube:
-        _check_lengths(self, {"side": self.side})
-        return self
-
-
-class Tendon(Table):
-    """A cylinder along z, held at its bottom and pulled at its top: the tendon of the paper's Fig. 6.
-
-    Length and square root of the area: 1e-6 to 1e6, one up to 10,000 times the other.
-    """
-
-    load_names: ClassVar[tuple[str, ...]] = ("force",)
-    axis_kinds: ClassVar[tuple[str, ...]] = ("global", "cylindrical")
-    number_of_elements: ClassVar[int] = 480
-
-    shape: Literal["tendon"] = Field(default="tendon", description="Which body it is.")
-    length: float = Field(default=10.0, gt=0, description="Length along z, in the scene's unit of length.")
-    area: float = Field(default=10.0, gt=0, description="Area of the cross-section, in the unit of length squared.")
-
-    @model_validator(mode="after")
-    def _can_be_meshed(self) -> Tendon:
-        _check_lengths(self, {"length": self.length, "area": math.sqrt(self.area)})
-        return self
-
-
-class Tube(Table):
-    """A thick-walled tube about z under inner pressure and axial stretch: the artery of the paper's Fig. 7.
-
-    Inner radius, wall thickness and length: 1e-6 to 1e6, one up to 10,000 times the other.
-    """
-
-    load_names: ClassVar[tuple[str, ...]] = ("pressure", "stretch")
-    axis_kinds: ClassVar[tuple[str, ...]] = ("global", "cylindrical")
-    number_of_elements: ClassVar[int] = 1536
-
-    shape: Literal["tube"] = Field(default="tube", description="Which body it is.")
-    inner_radius: float = Field(gt=0, description="Inner radius R_i, in the scene's unit of length.")
-    outer_radius: float = Field(gt=0, description="Outer radius R_o, in the scene's unit of length.")
-    length: float = Field(gt=0, description="Length along z, in the scene's unit of length.")
-
-    @model_validator(mode="after")
-    def _has_a_wall(self) -> Tube:
-        if self.inner_radius >= self.outer_radius:
-            limit = f"must be smaller than geometry.outer_radius = {shown(self.outer_radius)}"
-            raise fault(limit, "inner_radius", self.inner_radius)
-        wall = self.outer_radius - self.inner_radius
-        _check_lengths(self, {"inner_radius": self.inner_radius, "outer_radius": wall, "length": self.length})
-        return self
-
-
-Geometry = Annotated[Cube | Tendon | Tube, Field(discriminator="shape")]
 
 
 class Mesh(Table):
@@ -114,7 +47,7 @@ class Mesh(Table):
         description="Factor on the paper's number of elements in every direction (1: its own meshes). More than 10 "
         "million hexahedra, or those split into tetrahedra, are refused.",
     )
-    cell: Literal["hexahedron", "tetrahedron"] = Field(default="hexahedron", description="Shape of the elements.")
+    element: Literal["hexahedron", "tetrahedron"] = Field(default="hexahedron", description="Shape of the elements.")
     degree: Annotated[int, one_of((1, 2))] = Field(
         default=1, description="Polynomial degree of the displacement: 1 (the paper's) or 2."
     )
@@ -146,15 +79,15 @@ def _ramp(value: Any) -> tuple[tuple[float, float], ...]:
 
 
 class Load(Table):
-    """A load by name: `force` of cube and tendon, `pressure` and `stretch` of a tube. One that is not listed is zero.
+    """A load by name: `force` of cube and tendon, `pressure` and `elongation` of a tube; zero if it is not listed.
 
-    `force` is the total dead force along z on the top; `pressure` acts on the deformed inner face; `stretch` is the
-    prescribed axial elongation over the length (0.1: 10 %).
+    `force` is the total dead force along z on the top; `pressure` acts on the deformed inner face; `elongation` is the
+    prescribed engineering strain of the length (0.1: 10 % longer).
     """
 
     value: float = Field(
         description="Full value at factor 1: force in stress_unit times length squared, pressure in stress_unit, "
-        "stretch without unit (above -1)."
+        "elongation without unit (above -1)."
     )
     ramp: Annotated[tuple[tuple[float, float], ...], checked(_ramp)] = Field(
         description="Factor on the value over time, as [time, factor] pairs with increasing times: linear in between, "
@@ -227,7 +160,7 @@ def _petsc_options(value: Any) -> Any:
 class Solver(Table):
     """Solution of the nonlinear problem of each step."""
 
-    profile: Literal["direct"] = Field(
+    method: Annotated[str, one_of(METHODS)] = Field(
         default="direct", description="'direct': Newton's method, each system factorised."
     )
     absolute_tolerance: float = Field(
@@ -249,7 +182,7 @@ class Solver(Table):
     )
     petsc_options: Annotated[dict[str, Any], checked(_petsc_options)] = Field(
         default_factory=dict,
-        description="PETSc options that override the profile's, without the leading '-': snes_..., ksp_..., pc_....",
+        description="PETSc options that override the method's, without the leading '-': snes_..., ksp_..., pc_....",
     )
 
     @model_validator(mode="after")
@@ -288,7 +221,7 @@ class Scene(Table):
         description="Named parameters that lie under the scene's own keys, table by table (see Presets below).",
         json_schema_extra={"allowed": "one of " + ", ".join(map(repr, PRESETS))},
     )
-    geometry: Geometry
+    geometry: Annotated[SerializeAsAny[Shape], variant_of(SHAPES, "shape")]
     mesh: Mesh = Mesh()
     model: Model = Model()
     material: Material = Material()
@@ -310,10 +243,10 @@ class Scene(Table):
         if preset is not None and (not isinstance(preset, str) or preset not in PRESETS):
             raise fault("allowed are " + ", ".join(map(repr, PRESETS)), "preset", preset)
         shape = geometry.get("shape") if isinstance(geometry, dict) else None
-        if not isinstance(shape, str) or shape not in _SHAPES:
+        if not isinstance(shape, str) or shape not in SHAPES:
             return plain  # the field's own error says which shapes there are
         _check_load_names(shape, plain.get("loads"))
-        base = SHAPE_DEFAULTS.get(shape, {})
+        base = SHAPES[shape].defaults
         if preset is not None:
             if shape not in PRESETS[preset]:
                 known = ", ".join(map(repr, PRESETS[preset]))
@@ -328,12 +261,12 @@ class Scene(Table):
             rule = f"must be smaller than material.contour_length = {shown(material.contour_length)}"
             raise fault(rule, "cells.end_to_end_length", cells.end_to_end_length)
         if cells.axes not in geometry.axis_kinds:
-            rule = f"allowed for shape {geometry.shape!r} is " + ", ".join(map(repr, geometry.axis_kinds))
+            rule = f"allowed for shape {geometry.name!r} is " + ", ".join(map(repr, geometry.axis_kinds))
             raise fault(rule, "cells.axes", cells.axes)
         elements = geometry.number_of_elements * self.mesh.refinement**3
         if elements > LARGEST_MESH:
             largest = math.floor((LARGEST_MESH / geometry.number_of_elements) ** (1 / 3))
-            rule = f"must be at most {largest} for a {geometry.shape}: more makes over {LARGEST_MESH:g} elements"
+            rule = f"must be at most {largest} for a {geometry.name}: more makes over {LARGEST_MESH:g} elements"
             raise fault(rule, "mesh.refinement", self.mesh.refinement)
         for name, load in self.loads.items():
             self._check_load(name, load)
@@ -344,9 +277,11 @@ class Scene(Table):
         for index, (time, factor) in enumerate(load.ramp):
             if time <= self.time.end and not _is_multiple(time, step):
                 raise fault(_nearest_multiples(time, step, "time.step"), f"{key}.ramp[{index}][0]", time)
-            stretch = load.value * factor
-            if name == "stretch" and stretch <= -1:
-                rule = f"must be greater than -1 at every time; with the factor {shown(factor)} it is {stretch:.6g}"
+            value, above = load.value * factor, self.geometry.loads[name].above
+            if value <= above:
+                rule = (
+                    f"must be greater than {above:g} at every time; with the factor {shown(factor)} it is {value:.6g}"
+                )
                 raise fault(rule, f"{key}.value", load.value)
 
     def with_values(self, changes: Mapping[str, Any]) -> Scene:
@@ -375,12 +310,9 @@ class Scene(Table):
         return toml_text(self, header)
 
 
-_SHAPES: dict[str, type[Cube] | type[Tendon] | type[Tube]] = {"cube": Cube, "tendon": Tendon, "tube": Tube}
-
-
 def _check_load_names(shape: str, loads: Any) -> None:
     """A load that the shape does not have, before anything is said about what is missing in it."""
-    names = _SHAPES[shape].load_names
+    names = SHAPES[shape].loads
     for name, load in loads.items() if isinstance(loads, Mapping) else ():
         if name not in names:
             listed = ", ".join(f"loads.{known}" for known in names)
@@ -390,7 +322,7 @@ def _check_load_names(shape: str, loads: Any) -> None:
 def _plain(value: Any, every_value: bool = False) -> Any:
     """Tables as dicts of the values that were set (or of all), so that they merge as the same keys in TOML do."""
     if isinstance(value, BaseModel):
-        kind = {"shape": value.shape} if isinstance(value, (Cube, Tendon, Tube)) else {}
+        kind = {"shape": value.name} if isinstance(value, Shape) else {}
         names = [name for name in type(value).model_fields if every_value or name in value.model_fields_set]
         return kind | {name: _plain(getattr(value, name), every_value) for name in names}
     if isinstance(value, Mapping):

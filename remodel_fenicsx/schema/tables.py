@@ -66,6 +66,43 @@ def checked(check: Callable[[Any], Any]) -> BeforeValidator:
     return BeforeValidator(check)
 
 
+class VariantOf:
+    """Validator of a table that has several kinds: the key `tag` names one of a registry, later ones included.
+
+    Parameters
+    ----------
+    registry
+        Table class by name; each has a field `tag` with that name.
+    tag
+        The key that tells them apart.
+    """
+
+    def __init__(self, registry: Mapping[str, type[BaseModel]], tag: str):
+        self.registry, self.tag = registry, tag
+
+    def __call__(self, value: Any) -> Any:
+        if isinstance(value, BaseModel):
+            return value
+        if not isinstance(value, Mapping):
+            raise fault("must be a table")
+        listed = f"allowed {'is' if len(self.registry) == 1 else 'are'} " + ", ".join(map(shown, self.registry))
+        if self.tag not in value:
+            raise fault(f"missing; {listed}", self.tag, None)
+        name = value[self.tag]
+        if not isinstance(name, str) or name not in self.registry:
+            raise fault(listed, self.tag, name)
+        table = self.registry[name]
+        try:
+            return table.model_validate(dict(value))
+        except ValidationError as error:
+            raise PydanticCustomError("inner", "faults in {name}", {"name": name, "error": error}) from None
+
+
+def variant_of(registry: Mapping[str, type[BaseModel]], tag: str) -> BeforeValidator:
+    """Annotation of a field that is one of the tables of a registry."""
+    return BeforeValidator(VariantOf(registry, tag))
+
+
 def fault(rule: str, key: str = "", value: Any = _MISSING) -> PydanticCustomError:
     """Error to raise in a validator.
 
@@ -102,10 +139,23 @@ def printable(text: str) -> str:
 
 def one_line(error: ValidationError, table: type[BaseModel]) -> str:
     """`key = value: what is allowed` of the first fault, with the number of further ones."""
-    # a mistyped key is also a missing key: the mistyped one says more
-    details = sorted(error.errors(include_url=False), key=lambda detail: detail["type"] != "extra_forbidden")
+    details = _details(error)
     text = _describe(details[0], table)
     return text if len(details) == 1 else f"{text} (and {len(details) - 1} more)"
+
+
+def _details(error: ValidationError) -> list[ErrorDetails]:
+    """All faults; the place of one inside of a variant names the variant after its field."""
+    details: list[ErrorDetails] = []
+    for detail in error.errors(include_url=False):
+        if detail["type"] == "inner":
+            inner = _details(detail["ctx"]["error"])
+            place = (*detail["loc"], detail["ctx"]["name"])
+            details += [{**entry, "loc": (*place, *entry["loc"])} for entry in inner]  # type: ignore[list-item]
+        else:
+            details.append(detail)
+    # a mistyped key is also a missing key: the mistyped one says more
+    return sorted(details, key=lambda detail: detail["type"] != "extra_forbidden")
 
 
 def _describe(detail: ErrorDetails, table: type[BaseModel]) -> str:
@@ -117,13 +167,8 @@ def _describe(detail: ErrorDetails, table: type[BaseModel]) -> str:
         return f"{key}: {rule}" if value is None else f"{key} = {shown(value)}: {rule}"
     if kind == "extra_forbidden":
         return f"{key} = {shown(value)}: unknown key; {_suggestion(key, owner, table)}"
-    if field is not None and field.discriminator:
-        tag = str(field.discriminator)
-        if kind == "missing" or (isinstance(value, Mapping) and tag not in value):
-            return f"{key}.{tag}: missing; {allowed(field)}"
-        if isinstance(value, Mapping):
-            return f"{key}.{tag} = {shown(value[tag])}: {allowed(field)}"
-        return f"{key} = {shown(value)}: must be a table"
+    if field is not None and kind == "missing" and (variant := variant_of_field(field)):
+        return f"{key}.{variant.tag}: missing; {allowed(field)}"
     rule = detail["msg"] if field is None else allowed(field)
     return f"{key}: missing; {rule}" if kind == "missing" else f"{key} = {shown(value)}: {rule}"
 
@@ -139,8 +184,8 @@ def locate(table: type[BaseModel], location: tuple[int | str, ...]) -> tuple[str
         if is_table(annotation):
             owner, field = annotation, annotation.model_fields.get(str(item))
             annotation = None if field is None else field.annotation
-            if field is not None and field.discriminator and items:
-                annotation = variants(field)[str(items.pop(0))]
+            if field is not None and items and (variant := variant_of_field(field)):
+                annotation = variant.registry[str(items.pop(0))]
         elif get_origin(annotation) is dict:
             annotation = get_args(annotation)[1]
             if is_table(annotation):
@@ -206,15 +251,18 @@ def _fields(annotation: Any) -> dict[str, FieldInfo]:
     return annotation.model_fields if is_table(annotation) else {}
 
 
-def variants(field: FieldInfo) -> dict[str, type[BaseModel]]:
-    """The table classes of a field that has several, by the value of the key that tells them apart."""
-    return {table.model_fields[str(field.discriminator)].default: table for table in get_args(field.annotation)}
+def variant_of_field(field: FieldInfo) -> VariantOf | None:
+    """The registry behind a field that has several kinds of tables, or None."""
+    for entry in field.metadata:
+        if isinstance(entry, BeforeValidator) and isinstance(entry.func, VariantOf):
+            return entry.func
+    return None
 
 
 def choices(field: FieldInfo) -> list[Any]:
     """The values of a field that has a closed list of them, else an empty list."""
-    if field.discriminator:
-        return list(variants(field))
+    if variant := variant_of_field(field):
+        return list(variant.registry)
     for entry in field.metadata:
         if isinstance(entry, AfterValidator) and isinstance(entry.func, OneOf):
             return list(entry.func.choices)
@@ -242,8 +290,8 @@ def sections(table: type[BaseModel], key: str = "", variant: str = "") -> Iterat
     yield key, variant, table
     for name, field in table.model_fields.items():
         path = _joined(key, name)
-        if field.discriminator:
-            for tag, inner in variants(field).items():
+        if several := variant_of_field(field):
+            for tag, inner in several.registry.items():
                 yield from sections(inner, path, tag)
         elif is_table(field.annotation):
             yield from sections(field.annotation, path)  # type: ignore[arg-type]
