@@ -155,6 +155,9 @@ def run(
         Progress(scene.time.number_of_steps, scene.name, -1 if quiet else comm.rank) as progress,
     ):
         log.info("scene %s on %d ranks, results in %s", scene.name, comm.size, place)
+        log.info("%s", scene.summary())
+        for warning in scene.warnings():
+            log.warning("%s", warning)
         try:
             _record_steps(simulation, record, progress, stop)
         except (StepFailure, Interrupted) as reason:

@@ -50,7 +50,11 @@ def tendon_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_folder_holds_history_fields_scene_and_log(tendon_run: Path) -> None:
     names = {path.name for path in tendon_run.iterdir()}
     assert names == {"history.csv", "fields.vtkhdf", "fields_chains.vtkhdf", "scene.toml", "run.log"}
-    assert "finished" in (tendon_run / "run.log").read_text()
+    log = (tendon_run / "run.log").read_text()
+    assert "finished" in log
+    # 25 a time unit, over an area of 10
+    line = "network modulus c = 1.568 Pa, shear modulus mu = 3.103 Pa, largest force over its area 7.5 Pa"
+    assert f"INFO {line}\n" in log
 
 
 def test_history_has_the_columns_of_the_contract(tendon_run: Path) -> None:
@@ -67,6 +71,7 @@ def test_scene_as_run_reads_back_as_the_same_scene(tendon_run: Path) -> None:
     again = read_scene(tendon_run / "scene.toml")
     assert again == read_scene(demo("tendon"), ["time.end=3"])
     text = (tendon_run / "scene.toml").read_text()
+    assert "\nformat = 2\n" in text
     assert "dolfinx" in text and "PETSc" in text
 
 
@@ -316,6 +321,16 @@ def test_a_misspelt_petsc_option_is_said_and_logged(tmp_path: Path) -> None:
     assert warning.removeprefix("WARNING: ") in (tmp_path / "out" / "run.log").read_text()
 
 
+def test_a_chain_density_of_another_stress_unit_is_said_and_logged(tmp_path: Path) -> None:
+    settings = ["--set", "material.stress_unit=kPa", "--set", "loads.force.value=1 N", "--set", "time.end=1"]
+    done = run("run", demo("cube"), *settings, "--set=geometry.length_unit=cm", "-q", "-o", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.startswith("WARNING: material.chain_density = 7e+21 belongs to a scene in Pa")
+    assert done.stderr.count("\n") == 1
+    assert done.stderr.removeprefix("WARNING: ") in (tmp_path / "out" / "run.log").read_text()
+    assert read_scene(tmp_path / "out" / "scene.toml").loads["force"].value == 10.0  # 1 N in kPa cm^2
+
+
 def test_options_of_the_profile_that_the_scene_makes_needless_are_no_news(tmp_path: Path) -> None:
     options = [f"--set=solver.petsc_options.{option}" for option in ("ksp_type=cg", "pc_type=none")]
     done = run("run", demo("cube"), *options, "--set=time.end=2", "-q", "-o", tmp_path / "out")
@@ -418,7 +433,10 @@ def test_bad_input_ends_two_ranks_with_one_line(tmp_path: Path) -> None:
 
 def test_validate_new_and_info(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["validate", str(demo("artery"))]) == 0
-    assert capsys.readouterr().out.endswith("a valid scene (tube, 150 steps)\n")
+    assert capsys.readouterr().out.endswith(
+        "a valid scene (tube, 150 steps)\n"
+        "network modulus c = 1.568 Pa, shear modulus mu = 3.103 Pa, largest pressure 4.8 Pa\n"
+    )
     for preset in ("kuhl-holzapfel-2007", "sun-2002"):
         for shape in ("cube", "tendon", "tube"):
             assert cli.main(["new", preset, "--shape", shape]) == 0

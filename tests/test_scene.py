@@ -6,6 +6,7 @@ import copy
 import math
 import pickle
 import re
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -84,12 +85,35 @@ BAD_SCENES = [
     ({"time": {"end": 1.0}}, {"preset": PAPER}, "geometry.shape: missing; allowed are 'cube', 'tendon', 'tube'"),
     (CUBE, {"geometry": {"side": 1.0}}, "geometry.shape: missing; allowed are 'cube', 'tendon', 'tube'"),
     (CUBE, {"geometry": 3}, "geometry = 3: must be a table"),
-    (CUBE, {"geometry.radius": 3.0}, "geometry.radius = 3.0: unknown key; allowed are geometry.shape, geometry.side"),
+    (
+        CUBE,
+        {"geometry.radius": 3.0},
+        "geometry.radius = 3.0: unknown key; allowed are geometry.shape, geometry.side, geometry.length_unit",
+    ),
+    # without a shape nothing else is judged: preset, loads and units depend on it
+    (CUBE, {"preset": PAPER, "geometry": {}}, "geometry.shape: missing; allowed are 'cube', 'tendon', 'tube'"),
+    ({}, {}, "geometry.shape: missing; allowed are 'cube', 'tendon', 'tube'"),
+    (
+        {"preset": PAPER, "geometry": {"shape": "heart"}},
+        {},
+        "geometry.shape = 'heart': allowed are 'cube', 'tendon', 'tube'",
+    ),
+    (
+        {"preset": PAPER, "geometry": {"shape": "heart"}, "loads": {"pressure": {"value": "100 mmHg"}}},
+        {},
+        "geometry.shape = 'heart': allowed are 'cube', 'tendon', 'tube'",
+    ),
+    ({"preset": PAPER, "geometry": 3}, {}, "geometry = 3: must be a table"),
     # unknown keys
     (
         TUBE,
         {"geometry": {"shape": "tube", "inner_radus": 1.0, "outer_radius": 3.0, "length": 8.0}},
-        "geometry.inner_radus = 1.0: unknown key; did you mean geometry.inner_radius? (and 1 more)",
+        "geometry.inner_radus = 1.0: unknown key; did you mean geometry.inner_radius?",
+    ),
+    (
+        CUBE,
+        {"time": {"ende": 3.0, "stepp": 1.0}},
+        "time.ende = 3.0: unknown key; did you mean time.end? (and 1 more fault)",
     ),
     (TUBE, {"cells.sed": 3}, "cells.sed = 3: unknown key; did you mean cells.seed?"),
     (TUBE, {"kappa": 0.1}, "kappa = 0.1: unknown key; did you mean remodeling.kappa?"),
@@ -109,7 +133,12 @@ BAD_SCENES = [
         {"material.temperature": float("inf")},
         "material.temperature = inf: must be a finite number greater than 0",
     ),
-    (CUBE, {"material.lame_mu": "3.1"}, "material.lame_mu = '3.1': must be a finite number greater than 0"),
+    (
+        CUBE,
+        {"material.lame_mu": "3.1"},
+        "material.lame_mu = '3.1': must be a finite number greater than 0, "
+        "or one with a unit of stress as in '2.4 kPa'",
+    ),
     (CUBE, {"material.lame_mu": True}, "material.lame_mu = true: must be a finite number greater than 0"),
     (
         CUBE,
@@ -125,7 +154,7 @@ BAD_SCENES = [
     (
         CUBE,
         {"material.lame_mu": -1.0, "material.lame_lambda": -1.0, "cells.seed": -1},
-        "material.lame_lambda = -1.0: must be a finite number at least 0 (and 2 more)",
+        "material.lame_lambda = -1.0: must be a finite number at least 0 (and 2 more faults)",
     ),
     # cells
     (
@@ -188,7 +217,16 @@ BAD_SCENES = [
         {"loads.force": {"value": 1.0}},
         "loads.force.ramp: missing; must be a list of pairs [time, factor] with increasing times",
     ),
-    (TUBE, {"loads.pressure.value": "high"}, "loads.pressure.value = 'high': must be a finite number"),
+    (
+        TUBE,
+        {"loads.pressure.value": "high"},
+        "loads.pressure.value = 'high': must be a finite number, or one with a unit of stress as in '2.4 kPa'",
+    ),
+    (
+        TUBE,
+        {"loads.stretch": {"value": "much"}},
+        "loads.stretch.value = 'much': must be a finite number (and 1 more fault)",
+    ),
     (TUBE, {"loads.pressure.rmp": []}, "loads.pressure.rmp = []: unknown key; did you mean loads.pressure.ramp?"),
     (
         TUBE,
@@ -328,6 +366,15 @@ BAD_SCENES = [
     (CUBE, {"solver.petsc_options": "-ksp_type cg"}, "solver.petsc_options = '-ksp_type cg': must be a table"),
     (CUBE, {"output.fields": 1}, "output.fields = 1: must be true or false"),
     (CUBE, {"output.every": 0}, "output.every = 0: must be a whole number at least 1"),
+    # format
+    (
+        CUBE,
+        {"format": 3, "new_table": {"key": 1}},
+        "format = 3: written by a newer version of remodel_fenicsx; this one reads formats up to 2",
+    ),
+    (CUBE, {"format": 0}, "format = 0: must be a whole number at least 1 and at most 2"),
+    (CUBE, {"format": "2"}, "format = '2': must be a whole number at least 1 and at most 2"),
+    (CUBE, {"format": True}, "format = true: must be a whole number at least 1 and at most 2"),
     # name and preset
     (
         CUBE,
@@ -385,6 +432,22 @@ def test_a_law_registered_later_is_allowed(monkeypatch):
     monkeypatch.setitem(parameters.LAWS, "mine", parameters.LAWS["rate"])
     assert scene_from_dict(changed(CUBE, {"remodeling.law": "mine"})).remodeling.law == "mine"
     assert "'none', 'mine'" in refusal(changed(CUBE, {"remodeling.law": "yours"}))
+
+
+def test_a_key_of_an_earlier_format_is_refused_with_its_new_name(monkeypatch):
+    monkeypatch.setitem(parameters.RENAMED, "mesh.finite_cell", "mesh.degree")
+    monkeypatch.setitem(parameters.RENAMED, "loads.lengthening", "loads.pressure")
+    assert refusal(changed(TUBE, {"format": 1, "mesh.finite_cell": 1})) == "mesh.finite_cell = 1: is now mesh.degree"
+    assert refusal(changed(TUBE, {"mesh.finite_cell": 1})) == "mesh.finite_cell = 1: is now mesh.degree"
+    line = "loads.lengthening = {value = 1.0}: is now loads.pressure"
+    assert refusal(changed(TUBE, {"loads.lengthening": {"value": 1.0}})) == line
+
+
+def test_what_is_read_is_of_the_present_format():
+    assert scene_from_dict(CUBE) == scene_from_dict({**CUBE, "format": 1})
+    text = scene_from_dict({**CUBE, "format": 1}).to_toml("as run")
+    assert tomllib.loads(text)["format"] == parameters.FORMAT
+    assert [line for line in text.splitlines() if line and not line.startswith("#")][0] == "format = 2"
 
 
 @pytest.mark.parametrize("values", [None, [], 3, {1: 2}])
@@ -637,7 +700,7 @@ def test_a_preset_by_name():
     assert preset_scene(PAPER, "tube") == read_scene(ROOT / "demos" / "artery.toml", ["name=tube"])
     with pytest.raises(SceneError, match=r"^preset = 'none': allowed are 'kuhl-holzapfel-2007', 'sun-2002'$"):
         preset_scene("none", "tube")
-    with pytest.raises(SceneError, match=r"^geometry\.shape = 'heart': allowed are 'cube', 'tendon', 'tube' \(and"):
+    with pytest.raises(SceneError, match=r"^geometry\.shape = 'heart': allowed are 'cube', 'tendon', 'tube'$"):
         preset_scene(PAPER, "heart")
 
 
@@ -705,6 +768,55 @@ def test_good_cells():
     assert scene_from_dict(changed(CUBE, {"cells": {"end_to_end_length": 0.5, "initial": [0.3, 0.4, 0]}}))
     assert Tendon(length=1).length == 1.0
     assert Solver(petsc_options={"snes_monitor": True}).petsc_options == {"snes_monitor": True}
+
+
+# ---------------------------------------------------------------- summary and warnings
+
+
+def test_the_summary_is_one_line_in_one_unit():
+    beginning = "network modulus c = 1.568 Pa, shear modulus mu = 3.103 Pa"
+    assert preset_scene(PAPER, "tube").summary() == f"{beginning}, largest pressure 4.8 Pa"
+    assert preset_scene(PAPER, "tendon").summary() == f"{beginning}, largest force over its area 30 Pa"
+    stiff = preset_scene(PAPER, "cube").with_values({"material.stress_unit": "kPa", "geometry.side": 2.0})
+    line = "network modulus c = 0.004116 kPa, shear modulus mu = 3.103 kPa, largest force over its area 2.5 kPa"
+    assert stiff.summary() == line
+    assert scene_from_dict(CUBE).summary() == beginning
+
+
+def test_the_largest_load_is_the_largest_of_the_run():
+    load = Load(value=-2.0, ramp=[[0.0, 0.5], [10.0, -1.0], [20.0, 3.0]])
+    assert load.largest(10.0) == 2.0
+    assert load.largest(12.0) == 2.0 * 1.0  # the ramp passes 0 on the way from -1 to 3
+    assert load.largest(15.0) == pytest.approx(-2.0)
+    assert load.largest(18.0) == pytest.approx(-2.0 * 2.2)
+    assert load.largest(100.0) == -6.0
+    assert Load(value=1.0, ramp=[[5.0, -2.0], [10.0, 1.0]]).largest(10.0) == -2.0  # held before the first pair
+
+
+SOFT = (
+    "material.chain_density = 2e+21 belongs to a scene in Pa, but material.stress_unit is kPa: the network "
+    "(c = 0.001568 kPa) is 1000 times too soft beside the matrix (mu = 3.103 kPa); 2e+24 makes c the same number as in "
+    "Pa"
+)
+
+
+def test_a_chain_density_of_another_stress_unit_is_warned_of():
+    printed = preset_scene(PAPER, "tube")
+    assert printed.warnings() == []
+    soft = printed.with_values({"material.stress_unit": "kPa"})
+    assert soft.warnings() == [SOFT]
+    assert scene_from_dict(changed(TUBE, {"material.stress_unit": "kPa"})).warnings() == [SOFT]  # the defaults
+    assert soft.with_values({"material.stress_unit": "MPa"}).warnings()[0].count("1e+06 times too soft") == 1
+    for remedy in ({"material.chain_density": 2e24}, {"material.chain_density": 0.0}, {"material.lame_mu": "3.103 Pa"}):
+        assert soft.with_values(remedy).warnings() == [], remedy
+
+
+def test_a_preset_with_units_in_another_stress_unit(monkeypatch):
+    material = {"stress_unit": "kPa", "lame_mu": "3.103 kPa", "lame_lambda": "27293 Pa", "chain_density": 2e24}
+    monkeypatch.setitem(PRESETS, "stiff", {"cube": {"material": material}})
+    stiff = scene_from_dict({**CUBE, "preset": "stiff"})
+    assert (stiff.material.lame_mu, stiff.material.lame_lambda, stiff.warnings()) == (3.103, 27.293, [])
+    assert "is 1000 times too stiff beside" in stiff.with_values({"material.stress_unit": "Pa"}).warnings()[0]
 
 
 # ---------------------------------------------------------------- documentation

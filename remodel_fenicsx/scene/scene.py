@@ -16,9 +16,20 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import BaseModel, Field, model_validator
 
-from remodel_fenicsx.scene.parameters import PRESETS, Cells, Material, Remodeling, length_fault
+from remodel_fenicsx.scene.parameters import (
+    FORMAT,
+    LOAD_DIMENSIONS,
+    PRESETS,
+    RENAMED,
+    Cells,
+    Material,
+    Remodeling,
+    length_fault,
+)
 from remodel_fenicsx.schema.tables import SceneError, Table, checked, fault, is_number, one_of, quoted, shown
 from remodel_fenicsx.schema.toml import merged, parse_override, put, read_toml, toml_text
+from remodel_fenicsx.schema.units import AREA, FORCE, LENGTH, STRESS, LengthUnit
+from remodel_fenicsx.scene.values import base_material, in_own_units, in_present_format, known_shape
 
 MOST_STEPS = 1_000_000
 SAME_TIME = 1e-9  # relative: times closer than this are the same
@@ -49,7 +60,15 @@ class Cube(Table):
     number_of_elements: ClassVar[int] = 1
 
     shape: Literal["cube"] = Field(default="cube", description="Which body it is.")
-    side: float = Field(default=1.0, gt=0, description="Length of an edge, in the scene's unit of length.")
+    side: Annotated[float, LENGTH] = Field(
+        default=1.0, gt=0, description="Length of an edge, in the scene's unit of length."
+    )
+    length_unit: LengthUnit = None
+
+    @property
+    def loaded_area(self) -> float:
+        """Area that carries `force`."""
+        return self.side**2
 
     @model_validator(mode="after")
     def _can_be_meshed(self) -> Cube:
@@ -68,8 +87,18 @@ class Tendon(Table):
     number_of_elements: ClassVar[int] = 480
 
     shape: Literal["tendon"] = Field(default="tendon", description="Which body it is.")
-    length: float = Field(default=10.0, gt=0, description="Length along z, in the scene's unit of length.")
-    area: float = Field(default=10.0, gt=0, description="Area of the cross-section, in the unit of length squared.")
+    length: Annotated[float, LENGTH] = Field(
+        default=10.0, gt=0, description="Length along z, in the scene's unit of length."
+    )
+    area: Annotated[float, AREA] = Field(
+        default=10.0, gt=0, description="Area of the cross-section, in the unit of length squared."
+    )
+    length_unit: LengthUnit = None
+
+    @property
+    def loaded_area(self) -> float:
+        """Area that carries `force`."""
+        return self.area
 
     @model_validator(mode="after")
     def _can_be_meshed(self) -> Tendon:
@@ -88,9 +117,10 @@ class Tube(Table):
     number_of_elements: ClassVar[int] = 1536
 
     shape: Literal["tube"] = Field(default="tube", description="Which body it is.")
-    inner_radius: float = Field(gt=0, description="Inner radius R_i, in the scene's unit of length.")
-    outer_radius: float = Field(gt=0, description="Outer radius R_o, in the scene's unit of length.")
-    length: float = Field(gt=0, description="Length along z, in the scene's unit of length.")
+    inner_radius: Annotated[float, LENGTH] = Field(gt=0, description="Inner radius R_i, in the scene's unit of length.")
+    outer_radius: Annotated[float, LENGTH] = Field(gt=0, description="Outer radius R_o, in the scene's unit of length.")
+    length: Annotated[float, LENGTH] = Field(gt=0, description="Length along z, in the scene's unit of length.")
+    length_unit: LengthUnit = None
 
     @model_validator(mode="after")
     def _has_a_wall(self) -> Tube:
@@ -175,6 +205,11 @@ class Load(Table):
         (time0, factor0), (time1, factor1) = self.ramp[after - 1], self.ramp[after]
         return factor0 + (factor1 - factor0) * (time - time0) / (time1 - time0)
 
+    def largest(self, end: float) -> float:
+        """The value of largest magnitude from time 0 to `end`, with its sign."""
+        times = [end, *(time for time, _ in self.ramp if time < end)]
+        return max((self.value * self.factor(time) for time in times), key=abs)
+
 
 class Time(Table):
     """Simulated time, in the unit of 1/kappa. It starts at 0 with the unloaded body."""
@@ -230,7 +265,7 @@ class Solver(Table):
     profile: Literal["direct"] = Field(
         default="direct", description="'direct': Newton's method, each system factorised."
     )
-    absolute_tolerance: float = Field(
+    absolute_tolerance: Annotated[float, FORCE] = Field(
         default=0.0,
         ge=0,
         description="A step is solved when |R| <= absolute_tolerance + relative_tolerance |nodal forces|, R the "
@@ -278,6 +313,14 @@ def _name(value: Any) -> Any:
 class Scene(Table):
     """A whole scene: all keys above the first table, and the tables."""
 
+    renamed: ClassVar[Mapping[str, str]] = RENAMED
+
+    format: int = Field(
+        default=FORMAT,
+        ge=1,
+        le=FORMAT,
+        description="Number of the form in which a scene is written; a scene as run has it. Version 0.1.0 wrote none.",
+    )
     name: Annotated[str, checked(_name)] = Field(
         default="scene",
         description="Name of the scene and of its results folder. Default: the file's name without its ending.",
@@ -302,16 +345,14 @@ class Scene(Table):
     @model_validator(mode="before")
     @classmethod
     def _merge_preset(cls, values: Any) -> Any:
-        """The scene's keys over those of its preset over those of its shape."""
+        """The scene's keys over those of its preset over those of its shape; numbers in place of values with units."""
         if not isinstance(values, dict):
             return values
-        plain = _plain(values)
-        preset, geometry = plain.get("preset"), plain.get("geometry", {})
+        plain = in_present_format(_plain(values))
+        preset = plain.get("preset")
         if preset is not None and (not isinstance(preset, str) or preset not in PRESETS):
             raise fault("allowed are " + ", ".join(map(repr, PRESETS)), "preset", preset)
-        shape = geometry.get("shape") if isinstance(geometry, dict) else None
-        if not isinstance(shape, str) or shape not in _SHAPES:
-            return plain  # the field's own error says which shapes there are
+        shape = known_shape(plain.get("geometry", {}), _SHAPES)
         _check_load_names(shape, plain.get("loads"))
         base = SHAPE_DEFAULTS.get(shape, {})
         if preset is not None:
@@ -319,7 +360,7 @@ class Scene(Table):
                 known = ", ".join(map(repr, PRESETS[preset]))
                 raise fault(f"the preset {preset!r} has {known}", "geometry.shape", shape)
             base = merged(base, PRESETS[preset][shape])
-        return merged(base, plain)
+        return in_own_units(merged(base, plain), cls, _SHAPES[shape], Load)
 
     @model_validator(mode="after")
     def _tables_fit_together(self) -> Scene:
@@ -348,6 +389,22 @@ class Scene(Table):
             if name == "stretch" and stretch <= -1:
                 rule = f"must be greater than -1 at every time; with the factor {shown(factor)} it is {stretch:.6g}"
                 raise fault(rule, f"{key}.value", load.value)
+
+    def summary(self) -> str:
+        """Stiffness of network and matrix and the largest loads, in one unit and on one line."""
+        loads = {}
+        for name, load in self.loads.items():
+            largest, dimension = load.largest(self.time.end), LOAD_DIMENSIONS.get(name)
+            if dimension == STRESS:
+                loads[f"largest {name}"] = largest
+            elif dimension == FORCE:
+                loads[f"largest {name} over its area"] = largest / self.geometry.loaded_area  # type: ignore[union-attr]
+        return self.material.summary(loads)
+
+    def warnings(self) -> list[str]:
+        """What is allowed but hardly meant, each on one line."""
+        under = {} if self.preset is None else PRESETS[self.preset][self.geometry.shape].get("material", {})
+        return self.material.warnings(base_material(under))
 
     def with_values(self, changes: Mapping[str, Any]) -> Scene:
         """A validated copy with other values by dotted key: ``scene.with_values({"loads.pressure.value": 2.4})``.
@@ -383,8 +440,9 @@ def _check_load_names(shape: str, loads: Any) -> None:
     names = _SHAPES[shape].load_names
     for name, load in loads.items() if isinstance(loads, Mapping) else ():
         if name not in names:
-            listed = ", ".join(f"loads.{known}" for known in names)
-            raise fault(f"a {shape} has no such load; allowed: {listed}", f"loads.{quoted(str(name))}", load)
+            key, listed = f"loads.{quoted(str(name))}", ", ".join(f"loads.{known}" for known in names)
+            rule = f"is now {RENAMED[key]}" if key in RENAMED else f"a {shape} has no such load; allowed: {listed}"
+            raise fault(rule, key, load)
 
 
 def _plain(value: Any, every_value: bool = False) -> Any:
