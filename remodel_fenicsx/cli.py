@@ -180,6 +180,10 @@ def _end_all(message: str, code: int) -> int:
 def _validate(options: argparse.Namespace) -> int:
     scene = read_scene(options.scene, options.set)
     _say(f"{options.scene}: a valid scene ({scene.geometry.name}, {scene.time.number_of_steps} steps)")
+    _say(scene.summary())
+    if _rank() == 0:
+        for warning in scene.warnings():
+            _complain(f"warning: {warning}")
     return 0
 
 

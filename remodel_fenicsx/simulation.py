@@ -171,6 +171,9 @@ def run(
         stop = stack.enter_context(StopRequest())
         progress = stack.enter_context(Progress(scene.time.number_of_steps, scene.name, -1 if quiet else comm.rank))
         log.info("scene %s on %d ranks, results in %s", scene.name, comm.size, place)
+        log.info("%s", scene.summary())
+        for warning in scene.warnings():
+            log.warning("%s", warning)
         watchers: list[Watcher] = []
         if scene.output.fields:
             fields = Fields(place, scene.geometry, simulation.stepper, scene.output.every)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -10,6 +10,7 @@ from pydantic import Field, model_validator
 from remodel_fenicsx.body import gmsh_model as model
 from remodel_fenicsx.body.column import Column
 from remodel_fenicsx.body.shape import LoadKind, MeshSettings, Shape, check_lengths, uniaxial_columns
+from remodel_fenicsx.schema.units import FORCE, LENGTH
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -25,7 +26,7 @@ class Cube(Shape):
         "force": LoadKind(
             lambda shape, loading, name: loading.add_dead_force(name, "z1", component=2),
             "total dead force along z on the top",
-            "force",
+            FORCE,
         )
     }
     columns: ClassVar[tuple[Column, ...]] = uniaxial_columns("z1", "side")
@@ -33,7 +34,14 @@ class Cube(Shape):
     faces: ClassVar[tuple[str, ...]] = ("x0", "x1", "y0", "y1", "z0", "z1")
 
     shape: Literal["cube"] = Field(default="cube", description="Which body it is.")
-    side: float = Field(default=1.0, gt=0, description="Length of an edge, in the scene's unit of length.")
+    side: Annotated[float, LENGTH] = Field(
+        default=1.0, gt=0, description="Length of an edge, in the scene's unit of length."
+    )
+
+    @property
+    def loaded_area(self) -> float:
+        """Area that carries `force`."""
+        return self.side**2
 
     @model_validator(mode="after")
     def _can_be_meshed(self) -> Cube:

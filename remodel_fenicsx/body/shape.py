@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from remodel_fenicsx.body.column import Column
 from remodel_fenicsx.body.gmsh_model import length_fault
 from remodel_fenicsx.schema.tables import Table, fault
+from remodel_fenicsx.schema.units import Dimension, LengthUnit
 from remodel_fenicsx.tissue.cells import angle_to_axis
 
 if TYPE_CHECKING:  # shapes are part of every scene: they are read without dolfinx
@@ -48,7 +50,7 @@ class LoadKind:
     meaning
         One sentence for the documentation, the column's too.
     dimension
-        Of its value: "force", "stress" or "" for a number.
+        Of its value; None for a number.
     column
         Name of its column; default: its own.
     above
@@ -57,13 +59,14 @@ class LoadKind:
 
     add: Callable[[Any, Loading, str], None]
     meaning: str
-    dimension: str = ""
+    dimension: Dimension | None = None
     column: str = ""
     above: float = -np.inf
 
     def make_column(self, name: str) -> Column:
         """Its column, for the load of this name."""
-        return Column(self.column or name, self.dimension, self.meaning, lambda m: float(m.step.loads[name]))
+        unit = self.dimension.name if self.dimension else ""
+        return Column(self.column or name, unit, self.meaning, lambda m: float(m.step.loads[name]))
 
 
 class Shape(Table):
@@ -92,10 +95,18 @@ class Shape(Table):
     faces: ClassVar[tuple[str, ...]] = ()
     defaults: ClassVar[dict[str, Any]] = {}
 
+    shape: str = Field(description="Which body it is.")
+    length_unit: LengthUnit = None
+
+    @property
+    def loaded_area(self) -> float:
+        """Reference area that carries a force, in the scene's unit of length squared."""
+        raise NotImplementedError(f"a {self.name} has no loads of the dimension of a force")
+
     @property
     def name(self) -> str:
         """The shape's name."""
-        return str(getattr(self, "shape", type(self).__name__))
+        return self.shape
 
     @abstractmethod
     def build(self, mesh: MeshSettings, comm: MPI.Intracomm | None = None) -> Domain:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -12,6 +12,7 @@ from pydantic import Field, model_validator
 from remodel_fenicsx.body import gmsh_model as model
 from remodel_fenicsx.body.column import Column
 from remodel_fenicsx.body.shape import LoadKind, MeshSettings, Shape, check_lengths, uniaxial_columns
+from remodel_fenicsx.schema.units import AREA, FORCE, LENGTH
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -35,7 +36,7 @@ class Tendon(Shape):
         "force": LoadKind(
             lambda shape, loading, name: loading.add_dead_force(name, "top", component=2),
             "total dead force along z on the top",
-            "force",
+            FORCE,
         )
     }
     columns: ClassVar[tuple[Column, ...]] = uniaxial_columns("top", "length")
@@ -44,8 +45,17 @@ class Tendon(Shape):
     faces: ClassVar[tuple[str, ...]] = ("bottom", "top", "side")
 
     shape: Literal["tendon"] = Field(default="tendon", description="Which body it is.")
-    length: float = Field(default=10.0, gt=0, description="Length along z, in the scene's unit of length.")
-    area: float = Field(default=10.0, gt=0, description="Area of the cross-section, in the unit of length squared.")
+    length: Annotated[float, LENGTH] = Field(
+        default=10.0, gt=0, description="Length along z, in the scene's unit of length."
+    )
+    area: Annotated[float, AREA] = Field(
+        default=10.0, gt=0, description="Area of the cross-section, in the unit of length squared."
+    )
+
+    @property
+    def loaded_area(self) -> float:
+        """Area that carries `force`."""
+        return self.area
 
     @model_validator(mode="after")
     def _can_be_meshed(self) -> Tendon:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -12,6 +12,7 @@ from remodel_fenicsx.body import gmsh_model as model
 from remodel_fenicsx.body.column import Column
 from remodel_fenicsx.body.shape import Array, LoadKind, MeshSettings, Shape, check_lengths
 from remodel_fenicsx.schema.tables import fault, shown
+from remodel_fenicsx.schema.units import LENGTH, STRESS
 from remodel_fenicsx.tissue.cells import pitch_angle
 
 if TYPE_CHECKING:
@@ -55,7 +56,7 @@ class Tube(Shape):
         "pressure": LoadKind(
             lambda shape, loading, name: loading.add_follower_pressure(name, "inner"),
             "pressure on the deformed inner face",
-            "stress",
+            STRESS,
         ),
         "elongation": LoadKind(
             lambda shape, loading, name: loading.add_prescribed_elongation(name, "top", 2, shape.length),
@@ -82,9 +83,9 @@ class Tube(Shape):
     defaults: ClassVar[dict[str, Any]] = {"cells": {"axes": "cylindrical"}}
 
     shape: Literal["tube"] = Field(default="tube", description="Which body it is.")
-    inner_radius: float = Field(gt=0, description="Inner radius R_i, in the scene's unit of length.")
-    outer_radius: float = Field(gt=0, description="Outer radius R_o, in the scene's unit of length.")
-    length: float = Field(gt=0, description="Length along z, in the scene's unit of length.")
+    inner_radius: Annotated[float, LENGTH] = Field(gt=0, description="Inner radius R_i, in the scene's unit of length.")
+    outer_radius: Annotated[float, LENGTH] = Field(gt=0, description="Outer radius R_o, in the scene's unit of length.")
+    length: Annotated[float, LENGTH] = Field(gt=0, description="Length along z, in the scene's unit of length.")
 
     @model_validator(mode="after")
     def _has_a_wall(self) -> Tube:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
@@ -17,20 +18,26 @@ from remodel_fenicsx.tissue.chains import BOLTZMANN_CONSTANT, CHAINS
 from remodel_fenicsx.tissue.drivers import DRIVERS, FRAMES
 from remodel_fenicsx.tissue.energy import MATRICES, Tissue
 from remodel_fenicsx.tissue.laws import LAWS
+from remodel_fenicsx.schema.units import NUMBER_DENSITY, STRESS, TEMPERATURE
 
 COUPLINGS = ["staggered"]  # names of evolution.coupling.COUPLINGS, which a test holds to it
 STRESS_UNITS = {"Pa": 1.0, "kPa": 1.0e3, "MPa": 1.0e6}  # in Pa
 INITIAL_CELLS = ("random", "isotropic", "aligned")
+FORMAT = 2  # of recorded scenes: raised where a reader of the one before would not understand them
+RENAMED = {"mesh.cell": "mesh.element", "loads.stretch": "loads.elongation", "solver.profile": "solver.method"}
+"""Dotted key of an earlier format -> the key that has taken its place, for the error."""
 
 
 class Material(Table):
     """The tissue: an isotropic matrix (Lame constants) with a network of collagen chains."""
 
-    lame_lambda: float = Field(
+    lame_lambda: Annotated[float, STRESS] = Field(
         default=27.293, ge=0, description="First Lame constant lambda of the matrix, in stress_unit."
     )
-    lame_mu: float = Field(default=3.103, gt=0, description="Second Lame constant mu of the matrix, in stress_unit.")
-    chain_density: float = Field(
+    lame_mu: Annotated[float, STRESS] = Field(
+        default=3.103, gt=0, description="Second Lame constant mu of the matrix, in stress_unit."
+    )
+    chain_density: Annotated[float, NUMBER_DENSITY] = Field(
         default=2.0e21, ge=0, description="Number of chains n_chn per volume, in 1/m^3; 0: no chains."
     )
     contour_length: float = Field(
@@ -41,7 +48,9 @@ class Material(Table):
         gt=0,
         description="Persistence length A_p of a chain, its bending stiffness over k theta, in link lengths.",
     )
-    temperature: float = Field(default=310.0, gt=0, description="Absolute temperature theta, in K.")
+    temperature: Annotated[float, TEMPERATURE] = Field(
+        default=310.0, gt=0, description="Absolute temperature theta, in K."
+    )
     energy_factor: Annotated[int, one_of((1, 4))] = Field(
         default=1,
         description="Factor omega of the chain energy: 1 is the stress as printed (eq. 7; reproduces Fig. 6), "
@@ -83,6 +92,42 @@ class Material(Table):
             CHAINS[self.chain] if self.chain_density > 0 else None,
             MATRICES[self.matrix],
         )
+
+    def summary(self, loads: Mapping[str, float]) -> str:
+        """Stiffness of network and matrix and the loads, in one unit and on one line.
+
+        Parameters
+        ----------
+        loads
+            Stresses by the words for them, in stress_unit.
+        """
+        stresses = {"network modulus c =": self.network_modulus, "shear modulus mu =": self.lame_mu, **loads}
+        return ", ".join(f"{words} {value:.4g} {self.stress_unit}" for words, value in stresses.items())
+
+    def warnings(self, base: Material) -> list[str]:
+        """Lines on a network that a change of stress_unit alone has made too soft or too stiff for its matrix.
+
+        The Lame constants of a scene are numbers in stress_unit, the chain density is always in 1/m^3: whoever changes
+        the unit changes the one and not the other.
+
+        Parameters
+        ----------
+        base
+            What lies under the scene's own keys: the preset's material, or the defaults.
+        """
+        unit, factor = self.stress_unit, STRESS_UNITS[self.stress_unit] / STRESS_UNITS[base.stress_unit]
+        if factor == 1 or self.chain_density != base.chain_density or not self.chain_density:
+            return []
+        ratio = self.network_modulus / self.lame_mu / (base.network_modulus / base.lame_mu)
+        if 1 / 30 < ratio < 30:  # other chains or a tenfold stiffer matrix are a choice; units differ by a thousand
+            return []
+        return [
+            f"material.chain_density = {self.chain_density:g} belongs to a scene in {base.stress_unit}, but "
+            f"material.stress_unit is {unit}: the network (c = {self.network_modulus:.4g} {unit}) is "
+            f"{max(ratio, 1 / ratio):.4g} times too {'soft' if ratio < 1 else 'stiff'} beside the matrix "
+            f"(mu = {self.lame_mu:.4g} {unit}); {self.chain_density * factor:g} makes c the same number as in "
+            f"{base.stress_unit}"
+        ]
 
 
 def _initial_cells(value: Any) -> Any:

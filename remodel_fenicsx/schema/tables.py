@@ -9,8 +9,8 @@ import difflib
 import inspect
 import math
 import re
-from collections.abc import Callable, Collection, Iterator, Mapping
-from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args, get_origin
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, ValidationError
 from pydantic.fields import FieldInfo
@@ -28,7 +28,15 @@ class SceneError(ValueError):
 
 
 class Table(BaseModel):
-    """A table of a scene: immutable, no unknown keys, no conversion between types, no NaN and no infinity."""
+    """A table of a scene: immutable, no unknown keys, no conversion between types, no NaN and no infinity.
+
+    Attributes
+    ----------
+    renamed
+        Of the outermost table: dotted keys of earlier versions, each with the one that has taken its place.
+    """
+
+    renamed: ClassVar[Mapping[str, str]] = {}
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
@@ -139,9 +147,19 @@ def printable(text: str) -> str:
 
 def one_line(error: ValidationError, table: type[BaseModel]) -> str:
     """`key = value: what is allowed` of the first fault, with the number of further ones."""
-    details = _details(error)
-    text = _describe(details[0], table)
-    return text if len(details) == 1 else f"{text} (and {len(details) - 1} more)"
+    # a mistyped key is also a missing key: the mistyped one says more
+    details = sorted(_details(error), key=lambda detail: detail["type"] != "extra_forbidden")
+    mistyped = {_meant(detail["loc"], table) for detail in details if detail["type"] == "extra_forbidden"}
+    faults = [detail for detail in details if detail["type"] != "missing" or detail["loc"] not in mistyped]
+    text, more = _describe(faults[0], table), len(faults) - 1
+    return f"{text} (and {more} more fault{'s' if more > 1 else ''})" if more else text
+
+
+def _meant(location: tuple[int | str, ...], table: type[BaseModel]) -> tuple[int | str, ...]:
+    """Where the key nearest to an unknown one is, in the same table; the place itself if none is near."""
+    _, owner, _ = locate(table, location)
+    near = _nearest(str(location[-1]), owner.model_fields)
+    return (*location[:-1], *near) if near else location
 
 
 def _details(error: ValidationError) -> list[ErrorDetails]:
@@ -154,8 +172,7 @@ def _details(error: ValidationError) -> list[ErrorDetails]:
             details += [{**entry, "loc": (*place, *entry["loc"])} for entry in inner]  # type: ignore[list-item]
         else:
             details.append(detail)
-    # a mistyped key is also a missing key: the mistyped one says more
-    return sorted(details, key=lambda detail: detail["type"] != "extra_forbidden")
+    return details
 
 
 def _describe(detail: ErrorDetails, table: type[BaseModel]) -> str:
@@ -166,7 +183,9 @@ def _describe(detail: ErrorDetails, table: type[BaseModel]) -> str:
         value = context.get("value", value)
         return f"{key}: {rule}" if value is None else f"{key} = {shown(value)}: {rule}"
     if kind == "extra_forbidden":
-        return f"{key} = {shown(value)}: unknown key; {_suggestion(key, owner, table)}"
+        renamed: Mapping[str, str] = getattr(table, "renamed", {})
+        rule = f"is now {renamed[key]}" if key in renamed else f"unknown key; {_suggestion(key, owner, table)}"
+        return f"{key} = {shown(value)}: {rule}"
     if field is not None and kind == "missing" and (variant := variant_of_field(field)):
         return f"{key}.{variant.tag}: missing; {allowed(field)}"
     rule = detail["msg"] if field is None else allowed(field)
@@ -225,15 +244,20 @@ def _toml_text(value: Any) -> str:
     return str(value)
 
 
+def _nearest(name: str, known: Iterable[str], cutoff: float = 0.6) -> list[str]:
+    """The one name that is most like another, in a list, or none."""
+    return difflib.get_close_matches(name, known, n=1, cutoff=cutoff)
+
+
 def _suggestion(key: str, owner: type[BaseModel], table: type[BaseModel]) -> str:
     """The nearest key of the same table, else a key of the same name in another one, else all keys of the table."""
     parent, _, name = key.rpartition(".")
-    near = difflib.get_close_matches(name, owner.model_fields, n=1, cutoff=0.6)
+    near = _nearest(name, owner.model_fields)
     if near:
         return f"did you mean {_joined(parent, near[0])}?"
     others = [(other, inner) for other, _, inner in sections(table) if other != parent]
     elsewhere = {known: _joined(other, known) for other, inner in others for known in inner.model_fields}
-    near = difflib.get_close_matches(name, elsewhere, n=1, cutoff=0.8)
+    near = _nearest(name, elsewhere, cutoff=0.8)
     if near:
         return f"did you mean {elsewhere[near[0]]}?"
     return "allowed are " + ", ".join(_joined(parent, known) for known in owner.model_fields)
