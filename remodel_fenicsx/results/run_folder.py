@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from remodel_fenicsx.fem import compat
 from remodel_fenicsx.body import Domain
 from remodel_fenicsx.results.columns import Observer
+from remodel_fenicsx.results.recording import read_history as read_history  # where it was before
 from remodel_fenicsx.evolution.stepper import SolvedStep
 from remodel_fenicsx.results.vtkhdf import (
     LINE,
@@ -178,13 +179,6 @@ class History:
 def _number(value: float) -> str:
     """Shortest text that reads back as the same number."""
     return str(value) if isinstance(value, int) else repr(float(value))
-
-
-def read_history(folder: Path) -> dict[str, Array]:
-    """The columns of a recorded history.csv by name, each an array over the accepted steps."""
-    with (Path(folder) / "history.csv").open(newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-    return {name: np.array([float(row[name]) for row in rows]) for name in (rows[0] if rows else COMMON_COLUMNS)}
 
 
 class Fields:
