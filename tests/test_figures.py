@@ -596,7 +596,7 @@ def test_a_snapshot_is_really_drawn(tiny_run: Recording) -> None:
 
 def test_chains_on_the_far_side_are_not_drawn() -> None:
     _, ribbons = bodies.body(two_hexahedra())  # on the face x = 3
-    views = [rendering.View((side, 0.0, 0.0), (3.0, 0.0, 1.0), 3.0, (60, 60)) for side in (1.0, -1.0)]
+    views = [rendering.View((side, 0.0, 0.0), (3.0, 0.0, 1.0), 2.0, (160, 160)) for side in (1.0, -1.0)]
     front, behind = rendering.render([rendering.Picture(view, [ribbons]) for view in views])
     assert front.min() < 70 and np.all(behind == 255)
 
