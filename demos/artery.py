@@ -9,22 +9,22 @@
 
 # %%
 import sys
-import time as clock
 
-import dolfinx.fem
 from mpi4py import MPI
+from petsc4py import PETSc
 
-from remodel_fenicsx.tissue.cells import UnitCells
-from remodel_fenicsx.body import tube
-from remodel_fenicsx.system.interrupts import end_all_ranks_on_exception
+from remodel_fenicsx.body import Tube
 from remodel_fenicsx.body.loading import Loading
-from remodel_fenicsx.results.columns import Observer
-from remodel_fenicsx.scene.parameters import Cells, Material, Remodeling
-from remodel_fenicsx.fem.quadrature import Quadrature
-from remodel_fenicsx.results.run_folder import RunFolder, chosen_folder, history_row
-from remodel_fenicsx.evolution.remodeling import RemodelingPass
-from remodel_fenicsx.scene.scene import Solver
+from remodel_fenicsx.evolution.state import State
 from remodel_fenicsx.evolution.stepper import Stepper, times
+from remodel_fenicsx.evolution.unit_cells import UnitCells
+from remodel_fenicsx.fem.kinematics import FullKinematics
+from remodel_fenicsx.fem.quadrature import Quadrature
+from remodel_fenicsx.results.columns import Observer
+from remodel_fenicsx.results.run_folder import RunFolder, chosen_folder
+from remodel_fenicsx.scene.parameters import Cells, Material, Remodeling
+from remodel_fenicsx.scene.scene import Mesh, Solver
+from remodel_fenicsx.system.interrupts import end_all_ranks_on_exception
 
 end = float(sys.argv[1]) if len(sys.argv) > 1 else 150.0
 comm = MPI.COMM_WORLD
@@ -37,9 +37,10 @@ end_all_ranks_on_exception()
 # $u$, the deformation gradient $F = I + \nabla u$, $C = F^T F$, $J = \det F$.
 
 # %%
-domain = tube(inner_radius=1.0, outer_radius=3.0, length=8.0, comm=comm)
-space = dolfinx.fem.functionspace(domain.mesh, ("Lagrange", 1, (3,)))
-displacement = dolfinx.fem.Function(space, name="displacement")
+body = Tube(inner_radius=1.0, outer_radius=3.0, length=8.0)
+domain = body.build(Mesh(refinement=1, element="hexahedron", degree=1), comm)
+kinematics = FullKinematics()
+displacement = kinematics.unknown(domain.mesh, degree=1)
 
 # %% [markdown]
 # ## Tissue
@@ -47,23 +48,23 @@ displacement = dolfinx.fem.Function(space, name="displacement")
 # $$W = \frac{\lambda}{2}\ln^2 J + \frac{\mu}{2}(\operatorname{tr} C - 3) - \mu \ln J
 #     + c\,\frac{L}{4}\Big(2\frac{r^2}{L^2} + \frac{1}{1-r/L} - \frac{r}{L}\Big)
 #     - \frac{c}{2}\,g(r_0) \sum_I l_I^2 \ln(n_I \cdot C n_I)$$
-# with the end-to-end length $r^2 = \sum_I l_I^2\, n_I \cdot C n_I$ and $c = k\theta n / (4 A_p)$; `energy.py` says it
-# in UFL. The cells live at the quadrature points; each element starts with random dimensions, $|l| = r_0$.
+# with the end-to-end length $r^2 = \sum_I l_I^2\, n_I \cdot C n_I$ and $c = k\theta n / (4 A_p)$; `tissue/energy.py`
+# says it in UFL. The cells live at the quadrature points; each element starts with random dimensions, $|l| = r_0$.
 
 # %%
-material = Material(
+tissue = Material(
     lame_lambda=27.293,
     lame_mu=3.103,
     chain_density=2.0e21,
     contour_length=1.594,
     persistence_length=1.365,
     temperature=310.0,
-)
+).tissue(end_to_end_length=1.0)
 quadrature = Quadrature(domain.mesh, element_degree=1)
 cells = UnitCells(
     quadrature,
-    domain.cell_number,
-    domain.number_of_cells,
+    domain.element_number,
+    domain.number_of_elements,
     Cells(initial="random", axes="cylindrical", seed=1, end_to_end_length=1.0),
 )
 
@@ -73,19 +74,19 @@ cells = UnitCells(
 # shape. The pressure follows the deformed inner face: $p \int \operatorname{cof}(F) N \cdot v\, \mathrm{d}A$.
 
 # %%
-loading = Loading(domain, displacement)
+loading = Loading(domain, displacement, kinematics)
 loading.hold_face("bottom", component=2)
 loading.hold_node((1.0, 0.0, 0.0), component=1)
 loading.hold_node((-1.0, 0.0, 0.0), component=1)
 loading.hold_node((0.0, 1.0, 0.0), component=0)
-loading.add_prescribed_stretch("stretch", "top", component=2, length=8.0)
+loading.add_prescribed_elongation("elongation", "top", component=2, length=8.0)
 loading.add_follower_pressure("pressure", "inner")
 
 
 def load_values(time: float) -> dict[str, float]:
     """Up to t = 25, then held."""
     factor = min(time / 25.0, 1.0)
-    return {"pressure": 4.8 * factor, "stretch": 0.1 * factor}
+    return {"pressure": 4.8 * factor, "elongation": 0.1 * factor}
 
 
 # %% [markdown]
@@ -95,26 +96,19 @@ def load_values(time: float) -> dict[str, float]:
 # $$l = l^0 + (r_0\, e - l^0)\,(1 - e^{-\kappa t})$$
 
 # %%
-remodeling = RemodelingPass(
-    displacement, cells, material, Remodeling(driver="cauchy", law="explicit", frame="spatial", kappa=0.025)
-)
+remodeling = Remodeling(driver="cauchy", law="explicit", frame="spatial", kappa=0.025)
 
 # %% [markdown]
 # ## Through time
 # Each step sets the loads of its time, finds $u$ in equilibrium with the cells as they are, and then lets them remodel.
 
 # %%
-stepper = Stepper(displacement, loading, cells, material, remodeling, Solver(), load_values)
-observer = Observer(domain, displacement, loading, cells, material)
-
+state = State(displacement, kinematics, cells, loading)
+stepper = Stepper(state, tissue, remodeling, Solver(), load_values)
+line = (
+    "t = {time:5.1f}  outer radius {outer_radius:.4f}  "
+    "angles {fibre_angle_inner:5.1f} {fibre_angle_middle:5.1f} {fibre_angle_outer:5.1f}"
+)
 with RunFolder(folder, "# made by demos/artery.py\n", comm.rank) as record:
-    for time in times(end, step=1.0):
-        start = clock.perf_counter()
-        solved = stepper.solve(time)
-        columns, energy = observer.columns(), stepper.problem.stored_energy()
-        power = stepper.remodel(time)
-        record.append(history_row(solved, columns, energy, power, clock.perf_counter() - start))
-        if comm.rank == 0:
-            print(f"t = {time:5.1f}  outer radius {columns['outer_radius']:.4f}  "
-                  f"angles {columns['fibre_angle_inner']:5.1f} {columns['fibre_angle_middle']:5.1f} "
-                  f"{columns['fibre_angle_outer']:5.1f}")  # fmt: skip
+    for step in stepper.march(times(end, step=1.0), [Observer(body, stepper), record]):
+        PETSc.Sys.Print(line.format(**step.row))

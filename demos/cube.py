@@ -10,23 +10,23 @@
 
 # %%
 import sys
-import time as clock
 
-import dolfinx.fem
 import numpy as np
 from mpi4py import MPI
+from petsc4py import PETSc
 
-from remodel_fenicsx.tissue.cells import UnitCells
-from remodel_fenicsx.body import cube
-from remodel_fenicsx.system.interrupts import end_all_ranks_on_exception
+from remodel_fenicsx.body import Cube
 from remodel_fenicsx.body.loading import Loading
-from remodel_fenicsx.results.columns import Observer
-from remodel_fenicsx.scene.parameters import Cells, Material, Remodeling
-from remodel_fenicsx.fem.quadrature import Quadrature
-from remodel_fenicsx.results.run_folder import RunFolder, chosen_folder, history_row
-from remodel_fenicsx.evolution.remodeling import RemodelingPass
-from remodel_fenicsx.scene.scene import Solver
+from remodel_fenicsx.evolution.state import State
 from remodel_fenicsx.evolution.stepper import Stepper, times
+from remodel_fenicsx.evolution.unit_cells import UnitCells
+from remodel_fenicsx.fem.kinematics import FullKinematics
+from remodel_fenicsx.fem.quadrature import Quadrature
+from remodel_fenicsx.results.columns import Observer
+from remodel_fenicsx.results.run_folder import RunFolder, chosen_folder
+from remodel_fenicsx.scene.parameters import Cells, Material, Remodeling
+from remodel_fenicsx.scene.scene import Mesh, Solver
+from remodel_fenicsx.system.interrupts import end_all_ranks_on_exception
 
 end = float(sys.argv[1]) if len(sys.argv) > 1 else 100.0
 comm = MPI.COMM_WORLD
@@ -38,22 +38,23 @@ end_all_ranks_on_exception()
 # One element. Isotropic cells: $l_1 = l_2 = l_3 = r_0 / \sqrt3$.
 
 # %%
-domain = cube(side=1.0, comm=comm)
-space = dolfinx.fem.functionspace(domain.mesh, ("Lagrange", 1, (3,)))
-displacement = dolfinx.fem.Function(space, name="displacement")
-material = Material(
+body = Cube(side=1.0)
+domain = body.build(Mesh(refinement=1, element="hexahedron", degree=1), comm)
+kinematics = FullKinematics()
+displacement = kinematics.unknown(domain.mesh, degree=1)
+tissue = Material(
     lame_lambda=27.293,
     lame_mu=3.103,
     chain_density=7.0e21,
     contour_length=2.125,
     persistence_length=1.82,
     temperature=310.0,
-)
+).tissue(end_to_end_length=1.0)
 quadrature = Quadrature(domain.mesh, element_degree=1)
 cells = UnitCells(
     quadrature,
-    domain.cell_number,
-    domain.number_of_cells,
+    domain.element_number,
+    domain.number_of_elements,
     Cells(initial="isotropic", axes="global", end_to_end_length=1.0),
 )
 
@@ -62,7 +63,7 @@ cells = UnitCells(
 # Three symmetry planes, a dead force along z on the face z = 1.
 
 # %%
-loading = Loading(domain, displacement)
+loading = Loading(domain, displacement, kinematics)
 loading.hold_face("x0", component=0)
 loading.hold_face("y0", component=1)
 loading.hold_face("z0", component=2)
@@ -80,21 +81,18 @@ def load_values(time: float) -> dict[str, float]:
 
 # %%
 kappa = 0.025
-remodeling = RemodelingPass(
-    displacement, cells, material, Remodeling(driver="cauchy", law="explicit", frame="spatial", kappa=kappa)
-)
-stepper = Stepper(displacement, loading, cells, material, remodeling, Solver(), load_values)
-observer = Observer(domain, displacement, loading, cells, material)
+remodeling = Remodeling(driver="cauchy", law="explicit", frame="spatial", kappa=kappa)
+state = State(displacement, kinematics, cells, loading)
+stepper = Stepper(state, tissue, remodeling, Solver(), load_values)
 
+
+def closed_form(time: float) -> float:
+    """Angle of the cells of the step before, in degrees."""
+    s = 1 - np.exp(-kappa * (time - 1.0))
+    return np.degrees(np.arctan2(np.sqrt(2) * (1 - s), 1 - s + np.sqrt(3) * s))
+
+
+line = "t = {time:5.1f}  stretch {mean_stretch:.4f}  angle {mean_fibre_angle:8.5f}, in closed form {exact:8.5f}"
 with RunFolder(folder, "# made by demos/cube.py\n", comm.rank) as record:
-    for time in times(end, step=1.0):
-        start = clock.perf_counter()
-        solved = stepper.solve(time)
-        columns, energy = observer.columns(), stepper.problem.stored_energy()
-        power = stepper.remodel(time)
-        record.append(history_row(solved, columns, energy, power, clock.perf_counter() - start))
-        s = 1 - np.exp(-kappa * (time - 1.0))
-        closed_form = np.degrees(np.arctan2(np.sqrt(2) * (1 - s), 1 - s + np.sqrt(3) * s))
-        if comm.rank == 0:
-            print(f"t = {time:5.1f}  stretch {columns['mean_stretch']:.4f}  "
-                  f"angle {columns['mean_fibre_angle']:8.5f}, in closed form {closed_form:8.5f}")  # fmt: skip
+    for step in stepper.march(times(end, step=1.0), [Observer(body, stepper), record]):
+        PETSc.Sys.Print(line.format(**step.row, exact=closed_form(step.time)))

@@ -10,22 +10,22 @@
 
 # %%
 import sys
-import time as clock
 
-import dolfinx.fem
 from mpi4py import MPI
+from petsc4py import PETSc
 
-from remodel_fenicsx.tissue.cells import UnitCells
-from remodel_fenicsx.body import tendon
-from remodel_fenicsx.system.interrupts import end_all_ranks_on_exception
+from remodel_fenicsx.body import Tendon
 from remodel_fenicsx.body.loading import Loading
-from remodel_fenicsx.results.columns import Observer
-from remodel_fenicsx.scene.parameters import Cells, Material, Remodeling
-from remodel_fenicsx.fem.quadrature import Quadrature
-from remodel_fenicsx.results.run_folder import RunFolder, chosen_folder, history_row
-from remodel_fenicsx.evolution.remodeling import RemodelingPass
-from remodel_fenicsx.scene.scene import Solver
+from remodel_fenicsx.evolution.state import State
 from remodel_fenicsx.evolution.stepper import Stepper, times
+from remodel_fenicsx.evolution.unit_cells import UnitCells
+from remodel_fenicsx.fem.kinematics import FullKinematics
+from remodel_fenicsx.fem.quadrature import Quadrature
+from remodel_fenicsx.results.columns import Observer
+from remodel_fenicsx.results.run_folder import RunFolder, chosen_folder
+from remodel_fenicsx.scene.parameters import Cells, Material, Remodeling
+from remodel_fenicsx.scene.scene import Mesh, Solver
+from remodel_fenicsx.system.interrupts import end_all_ranks_on_exception
 
 end = float(sys.argv[1]) if len(sys.argv) > 1 else 150.0
 comm = MPI.COMM_WORLD
@@ -37,29 +37,30 @@ end_all_ranks_on_exception()
 # 48 trilinear elements in the cross-section, 10 along the axis z.
 
 # %%
-domain = tendon(length=10.0, area=10.0, comm=comm)
-space = dolfinx.fem.functionspace(domain.mesh, ("Lagrange", 1, (3,)))
-displacement = dolfinx.fem.Function(space, name="displacement")
+body = Tendon(length=10.0, area=10.0)
+domain = body.build(Mesh(refinement=1, element="hexahedron", degree=1), comm)
+kinematics = FullKinematics()
+displacement = kinematics.unknown(domain.mesh, degree=1)
 
 # %% [markdown]
 # ## Tissue
-# The energy of `energy.py`; a unit cell at every quadrature point with one random draw of $l_I$ per element,
+# The energy of `tissue/energy.py`; a unit cell at every quadrature point with one random draw of $l_I$ per element,
 # $|l| = r_0$. A cell whose long side lies along z is stiff, one that lies across is soft: the body is not homogeneous.
 
 # %%
-material = Material(
+tissue = Material(
     lame_lambda=27.293,
     lame_mu=3.103,
     chain_density=2.0e21,
     contour_length=1.594,
     persistence_length=1.365,
     temperature=310.0,
-)
+).tissue(end_to_end_length=1.0)
 quadrature = Quadrature(domain.mesh, element_degree=1)
 cells = UnitCells(
     quadrature,
-    domain.cell_number,
-    domain.number_of_cells,
+    domain.element_number,
+    domain.number_of_elements,
     Cells(initial="random", axes="global", seed=1, end_to_end_length=1.0),
 )
 
@@ -69,7 +70,7 @@ cells = UnitCells(
 # $T = F / A_0$ along z; the top is free to deform.
 
 # %%
-loading = Loading(domain, displacement)
+loading = Loading(domain, displacement, kinematics)
 loading.hold_face("bottom", component=2)
 loading.hold_node((0.0, 0.0, 0.0), component=0)
 loading.hold_node((0.0, 0.0, 0.0), component=1)
@@ -88,23 +89,16 @@ def load_values(time: float) -> dict[str, float]:
 # lets $l_1 \to r_0$, $l_2, l_3 \to 0$ with $n_1$ along the load.
 
 # %%
-remodeling = RemodelingPass(
-    displacement, cells, material, Remodeling(driver="cauchy", law="explicit", frame="spatial", kappa=0.025)
-)
+remodeling = Remodeling(driver="cauchy", law="explicit", frame="spatial", kappa=0.025)
 
 # %% [markdown]
 # ## Through time
+# Each step sets the loads of its time, finds $u$ in equilibrium with the cells as they are, and then lets them remodel.
 
 # %%
-stepper = Stepper(displacement, loading, cells, material, remodeling, Solver(), load_values)
-observer = Observer(domain, displacement, loading, cells, material)
-
+state = State(displacement, kinematics, cells, loading)
+stepper = Stepper(state, tissue, remodeling, Solver(), load_values)
+line = "t = {time:5.1f}  stretch {mean_stretch:.4f}  angle {mean_fibre_angle:5.1f}"
 with RunFolder(folder, "# made by demos/tendon.py\n", comm.rank) as record:
-    for time in times(end, step=1.0):
-        start = clock.perf_counter()
-        solved = stepper.solve(time)
-        columns, energy = observer.columns(), stepper.problem.stored_energy()
-        power = stepper.remodel(time)
-        record.append(history_row(solved, columns, energy, power, clock.perf_counter() - start))
-        if comm.rank == 0:
-            print(f"t = {time:5.1f}  stretch {columns['mean_stretch']:.4f}  angle {columns['mean_fibre_angle']:5.1f}")
+    for step in stepper.march(times(end, step=1.0), [Observer(body, stepper), record]):
+        PETSc.Sys.Print(line.format(**step.row))

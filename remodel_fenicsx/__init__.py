@@ -1,3 +1,27 @@
 """Predict how collagen in living tissue reorients under load (Kuhl & Holzapfel 2007) with FEniCSx."""
 
-__version__ = "0.1.0"
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.2.0"
+__all__ = ["Recording", "Scene", "SceneError", "Simulation", "preset_scene", "read_scene", "run"]
+
+if TYPE_CHECKING:
+    from remodel_fenicsx.results.recording import Recording
+    from remodel_fenicsx.scene import Scene, SceneError, preset_scene, read_scene
+    from remodel_fenicsx.simulation import Simulation, run
+
+_PLACES = {
+    "Recording": "results.recording",
+    **dict.fromkeys(("Scene", "SceneError", "preset_scene", "read_scene"), "scene"),
+    **dict.fromkeys(("Simulation", "run"), "simulation"),
+}
+
+
+def __getattr__(name: str) -> Any:
+    """The names above, when they are first asked for: scenes and recordings need no dolfinx."""
+    if name not in _PLACES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_PLACES[name]}"), name)

@@ -141,7 +141,7 @@ def _run(options: argparse.Namespace) -> int:
     from remodel_fenicsx.system.interrupts import Interrupted
     from remodel_fenicsx.results.run_folder import FolderTaken
     from remodel_fenicsx.simulation import run
-    from remodel_fenicsx.evolution.stepper import StepFailure
+    from remodel_fenicsx.evolution.parts import StepFailure
 
     _let_ctrl_c_raise()
     try:
@@ -179,7 +179,11 @@ def _end_all(message: str, code: int) -> int:
 
 def _validate(options: argparse.Namespace) -> int:
     scene = read_scene(options.scene, options.set)
-    _say(f"{options.scene}: a valid scene ({scene.geometry.shape}, {scene.time.number_of_steps} steps)")
+    _say(f"{options.scene}: a valid scene ({scene.geometry.name}, {scene.time.number_of_steps} steps)")
+    _say(scene.summary())
+    if _rank() == 0:
+        for warning in scene.warnings():
+            _complain(f"warning: {warning}")
     return 0
 
 
@@ -212,11 +216,11 @@ def _info(options: argparse.Namespace) -> int:
     reason = reason_unusable()
     if reason is not None:
         return _fail(f"the environment is not usable: {reason}; run through ./with-fenicsx", BAD_ENVIRONMENT)
-    from remodel_fenicsx.fem.petsc_options import PROFILES
+    from remodel_fenicsx.fem.solver_methods import METHODS
 
     for name, version in versions().items():
         _say(f"{name:16} {version}")
-    _say(f"{'solver profiles':16} {', '.join(PROFILES)}")
+    _say(f"{'solver methods':16} {', '.join(METHODS)}")
     return 0
 
 

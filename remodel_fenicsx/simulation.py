@@ -3,38 +3,30 @@
 from __future__ import annotations
 
 import logging
-import time as clock
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 
-import basix.ufl
-import dolfinx.fem
 from mpi4py import MPI
 
-from remodel_fenicsx import body as geometry
+from remodel_fenicsx.body.domain import Domain
+from remodel_fenicsx.body.loading import Loading, LoadValues
+from remodel_fenicsx.evolution.parts import StepFailure
+from remodel_fenicsx.evolution.state import State
+from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher, times
+from remodel_fenicsx.evolution.unit_cells import UnitCells
 from remodel_fenicsx.fem import jit
-from remodel_fenicsx.tissue.cells import UnitCells
+from remodel_fenicsx.fem.kinematics import KINEMATICS
+from remodel_fenicsx.fem.quadrature import Quadrature
+from remodel_fenicsx.results.columns import Observer
+from remodel_fenicsx.results.fields import Fields
+from remodel_fenicsx.results.run_folder import RunFolder, chosen_folder
+from remodel_fenicsx.scene import Scene, SceneError
 from remodel_fenicsx.system.environment import versions
 from remodel_fenicsx.system.interrupts import Interrupted, StopRequest, end_all_ranks_on_exception
-from remodel_fenicsx.body.loading import LOADINGS, LoadValues
-from remodel_fenicsx.results.columns import Observer
-from remodel_fenicsx.fem.quadrature import Quadrature
-from remodel_fenicsx.results.run_folder import Fields, RunFolder, chosen_folder, history_row
-from remodel_fenicsx.evolution.remodeling import RemodelingPass
-from remodel_fenicsx.scene.scene import Scene
-from remodel_fenicsx.evolution.stepper import StepFailure, Stepper, times
 from remodel_fenicsx.system.terminal import Progress, announce, open_log
 
 log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class StepRecord:
-    """An accepted step: its time and its row of the history."""
-
-    time: float
-    row: dict[str, float]
 
 
 class Simulation:
@@ -47,64 +39,88 @@ class Simulation:
     comm
         MPI communicator of the mesh.
     domain
-        A mesh of the scene's body to take in place of the one that the scene asks for; its cell type and degree must
-        be the scene's.
+        A mesh of the scene's body to take in place of the one that the scene asks for.
 
     Attributes
     ----------
-    domain, displacement, quadrature, cells, loading, remodeling, stepper, observer
+    domain, unknown, quadrature, cells, loading, state, tissue, stepper, observer
         The parts, each usable by itself (see demos/).
+
+    Raises
+    ------
+    SceneError
+        If `domain` is not a mesh of the scene's body and elements.
     """
 
-    def __init__(self, scene: Scene, comm: MPI.Intracomm = MPI.COMM_WORLD, domain: geometry.Domain | None = None):
-        self.scene = scene
-        self.domain = domain or geometry.build(scene.geometry, scene.mesh, comm)
-        mesh = self.domain.mesh
-        element = basix.ufl.element("Lagrange", mesh.topology.cell_name(), scene.mesh.degree, shape=(3,))
-        self.displacement = dolfinx.fem.Function(dolfinx.fem.functionspace(mesh, element), name="displacement")
+    def __init__(self, scene: Scene, comm: MPI.Intracomm = MPI.COMM_WORLD, domain: Domain | None = None):
+        self.scene, shape = scene, scene.geometry
+        self.domain = shape.build(scene.mesh, comm) if domain is None else checked_domain(domain, scene)
+        mesh, kinematics = self.domain.mesh, KINEMATICS[scene.model.kinematics]
+        self.unknown = kinematics.unknown(mesh, scene.mesh.degree)
         self.quadrature = Quadrature(mesh, scene.mesh.degree)
-        self.cells = UnitCells(self.quadrature, self.domain.cell_number, self.domain.number_of_cells, scene.cells)
-        self.loading = LOADINGS[self.domain.shape](self.domain, self.displacement)
-        self.remodeling = RemodelingPass(self.displacement, self.cells, scene.material, scene.remodeling)
-        self.stepper = Stepper(
-            self.displacement,
-            self.loading,
-            self.cells,
-            scene.material,
-            self.remodeling,
-            scene.solver,
-            self.load_values,
-        )
-        self.observer = Observer(self.domain, self.displacement, self.loading, self.cells, scene.material)
+        domain = self.domain
+        self.cells = UnitCells(self.quadrature, domain.element_number, domain.number_of_elements, scene.cells)
+        self.loading = Loading(domain, self.unknown, kinematics)
+        shape.support(self.loading)
+        self.state = State(self.unknown, kinematics, self.cells, self.loading)
+        tissue = scene.material.tissue(scene.cells.end_to_end_length)
+        self.stepper = Stepper(self.state, tissue, scene.remodeling, scene.solver, self.load_values)
+        self.tissue = self.stepper.tissue
+        self.observer = Observer(shape, self.stepper)
 
     def load_values(self, time: float) -> LoadValues:
         """Magnitude of every load at a time."""
         return {name: load.value * load.factor(time) for name, load in self.scene.loads.items()}
 
-    def steps(self, fields: Fields | None = None) -> Iterator[StepRecord]:
+    def steps(self, watchers: Sequence[Watcher] = ()) -> Iterator[Step]:
         """Solve and remodel step by step; what is yielded has been accepted.
 
         The state seen at a yield is one pass ahead of the row: the row and the fields belong to the solved state,
         before the remodeling pass (docs/theory.md).
 
+        Parameters
+        ----------
+        watchers
+            Who else follows the steps; the observer, which fills each step's row, comes first.
+
         Raises
         ------
-        stepping.StepFailure
+        StepFailure
             If a step has no admissible equilibrium.
         """
-        self.remodeling.warn_of_overcorrection()
-        if fields is not None:
-            fields.append(0.0)
-        every = self.scene.output.every
-        for number, time in enumerate(times(self.scene.time.end, self.scene.time.step), start=1):
-            start = clock.perf_counter()
-            solved = self.stepper.solve(time)
-            columns = self.observer.columns()
-            if fields is not None and (number % every == 0 or time >= self.scene.time.end * (1 - 1e-12)):
-                fields.append(time)
-            energy = self.stepper.problem.stored_energy()
-            power = self.stepper.remodel(time)
-            yield StepRecord(time, history_row(solved, columns, energy, power, clock.perf_counter() - start))
+        self.stepper.remodeling.warn_of_overcorrection()
+        ways = times(self.scene.time.end, self.scene.time.step)
+        return self.stepper.march(ways, [self.observer, *watchers])
+
+    def close(self) -> None:
+        """Free PETSc's objects and options."""
+        self.stepper.close()
+
+
+def checked_domain(domain: Domain, scene: Scene) -> Domain:
+    """The domain, if it is a mesh of the scene's body and elements.
+
+    Raises
+    ------
+    SceneError
+        If it is not; one line that names the key.
+    """
+    shape, mesh = scene.geometry, domain.mesh
+    kind, degree = mesh.topology.cell_name(), mesh.geometry.cmap.degree
+    if domain.shape != shape.name:
+        raise SceneError(f"geometry.shape = {shape.name!r}: the domain given is a {domain.shape!r}")
+    if kind != scene.mesh.element:
+        raise SceneError(f"mesh.element = {scene.mesh.element!r}: the domain given has elements of type {kind!r}")
+    if degree != scene.mesh.degree:
+        raise SceneError(f"mesh.degree = {scene.mesh.degree}: the domain given has degree {degree}")
+    missing = [face for face in shape.faces if face not in domain.faces]
+    if missing:
+        raise SceneError(f"geometry.shape = {shape.name!r}: the domain given has no face {', '.join(missing)}")
+    for name, value in domain.dimensions.items():
+        wanted = getattr(shape, name, value)
+        if abs(wanted - value) > 1e-9 * domain.size:
+            raise SceneError(f"geometry.{name} = {wanted:g}: that of the domain given is {value:g}")
+    return domain
 
 
 def run(
@@ -129,11 +145,11 @@ def run(
 
     Raises
     ------
-    record.FolderTaken
+    FolderTaken
         If the folder is not empty.
-    stepping.StepFailure
+    StepFailure
         If a step has no admissible equilibrium; all steps before it are recorded.
-    interrupts.Interrupted
+    Interrupted
         On SIGINT or SIGTERM; all accepted steps are recorded.
     OSError
         If the results cannot be written.
@@ -148,15 +164,25 @@ def run(
     header = "as run: all values, also those of preset and defaults\n" + "\n".join(
         f"{name} {version}" for name, version in versions().items()
     )
-    with (
-        RunFolder(place, scene.to_toml(header), comm.rank) as record,
-        open_log(place / "run.log", comm.rank),
-        StopRequest() as stop,
-        Progress(scene.time.number_of_steps, scene.name, -1 if quiet else comm.rank) as progress,
-    ):
+    with ExitStack() as stack:
+        stack.callback(simulation.close)
+        record = stack.enter_context(RunFolder(place, scene.to_toml(header), comm.rank))
+        stack.enter_context(open_log(place / "run.log", comm.rank))
+        stop = stack.enter_context(StopRequest())
+        progress = stack.enter_context(Progress(scene.time.number_of_steps, scene.name, -1 if quiet else comm.rank))
         log.info("scene %s on %d ranks, results in %s", scene.name, comm.size, place)
+        log.info("%s", scene.summary())
+        for warning in scene.warnings():
+            log.warning("%s", warning)
+        watchers: list[Watcher] = []
+        if scene.output.fields:
+            fields = Fields(place, scene.geometry, simulation.stepper, scene.output.every)
+            watchers.append(stack.enter_context(fields))
+        watchers += [record, _Report(scene, progress)]
+        simulation.stepper.stop_signal = lambda: stop.number
         try:
-            _record_steps(simulation, record, progress, stop)
+            for _ in simulation.steps(watchers):
+                pass
         except (StepFailure, Interrupted) as reason:
             log.info("ended: %s", reason)
             raise
@@ -164,20 +190,17 @@ def run(
     return place
 
 
-def _record_steps(simulation: Simulation, record: RunFolder, progress: Progress, stop: StopRequest) -> None:
-    """Step through the scene; each accepted step is on disk before the next one starts."""
-    scene = simulation.scene
-    simulation.stepper.problem.stop_signal = lambda: stop.number
-    if scene.output.fields:
-        record.fields = Fields(record.folder, simulation.domain, simulation.observer)
-    for number, step in enumerate(simulation.steps(record.fields), start=1):
-        record.append(step.row)
+class _Report(Watcher):
+    """Each accepted step in the log and on the terminal."""
+
+    def __init__(self, scene: Scene, progress: Progress):
+        self.progress = progress
+        self.loads = [kind.column or name for name, kind in scene.geometry.loads.items()]
+
+    def committed(self, step: Step) -> None:
+        """Say it."""
         log.info("%s", ", ".join(f"{name} {value:.6g}" for name, value in step.row.items()))
-        parts = int(step.row["substeps"])
+        parts = step.work.substeps
         message = f"time {step.time:g} solved in {parts} parts" if parts > 1 else None
-        progress.step(number, step.time, _loads(step.row), int(step.row["newton_iterations"]), message)
-
-
-def _loads(row: dict[str, float]) -> str:
-    names = ("force", "pressure", "axial_stretch")
-    return ", ".join(f"{name} {row[name]:.4g}" for name in names if name in row)
+        loads = ", ".join(f"{name} {step.row[name]:.4g}" for name in self.loads if name in step.row)
+        self.progress.step(step.number, step.time, loads, step.work.newton_iterations, message)

@@ -9,14 +9,14 @@ import numpy as np
 from mpi4py import MPI
 
 from remodel_fenicsx import body as geometry
-from remodel_fenicsx.body import gmsh_model as model
+from remodel_fenicsx.body import meshing
 
 
 def digest(domain):
     """Digest of the gathered mesh, of cell and node values drawn locally by number, and of the named faces' sizes."""
     points, cells = domain.gather_mesh()
-    table = np.random.default_rng(1).random((max(domain.number_of_cells, domain.number_of_nodes), 3))
-    values = domain.gather_cells(table[domain.cell_number]), domain.gather_nodes(table[domain.node_number])
+    table = np.random.default_rng(1).random((max(domain.number_of_elements, domain.number_of_nodes), 3))
+    values = domain.gather_elements(table[domain.element_number]), domain.gather_nodes(table[domain.node_number])
     parts = [points, cells, *values]
     facets = domain.mesh.topology.index_map(2)
     sizes = [
@@ -34,7 +34,7 @@ def digests(comm):
     return {
         "cube": digest(geometry.cube(comm=comm)),
         "tendon": digest(geometry.tendon(comm=comm)),
-        "tendon of tetrahedra": digest(geometry.tendon(cell="tetrahedron", comm=comm)),
+        "tendon of tetrahedra": digest(geometry.tendon(element="tetrahedron", comm=comm)),
         "tube": digest(geometry.tube(comm=comm)),
         "tube of degree 2": digest(geometry.tube(degree=2, comm=comm)),
     }
@@ -49,7 +49,7 @@ def failures(comm):
     said = []
     for draw in (broken, lambda: None):
         try:
-            model.build_domain(draw, "cube", {"side": 1.0}, comm)
+            meshing.build_domain(draw, "cube", {"side": 1.0}, comm)
         except geometry.GeometryError as error:
             said.append(str(error))
     return comm.gather(said, root=0)

@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Any
 
-import basix.ufl
-import dolfinx.fem
 import numpy as np
 
-from remodel_fenicsx.tissue.cells import UnitCells
-from remodel_fenicsx.body import Domain
-from remodel_fenicsx.body.loading import Loading
-from remodel_fenicsx.scene.parameters import Cells, Material
-from remodel_fenicsx.evolution.equilibrium import EquilibriumProblem
+from remodel_fenicsx.body import SHAPES
+from remodel_fenicsx.body.domain import Domain
+from remodel_fenicsx.body.loading import Loading, LoadValues
+from remodel_fenicsx.body.shape import Shape
+from remodel_fenicsx.evolution.equilibrium import Equilibrium
+from remodel_fenicsx.evolution.newton import GuardedNewton, Solution
+from remodel_fenicsx.evolution.remodeling import RemodelingPass
+from remodel_fenicsx.evolution.state import State
+from remodel_fenicsx.evolution.stepper import Stepper
+from remodel_fenicsx.evolution.unit_cells import UnitCells
+from remodel_fenicsx.fem.kinematics import FullKinematics
 from remodel_fenicsx.fem.quadrature import Quadrature
+from remodel_fenicsx.scene.parameters import Cells, Material, Remodeling
 from remodel_fenicsx.scene.scene import Solver
 
 MATERIAL = Material()
@@ -35,6 +41,18 @@ def random_rotations(rng: np.random.Generator, count: int) -> np.ndarray:
     return matrices * np.linalg.det(matrices)[:, None, None]
 
 
+class Problem(Equilibrium):
+    """An equilibrium with its solver."""
+
+    def __init__(self, state: State, material: Material, solver: Solver):
+        super().__init__(state, material.tissue(state.cells.settings.end_to_end_length))
+        self.newton = GuardedNewton(self, solver)
+
+    def solve(self) -> Solution:
+        """From the present unknowns."""
+        return self.newton.solve()
+
+
 @dataclass
 class Body:
     """A meshed body, its displacement and its cells; supports and loads are for the test to add."""
@@ -44,10 +62,36 @@ class Body:
     quadrature: Quadrature
     cells: UnitCells
     loading: Loading
+    kinematics: FullKinematics = field(default_factory=FullKinematics)
 
-    def problem(self, solver: Solver = TIGHT, material: Material = MATERIAL) -> EquilibriumProblem:
+    def state(self) -> State:
+        """Its state, with the loads as they are."""
+        loads = dict(self.loading.values)
+        state = State(self.displacement, self.kinematics, self.cells, self.loading)
+        self.loading.set(loads)
+        return state
+
+    def problem(self, solver: Solver = TIGHT, material: Material = MATERIAL) -> Problem:
         """Its equilibrium."""
-        return EquilibriumProblem(self.displacement, self.loading, self.cells, material, solver)
+        return Problem(self.state(), material, solver)
+
+    def remodeling(self, material: Material = MATERIAL, **settings: Any) -> RemodelingPass:
+        """A pass on it."""
+        tissue = material.tissue(self.cells.settings.end_to_end_length)
+        return RemodelingPass(self.state(), tissue, Remodeling(**settings))
+
+    def stepper(self, load_values: Callable[[float], LoadValues], solver: Solver = TIGHT, **remodeling: Any) -> Stepper:
+        """Its way through time."""
+        tissue = MATERIAL.tissue(self.cells.settings.end_to_end_length)
+        return Stepper(self.state(), tissue, Remodeling(**remodeling), solver, load_values)
+
+    def supported(self) -> Body:
+        """The same, held and loaded as its shape is in a scene."""
+        dimensions = {k: v for k, v in self.domain.dimensions.items() if k != "radius"}
+        shape: Shape = SHAPES[self.domain.shape](shape=self.domain.shape, **dimensions)
+        self.loading = Loading(self.domain, self.displacement)
+        shape.support(self.loading)
+        return self
 
     def set_displacement(self, values: np.ndarray) -> None:
         """Displacement by local node, (nodes, 3)."""
@@ -61,11 +105,9 @@ class Body:
 
 def body(domain: Domain, cells: Cells, degree: int = 1) -> Body:
     """Cells, quadrature and displacement of a mesh."""
-    mesh = domain.mesh
-    element = basix.ufl.element("Lagrange", mesh.topology.cell_name(), degree, shape=(3,))
-    displacement = dolfinx.fem.Function(dolfinx.fem.functionspace(mesh, element), name="displacement")
-    quadrature = Quadrature(mesh, degree)
-    unit_cells = UnitCells(quadrature, domain.cell_number, domain.number_of_cells, cells)
+    displacement = FullKinematics().unknown(domain.mesh, degree)
+    quadrature = Quadrature(domain.mesh, degree)
+    unit_cells = UnitCells(quadrature, domain.element_number, domain.number_of_elements, cells)
     return Body(domain, displacement, quadrature, unit_cells, Loading(domain, displacement))
 
 

@@ -15,6 +15,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from remodel_fenicsx.body import tube
+from remodel_fenicsx.results.columns import Measurement
 from remodel_fenicsx.scene.scene import Scene, scene_from_dict
 from remodel_fenicsx.simulation import Simulation
 from tests.reference.radial import RadialHistory, solve_radial
@@ -81,7 +82,7 @@ def scene(setting: Setting) -> Scene:
         "geometry": {"shape": "tube", "inner_radius": 1.0, "outer_radius": 3.0, "length": LENGTH},
         "mesh": {"degree": setting.degree},
         "cells": {"initial": "isotropic", "axes": "cylindrical"},
-        "loads": {"pressure": {"value": setting.pressure}, "stretch": {"value": setting.stretch}},
+        "loads": {"pressure": {"value": setting.pressure}, "elongation": {"value": setting.stretch}},
         "remodeling": {"driver": setting.driver, "law": setting.law, "frame": setting.frame},
         "time": {"end": setting.end},
     })  # fmt: skip
@@ -89,7 +90,7 @@ def scene(setting: Setting) -> Scene:
 
 def hold_symmetry_planes(simulation: Simulation) -> None:
     """u_x = 0 on x = 0 and u_y = 0 on y = 0: no swirl, no twist of the whole tube."""
-    space, zero = simulation.displacement.function_space, PETSc.ScalarType(0.0)  # type: ignore[attr-defined]
+    space, zero = simulation.unknown.function_space, PETSc.ScalarType(0.0)  # type: ignore[attr-defined]
     for component in (0, 1):
         subspace = space.sub(component)
         dofs = dolfinx.fem.locate_dofs_geometrical(
@@ -106,12 +107,14 @@ def finite_elements(setting: Setting) -> Run:
     simulation = Simulation(scene(setting), MPI.COMM_SELF, domain)
     if setting.planes:
         hold_symmetry_planes(simulation)
-    rows = [step.row for step in simulation.steps()]
+    steps = list(simulation.steps())
+    rows = [step.row for step in steps]
+    angle = Measurement(simulation.observer, steps[-1]).fibre_angle
     columns = {name: np.array([row[name] for row in rows]) for name in rows[0]}
     x = simulation.quadrature.coordinates
     return Run(
         columns["inner_radius"], columns["outer_radius"], np.hypot(x[..., 0], x[..., 1]).ravel(),
-        simulation.observer.reference_fibre_angle().ravel(), simulation.quadrature.volumes.ravel(), columns,
+        angle.ravel(), simulation.quadrature.volumes.ravel(), columns,
     )  # fmt: skip
 
 

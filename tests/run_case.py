@@ -13,7 +13,9 @@ import sys
 import numpy as np
 from mpi4py import MPI
 
-from remodel_fenicsx.results.run_folder import NodalGather
+from remodel_fenicsx.evolution.stepper import Step, Watcher
+from remodel_fenicsx.results.columns import Measurement
+from remodel_fenicsx.results.fields import NodalGather
 from remodel_fenicsx.scene.scene import scene_from_dict
 from remodel_fenicsx.simulation import Simulation
 
@@ -23,26 +25,26 @@ def main(out: str, request: dict) -> None:
     scene = scene_from_dict(request["scene"])
     simulation = Simulation(scene, MPI.COMM_WORLD)
     domain, cells, quadrature = simulation.domain, simulation.cells, simulation.quadrature
-    displacement = NodalGather(domain, simulation.displacement)
+    displacement = NodalGather(domain, simulation.state)
     saved: dict[str, object] = {}
     tension = np.zeros(quadrature.shape, dtype=bool)
-    inner_step = simulation.stepper.remodel
 
-    def remodel(time: float) -> object:
-        """The pass, watched: the solved state is here, before the cells change."""
-        nonlocal tension
-        if any(abs(time - wanted) < 1e-9 for wanted in request.get("snapshots", [])):
-            saved[f"u_{time:g}"] = displacement()
-            saved[f"stretch_{time:g}"] = domain.gather_cells(simulation.observer.element_stretch())
-            angle = quadrature.cell_mean(simulation.observer.reference_fibre_angle())
-            saved[f"angle_{time:g}"] = domain.gather_cells(angle)
-        _, driver = simulation.remodeling.driving_tensor()
-        third = np.linalg.eigvalsh(driver)[:, 0].reshape(quadrature.shape)
-        tension |= third > 0
-        return inner_step(time)
+    class Snapshots(Watcher):
+        """Looks at the solved state, before the cells change."""
 
-    simulation.stepper.remodel = remodel  # type: ignore[method-assign]
-    rows = [step.row for step in simulation.steps()]
+        def solved(self, step: Step) -> None:
+            nonlocal tension
+            if any(abs(step.time - wanted) < 1e-9 for wanted in request.get("snapshots", [])):
+                measured = Measurement(simulation.observer, step)
+                saved[f"u_{step.time:g}"] = displacement()
+                saved[f"stretch_{step.time:g}"] = domain.gather_elements(measured.axial_stretch)
+                angle = quadrature.element_mean(measured.fibre_angle)
+                saved[f"angle_{step.time:g}"] = domain.gather_elements(angle)
+            _, driver = simulation.stepper.remodeling.driving_tensor()
+            third = np.linalg.eigvalsh(driver)[:, 0].reshape(quadrature.shape)
+            tension |= third > 0
+
+    rows = [step.row for step in simulation.steps([Snapshots()])]
     saved["u"] = displacement()
     for name, values in {
         "l": cells.dimension_values,
@@ -51,7 +53,7 @@ def main(out: str, request: dict) -> None:
         "x": quadrature.coordinates,
         "third_in_tension": tension,
     }.items():
-        saved[name] = domain.gather_cells(values)
+        saved[name] = domain.gather_elements(values)
     if MPI.COMM_WORLD.rank == 0:
         columns = {name: np.array([row[name] for row in rows]) for name in rows[0]}
         np.savez(out, **columns, **saved)  # type: ignore[arg-type]

@@ -13,9 +13,9 @@ import ufl
 from mpi4py import MPI
 
 from remodel_fenicsx.fem import jit
-from remodel_fenicsx.tissue.energy import Cell, strain_energy, stresses
-from remodel_fenicsx.fem.kinematics import deformation_gradient
+from remodel_fenicsx.fem.kinematics import FullKinematics
 from remodel_fenicsx.scene.parameters import Material
+from remodel_fenicsx.tissue.cells import UnitCell
 
 Array = npt.NDArray[np.float64]
 
@@ -58,9 +58,9 @@ class Points:
         self.F, self.l, self.n = self.function((3, 3)), self.function((3,)), self.function((3, 3))
         outputs = []
         for material in (MATERIAL, AS_PRINTED):
-            cell = [Cell(self.l, self.n)]
-            tensors = stresses(self.F, cell, material, R0)
-            outputs.append(strain_energy(self.F, cell, material, R0))
+            cell, tissue = [UnitCell(self.l, self.n)], material.tissue(R0)
+            tensors = tissue.stresses(self.F, cell)
+            outputs.append(tissue.strain_energy(self.F, cell))
             outputs += [
                 t[i, j] for t in (tensors.second_piola_kirchhoff, tensors.cauchy) for i in range(3) for j in range(3)
             ]
@@ -109,6 +109,15 @@ def random_state(case: str, count: int = 64) -> tuple[Array, Array, Array]:
 def random_rotations(count: int) -> Array:
     q = np.linalg.qr(np.random.default_rng(9).normal(size=(count, 3, 3)))[0]
     return q * np.linalg.det(q)[:, None, None]
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_energy_is_the_same_on_arrays(points: Points, case: str) -> None:
+    """The same functions serve forms and plain arrays: a material point without a mesh."""
+    F, l, n = random_state(case)  # noqa: E741
+    for omega, material in ((1, MATERIAL), (4, AS_PRINTED)):
+        here = material.tissue(R0).strain_energy(F, [UnitCell(l, n)])
+        np.testing.assert_allclose(here, points.evaluate(F, l, n)[omega][0], rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -223,8 +232,9 @@ def forms() -> tuple:
         _, l, n = random_state("orthotropic")  # noqa: E741
         order = rng.permutation(len(l))
         functions[0].x.array[:], functions[1].x.array[:] = l[order].ravel(), n[order].ravel()
-        cells.append(Cell(functions[0], functions[1], weight))
-    energy = strain_energy(deformation_gradient(u), cells, MATERIAL, R0) * ufl.dx(metadata={"quadrature_degree": 2})
+        cells.append(UnitCell(functions[0], functions[1], weight))
+    F = FullKinematics().deformation_gradient(u)
+    energy = MATERIAL.tissue(R0).strain_energy(F, cells) * ufl.dx(metadata={"quadrature_degree": 2})
     residual = ufl.derivative(energy, u)
     return u, jit.form(energy), jit.form(residual), jit.form(ufl.derivative(residual, u))
 

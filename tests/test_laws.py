@@ -3,7 +3,11 @@
 import numpy as np
 import pytest
 
-from remodel_fenicsx.tissue.laws import LAWS, Array
+from remodel_fenicsx.tissue.cells import UnitCell
+from remodel_fenicsx.tissue.drivers import DRIVERS, FRAMES
+from remodel_fenicsx.tissue.laws import LAWS, Array, Drive, explicit, rate, relaxation
+
+FUNCTIONS = {"explicit": explicit, "rate": rate, "relaxation": relaxation}
 
 KAPPA = 0.025
 
@@ -18,7 +22,7 @@ def march(law: str, l0: Array, target: Array, times: Array, kappa: float = KAPPA
     """Dimensions at the end of a series of steps with a constant target."""
     l = l0  # noqa: E741
     for old, new in zip(times[:-1], times[1:]):
-        l = LAWS[law](l, l0, target, kappa, float(old), float(new))  # noqa: E741
+        l = FUNCTIONS[law](l, l0, target, kappa, float(old), float(new))  # noqa: E741
     return l
 
 
@@ -44,7 +48,7 @@ def test_rate_integrates_eq_10_between_any_two_times(cells: tuple[Array, Array])
     start, end, count = 12.0, 13.5, 2000
     middle = start + (np.arange(count) + 0.5) * (end - start) / count
     slopes = [KAPPA * (target - l0) * np.exp(-KAPPA * t) for t in middle]
-    change = LAWS["rate"](target, l0, target, KAPPA, start, end) - target
+    change = rate(target, l0, target, KAPPA, start, end) - target
     np.testing.assert_allclose(change, np.sum(slopes, axis=0) * (end - start) / count, atol=1e-10)
 
 
@@ -54,8 +58,8 @@ def test_laws_differ_when_the_target_changes() -> None:
     first, second = np.array([[1.0, 0.0, 0.0]]), np.array([[0.0, 1.0, 0.0]])
     ends = {}
     for law in ("explicit", "rate", "relaxation"):
-        half = LAWS[law](l0, l0, first, KAPPA, 0.0, 40.0)
-        ends[law] = LAWS[law](half, l0, second, KAPPA, 40.0, 1e5)[0]
+        half = FUNCTIONS[law](l0, l0, first, KAPPA, 0.0, 40.0)
+        ends[law] = FUNCTIONS[law](half, l0, second, KAPPA, 40.0, 1e5)[0]
     np.testing.assert_allclose(ends["explicit"], second[0], atol=1e-14)
     np.testing.assert_allclose(ends["relaxation"], second[0], atol=1e-14)
     weight = 1 - np.exp(-1.0)  # of the first target: kappa times 40 is one
@@ -64,27 +68,58 @@ def test_laws_differ_when_the_target_changes() -> None:
 
 def test_explicit_does_not_depend_on_the_previous_dimensions(cells: tuple[Array, Array]) -> None:
     l0, target = cells
-    one = LAWS["explicit"](l0, l0, target, KAPPA, 3.0, 4.0)
-    np.testing.assert_array_equal(one, LAWS["explicit"](np.full_like(l0, np.nan), l0, target, KAPPA, 3.0, 4.0))
+    one = explicit(l0, l0, target, KAPPA, 3.0, 4.0)
+    np.testing.assert_array_equal(one, explicit(np.full_like(l0, np.nan), l0, target, KAPPA, 3.0, 4.0))
+
+
+def uniaxial_drive(count: int, l0: Array) -> Drive:
+    """Tension of 2 along x at every point of an undeformed body."""
+    tensor = np.zeros((count, 3, 3))
+    tensor[:, 0, 0] = 2.0
+    F = np.broadcast_to(np.eye(3), (count, 3, 3))
+    return Drive(F, tensor, DRIVERS["cauchy"], FRAMES["material"], 0.0, l0, np.full(count, 1.3), KAPPA)
+
+
+def test_laws_turn_the_axes_at_once_and_the_dimensions_gradually(cells: tuple[Array, Array]) -> None:
+    l0, _ = cells
+    axes = np.broadcast_to(np.eye(3)[[2, 0, 1]], (len(l0), 3, 3))  # rows: z, x, y
+    for name, function in FUNCTIONS.items():
+        new = LAWS[name].update(UnitCell(l0, axes), uniaxial_drive(len(l0), l0), 3.0, 4.0)
+        np.testing.assert_allclose(np.abs(new.axes[:, 0]), np.broadcast_to([1.0, 0.0, 0.0], l0.shape), atol=1e-14)
+        target = np.broadcast_to([1.3, 0.0, 0.0], l0.shape)
+        np.testing.assert_allclose(new.dimensions, function(l0, l0, target, KAPPA, 3.0, 4.0), atol=1e-14)
+
+
+def test_points_without_tension_keep_their_cells(cells: tuple[Array, Array]) -> None:
+    l0, _ = cells
+    drive = uniaxial_drive(len(l0), l0)
+    drive.tensor[::2] *= -1.0
+    axes = np.broadcast_to(np.eye(3)[[2, 0, 1]], (len(l0), 3, 3))
+    new = LAWS["explicit"].update(UnitCell(l0, axes), drive, 3.0, 4.0)
+    np.testing.assert_array_equal(new.dimensions[::2], l0[::2])
+    np.testing.assert_array_equal(new.axes[::2], axes[::2])
+    assert np.all(np.abs(new.dimensions[1::2] - l0[1::2]).max(axis=1) > 1e-3)
 
 
 def test_none_changes_nothing(cells: tuple[Array, Array]) -> None:
-    l0, target = cells
-    np.testing.assert_array_equal(LAWS["none"](l0, 2 * l0, target, KAPPA, 3.0, 4.0), l0)
+    l0, _ = cells
+    old = UnitCell(l0, np.broadcast_to(np.eye(3), (len(l0), 3, 3)))
+    assert not LAWS["none"].remodels
+    assert LAWS["none"].update(old, uniaxial_drive(len(l0), l0), 3.0, 4.0) is old
 
 
 @pytest.mark.parametrize("law", ["explicit", "rate", "relaxation"])
 def test_no_remodeling_without_time_or_rate(law: str, cells: tuple[Array, Array]) -> None:
     l0, target = cells
-    np.testing.assert_array_equal(LAWS[law](l0, l0, target, 0.0, 3.0, 4.0), l0)
-    np.testing.assert_array_equal(LAWS[law](l0, l0, target, KAPPA, 0.0, 0.0), l0)
+    np.testing.assert_array_equal(FUNCTIONS[law](l0, l0, target, 0.0, 3.0, 4.0), l0)
+    np.testing.assert_array_equal(FUNCTIONS[law](l0, l0, target, KAPPA, 0.0, 0.0), l0)
 
 
-@pytest.mark.parametrize("law", sorted(LAWS))
+@pytest.mark.parametrize("law", sorted(FUNCTIONS))
 def test_arguments_are_left_alone(law: str, cells: tuple[Array, Array]) -> None:
     l0, target = cells
     copies = l0.copy(), target.copy()
-    LAWS[law](l0, l0, target, KAPPA, 1.0, 2.0)
+    FUNCTIONS[law](l0, l0, target, KAPPA, 1.0, 2.0)
     np.testing.assert_array_equal(l0, copies[0])
     np.testing.assert_array_equal(target, copies[1])
 
@@ -97,7 +132,7 @@ def test_chain_length_of_eq_11_dips_along_the_chord() -> None:
     cosine = np.sum(l0 * target, axis=1) / r0**2
     for time in (1.0, 12.0, 27.7, 150.0):
         s = 1 - np.exp(-KAPPA * time)
-        length = np.linalg.norm(LAWS["explicit"](l0, l0, target, KAPPA, time - 1.0, time), axis=1)
+        length = np.linalg.norm(explicit(l0, l0, target, KAPPA, time - 1.0, time), axis=1)
         np.testing.assert_allclose(length**2, r0**2 * (1 - 2 * s * (1 - s) * (1 - cosine)), rtol=1e-12)
         assert np.all(length >= r0 * np.sqrt(0.5) * (1 - 1e-12))
 
@@ -106,7 +141,7 @@ def test_largest_dip_is_29_percent() -> None:
     """From one axis to another, half way: at kappa t = ln 2 the chain is 1/sqrt 2 as long."""
     l0, target = np.array([[0.0, 0.0, 1.0]]), np.array([[1.0, 0.0, 0.0]])
     times = np.linspace(0.0, 150.0, 3001)
-    dips = [1 - float(np.linalg.norm(LAWS["explicit"](l0, l0, target, KAPPA, 0.0, float(t)))) for t in times]
+    dips = [1 - float(np.linalg.norm(explicit(l0, l0, target, KAPPA, 0.0, float(t)))) for t in times]
     assert max(dips) == pytest.approx(1 - np.sqrt(0.5), abs=1e-6)
     assert times[int(np.argmax(dips))] == pytest.approx(np.log(2) / KAPPA, abs=0.05)
     assert round(100 * max(dips)) == 29
@@ -115,5 +150,5 @@ def test_largest_dip_is_29_percent() -> None:
 def test_end_values_of_the_paper() -> None:
     """At t = 150 a share exp(-3.75) = 0.0235 of the start is left, in directions without tension nothing else."""
     l0, target = np.full((1, 3), 1 / np.sqrt(3)), np.array([[1.0, 0.0, 0.0]])
-    end = LAWS["explicit"](l0, l0, target, KAPPA, 149.0, 150.0)[0]
+    end = explicit(l0, l0, target, KAPPA, 149.0, 150.0)[0]
     np.testing.assert_allclose(end, [0.9765 + 0.0235 / np.sqrt(3), 0.0235 / np.sqrt(3), 0.0235 / np.sqrt(3)], atol=5e-5)

@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 
 from remodel_fenicsx import cli
-from remodel_fenicsx.results.run_folder import COMMON_COLUMNS, read_history
+from remodel_fenicsx.results.columns import COLUMNS
+from remodel_fenicsx.results.history import read_history
 from remodel_fenicsx.scene.scene import read_scene
 from tests.conftest import mpirun
 
@@ -50,23 +51,38 @@ def tendon_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_folder_holds_history_fields_scene_and_log(tendon_run: Path) -> None:
     names = {path.name for path in tendon_run.iterdir()}
     assert names == {"history.csv", "fields.vtkhdf", "fields_chains.vtkhdf", "scene.toml", "run.log"}
-    assert "finished" in (tendon_run / "run.log").read_text()
+    log = (tendon_run / "run.log").read_text()
+    assert "finished" in log
+    # 25 a time unit, over an area of 10
+    line = "network modulus c = 1.568 Pa, shear modulus mu = 3.103 Pa, largest force over its area 7.5 Pa"
+    assert f"INFO {line}\n" in log
 
 
 def test_history_has_the_columns_of_the_contract(tendon_run: Path) -> None:
     history = read_history(tendon_run)
     uniaxial = {"force", "mean_stretch", "min_stretch", "max_stretch", "mean_fibre_angle"}
-    assert set(history) == set(COMMON_COLUMNS) | uniaxial
-    np.testing.assert_array_equal(history["time"], [1.0, 2.0, 3.0])
-    np.testing.assert_allclose(history["force"], [25.0, 50.0, 75.0], rtol=1e-14)
-    assert np.all(history["min_stretch"] < history["mean_stretch"])
-    assert np.all(history["mean_stretch"] < history["max_stretch"])
+    assert set(history) == {"time", *COLUMNS} | uniaxial
+    np.testing.assert_array_equal(history["time"], [0.0, 1.0, 2.0, 3.0])
+    np.testing.assert_allclose(history["force"], [0.0, 25.0, 50.0, 75.0], rtol=1e-14)
+    assert np.all(history["min_stretch"][1:] < history["mean_stretch"][1:])
+    assert np.all(history["mean_stretch"][1:] < history["max_stretch"][1:])
+
+
+def test_the_first_row_is_the_unloaded_body(tendon_run: Path) -> None:
+    first = {name: values[0] for name, values in read_history(tendon_run).items()}
+    nothing = ("time", "force", "remodeling_power", "newton_iterations", "linear_iterations", "substeps", "seconds")
+    assert all(first[name] == 0.0 for name in nothing)
+    for name in ("mean_stretch", "min_stretch", "max_stretch", "min_jacobian"):
+        assert first[name] == pytest.approx(1.0, abs=1e-14)
+    assert first["max_chain_extension"] == pytest.approx(1.0 / 1.594, rel=1e-12)
+    assert 45.0 < first["mean_fibre_angle"] < 65.0
 
 
 def test_scene_as_run_reads_back_as_the_same_scene(tendon_run: Path) -> None:
     again = read_scene(tendon_run / "scene.toml")
     assert again == read_scene(demo("tendon"), ["time.end=3"])
     text = (tendon_run / "scene.toml").read_text()
+    assert "\nformat = 2\n" in text
     assert "dolfinx" in text and "PETSc" in text
 
 
@@ -114,7 +130,7 @@ def test_one_and_two_ranks_write_the_same_files(tendon_run: Path, tmp_path: Path
 
 
 def test_petsc_options_from_scene_and_environment(tmp_path: Path) -> None:
-    """The scene's lie over the profile's, those of PETSC_OPTIONS over the scene's."""
+    """The scene's lie over the method's, those of PETSC_OPTIONS over the scene's."""
     one = ["run", demo("cube"), "--set", "time.end=1", "-q", "-o"]
     quiet = run(*one, tmp_path / "quiet")
     assert quiet.returncode == 0 and "SNES Function norm" not in quiet.stdout
@@ -125,8 +141,8 @@ def test_petsc_options_from_scene_and_environment(tmp_path: Path) -> None:
     other = run(*one, tmp_path / "other", "--set", "solver.petsc_options.pc_type=cholesky", env=loose)
     assert other.returncode == 0, other.stderr
     direct, iterative = read_history(tmp_path / "quiet"), read_history(tmp_path / "other")
-    assert direct["linear_iterations"][0] == direct["newton_iterations"][0]
-    assert iterative["linear_iterations"][0] > 2 * iterative["newton_iterations"][0]
+    assert direct["linear_iterations"][1] == direct["newton_iterations"][1] > 0
+    assert iterative["linear_iterations"][1] > 2 * iterative["newton_iterations"][1]
     np.testing.assert_allclose(iterative["mean_stretch"], direct["mean_stretch"], rtol=1e-9)
 
 
@@ -135,18 +151,18 @@ def test_a_tube_run_has_the_columns_of_the_contract(tmp_path: Path) -> None:
     assert done.returncode == 0 and done.stderr == "", done.stderr
     history = read_history(tmp_path / "tube")
     radii = {"inner_radius", "outer_radius", "fibre_angle_inner", "fibre_angle_middle", "fibre_angle_outer"}
-    assert set(history) == set(COMMON_COLUMNS) | radii | {"pressure", "axial_stretch"}
-    assert history["pressure"][0] == pytest.approx(0.192)
-    assert history["axial_stretch"][0] == pytest.approx(0.004)
-    assert 1.0 < history["inner_radius"][0] < 1.05 and 3.0 < history["outer_radius"][0] < 3.01
+    assert set(history) == {"time", *COLUMNS} | radii | {"pressure", "axial_elongation"}
+    assert history["pressure"][1] == pytest.approx(0.192)
+    assert history["axial_elongation"][1] == pytest.approx(0.004)
+    assert 1.0 < history["inner_radius"][1] < 1.05 and 3.0 < history["outer_radius"][1] < 3.01
 
 
-@pytest.mark.parametrize("mesh", ["cell='tetrahedron'", "degree=2"])
+@pytest.mark.parametrize("mesh", ["element='tetrahedron'", "degree=2"])
 def test_other_elements_run_and_write_fields(mesh: str, tmp_path: Path) -> None:
     done = run("run", demo("tendon"), "--set", "time.end=1", "--set", f"mesh.{mesh}", "-o", tmp_path / "out")
     assert done.returncode == 0, done.stderr
     # 25 on an area of 10: the stiffer tetrahedra and the softer quadratic elements stay near 1.203
-    assert read_history(tmp_path / "out")["mean_stretch"][0] == pytest.approx(1.203, abs=0.02)
+    assert read_history(tmp_path / "out")["mean_stretch"][1] == pytest.approx(1.203, abs=0.02)
     pyvista = pytest.importorskip("pyvista")
     reader = pyvista.HDFReader(str(tmp_path / "out" / "fields.vtkhdf"))
     reader.reader.SetStep(1)
@@ -225,14 +241,14 @@ def test_a_load_beyond_floating_point_is_exit_code_3_and_said_in_words(tmp_path:
 @pytest.mark.parametrize("ranks", [1, 2])
 def test_an_impossible_load_is_exit_code_3_and_says_where(tmp_path: Path, ranks: int) -> None:
     # axial chains lock at a stretch of L / r0 = 1.594: reached between t = 2 and t = 3
-    settings = ["cells.initial=aligned", "cells.aligned_axis=2", "loads.stretch.value=1.0", "loads.pressure.value=0"]
-    settings += ["loads.stretch.ramp=[[0.0, 0.0], [5.0, 1.0]]", "remodeling.law=none", "solver.maximum_halvings=3"]
+    settings = ["cells.initial=aligned", "cells.aligned_axis=2", "loads.elongation.value=1.0", "loads.pressure.value=0"]
+    settings += ["loads.elongation.ramp=[[0.0, 0.0], [5.0, 1.0]]", "remodeling.law=none", "solver.maximum_halvings=3"]
     change = [word for setting in settings for word in ("--set", setting)]
     done = run("run", demo("artery"), *change, "-o", tmp_path / "out", "-q", ranks=ranks)
     assert done.returncode == 3, done.stderr
     line = next(line for line in done.stderr.splitlines() if line.startswith("remodel-fenicsx:"))
     assert "no equilibrium at time 3: " in line and "largest r/L = " in line and "try a smaller time.step" in line
-    np.testing.assert_array_equal(read_history(tmp_path / "out")["time"], [1.0, 2.0])
+    np.testing.assert_array_equal(read_history(tmp_path / "out")["time"], [0.0, 1.0, 2.0])
     assert (tmp_path / "out" / "scene.toml").exists()
 
 
@@ -256,7 +272,7 @@ def test_a_signal_ends_the_run_and_keeps_finished_steps(tmp_path: Path, number: 
     else:
         assert process.returncode != 0  # mpirun's own code
     rows = read_history(folder)
-    assert len(rows["time"]) >= 3 and rows["time"][-1] == len(rows["time"])
+    assert len(rows["time"]) >= 3 and rows["time"][-1] == len(rows["time"]) - 1
     assert history.read_text().endswith("\n")
     with h5py.File(folder / "fields.vtkhdf") as file:
         assert file["VTKHDF/Steps"].attrs["NSteps"] >= len(rows["time"])
@@ -316,6 +332,16 @@ def test_a_misspelt_petsc_option_is_said_and_logged(tmp_path: Path) -> None:
     assert warning.removeprefix("WARNING: ") in (tmp_path / "out" / "run.log").read_text()
 
 
+def test_a_chain_density_of_another_stress_unit_is_said_and_logged(tmp_path: Path) -> None:
+    settings = ["--set", "material.stress_unit=kPa", "--set", "loads.force.value=1 N", "--set", "time.end=1"]
+    done = run("run", demo("cube"), *settings, "--set=geometry.length_unit=cm", "-q", "-o", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.startswith("WARNING: material.chain_density = 7e+21 belongs to a scene in Pa")
+    assert done.stderr.count("\n") == 1
+    assert done.stderr.removeprefix("WARNING: ") in (tmp_path / "out" / "run.log").read_text()
+    assert read_scene(tmp_path / "out" / "scene.toml").loads["force"].value == 10.0  # 1 N in kPa cm^2
+
+
 def test_options_of_the_profile_that_the_scene_makes_needless_are_no_news(tmp_path: Path) -> None:
     options = [f"--set=solver.petsc_options.{option}" for option in ("ksp_type=cg", "pc_type=none")]
     done = run("run", demo("cube"), *options, "--set=time.end=2", "-q", "-o", tmp_path / "out")
@@ -360,7 +386,7 @@ geometry.shape=sphere | geometry.shape = 'sphere'
 geometry.radius=1.0 | geometry.radius
 mesh.refinement=0 | mesh.refinement = 0
 mesh.refinement=1.5 | mesh.refinement = 1.5
-mesh.cell=prism | mesh.cell = 'prism'
+mesh.element=prism | mesh.element = 'prism'
 mesh.degree=3 | mesh.degree = 3
 model.kinematics=plane | model.kinematics = 'plane'
 material.lame_lambda=-1.0 | material.lame_lambda = -1.0
@@ -377,7 +403,7 @@ cells.seed=-1 | cells.seed = -1
 cells.seed="one" | cells.seed = 'one'
 loads.pressure.ramp=[[0.0, 0.0], [25.0, 1.0], [20.0, 0.5]] | loads.pressure.ramp[2][0] = 20.0
 loads.pressure.ramp=[] | loads.pressure.ramp
-loads.stretch.value=-1.5 | loads.stretch
+loads.elongation.value=-1.5 | loads.elongation
 loads.force.value=1.0 | loads.force
 remodeling.kappa=-0.1 | remodeling.kappa = -0.1
 remodeling.driver=strain | remodeling.driver = 'strain'
@@ -386,7 +412,7 @@ remodeling.frame=eulerian | remodeling.frame = 'eulerian'
 time.end=0 | time.end = 0
 time.step=0.4 | loads
 time.step=-1.0 | time.step = -1.0
-solver.profile=magic | solver.profile = 'magic'
+solver.method=magic | solver.method = 'magic'
 solver.relative_tolerance=-1e-8 | solver.relative_tolerance
 output.every=0 | output.every = 0
 preset=paper | preset = 'paper'
@@ -418,7 +444,10 @@ def test_bad_input_ends_two_ranks_with_one_line(tmp_path: Path) -> None:
 
 def test_validate_new_and_info(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["validate", str(demo("artery"))]) == 0
-    assert capsys.readouterr().out.endswith("a valid scene (tube, 150 steps)\n")
+    assert capsys.readouterr().out.endswith(
+        "a valid scene (tube, 150 steps)\n"
+        "network modulus c = 1.568 Pa, shear modulus mu = 3.103 Pa, largest pressure 4.8 Pa\n"
+    )
     for preset in ("kuhl-holzapfel-2007", "sun-2002"):
         for shape in ("cube", "tendon", "tube"):
             assert cli.main(["new", preset, "--shape", shape]) == 0

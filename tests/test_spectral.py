@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from remodel_fenicsx.tissue.spectral import Array, positive_direction, principal
+from remodel_fenicsx.tissue.spectral import ROUNDING, Array, positive_direction, principal
 
 COUNT = 50
 
@@ -109,7 +109,7 @@ def test_noise_below_the_scale_is_the_zero_tensor() -> None:
     rng = np.random.default_rng(8)
     true, previous = random_axes(rng), random_axes(rng)
     noise = tensor([3e-16, 1e-16, -2e-16], true)
-    np.testing.assert_allclose(principal(noise, previous, scale=1.0)[1], previous, atol=1e-14)
+    np.testing.assert_allclose(principal(noise, previous, threshold=ROUNDING)[1], previous, atol=1e-14)
     np.testing.assert_allclose(absolute_cosines(principal(noise, previous)[1], true), 1.0, atol=1e-12)
 
 
@@ -201,4 +201,4 @@ def test_nothing_positive_is_inactive(values: list[float]) -> None:
 def test_noise_below_the_scale_is_inactive() -> None:
     noise = [[2e-16, 1e-16, -1e-16]]
     assert positive_direction(noise)[1].tolist() == [True]
-    assert positive_direction(noise, scale=1.0)[1].tolist() == [False]
+    assert positive_direction(noise, threshold=ROUNDING)[1].tolist() == [False]

@@ -2,19 +2,68 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+
 import numpy as np
-from mpi4py import MPI
+from pydantic import Field, model_validator
 
 from remodel_fenicsx.body import gmsh_model as model
-from remodel_fenicsx.body.domain import Domain
+from remodel_fenicsx.body.column import Column
+from remodel_fenicsx.body.shape import LoadKind, MeshSettings, Shape, check_lengths, uniaxial_columns
+from remodel_fenicsx.schema.units import FORCE, LENGTH
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
+
+    from remodel_fenicsx.body.domain import Domain
+    from remodel_fenicsx.body.loading import Loading
+
+
+class Cube(Shape):
+    """A cube, pulled along z: the homogeneous body of the paper's Fig. 5. It slides on the planes x = y = z = 0."""
+
+    loads: ClassVar[dict[str, LoadKind]] = {
+        "force": LoadKind(
+            lambda shape, loading, name: loading.add_dead_force(name, "z1", component=2),
+            "total dead force along z on the top",
+            FORCE,
+        )
+    }
+    columns: ClassVar[tuple[Column, ...]] = uniaxial_columns("z1", "side")
+    number_of_elements: ClassVar[int] = 1
+    faces: ClassVar[tuple[str, ...]] = ("x0", "x1", "y0", "y1", "z0", "z1")
+
+    shape: Literal["cube"] = Field(default="cube", description="Which body it is.")
+    side: Annotated[float, LENGTH] = Field(
+        default=1.0, gt=0, description="Length of an edge, in the scene's unit of length."
+    )
+
+    @property
+    def loaded_area(self) -> float:
+        """Area that carries `force`."""
+        return self.side**2
+
+    @model_validator(mode="after")
+    def _can_be_meshed(self) -> Cube:
+        check_lengths(self, {"side": self.side})
+        return self
+
+    def build(self, mesh: MeshSettings, comm: MPI.Intracomm | None = None) -> Domain:
+        """Mesh the cube."""
+        return cube(self.side, mesh.refinement, mesh.element, mesh.degree, comm)
+
+    def hold(self, loading: Loading) -> None:
+        """Symmetry planes x = y = z = 0."""
+        for component, face in enumerate(("x0", "y0", "z0")):
+            loading.hold_face(face, component)
 
 
 def cube(
     side: float = 1.0,
     refinement: int = 1,
-    cell: str = "hexahedron",
+    element: str = "hexahedron",
     degree: int = 1,
-    comm: MPI.Intracomm = MPI.COMM_WORLD,
+    comm: MPI.Intracomm | None = None,
 ) -> Domain:
     """Cube [0, side]^3 with the faces x0, x1, y0, y1, z0, z1. Collective.
 
@@ -24,12 +73,12 @@ def cube(
         Length of the edges.
     refinement
         Elements along each edge; 1 is the paper's single element.
-    cell
+    element
         "hexahedron", or "tetrahedron": each hexahedron split into six.
     degree
         Of the geometry, 1 or 2.
     comm
-        Ranks that share the mesh.
+        Ranks that share the mesh; default: all.
 
     Raises
     ------
@@ -38,17 +87,19 @@ def cube(
     GeometryError
         On all ranks, if Gmsh fails on rank 0.
     """
-    model.check_arguments({"side": side}, refinement, cell, degree)
+    model.check_arguments({"side": side}, refinement, element, degree)
     model.check_lengths({"side": side})
-    return model.build_domain(lambda: draw_cube(side, refinement, cell, degree), "cube", {"side": float(side)}, comm)
+    from remodel_fenicsx.body.meshing import build_domain
+
+    return build_domain(lambda: draw_cube(side, refinement, element, degree), "cube", {"side": float(side)}, comm)
 
 
-def draw_cube(side: float, refinement: int = 1, cell: str = "hexahedron", degree: int = 1) -> None:
+def draw_cube(side: float, refinement: int = 1, element: str = "hexahedron", degree: int = 1) -> None:
     """Draw and mesh the cube in the current Gmsh model."""
     n = refinement
     corners = model.points(side * np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]))
     y0, x1, y1, x0 = (model.line(corners[i], corners[(i + 1) % 4], n) for i in range(4))
-    section = model.block([y0, x1, y1, x0], corners, cell)
+    section = model.block([y0, x1, y1, x0], corners, element)
     sides = {"x0": x0, "x1": x1, "y0": y0, "y1": y1}
-    model.extrude([section], side, n, cell, sides, ends=("z0", "z1"))
+    model.extrude([section], side, n, element, sides, ends=("z0", "z1"))
     model.raise_degree(degree, np.zeros_like)

@@ -12,16 +12,13 @@ from mpi4py import MPI
 from remodel_fenicsx.fem import compat
 
 
-class GeometryError(RuntimeError):
-    """Gmsh could not build or read a mesh; raised on all ranks."""
-
-
 @dataclass(frozen=True, eq=False)
 class Domain:
     """A meshed body with named faces.
 
-    Cells and nodes have the numbers under which rank 0 gave them to dolfinx (0, 1, ... in the order of the input).
-    They do not depend on the number of ranks: what belongs to a cell or a node for good is drawn and written by them.
+    Elements and nodes have the numbers under which rank 0 gave them to dolfinx (0, 1, ... in the order of the
+    input). They do not depend on the number of ranks: what belongs to an element or a node for good is drawn and
+    written by them.
 
     Attributes
     ----------
@@ -32,14 +29,14 @@ class Domain:
     faces
         Name of a face -> its value in `facet_tags`, on every rank.
     shape
-        Name of the shape: "cube", "tendon", "tube".
+        Name of the shape (`body.SHAPES`).
     dimensions
         The shape's dimensions by name, in the scene's unit of length. Tendon: also `radius`, that of the outer nodes.
-    cell_number
-        Number of each local cell, owned ones first, then ghosts, (local cells,) int64.
+    element_number
+        Number of each local element, owned ones first, then ghosts, (local elements,) int64.
     node_number
         Number of each local geometry node, owned ones first, then ghosts, (local nodes,) int64.
-    number_of_cells, number_of_nodes
+    number_of_elements, number_of_nodes
         Of the whole mesh.
     """
 
@@ -48,17 +45,17 @@ class Domain:
     faces: dict[str, int]
     shape: str
     dimensions: dict[str, float]
-    cell_number: npt.NDArray[np.int64] = field(init=False)
+    element_number: npt.NDArray[np.int64] = field(init=False)
     node_number: npt.NDArray[np.int64] = field(init=False)
-    number_of_cells: int = field(init=False)
+    number_of_elements: int = field(init=False)
     number_of_nodes: int = field(init=False)
 
     def __post_init__(self) -> None:
         topology, geometry = self.mesh.topology, self.mesh.geometry
         settle = object.__setattr__  # the dataclass is frozen: these four follow from the mesh
-        settle(self, "cell_number", np.asarray(topology.original_cell_index, dtype=np.int64))
+        settle(self, "element_number", np.asarray(topology.original_cell_index, dtype=np.int64))
         settle(self, "node_number", np.asarray(geometry.input_global_indices, dtype=np.int64))
-        settle(self, "number_of_cells", int(topology.index_map(topology.dim).size_global))
+        settle(self, "number_of_elements", int(topology.index_map(topology.dim).size_global))
         settle(self, "number_of_nodes", int(geometry.index_map().size_global))
 
     @property
@@ -71,27 +68,27 @@ class Domain:
         """Largest dimension that is a length: the scale for tolerances on coordinates."""
         return max(value for name, value in self.dimensions.items() if name != "area")
 
-    def gather_cells(self, values: npt.ArrayLike) -> npt.NDArray[Any] | None:
-        """Bring what belongs to the cells to rank 0, in input order. Collective.
+    def gather_elements(self, values: npt.ArrayLike) -> npt.NDArray[Any] | None:
+        """Bring what belongs to the elements to rank 0, in input order. Collective.
 
         Parameters
         ----------
         values
-            One row per local cell, (owned cells or more, ...): rows behind the owned ones (ghosts) are ignored.
+            One row per local element, (owned ones or more, ...): rows behind the owned ones (ghosts) are ignored.
 
         Returns
         -------
         array or None
-            (number_of_cells, ...) on rank 0, None elsewhere.
+            (number_of_elements, ...) on rank 0, None elsewhere.
 
         Raises
         ------
         ValueError
-            If there are fewer rows than owned cells.
+            If there are fewer rows than owned elements.
         """
         topology = self.mesh.topology
         owned = topology.index_map(topology.dim).size_local
-        return self._gather(np.asarray(values), self.cell_number[:owned], self.number_of_cells)
+        return self._gather(np.asarray(values), self.element_number[:owned], self.number_of_elements)
 
     def gather_nodes(self, values: npt.ArrayLike) -> npt.NDArray[Any] | None:
         """Bring what belongs to the geometry nodes to rank 0, in input order. Collective.
@@ -119,13 +116,13 @@ class Domain:
 
         Returns
         -------
-        points, cells
-            (number_of_nodes, 3) and (number_of_cells, nodes per cell) on rank 0, (None, None) elsewhere. Within a cell
-            the nodes have dolfinx's (tensor product) order; `cells[:, dolfinx.cpp.io.perm_vtk(type, n)]` has VTK's.
+        points, elements
+            (number_of_nodes, 3) and (number_of_elements, nodes per element) on rank 0, None elsewhere. Within one
+            the nodes have dolfinx's (tensor product) order; `elements[:, dolfinx.cpp.io.perm_vtk(type, n)]` has VTK's.
         """
         points = self.gather_nodes(self.mesh.geometry.x)
-        cells = self.gather_cells(self.node_number[compat.geometry_dofmap(self.mesh)])
-        return (None, None) if points is None or cells is None else (points, cells)
+        elements = self.gather_elements(self.node_number[compat.geometry_dofmap(self.mesh)])
+        return (None, None) if points is None or elements is None else (points, elements)
 
     def _gather(self, values: npt.NDArray[Any], number: npt.NDArray[np.int64], total: int) -> npt.NDArray[Any] | None:
         short = self.comm.allreduce(len(values) < len(number), MPI.LOR)

@@ -1,4 +1,4 @@
-"""Gmsh on rank 0: plane section, extrusion, named faces, curved elements; from there to every rank's `Domain`."""
+"""Gmsh: plane section, extrusion, named faces, curved elements, and what it can mesh. Without dolfinx."""
 
 from __future__ import annotations
 
@@ -9,26 +9,46 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from mpi4py import MPI
 
-from remodel_fenicsx.fem import compat
-from remodel_fenicsx.body.domain import Domain, GeometryError
-from remodel_fenicsx.scene.parameters import length_fault
-
-CELLS = ("hexahedron", "tetrahedron")
+ELEMENTS = ("hexahedron", "tetrahedron")
 DEGREES = (1, 2)
-Draw = Callable[[], None]
+# Gmsh takes points that are closer than 1e-8 for one, and crashes on much longer or flatter bodies
+SMALLEST_LENGTH, LARGEST_LENGTH, LARGEST_LENGTH_RATIO = 1e-6, 1e6, 1e4
 
 
-def check_arguments(lengths: Mapping[str, float], refinement: Any, cell: str, degree: int) -> None:
+class GeometryError(RuntimeError):
+    """Gmsh could not build or read a mesh; raised on all ranks."""
+
+
+def length_fault(lengths: Mapping[str, float]) -> tuple[str, str] | None:
+    """What keeps a body from being meshed: the name of one of its lengths, and what is allowed; None if nothing does.
+
+    Parameters
+    ----------
+    lengths
+        Lengths, radii and wall thickness of the body by the key that decides each of them, in any unit.
+    """
+    for name, length in lengths.items():
+        if not SMALLEST_LENGTH <= length <= LARGEST_LENGTH:
+            return name, f"a length of {length:g} here; allowed are {SMALLEST_LENGTH:g} to {LARGEST_LENGTH:g}"
+    smallest, largest = min(lengths, key=lambda k: lengths[k]), max(lengths, key=lambda k: lengths[k])
+    if lengths[largest] <= LARGEST_LENGTH_RATIO * lengths[smallest]:
+        return None
+    return smallest, (
+        f"a length of {lengths[smallest]:g} is too small beside one of {lengths[largest]:g}; "
+        f"allowed is a ratio up to {LARGEST_LENGTH_RATIO:g}"
+    )
+
+
+def check_arguments(lengths: Mapping[str, float], refinement: Any, element: str, degree: int) -> None:
     """Refuse what is no body or no mesh, by the same one-line ValueError on every rank."""
     for name, value in lengths.items():
         if not (np.isfinite(value) and value > 0.0):
             raise ValueError(f"{name} = {value}: must be a positive number")
     if not (isinstance(refinement, (int, np.integer)) and refinement >= 1):
         raise ValueError(f"refinement = {refinement}: must be a whole number of at least 1")
-    if cell not in CELLS:
-        raise ValueError(f"cell = {cell!r}: allowed are {', '.join(CELLS)}")
+    if element not in ELEMENTS:
+        raise ValueError(f"element = {element!r}: allowed are {', '.join(ELEMENTS)}")
     if degree not in DEGREES:
         raise ValueError(f"degree = {degree}: allowed are 1 and 2")
 
@@ -64,47 +84,6 @@ def gmsh_model(name: str) -> Iterator[Any]:
             gmsh.finalize()
 
 
-def build_domain(draw: Draw, shape: str, dimensions: dict[str, float], comm: MPI.Intracomm) -> Domain:
-    """Draw and mesh on rank 0, then share the mesh. Collective.
-
-    Parameters
-    ----------
-    draw
-        Draws and meshes the body in the current Gmsh model, with physical groups for the volume and the faces.
-    shape, dimensions
-        As in `Domain`.
-    comm
-        Ranks that share the mesh.
-
-    Raises
-    ------
-    GeometryError
-        On all ranks, if `draw` fails on rank 0.
-    """
-    if comm.rank != 0:
-        verdict, faces = comm.bcast(None, root=0)
-        if verdict:
-            raise GeometryError(verdict)
-        return Domain(*compat.mesh_from_gmsh(None, comm), faces, shape, dimensions)
-    # the verdict goes out exactly once, whether Gmsh is missing, fails or is interrupted: nobody waits for ever
-    told = False
-    try:
-        with gmsh_model(shape) as gmsh:
-            draw()
-            faces = named_faces()
-            told = True
-            comm.bcast(("", faces), root=0)
-            return Domain(*compat.mesh_from_gmsh(gmsh.model, comm), faces, shape, dimensions)
-    except BaseException as error:
-        if told:
-            raise
-        verdict = f"Gmsh could not mesh the {shape}: {str(error) or type(error).__name__}"
-        comm.bcast((verdict, {}), root=0)
-        if not isinstance(error, Exception):  # Ctrl-C on rank 0 stays what it is there
-            raise
-        raise GeometryError(verdict) from error
-
-
 def named_faces() -> dict[str, int]:
     """Names and numbers of the faces of the current model, once it is sure that dolfinx can take the model.
 
@@ -113,18 +92,18 @@ def named_faces() -> dict[str, int]:
     Raises
     ------
     GeometryError
-        If there is not exactly one named volume with exactly one type of cell, or no face.
+        If there is not exactly one named volume with exactly one type of element, or no face.
     """
     import gmsh
 
     volumes, faces = gmsh.model.getPhysicalGroups(3), gmsh.model.getPhysicalGroups(2)
     kinds = gmsh.model.mesh.getElements(3)[0]
     if len(volumes) != 1 or len(kinds) != 1 or not faces:
-        raise GeometryError(f"{len(volumes)} named volumes, {len(kinds)} types of cells, {len(faces)} named faces")
+        raise GeometryError(f"{len(volumes)} named volumes, {len(kinds)} types of elements, {len(faces)} named faces")
     return {gmsh.model.getPhysicalName(2, tag): tag for _, tag in faces}
 
 
-def write_msh(path: str | Path, draw: Draw) -> None:
+def write_msh(path: str | Path, draw: Callable[[], None]) -> None:
     """Write what `draw` makes as a Gmsh file (format 4.1, ASCII); call it on one rank only."""
     with gmsh_model(Path(path).stem) as gmsh:
         draw()
@@ -181,14 +160,14 @@ def polygon(corners: Sequence[Point]) -> list[int]:
     return [line(start, stop)[0] for start, stop in zip(corners, [*corners[1:], corners[0]], strict=True)]
 
 
-def block(edges: Sequence[Sequence[int]], corners: Sequence[Point], cell: str) -> int:
+def block(edges: Sequence[Sequence[int]], corners: Sequence[Point], element: str) -> int:
     """Structured plane surface between four sides (each a chain of curves, a closed loop in all) and four corners."""
     import gmsh
 
     geo = gmsh.model.geo
     surface = geo.addPlaneSurface([geo.addCurveLoop([curve for side in edges for curve in side])])
     geo.mesh.setTransfiniteSurface(surface, cornerTags=[corner.tag for corner in corners])
-    if cell == "hexahedron":
+    if element == "hexahedron":
         geo.mesh.setRecombine(2, surface)
     return surface
 
@@ -202,7 +181,7 @@ def extrude(
     section: Sequence[int],
     length: float,
     layers: int,
-    cell: str,
+    element: str,
     sides: Mapping[str, Sequence[int]],
     ends: tuple[str, str] = ("bottom", "top"),
 ) -> None:
@@ -214,7 +193,7 @@ def extrude(
         Surfaces in the plane z = 0.
     length, layers
         Height, and number of equal element layers.
-    cell
+    element
         "hexahedron" or "tetrahedron".
     sides
         Name of a face -> the section's boundary curves that sweep it.
@@ -224,7 +203,7 @@ def extrude(
     import gmsh
 
     made = gmsh.model.geo.extrude(
-        [(2, surface) for surface in section], 0.0, 0.0, length, numElements=[layers], recombine=cell == "hexahedron"
+        [(2, surface) for surface in section], 0.0, 0.0, length, numElements=[layers], recombine=element == "hexahedron"
     )
     gmsh.model.geo.synchronize()
     volumes = [tag for dimension, tag in made if dimension == 3]

@@ -1,4 +1,4 @@
-"""Supports and loads of the shapes, as a scene names them: dead traction, follower pressure, prescribed stretch."""
+"""Supports and loads of a body: boundary conditions, dead traction, follower pressure, prescribed elongation."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from remodel_fenicsx.fem import jit
-from remodel_fenicsx.body import Domain
-from remodel_fenicsx.fem.kinematics import deformation_gradient
+from remodel_fenicsx.body.domain import Domain
+from remodel_fenicsx.fem.kinematics import FullKinematics, Kinematics
 
 LoadValues = dict[str, float]
 
@@ -25,29 +25,34 @@ class Loading:
     ----------
     domain
         The meshed body with its named faces.
-    displacement
-        dolfinx vector function, the unknown.
+    unknown
+        dolfinx function of the unknowns.
+    kinematics
+        What they mean.
 
     Attributes
     ----------
+    weight
+        Volume of the body per unit of mesh, or area per unit of its faces (UFL): a factor of every term.
     boundary_conditions
         dolfinx Dirichlet conditions.
     values
         Present magnitude of each named load.
     """
 
-    def __init__(self, domain: Domain, displacement: Any):
-        self.domain, self.displacement = domain, displacement
-        self.space = displacement.function_space
+    def __init__(self, domain: Domain, unknown: Any, kinematics: Kinematics | None = None):
+        self.domain, self.unknown, self.kinematics = domain, unknown, kinematics or FullKinematics()
+        self.space = unknown.function_space
+        self.weight = self.kinematics.weight(domain.mesh)
         self.boundary_conditions: list[Any] = []
         self.values: LoadValues = {}
-        self._magnitudes: dict[str, tuple[Any, float]] = {}
+        self._magnitudes: dict[str, list[tuple[Any, float]]] = {}
         self._terms: list[Callable[[Any, Any], Any]] = []
 
     # ------------------------------------------------------------ supports
     def hold_face(self, face: str, component: int) -> None:
         """u_component = 0 on a named face."""
-        self._prescribe(component, self._face_dofs(face, component), self._constant(0.0))
+        self._prescribe_face(face, component, self._constant(0.0))
 
     def hold_node(self, point: tuple[float, float, float], component: int) -> None:
         """u_component = 0 at the mesh node at `point`.
@@ -58,7 +63,9 @@ class Loading:
             If the mesh has no node there.
         """
         tolerance = 1e-9 * self.domain.size
-        subspace = self.space.sub(component)
+        subspace = self.kinematics.subspace(self.space, component)
+        if subspace is None:
+            return
         collapsed, _ = subspace.collapse()
         dofs = dolfinx.fem.locate_dofs_geometrical(
             (subspace, collapsed), lambda x: np.linalg.norm(x - np.reshape(point, (3, 1)), axis=0) < tolerance
@@ -68,28 +75,27 @@ class Loading:
         if found != 1:
             raise ValueError(f"{found} mesh nodes at {point}: a support needs exactly one")
         # on the sub-space's own dofs alone the value is a Constant, as for faces
-        self._prescribe(component, dofs[0], self._constant(0.0))
+        self.boundary_conditions.append(dolfinx.fem.dirichletbc(self._constant(0.0), dofs[0], subspace))
 
     # ------------------------------------------------------------ loads
     def add_dead_force(self, name: str, face: str, component: int) -> None:
         """A total force on a face: constant nominal traction, force over reference area, along a coordinate axis."""
-        area = self.area(face)
-        traction = self._magnitude(name)
+        traction = self.magnitude(name, 1.0 / self.area(face))
         direction = ufl.as_vector([1.0 if i == component else 0.0 for i in range(3)])
-        measure = self._surface_measure(face)
-        self._terms.append(lambda u, v: -traction / area * ufl.inner(direction, v) * measure)
+        measure = self.surface_measure(face)
+        self.add_term(lambda u, v: -traction * ufl.inner(direction, v) * self.weight * measure)
 
     def add_follower_pressure(self, name: str, face: str) -> None:
         """A pressure on the deformed face, against its outward normal: p cof(F) N . v, with the exact linearisation."""
-        pressure = self._magnitude(name)
+        pressure = self.magnitude(name)
         normal = ufl.FacetNormal(self.domain.mesh)
-        measure = self._surface_measure(face)
-        self._terms.append(lambda u, v: pressure * ufl.inner(ufl.cofac(deformation_gradient(u)) * normal, v) * measure)
+        measure = self.surface_measure(face)
+        F = self.kinematics.deformation_gradient
+        self.add_term(lambda u, v: pressure * ufl.inner(ufl.cofac(F(u)) * normal, v) * self.weight * measure)
 
-    def add_prescribed_stretch(self, name: str, face: str, component: int, length: float) -> None:
-        """u_component = stretch * length on a face: the engineering strain of the whole length."""
-        displacement = self._magnitude(name, length)
-        self._prescribe(component, self._face_dofs(face, component), displacement)
+    def add_prescribed_elongation(self, name: str, face: str, component: int, length: float) -> None:
+        """u_component = elongation * length on a face: the engineering strain of the whole length."""
+        self._prescribe_face(face, component, self.magnitude(name, length))
 
     def add_term(self, term: Callable[[Any, Any], Any]) -> None:
         """Any other load, as a term of the residual: minus its virtual work.
@@ -97,14 +103,30 @@ class Loading:
         Parameters
         ----------
         term
-            Function of displacement and test function that returns a UFL form: ``lambda u, v: -ufl.inner(b, v) * dx``
-            is a body force b per reference volume. Its derivative with respect to the displacement enters the tangent.
+            Function of the unknown and of the virtual displacement, a 3-vector, that returns a UFL form:
+            ``lambda u, v: -ufl.inner(b, v) * dx`` is a body force b per reference volume. Its derivative with respect
+            to the unknown enters the tangent.
         """
         self._terms.append(term)
 
-    def external_residual(self, displacement: Any, test: Any) -> list[Any]:
-        """Terms of the residual from the loads: minus the virtual work of the external forces (UFL)."""
-        return [term(displacement, test) for term in self._terms]
+    def magnitude(self, name: str, scale: float = 1.0) -> Any:
+        """A Constant that is the named load's present magnitude times `scale`: what a term is made of."""
+        constant = self._constant(0.0)
+        self._magnitudes.setdefault(name, []).append((constant, scale))
+        self.values[name] = 0.0
+        return constant
+
+    def surface_measure(self, face: str) -> Any:
+        """Measure over a named face of the mesh; times `weight` it is one over the body's face."""
+        measure = ufl.Measure("ds", domain=self.domain.mesh, subdomain_data=self.domain.facet_tags)
+        degree = self.space.element.basix_element.degree
+        return measure(self.domain.faces[face], metadata={"quadrature_degree": 2 * degree})
+
+    def external_residual(self, test: Any) -> Any:
+        """Minus the virtual work of the external forces, a UFL form; None without loads on faces or volumes."""
+        virtual = self.kinematics.displacement(test)
+        terms = [term(self.unknown, virtual) for term in self._terms]
+        return sum(terms[1:], terms[0]) if terms else None
 
     def set(self, values: Mapping[str, float]) -> None:
         """Give the named loads new magnitudes.
@@ -115,74 +137,24 @@ class Loading:
             If a name is not a load of this body.
         """
         for name, value in values.items():
-            constant, scale = self._magnitudes[name]
-            constant.value = value * scale
+            for constant, scale in self._magnitudes[name]:
+                constant.value = value * scale
             self.values[name] = float(value)
 
     def area(self, face: str) -> float:
         """Reference area of a named face."""
         one = dolfinx.fem.Constant(self.domain.mesh, PETSc.ScalarType(1.0))
-        local = dolfinx.fem.assemble_scalar(jit.form(one * self._surface_measure(face)))
+        local = dolfinx.fem.assemble_scalar(jit.form(one * self.weight * self.surface_measure(face)))
         return float(np.real(self.domain.mesh.comm.allreduce(local, MPI.SUM)))
 
     # ------------------------------------------------------------ inside
     def _constant(self, value: float) -> Any:
         return dolfinx.fem.Constant(self.domain.mesh, PETSc.ScalarType(value))
 
-    def _magnitude(self, name: str, scale: float = 1.0) -> Any:
-        constant = self._constant(0.0)
-        self._magnitudes[name] = (constant, scale)
-        self.values[name] = 0.0
-        return constant
-
-    def _surface_measure(self, face: str) -> Any:
-        measure = ufl.Measure("ds", domain=self.domain.mesh, subdomain_data=self.domain.facet_tags)
-        degree = self.space.element.basix_element.degree
-        return measure(self.domain.faces[face], metadata={"quadrature_degree": 2 * degree})
-
-    def _face_dofs(self, face: str, component: int) -> Any:
+    def _prescribe_face(self, face: str, component: int, value: Any) -> None:
+        subspace = self.kinematics.subspace(self.space, component)
+        if subspace is None:
+            return
         facets = self.domain.facet_tags.find(self.domain.faces[face])
-        return dolfinx.fem.locate_dofs_topological(self.space.sub(component), self.domain.mesh.topology.dim - 1, facets)
-
-    def _prescribe(self, component: int, dofs: Any, value: Any) -> None:
-        self.boundary_conditions.append(dolfinx.fem.dirichletbc(value, dofs, self.space.sub(component)))
-
-
-def cube_loading(domain: Domain, displacement: Any) -> Loading:
-    """Uniaxial tension of a cube along z (Fig. 5): symmetry planes x = y = z = 0, a dead `force` on z = side."""
-    loading = Loading(domain, displacement)
-    for component, face in enumerate(("x0", "y0", "z0")):
-        loading.hold_face(face, component)
-    loading.add_dead_force("force", "z1", component=2)
-    return loading
-
-
-def tendon_loading(domain: Domain, displacement: Any) -> Loading:
-    """Tendon (Fig. 6): u_z = 0 at the bottom, rigid motion held at two of its nodes, a dead `force` at the top."""
-    loading = Loading(domain, displacement)
-    loading.hold_face("bottom", 2)
-    loading.hold_node((0.0, 0.0, 0.0), 0)
-    loading.hold_node((0.0, 0.0, 0.0), 1)
-    loading.hold_node((domain.dimensions["radius"], 0.0, 0.0), 1)
-    loading.add_dead_force("force", "top", component=2)
-    return loading
-
-
-def tube_loading(domain: Domain, displacement: Any) -> Loading:
-    """Artery (Fig. 7): inner follower `pressure`, axial `stretch` of the ends, rigid motion held at three nodes."""
-    loading = Loading(domain, displacement)
-    radius = domain.dimensions["inner_radius"]
-    loading.hold_face("bottom", 2)
-    loading.hold_node((radius, 0.0, 0.0), 1)
-    loading.hold_node((-radius, 0.0, 0.0), 1)
-    loading.hold_node((0.0, radius, 0.0), 0)
-    loading.add_prescribed_stretch("stretch", "top", component=2, length=domain.dimensions["length"])
-    loading.add_follower_pressure("pressure", "inner")
-    return loading
-
-
-LOADINGS: dict[str, Callable[[Domain, Any], Loading]] = {
-    "cube": cube_loading,
-    "tendon": tendon_loading,
-    "tube": tube_loading,
-}
+        dofs = dolfinx.fem.locate_dofs_topological(subspace, self.domain.mesh.topology.dim - 1, facets)
+        self.boundary_conditions.append(dolfinx.fem.dirichletbc(value, dofs, subspace))

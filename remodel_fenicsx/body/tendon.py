@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import numpy as np
 import numpy.typing as npt
-from mpi4py import MPI
+from pydantic import Field, model_validator
 
 from remodel_fenicsx.body import gmsh_model as model
-from remodel_fenicsx.body.domain import Domain
+from remodel_fenicsx.body.column import Column
+from remodel_fenicsx.body.shape import LoadKind, MeshSettings, Shape, check_lengths, uniaxial_columns
+from remodel_fenicsx.schema.units import AREA, FORCE, LENGTH
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
+
+    from remodel_fenicsx.body.domain import Domain
+    from remodel_fenicsx.body.loading import Loading
 
 AROUND, CORE, RINGS, ALONG = 16, 4, 2, 10  # the paper's elements: around, along a side of the core, rings, along
 # The core's corners lie at this fraction of the radius, its sides this fraction of the way from straight to round:
@@ -17,13 +26,61 @@ AROUND, CORE, RINGS, ALONG = 16, 4, 2, 10  # the paper's elements: around, along
 CORE_RADIUS, CORE_ROUNDNESS = 0.65, 0.4
 
 
+class Tendon(Shape):
+    """A cylinder along z, held at its bottom and pulled at its top: the tendon of the paper's Fig. 6.
+
+    Length and square root of the area: 1e-6 to 1e6, one up to 10,000 times the other.
+    """
+
+    loads: ClassVar[dict[str, LoadKind]] = {
+        "force": LoadKind(
+            lambda shape, loading, name: loading.add_dead_force(name, "top", component=2),
+            "total dead force along z on the top",
+            FORCE,
+        )
+    }
+    columns: ClassVar[tuple[Column, ...]] = uniaxial_columns("top", "length")
+    axis_kinds: ClassVar[tuple[str, ...]] = ("global", "cylindrical")
+    number_of_elements: ClassVar[int] = 480
+    faces: ClassVar[tuple[str, ...]] = ("bottom", "top", "side")
+
+    shape: Literal["tendon"] = Field(default="tendon", description="Which body it is.")
+    length: Annotated[float, LENGTH] = Field(
+        default=10.0, gt=0, description="Length along z, in the scene's unit of length."
+    )
+    area: Annotated[float, AREA] = Field(
+        default=10.0, gt=0, description="Area of the cross-section, in the unit of length squared."
+    )
+
+    @property
+    def loaded_area(self) -> float:
+        """Area that carries `force`."""
+        return self.area
+
+    @model_validator(mode="after")
+    def _can_be_meshed(self) -> Tendon:
+        check_lengths(self, {"length": self.length, "area": math.sqrt(self.area)})
+        return self
+
+    def build(self, mesh: MeshSettings, comm: MPI.Intracomm | None = None) -> Domain:
+        """Mesh the tendon."""
+        return tendon(self.length, self.area, mesh.refinement, mesh.element, mesh.degree, comm)
+
+    def hold(self, loading: Loading) -> None:
+        """u_z = 0 at the bottom, the rigid motions held at two of its nodes."""
+        loading.hold_face("bottom", 2)
+        loading.hold_node((0.0, 0.0, 0.0), 0)
+        loading.hold_node((0.0, 0.0, 0.0), 1)
+        loading.hold_node((loading.domain.dimensions["radius"], 0.0, 0.0), 1)
+
+
 def tendon(
     length: float = 10.0,
     area: float = 10.0,
     refinement: int = 1,
-    cell: str = "hexahedron",
+    element: str = "hexahedron",
     degree: int = 1,
-    comm: MPI.Intracomm = MPI.COMM_WORLD,
+    comm: MPI.Intracomm | None = None,
 ) -> Domain:
     """Tendon around the z axis, 0 <= z <= length, with the faces bottom, top, side. Collective.
 
@@ -39,12 +96,12 @@ def tendon(
         Of the meshed cross-section, exactly.
     refinement
         Multiplies the paper's counts in every direction: a core of 4 x 4, two rings of 16, ten layers.
-    cell
+    element
         "hexahedron", or "tetrahedron": each hexahedron split into six.
     degree
         Of the geometry, 1 or 2 (curved).
     comm
-        Ranks that share the mesh.
+        Ranks that share the mesh; default: all.
 
     Raises
     ------
@@ -53,10 +110,12 @@ def tendon(
     GeometryError
         On all ranks, if Gmsh fails on rank 0.
     """
-    model.check_arguments({"length": length, "area": area}, refinement, cell, degree)
+    model.check_arguments({"length": length, "area": area}, refinement, element, degree)
     model.check_lengths({"length": length, "area": math.sqrt(area)})
     dimensions = {"length": float(length), "area": float(area), "radius": outer_radius(area, refinement, degree)}
-    return model.build_domain(lambda: draw_tendon(length, area, refinement, cell, degree), "tendon", dimensions, comm)
+    from remodel_fenicsx.body.meshing import build_domain
+
+    return build_domain(lambda: draw_tendon(length, area, refinement, element, degree), "tendon", dimensions, comm)
 
 
 def outer_radius(area: float, refinement: int = 1, degree: int = 1) -> float:
@@ -69,7 +128,7 @@ def outer_radius(area: float, refinement: int = 1, degree: int = 1) -> float:
     return float(np.sqrt(area / (number * sector)))
 
 
-def draw_tendon(length: float, area: float, refinement: int = 1, cell: str = "hexahedron", degree: int = 1) -> None:
+def draw_tendon(length: float, area: float, refinement: int = 1, element: str = "hexahedron", degree: int = 1) -> None:
     """Draw and mesh the tendon in the current Gmsh model: a core and four ring quarters, swept along z."""
     radius = outer_radius(area, refinement, degree)
     number, quarter = AROUND * refinement, CORE * refinement
@@ -78,7 +137,7 @@ def draw_tendon(length: float, area: float, refinement: int = 1, cell: str = "he
     inner_lines, outer_lines = model.polygon(inner), model.polygon(outer)
     corners = range(0, number, quarter)
     spokes = [model.line(inner[k], outer[k], RINGS * refinement) for k in corners]
-    section = [model.block([inner_lines], [inner[k] for k in corners], cell)]
+    section = [model.block([inner_lines], [inner[k] for k in corners], element)]
     for i, k in enumerate(corners):
         j, m = (i + 1) % 4, (k + quarter) % number
         edges = [
@@ -87,8 +146,8 @@ def draw_tendon(length: float, area: float, refinement: int = 1, cell: str = "he
             model.reverse(spokes[j]),
             model.reverse(inner_lines[k : k + quarter]),
         ]
-        section.append(model.block(edges, [inner[k], outer[k], outer[m], inner[m]], cell))
-    model.extrude(section, length, ALONG * refinement, cell, {"side": outer_lines})
+        section.append(model.block(edges, [inner[k], outer[k], outer[m], inner[m]], element))
+    model.extrude(section, length, ALONG * refinement, element, {"side": outer_lines})
     # round at the side, ever straighter towards the centre, where the elements are not concentric
     model.raise_degree(degree, lambda mean_radius: np.square(mean_radius / radius))
 

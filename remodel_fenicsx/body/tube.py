@@ -2,15 +2,115 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
-from mpi4py import MPI
+from pydantic import Field, model_validator
 
 from remodel_fenicsx.body import gmsh_model as model
-from remodel_fenicsx.body.domain import Domain
+from remodel_fenicsx.body.column import Column
+from remodel_fenicsx.body.shape import Array, LoadKind, MeshSettings, Shape, check_lengths
+from remodel_fenicsx.schema.tables import fault, shown
+from remodel_fenicsx.schema.units import LENGTH, STRESS
+from remodel_fenicsx.tissue.cells import pitch_angle
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
+
+    from remodel_fenicsx.body.domain import Domain
+    from remodel_fenicsx.body.loading import Loading
 
 PAPER = (16, 8, 12)  # the paper's elements around, through the wall, and along
+
+
+def _mean_radius(face: str) -> Callable[[Any], float]:
+    def value(m: Any) -> float:
+        return float(m.face_mean(face, np.linalg.norm(m.position[:, :2], axis=1), deformed=True))
+
+    return value
+
+
+def _layer_angle(share: float) -> Callable[[Any], float]:
+    """Mean angle over the elements that touch R_i + share (R_o - R_i)."""
+
+    def value(m: Any) -> float:
+        inner, outer = (m.domain.dimensions[f"{side}_radius"] for side in ("inner", "outer"))
+        radius = (1.0 - share) * inner + share * outer
+        return float(m.quadrature.mean(m.fibre_angle, m.elements_touching_radius(radius)))
+
+    return value
+
+
+_ANGLE = "mean of the reference angle, from circumferential (0) to axial (90 degrees), over the elements that touch"
+
+
+class Tube(Shape):
+    """A thick-walled tube about z under inner pressure and axial elongation: the artery of the paper's Fig. 7.
+
+    Its ends stay in their planes and are free to move radially. Inner radius, wall thickness and length: 1e-6 to 1e6,
+    one up to 10,000 times the other.
+    """
+
+    loads: ClassVar[dict[str, LoadKind]] = {
+        "pressure": LoadKind(
+            lambda shape, loading, name: loading.add_follower_pressure(name, "inner"),
+            "pressure on the deformed inner face",
+            STRESS,
+        ),
+        "elongation": LoadKind(
+            lambda shape, loading, name: loading.add_prescribed_elongation(name, "top", 2, shape.length),
+            "prescribed engineering strain of the length (0.1: 10 % longer)",
+            column="axial_elongation",
+            above=-1.0,
+        ),
+    }
+    columns: ClassVar[tuple[Column, ...]] = (
+        Column(
+            "inner_radius", "length", "mean distance from the axis over the deformed inner face", _mean_radius("inner")
+        ),
+        Column(
+            "outer_radius", "length", "mean distance from the axis over the deformed outer face", _mean_radius("outer")
+        ),
+        Column("fibre_angle_inner", "degrees", f"{_ANGLE} R_i", _layer_angle(0.0)),
+        Column("fibre_angle_middle", "degrees", f"{_ANGLE} (R_i + R_o)/2", _layer_angle(0.5)),
+        Column("fibre_angle_outer", "degrees", f"{_ANGLE} R_o", _layer_angle(1.0)),
+    )
+    axis_kinds: ClassVar[tuple[str, ...]] = ("global", "cylindrical")
+    number_of_elements: ClassVar[int] = 1536
+    faces: ClassVar[tuple[str, ...]] = ("bottom", "top", "inner", "outer")
+    # with global axes a tube of isotropic cells would not stay round in the first step
+    defaults: ClassVar[dict[str, Any]] = {"cells": {"axes": "cylindrical"}}
+
+    shape: Literal["tube"] = Field(default="tube", description="Which body it is.")
+    inner_radius: Annotated[float, LENGTH] = Field(gt=0, description="Inner radius R_i, in the scene's unit of length.")
+    outer_radius: Annotated[float, LENGTH] = Field(gt=0, description="Outer radius R_o, in the scene's unit of length.")
+    length: Annotated[float, LENGTH] = Field(gt=0, description="Length along z, in the scene's unit of length.")
+
+    @model_validator(mode="after")
+    def _has_a_wall(self) -> Tube:
+        if self.inner_radius >= self.outer_radius:
+            limit = f"must be smaller than geometry.outer_radius = {shown(self.outer_radius)}"
+            raise fault(limit, "inner_radius", self.inner_radius)
+        wall = self.outer_radius - self.inner_radius
+        check_lengths(self, {"inner_radius": self.inner_radius, "outer_radius": wall, "length": self.length})
+        return self
+
+    def build(self, mesh: MeshSettings, comm: MPI.Intracomm | None = None) -> Domain:
+        """Mesh the tube."""
+        size = self.inner_radius, self.outer_radius, self.length
+        return tube(*size, mesh.refinement, mesh.element, mesh.degree, comm)
+
+    def hold(self, loading: Loading) -> None:
+        """u_z = 0 at the bottom, the rigid motions held at three of its nodes."""
+        loading.hold_face("bottom", 2)
+        loading.hold_node((self.inner_radius, 0.0, 0.0), 1)
+        loading.hold_node((-self.inner_radius, 0.0, 0.0), 1)
+        loading.hold_node((0.0, self.inner_radius, 0.0), 0)
+
+    def fibre_angle(self, dimensions: Array, axes: Array, coordinates: Array) -> Array:
+        """Angle of the chain direction in the wall in degrees, from circumferential (0) to axial (90)."""
+        return pitch_angle(dimensions, axes, coordinates)
 
 
 def tube(
@@ -18,9 +118,9 @@ def tube(
     outer_radius: float = 3.0,
     length: float = 8.0,
     refinement: int = 1,
-    cell: str = "hexahedron",
+    element: str = "hexahedron",
     degree: int = 1,
-    comm: MPI.Intracomm = MPI.COMM_WORLD,
+    comm: MPI.Intracomm | None = None,
     divisions: tuple[int, int, int] | None = None,
 ) -> Domain:
     """Tube around the z axis, 0 <= z <= length, with the faces bottom, top, inner, outer. Collective.
@@ -34,12 +134,12 @@ def tube(
         Of the reference body, in the scene's unit of length.
     refinement
         Multiplies the paper's 16 elements around, 8 through the wall, 12 along.
-    cell
+    element
         "hexahedron", or "tetrahedron": each hexahedron split into six.
     degree
         Of the geometry, 1 or 2 (curved).
     comm
-        Ranks that share the mesh.
+        Ranks that share the mesh; default: all.
     divisions
         Elements around (a multiple of 4), through the wall and along, in place of the paper's 16, 8, 12; `refinement`
         multiplies them too.
@@ -52,13 +152,15 @@ def tube(
         On all ranks, if Gmsh fails on rank 0.
     """
     dimensions = {"inner_radius": inner_radius, "outer_radius": outer_radius, "length": length}
-    model.check_arguments(dimensions, refinement, cell, degree)
+    model.check_arguments(dimensions, refinement, element, degree)
     if not inner_radius < outer_radius:
         raise ValueError(f"inner_radius = {inner_radius}: must be smaller than outer_radius = {outer_radius}")
     model.check_lengths({"inner_radius": inner_radius, "outer_radius": outer_radius - inner_radius, "length": length})
     counts = PAPER if divisions is None else _checked(divisions)
-    return model.build_domain(
-        lambda: draw_tube(inner_radius, outer_radius, length, refinement, cell, degree, counts),
+    from remodel_fenicsx.body.meshing import build_domain
+
+    return build_domain(
+        lambda: draw_tube(inner_radius, outer_radius, length, refinement, element, degree, counts),
         "tube",
         {name: float(value) for name, value in dimensions.items()},
         comm,
@@ -70,7 +172,7 @@ def draw_tube(
     outer_radius: float,
     length: float,
     refinement: int = 1,
-    cell: str = "hexahedron",
+    element: str = "hexahedron",
     degree: int = 1,
     divisions: tuple[int, int, int] = PAPER,
 ) -> None:
@@ -91,8 +193,8 @@ def draw_tube(
             model.reverse(spokes[j]),
             model.reverse(inner_lines[k : k + quarter]),
         ]
-        section.append(model.block(edges, [inner[k], outer[k], outer[m], inner[m]], cell))
-    model.extrude(section, length, along, cell, {"inner": inner_lines, "outer": outer_lines})
+        section.append(model.block(edges, [inner[k], outer[k], outer[m], inner[m]], element))
+    model.extrude(section, length, along, element, {"inner": inner_lines, "outer": outer_lines})
     model.raise_degree(degree, np.ones_like)
 
 

@@ -1,72 +1,88 @@
-"""Solver profiles: PETSc options by name, and the user's own on top."""
+"""PETSc options of one problem: the method's, the scene's over them, the user's own `-remodel_...` over both.
+
+Every problem has a prefix of its own, so that two problems of one process never see each other's options.
+"""
 
 from __future__ import annotations
 
 import ctypes
+import itertools
+from collections.abc import Mapping
 from typing import Any
 
 from petsc4py import PETSc
 
-from remodel_fenicsx.scene.scene import SceneError, Solver
+from remodel_fenicsx.fem.solver_methods import METHODS
+from remodel_fenicsx.schema.tables import SceneError
 
-OPTIONS_PREFIX = "remodel_"
+USERS_PREFIX = "remodel_"
 
-# MUMPS: robust for indefinite tangents too, one factorisation pattern for all steps, any number of ranks
-PROFILES: dict[str, dict[str, Any]] = {
-    "direct": {
-        "snes_type": "newtonls",
-        "snes_linesearch_type": "basic",
-        "ksp_type": "preonly",
-        "pc_type": "lu",
-        "pc_factor_mat_solver_type": "mumps",
-    },
-}
-
-
-_set_here: set[str] = set()
+_numbers = itertools.count(1)
 _petsc = ctypes.CDLL(PETSc.__file__)  # for the one question that petsc4py cannot ask
 
 
-def set_options(snes: Any, settings: Solver) -> None:
-    """Give SNES the profile's options, then the scene's, under those of the command line or PETSC_OPTIONS.
+class ProblemOptions:
+    """The options of one problem in PETSc's database, from its making to `close`.
 
-    All carry the prefix `remodel_`: for instance ``PETSC_OPTIONS="-remodel_snes_monitor"``. They stay in PETSc's
-    database because the factorisation reads its own at the first solve.
+    They stay there meanwhile because a factorisation reads its own at the first solve.
+
+    Parameters
+    ----------
+    method
+        Key of `METHODS`.
+    options
+        The scene's: names without the leading '-'; True for a flag, False to leave one of the method's away.
     """
-    database = PETSc.Options()
-    _forget(set(_set_here))
-    for key, value in {**PROFILES[settings.profile], **settings.petsc_options}.items():
-        name = OPTIONS_PREFIX + key
-        if database.hasName(name) or value is False:
-            continue
-        database.setValue(name, None if value is True else value)
-        _set_here.add(name)
-    snes.setOptionsPrefix(OPTIONS_PREFIX)
-    try:
-        snes.setFromOptions()
-    except PETSc.Error as error:
-        _forget(set(_set_here))
-        given = ", ".join(f"{key} = {value!r}" for key, value in settings.petsc_options.items())
-        raise SceneError(
-            f"solver.petsc_options: {given or 'those of PETSC_OPTIONS'}: PETSc refuses them (error {error.ierr}); "
-            "allowed are the options of its manual pages"
-        ) from error
+
+    def __init__(self, method: str, options: Mapping[str, Any]):
+        self.prefix = f"{USERS_PREFIX}{next(_numbers)}_"
+        self._given = dict(options)
+        self._names: set[str] = set()
+        for key, value in {**METHODS[method], **options, **_users_options()}.items():
+            if value is not False:
+                PETSc.Options().setValue(self.prefix + key, None if value is True else value)
+                self._names.add(key)
+
+    def apply(self, snes: Any) -> None:
+        """Give them to SNES.
+
+        Raises
+        ------
+        SceneError
+            If PETSc refuses one.
+        """
+        snes.setOptionsPrefix(self.prefix)
+        try:
+            snes.setFromOptions()
+        except PETSc.Error as error:
+            self.close()
+            given = ", ".join(f"{key} = {value!r}" for key, value in self._given.items())
+            raise SceneError(
+                f"solver.petsc_options: {given or 'those of PETSC_OPTIONS'}: PETSc refuses them (error {error.ierr}); "
+                "allowed are the options of its manual pages"
+            ) from error
+
+    def unused(self) -> list[str]:
+        """The scene's and the user's options that PETSc has not asked for: misspelt, or without effect so far."""
+        own = {*self._given, *_users_options()}
+        return sorted(key for key in self._names & own if not _was_used(self.prefix + key))
+
+    def close(self) -> None:
+        """Take them out of PETSc's database."""
+        for key in self._names:
+            PETSc.Options().delValue(self.prefix + key)
+        self._names.clear()
 
 
-def unused_options(settings: Solver) -> list[str]:
-    """The scene's options that PETSc has not asked for by the end of the first solve: misspelt, or without effect.
-
-    They, and those of the profile that the scene's made needless, are taken out of PETSc's database.
-    """
-    unused = {name for name in _set_here if not _was_used(name)}
-    _forget(unused)
-    return sorted(key for key in settings.petsc_options if OPTIONS_PREFIX + key in unused)
-
-
-def _forget(names: set[str]) -> None:
-    for name in names:
-        PETSc.Options().delValue(name)
-    _set_here.difference_update(names)
+def _users_options() -> dict[str, str]:
+    """What the command line or PETSC_OPTIONS say under `remodel_`, without it; problems' own prefixes aside."""
+    found = {}
+    for name, value in PETSc.Options().getAll().items():
+        key = name.removeprefix(USERS_PREFIX)
+        if key != name and not key[:1].isdigit():
+            PETSc.Options().hasName(name)  # asked for: PETSc does not call it left over
+            found[key] = value
+    return found
 
 
 def _was_used(name: str) -> bool:

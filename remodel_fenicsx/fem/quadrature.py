@@ -1,4 +1,4 @@
-"""Quadrature points as a place where state lives: one rule for the cells, the forms and the stress evaluation."""
+"""Quadrature points as a place where state lives: one rule for the unit cells, the forms and the stress."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ DEGREES = {("hexahedron", 1): 2, ("hexahedron", 2): 4, ("tetrahedron", 1): 1, ("
 class Quadrature:
     """The quadrature points of a mesh, and functions and reductions over them.
 
-    Arrays over the points have shape (cells, points, ...): all cells this rank knows, owned first, then ghosts. Nothing
-    at a point depends on another point, so updates need no communication.
+    Arrays over the points have shape (elements, points, ...): all elements this rank knows, owned first, then ghosts.
+    Nothing at a point depends on another point, so updates need no communication.
 
     Parameters
     ----------
@@ -34,14 +34,14 @@ class Quadrature:
 
     def __init__(self, mesh: Any, element_degree: int):
         self.mesh = mesh
-        self.cell_name = mesh.topology.cell_name()
-        self.degree = DEGREES[self.cell_name, element_degree]
-        points, weights = basix.make_quadrature(basix.CellType[self.cell_name], self.degree)
+        self.element_kind = mesh.topology.cell_name()
+        self.degree = DEGREES[self.element_kind, element_degree]
+        points, weights = basix.make_quadrature(basix.CellType[self.element_kind], self.degree)
         self.points: NDArray[np.float64] = np.asarray(points, dtype=np.float64)
         self.weights: NDArray[np.float64] = np.asarray(weights, dtype=np.float64)
-        self.number_of_owned_cells = mesh.topology.index_map(mesh.topology.dim).size_local
-        self.cells = np.arange(
-            self.number_of_owned_cells + mesh.topology.index_map(mesh.topology.dim).num_ghosts, dtype=np.int32
+        self.number_of_owned_elements = mesh.topology.index_map(mesh.topology.dim).size_local
+        self.elements = np.arange(
+            self.number_of_owned_elements + mesh.topology.index_map(mesh.topology.dim).num_ghosts, dtype=np.int32
         )
         x = ufl.SpatialCoordinate(mesh)
         geometry = self.evaluate(jit.expression(ufl.as_vector([*x, ufl.JacobianDeterminant(mesh)]), self.points), (4,))
@@ -55,40 +55,42 @@ class Quadrature:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(cells of this rank with ghosts, points per cell)."""
-        return len(self.cells), len(self.weights)
+        """(elements of this rank with ghosts, points per element)."""
+        return len(self.elements), len(self.weights)
 
     def function(self, name: str, value_shape: tuple[int, ...]) -> Any:
         """A dolfinx function with values of `value_shape` at the points."""
-        element = basix.ufl.quadrature_element(self.cell_name, value_shape=value_shape, degree=self.degree)
+        element = basix.ufl.quadrature_element(self.element_kind, value_shape=value_shape, degree=self.degree)
         return dolfinx.fem.Function(dolfinx.fem.functionspace(self.mesh, element), name=name)
 
     def values(self, function: Any, value_shape: tuple[int, ...]) -> NDArray[np.float64]:
-        """The function's own memory as an array (cells, points, *value_shape)."""
+        """The function's own memory as an array (elements, points, *value_shape)."""
         return function.x.array.reshape(*self.shape, *value_shape)
 
     def evaluate(self, expression: Any, value_shape: tuple[int, ...]) -> NDArray[np.float64]:
-        """Values (cells, points, *value_shape) of a compiled expression at the points."""
-        return expression.eval(self.mesh, self.cells).reshape(*self.shape, *value_shape)
+        """Values (elements, points, *value_shape) of a compiled expression at the points."""
+        return expression.eval(self.mesh, self.elements).reshape(*self.shape, *value_shape)
 
     def owned(self, values: NDArray[Any]) -> NDArray[Any]:
-        """The rows of the cells that this rank owns."""
-        return values[: self.number_of_owned_cells]
+        """The rows of the elements that this rank owns."""
+        return values[: self.number_of_owned_elements]
 
     def integral(self, values: NDArray[np.float64]) -> float:
-        """Integral over the body of values (cells, points), over all ranks."""
+        """Integral over the body of values (elements, points), over all ranks."""
         local = float(np.sum(self.owned(values) * self.owned(self.volumes)))
         return self.mesh.comm.allreduce(local, MPI.SUM)
 
-    def mean(self, values: NDArray[np.float64], cells: NDArray[np.bool_] | None = None) -> float:
-        """Volume mean of values (cells, points), over all cells or those selected by a mask (cells,), on all ranks."""
-        chosen = np.ones(self.shape) if cells is None else np.broadcast_to(cells[:, None], self.shape).astype(float)
+    def mean(self, values: NDArray[np.float64], elements: NDArray[np.bool_] | None = None) -> float:
+        """Volume mean of values (elements, points), over all elements or those selected by a mask (elements,)."""
+        chosen = np.ones(self.shape)
+        if elements is not None:
+            chosen *= elements[:, None]
         return self.integral(values * chosen) / self.integral(chosen)
 
-    def cell_mean(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Volume mean over each cell: (cells, points, ...) to (cells, ...)."""
+    def element_mean(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Volume mean over each element: (elements, points, ...) to (elements, ...)."""
         share = self.volumes / self.volumes.sum(axis=1, keepdims=True)
-        return np.einsum("cp,cp...->c...", share, values)
+        return np.einsum("ep,ep...->e...", share, values)
 
     def maximum(self, values: NDArray[np.float64]) -> float:
         """Largest value over all points of all ranks."""

@@ -55,7 +55,7 @@ def scenes() -> dict[str, Scene]:
     found = {"tendon": preset_scene(PRESET, "tendon"), "artery": preset_scene(PRESET, "tube")}
     last_only = {"output.every": found["artery"].time.number_of_steps}
     for stretch, pressure in LOAD_CASES:
-        changes = {"loads.stretch.value": stretch, "loads.pressure.value": pressure}
+        changes = {"loads.elongation.value": stretch, "loads.pressure.value": pressure}
         found.setdefault(load_case_name(stretch, pressure), found["artery"].with_values(changes | last_only))
     for driver in ("pk2", "finger"):
         found[f"artery-{driver}"] = found["artery"].with_values({"remodeling.driver": driver} | last_only)
@@ -160,7 +160,7 @@ class _Pool:
     def __init__(self, cache: RunCache, missing: list[Scene], jobs: int):
         self.cache, self.jobs = cache, jobs
         cost = {"tube": 5.0, "tendon": 1.0, "cube": 0.05}
-        self.waiting = sorted(missing, key=lambda scene: cost[scene.geometry.shape] * scene.time.number_of_steps)
+        self.waiting = sorted(missing, key=lambda scene: cost[scene.geometry.name] * scene.time.number_of_steps)
         self.running: list[_Run] = []
         self.total, self.finished_steps = sum(scene.time.number_of_steps for scene in missing), 0
         self.progress = Line()

@@ -1,8 +1,9 @@
-"""What a run measures on a solved state: the columns of its history and the fields of its pictures."""
+"""The columns of a run's history, and how they are measured on a solved state."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
+from functools import cached_property
 from typing import Any
 
 import dolfinx.fem
@@ -11,180 +12,196 @@ import ufl
 from mpi4py import MPI
 from numpy.typing import NDArray
 
+from remodel_fenicsx.body.column import Column
+from remodel_fenicsx.body.domain import Domain
+from remodel_fenicsx.body.shape import Shape
+from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
 from remodel_fenicsx.fem import compat, jit
-from remodel_fenicsx.scene import parameters
-from remodel_fenicsx.tissue import spectral
-from remodel_fenicsx.tissue.cells import UnitCells, angle_to_axis, pitch_angle, structure_tensor
-from remodel_fenicsx.tissue.energy import stresses
-from remodel_fenicsx.body import Domain
-from remodel_fenicsx.fem.kinematics import deformation_gradient
-from remodel_fenicsx.body.loading import Loading
+from remodel_fenicsx.fem.quadrature import Quadrature
 
 Array = NDArray[np.float64]
-AXIAL = np.array([0.0, 0.0, 1.0])
+
+FIRST_COLUMN = Column("time", "time", "time of the scene", lambda m: m.step.time)
+COLUMNS: dict[str, Column] = {
+    column.name: column
+    for column in (
+        Column(
+            "max_chain_extension",
+            "",
+            "largest r/L, always below 1 (0 where no chain locks)",
+            lambda m: m.step.extension.max_chain_extension,
+        ),
+        Column("min_jacobian", "", "smallest J, always above 0", lambda m: m.step.extension.min_jacobian),
+        Column("stored_energy", "stress length^3", "integral of W", lambda m: m.equilibrium.stored_energy()),
+        Column(
+            "remodeling_power",
+            "stress length^3 / time",
+            "power released by the remodeling pass that follows (docs/theory.md)",
+            lambda m: m.step.remodeling_power,
+            after_pass=True,
+        ),
+        Column(
+            "newton_iterations",
+            "",
+            "Newton iterations of the step, failed attempts included",
+            lambda m: m.step.work.newton_iterations,
+        ),
+        Column("linear_iterations", "", "linear iterations of the same", lambda m: m.step.work.linear_iterations),
+        Column(
+            "substeps",
+            "",
+            "solves that made up the step; 1: the paper's step in one piece",
+            lambda m: m.step.work.substeps,
+        ),
+        Column("seconds", "s", "wall time of the step", lambda m: m.step.seconds, after_pass=True),
+    )
+}
+"""Columns of every shape by name, after `time` and those of the shape; a script adds its own."""
 
 
-class Observer:
-    """Measures a solved state.
+def columns_of(shape: Shape | type[Shape]) -> tuple[Column, ...]:
+    """All columns of a shape's history, in the order of the file."""
+    loads = (kind.make_column(name) for name, kind in shape.loads.items())
+    return (FIRST_COLUMN, *loads, *shape.columns, *COLUMNS.values())
+
+
+class Observer(Watcher):
+    """Gives every step its row.
 
     Parameters
     ----------
-    domain, displacement, loading, cells, material
-        The state; nothing here changes it.
+    shape
+        Says which columns there are, and what the fibre angle is.
+    stepper
+        What is measured; nothing here changes it.
+    columns
+        Other columns than `columns_of(shape)`.
     """
 
-    def __init__(
-        self, domain: Domain, displacement: Any, loading: Loading, cells: UnitCells, material: parameters.Material
-    ):
-        self.domain, self.displacement, self.loading, self.cells = domain, displacement, loading, cells
-        self.quadrature = cells.quadrature
-        F = deformation_gradient(displacement)
-        self._axial_stretch = jit.expression(F[2, 2], self.quadrature.points)
-        cauchy = stresses(F, [cells.ufl_cell], material, cells.settings.end_to_end_length).cauchy
-        entries = [t[i, j] for t in (F, cauchy) for i in range(3) for j in range(3)]
-        self._state = jit.expression(ufl.as_vector([*entries, *displacement]), self.quadrature.points)
-        self._contour_length = material.contour_length
-        self._columns = COLUMNS[domain.shape](self)
+    def __init__(self, shape: Shape, stepper: Stepper, columns: Sequence[Column] | None = None):
+        self.shape, self.stepper, self.state = shape, stepper, stepper.state
+        self.columns = columns_of(shape) if columns is None else tuple(columns)
+        self.quadrature: Quadrature = self.state.cells.quadrature
+        self.domain: Domain = self.state.loading.domain
+        self.tools: dict[Any, Any] = {}
 
-    def columns(self) -> dict[str, float]:
-        """The columns that belong to the shape (docs/commands.md)."""
-        return self._columns()
+    # ------------------------------------------------------------ as a watcher
+    def started(self, step: Step) -> None:
+        """Measure the start; every form that a column needs is compiled now."""
+        self.solved(step)
+        self.completed(step)
 
-    # ------------------------------------------------------------ fields
-    def cell_fields(self) -> dict[str, Array]:
-        """Element means for pictures, one row per local cell.
+    def solved(self, step: Step) -> None:
+        """Measure the solved state."""
+        step.row |= dict.fromkeys((column.name for column in self.columns), np.nan)
+        self._fill(step, after_pass=False)
 
-        `deformation_gradient` and `cauchy_stress` (9, row by row); `cell_dimensions` (3) and `axis_1..3`: the cell
-        whose structure tensor is the element's mean, longest first; `fibre_angle` and `fibre_angle_deformed` (degrees,
-        to the load axis, or in a tube from circumferential to axial); `chain_extension` (largest r/L in the element).
-        """
-        values = self.quadrature.evaluate(self._state, (21,))
-        F, cauchy = values[..., :9].reshape(*values.shape[:2], 3, 3), values[..., 9:18]
-        dimensions, axes = self.cells.dimension_values, self.cells.axis_values
-        deformed_axes = axes @ np.swapaxes(F, -1, -2)
-        position = self.quadrature.coordinates + values[..., 18:]
-        lengths, mean_axes = self.mean_cells()
-        squared = np.sum((dimensions[..., None] * deformed_axes) ** 2, axis=(-1, -2))
-        mean = self.quadrature.cell_mean
-        return {
-            "deformation_gradient": mean(values[..., :9]),
-            "cauchy_stress": mean(cauchy),
-            "cell_dimensions": lengths,
-            **{f"axis_{i + 1}": mean_axes[:, i] for i in range(3)},
-            "fibre_angle": mean(self.fibre_angle(axes, self.quadrature.coordinates)),
-            "fibre_angle_deformed": mean(self.fibre_angle(deformed_axes, position)),
-            "chain_extension": np.sqrt(squared.max(axis=1)) / self._contour_length,
-        }
+    def completed(self, step: Step) -> None:
+        """Fill in what is known only now."""
+        self._fill(step, after_pass=True)
 
-    def mean_cells(self) -> tuple[Array, Array]:
-        """Lengths (cells, 3) and axes as rows (cells, 3, 3) of the element's mean structure tensor, longest first."""
-        tensor = structure_tensor(self.cells.dimension_values, self.cells.axis_values)
-        squared, axes = spectral.principal(self.quadrature.cell_mean(tensor), self.cells.axis_values[:, 0])
-        return np.sqrt(np.maximum(squared, 0.0)), axes
+    def _fill(self, step: Step, after_pass: bool) -> None:
+        measurement = Measurement(self, step)
+        for column in self.columns:
+            if column.after_pass == after_pass:
+                step.row[column.name] = column.value(measurement)
 
-    def fibre_angle(self, axes: Array, coordinates: Array) -> Array:
-        """Angle of the chain direction in degrees: in a tube from circumferential to axial, else to the load axis z."""
-        if self.domain.shape == "tube":
-            return pitch_angle(self.cells.dimension_values, axes, coordinates)
-        return angle_to_axis(self.cells.dimension_values, axes, AXIAL)
 
-    def reference_fibre_angle(self) -> Array:
-        """Reference fibre angle at all points (cells, points), degrees."""
-        return self.fibre_angle(self.cells.axis_values, self.quadrature.coordinates)
+class Measurement:
+    """What columns may ask of a step; everything is computed once, when the first one asks.
 
-    def element_stretch(self) -> Array:
-        """Volume mean of F_zz in each local element, shape (cells,)."""
-        return self.quadrature.cell_mean(self.quadrature.evaluate(self._axial_stretch, (1,)))[:, 0]
+    Attributes
+    ----------
+    step
+        The step.
+    observer
+        Whose measurement it is.
+    domain, quadrature, state
+        The body, its quadrature points and its state.
+    """
 
-    # ------------------------------------------------------------ reductions
-    def reduce(self, values: Array, operation: Any) -> float:
-        """Largest (MPI.MAX) or smallest (MPI.MIN) of one value per local cell, over all ranks."""
-        owned = self.quadrature.owned(values)
-        pick = np.max if operation == MPI.MAX else np.min
-        start = -np.inf if operation == MPI.MAX else np.inf
-        return self.domain.mesh.comm.allreduce(float(pick(owned, initial=start)), operation)
+    def __init__(self, observer: Observer, step: Step):
+        self.step, self.observer = step, observer
+        self.domain, self.quadrature, self.state = observer.domain, observer.quadrature, observer.state
 
-    def cells_touching_radius(self, radius: float) -> NDArray[np.bool_]:
-        """Mask of the local cells with a reference point at this distance from the z axis, shape (cells,)."""
+    @property
+    def equilibrium(self) -> Any:
+        """The forms of the solved state (`evolution.equilibrium.Equilibrium`)."""
+        return self.observer.stepper.coupling.equilibrium
+
+    @cached_property
+    def displacement(self) -> Array:
+        """Displacement of the local nodes, (nodes, 3)."""
+        return self.state.kinematics.nodal_displacement(self.state.unknown)
+
+    @cached_property
+    def position(self) -> Array:
+        """Deformed place of the local nodes, (nodes, 3)."""
+        nodes: Array = self.state.unknown.function_space.tabulate_dof_coordinates()
+        return nodes + self.displacement
+
+    @cached_property
+    def fibre_angle(self) -> Array:
+        """Reference fibre angle at all points (elements, points), degrees."""
+        cells = self.state.cells
+        return self.observer.shape.fibre_angle(cells.dimension_values, cells.axis_values, self.quadrature.coordinates)
+
+    @cached_property
+    def axial_stretch(self) -> Array:
+        """Volume mean of F_zz in each local element, (elements,)."""
+        expression = self._tool("axial stretch", self._compile_axial_stretch)
+        return self.quadrature.element_mean(self.quadrature.evaluate(expression, (1,)))[:, 0]
+
+    def face_mean(self, face: str, nodal_values: Array, deformed: bool = False) -> float:
+        """Mean of nodal values (nodes,) over a named face, by its reference or its deformed area."""
+        mean = self._tool((face, deformed), lambda: _FaceMean(self.observer, face, deformed))
+        return float(mean(nodal_values))
+
+    def largest(self, values: Array) -> float:
+        """Largest of one value per local element, over all ranks."""
+        local = float(np.max(self.quadrature.owned(values), initial=-np.inf))
+        return float(self.domain.comm.allreduce(local, MPI.MAX))
+
+    def smallest(self, values: Array) -> float:
+        """Smallest of one value per local element, over all ranks."""
+        return -self.largest(-values)
+
+    def elements_touching_radius(self, radius: float) -> NDArray[np.bool_]:
+        """Mask of the local elements with a reference point at this distance from the z axis, (elements,)."""
         nodes = self.domain.mesh.geometry.x[compat.geometry_dofmap(self.domain.mesh)]
         radii = np.linalg.norm(nodes[..., :2], axis=-1)
         tolerance = 1e-6 * self.domain.size
         return (radii.min(axis=1) <= radius + tolerance) & (radii.max(axis=1) >= radius - tolerance)
+
+    def _tool(self, key: Any, make: Any) -> Any:
+        """What the observer keeps for all its measurements."""
+        if key not in self.observer.tools:
+            self.observer.tools[key] = make()
+        return self.observer.tools[key]
+
+    def _compile_axial_stretch(self) -> Any:
+        F = self.state.kinematics.deformation_gradient(self.state.unknown)
+        return jit.expression(F[2, 2], self.quadrature.points)
 
 
 class _FaceMean:
     """Mean over a face of a nodal field, over the reference or the deformed area."""
 
     def __init__(self, observer: Observer, face: str, deformed: bool):
-        domain, u = observer.domain, observer.displacement
-        degree = u.function_space.element.basix_element.degree
+        domain, state = observer.domain, observer.state
+        space = state.unknown.function_space
         # first component of a function of the displacement's space: surely the same order of nodes
-        self.field = dolfinx.fem.Function(u.function_space)
-        measure = ufl.Measure("ds", domain=domain.mesh, subdomain_data=domain.facet_tags)(
-            domain.faces[face], metadata={"quadrature_degree": 2 * degree}
-        )
+        self.field = dolfinx.fem.Function(space)
         normal = ufl.FacetNormal(domain.mesh)
-        stretched = ufl.cofac(deformation_gradient(u)) * normal
-        weight = ufl.sqrt(ufl.inner(stretched, stretched)) if deformed else ufl.sqrt(ufl.inner(normal, normal))
+        F = state.kinematics.deformation_gradient(state.unknown)
+        stretched = ufl.cofac(F) * normal if deformed else normal
+        weight = ufl.sqrt(ufl.inner(stretched, stretched)) * state.kinematics.weight(domain.mesh)
+        measure = state.loading.surface_measure(face)
         self._weighted, self._area = jit.form(self.field[0] * weight * measure), jit.form(weight * measure)
-        self._comm = domain.mesh.comm
+        self._comm = domain.comm
 
     def __call__(self, nodal_values: Array) -> float:
         self.field.x.array.reshape(-1, 3)[:, 0] = nodal_values
         both = np.array([np.real(dolfinx.fem.assemble_scalar(form)) for form in (self._weighted, self._area)])
         weighted, area = self._comm.allreduce(both, MPI.SUM)
         return float(weighted / area)
-
-
-def _uniaxial_columns(top: str, length_name: str) -> Callable[[Observer], Callable[[], dict[str, float]]]:
-    def prepare(observer: Observer) -> Callable[[], dict[str, float]]:
-        mean_on_top = _FaceMean(observer, top, deformed=False)
-        length = observer.domain.dimensions[length_name]
-
-        def columns() -> dict[str, float]:
-            stretch = observer.element_stretch()
-            axial_displacement = observer.displacement.x.array.reshape(-1, 3)[:, 2]
-            return {
-                "force": observer.loading.values["force"],
-                "mean_stretch": 1.0 + mean_on_top(axial_displacement) / length,
-                "min_stretch": observer.reduce(stretch, MPI.MIN),
-                "max_stretch": observer.reduce(stretch, MPI.MAX),
-                "mean_fibre_angle": observer.quadrature.mean(observer.reference_fibre_angle()),
-            }
-
-        return columns
-
-    return prepare
-
-
-def _tube_columns(observer: Observer) -> Callable[[], dict[str, float]]:
-    faces = {face: _FaceMean(observer, face, deformed=True) for face in ("inner", "outer")}
-    size = observer.domain.dimensions
-    radii = {
-        "inner": size["inner_radius"],
-        "middle": (size["inner_radius"] + size["outer_radius"]) / 2,
-        "outer": size["outer_radius"],
-    }
-    layers = {name: observer.cells_touching_radius(radius) for name, radius in radii.items()}
-    reference = observer.displacement.function_space.tabulate_dof_coordinates()
-
-    def columns() -> dict[str, float]:
-        position = reference + observer.displacement.x.array.reshape(-1, 3)
-        radius = np.linalg.norm(position[:, :2], axis=1)
-        angle = observer.reference_fibre_angle()
-        return {
-            "pressure": observer.loading.values["pressure"],
-            "axial_stretch": observer.loading.values["stretch"],
-            "inner_radius": faces["inner"](radius),
-            "outer_radius": faces["outer"](radius),
-            **{f"fibre_angle_{name}": observer.quadrature.mean(angle, layer) for name, layer in layers.items()},
-        }
-
-    return columns
-
-
-COLUMNS: dict[str, Callable[[Observer], Callable[[], dict[str, float]]]] = {
-    "cube": _uniaxial_columns("z1", "side"),
-    "tendon": _uniaxial_columns("top", "length"),
-    "tube": _tube_columns,
-}

@@ -6,51 +6,38 @@ Source: E. Kuhl, G. A. Holzapfel, J. Mater. Sci. 42 (2007) 8811-8823; docs/theor
 from __future__ import annotations
 
 import math
+
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from remodel_fenicsx.tissue.chains import BOLTZMANN_CONSTANT, CHAINS
-from remodel_fenicsx.tissue.laws import LAWS
 from remodel_fenicsx.schema.tables import Table, checked, fault, is_number, one_of, shown
+from remodel_fenicsx.tissue.cells import AXES
+from remodel_fenicsx.tissue.chains import BOLTZMANN_CONSTANT, CHAINS
+from remodel_fenicsx.tissue.drivers import DRIVERS, FRAMES
+from remodel_fenicsx.tissue.energy import MATRICES, Tissue
+from remodel_fenicsx.tissue.laws import LAWS
+from remodel_fenicsx.schema.units import NUMBER_DENSITY, STRESS, TEMPERATURE
 
-DRIVERS = ("cauchy", "pk2", "finger")
-FRAMES = ("material", "spatial")
+COUPLINGS = ["staggered"]  # names of evolution.coupling.COUPLINGS, which a test holds to it
 STRESS_UNITS = {"Pa": 1.0, "kPa": 1.0e3, "MPa": 1.0e6}  # in Pa
 INITIAL_CELLS = ("random", "isotropic", "aligned")
-# Gmsh takes points that are closer than 1e-8 for one, and crashes on much longer or flatter bodies
-SMALLEST_LENGTH, LARGEST_LENGTH, LARGEST_LENGTH_RATIO = 1e-6, 1e6, 1e4
-
-
-def length_fault(lengths: Mapping[str, float]) -> tuple[str, str] | None:
-    """What keeps a body from being meshed: the name of one of its lengths, and what is allowed; None if nothing does.
-
-    Parameters
-    ----------
-    lengths
-        Lengths, radii and wall thickness of the body by the key that decides each of them, in any unit.
-    """
-    for name, length in lengths.items():
-        if not SMALLEST_LENGTH <= length <= LARGEST_LENGTH:
-            return name, f"a length of {length:g} here; allowed are {SMALLEST_LENGTH:g} to {LARGEST_LENGTH:g}"
-    smallest, largest = min(lengths, key=lambda k: lengths[k]), max(lengths, key=lambda k: lengths[k])
-    if lengths[largest] <= LARGEST_LENGTH_RATIO * lengths[smallest]:
-        return None
-    return smallest, (
-        f"a length of {lengths[smallest]:g} is too small beside one of {lengths[largest]:g}; "
-        f"allowed is a ratio up to {LARGEST_LENGTH_RATIO:g}"
-    )
+FORMAT = 2  # of recorded scenes: raised where a reader of the one before would not understand them
+RENAMED = {"mesh.cell": "mesh.element", "loads.stretch": "loads.elongation", "solver.profile": "solver.method"}
+"""Dotted key of an earlier format -> the key that has taken its place, for the error."""
 
 
 class Material(Table):
     """The tissue: an isotropic matrix (Lame constants) with a network of collagen chains."""
 
-    lame_lambda: float = Field(
+    lame_lambda: Annotated[float, STRESS] = Field(
         default=27.293, ge=0, description="First Lame constant lambda of the matrix, in stress_unit."
     )
-    lame_mu: float = Field(default=3.103, gt=0, description="Second Lame constant mu of the matrix, in stress_unit.")
-    chain_density: float = Field(
+    lame_mu: Annotated[float, STRESS] = Field(
+        default=3.103, gt=0, description="Second Lame constant mu of the matrix, in stress_unit."
+    )
+    chain_density: Annotated[float, NUMBER_DENSITY] = Field(
         default=2.0e21, ge=0, description="Number of chains n_chn per volume, in 1/m^3; 0: no chains."
     )
     contour_length: float = Field(
@@ -61,12 +48,15 @@ class Material(Table):
         gt=0,
         description="Persistence length A_p of a chain, its bending stiffness over k theta, in link lengths.",
     )
-    temperature: float = Field(default=310.0, gt=0, description="Absolute temperature theta, in K.")
+    temperature: Annotated[float, TEMPERATURE] = Field(
+        default=310.0, gt=0, description="Absolute temperature theta, in K."
+    )
     energy_factor: Annotated[int, one_of((1, 4))] = Field(
         default=1,
         description="Factor omega of the chain energy: 1 is the stress as printed (eq. 7; reproduces Fig. 6), "
         "4 the energy as printed (eq. 4b).",
     )
+    matrix: Annotated[str, one_of(MATRICES)] = Field(default="neo-hookean", description="Energy of the matrix.")
     chain: Annotated[str, one_of(CHAINS)] = Field(default="wormlike", description="Force law of a single chain.")
     repulsion: Literal["axes"] = Field(
         default="axes",
@@ -84,6 +74,60 @@ class Material(Table):
         """c = omega k theta n_chn / (4 A_p), in stress_unit (1.568 Pa for the defaults)."""
         pascal = BOLTZMANN_CONSTANT * self.temperature * self.chain_density / (4 * self.persistence_length)
         return self.energy_factor * pascal / STRESS_UNITS[self.stress_unit]
+
+    def tissue(self, end_to_end_length: float) -> Tissue:
+        """The tissue of these parameters; without chains where there are none.
+
+        Parameters
+        ----------
+        end_to_end_length
+            r0, in link lengths.
+        """
+        return Tissue(
+            self.lame_lambda,
+            self.lame_mu,
+            self.network_modulus,
+            self.contour_length,
+            end_to_end_length,
+            CHAINS[self.chain] if self.chain_density > 0 else None,
+            MATRICES[self.matrix],
+        )
+
+    def summary(self, loads: Mapping[str, float]) -> str:
+        """Stiffness of network and matrix and the loads, in one unit and on one line.
+
+        Parameters
+        ----------
+        loads
+            Stresses by the words for them, in stress_unit.
+        """
+        stresses = {"network modulus c =": self.network_modulus, "shear modulus mu =": self.lame_mu, **loads}
+        return ", ".join(f"{words} {value:.4g} {self.stress_unit}" for words, value in stresses.items())
+
+    def warnings(self, base: Material) -> list[str]:
+        """Lines on a network that a change of stress_unit alone has made too soft or too stiff for its matrix.
+
+        The Lame constants of a scene are numbers in stress_unit, the chain density is always in 1/m^3: whoever changes
+        the unit changes the one and not the other.
+
+        Parameters
+        ----------
+        base
+            What lies under the scene's own keys: the preset's material, or the defaults.
+        """
+        unit, factor = self.stress_unit, STRESS_UNITS[self.stress_unit] / STRESS_UNITS[base.stress_unit]
+        if factor == 1 or self.chain_density != base.chain_density or not self.chain_density:
+            return []
+        ratio = self.network_modulus / self.lame_mu / (base.network_modulus / base.lame_mu)
+        if 1 / 30 < ratio < 30:  # other chains or a tenfold stiffer matrix are a choice; units differ by a thousand
+            return []
+        return [
+            f"material.chain_density = {self.chain_density:g} belongs to a scene in {base.stress_unit}, but "
+            f"material.stress_unit is {unit}: the network (c = {self.network_modulus:.4g} {unit}) is "
+            f"{max(ratio, 1 / ratio):.4g} times too {'soft' if ratio < 1 else 'stiff'} beside the matrix "
+            f"(mu = {self.lame_mu:.4g} {unit}); {self.chain_density * factor:g} makes c the same number as in "
+            f"{base.stress_unit}"
+        ]
 
 
 def _initial_cells(value: Any) -> Any:
@@ -107,7 +151,7 @@ class Cells(Table):
         "aligned_axis), or [l1, l2, l3] in link lengths.",
         json_schema_extra={"allowed": "'random', 'isotropic', 'aligned' or three lengths [l1, l2, l3]"},
     )
-    axes: Literal["global", "cylindrical"] = Field(
+    axes: Annotated[str, one_of(AXES)] = Field(
         default="global",
         description="Cell axes n_I before the first pass: 'global' (x, y, z) or 'cylindrical' (circumferential, axial, "
         "radial, about the z axis). Where neither scene nor preset says it: a tube starts with 'cylindrical'.",
@@ -162,7 +206,7 @@ class Remodeling(Table):
         "that the deformation carries onto the principal directions (objective), 'spatial' the principal directions "
         "themselves, as printed. The driver 'pk2' has material eigenvectors of its own.",
     )
-    coupling: Literal["staggered"] = Field(
+    coupling: Annotated[str, one_of(COUPLINGS)] = Field(
         default="staggered", description="'staggered': solve with the cells of the step before, then remodel once."
     )
     kappa: float = Field(
@@ -171,8 +215,6 @@ class Remodeling(Table):
 
 
 # ---------------------------------------------------------------- presets
-
-SHAPES = ("cube", "tendon", "tube")
 
 
 def _printed_method(
@@ -184,13 +226,14 @@ def _printed_method(
         "lame_mu": 3.103,
         "temperature": 310.0,
         "energy_factor": 1,
+        "matrix": "neo-hookean",
         "chain": "wormlike",
         "repulsion": "axes",
         "stress_unit": "Pa",
     }
     return {
         "geometry": geometry,
-        "mesh": {"refinement": 1, "cell": "hexahedron", "degree": 1},
+        "mesh": {"refinement": 1, "element": "hexahedron", "degree": 1},
         "model": {"kinematics": "full"},
         "material": common_material | material,
         "cells": {"end_to_end_length": 1.0} | cells,
@@ -230,7 +273,7 @@ _PAPER = {
     ),
     "tube": _printed_method(
         {"inner_radius": 1.0, "outer_radius": 3.0, "length": 8.0},
-        {"pressure": _load(4.8, 25.0), "stretch": _load(0.1, 25.0)},
+        {"pressure": _load(4.8, 25.0), "elongation": _load(0.1, 25.0)},
         150.0,
         _CHAINS,
         {"initial": "random", "axes": "cylindrical", "seed": 1},

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import tomlkit
 
+from remodel_fenicsx.body import SHAPES
 from remodel_fenicsx.scene.parameters import PRESET_NOTES, PRESETS
 from remodel_fenicsx.scene.scene import Scene
 from remodel_fenicsx.schema.tables import markdown_reference
 from remodel_fenicsx.schema.toml import merged
+from remodel_fenicsx.schema.units import Dimension, keys_with_units
 
 _REFERENCE = """# Keys of a scene
 
@@ -22,21 +26,54 @@ Where a key has several sources, the first of these wins: `--set KEY=VALUE` on t
 for the shape, the defaults below. Tables are merged key by key, lists are replaced whole. A preset's load stays when
 the scene names only another one; to take it away set its `value` to 0.
 
-`--set` takes a dotted key and a TOML value; a bare word is a string: `--set cells.seed=2`,
-`--set remodeling.frame=spatial`, `--set 'loads.pressure.ramp=[[0, 0], [25, 1]]'`.
+`--set` takes a dotted key and a TOML value; a bare word is a string, and so is a number with a unit:
+`--set cells.seed=2`, `--set remodeling.frame=spatial`, `--set 'loads.pressure.ramp=[[0, 0], [25, 1]]'`,
+`--set loads.pressure.value="100 mmHg"`.
 
+"""
+
+_UNITS = """## Values with units
+
+A number is in the scene's own unit. These keys also take a number with another unit, in quotes: `length = "8 mm"`,
+`value = "100 mmHg"`. It is converted once, when the scene is read; a scene as run has numbers. Unit names are those of
+pint: `kPa`, `mmHg`, `cmH2O`, `N/mm^2`, `um`, `degC`. Lengths and forces with units need `geometry.length_unit`. All
+other keys, those in link lengths or in the unit of time among them, take no unit. `remodel-fenicsx validate` prints
+network modulus, shear modulus and the largest load in one unit.
+
+| unit of | example | in the unit | keys |
+|---|---|---|---|
 """
 
 
 def scene_reference() -> str:
     """The page docs/scene.md: every key with default, what is allowed and meaning, and the presets."""
-    text = _REFERENCE + markdown_reference(Scene)
+    text = _REFERENCE + _UNITS + "\n".join(_unit_rows()) + "\n\n" + markdown_reference(Scene)
+    text += "\n## Loads of the shapes\n\n| load | shape | meaning |\n|---|---|---|\n" + "\n".join(_load_rows()) + "\n"
     for name, shapes in PRESETS.items():
         text += f"\n## Preset `{name}`\n\n{PRESET_NOTES[name]}\n"
         for shape, values in shapes.items():
             body = tomlkit.dumps(merged({"geometry": {"shape": shape}}, values))
             text += f"\nShape `{shape}`:\n\n```toml\n{body.strip()}\n```\n"
     return text
+
+
+def _unit_rows() -> Iterator[str]:
+    """One row of a Markdown table for each dimension that a key of a scene has."""
+    loads = {name: kind.dimension for shape in SHAPES.values() for name, kind in shape.loads.items() if kind.dimension}
+    keys: dict[Dimension, list[str]] = {}
+    for key, dimension in (*keys_with_units(Scene), *((f"loads.{name}.value", unit) for name, unit in loads.items())):
+        keys.setdefault(dimension, []).append(f"`{key}`")
+    for dimension, names in keys.items():
+        unit = " ".join(f"{name}^{power}" if power != 1 else name for name, power in dimension.powers)
+        yield f"| {dimension.name} | `{dimension.example}` | `{unit}` | {', '.join(names)} |"
+
+
+def _load_rows() -> Iterator[str]:
+    """One row of a Markdown table for each load of each shape."""
+    for shape, table in SHAPES.items():
+        for name, kind in table.loads.items():
+            unit = f", in the unit of {kind.dimension.name}" if kind.dimension else ""
+            yield f"| `{name}` | `{shape}` | {kind.meaning}{unit} |"
 
 
 if __name__ == "__main__":

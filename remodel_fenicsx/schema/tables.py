@@ -9,8 +9,8 @@ import difflib
 import inspect
 import math
 import re
-from collections.abc import Callable, Collection, Iterator, Mapping
-from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args, get_origin
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, ValidationError
 from pydantic.fields import FieldInfo
@@ -28,7 +28,15 @@ class SceneError(ValueError):
 
 
 class Table(BaseModel):
-    """A table of a scene: immutable, no unknown keys, no conversion between types, no NaN and no infinity."""
+    """A table of a scene: immutable, no unknown keys, no conversion between types, no NaN and no infinity.
+
+    Attributes
+    ----------
+    renamed
+        Of the outermost table: dotted keys of earlier versions, each with the one that has taken its place.
+    """
+
+    renamed: ClassVar[Mapping[str, str]] = {}
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
@@ -64,6 +72,43 @@ def one_of(choices: Collection[Any]) -> AfterValidator:
 def checked(check: Callable[[Any], Any]) -> BeforeValidator:
     """Annotation of a field whose value goes through `check` before its type is looked at."""
     return BeforeValidator(check)
+
+
+class VariantOf:
+    """Validator of a table that has several kinds: the key `tag` names one of a registry, later ones included.
+
+    Parameters
+    ----------
+    registry
+        Table class by name; each has a field `tag` with that name.
+    tag
+        The key that tells them apart.
+    """
+
+    def __init__(self, registry: Mapping[str, type[BaseModel]], tag: str):
+        self.registry, self.tag = registry, tag
+
+    def __call__(self, value: Any) -> Any:
+        if isinstance(value, BaseModel):
+            return value
+        if not isinstance(value, Mapping):
+            raise fault("must be a table")
+        listed = f"allowed {'is' if len(self.registry) == 1 else 'are'} " + ", ".join(map(shown, self.registry))
+        if self.tag not in value:
+            raise fault(f"missing; {listed}", self.tag, None)
+        name = value[self.tag]
+        if not isinstance(name, str) or name not in self.registry:
+            raise fault(listed, self.tag, name)
+        table = self.registry[name]
+        try:
+            return table.model_validate(dict(value))
+        except ValidationError as error:
+            raise PydanticCustomError("inner", "faults in {name}", {"name": name, "error": error}) from None
+
+
+def variant_of(registry: Mapping[str, type[BaseModel]], tag: str) -> BeforeValidator:
+    """Annotation of a field that is one of the tables of a registry."""
+    return BeforeValidator(VariantOf(registry, tag))
 
 
 def fault(rule: str, key: str = "", value: Any = _MISSING) -> PydanticCustomError:
@@ -103,9 +148,31 @@ def printable(text: str) -> str:
 def one_line(error: ValidationError, table: type[BaseModel]) -> str:
     """`key = value: what is allowed` of the first fault, with the number of further ones."""
     # a mistyped key is also a missing key: the mistyped one says more
-    details = sorted(error.errors(include_url=False), key=lambda detail: detail["type"] != "extra_forbidden")
-    text = _describe(details[0], table)
-    return text if len(details) == 1 else f"{text} (and {len(details) - 1} more)"
+    details = sorted(_details(error), key=lambda detail: detail["type"] != "extra_forbidden")
+    mistyped = {_meant(detail["loc"], table) for detail in details if detail["type"] == "extra_forbidden"}
+    faults = [detail for detail in details if detail["type"] != "missing" or detail["loc"] not in mistyped]
+    text, more = _describe(faults[0], table), len(faults) - 1
+    return f"{text} (and {more} more fault{'s' if more > 1 else ''})" if more else text
+
+
+def _meant(location: tuple[int | str, ...], table: type[BaseModel]) -> tuple[int | str, ...]:
+    """Where the key nearest to an unknown one is, in the same table; the place itself if none is near."""
+    _, owner, _ = locate(table, location)
+    near = _nearest(str(location[-1]), owner.model_fields)
+    return (*location[:-1], *near) if near else location
+
+
+def _details(error: ValidationError) -> list[ErrorDetails]:
+    """All faults; the place of one inside of a variant names the variant after its field."""
+    details: list[ErrorDetails] = []
+    for detail in error.errors(include_url=False):
+        if detail["type"] == "inner":
+            inner = _details(detail["ctx"]["error"])
+            place = (*detail["loc"], detail["ctx"]["name"])
+            details += [{**entry, "loc": (*place, *entry["loc"])} for entry in inner]  # type: ignore[list-item]
+        else:
+            details.append(detail)
+    return details
 
 
 def _describe(detail: ErrorDetails, table: type[BaseModel]) -> str:
@@ -116,14 +183,11 @@ def _describe(detail: ErrorDetails, table: type[BaseModel]) -> str:
         value = context.get("value", value)
         return f"{key}: {rule}" if value is None else f"{key} = {shown(value)}: {rule}"
     if kind == "extra_forbidden":
-        return f"{key} = {shown(value)}: unknown key; {_suggestion(key, owner, table)}"
-    if field is not None and field.discriminator:
-        tag = str(field.discriminator)
-        if kind == "missing" or (isinstance(value, Mapping) and tag not in value):
-            return f"{key}.{tag}: missing; {allowed(field)}"
-        if isinstance(value, Mapping):
-            return f"{key}.{tag} = {shown(value[tag])}: {allowed(field)}"
-        return f"{key} = {shown(value)}: must be a table"
+        renamed: Mapping[str, str] = getattr(table, "renamed", {})
+        rule = f"is now {renamed[key]}" if key in renamed else f"unknown key; {_suggestion(key, owner, table)}"
+        return f"{key} = {shown(value)}: {rule}"
+    if field is not None and kind == "missing" and (variant := variant_of_field(field)):
+        return f"{key}.{variant.tag}: missing; {allowed(field)}"
     rule = detail["msg"] if field is None else allowed(field)
     return f"{key}: missing; {rule}" if kind == "missing" else f"{key} = {shown(value)}: {rule}"
 
@@ -139,8 +203,8 @@ def locate(table: type[BaseModel], location: tuple[int | str, ...]) -> tuple[str
         if is_table(annotation):
             owner, field = annotation, annotation.model_fields.get(str(item))
             annotation = None if field is None else field.annotation
-            if field is not None and field.discriminator and items:
-                annotation = variants(field)[str(items.pop(0))]
+            if field is not None and items and (variant := variant_of_field(field)):
+                annotation = variant.registry[str(items.pop(0))]
         elif get_origin(annotation) is dict:
             annotation = get_args(annotation)[1]
             if is_table(annotation):
@@ -180,15 +244,20 @@ def _toml_text(value: Any) -> str:
     return str(value)
 
 
+def _nearest(name: str, known: Iterable[str], cutoff: float = 0.6) -> list[str]:
+    """The one name that is most like another, in a list, or none."""
+    return difflib.get_close_matches(name, known, n=1, cutoff=cutoff)
+
+
 def _suggestion(key: str, owner: type[BaseModel], table: type[BaseModel]) -> str:
     """The nearest key of the same table, else a key of the same name in another one, else all keys of the table."""
     parent, _, name = key.rpartition(".")
-    near = difflib.get_close_matches(name, owner.model_fields, n=1, cutoff=0.6)
+    near = _nearest(name, owner.model_fields)
     if near:
         return f"did you mean {_joined(parent, near[0])}?"
     others = [(other, inner) for other, _, inner in sections(table) if other != parent]
     elsewhere = {known: _joined(other, known) for other, inner in others for known in inner.model_fields}
-    near = difflib.get_close_matches(name, elsewhere, n=1, cutoff=0.8)
+    near = _nearest(name, elsewhere, cutoff=0.8)
     if near:
         return f"did you mean {elsewhere[near[0]]}?"
     return "allowed are " + ", ".join(_joined(parent, known) for known in owner.model_fields)
@@ -206,15 +275,18 @@ def _fields(annotation: Any) -> dict[str, FieldInfo]:
     return annotation.model_fields if is_table(annotation) else {}
 
 
-def variants(field: FieldInfo) -> dict[str, type[BaseModel]]:
-    """The table classes of a field that has several, by the value of the key that tells them apart."""
-    return {table.model_fields[str(field.discriminator)].default: table for table in get_args(field.annotation)}
+def variant_of_field(field: FieldInfo) -> VariantOf | None:
+    """The registry behind a field that has several kinds of tables, or None."""
+    for entry in field.metadata:
+        if isinstance(entry, BeforeValidator) and isinstance(entry.func, VariantOf):
+            return entry.func
+    return None
 
 
 def choices(field: FieldInfo) -> list[Any]:
     """The values of a field that has a closed list of them, else an empty list."""
-    if field.discriminator:
-        return list(variants(field))
+    if variant := variant_of_field(field):
+        return list(variant.registry)
     for entry in field.metadata:
         if isinstance(entry, AfterValidator) and isinstance(entry.func, OneOf):
             return list(entry.func.choices)
@@ -242,8 +314,8 @@ def sections(table: type[BaseModel], key: str = "", variant: str = "") -> Iterat
     yield key, variant, table
     for name, field in table.model_fields.items():
         path = _joined(key, name)
-        if field.discriminator:
-            for tag, inner in variants(field).items():
+        if several := variant_of_field(field):
+            for tag, inner in several.registry.items():
                 yield from sections(inner, path, tag)
         elif is_table(field.annotation):
             yield from sections(field.annotation, path)  # type: ignore[arg-type]

@@ -16,6 +16,7 @@ import tomlkit
 from pydantic import BaseModel
 
 from remodel_fenicsx.schema.tables import SceneError, printable, shown
+from remodel_fenicsx.schema.units import is_quantity
 
 COMMENT_WIDTH = 100  # characters of a line of comment
 
@@ -48,12 +49,12 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def parse_override(text: str) -> tuple[str, Any]:
-    """Dotted key and value of "KEY=VALUE"; VALUE is TOML, or a bare word for a string.
+    """Dotted key and value of "KEY=VALUE"; VALUE is TOML, or a string: a bare word, a number with a unit.
 
     Raises
     ------
     SceneError
-        If there is no '=', the key has an empty part or the value is neither.
+        If there is no '=', the key has an empty part or the value is none of these.
     """
     key, equals, value = (part.strip() for part in text.partition("="))
     if not equals:
@@ -66,7 +67,7 @@ def parse_override(text: str) -> tuple[str, Any]:
         parsed = {}
     if list(parsed) == ["value"]:
         return key, parsed["value"]
-    if re.fullmatch(r"[\w.+/:-]+", value):
+    if re.fullmatch(r"[\w.+/:-]+", value) or is_quantity(value):
         return key, value
     raise SceneError(f"--set {key} = {shown(value)}: must be a TOML value or a bare word")
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import remodel_fenicsx
 
 OLDEST_DOLFINX = (0, 9)
-NEEDED = ("basix", "dolfinx", "gmsh", "h5py", "mpi4py", "petsc4py", "rich", "ufl")
+NEEDED = ("basix", "dolfinx", "gmsh", "h5py", "mpi4py", "petsc4py", "pint", "rich", "ufl")
 
 
 def versions() -> dict[str, str]:

@@ -1,75 +1,58 @@
-"""The state of the collagen network: cell dimensions l_I and axes n_I at every quadrature point."""
+"""Orthotropic unit cells of the collagen network: dimensions l_I along axes n_I, plain arrays or UFL."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from remodel_fenicsx.scene import parameters
-from remodel_fenicsx.tissue.energy import Cell
-from remodel_fenicsx.fem.quadrature import Quadrature
+from remodel_fenicsx.tissue.operators import squared_stretch
 
 Array = NDArray[np.float64]
 
 
-class UnitCells:
-    """Orthotropic unit cells at the quadrature points (paper, Fig. 2).
-
-    Parameters
-    ----------
-    quadrature
-        The points.
-    cell_number
-        Number of each local cell (ghosts included) in the mesh file's order, shape (cells,): the seed's index, so that
-        random cells do not depend on the number of ranks.
-    number_of_cells
-        Cells of the whole mesh.
-    settings
-        `parameters.Cells`: initial dimensions, axes, seed, r0.
+class UnitCell(NamedTuple):
+    """An orthotropic eight-chain unit cell, or a share of one (paper, Fig. 2).
 
     Attributes
     ----------
-    dimensions, axes
-        dolfinx quadrature functions of shape (3,) and (3, 3); row I of `axes` is n_I.
-    initial_dimensions
-        l0_I by rank (not by direction), shape (cells, points, 3), in link lengths.
+    dimensions
+        l_I in link lengths: UFL vector of length 3, or array (..., 3).
+    axes
+        n_I: UFL tensor (3, 3) or array (..., 3, 3); row I is the unit vector n_I in the reference configuration.
+    weight
+        Share of this cell in r^2 and in W_rep. One for a whole cell; a blend of an old and a new cell (weights that add
+        up to one) is how a remodeling increment is applied in parts.
     """
 
-    def __init__(
-        self, quadrature: Quadrature, cell_number: NDArray[np.int64], number_of_cells: int, settings: parameters.Cells
-    ):
-        self.quadrature = quadrature
-        self.settings = settings
-        self.dimensions = quadrature.function("cell_dimensions", (3,))
-        self.axes = quadrature.function("cell_axes", (3, 3))
-        dimensions = initial_dimensions(settings, number_of_cells)[cell_number]
-        self.dimension_values[:] = dimensions[:, None, :]
-        self.axis_values[:] = initial_axes(settings.axes, quadrature.coordinates)
-        self.initial_dimensions: Array = self.dimension_values.copy()
+    dimensions: Any
+    axes: Any
+    weight: Any = 1.0
+
+    def squared_stretches(self, deformation_gradient: Any) -> list[Any]:
+        """I_I = n_I . C n_I, the squared stretches along the three axes (eq. 5)."""
+        return [squared_stretch(deformation_gradient, self.axes, i) for i in range(3)]
+
+
+class CellSettings(Protocol):
+    """What decides the cells at t = 0 (`scene.parameters.Cells`)."""
 
     @property
-    def dimension_values(self) -> Array:
-        """l_I, shape (cells, points, 3): the functions' own memory."""
-        return self.quadrature.values(self.dimensions, (3,))
+    def initial(self) -> str | tuple[float, float, float]: ...
 
     @property
-    def axis_values(self) -> Array:
-        """n_I as rows, shape (cells, points, 3, 3): the functions' own memory."""
-        return self.quadrature.values(self.axes, (3, 3))
+    def axes(self) -> str: ...
 
     @property
-    def ufl_cell(self) -> Cell:
-        """The cell as the energy takes it."""
-        return Cell(self.dimensions, self.axes)
+    def aligned_axis(self) -> int: ...
 
-    def set(self, dimensions: Array, axes: Array) -> None:
-        """Replace all dimensions (cells, points, 3) and axes (cells, points, 3, 3)."""
-        self.dimension_values[:] = dimensions
-        self.axis_values[:] = axes
+    @property
+    def seed(self) -> int: ...
 
-    def structure_tensor(self) -> Array:
-        """A = sum_I l_I^2 n_I (x) n_I, shape (cells, points, 3, 3), in squared link lengths."""
-        return structure_tensor(self.dimension_values, self.axis_values)
+    @property
+    def end_to_end_length(self) -> float: ...
 
 
 def structure_tensor(dimensions: Array, axes: Array) -> Array:
@@ -78,15 +61,15 @@ def structure_tensor(dimensions: Array, axes: Array) -> Array:
     return np.swapaxes(scaled, -1, -2) @ scaled
 
 
-def initial_dimensions(settings: parameters.Cells, number_of_cells: int) -> Array:
-    """l_I at t = 0 of every cell of the mesh file, shape (number_of_cells, 3), in link lengths.
+def initial_dimensions(settings: CellSettings, number_of_elements: int) -> Array:
+    """l_I at t = 0 of every element of the mesh file, shape (number_of_elements, 3), in link lengths.
 
     `random`: |l| = r0 and l uniform on the positive octant of the sphere, one draw per element. The whole list is drawn
-    on every rank, in the mesh file's order: the same cell gets the same draw for any number of ranks.
+    on every rank, in the mesh file's order: the same element gets the same draw for any number of ranks.
     """
     r0 = settings.end_to_end_length
     if settings.initial == "random":
-        draws = np.abs(np.random.default_rng(settings.seed).standard_normal((number_of_cells, 3)))
+        draws = np.abs(np.random.default_rng(settings.seed).standard_normal((number_of_elements, 3)))
         return r0 * draws / np.linalg.norm(draws, axis=1, keepdims=True)
     if settings.initial == "isotropic":
         lengths = [r0 / np.sqrt(3)] * 3
@@ -94,23 +77,32 @@ def initial_dimensions(settings: parameters.Cells, number_of_cells: int) -> Arra
         lengths = [r0 if axis == settings.aligned_axis else 0.0 for axis in (1, 2, 3)]
     else:
         lengths = [float(length) for length in settings.initial]
-    return np.tile(lengths, (number_of_cells, 1))
+    return np.tile(lengths, (number_of_elements, 1))
+
+
+def global_axes(coordinates: Array) -> Array:
+    """x, y, z at all points: rows, (..., 3, 3), at reference coordinates (..., 3)."""
+    axes = np.zeros((*coordinates.shape[:-1], 3, 3))
+    axes[...] = np.eye(3)
+    return axes
+
+
+def cylindrical_axes(coordinates: Array) -> Array:
+    """Circumferential, axial and radial direction about the z axis: rows, (..., 3, 3), at coordinates (..., 3)."""
+    axes = np.zeros((*coordinates.shape[:-1], 3, 3))
+    axes[..., 0, :] = circumferential_direction(coordinates)
+    axes[..., 1, 2] = 1.0
+    axes[..., 2, :] = radial_direction(coordinates)
+    return axes
+
+
+AXES: dict[str, Callable[[Array], Array]] = {"global": global_axes, "cylindrical": cylindrical_axes}
+"""Axes of the cells before the first pass by name: functions of the reference coordinates."""
 
 
 def initial_axes(kind: str, coordinates: Array) -> Array:
-    """n_I before the first pass, rows, shape (..., 3, 3), at reference coordinates (..., 3).
-
-    `global`: x, y, z. `cylindrical`: circumferential, axial, radial about the z axis.
-    """
-    axes = np.zeros((*coordinates.shape[:-1], 3, 3))
-    if kind == "global":
-        axes[...] = np.eye(3)
-        return axes
-    radial = radial_direction(coordinates)
-    axes[..., 0, :] = circumferential_direction(coordinates)
-    axes[..., 1, 2] = 1.0
-    axes[..., 2, :] = radial
-    return axes
+    """n_I before the first pass (`AXES`), rows, shape (..., 3, 3), at reference coordinates (..., 3)."""
+    return AXES[kind](coordinates)
 
 
 def radial_direction(coordinates: Array) -> Array:

@@ -48,13 +48,27 @@ def wormlike_force(end_to_end_length: Any, contour_length: Any, persistence_leng
 
 @dataclass(frozen=True)
 class Chain:
-    """A chain law: `energy(r, L)`, its secant `stiffness(r, L)` and one chain's `force(r, L, A_p, k_theta)`."""
+    """A chain law.
+
+    Attributes
+    ----------
+    energy
+        energy(r, L) over k theta / A_p, in link lengths.
+    stiffness
+        Its secant stiffness g(r, L): d(energy)/dr = g r.
+    locks
+        Whether a chain cannot become longer than L.
+    """
 
     energy: Callable[[Any, Any], Any]
     stiffness: Callable[[Any, Any], Any]
-    force: Callable[..., Any]
+    locks: bool = True
+
+    def force(self, end_to_end_length: Any, contour_length: Any, persistence_length: Any, k_theta: Any = 1.0) -> Any:
+        """Force that holds the ends of one chain apart: k theta / A_p times the derivative of its energy."""
+        return k_theta / persistence_length * self.stiffness(end_to_end_length, contour_length) * end_to_end_length
 
 
 CHAINS: dict[str, Chain] = {
-    "wormlike": Chain(wormlike_energy, wormlike_stiffness, wormlike_force),
+    "wormlike": Chain(wormlike_energy, wormlike_stiffness),
 }

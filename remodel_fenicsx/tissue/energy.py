@@ -1,4 +1,4 @@
-"""The strain energy of tissue with remodeling collagen, in UFL: the only place where it is written.
+"""The strain energy of tissue with remodeling collagen, in UFL or on arrays: the only place where it is written.
 
 Stresses, drivers, residual and tangent follow by differentiation. Per reference volume (docs/theory.md):
 
@@ -10,83 +10,48 @@ Stresses, drivers, residual and tangent follow by differentiation. Per reference
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import ufl
 
-from remodel_fenicsx.tissue.chains import CHAINS
-from remodel_fenicsx.scene.parameters import Material
+from remodel_fenicsx.tissue.cells import UnitCell, structure_tensor
+from remodel_fenicsx.tissue.chains import CHAINS, Chain
+from remodel_fenicsx.tissue.operators import component, det, ln, sqrt, squared_norm
 
 
-class Cell(NamedTuple):
-    """An orthotropic eight-chain unit cell, or a share of one.
-
-    Attributes
-    ----------
-    dimensions
-        l_I, UFL vector of length 3, in link lengths.
-    axes
-        n_I, UFL tensor of shape (3, 3): row I is the unit vector n_I in the reference configuration.
-    weight
-        Share of this cell in r^2 and in W_rep. One for a whole cell; a blend of an old and a new cell (weights that add
-        up to one) is how a remodeling increment is applied in parts.
-    """
-
-    dimensions: Any
-    axes: Any
-    weight: Any = 1.0
-
-    def squared_stretches(self, deformation_gradient: Any) -> list[Any]:
-        """I_I = n_I . C n_I, the squared stretches along the three axes (eq. 5)."""
-        fibres = [ufl.dot(deformation_gradient, self.axes[i, :]) for i in range(3)]
-        return [ufl.inner(fibre, fibre) for fibre in fibres]
+def neo_hookean(deformation_gradient: Any, lame_lambda: Any, lame_mu: Any) -> Any:
+    """W_iso = lambda/2 ln^2 J + mu/2 (tr C - 3) - mu ln J (eq. 4a)."""
+    log_jacobian = ln(det(deformation_gradient))
+    return (
+        lame_lambda / 2 * log_jacobian**2
+        + lame_mu / 2 * (squared_norm(deformation_gradient) - 3)
+        - lame_mu * log_jacobian
+    )
 
 
-def squared_end_to_end_length(deformation_gradient: Any, cells: Sequence[Cell]) -> Any:
+Matrix = Callable[[Any, Any, Any], Any]
+MATRICES: dict[str, Matrix] = {"neo-hookean": neo_hookean}
+"""Energies of the matrix by name: functions of F, lambda and mu (UFL or arrays), zero and stress-free at F = I."""
+
+
+def squared_end_to_end_length(deformation_gradient: Any, cells: Sequence[UnitCell]) -> Any:
     """r^2 = sum_I l_I^2 n_I . C n_I (eq. 5)."""
     return sum(
-        cell.weight * cell.dimensions[i] ** 2 * stretch
+        cell.weight * component(cell.dimensions, i) ** 2 * stretch
         for cell in cells
         for i, stretch in enumerate(cell.squared_stretches(deformation_gradient))
     )
 
 
-def strain_energy(
-    deformation_gradient: Any, cells: Sequence[Cell], material: Material, end_to_end_length: float
-) -> Any:
-    """W per reference volume (eqs. 3 and 4 with errata 1 and 2), in the material's stress unit.
-
-    Parameters
-    ----------
-    deformation_gradient
-        F, UFL, shape (3, 3).
-    cells
-        The unit cell: one whole cell, or shares whose weights add up to one.
-    material
-        Parameters of matrix and chains.
-    end_to_end_length
-        r0, the initial chain length, a constant of the material (erratum 3), in link lengths.
-    """
-    F, chain = deformation_gradient, CHAINS[material.chain]
-    jacobian = ufl.det(F)
-    log_jacobian = ufl.ln(jacobian)
-    matrix = (
-        material.lame_lambda / 2 * log_jacobian**2
-        + material.lame_mu / 2 * (ufl.inner(F, F) - 3)
-        - material.lame_mu * log_jacobian
+def repulsion_sum(deformation_gradient: Any, cells: Sequence[UnitCell]) -> Any:
+    """M = sum_I l_I^2 ln(n_I . C n_I), of which W_rep is made."""
+    return sum(
+        cell.weight * component(cell.dimensions, i) ** 2 * ln(stretch)
+        for cell in cells
+        for i, stretch in enumerate(cell.squared_stretches(deformation_gradient))
     )
-    chains = chain.energy(ufl.sqrt(squared_end_to_end_length(F, cells)), material.contour_length)
-    repulsion = (
-        -chain.stiffness(end_to_end_length, material.contour_length)
-        / 2
-        * sum(
-            cell.weight * cell.dimensions[i] ** 2 * ufl.ln(stretch)
-            for cell in cells
-            for i, stretch in enumerate(cell.squared_stretches(F))
-        )
-    )
-    return matrix + material.network_modulus * (chains + repulsion)
 
 
 class Stresses(NamedTuple):
@@ -97,10 +62,99 @@ class Stresses(NamedTuple):
     cauchy: Any
 
 
-def stresses(
-    deformation_gradient: Any, cells: Sequence[Cell], material: Material, end_to_end_length: float
-) -> Stresses:
-    """P = dW/dF, S = F^-1 P and sigma = P F^T / J (eqs. 6 and 7 with erratum 5), by differentiation of W."""
-    F = ufl.variable(deformation_gradient)
-    first = ufl.diff(strain_energy(F, cells, material, end_to_end_length), F)
-    return Stresses(first, ufl.dot(ufl.inv(F), first), ufl.dot(first, F.T) / ufl.det(F))
+@dataclass(frozen=True)
+class Tissue:
+    """Matrix and collagen network: the constitutive parameters and what follows from them.
+
+    Every parameter is a number, a dolfinx Constant, a DG0 function (regions) or an array over points: the same
+    functions serve forms and arrays. `fem.coefficients` makes one kind of the other.
+
+    Attributes
+    ----------
+    lame_lambda, lame_mu
+        Lame constants of the matrix, in a unit of stress.
+    network_modulus
+        c = omega k theta n_chn / (4 A_p), in the same unit.
+    contour_length
+        L, in link lengths.
+    end_to_end_length
+        r0, the initial length of a chain (erratum 3), in link lengths.
+    chain
+        Law of a single chain; None for a matrix without chains, which does not lock.
+    matrix
+        Energy of the matrix (`MATRICES`).
+    """
+
+    lame_lambda: Any
+    lame_mu: Any
+    network_modulus: Any
+    contour_length: Any
+    end_to_end_length: Any
+    chain: Chain | None = CHAINS["wormlike"]
+    matrix: Matrix = neo_hookean
+
+    @property
+    def locking_length(self) -> Any:
+        """Length at which a chain locks, in link lengths; None where nothing locks."""
+        return self.contour_length if self.chain is not None and self.chain.locks else None
+
+    @property
+    def network_stiffness(self) -> Any:
+        """c g(r0) r0^2, the initial stiffness of the network; 0 without chains."""
+        if self.chain is None:
+            return 0.0
+        stiffness = self.chain.stiffness(self.end_to_end_length, self.contour_length)
+        return self.network_modulus * stiffness * self.end_to_end_length**2
+
+    @property
+    def stiffness(self) -> Any:
+        """lambda + 2 mu + c g(r0) r0^2: a stress per strain of matrix and network."""
+        return self.lame_lambda + 2 * self.lame_mu + self.network_stiffness
+
+    def map(self, function: Callable[[str, Any], Any]) -> Tissue:
+        """The same tissue with function(name, value) for every parameter."""
+        names = ("lame_lambda", "lame_mu", "network_modulus", "contour_length", "end_to_end_length")
+        return replace(self, **{name: function(name, getattr(self, name)) for name in names})
+
+    def strain_energy(self, deformation_gradient: Any, cells: Sequence[UnitCell]) -> Any:
+        """W per reference volume (eqs. 3 and 4 with errata 1 and 2), in the unit of the Lame constants.
+
+        Parameters
+        ----------
+        deformation_gradient
+            F, UFL of shape (3, 3) or array (..., 3, 3).
+        cells
+            The unit cell: one whole cell, or shares whose weights add up to one.
+        """
+        energy = self.matrix(deformation_gradient, self.lame_lambda, self.lame_mu)
+        if self.chain is None:
+            return energy
+        length = sqrt(squared_end_to_end_length(deformation_gradient, cells))
+        chains = self.chain.energy(length, self.contour_length)
+        stiffness = self.chain.stiffness(self.end_to_end_length, self.contour_length)
+        repulsion = -stiffness / 2 * repulsion_sum(deformation_gradient, cells)
+        return energy + self.network_modulus * (chains + repulsion)
+
+    def stresses(self, deformation_gradient: Any, cells: Sequence[UnitCell]) -> Stresses:
+        """P = dW/dF, S = F^-1 P and sigma = P F^T / J (eqs. 6 and 7 with erratum 5), by differentiation of W; UFL."""
+        F = ufl.variable(deformation_gradient)
+        first = ufl.diff(self.strain_energy(F, cells), F)
+        return Stresses(first, ufl.dot(ufl.inv(F), first), ufl.dot(first, F.T) / ufl.det(F))
+
+    def energy_increment(self, deformation_gradient: Any, old: UnitCell, new: UnitCell) -> Any:
+        """First-order change of W at frozen F when the cells become others, per reference volume; arrays.
+
+        W depends on the cells through r^2 = A : C and M = sum_I l_I^2 ln I_I only:
+        dW = c g(r)/2 d(r^2) - c/2 g(r0) dM, taken at the old cells, where r < L. (Remark 6; the new cells themselves
+        may have r > L until the next solve, so their energy is not always defined.)
+        """
+        F = deformation_gradient
+        if self.chain is None:
+            return 0.0 * det(F)
+        C = F.swapaxes(-1, -2) @ F
+        squared = (structure_tensor(*old[:2]) * C).sum(axis=(-1, -2))
+        squared_change = (structure_tensor(*new[:2]) * C).sum(axis=(-1, -2)) - squared
+        repulsion_change = repulsion_sum(F, [new]) - repulsion_sum(F, [old])
+        stiffness = self.chain.stiffness(sqrt(squared), self.contour_length)
+        initial = self.chain.stiffness(self.end_to_end_length, self.contour_length)
+        return self.network_modulus / 2 * (stiffness * squared_change - initial * repulsion_change)

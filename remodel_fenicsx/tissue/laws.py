@@ -1,22 +1,107 @@
-"""Evolution laws of the cell dimensions: pure functions on arrays, one for each way to integrate the paper's eq. (10).
+"""Evolution laws: what the unit cells become while a drive acts on them. Pure functions on arrays.
 
-Every law has the signature ``law(l, l0, target, kappa, time_old, time_new) -> l_new`` with
-
-- ``l``: cell dimensions at time_old, shape (n, 3), in link lengths, by rank (column 0: largest eigenvalue),
-- ``l0``: cell dimensions at t = 0, shape (n, 3),
-- ``target``: r0 e, the dimensions that the driver asks for, shape (n, 3), e = lambda^+ / |lambda^+|,
-- ``kappa``: relaxation parameter, in 1/time.
+A law is `update(cells, drive, time_old, time_new) -> cells` with cells of shape (n, 3) and (n, 3, 3). The paper's laws
+(one for each way to integrate its eq. 10) change the dimensions by rank towards a target while the axes turn at once:
+`ranked` makes a law of such a function.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from remodel_fenicsx.tissue import spectral
+from remodel_fenicsx.tissue.cells import UnitCell
+from remodel_fenicsx.tissue.drivers import Driver, Frame, carried_axes
+
 Array = NDArray[np.float64]
-Law = Callable[[Array, Array, Array, float, float, float], Array]
+
+
+class Drive(NamedTuple):
+    """What acts on the cells of n points during a step.
+
+    Attributes
+    ----------
+    deformation_gradient
+        F, (n, 3, 3).
+    tensor
+        The driving tensor, symmetric, (n, 3, 3).
+    driver, frame
+        Where the tensor's eigenvectors live, and what becomes of them.
+    threshold
+        Principal values up to this size are zero, in the unit of the tensor; (n,) or a number.
+    initial_dimensions
+        l0_I by rank, (n, 3), in link lengths.
+    end_to_end_length
+        r0, in link lengths; (n,) or a number.
+    kappa
+        Speed of remodeling, in 1/time.
+    """
+
+    deformation_gradient: Array
+    tensor: Array
+    driver: Driver
+    frame: Frame
+    threshold: Array | float
+    initial_dimensions: Array
+    end_to_end_length: Array | float
+    kappa: float
+
+
+@dataclass(frozen=True)
+class Law:
+    """An evolution law.
+
+    Attributes
+    ----------
+    update
+        New cells from (cells, drive, time_old, time_new).
+    has_limit
+        Whether the cells tend to a limit under a constant drive that does not depend on the way there.
+    remodels
+        False where cells never change: then there is no pass at all.
+    """
+
+    update: Callable[[UnitCell, Drive, float, float], UnitCell]
+    has_limit: bool = False
+    remodels: bool = True
+
+
+RankedFunction = Callable[[Array, Array, Array, float, float, float], Array]
+
+
+def ranked(function: RankedFunction, has_limit: bool = False) -> Law:
+    """A law of the paper's kind: axes at the drive's principal directions, dimensions by rank from `function`.
+
+    Parameters
+    ----------
+    function
+        ``function(l, l0, target, kappa, time_old, time_new) -> l_new`` with l and l0 (n, 3) by rank (column 0: largest
+        principal value), target = r0 e, e = lambda^+ / |lambda^+|. Points without a positive value keep their cells.
+    has_limit
+        As in `Law`.
+    """
+
+    def update(cells: UnitCell, drive: Drive, time_old: float, time_new: float) -> UnitCell:
+        spatial = not drive.driver.material
+        F = drive.deformation_gradient
+        # the axes to keep where values agree, as vectors of the space in which the driver lives
+        previous = carried_axes(F, cells.axes) if spatial and drive.frame.carries_axes else cells.axes
+        values, axes = spectral.principal(drive.tensor, previous, threshold=drive.threshold)
+        direction, active = spectral.positive_direction(values, threshold=drive.threshold)
+        axes = drive.frame.axes(F, axes) if spatial else axes
+        target = np.reshape(drive.end_to_end_length, (-1, 1)) * direction
+        dimensions = function(cells.dimensions, drive.initial_dimensions, target, drive.kappa, time_old, time_new)
+        return UnitCell(
+            np.where(active[:, None], dimensions, cells.dimensions),
+            np.where(active[:, None, None], axes, cells.axes),
+        )
+
+    return Law(update, has_limit)
 
 
 def explicit(l: Array, l0: Array, target: Array, kappa: float, time_old: float, time_new: float) -> Array:
@@ -34,9 +119,14 @@ def relaxation(l: Array, l0: Array, target: Array, kappa: float, time_old: float
     return l - (target - l) * np.expm1(-kappa * (time_new - time_old))
 
 
-def none(l: Array, l0: Array, target: Array, kappa: float, time_old: float, time_new: float) -> Array:
-    """No change of the cell dimensions (the axes do not turn either: `remodel` skips the pass)."""
-    return l
+def keep(cells: UnitCell, drive: Drive, time_old: float, time_new: float) -> UnitCell:
+    """The same cells."""
+    return cells
 
 
-LAWS: dict[str, Law] = {"explicit": explicit, "rate": rate, "relaxation": relaxation, "none": none}
+LAWS: dict[str, Law] = {
+    "explicit": ranked(explicit, has_limit=True),
+    "rate": ranked(rate),
+    "relaxation": ranked(relaxation, has_limit=True),
+    "none": Law(keep, remodels=False),
+}

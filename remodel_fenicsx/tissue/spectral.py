@@ -19,7 +19,7 @@ zero, up to rounding; any threshold far above rounding gives the same choice on 
 
 
 def principal(
-    tensors: npt.ArrayLike, previous: npt.ArrayLike, tolerance: float = 1e-8, scale: float = 0.0
+    tensors: npt.ArrayLike, previous: npt.ArrayLike, tolerance: float = 1e-8, threshold: npt.ArrayLike = 0.0
 ) -> tuple[Array, Array]:
     """Return the principal values, descending, and the principal axes of symmetric tensors.
 
@@ -41,9 +41,9 @@ def principal(
         normalised nor orthogonal: F n_I will do.
     tolerance : float
         Values whose difference is at most `tolerance` times the largest absolute value are taken as equal.
-    scale : float
-        Typical size of the tensors in their unit (a stiffness, for stresses). Differences below rounding of `scale`
-        are taken as zero too. With the default 0 the axes do not depend on the unit.
+    threshold : float or (n,)
+        Differences up to this size, in the unit of the tensors, are taken as zero too. With the default 0 the axes do
+        not depend on the unit.
 
     Returns
     -------
@@ -67,9 +67,9 @@ def principal(
     axes = np.swapaxes(columns, 1, 2)[:, ::-1].copy()
 
     reference = _normalised(previous)
-    threshold = np.maximum(tolerance * _largest(values), ROUNDING * scale)
-    upper = values[:, 0] - values[:, 1] <= threshold
-    lower = values[:, 1] - values[:, 2] <= threshold
+    equal = np.maximum(tolerance * _largest(values), threshold)
+    upper = values[:, 0] - values[:, 1] <= equal
+    lower = values[:, 1] - values[:, 2] <= equal
     for cluster, normal_rank, first, second in (upper & ~lower, 2, 0, 1), (lower & ~upper, 0, 1, 2):
         at = np.flatnonzero(cluster)
         if at.size:
@@ -84,16 +84,16 @@ def principal(
     return values, _with_signs_of(reference, axes)
 
 
-def positive_direction(values: npt.ArrayLike, scale: float = 0.0) -> tuple[Array, npt.NDArray[np.bool_]]:
+def positive_direction(values: npt.ArrayLike, threshold: npt.ArrayLike = 0.0) -> tuple[Array, npt.NDArray[np.bool_]]:
     """Return the direction e = lambda^+ / |lambda^+| of the positive principal values (eqs. 9 to 11).
 
     Parameters
     ----------
     values : (n, 3)
         Principal values of the driving tensor, any unit.
-    scale : float
-        Typical size of the driving tensor in its unit; a value within rounding of `scale`, or of the largest
-        absolute value at its point, is not positive.
+    threshold : float or (n,)
+        A value up to this size, in the unit of the driving tensor, or within rounding of the largest absolute value at
+        its point, is not positive.
 
     Returns
     -------
@@ -110,7 +110,7 @@ def positive_direction(values: npt.ArrayLike, scale: float = 0.0) -> tuple[Array
     values = np.asarray(values, dtype=np.float64)
     _require_finite(values, "set of principal values")
     largest = _largest(values)
-    rounding = ROUNDING * np.maximum(largest, scale)
+    rounding = np.maximum(ROUNDING * largest, threshold)
     # divided by the largest value first: the squares of very small or large values would underflow or overflow
     positive = np.where(values > rounding[:, None], values, 0.0) / np.where(largest > 0.0, largest, 1.0)[:, None]
     norm = _length(positive)

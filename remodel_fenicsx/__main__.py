@@ -1,0 +1,8 @@
+"""``python -m remodel_fenicsx`` is the command remodel-fenicsx."""
+
+import sys
+
+from remodel_fenicsx.cli import main
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,172 @@
+"""What a body is: keys, mesh, supports, loads, columns, fibre angle; one file and one line in `body.SHAPES` each."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from remodel_fenicsx.body.column import Column
+from remodel_fenicsx.body.gmsh_model import length_fault
+from remodel_fenicsx.schema.tables import Table, fault
+from remodel_fenicsx.schema.units import Dimension, LengthUnit
+from remodel_fenicsx.tissue.cells import angle_to_axis
+
+if TYPE_CHECKING:  # shapes are part of every scene: they are read without dolfinx
+    from mpi4py import MPI
+
+    from remodel_fenicsx.body.domain import Domain
+    from remodel_fenicsx.body.loading import Loading
+
+Array = NDArray[np.float64]
+
+
+class MeshSettings(Protocol):
+    """The finite elements (`scene.Mesh`)."""
+
+    @property
+    def refinement(self) -> int: ...
+
+    @property
+    def element(self) -> str: ...
+
+    @property
+    def degree(self) -> int: ...
+
+
+@dataclass(frozen=True)
+class LoadKind:
+    """A load that a shape knows, named once.
+
+    Attributes
+    ----------
+    add
+        Adds it to a body's loading: add(shape, loading, name).
+    meaning
+        One sentence for the documentation, the column's too.
+    dimension
+        Of its value; None for a number.
+    column
+        Name of its column; default: its own.
+    above
+        Values must be greater than this.
+    """
+
+    add: Callable[[Any, Loading, str], None]
+    meaning: str
+    dimension: Dimension | None = None
+    column: str = ""
+    above: float = -np.inf
+
+    def make_column(self, name: str) -> Column:
+        """Its column, for the load of this name."""
+        unit = self.dimension.name if self.dimension else ""
+        return Column(self.column or name, unit, self.meaning, lambda m: float(m.step.loads[name]))
+
+
+class Shape(Table):
+    """A body of a scene. Its fields are the keys of `[geometry]`; `shape: Literal["name"] = "name"` is one of them.
+
+    Attributes
+    ----------
+    loads
+        Loads by name; a script may add its own.
+    columns
+        Columns of the history beside those of the loads.
+    axis_kinds
+        What `cells.axes` may be (`tissue.cells.AXES`).
+    number_of_elements
+        Hexahedra of the mesh with refinement 1.
+    faces
+        Names of the faces that supports, loads and columns refer to.
+    defaults
+        Defaults of other tables that this shape changes, under the keys of preset and scene.
+    """
+
+    loads: ClassVar[dict[str, LoadKind]]
+    columns: ClassVar[tuple[Column, ...]]
+    axis_kinds: ClassVar[tuple[str, ...]] = ("global",)
+    number_of_elements: ClassVar[int]
+    faces: ClassVar[tuple[str, ...]] = ()
+    defaults: ClassVar[dict[str, Any]] = {}
+
+    shape: str = Field(description="Which body it is.")
+    length_unit: LengthUnit = None
+
+    @property
+    def loaded_area(self) -> float:
+        """Reference area that carries a force, in the scene's unit of length squared."""
+        raise NotImplementedError(f"a {self.name} has no loads of the dimension of a force")
+
+    @property
+    def name(self) -> str:
+        """The shape's name."""
+        return self.shape
+
+    @abstractmethod
+    def build(self, mesh: MeshSettings, comm: MPI.Intracomm | None = None) -> Domain:
+        """Mesh the body. Collective.
+
+        Raises
+        ------
+        ValueError
+            If a value is not allowed.
+        body.gmsh_model.GeometryError
+            On all ranks, if Gmsh fails.
+        """
+
+    @abstractmethod
+    def hold(self, loading: Loading) -> None:
+        """Hold the body as it is held without loads."""
+
+    def support(self, loading: Loading) -> None:
+        """Hold the body and add every load that it knows, each zero."""
+        self.hold(loading)
+        for name, kind in self.loads.items():
+            kind.add(self, loading, name)
+
+    def all_columns(self) -> tuple[Column, ...]:
+        """Columns of the loads, then those of the shape."""
+        return (*(kind.make_column(name) for name, kind in self.loads.items()), *self.columns)
+
+    def fibre_angle(self, dimensions: Array, axes: Array, coordinates: Array) -> Array:
+        """Angle of the chain direction in degrees; here to the load axis z.
+
+        Parameters
+        ----------
+        dimensions, axes, coordinates
+            l_I (..., 3), axes as rows (..., 3, 3) and places (..., 3), all in the reference or all in the deformed
+            configuration.
+        """
+        return angle_to_axis(dimensions, axes, np.array([0.0, 0.0, 1.0]))
+
+
+def check_lengths(shape: Shape, lengths: dict[str, float]) -> None:
+    """Raise the fault of `length_fault` at its key."""
+    found = length_fault(lengths)
+    if found is not None:
+        raise fault(found[1], found[0], getattr(shape, found[0]))
+
+
+def uniaxial_columns(top: str, length: str) -> tuple[Column, ...]:
+    """Columns of a body that is pulled along z at the face `top`; `length` names its dimension along z."""
+
+    def mean_stretch(m: Any) -> float:
+        return float(1.0 + m.face_mean(top, m.displacement[:, 2]) / m.domain.dimensions[length])
+
+    return (
+        Column("mean_stretch", "", "length over reference length, mean of the top", mean_stretch),
+        Column("min_stretch", "", "smallest element mean of F_zz", lambda m: m.smallest(m.axial_stretch)),
+        Column("max_stretch", "", "largest element mean of F_zz", lambda m: m.largest(m.axial_stretch)),
+        Column(
+            "mean_fibre_angle",
+            "degrees",
+            "reference angle between chain direction and load axis, mean over the volume",
+            lambda m: m.quadrature.mean(m.fibre_angle),
+        ),
+    )

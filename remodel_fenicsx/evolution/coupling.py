@@ -1,0 +1,124 @@
+"""How equilibrium and remodeling of one step are coupled: strategies over the same state."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from typing import Protocol
+
+from remodel_fenicsx.body.loading import LoadValues
+from remodel_fenicsx.evolution.blend import Blend
+from remodel_fenicsx.evolution.equilibrium import Equilibrium
+from remodel_fenicsx.evolution.newton import GuardedNewton, SolveFailure, SolverSettings
+from remodel_fenicsx.evolution.parts import Change, Work
+from remodel_fenicsx.evolution.remodeling import RemodelingPass
+from remodel_fenicsx.evolution.state import State
+from remodel_fenicsx.tissue.energy import Tissue
+
+log = logging.getLogger(__name__)
+
+
+class Coupling(Protocol):
+    """One step in two halves, inside the stepper's transaction. What is between them is the step's row.
+
+    Attributes
+    ----------
+    equilibrium
+        The forms of the solved state.
+    """
+
+    equilibrium: Equilibrium
+
+    def solve(self, time: float, loads: LoadValues) -> Work:
+        """Bring the state to equilibrium with the loads of `time`; `state.equilibrium_cells` are those of the row."""
+
+    def remodel(self, time: float) -> float:
+        """Make the cells that the next step starts with; returns the power of remodeling."""
+
+    def close(self) -> None:
+        """Free PETSc's objects."""
+
+
+class Staggered:
+    """The paper's: solve with the cells of the step before, then one remodeling pass.
+
+    Where Newton's method cannot go to the new state in one piece, the change of the cells and then the change of the
+    loads are applied in parts (docs/theory.md, "Steps that are too large"): the state at the end is the same.
+    """
+
+    def __init__(self, state: State, tissue: Tissue, remodeling: RemodelingPass, settings: SolverSettings):
+        self.state, self.remodeling, self.settings = state, remodeling, settings
+        self.equilibrium = Equilibrium(state, tissue)
+        self.equilibrium.compile_energy()
+        self.newton = GuardedNewton(self.equilibrium, settings)
+        self.blend: Blend | None = None
+        if remodeling.law.remodels:
+            self.blend = Blend(state, tissue, settings)
+            self.blend.equilibrium.stop_signal = lambda: self.equilibrium.stop_signal()
+
+    def solve(self, time: float, loads: LoadValues) -> Work:
+        """Equilibrium at `time` with the present cells.
+
+        Raises
+        ------
+        StepFailure
+            If no admissible equilibrium is found.
+        """
+        work = Work()
+        if self.equilibrium.extension().admissible:
+            self._solve_in_one(time, loads, work)
+        else:
+            log.info("solving in parts: the remodeled cells have r >= L at the old displacement")
+            self._solve_in_parts(time, dict(self.state.loading.values), loads, work, failure=None)
+        self.state.settle_cells()
+        return work
+
+    def remodel(self, time: float) -> float:
+        """The pass with the solved state."""
+        return self.remodeling.apply(self.state.time, time)
+
+    def close(self) -> None:
+        """Free PETSc's objects."""
+        self.newton.close()
+        if self.blend is not None:
+            self.blend.close()
+
+    # ------------------------------------------------------------ in one piece: the paper's step
+    def _solve_in_one(self, time: float, loads: LoadValues, work: Work) -> None:
+        old_loads = dict(self.state.loading.values)
+        self.state.loading.set(loads)
+        try:
+            work.add(self.newton.solve())
+            work.substeps = 1
+        except SolveFailure as failure:
+            work.add(failure)
+            log.info("solving in parts: %s", failure.reason)
+            self._solve_in_parts(time, old_loads, loads, work, failure)
+
+    # ------------------------------------------------------------ in parts
+    def _solve_in_parts(
+        self, time: float, old_loads: LoadValues, new_loads: LoadValues, work: Work, failure: SolveFailure | None
+    ) -> None:
+        """First the change of the cells, then that of the loads; `failure`: that of the whole step, if it was tried."""
+        loading, halvings = self.state.loading, self.settings.maximum_halvings
+        loading.set(old_loads)
+        if self.blend is not None and self._cells_changed():
+            blend = self.blend
+            stage = "the change of the cells"
+            Change(time, stage, blend.set, blend.newton, halvings, blend.largest_part).advance(work)
+            failure = None  # the loads have not been tried from here
+
+        def set_load_fraction(fraction: float) -> None:
+            loading.set({k: old_loads[k] + fraction * (new_loads[k] - old_loads[k]) for k in new_loads})
+
+        Change(time, "the change of the loads", set_load_fraction, self.newton, halvings).advance(work, failure)
+        loading.set(new_loads)
+        log.info("time %g solved in %d parts", time, work.substeps)
+
+    def _cells_changed(self) -> bool:
+        same = self.state.equilibrium_cells.equals(self.state.cells)
+        return bool(self.state.comm.allreduce(int(not same)) > 0)
+
+
+Maker = Callable[[State, Tissue, RemodelingPass, SolverSettings], Coupling]
+COUPLINGS: dict[str, Maker] = {"staggered": Staggered}

@@ -1,0 +1,240 @@
+"""Newton's method for one equilibrium: PETSc SNES with the consistent tangent, and the guards r < L, J > 0."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import dolfinx.fem.petsc
+import numpy as np
+from petsc4py import PETSc
+
+from remodel_fenicsx.evolution.equilibrium import Equilibrium, Extension
+from remodel_fenicsx.fem import coefficients
+from remodel_fenicsx.fem.petsc_options import ProblemOptions
+from remodel_fenicsx.system.interrupts import Interrupted
+
+log = logging.getLogger(__name__)
+
+LINE_SEARCH_HALVINGS = 20  # of one Newton step, before the solve is given up
+
+
+class SolverSettings(Protocol):
+    """How a step is solved (`scene.Solver`)."""
+
+    @property
+    def method(self) -> str: ...
+
+    @property
+    def absolute_tolerance(self) -> float: ...
+
+    @property
+    def relative_tolerance(self) -> float: ...
+
+    @property
+    def maximum_iterations(self) -> int: ...
+
+    @property
+    def maximum_halvings(self) -> int: ...
+
+    @property
+    def petsc_options(self) -> Mapping[str, Any]: ...
+
+
+# by PETSc's SNESConvergedReason; numbers, for the names differ between its versions
+FAILURES = {
+    -3: "the linear solver failed",
+    -4: "forces or parameters are too large or too small for floating-point numbers",
+    -6: "the line search found no better state",
+    -9: "the residual grew beyond all bounds",
+}
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Work of a solve."""
+
+    newton_iterations: int
+    linear_iterations: int
+
+
+class SolveFailure(RuntimeError):
+    """SNES did not find an admissible equilibrium; the unknowns before the call are restored."""
+
+    def __init__(self, reason: str, newton_iterations: int, linear_iterations: int, extension: Extension):
+        super().__init__(reason)
+        self.reason = reason
+        self.newton_iterations = newton_iterations
+        self.linear_iterations = linear_iterations
+        self.extension = extension
+
+
+class GuardedNewton:
+    """Solves an equilibrium from the present unknowns; use `close` (or `with`) when it is needed no more.
+
+    Parameters
+    ----------
+    equilibrium
+        Residual, tangent and limits.
+    settings
+        Tolerances, limits and PETSc options.
+    """
+
+    def __init__(self, equilibrium: Equilibrium, settings: SolverSettings):
+        self.equilibrium, self.settings = equilibrium, settings
+        self.unknown = equilibrium.state.unknown
+        self._options = ProblemOptions(settings.method, settings.petsc_options)
+        self._x = self.unknown.x.petsc_vec.duplicate()
+        self._residual = self._x.duplicate()
+        self._external = self._x.duplicate()
+        self._matrix = equilibrium.create_matrix()
+        self._force_scale = 0.0
+        self._lost = False
+        self._options_checked = False
+        snes: Any = PETSc.SNES().create(equilibrium.comm)
+        snes.setFunction(self._assemble_residual, self._residual)
+        snes.setJacobian(self._assemble_tangent, self._matrix)
+        snes.setTolerances(rtol=0.0, atol=0.0, stol=0.0, max_it=settings.maximum_iterations)
+        snes.setLineSearchPreCheck(self._keep_admissible)
+        self._options.apply(snes)
+        snes.setConvergenceTest(self._converged)
+        self._snes: Any = snes
+
+    def close(self) -> None:
+        """Free PETSc's objects and take the options out of its database; calling it again does nothing."""
+        if self._snes is None:
+            return
+        for thing in (self._snes, self._matrix, self._x, self._residual, self._external):
+            thing.destroy()
+        self._options.close()
+        self._snes = None
+
+    def __enter__(self) -> GuardedNewton:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def solve(self) -> Solution:
+        """Solve from the present unknowns; on success they are the solution.
+
+        Raises
+        ------
+        SolveFailure
+            If SNES diverges or stops, or where it would stop at a state with r >= L or J <= 0. The unknowns are then
+            what they were before.
+        Interrupted
+            If a signal asked for the end; the unknowns are restored.
+        """
+        start = self.unknown.x.array.copy()
+        self._pull(self._x)
+        self._lost = False
+        self._snes.solve(None, self._x)
+        self._warn_of_unused_options()
+        reason = self._snes.getConvergedReason()
+        newton, linear = self._snes.getIterationNumber(), self._snes.getLinearSolveIterations()
+        self._push(self._x)
+        extension = self.equilibrium.extension()
+        if reason < 0 or self._lost or not extension.admissible:
+            self.unknown.x.array[:] = start
+            if extension.stop_signal:
+                raise Interrupted(extension.stop_signal)
+            raise SolveFailure(self._failure_text(reason, extension), newton, linear, extension)
+        return Solution(newton, linear)
+
+    def _warn_of_unused_options(self) -> None:
+        """Once, after the first solve; on all ranks, for each has a database of options."""
+        if self._options_checked:
+            return
+        self._options_checked = True
+        unused = self._options.unused()
+        if unused and self.equilibrium.comm.rank == 0:
+            log.warning("solver.petsc_options: without effect (misspelt?): %s", ", ".join(unused))
+
+    # ------------------------------------------------------------ SNES
+    def _pull(self, x: Any) -> None:
+        """Copy the unknowns into a PETSc vector."""
+        with x.localForm() as local:
+            local.array[:] = self.unknown.x.array
+
+    def _push(self, x: Any) -> None:
+        """Copy a PETSc vector into the unknowns, ghosts included."""
+        x.ghostUpdate(addv=PETSc.InsertMode.INSERT, mode=PETSc.ScatterMode.FORWARD)
+        with x.localForm() as local:
+            self.unknown.x.array[:] = local.array_r
+
+    def _assemble_residual(self, snes: Any, x: Any, residual: Any) -> None:
+        """R = internal forces - loads, zero where displacements are prescribed and met.
+
+        Fills R with NaN where the state is not admissible: line searches that know NaN shorten their step, others stop.
+        """
+        self._push(x)
+        equilibrium, loading = self.equilibrium, self.equilibrium.state.loading
+        equilibrium.assemble_internal(residual)
+        equilibrium.assemble_external(self._external)
+        # forces at the nodes, reactions included: what the residual must be small against
+        self._force_scale = max(residual.norm(), self._external.norm())
+        residual.axpy(1.0, self._external)
+        if equilibrium.prescribed_gap(x) > 1e-13 * loading.domain.size:
+            # lifting assembles tangents of the constrained elements; it adds exactly zero once x meets the conditions
+            equilibrium.assemble_lifting(self._external, x)
+            residual.axpy(1.0, self._external)
+        dolfinx.fem.petsc.set_bc(residual, loading.boundary_conditions, x, -1.0)
+        extension = equilibrium.extension()
+        self._lost = not extension.admissible or extension.stop_signal > 0
+        if self._lost:
+            residual.set(np.nan)
+
+    def _assemble_tangent(self, snes: Any, x: Any, matrix: Any, preconditioner: Any) -> None:
+        self.equilibrium.assemble_tangent(matrix)
+
+    def _keep_admissible(self, x: Any, step: Any) -> bool:
+        """Halve the Newton step until r < L and J > 0 everywhere (trial: x - step). True when it changed the step."""
+        trial = x.duplicate()
+        for halving in range(LINE_SEARCH_HALVINGS + 1):
+            trial.waxpy(-1.0, step, x)
+            self._push(trial)
+            extension = self.equilibrium.extension()
+            if extension.admissible or extension.stop_signal:
+                break
+            step.scale(0.5)
+        else:
+            log.debug("no admissible step after %d halvings", LINE_SEARCH_HALVINGS)
+        trial.destroy()
+        if halving:
+            log.debug("Newton step shortened to 1/%d to keep r < L and J > 0", 2**halving)
+        return halving > 0
+
+    def _converged(self, snes: Any, iteration: int, norms: tuple[float, float, float]) -> int:
+        """|R| <= absolute_tolerance + relative_tolerance * |nodal forces|: a scale that does not vanish in a hold."""
+        norm = norms[2]
+        if not np.isfinite(norm):
+            return PETSc.SNES.ConvergedReason.DIVERGED_FNORM_NAN
+        if norm <= self._tolerance():
+            return PETSc.SNES.ConvergedReason.CONVERGED_FNORM_ABS
+        if iteration >= snes.getTolerances()[3]:
+            return PETSc.SNES.ConvergedReason.DIVERGED_MAX_IT
+        return PETSc.SNES.ConvergedReason.ITERATING
+
+    def _tolerance(self) -> float:
+        # an unloaded body has no forces but rounding: 1e-5 of stiffness times area is a scale in any unit of stress
+        equilibrium = self.equilibrium
+        stiffness = stiffness_scale(equilibrium)
+        rounding_scale = 1e-5 * stiffness * equilibrium.state.loading.domain.size**2
+        scale = max(self._force_scale, rounding_scale)
+        return self.settings.absolute_tolerance + self.settings.relative_tolerance * scale
+
+    def _failure_text(self, reason: int, extension: Extension) -> str:
+        if reason >= 0 or self._lost:
+            return f"reached r/L = {extension.max_chain_extension:.4f}, J = {extension.min_jacobian:.4g}"
+        if reason == PETSc.SNES.ConvergedReason.DIVERGED_MAX_IT:
+            return f"no equilibrium within {self._snes.getTolerances()[3]} Newton iterations"
+        return FAILURES.get(reason, f"SNES stopped with reason {reason}")
+
+
+def stiffness_scale(equilibrium: Equilibrium) -> float:
+    """lambda + 2 mu + c g(r0) r0^2, with the largest value of each parameter in the body; over all ranks."""
+    mesh = equilibrium.quadrature.mesh
+    return float(equilibrium.tissue.map(lambda name, value: coefficients.largest(value, mesh)).stiffness)

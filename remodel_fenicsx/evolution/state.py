@@ -1,0 +1,94 @@
+"""The state of a simulation: what a step changes, a transaction restores and a checkpoint holds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from remodel_fenicsx.body.loading import Loading
+from remodel_fenicsx.evolution.unit_cells import CellField, UnitCells
+from remodel_fenicsx.fem.kinematics import Kinematics
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """Values of a state: arrays by the names of `State.functions`, loads, time, number of steps."""
+
+    arrays: dict[str, NDArray[np.float64]]
+    loads: dict[str, float]
+    time: float
+    number: int
+
+
+class State:
+    """Unknowns, unit cells, loads and time.
+
+    Parameters
+    ----------
+    unknown
+        dolfinx function of the unknowns (for full kinematics the displacement).
+    kinematics
+        What the unknowns mean.
+    cells
+        The unit cells.
+    loading
+        Supports and loads; its magnitudes are part of the state.
+
+    Attributes
+    ----------
+    equilibrium_cells
+        The cells with which the unknowns are in equilibrium. After a staggered step the cells themselves are one pass
+        ahead of them.
+    time, number
+        Time of the last committed step, and how many there were.
+    """
+
+    def __init__(self, unknown: Any, kinematics: Kinematics, cells: UnitCells, loading: Loading):
+        self.unknown, self.kinematics, self.cells, self.loading = unknown, kinematics, cells, loading
+        self.equilibrium_cells = CellField(cells.quadrature, "equilibrium_cell")
+        self.settle_cells()
+        self.time, self.number = 0.0, 0
+        # the body starts unloaded; a load that is there from t = 0 on comes with the first step
+        loading.set(dict.fromkeys(loading.values, 0.0))
+
+    @property
+    def comm(self) -> Any:
+        """Communicator of the mesh."""
+        return self.cells.quadrature.mesh.comm
+
+    def functions(self) -> dict[str, Any]:
+        """Every dolfinx function of the state by its name."""
+        cells, solved = self.cells, self.equilibrium_cells
+        functions = (self.unknown, cells.dimensions, cells.axes, solved.dimensions, solved.axes)
+        return {function.name: function for function in functions}
+
+    def settle_cells(self) -> None:
+        """The present cells are those with which the unknowns are in equilibrium."""
+        self.equilibrium_cells.set(self.cells.dimension_values, self.cells.axis_values)
+
+    def snapshot(self) -> Snapshot:
+        """A copy of all values."""
+        arrays = {name: function.x.array.copy() for name, function in self.functions().items()}
+        return Snapshot(arrays, dict(self.loading.values), self.time, self.number)
+
+    def restore(self, snapshot: Snapshot) -> None:
+        """Take all values from a snapshot."""
+        for name, function in self.functions().items():
+            function.x.array[:] = snapshot.arrays[name]
+        self.loading.set(snapshot.loads)
+        self.time, self.number = snapshot.time, snapshot.number
+
+    @contextmanager
+    def transaction(self) -> Iterator[None]:
+        """All that happens in the block, or nothing: whatever is raised in it, the state is what it was before."""
+        before = self.snapshot()
+        try:
+            yield
+        except BaseException:
+            self.restore(before)
+            raise

@@ -1,0 +1,190 @@
+"""Fields over time for ParaView and PyVista: element means on the mesh, and the chains of every element as lines."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+import ufl
+from numpy.typing import NDArray
+
+from remodel_fenicsx.body.domain import Domain
+from remodel_fenicsx.body.shape import Shape
+from remodel_fenicsx.evolution.equilibrium import at_points
+from remodel_fenicsx.evolution.state import State
+from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
+from remodel_fenicsx.fem import compat, jit
+from remodel_fenicsx.results.vtkhdf import (
+    LINE,
+    TransientGrid,
+    cell_type_and_permutation,
+    chain_displacement,
+    chain_lines,
+)
+from remodel_fenicsx.tissue import spectral
+from remodel_fenicsx.tissue.cells import structure_tensor
+
+Array = NDArray[np.float64]
+
+
+class ElementFields:
+    """Element means for pictures.
+
+    Parameters
+    ----------
+    shape
+        Says what the fibre angle is.
+    stepper
+        Its state and tissue; nothing here changes them.
+    """
+
+    def __init__(self, shape: Shape, stepper: Stepper):
+        self.shape, self.state = shape, stepper.state
+        self.quadrature = self.state.cells.quadrature
+        self.tissue = stepper.tissue
+        state = self.state
+        F = state.kinematics.deformation_gradient(state.unknown)
+        cauchy = self.tissue.stresses(F, [state.cells.ufl_cell]).cauchy
+        entries = [t[i, j] for t in (F, cauchy) for i in range(3) for j in range(3)]
+        displacement = state.kinematics.displacement(state.unknown)
+        expressions = ufl.as_vector([*entries, *(displacement[i] for i in range(3))])
+        self._state = jit.expression(expressions, self.quadrature.points)
+
+    def __call__(self) -> dict[str, Array]:
+        """By name, one row per local element.
+
+        `deformation_gradient` and `cauchy_stress` (9, row by row); `cell_dimensions` (3) and `axis_1..3`: the cell
+        whose structure tensor is the element's mean, longest first; `fibre_angle` and `fibre_angle_deformed` (degrees,
+        to the load axis, or in a tube from circumferential to axial); `chain_extension` (largest r/L in the element; 0
+        where no chain locks).
+        """
+        values = self.quadrature.evaluate(self._state, (21,))
+        F, cauchy = values[..., :9].reshape(*values.shape[:2], 3, 3), values[..., 9:18]
+        dimensions, axes = self.state.cells.dimension_values, self.state.cells.axis_values
+        deformed_axes = axes @ np.swapaxes(F, -1, -2)
+        position = self.quadrature.coordinates + values[..., 18:]
+        lengths, mean_axes = self.mean_cells()
+        squared = np.sum((dimensions[..., None] * deformed_axes) ** 2, axis=(-1, -2))
+        mean, fibre_angle = self.quadrature.element_mean, self.shape.fibre_angle
+        return {
+            "deformation_gradient": mean(values[..., :9]),
+            "cauchy_stress": mean(cauchy),
+            "cell_dimensions": lengths,
+            **{f"axis_{i + 1}": mean_axes[:, i] for i in range(3)},
+            "fibre_angle": mean(fibre_angle(dimensions, axes, self.quadrature.coordinates)),
+            "fibre_angle_deformed": mean(fibre_angle(dimensions, deformed_axes, position)),
+            "chain_extension": np.max(np.sqrt(squared) / self._locking_length(), axis=1),
+        }
+
+    def mean_cells(self) -> tuple[Array, Array]:
+        """Lengths (elements, 3) and axes as rows (elements, 3, 3) of the mean structure tensor, longest first."""
+        cells = self.state.cells
+        tensor = self.quadrature.element_mean(structure_tensor(cells.dimension_values, cells.axis_values))
+        squared, axes = spectral.principal(tensor, cells.axis_values[:, 0])
+        return np.sqrt(np.maximum(squared, 0.0)), axes
+
+    def _locking_length(self) -> Any:
+        length = at_points(self.tissue, self.quadrature).locking_length
+        return np.inf if length is None else length.reshape(self.quadrature.shape)
+
+
+class Fields(Watcher):
+    """Time series of fields: fields.vtkhdf (the mesh) and fields_chains.vtkhdf (four chain lines per element).
+
+    Both open in ParaView (5.12 or later) and PyVista as one time series. Nodes and elements stand in the mesh file's
+    order, whatever the number of ranks.
+
+    Parameters
+    ----------
+    folder
+        Where the files go.
+    shape, stepper
+        What is written.
+    every
+        Every so many steps; the first and the last one always.
+    """
+
+    def __init__(self, folder: Path, shape: Shape, stepper: Stepper, every: int = 1):
+        self.state, self.every = stepper.state, every
+        self.domain = domain = self.state.loading.domain
+        self._element_fields = ElementFields(shape, stepper)
+        self._displacement = NodalGather(domain, self.state)
+        quadrature = self.state.cells.quadrature
+        points, elements = domain.gather_mesh()
+        volume = quadrature.integral(np.ones(quadrature.shape))
+        self._grid: TransientGrid | None = None
+        self._chains: TransientGrid | None = None
+        if points is not None and elements is not None:
+            geometry = domain.mesh.geometry.cmap
+            cell_type, order = cell_type_and_permutation(domain.mesh.topology.cell_name(), geometry.degree)
+            self._grid = TransientGrid(folder / "fields.vtkhdf", points, elements[:, order], cell_type)
+            self._centres = points[elements].mean(axis=1)
+            self._elements = elements
+            # a chain reaches half of the smallest mean distance between elements, so that pictures stay readable
+            self._scale = 0.4 * (volume / len(elements)) ** (1 / 3)
+
+    # ------------------------------------------------------------ as a watcher
+    def started(self, step: Step) -> None:
+        """Write the start."""
+        self.append(step.time)
+
+    def solved(self, step: Step) -> None:
+        """Write the solved state, if it is its turn."""
+        if step.number % self.every == 0 or step.is_last:
+            self.append(step.time)
+
+    # ------------------------------------------------------------ writing
+    def append(self, time: float) -> None:
+        """Write the present state as the state of `time`. Collective."""
+        displacement = self._displacement()
+        gathered = {name: self.domain.gather_elements(values) for name, values in self._element_fields().items()}
+        if self._grid is None or displacement is None:
+            return
+        fields = {name: values for name, values in gathered.items() if values is not None}
+        self._grid.append(time, {"displacement": displacement}, fields)
+        self._append_chains(time, displacement, fields)
+
+    def _append_chains(self, time: float, displacement: Array, fields: dict[str, Array]) -> None:
+        axes = np.stack([fields[f"axis_{i + 1}"] for i in range(3)], axis=1)
+        points, lines = chain_lines(self._centres, fields["cell_dimensions"], axes, self._scale)
+        gradient = fields["deformation_gradient"].reshape(-1, 3, 3)
+        moved = chain_displacement(points, self._centres, displacement[self._elements].mean(axis=1), gradient)
+        if self._chains is None:
+            assert self._grid is not None
+            self._chains = TransientGrid(
+                self._grid.path.with_name("fields_chains.vtkhdf"), points, lines, LINE, point_dtype=np.float32
+            )
+        angle = np.repeat(fields["fibre_angle"], len(lines) // len(self._centres))
+        self._chains.append(time, {"displacement": moved}, {"fibre_angle": angle}, points=points)
+
+    def close(self) -> None:
+        """Close the files."""
+        for grid in (self._grid, self._chains):
+            if grid is not None:
+                grid.close()
+
+    def __enter__(self) -> Fields:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+class NodalGather:
+    """Gathers the displacement of the mesh nodes to rank 0, in the mesh file's order."""
+
+    def __init__(self, domain: Domain, state: State):
+        self.domain, self.state = domain, state
+        dofs = state.unknown.function_space.dofmap.list.reshape(-1)
+        nodes = compat.geometry_dofmap(domain.mesh).reshape(-1)
+        # the element and the geometry have the same degree: node k of an element is dof k of that element
+        self._dof_of_node = np.zeros(len(domain.node_number), dtype=np.int64)
+        self._dof_of_node[nodes] = dofs
+
+    def __call__(self) -> Array | None:
+        values = self.state.kinematics.nodal_displacement(self.state.unknown)[self._dof_of_node]
+        return self.domain.gather_nodes(values)

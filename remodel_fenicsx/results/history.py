@@ -1,0 +1,69 @@
+"""history.csv: one row per accepted step and one at t = 0; whole rows only, whatever happens."""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+class History:
+    """history.csv: one row per accepted step, complete on disk as soon as the step is accepted."""
+
+    def __init__(self, path: Path):
+        self._file = path.open("xb", buffering=0)
+        self._columns: list[str] | None = None
+        self._size = 0  # bytes of whole rows
+
+    def append(self, row: dict[str, float]) -> None:
+        """Write one row; the first one decides the columns.
+
+        Raises
+        ------
+        OSError
+            If the row could not be written (disk full); the file then ends with the row before.
+        ValueError
+            If the row has other columns than the first one.
+        """
+        text = io.StringIO(newline="")
+        writer = csv.DictWriter(text, fieldnames=self._columns or list(row), lineterminator="\n")
+        if self._columns is None:
+            writer.writeheader()
+        writer.writerow({key: _number(value) for key, value in row.items()})
+        self._write(text.getvalue().encode())
+        self._columns = list(writer.fieldnames)
+
+    def _write(self, data: bytes) -> None:
+        """All of it or nothing: a number that was cut short would read as another number."""
+        view = memoryview(data)
+        try:
+            while view:
+                view = view[self._file.write(view) :]
+            os.fsync(self._file.fileno())
+        except OSError:
+            self._file.truncate(self._size)
+            self._file.seek(self._size)
+            raise
+        self._size += len(data)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+def _number(value: float) -> str:
+    """Shortest text that reads back as the same number."""
+    return str(value) if isinstance(value, int) else repr(float(value))
+
+
+def read_history(folder: Path) -> dict[str, Array]:
+    """The columns of a recorded history.csv by name, each an array over the accepted steps."""
+    with (Path(folder) / "history.csv").open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    return {name: np.array([float(row[name]) for row in rows]) for name in (rows[0] if rows else ())}

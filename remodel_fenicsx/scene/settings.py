@@ -1,0 +1,184 @@
+"""The tables of a scene beside material, cells and remodeling: mesh, model, loads, time, solver, output."""
+
+from __future__ import annotations
+
+import bisect
+import math
+import re
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, model_validator
+
+from remodel_fenicsx.fem.solver_methods import METHODS
+from remodel_fenicsx.schema.tables import Table, checked, fault, is_number, one_of, quoted, shown
+from remodel_fenicsx.schema.units import FORCE
+
+MOST_STEPS = 1_000_000
+SAME_TIME = 1e-9  # relative: times closer than this are the same
+
+
+class Mesh(Table):
+    """The finite elements."""
+
+    refinement: int = Field(
+        default=1,
+        ge=1,
+        description="Factor on the paper's number of elements in every direction (1: its own meshes). More than 10 "
+        "million hexahedra, or those split into tetrahedra, are refused.",
+    )
+    element: Literal["hexahedron", "tetrahedron"] = Field(default="hexahedron", description="Shape of the elements.")
+    degree: Annotated[int, one_of((1, 2))] = Field(
+        default=1, description="Polynomial degree of the displacement: 1 (the paper's) or 2."
+    )
+
+
+class Model(Table):
+    """Which unknowns describe the deformation."""
+
+    kinematics: Literal["full"] = Field(default="full", description="'full': the displacement in three dimensions.")
+
+
+# ---------------------------------------------------------------- loads and time
+
+
+def _ramp(value: Any) -> tuple[tuple[float, float], ...]:
+    """Pairs (time, factor) whose times increase; anything else is a fault that names the entry."""
+    if not isinstance(value, (list, tuple)) or not value:
+        raise fault("must be a list of pairs [time, factor], at least one")
+    for index, entry in enumerate(value):
+        if not isinstance(entry, (list, tuple)) or len(entry) != 2 or not all(map(is_number, entry)):
+            raise fault("must be a pair [time, factor] of finite numbers", f"[{index}]", entry)
+    for index, (time, _) in enumerate(value):
+        if time < 0:
+            raise fault("must be at least 0, where the simulation starts", f"[{index}][0]", time)
+        if index and time <= value[index - 1][0]:
+            rule = f"must be later than the time {shown(value[index - 1][0])} of the entry before"
+            raise fault(rule, f"[{index}][0]", time)
+    return tuple((float(time), float(factor)) for time, factor in value)
+
+
+class Load(Table):
+    """A load by name: `force` of cube and tendon, `pressure` and `elongation` of a tube; zero if it is not listed.
+
+    `force` is the total dead force along z on the top; `pressure` acts on the deformed inner face; `elongation` is the
+    prescribed engineering strain of the length (0.1: 10 % longer).
+    """
+
+    value: float = Field(
+        description="Full value at factor 1: force in stress_unit times length squared, pressure in stress_unit, "
+        "elongation without unit (above -1)."
+    )
+    ramp: Annotated[tuple[tuple[float, float], ...], checked(_ramp)] = Field(
+        description="Factor on the value over time, as [time, factor] pairs with increasing times: linear in between, "
+        "held before the first and after the last pair. Times up to time.end must be multiples of time.step.",
+        json_schema_extra={"allowed": "a list of pairs [time, factor] with increasing times"},
+    )
+
+    def factor(self, time: float) -> float:
+        """Factor on the value at a time: piecewise linear, held before the first and after the last pair."""
+        for ramp_time, factor in self.ramp:  # exact at its own times
+            if abs(time - ramp_time) <= SAME_TIME * abs(ramp_time):
+                return factor
+        after = bisect.bisect_right(self.ramp, time, key=lambda pair: pair[0])
+        if after == 0:
+            return self.ramp[0][1]
+        if after == len(self.ramp):
+            return self.ramp[-1][1]
+        (time0, factor0), (time1, factor1) = self.ramp[after - 1], self.ramp[after]
+        return factor0 + (factor1 - factor0) * (time - time0) / (time1 - time0)
+
+    def largest(self, end: float) -> float:
+        """The value of largest magnitude from time 0 to `end`, with its sign."""
+        times = [end, *(time for time, _ in self.ramp if time < end)]
+        return max((self.value * self.factor(time) for time in times), key=abs)
+
+
+class Time(Table):
+    """Simulated time, in the unit of 1/kappa. It starts at 0 with the unloaded body."""
+
+    end: float = Field(gt=0, description="Last time; a whole number of steps.")
+    step: float = Field(default=1.0, gt=0, description="Time between two remodeling passes.")
+
+    @model_validator(mode="after")
+    def _whole_number_of_steps(self) -> Time:
+        if self.step > self.end:
+            raise fault(f"must be at most time.end = {shown(self.end)}", "step", self.step)
+        if self.end / self.step > MOST_STEPS:
+            rule = f"must be at least time.end / {MOST_STEPS} = {self.end / MOST_STEPS:.6g}"
+            raise fault(rule, "step", self.step)
+        if not is_multiple(self.end, self.step):
+            raise fault(nearest_multiples(self.end, self.step, "time.step"), "end", self.end)
+        return self
+
+    @property
+    def number_of_steps(self) -> int:
+        """Number of steps from 0 to the end."""
+        return round(self.end / self.step)
+
+
+def is_multiple(time: float, step: float) -> bool:
+    return abs(time / step - round(time / step)) <= SAME_TIME * max(1.0, time / step)
+
+
+def nearest_multiples(time: float, step: float, name: str) -> str:
+    below = math.floor(time / step)
+    nearest = f"{below * step:.12g} and {(below + 1) * step:.12g}"
+    return f"must be a multiple of {name} = {shown(step)}; the nearest are {nearest}"
+
+
+# ---------------------------------------------------------------- solver and output
+
+
+def _petsc_options(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        for name, entry in value.items():
+            if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z]\w*", name):
+                raise fault("not a PETSc option; write its name without the leading '-'", quoted(str(name)), entry)
+            if name in ("snes_rtol", "snes_atol", "snes_stol"):
+                raise fault("has no effect; use solver.relative_tolerance, solver.absolute_tolerance", name, entry)
+            if not isinstance(entry, (str, bool)) and not is_number(entry):
+                raise fault("must be a string, a finite number, true or false", name, entry)
+    return value
+
+
+class Solver(Table):
+    """Solution of the nonlinear problem of each step."""
+
+    method: Annotated[str, one_of(METHODS)] = Field(
+        default="direct", description="'direct': Newton's method, each system factorised."
+    )
+    absolute_tolerance: Annotated[float, FORCE] = Field(
+        default=0.0,
+        ge=0,
+        description="A step is solved when |R| <= absolute_tolerance + relative_tolerance |nodal forces|, R the "
+        "vector of out-of-balance nodal forces; in the unit of force, so that it depends on the units of the scene.",
+    )
+    relative_tolerance: float = Field(
+        default=1e-10,
+        ge=0,
+        lt=1,
+        description="See absolute_tolerance; relative to the norm of the internal nodal forces, which stays when the "
+        "load is held.",
+    )
+    maximum_iterations: int = Field(default=25, ge=1, description="Newton iterations before a step counts as failed.")
+    maximum_halvings: int = Field(
+        default=12, ge=0, description="How often a failed step is halved before the run ends with an error."
+    )
+    petsc_options: Annotated[dict[str, Any], checked(_petsc_options)] = Field(
+        default_factory=dict,
+        description="PETSc options that override the method's, without the leading '-': snes_..., ksp_..., pc_....",
+    )
+
+    @model_validator(mode="after")
+    def _has_a_tolerance(self) -> Solver:
+        if self.absolute_tolerance == 0.0 and self.relative_tolerance == 0.0:
+            raise fault("must be greater than 0 where absolute_tolerance is 0", "relative_tolerance", 0.0)
+        return self
+
+
+class Output(Table):
+    """What a run writes beside its history table."""
+
+    fields: bool = Field(default=True, description="Whether to write fields for ParaView.")
+    every: int = Field(default=1, ge=1, description="Write the fields of every n-th step; the last one always.")

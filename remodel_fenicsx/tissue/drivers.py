@@ -1,0 +1,107 @@
+"""Driving tensors, and the frames that make cell axes of their eigenvectors (paper, eqs. 8 and 9)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import ufl
+from numpy.typing import NDArray
+
+from remodel_fenicsx.tissue.energy import Stresses, Tissue
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Driver:
+    """A driving tensor.
+
+    Attributes
+    ----------
+    tensor
+        Its UFL expression from (F, stresses).
+    material
+        Whether its eigenvectors are material vectors.
+    scale
+        A typical size from the tissue, below whose rounding an eigenvalue is zero: the 1e-16 of an unloaded body is
+        no tension.
+    """
+
+    tensor: Callable[[Any, Stresses], Any]
+    material: bool
+    scale: Callable[[Tissue], Any]
+    # by frame: factor by which a pass multiplies a small tilt of the axes, where it is below -1 (docs/theory.md)
+    overcorrection: dict[str, float] = field(default_factory=dict)
+
+
+def _matrix_stiffness(tissue: Tissue) -> Any:
+    """lambda + 2 mu: a stress per strain."""
+    return tissue.lame_lambda + 2 * tissue.lame_mu
+
+
+DRIVERS: dict[str, Driver] = {
+    "cauchy": Driver(lambda F, s: s.cauchy, material=False, scale=_matrix_stiffness),
+    "pk2": Driver(
+        lambda F, s: s.second_piola_kirchhoff,
+        material=True,
+        scale=_matrix_stiffness,
+        overcorrection={"material": -1.5, "spatial": -1.5},
+    ),
+    "finger": Driver(
+        lambda F, s: ufl.dot(F, F.T),
+        material=False,
+        scale=lambda tissue: 1.0,
+        overcorrection={"material": -2.6, "spatial": -1.9},
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What becomes of the eigenvectors of a spatial driver.
+
+    Attributes
+    ----------
+    axes
+        n_I from (F (n, 3, 3), m_I as rows (n, 3, 3)).
+    carries_axes
+        Whether the cells' axes move with the material, so that F n_I are the previous axes in space.
+    """
+
+    axes: Callable[[Array, Array], Array]
+    carries_axes: bool
+
+
+def spatial_frame(F: Array, spatial_axes: Array) -> Array:
+    """n_I = m_I as printed in eq. (9): spatial eigenvectors taken for material axes. Not objective (erratum 4)."""
+    return spatial_axes
+
+
+def material_frame(F: Array, spatial_axes: Array) -> Array:
+    """n_1 = F^-1 m_1 normalised, n_2 = F^-1 m_2 orthogonalised against n_1, n_3 = n_1 x n_2. Objective.
+
+    n_1 is the fibre that the deformation carries onto the first principal direction. F (n, 3, 3); rows (n, 3, 3).
+    """
+    pulled_back = np.swapaxes(np.linalg.solve(F, np.swapaxes(spatial_axes, -1, -2)), -1, -2)
+    first = _unit(pulled_back[:, 0])
+    second = pulled_back[:, 1] - np.sum(pulled_back[:, 1] * first, axis=-1, keepdims=True) * first
+    second = _unit(second)
+    return np.stack([first, second, np.cross(first, second)], axis=1)
+
+
+FRAMES: dict[str, Frame] = {
+    "material": Frame(material_frame, carries_axes=True),
+    "spatial": Frame(spatial_frame, carries_axes=False),
+}
+
+
+def carried_axes(F: Array, axes: Array) -> Array:
+    """F n_I normalised: where the deformation carries the axes, rows, (n, 3, 3)."""
+    return _unit(axes @ np.swapaxes(F, 1, 2))
+
+
+def _unit(vectors: Array) -> Array:
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
