@@ -21,6 +21,9 @@ from typing import IO, Any
 import dolfinx.fem
 import ffcx.codegeneration.jit
 from mpi4py import MPI
+from ufl.classes import Label
+from ufl.corealg.map_dag import map_expr_dag
+from ufl.corealg.multifunction import MultiFunction
 from ufl.domain import extract_unique_domain
 
 from remodel_fenicsx.system.interrupts import SIGNALS, Interrupted, stopping_at_once
@@ -106,7 +109,25 @@ def form(ufl_form: Any, name: str | None = None) -> Any:
 def expression(ufl_expression: Any, points: Any, name: str | None = None) -> Any:
     """Compile a UFL expression for evaluation at reference points of shape (n, 3); otherwise like `form`."""
     with _compiler_watched(extract_unique_domain(ufl_expression).ufl_cargo().comm, name or "an expression", 1):
-        return dolfinx.fem.Expression(ufl_expression, points, jit_options=jit_options())
+        return dolfinx.fem.Expression(map_expr_dag(_OwnLabels(), ufl_expression), points, jit_options=jit_options())
+
+
+class _OwnLabels(MultiFunction):
+    """Numbers the variables (`ufl.variable`) of an expression from 0.
+
+    UFL numbers them through the life of a process, and FFCx takes these numbers into the kernel's name: without this
+    the second problem of a process compiles the same expression again.
+    """
+
+    expr = MultiFunction.reuse_if_untouched
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.labels: dict[Label, Label] = {}
+
+    def label(self, label: Label) -> Label:
+        """The next number, or the one that this label has got."""
+        return self.labels.setdefault(label, Label(len(self.labels)))
 
 
 @contextmanager
