@@ -5,13 +5,13 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
-import signal
 import sys
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import remodel_fenicsx
+from remodel_fenicsx.system import interrupts
 from remodel_fenicsx.system.environment import reason_unusable, versions
 from remodel_fenicsx.scene.parameters import PRESETS
 from remodel_fenicsx.scene.scene import Scene, SceneError, preset_scene, read_scene
@@ -72,7 +72,7 @@ def parser() -> argparse.ArgumentParser:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code of docs/commands.md (0, 2, 3, 5, 129, 130, 143)."""
-    with _ctrl_c_ends_at_once():
+    with interrupts.ending_at_once():
         options = _parsed(arguments)
         try:
             code = COMMANDS[options.command](options)
@@ -87,29 +87,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return code
 
 
-@contextlib.contextmanager
-def _ctrl_c_ends_at_once() -> Iterator[None]:
-    """Until `_let_ctrl_c_raise`: a KeyboardInterrupt out of half-imported libraries would be pages of traceback."""
-    before = signal.getsignal(signal.SIGINT)
-    if before == signal.default_int_handler:
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
-def _let_ctrl_c_raise() -> None:
-    if signal.getsignal(signal.SIGINT) == signal.SIG_DFL:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-
-
 def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
     """The options; of several ranks only the first says what is wrong with them."""
-    # MPI itself would have to be started to ask it
-    rank = os.environ.get("OMPI_COMM_WORLD_RANK") or os.environ.get("PMI_RANK") or "0"
     with contextlib.ExitStack() as stack:
-        if rank != "0":
+        if not interrupts.is_first_rank():
             silence = stack.enter_context(open(os.devnull, "w"))
             stack.enter_context(contextlib.redirect_stdout(silence))
             stack.enter_context(contextlib.redirect_stderr(silence))
@@ -145,24 +126,22 @@ def _run(options: argparse.Namespace) -> int:
     reason = reason_unusable()
     if reason is not None:
         return _fail(f"the environment is not usable: {reason}; run through ./with-fenicsx", BAD_ENVIRONMENT)
+    interrupts.take_back_signals()
     from remodel_fenicsx.body import GeometryError
-    from remodel_fenicsx.system.interrupts import Interrupted
     from remodel_fenicsx.results.run_folder import FolderTaken
     from remodel_fenicsx.simulation import run
     from remodel_fenicsx.evolution.parts import StepFailure
 
-    _let_ctrl_c_raise()
     try:
         folder = run(scene, options.output, quiet=options.quiet)
     except (FolderTaken, SceneError, GeometryError) as error:
         return _fail(" ".join(str(error).split()), BAD_INPUT)
-    except KeyboardInterrupt:  # before the first step
-        return _fail("stopped by SIGINT; nothing was computed", 130)
     except StepFailure as failure:
         advice = "try a smaller time.step, a slower ramp or lower loads; every finished step is kept"
         return _fail(f"{failure}. {advice}", SOLVE_FAILED)
-    except Interrupted as interruption:
-        return _fail(f"stopped by {interruption}; every finished step is kept", interruption.exit_code)
+    except interrupts.Interrupted as interruption:
+        end = _fail if interruption.on_all_ranks else _end_all
+        return end(f"stopped by {interruption}; {interruption.kept}", interruption.exit_code)
     except OSError as error:
         if options.output and isinstance(error, (FileExistsError, NotADirectoryError)):  # lies in a file, or just taken
             text = f"-o {options.output}: {error.filename}: {error.strerror}; allowed is a new or an empty folder"
@@ -207,14 +186,14 @@ def _figures(options: argparse.Namespace) -> int:
     except ImportError as error:
         return _fail(f"the environment is not usable: {error}; run through ./with-fenicsx", BAD_ENVIRONMENT)
     folder, runs = options.output or figures.DEFAULT_FOLDER, options.runs or figures.DEFAULT_RUNS
-    _let_ctrl_c_raise()
     try:
         formats = [name for text in options.format for name in text.split(",")] or ["png"]
-        written = figures.draw(options.names, folder, runs, options.jobs, formats, options.stamp)
+        with interrupts.StopRequest(), interrupts.stopping_at_once():
+            written = figures.draw(options.names, folder, runs, options.jobs, formats, options.stamp)
     except figures.FigureError as error:
         return _fail(str(error), error.exit_code)
-    except KeyboardInterrupt:
-        return _fail("stopped; finished runs and figures are kept", 130)
+    except interrupts.Interrupted as interruption:
+        return _fail("stopped; finished runs and figures are kept", interruption.exit_code)
     except OSError as error:
         return _fail(f"cannot write the figures: {error}", BAD_ENVIRONMENT)
     print("\n".join(map(str, written)))

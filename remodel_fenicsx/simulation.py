@@ -15,7 +15,6 @@ from remodel_fenicsx.evolution.parts import StepFailure
 from remodel_fenicsx.evolution.state import State
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher, times
 from remodel_fenicsx.evolution.unit_cells import UnitCells
-from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.results.columns import Observer
@@ -23,8 +22,14 @@ from remodel_fenicsx.results.fields import Fields
 from remodel_fenicsx.results.run_folder import RunFolder, chosen_folder
 from remodel_fenicsx.scene import Scene, SceneError
 from remodel_fenicsx.system.environment import versions
-from remodel_fenicsx.system.interrupts import Interrupted, StopRequest, end_all_ranks_on_exception
-from remodel_fenicsx.system.terminal import Progress, announce, open_log
+from remodel_fenicsx.system.interrupts import (
+    Interrupted,
+    StopRequest,
+    end_all_ranks_on_exception,
+    stopping_at_once,
+    take_back_signals,
+)
+from remodel_fenicsx.system.terminal import Progress, hold_log, open_log
 
 log = logging.getLogger(__name__)
 
@@ -53,6 +58,7 @@ class Simulation:
     """
 
     def __init__(self, scene: Scene, comm: MPI.Intracomm = MPI.COMM_WORLD, domain: Domain | None = None):
+        take_back_signals()
         self.scene, shape = scene, scene.geometry
         self.domain = shape.build(scene.mesh, comm) if domain is None else checked_domain(domain, scene)
         mesh, kinematics = self.domain.mesh, KINEMATICS[scene.model.kinematics]
@@ -150,25 +156,39 @@ def run(
     StepFailure
         If a step has no admissible equilibrium; all steps before it are recorded.
     Interrupted
-        On SIGINT or SIGTERM; all accepted steps are recorded.
+        On SIGINT, SIGTERM or SIGHUP; all accepted steps are recorded.
     OSError
         If the results cannot be written.
     """
     end_all_ranks_on_exception()
     # what the scene asks for is built before anything is written
     place = None if folder is None else chosen_folder(folder, scene.name, comm)
-    if not quiet and comm.rank == 0 and jit.is_cold():
-        announce("compiling the forms of the model, once on this machine: about half a minute")
-    simulation = Simulation(scene, comm)
-    place = place or chosen_folder(None, scene.name, comm)
+    with StopRequest() as stop:
+        with hold_log(comm.rank, quiet=quiet) as held:
+            simulation = _built(scene, comm)
+            place = place or chosen_folder(None, scene.name, comm)
+        _record(simulation, place, stop, quiet, held)
+    return place
+
+
+def _built(scene: Scene, comm: MPI.Intracomm) -> Simulation:
+    try:
+        with stopping_at_once():
+            return Simulation(scene, comm)
+    except Interrupted as interruption:
+        interruption.kept = "nothing was computed"
+        raise
+
+
+def _record(simulation: Simulation, place: Path, stop: StopRequest, quiet: bool, held: list[logging.LogRecord]) -> None:
+    scene, comm = simulation.scene, simulation.domain.mesh.comm
     header = "as run: all values, also those of preset and defaults\n" + "\n".join(
         f"{name} {version}" for name, version in versions().items()
     )
     with ExitStack() as stack:
         stack.callback(simulation.close)
         record = stack.enter_context(RunFolder(place, scene.to_toml(header), comm.rank))
-        stack.enter_context(open_log(place / "run.log", comm.rank))
-        stop = stack.enter_context(StopRequest())
+        stack.enter_context(open_log(place / "run.log", comm.rank, quiet=quiet, held=held))
         progress = stack.enter_context(Progress(scene.time.number_of_steps, scene.name, -1 if quiet else comm.rank))
         log.info("scene %s on %d ranks, results in %s", scene.name, comm.size, place)
         log.info("%s", scene.summary())
@@ -187,7 +207,6 @@ def run(
             log.info("ended: %s", reason)
             raise
         log.info("finished")
-    return place
 
 
 class _Report(Watcher):

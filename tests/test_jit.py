@@ -1,16 +1,22 @@
-"""The cache of compiled forms: compilations that were cut off, runs at once, folders that cannot be written."""
+"""Compiling: what is said, who waits for whom, compilations that were cut off, folders that cannot be written."""
 
 from __future__ import annotations
 
+import fcntl
 import os
+import signal
 import subprocess
 import sys
+import time
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
 from tests.conftest import mpirun
+from tests.processes import session_members, wait_for_compiler
 
 PROGRAM = """
 import logging, sys, ufl, dolfinx
@@ -20,26 +26,79 @@ logging.basicConfig(level=logging.INFO)
 jit.TIMEOUT = 2
 mesh = dolfinx.mesh.create_unit_cube(MPI.COMM_WORLD, 2, 2, 2)
 x = ufl.SpatialCoordinate(mesh)
-value = dolfinx.fem.assemble_scalar(jit.form(x[0] ** 3 * ufl.dx))
+value = dolfinx.fem.assemble_scalar(jit.form(x[0] ** 3 * ufl.dx, name="the moment"))
 total = mesh.comm.allreduce(value)
 assert abs(total - 0.25) < 1e-12, total
+print(len(jit.compiled_kernels()))
 """
 
 
 def compile_and_use(cache: Path, ranks: int = 1, **variables: str) -> subprocess.CompletedProcess[str]:
-    own = {"PYTHONPATH": str(Path(__file__).parents[1]), "XDG_CACHE_HOME": str(cache), **variables}
-    command = mpirun(ranks, sys.executable, "-c", PROGRAM)
-    return subprocess.run(command, capture_output=True, text=True, timeout=120, env=os.environ | own)
+    command, environment = program(cache)
+    command = mpirun(ranks, *command)
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, env=environment | variables)
 
 
-@pytest.mark.parametrize("lost", [".c", ".c.cached"])
-@pytest.mark.parametrize("ranks", [1, 2])
+def program(cache: Path, text: str = PROGRAM) -> tuple[list[str], dict[str, str]]:
+    """The command and its environment."""
+    own = {"PYTHONPATH": str(Path(__file__).parents[1]), "XDG_CACHE_HOME": str(cache)}
+    return [sys.executable, "-c", text], os.environ | own
+
+
+def one_file(folder: Path, pattern: str) -> Path:
+    (file,) = folder.rglob(pattern)
+    return file
+
+
+@contextmanager
+def locked_by_this_process(cache: Path) -> Iterator[None]:
+    """As if a run with this process's number were compiling."""
+    with one_file(cache, "compiling.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        lock.write(f"{os.getpid()}\n")
+        lock.flush()
+        yield
+
+
+def test_only_what_is_really_compiled_is_said_and_counted(tmp_path: Path) -> None:
+    count = tmp_path / "count"
+    first, again = (compile_and_use(tmp_path, REMODEL_FENICSX_COMPILED=str(count)) for _ in range(2))
+    assert (first.returncode, again.returncode) == (0, 0), first.stderr[-2000:]
+    assert first.stderr.count("compiling the moment, once on this machine: about 1 s") == 1
+    assert first.stderr.count("compiled the moment in ") == 1
+    assert "compil" not in again.stderr
+    assert (first.stdout, again.stdout) == ("1\n", "0\n")
+    assert count.read_text() == one_file(tmp_path, "libffcx_forms_*.c").stem + "\n"
+
+
+def test_what_is_in_the_cache_waits_for_no_compiler(tmp_path: Path) -> None:
+    assert compile_and_use(tmp_path).returncode == 0
+    with locked_by_this_process(tmp_path):
+        warm = compile_and_use(tmp_path)
+    assert warm.returncode == 0, warm.stderr[-2000:]
+    assert "waiting" not in warm.stderr
+
+
+def test_who_waits_for_a_compiler_says_for_whose(tmp_path: Path) -> None:
+    assert compile_and_use(tmp_path).returncode == 0
+    for path in tmp_path.rglob("libffcx_*"):
+        path.unlink()
+    command, environment = program(tmp_path)
+    with locked_by_this_process(tmp_path):
+        waiting = subprocess.Popen(command, stderr=subprocess.PIPE, env=environment, text=True)
+        assert waiting.stderr
+        line = next(line for line in waiting.stderr if "compil" in line)
+    assert f"another run is compiling forms (process {os.getpid()}): waiting for it" in line
+    assert "compiling the moment" in waiting.communicate(timeout=120)[1]
+    assert waiting.returncode == 0
+
+
+@pytest.mark.parametrize(("ranks", "lost"), [(1, ".c"), (2, ".c"), (2, ".c.cached"), (1, ".so")])
 def test_a_compilation_that_was_cut_off_is_done_again_at_once(ranks: int, lost: str, tmp_path: Path) -> None:
     assert compile_and_use(tmp_path, ranks).returncode == 0
-    (library,) = tmp_path.rglob("libffcx_forms_*.so")
-    (source,) = tmp_path.rglob("libffcx_forms_*.c")
+    library, source = one_file(tmp_path, "libffcx_forms_*.so"), one_file(tmp_path, "libffcx_forms_*.c")
     library.unlink()  # as if the compiler had been killed: mostly .c, the lock, stays without the end mark
-    source.with_suffix(lost).unlink()
+    source.with_suffix(lost).unlink(missing_ok=True)
     again = compile_and_use(tmp_path, ranks)
     assert again.returncode == 0, again.stderr[-2000:]
     assert "removing a compilation that was cut off" in again.stderr
@@ -52,6 +111,7 @@ def test_runs_at_once_compile_one_after_the_other(tmp_path: Path) -> None:
         done = list(pool.map(lambda _: compile_and_use(tmp_path), range(3)))
     assert [run.returncode for run in done] == [0, 0, 0], [run.stderr[-500:] for run in done]
     assert not any("removing a compilation" in run.stderr for run in done)  # none takes another's work for cut off
+    assert sorted(run.stdout for run in done) == ["0\n", "0\n", "1\n"]
 
 
 def test_a_cache_that_cannot_be_written_is_replaced_with_a_warning(tmp_path: Path) -> None:
@@ -62,3 +122,50 @@ def test_a_cache_that_cannot_be_written_is_replaced_with_a_warning(tmp_path: Pat
     assert done.returncode == 0, done.stderr[-2000:]
     assert done.stderr.count("cannot write to") == 1 and str(temporary) in done.stderr
     assert list(temporary.rglob("libffcx_forms_*.so"))
+
+
+# A run that is under way: a signal is a request that it looks at now and then, but not while it compiles
+IN_A_RUN = """
+import sys, ufl, dolfinx
+from mpi4py import MPI
+from remodel_fenicsx.fem import jit
+from remodel_fenicsx.system.interrupts import Interrupted, StopRequest
+mesh = dolfinx.mesh.create_unit_cube(MPI.COMM_WORLD, 2, 2, 2)
+x = ufl.SpatialCoordinate(mesh)
+# takes the compiler a while
+terms = [ufl.exp(x[0] * k) * ufl.sin(x[1] + k) * ufl.cos(x[2] * k) for k in range(1, 150)]
+with StopRequest():
+    try:
+        jit.form(sum(terms[1:], terms[0]) * ufl.dx(degree=4))
+    except Interrupted as interruption:
+        sys.exit(interruption.exit_code)
+"""
+
+
+@pytest.mark.parametrize(
+    ("target", "number"),
+    [
+        ("group", signal.SIGINT),
+        ("group", signal.SIGTERM),
+        ("group", signal.SIGHUP),
+        ("process", signal.SIGTERM),
+        ("compiler", signal.SIGTERM),
+    ],
+)
+def test_a_signal_ends_the_compiler_and_leaves_nothing(target: str, number: signal.Signals, tmp_path: Path) -> None:
+    """A terminal, and timeout, send it to the group; a supervisor to one process; some to all, one by one."""
+    command, environment = program(tmp_path, IN_A_RUN)
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, env=environment, text=True, start_new_session=True)
+    compiler = wait_for_compiler(process)
+    if target == "group":
+        os.killpg(process.pid, number)
+    else:
+        os.kill(process.pid if target == "process" else compiler, number)
+    errors = process.communicate(timeout=60)[1]
+    assert (process.returncode, errors) == (128 + number, "")
+    if target != "compiler":  # whoever ends gcc alone leaves gcc's own children to themselves
+        deadline = time.monotonic() + 10  # what was killed vanishes in its own time
+        while session_members(process.pid) and time.monotonic() < deadline:
+            time.sleep(0.05)
+        assert session_members(process.pid) == {}
+    assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == ["compiling.lock"]

@@ -21,8 +21,10 @@ SYSTEM_PATH = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
 
 MMDEBSTRAP = r"""#!/bin/bash
 # the arguments, one a line, then what STUB_BUILD asks for
+[ "$1" != --unshare-helper ] || { shift; printf '%s\n' "$*" >> "$RECORD/helper"; exec "$@"; }
 printf '%s\n' "$@" '----' >> "$RECORD/mmdebstrap"
 echo $$ > "$RECORD/pid"
+readlink /proc/$$/fd/* | grep '\.lock$' > "$RECORD/held"
 echo "I: downloading packages with apt..." >&2
 target=${!#}
 [ "$target" != - ] || target=$(mktemp -d)
@@ -31,6 +33,7 @@ touch "$target/half"
 timeout 2 cat > /dev/null
 case ${STUB_BUILD:-} in
     fail) echo "E: no such mirror" >&2; exit 1 ;;
+    killed) sleep 100 & echo $! > "$RECORD/orphan"; kill -KILL $$ ;;
     slow) touch "$RECORD/begun"; sleep 4 ;;
     hang) touch "$RECORD/begun"; sleep 300 ;;
 esac
@@ -354,6 +357,132 @@ def test_killed_build_is_never_used(rooted):
     assert rooted.roots() == [part.removesuffix(".part")]
     assert not (rooted.cache / "remodel-fenicsx" / rooted.roots()[0] / "left over").exists()
     assert len(rooted.builds()) == 2
+
+
+def a_user_builds(rooted, tmp_path) -> dict[str, str]:
+    """The environment in which the launcher takes the way of one who is not root: the root comes as a tar stream."""
+    script(rooted.stubs / "id", "#!/bin/sh\necho 1000\n")
+    if os.getuid() == 0:  # who may mount already needs no user namespace for it
+        real = shutil.which("unshare", path=SYSTEM_PATH)
+        script(
+            rooted.stubs / "unshare",
+            f'#!/bin/bash\nshopt -s extglob\nexec {real} "${{@/--@(user|map-root-user)/--mount}}"\n',
+        )
+    (tmp_path / "temporary").mkdir()
+    return {"TMPDIR": str(tmp_path / "temporary")}
+
+
+def killed_build(rooted, environment: dict[str, str]) -> Path:
+    """Launcher and builder end by SIGKILL in the middle; the temporary folder that is left."""
+    silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    process = rooted.start("true", environment=environment | {"STUB_BUILD": "hang"}, **silent)
+    wait_for((rooted.record / "begun").exists, "the build")
+    process.kill()
+    process.wait()
+    os.killpg(os.getpgid(int((rooted.record / "pid").read_text())), signal.SIGKILL)
+    (lock,) = (rooted.cache / "remodel-fenicsx").glob("*.lock")
+    wait_for(lambda: subprocess.run(["flock", "-n", lock, "true"]).returncode == 0, "the end of all that held the lock")
+    (left,) = Path(environment["TMPDIR"]).glob("remodel-fenicsx-build-*")
+    assert list(left.glob("*/half"))
+    # as owned by a mapped user: rm alone does not get rid of it
+    script(
+        rooted.stubs / "rm",
+        f"""#!/bin/bash
+shopt -s nullglob; rest=({left}/*/*)
+[ ${{#rest[@]}} = 0 ] || [ "${{!#}}" != {left} ] || exit 1
+exec {shutil.which("rm", path=SYSTEM_PATH)} "$@"
+""",
+    )
+    return left
+
+
+@pytest.mark.parametrize("other_list", [False, True])
+def test_the_next_start_removes_what_a_killed_build_left(rooted, tmp_path, other_list):
+    environment = a_user_builds(rooted, tmp_path)
+    left = killed_build(rooted, environment)
+    (part,) = rooted.roots()
+    if other_list:
+        rooted.packages.write_text(rooted.packages.read_text() + "one-more\n")
+    after = rooted.run("echo", "after", environment=environment)
+    assert (after.returncode, after.stdout) == (0, "after\n"), after.stderr
+    assert "with-fenicsx: removing what a build that was killed has left of " in after.stderr
+    assert part not in rooted.roots() and len(rooted.roots()) == 1
+    assert list((tmp_path / "temporary").iterdir()) == []
+    assert (rooted.record / "helper").read_text() == f"find {left} -mindepth 2 -xdev -delete\n"
+    assert list((rooted.cache / "remodel-fenicsx").glob("*.building")) == []
+    assert rooted.run("true", environment=environment).stderr == ""
+
+
+def test_what_a_build_that_goes_on_needs_is_not_removed(rooted, tmp_path):
+    environment = a_user_builds(rooted, tmp_path)
+    first = rooted.start("echo", "first", environment=environment | {"STUB_BUILD": "slow"})
+    wait_for((rooted.record / "begun").exists, "the first build")
+    other = Clone(tmp_path / "other", cache=rooted.cache)
+    other.packages.write_text(other.packages.read_text() + "one-more\n")
+    a_user_builds(other, tmp_path / "other")
+    second = other.run("echo", "second", environment=environment)
+    assert (second.returncode, second.stdout) == (0, "second\n")
+    assert "removing" not in second.stderr
+    assert list((tmp_path / "temporary").glob("remodel-fenicsx-build-*/*/half"))
+    out, err = first.communicate(timeout=20)
+    assert (first.returncode, out) == (0, "first\n"), err
+    assert list((tmp_path / "temporary").iterdir()) == []
+    # what mmdebstrap leaves behind when it is killed must not hold up all later starts
+    assert (rooted.record / "held").read_text() == ""
+
+
+def test_processes_of_mapped_users_that_a_killed_build_left_are_ended(rooted, tmp_path):
+    """mmdebstrap's own, without a parent, hold its pipes open: they wait for ever."""
+    become = [sys.executable, "-c", "import os; os.setuid(65534)"]
+    if subprocess.run(become, stderr=subprocess.DEVNULL).returncode != 0:
+        pytest.skip("starts a process of another user: needs the real root")
+    environment = a_user_builds(rooted, tmp_path)
+    left = killed_build(rooted, environment)
+    (record,) = (rooted.cache / "remodel-fenicsx").glob("*.building")
+    others = "import os, sys, time; os.setuid(65534); print(flush=True); time.sleep(100)"
+    leader = f"import subprocess, sys; subprocess.Popen([sys.executable, '-c', {others!r}]).stdout"
+    dead = subprocess.Popen([sys.executable, "-c", leader], start_new_session=True, stdout=subprocess.PIPE)
+    other = subprocess.Popen([sys.executable, "-c", others], start_new_session=True, stdout=subprocess.DEVNULL)
+    try:
+        dead.stdout.readline()
+        dead.wait()
+        assert group_lives(dead.pid)
+        record.write_text(f"{dead.pid}\n{left}\n")
+        assert rooted.run("true", environment=environment).returncode == 0
+        wait_for(lambda: not group_lives(dead.pid), "the end of the mapped users' processes")
+        assert other.poll() is None
+    finally:
+        other.kill()
+        other.wait()
+    assert list((tmp_path / "temporary").iterdir()) == []
+
+
+def group_lives(group: int) -> bool:
+    """Whether a process group has a process that is more than a zombie."""
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            state, _, its_group = path.read_text().rpartition(")")[2].split()[:3]
+        except (FileNotFoundError, ProcessLookupError):  # it has ended meanwhile
+            continue
+        if int(its_group) == group and state != "Z":
+            return True
+    return False
+
+
+@pytest.mark.parametrize("way", ["fail", "terminated", "killed"])
+def test_a_build_that_ends_too_early_takes_its_temporary_folder_along(rooted, tmp_path, way):
+    environment = a_user_builds(rooted, tmp_path)
+    process = rooted.start("true", environment=environment | {"STUB_BUILD": "hang" if way == "terminated" else way})
+    if way == "terminated":
+        wait_for((rooted.record / "begun").exists, "the build")
+        process.terminate()
+    process.communicate(timeout=20)
+    assert process.returncode == {"fail": 5, "terminated": 143, "killed": 5}[way]
+    if way == "killed":
+        orphan = Path("/proc", (rooted.record / "orphan").read_text().strip())
+        wait_for(lambda: not orphan.exists() or "Z" in (orphan / "stat").read_text().split(")")[1], "the orphan's end")
+    assert list((tmp_path / "temporary").iterdir()) == []
+    assert sorted(path.suffix for path in (rooted.cache / "remodel-fenicsx").iterdir()) == [".lock", ".log"]
 
 
 def test_failed_build(rooted):

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from remodel_fenicsx.results.recording import read_history
+from tests.processes import session_members, wait_for_compiler
 
 PROJECT = Path(__file__).parents[1]
 CUBE = ["run", str(PROJECT / "demos" / "cube.toml"), "--set", "time.end=10"]
@@ -61,21 +62,122 @@ def test_a_signal_that_was_ignored_from_the_start_stays_ignored(number: signal.S
     assert len(read_history(tmp_path / "out")["time"]) == 10
 
 
-@pytest.mark.parametrize("module", ["pydantic", "mpi4py", "petsc4py.PETSc", "dolfinx", "basix"])
-def test_ctrl_c_among_the_imports_ends_without_a_word(module: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("module", "number"),
+    [
+        ("pydantic", signal.SIGINT),
+        ("mpi4py", signal.SIGTERM),
+        ("petsc4py.PETSc", signal.SIGINT),
+        ("dolfinx", signal.SIGTERM),
+        ("basix", signal.SIGHUP),
+    ],
+)
+def test_a_signal_among_the_imports_ends_with_a_line(module: str, number: signal.Signals, tmp_path: Path) -> None:
     program = f"""
 import os, runpy, signal, sys
-class CtrlC:
+class Signal:
     def find_spec(name, path=None, target=None):
         if name == {module!r}:
-            os.kill(os.getpid(), signal.SIGINT)
-sys.meta_path.insert(0, CtrlC)
+            os.kill(os.getpid(), {int(number)})
+sys.meta_path.insert(0, Signal)
 sys.argv = {["remodel-fenicsx", *CUBE, "-o", str(tmp_path / "out")]!r}
 runpy.run_path({str(PROJECT / "bin" / "remodel-fenicsx")!r}, run_name="__main__")
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=100)
-    assert (done.returncode, done.stdout, done.stderr) == (-signal.SIGINT, "", "")
+    line = f"remodel-fenicsx: stopped by {number.name}\n"
+    assert (done.returncode, done.stdout, done.stderr) == (128 + number, "", line)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("module", ["simulation", "evolution.equilibrium", "system.interrupts", "cli"])
+def test_an_import_changes_no_handler(module: str) -> None:
+    """What Python knows of; PETSc puts some of its own below (take_back_signals)."""
+    program = f"""
+import signal
+def handlers(): return [signal.getsignal(number) for number in signal.valid_signals()]
+before = handlers()
+import remodel_fenicsx.{module}
+assert handlers() == before
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=100)
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_applications_signals_are_its_own_again_with_petsc() -> None:
+    """PETSc would abort the process, with pages of advice."""
+    program = """
+import os, signal
+signal.signal(signal.SIGHUP, signal.SIG_IGN)
+from remodel_fenicsx.system.interrupts import take_back_signals
+take_back_signals()
+os.kill(os.getpid(), signal.SIGHUP)
+reading, writing = os.pipe()
+os.close(reading)
+try:
+    os.write(writing, b"nobody reads this")
+except BrokenPipeError:
+    print("a closed pipe is an error")
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=100)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "a closed pipe is an error\n", "")
+
+
+# ---------------------------------------------------------------- while it compiles
+
+
+def start_cold(tmp_path: Path, *words: str) -> subprocess.Popen[str]:
+    """A run in a session and group of its own, with an empty cache of kernels."""
+    command = [*words, sys.executable, str(PROJECT / "bin" / "remodel-fenicsx"), *CUBE, "-o", str(tmp_path / "out")]
+    environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path / "cache")}
+    pipe = subprocess.PIPE
+    return subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, env=environment, start_new_session=True)
+
+
+def nothing_is_left(tmp_path: Path) -> bool:
+    """No results, and no kernel that the next start would have to wait for."""
+    sources = {path.name for path in (tmp_path / "cache").rglob("*.c")}
+    finished = {path.name.removesuffix(".cached") for path in (tmp_path / "cache").rglob("*.c.cached")}
+    return sources == finished and not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_to_the_group_while_the_compiler_runs(number: signal.Signals, tmp_path: Path) -> None:
+    process = start_cold(tmp_path)
+    wait_for_compiler(process)
+    os.killpg(process.pid, number)
+    output, errors = process.communicate(timeout=60)
+    lines = errors.splitlines()
+    assert (process.returncode, output) == (128 + number, "")
+    assert lines[-1] == f"remodel-fenicsx: stopped by {number.name}; nothing was computed"
+    assert lines[:-1] and all(line.startswith("compiling ") for line in lines[:-1])
+    assert nothing_is_left(tmp_path)
+
+
+def test_a_limit_of_time_while_the_compiler_runs(tmp_path: Path) -> None:
+    """timeout sends its signal to the process, then to the group; wherever the run is by then."""
+    process = start_cold(tmp_path, "timeout", "--preserve-status", "3")
+    errors = process.communicate(timeout=60)[1]
+    assert process.returncode == 143, errors
+    rest = [line for line in errors.splitlines() if not line.startswith("compiling ")]
+    assert len(rest) == 1 and rest[0].startswith("remodel-fenicsx: stopped by SIGTERM")
+    assert session_members(process.pid) == {}
+    assert nothing_is_left(tmp_path)
+
+
+def test_a_cold_quiet_run_leaves_what_it_compiled_in_the_log_alone(tmp_path: Path) -> None:
+    count, log = tmp_path / "count", tmp_path / "out" / "run.log"
+    environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path / "cache"), "REMODEL_FENICSX_COMPILED": str(count)}
+    words = [*COMMAND, "--set", "time.end=1", "-q", "-o"]
+    done = subprocess.run([*words, tmp_path / "out"], capture_output=True, text=True, timeout=300, env=environment)
+    assert (done.returncode, done.stderr) == (0, "")
+    kernels = sorted(path.stem for path in (tmp_path / "cache").rglob("*.c"))
+    assert sorted(count.read_text().split()) == kernels and len(kernels) > 5
+    assert log.read_text().count("NOTICE compiling ") == log.read_text().count("INFO compiled ") == len(kernels)
+    # all that a run needs is there before its first step
+    assert log.read_text().rindex("compiled ") < log.read_text().index("results in")
+    subprocess.run([*words, tmp_path / "again"], capture_output=True, timeout=300, env=environment)
+    assert "compil" not in (tmp_path / "again" / "run.log").read_text()
+    assert len(count.read_text().split()) == len(kernels)
 
 
 def test_a_usage_error_is_said_by_the_first_rank_alone() -> None:

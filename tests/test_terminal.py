@@ -13,7 +13,7 @@ import warnings
 import pytest
 
 from remodel_fenicsx.system import terminal
-from remodel_fenicsx.system.terminal import Progress, open_log
+from remodel_fenicsx.system.terminal import NOTICE, Progress, hold_log, open_log
 
 SCRIPT = """
 import sys, time, logging
@@ -79,6 +79,28 @@ def test_a_narrow_terminal_gets_one_line(tmp_path):
     assert max(len(line) for line in re.split(r"[\r\n]+", plain(text))) <= 50
 
 
+@pytest.mark.parametrize(
+    ("columns", "shown"),
+    [
+        (120, "artery [4] BAR N/8 t = N, pressure 0.192, axial_stretch 0.004, 3 Newton N:N:N N s left"),
+        (80, "artery [4] BAR N/8 t = N, 3 Newton N:N:N N s left"),
+        (60, "artery [4] BAR N/8 t = N N s left"),
+        (40, "artery [4] BAR N/8 N s left"),
+        (30, "ar… BAR N/8 N s left"),
+    ],
+)
+def test_bar_and_time_left_stay_where_it_is_narrow(columns, shown, tmp_path):
+    script = SCRIPT.replace("pressure [0.5]", "pressure 0.192, axial_stretch 0.004")
+    _, text = run_in_terminal([sys.executable, "-c", script, str(tmp_path / "run.log"), "0"], columns)
+    lines = [line for line in re.split(r"[\r\n]+", plain(text)) if "━" in line]
+    # ^C is shown behind the line: where that would not fit, the terminal breaks it, and it stands there twice
+    assert max(len(line.rstrip("\n")) for line in lines) <= columns - 2
+    underway = [line.strip() for line in lines if "left" in line]
+    normal = re.sub(r"[━╸╺]+", "BAR", underway[-1])
+    assert re.sub(r"(?<=BAR )\d|(?<=t = )\d|\d+(?=:)|(?<=:)\d+|\d+(?= s left)", "N", normal) == shown
+    assert len(re.findall("[━╸╺]", underway[-1])) >= 10
+
+
 def test_output_that_goes_to_a_file_stays_there(tmp_path):
     command = f'{sys.executable} -c "$0" {tmp_path}/run.log 0 > {tmp_path}/out'
     script = SCRIPT.replace("time.sleep(0.06)", "print(k)")
@@ -139,7 +161,8 @@ def test_other_ranks_are_silent(capsys, tmp_path):
 def test_a_closed_pipe_does_not_end_the_run():
     script = SCRIPT.replace("open_log(sys.argv[1])", "open_log('/dev/null')").replace("time.sleep(0.06)", "pass")
     script = script.replace('Progress(8, "artery [4]", 0)', 'Progress(8, "artery", 0, interval=0.0)')
-    script = "import remodel_fenicsx.evolution.equilibrium\n" + script  # with PETSc, which would end the process
+    # with PETSc, which would end the process
+    script = "from remodel_fenicsx.system.interrupts import take_back_signals\ntake_back_signals()\n" + script
     reading, writing = os.pipe()
     with subprocess.Popen([sys.executable, "-c", script, "", "0"], stdout=subprocess.PIPE, stderr=writing) as run:
         os.close(writing)
@@ -168,6 +191,31 @@ def test_log_has_times_and_the_terminal_only_warnings(tmp_path, capsys):
     assert "after the run" not in path.read_text() and "not wanted" not in path.read_text()
     err = capsys.readouterr().err
     assert err.startswith("WARNING: slow\nWARNING: ") and "from Python" in err and "iterations" not in err
+
+
+@pytest.mark.parametrize("quiet", [False, True])
+def test_what_is_logged_before_there_is_a_folder(quiet, tmp_path, capsys):
+    path = tmp_path / "run.log"
+    with hold_log(quiet=quiet) as held:
+        log = logging.getLogger("remodel_fenicsx.fem.jit")
+        log.log(NOTICE, "compiling")
+        log.info("compiled")
+        log.warning("slow")
+        seen = capsys.readouterr().err
+    log.warning("in between")
+    with open_log(path, quiet=quiet, held=held):
+        log.log(NOTICE, "compiling more")
+    again = capsys.readouterr().err.replace("in between\n", "")
+    notices = [] if quiet else ["compiling\n", "compiling more\n"]
+    assert (seen, again) == ("".join([*notices[:1], "WARNING: slow\n"]), "".join(notices[1:]))
+    said = [line.split(" ", 2)[2] for line in path.read_text().splitlines()]
+    assert said == ["NOTICE compiling", "INFO compiled", "WARNING slow", "NOTICE compiling more"]
+
+
+def test_held_lines_of_other_ranks_are_not_shown(tmp_path, capsys):
+    with hold_log(1, quiet=False) as held:
+        logging.getLogger("remodel_fenicsx.fem.jit").log(NOTICE, "compiling")
+    assert capsys.readouterr() == ("", "") and not held
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="Linux has a disk that is always full")

@@ -1,32 +1,56 @@
-"""How forms and expressions are compiled: one place for compiler flags, the cache and its one known trap."""
+"""How forms and expressions are compiled: one place for compiler flags, the cache, and what a compilation says."""
 
 from __future__ import annotations
 
 import fcntl
 import functools
 import hashlib
+import importlib.machinery
 import logging
 import os
 import platform
+import resource
+import subprocess
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+import time as clock
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
 
 import dolfinx.fem
+import ffcx.codegeneration.jit
 from mpi4py import MPI
+from ufl.classes import Label
+from ufl.corealg.map_dag import map_expr_dag
+from ufl.corealg.multifunction import MultiFunction
 from ufl.domain import extract_unique_domain
+
+from remodel_fenicsx.system.interrupts import SIGNALS, Interrupted, stopping_at_once
+from remodel_fenicsx.system.terminal import NOTICE
 
 log = logging.getLogger(__name__)
 
-TIMEOUT = 600  # seconds that FFCx waits for another process to compile a form; none was cut off (_alone)
+TIMEOUT = 600  # seconds that FFCx waits for another process to compile a form; none was cut off (_compiling)
+COMPILED = "REMODEL_FENICSX_COMPILED"  # names a file that gets a line for each kernel that is really compiled
 
 # Faster than -O2 by a third for this energy, and NaN and infinity keep their meaning: the guards rely on them.
 COMPILER_FLAGS = [
     "-O2", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros", "-freciprocal-math",
     "-fassociative-math", "-w",
 ]  # fmt: skip
+
+# By number of arguments: what a form is, and the seconds that it takes (the energy here, hexahedra, one core)
+_KINDS = {0: ("an integral", 1), 1: ("the residual", 1), 2: ("the tangent", 5)}
+_GRACE = 0.5  # seconds: whatever ended the compiler may be about to end this process too
+
+_compiled: list[str] = []
+_waited_for: set[str] = set()
+
+
+def compiled_kernels() -> tuple[str, ...]:
+    """Names of the kernels that this process has really compiled, not found in the cache."""
+    return tuple(_compiled)
 
 
 @functools.cache
@@ -55,47 +79,153 @@ def cache_folder() -> Path:
     return other / name
 
 
-def is_cold() -> bool:
-    """Whether nothing has been compiled on this machine yet, so that the first run takes longer."""
-    return not any(cache_folder().glob("*.c.cached"))
-
-
 def jit_options() -> dict[str, Any]:
     """Options for every compiled form or expression."""
     return {"cffi_extra_compile_args": COMPILER_FLAGS, "cache_dir": cache_folder(), "timeout": TIMEOUT}
 
 
-def form(ufl_form: Any) -> Any:
-    """Compile a UFL form.
+def form(ufl_form: Any, name: str | None = None) -> Any:
+    """Compile a UFL form, or take it from the cache.
+
+    Parameters
+    ----------
+    ufl_form
+        The form.
+    name
+        What is being compiled, for people: "the mass matrix". Default: by the number of its arguments.
 
     Raises
     ------
+    Interrupted
+        If a `StopRequest` is waiting for signals and one came while it was compiled.
     RuntimeError
         If the kernel does not compile.
     """
-    with _alone(ufl_form.ufl_domains()[0].ufl_cargo().comm):
+    kind, seconds = _KINDS[len(ufl_form.arguments())]
+    with _compiler_watched(ufl_form.ufl_domains()[0].ufl_cargo().comm, name or kind, seconds):
         return dolfinx.fem.form(ufl_form, jit_options=jit_options())
 
 
-def expression(ufl_expression: Any, points: Any) -> Any:
-    """Compile a UFL expression for evaluation at reference points of shape (n, 3)."""
-    with _alone(extract_unique_domain(ufl_expression).ufl_cargo().comm):
-        return dolfinx.fem.Expression(ufl_expression, points, jit_options=jit_options())
+def expression(ufl_expression: Any, points: Any, name: str | None = None) -> Any:
+    """Compile a UFL expression for evaluation at reference points of shape (n, 3); otherwise like `form`."""
+    with _compiler_watched(extract_unique_domain(ufl_expression).ufl_cargo().comm, name or "an expression", 1):
+        return dolfinx.fem.Expression(map_expr_dag(_OwnLabels(), ufl_expression), points, jit_options=jit_options())
+
+
+class _OwnLabels(MultiFunction):
+    """Numbers the variables (`ufl.variable`) of an expression from 0.
+
+    UFL numbers them through the life of a process, and FFCx takes these numbers into the kernel's name: without this
+    the second problem of a process compiles the same expression again.
+    """
+
+    expr = MultiFunction.reuse_if_untouched
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.labels: dict[Label, Label] = {}
+
+    def label(self, label: Label) -> Label:
+        """The next number, or the one that this label has got."""
+        return self.labels.setdefault(label, Label(len(self.labels)))
 
 
 @contextmanager
-def _alone(comm: MPI.Intracomm) -> Iterator[None]:
-    """Only one process compiles at a time, so that whatever is unfinished before was cut off: it is removed.
+def _compiler_watched(comm: MPI.Intracomm, what: str, seconds: int) -> Iterator[None]:
+    """Within, what is not in the cache is compiled by one process at a time, and said.
 
-    FFCx itself would wait for it: its .c file is the lock, and stays when a process is killed. The lock here is the
-    kernel's, which ends with its process. Of several ranks the first compiles, the others wait for it.
+    FFCx computes a kernel's name and looks for it by `get_cached_module`: nothing else knows without doing that work
+    twice whether the compiler is going to run. So this stands before that function. What is in the cache passes at
+    once: no lock, no waiting. Of several ranks the first compiles; the others ask when it is done.
     """
     if comm.rank != 0:
         yield
         return
+    look_up: Callable[..., Any] = ffcx.codegeneration.jit.get_cached_module
+    with ExitStack() as until_compiled:
+
+        def watched(kernel: str, *arguments: Any, **options: Any) -> Any:
+            if not _is_cached(kernel):
+                until_compiled.enter_context(_compiling(kernel, what, seconds))
+            return look_up(kernel, *arguments, **options)
+
+        ffcx.codegeneration.jit.get_cached_module = watched
+        try:
+            yield
+        finally:
+            ffcx.codegeneration.jit.get_cached_module = look_up
+
+
+@contextmanager
+def _compiling(kernel: str, what: str, seconds: int) -> Iterator[None]:
+    """The only process that compiles; stopped by a signal at once, and then nothing of the kernel stays."""
+    with stopping_at_once(), _alone():
+        if _is_cached(kernel):  # by the run that this one has waited for
+            yield
+            return
+        log.log(NOTICE, "compiling %s, once on this machine: about %d s", what, seconds)
+        start, before = clock.monotonic(), resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
+        handlers = logging.getLogger().handlers.copy()
+        try:
+            yield
+        except BaseException as error:
+            logging.getLogger().handlers = handlers  # FFCx has put others there, and gives them back on success only
+            _remove(kernel)
+            _raise_if_killed(error)
+            raise
+        spent = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - before
+        elapsed = clock.monotonic() - start
+        log.info("compiled %s in %.1f s, %.1f s of processor time in the compiler: %s", what, elapsed, spent, kernel)
+        _count(kernel)
+
+
+def _raise_if_killed(error: BaseException | None) -> None:
+    """A compiler that a signal has ended is an interruption, whether the signal was for this process too or not."""
+    if not isinstance(error, Exception) or isinstance(error, Interrupted):
+        return
+    clock.sleep(_GRACE)  # Interrupted is raised here if the signal is on its way
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, subprocess.CalledProcessError) and -cause.returncode in SIGNALS:
+            raise Interrupted(-cause.returncode, on_all_ranks=False) from error
+        cause = cause.__cause__ or cause.__context__
+
+
+def _count(kernel: str) -> None:
+    _compiled.append(kernel)
+    if os.environ.get(COMPILED):
+        with open(os.environ[COMPILED], "a") as file:
+            file.write(f"{kernel}\n")
+
+
+# ---------------------------------------------------------------- the cache
+
+
+def _files(kernel: str) -> list[Path]:
+    """What FFCx leaves of a kernel: the source, which is its lock, the end mark, the library."""
+    folder, library = cache_folder(), importlib.machinery.EXTENSION_SUFFIXES[0]
+    return [folder / f"{kernel}{ending}" for ending in (".c", ".c.cached", library)]
+
+
+def _is_cached(kernel: str) -> bool:
+    return all(path.exists() for path in _files(kernel))
+
+
+def _remove(kernel: str) -> None:
+    for path in cache_folder().glob(f"{kernel}.*"):
+        path.unlink(missing_ok=True)
+
+
+@contextmanager
+def _alone() -> Iterator[None]:
+    """Only one process compiles at a time, so that whatever is unfinished before was cut off: it is removed.
+
+    FFCx itself would wait for it: its .c file is the lock, and stays when a process is killed. The lock here is the
+    operating system's, which ends with its process; the file holds the number of that process.
+    """
     folder = cache_folder()
     folder.mkdir(parents=True, exist_ok=True)
-    with (folder / "compiling.lock").open("a") as lock:
+    with (folder / "compiling.lock").open("a+") as lock:
         try:
             _take(lock)
             _remove_unfinished()
@@ -108,16 +238,24 @@ def _take(lock: IO[str]) -> None:
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
-        log.info("another run is compiling forms: waiting for it")
+        lock.seek(0)
+        process = lock.read().strip() or "unknown"
+        log.log(
+            logging.INFO if process in _waited_for else NOTICE,  # once on the terminal, not for every kernel
+            "another run is compiling forms (process %s): waiting for it",
+            process,
+        )
+        _waited_for.add(process)
         fcntl.flock(lock, fcntl.LOCK_EX)
+    lock.truncate(0)
+    lock.write(f"{os.getpid()}\n")
+    lock.flush()
 
 
 def _remove_unfinished() -> None:
-    """Remove what a killed compilation left: a .c file (FFCx's lock) without .c.cached (its end mark), or it alone."""
-    names = {name for name in os.listdir(cache_folder()) if name.startswith("libffcx_")}
-    sources = {name for name in names if name.endswith(".c")}
-    finished = {name.removesuffix(".cached") for name in names if name.endswith(".c.cached")}
-    for name in sources ^ finished:
-        log.info("removing a compilation that was cut off: %s", name)
-        for path in (cache_folder() / name, cache_folder() / f"{name}.cached"):
-            path.unlink(missing_ok=True)
+    """Remove what a killed compilation left: a .c file (FFCx's lock) without end mark or library, or one of these."""
+    kernels = {name.partition(".")[0] for name in os.listdir(cache_folder()) if name.startswith("libffcx_")}
+    for kernel in kernels:
+        if not _is_cached(kernel):
+            log.info("removing a compilation that was cut off: %s", kernel)
+            _remove(kernel)

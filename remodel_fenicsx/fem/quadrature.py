@@ -44,7 +44,9 @@ class Quadrature:
             self.number_of_owned_elements + mesh.topology.index_map(mesh.topology.dim).num_ghosts, dtype=np.int32
         )
         x = ufl.SpatialCoordinate(mesh)
-        geometry = self.evaluate(jit.expression(ufl.as_vector([*x, ufl.JacobianDeterminant(mesh)]), self.points), (4,))
+        geometry = self.evaluate(
+            jit.expression(ufl.as_vector([*x, ufl.JacobianDeterminant(mesh)]), self.points, "the geometry"), (4,)
+        )
         self.coordinates: NDArray[np.float64] = geometry[..., :3]
         self.volumes: NDArray[np.float64] = np.abs(geometry[..., 3]) * self.weights
 

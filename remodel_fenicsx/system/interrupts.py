@@ -1,15 +1,21 @@
-"""Signals: Ctrl-C, SIGTERM and SIGHUP, remembered until the run is at a place where it can stop cleanly."""
+"""Signals: Ctrl-C, SIGTERM and SIGHUP, remembered until the run is at a place where it can stop cleanly.
+
+Importing this module changes nothing; an application calls what it wants.
+"""
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 import threading
 import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
 from types import FrameType, TracebackType
 
-import petsc4py.PETSc  # noqa: F401 - before its signals can be taken back
-from mpi4py import MPI
+SIGNALS: tuple[int, ...] = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # ask a process to end
 
 _EXIT_CODE_BASE = 128
 
@@ -17,9 +23,31 @@ _EXIT_CODE_BASE = 128
 _NOT_PETSCS = (signal.SIGHUP, signal.SIGINT, signal.SIGPIPE, signal.SIGQUIT, signal.SIGTERM, signal.SIGURG)
 
 
-def _take_back_signals() -> None:
+class Interrupted(Exception):  # noqa: N818 - no error: somebody asked for it
+    """The run was asked to stop; the step under way is dropped.
+
+    Attributes
+    ----------
+    exit_code
+        128 and the number of the signal.
+    on_all_ranks
+        Whether it is raised on every rank; if not, others wait for this one and must be ended.
+    kept
+        What is left of the run, in words.
+    """
+
+    def __init__(self, number: int, on_all_ranks: bool = True):
+        super().__init__(signal.Signals(number).name)
+        self.on_all_ranks = on_all_ranks
+        self.exit_code = _EXIT_CODE_BASE + number
+        self.kept = "every finished step is kept"
+
+
+def take_back_signals() -> None:
     """What Python had set before PETSc was loaded: a closed pipe is a BrokenPipeError, an ignored signal is ignored."""
-    if threading.current_thread() is not threading.main_thread():  # others may not
+    import petsc4py.PETSc  # noqa: F401 - before its signals can be taken back
+
+    if not _is_main_thread():
         return
     for number in _NOT_PETSCS:
         handler = signal.getsignal(number)  # what Python remembers: it does not see that PETSc has replaced it
@@ -27,56 +55,155 @@ def _take_back_signals() -> None:
             signal.signal(number, handler)
 
 
-_take_back_signals()
+def _is_main_thread() -> bool:
+    """Others may not set handlers."""
+    return threading.current_thread() is threading.main_thread()
 
 
-class Interrupted(Exception):  # noqa: N818 - no error: somebody asked for it
-    """The run was asked to stop; the step under way is dropped."""
+# ---------------------------------------------------------------- ranks
 
-    def __init__(self, number: int):
-        super().__init__(signal.Signals(number).name)
-        self.exit_code = _EXIT_CODE_BASE + number
+
+def is_first_rank() -> bool:
+    """Whether this process is the one that speaks, without starting MPI."""
+    return (os.environ.get("OMPI_COMM_WORLD_RANK") or os.environ.get("PMI_RANK") or "0") == "0"
 
 
 def end_all_ranks_on_exception() -> None:
     """From now on an exception that nobody catches ends every rank of the run, not only the one that raised it.
 
     The others would wait for it for ever. (``python3 -m mpi4py`` is not enough once PETSc is there: its own end is
-    collective and comes first.) On one rank nothing changes.
+    collective and comes first.) On one rank nothing changes but that signals are taken back from PETSc, which would
+    end a rank in its own way (`take_back_signals`).
     """
+    from mpi4py import MPI
+
+    take_back_signals()
     if MPI.COMM_WORLD.size > 1:
         sys.excepthook = _print_and_abort
 
 
 def _print_and_abort(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+    from mpi4py import MPI
+
     traceback.print_exception(kind, error, trace)
     sys.stderr.flush()
     MPI.COMM_WORLD.Abort(1)
+
+
+# ---------------------------------------------------------------- before there is anything to keep
+
+
+@contextmanager
+def ending_at_once() -> Iterator[None]:
+    """Within, a signal ends the process with one line and its exit code, wherever no `StopRequest` waits for it.
+
+    No exception: out of half-imported libraries that would be pages of traceback. A signal that is ignored, or that
+    somebody else handles, is left alone.
+    """
+    before: dict[int, object] = {}
+    if _is_main_thread():
+        for number in SIGNALS:
+            if signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
+                before[number] = signal.signal(number, _end)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)  # type: ignore[arg-type]
+
+
+def _end(number: int, frame: FrameType | None) -> None:
+    if is_first_rank():
+        with suppress(OSError):  # the terminal is gone
+            os.write(2, f"remodel-fenicsx: stopped by {signal.Signals(number).name}\n".encode())
+    os._exit(_EXIT_CODE_BASE + number)
+
+
+# ---------------------------------------------------------------- a run
 
 
 class StopRequest:
     """Context that turns the first SIGINT, SIGTERM or SIGHUP into a request; a second one stops at once.
 
     PETSc must not see an exception from a callback, so a handler that raises is not enough: the solver asks `number`.
-    A signal that is ignored (a background job of a script, nohup) stays ignored.
+    Elsewhere see `stopping_at_once`. A signal that is ignored (a background job of a script, nohup) stays ignored.
     """
 
     def __init__(self) -> None:
         self.number = 0
+        self.raises = False
         self._previous: dict[int, object] = {}
 
     def __enter__(self) -> StopRequest:
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        for number in SIGNALS if _is_main_thread() else ():
             if signal.getsignal(number) != signal.SIG_IGN:
                 self._previous[number] = signal.signal(number, self._remember)
+        _requests.append(self)
         return self
 
     def _remember(self, number: int, frame: FrameType | None) -> None:
         self.number = number
         signal.signal(number, signal.SIG_DFL)
+        if self.raises:
+            _end_children(number)
+            raise Interrupted(number, on_all_ranks=False)
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        _requests.remove(self)
         for number, handler in self._previous.items():
             signal.signal(number, handler)  # type: ignore[arg-type]
+
+
+_requests: list[StopRequest] = []  # those that are waiting for signals; the last one gets them
+
+
+@contextmanager
+def stopping_at_once() -> Iterator[None]:
+    """Within, a request to stop is an exception at once; programs that were started (a compiler) are ended first.
+
+    For places that take long and are not called by PETSc. Without a `StopRequest` nothing changes.
+
+    Raises
+    ------
+    Interrupted
+        Where the signal comes, also in place of the error that it led to elsewhere; at the start if it came before.
+    """
+    if not _requests:
+        yield
+        return
+    request = _requests[-1]
+    before, request.raises = request.raises, True
+    try:
+        _check(request)
+        yield
+        _check(request)
+    except Interrupted:
+        raise
+    except Exception as error:
+        if request.number:
+            raise Interrupted(request.number, on_all_ranks=False) from error
+        raise
+    finally:
+        request.raises = before
+
+
+def _check(request: StopRequest) -> None:
+    if request.number:
+        raise Interrupted(request.number, on_all_ranks=False)
+
+
+def _end_children(number: int) -> None:
+    """A signal for this process alone would leave gcc's own children working for nobody (Linux; elsewhere it does)."""
+    for process in _descendants(os.getpid()):
+        with suppress(ProcessLookupError):
+            os.kill(process, number)
+
+
+def _descendants(process: int) -> list[int]:
+    try:
+        children = [int(word) for word in Path(f"/proc/{process}/task/{process}/children").read_text().split()]
+    except OSError:  # it has ended, or this is no Linux
+        return []
+    return [one for child in children for one in (child, *_descendants(child))]

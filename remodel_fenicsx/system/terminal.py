@@ -6,16 +6,25 @@ import logging
 import os
 import sys
 import time as clock
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from datetime import timedelta
 from types import TracebackType
+from typing import Any
 
+from rich.cells import cell_len, set_cell_size
 from rich.console import Console
-from rich.progress import BarColumn, Progress as RichProgress, TaskID, TextColumn, TimeElapsedColumn
+from rich.progress import Progress as RichProgress, ProgressColumn, Task, TaskID
+from rich.progress_bar import ProgressBar
+from rich.table import Table
 from rich.text import Text
 
 LOGGER = "remodel_fenicsx"
 LOG_FORMAT = "%(asctime)s %(levelname)s %(message)s"
+
+# for the log, and for the terminal unless it is to be quiet: a wait with its reason. No warning: all is well
+NOTICE = (logging.INFO + logging.WARNING) // 2
+logging.addLevelName(NOTICE, "NOTICE")
 
 
 class Progress:
@@ -49,12 +58,13 @@ class Progress:
         self._start = clock.monotonic()
         if not self._silent and _is_terminal():
             # rich leads what others print, warnings of the log for one, around the bar; what goes to a file stays there
+            console = Console(stderr=True)
             self._bar = RichProgress(
-                TextColumn("{task.description}"), BarColumn(bar_width=24), TextColumn("{task.completed}/{task.total}"),
-                TextColumn("{task.fields[state]}"), TimeElapsedColumn(), TextColumn("{task.fields[left]}"),
-                console=Console(stderr=True), refresh_per_second=4, redirect_stdout=sys.stdout.isatty(),
-            )  # fmt: skip
-            self._task = self._bar.add_task(Text(self._title).markup, total=self._total, state="starting", left="")
+                _Line(console), console=console, refresh_per_second=4, redirect_stdout=sys.stdout.isatty()
+            )
+            self._task = self._bar.add_task(
+                self._title, total=self._total, time="starting", loads="", newton="", left=""
+            )
             self._bar.start()
         return self
 
@@ -86,14 +96,14 @@ class Progress:
         """
         if self._silent:
             return
-        state = ", ".join(filter(None, [f"t = {time:g}", load_text, f"{newton_iterations} Newton"]))
+        state: dict[str, Any] = {"time": f"t = {time:g}", "loads": load_text, "newton": f"{newton_iterations} Newton"}
         left = self._time_left(index)
         if message is not None:
             self.message(message)
         if self._bar is not None:
-            self._bar.update(self._task, completed=index, state=Text(state).markup, left=left)
+            self._bar.update(self._task, completed=index, left=left, **state)
             return
-        self._pending = f"{self._title}: step {index}/{self._total}, {state}" + (f", {left}" if left else "")
+        self._pending = f"{self._title}: " + _joined(f"step {index}/{self._total}", *state.values(), left)
         now = clock.monotonic()
         if not self._started or index >= self._total or now - self._last_line >= self._interval:
             self._print(self._pending)
@@ -118,6 +128,46 @@ class Progress:
         announce(line)
 
 
+class _Line(ProgressColumn):
+    """The whole line: title, bar, step, state, time so far, time left; what counts least goes where it is narrow."""
+
+    _WIDEST_BAR, _NARROWEST_BAR = 24, 10
+    _GAPS = 2  # one on each side of the bar
+    # a line that reaches the edge is broken by the ^C that a terminal shows, and then stands there twice
+    _MARGIN = 3
+
+    def __init__(self, console: Console):
+        super().__init__()
+        self._console = console
+
+    def render(self, task: Task) -> Table:
+        """The line, for the terminal's present width."""
+        title = task.description
+        room = self._console.width - self._MARGIN - self._GAPS - cell_len(title)
+        texts = [_behind_bar(task, extras) for extras in (4, 3, 2, 1, 0)]
+        text = next((text for text in texts if cell_len(text) <= room - self._WIDEST_BAR), texts[-1])
+        bar_width = min(self._WIDEST_BAR, max(self._NARROWEST_BAR, room - cell_len(text)))
+        excess = bar_width + cell_len(text) - room
+        if excess > 0:
+            title = set_cell_size(title, max(0, cell_len(title) - excess - 1)) + "…"
+        line = Table.grid(padding=(0, 1, 0, 0))
+        line.add_row(Text(title), ProgressBar(task.total, task.completed, width=bar_width), Text(text, no_wrap=True))
+        return line
+
+
+def _behind_bar(task: Task, extras: int) -> str:
+    """Step and time left, and so many of time, time so far, Newton iterations and loads."""
+    shown = ("time", "elapsed", "newton", "loads")[:extras]
+    state = _joined(*(task.fields[name] for name in ("time", "loads", "newton") if name in shown))
+    elapsed = str(timedelta(seconds=int(task.elapsed or 0))) if "elapsed" in shown else ""
+    number = f"{task.completed:.0f}/{task.total:.0f}"
+    return " ".join(filter(None, [number, state, elapsed, task.fields["left"]]))
+
+
+def _joined(*parts: str) -> str:
+    return ", ".join(filter(None, parts))
+
+
 def announce(line: str, end: str = "\n") -> None:
     """Print a line on stderr; if whoever read it is gone (a closed pipe), that is no reason to lose a long run."""
     with suppress(OSError):
@@ -125,19 +175,58 @@ def announce(line: str, end: str = "\n") -> None:
 
 
 @contextmanager
-def open_log(path: str | os.PathLike[str], comm_rank: int = 0) -> Iterator[logging.Logger]:
+def hold_log(comm_rank: int = 0, *, quiet: bool = True) -> Iterator[list[logging.LogRecord]]:
+    """Keep what the package logs for `open_log`, until there is a folder for it; the terminal gets its part at once."""
+    held = _Held()
+    with _logged_to([held, _screen(quiet)], comm_rank):
+        yield held.records
+
+
+@contextmanager
+def open_log(
+    path: str | os.PathLike[str],
+    comm_rank: int = 0,
+    *,
+    quiet: bool = True,
+    held: Sequence[logging.LogRecord] = (),
+) -> Iterator[logging.Logger]:
     """Write what the package logs, with times, to the end of `path`, and warnings to the terminal too.
 
     Python's warnings go the same way. Without this, logging is as the calling script has set it up. On ranks other
     than 0 nothing is written or shown.
+
+    Parameters
+    ----------
+    path
+        The log file.
+    comm_rank
+        Rank of this process.
+    quiet
+        No notices on the terminal, warnings only.
+    held
+        What was logged before there was a file (`hold_log`): it goes first.
 
     Raises
     ------
     OSError
         If the file cannot be opened; later, out of the logging call, if it cannot be written (disk full).
     """
+    handlers: list[logging.Handler] = []
+    if comm_rank == 0:
+        file = _LogFile(path, encoding="utf-8")
+        file.setFormatter(_OneBlock(LOG_FORMAT))
+        handlers = [file, _screen(quiet)]
+        for record in held:
+            file.handle(record)
+    with _logged_to(handlers, comm_rank) as logger:
+        yield logger
+
+
+@contextmanager
+def _logged_to(handlers: list[logging.Handler], comm_rank: int) -> Iterator[logging.Logger]:
+    """The package's log and Python's warnings go to these handlers, on other ranks nowhere."""
     logger, python_warnings = logging.getLogger(LOGGER), logging.getLogger("py.warnings")
-    handlers = _handlers(path) if comm_rank == 0 else [logging.NullHandler()]
+    handlers = handlers if comm_rank == 0 else [logging.NullHandler()]
     before = logger.level, logger.propagate, python_warnings.propagate
     logger.setLevel(logging.INFO)
     logger.propagate = python_warnings.propagate = False
@@ -158,12 +247,10 @@ def open_log(path: str | os.PathLike[str], comm_rank: int = 0) -> Iterator[loggi
             handler.close()  # last: a full disk makes this an error
 
 
-def _handlers(path: str | os.PathLike[str]) -> list[logging.Handler]:
-    file = _LogFile(path, encoding="utf-8")
-    file.setFormatter(_OneBlock(LOG_FORMAT))
-    screen = _Screen(logging.WARNING)
-    screen.setFormatter(_OneBlock("%(levelname)s: %(message)s"))
-    return [file, screen]
+def _screen(quiet: bool) -> logging.Handler:
+    screen = _Screen(logging.WARNING if quiet else NOTICE)
+    screen.setFormatter(_ForPeople("%(levelname)s: %(message)s"))
+    return screen
 
 
 class _OneBlock(logging.Formatter):
@@ -173,12 +260,28 @@ class _OneBlock(logging.Formatter):
         return super().format(record).rstrip()
 
 
+class _ForPeople(_OneBlock):
+    """Notices are sentences; only what is wrong says how wrong."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return record.getMessage() if record.levelno == NOTICE else super().format(record)
+
+
 class _LogFile(logging.FileHandler):
     """A log whose write errors are errors."""
 
     def handleError(self, record: logging.LogRecord) -> None:
         # called inside logging's own `except`: logging would print a traceback for every line and go on
         raise
+
+
+class _Held(logging.Handler):
+    def __init__(self) -> None:
+        super().__init__()
+        self.records: list[logging.LogRecord] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.records.append(record)
 
 
 class _Screen(logging.Handler):

@@ -1,0 +1,36 @@
+"""Processes that tests look at: who is at work in a session (Linux)."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import time
+from pathlib import Path
+
+
+def session_members(session: int) -> dict[int, str]:
+    """Number and name of every process of a session that has not ended."""
+    found = {}
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            # number (name) state parent group session ...; a name may hold spaces and brackets
+            front, _, rest = (folder / "stat").read_text().rpartition(")")
+        except OSError:  # it has ended meanwhile
+            continue
+        state, _, _, its_session = rest.split()[:4]
+        if int(its_session) == session and state not in "ZX":
+            found[int(folder.name)] = front.partition("(")[2]
+    return found
+
+
+def wait_for_compiler(process: subprocess.Popen[str], timeout: float = 120) -> int:
+    """Wait until the C compiler itself is at work in this process's session; the number of the gcc that called it."""
+    deadline = time.monotonic() + timeout
+    while time.monotonic() < deadline:
+        for number, name in session_members(process.pid).items():
+            if name == "cc1":
+                return int(Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()[1])
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.01)
+    os.killpg(process.pid, 9)
+    raise AssertionError("no compiler was started")

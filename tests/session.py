@@ -1,0 +1,165 @@
+"""A test session's own rules, as a plugin of pytest's: limits that find a hang, launcher tests only when its files have
+changed, and how many kernels were compiled.
+"""
+
+from __future__ import annotations
+
+import datetime
+import faulthandler
+import hashlib
+import os
+import platform
+import signal
+import tempfile
+from collections import defaultdict
+from collections.abc import Generator
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import pytest
+
+PROJECT = Path(__file__).resolve().parents[1]
+SLOW_LIMIT = 3600  # seconds for a test marked slow; pyproject.toml has the limit of all others
+COMPILED = "REMODEL_FENICSX_COMPILED"  # names the file that gets one line for each kernel that is compiled
+LAUNCHER_TEST = "test_launcher.py"
+
+
+# ---------------------------------------------------------------- limits
+def descendants(process: int) -> list[int]:
+    """All processes that this one has started, and those started by them."""
+    children: dict[int, list[int]] = defaultdict(list)
+    for entry in Path("/proc").glob("[0-9]*"):
+        try:
+            parent = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
+        except (FileNotFoundError, ProcessLookupError):  # it has ended meanwhile
+            continue
+        children[parent].append(int(entry.name))
+    found = [process]
+    for one in found:
+        found += children[one]
+    return found[1:]
+
+
+def kill_descendants() -> None:
+    """What a test that hangs has started, mpirun's ranks as well: killing mpirun alone would leave them."""
+    for process in descendants(os.getpid()):
+        try:
+            os.kill(process, signal.SIGKILL)
+        except ProcessLookupError:  # it has ended meanwhile
+            continue
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Of pyproject.toml, and of -o NAME=VALUE."""
+    parser.addini(
+        "timeout_grace", "seconds after a test's limit: if it goes on then, its process is ended", default="60"
+    )
+
+
+@pytest.hookimpl(wrapper=True, optionalhook=True)
+def pytest_timeout_set_timer(item: pytest.Item, settings: Any) -> Generator[None, Any, Any]:
+    """At its limit a test fails, with all it has started; where Python's signals do not arrive, its process ends."""
+    result = yield
+    fail = signal.getsignal(signal.SIGALRM)
+    assert callable(fail), "pytest-timeout's method must be 'signal'"
+
+    def end(number: int, frame: FrameType | None) -> None:
+        kill_descendants()
+        fail(number, frame)
+
+    signal.signal(signal.SIGALRM, end)
+    end_at = settings.timeout + float(item.config.getini("timeout_grace"))
+    faulthandler.dump_traceback_later(end_at, exit=True, file=item.config.stash[STANDARD_ERROR])
+    return result
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_timeout_cancel_timer(item: pytest.Item) -> None:
+    """The test has ended."""
+    faulthandler.cancel_dump_traceback_later()
+
+
+def pytest_enter_pdb() -> None:
+    """Who debugs takes the time it takes."""
+    faulthandler.cancel_dump_traceback_later()
+
+
+# ---------------------------------------------------------------- launcher tests
+class LauncherTests:
+    """They run when the launcher's files differ from those with which they last passed here, or when they are named.
+
+    The stamp of a pass is a file in the cache folder; its name is the hash of these files and of the machine's kernel.
+    """
+
+    def __init__(self, config: pytest.Config):
+        base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        self.stamp = base / "remodel-fenicsx" / "launcher-tests" / launcher_key()
+        files = [Path(word.split("::")[0]).name for word in config.args]
+        selected = config.getoption("markexpr") + config.getoption("keyword")
+        self.named = LAUNCHER_TEST in files or "launcher" in selected
+        self.whole = not any("::" in word for word in config.args)
+        self.collected: set[str] = set()
+        self.passed: set[str] = set()
+
+    def pytest_itemcollected(self, item: pytest.Item) -> None:
+        """Mark them, and skip them with the reason."""
+        if item.path.name != LAUNCHER_TEST:
+            return
+        self.collected.add(item.nodeid)
+        item.add_marker("launcher")
+        if not self.named and self.stamp.exists():
+            day = self.stamp.read_text().strip()
+            reason = f"they passed here on {day}, the launcher's files are the same; -m launcher runs them"
+            item.add_marker(pytest.mark.skip(reason))
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        """One phase of one test."""
+        if report.when == "call" and report.passed and report.nodeid in self.collected:
+            self.passed.add(report.nodeid)
+        elif not report.passed:
+            self.passed.discard(report.nodeid)
+
+    def pytest_sessionfinish(self) -> None:
+        """Leave the stamp if all have passed, none skipped, in this process."""
+        if self.whole and self.collected and self.collected == self.passed:
+            self.stamp.parent.mkdir(parents=True, exist_ok=True)
+            self.stamp.write_text(f"{datetime.date.today()}\n")
+
+
+def launcher_key() -> str:
+    """Hash of what these tests look at."""
+    files = ["with-fenicsx", "Dockerfile", "bin/remodel-fenicsx", ".ci/run", "tests/run", "tests/container/run"]
+    files += [f"tests/{LAUNCHER_TEST}", *(f"environment/{path.name}" for path in (PROJECT / "environment").iterdir())]
+    key = hashlib.sha256(f"{platform.platform()} {os.getuid()} {os.environ.get('REMODEL_FENICSX_ROOT')}".encode())
+    for name in sorted(files):
+        path = PROJECT / name
+        key.update(f"{name} {path.stat().st_mode:o} {path.stat().st_size}\n".encode() + path.read_bytes())
+    return key.hexdigest()[:16]
+
+
+# ---------------------------------------------------------------- the session
+STANDARD_ERROR = pytest.StashKey[int]()
+
+
+def pytest_itemcollected(item: pytest.Item) -> None:
+    """Slow tests have a limit of their own."""
+    if item.get_closest_marker("slow") and not item.get_closest_marker("timeout"):
+        item.add_marker(pytest.mark.timeout(SLOW_LIMIT))
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Before anything is collected or started."""
+    config.stash[STANDARD_ERROR] = os.dup(2)  # during a test, 2 is a file that would be lost with the process
+    config.pluginmanager.register(LauncherTests(config))
+    if COMPILED not in os.environ:  # pytest-xdist's workers have it from the process that starts them
+        folder = tempfile.TemporaryDirectory(prefix="remodel-fenicsx-tests-")
+        os.environ[COMPILED] = str(Path(folder.name) / "compiled")
+        config.add_cleanup(lambda: (os.environ.pop(COMPILED), folder.cleanup()))
+
+
+def pytest_terminal_summary(terminalreporter: Any) -> None:
+    """How many kernels were compiled, by all processes of the session."""
+    path = Path(os.environ[COMPILED])
+    lines = path.read_text().splitlines() if path.exists() else []
+    terminalreporter.write_line(f"kernels compiled: {len(lines)}")
