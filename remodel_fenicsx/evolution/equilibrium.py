@@ -108,6 +108,15 @@ class Equilibrium:
             return np.full(self.quadrature.shape, np.inf)
         return coefficients.point_values(length, self.quadrature)
 
+    def stress_rounding(self, max_chain_extension: float) -> float:
+        """Rounding error of a stress in this body, from the stiffness of matrix and network at the largest r/L."""
+        mesh = self.quadrature.mesh
+        numbers = self.tissue.map(lambda name, value: coefficients.largest(value, mesh))
+        length = numbers.end_to_end_length
+        if numbers.locking_length is not None:
+            length = max(length, max_chain_extension * numbers.locking_length)
+        return float(np.finfo(np.float64).eps * numbers.stiffness(length))
+
     def stored_energy(self) -> float:
         """Integral of W over the body."""
         if self._energy_form is None:

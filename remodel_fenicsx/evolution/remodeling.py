@@ -21,6 +21,9 @@ from remodel_fenicsx.tissue.laws import LAWS, Drive
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
+RESIDUAL_SHARE = 20.0  # an eighth of an element's nodes share a face's force; a pulled-back stress is larger still
+ROUNDINGS = 64.0  # how many times the rounding of a stress its principal values may be off
+
 
 class RemodelingSettings(Protocol):
     """How the cells follow the load (`scene.parameters.Remodeling`)."""
@@ -61,6 +64,7 @@ class RemodelingPass:
         self.driver, self.law, self.frame = DRIVERS[settings.driver], LAWS[settings.law], FRAMES[settings.frame]
         if not self.law.remodels:
             return
+        self._smallest_area = self.quadrature.minimum(self.quadrature.smallest_areas)
         F = state.kinematics.deformation_gradient(state.unknown)
         tensor = self.driver.tensor(F, self.tissue.stresses(F, [state.cells.ufl_cell]))
         # one stacked expression: the deformation gradient comes at no cost with the driver
@@ -85,7 +89,7 @@ class RemodelingPass:
         driver = values[:, 1]
         return values[:, 0], (driver + np.swapaxes(driver, 1, 2)) / 2
 
-    def drive(self) -> Drive:
+    def drive(self, stress_noise: float = 0.0) -> Drive:
         """What acts on the cells in the present state."""
         F, tensor = self.driving_tensor()
         return Drive(
@@ -93,25 +97,33 @@ class RemodelingPass:
             tensor,
             self.driver,
             self.frame,
-            self.threshold(),
+            stress_noise if self.driver.is_stress else spectral.ROUNDING,
             self.state.cells.initial_dimensions.reshape(-1, 3),
             coefficients.point_values(self.tissue.end_to_end_length, self.quadrature).reshape(-1),
             self.settings.kappa,
         )
 
-    def threshold(self) -> float:
-        """Size up to which a principal value of the driving tensor is rounding error."""
-        mesh = self.quadrature.mesh
-        numbers = self.tissue.map(lambda name, value: coefficients.largest(value, mesh))
-        return spectral.ROUNDING * float(self.driver.scale(numbers))
+    def stress_noise(self, stress_rounding: float, residual: float) -> float:
+        """Size up to which a principal stress may be an error: of rounding, or of the equilibrium as it was accepted.
 
-    def updated_cells(self, time_old: float, time_new: float) -> tuple[UnitCell, Array]:
+        Parameters
+        ----------
+        stress_rounding
+            Rounding error of a stress (`Equilibrium.stress_rounding`).
+        residual
+            Norm of the out-of-balance nodal forces, in the unit of force.
+        """
+        return RESIDUAL_SHARE * residual / self._smallest_area + ROUNDINGS * stress_rounding
+
+    def updated_cells(self, time_old: float, time_new: float, stress_noise: float = 0.0) -> tuple[UnitCell, Array]:
         """New cells of all points in one row, and F (n, 3, 3). Changes nothing."""
-        drive = self.drive()
+        drive = self.drive(stress_noise)
         return self.law.update(self.state.cells.point_cells, drive, time_old, time_new), drive.deformation_gradient
 
-    def apply(self, time_old: float, time_new: float) -> float:
+    def apply(self, time_old: float, time_new: float, stress_noise: float = 0.0) -> float:
         """Remodel over a step with the stress of the solved state at time_new; returns the power of remodeling.
+
+        Principal stresses up to `stress_noise` are zero.
 
         The power is the stored energy that the pass releases at frozen deformation, per time, to first order
         (`Tissue.energy_increment`; Remark 6).
@@ -121,11 +133,9 @@ class RemodelingPass:
         FloatingPointError
             If the driving tensor is not finite anywhere.
         """
-        if not self.law.remodels:
-            return 0.0
         cells, shape = self.state.cells, self.quadrature.shape
-        updated, F = self.updated_cells(time_old, time_new)
+        updated, F = self.updated_cells(time_old, time_new, stress_noise)
         increment: Any = at_points(self.tissue, self.quadrature).energy_increment(F, cells.point_cells, updated)
-        power: float = -self.quadrature.integral(increment.reshape(shape)) / (time_new - time_old)
+        power: float = 0.0 - self.quadrature.integral(increment.reshape(shape)) / (time_new - time_old)
         cells.set(updated.dimensions.reshape(*shape, 3), updated.axes.reshape(*shape, 3, 3))
         return power
