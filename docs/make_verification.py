@@ -22,6 +22,8 @@ DOCS = Path(__file__).resolve().parent
 sys.path[:0] = [str(DOCS), str(DOCS.parent)]
 
 from remodel_fenicsx import paper as figures  # noqa: E402
+from remodel_fenicsx.paper.captions import CAPTIONS  # noqa: E402
+from remodel_fenicsx.paper.cases import LOAD_CASES  # noqa: E402
 from remodel_fenicsx.paper.output import COLOURS, STYLE, Page, read_table  # noqa: E402
 from tests.reference.radial import RadialHistory, solve_radial  # noqa: E402
 from verification_studies import study  # noqa: E402
@@ -35,7 +37,12 @@ REFERENCE = {
     "finger": {"driver": "finger"},
     "rate": {"law": "rate"},
 }
-CASES = ((10.0, 0.0), (10.0, 2.4), (10.0, 4.8), (5.0, 4.8), (0.0, 4.8))
+CASES = tuple((100 * elongation, pressure) for elongation, pressure in LOAD_CASES)
+REFERENCE_CAPTION = (
+    "The artery against the independent radial reference",
+    "Reference fibre angle at t = 150 by driver and law. Points: means of the layers of elements, random cells; "
+    "lines: the radial reference, isotropic cells.",
+)
 
 Columns = dict[str, np.ndarray]
 
@@ -90,8 +97,7 @@ def _draw_reference(page: Page, curves: dict[str, tuple[np.ndarray, np.ndarray]]
     axes.set_ylim(-2, 92)
     axes.set_yticks(range(0, 91, 15))
     axes.legend(loc="upper left")
-    made_with = "points: layer means of the runs, random cells; lines: tests/reference/radial.py, isotropic cells"
-    page.save_figure(figure, "The artery against the independent radial reference", made_with)
+    page.save_figure(figure, f"{made_with(page.folder)}; tests/reference/radial.py")
 
 
 def layer_angles(folder: Path) -> Columns:
@@ -400,6 +406,8 @@ def page(kept: Path = KEPT) -> str:
         "table_turned": invariance_table(kept, "deformed body"),
         "table_everything": invariance_table(kept, "everything"),
         "made_with": made_with(kept),
+        **{f"caption_{name}": caption for name, (_, caption) in CAPTIONS.items()},
+        "caption_reference": REFERENCE_CAPTION[1],
     }  # fmt: skip
     return (DOCS / "make_verification.template.md").read_text(encoding="utf-8").format_map(values)
 
@@ -409,7 +417,7 @@ def main() -> None:
     drawn = figures.DEFAULT_FOLDER
     figures.draw(folder=drawn)
     with matplotlib.rc_context(STYLE):
-        radial_reference(Page(drawn, "radial-reference"))
+        radial_reference(Page(drawn, "radial-reference", *REFERENCE_CAPTION))
     studies = study(drawn)
     KEPT.mkdir(exist_ok=True)
     pictures = (*figures.FIGURES, "radial-reference")

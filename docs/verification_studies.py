@@ -21,7 +21,9 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from remodel_fenicsx.paper.output import Page, read_table  # noqa: E402
-from remodel_fenicsx.paper.runs import cores, library_versions, scenes, source_fingerprint  # noqa: E402
+from remodel_fenicsx.paper.cases import scenes  # noqa: E402
+from remodel_fenicsx.paper.runs import cores  # noqa: E402
+from remodel_fenicsx.paper.validity import library_versions, source_fingerprint  # noqa: E402
 
 Row = dict[str, Any]
 USED_BY_STUDIES = (

@@ -56,6 +56,14 @@ def parser() -> argparse.ArgumentParser:
     figures.add_argument("names", nargs="*", metavar="NAME", help="fig1, fig5 to fig11, rate, energy (default: all)")
     figures.add_argument("-o", "--output", type=Path, metavar="DIR", help="folder for the figures (default: figures)")
     figures.add_argument("--runs", type=Path, metavar="DIR", help="recorded runs (default: results/figures-cache)")
+    figures.add_argument(
+        "--format",
+        action="append",
+        default=[],
+        metavar="FORMAT",
+        help="png, pdf or svg, or several with commas between; may be repeated (default: png)",
+    )
+    figures.add_argument("--stamp", action="store_true", help="show in each picture what it was made with")
     figures.add_argument("--jobs", type=int, metavar="N", help="runs at a time (default: as many as there are cores)")
     text = "Print versions, solvers and BLAS."
     commands.add_parser("info", help=text, description=text)
@@ -179,8 +187,9 @@ def _figures(options: argparse.Namespace) -> int:
         return _fail(f"the environment is not usable: {error}; run through ./with-fenicsx", BAD_ENVIRONMENT)
     folder, runs = options.output or figures.DEFAULT_FOLDER, options.runs or figures.DEFAULT_RUNS
     try:
+        formats = [name for text in options.format for name in text.split(",")] or ["png"]
         with interrupts.StopRequest(), interrupts.stopping_at_once():
-            written = figures.draw(options.names, folder, runs, options.jobs)
+            written = figures.draw(options.names, folder, runs, options.jobs, formats, options.stamp)
     except figures.FigureError as error:
         return _fail(str(error), error.exit_code)
     except interrupts.Interrupted as interruption:

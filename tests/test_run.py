@@ -16,7 +16,7 @@ import pytest
 
 from remodel_fenicsx import cli
 from remodel_fenicsx.results.columns import COLUMNS
-from remodel_fenicsx.results.history import read_history
+from remodel_fenicsx.results.recording import read_history
 from remodel_fenicsx.scene.scene import read_scene
 from tests.conftest import mpirun
 

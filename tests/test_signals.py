@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from remodel_fenicsx.results.run_folder import read_history
+from remodel_fenicsx.results.recording import read_history
 from tests.processes import session_members, wait_for_compiler
 
 PROJECT = Path(__file__).parents[1]

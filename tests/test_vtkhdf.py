@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import resource
 import shutil
 import signal
@@ -99,6 +100,20 @@ def test_reader_finds_every_step(tmp_path):
         assert np.array_equal(found[f"{k} cell l"], cell_data["l"].astype(np.float32))
         assert np.array_equal(found[f"{k} cell number"], cell_data["number"])
         assert np.array_equal(found[f"{k} cell active"], [1, 0])
+
+
+def test_the_page_shows_what_really_steps_through_time(tmp_path):
+    page = (Path(__file__).parents[1] / "docs" / "commands.md").read_text(encoding="utf-8")
+    (code,) = [block for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "import pyvista" in block]
+    path = tmp_path / "results" / "artery" / "fields.vtkhdf"
+    path.parent.mkdir(parents=True)
+    with TransientGrid(path, CUBE, VTK_CUBE, 12) as grid:
+        for k in range(3):
+            grid.append(k, {"displacement": np.full((8, 3), 0.25 * k)})
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0 and "rror" not in done.stderr, done.stderr
+    said = [tuple(map(float, line.split())) for line in done.stdout.splitlines()]
+    assert said == [(0.0, 0.0), (1.0, 0.25), (2.0, 0.5), (1.0, 0.25)]
 
 
 def test_double_precision_is_exact(tmp_path):

@@ -14,9 +14,12 @@ import matplotlib
 from mpi4py import MPI
 
 from remodel_fenicsx.paper import bodies, curves, structures
-from remodel_fenicsx.paper.output import STYLE, Page, check_folder
-from remodel_fenicsx.paper.recordings import Recording
-from remodel_fenicsx.paper.runs import KAPPAS, LOAD_CASES, FigureError, Line, RunCache, cores, load_case_name, scenes
+from remodel_fenicsx.paper.captions import CAPTIONS
+from remodel_fenicsx.paper.cases import KAPPAS, LOAD_CASES, load_case_name, scenes
+from remodel_fenicsx.paper.errors import FigureError
+from remodel_fenicsx.paper.output import FORMATS, STYLE, Page, check_folder
+from remodel_fenicsx.paper.runs import Line, RunCache, cores
+from remodel_fenicsx.results.recording import Recording
 
 __all__ = ["DEFAULT_FOLDER", "DEFAULT_RUNS", "FIGURES", "FigureError", "draw"]
 
@@ -46,7 +49,12 @@ FIGURES: dict[str, FigureSpec] = {
 
 
 def draw(
-    names: Sequence[str] = (), folder: Path = DEFAULT_FOLDER, runs: Path = DEFAULT_RUNS, jobs: int | None = None
+    names: Sequence[str] = (),
+    folder: Path = DEFAULT_FOLDER,
+    runs: Path = DEFAULT_RUNS,
+    jobs: int | None = None,
+    formats: Sequence[str] = ("png",),
+    stamp: bool = False,
 ) -> list[Path]:
     """Draw figures from recorded runs, after running what is not recorded or no longer valid.
 
@@ -55,11 +63,15 @@ def draw(
     names
         Keys of `FIGURES`; none: all.
     folder
-        For NAME.png and NAME*.csv. Only files that this function wrote are ever overwritten.
+        For NAME.png (or .pdf, .svg) and NAME*.csv. Only files that this function wrote are ever overwritten.
     runs
         Recorded runs.
     jobs
         Runs at a time; default: as many as there are cores.
+    formats
+        Of the pictures: some of "png", "pdf", "svg".
+    stamp
+        Whether each picture shows at its foot what it was made with; it stands in the file in any case.
 
     Returns
     -------
@@ -77,12 +89,15 @@ def draw(
     for name in names:
         if name not in FIGURES:
             raise FigureError(f"figures {name}: no such figure; allowed are {', '.join(FIGURES)}", 2)
+    for ending in formats:
+        if ending not in FORMATS:
+            raise FigureError(f"--format {ending}: no such format; allowed are {', '.join(FORMATS)}", 2)
     if jobs is not None and jobs < 1:
         raise FigureError(f"--jobs {jobs}: must be at least 1", 2)
     if runs.exists() and not runs.is_dir():
         raise FigureError(f"--runs {runs}: is a file; allowed is a folder", 2)
     chosen = [name for name in FIGURES if not names or name in names]
-    check_folder(folder, chosen)
+    check_folder(folder, chosen, formats)
     known = scenes()
     needed = dict.fromkeys(run for name in chosen for run in FIGURES[name].runs)
     recorded = RunCache(runs).obtain([known[run] for run in needed], jobs or cores())
@@ -90,7 +105,8 @@ def draw(
     progress, written = Line(), []
     for number, name in enumerate(chosen, start=1):
         progress.show(f"figures: drawing {name} ({number}/{len(chosen)})", at_once=True)
-        page = Page(folder, name, bodies.scale_colours())
+        title, caption = CAPTIONS[name]
+        page = Page(folder, name, title, caption, bodies.scale_colours(), tuple(dict.fromkeys(formats)), stamp)
         with matplotlib.rc_context(STYLE):
             FIGURES[name].draw(recordings, page)
         written += page.written

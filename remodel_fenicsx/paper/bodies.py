@@ -12,16 +12,18 @@ from matplotlib.colors import BoundaryNorm, Colormap
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from remodel_fenicsx.paper.recordings import Snapshot
+from remodel_fenicsx.paper.snapshots import Snapshot
 from remodel_fenicsx.paper.rendering import AMBIENT, Patch, Pixels
-from remodel_fenicsx.results.vtkhdf import chain_displacement, chain_lines
+from remodel_fenicsx.results.vtkhdf import chain_lines
 
 Array = NDArray[np.float64]
 
 LEVELS = 18  # steps of 5 degrees: a colour can be read off the scale
 CHAIN_COLOUR = (0.08, 0.08, 0.10)
-CHAIN_REACH = 0.5  # half a chain's length over the shorter side of its face, both undeformed
-CHAIN_WIDTH = 0.07  # over the same
+CHAIN_REACH = 0.39  # half a chain's length over the shorter side of its face, both undeformed
+CHAIN_ROOM = 0.78  # how far a chain goes at most, over the way from the middle to the edge of its face
+CHAIN_WIDTH = 0.06  # over the shorter side
+CHAIN_LIFT = 0.2  # towards the eye, over the same: faces need not be plane
 
 
 def scale() -> tuple[Colormap, BoundaryNorm]:
@@ -53,7 +55,7 @@ def body(snapshot: Snapshot, shown: NDArray[np.bool_] | None = None, chains_on: 
     chains_on
         "side": chains on faces that look away from the z axis; "none".
     """
-    shown = np.ones(len(snapshot.cells), dtype=bool) if shown is None else shown
+    shown = np.ones(len(snapshot.elements), dtype=bool) if shown is None else shown
     faces, elements = snapshot.exterior(shown)
     angle = snapshot.fields["fibre_angle_deformed"][elements]
     patches = [Patch(snapshot.deformed[faces], coloured(angle), edges=True)]
@@ -66,7 +68,9 @@ def body(snapshot: Snapshot, shown: NDArray[np.bool_] | None = None, chains_on: 
 
 
 def chains(snapshot: Snapshot, faces: NDArray[np.int64], elements: NDArray[np.int64]) -> Patch:
-    """The four chains of each element, deformed, projected on one of its faces: narrow ribbons a little outside of it.
+    """The four chains of each element, deformed, projected on one of its faces: narrow ribbons.
+
+    They stay in their face and clear of its edge, so that those of neighbours do not read as one line.
 
     Parameters
     ----------
@@ -78,27 +82,40 @@ def chains(snapshot: Snapshot, faces: NDArray[np.int64], elements: NDArray[np.in
         The element of each, (m,).
     """
     fields, reference, deformed = snapshot.fields, snapshot.points[faces], snapshot.deformed[faces]
-    centres = reference.mean(axis=1)
+    centres, middle = reference.mean(axis=1), deformed.mean(axis=1)
     axes = np.stack([fields[f"axis_{i + 1}"][elements] for i in range(3)], axis=1)
     gradient = fields["deformation_gradient"][elements].reshape(-1, 3, 3)
-    ends, _ = chain_lines(centres, fields["cell_dimensions"][elements], axes, 1.0)
     size = np.linalg.norm(reference - np.roll(reference, 1, axis=1), axis=2).min(axis=1)
-    ends = centres[:, None] + (CHAIN_REACH * size)[:, None, None] * (ends.reshape(-1, 8, 3) - centres[:, None])
-    moved = chain_displacement(ends.reshape(-1, 3), centres, snapshot.displacement[faces].mean(axis=1), gradient)
-    normal, middle = _normals(deformed), deformed.mean(axis=1)
+    ends, _ = chain_lines(np.zeros_like(centres), fields["cell_dimensions"][elements], axes, 1.0)
+    half = CHAIN_REACH * size[:, None, None] * ends.reshape(-1, 8, 3)[:, ::2]  # (m, 4, 3): one half of each chain
+    outward = _normals(deformed)
     inner = np.einsum("mij,mj->mi", gradient, snapshot.centres[elements] - centres)
-    normal *= -np.sign(np.sum(normal * inner, axis=1))[:, None]
-    arms = ends + moved.reshape(-1, 8, 3) - middle[:, None]
-    arms = arms[:, ::2]  # (m, 4, 3): one half of each chain
-    arms = arms - np.einsum("mki,mi->mk", arms, normal)[..., None] * normal[:, None]
-    across = np.cross(normal[:, None], arms)
+    outward *= -np.sign(np.sum(outward * inner, axis=1))[:, None]
+    arms = _on_plane(half @ np.swapaxes(gradient, 1, 2), outward)
+    arms *= np.minimum(1.0, CHAIN_ROOM * _room(arms, _on_plane(deformed - middle[:, None], outward), outward))[
+        ..., None
+    ]
+    across = np.cross(outward[:, None], arms)
     length = np.linalg.norm(across, axis=-1, keepdims=True)
     across *= (CHAIN_WIDTH / 2 * size)[:, None, None] / np.where(length > 0, length, 1.0)
-    # outside of a face that need not be plane, and each chain above the one before
-    lift = (0.03 + 0.002 * np.arange(4))[None, :, None] * size[:, None, None] * normal[:, None]
-    start, end = middle[:, None] - arms + lift, middle[:, None] + arms + lift
+    start, end = middle[:, None] - arms, middle[:, None] + arms
     corners = np.stack([start - across, end - across, end + across, start + across], axis=2).reshape(-1, 4, 3)
-    return Patch(corners, np.tile(CHAIN_COLOUR, (len(corners), 1)))
+    lift = CHAIN_LIFT * float(np.median(size)) if len(size) else 0.0
+    return Patch(corners, np.tile(CHAIN_COLOUR, (len(corners), 1)), lies_on=lift)
+
+
+def _on_plane(vectors: Array, normal: Array) -> Array:
+    """Vectors (m, n, 3) without their part along a unit normal (m, 3)."""
+    return vectors - np.einsum("mki,mi->mk", vectors, normal)[..., None] * normal[:, None]
+
+
+def _room(arms: Array, corners: Array, normal: Array) -> Array:
+    """Factors (m, n) by which lines from -arm to +arm (m, n, 3) reach the edge of faces about 0, corners (m, 4, 3)."""
+    edges = np.roll(corners, -1, axis=1) - corners
+    across = np.cross(edges, normal[:, None])
+    distance = np.abs(np.sum(across * corners, axis=2))
+    towards = np.abs(np.einsum("mei,mki->mke", across, arms))
+    return (distance[:, None] / np.where(towards > 0, towards, np.finfo(float).tiny)).min(axis=2)
 
 
 def _normals(corners: Array) -> Array:
@@ -111,8 +128,9 @@ def _normals(corners: Array) -> Array:
 
 
 def place(axes: Axes, image: Pixels) -> None:
-    """Put a picture into axes that show nothing else."""
+    """Put a picture into axes that show nothing else, at their upper edge."""
     axes.imshow(image, interpolation="lanczos")
+    axes.set_anchor("N")
     axes.set_axis_off()
 
 

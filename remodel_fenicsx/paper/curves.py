@@ -8,25 +8,21 @@ from matplotlib.figure import Figure
 
 from remodel_fenicsx.tissue.chains import CHAINS
 from remodel_fenicsx.paper.bodies import angle_scale, place
-from remodel_fenicsx.paper.output import COLOURS, Page
-from remodel_fenicsx.paper.recordings import Array, Recording, Snapshot, Table
+from remodel_fenicsx.paper.cases import KAPPAS
+from remodel_fenicsx.paper.output import COLOURS, Page, panel_letters
 from remodel_fenicsx.paper.rendering import render
-from remodel_fenicsx.paper.runs import KAPPAS
+from remodel_fenicsx.paper.snapshots import Array, Snapshot, Table, first_cells, made_with
+from remodel_fenicsx.results.recording import Recording
 from remodel_fenicsx.paper.structures import SOLVED, at, joined, layer_table, peeled, tube_picture, wall_table
 
 PERSISTENCE_LENGTHS = (0.1, 0.4, 0.8)  # Remark 1
 ANGLE_LABEL = "reference fibre angle{} (degrees)"
-DRIVER_NAMES = {
-    "cauchy": r"Cauchy stress $\sigma$",
-    "pk2": "second Piola-Kirchhoff stress $S$",
-    "finger": "Finger tensor $b$",
+DRIVERS = {
+    "cauchy": ("Cauchy stress", r"$\sigma$"),
+    "pk2": ("second Piola-Kirchhoff stress", "$S$"),
+    "finger": ("Finger tensor", "$b$"),
 }
 PLACES = {"inner": ":", "middle": "--", "outer": "-"}
-# what must not be read out of a picture without being told
-WARNINGS = {
-    "finger": "$b$: the printed pass over-corrects and\nshears these elements to and fro, see\n"
-    "Fig. 11 in docs/verification.md\n"
-}
 
 
 def draw_chain_force(runs: dict[str, Recording], page: Page) -> None:
@@ -40,9 +36,9 @@ def draw_chain_force(runs: dict[str, Recording], page: Page) -> None:
     axes.axvline(1.0, color="0.5", lw=0.8, ls=":")
     axes.set(xlabel="chain stretch $r/L$", ylabel=r"chain force $f$ for $k\theta$ = 1", xlim=(0, 1.02), ylim=(0, 30))
     axes.legend(title="persistence length", loc="upper left")
-    made_with = "eq. (2), wormlike chain; no simulation"
-    page.save_figure(figure, "Force of a single chain (Fig. 1)", made_with)
-    notes = [made_with, "force for k theta = 1; lengths in link lengths"]
+    made = "eq. (2), wormlike chain; no simulation"
+    page.save_figure(figure, made)
+    notes = [made, "force for k theta = 1; lengths in link lengths"]
     page.save_table({"extension": extension} | {f"force_A_{A:g}": force[A] for A in PERSISTENCE_LENGTHS}, notes)
 
 
@@ -64,17 +60,18 @@ def draw_alignment(runs: dict[str, Recording], page: Page) -> None:
         columns = runs[f"cube-{kappa:g}"].history
         time = columns["time"]
         step = runs[f"cube-{kappa:g}"].scene.time.step
-        # a row is the state before the pass of its time: its cells are those of the time before
-        exact = closed_form_angle(time - step, kappa)
+        # a row is the state before the pass of its time: its cells are those of the time before, or the first ones
+        exact = closed_form_angle(np.maximum(time - step, 0.0), kappa)
+        marked = np.isclose(time % 10.0, 0.0) & (time > 0)
         table |= {"time": time, f"angle_kappa_{kappa:g}": columns["mean_fibre_angle"], f"exact_kappa_{kappa:g}": exact}
         axes.plot(time, columns["mean_fibre_angle"], color=colour, label=rf"$\kappa$ = {kappa:g}")
-        axes.plot(time[9::10], exact[9::10], "o", ms=3.5, mfc="white", mec=colour)
+        axes.plot(time[marked], exact[marked], "o", ms=3.5, mfc="white", mec=colour)
     axes.plot([], [], "o", ms=3.5, mfc="white", mec="0.4", label="closed form")
     axes.set(xlabel="time", ylabel="angle between chains and load (degrees)", xlim=(0, 100), ylim=(0, 60))
     axes.legend(loc="upper right")
-    made_with = runs[f"cube-{KAPPAS[0]:g}"].made_with()
-    page.save_figure(figure, "Alignment of the chains of a cube under tension (Fig. 5)", made_with)
-    notes = [made_with, "angle_kappa_K: run with kappa = K; exact_kappa_K: closed form of the cells of the same row"]
+    made = made_with(runs[f"cube-{KAPPAS[0]:g}"])
+    page.save_figure(figure, made)
+    notes = [made, "angle_kappa_K: run with kappa = K; exact_kappa_K: closed form of the cells of the same row"]
     page.save_table(table, [*notes, "rows belong to the solved state, whose cells are those after the pass before"])
 
 
@@ -84,24 +81,23 @@ def draw_alignment(runs: dict[str, Recording], page: Page) -> None:
 def draw_drivers(runs: dict[str, Recording], page: Page, other: str) -> None:
     """Figs. 10 and 11: angle over radius (left), peeled tubes (right), for the Cauchy stress and another driver."""
     pair = {"cauchy": runs["artery"], other: runs[f"artery-{other}"]}
-    ends = {driver: run.snapshot(run.scene.time.end) for driver, run in pair.items()}
+    ends = {driver: Snapshot.of(run, run.scene.time.end) for driver, run in pair.items()}
     tallest = max(snapshot.deformed[:, 2].max() for snapshot in ends.values())
     images = render([tube_picture(s, peeled(s), 1.25 * tallest, (390, 560)) for s in ends.values()])
     when = at(ends["cauchy"])
     figure = Figure(figsize=(8.2, 3.5))
-    axes = figure.add_axes((0.065, 0.145, 0.40, 0.81))
-    _draw_profiles(axes, {DRIVER_NAMES[driver]: layer_table(snapshot) for driver, snapshot in ends.items()})
+    axes = figure.add_axes((0.065, 0.145, 0.40, 0.79))
+    _draw_profiles(axes, {" ".join(DRIVERS[driver]): layer_table(snapshot) for driver, snapshot in ends.items()})
     axes.set(xlabel="reference radius $R$", ylabel=ANGLE_LABEL.format(when))
     axes.legend(loc="upper left", title="driven by", alignment="left")
-    notes = [*filter(None, [WARNINGS.get(other)]), "lines: means of the element layers; bands: all elements"]
-    axes.text(0.985, 0.02, "\n".join(notes), transform=axes.transAxes, ha="right", fontsize=6.5, color="0.35")
+    panels = [axes]
     for number, (driver, image) in enumerate(zip(ends, images, strict=True)):
-        picture = figure.add_axes((0.50 + 0.245 * number, 0.215, 0.24, 0.71))
-        place(picture, image)
-        picture.set_title(DRIVER_NAMES[driver], pad=3, fontsize=8.5)
+        panels.append(figure.add_axes((0.50 + 0.245 * number, 0.215, 0.24, 0.72)))
+        place(panels[-1], image)
+        panels[-1].set_title(f"driven by {DRIVERS[driver][1]}")
     angle_scale(figure, (0.545, 0.15, 0.40, 0.026), f"deformed angle{when}: 0° circumferential, 90° axial")
-    title = f"Remodeling driven by {' and '.join(ends)} (Fig. {10 if other == 'pk2' else 11})"
-    page.save_figure(figure, title, pair["cauchy"].made_with())
+    panel_letters(*panels)
+    page.save_figure(figure, made_with(pair["cauchy"]))
     _save_drivers(pair, ends, page)
 
 
@@ -118,7 +114,7 @@ def _draw_profiles(axes: Axes, tables: dict[str, Table]) -> None:
 
 def _save_drivers(pair: dict[str, Recording], ends: dict[str, Snapshot], page: Page) -> None:
     """Layers, histories and every element that is drawn, of both drivers."""
-    made_with = pair["cauchy"].made_with()
+    made = made_with(pair["cauchy"])
     layers: Table = {}
     history: Table = {}
     elements = []
@@ -131,17 +127,17 @@ def _save_drivers(pair: dict[str, Recording], ends: dict[str, Snapshot], page: P
         history |= {"time": rows["time"]} | {f"{name}_{driver}": rows[name] for name in recorded}
         drawn = wall_table(snapshot, peeled(snapshot))
         elements.append({"driver": np.full(len(drawn["time"]), driver)} | drawn)
-    page.save_table(layers, [made_with, f"element layers, reference angles in degrees; {SOLVED}"])
-    page.save_table(history, [made_with, "rows of the two histories, reference angles in degrees"], "history")
-    page.save_table(joined(elements), [made_with, f"the elements that are drawn; {SOLVED}"], "elements")
+    page.save_table(layers, [made, f"element layers, reference angles in degrees; {SOLVED}"])
+    page.save_table(history, [made, "rows of the two histories, reference angles in degrees"], "history")
+    page.save_table(joined(elements), [made, f"the elements that are drawn; {SOLVED}"], "elements")
 
 
 def draw_rate(runs: dict[str, Recording], page: Page) -> None:
     """Erratum 7: eqs. (10) and (11) on the same artery."""
     pair = {"eq. (11), explicit": runs["artery"], "eq. (10), rate": runs["artery-rate"]}
-    figure = Figure(figsize=(7.6, 3.2))
-    over_time, over_radius = figure.add_axes((0.065, 0.15, 0.42, 0.80)), figure.add_axes((0.56, 0.15, 0.415, 0.80))
-    ends = {label: run.snapshot(run.scene.time.end) for label, run in pair.items()}
+    figure = Figure(figsize=(7.8, 3.6))
+    over_time, over_radius = figure.add_axes((0.065, 0.135, 0.42, 0.79)), figure.add_axes((0.56, 0.135, 0.415, 0.79))
+    ends = {label: Snapshot.of(run, run.scene.time.end) for label, run in pair.items()}
     tables = {label: layer_table(snapshot) for label, snapshot in ends.items()}
     _draw_rate_histories(over_time, pair)
     _draw_profiles(over_radius, tables)
@@ -156,10 +152,11 @@ def draw_rate(runs: dict[str, Recording], page: Page) -> None:
         columns |= {"time": run.history["time"]} | angles
         profile |= {"layer": table["layer"], "radius": table["radius"]}
         profile |= {f"{name}_{law}": table[name] for name in ("fibre_angle", "fibre_angle_least", "fibre_angle_most")}
-    made_with = pair["eq. (11), explicit"].made_with()
-    page.save_figure(figure, "Eqs. (10) and (11) on the same artery (erratum 7)", made_with)
-    page.save_table(profile, [made_with, f"element layers at the end, reference angles in degrees; {SOLVED}"])
-    page.save_table(columns, [made_with, "rows of the two histories, reference angles in degrees"], "history")
+    made = made_with(pair["eq. (11), explicit"])
+    panel_letters(over_time, over_radius)
+    page.save_figure(figure, made)
+    page.save_table(profile, [made, f"element layers at the end, reference angles in degrees; {SOLVED}"])
+    page.save_table(columns, [made, "rows of the two histories, reference angles in degrees"], "history")
 
 
 def _draw_rate_histories(axes: Axes, pair: dict[str, Recording]) -> None:
@@ -186,21 +183,22 @@ def draw_energy(runs: dict[str, Recording], page: Page) -> None:
     figure = Figure(figsize=(8.2, 4.2))
     unit = demos["cube"].scene.material.stress_unit
     labels = f"stored energy\n({unit} · length³)", f"power of remodeling\n({unit} · length³ / time)"
+    panels = []
     for number, (name, run) in enumerate(demos.items()):
         left = 0.11 + 0.313 * number
-        above, below = figure.add_axes((left, 0.585, 0.245, 0.36)), figure.add_axes((left, 0.17, 0.245, 0.36))
+        above, below = figure.add_axes((left, 0.575, 0.245, 0.36)), figure.add_axes((left, 0.12, 0.245, 0.36))
+        panels.append((above, below))
         _draw_energy(above, below, run)
-        above.set_title(f"{name}, {run.first_cells}", fontsize=8.5)
+        above.set_title(f"{name}, {first_cells(run)}", fontsize=8.5)
         if number == 0:
             for axes, label in zip((above, below), labels, strict=True):
                 axes.set_ylabel(label)
                 axes.yaxis.set_label_coords(-0.26, 0.5)
-    explanation = "green: the passes release stored energy; red: they take energy in; dotted: end of the ramp"
-    figure.text(0.985, 0.03, explanation, fontsize=6.5, color="0.35", ha="right")
-    made_with = demos["artery"].made_with(", ".join(f"{run.first_cells} ({name})" for name, run in demos.items()))
-    page.save_figure(figure, "Stored energy and power of remodeling (Remark 6)", made_with)
+    panel_letters(*(axes for row in zip(*panels, strict=True) for axes in row))
+    made = made_with(demos["artery"], ", ".join(f"{first_cells(run)} ({name})" for name, run in demos.items()))
+    page.save_figure(figure, made)
     meaning = "remodeling_power = -dW/dl . dl/dt - dW/dn . dn/dt, over the body: positive where a pass releases"
-    notes = [made_with, f"{meaning} stored energy at frozen deformation; in {unit}, the scene's length and time"]
+    notes = [made, f"{meaning} stored energy at frozen deformation; in {unit}, the scene's length and time"]
     names = ("time", "stored_energy", "remodeling_power")
     tables = [{"demo": np.full(len(run.history["time"]), demo)} | {name: run.history[name] for name in names}
               for demo, run in demos.items()]  # fmt: skip
@@ -208,11 +206,10 @@ def draw_energy(runs: dict[str, Recording], page: Page) -> None:
 
 
 def _draw_energy(above: Axes, below: Axes, run: Recording) -> None:
-    """Stored energy above, power of remodeling below."""
-    time, power = run.history["time"], run.history["remodeling_power"]
+    """Stored energy above; below the power of remodeling, a pass's over the whole of its step."""
+    time, passes = run.history["time"], run.history["time"] > 0
     above.plot(time, run.history["stored_energy"], color=COLOURS[0])
-    below.plot(time, power, color=COLOURS[1])
-    _shade_sign(below, time, power)
+    _draw_power(below, np.concatenate([[0.0], time[passes]]), run.history["remodeling_power"][passes])
     ramp_end = max(load.ramp[-1][0] for load in run.scene.loads.values())
     for axes in (above, below):
         axes.axvline(ramp_end, color="0.6", lw=0.8, ls=":")
@@ -222,7 +219,9 @@ def _draw_energy(above: Axes, below: Axes, run: Recording) -> None:
     below.set_xlabel("time")
 
 
-def _shade_sign(axes: Axes, time: Array, power: Array) -> None:
+def _draw_power(axes: Axes, edges: Array, power: Array) -> None:
+    """Power (n,) of the steps between n + 1 times; green where energy is released, red where it is taken in."""
+    for sign, colour in ((1, COLOURS[2]), (-1, COLOURS[1])):
+        axes.stairs(sign * np.maximum(sign * power, 0.0), edges, fill=True, color=colour, alpha=0.25, lw=0)
+    axes.stairs(power, edges, baseline=None, color=COLOURS[1], lw=1.2)
     axes.axhline(0.0, color="0.3", lw=0.8)
-    axes.fill_between(time, np.maximum(power, 0.0), 0.0, color=COLOURS[2], alpha=0.25, lw=0)
-    axes.fill_between(time, np.minimum(power, 0.0), 0.0, color=COLOURS[1], alpha=0.25, lw=0)

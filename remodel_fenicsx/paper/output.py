@@ -1,4 +1,4 @@
-"""What a figure leaves in its folder: a picture and its data, each saying what it was made with."""
+"""What a figure leaves in its folder: its picture, in some formats, and its data; each says what it was made with."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from typing import Any
 
 import matplotlib
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
@@ -19,14 +20,16 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
 import remodel_fenicsx
-from remodel_fenicsx.paper.runs import FigureError
+from remodel_fenicsx.paper.errors import FigureError
 
 MARK = "remodel_fenicsx figures"  # in every file: what bears it may be drawn anew
-DOTS_PER_INCH = 200
-STYLE = {
+FORMATS = ("png", "pdf", "svg")
+DOTS_PER_INCH = {"png": 200, "pdf": 300, "svg": 300}  # of pictures in space where all else is lines and letters
+STYLE: dict[str, Any] = {
     "font.family": "DejaVu Sans",
     "font.size": 8.5,
     "axes.titlesize": 9,
+    "axes.titlepad": 4.0,
     "axes.labelsize": 9,
     "axes.spines.top": False,
     "axes.spines.right": False,
@@ -37,6 +40,8 @@ STYLE = {
     "lines.linewidth": 1.6,
     "legend.frameon": False,
     "figure.facecolor": "white",
+    "pdf.fonttype": 42,  # letters that can be searched and edited
+    "svg.hashsalt": MARK,  # the same figure, the same file
 }
 COLOURS = ("#1b4f9c", "#d1495b", "#2a9d6f", "#e09f3e", "#6c4f9c")  # apart in lightness too
 
@@ -50,32 +55,63 @@ class Page:
         Where they go.
     name
         Name of the figure: NAME.png, NAME.csv, NAME-PART.csv.
+    title, caption
+        What the figure is, and what is to be known to read it: in the file of the picture, not in the picture.
     colours
         Colours (n, 3) in 0..1 that the picture must show as they are.
+    formats
+        Of `FORMATS`.
+    stamp
+        Whether the picture itself shows what it was made with, at its foot.
     """
 
-    def __init__(self, folder: Path, name: str, colours: NDArray[np.float64] | None = None):
-        self.folder, self.name = folder, name
+    def __init__(
+        self,
+        folder: Path,
+        name: str,
+        title: str = "",
+        caption: str = "",
+        colours: NDArray[np.float64] | None = None,
+        formats: Sequence[str] = ("png",),
+        stamp: bool = False,
+    ):
+        self.folder, self.name, self.title, self.caption = folder, name, title, caption
         self.colours = np.zeros((0, 3)) if colours is None else colours
+        self.formats, self.stamp = formats, stamp
         self.written: list[Path] = []
 
-    def save_figure(self, figure: Figure, title: str, made_with: str) -> None:
-        """Write NAME.png with a line at its foot that says what it was made with."""
+    def save_figure(self, figure: Figure, made_with: str) -> None:
+        """Write NAME.png, or what formats are wanted; title, caption and what it was made with stand in each file."""
         made_with = f"{made_with}; matplotlib {matplotlib.__version__}"
-        figure.text(0.004, 0.004, made_with, fontsize=4.5, color="0.55", ha="left", va="bottom")
-        FigureCanvasAgg(figure)
-        buffer = io.BytesIO()
-        figure.savefig(buffer, format="png", dpi=DOTS_PER_INCH, facecolor="white")
-        notes = PngInfo()
-        entries = {"Software": f"{MARK} {remodel_fenicsx.__version__}", "Title": title, "Source": made_with,
-                   "Comment": f"remodel-fenicsx figures {self.name}"}  # fmt: skip
-        for key, value in entries.items():
-            notes.add_text(key, value)
-        small = io.BytesIO()
-        with Image.open(buffer) as drawn:
-            picture = with_palette(drawn.convert("RGB"), self.colours)
-            picture.save(small, "png", pnginfo=notes, optimize=True, dpi=(DOTS_PER_INCH, DOTS_PER_INCH))
-        self._write(f"{self.name}.png", small.getvalue())
+        if self.stamp:
+            figure.text(0.004, 0.004, made_with, fontsize=4.5, color="0.55", ha="left", va="bottom")
+        made_by = f"{MARK} {remodel_fenicsx.__version__}"
+        common = {"Title": self.title, "Creator": made_by}
+        notes: dict[str, dict[str, Any]] = {
+            "png": {"Software": made_by, "Title": self.title, "Description": self.caption, "Source": made_with,
+                    "Comment": f"remodel-fenicsx figures {self.name}"},
+            "pdf": common | {"Subject": self.caption, "Keywords": made_with, "CreationDate": None},
+            "svg": common | {"Description": self.caption, "Source": made_with, "Date": None},
+        }  # fmt: skip
+        for ending in self.formats:
+            buffer = io.BytesIO()
+            how: dict[str, Any] = {"format": ending, "dpi": DOTS_PER_INCH[ending], "facecolor": "white"}
+            if ending != "png":
+                how["metadata"] = notes[ending]
+            figure.savefig(buffer, **how)
+            content = self._with_few_colours(buffer, notes["png"]) if ending == "png" else buffer.getvalue()
+            self._write(f"{self.name}.{ending}", content)
+
+    def _with_few_colours(self, drawn: io.BytesIO, notes: Mapping[str, str]) -> bytes:
+        """A PNG of 256 colours with these notes."""
+        texts = PngInfo()
+        for key, value in notes.items():
+            texts.add_text(key, value)
+        small, dpi = io.BytesIO(), DOTS_PER_INCH["png"]
+        with Image.open(drawn) as full:
+            picture = with_palette(full.convert("RGB"), self.colours)
+            picture.save(small, "png", pnginfo=texts, optimize=True, dpi=(dpi, dpi))
+        return small.getvalue()
 
     def save_table(self, columns: Mapping[str, ArrayLike], notes: Sequence[str], part: str = "") -> None:
         """Write NAME.csv or NAME-PART.csv: notes as comments, then the columns, all of one length."""
@@ -102,6 +138,26 @@ class Page:
         self.written.append(path)
 
 
+def panel_letters(*panels: Axes) -> None:
+    """Letter the panels of a figure a, b, c, ...: bold, on the line of the titles, where their column begins."""
+    lefts = [_left_end(axes) for axes in panels]
+    for letter, axes in zip("abcdefgh", panels, strict=False):
+        start = axes.get_position().x0
+        left = min(end for end, other in zip(lefts, panels, strict=True) if abs(other.get_position().x0 - start) < 1e-6)
+        axes.annotate(letter, (left, 1.0), (0.0, STYLE["axes.titlepad"]), xycoords=("figure fraction", "axes fraction"),
+                      textcoords="offset points", fontsize=10, fontweight="bold", ha="left", va="baseline",
+                      annotation_clip=False)  # fmt: skip
+
+
+def _left_end(axes: Axes) -> float:
+    """Where axes with all their labels begin, over the width of the figure."""
+    figure = axes.get_figure()
+    assert isinstance(figure, Figure)
+    place = axes.get_tightbbox(FigureCanvasAgg(figure).get_renderer())
+    assert place is not None
+    return float(figure.transFigure.inverted().transform((place.x0, 0.0))[0])
+
+
 def with_palette(picture: Image.Image, colours: NDArray[np.float64]) -> Image.Image:
     """A picture of 256 colours, a quarter as large: these (n, 3) in 0..1 as they are, the rest chosen for the picture.
 
@@ -126,7 +182,7 @@ def _cell(value: Any) -> str:
     return str(value) if isinstance(value, (str, int, np.integer)) else f"{float(value):.7g}"
 
 
-def check_folder(folder: Path, names: Sequence[str]) -> None:
+def check_folder(folder: Path, names: Sequence[str], formats: Sequence[str]) -> None:
     """That the folder can take these figures without touching anything of anybody else's; nothing is left in it.
 
     Raises
@@ -139,7 +195,8 @@ def check_folder(folder: Path, names: Sequence[str]) -> None:
     if folder.exists() and not folder.is_dir():
         raise FigureError(f"-o {folder}: is a file; allowed is a folder", 2)
     for name in names:
-        for path in (folder / f"{name}.png", folder / f"{name}.csv", *folder.glob(f"{name}-*.csv")):
+        endings = (*formats, "csv")
+        for path in (*(folder / f"{name}.{ending}" for ending in endings), *folder.glob(f"{name}-*.csv")):
             _check_ours(path)
     there = next(place for place in (folder, *folder.absolute().parents) if place.exists())
     with tempfile.TemporaryDirectory(prefix=".remodel-fenicsx-", dir=there):
@@ -149,9 +206,7 @@ def check_folder(folder: Path, names: Sequence[str]) -> None:
 def _check_ours(path: Path) -> None:
     if not path.exists():
         return
-    with path.open("rb") as file:
-        start = file.read(4096)
-    if MARK.encode() not in start:
+    if MARK.encode() not in path.read_bytes():  # in a PDF it comes last
         message = f"{path}: is not a figure of this command and is not overwritten; choose another folder with -o"
         raise FigureError(message, 2)
 

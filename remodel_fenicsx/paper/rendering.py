@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from remodel_fenicsx.paper.runs import FigureError
+from remodel_fenicsx.paper.errors import FigureError
 
 Array = NDArray[np.float64]
 Pixels = NDArray[np.uint8]
@@ -30,11 +30,25 @@ SAMPLES = 2  # pictures are drawn this much larger and made smaller: smooth edge
 
 @dataclass(frozen=True)
 class Patch:
-    """Quadrilaterals: corners (m, 4, 3), a colour each (m, 3) in 0..1, and whether their edges are drawn."""
+    """Quadrilaterals in space.
+
+    Attributes
+    ----------
+    corners
+        (m, 4, 3), counter-clockwise where they are seen from outside.
+    colours
+        One of each, (m, 3) in 0..1.
+    edges
+        Whether their edges are drawn.
+    lies_on
+        0 for a surface. For what lies on one: how far it is moved towards the eye so that the surface does not cover
+        it. In a parallel view that moves nothing in the picture. Where it is seen from behind, it is left out.
+    """
 
     corners: Array
     colours: Array
     edges: bool = False
+    lies_on: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -100,17 +114,20 @@ def _draw(picture: Picture) -> Pixels:
     plotter: Any = pyvista.Plotter(off_screen=True, window_size=[columns, rows], lighting="none")
     plotter.set_background("white")
     plotter.add_light(pyvista.Light(light_type="headlight", intensity=1.0))
+    direction = np.array(picture.view.direction) / np.linalg.norm(picture.view.direction)
     for patch in picture.patches:
         count = len(patch.corners)
+        if not count:
+            continue
         faces = np.column_stack([np.full(count, 4), np.arange(4 * count).reshape(-1, 4)]).ravel()
-        surface = pyvista.PolyData(patch.corners.reshape(-1, 3), faces)
+        surface = pyvista.PolyData((patch.corners + patch.lies_on * direction).reshape(-1, 3), faces)
         surface.cell_data["colour"] = np.rint(255 * patch.colours).astype(np.uint8)
         plotter.add_mesh(
             surface, scalars="colour", rgb=True, show_edges=patch.edges, edge_color="#777777", line_width=SAMPLES * 0.5,
             ambient=AMBIENT, diffuse=1 - AMBIENT, specular=0.0, smooth_shading=False, show_scalar_bar=False,
+            culling="back" if patch.lies_on else None,
         )  # fmt: skip
     view = picture.view
-    direction = np.array(view.direction) / np.linalg.norm(view.direction)
     camera = plotter.camera
     camera.focal_point = view.centre
     camera.position = tuple(np.array(view.centre) + 10 * view.height * direction)

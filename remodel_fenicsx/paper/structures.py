@@ -5,15 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from remodel_fenicsx.tissue.cells import initial_axes, radial_direction
 from remodel_fenicsx.paper.bodies import angle_scale, body, place
-from remodel_fenicsx.paper.output import COLOURS, Page
-from remodel_fenicsx.paper.recordings import Array, Recording, Snapshot, Table, layers, radii, rank_of
+from remodel_fenicsx.paper.cases import ELONGATION_COLUMN, LOAD_CASES, load_case_name
+from remodel_fenicsx.paper.output import COLOURS, Page, panel_letters
 from remodel_fenicsx.paper.rendering import Picture, View, render
-from remodel_fenicsx.paper.runs import LOAD_CASES, load_case_name
+from remodel_fenicsx.paper.snapshots import Array, Snapshot, Table, layers, made_with, radii, rank_of
+from remodel_fenicsx.results.recording import Recording
 
 TENDON_TIMES = (1.0, 12.0, 25.0, 50.0, 150.0)
 ARTERY_TIMES = (1.0, 24.0, 50.0, 100.0, 150.0)
@@ -28,7 +30,7 @@ FROM_ABOVE = (0.35, -1.0, 0.42)  # the direction from which tubes are seen
 
 def element_table(snapshot: Snapshot, shown: NDArray[np.bool_] | None = None) -> Table:
     """What is drawn of each element: reference centre, angles in degrees, cell dimensions, r/L."""
-    shown = np.ones(len(snapshot.cells), dtype=bool) if shown is None else shown
+    shown = np.ones(len(snapshot.elements), dtype=bool) if shown is None else shown
     x, y, z = snapshot.centres[shown].T
     fields = {name: values[shown] for name, values in snapshot.fields.items()}
     lengths = {f"l_{i + 1}": fields["cell_dimensions"][:, i] for i in range(3)}
@@ -48,7 +50,7 @@ def element_table(snapshot: Snapshot, shown: NDArray[np.bool_] | None = None) ->
 
 def wall_table(snapshot: Snapshot, shown: NDArray[np.bool_] | None = None) -> Table:
     """`element_table` of a tube, with the radial component of its cells."""
-    shown = np.ones(len(snapshot.cells), dtype=bool) if shown is None else shown
+    shown = np.ones(len(snapshot.elements), dtype=bool) if shown is None else shown
     return element_table(snapshot, shown) | {"l_radial": radial_dimension(snapshot)[shown]}
 
 
@@ -84,7 +86,7 @@ def tube_picture(
 def draw_tendon(runs: dict[str, Recording], page: Page) -> None:
     """Fig. 6: stretch over time, and snapshots coloured by the angle to the load axis."""
     run = runs["tendon"]
-    snapshots = [run.snapshot(time) for time in TENDON_TIMES]
+    snapshots = [Snapshot.of(run, time) for time in TENDON_TIMES]
     longest = max(snapshot.deformed[:, 2].max() for snapshot in snapshots)
     height, pixels = 1.1 * longest, (270, 1000)
     pictures = [
@@ -93,7 +95,7 @@ def draw_tendon(runs: dict[str, Recording], page: Page) -> None:
     ]
     images = render(pictures)
     figure = Figure(figsize=(8.2, 4.3))
-    axes = figure.add_axes((0.065, 0.145, 0.36, 0.775))
+    axes = figure.add_axes((0.065, 0.115, 0.36, 0.825))
     columns = run.history
     axes.fill_between(columns["time"], columns["min_stretch"], columns["max_stretch"], color="0.88", lw=0,
                       label="elements, least to most")  # fmt: skip
@@ -102,18 +104,20 @@ def draw_tendon(runs: dict[str, Recording], page: Page) -> None:
     axes.plot(TENDON_TIMES, marks, "o", ms=4, color=COLOURS[0], clip_on=False)
     axes.set(xlabel="time", ylabel="stretch", xlim=(0, run.scene.time.end), ylim=(1.0, None))
     axes.legend(loc="upper right")
+    panels = [axes]
     for number, (time, image) in enumerate(zip(TENDON_TIMES, images, strict=True)):
-        picture = figure.add_axes((0.45 + 0.109 * number, 0.175, 0.109, 0.765))
-        place(picture, image)
-        picture.set_title(f"$t$ = {time:g}", pad=2)
-    angle_scale(figure, (0.50, 0.145, 0.44, 0.022), TO_LOAD)
-    page.save_figure(figure, "Cylindrical tendon under uniaxial tension (Fig. 6)", run.made_with())
-    notes = [run.made_with(), "fig6, left; stretches 1 = undeformed, angle in degrees to the load axis (reference)"]
+        panels.append(figure.add_axes((0.45 + 0.109 * number, 0.145, 0.109, 0.795)))
+        place(panels[-1], image)
+        panels[-1].set_title(f"$t$ = {time:g}")
+    angle_scale(figure, (0.50, 0.115, 0.44, 0.022), TO_LOAD)
+    panel_letters(*panels)
+    page.save_figure(figure, made_with(run))
+    notes = [made_with(run), "fig6, left; stretches 1 = undeformed, angle in degrees to the load axis (reference)"]
     names = ("time", "force", "mean_stretch", "min_stretch", "max_stretch", "mean_fibre_angle")
     page.save_table({name: columns[name] for name in names}, notes)
-    page.save_table(joined([element_table(s) for s in snapshots]), [run.made_with(), f"fig6, right; {SOLVED}"],
+    page.save_table(joined([element_table(s) for s in snapshots]), [made_with(run), f"fig6, right; {SOLVED}"],
                     "elements")  # fmt: skip
-    page.save_table(snapshot_summary(snapshots), [run.made_with(), f"over all elements; {SOLVED}"], "snapshots")
+    page.save_table(snapshot_summary(snapshots), [made_with(run), f"over all elements; {SOLVED}"], "snapshots")
 
 
 def snapshot_summary(snapshots: Sequence[Snapshot]) -> Table:
@@ -143,28 +147,36 @@ def snapshot_summary(snapshots: Sequence[Snapshot]) -> Table:
 def draw_artery(runs: dict[str, Recording], page: Page) -> None:
     """Fig. 7: five snapshots of the artery."""
     run = runs["artery"]
-    snapshots = [run.snapshot(time) for time in ARTERY_TIMES]
+    snapshots = [Snapshot.of(run, time) for time in ARTERY_TIMES]
     tallest = max(snapshot.deformed[:, 2].max() for snapshot in snapshots)
     images = render([tube_picture(s, None, 1.25 * tallest, (360, 560)) for s in snapshots])
     figure = Figure(figsize=(8.2, 3.5))
+    panels = []
     for number, (time, image) in enumerate(zip(ARTERY_TIMES, images, strict=True)):
-        axes = figure.add_axes((0.005 + 0.198 * number, 0.225, 0.198, 0.72))
+        axes = figure.add_axes((0.005 + 0.198 * number, 0.215, 0.198, 0.72))
+        panels.append(axes)
         place(axes, image)
-        axes.set_title(f"$t$ = {time:g}", pad=3)
-        loads = f"$p$ = {run.value('pressure', time):.3g},  stretch {100 * run.value('axial_stretch', time):.2g} %"
-        axes.text(0.5, -0.015, loads, transform=axes.transAxes, ha="center", va="top", fontsize=7, color="0.35")
-    angle_scale(figure, (0.25, 0.15, 0.5, 0.026), IN_WALL.format(""))
-    page.save_figure(figure, "Artery under axial stretch and inner pressure (Fig. 7)", run.made_with())
-    names = ("pressure", "axial_stretch", "inner_radius", "outer_radius",
+        axes.set_title(f"$t$ = {time:g}")
+        _write_loads(axes, run.value(ELONGATION_COLUMN, time), run.value("pressure", time))
+    angle_scale(figure, (0.25, 0.125, 0.5, 0.026), IN_WALL.format(""))
+    panel_letters(*panels)
+    page.save_figure(figure, made_with(run))
+    names = ("pressure", ELONGATION_COLUMN, "inner_radius", "outer_radius",
              "fibre_angle_inner", "fibre_angle_middle", "fibre_angle_outer")  # fmt: skip
     summary = {"time": list(ARTERY_TIMES)} | {name: [run.value(name, t) for t in ARTERY_TIMES] for name in names}
     summary["mean_l_radial"] = [radial_dimension(s).mean() for s in snapshots]
     meaning = "rows of the run's history; reference angles in degrees; mean_l_radial: radial component, all elements"
-    page.save_table(summary, [run.made_with(), meaning])
+    page.save_table(summary, [made_with(run), meaning])
     history = {name: run.history[name] for name in ("time", *names)}
-    page.save_table(history, [run.made_with(), "the whole history"], "history")
+    page.save_table(history, [made_with(run), "the whole history"], "history")
     tables = [wall_table(s) for s in snapshots]
-    page.save_table(joined(tables), [run.made_with(), f"what is drawn; {SOLVED}"], "elements")
+    page.save_table(joined(tables), [made_with(run), f"what is drawn; {SOLVED}"], "elements")
+
+
+def _write_loads(axes: Axes, elongation: float, pressure: float) -> None:
+    """Below a picture."""
+    text = f"elongation {100 * elongation:.2g} %,  $p$ = {pressure:.3g}"
+    axes.text(0.5, -0.015, text, transform=axes.transAxes, ha="center", va="top", fontsize=7, color="0.35")
 
 
 def layer_table(snapshot: Snapshot) -> Table:
@@ -174,7 +186,7 @@ def layer_table(snapshot: Snapshot) -> Table:
     stays round, large where it swirls or where elements are sheared to and fro.
     """
     number = layers(snapshot)
-    radius = radii(snapshot.points, snapshot.cells)
+    radius = radii(snapshot.points, snapshot.elements)
     count = np.bincount(number)
 
     def per_layer(name: str) -> Array:
@@ -184,7 +196,7 @@ def layer_table(snapshot: Snapshot) -> Table:
     reference = snapshot.fields["fibre_angle"]
     shear = local_shear(snapshot)
     dimensions = [np.bincount(number, snapshot.fields["cell_dimensions"][:, i]) / count for i in range(3)]
-    deformed = radii(snapshot.deformed, snapshot.cells)
+    deformed = radii(snapshot.deformed, snapshot.elements)
     return {
         "layer": np.arange(1, len(count) + 1),
         "radius": np.bincount(number, radius) / count,
@@ -210,23 +222,26 @@ def local_shear(snapshot: Snapshot) -> Array:
 def draw_layers(runs: dict[str, Recording], page: Page) -> None:
     """Fig. 8: the end of Fig. 7, three layers of its wall apart."""
     run = runs["artery"]
-    snapshot = run.snapshot(run.scene.time.end)
+    snapshot = Snapshot.of(run, run.scene.time.end)
     number, table = layers(snapshot), layer_table(snapshot)
     tallest = snapshot.deformed[:, 2].max()
     images = render([tube_picture(snapshot, number == k, 1.27 * tallest, (440, 600)) for k in WALL_LAYERS.values()])
     figure = Figure(figsize=(6.4, 3.95))
+    panels = []
     for place_number, ((name, k), image) in enumerate(zip(WALL_LAYERS.items(), images, strict=True)):
         axes = figure.add_axes((0.01 + 0.33 * place_number, 0.255, 0.32, 0.69))
+        panels.append(axes)
         place(axes, image)
-        axes.set_title(name, pad=3)
+        axes.set_title(name)
         means = f"{table['fibre_angle'][k]:.1f}° reference, {table['fibre_angle_deformed'][k]:.1f}° deformed"
         text = f"layer {k + 1} of {len(table['layer'])}; mean angle\n{means}"
         axes.text(0.5, -0.015, text, transform=axes.transAxes, ha="center", va="top", fontsize=7.5, color="0.35")
     angle_scale(figure, (0.2, 0.125, 0.6, 0.025), IN_WALL.format(at(snapshot)))
-    page.save_figure(figure, "Chains in the layers of the artery's wall (Fig. 8)", run.made_with())
-    page.save_table(table, [run.made_with(), f"means over element layers; time {run.scene.time.end:g}; {SOLVED}"])
+    panel_letters(*panels)
+    page.save_figure(figure, made_with(run))
+    page.save_table(table, [made_with(run), f"means over element layers; time {run.scene.time.end:g}; {SOLVED}"])
     drawn = np.isin(number, list(WALL_LAYERS.values()))
-    page.save_table(wall_table(snapshot, drawn), [run.made_with(), "the elements that are drawn"], "elements")
+    page.save_table(wall_table(snapshot, drawn), [made_with(run), "the elements that are drawn"], "elements")
 
 
 def peeled(snapshot: Snapshot) -> NDArray[np.bool_]:
@@ -238,26 +253,29 @@ def peeled(snapshot: Snapshot) -> NDArray[np.bool_]:
 def draw_load_cases(runs: dict[str, Recording], page: Page) -> None:
     """Fig. 9: the ends of five load cases, the layers virtually peeled off."""
     cases = [runs[load_case_name(*case)] for case in LOAD_CASES]
-    snapshots = [run.snapshot(run.scene.time.end) for run in cases]
+    snapshots = [Snapshot.of(run, run.scene.time.end) for run in cases]
     tallest = max(snapshot.deformed[:, 2].max() for snapshot in snapshots)
     images = render([tube_picture(s, peeled(s), 1.25 * tallest, (360, 560)) for s in snapshots])
     figure = Figure(figsize=(8.2, 3.4))
-    for number, ((stretch, pressure), image) in enumerate(zip(LOAD_CASES, images, strict=True)):
-        axes = figure.add_axes((0.005 + 0.198 * number, 0.215, 0.198, 0.73))
+    panels = []
+    for number, ((elongation, pressure), image) in enumerate(zip(LOAD_CASES, images, strict=True)):
+        axes = figure.add_axes((0.005 + 0.198 * number, 0.215, 0.198, 0.72))
+        panels.append(axes)
         place(axes, image)
-        axes.set_title(f"stretch {100 * stretch:g} %,  $p$ = {pressure:g}", pad=3, fontsize=8)
-    angle_scale(figure, (0.25, 0.15, 0.5, 0.026), IN_WALL.format(at(snapshots[0])))
-    made_with = cases[0].made_with()
-    page.save_figure(figure, "Load cases from pure stretch to pure pressure (Fig. 9)", made_with)
+        _write_loads(axes, elongation, pressure)
+    angle_scale(figure, (0.25, 0.125, 0.5, 0.026), IN_WALL.format(at(snapshots[0])))
+    panel_letters(*panels)
+    made = made_with(cases[0])
+    page.save_figure(figure, made)
     tables = []
     for (stretch, pressure), snapshot in zip(LOAD_CASES, snapshots, strict=True):
         table = layer_table(snapshot)
         loads = {"stretch": np.full(len(table["layer"]), stretch), "pressure": np.full(len(table["layer"]), pressure)}
         tables.append(loads | table)
-    page.save_table(joined(tables), [made_with, f"means over element layers; {SOLVED}"])
+    page.save_table(joined(tables), [made, f"means over element layers; {SOLVED}"])
     elements = []
     for (stretch, pressure), snapshot in zip(LOAD_CASES, snapshots, strict=True):
         table = wall_table(snapshot, peeled(snapshot))
         loads = {"stretch": np.full(len(table["x"]), stretch), "pressure": np.full(len(table["x"]), pressure)}
         elements.append(loads | table)
-    page.save_table(joined(elements), [made_with, f"the elements that are drawn; {SOLVED}"], "elements")
+    page.save_table(joined(elements), [made, f"the elements that are drawn; {SOLVED}"], "elements")

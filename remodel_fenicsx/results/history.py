@@ -7,11 +7,6 @@ import io
 import os
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
-Array = NDArray[np.float64]
-
 
 class History:
     """history.csv: one row per accepted step, complete on disk as soon as the step is accepted."""
@@ -60,10 +55,3 @@ class History:
 def _number(value: float) -> str:
     """Shortest text that reads back as the same number."""
     return str(value) if isinstance(value, int) else repr(float(value))
-
-
-def read_history(folder: Path) -> dict[str, Array]:
-    """The columns of a recorded history.csv by name, each an array over the accepted steps."""
-    with (Path(folder) / "history.csv").open(newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-    return {name: np.array([float(row[name]) for row in rows]) for name in (rows[0] if rows else ())}

@@ -12,9 +12,7 @@ from types import TracebackType
 from mpi4py import MPI
 
 from remodel_fenicsx.evolution.stepper import Step, Watcher
-from remodel_fenicsx.results.history import History, read_history
-
-__all__ = ["FolderTaken", "RunFolder", "choose_folder", "chosen_folder", "read_history"]
+from remodel_fenicsx.results.history import History
 
 
 class FolderTaken(ValueError):

@@ -1,0 +1,252 @@
+"""Reading back what a run has recorded. It needs h5py and numpy, no dolfinx: results are read on any machine."""
+
+from __future__ import annotations
+
+import csv
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from remodel_fenicsx.scene.scene import Scene
+
+Array = NDArray[np.float64]
+
+HISTORY, FIELDS, SCENE = "history.csv", "fields.vtkhdf", "scene.toml"
+SAME_TIME = 1e-9  # two times are one if they differ by less, relative to the larger of 1 and the time
+
+
+class RecordingError(ValueError):
+    """A folder is no recorded run, is damaged, or does not hold what was asked for; one line says which."""
+
+
+class HistoryColumns(dict[str, Array]):
+    """The columns of a history by name, each (rows,); a value that was not computed is NaN."""
+
+    def frame(self) -> Any:
+        """The columns as a pandas DataFrame, one row per recorded step.
+
+        Raises
+        ------
+        ImportError
+            If there is no pandas.
+        """
+        try:
+            import pandas
+        except ImportError as error:
+            raise ImportError("history.frame() needs pandas, which is not installed; the columns need not") from error
+        return pandas.DataFrame(dict(self))
+
+
+class Recording:
+    """The folder of a run, finished or under way.
+
+    Everything is read when it is first asked for, and once: a new `Recording` sees what has been added since.
+
+    Parameters
+    ----------
+    folder
+        What `remodel-fenicsx run -o` was given.
+
+    Attributes
+    ----------
+    path : Path
+        The folder.
+
+    Raises
+    ------
+    RecordingError
+        If it is no folder of a run.
+    """
+
+    def __init__(self, folder: str | os.PathLike[str]):
+        self.path = Path(folder)
+        if not self.path.is_dir():
+            raise RecordingError(f"{self.path}: {'is a file' if self.path.exists() else 'there is no such folder'}")
+        for name in (SCENE, HISTORY):
+            if not (self.path / name).is_file():
+                raise RecordingError(f"{self.path}: is not the folder of a run, it has no {name}")
+
+    def __repr__(self) -> str:
+        return f"Recording({str(self.path)!r})"
+
+    # ------------------------------------------------------------ scene
+    @cached_property
+    def scene(self) -> Scene:
+        """The scene as run (this alone imports pydantic).
+
+        Raises
+        ------
+        SceneError
+            If scene.toml is not a scene.
+        """
+        from remodel_fenicsx.scene.scene import read_scene
+
+        return read_scene(self.path / SCENE)
+
+    @cached_property
+    def versions(self) -> dict[str, str]:
+        """Versions of package and libraries that the run wrote on top of its scene, by name."""
+        found = {}
+        for line in (self.path / SCENE).read_text(encoding="utf-8").splitlines()[1:]:
+            if not line.startswith("#"):
+                break
+            name, _, version = line[1:].strip().partition(" ")
+            found[name] = version
+        return found
+
+    # ------------------------------------------------------------ history
+    @cached_property
+    def history(self) -> HistoryColumns:
+        """Columns of history.csv by name, arrays (rows,); `history.frame()` is a pandas DataFrame.
+
+        Raises
+        ------
+        RecordingError
+            If history.csv is damaged.
+        """
+        return read_history(self.path)
+
+    def value(self, column: str, time: float) -> float:
+        """A column of the history at a recorded time.
+
+        Raises
+        ------
+        RecordingError
+            If there is no such column, or no row at this time.
+        """
+        if column not in self.history:
+            raise RecordingError(f"{self.path}: no column {column!r}; there are {', '.join(self.history)}")
+        return float(self.history[column][self._number_of(time, self.history["time"], "row")])
+
+    # ------------------------------------------------------------ fields
+    @cached_property
+    def times(self) -> Array:
+        """Times at which fields are recorded, (n,); none if the run wrote no fields.
+
+        Raises
+        ------
+        RecordingError
+            If fields.vtkhdf is damaged.
+        """
+        if not (self.path / FIELDS).exists():
+            return np.zeros(0)
+        with self._fields_file() as root:
+            steps = root["Steps"]
+            return _block(steps["Values"], 0, int(steps.attrs["NSteps"]))
+
+    @cached_property
+    def points(self) -> Array:
+        """Reference coordinates of the nodes, (nodes, 3).
+
+        Raises
+        ------
+        RecordingError
+            If the run wrote no fields, or fields.vtkhdf is damaged.
+        """
+        with self._fields_file() as root:
+            return _block(root["Points"], 0, int(root["NumberOfPoints"][0]))
+
+    @cached_property
+    def elements(self) -> NDArray[np.int64]:
+        """Numbers of the nodes of each element in VTK's order, (elements, nodes of one).
+
+        Raises
+        ------
+        RecordingError
+            If the run wrote no fields, or fields.vtkhdf is damaged.
+        """
+        with self._fields_file() as root:
+            count = int(root["NumberOfCells"][0])
+            return np.asarray(root["Connectivity"][:], dtype=np.int64).reshape(count, -1)
+
+    def fields(self, time: float) -> dict[str, Array]:
+        """The fields at a recorded time by name: at the nodes, (nodes, ...), and means over the elements, (elements, ...).
+
+        `displacement` belongs to the nodes; docs/commands.md lists the others. Values have 7 digits.
+
+        Raises
+        ------
+        RecordingError
+            If no fields are recorded at this time, or fields.vtkhdf is damaged.
+        """
+        number = self._number_of(time, self.times, "fields")
+        found: dict[str, Array] = {}
+        with self._fields_file() as root:
+            for kind, unit in (("PointData", "NumberOfPoints"), ("CellData", "NumberOfCells")):
+                for name, values in root[kind].items():
+                    start = int(root["Steps"][f"{kind}Offsets"][name][number])
+                    found[name] = _block(values, start, int(root[unit][0]))
+        return found
+
+    def _number_of(self, time: float, times: Array, what: str) -> int:
+        """Which of the times this one is."""
+        found = np.flatnonzero(np.abs(times - time) <= SAME_TIME * max(1.0, abs(time)))
+        if not len(found):
+            raise RecordingError(f"{self.path}: no {what} at time {time:g}; recorded are {_in_words(times)}")
+        return int(found[0])
+
+    @contextmanager
+    def _fields_file(self) -> Iterator[h5py.Group]:
+        path = self.path / FIELDS
+        if not path.exists():
+            raise RecordingError(f"{self.path}: the run recorded no fields, there is no {FIELDS}")
+        try:
+            with h5py.File(path, "r") as file:
+                yield file["VTKHDF"]
+        except (OSError, RuntimeError, KeyError, ValueError, IndexError, TypeError) as error:
+            # h5py's own words can be several lines
+            raise RecordingError(f"{path}: is damaged or of another kind: {' '.join(str(error).split())}") from error
+
+
+def read_history(folder: str | os.PathLike[str]) -> HistoryColumns:
+    """The columns of a folder's history.csv by name, arrays over its rows; before the first step only `time`, empty.
+
+    Raises
+    ------
+    RecordingError
+        If there is none or it is damaged.
+    """
+    path = Path(folder) / HISTORY
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise RecordingError(f"{path}: cannot be read: {error}") from error
+    if not text:
+        return HistoryColumns(time=np.zeros(0))
+    if not text.endswith("\n"):
+        raise RecordingError(f"{path}: ends in the middle of a row")
+    names, *rows = csv.reader(text.splitlines())
+    if "time" not in names:
+        raise RecordingError(f"{path}: is not the history of a run, it has no column 'time'")
+    for number, row in enumerate(rows, start=2):
+        if len(row) != len(names):
+            raise RecordingError(f"{path}, line {number}: {len(row)} values, but there are {len(names)} columns")
+    try:
+        values = np.array([[float(cell) if cell else np.nan for cell in row] for row in rows]).reshape(-1, len(names))
+    except ValueError as error:
+        raise RecordingError(f"{path}: {error}") from error
+    return HistoryColumns(zip(names, values.T, strict=True))
+
+
+def _block(dataset: h5py.Dataset, start: int, length: int) -> Array:
+    """Rows of a dataset as numbers of double precision; all of them or ValueError."""
+    values = np.asarray(dataset[start : start + length], dtype=np.float64)
+    if len(values) != length:
+        raise ValueError(f"values of {dataset.name} are missing")
+    return values
+
+
+def _in_words(times: Array) -> str:
+    """Recorded times: all of a few, the first and the last ones of many."""
+    if not len(times):
+        return "none"
+    shown = [f"{time:g}" for time in times]
+    return ", ".join(shown if len(shown) <= 8 else [*shown[:3], "...", *shown[-2:]])
