@@ -124,6 +124,29 @@ def test_a_cache_that_cannot_be_written_is_replaced_with_a_warning(tmp_path: Pat
     assert list(temporary.rglob("libffcx_forms_*.so"))
 
 
+DERIVED_TWICE = """
+import dolfinx, numpy, ufl
+from mpi4py import MPI
+from remodel_fenicsx.fem import jit
+mesh = dolfinx.mesh.create_unit_cube(MPI.COMM_WORLD, 1, 1, 1, dolfinx.mesh.CellType.hexahedron)
+for _ in range(2):
+    x = ufl.SpatialCoordinate(mesh)
+    first, second = ufl.variable(x[0]), ufl.variable(x[1])
+    value = first**2 * second**3
+    derivatives = ufl.as_vector([ufl.diff(value, first), ufl.diff(value, second)])
+    compiled = jit.expression(derivatives, numpy.array([[0.5, 0.25, 0.0]]))
+    numpy.testing.assert_allclose(compiled.eval(mesh, numpy.zeros(1, numpy.int32)), [[1 / 64, 3 / 64]])
+print(len(jit.compiled_kernels()))
+"""
+
+
+def test_an_expression_with_derivatives_is_compiled_once_for_all_problems_of_a_process(tmp_path: Path) -> None:
+    """Of (0.5^2 0.25^3): UFL's numbers of variables are not part of the kernel."""
+    command, environment = program(tmp_path, DERIVED_TWICE)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, env=environment)
+    assert (done.returncode, done.stdout) == (0, "1\n"), done.stderr[-2000:]
+
+
 # A run that is under way: a signal is a request that it looks at now and then, but not while it compiles
 IN_A_RUN = """
 import sys, ufl, dolfinx
