@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import mpirun
-from tests.processes import session_members, wait_for_compiler
+from tests.processes import all_end, wait_for_compiler
 
 PROGRAM = """
 import logging, sys, ufl, dolfinx
@@ -89,6 +89,7 @@ def test_who_waits_for_a_compiler_says_for_whose(tmp_path: Path) -> None:
         assert waiting.stderr
         line = next(line for line in waiting.stderr if "compil" in line)
     assert f"another run is compiling forms (process {os.getpid()}): waiting for it" in line
+    assert line.startswith("NOTICE:")  # the terminal gets it
     assert "compiling the moment" in waiting.communicate(timeout=120)[1]
     assert waiting.returncode == 0
 
@@ -171,24 +172,39 @@ with StopRequest():
         ("group", signal.SIGINT),
         ("group", signal.SIGTERM),
         ("group", signal.SIGHUP),
-        ("process", signal.SIGTERM),
+        ("process and group", signal.SIGTERM),
         ("compiler", signal.SIGTERM),
     ],
 )
 def test_a_signal_ends_the_compiler_and_leaves_nothing(target: str, number: signal.Signals, tmp_path: Path) -> None:
-    """A terminal, and timeout, send it to the group; a supervisor to one process; some to all, one by one."""
+    """A terminal sends it to the group, timeout to the process and then to its group, some to all, one by one."""
     command, environment = program(tmp_path, IN_A_RUN)
     process = subprocess.Popen(command, stderr=subprocess.PIPE, env=environment, text=True, start_new_session=True)
     compiler = wait_for_compiler(process)
-    if target == "group":
+    if target != "group":
+        os.kill(compiler if target == "compiler" else process.pid, number)
+        time.sleep(0.01)
+    if "group" in target:
         os.killpg(process.pid, number)
-    else:
-        os.kill(process.pid if target == "process" else compiler, number)
     errors = process.communicate(timeout=60)[1]
     assert (process.returncode, errors) == (128 + number, "")
     if target != "compiler":  # whoever ends gcc alone leaves gcc's own children to themselves
-        deadline = time.monotonic() + 10  # what was killed vanishes in its own time
-        while session_members(process.pid) and time.monotonic() < deadline:
-            time.sleep(0.05)
-        assert session_members(process.pid) == {}
+        assert all_end(process.pid)
     assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == ["compiling.lock"]
+
+
+def test_a_signal_for_one_process_ends_the_compilers_own_children(tmp_path: Path) -> None:
+    """As a supervisor sends it. A compiler stands in that would be at work for ever, in a program of its own."""
+    compiler = tmp_path / "compiler"
+    compiler.write_text("#!/bin/sh\nsleep 1000\nexit 1\n")
+    compiler.chmod(0o755)
+    command, environment = program(tmp_path, IN_A_RUN.replace("150", "3"))
+    environment["CC"] = str(compiler)
+    process = subprocess.Popen(command, stderr=subprocess.DEVNULL, env=environment, text=True, start_new_session=True)
+    wait_for_compiler(process, "sleep")
+    process.terminate()
+    assert process.wait(timeout=60) == 143
+    ended = all_end(process.pid)
+    if not ended:
+        os.killpg(process.pid, signal.SIGKILL)
+    assert ended
