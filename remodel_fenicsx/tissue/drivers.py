@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import ufl
 from numpy.typing import NDArray
 
 from remodel_fenicsx.tissue.energy import Stresses
@@ -37,6 +36,13 @@ class Driver:
     overcorrection: dict[str, float] = field(default_factory=dict)
 
 
+def finger_tensor(deformation_gradient: Any, stresses: Stresses) -> Any:
+    """b = F F^T (UFL)."""
+    import ufl
+
+    return ufl.dot(deformation_gradient, deformation_gradient.T)
+
+
 DRIVERS: dict[str, Driver] = {
     "cauchy": Driver(lambda F, s: s.cauchy, material=False),
     "pk2": Driver(
@@ -45,7 +51,7 @@ DRIVERS: dict[str, Driver] = {
         overcorrection={"material": -1.5, "spatial": -1.5},
     ),
     "finger": Driver(
-        lambda F, s: ufl.dot(F, F.T),
+        finger_tensor,
         material=False,
         is_stress=False,
         overcorrection={"material": -2.6, "spatial": -1.9},

@@ -14,8 +14,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
-import ufl
-
 from remodel_fenicsx.tissue.cells import UnitCell, structure_tensor
 from remodel_fenicsx.tissue.chains import CHAINS, Chain
 from remodel_fenicsx.tissue.operators import component, det, ln, sqrt, squared_norm
@@ -138,6 +136,8 @@ class Tissue:
 
     def stresses(self, deformation_gradient: Any, cells: Sequence[UnitCell]) -> Stresses:
         """P = dW/dF, S = F^-1 P and sigma = P F^T / J (eqs. 6 and 7 with erratum 5), by differentiation of W; UFL."""
+        import ufl
+
         F = ufl.variable(deformation_gradient)
         first = ufl.diff(self.strain_energy(F, cells), F)
         return Stresses(first, ufl.dot(ufl.inv(F), first), ufl.dot(first, F.T) / ufl.det(F))
