@@ -1,7 +1,7 @@
 """The few tensor operations of the model, on UFL expressions and on arrays alike.
 
-Arrays have shape (..., 3, 3) for tensors and (..., 3) for vectors; what is in front are points. What is neither a number
-nor an array is UFL, which is imported only then: scenes are read, and points computed, without it.
+Arrays have shape (..., 3, 3) for tensors and (..., 3) for vectors; what is in front are points. What is neither number
+nor array is UFL, which is imported only then: scenes are read, and points computed, without it.
 """
 
 from __future__ import annotations
