@@ -79,9 +79,7 @@ class Staggered:
         """The pass with the solved state."""
         if not self.remodeling.law.remodels:
             return 0.0
-        extension = self.equilibrium.extension().max_chain_extension
-        noise = self.remodeling.stress_noise(self.equilibrium.stress_rounding(extension), self._residual)
-        return self.remodeling.apply(self.state.time, time, noise)
+        return self.remodeling.apply(self.state.time, time, self._residual)
 
     def close(self) -> None:
         """Free PETSc's objects."""

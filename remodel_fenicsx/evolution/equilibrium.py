@@ -108,15 +108,6 @@ class Equilibrium:
             return np.full(self.quadrature.shape, np.inf)
         return coefficients.point_values(length, self.quadrature)
 
-    def stress_rounding(self, max_chain_extension: float) -> float:
-        """Rounding error of a stress in this body, from the stiffness of matrix and network at the largest r/L."""
-        mesh = self.quadrature.mesh
-        numbers = self.tissue.map(lambda name, value: coefficients.largest(value, mesh))
-        length = numbers.end_to_end_length
-        if numbers.locking_length is not None:
-            length = max(length, max_chain_extension * numbers.locking_length)
-        return float(np.finfo(np.float64).eps * numbers.stiffness(length))
-
     def stored_energy(self) -> float:
         """Integral of W over the body."""
         if self._energy_form is None:
@@ -191,6 +182,15 @@ def on_mesh(tissue: Tissue, mesh: Any) -> Tissue:
 def at_points(tissue: Tissue, quadrature: Any) -> Tissue:
     """A tissue on a mesh with its parameters as arrays over the points in one row, (elements * points,)."""
     return tissue.map(lambda name, value: coefficients.point_values(value, quadrature).reshape(-1))
+
+
+def stress_rounding(tissue: Tissue, mesh: Any, max_chain_extension: float) -> float:
+    """Rounding error of a stress in a body, from the stiffness of matrix and network at the largest r/L."""
+    numbers = tissue.map(lambda name, value: coefficients.largest(value, mesh))
+    length = numbers.end_to_end_length
+    if numbers.locking_length is not None:
+        length = max(length, max_chain_extension * numbers.locking_length)
+    return float(np.finfo(np.float64).eps * numbers.stiffness(length))
 
 
 def _depends_on(form: Any, unknown: Any) -> bool:

@@ -11,7 +11,7 @@ import dolfinx.fem.petsc
 import numpy as np
 from petsc4py import PETSc
 
-from remodel_fenicsx.evolution.equilibrium import Equilibrium, Extension
+from remodel_fenicsx.evolution.equilibrium import Equilibrium, Extension, stress_rounding
 from remodel_fenicsx.fem.petsc_options import ProblemOptions
 from remodel_fenicsx.system.interrupts import Interrupted
 
@@ -186,10 +186,12 @@ class GuardedNewton:
             residual.axpy(1.0, self._external)
         dolfinx.fem.petsc.set_bc(residual, loading.boundary_conditions, x, -1.0)
         extension = equilibrium.extension()
-        self._stress_rounding = equilibrium.stress_rounding(extension.max_chain_extension)
         self._lost = not extension.admissible or extension.stop_signal > 0
         if self._lost:
             residual.set(np.nan)
+            return
+        mesh = equilibrium.quadrature.mesh
+        self._stress_rounding = stress_rounding(equilibrium.tissue, mesh, extension.max_chain_extension)
 
     def _assemble_tangent(self, snes: Any, x: Any, matrix: Any, preconditioner: Any) -> None:
         self.equilibrium.assemble_tangent(matrix)
