@@ -22,6 +22,7 @@ from remodel_fenicsx.scene.values import base_material, in_own_units, in_present
 from remodel_fenicsx.schema.tables import SceneError, Table, checked, fault, quoted, shown, variant_of
 from remodel_fenicsx.schema.toml import merged, parse_override, put, read_toml, toml_text
 from remodel_fenicsx.schema.units import FORCE, STRESS
+from remodel_fenicsx.tissue.chains import CHAINS
 
 LARGEST_MESH = 10_000_000  # hexahedra; Gmsh, which is serial, needs about 10 GB for them
 
@@ -90,7 +91,7 @@ class Scene(Table):
     @model_validator(mode="after")
     def _tables_fit_together(self) -> Scene:
         cells, material, geometry = self.cells, self.material, self.geometry
-        if cells.end_to_end_length >= material.contour_length:
+        if CHAINS[material.chain].locks and cells.end_to_end_length >= material.contour_length:
             rule = f"must be smaller than material.contour_length = {shown(material.contour_length)}"
             raise fault(rule, "cells.end_to_end_length", cells.end_to_end_length)
         if cells.axes not in geometry.axis_kinds:

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import ufl
 from numpy.typing import NDArray
 
 from remodel_fenicsx.tissue.energy import Stresses, Tissue
@@ -37,6 +36,13 @@ class Driver:
     overcorrection: dict[str, float] = field(default_factory=dict)
 
 
+def finger_tensor(F: Any, stresses: Stresses) -> Any:
+    """b = F F^T."""
+    import ufl  # not above: scenes, which name drivers, are read without it
+
+    return ufl.dot(F, F.T)
+
+
 def _matrix_stiffness(tissue: Tissue) -> Any:
     """lambda + 2 mu: a stress per strain."""
     return tissue.lame_lambda + 2 * tissue.lame_mu
@@ -51,7 +57,7 @@ DRIVERS: dict[str, Driver] = {
         overcorrection={"material": -1.5, "spatial": -1.5},
     ),
     "finger": Driver(
-        lambda F, s: ufl.dot(F, F.T),
+        finger_tensor,
         material=False,
         scale=lambda tissue: 1.0,
         overcorrection={"material": -2.6, "spatial": -1.9},

@@ -14,8 +14,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
-import ufl
-
 from remodel_fenicsx.tissue.cells import UnitCell, structure_tensor
 from remodel_fenicsx.tissue.chains import CHAINS, Chain
 from remodel_fenicsx.tissue.operators import component, det, ln, sqrt, squared_norm
@@ -76,7 +74,7 @@ class Tissue:
     network_modulus
         c = omega k theta n_chn / (4 A_p), in the same unit.
     contour_length
-        L, in link lengths.
+        L, in link lengths. A chain law that does not lock may mean something else by it, or nothing.
     end_to_end_length
         r0, the initial length of a chain (erratum 3), in link lengths.
     chain
@@ -137,6 +135,8 @@ class Tissue:
 
     def stresses(self, deformation_gradient: Any, cells: Sequence[UnitCell]) -> Stresses:
         """P = dW/dF, S = F^-1 P and sigma = P F^T / J (eqs. 6 and 7 with erratum 5), by differentiation of W; UFL."""
+        import ufl
+
         F = ufl.variable(deformation_gradient)
         first = ufl.diff(self.strain_energy(F, cells), F)
         return Stresses(first, ufl.dot(ufl.inv(F), first), ufl.dot(first, F.T) / ufl.det(F))
