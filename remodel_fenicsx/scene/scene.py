@@ -147,7 +147,7 @@ class Scene(Table):
         values = _plain({name: getattr(self, name) for name in type(self).model_fields}, every_value=True)
         for key, value in changes.items():
             put(values, key, value)
-        return Scene(**values)
+        return type(self)(**values)
 
     def to_toml(self, header: str = "") -> str:
         """The scene with all its values as TOML, each under its description; `read_scene` gives the same scene back.
