@@ -60,7 +60,7 @@ class Simulation:
     def __init__(self, scene: Scene, comm: MPI.Intracomm = MPI.COMM_WORLD, domain: Domain | None = None):
         take_back_signals()
         self.scene, shape = scene, scene.geometry
-        self.domain = shape.build(scene.mesh, comm) if domain is None else checked_domain(domain, scene)
+        self.domain = checked_domain(shape.build(scene.mesh, comm) if domain is None else domain, scene)
         mesh, kinematics = self.domain.mesh, KINEMATICS[scene.model.kinematics]
         self.unknown = kinematics.unknown(mesh, scene.mesh.degree)
         self.quadrature = Quadrature(mesh, scene.mesh.degree)
@@ -114,18 +114,18 @@ def checked_domain(domain: Domain, scene: Scene) -> Domain:
     shape, mesh = scene.geometry, domain.mesh
     kind, degree = mesh.topology.cell_name(), mesh.geometry.cmap.degree
     if domain.shape != shape.name:
-        raise SceneError(f"geometry.shape = {shape.name!r}: the domain given is a {domain.shape!r}")
+        raise SceneError(f"geometry.shape = {shape.name!r}: the mesh is a {domain.shape!r}")
     if kind != scene.mesh.element:
-        raise SceneError(f"mesh.element = {scene.mesh.element!r}: the domain given has elements of type {kind!r}")
+        raise SceneError(f"mesh.element = {scene.mesh.element!r}: the mesh has elements of type {kind!r}")
     if degree != scene.mesh.degree:
-        raise SceneError(f"mesh.degree = {scene.mesh.degree}: the domain given has degree {degree}")
+        raise SceneError(f"mesh.degree = {scene.mesh.degree}: the mesh has degree {degree}")
     missing = [face for face in shape.faces if face not in domain.faces]
     if missing:
-        raise SceneError(f"geometry.shape = {shape.name!r}: the domain given has no face {', '.join(missing)}")
+        raise SceneError(f"geometry.shape = {shape.name!r}: the mesh has no face {', '.join(missing)}")
     for name, value in domain.dimensions.items():
         wanted = getattr(shape, name, value)
         if abs(wanted - value) > 1e-9 * domain.size:
-            raise SceneError(f"geometry.{name} = {wanted:g}: that of the domain given is {value:g}")
+            raise SceneError(f"geometry.{name} = {wanted:g}: that of the mesh is {value:g}")
     return domain
 
 

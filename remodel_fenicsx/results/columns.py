@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -149,12 +149,12 @@ class Measurement:
     @cached_property
     def axial_stretch(self) -> Array:
         """Volume mean of F_zz in each local element, (elements,)."""
-        expression = self._tool("axial stretch", self._compile_axial_stretch)
+        expression = self.tool("axial stretch", self._compile_axial_stretch)
         return self.quadrature.element_mean(self.quadrature.evaluate(expression, (1,)))[:, 0]
 
     def face_mean(self, face: str, nodal_values: Array, deformed: bool = False) -> float:
         """Mean of nodal values (nodes,) over a named face, by its reference or its deformed area."""
-        mean = self._tool((face, deformed), lambda: _FaceMean(self.observer, face, deformed))
+        mean = self.tool((face, deformed), lambda: _FaceMean(self.observer, face, deformed))
         return float(mean(nodal_values))
 
     def largest(self, values: Array) -> float:
@@ -173,8 +173,8 @@ class Measurement:
         tolerance = 1e-6 * self.domain.size
         return (radii.min(axis=1) <= radius + tolerance) & (radii.max(axis=1) >= radius - tolerance)
 
-    def _tool(self, key: Any, make: Any) -> Any:
-        """What the observer keeps for all its measurements."""
+    def tool(self, key: Any, make: Callable[[], Any]) -> Any:
+        """What a column needs for every step, a compiled form say: made once, by make(), and kept under a key."""
         if key not in self.observer.tools:
             self.observer.tools[key] = make()
         return self.observer.tools[key]

@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
+from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.fem.solver_methods import METHODS
 from remodel_fenicsx.schema.tables import Table, checked, fault, is_number, one_of, quoted, shown
 from remodel_fenicsx.schema.times import is_multiple, same_time
@@ -36,7 +37,9 @@ class Mesh(Table):
 class Model(Table):
     """Which unknowns describe the deformation."""
 
-    kinematics: Literal["full"] = Field(default="full", description="'full': the displacement in three dimensions.")
+    kinematics: Annotated[str, one_of(KINEMATICS)] = Field(
+        default="full", description="'full': the displacement in three dimensions."
+    )
 
 
 # ---------------------------------------------------------------- loads and time
