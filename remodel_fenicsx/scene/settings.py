@@ -176,8 +176,19 @@ class Solver(Table):
         return self
 
 
+def _columns(value: Any) -> Any:
+    if not isinstance(value, (list, tuple)) or not all(isinstance(name, str) for name in value):
+        raise fault("must be a list of names of columns")
+    return tuple(value)
+
+
 class Output(Table):
     """What a run writes beside its history table."""
 
     fields: bool = Field(default=True, description="Whether to write fields for ParaView.")
+    columns: Annotated[tuple[str, ...], checked(_columns)] = Field(
+        default=(),
+        description="Columns of the history beside those that it always has: 'pass_residual' (docs/commands.md).",
+        json_schema_extra={"allowed": "a list of names of columns"},
+    )
     every: int = Field(default=1, ge=1, description="Write the fields of every n-th step; the last one always.")
