@@ -32,7 +32,7 @@ from remodel_fenicsx.scene import parameters
 from remodel_fenicsx.scene.parameters import Remodeling
 from remodel_fenicsx.schema.tables import markdown_reference
 from remodel_fenicsx.schema.units import FORCE, LENGTH, LENGTH_UNIT, STRESS_UNIT, Dimension
-from remodel_fenicsx.tissue.cells import UnitCell, angle_to_axis
+from remodel_fenicsx.tissue.cells import AXES, UnitCell, angle_to_axis
 from remodel_fenicsx.tissue.chains import CHAINS, Chain
 from remodel_fenicsx.tissue.drivers import DRIVERS, FRAMES, Driver, Frame
 from remodel_fenicsx.tissue.energy import MATRICES, neo_hookean
@@ -197,6 +197,21 @@ def test_a_law_of_another_kind(monkeypatch: pytest.MonkeyPatch) -> None:
     stretch = column(rows, "mean_stretch")
     assert stretch[1] < stretch[2] < stretch[3]  # under the same load
     assert all(row["remodeling_power"] != 0 for row in rows)
+
+
+def test_initial_axes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Cells along an axis that leans by 30 degrees from the load."""
+
+    def leaning(coordinates: np.ndarray) -> np.ndarray:
+        c, s = np.cos(np.pi / 6), 0.5
+        return np.broadcast_to([[c, 0.0, -s], [0.0, 1.0, 0.0], [s, 0.0, c]], (*coordinates.shape[:-1], 3, 3))
+
+    monkeypatch.setitem(AXES, "leaning", leaning)
+    with pytest.raises(SceneError, match="^cells.axes = 'leaning': allowed for shape 'cube' is 'global'$"):
+        scene(cells={"axes": "leaning", "initial": "aligned"})
+    monkeypatch.setattr(Cube, "axis_kinds", (*Cube.axis_kinds, "leaning"))
+    (first, *_) = rows_of(scene(cells={"axes": "leaning", "initial": "aligned"}))
+    assert first["mean_fibre_angle"] == pytest.approx(30.0)
 
 
 # ---------------------------------------------------------------- bodies
