@@ -64,7 +64,7 @@ COLUMNS_ON_REQUEST: dict[str, Column] = {
         Column(
             "pass_residual",
             "squared link length",
-            "max |A_pass - A|, by which the pass of the step wants to change the cells: how far the row is from consistency",
+            "largest norm of A_pass - A over all points: how far the row is from cells that belong to its own stress",
             lambda m: m.observer.stepper.remodeling.residual(),
             after_pass=True,
         ),
