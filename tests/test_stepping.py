@@ -266,6 +266,11 @@ def test_times_are_computed_from_their_numbers() -> None:
     assert list(times(1.0, 0.3333333333)) == [0.3333333333, 0.6666666666, 1.0]  # a third, as a scene may write it
 
 
+def test_times_of_numpys_numbers_are_the_same() -> None:
+    assert list(times(np.float64(2), np.float64(1))) == [1.0, 2.0]
+    assert all(type(time) is float for time in times(np.float64(2), np.float64(1)))
+
+
 def test_loads_are_hit_exactly_at_the_times_of_the_ramp() -> None:
     ramp = [[0.0, 0.0], [0.3, 1.0], [0.6, 0.25]]
     load = Load(value=10.0, ramp=ramp)

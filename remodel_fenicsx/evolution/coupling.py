@@ -51,6 +51,7 @@ class Staggered:
         self.equilibrium = Equilibrium(state, tissue)
         self.equilibrium.compile_energy()
         self.newton = GuardedNewton(self.equilibrium, settings)
+        self._residual = 0.0
         self.blend: Blend | None = None
         if remodeling.law.remodels:
             self.blend = Blend(state, tissue, settings)
@@ -71,11 +72,14 @@ class Staggered:
             log.info("solving in parts: the remodeled cells have r >= L at the old displacement")
             self._solve_in_parts(time, dict(self.state.loading.values), loads, work, failure=None)
         self.state.settle_cells()
+        self._residual = work.residual
         return work
 
     def remodel(self, time: float) -> float:
         """The pass with the solved state."""
-        return self.remodeling.apply(self.state.time, time)
+        if not self.remodeling.law.remodels:
+            return 0.0
+        return self.remodeling.apply(self.state.time, time, self._residual)
 
     def close(self) -> None:
         """Free PETSc's objects."""

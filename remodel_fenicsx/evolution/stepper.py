@@ -16,8 +16,6 @@ from remodel_fenicsx.evolution.remodeling import RemodelingPass, RemodelingSetti
 from remodel_fenicsx.evolution.state import State
 from remodel_fenicsx.tissue.energy import Tissue
 
-SAME_TIME = 1e-9  # relative: times closer than this are the same
-
 
 @dataclass
 class Step:

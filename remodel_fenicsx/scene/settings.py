@@ -12,10 +12,10 @@ from pydantic import Field, model_validator
 
 from remodel_fenicsx.fem.solver_methods import METHODS
 from remodel_fenicsx.schema.tables import Table, checked, fault, is_number, one_of, quoted, shown
+from remodel_fenicsx.schema.times import is_multiple, same_time
 from remodel_fenicsx.schema.units import FORCE
 
 MOST_STEPS = 1_000_000
-SAME_TIME = 1e-9  # relative: times closer than this are the same
 
 
 class Mesh(Table):
@@ -78,7 +78,7 @@ class Load(Table):
     def factor(self, time: float) -> float:
         """Factor on the value at a time: piecewise linear, held before the first and after the last pair."""
         for ramp_time, factor in self.ramp:  # exact at its own times
-            if abs(time - ramp_time) <= SAME_TIME * abs(ramp_time):
+            if same_time(time, ramp_time):
                 return factor
         after = bisect.bisect_right(self.ramp, time, key=lambda pair: pair[0])
         if after == 0:
@@ -115,10 +115,6 @@ class Time(Table):
     def number_of_steps(self) -> int:
         """Number of steps from 0 to the end."""
         return round(self.end / self.step)
-
-
-def is_multiple(time: float, step: float) -> bool:
-    return abs(time / step - round(time / step)) <= SAME_TIME * max(1.0, time / step)
 
 
 def nearest_multiples(time: float, step: float, name: str) -> str:
