@@ -17,7 +17,7 @@ from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher, times
 from remodel_fenicsx.evolution.unit_cells import UnitCells
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.fem.quadrature import Quadrature
-from remodel_fenicsx.results.columns import Observer
+from remodel_fenicsx.results.columns import COLUMNS_ON_REQUEST, Observer, columns_of
 from remodel_fenicsx.results.fields import Fields
 from remodel_fenicsx.results.run_folder import RunFolder, chosen_folder
 from remodel_fenicsx.scene import Scene, SceneError
@@ -60,7 +60,7 @@ class Simulation:
     def __init__(self, scene: Scene, comm: MPI.Intracomm = MPI.COMM_WORLD, domain: Domain | None = None):
         take_back_signals()
         self.scene, shape = scene, scene.geometry
-        self.domain = shape.build(scene.mesh, comm) if domain is None else checked_domain(domain, scene)
+        self.domain = checked_domain(shape.build(scene.mesh, comm) if domain is None else domain, scene)
         mesh, kinematics = self.domain.mesh, KINEMATICS[scene.model.kinematics]
         self.unknown = kinematics.unknown(mesh, scene.mesh.degree)
         self.quadrature = Quadrature(mesh, scene.mesh.degree)
@@ -72,7 +72,7 @@ class Simulation:
         tissue = scene.material.tissue(scene.cells.end_to_end_length)
         self.stepper = Stepper(self.state, tissue, scene.remodeling, scene.solver, self.load_values)
         self.tissue = self.stepper.tissue
-        self.observer = Observer(shape, self.stepper)
+        self.observer = Observer(shape, self.stepper, columns_of(shape, checked_columns(scene.output.columns)))
 
     def load_values(self, time: float) -> LoadValues:
         """Magnitude of every load at a time."""
@@ -94,13 +94,28 @@ class Simulation:
         StepFailure
             If a step has no admissible equilibrium.
         """
-        self.stepper.remodeling.warn_of_overcorrection()
+        self.stepper.remodeling.warn_of_overcorrection(self.stepper.coupling.share)
         ways = times(self.scene.time.end, self.scene.time.step)
         return self.stepper.march(ways, [self.observer, *watchers])
 
     def close(self) -> None:
         """Free PETSc's objects and options."""
         self.stepper.close()
+
+
+def checked_columns(names: Sequence[str]) -> Sequence[str]:
+    """The names, if they are columns on request.
+
+    Raises
+    ------
+    SceneError
+        If one is not; one line that names the key.
+    """
+    for name in names:
+        if name not in COLUMNS_ON_REQUEST:
+            known = ", ".join(map(repr, COLUMNS_ON_REQUEST))
+            raise SceneError(f"output.columns = {name!r}: no such column on request; allowed are {known}")
+    return names
 
 
 def checked_domain(domain: Domain, scene: Scene) -> Domain:
@@ -114,18 +129,18 @@ def checked_domain(domain: Domain, scene: Scene) -> Domain:
     shape, mesh = scene.geometry, domain.mesh
     kind, degree = mesh.topology.cell_name(), mesh.geometry.cmap.degree
     if domain.shape != shape.name:
-        raise SceneError(f"geometry.shape = {shape.name!r}: the domain given is a {domain.shape!r}")
+        raise SceneError(f"geometry.shape = {shape.name!r}: the mesh is a {domain.shape!r}")
     if kind != scene.mesh.element:
-        raise SceneError(f"mesh.element = {scene.mesh.element!r}: the domain given has elements of type {kind!r}")
+        raise SceneError(f"mesh.element = {scene.mesh.element!r}: the mesh has elements of type {kind!r}")
     if degree != scene.mesh.degree:
-        raise SceneError(f"mesh.degree = {scene.mesh.degree}: the domain given has degree {degree}")
+        raise SceneError(f"mesh.degree = {scene.mesh.degree}: the mesh has degree {degree}")
     missing = [face for face in shape.faces if face not in domain.faces]
     if missing:
-        raise SceneError(f"geometry.shape = {shape.name!r}: the domain given has no face {', '.join(missing)}")
+        raise SceneError(f"geometry.shape = {shape.name!r}: the mesh has no face {', '.join(missing)}")
     for name, value in domain.dimensions.items():
         wanted = getattr(shape, name, value)
         if abs(wanted - value) > 1e-9 * domain.size:
-            raise SceneError(f"geometry.{name} = {wanted:g}: that of the domain given is {value:g}")
+            raise SceneError(f"geometry.{name} = {wanted:g}: that of the mesh is {value:g}")
     return domain
 
 

@@ -130,10 +130,6 @@ class Shape(Table):
         for name, kind in self.loads.items():
             kind.add(self, loading, name)
 
-    def all_columns(self) -> tuple[Column, ...]:
-        """Columns of the loads, then those of the shape."""
-        return (*(kind.make_column(name) for name, kind in self.loads.items()), *self.columns)
-
     def fibre_angle(self, dimensions: Array, axes: Array, coordinates: Array) -> Array:
         """Angle of the chain direction in degrees; here to the load axis z.
 

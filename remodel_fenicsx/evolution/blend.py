@@ -58,7 +58,7 @@ class Blend:
         now = quadrature.owned(equilibrium.limit_values()[0])
         self.theta.value = 1.0
         end = quadrature.owned(equilibrium.limit_values()[0])
-        allowed = (length - KEPT_RESERVE * (length - np.sqrt(now))) ** 2
+        allowed = ((1 - KEPT_RESERVE) * length + KEPT_RESERVE * np.sqrt(now)) ** 2  # infinite where nothing locks
         growth = end - now
         room = np.where(growth > 0, (allowed - now) / np.where(growth > 0, growth, 1.0), np.inf)
         return (1.0 - done) * quadrature.minimum(room)

@@ -13,10 +13,10 @@ from remodel_fenicsx.evolution.equilibrium import at_points, on_mesh, stress_rou
 from remodel_fenicsx.evolution.state import State
 from remodel_fenicsx.fem import coefficients, jit
 from remodel_fenicsx.tissue import spectral
-from remodel_fenicsx.tissue.cells import UnitCell
+from remodel_fenicsx.tissue.cells import UnitCell, structure_tensor
 from remodel_fenicsx.tissue.drivers import DRIVERS, FRAMES
 from remodel_fenicsx.tissue.energy import Tissue, squared_end_to_end_length
-from remodel_fenicsx.tissue.laws import LAWS, Drive
+from remodel_fenicsx.tissue.laws import LAWS, Drive, relaxed
 
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
@@ -39,6 +39,9 @@ class RemodelingSettings(Protocol):
 
     @property
     def coupling(self) -> str: ...
+
+    @property
+    def relaxation_factor(self) -> float: ...
 
     @property
     def kappa(self) -> float: ...
@@ -64,6 +67,7 @@ class RemodelingPass:
         self.driver, self.law, self.frame = DRIVERS[settings.driver], LAWS[settings.law], FRAMES[settings.frame]
         if not self.law.remodels:
             return
+        self._change: tuple[UnitCell, UnitCell] | None = None
         self._smallest_area = self.quadrature.minimum(self.quadrature.smallest_areas)
         F = state.kinematics.deformation_gradient(state.unknown)
         tensor = self.driver.tensor(F, self.tissue.stresses(F, [state.cells.ufl_cell]))
@@ -71,10 +75,16 @@ class RemodelingPass:
         stacked = ufl.as_vector([t[i, j] for t in (F, tensor) for i in range(3) for j in range(3)])
         self._expression = jit.expression(stacked, self.quadrature.points)
 
-    def warn_of_overcorrection(self) -> None:
-        """Log a warning where driver and frame are known to over-correct (docs/theory.md, Stability of the pass)."""
-        factor = self.driver.overcorrection.get(self.settings.frame)
-        if factor is not None and self.law.remodels and self.state.comm.rank == 0:
+    def warn_of_overcorrection(self, share: float = 1.0) -> None:
+        """Log a warning where driver and frame are known to over-correct (docs/theory.md, Stability of the pass).
+
+        Parameters
+        ----------
+        share
+            Share of a pass's change that is made.
+        """
+        factor = 1 - share * (1 - self.driver.overcorrection.get(self.settings.frame, 1.0))
+        if factor < -1 and self.law.remodels and self.state.comm.rank == 0:
             log.warning(
                 "remodeling.driver = %r with frame = %r over-corrects: a pass multiplies small tilts of the axes by "
                 "about %g, so late results may drift (docs/theory.md, Stability of the pass)",
@@ -128,11 +138,12 @@ class RemodelingPass:
         drive = self.drive(residual)
         return self.law.update(self.state.cells.point_cells, drive, time_old, time_new), drive.deformation_gradient
 
-    def apply(self, time_old: float, time_new: float, residual: float = 0.0) -> float:
+    def apply(self, time_old: float, time_new: float, residual: float = 0.0, factor: float = 1.0) -> float:
         """Remodel over a step with the stress of the solved state at time_new; returns the power of remodeling.
 
         The power is the stored energy that the pass releases at frozen deformation, per time, to first order
-        (`Tissue.energy_increment`; Remark 6). A principal stress counts as tension beyond `stress_noise`.
+        (`Tissue.energy_increment`; Remark 6). A principal stress counts as tension beyond `stress_noise`. Of the change
+        of the cells a share `factor` is made (`laws.relaxed`).
 
         Raises
         ------
@@ -140,8 +151,24 @@ class RemodelingPass:
             If the driving tensor is not finite anywhere.
         """
         cells, shape = self.state.cells, self.quadrature.shape
-        updated, F = self.updated_cells(time_old, time_new, residual)
+        asked, F = self.updated_cells(time_old, time_new, residual)
+        self._change = (
+            UnitCell(cells.dimension_values.reshape(-1, 3).copy(), cells.axis_values.reshape(-1, 3, 3).copy()),
+            asked,
+        )
+        updated = relaxed(self._change[0], asked, factor)
         increment: Any = at_points(self.tissue, self.quadrature).energy_increment(F, cells.point_cells, updated)
         power: float = 0.0 - self.quadrature.integral(increment.reshape(shape)) / (time_new - time_old)
         cells.set(updated.dimensions.reshape(*shape, 3), updated.axes.reshape(*shape, 3, 3))
         return power
+
+    def residual(self) -> float:
+        """max |A_pass - A| of the last pass over all points, A those of the solved state, in squared link lengths.
+
+        How far the solved state is from one whose cells belong to its own stress; NaN before the first pass.
+        """
+        if not self.law.remodels or self._change is None:
+            return float("nan")
+        before, after = (structure_tensor(*cells[:2]) for cells in self._change)
+        distance = np.linalg.norm(after - before, axis=(-1, -2))
+        return self.quadrature.maximum(distance.reshape(self.quadrature.shape))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time as clock
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from decimal import Decimal
 
@@ -55,7 +56,7 @@ class Step:
 class Watcher:
     """Follows the steps; whoever wants to know less overrides less.
 
-    All but `committed` happen inside the step's transaction: an exception there undoes the step.
+    `solved` and `completed` happen inside the step's transaction: an exception there undoes the step for all watchers.
     """
 
     def started(self, step: Step) -> None:
@@ -66,6 +67,9 @@ class Watcher:
 
     def completed(self, step: Step) -> None:
         """The cells have remodeled; all of the step is known."""
+
+    def undone(self, step: Step) -> None:
+        """Somebody has failed after the state was solved, here or elsewhere: what is kept of the step must go."""
 
     def committed(self, step: Step) -> None:
         """The step is accepted."""
@@ -128,17 +132,18 @@ class Stepper:
         if time <= state.time:
             raise ValueError(f"time {time!r} does not come after {state.time!r}, that of the last step")
         with state.transaction():
-            loads = self.load_values(time)
-            work = self.coupling.solve(time, loads)
+            work = self.coupling.solve(time, self.load_values(time))
             extension = self.coupling.equilibrium.extension()
+            loads = dict(state.loading.values)  # those that nobody has named too
             step = Step(time, state.number + 1, loads, extension, work, is_last=is_last)
-            for watcher in watchers:
-                watcher.solved(step)
-            step.remodeling_power = self.coupling.remodel(time)
-            state.time, state.number = time, step.number
-            step.seconds = clock.perf_counter() - start
-            for watcher in watchers:
-                watcher.completed(step)
+            with undone_by_all(watchers, step):
+                for watcher in watchers:
+                    watcher.solved(step)
+                step.remodeling_power = self.coupling.remodel(time)
+                state.time, state.number = time, step.number
+                step.seconds = clock.perf_counter() - start
+                for watcher in watchers:
+                    watcher.completed(step)
         for watcher in watchers:
             watcher.committed(step)
         return step
@@ -153,6 +158,17 @@ class Stepper:
     def close(self) -> None:
         """Free PETSc's objects and options; the state stays."""
         self.coupling.close()
+
+
+@contextmanager
+def undone_by_all(watchers: Sequence[Watcher], step: Step) -> Iterator[None]:
+    """Whatever is raised in the block, every watcher forgets the step, the last one first."""
+    try:
+        yield
+    except BaseException:
+        for watcher in reversed(watchers):
+            watcher.undone(step)
+        raise
 
 
 def times(end: float, step: float) -> Iterator[float]:

@@ -24,14 +24,16 @@ def coefficient(mesh: Any, name: str, value: Any) -> Any:
     name
         Of the parameter, for errors.
     value
-        A number, which becomes a Constant; a scalar dolfinx Constant, or a scalar DG0 Function of this mesh, as it is.
+        A number, which becomes a Constant; a scalar dolfinx Constant, or a scalar DG0 Function of this mesh, which stay
+        the user's: what is returned shares their memory. It is an object of its own, because UFL numbers constants and
+        functions by their age, and kernels are found again by these numbers.
 
     Raises
     ------
     TypeError
         If it is anything else.
     ValueError
-        If a number is not finite, or a Constant or Function belongs to another mesh or has another shape.
+        If a value is not finite, or a Constant or Function belongs to another mesh or has another shape.
     """
     if isinstance(value, Real) and not isinstance(value, (bool, np.bool_)):
         if not np.isfinite(float(value)):
@@ -41,20 +43,32 @@ def coefficient(mesh: Any, name: str, value: Any) -> Any:
         _require_this_mesh(mesh, name, value.ufl_domain())
         if value.ufl_shape != ():
             raise ValueError(f"{name}: a Constant of shape {value.ufl_shape}; must be a scalar")
-        return value
+        if not np.all(np.isfinite(value.value)):
+            raise ValueError(f"{name} = {value.value}: must be finite")
+        own = dolfinx.fem.Constant(mesh, PETSc.ScalarType(value.value))
+        own._cpp_object = value._cpp_object
+        return own
     if isinstance(value, dolfinx.fem.Function):
         space = value.function_space
         _require_this_mesh(mesh, name, space.mesh.ufl_domain())
         element = space.ufl_element()
         if element.degree != 0 or not element.discontinuous or value.ufl_shape != ():
-            raise ValueError(
-                f"{name}: a Function on {element}; must be a scalar one of degree DG0, one value an element"
-            )
-        return value
+            raise ValueError(f"{name}: {_described(value)}; must be a scalar DG0 Function, one value an element")
+        finite = bool(np.all(np.isfinite(value.x.array)))
+        if not mesh.comm.allreduce(finite, MPI.LAND):
+            raise ValueError(f"{name}: a Function with values that are not finite; every one must be")
+        return dolfinx.fem.Function(space, value.x, name=name)
     raise TypeError(
         f"{name} = {value!r:.60}: must be a number, a dolfinx Constant or a DG0 Function of this mesh, "
         f"not a {type(value).__name__}"
     )
+
+
+def _described(function: Any) -> str:
+    """What a Function is, on one line."""
+    element = function.function_space.ufl_element()
+    family, shape = getattr(element, "family_name", "quadrature"), function.ufl_shape
+    return f"a Function of {family} elements of degree {element.degree}" + (f" and shape {shape}" if shape else "")
 
 
 def _require_this_mesh(mesh: Any, name: str, domain: Any) -> None:

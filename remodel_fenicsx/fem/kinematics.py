@@ -1,16 +1,14 @@
 """Kinematics: which unknowns describe the deformation, and the deformation gradient that follows from them.
 
-Everything else asks the object: F is always 3x3, a displacement always has three components.
+Everything else asks the object: F is always 3x3, a displacement always has three components. dolfinx is imported when
+it is needed: scenes, which name kinematics, are read without it.
 """
 
 from __future__ import annotations
 
 from typing import Any, Protocol
 
-import basix.ufl
-import dolfinx.fem
 import numpy as np
-import ufl
 from numpy.typing import NDArray
 
 
@@ -41,6 +39,9 @@ class FullKinematics:
 
     def unknown(self, mesh: Any, degree: int) -> Any:
         """A vector function, zero."""
+        import basix.ufl
+        import dolfinx.fem
+
         element = basix.ufl.element("Lagrange", mesh.topology.cell_name(), degree, shape=(3,))
         return dolfinx.fem.Function(dolfinx.fem.functionspace(mesh, element), name="displacement")
 
@@ -50,6 +51,8 @@ class FullKinematics:
 
     def deformation_gradient(self, unknown: Any) -> Any:
         """F = I + grad u."""
+        import ufl
+
         return ufl.Identity(3) + ufl.grad(unknown)
 
     def weight(self, mesh: Any) -> Any:
@@ -67,3 +70,4 @@ class FullKinematics:
 
 
 KINEMATICS: dict[str, Kinematics] = {"full": FullKinematics()}
+"""Kinematics by the name that a scene gives them."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -58,11 +58,32 @@ COLUMNS: dict[str, Column] = {
 }
 """Columns of every shape by name, after `time` and those of the shape; a script adds its own."""
 
+COLUMNS_ON_REQUEST: dict[str, Column] = {
+    column.name: column
+    for column in (
+        Column(
+            "pass_residual",
+            "squared link length",
+            "largest norm of A_pass - A over all points: how far the row is from cells that belong to its own stress",
+            lambda m: m.observer.stepper.remodeling.residual(),
+            after_pass=True,
+        ),
+    )
+}
+"""Columns that a scene may name in `output.columns`; a script adds its own."""
 
-def columns_of(shape: Shape | type[Shape]) -> tuple[Column, ...]:
-    """All columns of a shape's history, in the order of the file."""
+
+def columns_of(shape: Shape | type[Shape], requested: Sequence[str] = ()) -> tuple[Column, ...]:
+    """All columns of a shape's history, in the order of the file, those on request last.
+
+    Raises
+    ------
+    KeyError
+        If a column that is requested does not exist.
+    """
     loads = (kind.make_column(name) for name, kind in shape.loads.items())
-    return (FIRST_COLUMN, *loads, *shape.columns, *COLUMNS.values())
+    extra = (COLUMNS_ON_REQUEST[name] for name in requested)
+    return (FIRST_COLUMN, *loads, *shape.columns, *COLUMNS.values(), *extra)
 
 
 class Observer(Watcher):
@@ -149,12 +170,12 @@ class Measurement:
     @cached_property
     def axial_stretch(self) -> Array:
         """Volume mean of F_zz in each local element, (elements,)."""
-        expression = self._tool("axial stretch", self._compile_axial_stretch)
+        expression = self.tool("axial stretch", self._compile_axial_stretch)
         return self.quadrature.element_mean(self.quadrature.evaluate(expression, (1,)))[:, 0]
 
     def face_mean(self, face: str, nodal_values: Array, deformed: bool = False) -> float:
         """Mean of nodal values (nodes,) over a named face, by its reference or its deformed area."""
-        mean = self._tool((face, deformed), lambda: _FaceMean(self.observer, face, deformed))
+        mean = self.tool((face, deformed), lambda: _FaceMean(self.observer, face, deformed))
         return float(mean(nodal_values))
 
     def largest(self, values: Array) -> float:
@@ -173,8 +194,8 @@ class Measurement:
         tolerance = 1e-6 * self.domain.size
         return (radii.min(axis=1) <= radius + tolerance) & (radii.max(axis=1) >= radius - tolerance)
 
-    def _tool(self, key: Any, make: Any) -> Any:
-        """What the observer keeps for all its measurements."""
+    def tool(self, key: Any, make: Callable[[], Any]) -> Any:
+        """What a column needs for every step, a compiled form say: made once, by make(), and kept under a key."""
         if key not in self.observer.tools:
             self.observer.tools[key] = make()
         return self.observer.tools[key]

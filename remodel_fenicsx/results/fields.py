@@ -135,6 +135,12 @@ class Fields(Watcher):
         if step.number % self.every == 0 or step.is_last:
             self.append(step.time)
 
+    def undone(self, step: Step) -> None:
+        """Take back what was written of it."""
+        for grid in (self._grid, self._chains):
+            if grid is not None and grid.last_time == step.time:
+                grid.drop_last()
+
     # ------------------------------------------------------------ writing
     def append(self, time: float) -> None:
         """Write the present state as the state of `time`. Collective."""

@@ -14,7 +14,7 @@ class History:
     def __init__(self, path: Path):
         self._file = path.open("xb", buffering=0)
         self._columns: list[str] | None = None
-        self._size = 0  # bytes of whole rows
+        self._sizes = [0]  # bytes up to the end of each whole row
 
     def append(self, row: dict[str, float]) -> None:
         """Write one row; the first one decides the columns.
@@ -28,7 +28,7 @@ class History:
         """
         text = io.StringIO(newline="")
         writer = csv.DictWriter(text, fieldnames=self._columns or list(row), lineterminator="\n")
-        if self._columns is None:
+        if not self._sizes[-1]:
             writer.writeheader()
         writer.writerow({key: _number(value) for key, value in row.items()})
         self._write(text.getvalue().encode())
@@ -42,10 +42,18 @@ class History:
                 view = view[self._file.write(view) :]
             os.fsync(self._file.fileno())
         except OSError:
-            self._file.truncate(self._size)
-            self._file.seek(self._size)
+            self._cut()
             raise
-        self._size += len(data)
+        self._sizes = [self._sizes[-1], self._sizes[-1] + len(data)]
+
+    def drop_last(self) -> None:
+        """Take the last row back; only once after each row."""
+        self._sizes.pop()
+        self._cut()
+
+    def _cut(self) -> None:
+        self._file.truncate(self._sizes[-1])
+        self._file.seek(self._sizes[-1])
 
     def close(self) -> None:
         """Close the file."""

@@ -91,6 +91,7 @@ class RunFolder(Watcher):
     def __init__(self, folder: Path, scene_text: str, rank: int = 0):
         self.folder = Path(folder)
         self.history: History | None = None
+        self._last_row = -1  # number of its step
         if rank == 0:
             self.folder.mkdir(parents=True, exist_ok=True)
             with (self.folder / "scene.toml").open("x", encoding="utf-8") as file:
@@ -107,6 +108,13 @@ class RunFolder(Watcher):
         """Write the row of the step; an observer before this watcher has filled it."""
         if self.history is not None:
             self.history.append(step.row)
+            self._last_row = step.number
+
+    def undone(self, step: Step) -> None:
+        """Take its row back, if it was written."""
+        if self.history is not None and self._last_row == step.number:
+            self.history.drop_last()
+            self._last_row = -1
 
     def close(self) -> None:
         """Close the history."""

@@ -156,6 +156,20 @@ class TransientGrid:
             self._file.flush()
             self._staged.commit()
 
+    def drop_last(self) -> None:
+        """Take the last step back; the next `append`, or `close`, brings that to the disk."""
+        with signals_held_back():
+            self.number_of_steps = left = self.number_of_steps - 1
+            steps = self._root["Steps"]
+            self._last_time = float(steps["Values"][left - 1]) if left else -np.inf
+            self._point_blocks = 1 + int(steps["PointOffsets"][left - 1]) // self.number_of_points if left else 1
+            steps.attrs.modify("NSteps", np.int64(left))
+
+    @property
+    def last_time(self) -> float:
+        """Time of the last step, -inf before the first."""
+        return self._last_time
+
     def close(self) -> None:
         """Write what is not yet on the disk and close; more than once does no harm.
 
@@ -203,7 +217,7 @@ class TransientGrid:
         step, steps = self.number_of_steps, self._root["Steps"]
         for kind, fields in blocks.items():
             for name, values in fields.items():
-                if step == 0:
+                if name not in self._root[kind]:
                     _create(self._root[kind], name, values)
                     _create_row_dataset(steps[f"{kind}Offsets"], name, np.int64)
                 _write_block(self._root[kind][name], step, values)

@@ -23,6 +23,7 @@ from remodel_fenicsx.schema.tables import SceneError, Table, checked, fault, quo
 from remodel_fenicsx.schema.times import is_multiple
 from remodel_fenicsx.schema.toml import merged, parse_override, put, read_toml, toml_text
 from remodel_fenicsx.schema.units import FORCE, STRESS
+from remodel_fenicsx.tissue.chains import CHAINS
 
 LARGEST_MESH = 10_000_000  # hexahedra; Gmsh, which is serial, needs about 10 GB for them
 
@@ -91,7 +92,7 @@ class Scene(Table):
     @model_validator(mode="after")
     def _tables_fit_together(self) -> Scene:
         cells, material, geometry = self.cells, self.material, self.geometry
-        if cells.end_to_end_length >= material.contour_length:
+        if CHAINS[material.chain].locks and cells.end_to_end_length >= material.contour_length:
             rule = f"must be smaller than material.contour_length = {shown(material.contour_length)}"
             raise fault(rule, "cells.end_to_end_length", cells.end_to_end_length)
         if cells.axes not in geometry.axis_kinds:
@@ -147,7 +148,7 @@ class Scene(Table):
         values = _plain({name: getattr(self, name) for name in type(self).model_fields}, every_value=True)
         for key, value in changes.items():
             put(values, key, value)
-        return Scene(**values)
+        return type(self)(**values)
 
     def to_toml(self, header: str = "") -> str:
         """The scene with all its values as TOML, each under its description; `read_scene` gives the same scene back.

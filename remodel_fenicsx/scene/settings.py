@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
+from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.fem.solver_methods import METHODS
 from remodel_fenicsx.schema.tables import Table, checked, fault, is_number, one_of, quoted, shown
 from remodel_fenicsx.schema.times import is_multiple, same_time
@@ -36,7 +37,9 @@ class Mesh(Table):
 class Model(Table):
     """Which unknowns describe the deformation."""
 
-    kinematics: Literal["full"] = Field(default="full", description="'full': the displacement in three dimensions.")
+    kinematics: Annotated[str, one_of(KINEMATICS)] = Field(
+        default="full", description="'full': the displacement in three dimensions."
+    )
 
 
 # ---------------------------------------------------------------- loads and time
@@ -173,8 +176,19 @@ class Solver(Table):
         return self
 
 
+def _columns(value: Any) -> Any:
+    if not isinstance(value, (list, tuple)) or not all(isinstance(name, str) for name in value):
+        raise fault("must be a list of names of columns")
+    return tuple(value)
+
+
 class Output(Table):
     """What a run writes beside its history table."""
 
     fields: bool = Field(default=True, description="Whether to write fields for ParaView.")
+    columns: Annotated[tuple[str, ...], checked(_columns)] = Field(
+        default=(),
+        description="Columns of the history beside those that it always has: 'pass_residual' (docs/commands.md).",
+        json_schema_extra={"allowed": "a list of names of columns"},
+    )
     every: int = Field(default=1, ge=1, description="Write the fields of every n-th step; the last one always.")

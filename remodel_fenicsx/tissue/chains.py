@@ -57,7 +57,7 @@ class Chain:
     stiffness
         Its secant stiffness g(r, L): d(energy)/dr = g r.
     locks
-        Whether a chain cannot become longer than L.
+        Whether a chain cannot become longer than L. Where it can, nothing is held below L, and r0 may be above it.
     """
 
     energy: Callable[[Any, Any], Any]

@@ -74,7 +74,7 @@ class Tissue:
     network_modulus
         c = omega k theta n_chn / (4 A_p), in the same unit.
     contour_length
-        L, in link lengths.
+        L, in link lengths. A chain law that does not lock may mean something else by it, or nothing.
     end_to_end_length
         r0, the initial length of a chain (erratum 3), in link lengths.
     chain

@@ -1,0 +1,78 @@
+"""Pages that are made from the code are those that the code makes, and what they show runs as it stands."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import remodel_fenicsx
+from remodel_fenicsx.results.reference import column_reference
+
+ROOT = Path(__file__).parents[1]
+
+
+def page(name: str) -> str:
+    """Its text."""
+    return (ROOT / name).read_text(encoding="utf-8")
+
+
+def test_the_table_of_columns_is_the_one_that_the_code_makes() -> None:
+    remedy = "./with-fenicsx python3 -m remodel_fenicsx.results.reference"
+    found = re.search(
+        rf"<!-- columns: {re.escape(remedy)} -->\n\n(.*?)\n<!-- end of columns -->", page("docs/commands.md"), re.DOTALL
+    )
+    assert found is not None and found[1] == column_reference(), f"between the two comments belongs: {remedy}"
+
+
+def test_every_column_of_every_shape_is_in_the_table() -> None:
+    """The names of the contract, one by one."""
+    names = set(re.findall(r"^\| `(\w+)` \|", column_reference(), re.MULTILINE))
+    assert names >= {"time", "max_chain_extension", "min_jacobian", "stored_energy", "remodeling_power", "seconds",
+                     "newton_iterations", "linear_iterations", "substeps", "force", "mean_stretch", "pressure",
+                     "axial_elongation", "inner_radius", "outer_radius", "mean_fibre_angle", "fibre_angle_inner",
+                     "fibre_angle_middle", "fibre_angle_outer", "min_stretch", "max_stretch"}  # fmt: skip
+    assert "| `force` | cube, tendon | force |" in column_reference()
+
+
+def test_the_python_of_the_readme_runs_as_it_stands(tmp_path: Path) -> None:
+    (code,) = re.findall(r"```python\n(.*?)```", page("README.md"), re.DOTALL)
+    short, number = re.subn(r'"time\.end": 30\.0', '"time.end": 2.0', code)
+    assert number == 1
+    (tmp_path / "mine.py").write_text(short)
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "mine.py"]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr[-2000:]
+    *steps, radii = done.stdout.strip().split("\n")
+    assert [float(line.split()[0]) for line in steps] == [1.0, 2.0]
+    recorded = [float(radius) for radius in radii.strip("[]").split()]
+    assert recorded == pytest.approx([3.0, *(float(line.split()[1]) for line in steps)], abs=1e-7)
+    assert (tmp_path / "results" / "half-pressure" / "fields.vtkhdf").exists()
+
+
+@pytest.mark.parametrize("name", ["README.md", "CONTRIBUTING.md", *(f"docs/{name}.md" for name in (
+    "architecture", "commands", "environment", "theory", "verification"))])  # fmt: skip
+def test_files_and_modules_that_a_page_names_are_there(name: str) -> None:
+    """Paths in backticks or links, and modules after the package's name."""
+    text = re.sub(r"```.*?```", "", page(name), flags=re.DOTALL)
+    rooms = "|".join(("tissue", "fem", "body", "scene", "evolution", "results", "paper", "system", "schema"))
+    paths = re.findall(rf"`((?:{rooms}|tests|docs|demos|benchmarks|meshes)/[\w/-]+\.\w+)`", text)
+    for path in paths:
+        places = (ROOT / path, ROOT / "remodel_fenicsx" / path)
+        assert any(place.exists() for place in places), path
+    for module in re.findall(r"remodel_fenicsx(?:\.\w+)+", text):
+        assert (ROOT / module.replace(".", "/")).with_suffix(".py").exists(), module
+    for link in re.findall(r"\]\((?!http)([\w./-]+)\)", text):
+        assert (ROOT / name).parent.joinpath(link).exists(), link
+
+
+def test_the_names_of_the_package_are_there() -> None:
+    for name in remodel_fenicsx.__all__:
+        assert getattr(remodel_fenicsx, name).__name__ == name
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        remodel_fenicsx.nothing  # noqa: B018

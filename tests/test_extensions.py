@@ -1,0 +1,417 @@
+"""Whatever CONTRIBUTING.md says can be added, added from outside the package, as a user's script would.
+
+Each test writes the new thing, registers it, names it in a scene and looks at the physics. It imports only what a user
+may; `monkeypatch.setitem` stands for the script's own ``REGISTRY["mine"] = mine``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal
+
+import dolfinx
+import numpy as np
+import pytest
+import ufl
+from mpi4py import MPI
+from pydantic import Field
+
+from remodel_fenicsx import Recording, Scene, SceneError, Simulation, run
+from remodel_fenicsx.body import SHAPES, Cube, LoadKind, Shape
+from remodel_fenicsx.body.column import Column
+from remodel_fenicsx.body.domain import Domain
+from remodel_fenicsx.body.shape import uniaxial_columns
+from remodel_fenicsx.evolution import coupling
+from remodel_fenicsx.fem import jit
+from remodel_fenicsx.fem.kinematics import KINEMATICS, FullKinematics
+from remodel_fenicsx.fem.solver_methods import METHODS
+from remodel_fenicsx.results.columns import COLUMNS, Measurement
+from remodel_fenicsx.scene import parameters
+from remodel_fenicsx.scene.parameters import Remodeling
+from remodel_fenicsx.schema.tables import markdown_reference
+from remodel_fenicsx.schema.units import FORCE, LENGTH, LENGTH_UNIT, STRESS_UNIT, Dimension
+from remodel_fenicsx.tissue.cells import AXES, UnitCell, angle_to_axis
+from remodel_fenicsx.tissue.chains import CHAINS, Chain
+from remodel_fenicsx.tissue.drivers import DRIVERS, FRAMES, Driver, Frame
+from remodel_fenicsx.tissue.energy import MATRICES, neo_hookean
+from remodel_fenicsx.tissue.laws import LAWS, Drive, Law, ranked
+
+KAPPA = 0.1
+SCENE: dict[str, Any] = {
+    "preset": "kuhl-holzapfel-2007",
+    "geometry": {"shape": "cube"},
+    "loads": {"force": {"value": 10.0, "ramp": [[0.0, 0.0], [2.0, 1.0]]}},
+    "remodeling": {"kappa": KAPPA},
+    "time": {"end": 4.0},
+}
+ELASTIC = {"remodeling.law": "none"}
+WITHOUT_CHAINS = {"material.chain_density": 0.0, "remodeling.law": "none"}
+
+
+def scene(**tables: dict[str, Any]) -> Scene:
+    """The cube, pulled in two steps and held, with other values."""
+    values = {name: dict(table) if isinstance(table, dict) else table for name, table in SCENE.items()}
+    for name, table in tables.items():
+        values[name] = {**values.get(name, {}), **table}
+    return Scene(**values)
+
+
+@contextmanager
+def simulated(scene: Scene) -> Iterator[tuple[Simulation, list[dict[str, float]]]]:
+    """A simulation at its end, and its rows."""
+    simulation = Simulation(scene, MPI.COMM_SELF)
+    try:
+        yield simulation, [step.row for step in simulation.steps()]
+    finally:
+        simulation.close()
+
+
+def rows_of(scene: Scene) -> list[dict[str, float]]:
+    """All rows of a scene."""
+    with simulated(scene) as (_, rows):
+        return rows
+
+
+def column(rows: list[dict[str, float]], name: str) -> list[float]:
+    """A column, without its start."""
+    return [row[name] for row in rows]
+
+
+# ---------------------------------------------------------------- tissue
+def test_a_chain_law(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A linear spring in three dimensions: with isotropic cells it is a matrix with mu + c g / 3, and never locks."""
+    g = 0.7
+    monkeypatch.setitem(CHAINS, "spring", Chain(lambda r, L: g * r**2 / 2, lambda r, L: g, locks=False))
+    pulled = scene(loads={"force": {"value": 30.0, "ramp": [[0.0, 0.0], [4.0, 1.0]]}}).with_values(ELASTIC)
+    springs = pulled.with_values({"material.chain": "spring"})
+    with simulated(springs) as (simulation, found):
+        squared = simulation.stepper.coupling.equilibrium.limit_values()[0]
+    assert np.sqrt(squared.min()) > springs.material.contour_length  # no wormlike chain can be so long
+    assert set(column(found, "max_chain_extension")) == {0.0}
+    stiffer = pulled.material.lame_mu + pulled.material.network_modulus * g / 3
+    matrix = rows_of(pulled.with_values({**WITHOUT_CHAINS, "material.lame_mu": stiffer}))
+    np.testing.assert_allclose(column(found, "mean_stretch"), column(matrix, "mean_stretch"), rtol=1e-9)
+    wormlike = rows_of(pulled)[-1]
+    assert 0.8 < wormlike["max_chain_extension"] < 1.0
+    assert wormlike["mean_stretch"] < found[-1]["mean_stretch"] / 1.5
+
+
+def test_a_chain_that_does_not_lock_may_start_longer_than_its_contour_length(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(CHAINS, "spring", Chain(lambda r, L: r**2 / 2, lambda r, L: 1.0, locks=False))
+    long = {"cells.end_to_end_length": 3.0, "material.contour_length": 2.0}
+    assert scene().with_values({**long, "material.chain": "spring"}).cells.end_to_end_length == 3.0
+    with pytest.raises(SceneError, match="must be smaller than material.contour_length = 2"):
+        scene().with_values(long)
+
+
+def test_a_matrix_energy(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Typed again it is the same, to the last bit; of twice the energy it is the same with half of the constants."""
+
+    def again(F: Any, lame_lambda: Any, lame_mu: Any) -> Any:
+        log_jacobian = ufl.ln(ufl.det(F))
+        return lame_lambda / 2 * log_jacobian**2 + lame_mu / 2 * (ufl.inner(F, F) - 3) - lame_mu * log_jacobian
+
+    monkeypatch.setitem(MATRICES, "again", again)
+    monkeypatch.setitem(MATRICES, "double", lambda F, *lame: 2 * neo_hookean(F, *lame))
+    matrix = scene().with_values(WITHOUT_CHAINS)
+    expected = column(rows_of(matrix), "mean_stretch")
+    assert column(rows_of(matrix.with_values({"material.matrix": "again"})), "mean_stretch") == expected
+    half = {f"material.{name}": getattr(matrix.material, name) / 2 for name in ("lame_lambda", "lame_mu")}
+    doubled = column(rows_of(matrix.with_values({**half, "material.matrix": "double"})), "mean_stretch")
+    np.testing.assert_allclose(doubled, expected, rtol=1e-12)
+    assert expected[-1] > 1.5
+
+
+def test_a_driver(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The Kirchhoff stress is J times Cauchy's: the same axes, the same ratios, the same cells."""
+    monkeypatch.setitem(DRIVERS, "kirchhoff", Driver(lambda F, s: ufl.det(F) * s.cauchy, False))
+    monkeypatch.setitem(DRIVERS, "pressed", Driver(lambda F, s: -s.cauchy, False))
+    final = {}
+    for name in ("cauchy", "kirchhoff", "pressed"):
+        with simulated(scene(remodeling={"driver": name})) as (simulation, _):
+            final[name] = simulation.cells.structure_tensor()
+    np.testing.assert_allclose(final["kirchhoff"], final["cauchy"], atol=1e-12)
+    np.testing.assert_allclose(final["pressed"], np.broadcast_to(np.eye(3) / 3, final["pressed"].shape), atol=1e-12)
+    assert final["cauchy"][0, 0, 2, 2] > 0.5
+
+
+def rotated_back(F: np.ndarray, spatial_axes: np.ndarray) -> np.ndarray:
+    """n_I = R^T m_I with F = R U: a frame of a user's."""
+    left, _, right = np.linalg.svd(F)
+    return spatial_axes @ (left @ right)
+
+
+def test_a_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where nothing turns it is the printed frame; a rotation of the loaded body, which that one sees, it does not."""
+    monkeypatch.setitem(FRAMES, "rotated", Frame(rotated_back, carries_axes=False))
+    monkeypatch.setitem(FRAMES, "across", Frame(lambda F, m: np.roll(m, 1, axis=1), carries_axes=False))
+    frames = ("spatial", "rotated", "across")
+    expected, found, across = (rows_of(scene(remodeling={"frame": name}))[-1]["mean_fibre_angle"] for name in frames)
+    assert found == pytest.approx(expected, abs=1e-12)
+    assert expected < 50 and across > 60
+
+    F, stress = np.diag([0.8, 1.1, 1.4])[None], np.diag([-1.0, 0.5, 2.0])[None]
+    turn = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
+    cells = UnitCell(np.full((1, 3), 3**-0.5), np.eye(3)[None])
+    axes = {}
+    for frame in ("spatial", "rotated"):
+        for Q in (np.eye(3), turn):
+            drive = Drive(Q @ F, Q @ stress @ Q.T, DRIVERS["cauchy"], FRAMES[frame], 0.0, cells.dimensions, 1.0, KAPPA)
+            axes.setdefault(frame, []).append(LAWS["explicit"].update(cells, drive, 0.0, 1.0).axes[0])
+    still, turned = axes["rotated"]
+    np.testing.assert_allclose(np.abs(still @ turned.T), np.eye(3), atol=1e-12)
+    still, turned = axes["spatial"]
+    assert np.abs(np.abs(still @ turned.T) - np.eye(3)).max() > 0.1
+
+
+def test_a_ranked_law(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Relaxation by Euler's explicit method: after n passes towards the load axis (1 - kappa)^n of l0 is left."""
+
+    def euler(l: Any, l0: Any, target: Any, kappa: float, time_old: float, time_new: float) -> Any:
+        return l + kappa * (time_new - time_old) * (target - l)
+
+    monkeypatch.setitem(LAWS, "euler", ranked(euler, has_limit=True))
+    rows = rows_of(scene(remodeling={"law": "euler"}))
+    for passes, row in enumerate(rows):
+        left = (1 - KAPPA) ** passes
+        across, along = left / np.sqrt(3), 1 - left + left / np.sqrt(3)
+        angle = np.degrees(np.arctan2(np.sqrt(2) * across, along))
+        assert row["mean_fibre_angle"] == pytest.approx(angle, abs=1e-9)
+
+
+def test_a_law_of_another_kind(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Collagen that is lost where it is pulled: no target, no ranks, the axes stay."""
+
+    def lost(cells: UnitCell, drive: Drive, time_old: float, time_new: float) -> UnitCell:
+        pulled = np.linalg.eigvalsh(drive.tensor)[:, -1:] > drive.threshold
+        share = np.where(pulled, np.exp(-drive.kappa * (time_new - time_old)), 1.0)
+        return UnitCell(share * cells.dimensions, cells.axes)
+
+    monkeypatch.setitem(LAWS, "lost", Law(lost))
+    with simulated(scene(remodeling={"law": "lost"})) as (simulation, rows):
+        left = np.exp(-KAPPA * 4.0) * simulation.cells.initial_dimensions
+        np.testing.assert_allclose(simulation.cells.dimension_values, left, rtol=1e-13)
+        np.testing.assert_array_equal(simulation.cells.axis_values[..., :, :], np.eye(3) + 0 * left[..., None])
+    stretch = column(rows, "mean_stretch")
+    assert stretch[1] < stretch[2] < stretch[3]  # under the same load
+    assert all(row["remodeling_power"] != 0 for row in rows)
+
+
+def test_initial_axes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Cells along an axis that leans by 30 degrees from the load."""
+
+    def leaning(coordinates: np.ndarray) -> np.ndarray:
+        c, s = np.cos(np.pi / 6), 0.5
+        return np.broadcast_to([[c, 0.0, -s], [0.0, 1.0, 0.0], [s, 0.0, c]], (*coordinates.shape[:-1], 3, 3))
+
+    monkeypatch.setitem(AXES, "leaning", leaning)
+    with pytest.raises(SceneError, match="^cells.axes = 'leaning': allowed for shape 'cube' is 'global'$"):
+        scene(cells={"axes": "leaning", "initial": "aligned"})
+    monkeypatch.setattr(Cube, "axis_kinds", (*Cube.axis_kinds, "leaning"))
+    (first, *_) = rows_of(scene(cells={"axes": "leaning", "initial": "aligned"}))
+    assert first["mean_fibre_angle"] == pytest.approx(30.0)
+
+
+# ---------------------------------------------------------------- bodies
+def test_a_load(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Weight along z: on one trilinear element the nodal forces are those of half of it, pulling at the top."""
+
+    def add_weight(shape: Shape, loading: Any, name: str) -> None:
+        weight = loading.magnitude(name)
+        loading.add_term(lambda u, v: -weight * v[2] * loading.weight * ufl.dx)
+
+    density = Dimension("force per volume", "9.81 kN/m^3", ((STRESS_UNIT, 1), (LENGTH_UNIT, -1)))
+    monkeypatch.setitem(Cube.loads, "weight", LoadKind(add_weight, "weight along z per reference volume", density))
+    ramp = [[0.0, 0.0], [2.0, 1.0]]
+    heavy = scene(geometry={"length_unit": "m"}, loads={"force": {"value": 0.0, "ramp": ramp},
+                                                        "weight": {"value": "0.02 kN/m^3", "ramp": ramp}})  # fmt: skip
+    assert heavy.loads["weight"].value == pytest.approx(20.0)
+    found, expected = rows_of(heavy), rows_of(scene())
+    for row, other in zip(found, expected, strict=True):
+        assert row["mean_stretch"] == pytest.approx(other["mean_stretch"], abs=1e-10)
+        assert row["mean_fibre_angle"] == pytest.approx(other["mean_fibre_angle"], abs=1e-9)
+    assert column(found, "weight") == [10.0, 20.0, 20.0, 20.0]
+    with pytest.raises(SceneError, match="a tendon has no such load"):
+        Scene(geometry={"shape": "tendon"}, loads={"weight": {"value": 1.0, "ramp": ramp}}, time={"end": 1.0})
+
+
+def test_a_column(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """The body's volume, integrated on the mesh: the cube's lengths know it too."""
+
+    def volume(m: Measurement) -> float:
+        def compiled() -> Any:
+            F = m.state.kinematics.deformation_gradient(m.state.unknown)
+            return jit.form(ufl.det(F) * m.quadrature.dx)
+
+        return float(dolfinx.fem.assemble_scalar(m.tool("volume", compiled)))
+
+    monkeypatch.setitem(COLUMNS, "volume", Column("volume", "length^3", "volume of the deformed body", volume))
+    section = Column(
+        "section", "length^2", "area across the load", lambda m: float(np.prod(m.position.max(axis=0)[:2]))
+    )
+    monkeypatch.setattr(Cube, "columns", (*Cube.columns, section))
+    run(scene(), tmp_path / "run", MPI.COMM_SELF)
+    history = Recording(tmp_path / "run").history
+    np.testing.assert_allclose(history["volume"], history["section"] * history["mean_stretch"], rtol=1e-12)
+    assert history["volume"][0] == pytest.approx(1.0) and history["volume"][-1] > 1.05
+
+
+class Bar(Shape):
+    """A bar of rectangular cross-section along z, of cubes of a chosen size, meshed by dolfinx alone."""
+
+    loads: ClassVar[dict[str, LoadKind]] = {
+        "force": LoadKind(lambda shape, loading, name: loading.add_dead_force(name, "z1", 2), "force on the top", FORCE)
+    }
+    columns: ClassVar[tuple[Column, ...]] = (
+        *uniaxial_columns("z1", "length"),
+        Column("width", "length", "mean of the deformed side", lambda m: m.face_mean("x1", m.position[:, 0])),
+    )
+    number_of_elements: ClassVar[int] = 4
+    faces: ClassVar[tuple[str, ...]] = ("x0", "x1", "y0", "y1", "z0", "z1")
+
+    shape: Literal["bar"] = Field(default="bar", description="Which body it is.")
+    width: Annotated[float, LENGTH] = Field(default=1.0, gt=0, description="Length along x.")
+    depth: Annotated[float, LENGTH] = Field(default=2.0, gt=0, description="Length along y.")
+    length: Annotated[float, LENGTH] = Field(default=4.0, gt=0, description="Length along z.")
+
+    @property
+    def loaded_area(self) -> float:
+        """Of the top."""
+        return self.width * self.depth
+
+    def build(self, mesh: Any, comm: Any = None) -> Domain:
+        """A box."""
+        size = np.array([self.width, self.depth, self.length])
+        kind, counts = dolfinx.mesh.CellType[mesh.element], [mesh.refinement * n for n in (1, 2, 2)]
+        box = dolfinx.mesh.create_box(comm or MPI.COMM_WORLD, [np.zeros(3), size], counts, kind)
+        facets, values = [], []
+        for tag, (axis, place) in enumerate(((axis, end) for axis in range(3) for end in (0.0, size[axis])), start=1):
+            found = dolfinx.mesh.locate_entities_boundary(box, 2, lambda x: np.isclose(x[axis], place))
+            facets.append(found)
+            values.append(np.full(len(found), tag, dtype=np.int32))
+        order = np.argsort(np.concatenate(facets))
+        tags = dolfinx.mesh.meshtags(box, 2, np.concatenate(facets)[order], np.concatenate(values)[order])
+        dimensions = {"width": self.width, "depth": self.depth, "length": self.length}
+        return Domain(box, tags, {name: tag for tag, name in enumerate(self.faces, start=1)}, "bar", dimensions)
+
+    def hold(self, loading: Any) -> None:
+        """Three planes of symmetry."""
+        for component, face in enumerate(("x0", "y0", "z0")):
+            loading.hold_face(face, component)
+
+    def fibre_angle(self, dimensions: Any, axes: Any, coordinates: Any) -> Any:
+        """To x, across the load."""
+        return angle_to_axis(dimensions, axes, np.array([1.0, 0.0, 0.0]))
+
+
+def test_a_shape(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A bar of isotropic cells is as uniform as the cube: the same stretch under the same stress."""
+    monkeypatch.setitem(SHAPES, "bar", Bar)
+    cube = scene().with_values({"preset": None, "material.chain_density": 0.0})
+    values = cube.model_dump(exclude={"geometry", "preset", "format"}, exclude_none=True)
+    values["loads"]["force"]["value"] *= 1.5 * 2.0
+    bar = Scene(**values, geometry={"shape": "bar", "width": 1.5, "depth": 2.0, "length": 4.0})
+    folder = run(bar, tmp_path / "run", MPI.COMM_SELF)
+    recording, expected = Recording(folder), rows_of(cube)
+    assert recording.scene == bar and isinstance(recording.scene.geometry, Bar)
+    history = {name: values[1:] for name, values in recording.history.items()}
+    np.testing.assert_allclose(history["mean_stretch"], column(expected, "mean_stretch"), rtol=1e-9)
+    np.testing.assert_allclose(history["force"], 3 * np.array(column(expected, "force")), rtol=1e-14)
+    along = np.cos(np.radians(column(expected, "mean_fibre_angle"))) ** 2
+    across = np.degrees(np.arccos(np.sqrt((1 - along) / 2)))
+    np.testing.assert_allclose(history["mean_fibre_angle"], across, rtol=1e-9)
+    deformed = recording.points + recording.fields(4.0)["displacement"]
+    assert deformed[:, 0].max() == pytest.approx(history["width"][-1], rel=1e-6)
+    assert len(recording.elements) == 4 and history["width"][-1] < 1.4
+
+
+def test_a_shape_that_does_not_mesh_what_the_scene_asks_for_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(SHAPES, "bar", Bar)
+    curved = Scene(geometry={"shape": "bar"}, mesh={"degree": 2}, time={"end": 1.0})
+    with pytest.raises(SceneError, match="^mesh.degree = 2: the mesh has degree 1$"):
+        Simulation(curved, MPI.COMM_SELF)
+    with pytest.raises(SceneError, match="^geometry.shape = 'rod': allowed are 'cube', 'tendon', 'tube', 'bar'$"):
+        Scene(geometry={"shape": "rod"}, time={"end": 1.0})
+
+
+# ---------------------------------------------------------------- the way through time
+def test_a_coupling(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One that lets the cells alone until t = 2."""
+
+    class Late(coupling.Staggered):
+        def remodel(self, time: float) -> float:
+            return super().remodel(time) if time > 2.0 else 0.0
+
+    monkeypatch.setitem(coupling.COUPLINGS, "late", Late)
+    with pytest.raises(SceneError, match="^remodeling.coupling = 'late': allowed are 'staggered', 'relaxed'$"):
+        scene(remodeling={"coupling": "late"})
+    monkeypatch.setitem(parameters.COUPLINGS, "late", "as staggered, but the cells stay as they are up to t = 2")
+    angles = column(rows_of(scene(remodeling={"coupling": "late"})), "mean_fibre_angle")
+    isotropic = np.degrees(np.arccos(3**-0.5))
+    np.testing.assert_allclose(angles[:3], isotropic, rtol=1e-12)
+    assert angles[3] < isotropic - 5
+
+
+def test_every_coupling_is_told_to_scenes() -> None:
+    assert set(parameters.COUPLINGS) == set(coupling.COUPLINGS)
+
+
+def test_a_kinematics(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Half of the displacement as the unknown: nobody who asks the kinematics notices."""
+
+    class Halved(FullKinematics):
+        def displacement(self, unknown: Any) -> Any:
+            return 2 * unknown
+
+        def deformation_gradient(self, unknown: Any) -> Any:
+            return ufl.Identity(3) + 2 * ufl.grad(unknown)
+
+        def nodal_displacement(self, unknown: Any) -> Any:
+            return 2 * super().nodal_displacement(unknown)
+
+    monkeypatch.setitem(KINEMATICS, "halved", Halved())
+    matrix = scene().with_values(WITHOUT_CHAINS)
+    expected, found = rows_of(matrix), []
+    with simulated(matrix.with_values({"model.kinematics": "halved"})) as (simulation, found):
+        top = simulation.unknown.x.array.max()
+    for name in ("mean_stretch", "min_stretch", "min_jacobian", "stored_energy"):
+        np.testing.assert_allclose(column(found, name), column(expected, name), rtol=1e-9, err_msg=name)
+    assert 2 * top == pytest.approx(found[-1]["mean_stretch"] - 1)
+
+
+def test_a_solver_method(monkeypatch: pytest.MonkeyPatch) -> None:
+    method = {"snes_type": "newtonls", "snes_linesearch_type": "basic", "ksp_type": "gmres", "pc_type": "jacobi"}
+    monkeypatch.setitem(METHODS, "krylov", {**method, "ksp_rtol": 1e-12})
+    expected, found = (rows_of(scene().with_values({"solver.method": name})) for name in ("direct", "krylov"))
+    np.testing.assert_allclose(column(found, "mean_stretch"), column(expected, "mean_stretch"), rtol=1e-9)
+    assert column(expected, "linear_iterations") == column(expected, "newton_iterations")
+    assert sum(column(found, "linear_iterations")) > 2 * sum(column(found, "newton_iterations"))
+
+
+# ---------------------------------------------------------------- scenes
+class HealingRemodeling(Remodeling):
+    """A table with one more key."""
+
+    rest: float = Field(default=0.0, ge=0, description="Time before the cells begin to remodel.")
+
+
+class HealingScene(Scene):
+    """A scene with that table."""
+
+    remodeling: HealingRemodeling = HealingRemodeling()
+
+
+def test_a_scene_key() -> None:
+    """A field of a table: read, checked, written back and documented like all others."""
+    values = {**SCENE, "remodeling": {"rest": 2.5}}
+    made = HealingScene(**values)
+    assert made.remodeling.rest == 2.5 and made.remodeling.frame == "spatial"  # the preset's lies below
+    assert "rest = 2.5" in made.to_toml()
+    assert made.with_values({"remodeling.rest": 3.0}).remodeling.rest == 3.0
+    with pytest.raises(SceneError, match="^remodeling.rest = -1.0: must be a finite number at least 0$"):
+        HealingScene(**{**SCENE, "remodeling": {"rest": -1.0}})
+    with pytest.raises(SceneError, match="^remodeling.rest = 2.5: unknown key"):
+        Scene(**values)
+    assert "| `rest` | `0.0` | a finite number at least 0 | Time before the cells" in markdown_reference(HealingScene)

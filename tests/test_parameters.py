@@ -1,0 +1,243 @@
+"""Material parameters as arguments: one number for the body or one for each element; tissue without chains."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import basix.ufl
+import dolfinx
+import numpy as np
+import pytest
+import ufl
+from mpi4py import MPI
+
+from remodel_fenicsx import Scene, SceneError, Simulation
+from remodel_fenicsx.body import cube, tube
+from remodel_fenicsx.evolution.stepper import Stepper
+from remodel_fenicsx.fem import jit
+from remodel_fenicsx.scene.parameters import Cells, Remodeling
+from remodel_fenicsx.tissue.energy import Tissue
+from tests import parts
+
+PARAMETERS = ("lame_lambda", "lame_mu", "network_modulus", "contour_length", "end_to_end_length")
+FORCE = 6.0
+ELASTIC = Remodeling(law="none")
+
+
+def bar() -> parts.Body:
+    """Eight elements of isotropic cells, pulled along z."""
+    return parts.body(cube(refinement=2, comm=MPI.COMM_SELF), Cells(initial="isotropic")).supported()
+
+
+def tissue() -> Tissue:
+    """The paper's."""
+    return parts.MATERIAL.tissue(1.0)
+
+
+def regions(mesh: Any, lower: float, upper: float) -> Any:
+    """A DG0 Function with one value below z = 1/2 and one above."""
+    function = dolfinx.fem.Function(dolfinx.fem.functionspace(mesh, ("DG", 0)))
+    function.interpolate(lambda x: np.where(x[2] < 0.5, lower, upper))
+    return function
+
+
+def everywhere(mesh: Any, kind: str, value: float) -> Any:
+    """One value for the body, as a Constant or as a Function."""
+    return dolfinx.fem.Constant(mesh, value) if kind == "Constant" else regions(mesh, value, value)
+
+
+def pulled(made: parts.Body, tissue: Tissue, force: float = FORCE) -> Stepper:
+    """In equilibrium with the force, after two steps."""
+    stepper = Stepper(made.state(), tissue, ELASTIC, parts.TIGHT, lambda t: {"force": t * force / 2})
+    for time in (1.0, 2.0):
+        stepper.advance(time)
+    return stepper
+
+
+def heights(made: parts.Body) -> np.ndarray:
+    """Mean displacement along z at z = 0, 1/2, 1."""
+    moved = made.displacement.x.array.reshape(-1, 3)[:, 2]
+    return np.array([moved[np.isclose(made.nodes[:, 2], z)].mean() for z in (0.0, 0.5, 1.0)])
+
+
+# ---------------------------------------------------------------- one number, or one for each element
+@pytest.mark.parametrize("kind", ["Constant", "Function"])
+def test_one_value_everywhere_is_the_number(kind: str) -> None:
+    """Equilibrium, energy, limits, the pass and its power."""
+    found = {}
+    for wrap in (False, True):
+        made = bar()
+        mesh = made.domain.mesh
+        material = tissue().map(lambda _, value: everywhere(mesh, kind, value) if wrap else value)
+        stepper = pulled(made, material)
+        # the same solver of the same numbers: what is left is rounding
+        equilibrium = stepper.coupling.equilibrium
+        remodeling = parts.RemodelingPass(stepper.state, material, Remodeling(driver="cauchy"))
+        power = remodeling.apply(2.0, 3.5)
+        scalars = [equilibrium.stored_energy(), equilibrium.extension().max_chain_extension, power, heights(made)[2]]
+        found[wrap] = np.concatenate([scalars, made.displacement.x.array, made.cells.structure_tensor().ravel()])
+        stepper.close()
+    np.testing.assert_allclose(found[True], found[False], rtol=1e-12, atol=1e-12)
+    assert abs(found[True][2]) > 1e-3 and found[True][3] > 0.1
+
+
+def test_each_half_of_a_bar_has_its_own_stiffness() -> None:
+    """Without lambda and with soft chains nothing happens across the load: F/A = mu (a - 1/a) in each half."""
+    made = bar()
+    mesh, mu = made.domain.mesh, (2.0, 6.0)
+    constants = tissue().map(lambda _, value: regions(mesh, value, value))
+    none, long = regions(mesh, 0.0, 0.0), regions(mesh, 80.0, 30.0)
+    material = replace(
+        constants, lame_mu=regions(mesh, *mu), lame_lambda=none, network_modulus=none, contour_length=long
+    )
+    stepper = pulled(made, material)
+    stretches = 1 + np.diff(heights(made)) / 0.5
+    exact = [FORCE / m / 2 + np.hypot(FORCE / m / 2, 1) for m in mu]
+    np.testing.assert_allclose(stretches, exact, rtol=1e-9)
+    # r/L with the L of each half, and where it is largest
+    extension = stepper.coupling.equilibrium.extension()
+    lengths = [np.sqrt((2 + a**2) / 3) for a in exact]
+    assert extension.max_chain_extension == pytest.approx(lengths[1] / 30.0, rel=1e-9)
+    assert extension.worst_point[2] > 0.5 and lengths[1] < lengths[0]
+    stepper.close()
+
+
+def test_a_constant_stays_the_users_and_compiles_nothing() -> None:
+    """A new value is there at the next solve; in whatever order constants are made, the kernels are the same."""
+    other = bar()
+    pulled(other, replace(tissue(), lame_mu=6.0), 1.5 * FORCE).close()
+    known = len(jit.compiled_kernels())
+    made = bar()
+    mu = dolfinx.fem.Constant(made.domain.mesh, 3.103)
+    stepper = pulled(made, replace(tissue(), lame_mu=mu))
+    soft = heights(made)[2]
+    mu.value = 6.0
+    stepper.advance(3.0)
+    stepper.close()
+    assert heights(made)[2] == pytest.approx(heights(other)[2], rel=1e-9) and abs(heights(made)[2] / soft - 1) > 0.01
+    assert len(jit.compiled_kernels()) == known
+
+
+def functions(mesh: Any) -> dict[str, Any]:
+    """Functions that are no DG0 Function of a mesh, or not of this one."""
+    other = cube(comm=MPI.COMM_SELF).mesh
+    quadrature = basix.ufl.quadrature_element("hexahedron", degree=2)
+    spaces = {"DG1": (mesh, ("DG", 1)), "P1": (mesh, ("Lagrange", 1)), "vector": (mesh, ("DG", 0, (3,))),
+              "points": (mesh, quadrature), "another mesh": (other, ("DG", 0))}  # fmt: skip
+    made = {name: dolfinx.fem.Function(dolfinx.fem.functionspace(*space)) for name, space in spaces.items()}
+    return made | {"nan": regions(mesh, np.nan, 1.0), "another mesh's Constant": dolfinx.fem.Constant(other, 1.0)}
+
+
+@pytest.mark.parametrize(("name", "said"), [
+    ("DG1", "a Function of P elements of degree 1; must be a scalar DG0 Function, one value an element"),
+    ("P1", "a Function of P elements of degree 1; must be a scalar DG0 Function, one value an element"),
+    ("vector", "a Function of P elements of degree 0 and shape (3,); must be a scalar DG0 Function, "
+     "one value an element"),
+    ("points", "a Function of quadrature elements of degree 2; must be a scalar DG0 Function, one value an element"),
+    ("another mesh", "belongs to another mesh; must be of this one"),
+    ("another mesh's Constant", "belongs to another mesh; must be of this one"),
+    ("nan", "a Function with values that are not finite; every one must be"),
+])  # fmt: skip
+def test_a_function_of_another_kind_is_refused(name: str, said: str) -> None:
+    made = bar()
+    bad = functions(made.domain.mesh)[name]
+    with pytest.raises(ValueError) as caught:
+        Stepper(made.state(), replace(tissue(), lame_mu=bad), ELASTIC, parts.TIGHT, lambda t: {})
+    assert str(caught.value) == f"lame_mu: {said}"
+
+
+@pytest.mark.parametrize("parameter", PARAMETERS)
+@pytest.mark.parametrize("bad", [
+    np.ones(8), np.array(2.0), "3.1", None, True, 1j, ufl.as_ufl(2.0), [1.0], float("nan"), float("inf"),
+], ids=repr)  # fmt: skip
+def test_whatever_else_is_refused(parameter: str, bad: Any) -> None:
+    made = bar()
+    with pytest.raises((TypeError, ValueError), match=f"^{parameter}") as caught:
+        Stepper(made.state(), replace(tissue(), **{parameter: bad}), ELASTIC, parts.TIGHT, lambda t: {})
+    assert "\n" not in str(caught.value) and "must be" in str(caught.value)
+
+
+def test_numbers_of_all_kinds_are_taken() -> None:
+    made = bar()
+    material = Tissue(27, np.float64(3.103), np.float32(1.5), np.int64(2), 1.0)
+    stepper = Stepper(made.state(), material, ELASTIC, parts.TIGHT, lambda t: {"force": t})
+    assert stepper.advance(1.0).work.newton_iterations > 1
+    stepper.close()
+
+
+# ---------------------------------------------------------------- without chains
+def neo_hookean_stretch(stress: float, lame_lambda: float, lame_mu: float) -> float:
+    """Stretch a of a bar under a nominal stress: P_zz = stress and P_xx = 0 of eq. (4a), by Newton's method."""
+    a, b = 1.0, 1.0
+    for fraction in np.linspace(0.0, 1.0, 201)[1:]:
+        for _ in range(50):
+            log_jacobian = np.log(a * b**2)
+            residual = np.array([
+                (lame_lambda * log_jacobian - lame_mu) / a + lame_mu * a - fraction * stress,
+                (lame_lambda * log_jacobian - lame_mu) / b + lame_mu * b,
+            ])  # fmt: skip
+            slope = np.array([
+                [(lame_lambda - lame_lambda * log_jacobian + lame_mu) / a**2 + lame_mu, 2 * lame_lambda / (a * b)],
+                [lame_lambda / (a * b), (2 * lame_lambda - lame_lambda * log_jacobian + lame_mu) / b**2 + lame_mu],
+            ])  # fmt: skip
+            a, b = np.array([a, b]) - np.linalg.solve(slope, residual)
+    assert np.abs(residual).max() < 1e-10
+    return float(a)
+
+
+@pytest.mark.parametrize("law", ["none", "explicit"])
+def test_without_chains_nothing_locks(law: str) -> None:
+    """Cells may turn and grow as they like: the body is its matrix, far beyond the contour length."""
+    scene = Scene(
+        geometry={"shape": "cube"},
+        material={"chain_density": 0.0},
+        loads={"force": {"value": 30.0, "ramp": [[0.0, 0.0], [10.0, 1.0]]}},
+        remodeling={"law": law},
+        time={"end": 11.0},
+    )
+    simulation = Simulation(scene, MPI.COMM_SELF)
+    rows = [step.row for step in simulation.steps()]
+    exact = neo_hookean_stretch(30.0, scene.material.lame_lambda, scene.material.lame_mu)
+    assert exact > 3 * scene.material.contour_length
+    assert rows[-1]["mean_stretch"] == pytest.approx(exact, rel=1e-8)
+    assert {row["max_chain_extension"] for row in rows} == {0.0}
+    assert {row["remodeling_power"] for row in rows} == {0.0}
+    # no chain is in the kernels: two constants of the matrix, and of the fields the displacement alone
+    energy = simulation.stepper.coupling.equilibrium.energy
+    assert energy.coefficients() == (simulation.unknown,)
+    assert {float(c.value) for c in energy.constants()} == {27.293, 3.103}
+    simulation.close()
+
+
+def test_a_load_that_a_scene_does_not_name_is_zero() -> None:
+    simulation = Simulation(Scene(geometry={"shape": "cube"}, time={"end": 1.0}), MPI.COMM_SELF)
+    (row,) = [step.row for step in simulation.steps()]
+    simulation.close()
+    assert row["force"] == 0.0 and row["mean_stretch"] == pytest.approx(1.0, abs=1e-12)
+
+
+# ---------------------------------------------------------------- a mesh of the user's
+TUBE = {"geometry": {"shape": "tube", "inner_radius": 1.0, "outer_radius": 2.0, "length": 1.0}, "time": {"end": 1.0}}
+
+
+@pytest.mark.parametrize(("changes", "line"), [
+    ({"geometry": {"shape": "cube"}}, "geometry.shape = 'cube': the mesh is a 'tube'"),
+    ({"mesh": {"element": "tetrahedron"}}, "mesh.element = 'tetrahedron': the mesh has elements of type 'hexahedron'"),
+    ({"mesh": {"degree": 2}}, "mesh.degree = 2: the mesh has degree 1"),
+    ({"geometry": {**TUBE["geometry"], "length": 1.1}}, "geometry.length = 1.1: that of the mesh is 1"),
+    ({"geometry": {**TUBE["geometry"], "outer_radius": 2.5}}, "geometry.outer_radius = 2.5: that of the mesh is 2"),
+])  # fmt: skip
+def test_a_domain_that_is_not_the_scenes_is_refused_with_one_line(changes: dict[str, Any], line: str) -> None:
+    domain = tube(1.0, 2.0, 1.0, divisions=(8, 1, 1), comm=MPI.COMM_SELF)
+    assert Simulation(Scene(**TUBE), MPI.COMM_SELF, domain).domain is domain
+    with pytest.raises(SceneError) as caught:
+        Simulation(Scene(**{**TUBE, **changes}), MPI.COMM_SELF, domain)
+    assert str(caught.value) == line
+
+
+def test_a_domain_without_one_of_the_shapes_faces_is_refused() -> None:
+    domain = tube(1.0, 2.0, 1.0, divisions=(8, 1, 1), comm=MPI.COMM_SELF)
+    del domain.faces["inner"]
+    with pytest.raises(SceneError, match="^geometry.shape = 'tube': the mesh has no face inner$"):
+        Simulation(Scene(**TUBE), MPI.COMM_SELF, domain)
