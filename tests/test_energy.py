@@ -150,6 +150,15 @@ def test_energy_of_the_matrix_and_of_the_undeformed_network() -> None:
     np.testing.assert_allclose(undeformed, psi, rtol=1e-13)
 
 
+def test_stiffness_of_matrix_and_network() -> None:
+    """lambda + 2 mu + c (r df/dr + g(r0) r0^2), f = r/L + 1/(4 (1-r/L)^2) - 1/4 the chain's force."""
+    big_l, matrix, c = 1.594, 27.293 + 2 * 3.103, 1.381e-23 * 310.0 * 2e21 / (4 * 1.365)
+    r = big_l * np.array([0.1, 1 / big_l, 0.9, 1 - 1e-4])
+    slope = 1 / big_l + 1 / (2 * big_l * (1 - r / big_l) ** 3)
+    np.testing.assert_allclose(MATERIAL.tissue(R0).stiffness(r), matrix + c * (r * slope + bracket(R0)), rtol=1e-5)
+    assert Material(chain_density=0.0).tissue(R0).stiffness(1.0) == matrix
+
+
 def test_energy_increment_is_the_slope_from_the_old_to_the_new_cell() -> None:
     """By central differences along the straight way between two cells, of which r^2 and W_rep are the shares."""
     F, l, n = random_state("orthotropic")  # noqa: E741

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dolfinx.mesh
 import numpy as np
 import pytest
 import ufl
@@ -60,6 +61,16 @@ def test_integral_and_mean_are_by_volume_over_all_elements_or_some(points: Quadr
     expected = (AROUND * small * near + large * far) / (AROUND * small + large)
     assert points.mean(values, some) == pytest.approx(expected, rel=1e-13)
     assert points.maximum(values) == values.max() and points.minimum(values) == values.min()
+
+
+def test_areas_are_volume_over_the_least_and_the_largest_extent() -> None:
+    box = dolfinx.mesh.create_box(
+        MPI.COMM_SELF, [[0.0, 0.0, 0.0], [4.0, 3.0, 6.0]], [2, 1, 1], dolfinx.mesh.CellType.hexahedron
+    )
+    points = Quadrature(box, 1)
+    np.testing.assert_allclose(points.largest_areas, [3.0 * 6.0] * 2, rtol=1e-14)
+    np.testing.assert_allclose(points.smallest_areas, [2.0 * 3.0] * 2, rtol=1e-14)
+    assert points.norm(np.array([3.0, 4.0])) == pytest.approx(5.0, rel=1e-15)
 
 
 def test_a_deformation_gradient_has_the_derivatives_of_a_component_in_its_row() -> None:

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from mpi4py import MPI
 
+from remodel_fenicsx.body import cube
+from remodel_fenicsx.scene.parameters import Cells
 from remodel_fenicsx.scene import preset_scene
 from remodel_fenicsx.simulation import Simulation
+from tests import parts
 
 PAPER = "kuhl-holzapfel-2007"
 
@@ -21,6 +25,16 @@ def test_uniaxial_compression_remodels_nothing(density: float, frame: str) -> No
     changes = {"loads.force.value": -10.0, "material.chain_density": density, "remodeling.frame": frame}
     scene = preset_scene(PAPER, "cube").with_values({**changes, "time.end": 20.0})
     angles = [step.row["mean_fibre_angle"] for step in Simulation(scene).steps()]
+    np.testing.assert_allclose(angles, np.degrees(np.arctan(np.sqrt(2.0))), rtol=0, atol=1e-10)
+
+
+def test_what_a_loose_tolerance_leaves_is_no_tension() -> None:
+    """Out-of-balance forces that were accepted are lateral stresses of 1e-3 here, far above rounding."""
+    changes = {"loads.force.value": -10.0, "material.chain_density": 1e24, "solver.relative_tolerance": 1e-4}
+    scene = preset_scene(PAPER, "cube").with_values({**changes, "time.end": 12.0})
+    steps = list(Simulation(scene).steps())
+    assert 1e-5 < max(step.work.residual for step in steps) < 1e-2
+    angles = [step.row["mean_fibre_angle"] for step in steps]
     np.testing.assert_allclose(angles, np.degrees(np.arctan(np.sqrt(2.0))), rtol=0, atol=1e-10)
 
 
@@ -44,6 +58,19 @@ def test_a_small_force_on_a_slender_body_is_solved() -> None:
         stretches.append(step.row["mean_stretch"] - 1.0)
     assert stretches[0] == pytest.approx(2.4656e-7, rel=1e-3)
     assert stretches[1] == pytest.approx(stretches[0], rel=1e-6)
+
+
+def test_the_tolerance_is_a_force() -> None:
+    """A body a thousand times as large with the same stress has a million times the forces, and their rounding."""
+    found = []
+    for side in (1.0, 1e3):
+        made = parts.body(cube(side, comm=MPI.COMM_SELF), Cells(initial="isotropic")).supported()
+        problem = made.problem(parts.TIGHT.model_copy(update={"absolute_tolerance": 0.0, "relative_tolerance": 1e-30}))
+        made.loading.set({"force": side**2})
+        problem.solve()
+        found.append(problem.newton._tolerance())
+    assert 0.0 < found[0] < 1e-12
+    assert found[1] == pytest.approx(1e6 * found[0], rel=1e-6)
 
 
 def test_chains_near_their_contour_length_are_solved_to_rounding() -> None:
