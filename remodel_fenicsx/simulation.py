@@ -99,7 +99,7 @@ class Simulation:
         return self.stepper.march(ways, [self.observer, *watchers])
 
     def close(self) -> None:
-        """Free PETSc's objects and options."""
+        """Free PETSc's objects and options. Collective."""
         self.stepper.close()
 
 
@@ -186,7 +186,6 @@ def _record(simulation: Simulation, place: Path, stop: StopRequest, quiet: bool,
         f"{name} {version}" for name, version in versions().items()
     )
     with ExitStack() as stack:
-        stack.callback(simulation.close)
         record = stack.enter_context(RunFolder(place, scene.to_toml(header), comm.rank))
         stack.enter_context(open_log(place / "run.log", comm.rank, quiet=quiet, held=held))
         progress = stack.enter_context(Progress(scene.time.number_of_steps, scene.name, -1 if quiet else comm.rank))
@@ -205,7 +204,10 @@ def _record(simulation: Simulation, place: Path, stop: StopRequest, quiet: bool,
                 pass
         except (StepFailure, Interrupted) as reason:
             log.info("ended: %s", reason)
+            simulation.close()
             raise
+        # not after other exceptions: one rank may be alone with its own, and would wait here for the others for ever
+        simulation.close()
         log.info("finished")
 
 
