@@ -17,7 +17,7 @@ from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher, times
 from remodel_fenicsx.evolution.unit_cells import UnitCells
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.fem.quadrature import Quadrature
-from remodel_fenicsx.results.columns import Observer
+from remodel_fenicsx.results.columns import COLUMNS_ON_REQUEST, Observer, columns_of
 from remodel_fenicsx.results.fields import Fields
 from remodel_fenicsx.results.run_folder import RunFolder, chosen_folder
 from remodel_fenicsx.scene import Scene, SceneError
@@ -72,7 +72,7 @@ class Simulation:
         tissue = scene.material.tissue(scene.cells.end_to_end_length)
         self.stepper = Stepper(self.state, tissue, scene.remodeling, scene.solver, self.load_values)
         self.tissue = self.stepper.tissue
-        self.observer = Observer(shape, self.stepper)
+        self.observer = Observer(shape, self.stepper, columns_of(shape, checked_columns(scene.output.columns)))
 
     def load_values(self, time: float) -> LoadValues:
         """Magnitude of every load at a time."""
@@ -94,13 +94,28 @@ class Simulation:
         StepFailure
             If a step has no admissible equilibrium.
         """
-        self.stepper.remodeling.warn_of_overcorrection()
+        self.stepper.remodeling.warn_of_overcorrection(self.stepper.coupling.share)
         ways = times(self.scene.time.end, self.scene.time.step)
         return self.stepper.march(ways, [self.observer, *watchers])
 
     def close(self) -> None:
-        """Free PETSc's objects and options. Collective."""
+        """Free PETSc's objects and options."""
         self.stepper.close()
+
+
+def checked_columns(names: Sequence[str]) -> Sequence[str]:
+    """The names, if they are columns on request.
+
+    Raises
+    ------
+    SceneError
+        If one is not; one line that names the key.
+    """
+    for name in names:
+        if name not in COLUMNS_ON_REQUEST:
+            known = ", ".join(map(repr, COLUMNS_ON_REQUEST))
+            raise SceneError(f"output.columns = {name!r}: no such column on request; allowed are {known}")
+    return names
 
 
 def checked_domain(domain: Domain, scene: Scene) -> Domain:
@@ -204,9 +219,8 @@ def _record(simulation: Simulation, place: Path, stop: StopRequest, quiet: bool,
                 pass
         except (StepFailure, Interrupted) as reason:
             log.info("ended: %s", reason)
-            simulation.close()
+            simulation.close()  # all ranks have this exception; after any other one they would wait for ever
             raise
-        # not after other exceptions: one rank may be alone with its own, and would wait here for the others for ever
         simulation.close()
         log.info("finished")
 

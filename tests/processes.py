@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import time
+from contextlib import suppress
 from pathlib import Path
 
 
@@ -23,13 +24,22 @@ def session_members(session: int) -> dict[int, str]:
     return found
 
 
-def wait_for_compiler(process: subprocess.Popen[str], timeout: float = 120) -> int:
+def all_end(session: int, timeout: float = 10) -> bool:
+    """Whether all processes of a session end by themselves: what was killed does so in its own time."""
+    deadline = time.monotonic() + timeout
+    while session_members(session) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    return not session_members(session)
+
+
+def wait_for_compiler(process: subprocess.Popen[str], program: str = "cc1", timeout: float = 120) -> int:
     """Wait until the C compiler itself is at work in this process's session; the number of the gcc that called it."""
     deadline = time.monotonic() + timeout
     while time.monotonic() < deadline:
         for number, name in session_members(process.pid).items():
-            if name == "cc1":
-                return int(Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()[1])
+            if name == program:
+                with suppress(OSError):  # it has ended meanwhile
+                    return int(Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()[1])
         assert process.poll() is None, process.communicate()
         time.sleep(0.01)
     os.killpg(process.pid, 9)

@@ -122,6 +122,60 @@ def test_energy_is_the_same_on_arrays(points: Points, case: str) -> None:
 
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("omega", [1, 4])
+def test_energy_on_arrays_has_the_stress_of_eq_7(case: str, omega: int) -> None:
+    """A material point without forms: P = dW/dF by complex steps; on one cell and on two shares of it."""
+    F, l, n = random_state(case)  # noqa: E741
+    tissue = Material(energy_factor=omega).tissue(R0)
+    for cells in ([UnitCell(l, n)], [UnitCell(l, n, 0.3), UnitCell(l, n, 0.7)]):
+        first = np.empty_like(F)
+        for i, j in np.ndindex(3, 3):
+            step = np.zeros((3, 3), complex)
+            step[i, j] = 1e-30j
+            first[:, i, j] = tissue.strain_energy(F + step, cells).imag / 1e-30
+        cauchy = first @ np.swapaxes(F, 1, 2) / np.linalg.det(F)[:, None, None]
+        np.testing.assert_allclose(cauchy, stress_by_hand(F, l, n, omega), rtol=1e-10, atol=1e-11)
+
+
+def test_energy_of_the_matrix_and_of_the_undeformed_network() -> None:
+    """What no stress shows: the matrix alone has none at F = I, and only psi of eq. (4b) is left of the network."""
+    F, l, n = random_state("orthotropic")  # noqa: E741
+    J = np.linalg.det(F)
+    matrix = 27.293 / 2 * np.log(J) ** 2 + 3.103 / 2 * (np.sum(F**2, axis=(1, 2)) - 3) - 3.103 * np.log(J)
+    alone = Material(chain_density=0.0).tissue(R0)
+    assert alone.locking_length is None
+    np.testing.assert_allclose(alone.strain_energy(F, [UnitCell(l, n)]), matrix, rtol=1e-13, atol=1e-13)
+    x, big_l = 1 / 1.594, 1.594
+    psi = 1.381e-23 * 310.0 * 2e21 / (4 * 1.365) * big_l / 4 * (2 * x**2 + 1 / (1 - x) - x)
+    undeformed = MATERIAL.tissue(R0).strain_energy(np.broadcast_to(np.eye(3), F.shape), [UnitCell(l, n)])
+    np.testing.assert_allclose(undeformed, psi, rtol=1e-13)
+
+
+def test_stiffness_of_matrix_and_network() -> None:
+    """lambda + 2 mu + c (r df/dr + g(r0) r0^2), f = r/L + 1/(4 (1-r/L)^2) - 1/4 the chain's force."""
+    big_l, matrix, c = 1.594, 27.293 + 2 * 3.103, 1.381e-23 * 310.0 * 2e21 / (4 * 1.365)
+    r = big_l * np.array([0.1, 1 / big_l, 0.9, 1 - 1e-4])
+    slope = 1 / big_l + 1 / (2 * big_l * (1 - r / big_l) ** 3)
+    np.testing.assert_allclose(MATERIAL.tissue(R0).stiffness(r), matrix + c * (r * slope + bracket(R0)), rtol=1e-5)
+    assert Material(chain_density=0.0).tissue(R0).stiffness(1.0) == matrix
+
+
+def test_energy_increment_is_the_slope_from_the_old_to_the_new_cell() -> None:
+    """By central differences along the straight way between two cells, of which r^2 and W_rep are the shares."""
+    F, l, n = random_state("orthotropic")  # noqa: E741
+    rng = np.random.default_rng(8)
+    old, new = UnitCell(l, n), UnitCell(l[rng.permutation(len(l))], random_rotations(len(l)))
+    tissue, h = MATERIAL.tissue(R0), 1e-5
+    energies = [
+        tissue.strain_energy(F, [UnitCell(*old[:2], 1 - theta), UnitCell(*new[:2], theta)]) for theta in (h, -h)
+    ]
+    slope = (energies[0] - energies[1]) / (2 * h)
+    found = tissue.energy_increment(F, old, new)
+    assert np.abs(found).max() > 0.5
+    np.testing.assert_allclose(found, slope, rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("omega", [1, 4])
 def test_stress_is_eq_7(points: Points, case: str, omega: int) -> None:
     F, l, n = random_state(case)  # noqa: E741
     _, second, cauchy = points.evaluate(F, l, n)[omega]

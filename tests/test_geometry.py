@@ -445,6 +445,6 @@ def test_two_ranks_gather_what_one_rank_has_and_fail_together():
     assert together["digests"] == alone
     said = [
         "Gmsh could not mesh the cube: no more ink",
-        "Gmsh could not mesh the cube: 0 named volumes, 0 types of cells, 0 named faces",
+        "Gmsh could not mesh the cube: 0 named volumes, 0 types of elements, 0 named faces",
     ]
     assert together["failures"] == [said, said]

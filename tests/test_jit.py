@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import mpirun
-from tests.processes import session_members, wait_for_compiler
+from tests.processes import all_end, wait_for_compiler
 
 PROGRAM = """
 import logging, sys, ufl, dolfinx
@@ -89,6 +89,7 @@ def test_who_waits_for_a_compiler_says_for_whose(tmp_path: Path) -> None:
         assert waiting.stderr
         line = next(line for line in waiting.stderr if "compil" in line)
     assert f"another run is compiling forms (process {os.getpid()}): waiting for it" in line
+    assert line.startswith("NOTICE:")  # the terminal gets it
     assert "compiling the moment" in waiting.communicate(timeout=120)[1]
     assert waiting.returncode == 0
 
@@ -124,6 +125,29 @@ def test_a_cache_that_cannot_be_written_is_replaced_with_a_warning(tmp_path: Pat
     assert list(temporary.rglob("libffcx_forms_*.so"))
 
 
+DERIVED_TWICE = """
+import dolfinx, numpy, ufl
+from mpi4py import MPI
+from remodel_fenicsx.fem import jit
+mesh = dolfinx.mesh.create_unit_cube(MPI.COMM_WORLD, 1, 1, 1, dolfinx.mesh.CellType.hexahedron)
+for _ in range(2):
+    x = ufl.SpatialCoordinate(mesh)
+    first, second = ufl.variable(x[0]), ufl.variable(x[1])
+    value = first**2 * second**3
+    derivatives = ufl.as_vector([ufl.diff(value, first), ufl.diff(value, second)])
+    compiled = jit.expression(derivatives, numpy.array([[0.5, 0.25, 0.0]]))
+    numpy.testing.assert_allclose(compiled.eval(mesh, numpy.zeros(1, numpy.int32)), [[1 / 64, 3 / 64]])
+print(len(jit.compiled_kernels()))
+"""
+
+
+def test_an_expression_with_derivatives_is_compiled_once_for_all_problems_of_a_process(tmp_path: Path) -> None:
+    """Of (0.5^2 0.25^3): UFL's numbers of variables are not part of the kernel."""
+    command, environment = program(tmp_path, DERIVED_TWICE)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, env=environment)
+    assert (done.returncode, done.stdout) == (0, "1\n"), done.stderr[-2000:]
+
+
 # A run that is under way: a signal is a request that it looks at now and then, but not while it compiles
 IN_A_RUN = """
 import sys, ufl, dolfinx
@@ -148,24 +172,39 @@ with StopRequest():
         ("group", signal.SIGINT),
         ("group", signal.SIGTERM),
         ("group", signal.SIGHUP),
-        ("process", signal.SIGTERM),
+        ("process and group", signal.SIGTERM),
         ("compiler", signal.SIGTERM),
     ],
 )
 def test_a_signal_ends_the_compiler_and_leaves_nothing(target: str, number: signal.Signals, tmp_path: Path) -> None:
-    """A terminal, and timeout, send it to the group; a supervisor to one process; some to all, one by one."""
+    """A terminal sends it to the group, timeout to the process and then to its group, some to all, one by one."""
     command, environment = program(tmp_path, IN_A_RUN)
     process = subprocess.Popen(command, stderr=subprocess.PIPE, env=environment, text=True, start_new_session=True)
     compiler = wait_for_compiler(process)
-    if target == "group":
+    if target != "group":
+        os.kill(compiler if target == "compiler" else process.pid, number)
+        time.sleep(0.01)
+    if "group" in target:
         os.killpg(process.pid, number)
-    else:
-        os.kill(process.pid if target == "process" else compiler, number)
     errors = process.communicate(timeout=60)[1]
     assert (process.returncode, errors) == (128 + number, "")
     if target != "compiler":  # whoever ends gcc alone leaves gcc's own children to themselves
-        deadline = time.monotonic() + 10  # what was killed vanishes in its own time
-        while session_members(process.pid) and time.monotonic() < deadline:
-            time.sleep(0.05)
-        assert session_members(process.pid) == {}
+        assert all_end(process.pid)
     assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == ["compiling.lock"]
+
+
+def test_a_signal_for_one_process_ends_the_compilers_own_children(tmp_path: Path) -> None:
+    """As a supervisor sends it. A compiler stands in that would be at work for ever, in a program of its own."""
+    compiler = tmp_path / "compiler"
+    compiler.write_text("#!/bin/sh\nsleep 1000\nexit 1\n")
+    compiler.chmod(0o755)
+    command, environment = program(tmp_path, IN_A_RUN.replace("150", "3"))
+    environment["CC"] = str(compiler)
+    process = subprocess.Popen(command, stderr=subprocess.DEVNULL, env=environment, text=True, start_new_session=True)
+    wait_for_compiler(process, "sleep")
+    process.terminate()
+    assert process.wait(timeout=60) == 143
+    ended = all_end(process.pid)
+    if not ended:
+        os.killpg(process.pid, signal.SIGKILL)
+    assert ended

@@ -6,6 +6,7 @@ import pytest
 from remodel_fenicsx.tissue.cells import UnitCell
 from remodel_fenicsx.tissue.drivers import DRIVERS, FRAMES
 from remodel_fenicsx.tissue.laws import LAWS, Array, Drive, explicit, rate, relaxation
+from tests import parts
 
 FUNCTIONS = {"explicit": explicit, "rate": rate, "relaxation": relaxation}
 
@@ -99,6 +100,69 @@ def test_points_without_tension_keep_their_cells(cells: tuple[Array, Array]) -> 
     np.testing.assert_array_equal(new.dimensions[::2], l0[::2])
     np.testing.assert_array_equal(new.axes[::2], axes[::2])
     assert np.all(np.abs(new.dimensions[1::2] - l0[1::2]).max(axis=1) > 1e-3)
+
+
+def random_cells(rng: np.random.Generator, count: int = 50) -> UnitCell:
+    """Cells of any dimensions, turned anywhere."""
+    return UnitCell(1.3 * octant(rng, count), parts.random_rotations(rng, count))
+
+
+def drive(tensor: Array, F: Array, frame: str, driver: str = "cauchy", threshold: float = 0.0) -> Drive:
+    """A drive on cells that began with equal dimensions, r0 = 1.3."""
+    count = len(tensor)
+    l0 = np.full((count, 3), 1.3 / np.sqrt(3))
+    return Drive(F, tensor, DRIVERS[driver], FRAMES[frame], threshold, l0, np.full(count, 1.3), KAPPA)
+
+
+@pytest.mark.parametrize(("driver", "frame"), [
+    ("cauchy", "material"), ("finger", "material"), ("cauchy", "spatial"), ("pk2", "material"), ("pk2", "spatial"),
+])  # fmt: skip
+def test_equal_principal_values_keep_the_axes_whatever_the_deformation(driver: str, frame: str) -> None:
+    """What the tensor does not decide, the previous axes do: in space as the deformation has carried them there."""
+    rng = np.random.default_rng(3)
+    old = random_cells(rng)
+    F = parts.random_rotations(rng, 50) @ (np.eye(3) + rng.uniform(-0.3, 0.3, (50, 3, 3)))
+    tensor = np.broadcast_to(2.0 * np.eye(3), F.shape)
+    new = LAWS["explicit"].update(old, drive(tensor, F, frame, driver), 3.0, 4.0)
+    np.testing.assert_allclose(new.axes, old.axes, atol=1e-13)
+    assert np.abs(new.dimensions - old.dimensions).max() > 0.1  # they have remodeled
+
+
+def test_frames_make_material_axes_of_spatial_directions_and_leave_material_ones() -> None:
+    """A quarter turn carries the fibres along x onto y, where the tension is."""
+    turn = np.array([[[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]])
+    tensor = np.diag([1.0, 3.0, 2.0])[None]
+    old = UnitCell(np.array([[0.9, 0.8, 0.5]]), np.eye(3)[None])
+    x, y, z = np.eye(3)
+    expected = {("cauchy", "material"): [x, z, y], ("cauchy", "spatial"): [y, z, x], ("pk2", "material"): [y, z, x]}
+    for (driver, frame), axes in expected.items():
+        new = LAWS["explicit"].update(old, drive(tensor, turn, frame, driver), 3.0, 4.0)
+        np.testing.assert_allclose(np.abs(new.axes[0]), axes, atol=1e-14, err_msg=f"{driver} {frame}")
+        # by rank: the target is r0 (3, 2, 1) / sqrt 14, approached from the equal dimensions of the start
+        e = 1.3 * np.array([3.0, 2.0, 1.0]) / np.sqrt(14)
+        start = 1.3 / np.sqrt(3)
+        np.testing.assert_allclose(new.dimensions[0], start + (e - start) * (1 - np.exp(-KAPPA * 4.0)), atol=1e-14)
+
+
+def test_below_the_threshold_values_are_zero_and_differences_are_none() -> None:
+    rng = np.random.default_rng(4)
+    old, true = random_cells(rng), parts.random_rotations(rng, 50)
+    F = np.broadcast_to(np.eye(3), true.shape)
+
+    def updated(values: list[float]) -> UnitCell:
+        tensor = np.swapaxes(true, 1, 2) @ (np.array(values)[:, None] * true)
+        return LAWS["explicit"].update(old, drive(tensor, F, "material", threshold=1e-3), 0.0, 1e9)
+
+    # the largest two differ by less: any direction of their plane is as good, so the previous axes choose it
+    new = updated([0.0023, 0.0017, -0.02])
+    np.testing.assert_allclose(np.abs(np.sum(new.axes[:, 2] * true[:, 2], axis=1)), 1.0, atol=1e-12)
+    projected = old.axes[:, 0] - np.sum(old.axes[:, 0] * true[:, 2], axis=1)[:, None] * true[:, 2]
+    projected /= np.linalg.norm(projected, axis=1)[:, None]
+    np.testing.assert_allclose(new.axes[:, 0], projected, atol=1e-12)
+    # the second value is no tension
+    np.testing.assert_allclose(updated([0.02, 0.0009, -0.02]).dimensions, np.tile([1.3, 0.0, 0.0], (50, 1)), atol=1e-12)
+    for name, values in zip(("dimensions", "axes"), updated([0.0009, -0.02, -0.03])):
+        np.testing.assert_array_equal(values, getattr(old, name))
 
 
 def test_none_changes_nothing(cells: tuple[Array, Array]) -> None:

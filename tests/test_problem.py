@@ -113,6 +113,56 @@ def test_pressure_tangent_is_symmetric_on_the_artery_and_not_with_free_ends(elem
     assert np.linalg.norm(tangent - tangent.T) > 0.1 * np.linalg.norm(tangent)
 
 
+def test_loads_are_what_their_names_say() -> None:
+    """On a cube of side 2: the whole force, the pressure times the area, the elongation times the length."""
+    made = parts.body(cube(2.0, refinement=2), RANDOM)
+    made.loading.add_dead_force("force", "z1", component=2)
+    made.loading.add_follower_pressure("pressure", "x1")
+    made.loading.add_prescribed_elongation("elongation", "z1", 2, 2.0)
+    problem = made.problem()
+    for loads, total in (({"force": 3.0, "pressure": 0.0}, [0, 0, 3]), ({"force": 0.0, "pressure": 5.0}, [-20, 0, 0])):
+        made.loading.set(loads)
+        external = -dolfinx.fem.assemble_vector(problem.external_form).array.reshape(-1, 3)
+        np.testing.assert_allclose(external.sum(axis=0), total, atol=1e-13)
+        assert made.loading.values == {**loads, "elongation": 0.0}
+    made.loading.set({"elongation": 0.1})
+    assert problem.prescribed_gap(problem.state.unknown.x.petsc_vec) == pytest.approx(0.2, rel=1e-14)
+
+
+def test_lifting_is_the_tangent_times_the_way_to_the_prescribed_values() -> None:
+    """K (u_prescribed - x) at the nodes that are free."""
+    made = parts.body(cube(refinement=2), RANDOM)
+    made.loading.hold_face("z0", 2)
+    made.loading.add_prescribed_elongation("elongation", "z1", 2, 1.0)
+    problem = made.problem()
+    made.loading.set({"elongation": 0.07})
+    made.set_displacement(smooth(made.nodes, 0.05, 1))
+    x, lifted = problem.state.unknown.x.petsc_vec.copy(), problem.state.unknown.x.petsc_vec.duplicate()
+    target = x.array.copy().reshape(-1, 3)
+    bottom, top = (np.isclose(made.nodes[:, 2], z) for z in (0.0, 1.0))
+    target[bottom, 2], target[top, 2] = 0.0, 0.07
+    assert problem.prescribed_gap(x) == np.abs(target.ravel() - x.array).max() > 0.01
+    problem.assemble_lifting(lifted, x)
+    expected = assembled_tangent(problem) @ (target.ravel() - x.array)
+    free = np.ones_like(target, dtype=bool)
+    free[bottom | top, 2] = False
+    np.testing.assert_allclose(lifted.array[free.ravel()], expected[free.ravel()], atol=1e-12)
+    assert np.abs(expected[free.ravel()]).max() > 0.1
+
+
+def test_a_prescribed_elongation_is_reached_as_fast_as_newton_can() -> None:
+    """Lifting spreads it over the body at once: without it, or with its sign wrong, the first layer takes it all."""
+    made = parts.body(cube(refinement=4), Cells(initial="isotropic"))
+    for component, face in enumerate(("x0", "y0", "z0")):
+        made.loading.hold_face(face, component)
+    made.loading.add_prescribed_elongation("elongation", "z1", 2, 1.0)
+    made.loading.set({"elongation": 0.2})
+    solution = made.problem().solve()
+    u = made.displacement.x.array.reshape(-1, 3)
+    np.testing.assert_allclose(u[:, 2], 0.2 * made.nodes[:, 2], atol=1e-10)
+    assert solution.newton_iterations <= 5
+
+
 # ---------------------------------------------------------------- guards
 def held_cube() -> parts.Body:
     """Random cells, the bottom clamped, a dead force on the top."""
@@ -214,6 +264,16 @@ def test_nan_anywhere_is_a_failure_not_a_result(where: str) -> None:
     with pytest.raises(SolveFailure):
         problem.solve()
     np.testing.assert_array_equal(made.displacement.x.array, before)
+
+
+def test_a_solve_that_is_cut_off_leaves_the_displacement_where_it_was() -> None:
+    made = held_cube()
+    start = 1e-3 * smooth(made.nodes, 1.0, 1).ravel()
+    made.set_displacement(start)
+    made.loading.set({"force": 3.0})
+    with pytest.raises(SolveFailure, match="no equilibrium within 1 Newton iterations"):
+        made.problem(parts.TIGHT.model_copy(update={"maximum_iterations": 1})).solve()
+    np.testing.assert_array_equal(made.displacement.x.array, start)
 
 
 def test_a_failed_solve_leaves_a_solver_that_works() -> None:

@@ -200,6 +200,15 @@ def test_order_of_directions() -> None:
     np.testing.assert_array_equal(ranks, [[2, 1, 0], [2, 1, 0], [2, 1, 0], [2, 1, 0]])
 
 
+@pytest.mark.parametrize("density", [2e21, 1e24])
+def test_the_solvers_noise_does_not_remodel(density: float) -> None:
+    """A tube that is only shortened: hoop and radial stress are zero up to the solver's tolerance, and no tension."""
+    material = radial.RadialMaterial(network_modulus=MATERIAL.network_modulus * density / 2e21)
+    history = radial.solve_radial(pressure=0.0, stretch=-0.05, end=30.0, elements=10, material=material)
+    np.testing.assert_array_equal(history.dimensions[-1], history.dimensions[0])
+    assert np.all(history.cauchy[-1, :, 1] < -0.1)
+
+
 def test_published_numbers_of_the_artery() -> None:
     """Radii of the resolved solve, the remodeling from t = 24 to 150, angles of Fig. 8, the decay of l_3."""
     history = run()

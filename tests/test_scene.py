@@ -112,7 +112,7 @@ BAD_SCENES = [
     (
         TUBE,
         {"output.pictures!": True},
-        "output.'pictures!' = true: unknown key; allowed are output.fields, output.every",
+        "output.'pictures!' = true: unknown key; allowed are output.fields, output.columns, output.every",
     ),
     (TUBE, {"time.x\ny": 1}, "time.'x\\ny' = 1: unknown key; allowed are time.end, time.step"),
     # material
@@ -295,7 +295,7 @@ BAD_SCENES = [
     (CUBE, {"remodeling.law": 1}, "remodeling.law = 1: allowed are 'explicit', 'rate', 'relaxation', 'none'"),
     (CUBE, {"remodeling.driver": "strain"}, "remodeling.driver = 'strain': allowed are 'cauchy', 'pk2', 'finger'"),
     (CUBE, {"remodeling.frame": "corotated"}, "remodeling.frame = 'corotated': allowed are 'material', 'spatial'"),
-    (CUBE, {"remodeling.coupling": "implicit"}, "remodeling.coupling = 'implicit': allowed is 'staggered'"),
+    (CUBE, {"remodeling.coupling": "implicit"}, "remodeling.coupling = 'implicit': allowed are 'staggered', 'relaxed'"),
     (CUBE, {"model.kinematics": "radial"}, "model.kinematics = 'radial': allowed is 'full'"),
     (CUBE, {"geometry.side": 1e7}, "geometry.side = 10000000.0: a length of 1e+07 here; allowed are 1e-06 to 1e+06"),
     (

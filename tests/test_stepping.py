@@ -220,6 +220,22 @@ def test_parts_are_halved_after_a_failure_and_doubled_after_a_success(monkeypatc
     assert made.loading.values == {"force": 8.0}
 
 
+def test_a_part_that_would_go_beyond_the_end_is_halved_from_what_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    """After three quarters half of the whole would be next: the quarter that is left is refused, an eighth tried."""
+    made = clamped_cube()
+    stepper = made.stepper(lambda t: {"force": 8.0 * t})
+    refusing = Refusing(made, 2.5)
+    real = refusing.__call__
+
+    def stricter_near_the_end() -> Solution:
+        refusing.limit = 1.5 if refusing.accepted[-1] >= 6.0 else 2.5
+        return real()
+
+    monkeypatch.setattr(stepper.coupling.newton, "solve", stricter_near_the_end)  # type: ignore[attr-defined]
+    assert solve(stepper, 1.0).substeps == 5
+    assert refusing.tried == [8.0, 4.0, 2.0, 6.0, 4.0, 8.0, 6.0, 8.0, 7.0, 8.0]
+
+
 def test_parts_that_do_not_divide_the_step_end_on_its_load_exactly(monkeypatch: pytest.MonkeyPatch) -> None:
     made = clamped_cube()
     target = 0.1 + 0.2  # not what 3 * 0.1 or sums of parts of it give
@@ -246,7 +262,13 @@ def test_the_number_of_halvings_is_the_scenes(halvings: int, monkeypatch: pytest
 def test_times_are_computed_from_their_numbers() -> None:
     assert list(times(150.0, 1.0)) == [float(k) for k in range(1, 151)]
     assert list(times(100.0, 0.1)) == [k / 10 for k in range(1, 1001)]  # 0.3, not 3 * 0.1 = 0.30000000000000004
+    assert list(times(0.3, 0.1)) == [0.1, 0.2, 0.3] and 0.3 / 0.1 < 3.0
     assert list(times(1.0, 0.3333333333)) == [0.3333333333, 0.6666666666, 1.0]  # a third, as a scene may write it
+
+
+def test_times_of_numpys_numbers_are_the_same() -> None:
+    assert list(times(np.float64(2), np.float64(1))) == [1.0, 2.0]
+    assert all(type(time) is float for time in times(np.float64(2), np.float64(1)))
 
 
 def test_loads_are_hit_exactly_at_the_times_of_the_ramp() -> None:
@@ -267,6 +289,41 @@ def test_a_load_that_is_there_from_the_start_can_be_solved_in_parts(monkeypatch:
     monkeypatch.setattr(stepper.coupling.newton, "solve", refusing)  # type: ignore[attr-defined]
     assert solve(stepper, 1.0).substeps == 2
     assert refusing.tried == [8.0, 4.0, 8.0]
+
+
+def test_after_an_exchange_of_the_cells_the_loads_are_tried_in_one_piece(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The failure of the whole step says nothing of the loads alone: they start from another state now."""
+    made = clamped_cube()
+    stepper = made.stepper(lambda t: {"force": t}, kappa=0.4)
+    stepper.advance(1.0)
+    coupling: Any = stepper.coupling
+    tried: list[tuple[str, float]] = []
+
+    def refuse_the_first(newton: GuardedNewton) -> Solution:
+        tried.append(("loads" if newton is coupling.newton else "cells", made.loading.values["force"]))
+        if len(tried) == 1:
+            raise SolveFailure("too much", 7, 7, Extension(0.9, 0.5, (0.0, 0.0, 0.0)))
+        return Solution(3, 3)
+
+    monkeypatch.setattr(GuardedNewton, "solve", refuse_the_first)
+    work = solve(stepper, 9.0)
+    assert tried == [("loads", 9.0), ("cells", 1.0), ("loads", 9.0)]
+    assert work.substeps == 2 and work.newton_iterations == 7 + 3 + 3
+
+
+def test_without_a_change_of_the_cells_only_the_loads_are_divided(monkeypatch: pytest.MonkeyPatch) -> None:
+    """From the load of the step before to exactly the new one, which their difference misses by rounding."""
+    made = clamped_cube()
+    old, new = 0.4, 1.8
+    assert old + (new - old) != new
+    stepper = made.stepper(lambda t: {"force": {1.0: old, 2.0: new}[t]}, law="none")
+    stepper.advance(1.0)
+    refusing = Refusing(made, 0.8)
+    refusing.accepted = [old]
+    monkeypatch.setattr(stepper.coupling.newton, "solve", refusing)  # type: ignore[attr-defined]
+    assert solve(stepper, 2.0).substeps == 2
+    assert refusing.tried == pytest.approx([new, (old + new) / 2, new], rel=1e-14)
+    assert made.loading.values["force"] == new
 
 
 @pytest.mark.parametrize("unit", [1.0, 1e3, 1e6])

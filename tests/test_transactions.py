@@ -164,7 +164,7 @@ FAULTS: dict[str, tuple[Callable[..., list[Watcher]], BaseException]] = {
         OSError(errno.ENOSPC, "disk full"),
     ),
     "watcher, solved": (hook("solved"), RuntimeError()),
-    "pass": (after(lambda s: s.stepper.remodeling, "apply", lambda old, new: new), FloatingPointError()),
+    "pass": (after(lambda s: s.stepper.remodeling, "apply", lambda old, new, *_: new), FloatingPointError()),
     "column after the pass": (column(after_pass=True), ValueError()),
     "watcher, completed": (hook("completed"), KeyboardInterrupt()),
     "history": (full_disk, OSError(errno.EFBIG, "File too large")),

@@ -25,9 +25,12 @@ class Coupling(Protocol):
     ----------
     equilibrium
         The forms of the solved state.
+    share
+        Share of a pass's change of the cells that is made.
     """
 
     equilibrium: Equilibrium
+    share: float
 
     def solve(self, time: float, loads: LoadValues) -> Work:
         """Bring the state to equilibrium with the loads of `time`; `state.equilibrium_cells` are those of the row."""
@@ -51,6 +54,7 @@ class Staggered:
         self.equilibrium = Equilibrium(state, tissue)
         self.equilibrium.compile_energy()
         self.newton = GuardedNewton(self.equilibrium, settings)
+        self.share, self._residual = 1.0, 0.0
         self.blend: Blend | None = None
         if remodeling.law.remodels:
             self.blend = Blend(state, tissue, settings)
@@ -71,11 +75,14 @@ class Staggered:
             log.info("solving in parts: the remodeled cells have r >= L at the old displacement")
             self._solve_in_parts(time, dict(self.state.loading.values), loads, work, failure=None)
         self.state.settle_cells()
+        self._residual = work.residual
         return work
 
     def remodel(self, time: float) -> float:
         """The pass with the solved state."""
-        return self.remodeling.apply(self.state.time, time)
+        if not self.remodeling.law.remodels:
+            return 0.0
+        return self.remodeling.apply(self.state.time, time, self._residual, self.share)
 
     def close(self) -> None:
         """Free PETSc's objects."""
@@ -120,5 +127,16 @@ class Staggered:
         return bool(self.state.comm.allreduce(int(not same)) > 0)
 
 
+class Relaxed(Staggered):
+    """A share of each pass's change of the structure tensor: stable where the printed pass over-corrects.
+
+    The cells then lag by (1 - factor)/factor further steps (docs/theory.md, "The relaxed pass").
+    """
+
+    def __init__(self, state: State, tissue: Tissue, remodeling: RemodelingPass, settings: SolverSettings):
+        super().__init__(state, tissue, remodeling, settings)
+        self.share = remodeling.settings.relaxation_factor
+
+
 Maker = Callable[[State, Tissue, RemodelingPass, SolverSettings], Coupling]
-COUPLINGS: dict[str, Maker] = {"staggered": Staggered}
+COUPLINGS: dict[str, Maker] = {"staggered": Staggered, "relaxed": Relaxed}

@@ -184,6 +184,15 @@ def at_points(tissue: Tissue, quadrature: Any) -> Tissue:
     return tissue.map(lambda name, value: coefficients.point_values(value, quadrature).reshape(-1))
 
 
+def stress_rounding(tissue: Tissue, mesh: Any, max_chain_extension: float) -> float:
+    """Rounding error of a stress in a body, from the stiffness of matrix and network at the largest r/L."""
+    numbers = tissue.map(lambda name, value: coefficients.largest(value, mesh))
+    length = numbers.end_to_end_length
+    if numbers.locking_length is not None:
+        length = max(length, max_chain_extension * numbers.locking_length)
+    return float(np.finfo(np.float64).eps * numbers.stiffness(length))
+
+
 def _depends_on(form: Any, unknown: Any) -> bool:
     """Whether a form's derivative with respect to the unknown is not zero."""
     return unknown in form.coefficients()

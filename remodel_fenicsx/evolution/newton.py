@@ -11,14 +11,14 @@ import dolfinx.fem.petsc
 import numpy as np
 from petsc4py import PETSc
 
-from remodel_fenicsx.evolution.equilibrium import Equilibrium, Extension
-from remodel_fenicsx.fem import coefficients
+from remodel_fenicsx.evolution.equilibrium import Equilibrium, Extension, stress_rounding
 from remodel_fenicsx.fem.petsc_options import ProblemOptions
 from remodel_fenicsx.system.interrupts import Interrupted
 
 log = logging.getLogger(__name__)
 
 LINE_SEARCH_HALVINGS = 20  # of one Newton step, before the solve is given up
+ROUNDINGS = 8.0  # how many times the rounding of assembled forces a residual may be
 
 
 class SolverSettings(Protocol):
@@ -58,6 +58,8 @@ class Solution:
 
     newton_iterations: int
     linear_iterations: int
+    residual: float = 0.0
+    """Norm of the out-of-balance nodal forces that was accepted."""
 
 
 class SolveFailure(RuntimeError):
@@ -90,7 +92,8 @@ class GuardedNewton:
         self._residual = self._x.duplicate()
         self._external = self._x.duplicate()
         self._matrix = equilibrium.create_matrix()
-        self._force_scale = 0.0
+        self._force_scale = self._stress_rounding = 0.0
+        self._area = equilibrium.quadrature.norm(equilibrium.quadrature.largest_areas)
         self._lost = False
         self._options_checked = False
         snes: Any = PETSc.SNES().create(equilibrium.comm)
@@ -142,7 +145,7 @@ class GuardedNewton:
             if extension.stop_signal:
                 raise Interrupted(extension.stop_signal)
             raise SolveFailure(self._failure_text(reason, extension), newton, linear, extension)
-        return Solution(newton, linear)
+        return Solution(newton, linear, float(self._snes.getFunctionNorm()))
 
     def _warn_of_unused_options(self) -> None:
         """Once, after the first solve; on all ranks, for each has a database of options."""
@@ -186,6 +189,9 @@ class GuardedNewton:
         self._lost = not extension.admissible or extension.stop_signal > 0
         if self._lost:
             residual.set(np.nan)
+            return
+        mesh = equilibrium.quadrature.mesh
+        self._stress_rounding = stress_rounding(equilibrium.tissue, mesh, extension.max_chain_extension)
 
     def _assemble_tangent(self, snes: Any, x: Any, matrix: Any, preconditioner: Any) -> None:
         self.equilibrium.assemble_tangent(matrix)
@@ -219,12 +225,9 @@ class GuardedNewton:
         return PETSc.SNES.ConvergedReason.ITERATING
 
     def _tolerance(self) -> float:
-        # an unloaded body has no forces but rounding: 1e-5 of stiffness times area is a scale in any unit of stress
-        equilibrium = self.equilibrium
-        stiffness = stiffness_scale(equilibrium)
-        rounding_scale = 1e-5 * stiffness * equilibrium.state.loading.domain.size**2
-        scale = max(self._force_scale, rounding_scale)
-        return self.settings.absolute_tolerance + self.settings.relative_tolerance * scale
+        """Relative to the forces at the nodes, not below the rounding of forces that add up to nothing there."""
+        relative = self.settings.relative_tolerance * self._force_scale
+        return self.settings.absolute_tolerance + max(relative, ROUNDINGS * self._stress_rounding * self._area)
 
     def _failure_text(self, reason: int, extension: Extension) -> str:
         if reason >= 0 or self._lost:
@@ -232,9 +235,3 @@ class GuardedNewton:
         if reason == PETSc.SNES.ConvergedReason.DIVERGED_MAX_IT:
             return f"no equilibrium within {self._snes.getTolerances()[3]} Newton iterations"
         return FAILURES.get(reason, f"SNES stopped with reason {reason}")
-
-
-def stiffness_scale(equilibrium: Equilibrium) -> float:
-    """lambda + 2 mu + c g(r0) r0^2, with the largest value of each parameter in the body; over all ranks."""
-    mesh = equilibrium.quadrature.mesh
-    return float(equilibrium.tissue.map(lambda name, value: coefficients.largest(value, mesh)).stiffness)

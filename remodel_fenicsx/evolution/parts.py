@@ -18,11 +18,14 @@ class Work:
     newton_iterations: int = 0
     linear_iterations: int = 0
     substeps: int = 0
+    residual: float = 0.0  # of the last solution, in the unit of force
 
     def add(self, done: Solution | SolveFailure) -> None:
         """Count a solve."""
         self.newton_iterations += done.newton_iterations
         self.linear_iterations += done.linear_iterations
+        if isinstance(done, Solution):
+            self.residual = done.residual
 
 
 class StepFailure(RuntimeError):

@@ -9,17 +9,20 @@ import numpy as np
 import ufl
 from numpy.typing import NDArray
 
-from remodel_fenicsx.evolution.equilibrium import at_points, on_mesh
+from remodel_fenicsx.evolution.equilibrium import at_points, on_mesh, stress_rounding
 from remodel_fenicsx.evolution.state import State
 from remodel_fenicsx.fem import coefficients, jit
 from remodel_fenicsx.tissue import spectral
-from remodel_fenicsx.tissue.cells import UnitCell
+from remodel_fenicsx.tissue.cells import UnitCell, structure_tensor
 from remodel_fenicsx.tissue.drivers import DRIVERS, FRAMES
-from remodel_fenicsx.tissue.energy import Tissue
-from remodel_fenicsx.tissue.laws import LAWS, Drive
+from remodel_fenicsx.tissue.energy import Tissue, squared_end_to_end_length
+from remodel_fenicsx.tissue.laws import LAWS, Drive, relaxed
 
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
+
+RESIDUAL_SHARE = 20.0  # an eighth of an element's nodes share a face's force; a pulled-back stress is larger still
+ROUNDINGS = 64.0  # how many times the rounding of a stress its principal values may be off
 
 
 class RemodelingSettings(Protocol):
@@ -36,6 +39,9 @@ class RemodelingSettings(Protocol):
 
     @property
     def coupling(self) -> str: ...
+
+    @property
+    def relaxation_factor(self) -> float: ...
 
     @property
     def kappa(self) -> float: ...
@@ -61,16 +67,24 @@ class RemodelingPass:
         self.driver, self.law, self.frame = DRIVERS[settings.driver], LAWS[settings.law], FRAMES[settings.frame]
         if not self.law.remodels:
             return
+        self._change: tuple[UnitCell, UnitCell] | None = None
+        self._smallest_area = self.quadrature.minimum(self.quadrature.smallest_areas)
         F = state.kinematics.deformation_gradient(state.unknown)
         tensor = self.driver.tensor(F, self.tissue.stresses(F, [state.cells.ufl_cell]))
         # one stacked expression: the deformation gradient comes at no cost with the driver
         stacked = ufl.as_vector([t[i, j] for t in (F, tensor) for i in range(3) for j in range(3)])
         self._expression = jit.expression(stacked, self.quadrature.points)
 
-    def warn_of_overcorrection(self) -> None:
-        """Log a warning where driver and frame are known to over-correct (docs/theory.md, Stability of the pass)."""
-        factor = self.driver.overcorrection.get(self.settings.frame)
-        if factor is not None and self.law.remodels and self.state.comm.rank == 0:
+    def warn_of_overcorrection(self, share: float = 1.0) -> None:
+        """Log a warning where driver and frame are known to over-correct (docs/theory.md, Stability of the pass).
+
+        Parameters
+        ----------
+        share
+            Share of a pass's change that is made.
+        """
+        factor = 1 - share * (1 - self.driver.overcorrection.get(self.settings.frame, 1.0))
+        if factor < -1 and self.law.remodels and self.state.comm.rank == 0:
             log.warning(
                 "remodeling.driver = %r with frame = %r over-corrects: a pass multiplies small tilts of the axes by "
                 "about %g, so late results may drift (docs/theory.md, Stability of the pass)",
@@ -85,47 +99,76 @@ class RemodelingPass:
         driver = values[:, 1]
         return values[:, 0], (driver + np.swapaxes(driver, 1, 2)) / 2
 
-    def drive(self) -> Drive:
-        """What acts on the cells in the present state."""
+    def drive(self, residual: float = 0.0) -> Drive:
+        """What acts on the cells in the present state, which was accepted with this norm of out-of-balance forces."""
         F, tensor = self.driving_tensor()
         return Drive(
             F,
             tensor,
             self.driver,
             self.frame,
-            self.threshold(),
+            self.stress_noise(F, residual) if self.driver.is_stress else spectral.ROUNDING,
             self.state.cells.initial_dimensions.reshape(-1, 3),
             coefficients.point_values(self.tissue.end_to_end_length, self.quadrature).reshape(-1),
             self.settings.kappa,
         )
 
-    def threshold(self) -> float:
-        """Size up to which a principal value of the driving tensor is rounding error."""
-        mesh = self.quadrature.mesh
-        numbers = self.tissue.map(lambda name, value: coefficients.largest(value, mesh))
-        return spectral.ROUNDING * float(self.driver.scale(numbers))
+    def stress_noise(self, F: Array, residual: float) -> float:
+        """Size up to which a principal stress may be an error: of rounding, or of the equilibrium as it was accepted.
 
-    def updated_cells(self, time_old: float, time_new: float) -> tuple[UnitCell, Array]:
+        Parameters
+        ----------
+        F
+            At all points in one row, (n, 3, 3).
+        residual
+            Norm of the out-of-balance nodal forces, in the unit of force.
+        """
+        rounding = stress_rounding(self.tissue, self.quadrature.mesh, self._max_chain_extension(F))
+        return RESIDUAL_SHARE * residual / self._smallest_area + ROUNDINGS * rounding
+
+    def _max_chain_extension(self, F: Array) -> float:
+        length = at_points(self.tissue, self.quadrature).locking_length
+        if length is None:
+            return 0.0
+        squared = squared_end_to_end_length(F, [self.state.cells.point_cells]) / length**2
+        return float(np.sqrt(self.quadrature.maximum(squared.reshape(self.quadrature.shape))))
+
+    def updated_cells(self, time_old: float, time_new: float, residual: float = 0.0) -> tuple[UnitCell, Array]:
         """New cells of all points in one row, and F (n, 3, 3). Changes nothing."""
-        drive = self.drive()
+        drive = self.drive(residual)
         return self.law.update(self.state.cells.point_cells, drive, time_old, time_new), drive.deformation_gradient
 
-    def apply(self, time_old: float, time_new: float) -> float:
+    def apply(self, time_old: float, time_new: float, residual: float = 0.0, factor: float = 1.0) -> float:
         """Remodel over a step with the stress of the solved state at time_new; returns the power of remodeling.
 
         The power is the stored energy that the pass releases at frozen deformation, per time, to first order
-        (`Tissue.energy_increment`; Remark 6).
+        (`Tissue.energy_increment`; Remark 6). A principal stress counts as tension beyond `stress_noise`. Of the change
+        of the cells a share `factor` is made (`laws.relaxed`).
 
         Raises
         ------
         FloatingPointError
             If the driving tensor is not finite anywhere.
         """
-        if not self.law.remodels:
-            return 0.0
         cells, shape = self.state.cells, self.quadrature.shape
-        updated, F = self.updated_cells(time_old, time_new)
+        asked, F = self.updated_cells(time_old, time_new, residual)
+        self._change = (
+            UnitCell(cells.dimension_values.reshape(-1, 3).copy(), cells.axis_values.reshape(-1, 3, 3).copy()),
+            asked,
+        )
+        updated = relaxed(self._change[0], asked, factor)
         increment: Any = at_points(self.tissue, self.quadrature).energy_increment(F, cells.point_cells, updated)
-        power: float = -self.quadrature.integral(increment.reshape(shape)) / (time_new - time_old)
+        power: float = 0.0 - self.quadrature.integral(increment.reshape(shape)) / (time_new - time_old)
         cells.set(updated.dimensions.reshape(*shape, 3), updated.axes.reshape(*shape, 3, 3))
         return power
+
+    def residual(self) -> float:
+        """max |A_pass - A| of the last pass over all points, A those of the solved state, in squared link lengths.
+
+        How far the solved state is from one whose cells belong to its own stress; NaN before the first pass.
+        """
+        if not self.law.remodels or self._change is None:
+            return float("nan")
+        before, after = (structure_tensor(*cells[:2]) for cells in self._change)
+        distance = np.linalg.norm(after - before, axis=(-1, -2))
+        return self.quadrature.maximum(distance.reshape(self.quadrature.shape))

@@ -30,6 +30,16 @@ class Quadrature:
         dolfinx mesh.
     element_degree
         Degree of the displacement element (1 or 2); decides the rule.
+
+    Attributes
+    ----------
+    coordinates
+        Reference coordinates of the points, (elements, points, 3).
+    volumes
+        Weight of the points in integrals over the body, (elements, points).
+    largest_areas, smallest_areas
+        Volume over the least and over the largest extent, (elements,): a stress times these is about the largest and
+        the smallest force that it means for a node of the element.
     """
 
     def __init__(self, mesh: Any, element_degree: int):
@@ -43,12 +53,15 @@ class Quadrature:
         self.elements = np.arange(
             self.number_of_owned_elements + mesh.topology.index_map(mesh.topology.dim).num_ghosts, dtype=np.int32
         )
-        x = ufl.SpatialCoordinate(mesh)
-        geometry = self.evaluate(
-            jit.expression(ufl.as_vector([*x, ufl.JacobianDeterminant(mesh)]), self.points, "the geometry"), (4,)
-        )
+        x, jacobian = ufl.SpatialCoordinate(mesh), ufl.Jacobian(mesh)
+        entries = [jacobian[i, j] for i in range(jacobian.ufl_shape[0]) for j in range(jacobian.ufl_shape[1])]
+        values = ufl.as_vector([*x, ufl.JacobianDeterminant(mesh), *entries])
+        geometry = self.evaluate(jit.expression(values, self.points, "the geometry"), (4 + len(entries),))
         self.coordinates: NDArray[np.float64] = geometry[..., :3]
         self.volumes: NDArray[np.float64] = np.abs(geometry[..., 3]) * self.weights
+        lengths = np.linalg.svd(geometry[..., 4:].reshape(*self.shape, *jacobian.ufl_shape), compute_uv=False)
+        self.largest_areas: NDArray[np.float64] = (self.volumes / lengths[..., -1]).sum(axis=1)
+        self.smallest_areas: NDArray[np.float64] = (self.volumes / lengths[..., 0]).sum(axis=1)
 
     @property
     def dx(self) -> ufl.Measure:
@@ -95,10 +108,14 @@ class Quadrature:
         return np.einsum("ep,ep...->e...", share, values)
 
     def maximum(self, values: NDArray[np.float64]) -> float:
-        """Largest value over all points of all ranks."""
+        """Largest of values (elements, ...) over all ranks."""
         local = float(np.max(self.owned(values), initial=-np.inf))
-        return self.mesh.comm.allreduce(local, MPI.MAX)
+        return float(self.mesh.comm.allreduce(local, MPI.MAX))
 
     def minimum(self, values: NDArray[np.float64]) -> float:
-        """Smallest value over all points of all ranks."""
+        """Smallest of values (elements, ...) over all ranks."""
         return -self.maximum(-values)
+
+    def norm(self, values: NDArray[np.float64]) -> float:
+        """Root of the sum of the squares of values (elements, ...), over all ranks."""
+        return float(np.sqrt(self.mesh.comm.allreduce(float(np.sum(self.owned(values) ** 2)), MPI.SUM)))

@@ -58,11 +58,32 @@ COLUMNS: dict[str, Column] = {
 }
 """Columns of every shape by name, after `time` and those of the shape; a script adds its own."""
 
+COLUMNS_ON_REQUEST: dict[str, Column] = {
+    column.name: column
+    for column in (
+        Column(
+            "pass_residual",
+            "squared link length",
+            "largest norm of A_pass - A over all points: how far the row is from cells that belong to its own stress",
+            lambda m: m.observer.stepper.remodeling.residual(),
+            after_pass=True,
+        ),
+    )
+}
+"""Columns that a scene may name in `output.columns`; a script adds its own."""
 
-def columns_of(shape: Shape | type[Shape]) -> tuple[Column, ...]:
-    """All columns of a shape's history, in the order of the file."""
+
+def columns_of(shape: Shape | type[Shape], requested: Sequence[str] = ()) -> tuple[Column, ...]:
+    """All columns of a shape's history, in the order of the file, those on request last.
+
+    Raises
+    ------
+    KeyError
+        If a column that is requested does not exist.
+    """
     loads = (kind.make_column(name) for name, kind in shape.loads.items())
-    return (FIRST_COLUMN, *loads, *shape.columns, *COLUMNS.values())
+    extra = (COLUMNS_ON_REQUEST[name] for name in requested)
+    return (FIRST_COLUMN, *loads, *shape.columns, *COLUMNS.values(), *extra)
 
 
 class Observer(Watcher):

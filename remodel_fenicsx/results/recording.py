@@ -14,13 +14,14 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from remodel_fenicsx.schema.times import same_time
+
 if TYPE_CHECKING:
     from remodel_fenicsx.scene.scene import Scene
 
 Array = NDArray[np.float64]
 
 HISTORY, FIELDS, SCENE = "history.csv", "fields.vtkhdf", "scene.toml"
-SAME_TIME = 1e-9  # two times are one if they differ by less, relative to the larger of 1 and the time
 
 
 class RecordingError(ValueError):
@@ -188,10 +189,10 @@ class Recording:
 
     def _number_of(self, time: float, times: Array, what: str) -> int:
         """Which of the times this one is."""
-        found = np.flatnonzero(np.abs(times - time) <= SAME_TIME * max(1.0, abs(time)))
-        if not len(found):
+        found = [number for number, recorded in enumerate(times) if same_time(recorded, time)]
+        if not found:
             raise RecordingError(f"{self.path}: no {what} at time {time:g}; recorded are {_in_words(times)}")
-        return int(found[0])
+        return found[0]
 
     @contextmanager
     def _fields_file(self) -> Iterator[h5py.Group]:

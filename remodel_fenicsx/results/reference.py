@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from remodel_fenicsx.body import SHAPES
 from remodel_fenicsx.body.column import Column
-from remodel_fenicsx.results.columns import columns_of
+from remodel_fenicsx.results.columns import COLUMNS_ON_REQUEST, columns_of
 
 
 def column_reference() -> str:
@@ -23,6 +23,8 @@ def _rows() -> Iterator[str]:
     for (name, unit, meaning), having in sorted(shapes.items(), key=lambda item: len(item[1]) != len(SHAPES)):
         of = "all" if len(having) == len(SHAPES) else ", ".join(having)
         yield f"| `{name}` | {of} | {unit} | {meaning} |"
+    for column in COLUMNS_ON_REQUEST.values():
+        yield f"| `{column.name}` | on request | {column.unit} | {column.meaning} |"
 
 
 def _key(column: Column) -> tuple[str, str, str]:

@@ -20,7 +20,11 @@ from remodel_fenicsx.tissue.energy import MATRICES, Tissue
 from remodel_fenicsx.tissue.laws import LAWS
 from remodel_fenicsx.schema.units import NUMBER_DENSITY, STRESS, TEMPERATURE
 
-COUPLINGS = {"staggered": "solve with the cells of the step before, then remodel once"}
+COUPLINGS = {
+    "staggered": "solve with the cells of the step before, then remodel once",
+    "relaxed": "the same with a share, relaxation_factor, of what the pass changes: stable for every driver and frame, "
+    "where 'staggered' over-corrects with 'pk2' and 'finger'",
+}
 """What each of `evolution.coupling.COUPLINGS` does; that room is above this one, and a test holds the two together."""
 STRESS_UNITS = {"Pa": 1.0, "kPa": 1.0e3, "MPa": 1.0e6}  # in Pa
 INITIAL_CELLS = ("random", "isotropic", "aligned")
@@ -209,6 +213,12 @@ class Remodeling(Table):
     )
     coupling: Annotated[str, one_of(COUPLINGS)] = Field(
         default="staggered", description="; ".join(f"{name!r}: {text}" for name, text in COUPLINGS.items()) + "."
+    )
+    relaxation_factor: float = Field(
+        default=0.5,
+        gt=0,
+        le=1,
+        description="Share theta of a pass's change of the structure tensor that 'relaxed' makes; 1 is 'staggered'.",
     )
     kappa: float = Field(
         default=0.025, ge=0, description="Speed of remodeling kappa, in 1/time; a difference fades like exp(-kappa t)."

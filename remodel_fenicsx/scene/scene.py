@@ -17,9 +17,10 @@ from pydantic import BaseModel, Field, SerializeAsAny, model_validator
 
 from remodel_fenicsx.body import SHAPES, Shape
 from remodel_fenicsx.scene.parameters import FORMAT, PRESETS, RENAMED, Cells, Material, Remodeling
-from remodel_fenicsx.scene.settings import Load, Mesh, Model, Output, Solver, Time, is_multiple, nearest_multiples
+from remodel_fenicsx.scene.settings import Load, Mesh, Model, Output, Solver, Time, nearest_multiples
 from remodel_fenicsx.scene.values import base_material, in_own_units, in_present_format, known_shape
 from remodel_fenicsx.schema.tables import SceneError, Table, checked, fault, quoted, shown, variant_of
+from remodel_fenicsx.schema.times import is_multiple
 from remodel_fenicsx.schema.toml import merged, parse_override, put, read_toml, toml_text
 from remodel_fenicsx.schema.units import FORCE, STRESS
 from remodel_fenicsx.tissue.chains import CHAINS

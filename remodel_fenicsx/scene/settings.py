@@ -13,10 +13,10 @@ from pydantic import Field, model_validator
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.fem.solver_methods import METHODS
 from remodel_fenicsx.schema.tables import Table, checked, fault, is_number, one_of, quoted, shown
+from remodel_fenicsx.schema.times import is_multiple, same_time
 from remodel_fenicsx.schema.units import FORCE
 
 MOST_STEPS = 1_000_000
-SAME_TIME = 1e-9  # relative: times closer than this are the same
 
 
 class Mesh(Table):
@@ -81,7 +81,7 @@ class Load(Table):
     def factor(self, time: float) -> float:
         """Factor on the value at a time: piecewise linear, held before the first and after the last pair."""
         for ramp_time, factor in self.ramp:  # exact at its own times
-            if abs(time - ramp_time) <= SAME_TIME * abs(ramp_time):
+            if same_time(time, ramp_time):
                 return factor
         after = bisect.bisect_right(self.ramp, time, key=lambda pair: pair[0])
         if after == 0:
@@ -118,10 +118,6 @@ class Time(Table):
     def number_of_steps(self) -> int:
         """Number of steps from 0 to the end."""
         return round(self.end / self.step)
-
-
-def is_multiple(time: float, step: float) -> bool:
-    return abs(time / step - round(time / step)) <= SAME_TIME * max(1.0, time / step)
 
 
 def nearest_multiples(time: float, step: float, name: str) -> str:
@@ -180,8 +176,19 @@ class Solver(Table):
         return self
 
 
+def _columns(value: Any) -> Any:
+    if not isinstance(value, (list, tuple)) or not all(isinstance(name, str) for name in value):
+        raise fault("must be a list of names of columns")
+    return tuple(value)
+
+
 class Output(Table):
     """What a run writes beside its history table."""
 
     fields: bool = Field(default=True, description="Whether to write fields for ParaView.")
+    columns: Annotated[tuple[str, ...], checked(_columns)] = Field(
+        default=(),
+        description="Columns of the history beside those that it always has: 'pass_residual' (docs/commands.md).",
+        json_schema_extra={"allowed": "a list of names of columns"},
+    )
     every: int = Field(default=1, ge=1, description="Write the fields of every n-th step; the last one always.")

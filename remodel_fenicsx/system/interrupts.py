@@ -9,6 +9,7 @@ import os
 import signal
 import sys
 import threading
+import time as clock
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -18,6 +19,7 @@ from types import FrameType, TracebackType
 SIGNALS: tuple[int, ...] = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # ask a process to end
 
 _EXIT_CODE_BASE = 128
+_ONE_SIGNAL = 0.2  # seconds: timeout, for one, sends its signal to the process, and then to the group that this is in
 
 # PETSc aborts on all of these, and on some that a run outlives: a closed pipe, the hang-up that nohup ignores
 _NOT_PETSCS = (signal.SIGHUP, signal.SIGINT, signal.SIGPIPE, signal.SIGQUIT, signal.SIGTERM, signal.SIGURG)
@@ -113,6 +115,7 @@ def ending_at_once() -> Iterator[None]:
 
 
 def _end(number: int, frame: FrameType | None) -> None:
+    signal.signal(number, signal.SIG_IGN)  # one line, also of a signal that comes twice
     if is_first_rank():
         with suppress(OSError):  # the terminal is gone
             os.write(2, f"remodel-fenicsx: stopped by {signal.Signals(number).name}\n".encode())
@@ -142,7 +145,10 @@ class StopRequest:
         return self
 
     def _remember(self, number: int, frame: FrameType | None) -> None:
+        if number == self.number:  # during the sleep below
+            return
         self.number = number
+        clock.sleep(_ONE_SIGNAL)
         signal.signal(number, signal.SIG_DFL)
         if self.raises:
             _end_children(number)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from remodel_fenicsx.tissue.energy import Stresses, Tissue
+from remodel_fenicsx.tissue.energy import Stresses
 
 Array = NDArray[np.float64]
 
@@ -24,42 +24,36 @@ class Driver:
         Its UFL expression from (F, stresses).
     material
         Whether its eigenvectors are material vectors.
-    scale
-        A typical size from the tissue, below whose rounding an eigenvalue is zero: the 1e-16 of an unloaded body is
-        no tension.
+    is_stress
+        Whether it is a stress, zero up to the rounding of stresses and to the residual that was accepted; else it is a
+        number near one, zero up to its own rounding.
     """
 
     tensor: Callable[[Any, Stresses], Any]
     material: bool
-    scale: Callable[[Tissue], Any]
+    is_stress: bool = True
     # by frame: factor by which a pass multiplies a small tilt of the axes, where it is below -1 (docs/theory.md)
     overcorrection: dict[str, float] = field(default_factory=dict)
 
 
-def finger_tensor(F: Any, stresses: Stresses) -> Any:
-    """b = F F^T."""
-    import ufl  # not above: scenes, which name drivers, are read without it
+def finger_tensor(deformation_gradient: Any, stresses: Stresses) -> Any:
+    """b = F F^T (UFL)."""
+    import ufl
 
-    return ufl.dot(F, F.T)
-
-
-def _matrix_stiffness(tissue: Tissue) -> Any:
-    """lambda + 2 mu: a stress per strain."""
-    return tissue.lame_lambda + 2 * tissue.lame_mu
+    return ufl.dot(deformation_gradient, deformation_gradient.T)
 
 
 DRIVERS: dict[str, Driver] = {
-    "cauchy": Driver(lambda F, s: s.cauchy, material=False, scale=_matrix_stiffness),
+    "cauchy": Driver(lambda F, s: s.cauchy, material=False),
     "pk2": Driver(
         lambda F, s: s.second_piola_kirchhoff,
         material=True,
-        scale=_matrix_stiffness,
         overcorrection={"material": -1.5, "spatial": -1.5},
     ),
     "finger": Driver(
         finger_tensor,
         material=False,
-        scale=lambda tissue: 1.0,
+        is_stress=False,
         overcorrection={"material": -2.6, "spatial": -1.9},
     ),
 }

@@ -96,18 +96,19 @@ class Tissue:
         """Length at which a chain locks, in link lengths; None where nothing locks."""
         return self.contour_length if self.chain is not None and self.chain.locks else None
 
-    @property
-    def network_stiffness(self) -> Any:
-        """c g(r0) r0^2, the initial stiffness of the network; 0 without chains."""
-        if self.chain is None:
-            return 0.0
-        stiffness = self.chain.stiffness(self.end_to_end_length, self.contour_length)
-        return self.network_modulus * stiffness * self.end_to_end_length**2
+    def stiffness(self, end_to_end_length: Any) -> Any:
+        """A stress per strain of matrix and network, where chains have a length r; times eps the rounding of a stress.
 
-    @property
-    def stiffness(self) -> Any:
-        """lambda + 2 mu + c g(r0) r0^2: a stress per strain of matrix and network."""
-        return self.lame_lambda + 2 * self.lame_mu + self.network_stiffness
+        lambda + 2 mu + c (r d(g r)/dr + g(r0) r0^2): near the contour length the chains' force changes by much more
+        than itself when r changes by a little.
+        """
+        matrix = self.lame_lambda + 2 * self.lame_mu
+        if self.chain is None:
+            return matrix
+        r, r0, L, g = end_to_end_length, self.end_to_end_length, self.contour_length, self.chain.stiffness
+        h = 1e-6 * r * (1 - r / L if self.chain.locks else 1)
+        slope = ((r + h) * g(r + h, L) - (r - h) * g(r - h, L)) / (2 * h)
+        return matrix + self.network_modulus * (r * slope + g(r0, L) * r0**2)
 
     def map(self, function: Callable[[str, Any], Any]) -> Tissue:
         """The same tissue with function(name, value) for every parameter."""

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from remodel_fenicsx.tissue import spectral
-from remodel_fenicsx.tissue.cells import UnitCell
+from remodel_fenicsx.tissue.cells import UnitCell, structure_tensor
 from remodel_fenicsx.tissue.drivers import Driver, Frame, carried_axes
 
 Array = NDArray[np.float64]
@@ -102,6 +102,19 @@ def ranked(function: RankedFunction, has_limit: bool = False) -> Law:
         )
 
     return Law(update, has_limit)
+
+
+def relaxed(old: UnitCell, new: UnitCell, factor: float) -> UnitCell:
+    """The cells that a pass has reached with a share of its change: A = A_old + factor (A_new - A_old).
+
+    A = sum_I l_I^2 n_I (x) n_I; the dimensions are the roots of its eigenvalues, the axes its eigenvectors. Where
+    eigenvalues agree, the new axes decide. Arrays of n points; a factor of 1 gives the new cells as they are.
+    """
+    if factor == 1.0:
+        return new
+    before, after = structure_tensor(*old[:2]), structure_tensor(*new[:2])
+    squared, axes = spectral.principal(before + factor * (after - before), new.axes)
+    return UnitCell(np.sqrt(np.maximum(squared, 0.0)), axes)
 
 
 def explicit(l: Array, l0: Array, target: Array, kappa: float, time_old: float, time_new: float) -> Array:

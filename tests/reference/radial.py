@@ -247,11 +247,19 @@ def driving_values(driver: str, stretches: Array, cauchy: Array) -> Array:
     return {"cauchy": cauchy, "pk2": jacobian * cauchy / stretches**2, "finger": stretches**2}[driver]
 
 
-def sorted_directions(values: Array, previous: Array, tolerance: float = 1e-8) -> Array:
+def stress_noise(stretches: Array, squares: Array, material: RadialMaterial) -> float:
+    """Return the size up to which a stress may be the solver's error: strains are accepted to 1e-11."""
+    m = material
+    r = np.sqrt(np.sum(squares * stretches**2, axis=1))
+    network = m.network_modulus * secant_stiffness(r, m.contour_length) * r**2 / (1 - r / m.contour_length)
+    return 1e-11 * float(m.lame_lambda + 2 * m.lame_mu + np.max(network))
+
+
+def sorted_directions(values: Array, previous: Array, tolerance: float = 1e-8, noise: float = 0.0) -> Array:
     """Return the directions by descending value; values that agree keep their previous order."""
     ranks = previous.copy()
     rows = np.arange(len(ranks))
-    near = tolerance * np.max(np.abs(values), axis=1)
+    near = np.maximum(tolerance * np.max(np.abs(values), axis=1), noise)
     for first in (0, 1, 0):
         a, b = ranks[:, first].copy(), ranks[:, first + 1].copy()
         swap = values[rows, b] > values[rows, a] + near
@@ -282,15 +290,16 @@ def remodel(
     time: float,
     step: float,
     r0: float,
+    noise: float = 0.0,
 ) -> tuple[Array, Array]:
     """Return the dimensions by rank and the direction of each rank after one remodeling pass."""
     if law == "none":
         return ranked, ranks
     largest = np.max(np.abs(values), axis=1, keepdims=True)
-    positive = np.where(values > 1e-14 * largest, values, 0.0)
+    positive = np.where(values > np.maximum(1e-14 * largest, noise), values, 0.0)
     norm = np.linalg.norm(positive, axis=1, keepdims=True)
     active = norm > 0
-    new_ranks = np.where(active, sorted_directions(values, ranks), ranks)
+    new_ranks = np.where(active, sorted_directions(values, ranks, noise=noise), ranks)
     direction = np.take_along_axis(positive / np.where(active, norm, 1.0), new_ranks, axis=1)
     new = updated(law, ranked, start, r0 * direction, kappa, time, step)
     return np.where(active, new, ranked), new_ranks
@@ -358,6 +367,7 @@ def solve_radial(
             float(time),
             step,
             material.end_to_end_length,
+            0.0 if driver == "finger" else stress_noise(stretches, state[0], material),
         )
         by_direction = np.empty_like(ranked)
         np.put_along_axis(by_direction, ranks, ranked, axis=1)
