@@ -20,10 +20,15 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
+from remodel_fenicsx.evolution.remodeling import RemodelingPass  # noqa: E402
+from remodel_fenicsx.evolution.stepper import Step, Watcher  # noqa: E402
 from remodel_fenicsx.paper.output import Page, read_table  # noqa: E402
 from remodel_fenicsx.paper.cases import scenes  # noqa: E402
 from remodel_fenicsx.paper.runs import cores  # noqa: E402
 from remodel_fenicsx.paper.validity import library_versions, source_fingerprint  # noqa: E402
+from remodel_fenicsx.results.columns import Measurement  # noqa: E402
+from remodel_fenicsx.simulation import Simulation  # noqa: E402
+from remodel_fenicsx.tissue.spectral import positive_direction  # noqa: E402
 
 Row = dict[str, Any]
 USED_BY_STUDIES = (
@@ -134,41 +139,44 @@ def invariance_jobs() -> dict[str, list[tuple[Callable[[Any], Row], Any]]]:
 # ---------------------------------------------------------------- single runs
 
 
-def stopped_points(name: str) -> list[Row]:
+class Passes(Watcher):
+    """Counts, for every point, the passes in which a principal value of the driving tensor was positive."""
+
+    def __init__(self, remodeling: RemodelingPass):
+        self.remodeling, self.shape = remodeling, remodeling.quadrature.shape
+        self.number = np.zeros(self.shape, dtype=int)
+        self.active = np.ones(self.shape, dtype=bool)
+        self.largest = np.zeros(self.shape)
+
+    def solved(self, step: Step) -> None:
+        """Look at what the pass of this step will see."""
+        drive = self.remodeling.drive()
+        values = np.linalg.eigvalsh(drive.tensor)
+        self.largest = values[:, 2].reshape(self.shape)
+        self.active = positive_direction(values, drive.threshold)[1].reshape(self.shape)
+        self.number += self.active
+
+
+def stopped_points(name: str, **changes: Any) -> list[Row]:
     """Points of a run of the figures where no principal stress is positive in the last pass, so that it does nothing.
 
     `passes`: in how many passes the point did remodel before.
     """
-    from remodel_fenicsx.simulation import Simulation
-
-    simulation = Simulation(scenes()[name].with_values({"output.fields": False}))
-    remodeling, shape = simulation.remodeling, simulation.quadrature.shape
-    passes, active = np.zeros(shape, dtype=int), np.ones(shape, dtype=bool)
-    update = remodeling.updated_cells
-
-    def watched(time_old: float, time_new: float) -> Any:
-        found = update(time_old, time_new)
-        active[...] = found[2].reshape(shape)
-        passes[...] += active
-        return found
-
-    remodeling.updated_cells = watched  # type: ignore[method-assign]
-    for _ in simulation.steps():
-        pass
-    stress = np.linalg.eigvalsh(remodeling.driving_tensor()[1]).reshape(*shape, 3)
-    x, angle = simulation.quadrature.coordinates, simulation.observer.reference_fibre_angle()
+    simulation = Simulation(scenes()[name].with_values({"output.fields": False, **changes}))
+    passes = Passes(simulation.stepper.remodeling)
+    *_, last = simulation.steps([passes])
+    x, angle = simulation.quadrature.coordinates, Measurement(simulation.observer, last).fibre_angle
+    simulation.close()
     return [
-        {"element": element, "radius": np.hypot(*x[element, point, :2]), "passes": passes[element, point],
-         "largest_stress": stress[element, point, 2], "fibre_angle": angle[element, point]}
-        for element, point in np.argwhere(~active)
+        {"element": element, "radius": np.hypot(*x[element, point, :2]), "passes": passes.number[element, point],
+         "largest_stress": passes.largest[element, point], "fibre_angle": angle[element, point]}
+        for element, point in np.argwhere(~passes.active)
     ]  # fmt: skip
 
 
-def stiff_tendon(name: str) -> list[Row]:
+def stiff_tendon(name: str, **changes: Any) -> list[Row]:
     """The tendon with four times the energy of its chains (erratum 1): its stretch at the end."""
-    from remodel_fenicsx.simulation import Simulation
-
-    scene = scenes()[name].with_values({"output.fields": False, "material.energy_factor": 4})
+    scene = scenes()[name].with_values({"output.fields": False, "material.energy_factor": 4, **changes})
     *_, last = Simulation(scene).steps()
     return [{"time": last.time, "mean_stretch": last.row["mean_stretch"]}]
 

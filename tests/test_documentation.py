@@ -76,3 +76,43 @@ def test_the_names_of_the_package_are_there() -> None:
         assert getattr(remodel_fenicsx, name).__name__ == name
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         remodel_fenicsx.nothing  # noqa: B018
+
+
+# ---------------------------------------------------------------- scripts beside the package
+def script(program: list[str], folder: Path) -> str:
+    """What it prints."""
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join((str(ROOT), str(ROOT / "docs")))}
+    done = subprocess.run(
+        [sys.executable, *program], cwd=folder, env=environment, capture_output=True, text=True, timeout=500
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    return done.stdout
+
+
+def test_the_benchmark_says_where_the_time_goes(tmp_path: Path) -> None:
+    printed = script([str(ROOT / "benchmarks" / "artery"), "--steps", "2"], tmp_path)
+    (total,) = re.findall(r"^artery: 2 steps, \d+ Newton iterations, ([\d.]+) s$", printed, re.MULTILINE)
+    parts = dict(re.findall(r"^(\w[\w ]*?) +([\d.]+) s +[\d.]+ %$", printed, re.MULTILINE))
+    assert set(parts) == {"tangent", "residual", "linear solve", "guards and the rest of SNES", "remodeling",
+                          "columns", "record", "the rest"}  # fmt: skip
+    assert sum(map(float, parts.values())) == pytest.approx(float(total), abs=0.1)
+    assert all(float(parts[name]) > 0 for name in ("tangent", "linear solve", "remodeling", "record"))
+
+
+STUDIES = """
+import verification_studies as studies
+(row,) = studies.stiff_tendon("tendon", **{"time.end": 1.0, "material.energy_factor": 1})
+assert 1.1 < row["mean_stretch"] < 1.3 and row["time"] == 1.0, row
+# with a hint of suction some points are not pulled in any direction
+points = studies.stopped_points("artery-0-4.8", **{"time.end": 1.0, "loads.pressure.value": -1e-6})
+assert 0 < len(points) < 1536 * 8, len(points)
+for point in points:
+    assert point["passes"] == 0 and point["largest_stress"] < 1e-7 and 1 < point["radius"] < 3, point
+print(sorted(points[0]))
+"""
+
+
+def test_the_studies_of_the_verification_page_run(tmp_path: Path) -> None:
+    """Short ones; the comparisons with the radial reference are tests of their own."""
+    printed = script(["-c", STUDIES], tmp_path)
+    assert printed == "['element', 'fibre_angle', 'largest_stress', 'passes', 'radius']\n"
