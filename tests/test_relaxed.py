@@ -35,6 +35,13 @@ def test_the_share_is_one_of_the_structure_tensor(factor: float) -> None:
     )
 
 
+def test_where_eigenvalues_agree_the_new_axes_decide() -> None:
+    old, new = (UnitCell(np.full((50, 3), 0.5), random_cells(seed).axes) for seed in (1, 2))
+    found = relaxed(old, new, 0.3)
+    np.testing.assert_allclose(found.axes, new.axes, atol=1e-12)
+    np.testing.assert_allclose(found.dimensions, 0.5, rtol=1e-12)
+
+
 def test_the_whole_share_is_the_pass_itself() -> None:
     old, new = random_cells(1), random_cells(2)
     assert relaxed(old, new, 1.0) is new
