@@ -142,10 +142,10 @@ def launcher_key() -> str:
 
 # ---------------------------------------------------------------- which files start first
 class LongFilesFirst(LoadFileScheduling):  # type: ignore[misc]
-    """One file goes to one worker, as with --dist loadfile; the files of pyproject.toml's `start_first` before all others.
+    """One file goes to one worker, as with --dist loadfile; those of `start_first` (pyproject.toml) come first.
 
-    By itself pytest-xdist starts with the files of most tests: those that run through time have few, would come last, and
-    one worker would then wait for the other.
+    By itself pytest-xdist starts with the files of most tests. Those that run through time have few, would come last,
+    and one worker would wait for the other.
     """
 
     def _assign_work_unit(self, node: Any) -> None:
