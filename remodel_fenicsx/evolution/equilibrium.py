@@ -14,10 +14,12 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
+from remodel_fenicsx.evolution.pointwise import Shares, pointwise_repulsion
 from remodel_fenicsx.evolution.state import State
 from remodel_fenicsx.fem import coefficients, jit
 from remodel_fenicsx.tissue.cells import UnitCell
-from remodel_fenicsx.tissue.energy import Tissue, squared_end_to_end_length
+from remodel_fenicsx.tissue.energy import Tissue
+from remodel_fenicsx.tissue.repulsion import squared_end_to_end_length
 
 
 @dataclass(frozen=True)
@@ -47,8 +49,9 @@ class Equilibrium:
         Unknowns, cells and loads.
     tissue
         Its parameters; numbers become Constants of the mesh.
-    shares
-        The cells as the energy takes them, when not simply the state's (a blend of two).
+    shares, point_shares
+        The cells as the energy takes them, when not simply the state's (a blend of two), and a function that gives them
+        as arrays.
 
     Raises
     ------
@@ -56,7 +59,13 @@ class Equilibrium:
         If a parameter is neither a number, nor a Constant, nor a DG0 Function of the mesh.
     """
 
-    def __init__(self, state: State, tissue: Tissue, shares: Sequence[UnitCell] | None = None):
+    def __init__(
+        self,
+        state: State,
+        tissue: Tissue,
+        shares: Sequence[UnitCell] | None = None,
+        point_shares: Shares | None = None,
+    ):
         self.state, self.quadrature = state, state.cells.quadrature
         mesh = self.quadrature.mesh
         self.comm = mesh.comm
@@ -68,10 +77,16 @@ class Equilibrium:
         F = state.kinematics.deformation_gradient(u)
         self.energy = self.tissue.strain_energy(F, shares) * state.kinematics.weight(mesh) * self.quadrature.dx
         internal, external = ufl.derivative(self.energy, u, test), loading.external_residual(test)
+        tangent = ufl.derivative(internal, u, trial)
+        self.pointwise = pointwise_repulsion(state, self.tissue, point_shares)
+        if self.pointwise is not None:
+            weight, dx = state.kinematics.weight(mesh), self.quadrature.dx
+            internal += self.pointwise.residual(u, F, test) * weight * dx
+            tangent += self.pointwise.tangent(u, F, test, trial) * weight * dx
         self.internal_form = jit.form(internal)
         self.external_form = None if external is None else jit.form(external)
         # apart, so that bodies with other loads share the costly one
-        self.tangent_forms = [jit.form(ufl.derivative(internal, u, trial))]
+        self.tangent_forms = [jit.form(tangent)]
         if external is not None and _depends_on(external, u):
             self.tangent_forms.append(jit.form(ufl.derivative(external, u, trial)))
         squared = squared_end_to_end_length(F, shares) if self.tissue.chain is not None else ufl.as_ufl(0.0)
@@ -113,7 +128,8 @@ class Equilibrium:
         if self._energy_form is None:
             self.compile_energy()
         local = np.real(dolfinx.fem.assemble_scalar(self._energy_form))
-        return float(self.comm.allreduce(local, MPI.SUM))
+        pointwise = 0.0 if self.pointwise is None else self.pointwise.energy()
+        return float(self.comm.allreduce(local, MPI.SUM)) + pointwise
 
     def compile_energy(self) -> None:
         """Make `stored_energy` ready; apart, because a blend needs none."""
@@ -122,6 +138,8 @@ class Equilibrium:
     # ------------------------------------------------------------ what a solver asks
     def assemble_internal(self, vector: Any) -> None:
         """Internal nodal forces of the present unknowns."""
+        if self.pointwise is not None:
+            self.pointwise.update()
         self._assemble(vector, self.internal_form)
 
     def assemble_external(self, vector: Any) -> None:
@@ -140,6 +158,7 @@ class Equilibrium:
         with vector.localForm() as local:
             local.set(0.0)
         conditions = self.state.loading.boundary_conditions
+        self._update_tangent()
         for form in self.tangent_forms:
             dolfinx.fem.petsc.apply_lifting(vector, [form], bcs=[conditions], x0=[x], alpha=-1.0)
         vector.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
@@ -151,12 +170,17 @@ class Equilibrium:
     def assemble_tangent(self, matrix: Any) -> None:
         """Derivative of the residual at the present unknowns, one on the diagonal where they are prescribed."""
         matrix.zeroEntries()
+        self._update_tangent()
         for form in self.tangent_forms:
             # mypy sees the other overload of a single-dispatch function
             dolfinx.fem.petsc.assemble_matrix(
                 matrix, form, bcs=self.state.loading.boundary_conditions  # type: ignore[misc]
             )
             matrix.assemble()
+
+    def _update_tangent(self) -> None:
+        if self.pointwise is not None:
+            self.pointwise.update(stiffness=True)
 
     def prescribed_gap(self, x: Any) -> float:
         """Largest distance of a prescribed value from its target, over all ranks."""

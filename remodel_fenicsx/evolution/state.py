@@ -52,6 +52,7 @@ class State:
         self.unknown, self.kinematics, self.cells, self.loading = unknown, kinematics, cells, loading
         self.equilibrium_cells = CellField(cells.quadrature, "equilibrium_cell")
         self.settle_cells()
+        self._kept: list[Any] = []
         self.time, self.number = 0.0, 0
         # the body starts unloaded; a load that is there from t = 0 on comes with the first step
         loading.set(dict.fromkeys(loading.values, 0.0))
@@ -64,8 +65,12 @@ class State:
     def functions(self) -> dict[str, Any]:
         """Every dolfinx function of the state by its name."""
         cells, solved = self.cells, self.equilibrium_cells
-        functions = (self.unknown, cells.dimensions, cells.axes, solved.dimensions, solved.axes)
+        functions = (self.unknown, cells.dimensions, cells.axes, solved.dimensions, solved.axes, *self._kept)
         return {function.name: function for function in functions}
+
+    def keep(self, function: Any) -> None:
+        """Make a function part of the state: what a coupling remembers from step to step."""
+        self._kept.append(function)
 
     def settle_cells(self) -> None:
         """The present cells are those with which the unknowns are in equilibrium."""

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.shape import Shape
 from remodel_fenicsx.evolution.equilibrium import at_points
+from remodel_fenicsx.evolution.pointwise import pointwise_repulsion
 from remodel_fenicsx.evolution.state import State
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
 from remodel_fenicsx.fem import compat, jit
@@ -46,7 +47,9 @@ class ElementFields:
         self.tissue = stepper.tissue
         state = self.state
         F = state.kinematics.deformation_gradient(state.unknown)
-        cauchy = self.tissue.stresses(F, [state.cells.ufl_cell]).cauchy
+        self._pointwise = pointwise_repulsion(state, self.tissue)
+        additional = None if self._pointwise is None else self._pointwise.stress
+        cauchy = self.tissue.stresses(F, [state.cells.ufl_cell], additional).cauchy
         entries = [t[i, j] for t in (F, cauchy) for i in range(3) for j in range(3)]
         displacement = state.kinematics.displacement(state.unknown)
         expressions = ufl.as_vector([*entries, *(displacement[i] for i in range(3))])
@@ -60,6 +63,8 @@ class ElementFields:
         to the load axis, or in a tube from circumferential to axial); `chain_extension` (largest r/L in the element; 0
         where no chain locks).
         """
+        if self._pointwise is not None:
+            self._pointwise.update()
         values = self.quadrature.evaluate(self._state, (21,))
         F, cauchy = values[..., :9].reshape(*values.shape[:2], 3, 3), values[..., 9:18]
         dimensions, axes = self.state.cells.dimension_values, self.state.cells.axis_values

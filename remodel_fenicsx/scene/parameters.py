@@ -18,12 +18,15 @@ from remodel_fenicsx.tissue.chains import BOLTZMANN_CONSTANT, CHAINS
 from remodel_fenicsx.tissue.drivers import DRIVERS, FRAMES
 from remodel_fenicsx.tissue.energy import MATRICES, Tissue
 from remodel_fenicsx.tissue.laws import LAWS
+from remodel_fenicsx.tissue.repulsion import REPULSIONS
 from remodel_fenicsx.schema.units import NUMBER_DENSITY, STRESS, TEMPERATURE
 
 COUPLINGS = {
     "staggered": "solve with the cells of the step before, then remodel once",
     "relaxed": "the same with a share, relaxation_factor, of what the pass changes: stable for every driver and frame, "
     "where 'staggered' over-corrects with 'pk2' and 'finger'",
+    "extrapolated": "remodel first, towards the stress of the middle of the step, extrapolated from the two steps before; "
+    "then solve: of second order, for the law 'tensor'",
 }
 """What each of `evolution.coupling.COUPLINGS` does; that room is above this one, and a test holds the two together."""
 STRESS_UNITS = {"Pa": 1.0, "kPa": 1.0e3, "MPa": 1.0e6}  # in Pa
@@ -63,10 +66,11 @@ class Material(Table):
     )
     matrix: Annotated[str, one_of(MATRICES)] = Field(default="neo-hookean", description="Energy of the matrix.")
     chain: Annotated[str, one_of(CHAINS)] = Field(default="wormlike", description="Force law of a single chain.")
-    repulsion: Literal["axes"] = Field(
+    repulsion: Annotated[str, one_of(REPULSIONS)] = Field(
         default="axes",
         description="Form of the repulsive energy that makes the reference state stress-free: 'axes' is the paper's, "
-        "in the stretches along the three cell axes.",
+        "in the stretches along the three cell axes; 'log' sees the structure tensor alone (A : ln C), equals it where "
+        "both have the same axes and suits the law 'tensor'; 'length' is a function of the chains' length alone.",
     )
     stress_unit: Literal["Pa", "kPa", "MPa"] = Field(
         default="Pa",
@@ -96,6 +100,7 @@ class Material(Table):
             end_to_end_length,
             CHAINS[self.chain] if self.chain_density > 0 else None,
             MATRICES[self.matrix],
+            REPULSIONS[self.repulsion],
         )
 
     def summary(self, loads: Mapping[str, float]) -> str:
@@ -203,7 +208,8 @@ class Remodeling(Table):
     law: Annotated[str, one_of(LAWS)] = Field(
         default="explicit",
         description="Evolution of the cell dimensions: 'explicit' is eq. (11), in absolute time; 'rate' integrates eq. "
-        "(10); 'relaxation' is dl/dt = kappa (r0 e - l), right for changing loads; 'none' leaves the cells alone.",
+        "(10); 'relaxation' is dl/dt = kappa (r0 e - l), right for changing loads; 'tensor' is "
+        "the same for the structure tensor as a whole, without ranks and axes; 'none' leaves the cells alone.",
     )
     frame: Annotated[str, one_of(FRAMES)] = Field(
         default="material",

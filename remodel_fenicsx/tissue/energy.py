@@ -16,7 +16,8 @@ from typing import Any, NamedTuple
 
 from remodel_fenicsx.tissue.cells import UnitCell, structure_tensor
 from remodel_fenicsx.tissue.chains import CHAINS, Chain
-from remodel_fenicsx.tissue.operators import component, det, ln, sqrt, squared_norm
+from remodel_fenicsx.tissue.operators import det, is_array, ln, sqrt, squared_norm
+from remodel_fenicsx.tissue.repulsion import REPULSIONS, Repulsion, squared_end_to_end_length
 
 
 def neo_hookean(deformation_gradient: Any, lame_lambda: Any, lame_mu: Any) -> Any:
@@ -32,24 +33,6 @@ def neo_hookean(deformation_gradient: Any, lame_lambda: Any, lame_mu: Any) -> An
 Matrix = Callable[[Any, Any, Any], Any]
 MATRICES: dict[str, Matrix] = {"neo-hookean": neo_hookean}
 """Energies of the matrix by name: functions of F, lambda and mu (UFL or arrays), zero and stress-free at F = I."""
-
-
-def squared_end_to_end_length(deformation_gradient: Any, cells: Sequence[UnitCell]) -> Any:
-    """r^2 = sum_I l_I^2 n_I . C n_I (eq. 5)."""
-    return sum(
-        cell.weight * component(cell.dimensions, i) ** 2 * stretch
-        for cell in cells
-        for i, stretch in enumerate(cell.squared_stretches(deformation_gradient))
-    )
-
-
-def repulsion_sum(deformation_gradient: Any, cells: Sequence[UnitCell]) -> Any:
-    """M = sum_I l_I^2 ln(n_I . C n_I), of which W_rep is made."""
-    return sum(
-        cell.weight * component(cell.dimensions, i) ** 2 * ln(stretch)
-        for cell in cells
-        for i, stretch in enumerate(cell.squared_stretches(deformation_gradient))
-    )
 
 
 class Stresses(NamedTuple):
@@ -81,6 +64,8 @@ class Tissue:
         Law of a single chain; None for a matrix without chains, which does not lock.
     matrix
         Energy of the matrix (`MATRICES`).
+    repulsion
+        Form of the repulsive energy (`REPULSIONS`).
     """
 
     lame_lambda: Any
@@ -90,6 +75,7 @@ class Tissue:
     end_to_end_length: Any
     chain: Chain | None = CHAINS["wormlike"]
     matrix: Matrix = neo_hookean
+    repulsion: Repulsion = REPULSIONS["axes"]
 
     @property
     def locking_length(self) -> Any:
@@ -124,22 +110,43 @@ class Tissue:
             F, UFL of shape (3, 3) or array (..., 3, 3).
         cells
             The unit cell: one whole cell, or shares whose weights add up to one.
+
+        In UFL a repulsion that has derivatives of its own (`Repulsion.derivatives`) is left out: these enter forms as
+        values at the quadrature points (`evolution.pointwise`).
         """
         energy = self.matrix(deformation_gradient, self.lame_lambda, self.lame_mu)
         if self.chain is None:
             return energy
         length = sqrt(squared_end_to_end_length(deformation_gradient, cells))
         chains = self.chain.energy(length, self.contour_length)
+        if not is_array(deformation_gradient) and self.repulsion.derivatives is not None:
+            return energy + self.network_modulus * chains
         stiffness = self.chain.stiffness(self.end_to_end_length, self.contour_length)
-        repulsion = -stiffness / 2 * repulsion_sum(deformation_gradient, cells)
+        repulsion = -stiffness / 2 * self.repulsion.sum(deformation_gradient, cells, self.end_to_end_length)
         return energy + self.network_modulus * (chains + repulsion)
 
-    def stresses(self, deformation_gradient: Any, cells: Sequence[UnitCell]) -> Stresses:
-        """P = dW/dF, S = F^-1 P and sigma = P F^T / J (eqs. 6 and 7 with erratum 5), by differentiation of W; UFL."""
+    @property
+    def repulsion_modulus(self) -> Any:
+        """c g(r0): W_rep = -c g(r0) M / 2."""
+        assert self.chain is not None
+        return self.network_modulus * self.chain.stiffness(self.end_to_end_length, self.contour_length)
+
+    def stresses(self, deformation_gradient: Any, cells: Sequence[UnitCell], additional: Any = None) -> Stresses:
+        """P = dW/dF, S = F^-1 P and sigma = P F^T / J (eqs. 6 and 7 with erratum 5), by differentiation of W; UFL.
+
+        Parameters
+        ----------
+        deformation_gradient, cells
+            As for `strain_energy`.
+        additional
+            Second Piola-Kirchhoff stress of what `strain_energy` leaves out of UFL, or None.
+        """
         import ufl
 
         F = ufl.variable(deformation_gradient)
         first = ufl.diff(self.strain_energy(F, cells), F)
+        if additional is not None:
+            first += ufl.dot(F, additional)
         return Stresses(first, ufl.dot(ufl.inv(F), first), ufl.dot(first, F.T) / ufl.det(F))
 
     def energy_increment(self, deformation_gradient: Any, old: UnitCell, new: UnitCell) -> Any:
@@ -155,7 +162,8 @@ class Tissue:
         C = F.swapaxes(-1, -2) @ F
         squared = (structure_tensor(*old[:2]) * C).sum(axis=(-1, -2))
         squared_change = (structure_tensor(*new[:2]) * C).sum(axis=(-1, -2)) - squared
-        repulsion_change = repulsion_sum(F, [new]) - repulsion_sum(F, [old])
+        r0 = self.end_to_end_length
+        repulsion_change = self.repulsion.sum(F, [new], r0) - self.repulsion.sum(F, [old], r0)
         stiffness = self.chain.stiffness(sqrt(squared), self.contour_length)
         initial = self.chain.stiffness(self.end_to_end_length, self.contour_length)
         return self.network_modulus / 2 * (stiffness * squared_change - initial * repulsion_change)
