@@ -11,6 +11,7 @@ from mpi4py import MPI
 
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.loading import Loading, LoadValues
+from remodel_fenicsx.evolution.chatter import Chatter
 from remodel_fenicsx.evolution.parts import StepFailure
 from remodel_fenicsx.evolution.state import State
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher, times
@@ -94,9 +95,9 @@ class Simulation:
         StepFailure
             If a step has no admissible equilibrium.
         """
-        self.stepper.remodeling.warn_of_overcorrection(self.stepper.coupling.share)
         ways = times(self.scene.time.end, self.scene.time.step)
-        return self.stepper.march(ways, [self.observer, *watchers])
+        chatter = [Chatter(self.stepper)] if self.stepper.remodeling.law.remodels else []
+        return self.stepper.march(ways, [self.observer, *chatter, *watchers])
 
     def close(self) -> None:
         """Free PETSc's objects and options."""

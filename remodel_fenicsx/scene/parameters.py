@@ -22,8 +22,8 @@ from remodel_fenicsx.schema.units import NUMBER_DENSITY, STRESS, TEMPERATURE
 
 COUPLINGS = {
     "staggered": "solve with the cells of the step before, then remodel once",
-    "relaxed": "the same with a share, relaxation_factor, of what the pass changes: stable for every driver and frame, "
-    "where 'staggered' over-corrects with 'pk2' and 'finger'",
+    "relaxed": "the same with a share, relaxation_factor, of what the pass changes: half of it is stable for every "
+    "driver and frame but under weak loads, where 'staggered' over-corrects with 'pk2' and 'finger'",
 }
 """What each of `evolution.coupling.COUPLINGS` does; that room is above this one, and a test holds the two together."""
 STRESS_UNITS = {"Pa": 1.0, "kPa": 1.0e3, "MPa": 1.0e6}  # in Pa

@@ -118,6 +118,31 @@ def positive_direction(values: npt.ArrayLike, threshold: npt.ArrayLike = 0.0) ->
     return positive / np.where(active, norm, 1.0)[:, None], active
 
 
+def without_noise(tensors: Array, axes: Array, noise: npt.ArrayLike) -> Array:
+    """Return the symmetric tensors with the given axes as principal axes, where they are so within the tensors' error.
+
+    Where two principal values are close, an error of the tensor turns its axes by far more than its own size. What
+    decides is therefore what the tensor has across the given axes: up to `noise` it is taken for zero.
+
+    Parameters
+    ----------
+    tensors : (n, 3, 3)
+        Symmetric.
+    axes : (n, 3, 3)
+        Rows are independent vectors; they are orthonormalised in their order.
+    noise : float or (n,)
+        Error of a component, in the unit of the tensors.
+    """
+    first = _normalised(axes[:, 0])
+    second = _normalised(axes[:, 1] - np.einsum("na,na->n", axes[:, 1], first)[:, None] * first)
+    frame = np.stack([first, second, np.cross(first, second)], axis=1)
+    components = frame @ tensors @ np.swapaxes(frame, 1, 2)
+    across = _largest(np.stack([components[:, 0, 1], components[:, 1, 2], components[:, 0, 2]], axis=1))
+    values = np.einsum("nii->ni", components)
+    steady = np.swapaxes(frame, 1, 2) @ (values[:, :, None] * frame)
+    return np.where((across <= np.asarray(noise, dtype=np.float64))[:, None, None], steady, tensors)
+
+
 def _require_finite(values: Array, noun: str) -> None:
     if not np.isfinite(values).all():
         bad = ~np.isfinite(values).all(axis=tuple(range(1, values.ndim)))
