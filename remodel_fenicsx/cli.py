@@ -137,8 +137,7 @@ def _run(options: argparse.Namespace) -> int:
     except (FolderTaken, SceneError, GeometryError) as error:
         return _fail(" ".join(str(error).split()), BAD_INPUT)
     except StepFailure as failure:
-        advice = "try a smaller time.step, a slower ramp or lower loads; every finished step is kept"
-        return _fail(f"{failure}. {advice}", SOLVE_FAILED)
+        return _fail(f"{failure}. {failure.refusal}; every finished step is kept", SOLVE_FAILED)
     except interrupts.Interrupted as interruption:
         end = _fail if interruption.on_all_ranks else _end_all
         return end(f"stopped by {interruption}; {interruption.kept}", interruption.exit_code)

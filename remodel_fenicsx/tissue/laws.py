@@ -85,8 +85,6 @@ class Law:
         Whether the cells tend to a limit under a constant drive that does not depend on the way there.
     remodels
         False where cells never change: then there is no pass at all.
-    turns_at_once
-        Whether a pass puts the axes at the drive's principal directions, which is what may over-correct.
     share
         Cells that have made a share of a change, from (old, new, factor); `relaxed` where the law has none of its own.
     """
@@ -94,7 +92,6 @@ class Law:
     update: Callable[[UnitCell, Drive, float, float], UnitCell]
     has_limit: bool = False
     remodels: bool = True
-    turns_at_once: bool = True
     share: Callable[[UnitCell, UnitCell, float], UnitCell] = relaxed
 
 
@@ -244,6 +241,6 @@ LAWS: dict[str, Law] = {
     "explicit": ranked(explicit, has_limit=True),
     "rate": ranked(rate),
     "relaxation": ranked(relaxation, has_limit=True),
-    "rotation": Law(rotation, turns_at_once=False, share=turned_in_part),
+    "rotation": Law(rotation, share=turned_in_part),
     "none": Law(keep, remodels=False),
 }
