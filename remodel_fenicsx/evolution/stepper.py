@@ -66,6 +66,9 @@ class Watcher:
     def started(self, step: Step) -> None:
         """Before the first step: the unloaded body, as a step of its own."""
 
+    def resumed(self, step: Step) -> None:
+        """In place of `started` where a run goes on: the last step that was committed, its cells already remodeled."""
+
     def solved(self, step: Step) -> None:
         """The state is the solved one, which the step's row describes."""
 
@@ -117,7 +120,10 @@ class Stepper:
         state = self.state
         step = Step(state.time, state.number, dict(state.loading.values), self.coupling.equilibrium.extension(), Work())
         for watcher in watchers:
-            watcher.started(step)
+            if step.number:
+                watcher.resumed(step)
+            else:
+                watcher.started(step)
         return step
 
     def advance(self, time: float, watchers: Sequence[Watcher] = (), is_last: bool = False) -> Step:

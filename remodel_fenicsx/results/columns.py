@@ -118,6 +118,10 @@ class Observer(Watcher):
         self.solved(step)
         self.completed(step)
 
+    def resumed(self, step: Step) -> None:
+        """Compile every form that a column needs; nobody keeps this row."""
+        self.started(step)
+
     def solved(self, step: Step) -> None:
         """Measure the solved state."""
         step.row |= dict.fromkeys((column.name for column in self.columns), np.nan)

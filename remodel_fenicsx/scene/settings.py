@@ -199,3 +199,11 @@ class Output(Table):
         json_schema_extra={"allowed": "a list of names of columns"},
     )
     every: int = Field(default=1, ge=1, description="Write the fields of every n-th step; the last one always.")
+    checkpoint: int | None = Field(
+        default=None,
+        ge=0,
+        description="Steps between two checkpoints, from which a run can be resumed; 0: only at the end. Without it "
+        "they are chosen by time: at most 10 minutes are lost, and they cost below 5 % of the run. There is always one "
+        "at the end, however the run ends.",
+        json_schema_extra={"allowed": "a whole number at least 0"},
+    )
