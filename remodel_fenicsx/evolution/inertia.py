@@ -184,7 +184,9 @@ class Inertia:
         nodes = function.function_space.tabulate_dof_coordinates()
         largest = self.equilibrium.comm.allreduce(float(np.max(amplitude, initial=0.0)), MPI.MAX)
         # of nodes that symmetry makes equal the first one in space, whatever the number of ranks
-        candidates = [tuple(float(round(c, 12)) + 0.0 for c in node) for node in nodes[amplitude >= (1 - 1e-6) * largest]]
+        candidates = [
+            tuple(float(round(c, 12)) + 0.0 for c in node) for node in nodes[amplitude >= (1 - 1e-6) * largest]
+        ]
         found = [node for rank in self.equilibrium.comm.allgather(candidates) for node in rank]
         x, y, z = min(found)
         return Mode(eigenvalue, (x, y, z), function.x.array.copy())

@@ -130,7 +130,7 @@ class StabilityWatcher(Watcher):
 
 
 class Signs:
-    """What the factorisation of Newton's last tangent tells for nothing, or for one substitution, about its eigenvalues.
+    """What the factors of Newton's last tangent tell for nothing, or for one substitution, about its eigenvalues.
 
     - The sign of its determinant (MUMPS, ICNTL(33)): it changes with each eigenvalue that changes sign.
     - The curvature w.K w / w.w of w = K^-1 v. From step to step this is inverse iteration: v turns to the mode of the
