@@ -112,7 +112,7 @@ BAD_SCENES = [
     (
         TUBE,
         {"output.pictures!": True},
-        "output.'pictures!' = true: unknown key; allowed are output.fields, output.columns, output.every",
+        "output.'pictures!' = true: unknown key; allowed are output.fields, output.columns, output.every, output.checkpoint",
     ),
     (TUBE, {"time.x\ny": 1}, "time.'x\\ny' = 1: unknown key; allowed are time.end, time.step"),
     # material
