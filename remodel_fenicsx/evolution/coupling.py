@@ -32,11 +32,14 @@ class Coupling(Protocol):
     ----------
     equilibrium
         The forms of the solved state.
+    newton
+        What solved it.
     share
         Share of a pass's change of the cells that is made.
     """
 
     equilibrium: Equilibrium
+    newton: GuardedNewton
     share: float
 
     def solve(self, time: float, loads: LoadValues) -> Work:
@@ -156,7 +159,7 @@ class Extrapolated(Staggered):
         super().__init__(state, tissue, remodeling, settings)
         self._targets = state.cells.quadrature.function("targets", (2, 11))  # the last first: E, s, its time
         self._values[..., 10] = NEVER
-        state.keep(self._targets)
+        state.remember(self._targets)
         self._power = 0.0
 
     @property

@@ -1,8 +1,8 @@
 """The repulsive energy that makes the unloaded tissue stress-free: W_rep = -c/2 g(r0) M, with M in several forms.
 
-`axes` is the paper's (eq. 4c): it sees the axes of a cell. `log` sees the structure tensor A = sum_I l_I^2 n_I (x) n_I alone:
-it equals `axes` where C and the cell are coaxial, is isotropic for isotropic cells in every frame, and leaves C = I
-stress-free for every A (docs/theory.md, "The consistent variant"). `length` is the simplest function of A; it has no
+`axes` is the paper's (eq. 4c): it sees the axes of a cell. `log` sees the structure tensor A = sum_I l_I^2 n_I (x) n_I
+alone: it equals `axes` where C and the cell are coaxial, is isotropic for isotropic cells in every frame, and leaves
+C = I stress-free for every A (docs/theory.md, "The consistent variant"). `length` is the simplest function of A; it has no
 shear stiffness from isotropic cells.
 """
 

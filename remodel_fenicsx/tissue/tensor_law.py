@@ -2,8 +2,8 @@
 
     dA/dt = kappa s (r0^2 E - A),    E = N / tr N,  N = (D+)^2
 
-D is the driving tensor in material space, D+ its positive part, s a switch that is one under tension and vanishes with it.
-For the driver `finger` D is C. E has trace one, so tr A stays r0^2. Pure functions on arrays (n, 3, 3).
+D is the driving tensor in material space, D+ its positive part, s a switch that is one under tension and vanishes with
+it. For the driver `finger` D is C. E has trace one, so tr A stays r0^2. Pure functions on arrays (n, 3, 3).
 """
 
 from __future__ import annotations
