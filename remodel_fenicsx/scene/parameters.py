@@ -30,6 +30,7 @@ COUPLINGS = {
     "before; then solve: of second order, for the law 'tensor'",
 }
 """What each of `evolution.coupling.COUPLINGS` does; that room is above this one, and a test holds the two together."""
+FOR_LAWS_WITH_A_TARGET = ("extrapolated",)
 STRESS_UNITS = {"Pa": 1.0, "kPa": 1.0e3, "MPa": 1.0e6}  # in Pa
 INITIAL_CELLS = ("random", "isotropic", "aligned")
 FORMAT = 2  # of recorded scenes: raised where a reader of the one before would not understand them
@@ -243,6 +244,15 @@ class Remodeling(Table):
         description="Time of the law 'rotation': a small angle between fibre and tension fades like "
         "exp(-t / rotation_time).",
     )
+
+    @model_validator(mode="after")
+    def _coupling_fits_the_law(self) -> Remodeling:
+        if self.coupling in FOR_LAWS_WITH_A_TARGET and LAWS[self.law].target is None:
+            laws = ", ".join(repr(name) for name, law in LAWS.items() if law.target is not None)
+            raise fault(
+                f"needs a remodeling.law with a target that can be extrapolated: {laws}", "coupling", self.coupling
+            )
+        return self
 
 
 # ---------------------------------------------------------------- presets

@@ -2,8 +2,8 @@
 
 `axes` is the paper's (eq. 4c): it sees the axes of a cell. `log` sees the structure tensor A = sum_I l_I^2 n_I (x) n_I
 alone: it equals `axes` where C and the cell are coaxial, is isotropic for isotropic cells in every frame, and leaves
-C = I stress-free for every A (docs/theory.md, "The consistent variant"). `length` is the simplest function of A; it has no
-shear stiffness from isotropic cells.
+C = I stress-free for every A (docs/theory.md, "The consistent variant"). `length` is the simplest function of A; it has
+no shear stiffness from isotropic cells.
 """
 
 from __future__ import annotations
