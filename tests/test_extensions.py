@@ -37,6 +37,7 @@ from remodel_fenicsx.tissue.chains import CHAINS, Chain
 from remodel_fenicsx.tissue.drivers import DRIVERS, FRAMES, Driver, Frame
 from remodel_fenicsx.tissue.energy import MATRICES, neo_hookean
 from remodel_fenicsx.tissue.laws import LAWS, Drive, Law, ranked
+from remodel_fenicsx.tissue.repulsion import REPULSIONS, Repulsion, axes_sum, squared_end_to_end_length
 from remodel_fenicsx.tissue.spectral import PAIRINGS, principal
 
 KAPPA = 0.1
@@ -123,6 +124,21 @@ def test_a_matrix_energy(monkeypatch: pytest.MonkeyPatch) -> None:
     doubled = column(rows_of(matrix.with_values({**half, "material.matrix": "double"})), "mean_stretch")
     np.testing.assert_allclose(doubled, expected, rtol=1e-12)
     assert expected[-1] > 1.5
+
+
+def test_a_repulsion(monkeypatch: pytest.MonkeyPatch) -> None:
+    """M = r^2 cancels the chains' stress at F = I as the logarithms do; the network is then softer."""
+    monkeypatch.setitem(REPULSIONS, "again", Repulsion(axes_sum))
+    monkeypatch.setitem(REPULSIONS, "squared", Repulsion(lambda F, cells, r0: squared_end_to_end_length(F, cells)))
+    expected = column(rows_of(scene(**{"remodeling": {"law": "none"}})), "mean_stretch")
+    found = {
+        name: column(rows_of(scene(material={"repulsion": name}, remodeling={"law": "none"})), "mean_stretch")
+        for name in ("again", "squared")
+    }
+    assert found["again"] == expected
+    assert found["squared"][0] > expected[0] > 1.0
+    with simulated(scene(material={"repulsion": "squared"}).with_values({"loads.force.value": 0.0})) as (simulation, _):
+        assert np.abs(simulation.unknown.x.array).max() < 1e-14
 
 
 def test_a_driver(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -362,7 +378,9 @@ def test_a_coupling(monkeypatch: pytest.MonkeyPatch) -> None:
             return super().remodel(time) if time > 2.0 else 0.0
 
     monkeypatch.setitem(coupling.COUPLINGS, "late", Late)
-    with pytest.raises(SceneError, match="^remodeling.coupling = 'late': allowed are 'staggered', 'relaxed'$"):
+    with pytest.raises(
+        SceneError, match="^remodeling.coupling = 'late': allowed are 'staggered', 'relaxed', 'extrapolated'$"
+    ):
         scene(remodeling={"coupling": "late"})
     monkeypatch.setitem(parameters.COUPLINGS, "late", "as staggered, but the cells stay as they are up to t = 2")
     angles = column(rows_of(scene(remodeling={"coupling": "late"})), "mean_fibre_angle")

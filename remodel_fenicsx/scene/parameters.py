@@ -336,8 +336,17 @@ def _with_measured_collagen(scene: dict[str, dict[str, Any]]) -> dict[str, dict[
     }
 
 
+def _consistent(scene: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    changes = {"law": "tensor", "frame": "material", "coupling": "extrapolated"}
+    return scene | {
+        "material": scene["material"] | {"repulsion": "log"},
+        "remodeling": {name: value for name, value in (scene["remodeling"] | changes).items() if name != "pairing"},
+    }
+
+
 PRESETS: dict[str, dict[str, dict[str, Any]]] = {
     "kuhl-holzapfel-2007": _PAPER,
+    "consistent": {shape: _consistent(scene) for shape, scene in _PAPER.items()},
     "sun-2002": {shape: _with_measured_collagen(scene) for shape, scene in _PAPER.items()},
 }
 """Preset name -> shape -> scene keys; they lie under the keys of the scene that names the preset."""
@@ -345,7 +354,9 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
 PRESET_NOTES = {
     "kuhl-holzapfel-2007": "The printed method on the three bodies of the paper: Fig. 5 (cube), Fig. 6 (tendon), "
     "Figs. 7 to 11 (tube). The frame is 'spatial', as printed in eq. (9).",
-    "sun-2002": "The same with collagen I as measured with optical tweezers (paper, Remark 2): contour length 309 nm, "
-    "persistence length 14.5 nm, all chain lengths in nm. End-to-end length (that of a free chain) and chain density "
-    "(the same initial stiffness of the network) are choices of this project, not of the paper.",
+    "consistent": "The paper's bodies and parameters with a law and an energy that see the structure tensor alone "
+    "(docs/theory.md, The consistent variant), second order in the time step.",
+    "sun-2002": "The printed method with collagen I as measured with optical tweezers (paper, Remark 2): contour "
+    "length 309 nm, persistence length 14.5 nm, all chain lengths in nm. End-to-end length (that of a free chain) and "
+    "chain density (the same initial stiffness of the network) are choices of this project, not of the paper.",
 }

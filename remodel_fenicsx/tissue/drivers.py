@@ -48,6 +48,14 @@ DRIVERS: dict[str, Driver] = {
 }
 
 
+def rotated_back(F: Array, spatial_tensor: Array) -> Array:
+    """R^T t R with the rotation R of F = R U: objective. For t = sigma it is U S U / J, for t = b it is C."""
+    u, _, vt = np.linalg.svd(F)
+    R = u @ vt
+    back: Array = np.swapaxes(R, 1, 2) @ spatial_tensor @ R
+    return (back + np.swapaxes(back, 1, 2)) / 2
+
+
 @dataclass(frozen=True)
 class Frame:
     """What becomes of the eigenvectors of a spatial driver.
@@ -64,7 +72,7 @@ class Frame:
 
     axes: Callable[[Array, Array], Array]
     carries_axes: bool
-    tensor: Callable[[Array, Array], Array]
+    tensor: Callable[[Array, Array], Array] = rotated_back
 
 
 def spatial_frame(F: Array, spatial_axes: Array) -> Array:
@@ -84,16 +92,8 @@ def material_frame(F: Array, spatial_axes: Array) -> Array:
     return np.stack([first, second, np.cross(first, second)], axis=1)
 
 
-def rotated_back(F: Array, spatial_tensor: Array) -> Array:
-    """R^T t R with the rotation R of F = R U: objective. For t = sigma it is U S U / J, for t = b it is C."""
-    u, _, vt = np.linalg.svd(F)
-    R = u @ vt
-    back: Array = np.swapaxes(R, 1, 2) @ spatial_tensor @ R
-    return (back + np.swapaxes(back, 1, 2)) / 2
-
-
 FRAMES: dict[str, Frame] = {
-    "material": Frame(material_frame, carries_axes=True, tensor=rotated_back),
+    "material": Frame(material_frame, carries_axes=True),
     "spatial": Frame(spatial_frame, carries_axes=False, tensor=lambda F, tensor: tensor),
 }
 
