@@ -297,12 +297,12 @@ BAD_SCENES = [
     (
         CUBE,
         {"remodeling.law": "foo"},
-        "remodeling.law = 'foo': allowed are 'explicit', 'rate', 'relaxation', 'rotation', 'tensor', 'none'",
+        "remodeling.law = 'foo': allowed are 'explicit', 'rate', 'relaxation', 'tensor', 'rotation', 'none'",
     ),
     (
         CUBE,
         {"remodeling.law": 1},
-        "remodeling.law = 1: allowed are 'explicit', 'rate', 'relaxation', 'rotation', 'tensor', 'none'",
+        "remodeling.law = 1: allowed are 'explicit', 'rate', 'relaxation', 'tensor', 'rotation', 'none'",
     ),
     (CUBE, {"remodeling.driver": "strain"}, "remodeling.driver = 'strain': allowed are 'cauchy', 'pk2', 'finger'"),
     (CUBE, {"remodeling.frame": "corotated"}, "remodeling.frame = 'corotated': allowed are 'material', 'spatial'"),
