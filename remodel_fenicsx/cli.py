@@ -189,8 +189,8 @@ def _run(options: argparse.Namespace) -> int:
     except (FolderTaken, SceneError, GeometryError, CheckpointError, RecordingError) as error:
         return _fail(" ".join(str(error).split()), BAD_INPUT)
     except StepFailure as failure:
-        advice = "try a smaller time.step, a slower ramp or lower loads; every finished step is kept"
-        return _fail(f"{failure}. {advice}, and run --resume goes on from there", SOLVE_FAILED)
+        text = f"{failure}. {failure.refusal}; every finished step is kept"
+        return _fail(f"{text}, and run --resume goes on from there", SOLVE_FAILED)
     except interrupts.Paused as pause:
         way = f"it goes on with: remodel-fenicsx run --resume {shlex.quote(str(pause.folder))}"
         return _fail(f"{pause}: all is kept up to time {pause.time:g}; {way}", STOPPED)

@@ -14,6 +14,8 @@ from mpi4py import MPI
 
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.loading import Loading, LoadValues
+from remodel_fenicsx.evolution.chatter import Chatter
+from remodel_fenicsx.evolution.monitor import StabilityWatcher
 from remodel_fenicsx.evolution.parts import StepFailure
 from remodel_fenicsx.evolution.pause import Pause
 from remodel_fenicsx.evolution.state import State
@@ -81,6 +83,8 @@ class Simulation:
         tissue = scene.material.tissue(scene.cells.end_to_end_length)
         self.stepper = Stepper(self.state, tissue, scene.remodeling, scene.solver, self.load_values)
         self.tissue = self.stepper.tissue
+        counted = "negative_eigenvalues" in scene.output.columns
+        self.stability = StabilityWatcher(self.stepper, scene.solver.unstable, every_step=counted)
         self.observer = Observer(shape, self.stepper, columns_of(shape, checked_columns(scene.output.columns)))
 
     def load_values(self, time: float) -> LoadValues:
@@ -96,19 +100,20 @@ class Simulation:
         Parameters
         ----------
         watchers
-            Who else follows the steps; the observer, which fills each step's row, comes first.
+            Who else follows the steps; those who watch the stability and fill each step's row come first.
 
         Raises
         ------
         StepFailure
             If a step has no admissible equilibrium.
         """
-        self.stepper.remodeling.warn_of_overcorrection(self.stepper.coupling.share)
         remaining = list(times(self.scene.time.end, self.scene.time.step))[self.state.number :]
-        return self.stepper.march(remaining, [self.observer, *watchers])
+        chatter = [Chatter(self.stepper)] if self.stepper.remodeling.law.remodels else []
+        return self.stepper.march(remaining, [self.stability, self.observer, *chatter, *watchers])
 
     def close(self) -> None:
         """Free PETSc's objects and options."""
+        self.stability.close()
         self.stepper.close()
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time as clock
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -38,6 +39,8 @@ class Step:
         Wall time; known once it is complete.
     is_last
         Whether it is the last one of the way.
+    negative_eigenvalues
+        Of the tangent at the solved state, where somebody has counted them; NaN where not (`monitor.StabilityWatcher`).
     row
         Its columns by name, where somebody measures (`results.columns.Observer`).
     """
@@ -50,6 +53,7 @@ class Step:
     remodeling_power: float = 0.0
     seconds: float = 0.0
     is_last: bool = False
+    negative_eigenvalues: float = math.nan
     row: dict[str, float] = field(default_factory=dict)
 
 

@@ -68,6 +68,12 @@ COLUMNS_ON_REQUEST: dict[str, Column] = {
             lambda m: m.observer.stepper.remodeling.residual(),
             after_pass=True,
         ),
+        Column(
+            "negative_eigenvalues",
+            "",
+            "negative eigenvalues of the tangent's symmetric part: 0 where the equilibrium is stable",
+            lambda m: m.step.negative_eigenvalues,
+        ),
     )
 }
 """Columns that a scene may name in `output.columns`; a script adds its own."""

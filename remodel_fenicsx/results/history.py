@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -107,5 +108,7 @@ class History:
 
 
 def _number(value: float) -> str:
-    """Shortest text that reads back as the same number."""
+    """Shortest text that reads back as the same number; none for what was not computed."""
+    if math.isnan(value):
+        return ""
     return str(value) if isinstance(value, int) else repr(float(value))
