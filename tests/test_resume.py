@@ -334,6 +334,14 @@ def test_a_wall_time_that_is_over_is_exit_code_4(half: Path) -> None:
     assert done.stderr.count("remodel-fenicsx: stopped before --max-wall-time is over: all is kept up to time 6; ") == 1
 
 
+@pytest.mark.parametrize("name", ["history.csv", "fields.vtkhdf"])
+def test_what_is_damaged_is_said_in_one_line_and_nothing_else(name: str, half: Path) -> None:
+    (half / name).write_bytes(b"")
+    done = command("run", "--resume", half, "--set", "time.end=10")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith(f"remodel-fenicsx: {half / name}: ") and done.stderr.count("\n") == 1, done.stderr
+
+
 def test_the_status_of_a_run(half: Path) -> None:
     assert status(half)[0] == f"{half}: scene, step 6 of 6, time 6 of 6"
     assert status(half)[1] == "finished" and status(half)[-1] == "checkpoint at time 6"
