@@ -12,19 +12,28 @@ import time as clock
 import traceback
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NoReturn
 
 import remodel_fenicsx
 from remodel_fenicsx.system import interrupts
 from remodel_fenicsx.system.environment import reason_unusable, versions
 from remodel_fenicsx.scene.parameters import PRESETS
 from remodel_fenicsx.scene.scene import Scene, SceneError, preset_scene, read_scene
+from remodel_fenicsx.schema.tables import printable
 
 BAD_INPUT, SOLVE_FAILED, STOPPED, BAD_ENVIRONMENT = 2, 3, interrupts.PAUSED, 5
 
 
+class _Parser(argparse.ArgumentParser):
+    """What it complains of stays on one line, control characters and all."""
+
+    def error(self, message: str) -> NoReturn:
+        super().error(printable(message))
+
+
 def parser() -> argparse.ArgumentParser:
     """The command line."""
-    main_parser = argparse.ArgumentParser(
+    main_parser = _Parser(
         prog="remodel-fenicsx",
         description="Predict how collagen in living tissue reorients under load (Kuhl & Holzapfel 2007).",
         epilog="exit codes: 0 finished, 2 bad input, 3 the solve failed, 4 stopped on purpose, 5 environment not "
@@ -147,7 +156,7 @@ def _say(text: str) -> None:
 
 def _complain(message: str) -> None:
     with contextlib.suppress(OSError):  # nobody is there to read it
-        print(f"remodel-fenicsx: {message}", file=sys.stderr, flush=True)
+        print(f"remodel-fenicsx: {printable(message)}", file=sys.stderr, flush=True)
 
 
 def _fail(message: str, code: int) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import tomllib
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar, cast
@@ -28,7 +28,7 @@ from remodel_fenicsx.results.checkpoint_file import Checkpoint, CheckpointError,
 from remodel_fenicsx.results.columns import COLUMNS_ON_REQUEST, Observer, columns_of
 from remodel_fenicsx.results.fields import Fields
 from remodel_fenicsx.results.recording import SCENE, RecordingError
-from remodel_fenicsx.results.run_folder import LastStep, RunFolder, chosen_folder, forget_steps, locked
+from remodel_fenicsx.results.run_folder import FolderTaken, LastStep, RunFolder, chosen_folder, forget_steps, locked
 from remodel_fenicsx.scene import Scene, SceneError, read_scene, scene_from_dict
 from remodel_fenicsx.scene.continuation import check_continuation
 from remodel_fenicsx.system.environment import versions
@@ -204,7 +204,7 @@ def run(
         with hold_log(comm.rank, quiet=quiet) as held:
             simulation = _built(scene, comm)
             place = place or chosen_folder(None, scene.name, comm)
-        with locked(place, comm, new=True):
+        with _closing(simulation), locked(place, comm, new=True):
             _record(simulation, place, _Circumstances(stop, quiet, held, deadline))
     return place
 
@@ -246,9 +246,10 @@ def resume(
         with hold_log(comm.rank, quiet=quiet) as held:
             scene, checkpoint = _kept(place, overrides, comm)
             simulation = _built(scene, comm)
+        with _closing(simulation):
             if comm.bcast(checkpoint is not None):
                 restore_state(simulation.state, checkpoint)
-        _record(simulation, place, _Circumstances(stop, quiet, held, deadline, resumes=True))
+            _record(simulation, place, _Circumstances(stop, quiet, held, deadline, resumes=True))
     return place
 
 
@@ -287,6 +288,21 @@ def _built(scene: Scene, comm: MPI.Intracomm) -> Simulation:
     except Interrupted as interruption:
         interruption.kept = "nothing was computed"
         raise
+
+
+@contextmanager
+def _closing(simulation: Simulation) -> Iterator[None]:
+    """Close it at the end, if all ranks come there: the others would wait for ever."""
+    try:
+        yield
+    except (StepFailure, Interrupted, Paused, FolderTaken, SceneError, CheckpointError, RecordingError):
+        simulation.close()
+        raise
+    except BaseException:
+        if simulation.domain.comm.size == 1:
+            simulation.close()
+        raise
+    simulation.close()
 
 
 @dataclass
@@ -335,9 +351,7 @@ def _record(simulation: Simulation, place: Path, around: _Circumstances) -> None
             log.info("ended: %s", reason)
             if getattr(reason, "on_all_ranks", True):
                 checkpoints.write()
-            simulation.close()  # all ranks have this exception; after any other one they would wait for ever
             raise
-        simulation.close()
         log.info("finished")
 
 

@@ -97,6 +97,10 @@ class Chatter(Watcher):
         """The cells before the first pass."""
         self._course = self._before = self._continued(_Course(), step)
 
+    def resumed(self, step: Step) -> None:
+        """The cells after the last pass before; the passes before that one are forgotten."""
+        self.started(step)
+
     def completed(self, step: Step) -> None:
         """One pass more."""
         self._before = self._course

@@ -85,7 +85,7 @@ def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
     text = np.frombuffer(json.dumps(header, allow_nan=False).encode(), dtype=np.uint8)
     whole = io.BytesIO()
     np.savez(whole, **{_HEADER: text}, **checkpoint.arrays)  # type: ignore[arg-type]
-    data = whole.getbuffer()
+    data = whole.getvalue()
     try:
         newest = read_pointer(folder)[:1]
     except CheckpointError:  # whoever resumed has been told

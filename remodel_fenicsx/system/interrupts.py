@@ -223,6 +223,16 @@ def stopping_at_once() -> Iterator[None]:
         request.raises = before
 
 
+@contextmanager
+def pause_held_back() -> Iterator[None]:
+    """Within, SIGUSR1 waits, also for programs that are started: one sent to the whole group would kill a compiler."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {PAUSE})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def _check(request: StopRequest) -> None:
     if request.number:
         raise Interrupted(request.number, on_all_ranks=False)
