@@ -7,7 +7,8 @@ import contextlib
 import os
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from importlib.util import find_spec
 from pathlib import Path
 
 import remodel_fenicsx
@@ -47,6 +48,14 @@ def parser() -> argparse.ArgumentParser:
         "-o", "--output", type=Path, metavar="DIR", help="new or empty folder for the results (default: results/NAME)"
     )
     run_command.add_argument("-q", "--quiet", action="store_true", help="no progress")
+    stability = scene_command(
+        "stability", "Run a scene and say by what its passes multiply a small change of the cells."
+    )
+    stability.add_argument(
+        "-o", "--output", type=Path, metavar="DIR", help="new or empty folder (default: results/NAME-stability)"
+    )
+    stability.add_argument("--times", type=_positive, default=10, metavar="N", help="times to analyse (default: 10)")
+    stability.add_argument("-q", "--quiet", action="store_true", help="no progress")
     scene_command("validate", "Check a scene without running it.")
     new = commands.add_parser("new", help="Print a scene of a preset.", description="Print a scene of a preset.")
     new.add_argument("preset", metavar="PRESET", help=", ".join(PRESETS))
@@ -87,6 +96,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return code
 
 
+def _positive(text: str) -> int:
+    number = int(text)
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"{text}: allowed is a whole number at least 1")
+    return number
+
+
 def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
     """The options; of several ranks only the first says what is wrong with them."""
     with contextlib.ExitStack() as stack:
@@ -121,7 +137,7 @@ def _fail(message: str, code: int) -> int:
     return code
 
 
-def _run(options: argparse.Namespace) -> int:
+def _run(options: argparse.Namespace, task: Callable[..., Path] | None = None) -> int:
     scene = read_scene(options.scene, options.set)
     reason = reason_unusable()
     if reason is not None:
@@ -133,7 +149,7 @@ def _run(options: argparse.Namespace) -> int:
     from remodel_fenicsx.evolution.parts import StepFailure
 
     try:
-        folder = run(scene, options.output, quiet=options.quiet)
+        folder = (task or run)(scene, options.output, quiet=options.quiet)
     except (FolderTaken, SceneError, GeometryError) as error:
         return _fail(" ".join(str(error).split()), BAD_INPUT)
     except StepFailure as failure:
@@ -152,6 +168,21 @@ def _run(options: argparse.Namespace) -> int:
         return _end_all("stopped by a defect of the program, see above", 1)
     _say(f"results in {folder}")
     return 0
+
+
+def _stability(options: argparse.Namespace) -> int:
+    missing = [name for name in ("matplotlib", "PIL") if find_spec(name) is None]
+    if missing:
+        return _fail(f"the environment is not usable: no {missing[0]}; run through ./with-fenicsx", BAD_ENVIRONMENT)
+
+    def analyse(scene: Scene, folder: Path | None, quiet: bool) -> Path:
+        from remodel_fenicsx.stability import in_words, stability
+
+        place, table = stability(scene, folder, options.times, quiet=quiet)
+        _say(in_words(table))
+        return place
+
+    return _run(options, analyse)
 
 
 def _end_all(message: str, code: int) -> int:
@@ -212,7 +243,14 @@ def _info(options: argparse.Namespace) -> int:
     return 0
 
 
-COMMANDS = {"run": _run, "validate": _validate, "new": _new, "figures": _figures, "info": _info}
+COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
+    "run": _run,
+    "stability": _stability,
+    "validate": _validate,
+    "new": _new,
+    "figures": _figures,
+    "info": _info,
+}
 
 
 if __name__ == "__main__":
