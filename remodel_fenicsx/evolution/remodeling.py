@@ -15,7 +15,7 @@ from remodel_fenicsx.tissue import spectral
 from remodel_fenicsx.tissue.cells import UnitCell, structure_tensor
 from remodel_fenicsx.tissue.drivers import DRIVERS, FRAMES, carried_axes
 from remodel_fenicsx.tissue.energy import Tissue, squared_end_to_end_length
-from remodel_fenicsx.tissue.laws import LAWS, Drive, relaxed
+from remodel_fenicsx.tissue.laws import LAWS, Drive
 
 Array = NDArray[np.float64]
 
@@ -44,6 +44,12 @@ class RemodelingSettings(Protocol):
     @property
     def kappa(self) -> float: ...
 
+    @property
+    def pairing(self) -> str: ...
+
+    @property
+    def rotation_time(self) -> float: ...
+
 
 class RemodelingPass:
     """Updates the unit cells of a solved state.
@@ -55,7 +61,7 @@ class RemodelingPass:
     tissue
         Parameters of matrix and chains.
     settings
-        Driver, law, frame and kappa.
+        Driver, law, frame, pairing, kappa and rotation time.
     """
 
     def __init__(self, state: State, tissue: Tissue, settings: RemodelingSettings):
@@ -92,6 +98,8 @@ class RemodelingPass:
             self.state.cells.initial_dimensions.reshape(-1, 3),
             coefficients.point_values(self.tissue.end_to_end_length, self.quadrature).reshape(-1),
             self.settings.kappa,
+            spectral.PAIRINGS[self.settings.pairing],
+            self.settings.rotation_time,
         )
 
     def _steady_axes(self, F: Array) -> Array:
@@ -129,7 +137,7 @@ class RemodelingPass:
 
         The power is the stored energy that the pass releases at frozen deformation, per time, to first order
         (`Tissue.energy_increment`; Remark 6). A principal stress counts as tension beyond `stress_noise`. Of the change
-        of the cells a share `factor` is made (`laws.relaxed`).
+        of the cells a share `factor` is made (`Law.share`).
 
         Raises
         ------
@@ -142,7 +150,7 @@ class RemodelingPass:
             UnitCell(cells.dimension_values.reshape(-1, 3).copy(), cells.axis_values.reshape(-1, 3, 3).copy()),
             asked,
         )
-        updated = relaxed(self._change[0], asked, factor)
+        updated = self.law.share(self._change[0], asked, factor)
         increment: Any = at_points(self.tissue, self.quadrature).energy_increment(F, cells.point_cells, updated)
         power: float = 0.0 - self.quadrature.integral(increment.reshape(shape)) / (time_new - time_old)
         cells.set(updated.dimensions.reshape(*shape, 3), updated.axes.reshape(*shape, 3, 3))
