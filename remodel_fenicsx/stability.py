@@ -25,6 +25,7 @@ from remodel_fenicsx.tissue.laws import LAWS
 log = logging.getLogger(__name__)
 
 NAME = "stability"
+LONG_SCALE = -12.0  # lowest factor that is drawn on a linear scale
 Table = dict[str, list[float]]
 
 
@@ -134,12 +135,13 @@ def draw(table: Table, folder: Path, scene: Scene, share: float) -> None:
         if share != 1.0:
             label = f"the share {share:g} of it that is made"
             axes.plot(table["time"], table["factor_of_coupling"], "s-", markersize=4, color=COLOURS[0], label=label)
-        axes.set_yscale("symlog", linthresh=2, linscale=1.5)
-        lowest = np.nanmin([*table["factor"], -1.5])
-        axes.set_ylim(1.3 * lowest if lowest < -2 else -2.2, 1.2)
-        ticks = [1, 0, -1, -2, *(t for t in (-5, -10, -20, -50, -100, -200, -500, -1000) if t > 1.3 * lowest)]
-        axes.set_yticks(ticks, [f"{tick:d}".replace("-", "−") for tick in ticks])
-        axes.set_yticks([], minor=True)
+        lowest = np.nanmin([*table["factor"], -1.6])
+        if lowest < LONG_SCALE:
+            axes.set_yscale("symlog", linthresh=2, linscale=1.0)
+            ticks = [1, 0, -1, -2, *(t for t in (-5, -10, -20, -50, -100, -200, -500, -1000) if t > 1.3 * lowest)]
+            axes.set_yticks(ticks, [f"{tick:d}".replace("-", "−") for tick in ticks])
+            axes.set_yticks([], minor=True)
+        axes.set_ylim(1.3 * lowest, 1.2)
         axes.set_xlim(left=0)
         axes.set_xlabel("time")
         axes.set_ylabel("factor of a pass, most negative")
