@@ -16,7 +16,8 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGE = "remodel_fenicsx"
 # what a room may import: itself, and those before it
-ROOMS = ("system", "schema", "tissue", "fem", "body", "scene", "evolution", "results", "paper", "simulation", "cli")
+ROOMS = ("system", "schema", "tissue", "fem", "body", "scene", "evolution", "results", "paper", "simulation",
+         "stability", "cli")  # fmt: skip
 LONGEST = 400
 # imports that only the type checker follows: of what is there without dolfinx, to what is not
 TYPES_ONLY = {
