@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
 
 from remodel_fenicsx.evolution.newton import GuardedNewton, Solution, SolveFailure
-from remodel_fenicsx.evolution.refusals import TOO_LARGE, Refusal
+from remodel_fenicsx.evolution.refusals import Refusal, diagnosed
 
 log = logging.getLogger(__name__)
 
@@ -30,7 +33,15 @@ class Work:
 
 
 class StepFailure(RuntimeError):
-    """A step cannot be solved even in the smallest parts; the state is that of the last accepted step."""
+    """A step cannot be solved, or is not wanted; the state is that of the last accepted step.
+
+    Attributes
+    ----------
+    time
+        Of the step.
+    refusal
+        Why, and what helps.
+    """
 
     def __init__(self, time: float, text: str, refusal: Refusal):
         super().__init__(text)
@@ -71,6 +82,7 @@ class Change:
     newton: GuardedNewton
     maximum_halvings: int
     largest_part: Callable[[float], float] = lambda done: 1.0
+    _direction: NDArray[np.float64] | None = field(default=None, init=False)  # of the unknowns over the last part
 
     def advance(self, work: Work, failure: SolveFailure | None = None) -> None:
         """Go from 0 to 1; `failure`: that of the whole, if it was tried.
@@ -86,6 +98,7 @@ class Change:
         while done < 1.0:
             part = min(part, self.largest_part(done), 1.0 - done)
             self.set_fraction(1.0 if done + part > 1.0 - 1e-12 else done + part)
+            before = self.newton.unknown.x.array.copy()
             try:
                 work.add(self.newton.solve())
             except SolveFailure as failed:
@@ -94,11 +107,13 @@ class Change:
             else:
                 done = 1.0 if done + part > 1.0 - 1e-12 else done + part
                 part *= 2
+                self._direction = self.newton.unknown.x.array - before
                 work.substeps += 1
 
     def _halved(self, part: float, done: float, failure: SolveFailure) -> float:
         if part / 2 < 2.0**-self.maximum_halvings:
             text = failure_text(self.time, self.stage, done, failure)
-            raise StepFailure(self.time, text, TOO_LARGE) from failure
+            self.set_fraction(done)  # the last state that was solved
+            raise StepFailure(self.time, text, diagnosed(self.newton, failure, self._direction)) from failure
         log.debug("%s: %s; next part %g", self.stage, failure.reason, part / 2)
         return part / 2
