@@ -101,6 +101,17 @@ class Equilibrium:
         extension = Extension(largest, min(rank[2] for rank in ranks), worst_point, max(rank[3] for rank in ranks))
         return extension, stretch
 
+    def keeps_reserve(self, before: Any, after: Any, share: float, nearer_than: float = 0.0) -> bool:
+        """Whether every point of all ranks keeps a share of its 1 - r/L; `nearer_than`: only those with r/L above it.
+
+        Parameters
+        ----------
+        before, after
+            r/L at the points, from `extension_and_stretches`.
+        """
+        lost = bool(np.any((after > nearer_than) & (1 - after < share * (1 - before))))
+        return not self.comm.allreduce(lost, MPI.LOR)
+
     def limit_values(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """r^2 in squared link lengths (0 without chains) and J at all points, each (elements, points)."""
         values = self.quadrature.evaluate(self._limits, (2,))

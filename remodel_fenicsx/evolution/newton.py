@@ -9,7 +9,6 @@ from typing import Any, Protocol
 
 import dolfinx.fem.petsc
 import numpy as np
-from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
@@ -225,13 +224,12 @@ class GuardedNewton:
         Near L each point also keeps a share of its 1 - r/L: from a point much too near, where forces are huge, Newton's
         method comes back only by a factor of 1.5 an iteration.
         """
-        before = self._stretches
         trial = x.duplicate()
         for halving in range(LINE_SEARCH_HALVINGS + 1):
             trial.waxpy(-1.0, step, x)
             self._push(trial)
             extension, stretches = self.equilibrium.extension_and_stretches()
-            if extension.stop_signal or (extension.admissible and self._is_kept(before, stretches)):
+            if extension.stop_signal or (extension.admissible and self._keeps_reserve(stretches)):
                 break
             step.scale(0.5)
         else:
@@ -241,10 +239,9 @@ class GuardedNewton:
             log.debug("Newton step shortened to 1/%d to keep r < L and J > 0", 2**halving)
         return halving > 0
 
-    def _is_kept(self, before: NDArray[np.float64] | None, after: NDArray[np.float64]) -> bool:
-        """Whether no point near L loses more than a share of its 1 - r/L."""
-        lost = before is not None and bool(np.any((after > NEAR_LOCKING) & (1 - after < KEPT_RESERVE * (1 - before))))
-        return not self.equilibrium.comm.allreduce(lost, MPI.LOR)
+    def _keeps_reserve(self, stretches: NDArray[np.float64]) -> bool:
+        before = self._stretches
+        return before is None or self.equilibrium.keeps_reserve(before, stretches, KEPT_RESERVE, NEAR_LOCKING)
 
     def _converged(self, snes: Any, iteration: int, norms: tuple[float, float, float]) -> int:
         """|R| <= absolute_tolerance + relative_tolerance * |nodal forces|: a scale that does not vanish in a hold."""

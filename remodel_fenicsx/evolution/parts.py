@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from remodel_fenicsx.evolution.newton import GuardedNewton, Solution, SolveFailure
 from remodel_fenicsx.evolution.refusals import Refusal, diagnosed
 
+KEPT_RESERVE = 0.2  # share of 1 - r/L that a part of a remodeling increment leaves at every point
 log = logging.getLogger(__name__)
 
 
@@ -96,19 +97,43 @@ class Change:
         if failure is not None:
             part = self._halved(part, done, failure)
         while done < 1.0:
-            part = min(part, self.largest_part(done), 1.0 - done)
-            self.set_fraction(1.0 if done + part > 1.0 - 1e-12 else done + part)
             before = self.newton.unknown.x.array.copy()
+            part = self._started(min(part, 1.0 - done), done)
+            self.set_fraction(1.0 if done + part > 1.0 - 1e-12 else done + part)
             try:
                 work.add(self.newton.solve())
             except SolveFailure as failed:
+                self.newton.unknown.x.array[:] = before
                 work.add(failed)
                 part = self._halved(part, done, failed)
             else:
                 done = 1.0 if done + part > 1.0 - 1e-12 else done + part
+                self._direction = (self.newton.unknown.x.array - before) / part
                 part *= 2
-                self._direction = self.newton.unknown.x.array - before
                 work.substeps += 1
+
+    def _started(self, wanted: float, done: float) -> float:
+        """The next part, with the unknowns that it starts from.
+
+        Where the bound at the present unknowns is smaller than what is wanted, they go on as over the last part: along
+        that way chains keep about their length, and parts can be larger. Every point keeps its reserve there too.
+        """
+        bound = min(wanted, self.largest_part(done))
+        if self._direction is None or bound >= wanted:
+            return bound
+        unknown, equilibrium = self.newton.unknown.x.array, self.newton.equilibrium
+        before = unknown.copy()
+        self.set_fraction(done)
+        _, present = equilibrium.extension_and_stretches()
+        while wanted > bound:
+            self.set_fraction(done + wanted)
+            unknown[:] = before + wanted * self._direction
+            extension, expected = equilibrium.extension_and_stretches()
+            if extension.admissible and equilibrium.keeps_reserve(present, expected, KEPT_RESERVE):
+                return wanted
+            wanted /= 2
+        unknown[:] = before
+        return bound
 
     def _halved(self, part: float, done: float, failure: SolveFailure) -> float:
         if part / 2 < 2.0**-self.maximum_halvings:
