@@ -8,10 +8,11 @@ from petsc4py import PETSc
 
 from remodel_fenicsx.evolution.equilibrium import Equilibrium
 from remodel_fenicsx.evolution.newton import GuardedNewton, SolverSettings
-from remodel_fenicsx.evolution.parts import KEPT_RESERVE
 from remodel_fenicsx.evolution.state import State
 from remodel_fenicsx.tissue.cells import UnitCell
 from remodel_fenicsx.tissue.energy import Tissue
+
+KEPT_RESERVE = 0.2  # share of 1 - r/L that a part of a remodeling increment leaves at every point
 
 
 class Blend:

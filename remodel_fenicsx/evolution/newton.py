@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -21,6 +21,7 @@ log = logging.getLogger(__name__)
 LINE_SEARCH_HALVINGS = 20  # of one Newton step, before the solve is given up
 ROUNDINGS = 8.0  # how many times the rounding of assembled forces a residual may be
 PRESCRIBED_MET = 1e-10  # of the body's size: how far a prescribed displacement may be missed; no force measures it
+ON_THE_WAY = 1e-3  # of the nodal forces: residual of a part that others follow
 NEAR_LOCKING, KEPT_RESERVE = 0.95, 0.3  # a Newton step that ends above this r/L keeps this share of 1 - r/L
 NEARLY_LOCKED, COARSE, GOES_DOWN = 0.99, 1e-8, 0.25  # see GuardedNewton._is_small
 
@@ -106,6 +107,7 @@ class GuardedNewton:
         self._matrix = equilibrium.create_matrix()
         self._force_scale = self._stress_rounding = self._extension = 0.0
         self._area = equilibrium.quadrature.norm(equilibrium.quadrature.largest_areas)
+        self.on_the_way = False  # whether the solution is only the start of a further one: then it may be coarser
         self._lost = False
         self._gap = self._last_norm = np.inf
         self._stretches: NDArray[np.float64] | None = None
@@ -161,6 +163,34 @@ class GuardedNewton:
             left = float(self._snes.getFunctionNorm()) / max(self._tolerance(), float(np.finfo(np.float64).tiny))
             raise SolveFailure(self._failure_text(reason, extension), newton, linear, extension, left)
         return Solution(newton, linear, float(self._snes.getFunctionNorm()))
+
+    def tangent_direction(self, set_fraction: Callable[[float], None], done: float, distance: float) -> Any:
+        """Change of the unknowns per fraction of a change of the problem, at a solved state; one linear solve.
+
+        Parameters
+        ----------
+        set_fraction, done
+            Applies a fraction of the change; the one that is solved. It is applied at the end.
+        distance
+            Fraction over which the residual's slope is taken.
+        """
+        self._pull(self._x)
+        slope, direction = self._x.duplicate(), self._x.duplicate()
+        set_fraction(done + distance)
+        self._assemble_residual(self._snes, self._x, slope)
+        set_fraction(done)
+        self._assemble_residual(self._snes, self._x, self._residual)
+        slope.axpy(-1.0, self._residual)
+        self.equilibrium.assemble_tangent(self._matrix)
+        solver = self._snes.getKSP()
+        solver.setOperators(self._matrix)
+        solver.solve(slope, direction)
+        direction.ghostUpdate(addv=PETSc.InsertMode.INSERT, mode=PETSc.ScatterMode.FORWARD)
+        with direction.localForm() as local:
+            values = -local.array_r / distance
+        slope.destroy()
+        direction.destroy()
+        return values
 
     def factorisation(self) -> Any | None:
         """PETSc's preconditioner with the factors of the last tangent; None where the method does not factorise."""
@@ -261,6 +291,8 @@ class GuardedNewton:
         Near L the rounding of the worst point may be far above that of all others. There what is below it counts as
         solved only when it goes no further down.
         """
+        if self.on_the_way and norm <= ON_THE_WAY * self._force_scale:
+            return True
         if norm > self._tolerance():
             return False
         relative = self.settings.absolute_tolerance + self.settings.relative_tolerance * self._force_scale

@@ -9,10 +9,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from remodel_fenicsx.evolution.blend import KEPT_RESERVE
 from remodel_fenicsx.evolution.newton import GuardedNewton, Solution, SolveFailure
 from remodel_fenicsx.evolution.refusals import Refusal, diagnosed
 
-KEPT_RESERVE = 0.2  # share of 1 - r/L that a part of a remodeling increment leaves at every point
+SLOPE_SHARE = 1e-3  # of the bounded part: over it the slope of the residual is taken
 log = logging.getLogger(__name__)
 
 
@@ -75,6 +76,8 @@ class Change:
         How often the whole is halved before it has failed.
     largest_part
         Largest further part from a fraction on, where there is a bound.
+    roughly
+        Whether all parts but the last may be solved coarsely. Not near a limit of the load: it would be passed.
     """
 
     time: float
@@ -83,6 +86,7 @@ class Change:
     newton: GuardedNewton
     maximum_halvings: int
     largest_part: Callable[[float], float] = lambda done: 1.0
+    roughly: bool = False
     _direction: NDArray[np.float64] | None = field(default=None, init=False)  # of the unknowns over the last part
 
     def advance(self, work: Work, failure: SolveFailure | None = None) -> None:
@@ -98,8 +102,10 @@ class Change:
             part = self._halved(part, done, failure)
         while done < 1.0:
             before = self.newton.unknown.x.array.copy()
-            part = self._started(min(part, 1.0 - done), done)
-            self.set_fraction(1.0 if done + part > 1.0 - 1e-12 else done + part)
+            part = self._started(min(part, 1.0 - done), done, work)
+            is_last = done + part > 1.0 - 1e-12
+            self.set_fraction(1.0 if is_last else done + part)
+            self.newton.on_the_way = self.roughly and not is_last
             try:
                 work.add(self.newton.solve())
             except SolveFailure as failed:
@@ -107,19 +113,28 @@ class Change:
                 work.add(failed)
                 part = self._halved(part, done, failed)
             else:
-                done = 1.0 if done + part > 1.0 - 1e-12 else done + part
+                done = 1.0 if is_last else done + part
                 self._direction = (self.newton.unknown.x.array - before) / part
                 part *= 2
                 work.substeps += 1
+            finally:
+                self.newton.on_the_way = False
 
-    def _started(self, wanted: float, done: float) -> float:
+    def _started(self, wanted: float, done: float, work: Work) -> float:
         """The next part, with the unknowns that it starts from.
 
         Where the bound at the present unknowns is smaller than what is wanted, they go on as over the last part: along
         that way chains keep about their length, and parts can be larger. Every point keeps its reserve there too.
         """
         bound = min(wanted, self.largest_part(done))
-        if self._direction is None or bound >= wanted:
+        if bound >= wanted:
+            return bound
+        if self._direction is None:
+            self._direction = self.newton.tangent_direction(self.set_fraction, done, SLOPE_SHARE * bound)
+            work.newton_iterations += 1
+            work.linear_iterations += 1
+        if not np.all(np.isfinite(self._direction)):
+            self._direction = None
             return bound
         unknown, equilibrium = self.newton.unknown.x.array, self.newton.equilibrium
         before = unknown.copy()
