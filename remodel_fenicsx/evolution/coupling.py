@@ -122,7 +122,7 @@ class Staggered:
         if self.blend is not None and self._cells_changed():
             blend = self.blend
             stage = "the change of the cells"
-            Change(time, stage, blend.set, blend.newton, halvings, blend.largest_part).advance(work)
+            Change(time, stage, blend.set, blend.newton, halvings, blend.largest_part, roughly=True).advance(work)
             failure = None  # the loads have not been tried from here
 
         def set_load_fraction(fraction: float) -> None:

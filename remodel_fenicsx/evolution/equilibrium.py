@@ -96,6 +96,10 @@ class Equilibrium:
     # ------------------------------------------------------------ what users ask
     def extension(self) -> Extension:
         """Largest r/L and smallest J of the present unknowns over all points of all ranks."""
+        return self.extension_and_stretches()[0]
+
+    def extension_and_stretches(self) -> tuple[Extension, NDArray[np.float64]]:
+        """The extension, and r/L at the points of this rank's own elements, (elements, points); infinite for NaN."""
         squared, jacobian = (self.quadrature.owned(values) for values in self.limit_values())
         with np.errstate(invalid="ignore"):
             stretch = np.sqrt(squared) / self.quadrature.owned(self.locking_length())
@@ -109,7 +113,19 @@ class Equilibrium:
             local = (-np.inf, (np.nan, np.nan, np.nan))
         ranks = self.comm.allgather((*local, float(np.min(jacobian, initial=np.inf)), self.stop_signal()))
         largest, worst_point = max((rank[:2] for rank in ranks), key=lambda pair: pair[0])
-        return Extension(largest, min(rank[2] for rank in ranks), worst_point, max(rank[3] for rank in ranks))
+        extension = Extension(largest, min(rank[2] for rank in ranks), worst_point, max(rank[3] for rank in ranks))
+        return extension, stretch
+
+    def keeps_reserve(self, before: Any, after: Any, share: float, nearer_than: float = 0.0) -> bool:
+        """Whether every point of all ranks keeps a share of its 1 - r/L; `nearer_than`: only those with r/L above it.
+
+        Parameters
+        ----------
+        before, after
+            r/L at the points, from `extension_and_stretches`.
+        """
+        lost = bool(np.any((after > nearer_than) & (1 - after < share * (1 - before))))
+        return not self.comm.allreduce(lost, MPI.LOR)
 
     def limit_values(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """r^2 in squared link lengths (0 without chains) and J at all points, each (elements, points)."""
@@ -182,12 +198,12 @@ class Equilibrium:
         if self.pointwise is not None:
             self.pointwise.update(stiffness=True)
 
-    def prescribed(self) -> NDArray[np.bool_]:
-        """Which of this rank's unknowns, ghosts included, supports and loads prescribe."""
+    def prescribed_values(self) -> NDArray[np.float64]:
+        """What supports and loads prescribe of this rank's unknowns, ghosts included; NaN where they are free."""
         values = np.full_like(self.state.unknown.x.array, np.nan)
         for condition in self.state.loading.boundary_conditions:
             condition.set(values)
-        return ~np.isnan(values)
+        return values
 
     def prescribed_gap(self, x: Any) -> float:
         """Largest distance of a prescribed value from its target, over all ranks."""
