@@ -11,10 +11,12 @@ from mpi4py import MPI
 
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.loading import Loading, LoadValues
+from remodel_fenicsx.evolution.locking import LockingWarning
 from remodel_fenicsx.evolution.parts import StepFailure
 from remodel_fenicsx.evolution.state import State
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher, times
 from remodel_fenicsx.evolution.unit_cells import UnitCells
+from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.results.columns import COLUMNS_ON_REQUEST, Observer, columns_of
@@ -68,7 +70,8 @@ class Simulation:
         self.cells = UnitCells(self.quadrature, domain.element_number, domain.number_of_elements, scene.cells)
         self.loading = Loading(domain, self.unknown, kinematics)
         shape.support(self.loading)
-        self.state = State(self.unknown, kinematics, self.cells, self.loading)
+        formulation = FORMULATIONS[scene.mesh.formulation]
+        self.state = State(self.unknown, kinematics, self.cells, self.loading, formulation)
         tissue = scene.material.tissue(scene.cells.end_to_end_length)
         self.stepper = Stepper(self.state, tissue, scene.remodeling, scene.solver, self.load_values)
         self.tissue = self.stepper.tissue
@@ -96,7 +99,9 @@ class Simulation:
         """
         self.stepper.remodeling.warn_of_overcorrection(self.stepper.coupling.share)
         ways = times(self.scene.time.end, self.scene.time.step)
-        return self.stepper.march(ways, [self.observer, *watchers])
+        mesh = self.scene.mesh
+        locking = LockingWarning(self.stepper, FORMULATIONS[mesh.formulation].locks(mesh.element, mesh.degree))
+        return self.stepper.march(ways, [self.observer, locking, *watchers])
 
     def close(self) -> None:
         """Free PETSc's objects and options."""

@@ -70,7 +70,7 @@ class RemodelingPass:
         self._change: tuple[UnitCell, UnitCell] | None = None
         self._smallest_area = self.quadrature.minimum(self.quadrature.smallest_areas)
         F = state.kinematics.deformation_gradient(state.unknown)
-        tensor = self.driver.tensor(F, self.tissue.stresses(F, [state.cells.ufl_cell]))
+        tensor = self.driver.tensor(F, state.dilatation.stresses(self.tissue, F, [state.cells.ufl_cell]))
         # one stacked expression: the deformation gradient comes at no cost with the driver
         stacked = ufl.as_vector([t[i, j] for t in (F, tensor) for i in range(3) for j in range(3)])
         self._expression = jit.expression(stacked, self.quadrature.points)
@@ -95,6 +95,7 @@ class RemodelingPass:
 
     def driving_tensor(self) -> tuple[Array, Array]:
         """F and the symmetric driving tensor at all points, each (elements * points, 3, 3)."""
+        self.state.dilatation.refresh()
         values = self.quadrature.evaluate(self._expression, (2, 3, 3)).reshape(-1, 2, 3, 3)
         driver = values[:, 1]
         return values[:, 0], (driver + np.swapaxes(driver, 1, 2)) / 2

@@ -46,7 +46,7 @@ class ElementFields:
         self.tissue = stepper.tissue
         state = self.state
         F = state.kinematics.deformation_gradient(state.unknown)
-        cauchy = self.tissue.stresses(F, [state.cells.ufl_cell]).cauchy
+        cauchy = state.dilatation.stresses(self.tissue, F, [state.cells.ufl_cell]).cauchy
         entries = [t[i, j] for t in (F, cauchy) for i in range(3) for j in range(3)]
         displacement = state.kinematics.displacement(state.unknown)
         expressions = ufl.as_vector([*entries, *(displacement[i] for i in range(3))])
@@ -60,6 +60,7 @@ class ElementFields:
         to the load axis, or in a tube from circumferential to axial); `chain_extension` (largest r/L in the element; 0
         where no chain locks).
         """
+        self.state.dilatation.refresh()
         values = self.quadrature.evaluate(self._state, (21,))
         F, cauchy = values[..., :9].reshape(*values.shape[:2], 3, 3), values[..., 9:18]
         dimensions, axes = self.state.cells.dimension_values, self.state.cells.axis_values
