@@ -119,7 +119,7 @@ class Membrane(Prism):
 
 
 def transversely_isotropic(F: Any, lame_lambda: Any, lame_mu: Any) -> Any:
-    """W = C/2 (exp Q - 1), Q = b_f E11^2 + b_t (E22^2 + E33^2 + 2 E23^2) + b_fs (2 E12^2 + 2 E13^2), C = mu, fibre x."""
+    """W = C/2 (exp Q - 1), Q = b_f E11^2 + b_t (E22^2 + E33^2 + 2 E23^2) + 2 b_fs (E12^2 + E13^2), C = mu, fibre x."""
     E = (F.T * F - ufl.Identity(3)) / 2
     along, across = 8 * E[0, 0] ** 2, 2 * (E[1, 1] ** 2 + E[2, 2] ** 2 + E[1, 2] ** 2 + E[2, 1] ** 2)
     sheared = 4 * (E[0, 1] ** 2 + E[1, 0] ** 2 + E[0, 2] ** 2 + E[2, 0] ** 2)

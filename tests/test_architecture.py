@@ -198,7 +198,7 @@ def test_no_module_is_longer_than_one_can_hold_in_mind() -> None:
 THINGS = (
     "a chain law", "a matrix energy", "a driver", "a frame", "a law towards a target, by rank", "any other law",
     "initial axes of the cells", "a load", "a column of every shape", "a column of one shape", "a shape",
-    "a kinematics", "a solver method", "a coupling", "a key of a scene",
+    "a kinematics", "a formulation", "a solver method", "a coupling", "a key of a scene",
 )  # fmt: skip
 
 

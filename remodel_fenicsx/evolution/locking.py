@@ -1,11 +1,12 @@
-"""Elements that lock in a stiff bulk: how much of the energy is in changes of volume that only the elements make."""
+"""Elements that lock in a stiff bulk: how much work goes into changes of volume that only elements make."""
 
 from __future__ import annotations
 
 import logging
 
+import dolfinx.fem
 import numpy as np
-from numpy.typing import NDArray
+from mpi4py import MPI
 
 from remodel_fenicsx.evolution.equilibrium import at_points
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
@@ -13,7 +14,7 @@ from remodel_fenicsx.fem.formulations import Locking
 
 log = logging.getLogger(__name__)
 
-UNIFORM = 1e-9  # share of the energy in differences of J up to which they are rounding
+UNIFORM = 1e-9  # relative differences of J up to which they are rounding
 
 
 class LockingWarning(Watcher):
@@ -21,13 +22,14 @@ class LockingWarning(Watcher):
 
     A body can lock where lambda is large beside mu: the network adds nothing to the stiffness against shear between
     the axes of its cells, however stiff it is along them. Whether it does depends on what it is asked to do, and the
-    solved state tells. A body that does not lock has next to no energy in changes of volume, of order mu/lambda; in
-    one that does J differs from point to point of an element. The share of the stored energy of these differences,
+    solved state tells. A body that does not lock spends next to nothing on changes of volume, of order mu/lambda; in
+    one that does J differs from point to point of an element. The share of these differences,
 
-        share = int lambda/2 (ln^2 J - ln^2 J_e) dV / int W dV,   J_e the mean of J over the element,
+        share = int lambda/2 (ln^2 J - ln^2 J_e) dV / (f . u / 2),   J_e the mean of J over the element,
 
-    is about the share by which loads move the body too little. Elements of a single point have no such differences:
-    they count as locked as soon as different elements have different J.
+    f the internal nodal forces, is about the share by which loads move the body too little. (The stored energy is no
+    scale: chains have some without any load.) Elements of a single point have no such differences: they count as
+    locked as soon as different elements have different J.
 
     Parameters
     ----------
@@ -48,21 +50,26 @@ class LockingWarning(Watcher):
         return self.quadrature.maximum(ratio.reshape(self.quadrature.shape))
 
     def energy_share(self) -> float:
-        """The share of the present state; 0 without energy. In elements of one point: 1 if J varies."""
-        quadrature, equilibrium = self.quadrature, self.stepper.coupling.equilibrium
-        energy, jacobian = equilibrium.stored_energy(), equilibrium.limit_values()[1]
-        if not energy > 0:
+        """The share of the present state; 0 where J is the same all over, else 1 for elements of a single point."""
+        quadrature = self.quadrature
+        logarithm = np.log(self.stepper.coupling.equilibrium.limit_values()[1])
+        single = quadrature.shape[1] == 1
+        means = np.full((len(logarithm), 1), quadrature.mean(logarithm))
+        if not single:
+            means = quadrature.element_mean(logarithm)[:, None]
+        if quadrature.maximum(np.abs(logarithm - means)) < UNIFORM:
             return 0.0
-        means = np.broadcast_to(quadrature.element_mean(jacobian)[:, None], jacobian.shape)
-        if quadrature.shape[1] > 1:
-            return self._volumetric_energy(jacobian, means) / energy
-        whole = np.full(jacobian.shape, quadrature.mean(jacobian))
-        return float(self._volumetric_energy(jacobian, whole) > UNIFORM * energy)
+        work = self.work()
+        stiffness = self.tissue.lame_lambda.reshape(logarithm.shape)
+        energy = quadrature.integral(stiffness / 2 * (logarithm**2 - means**2))
+        return 1.0 if single else energy / work if work > 0 else 0.0
 
-    def _volumetric_energy(self, jacobian: NDArray[np.float64], means: NDArray[np.float64]) -> float:
-        """Energy of J beyond that of the means."""
-        stiffness = self.tissue.lame_lambda.reshape(jacobian.shape)
-        return self.quadrature.integral(stiffness / 2 * (np.log(jacobian) ** 2 - np.log(means) ** 2))
+    def work(self) -> float:
+        """Half of the internal nodal forces times the unknowns: the work of loads and supports if all were linear."""
+        state, forms = self.stepper.state, self.stepper.coupling.equilibrium.internal_forms
+        # shares of the ranks in a node's force are not added up: their sum over all ranks is the same
+        local = sum(float(dolfinx.fem.assemble_vector(form).array @ state.unknown.x.array) for form in forms)
+        return float(state.comm.allreduce(local, MPI.SUM)) / 2
 
     def solved(self, step: Step) -> None:
         """Look, until it was said."""
@@ -73,7 +80,7 @@ class LockingWarning(Watcher):
             return
         self.limits = None
         if self.stepper.state.comm.rank == 0:
-            inside = f"{100 * share:.2g} % of the stored energy is in changes of volume inside single elements"
+            inside = f"{100 * share:.2g} % of the work goes into changes of volume inside single elements"
             log.warning(
                 "time %g: the elements lock, the body moves too little (lambda/mu up to %.4g; %s); set mesh.element = "
                 "'hexahedron' and mesh.formulation = 'selective-integration' (docs/theory.md, Volumetric locking)",

@@ -1,7 +1,7 @@
 """Formulations: where an element takes the change of volume, which decides whether it locks in a stiff bulk.
 
 An element of low degree cannot keep J = 1 at all of its points and bend; where lambda is much larger than every
-stiffness against shear it then hardly moves (docs/theory.md, Volumetric locking). dolfinx is imported when it is needed:
+stiffness against shear it then hardly moves (docs/theory.md, Volumetric locking). dolfinx is imported when needed:
 scenes, which name formulations, are read without it.
 """
 
@@ -63,7 +63,7 @@ class Locking(NamedTuple):
     stiffness_ratio
         lambda/mu up to which they never do.
     energy_share
-        Share of the stored energy that changes of volume inside single elements may have.
+        Share of the work that changes of volume inside single elements may take.
     """
 
     stiffness_ratio: float
