@@ -197,8 +197,9 @@ def test_no_module_is_longer_than_one_can_hold_in_mind() -> None:
 # ---------------------------------------------------------------- what to touch to add something
 THINGS = (
     "a chain law", "a matrix energy", "a driver", "a frame", "a law towards a target, by rank", "any other law",
-    "initial axes of the cells", "a load", "a column of every shape", "a column of one shape", "a shape",
-    "a kinematics", "a formulation", "a solver method", "a coupling", "a key of a scene",
+    "a pairing of values and dimensions", "initial axes of the cells", "a load", "a column of every shape",
+    "a column of one shape", "a shape", "a kinematics", "a formulation", "a solver method", "a coupling",
+    "a key of a scene",
 )  # fmt: skip
 
 

@@ -38,6 +38,7 @@ from remodel_fenicsx.tissue.chains import CHAINS, Chain
 from remodel_fenicsx.tissue.drivers import DRIVERS, FRAMES, Driver, Frame
 from remodel_fenicsx.tissue.energy import MATRICES, neo_hookean
 from remodel_fenicsx.tissue.laws import LAWS, Drive, Law, ranked
+from remodel_fenicsx.tissue.spectral import PAIRINGS, principal
 
 KAPPA = 0.1
 SCENE: dict[str, Any] = {
@@ -198,6 +199,22 @@ def test_a_law_of_another_kind(monkeypatch: pytest.MonkeyPatch) -> None:
     stretch = column(rows, "mean_stretch")
     assert stretch[1] < stretch[2] < stretch[3]  # under the same load
     assert all(row["remodeling_power"] != 0 for row in rows)
+
+
+def test_a_pairing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The largest tension belongs to the last dimension: the start of a cell is another one, eq. (11) is the same."""
+
+    def ascending(*tensors: Any, **limits: Any) -> Any:
+        values, axes = principal(*tensors, **limits)
+        return values[:, ::-1], axes[:, ::-1]
+
+    monkeypatch.setitem(PAIRINGS, "ascending", ascending)
+    for pairing, along, across in (("sorted", 0.8, 0.6), ("ascending", 0.0, 1.0)):
+        rows = rows_of(scene(cells={"initial": [0.8, 0.6, 0.0]}, remodeling={"pairing": pairing}))
+        for passes, row in enumerate(rows[1:], start=1):
+            left = np.exp(-KAPPA * passes)
+            angle = np.degrees(np.arctan2(across * left, along * left + 1 - left))
+            assert row["mean_fibre_angle"] == pytest.approx(angle, abs=1e-6), (pairing, passes)
 
 
 def test_initial_axes(monkeypatch: pytest.MonkeyPatch) -> None:

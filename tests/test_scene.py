@@ -112,7 +112,7 @@ BAD_SCENES = [
     (
         TUBE,
         {"output.pictures!": True},
-        "output.'pictures!' = true: unknown key; allowed are output.fields, output.columns, output.every",
+        "output.'pictures!' = true: unknown key; allowed are output.fields, output.columns, output.every, output.checkpoint",
     ),
     (TUBE, {"time.x\ny": 1}, "time.'x\\ny' = 1: unknown key; allowed are time.end, time.step"),
     # material
@@ -291,8 +291,18 @@ BAD_SCENES = [
     ),
     # remodeling, model, mesh
     (CUBE, {"remodeling.kappa": -0.1}, "remodeling.kappa = -0.1: must be a finite number at least 0"),
-    (CUBE, {"remodeling.law": "foo"}, "remodeling.law = 'foo': allowed are 'explicit', 'rate', 'relaxation', 'none'"),
-    (CUBE, {"remodeling.law": 1}, "remodeling.law = 1: allowed are 'explicit', 'rate', 'relaxation', 'none'"),
+    (CUBE, {"remodeling.rotation_time": 0.0}, "remodeling.rotation_time = 0.0: must be a finite number greater than 0"),
+    (CUBE, {"remodeling.pairing": "rank"}, "remodeling.pairing = 'rank': allowed are 'sorted', 'continuous'"),
+    (
+        CUBE,
+        {"remodeling.law": "foo"},
+        "remodeling.law = 'foo': allowed are 'explicit', 'rate', 'relaxation', 'rotation', 'none'",
+    ),
+    (
+        CUBE,
+        {"remodeling.law": 1},
+        "remodeling.law = 1: allowed are 'explicit', 'rate', 'relaxation', 'rotation', 'none'",
+    ),
     (CUBE, {"remodeling.driver": "strain"}, "remodeling.driver = 'strain': allowed are 'cauchy', 'pk2', 'finger'"),
     (CUBE, {"remodeling.frame": "corotated"}, "remodeling.frame = 'corotated': allowed are 'material', 'spatial'"),
     (CUBE, {"remodeling.coupling": "implicit"}, "remodeling.coupling = 'implicit': allowed are 'staggered', 'relaxed'"),
@@ -550,6 +560,7 @@ def test_the_preset_is_the_printed_method():
         "remodeling.driver": "cauchy",
         "remodeling.law": "explicit",
         "remodeling.frame": "spatial",
+        "remodeling.pairing": "sorted",
         "remodeling.coupling": "staggered",
         "remodeling.kappa": 0.025,
         "material.lame_lambda": 27.293,

@@ -16,14 +16,9 @@ import h5py
 import numpy as np
 import pytest
 
+from remodel_fenicsx.results.chain_lines import chain_displacement, chain_lines
 from remodel_fenicsx.results.staged_file import StagedFile
-from remodel_fenicsx.results.vtkhdf import (
-    LINE,
-    TransientGrid,
-    cell_type_and_permutation,
-    chain_displacement,
-    chain_lines,
-)
+from remodel_fenicsx.results.vtkhdf import LINE, TransientGrid, cell_type_and_permutation
 
 # In a process of its own, as users do. Steps are read forwards and backwards: VTK keeps the meshes of earlier steps.
 READER = """

@@ -25,11 +25,14 @@ class Coupling(Protocol):
     ----------
     equilibrium
         The forms of the solved state.
+    newton
+        What solved it.
     share
         Share of a pass's change of the cells that is made.
     """
 
     equilibrium: Equilibrium
+    newton: GuardedNewton
     share: float
 
     def solve(self, time: float, loads: LoadValues) -> Work:

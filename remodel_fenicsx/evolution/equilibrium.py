@@ -161,6 +161,13 @@ class Equilibrium:
             )
             matrix.assemble()
 
+    def prescribed(self) -> NDArray[np.bool_]:
+        """Which of this rank's unknowns, ghosts included, supports and loads prescribe."""
+        values = np.full_like(self.state.unknown.x.array, np.nan)
+        for condition in self.state.loading.boundary_conditions:
+            condition.set(values)
+        return ~np.isnan(values)
+
     def prescribed_gap(self, x: Any) -> float:
         """Largest distance of a prescribed value from its target, over all ranks."""
         with x.localForm() as local:

@@ -147,6 +147,11 @@ class GuardedNewton:
             raise SolveFailure(self._failure_text(reason, extension), newton, linear, extension)
         return Solution(newton, linear, float(self._snes.getFunctionNorm()))
 
+    def factorisation(self) -> Any | None:
+        """PETSc's preconditioner with the factors of the last tangent; None where the method does not factorise."""
+        preconditioner = self._snes.getKSP().getPC()
+        return preconditioner if preconditioner.getType() in ("lu", "cholesky") else None
+
     def _warn_of_unused_options(self) -> None:
         """Once, after the first solve; on all ranks, for each has a database of options."""
         if self._options_checked:

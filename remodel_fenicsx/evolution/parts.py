@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from remodel_fenicsx.evolution.newton import GuardedNewton, Solution, SolveFailure
+from remodel_fenicsx.evolution.refusals import TOO_LARGE, Refusal
 
 log = logging.getLogger(__name__)
 
@@ -31,14 +32,19 @@ class Work:
 class StepFailure(RuntimeError):
     """A step cannot be solved even in the smallest parts; the state is that of the last accepted step."""
 
-    def __init__(self, time: float, stage: str, fraction: float, cause: SolveFailure):
-        point = ", ".join(f"{c:.3f}" for c in cause.extension.worst_point)
-        super().__init__(
-            f"no equilibrium at time {time:g}: {stage} stops at {100 * fraction:.3g} % of the step ({cause.reason}; "
-            f"largest r/L = {cause.extension.max_chain_extension:.4f} at ({point}), "
-            f"smallest J = {cause.extension.min_jacobian:.4g})"
-        )
-        self.time = time
+    def __init__(self, time: float, text: str, refusal: Refusal):
+        super().__init__(text)
+        self.time, self.refusal = time, refusal
+
+
+def failure_text(time: float, stage: str, fraction: float, cause: SolveFailure) -> str:
+    """Where a change of the problem has stopped, and why."""
+    point = ", ".join(f"{c:.3f}" for c in cause.extension.worst_point)
+    return (
+        f"no equilibrium at time {time:g}: {stage} stops at {100 * fraction:.3g} % of the step ({cause.reason}; "
+        f"largest r/L = {cause.extension.max_chain_extension:.4f} at ({point}), "
+        f"smallest J = {cause.extension.min_jacobian:.4g})"
+    )
 
 
 @dataclass
@@ -92,6 +98,7 @@ class Change:
 
     def _halved(self, part: float, done: float, failure: SolveFailure) -> float:
         if part / 2 < 2.0**-self.maximum_halvings:
-            raise StepFailure(self.time, self.stage, done, failure) from failure
+            text = failure_text(self.time, self.stage, done, failure)
+            raise StepFailure(self.time, text, TOO_LARGE) from failure
         log.debug("%s: %s; next part %g", self.stage, failure.reason, part / 2)
         return part / 2

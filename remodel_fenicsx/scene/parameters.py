@@ -18,12 +18,13 @@ from remodel_fenicsx.tissue.chains import BOLTZMANN_CONSTANT, CHAINS
 from remodel_fenicsx.tissue.drivers import DRIVERS, FRAMES
 from remodel_fenicsx.tissue.energy import MATRICES, Tissue
 from remodel_fenicsx.tissue.laws import LAWS
+from remodel_fenicsx.tissue.spectral import PAIRINGS
 from remodel_fenicsx.schema.units import NUMBER_DENSITY, STRESS, TEMPERATURE
 
 COUPLINGS = {
     "staggered": "solve with the cells of the step before, then remodel once",
-    "relaxed": "the same with a share, relaxation_factor, of what the pass changes: stable for every driver and frame, "
-    "where 'staggered' over-corrects with 'pk2' and 'finger'",
+    "relaxed": "the same with a share, relaxation_factor, of what the pass changes: half of it is stable for every "
+    "driver and frame but under weak loads, where 'staggered' over-corrects with 'pk2' and 'finger'",
 }
 """What each of `evolution.coupling.COUPLINGS` does; that room is above this one, and a test holds the two together."""
 STRESS_UNITS = {"Pa": 1.0, "kPa": 1.0e3, "MPa": 1.0e6}  # in Pa
@@ -202,14 +203,21 @@ class Remodeling(Table):
     )
     law: Annotated[str, one_of(LAWS)] = Field(
         default="explicit",
-        description="Evolution of the cell dimensions: 'explicit' is eq. (11), in absolute time; 'rate' integrates eq. "
-        "(10); 'relaxation' is dl/dt = kappa (r0 e - l), right for changing loads; 'none' leaves the cells alone.",
+        description="Evolution of the cells: 'explicit' is eq. (11), in absolute time; 'rate' integrates eq. (10); "
+        "'relaxation' is dl/dt = kappa (r0 e - l), right for changing loads; 'rotation' (Remark 5) turns the axis of "
+        "the largest dimension gradually and leaves the dimensions alone; 'none' leaves the cells alone.",
     )
     frame: Annotated[str, one_of(FRAMES)] = Field(
         default="material",
         description="Axes of the remodeled cells, for the drivers 'cauchy' and 'finger': 'material' takes the fibres "
         "that the deformation carries onto the principal directions (objective), 'spatial' the principal directions "
         "themselves, as printed. The driver 'pk2' has material eigenvectors of its own.",
+    )
+    pairing: Annotated[str, one_of(PAIRINGS)] = Field(
+        default="sorted",
+        description="Which dimension follows which principal value: 'sorted' by rank, as printed (where two values "
+        "cross, the cell turns by 90 degrees at once), 'continuous' by axis (each principal direction goes on from the "
+        "axis that it overlaps most). The law 'rotation' does not ask.",
     )
     coupling: Annotated[str, one_of(COUPLINGS)] = Field(
         default="staggered", description="; ".join(f"{name!r}: {text}" for name, text in COUPLINGS.items()) + "."
@@ -222,6 +230,12 @@ class Remodeling(Table):
     )
     kappa: float = Field(
         default=0.025, ge=0, description="Speed of remodeling kappa, in 1/time; a difference fades like exp(-kappa t)."
+    )
+    rotation_time: float = Field(
+        default=40.0,
+        gt=0,
+        description="Time of the law 'rotation': a small angle between fibre and tension fades like "
+        "exp(-t / rotation_time).",
     )
 
 
@@ -253,6 +267,7 @@ def _printed_method(
             "driver": "cauchy",
             "law": "explicit",
             "frame": "spatial",
+            "pairing": "sorted",
             "coupling": "staggered",
             "kappa": 0.025,
         },

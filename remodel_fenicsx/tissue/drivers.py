@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -32,8 +32,6 @@ class Driver:
     tensor: Callable[[Any, Stresses], Any]
     material: bool
     is_stress: bool = True
-    # by frame: factor by which a pass multiplies a small tilt of the axes, where it is below -1 (docs/theory.md)
-    overcorrection: dict[str, float] = field(default_factory=dict)
 
 
 def finger_tensor(deformation_gradient: Any, stresses: Stresses) -> Any:
@@ -45,17 +43,8 @@ def finger_tensor(deformation_gradient: Any, stresses: Stresses) -> Any:
 
 DRIVERS: dict[str, Driver] = {
     "cauchy": Driver(lambda F, s: s.cauchy, material=False),
-    "pk2": Driver(
-        lambda F, s: s.second_piola_kirchhoff,
-        material=True,
-        overcorrection={"material": -1.5, "spatial": -1.5},
-    ),
-    "finger": Driver(
-        finger_tensor,
-        material=False,
-        is_stress=False,
-        overcorrection={"material": -2.6, "spatial": -1.9},
-    ),
+    "pk2": Driver(lambda F, s: s.second_piola_kirchhoff, material=True),
+    "finger": Driver(finger_tensor, material=False, is_stress=False),
 }
 
 

@@ -1,0 +1,275 @@
+"""Families on tubes and tendons: locking, axial stretch, suction, buckling, random cells."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from benchmarks.stability_map.cases import Case, Finding, Run, family, with_values
+from benchmarks.stability_map.homogeneous import CUBE, DRIVERS, FRAMES, material
+from tests.reference.radial import RadialHistory, RadialMaterial, Tube, solve_radial
+
+SOFT = {"chain_density": 2.0e21, "contour_length": 1.594, "persistence_length": 1.365}
+TUBE: dict[str, Any] = {
+    **CUBE,
+    "geometry": {"shape": "tube", "inner_radius": 1.0, "outer_radius": 3.0, "length": 0.5},
+    "mesh": {"refinement": 1, "element": "hexahedron", "degree": 2},
+    "material": {**CUBE["material"], **SOFT},
+    "cells": {"initial": "isotropic", "axes": "cylindrical", "end_to_end_length": 1.0},
+    "loads": {
+        "pressure": {"value": 4.8, "ramp": [[0.0, 0.0], [20.0, 1.0]]},
+        "elongation": {"value": 0.1, "ramp": [[0.0, 0.0], [20.0, 1.0]]},
+    },
+    "time": {"end": 40.0, "step": 2.0},
+}
+TENDON: dict[str, Any] = {
+    **CUBE,
+    "geometry": {"shape": "tendon", "length": 10.0, "area": 10.0},
+    "material": {**CUBE["material"], **SOFT},
+    "cells": {"initial": "random", "seed": 1, "axes": "global", "end_to_end_length": 1.0},
+    "loads": {"force": {"value": 300.0, "ramp": [[0.0, 0.0], [12.0, 1.0]]}},
+    "time": {"end": 40.0, "step": 1.0},
+}
+COARSE_TENDON = {"tendon": {"AROUND": 8, "CORE": 2, "RINGS": 1, "ALONG": 3}}
+RADIUS_TOLERANCE, DISPLACEMENT_TOLERANCE, STEP_TOLERANCE = 0.01, 0.035, 0.01
+REFERENCE = "tube in one dimension"
+
+
+def ring(around: int, through: int) -> dict[str, Any]:
+    """Elements around and through the wall, one along."""
+    return {"tube": {"PAPER": [around, through, 1]}}
+
+
+# ---------------------------------------------------------------- the tube in one dimension
+@lru_cache(maxsize=None)
+def radial(end: float, **arguments: Any) -> RadialHistory:
+    """The reference up to a time."""
+    return solve_radial(end=end, elements=60, **arguments)
+
+
+def reference(scene: dict[str, Any]) -> tuple[RadialHistory | None, bool]:
+    """As far as the reference goes, and whether that is the end."""
+    loads, r, time = scene["loads"], scene["remodeling"], scene["time"]
+    arguments: dict[str, Any] = {
+        "pressure": loads["pressure"]["value"], "stretch": loads["elongation"]["value"],
+        "ramp_time": loads["pressure"]["ramp"][-1][0], "step": time["step"], "driver": r["driver"], "law": r["law"],
+        "kappa": r["kappa"], "material": material(scene),
+    }  # fmt: skip
+    last = round(time["end"] / time["step"])
+    low, high, found = 0, last + 1, None  # the last step that it reaches lies in [low, high)
+    while high - low > 1:
+        middle = high - 1 if high == last + 1 and low == 0 else (low + high) // 2
+        try:
+            found, low = radial(middle * time["step"], **arguments), middle
+        except (RuntimeError, ValueError, np.linalg.LinAlgError):
+            high = middle
+    return found, low == last
+
+
+def check_tube(case: Case, run: Run) -> Finding:
+    """Inner and outer radius by step."""
+    expected, whole = reference(case.scene)
+    rows = min(len(run.column("time")), 0 if expected is None else len(expected.times))
+    known = case.options.get("unstable")
+    if expected is None or not rows:
+        return Finding(np.inf if run.code == 0 else 0.0, "no row to compare", known, whole)
+    inner, outer = expected.inner_radii[:rows], expected.outer_radii[:rows]
+    off = {
+        name: float(np.max(np.abs(run.column(name)[:rows] / radii - 1)))
+        for name, radii in (("inner_radius", inner), ("outer_radius", outer))
+    }
+    words = ", ".join(f"{name} off by {100 * value:.3g} %" for name, value in off.items())
+    if not whole:
+        words += f"; the reference ends at t = {expected.times[-1]:g}"
+    ratio = max(off.values()) / RADIUS_TOLERANCE
+    return Finding(np.inf if run.code == 0 and not whole else ratio, words, known, whole)
+
+
+def check_inner_displacement(case: Case, run: Run) -> Finding:
+    """Displacement of the inner face under the last pressure, elastic."""
+    m = case.scene["material"]
+    tube = Tube(1.0, 3.0, 400, RadialMaterial(m["lame_lambda"], m["lame_mu"], 0.0))
+    radii, zero = tube.nodes.copy(), np.zeros((len(tube.points), 3))
+    pressure = case.scene["loads"]["pressure"]["value"]
+    for share in np.linspace(0.1, 1.0, 10):
+        radii = tube.advance(radii, (zero, pressure * (share - 0.1), 1.0), (zero, pressure * share, 1.0))
+    found = run.column("inner_radius")
+    if not len(found):
+        return Finding(0.0, "no row")
+    error = (found[-1] - 1) / (radii[0] - 1) - 1 if run.code == 0 else 0.0
+    return Finding(abs(error) / DISPLACEMENT_TOLERANCE, f"inner displacement off by {100 * error:.3g} %")
+
+
+def tube_case(family_name: str, changes: dict[str, Any], place: dict[str, Any], **more: Any) -> Case:
+    """A short piece of the demo's artery with isotropic cells."""
+    key = f"{family_name}: " + ", ".join(f"{name} {value}" for name, value in place.items())
+    options: dict[str, Any] = {
+        "reference": REFERENCE,
+        "place": place,
+        "check": check_tube,
+        "counts": ring(8, 4),
+        **more,
+    }
+    return Case(family_name, key, with_values(TUBE, changes), **options)
+
+
+@family("tube")
+def tubes() -> Iterator[Case]:
+    """Pressure and axial stretch, drivers, frames."""
+    for pressure in (0.0, 0.01, 0.5, 2.4, 4.8, 12.0, 48.0):
+        for stretch in (-0.2, 0.0, 0.1, 0.3, 0.55):
+            changes = {"loads.pressure.value": pressure, "loads.elongation.value": stretch}
+            yield tube_case(
+                "tube", changes, {"pressure": pressure, "stretch": stretch}, reduced=(pressure, stretch) == (2.4, 0.1)
+            )
+    for driver in DRIVERS:
+        for frame in FRAMES:
+            for coupling in ("staggered", "relaxed"):
+                if coupling == "relaxed":
+                    continue  # the reference is staggered; `tube, long` has the relaxed ones
+                changes = {"remodeling.driver": driver, "remodeling.frame": frame}
+                place = {"driver": driver, "frame": frame, "coupling": coupling}
+                yield tube_case("tube", changes, place)
+
+
+@family("tube, long")
+def long_tubes() -> Iterator[Case]:
+    """Hundred passes, where what over-corrects has left the symmetric solution."""
+    for driver in DRIVERS:
+        for frame in FRAMES:
+            for coupling in ("staggered", "relaxed"):
+                changes = {"remodeling.driver": driver, "remodeling.frame": frame, "remodeling.coupling": coupling}
+                changes |= {"time.end": 120.0, "time.step": 1.0, "mesh.degree": 1}
+                place = {"driver": driver, "frame": frame, "coupling": coupling}
+                options = {"counts": ring(16, 8), "check": check_long}
+                yield tube_case("tube, long", changes, place, **options)
+
+
+LONG_TOLERANCE = 0.02  # trilinear elements: 1 % of error of their own
+
+
+def check_long(case: Case, run: Run) -> Finding:
+    """As `check_tube`, with the error of the elements."""
+    finding = check_tube(case, run)
+    return Finding(finding.ratio * RADIUS_TOLERANCE / LONG_TOLERANCE, finding.words, finding.unstable, finding.solvable)
+
+
+@family("tube, parameters")
+def tube_parameters() -> Iterator[Case]:
+    """r0/L, lambda/mu with chains, speed, laws."""
+    for share in (0.05, 0.3, 0.6, 0.9, 0.99):
+        for pressure in (0.5, 2.4):
+            changes = {"cells.end_to_end_length": share * 1.594, "loads.pressure.value": pressure}
+            changes |= {"loads.elongation.value": 0.0}
+            yield tube_case("tube, parameters", changes, {"r0/L": share, "pressure": pressure})
+    for ratio in (0.1, 10.0, 100.0, 1e3, 1e4):
+        for element, degree in (("hex1", 1), ("hex2", 2)):
+            changes = {"material.lame_lambda": ratio * 3.103, "loads.pressure.value": 2.4, "mesh.degree": degree}
+            counts = ring(16, 8) if degree == 1 else ring(8, 4)
+            place = {"lambda/mu": ratio, "element": element}
+            yield tube_case("tube, parameters", changes, place, counts=counts, check=check_long)
+    for speed in (1e-3, 0.25, 10.0):
+        for law in ("explicit", "rate", "relaxation"):
+            changes = {"remodeling.kappa": speed / 2, "remodeling.law": law, "loads.pressure.value": 2.4}
+            yield tube_case("tube, parameters", changes, {"kappa dt": speed, "law": law})
+
+
+@family("suction")
+def suctions() -> Iterator[Case]:
+    """Inner pressure below zero: a ring that buckles. That -4.8 is unstable was measured on 0.1.0 (eigenvalue -8.7)."""
+    for pressure in (-0.1, -1.0, -4.8):
+        for degree, counts in ((1, ring(16, 8)), (2, ring(8, 4))):
+            changes = {"loads.pressure.value": pressure, "loads.elongation.value": 0.0, "mesh.degree": degree}
+            options = {"unstable": True if pressure == -4.8 else None}
+            place = {"pressure": pressure, "degree": degree}
+            yield tube_case("suction", changes, place, counts=counts, options=options, check=check_long)
+
+
+ELASTIC = {"material.chain_density": 0.0, "remodeling.law": "none", "loads.elongation.value": 0.0}
+MESHES = {
+    "hex1 16x8": ("hexahedron", 1, ring(16, 8)), "hex1 32x16": ("hexahedron", 1, ring(32, 16)),
+    "hex2 8x4": ("hexahedron", 2, ring(8, 4)), "tet1 16x8": ("tetrahedron", 1, ring(16, 8)),
+    "tet2 8x4": ("tetrahedron", 2, ring(8, 4)),
+}  # fmt: skip
+
+
+@family("locking")
+def locking() -> Iterator[Case]:
+    """Thick tube without chains, p = 2, towards incompressibility."""
+    for mesh, (kind, degree, counts) in MESHES.items():
+        for ratio in (0.1, 1.0, 10.0, 100.0, 1e3, 1e4, 1e5):
+            changes = {
+                **ELASTIC, "loads.pressure": {"value": 2.0, "ramp": [[0.0, 0.0], [4.0, 1.0]]}, "mesh.element": kind,
+                "mesh.degree": degree, "material.lame_lambda": ratio * 3.103, "time.end": 4.0, "time.step": 1.0,
+            }  # fmt: skip
+            place = {"mesh": mesh, "lambda/mu": ratio}
+            options = {"check": check_inner_displacement, "counts": counts}
+            yield tube_case("locking", changes, place, reduced=mesh == "hex2 8x4" and ratio in (1.0, 100.0), **options)
+
+
+# ---------------------------------------------------------------- tendons
+def check_half_step(case: Case, run: Run) -> Finding:
+    """The same with half of the step: mean stretch and mean angle at the end."""
+    other = run.companion
+    if other is None or other.code != 0 or run.code != 0:
+        return Finding(np.nan if run.code == 0 else 0.0, "half of the step does not come to the end")
+    stretch = abs(run.column("mean_stretch")[-1] / other.column("mean_stretch")[-1] - 1)
+    angle = abs(run.column("mean_fibre_angle")[-1] - other.column("mean_fibre_angle")[-1])
+    ratio = max(stretch / STEP_TOLERANCE, angle / case.options.get("angle", 1.5))
+    return Finding(float(ratio), f"half of the step: stretch {100 * stretch:.3g} %, angle {angle:.3g} degrees")
+
+
+def tendon_case(family_name: str, changes: dict[str, Any], place: dict[str, Any], **more: Any) -> Case:
+    """A coarse tendon."""
+    key = f"{family_name}: " + ", ".join(f"{name} {value}" for name, value in place.items())
+    options: dict[str, Any] = {"reference": "half of the step", "place": place, "counts": COARSE_TENDON}
+    options |= {"check": check_half_step, **more}
+    scene = with_values(TENDON, changes)
+    if options["check"] is check_half_step:
+        options["companion"] = with_values(scene, {"time.step": scene["time"]["step"] / 2})
+    return Case(family_name, key, scene, **options)
+
+
+@family("random cells")
+def random_cells() -> Iterator[Case]:
+    """A tendon of random cells: every driver, frame and coupling, from weak loads to locking."""
+    for driver in DRIVERS:
+        for frame in FRAMES:
+            for coupling in ("staggered", "relaxed"):
+                for force in (30.0, 300.0):
+                    changes = {"remodeling.driver": driver, "remodeling.frame": frame, "loads.force.value": force}
+                    changes |= {"remodeling.coupling": coupling}
+                    place = {"driver": driver, "frame": frame, "coupling": coupling, "force": force}
+                    yield tendon_case("random cells", changes, place)
+    for force in (0.01, 1.0, 1000.0, 3000.0):
+        for frame in FRAMES:
+            changes = {"loads.force.value": force, "remodeling.frame": frame}
+            yield tendon_case("random cells", changes, {"frame": frame, "force": force})
+
+
+@family("buckling")
+def buckling() -> Iterator[Case]:
+    """A slender column without chains, clamped at its bottom: Euler's load is the reference."""
+    length, area, mu, lame = 10.0, 0.1, 3.103, 27.293
+    modulus = mu * (3 * lame + 2 * mu) / (lame + mu)
+    euler = np.pi**2 * modulus * area**2 / (4 * np.pi) / (4 * length**2)
+    for share in (0.25, 0.5, 2.0, 10.0, 100.0):
+        changes = {
+            "geometry.area": area, "material.chain_density": 0.0, "remodeling.law": "none", "mesh.degree": 2,
+            "loads.force": {"value": -share * euler, "ramp": [[0.0, 0.0], [4.0, 1.0]]}, "time.end": 4.0,
+        }  # fmt: skip
+        options = {"unstable": share > 1, "strain": -share * euler / area / modulus}
+        place = {"force over Euler's": share}
+        yield tendon_case("buckling", changes, place, check=check_column, options=options, reference="Euler's load")
+
+
+def check_column(case: Case, run: Run) -> Finding:
+    """The straight column's linear strain, and whether it can stay straight."""
+    found = run.column("mean_stretch")
+    if not len(found):
+        return Finding(0.0, "no row", case.options["unstable"])
+    error = abs((found[-1] - 1) / case.options["strain"] - 1)
+    return Finding(error / 0.02, f"strain off by {100 * error:.3g} %", case.options["unstable"])

@@ -1,0 +1,118 @@
+"""Families under a prescribed deformation of the whole boundary: axes that are not coaxial, bad elements inside."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from benchmarks.stability_map.cases import Case, Finding, Run, family, with_values
+from benchmarks.stability_map.homogeneous import (
+    COUPLINGS,
+    CUBE,
+    DRIVERS,
+    FRAMES,
+    factor,
+    initial,
+    material,
+    step_times,
+)
+from benchmarks.stability_map.point import prescribed_path
+
+FINER = 16  # steps of the reference in one of the scene's
+LIMIT_TOLERANCE = 0.03  # of A over r0^2: the staggered pass has an error of the order of kappa dt = 0.025
+SETTLED = 0.01  # of A between two references, or there is no limit
+REFERENCE = "material point, dt -> 0"
+RAMP = [[0.0, 0.0], [10.0, 1.0]]
+
+
+def gradients(scene: dict[str, Any], times: np.ndarray) -> np.ndarray:
+    """F by step, (steps, 3, 3)."""
+    F = np.tile(np.eye(3), (len(times), 1, 1))
+    for name, load in scene["loads"].items():
+        i, j = ("xyz".index(letter) for letter in name[-2:])
+        F[:, i, j] += load["value"] * factor(load["ramp"], times)
+    return F
+
+
+def limit(scene: dict[str, Any], finer: int) -> np.ndarray:
+    """A at the last row's time for a step that goes to zero, relaxed so that it does not chatter."""
+    coarse, r = step_times(scene), scene["remodeling"]
+    step = scene["time"]["step"] / finer
+    # the row's cells have remodeled up to the step before it
+    times = step * np.arange(1, round((coarse[-1] - scene["time"]["step"]) / step) + 2)
+    path = prescribed_path(
+        material(scene), gradients(scene, times), times, initial(scene),
+        r["driver"], r["law"], r["frame"], r["kappa"], 0.5,
+    )  # fmt: skip
+    return np.asarray(path[-1])
+
+
+def check_limit(case: Case, run: Run) -> Finding:
+    """F everywhere as on the boundary, and A as for dt -> 0."""
+    if "time" not in run.fields:
+        return Finding(0.0, "no field")
+    r0 = case.scene["cells"]["end_to_end_length"]
+    expected, coarser = limit(case.scene, FINER), limit(case.scene, FINER // 2)
+    if np.abs(expected - coarser).max() / r0**2 > SETTLED:
+        return Finding(np.nan, "the reference does not converge with dt")
+    F = gradients(case.scene, step_times(case.scene))[-1]
+    patch = np.abs(run.tensor("deformation_gradient") - F).max() / np.abs(F).max() / 1e-5
+    cells = np.abs(run.structure_tensor() - expected).max() / r0**2 / LIMIT_TOLERANCE
+    words = f"A differs from dt -> 0 by {cells * LIMIT_TOLERANCE:.3g} r0^2" if cells > patch else "F is not uniform"
+    return Finding(float(max(cells, patch)), words)
+
+
+def driven_case(family_name: str, changes: dict[str, Any], place: dict[str, Any], **more: Any) -> Case:
+    """The driven block of `extensions`."""
+    base = {**CUBE, "geometry": {"shape": "driven", "side": 1.0}, "loads": {}}
+    key = f"{family_name}: " + ", ".join(f"{name} {value}" for name, value in place.items())
+    options = {"reference": REFERENCE, "place": place, "extended": True, **more}
+    return Case(family_name, key, with_values(base, changes), check_limit, **options)
+
+
+@family("shear")
+def shears() -> Iterator[Case]:
+    """Simple shear: the principal directions turn with the load and differ between stress, strain and cells."""
+    for amount in (0.01, 0.3, 1.0):
+        for driver in DRIVERS:
+            for frame in FRAMES[:1] if driver == "pk2" else FRAMES:
+                for coupling in COUPLINGS:
+                    changes = {"loads.h_xz": {"value": amount, "ramp": RAMP}, "time.end": 40.0}
+                    changes |= {"remodeling.driver": driver, "remodeling.frame": frame}
+                    changes |= {"remodeling.coupling": coupling}
+                    place = {"shear": amount, "driver": driver, "frame": frame, "coupling": coupling}
+                    yield driven_case("shear", changes, place, reduced=amount == 0.3 and driver == "cauchy")
+
+
+@family("shear of bad elements")
+def bad_shears() -> Iterator[Case]:
+    """The patch test under shear and stretch, with a node inside that is moved."""
+    for distortion in (0.0, 0.9, 0.999):
+        for law in ("explicit", "relaxation"):
+            for frame in FRAMES:
+                changes = {
+                    "loads.h_xz": {"value": 0.3, "ramp": RAMP}, "loads.h_zz": {"value": 0.2, "ramp": RAMP},
+                    "mesh.refinement": 2, "geometry.distortion": distortion, "remodeling.law": law,
+                    "remodeling.frame": frame, "time.end": 30.0,
+                }  # fmt: skip
+                place = {"distortion": distortion, "law": law, "frame": frame}
+                yield driven_case("shear of bad elements", changes, place, reduced=distortion == 0.9)
+
+
+@family("shear reversed")
+def reversed_shears() -> Iterator[Case]:
+    """Shear that changes its sign, under a constant stretch; laws that forget."""
+    for law in ("explicit", "relaxation"):
+        for driver in DRIVERS:
+            for frame in FRAMES[:1] if driver == "pk2" else FRAMES:
+                for coupling in COUPLINGS:
+                    changes = {
+                        "loads.h_xz": {"value": 0.3, "ramp": [[0, 0], [10, 1], [30, 1], [50, -1]]},
+                        "loads.h_zz": {"value": 0.1, "ramp": RAMP}, "remodeling.law": law,
+                        "remodeling.driver": driver, "remodeling.frame": frame, "remodeling.coupling": coupling,
+                        "time.end": 80.0,
+                    }  # fmt: skip
+                    place = {"law": law, "driver": driver, "frame": frame, "coupling": coupling}
+                    yield driven_case("shear reversed", changes, place)

@@ -1,0 +1,139 @@
+"""Runs scenes through a checkout's own command line, many in one process, and returns what a user would see.
+
+    python3 runner.py       reads one request a line (JSON), answers with one line each; PYTHONPATH names the checkout
+
+It imports nothing of this checkout but the bodies and loads of `extensions`, which another version may not know.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import io
+import json
+import os
+import re
+import sys
+import tempfile
+import time as clock
+import traceback
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import tomlkit
+
+MESH_MODULES = ("remodel_fenicsx.body", "remodel_fenicsx.geometry")  # of this version, of 0.1.0
+UNKNOWN = re.compile(r"unknown key|allowed are|has no such")  # another version's words for what it does not have
+WANTED_FIELDS = ("deformation_gradient", "cauchy_stress", "cell_dimensions", "axis_1", "axis_2", "axis_3")
+
+
+# keys of this version that 0.1.0 calls otherwise
+EARLIER = {("mesh", "element"): ("mesh", "cell"), ("loads", "elongation"): ("loads", "stretch")}
+
+
+def in_words_of(version: str, scene: dict[str, Any]) -> dict[str, Any]:
+    """The scene with the keys that a version knows it by."""
+    if not version.startswith("0.1."):
+        return scene
+    copy = {name: dict(value) if isinstance(value, dict) else value for name, value in scene.items()}
+    for (table, key), (_, earlier) in EARLIER.items():
+        if key in copy.get(table, {}):
+            copy[table][earlier] = copy[table].pop(key)
+    return copy
+
+
+def run_request(request: dict[str, Any]) -> dict[str, Any]:
+    """Run one scene.
+
+    Parameters
+    ----------
+    request
+        `scene`: nested tables; `counts`: {module: {constant: value}}, numbers of elements that scenes cannot ask for;
+        `extended`: whether it needs the loads and bodies of `extensions`; `other`: whether this is another checkout.
+
+    Returns
+    -------
+    `code`: exit code, or None where this version cannot express the scene; `said`: standard error; `warnings`: lines
+    of run.log; `history`: columns; `fields`: of the last recorded time; `seconds`.
+    """
+    if request.get("extended"):
+        try:
+            importlib.import_module("benchmarks.stability_map.extensions").register()
+        except ImportError as error:
+            return {"code": None, "said": f"{error}"}
+    start, version = clock.perf_counter(), importlib.import_module("remodel_fenicsx").__version__
+    with tempfile.TemporaryDirectory(prefix="remodel-fenicsx-stability-") as folder:
+        scene, results = Path(folder) / "scene.toml", Path(folder) / "run"
+        scene.write_text(tomlkit.dumps(in_words_of(version, request["scene"])), encoding="utf-8")
+        said = io.StringIO()
+        with element_counts(request.get("counts", {})), contextlib.redirect_stderr(said):
+            with contextlib.redirect_stdout(io.StringIO()):
+                try:
+                    code = importlib.import_module("remodel_fenicsx.cli").main(
+                        ["run", str(scene), "-o", str(results), "-q"]
+                    )
+                except SystemExit as error:  # the command line's own words for its arguments
+                    code = error.code
+                except Exception:  # a defect of the program is an outcome of the map, with its traceback
+                    code, trace = 1, traceback.format_exc()
+                    said.write(trace)
+        if code == 2 and UNKNOWN.search(said.getvalue()) and request.get("other"):
+            code = None
+        found = {"code": code, "said": said.getvalue()[-2000:], "seconds": clock.perf_counter() - start}
+        return {**found, **read_results(results)}
+
+
+@contextlib.contextmanager
+def element_counts(counts: dict[str, dict[str, Any]]) -> Any:
+    """Numbers of elements other than the paper's, where meshes are made."""
+    before = []
+    for name, constants in counts.items():
+        for room in MESH_MODULES:
+            with contextlib.suppress(ImportError):
+                module = importlib.import_module(f"{room}.{name}")
+                for key, value in constants.items():
+                    before.append((module, key, getattr(module, key)))
+                    setattr(module, key, tuple(value) if isinstance(value, list) else value)
+    try:
+        yield
+    finally:
+        for module, key, value in before:
+            setattr(module, key, value)
+
+
+def read_results(folder: Path) -> dict[str, Any]:
+    """Warnings, history and last fields of a run's folder, as far as it came."""
+    found: dict[str, Any] = {"warnings": [], "history": {}, "fields": {}}
+    if (folder / "run.log").exists():
+        lines = (folder / "run.log").read_text(encoding="utf-8").splitlines()
+        found["warnings"] = [re.sub(r"^.*? WARNING ", "", line) for line in lines if " WARNING " in line]
+    if (folder / "history.csv").exists():
+        names, *rows = (folder / "history.csv").read_text(encoding="utf-8").splitlines() or [""]
+        values = [[float(entry or "nan") for entry in row.split(",")] for row in rows]
+        found["history"] = {name: [row[i] for row in values] for i, name in enumerate(names.split(","))}
+    if (folder / "fields.vtkhdf").exists():
+        with h5py.File(folder / "fields.vtkhdf", "r") as file:
+            root = file["VTKHDF"]
+            last = int(root["Steps"].attrs["NSteps"]) - 1
+            number = int(root["NumberOfCells"][0])
+            for name in WANTED_FIELDS if last >= 0 else ():
+                first = int(root["Steps"]["CellDataOffsets"][name][last])
+                values = np.asarray(root["CellData"][name][first : first + number], dtype=np.float64)
+                found["fields"][name] = values.reshape(number, -1).tolist()
+            found["fields"]["time"] = float(root["Steps"]["Values"][last]) if last >= 0 else None
+    return found
+
+
+def main() -> None:
+    """Answer requests until the input ends; what libraries print goes to the standard error."""
+    answers = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)
+    for line in sys.stdin:
+        answers.write(json.dumps(run_request(json.loads(line))) + "\n")
+        answers.flush()
+
+
+if __name__ == "__main__":
+    main()
