@@ -54,9 +54,8 @@ class LockingWarning(Watcher):
         quadrature = self.quadrature
         logarithm = np.log(self.stepper.coupling.equilibrium.limit_values()[1])
         single = quadrature.shape[1] == 1
-        means = np.full((len(logarithm), 1), quadrature.mean(logarithm))
-        if not single:
-            means = quadrature.element_mean(logarithm)[:, None]
+        whole = np.full(len(logarithm), quadrature.mean(logarithm))
+        means = (whole if single else quadrature.element_mean(logarithm))[:, None]
         if quadrature.maximum(np.abs(logarithm - means)) < UNIFORM:
             return 0.0
         work = self.work()
