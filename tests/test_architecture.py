@@ -198,9 +198,10 @@ def test_no_module_is_longer_than_one_can_hold_in_mind() -> None:
 # ---------------------------------------------------------------- what to touch to add something
 THINGS = (
     "a chain law", "a matrix energy", "a repulsive energy", "a driver", "a frame",
-    "a law towards a target, by rank", "any other law", "a pairing of values and dimensions",
-    "initial axes of the cells", "a load", "a column of every shape",
-    "a column of one shape", "a shape", "a kinematics", "a solver method", "a coupling", "a key of a scene",
+    "a law towards a target, by rank", "any other law",
+    "a pairing of values and dimensions", "initial axes of the cells", "a load", "a column of every shape",
+    "a column of one shape", "a shape", "a kinematics", "a formulation", "a solver method", "a coupling",
+    "a key of a scene",
 )  # fmt: skip
 
 

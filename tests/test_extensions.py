@@ -25,6 +25,7 @@ from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.shape import uniaxial_columns
 from remodel_fenicsx.evolution import coupling
 from remodel_fenicsx.fem import jit
+from remodel_fenicsx.fem.formulations import FORMULATIONS, Selective
 from remodel_fenicsx.fem.kinematics import KINEMATICS, FullKinematics
 from remodel_fenicsx.fem.solver_methods import METHODS
 from remodel_fenicsx.results.columns import COLUMNS, Measurement
@@ -414,6 +415,20 @@ def test_a_kinematics(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("mean_stretch", "min_stretch", "min_jacobian", "stored_energy"):
         np.testing.assert_allclose(column(found, name), column(expected, name), rtol=1e-9, err_msg=name)
     assert 2 * top == pytest.approx(found[-1]["mean_stretch"] - 1)
+
+
+def test_a_formulation(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The two parts apart, but by the same rule: rows as with the whole energy, pressure and remodeling too."""
+    monkeypatch.setitem(FORMULATIONS, "apart", Selective("both parts at all points", {("hexahedron", 1): 2}))
+    with pytest.raises(
+        SceneError, match="^mesh.formulation = 'apart': allowed for elements 'hexahedron' of degree 2 is"
+    ):
+        scene(mesh={"formulation": "apart", "degree": 2})
+    expected = rows_of(scene(cells={"initial": "random"}))
+    with simulated(scene(cells={"initial": "random"}, mesh={"formulation": "apart"})) as (simulation, found):
+        assert simulation.state.dilatation.jacobians().shape == (1, 8)
+    for name in ("mean_stretch", "mean_fibre_angle", "stored_energy", "remodeling_power"):
+        np.testing.assert_allclose(column(found, name), column(expected, name), rtol=1e-8, err_msg=name)
 
 
 def test_a_solver_method(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -23,7 +23,7 @@ RANDOM = Cells(initial="random", seed=3)
 def assembled_vector(problem: parts.Problem) -> np.ndarray:
     """Internal forces minus loads at the present displacement, no support applied."""
     total = np.zeros_like(problem.state.unknown.x.array)
-    for form in (problem.internal_form, problem.external_form):
+    for form in (*problem.internal_forms, problem.external_form):
         if form is not None:
             total += dolfinx.fem.assemble_vector(form).array
     return total

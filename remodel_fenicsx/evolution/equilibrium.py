@@ -75,23 +75,24 @@ class Equilibrium:
         u, shares, loading = state.unknown, shares or [state.cells.ufl_cell], state.loading
         test, trial = ufl.TestFunction(u.function_space), ufl.TrialFunction(u.function_space)
         F = state.kinematics.deformation_gradient(u)
-        self.energy = self.tissue.strain_energy(F, shares) * state.kinematics.weight(mesh) * self.quadrature.dx
-        internal, external = ufl.derivative(self.energy, u, test), loading.external_residual(test)
-        tangent = ufl.derivative(internal, u, trial)
+        self.energies = state.dilatation.energies(self.tissue, F, shares, state.kinematics.weight(mesh))
+        internal = [ufl.derivative(energy, u, test) for energy in self.energies]
+        tangents = [ufl.derivative(form, u, trial) for form in internal]
+        external = loading.external_residual(test)
         self.pointwise = pointwise_repulsion(state, self.tissue, point_shares)
         if self.pointwise is not None:
             weight, dx = state.kinematics.weight(mesh), self.quadrature.dx
-            internal += self.pointwise.residual(u, F, test) * weight * dx
-            tangent += self.pointwise.tangent(u, F, test, trial) * weight * dx
-        self.internal_form = jit.form(internal)
+            internal[0] += self.pointwise.residual(u, F, test) * weight * dx
+            tangents[0] += self.pointwise.tangent(u, F, test, trial) * weight * dx
+        self.internal_forms = [jit.form(form) for form in internal]
         self.external_form = None if external is None else jit.form(external)
         # apart, so that bodies with other loads share the costly one
-        self.tangent_forms = [jit.form(tangent)]
+        self.tangent_forms = [jit.form(form) for form in tangents]
         if external is not None and _depends_on(external, u):
             self.tangent_forms.append(jit.form(ufl.derivative(external, u, trial)))
         squared = squared_end_to_end_length(F, shares) if self.tissue.chain is not None else ufl.as_ufl(0.0)
         self._limits = jit.expression(ufl.as_vector([squared, ufl.det(F)]), self.quadrature.points)
-        self._energy_form: Any = None
+        self._energy_forms: list[Any] = []
 
     # ------------------------------------------------------------ what users ask
     def extension(self) -> Extension:
@@ -100,7 +101,9 @@ class Equilibrium:
 
     def extension_and_stretches(self) -> tuple[Extension, NDArray[np.float64]]:
         """The extension, and r/L at the points of this rank's own elements, (elements, points); infinite for NaN."""
-        squared, jacobian = (self.quadrature.owned(values) for values in self.limit_values())
+        squared, at_points = self.limit_values()
+        jacobian = np.hstack([at_points, self.state.dilatation.jacobians()])
+        squared, jacobian = self.quadrature.owned(squared), self.quadrature.owned(jacobian)
         with np.errstate(invalid="ignore"):
             stretch = np.sqrt(squared) / self.quadrature.owned(self.locking_length())
         stretch = np.where(np.isfinite(stretch), stretch, np.inf)
@@ -141,33 +144,33 @@ class Equilibrium:
 
     def stored_energy(self) -> float:
         """Integral of W over the body."""
-        if self._energy_form is None:
+        if not self._energy_forms:
             self.compile_energy()
-        local = np.real(dolfinx.fem.assemble_scalar(self._energy_form))
+        local = sum(np.real(dolfinx.fem.assemble_scalar(form)) for form in self._energy_forms)
         pointwise = 0.0 if self.pointwise is None else self.pointwise.energy()
         return float(self.comm.allreduce(local, MPI.SUM)) + pointwise
 
     def compile_energy(self) -> None:
         """Make `stored_energy` ready; apart, because a blend needs none."""
-        self._energy_form = jit.form(self.energy)
+        self._energy_forms = [jit.form(energy) for energy in self.energies]
 
     # ------------------------------------------------------------ what a solver asks
     def assemble_internal(self, vector: Any) -> None:
         """Internal nodal forces of the present unknowns."""
         if self.pointwise is not None:
             self.pointwise.update()
-        self._assemble(vector, self.internal_form)
+        self._assemble(vector, self.internal_forms)
 
     def assemble_external(self, vector: Any) -> None:
         """Minus the nodal forces of the loads."""
-        self._assemble(vector, self.external_form)
+        self._assemble(vector, [] if self.external_form is None else [self.external_form])
 
-    def _assemble(self, vector: Any, form: Any) -> None:
+    def _assemble(self, vector: Any, forms: Sequence[Any]) -> None:
         with vector.localForm() as local:
             local.set(0.0)
-        if form is not None:
+        for form in forms:
             dolfinx.fem.petsc.assemble_vector(vector, form)
-            vector.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
+        vector.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
 
     def assemble_lifting(self, vector: Any, x: Any) -> None:
         """What the tangent makes of the distance between prescribed values and x: K (u_prescribed - x)."""

@@ -77,15 +77,18 @@ class RemodelingPass:
         self._change: tuple[UnitCell, UnitCell] | None = None
         self._smallest_area = self.quadrature.minimum(self.quadrature.smallest_areas)
         F = state.kinematics.deformation_gradient(state.unknown)
+        stresses = state.dilatation.stresses(self.tissue, F, [state.cells.ufl_cell])
         self._pointwise = pointwise_repulsion(state, self.tissue)
-        additional = None if self._pointwise is None else self._pointwise.stress
-        tensor = self.driver.tensor(F, self.tissue.stresses(F, [state.cells.ufl_cell], additional))
+        if self._pointwise is not None:
+            stresses = stresses.plus(F, self._pointwise.stress)
+        tensor = self.driver.tensor(F, stresses)
         # one stacked expression: the deformation gradient comes at no cost with the driver
         stacked = ufl.as_vector([t[i, j] for t in (F, tensor) for i in range(3) for j in range(3)])
         self._expression = jit.expression(stacked, self.quadrature.points)
 
     def driving_tensor(self) -> tuple[Array, Array]:
         """F and the symmetric driving tensor at all points, each (elements * points, 3, 3)."""
+        self.state.dilatation.refresh()
         if self._pointwise is not None:
             self._pointwise.update()
         values = self.quadrature.evaluate(self._expression, (2, 3, 3)).reshape(-1, 2, 3, 3)

@@ -46,9 +46,11 @@ class ElementFields:
         self.tissue = stepper.tissue
         state = self.state
         F = state.kinematics.deformation_gradient(state.unknown)
+        stresses = state.dilatation.stresses(self.tissue, F, [state.cells.ufl_cell])
         self._pointwise = pointwise_repulsion(state, self.tissue)
-        additional = None if self._pointwise is None else self._pointwise.stress
-        cauchy = self.tissue.stresses(F, [state.cells.ufl_cell], additional).cauchy
+        if self._pointwise is not None:
+            stresses = stresses.plus(F, self._pointwise.stress)
+        cauchy = stresses.cauchy
         entries = [t[i, j] for t in (F, cauchy) for i in range(3) for j in range(3)]
         displacement = state.kinematics.displacement(state.unknown)
         expressions = ufl.as_vector([*entries, *(displacement[i] for i in range(3))])
@@ -62,6 +64,7 @@ class ElementFields:
         to the load axis, or in a tube from circumferential to axial); `chain_extension` (largest r/L in the element; 0
         where no chain locks).
         """
+        self.state.dilatation.refresh()
         if self._pointwise is not None:
             self._pointwise.update()
         values = self.quadrature.evaluate(self._state, (21,))

@@ -274,7 +274,7 @@ def _printed_method(
     }
     return {
         "geometry": geometry,
-        "mesh": {"refinement": 1, "element": "hexahedron", "degree": 1},
+        "mesh": {"refinement": 1, "element": "hexahedron", "degree": 1, "formulation": "displacement"},
         "model": {"kinematics": "full"},
         "material": common_material | material,
         "cells": {"end_to_end_length": 1.0} | cells,

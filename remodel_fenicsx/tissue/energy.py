@@ -20,19 +20,52 @@ from remodel_fenicsx.tissue.operators import det, is_array, ln, sqrt, squared_no
 from remodel_fenicsx.tissue.repulsion import REPULSIONS, Repulsion, squared_end_to_end_length
 
 
-def neo_hookean(deformation_gradient: Any, lame_lambda: Any, lame_mu: Any) -> Any:
-    """W_iso = lambda/2 ln^2 J + mu/2 (tr C - 3) - mu ln J (eq. 4a)."""
-    log_jacobian = ln(det(deformation_gradient))
-    return (
-        lame_lambda / 2 * log_jacobian**2
-        + lame_mu / 2 * (squared_norm(deformation_gradient) - 3)
-        - lame_mu * log_jacobian
-    )
+Term = Callable[[Any, Any, Any], Any]
 
 
-Matrix = Callable[[Any, Any, Any], Any]
-MATRICES: dict[str, Matrix] = {"neo-hookean": neo_hookean}
-"""Energies of the matrix by name: functions of F, lambda and mu (UFL or arrays), zero and stress-free at F = I."""
+class Matrix:
+    """An energy of the matrix whose volumetric part is told apart, as `fem.formulations` need it.
+
+    Called with F, lambda and mu it is the whole energy. Its terms are added one after the other: grouped otherwise, the
+    last digits would be others.
+
+    Parameters
+    ----------
+    volumetric
+        What resists a change of volume, a function of J, lambda and mu: zero and without slope at J = 1.
+    others
+        All other terms, functions of F, lambda and mu; together zero and stress-free at F = I.
+    """
+
+    def __init__(self, volumetric: Term, *others: Term):
+        self.volumetric, self.others = volumetric, others
+
+    def __call__(self, deformation_gradient: Any, lame_lambda: Any, lame_mu: Any) -> Any:
+        """The whole energy."""
+        volumetric = self.volumetric(det(deformation_gradient), lame_lambda, lame_mu)
+        return sum((term(deformation_gradient, lame_lambda, lame_mu) for term in self.others), volumetric)
+
+    def distortional(self, deformation_gradient: Any, lame_lambda: Any, lame_mu: Any) -> Any:
+        """All but the volumetric part."""
+        first, *rest = (term(deformation_gradient, lame_lambda, lame_mu) for term in self.others)
+        return sum(rest, first)
+
+
+def logarithmic_dilatation(jacobian: Any, lame_lambda: Any, lame_mu: Any) -> Any:
+    """U = lambda/2 ln^2 J, the volumetric part of eq. (4a): its Kirchhoff pressure is lambda ln J."""
+    return lame_lambda / 2 * ln(jacobian) ** 2
+
+
+neo_hookean = Matrix(
+    logarithmic_dilatation,
+    lambda F, lame_lambda, lame_mu: lame_mu / 2 * (squared_norm(F) - 3),
+    lambda F, lame_lambda, lame_mu: -(lame_mu * ln(det(F))),
+)
+"""W_iso = lambda/2 ln^2 J + mu/2 (tr C - 3) - mu ln J (eq. 4a)."""
+
+MATRICES: dict[str, Term] = {"neo-hookean": neo_hookean}
+"""Energies of the matrix by name: functions of F, lambda and mu (UFL or arrays), zero and stress-free at F = I; those
+that formulations other than "displacement" can take are a `Matrix`."""
 
 
 class Stresses(NamedTuple):
@@ -41,6 +74,15 @@ class Stresses(NamedTuple):
     first_piola_kirchhoff: Any
     second_piola_kirchhoff: Any
     cauchy: Any
+
+    def plus(self, deformation_gradient: Any, second_piola_kirchhoff: Any) -> Stresses:
+        """With what `Tissue.strain_energy` leaves out of UFL, a second Piola-Kirchhoff stress."""
+        import ufl
+
+        F, S = deformation_gradient, second_piola_kirchhoff
+        P = ufl.dot(F, S)
+        first, second, cauchy = self
+        return Stresses(first + P, second + S, cauchy + ufl.dot(P, F.T) / ufl.det(F))
 
 
 @dataclass(frozen=True)
@@ -74,7 +116,7 @@ class Tissue:
     contour_length: Any
     end_to_end_length: Any
     chain: Chain | None = CHAINS["wormlike"]
-    matrix: Matrix = neo_hookean
+    matrix: Term = neo_hookean
     repulsion: Repulsion = REPULSIONS["axes"]
 
     @property
@@ -115,6 +157,26 @@ class Tissue:
         values at the quadrature points (`evolution.pointwise`).
         """
         energy = self.matrix(deformation_gradient, self.lame_lambda, self.lame_mu)
+        return self._with_network(energy, deformation_gradient, cells)
+
+    def distortional_energy(self, deformation_gradient: Any, cells: Sequence[UnitCell]) -> Any:
+        """W without the volumetric part of the matrix; as `strain_energy`, which it makes together with that part."""
+        energy = self._parts().distortional(deformation_gradient, self.lame_lambda, self.lame_mu)
+        return self._with_network(energy, deformation_gradient, cells)
+
+    def volumetric_energy(self, jacobian: Any) -> Any:
+        """The volumetric part of the matrix, U(J)."""
+        return self._parts().volumetric(jacobian, self.lame_lambda, self.lame_mu)
+
+    def _parts(self) -> Matrix:
+        if isinstance(self.matrix, Matrix):
+            return self.matrix
+        raise TypeError(
+            "the volumetric part of this matrix energy is not told apart: it must be a tissue.energy.Matrix"
+        )
+
+    def _with_network(self, energy: Any, deformation_gradient: Any, cells: Sequence[UnitCell]) -> Any:
+        """An energy plus that of the chains, where there are any."""
         if self.chain is None:
             return energy
         length = sqrt(squared_end_to_end_length(deformation_gradient, cells))
@@ -131,23 +193,20 @@ class Tissue:
         assert self.chain is not None
         return self.network_modulus * self.chain.stiffness(self.end_to_end_length, self.contour_length)
 
-    def stresses(self, deformation_gradient: Any, cells: Sequence[UnitCell], additional: Any = None) -> Stresses:
-        """P = dW/dF, S = F^-1 P and sigma = P F^T / J (eqs. 6 and 7 with erratum 5), by differentiation of W; UFL.
-
-        Parameters
-        ----------
-        deformation_gradient, cells
-            As for `strain_energy`.
-        additional
-            Second Piola-Kirchhoff stress of what `strain_energy` leaves out of UFL, or None.
-        """
+    def stresses(self, deformation_gradient: Any, cells: Sequence[UnitCell]) -> Stresses:
+        """P = dW/dF, S = F^-1 P and sigma = P F^T / J (eqs. 6 and 7 with erratum 5), by differentiation of W; UFL."""
         import ufl
 
         F = ufl.variable(deformation_gradient)
-        first = ufl.diff(self.strain_energy(F, cells), F)
-        if additional is not None:
-            first += ufl.dot(F, additional)
-        return Stresses(first, ufl.dot(ufl.inv(F), first), ufl.dot(first, F.T) / ufl.det(F))
+        return _stresses(F, ufl.diff(self.strain_energy(F, cells), F))
+
+    def stresses_of_parts(self, deformation_gradient: Any, cells: Sequence[UnitCell], jacobian: Any) -> Stresses:
+        """The same with U at another J than det F: P = d(W - U)/dF + J U'(J) F^-T, J U' the Kirchhoff pressure; UFL."""
+        import ufl
+
+        F, J = ufl.variable(deformation_gradient), ufl.variable(jacobian)
+        pressure = J * ufl.diff(self.volumetric_energy(J), J)
+        return _stresses(F, ufl.diff(self.distortional_energy(F, cells), F) + pressure * ufl.inv(F).T)
 
     def energy_increment(self, deformation_gradient: Any, old: UnitCell, new: UnitCell) -> Any:
         """First-order change of W at frozen F when the cells become others, per reference volume; arrays.
@@ -167,3 +226,10 @@ class Tissue:
         stiffness = self.chain.stiffness(sqrt(squared), self.contour_length)
         initial = self.chain.stiffness(self.end_to_end_length, self.contour_length)
         return self.network_modulus / 2 * (stiffness * squared_change - initial * repulsion_change)
+
+
+def _stresses(F: Any, first: Any) -> Stresses:
+    """All of them from P; UFL."""
+    import ufl
+
+    return Stresses(first, ufl.dot(ufl.inv(F), first), ufl.dot(first, F.T) / ufl.det(F))
