@@ -142,7 +142,11 @@ class Inertia:
         if self._factorised is None:
             self._factorised = matrix.copy()
         matrix.copy(self._factorised, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
-        self._factorised.shift(-shift)
+        if shift:  # PETSc's own shift would be a change of the pattern on several ranks, and a new factorisation
+            diagonal = matrix.getDiagonal()
+            diagonal.shift(-shift)
+            self._factorised.setDiagonal(diagonal)
+            diagonal.destroy()
         if self._factorisation is None:  # kept: the order of elimination is found once
             self._factorisation = PETSc.PC().create(self.equilibrium.comm)
             self._factorisation.setType("cholesky")  # SYM = 2 as long as nobody calls the matrix positive definite
