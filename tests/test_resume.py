@@ -21,6 +21,7 @@ from mpi4py import MPI
 from remodel_fenicsx import Recording, Scene, SceneError
 from remodel_fenicsx.evolution.parts import StepFailure, Work
 from remodel_fenicsx.evolution.state import State
+from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.evolution.coupling import COUPLINGS, Staggered
 from remodel_fenicsx.results.checkpoint import Checkpoints
 from remodel_fenicsx.results.checkpoint_file import Checkpoint, CheckpointError, _read, read_checkpoint, read_pointer
@@ -217,6 +218,19 @@ def test_another_scene_is_refused_and_nothing_changes(half: Path, changes: list[
         resume(half, changes, SELF)
     assert message.removesuffix("; ") in str(refusal.value) and "\n" not in str(refusal.value)
     assert {path.name: path.read_bytes() for path in half.iterdir() if path.name != "run.log"} == before
+
+
+def test_another_mesh_is_refused(half: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As another Gmsh may make it of the same scene."""
+    nodes = Domain.gather_nodes
+
+    def moved(domain: Domain, values: Any) -> Any:
+        found = nodes(domain, values)
+        return found if found is None else found + 1e-6
+
+    monkeypatch.setattr(Domain, "gather_nodes", moved)
+    with pytest.raises(CheckpointError, match="the checkpoint has another mesh"):
+        resume(half, LONGER, SELF)
 
 
 def test_what_may_change_changes(half: Path) -> None:
