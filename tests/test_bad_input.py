@@ -255,11 +255,9 @@ def test_a_wall_time(text: str) -> None:
 def test_some_through_the_shell(place: Path) -> None:
     """As a user types them."""
     chosen = random.Random(1)
-    words = [*FILES, *SETTINGS, "--set", "-o", "--resume"]
+    words = [word for word in (*FILES, *SETTINGS, "--set", "-o", "--resume") if word not in ("run", "scene.toml")]
     for _ in range(30 * FACTOR):
         line = [chosen.choice(["run", "validate", "status"]), *(chosen.choice(words) for _ in range(3))]
-        if line[0] == "run" and "scene.toml" in line or "run" in line[1:]:
-            continue  # it would really run
         done = subprocess.run([sys.executable, "-m", "remodel_fenicsx.cli", *line], capture_output=True, text=True)
         assert done.returncode in (0, 2, 5), (line, done.stderr)
         assert "Traceback" not in done.stderr and (done.returncode == 0 or "remodel-fenicsx" in done.stderr), line

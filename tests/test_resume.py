@@ -18,11 +18,12 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from remodel_fenicsx import Recording, Scene, SceneError
+from remodel_fenicsx import Recording, Scene, SceneError, Simulation
 from remodel_fenicsx.evolution.parts import StepFailure, Work
 from remodel_fenicsx.evolution.state import State
+from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.evolution.coupling import COUPLINGS, Staggered
-from remodel_fenicsx.results.checkpoint import Checkpoints
+from remodel_fenicsx.results.checkpoint import Checkpoints, gather_state, restore_state
 from remodel_fenicsx.results.checkpoint_file import Checkpoint, CheckpointError, _read, read_checkpoint, read_pointer
 from remodel_fenicsx.results.recording import RecordingError
 from remodel_fenicsx.results.run_lock import FolderTaken, RunLock, lock_holder
@@ -112,6 +113,20 @@ def test_a_run_at_its_end_stays_as_it_is(half: Path) -> None:
     before = rows(half), Recording(half).times.tolist()
     resume(half, [], SELF)
     assert (rows(half), Recording(half).times.tolist()) == before
+
+
+def test_a_state_comes_back_whole(half: Path) -> None:
+    kept = read_checkpoint(half)
+    assert kept is not None
+    simulation = Simulation(Recording(half).scene, SELF)
+    state = simulation.state
+    restore_state(state, kept)
+    assert (state.time, state.number, state.loading.values) == (6.0, 6, {"force": 8.0})
+    arrays = gather_state(state)
+    assert arrays is not None and list(arrays) == kept.functions
+    for name, values in arrays.items():
+        np.testing.assert_array_equal(values, kept.arrays[f"function/{name}"], err_msg=name)
+    simulation.close()
 
 
 def test_steps_after_the_checkpoint_are_done_again(half: Path, whole: Path) -> None:
@@ -217,6 +232,19 @@ def test_another_scene_is_refused_and_nothing_changes(half: Path, changes: list[
         resume(half, changes, SELF)
     assert message.removesuffix("; ") in str(refusal.value) and "\n" not in str(refusal.value)
     assert {path.name: path.read_bytes() for path in half.iterdir() if path.name != "run.log"} == before
+
+
+def test_another_mesh_is_refused(half: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As another Gmsh may make it of the same scene."""
+    nodes = Domain.gather_nodes
+
+    def moved(domain: Domain, values: Any) -> Any:
+        found = nodes(domain, values)
+        return found if found is None else found + 1e-6
+
+    monkeypatch.setattr(Domain, "gather_nodes", moved)
+    with pytest.raises(CheckpointError, match="the checkpoint has another mesh"):
+        resume(half, LONGER, SELF)
 
 
 def test_what_may_change_changes(half: Path) -> None:

@@ -206,3 +206,40 @@ def test_a_usage_error_is_said_by_the_first_rank_alone() -> None:
         assert done.returncode == 2
         said.append(done.stderr + done.stdout)
     assert "one of the arguments SCENE --resume is required" in said[0] and said[1] == ""
+
+
+def test_a_pause_for_the_whole_group_spares_the_compiler() -> None:
+    """Batch systems send SIGUSR1 to all that a job has started."""
+    program = """
+import os, signal, subprocess
+from remodel_fenicsx.system.interrupts import StopRequest, pause_held_back
+with StopRequest() as stop:
+    with pause_held_back():
+        compiler = subprocess.Popen(["sleep", "0.3"])
+        os.killpg(0, signal.SIGUSR1)
+        assert compiler.wait() == 0 and not stop.pause
+    assert stop.pause and not stop.number
+os.kill(os.getpid(), signal.SIGUSR1)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, process_group=0)
+    assert done.returncode == -signal.SIGUSR1, done.stderr
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_what_was_done_before_a_signal_is_resumed(number: signal.Signals, tmp_path: Path) -> None:
+    """Checkpoints only at the end: the end that a signal makes is one too."""
+    out = tmp_path / "out"
+    words = [*COMMAND, "--set", "output.checkpoint=0", "--set", "time.end=400", "-q", "-o", str(out)]
+    process = subprocess.Popen(words, stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 200
+    while time.monotonic() < deadline and not ((out / "history.csv").exists() and len(read_history(out)["time"]) > 3):
+        time.sleep(0.02)
+        assert process.poll() is None
+    process.send_signal(number)
+    assert process.wait(100) == 128 + number
+    last = read_history(out)["time"][-1]
+    done = subprocess.run([*COMMAND[:3], "run", "--resume", out, "--set", f"time.end={last + 2}"], text=True,
+                          capture_output=True)  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert f"goes on from the checkpoint of time {last:g}, step {last:g}\n" in (out / "run.log").read_text()
+    assert read_history(out)["time"].tolist() == [float(time) for time in range(int(last) + 3)]

@@ -7,6 +7,7 @@ import re
 import resource
 import shutil
 import signal
+import struct
 import subprocess
 import sys
 from pathlib import Path
@@ -444,7 +445,11 @@ def test_a_commit_that_was_cut_off_is_finished_by_who_opens_the_file(tmp_path, m
     for _ in range(2):  # a second time it is whole already
         StagedFile(path, existing=True).close()
         assert path.read_bytes() == expected
-    with path.open("ab") as file:
-        file.write(b"remodel1")  # the mark alone says nothing
-    StagedFile(path, existing=True).close()
-    assert path.read_bytes() == expected + b"remodel1"
+
+
+def test_a_mark_without_its_changes_says_nothing(tmp_path):
+    changes = struct.pack("<QQ", 0, 3) + b"bad"
+    for end in (struct.pack("<QI8s", len(changes), 1, b"remodel1"), struct.pack("<QI8s", 2**40, 1, b"remodel1"), b"x"):
+        (tmp_path / "f").write_bytes(b"good" + changes + end)
+        StagedFile(tmp_path / "f", existing=True).close()
+        assert (tmp_path / "f").read_bytes() == b"good" + changes + end
