@@ -35,7 +35,7 @@ TENDON: dict[str, Any] = {
 }
 RAMP = [[0.0, 0.0], [10.0, 1.0]]
 COARSE_TENDON = {"tendon": {"AROUND": 8, "CORE": 2, "RINGS": 1, "ALONG": 3}}
-RADIUS_TOLERANCE, DISPLACEMENT_TOLERANCE, STEP_TOLERANCE = 0.01, 0.035, 0.01
+RADIUS_TOLERANCE, STEP_TOLERANCE = 0.01, 0.01
 ANGLE_TOLERANCE = 1.5  # degrees, of the mean over a body of random cells
 REFERENCE = "tube in one dimension"
 
@@ -102,7 +102,7 @@ def check_inner_displacement(case: Case, run: Run) -> Finding:
     if not len(found):
         return Finding(0.0, "no row")
     error = (found[-1] - 1) / (radii[0] - 1) - 1 if run.code == 0 else 0.0
-    return Finding(abs(error) / DISPLACEMENT_TOLERANCE, f"inner displacement off by {100 * error:.3g} %")
+    return Finding(abs(error) / case.options["tolerance"], f"inner displacement off by {100 * error:.3g} %")
 
 
 def tube_case(family_name: str, changes: dict[str, Any], place: dict[str, Any], **more: Any) -> Case:
@@ -191,24 +191,25 @@ def suctions() -> Iterator[Case]:
 
 
 ELASTIC = {"material.chain_density": 0.0, "remodeling.law": "none", "loads.elongation.value": 0.0}
+# the tolerance is the error that the mesh has where nothing locks, or 3.5 %
 MESHES = {
-    "hex1 16x8": ("hexahedron", 1, ring(16, 8)), "hex1 32x16": ("hexahedron", 1, ring(32, 16)),
-    "hex2 8x4": ("hexahedron", 2, ring(8, 4)), "tet1 16x8": ("tetrahedron", 1, ring(16, 8)),
-    "tet2 8x4": ("tetrahedron", 2, ring(8, 4)),
+    "hex1 16x8": ("hexahedron", 1, ring(16, 8), 0.05), "hex1 32x16": ("hexahedron", 1, ring(32, 16), 0.035),
+    "hex2 8x4": ("hexahedron", 2, ring(8, 4), 0.035), "tet1 16x8": ("tetrahedron", 1, ring(16, 8), 0.1),
+    "tet2 8x4": ("tetrahedron", 2, ring(8, 4), 0.035),
 }  # fmt: skip
 
 
 @family("locking")
 def locking() -> Iterator[Case]:
     """Thick tube without chains, p = 2, towards incompressibility."""
-    for mesh, (kind, degree, counts) in MESHES.items():
+    for mesh, (kind, degree, counts, tolerance) in MESHES.items():
         for ratio in (0.1, 1.0, 10.0, 100.0, 1e3, 1e4, 1e5):
             changes = {
                 **ELASTIC, "loads.pressure": {"value": 2.0, "ramp": [[0.0, 0.0], [4.0, 1.0]]}, "mesh.element": kind,
                 "mesh.degree": degree, "material.lame_lambda": ratio * 3.103, "time.end": 4.0, "time.step": 1.0,
             }  # fmt: skip
             place = {"mesh": mesh, "lambda/mu": ratio}
-            options = {"check": check_inner_displacement, "counts": counts}
+            options = {"check": check_inner_displacement, "counts": counts, "options": {"tolerance": tolerance}}
             yield tube_case("locking", changes, place, reduced=mesh == "hex2 8x4" and ratio in (1.0, 100.0), **options)
 
 

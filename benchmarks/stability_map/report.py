@@ -28,17 +28,14 @@ def read_records(file: Path) -> list[Record]:
     return [json.loads(line) for line in lines if line.endswith("\n")]
 
 
-def latest(
-    records: Iterable[Record], cases: Mapping[str, Case], digest: Any, source: str | None = None
-) -> list[Record]:
-    """The last record of each case as it is now, in the order of the cases."""
-    found = {
-        record["key"]: record
-        for record in records
-        if record["key"] in cases
-        and record["digest"] == digest(cases[record["key"]])
-        and source in (None, record["source"])
-    }
+def latest(records: Iterable[Record], cases: Mapping[str, Case], digest: Any = None, source: str = "") -> list[Record]:
+    """The last record of each case, in the order of the cases; with a digest only of the case as it is now."""
+    found = {}
+    for record in records:
+        case = cases.get(record["key"])
+        now = case is not None and (digest is None or record["digest"] == digest(case))
+        if now and source in ("", record["source"]):
+            found[record["key"]] = record
     return [found[key] for key in cases if key in found]
 
 
@@ -70,13 +67,15 @@ def table(records: Iterable[Record]) -> str:
 
 def comparison(before: Sequence[Record], after: Sequence[Record]) -> str:
     """Totals of both, over all cases and over those that both can express, as Markdown."""
+    both = {record["key"] for record in after}
     there = {record["key"] for record in before if record["outcome"] != "not there"}
     columns = [*OUTCOMES, *EXTRA]
     lines = ["| | cases | " + " | ".join(columns) + " |", "|---" * (len(columns) + 2) + "|"]
     for name, records in (
         ("0.1.0", before),
         ("now", after),
-        ("now, what 0.1.0 has too", [record for record in after if record["key"] in there]),
+        ("0.1.0, run with both", [record for record in before if record["key"] in both & there]),
+        ("now, run with both", [record for record in after if record["key"] in both & there]),
     ):
         row = counts(records)["**all**"]
         number = sum(row[outcome] for outcome in OUTCOMES)
@@ -152,7 +151,7 @@ def write(results: Path, cases: Mapping[str, Case], source: str, digest: Any) ->
     """docs/stability.md and its picture; 1 if nothing has been measured."""
     version = source.partition("+")[0]
     after = latest(read_records(results / f"{version}.jsonl"), cases, digest, source)
-    before = latest([*read_records(BEFORE), *read_records(results / "0.1.0.jsonl")], cases, digest)
+    before = latest([*read_records(BEFORE), *read_records(results / "0.1.0.jsonl")], cases)
     if not after:
         print(f"nothing has been measured with {source}: run benchmarks/stability first")
         return 1
