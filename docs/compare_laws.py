@@ -181,12 +181,12 @@ def draw(folder: Path) -> None:
     """The picture."""
     runs = kept_runs(folder)
     figure = Figure(figsize=(7.2, 6.0))
-    panels = [figure.add_axes((x, y, 0.395, 0.34)) for y in (0.60, 0.13) for x in (0.075, 0.58)]
+    panels = [figure.add_axes((x, y, 0.395, 0.33)) for y in (0.62, 0.17) for x in (0.075, 0.58)]
     _curves(panels[0], runs, "cube", "angle", "mean fibre angle to z (degrees)")
-    _curves(panels[1], runs, "cube", "change", r"largest change of $A$ in a pass, over $r_0^2$")
+    _curves(panels[1], runs, "cube", "change", r"largest change of $A$ / $r_0^2$")
     _curves(panels[2], runs, "tendon", "size", "mean stretch")
     _curves(panels[3], runs, "artery", "angle", "fibre angle, outer wall (degrees)")
-    panels[1].set(yscale="log", ylim=(1e-5, 3))
+    panels[1].set(yscale="log", ylim=(1e-4, 3))
     for axes, title in zip(panels, ("load that turns", "load that turns", "tendon", "artery"), strict=True):
         axes.set_title(title)
     for axes in panels[:2]:

@@ -10,7 +10,8 @@ import shlex
 import sys
 import time as clock
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import NoReturn
 
@@ -73,6 +74,15 @@ def parser() -> argparse.ArgumentParser:
         help="stop before this time is over, after a whole step, with exit code 4: 90s, 30min, 2h, 1.5d",
     )
     run_command.add_argument("-q", "--quiet", action="store_true", help="no progress")
+    stability = scene_command(
+        "stability", "Run a scene and say by what its passes multiply a small change of the cells."
+    )
+    stability.add_argument(
+        "-o", "--output", type=Path, metavar="DIR", help="new or empty folder (default: results/NAME-stability)"
+    )
+    stability.add_argument("--times", type=_positive, default=10, metavar="N", help="times to analyse (default: 10)")
+    stability.add_argument("-q", "--quiet", action="store_true", help="no progress")
+    stability.set_defaults(resume=None, max_wall_time=None)
     text = "Say where the run in DIR is, how fast, and whether it is alive."
     status = commands.add_parser("status", help=text, description=text)
     status.add_argument("folder", type=Path, metavar="DIR", help="folder of a run")
@@ -131,6 +141,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return code
 
 
+def _positive(text: str) -> int:
+    number = int(text)
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"{text}: allowed is a whole number at least 1")
+    return number
+
+
 def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
     """The options; of several ranks only the first says what is wrong with them."""
     with contextlib.ExitStack() as stack:
@@ -165,7 +182,7 @@ def _fail(message: str, code: int) -> int:
     return code
 
 
-def _run(options: argparse.Namespace) -> int:
+def _run(options: argparse.Namespace, task: Callable[..., Path] | None = None) -> int:
     deadline = None if options.max_wall_time is None else clock.monotonic() + options.max_wall_time
     scene = None if options.resume else read_scene(options.scene, options.set)
     if options.resume and options.output:
@@ -184,6 +201,8 @@ def _run(options: argparse.Namespace) -> int:
     try:
         if scene is None:
             folder = resume(options.resume, options.set, quiet=options.quiet, deadline=deadline)
+        elif task is not None:
+            folder = task(scene, options.output, quiet=options.quiet)
         else:
             folder = run(scene, options.output, quiet=options.quiet, deadline=deadline)
     except (FolderTaken, SceneError, GeometryError, CheckpointError, RecordingError) as error:
@@ -207,6 +226,21 @@ def _run(options: argparse.Namespace) -> int:
         return _end_all("stopped by a defect of the program, see above", 1)
     _say(f"results in {folder}")
     return 0
+
+
+def _stability(options: argparse.Namespace) -> int:
+    missing = [name for name in ("matplotlib", "PIL") if find_spec(name) is None]
+    if missing:
+        return _fail(f"the environment is not usable: no {missing[0]}; run through ./with-fenicsx", BAD_ENVIRONMENT)
+
+    def analyse(scene: Scene, folder: Path | None, quiet: bool) -> Path:
+        from remodel_fenicsx.stability import in_words, stability
+
+        place, table = stability(scene, folder, options.times, quiet=quiet)
+        _say(in_words(table))
+        return place
+
+    return _run(options, analyse)
 
 
 def _end_all(message: str, code: int) -> int:
@@ -282,7 +316,15 @@ def _info(options: argparse.Namespace) -> int:
     return 0
 
 
-COMMANDS = {"run": _run, "status": _status, "validate": _validate, "new": _new, "figures": _figures, "info": _info}
+COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
+    "run": _run,
+    "stability": _stability,
+    "status": _status,
+    "validate": _validate,
+    "new": _new,
+    "figures": _figures,
+    "info": _info,
+}
 
 
 if __name__ == "__main__":

@@ -15,12 +15,14 @@ from mpi4py import MPI
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.loading import Loading, LoadValues
 from remodel_fenicsx.evolution.chatter import Chatter
+from remodel_fenicsx.evolution.locking import LockingWarning
 from remodel_fenicsx.evolution.monitor import StabilityWatcher
 from remodel_fenicsx.evolution.parts import StepFailure
 from remodel_fenicsx.evolution.pause import Pause
 from remodel_fenicsx.evolution.state import State
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher, times
 from remodel_fenicsx.evolution.unit_cells import UnitCells
+from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.results.checkpoint import Checkpoints, restore_state
@@ -79,7 +81,8 @@ class Simulation:
         self.cells = UnitCells(self.quadrature, domain.element_number, domain.number_of_elements, scene.cells)
         self.loading = Loading(domain, self.unknown, kinematics)
         shape.support(self.loading)
-        self.state = State(self.unknown, kinematics, self.cells, self.loading)
+        formulation = FORMULATIONS[scene.mesh.formulation]
+        self.state = State(self.unknown, kinematics, self.cells, self.loading, formulation)
         tissue = scene.material.tissue(scene.cells.end_to_end_length)
         self.stepper = Stepper(self.state, tissue, scene.remodeling, scene.solver, self.load_values)
         self.tissue = self.stepper.tissue
@@ -109,7 +112,9 @@ class Simulation:
         """
         remaining = list(times(self.scene.time.end, self.scene.time.step))[self.state.number :]
         chatter = [Chatter(self.stepper)] if self.stepper.remodeling.law.remodels else []
-        return self.stepper.march(remaining, [self.stability, self.observer, *chatter, *watchers])
+        locks = FORMULATIONS[self.scene.mesh.formulation].locks(self.scene.mesh.element, self.scene.mesh.degree)
+        locking = LockingWarning(self.stepper, locks)
+        return self.stepper.march(remaining, [self.stability, self.observer, *chatter, locking, *watchers])
 
     def close(self) -> None:
         """Free PETSc's objects and options."""

@@ -82,7 +82,7 @@ def test_the_relaxed_pass_settles_where_the_printed_one_jumps(caplog: pytest.Log
     assert min(row["pass_residual"] for row in printed) > 0.6
     assert settled[0]["pass_residual"] == pytest.approx(printed[0]["pass_residual"], rel=1e-9)
     assert settled[-1]["pass_residual"] < 0.2
-    assert sum(row["newton_iterations"] for row in settled) < 0.5 * sum(row["newton_iterations"] for row in printed)
+    assert sum(row["newton_iterations"] for row in settled) < 0.6 * sum(row["newton_iterations"] for row in printed)
 
 
 def test_an_unknown_column_is_refused_in_one_line() -> None:

@@ -174,6 +174,14 @@ def test_equal_values_and_no_tension_turn_nothing(values: list[float], threshold
     np.testing.assert_allclose(new.axes, old.axes, atol=1e-14)
 
 
+def test_the_nearer_sense_is_the_one_in_the_reference_configuration() -> None:
+    """In a strong shear a fibre may be near one sense of the tension in space, and its goal near the other one."""
+    old, stress, _ = random_case(12)
+    F = np.tile(np.eye(3) + 3.0 * np.outer(X, Y), (40, 1, 1))
+    goal = updated(old, pulled(stress, F), 1e9).axes[:, 0]
+    assert np.all(np.sum(goal * old.axes[:, 0], axis=1) > -1e-3)
+
+
 @pytest.mark.parametrize("relative_step", [0.0, 1e-9, 1e-3, 1.0, 30.0, 1e9])
 def test_what_an_implicit_step_leaves_of_an_angle(relative_step: float) -> None:
     angle = np.concatenate([[0.0, 1e-300, 1e-9], np.linspace(0.01, np.pi / 2 + 1e-3, 200)])

@@ -100,7 +100,10 @@ def run(keys: list[str], checkout: Path, source: str, file: Path, options: argpa
     with (
         file.open("a", encoding="utf-8") as out,
         ProcessPoolExecutor(
-            options.jobs, multiprocessing.get_context("spawn"), set_up, (str(checkout), options.limit, source)
+            options.jobs,
+            multiprocessing.get_context("spawn"),
+            set_up,
+            (str(checkout), options.limit, source, "" if options.again else str(file.parent / "runs")),
         ) as pool,
     ):
         waiting = {pool.submit(evaluate, key): key for key in keys}

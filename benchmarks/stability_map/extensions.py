@@ -13,6 +13,7 @@ from remodel_fenicsx.body import SHAPES, Cube, LoadKind
 from remodel_fenicsx.body.column import Column
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.shape import uniaxial_columns
+from remodel_fenicsx.body.tendon import Tendon
 from remodel_fenicsx.schema.units import FORCE, LENGTH
 
 
@@ -108,6 +109,59 @@ class Driven(Cube):
         return distorted(super().build(mesh, comm), self.shape, self.side, self.distortion)
 
 
+class Twisted(Tendon):
+    """A tendon that is clamped at its bottom, while its top is turned about z and lifted as a rigid plate."""
+
+    loads: ClassVar[dict[str, LoadKind]] = {
+        "twist": LoadKind(lambda shape, loading, name: turn_top(loading, name), "angle of the top in radians"),
+        "elongation": LoadKind(
+            lambda shape, loading, name: loading.add_prescribed_elongation(name, "top", 2, shape.length),
+            "engineering strain of the length",
+        ),
+    }
+    columns: ClassVar[tuple[Column, ...]] = uniaxial_columns("top", "length")[-1:]
+    shape: Literal["twisted"] = Field(default="twisted", description="Which body it is.")
+
+    def build(self, mesh: Any, comm: Any = None) -> Domain:
+        """The tendon's mesh."""
+        return replace(super().build(mesh, comm), shape=self.shape)
+
+    def hold(self, loading: Any) -> None:
+        """The bottom, wholly."""
+        for component in range(3):
+            loading.hold_face("bottom", component)
+
+
+def turn_top(loading: Any, name: str) -> None:
+    """Prescribe x and y of the top: a rotation by the load of this name."""
+    facets = loading.domain.facet_tags.find(loading.domain.faces["top"])
+    parts = []
+    for component in (0, 1):
+        space = loading.space.sub(component)
+        collapsed = space.collapse()[0]
+        parts.append(dolfinx.fem.Function(collapsed))
+        dofs = dolfinx.fem.locate_dofs_topological((space, collapsed), 2, facets)
+        loading.boundary_conditions.append(dolfinx.fem.dirichletbc(parts[-1], dofs, space))
+
+    class Angle:
+        """What `Loading.set` sets."""
+
+        _value = 0.0
+
+        @property
+        def value(self) -> float:
+            return self._value
+
+        @value.setter
+        def value(self, angle: float) -> None:
+            self._value, c, s = angle, np.cos(angle) - 1, np.sin(angle)
+            parts[0].interpolate(lambda x: c * x[0] - s * x[1])
+            parts[1].interpolate(lambda x: s * x[0] + c * x[1])
+
+    loading.magnitude(name)
+    loading._magnitudes[name] = [(Angle(), 1.0)]  # a Constant cannot be a field
+
+
 def register() -> None:
     """Scenes know these shapes from now on."""
-    SHAPES.update({"block": Block, "driven": Driven})
+    SHAPES.update({"block": Block, "driven": Driven, "twisted": Twisted})

@@ -14,7 +14,9 @@ OUTCOMES = ("right", "refused", "unstable", "warned", "wrong", "unchecked", "not
 CAUSES = re.compile(
     r"limit point|bifurcation|kinematic locking|chain locking|chains? lock|solver tolerance|eigenvalue", re.I
 )
-UNSTABLE = re.compile(r"negative eigenvalue|unstable equilibrium|no longer a minimum|lost (its )?stability", re.I)
+UNSTABLE = re.compile(
+    r"negative eigenvalue|unstable equilibrium|equilibrium is unstable|no longer a minimum|lost (its )?stability", re.I
+)
 BAD_INPUT, SOLVE_FAILED, NO_END, CRASHED = 2, 3, -2, -1
 
 
@@ -83,4 +85,4 @@ def _refused(run: Run, finding: Finding, ratio: float | None) -> Verdict:
         notes.append("the reference goes on")
     if ratio is not None and ratio > 1:
         notes.append(f"accepted rows are off: {finding.words}")
-    return Verdict("refused", "; ".join(notes), ratio, cause_named=bool(CAUSES.search(message)))
+    return Verdict("refused", "; ".join(notes), ratio, cause_named=bool(CAUSES.search(run.said)))

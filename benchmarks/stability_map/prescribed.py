@@ -37,14 +37,17 @@ def gradients(scene: dict[str, Any], times: np.ndarray) -> np.ndarray:
 
 
 def limit(scene: dict[str, Any], finer: int) -> np.ndarray:
-    """A at the last row's time for a step that goes to zero, relaxed so that it does not chatter."""
+    """A at the last row's time for a step that goes to zero.
+
+    The law `explicit` is relaxed, so that it does not chatter; laws with a memory would only become slower by that.
+    """
     coarse, r = step_times(scene), scene["remodeling"]
     step = scene["time"]["step"] / finer
     # the row's cells have remodeled up to the step before it
     times = step * np.arange(1, round((coarse[-1] - scene["time"]["step"]) / step) + 2)
     path = prescribed_path(
         material(scene), gradients(scene, times), times, initial(scene),
-        r["driver"], r["law"], r["frame"], r["kappa"], 0.5,
+        r["driver"], r["law"], r["frame"], r["kappa"], 0.5 if r["law"] == "explicit" else 1.0,
     )  # fmt: skip
     return np.asarray(path[-1])
 

@@ -85,12 +85,15 @@ def comparison(before: Sequence[Record], after: Sequence[Record]) -> str:
 
 
 def listed(records: Iterable[Record], cases: Mapping[str, Case], chosen: Any) -> str:
-    """The chosen cases, a line each with what is said of them and the command that shows them."""
-    lines = []
+    """The chosen cases, a line each with what is said of them; for the first of a family the command that shows it."""
+    lines, families = [], set()
     for record in records:
         if chosen(record):
-            words = " ".join(record["words"].split()).replace("|", "/")[:240]
-            lines.append(f"- **{record['key']}**: {words}  \n  `{cases[record['key']].command}`")
+            words = " ".join(record["words"].split()).replace("|", "/")[:200]
+            lines.append(f"- {record['key']}: {words}")
+            if record["family"] not in families:
+                lines[-1] += f"  \n  `{cases[record['key']].command}`"
+            families.add(record["family"])
     return "\n".join(lines) or "None."
 
 

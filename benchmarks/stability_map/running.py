@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import hashlib
 import json
 import os
@@ -11,6 +12,7 @@ import sys
 import tempfile
 import time as clock
 from dataclasses import asdict
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +24,7 @@ from benchmarks.stability_map.judging import CRASHED, NO_END, judged
 PROJECT = Path(__file__).resolve().parents[2]
 RUNNER = Path(__file__).with_name("runner.py")
 Record = dict[str, Any]
+ENDED = (0, 1, 2, 3)  # a run that was killed, or went on for too long, may end otherwise another time
 
 
 class Runner:
@@ -31,20 +34,38 @@ class Runner:
     ----------
     checkout
         Folder with `remodel_fenicsx`.
+    store
+        Folder that keeps what came out of a scene, so that a new reference runs nothing again.
     limit
         Seconds of processor time that one scene may take; then the process is ended and another one started.
     """
 
-    def __init__(self, checkout: Path, limit: float):
-        self.checkout, self.limit = checkout, limit
+    def __init__(self, checkout: Path, limit: float, store: Path | None = None):
+        self.checkout, self.limit, self.store = checkout, limit, store
         self._process: subprocess.Popen[str] | None = None
 
     def run(self, request: dict[str, Any]) -> Run:
+        """One scene, from the store if it is there."""
+        if self.store is None:
+            return self._run(request)
+        text = json.dumps(request, sort_keys=True, default=plain)
+        kept = self.store / f"{hashlib.sha256(text.encode()).hexdigest()[:20]}.json.gz"
+        if kept.exists():
+            return Run(**json.loads(gzip.decompress(kept.read_bytes())))
+        run = self._run(request)
+        if run.code in (None, *ENDED):
+            self.store.mkdir(parents=True, exist_ok=True)
+            part = kept.with_suffix(f".{os.getpid()}")
+            part.write_bytes(gzip.compress(json.dumps(asdict(run)).encode()))
+            part.rename(kept)
+        return run
+
+    def _run(self, request: dict[str, Any]) -> Run:
         """One scene; `CRASHED` or `NO_END` with words where there is no answer."""
         process = self._process = self._process or self._started()
         assert process.stdin is not None and process.stdout is not None
         try:
-            process.stdin.write(json.dumps({**request, "other": self.checkout != PROJECT}) + "\n")
+            process.stdin.write(json.dumps({**request, "other": self.checkout != PROJECT}, default=plain) + "\n")
             process.stdin.flush()
             end = processor_seconds(process.pid) + self.limit
             while not (ready := select.select([process.stdout], [], [], 0.5)[0]):
@@ -101,14 +122,24 @@ def evaluated(case: Case, runner: Runner, source: str) -> Record:
     }  # fmt: skip
 
 
+def plain(value: Any) -> Any:
+    """What json does not know: numbers of numpy."""
+    return value.item() if isinstance(value, np.generic) else str(value)
+
+
 def digest(case: Case) -> str:
-    """Of everything that makes its result: a case that changes is run again."""
-    text = json.dumps(
-        [case.scene, case.companion, dict(case.counts), dict(case.options), case.check.__name__],
-        sort_keys=True,
-        default=lambda value: value.item() if isinstance(value, np.generic) else str(value),
-    )
+    """Of everything that makes its result, references included: what changes is judged again."""
+    scenes = [case.scene, case.companion, dict(case.counts), dict(case.options), case.check.__name__]
+    text = json.dumps(scenes, sort_keys=True, default=plain) + references()
     return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
+@lru_cache
+def references() -> str:
+    """Hash of what judges."""
+    files = [PROJECT / "tests" / "reference" / "radial.py"]
+    files += [path for path in sorted(RUNNER.parent.glob("*.py")) if path.stem not in ("command", "report", "running")]
+    return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()
 
 
 def source_of(checkout: Path) -> str:
@@ -125,10 +156,12 @@ def source_of(checkout: Path) -> str:
 _mine: dict[str, Any] = {}
 
 
-def set_up(checkout: str, limit: float, source: str) -> None:
+def set_up(checkout: str, limit: float, source: str, store: str) -> None:
     """Of a process of the pool."""
     os.environ["OMP_NUM_THREADS"] = "1"
-    _mine.update(runner=Runner(Path(checkout), limit), source=source, cases=all_cases())
+    _mine.update(
+        runner=Runner(Path(checkout), limit, Path(store) / source if store else None), source=source, cases=all_cases()
+    )
 
 
 def evaluate(key: str) -> Record:

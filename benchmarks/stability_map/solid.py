@@ -40,9 +40,15 @@ def gradients() -> tuple[Array, Array]:
     return found, np.full(8, 0.125)
 
 
-def smallest_eigenvalue(stretches: Array, squares: Array, material: RadialMaterial) -> float:
-    """Smallest eigenvalue of the tangent of the sliding unit cube in one element, over that of the unloaded one."""
-    return _smallest(np.diag(stretches), squares, material) / _smallest(np.eye(3), squares, material)
+def smallest_eigenvalue(
+    stretches: Array, squares: Array, material: RadialMaterial, start: Array | None = None
+) -> float:
+    """Smallest eigenvalue of the tangent of the sliding unit cube in one element, over that of the unloaded one.
+
+    `start`: squares l_d^2 of the unloaded body, if they were others; its tangent is positive where |l| = r0.
+    """
+    unloaded = _smallest(np.eye(3), squares if start is None else start, material)
+    return _smallest(np.diag(stretches), squares, material) / unloaded
 
 
 def _smallest(F: Array, squares: Array, material: RadialMaterial) -> float:

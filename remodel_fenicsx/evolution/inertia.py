@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from remodel_fenicsx.evolution.equilibrium import Equilibrium
+from remodel_fenicsx.tissue.cells import initial_axes
 
 Array = NDArray[np.float64]
 
@@ -116,6 +117,14 @@ class Inertia:
             thing.destroy()
         return mode
 
+    def cosine(self, mode: Mode, direction: Array) -> float:
+        """Of the angle between a mode and another change of the unknowns, without its sign."""
+        unknown = self.equilibrium.state.unknown
+        owned = unknown.function_space.dofmap.index_map.size_local * unknown.function_space.dofmap.index_map_bs
+        mine, other = mode.displacement[:owned], direction[:owned]
+        products = self.equilibrium.comm.allreduce(np.array([mine @ other, mine @ mine, other @ other]), MPI.SUM)
+        return float(abs(products[0]) / np.sqrt(max(products[1] * products[2], np.finfo(np.float64).tiny)))
+
     # ------------------------------------------------------------ matrices
     def _assemble(self) -> None:
         if self._tangent is None:
@@ -133,7 +142,11 @@ class Inertia:
         if self._factorised is None:
             self._factorised = matrix.copy()
         matrix.copy(self._factorised, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
-        self._factorised.shift(-shift)
+        if shift:  # PETSc's own shift would be a change of the pattern on several ranks, and a new factorisation
+            diagonal = matrix.getDiagonal()
+            diagonal.shift(-shift)
+            self._factorised.setDiagonal(diagonal)
+            diagonal.destroy()
         if self._factorisation is None:  # kept: the order of elimination is found once
             self._factorisation = PETSc.PC().create(self.equilibrium.comm)
             self._factorisation.setType("cholesky")  # SYM = 2 as long as nobody calls the matrix positive definite
@@ -154,7 +167,7 @@ class Inertia:
         matrix, diagonal = self._symmetric.copy(), self._symmetric.createVecRight()
         self._symmetric.getDiagonal(diagonal)
         local = diagonal.array
-        held = self.equilibrium.prescribed()[: len(local)]
+        held = ~np.isnan(self.equilibrium.prescribed_values()[: len(local)])
         largest = float(np.max(np.abs(local[~held]), initial=0.0))
         local[held] = self.equilibrium.comm.allreduce(largest, MPI.MAX)
         matrix.setDiagonal(diagonal)
@@ -190,6 +203,20 @@ class Inertia:
         found = [node for rank in self.equilibrium.comm.allgather(candidates) for node in rank]
         x, y, z = min(found)
         return Mode(eigenvalue, (x, y, z), function.x.array.copy())
+
+
+def of_the_unloaded_body(inertia: Inertia) -> tuple[int, float]:
+    """Negative eigenvalues, and the lowest one, without loads, displacement and remodeling; the state stays."""
+    state = inertia.equilibrium.state
+    before, cells = state.snapshot(), state.cells
+    try:
+        state.unknown.x.array[:] = 0.0
+        state.loading.set(dict.fromkeys(state.loading.values, 0.0))
+        cells.set(cells.initial_dimensions, initial_axes(cells.settings.axes, cells.quadrature.coordinates))
+        state.settle_cells()
+        return inertia.negative_eigenvalues(), inertia.lowest().eigenvalue
+    finally:
+        state.restore(before)
 
 
 def uneven(vector: Any) -> Any:

@@ -7,11 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from remodel_fenicsx.evolution.inertia import FactorisationFailed, Inertia, Mode, uneven
+from remodel_fenicsx.evolution.inertia import FactorisationFailed, Inertia, Mode, of_the_unloaded_body, uneven
 from remodel_fenicsx.evolution.parts import StepFailure
 from remodel_fenicsx.evolution.refusals import UNSTABLE
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
-from remodel_fenicsx.tissue.cells import initial_axes
 
 log = logging.getLogger(__name__)
 
@@ -107,17 +106,9 @@ class StabilityWatcher(Watcher):
         self._warn("time %g: the equilibrium is unstable, the body would leave it: %s", step.time, text)
 
     def _of_the_unloaded_body(self) -> tuple[int, float]:
-        """Negative eigenvalues, and the lowest one, of the body without loads, displacement and remodeling."""
+        """`inertia.of_the_unloaded_body`, once."""
         if self._unloaded is None:
-            state, before = self.state, self.state.snapshot()
-            try:
-                state.unknown.x.array[:] = 0.0
-                state.loading.set(dict.fromkeys(state.loading.values, 0.0))
-                axes = initial_axes(state.cells.settings.axes, state.cells.quadrature.coordinates)
-                state.cells.set(state.cells.initial_dimensions, axes)
-                self._unloaded = self.inertia.negative_eigenvalues(), self.inertia.lowest().eigenvalue
-            finally:
-                state.restore(before)
+            self._unloaded = of_the_unloaded_body(self.inertia)
         return self._unloaded
 
     def _warn(self, *message: Any) -> None:
@@ -170,7 +161,7 @@ class Signs:
         first = self._vector is None
         if first:
             self._vector = uneven(factorisation.getOperators()[0].createVecRight())
-            free = ~self.equilibrium.prescribed()[: self._vector.getLocalSize()]
+            free = np.isnan(self.equilibrium.prescribed_values()[: self._vector.getLocalSize()])
             self._vector.array[:] *= free  # prescribed ones have an eigenvalue of their own, one
         image = self._vector.duplicate()
         curvature = np.inf

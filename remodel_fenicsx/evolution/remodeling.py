@@ -9,13 +9,16 @@ import ufl
 from numpy.typing import NDArray
 
 from remodel_fenicsx.evolution.equilibrium import at_points, on_mesh, stress_rounding
+from remodel_fenicsx.evolution.pointwise import pointwise_repulsion
 from remodel_fenicsx.evolution.state import State
 from remodel_fenicsx.fem import coefficients, jit
 from remodel_fenicsx.tissue import spectral
 from remodel_fenicsx.tissue.cells import UnitCell, structure_tensor
 from remodel_fenicsx.tissue.drivers import DRIVERS, FRAMES, carried_axes
-from remodel_fenicsx.tissue.energy import Tissue, squared_end_to_end_length
+from remodel_fenicsx.tissue.energy import Tissue
 from remodel_fenicsx.tissue.laws import LAWS, Drive
+from remodel_fenicsx.tissue.repulsion import squared_end_to_end_length
+from remodel_fenicsx.tissue.tensor_law import Target
 
 Array = NDArray[np.float64]
 
@@ -74,13 +77,20 @@ class RemodelingPass:
         self._change: tuple[UnitCell, UnitCell] | None = None
         self._smallest_area = self.quadrature.minimum(self.quadrature.smallest_areas)
         F = state.kinematics.deformation_gradient(state.unknown)
-        tensor = self.driver.tensor(F, self.tissue.stresses(F, [state.cells.ufl_cell]))
+        stresses = state.dilatation.stresses(self.tissue, F, [state.cells.ufl_cell])
+        self._pointwise = pointwise_repulsion(state, self.tissue)
+        if self._pointwise is not None:
+            stresses = stresses.plus(F, self._pointwise.stress)
+        tensor = self.driver.tensor(F, stresses)
         # one stacked expression: the deformation gradient comes at no cost with the driver
         stacked = ufl.as_vector([t[i, j] for t in (F, tensor) for i in range(3) for j in range(3)])
         self._expression = jit.expression(stacked, self.quadrature.points)
 
     def driving_tensor(self) -> tuple[Array, Array]:
         """F and the symmetric driving tensor at all points, each (elements * points, 3, 3)."""
+        self.state.dilatation.refresh()
+        if self._pointwise is not None:
+            self._pointwise.update()
         values = self.quadrature.evaluate(self._expression, (2, 3, 3)).reshape(-1, 2, 3, 3)
         driver = values[:, 1]
         return values[:, 0], (driver + np.swapaxes(driver, 1, 2)) / 2
@@ -132,6 +142,18 @@ class RemodelingPass:
         drive = self.drive(residual)
         return self.law.update(self.state.cells.point_cells, drive, time_old, time_new), drive.deformation_gradient
 
+    def target(self, residual: float = 0.0) -> Target:
+        """What the structure tensor tends to in the present state; of laws that have one."""
+        assert self.law.target is not None
+        return self.law.target(self.drive(residual))
+
+    def followed(self, target: Target, duration: float) -> tuple[UnitCell, Array]:
+        """Cells of all points in one row after a time with this target, and F (n, 3, 3). Changes nothing."""
+        assert self.law.follow is not None
+        r0 = coefficients.point_values(self.tissue.end_to_end_length, self.quadrature).reshape(-1)
+        F, _ = self.driving_tensor()
+        return self.law.follow(self.state.cells.point_cells, target, r0, self.settings.kappa * duration), F
+
     def apply(self, time_old: float, time_new: float, residual: float = 0.0, factor: float = 1.0) -> float:
         """Remodel over a step with the stress of the solved state at time_new; returns the power of remodeling.
 
@@ -144,15 +166,19 @@ class RemodelingPass:
         FloatingPointError
             If the driving tensor is not finite anywhere.
         """
-        cells, shape = self.state.cells, self.quadrature.shape
         asked, F = self.updated_cells(time_old, time_new, residual)
+        return self.replace(asked, F, time_new - time_old, factor)
+
+    def replace(self, asked: UnitCell, F: Array, duration: float, factor: float = 1.0) -> float:
+        """Give the state other cells, or a share of the change; returns the power of remodeling at frozen F."""
+        cells, shape = self.state.cells, self.quadrature.shape
         self._change = (
             UnitCell(cells.dimension_values.reshape(-1, 3).copy(), cells.axis_values.reshape(-1, 3, 3).copy()),
             asked,
         )
         updated = self.law.share(self._change[0], asked, factor)
         increment: Any = at_points(self.tissue, self.quadrature).energy_increment(F, cells.point_cells, updated)
-        power: float = 0.0 - self.quadrature.integral(increment.reshape(shape)) / (time_new - time_old)
+        power: float = 0.0 - self.quadrature.integral(increment.reshape(shape)) / duration
         cells.set(updated.dimensions.reshape(*shape, 3), updated.axes.reshape(*shape, 3, 3))
         return power
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.body.loading import Loading
 from remodel_fenicsx.evolution.unit_cells import CellField, UnitCells
+from remodel_fenicsx.fem.formulations import FORMULATIONS, Formulation
 from remodel_fenicsx.fem.kinematics import Kinematics
 
 
@@ -39,9 +40,13 @@ class State:
         The unit cells.
     loading
         Supports and loads; its magnitudes are part of the state.
+    formulation
+        Where the elements take the change of volume; default: "displacement".
 
     Attributes
     ----------
+    dilatation
+        The formulation for these unknowns.
     equilibrium_cells
         The cells with which the unknowns are in equilibrium. After a staggered step the cells themselves are one pass
         ahead of them.
@@ -51,8 +56,16 @@ class State:
         What else is remembered from step to step, by name: a coupling puts its own here, its functions by `remember`.
     """
 
-    def __init__(self, unknown: Any, kinematics: Kinematics, cells: UnitCells, loading: Loading):
+    def __init__(
+        self,
+        unknown: Any,
+        kinematics: Kinematics,
+        cells: UnitCells,
+        loading: Loading,
+        formulation: Formulation = FORMULATIONS["displacement"],
+    ):
         self.unknown, self.kinematics, self.cells, self.loading = unknown, kinematics, cells, loading
+        self.dilatation = formulation.on(kinematics, unknown, cells.quadrature)
         self.equilibrium_cells = CellField(cells.quadrature, "equilibrium_cell")
         self.settle_cells()
         self.time, self.number = 0.0, 0

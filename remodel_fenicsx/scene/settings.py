@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
+from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.fem.solver_methods import METHODS
 from remodel_fenicsx.schema.tables import Table, checked, fault, is_number, one_of, quoted, shown
@@ -32,6 +33,21 @@ class Mesh(Table):
     degree: Annotated[int, one_of((1, 2))] = Field(
         default=1, description="Polynomial degree of the displacement: 1 (the paper's) or 2."
     )
+    formulation: Annotated[str, one_of(FORMULATIONS)] = Field(
+        default="displacement",
+        description="Where the elements take the change of volume: "
+        + "; ".join(f"{name!r}: {formulation.meaning}" for name, formulation in FORMULATIONS.items())
+        + ".",
+    )
+
+    @model_validator(mode="after")
+    def _formulation_has_the_element(self) -> Mesh:
+        pair = self.element, self.degree
+        if not FORMULATIONS[self.formulation].has(*pair):
+            able = [name for name, formulation in FORMULATIONS.items() if formulation.has(*pair)]
+            rule = f"allowed for elements {self.element!r} of degree {self.degree} is {', '.join(map(repr, able))}"
+            raise fault(rule, "formulation", self.formulation)
+        return self
 
 
 class Model(Table):

@@ -48,6 +48,14 @@ DRIVERS: dict[str, Driver] = {
 }
 
 
+def rotated_back(F: Array, spatial_tensor: Array) -> Array:
+    """R^T t R with the rotation R of F = R U: objective. For t = sigma it is U S U / J, for t = b it is C."""
+    u, _, vt = np.linalg.svd(F)
+    R = u @ vt
+    back: Array = np.swapaxes(R, 1, 2) @ spatial_tensor @ R
+    return (back + np.swapaxes(back, 1, 2)) / 2
+
+
 @dataclass(frozen=True)
 class Frame:
     """What becomes of the eigenvectors of a spatial driver.
@@ -58,10 +66,13 @@ class Frame:
         n_I from (F (n, 3, 3), m_I as rows (n, 3, 3)).
     carries_axes
         Whether the cells' axes move with the material, so that F n_I are the previous axes in space.
+    tensor
+        A spatial tensor as one in material space, from (F (n, 3, 3), tensor (n, 3, 3)): for laws that need no axes.
     """
 
     axes: Callable[[Array, Array], Array]
     carries_axes: bool
+    tensor: Callable[[Array, Array], Array] = rotated_back
 
 
 def spatial_frame(F: Array, spatial_axes: Array) -> Array:
@@ -83,7 +94,7 @@ def material_frame(F: Array, spatial_axes: Array) -> Array:
 
 FRAMES: dict[str, Frame] = {
     "material": Frame(material_frame, carries_axes=True),
-    "spatial": Frame(spatial_frame, carries_axes=False),
+    "spatial": Frame(spatial_frame, carries_axes=False, tensor=lambda F, tensor: tensor),
 }
 
 

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from remodel_fenicsx.tissue import spectral
+from remodel_fenicsx.tissue import spectral, tensor_law
 from remodel_fenicsx.tissue.cells import UnitCell, structure_tensor
 from remodel_fenicsx.tissue.drivers import Driver, Frame, carried_axes
 
@@ -85,6 +85,9 @@ class Law:
         Whether the cells tend to a limit under a constant drive that does not depend on the way there.
     remodels
         False where cells never change: then there is no pass at all.
+    target, follow
+        Of laws whose cells tend to a tensor: ``target(drive)`` and ``follow(cells, target, r0, kappa dt)``, of which
+        `update` is made. A scheme of second order needs them apart.
     share
         Cells that have made a share of a change, from (old, new, factor); `relaxed` where the law has none of its own.
     """
@@ -92,6 +95,8 @@ class Law:
     update: Callable[[UnitCell, Drive, float, float], UnitCell]
     has_limit: bool = False
     remodels: bool = True
+    target: Callable[[Drive], tensor_law.Target] | None = None
+    follow: Callable[[UnitCell, tensor_law.Target, Array | float, float], UnitCell] | None = None
     share: Callable[[UnitCell, UnitCell, float], UnitCell] = relaxed
 
 
@@ -237,10 +242,37 @@ def keep(cells: UnitCell, drive: Drive, time_old: float, time_new: float) -> Uni
     return cells
 
 
+def tensor_target(drive: Drive) -> tensor_law.Target:
+    """What the structure tensor tends to (`tensor_law.target`)."""
+    tensor = drive.tensor
+    if not drive.driver.material:
+        tensor = drive.frame.tensor(drive.deformation_gradient, tensor)
+    return tensor_law.target(tensor, drive.threshold)
+
+
+def follow_tensor(
+    cells: UnitCell, target: tensor_law.Target, end_to_end_length: Array | float, rate: float
+) -> UnitCell:
+    """Cells whose structure tensor is `tensor_law.follow`; where its eigenvalues agree, the axes stay.
+
+    Lengths are NaN where the target, extrapolated, makes the tensor indefinite by more than rounding.
+    """
+    structure = tensor_law.follow(structure_tensor(*cells[:2]), target, end_to_end_length, rate)
+    squared, axes = spectral.continued(structure, cells.axes)
+    rounding = spectral.ROUNDING * np.abs(squared).max(axis=-1, keepdims=True)
+    return UnitCell(np.where(squared < -rounding, np.nan, np.sqrt(np.maximum(squared, 0.0))), axes)
+
+
+def tensor(cells: UnitCell, drive: Drive, time_old: float, time_new: float) -> UnitCell:
+    """dA/dt = kappa s (r0^2 E - A) with E and s frozen over the step (docs/theory.md, "The consistent variant")."""
+    return follow_tensor(cells, tensor_target(drive), drive.end_to_end_length, drive.kappa * (time_new - time_old))
+
+
 LAWS: dict[str, Law] = {
     "explicit": ranked(explicit, has_limit=True),
     "rate": ranked(rate),
     "relaxation": ranked(relaxation, has_limit=True),
+    "tensor": Law(tensor, has_limit=True, target=tensor_target, follow=follow_tensor),
     "rotation": Law(rotation, share=turned_in_part),
     "none": Law(keep, remodels=False),
 }
