@@ -52,8 +52,8 @@ def one_file(folder: Path, pattern: str) -> Path:
 
 @contextmanager
 def locked_by_this_process(cache: Path) -> Iterator[None]:
-    """As if a run with this process's number were compiling."""
-    with one_file(cache, "compiling.lock").open("w") as lock:
+    """As if a run with this process's number were compiling the program's kernel."""
+    with one_file(cache, "locks/libffcx_*").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         lock.write(f"{os.getpid()}\n")
         lock.flush()
@@ -81,17 +81,26 @@ def test_what_is_in_the_cache_waits_for_no_compiler(tmp_path: Path) -> None:
 
 def test_who_waits_for_a_compiler_says_for_whose(tmp_path: Path) -> None:
     assert compile_and_use(tmp_path).returncode == 0
-    for path in tmp_path.rglob("libffcx_*"):
+    for path in tmp_path.rglob("libffcx_*.*"):  # all but the lock
         path.unlink()
     command, environment = program(tmp_path)
     with locked_by_this_process(tmp_path):
         waiting = subprocess.Popen(command, stderr=subprocess.PIPE, env=environment, text=True)
         assert waiting.stderr
         line = next(line for line in waiting.stderr if "compil" in line)
-    assert f"another run is compiling forms (process {os.getpid()}): waiting for it" in line
+    assert f"another run is compiling the same (process {os.getpid()}): waiting for it" in line
     assert line.startswith("NOTICE:")  # the terminal gets it
     assert "compiling the moment" in waiting.communicate(timeout=120)[1]
     assert waiting.returncode == 0
+
+
+def test_other_kernels_are_compiled_at_the_same_time(tmp_path: Path) -> None:
+    assert compile_and_use(tmp_path).returncode == 0
+    command, environment = program(tmp_path, PROGRAM.replace("x[0] ** 3 *", "x[1] * x[0] ** 2 * 3 / 2 *"))
+    with locked_by_this_process(tmp_path):
+        other = subprocess.run(command, capture_output=True, text=True, timeout=120, env=environment)
+    assert other.returncode == 0, other.stderr[-2000:]
+    assert "compiling the moment" in other.stderr and "waiting" not in other.stderr
 
 
 @pytest.mark.parametrize(("ranks", "lost"), [(1, ".c"), (2, ".c"), (2, ".c.cached"), (1, ".so")])
@@ -190,7 +199,7 @@ def test_a_signal_ends_the_compiler_and_leaves_nothing(target: str, number: sign
     assert (process.returncode, errors) == (128 + number, "")
     if target != "compiler":  # whoever ends gcc alone leaves gcc's own children to themselves
         assert all_end(process.pid)
-    assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == ["compiling.lock"]
+    assert {path.parent.name for path in tmp_path.rglob("*") if path.is_file()} == {"locks"}
 
 
 def test_a_signal_for_one_process_ends_the_compilers_own_children(tmp_path: Path) -> None:

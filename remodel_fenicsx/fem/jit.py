@@ -132,7 +132,7 @@ class _OwnLabels(MultiFunction):
 
 @contextmanager
 def _compiler_watched(comm: MPI.Intracomm, what: str, seconds: int) -> Iterator[None]:
-    """Within, what is not in the cache is compiled by one process at a time, and said.
+    """Within, what is not in the cache is compiled, each kernel by one process, and said.
 
     FFCx computes a kernel's name and looks for it by `get_cached_module`: nothing else knows without doing that work
     twice whether the compiler is going to run. So this stands before that function. What is in the cache passes at
@@ -158,8 +158,8 @@ def _compiler_watched(comm: MPI.Intracomm, what: str, seconds: int) -> Iterator[
 
 @contextmanager
 def _compiling(kernel: str, what: str, seconds: int) -> Iterator[None]:
-    """The only process that compiles; stopped by a signal at once, and then nothing of the kernel stays."""
-    with stopping_at_once(), pause_held_back(), _alone():
+    """The only process that compiles this kernel; a signal stops it at once, and then nothing of the kernel stays."""
+    with stopping_at_once(), pause_held_back(), _alone(kernel):
         if _is_cached(kernel):  # by the run that this one has waited for
             yield
             return
@@ -217,18 +217,19 @@ def _remove(kernel: str) -> None:
 
 
 @contextmanager
-def _alone() -> Iterator[None]:
-    """Only one process compiles at a time, so that whatever is unfinished before was cut off: it is removed.
+def _alone(kernel: str) -> Iterator[None]:
+    """Only one process compiles a kernel, so that whatever is unfinished of it was cut off before: it is removed.
 
     FFCx itself would wait for it: its .c file is the lock, and stays when a process is killed. The lock here is the
-    operating system's, which ends with its process; the file holds the number of that process.
+    operating system's, which ends with its process; the file holds the number of that process. Other kernels have
+    other locks: several runs, or tests, compile at the same time.
     """
-    folder = cache_folder()
+    folder = cache_folder() / "locks"
     folder.mkdir(parents=True, exist_ok=True)
-    with (folder / "compiling.lock").open("a+") as lock:
+    with (folder / kernel).open("a+") as lock:
         try:
             _take(lock)
-            _remove_unfinished()
+            _remove_unfinished(kernel)
         except OSError as error:  # some network file systems have no locks
             log.warning("%s cannot be locked (%s): runs at once may wait for each other", lock.name, error.strerror)
         yield
@@ -242,7 +243,7 @@ def _take(lock: IO[str]) -> None:
         process = lock.read().strip() or "unknown"
         log.log(
             logging.INFO if process in _waited_for else NOTICE,  # once on the terminal, not for every kernel
-            "another run is compiling forms (process %s): waiting for it",
+            "another run is compiling the same (process %s): waiting for it",
             process,
         )
         _waited_for.add(process)
@@ -252,10 +253,8 @@ def _take(lock: IO[str]) -> None:
     lock.flush()
 
 
-def _remove_unfinished() -> None:
+def _remove_unfinished(kernel: str) -> None:
     """Remove what a killed compilation left: a .c file (FFCx's lock) without end mark or library, or one of these."""
-    kernels = {name.partition(".")[0] for name in os.listdir(cache_folder()) if name.startswith("libffcx_")}
-    for kernel in kernels:
-        if not _is_cached(kernel):
-            log.info("removing a compilation that was cut off: %s", kernel)
-            _remove(kernel)
+    if not _is_cached(kernel) and any(path.exists() for path in _files(kernel)):
+        log.info("removing a compilation that was cut off: %s", kernel)
+        _remove(kernel)
