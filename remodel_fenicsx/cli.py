@@ -5,34 +5,54 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
+import re
+import shlex
 import sys
+import time as clock
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from importlib.util import find_spec
 from pathlib import Path
+from typing import NoReturn
 
 import remodel_fenicsx
 from remodel_fenicsx.system import interrupts
 from remodel_fenicsx.system.environment import reason_unusable, versions
 from remodel_fenicsx.scene.parameters import PRESETS
 from remodel_fenicsx.scene.scene import Scene, SceneError, preset_scene, read_scene
+from remodel_fenicsx.schema.tables import printable
 
-BAD_INPUT, SOLVE_FAILED, BAD_ENVIRONMENT = 2, 3, 5
+BAD_INPUT, SOLVE_FAILED, STOPPED, BAD_ENVIRONMENT = 2, 3, interrupts.PAUSED, 5
+
+
+class _Parser(argparse.ArgumentParser):
+    """What it complains of stays on one line, control characters and all."""
+
+    def error(self, message: str) -> NoReturn:
+        super().error(printable(message))
 
 
 def parser() -> argparse.ArgumentParser:
     """The command line."""
-    main_parser = argparse.ArgumentParser(
+    main_parser = _Parser(
         prog="remodel-fenicsx",
         description="Predict how collagen in living tissue reorients under load (Kuhl & Holzapfel 2007).",
-        epilog="exit codes: 0 finished, 2 bad input, 3 the solve failed, 5 environment not usable, "
-        "129/130/143 interrupted",
+        epilog="exit codes: 0 finished, 2 bad input, 3 the solve failed, 4 stopped on purpose, 5 environment not "
+        "usable, 129/130/143 interrupted",
     )
     main_parser.add_argument("--version", action="version", version=remodel_fenicsx.__version__)
     commands = main_parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
-    def scene_command(name: str, text: str) -> argparse.ArgumentParser:
+    def scene_command(name: str, text: str, resumes: bool = False) -> argparse.ArgumentParser:
         command = commands.add_parser(name, help=text, description=text)
-        command.add_argument("scene", type=Path, metavar="SCENE", help="scene file (TOML), see docs/scene.md")
+        meaning = "scene file (TOML), see docs/scene.md"
+        if resumes:
+            which = command.add_mutually_exclusive_group(required=True)
+            which.add_argument("scene", type=Path, nargs="?", metavar="SCENE", help=meaning)
+            text = "go on with the run in DIR from its last checkpoint"
+            which.add_argument("--resume", type=Path, metavar="DIR", help=text)
+        else:
+            command.add_argument("scene", type=Path, metavar="SCENE", help=meaning)
         command.add_argument(
             "--set",
             action="append",
@@ -42,11 +62,30 @@ def parser() -> argparse.ArgumentParser:
         )
         return command
 
-    run_command = scene_command("run", "Run a scene; mpirun -n N remodel-fenicsx run ... is the same run on N ranks.")
+    text = "Run a scene; mpirun -n N remodel-fenicsx run ... is the same run on N ranks."
+    run_command = scene_command("run", text, resumes=True)
     run_command.add_argument(
         "-o", "--output", type=Path, metavar="DIR", help="new or empty folder for the results (default: results/NAME)"
     )
+    run_command.add_argument(
+        "--max-wall-time",
+        type=wall_time,
+        metavar="TIME",
+        help="stop before this time is over, after a whole step, with exit code 4: 90s, 30min, 2h, 1.5d",
+    )
     run_command.add_argument("-q", "--quiet", action="store_true", help="no progress")
+    stability = scene_command(
+        "stability", "Run a scene and say by what its passes multiply a small change of the cells."
+    )
+    stability.add_argument(
+        "-o", "--output", type=Path, metavar="DIR", help="new or empty folder (default: results/NAME-stability)"
+    )
+    stability.add_argument("--times", type=_positive, default=10, metavar="N", help="times to analyse (default: 10)")
+    stability.add_argument("-q", "--quiet", action="store_true", help="no progress")
+    stability.set_defaults(resume=None, max_wall_time=None)
+    text = "Say where the run in DIR is, how fast, and whether it is alive."
+    status = commands.add_parser("status", help=text, description=text)
+    status.add_argument("folder", type=Path, metavar="DIR", help="folder of a run")
     scene_command("validate", "Check a scene without running it.")
     new = commands.add_parser("new", help="Print a scene of a preset.", description="Print a scene of a preset.")
     new.add_argument("preset", metavar="PRESET", help=", ".join(PRESETS))
@@ -70,8 +109,23 @@ def parser() -> argparse.ArgumentParser:
     return main_parser
 
 
+def wall_time(text: str) -> float:
+    """Seconds of a time such as 90s, 30min, 2h.
+
+    Raises
+    ------
+    ArgumentTypeError
+        If it is none.
+    """
+    found = re.fullmatch(r"([0-9]{1,9}(?:\.[0-9]{1,9})?)\s*(s|min|h|d)", text)
+    seconds = float(found[1]) * {"s": 1, "min": 60, "h": 3600, "d": 86400}[found[2]] if found else 0.0
+    if seconds <= 0:
+        raise argparse.ArgumentTypeError(f"{text!r}: must be a time greater than 0 with its unit: 90s, 30min, 2h, 1.5d")
+    return seconds
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit code of docs/commands.md (0, 2, 3, 5, 129, 130, 143)."""
+    """Run the command line; returns the exit code of docs/commands.md (0, 2, 3, 4, 5, 129, 130, 143)."""
     with interrupts.ending_at_once():
         options = _parsed(arguments)
         try:
@@ -85,6 +139,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 return 0
             return _fail(f"cannot write to the standard output: {error.strerror}", BAD_ENVIRONMENT)
         return code
+
+
+def _positive(text: str) -> int:
+    number = int(text)
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"{text}: allowed is a whole number at least 1")
+    return number
 
 
 def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -112,7 +173,7 @@ def _say(text: str) -> None:
 
 def _complain(message: str) -> None:
     with contextlib.suppress(OSError):  # nobody is there to read it
-        print(f"remodel-fenicsx: {message}", file=sys.stderr, flush=True)
+        print(f"remodel-fenicsx: {printable(message)}", file=sys.stderr, flush=True)
 
 
 def _fail(message: str, code: int) -> int:
@@ -121,24 +182,37 @@ def _fail(message: str, code: int) -> int:
     return code
 
 
-def _run(options: argparse.Namespace) -> int:
-    scene = read_scene(options.scene, options.set)
+def _run(options: argparse.Namespace, task: Callable[..., Path] | None = None) -> int:
+    deadline = None if options.max_wall_time is None else clock.monotonic() + options.max_wall_time
+    scene = None if options.resume else read_scene(options.scene, options.set)
+    if options.resume and options.output:
+        return _fail("-o: a run goes on in its own folder", BAD_INPUT)
     reason = reason_unusable()
     if reason is not None:
         return _fail(f"the environment is not usable: {reason}; run through ./with-fenicsx", BAD_ENVIRONMENT)
     interrupts.take_back_signals()
     from remodel_fenicsx.body import GeometryError
-    from remodel_fenicsx.results.run_folder import FolderTaken
-    from remodel_fenicsx.simulation import run
     from remodel_fenicsx.evolution.parts import StepFailure
+    from remodel_fenicsx.results.checkpoint_file import CheckpointError
+    from remodel_fenicsx.results.recording import RecordingError
+    from remodel_fenicsx.results.run_folder import FolderTaken
+    from remodel_fenicsx.simulation import resume, run
 
     try:
-        folder = run(scene, options.output, quiet=options.quiet)
-    except (FolderTaken, SceneError, GeometryError) as error:
+        if scene is None:
+            folder = resume(options.resume, options.set, quiet=options.quiet, deadline=deadline)
+        elif task is not None:
+            folder = task(scene, options.output, quiet=options.quiet)
+        else:
+            folder = run(scene, options.output, quiet=options.quiet, deadline=deadline)
+    except (FolderTaken, SceneError, GeometryError, CheckpointError, RecordingError) as error:
         return _fail(" ".join(str(error).split()), BAD_INPUT)
     except StepFailure as failure:
-        advice = "try a smaller time.step, a slower ramp or lower loads; every finished step is kept"
-        return _fail(f"{failure}. {advice}", SOLVE_FAILED)
+        text = f"{failure}. {failure.refusal}; every finished step is kept"
+        return _fail(f"{text}, and run --resume goes on from there", SOLVE_FAILED)
+    except interrupts.Paused as pause:
+        way = f"it goes on with: remodel-fenicsx run --resume {shlex.quote(str(pause.folder))}"
+        return _fail(f"{pause}: all is kept up to time {pause.time:g}; {way}", STOPPED)
     except interrupts.Interrupted as interruption:
         end = _fail if interruption.on_all_ranks else _end_all
         return end(f"stopped by {interruption}; {interruption.kept}", interruption.exit_code)
@@ -154,6 +228,21 @@ def _run(options: argparse.Namespace) -> int:
     return 0
 
 
+def _stability(options: argparse.Namespace) -> int:
+    missing = [name for name in ("matplotlib", "PIL") if find_spec(name) is None]
+    if missing:
+        return _fail(f"the environment is not usable: no {missing[0]}; run through ./with-fenicsx", BAD_ENVIRONMENT)
+
+    def analyse(scene: Scene, folder: Path | None, quiet: bool) -> Path:
+        from remodel_fenicsx.stability import in_words, stability
+
+        place, table = stability(scene, folder, options.times, quiet=quiet)
+        _say(in_words(table))
+        return place
+
+    return _run(options, analyse)
+
+
 def _end_all(message: str, code: int) -> int:
     """End the run on all ranks: an error on one of them leaves the others waiting for ever."""
     from mpi4py import MPI
@@ -162,6 +251,21 @@ def _end_all(message: str, code: int) -> int:
     if MPI.COMM_WORLD.size > 1:
         MPI.COMM_WORLD.Abort(code)
     return code
+
+
+def _status(options: argparse.Namespace) -> int:
+    from remodel_fenicsx.results.checkpoint_file import CheckpointError
+    from remodel_fenicsx.results.recording import RecordingError
+    from remodel_fenicsx.results.status import status
+
+    try:
+        lines = status(options.folder)
+    except (RecordingError, CheckpointError) as error:
+        return _fail(str(error), BAD_INPUT)
+    except OSError as error:
+        return _fail(f"{options.folder}: cannot be read: {error.strerror}", BAD_ENVIRONMENT)
+    _say("\n".join(lines))
+    return 0
 
 
 def _validate(options: argparse.Namespace) -> int:
@@ -212,7 +316,15 @@ def _info(options: argparse.Namespace) -> int:
     return 0
 
 
-COMMANDS = {"run": _run, "validate": _validate, "new": _new, "figures": _figures, "info": _info}
+COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
+    "run": _run,
+    "stability": _stability,
+    "status": _status,
+    "validate": _validate,
+    "new": _new,
+    "figures": _figures,
+    "info": _info,
+}
 
 
 if __name__ == "__main__":

@@ -3,27 +3,40 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack
+import tomllib
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TypeVar, cast
 
 from mpi4py import MPI
 
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.loading import Loading, LoadValues
+from remodel_fenicsx.evolution.chatter import Chatter
+from remodel_fenicsx.evolution.locking import LockingWarning
+from remodel_fenicsx.evolution.monitor import StabilityWatcher
 from remodel_fenicsx.evolution.parts import StepFailure
+from remodel_fenicsx.evolution.pause import Pause
 from remodel_fenicsx.evolution.state import State
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher, times
 from remodel_fenicsx.evolution.unit_cells import UnitCells
+from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.fem.quadrature import Quadrature
+from remodel_fenicsx.results.checkpoint import Checkpoints, restore_state
+from remodel_fenicsx.results.checkpoint_file import Checkpoint, CheckpointError, read_checkpoint
 from remodel_fenicsx.results.columns import COLUMNS_ON_REQUEST, Observer, columns_of
 from remodel_fenicsx.results.fields import Fields
-from remodel_fenicsx.results.run_folder import RunFolder, chosen_folder
-from remodel_fenicsx.scene import Scene, SceneError
+from remodel_fenicsx.results.recording import SCENE, RecordingError
+from remodel_fenicsx.results.run_folder import FolderTaken, LastStep, RunFolder, chosen_folder, forget_steps, locked
+from remodel_fenicsx.scene import Scene, SceneError, read_scene, scene_from_dict
+from remodel_fenicsx.scene.continuation import check_continuation
 from remodel_fenicsx.system.environment import versions
 from remodel_fenicsx.system.interrupts import (
     Interrupted,
+    Paused,
     StopRequest,
     end_all_ranks_on_exception,
     stopping_at_once,
@@ -68,10 +81,13 @@ class Simulation:
         self.cells = UnitCells(self.quadrature, domain.element_number, domain.number_of_elements, scene.cells)
         self.loading = Loading(domain, self.unknown, kinematics)
         shape.support(self.loading)
-        self.state = State(self.unknown, kinematics, self.cells, self.loading)
+        formulation = FORMULATIONS[scene.mesh.formulation]
+        self.state = State(self.unknown, kinematics, self.cells, self.loading, formulation)
         tissue = scene.material.tissue(scene.cells.end_to_end_length)
         self.stepper = Stepper(self.state, tissue, scene.remodeling, scene.solver, self.load_values)
         self.tissue = self.stepper.tissue
+        counted = "negative_eigenvalues" in scene.output.columns
+        self.stability = StabilityWatcher(self.stepper, scene.solver.unstable, every_step=counted)
         self.observer = Observer(shape, self.stepper, columns_of(shape, checked_columns(scene.output.columns)))
 
     def load_values(self, time: float) -> LoadValues:
@@ -79,7 +95,7 @@ class Simulation:
         return {name: load.value * load.factor(time) for name, load in self.scene.loads.items()}
 
     def steps(self, watchers: Sequence[Watcher] = ()) -> Iterator[Step]:
-        """Solve and remodel step by step; what is yielded has been accepted.
+        """Solve and remodel step by step, from where the state is; what is yielded has been accepted.
 
         The state seen at a yield is one pass ahead of the row: the row and the fields belong to the solved state,
         before the remodeling pass (docs/theory.md).
@@ -87,19 +103,22 @@ class Simulation:
         Parameters
         ----------
         watchers
-            Who else follows the steps; the observer, which fills each step's row, comes first.
+            Who else follows the steps; those who watch the stability and fill each step's row come first.
 
         Raises
         ------
         StepFailure
             If a step has no admissible equilibrium.
         """
-        self.stepper.remodeling.warn_of_overcorrection(self.stepper.coupling.share)
-        ways = times(self.scene.time.end, self.scene.time.step)
-        return self.stepper.march(ways, [self.observer, *watchers])
+        remaining = list(times(self.scene.time.end, self.scene.time.step))[self.state.number :]
+        chatter = [Chatter(self.stepper)] if self.stepper.remodeling.law.remodels else []
+        locks = FORMULATIONS[self.scene.mesh.formulation].locks(self.scene.mesh.element, self.scene.mesh.degree)
+        locking = LockingWarning(self.stepper, locks)
+        return self.stepper.march(remaining, [self.stability, self.observer, *chatter, locking, *watchers])
 
     def close(self) -> None:
         """Free PETSc's objects and options."""
+        self.stability.close()
         self.stepper.close()
 
 
@@ -145,7 +164,11 @@ def checked_domain(domain: Domain, scene: Scene) -> Domain:
 
 
 def run(
-    scene: Scene, folder: Path | str | None = None, comm: MPI.Intracomm = MPI.COMM_WORLD, quiet: bool = True
+    scene: Scene,
+    folder: Path | str | None = None,
+    comm: MPI.Intracomm = MPI.COMM_WORLD,
+    quiet: bool = True,
+    deadline: float | None = None,
 ) -> Path:
     """Run a scene and record it.
 
@@ -159,19 +182,23 @@ def run(
         MPI communicator.
     quiet
         No progress on the terminal.
+    deadline
+        `time.monotonic` before which it shall stop, between two steps; None: never.
 
     Returns
     -------
-    The folder with history.csv, fields.vtkhdf, fields_chains.vtkhdf, scene.toml and run.log.
+    The folder with history.csv, fields.vtkhdf, fields_chains.vtkhdf, scene.toml, run.log and the checkpoints.
 
     Raises
     ------
     FolderTaken
         If the folder is not empty.
     StepFailure
-        If a step has no admissible equilibrium; all steps before it are recorded.
+        If a step has no admissible equilibrium; all steps before it are recorded, with a checkpoint.
     Interrupted
         On SIGINT, SIGTERM or SIGHUP; all accepted steps are recorded.
+    Paused
+        On SIGUSR1, or before the deadline; all is recorded, with a checkpoint.
     OSError
         If the results cannot be written.
     """
@@ -182,8 +209,81 @@ def run(
         with hold_log(comm.rank, quiet=quiet) as held:
             simulation = _built(scene, comm)
             place = place or chosen_folder(None, scene.name, comm)
-        _record(simulation, place, stop, quiet, held)
+        with _closing(simulation), locked(place, comm, new=True):
+            _record(simulation, place, _Circumstances(stop, quiet, held, deadline))
     return place
+
+
+def resume(
+    folder: Path | str,
+    overrides: Sequence[str] = (),
+    comm: MPI.Intracomm = MPI.COMM_WORLD,
+    quiet: bool = True,
+    deadline: float | None = None,
+) -> Path:
+    """Go on with a recorded run from its last checkpoint, or from t = 0 where it has none yet.
+
+    Parameters
+    ----------
+    folder
+        The run's.
+    overrides
+        "KEY=VALUE": keys that may change are time.end, output, solver, and loads after the checkpoint.
+    comm, quiet, deadline
+        As for `run`; the number of ranks may be another one.
+
+    Returns
+    -------
+    The folder.
+
+    Raises
+    ------
+    FolderTaken
+        If it is not the folder of a run, or a run writes in it.
+    SceneError, CheckpointError, RecordingError
+        If the scene is another one, no checkpoint is whole, or history or fields are damaged.
+    StepFailure, Interrupted, Paused, OSError
+        As `run` does.
+    """
+    end_all_ranks_on_exception()
+    place = Path(folder)
+    with StopRequest() as stop, locked(place, comm, new=False):
+        with hold_log(comm.rank, quiet=quiet) as held:
+            scene, checkpoint = _kept(place, overrides, comm)
+            simulation = _built(scene, comm)
+        with _closing(simulation):
+            if comm.bcast(checkpoint is not None):
+                restore_state(simulation.state, checkpoint)
+            _record(simulation, place, _Circumstances(stop, quiet, held, deadline, resumes=True))
+    return place
+
+
+def _kept(place: Path, overrides: Sequence[str], comm: MPI.Intracomm) -> tuple[Scene, Checkpoint | None]:
+    """Scene, and checkpoint on rank 0, of a run that goes on; or the refusal on all ranks."""
+    scene = checkpoint = refusal = None
+    if comm.rank == 0:
+        try:
+            scene = read_scene(place / SCENE, overrides)
+            checkpoint = read_checkpoint(place)
+            if checkpoint is not None:
+                check_continuation(scene_from_dict(tomllib.loads(checkpoint.scene)), scene, checkpoint.time)
+                _say_where(checkpoint)
+            else:
+                log.info("no checkpoint yet: starts again at t = 0")
+        except (SceneError, CheckpointError) as error:
+            refusal = error
+    refusal = comm.bcast(refusal)
+    if refusal is not None:
+        raise refusal
+    return comm.bcast(scene), checkpoint
+
+
+def _say_where(checkpoint: Checkpoint) -> None:
+    log.info("goes on from the checkpoint of time %g, step %d", checkpoint.time, checkpoint.number)
+    now = versions()
+    for name, version in checkpoint.versions.items():
+        if now.get(name) != version:
+            log.warning("goes on with %s %s, was %s", name, now.get(name), version)
 
 
 def _built(scene: Scene, comm: MPI.Intracomm) -> Simulation:
@@ -195,34 +295,85 @@ def _built(scene: Scene, comm: MPI.Intracomm) -> Simulation:
         raise
 
 
-def _record(simulation: Simulation, place: Path, stop: StopRequest, quiet: bool, held: list[logging.LogRecord]) -> None:
-    scene, comm = simulation.scene, simulation.domain.mesh.comm
+@contextmanager
+def _closing(simulation: Simulation) -> Iterator[None]:
+    """Close it at the end, if all ranks come there: the others would wait for ever."""
+    try:
+        yield
+    except (StepFailure, Interrupted, Paused, FolderTaken, SceneError, CheckpointError, RecordingError):
+        simulation.close()
+        raise
+    except BaseException:
+        if simulation.domain.comm.size == 1:
+            simulation.close()
+        raise
+    simulation.close()
+
+
+@dataclass
+class _Circumstances:
+    """Of a run: who may stop it, what was logged before it had a folder, whether it goes on."""
+
+    stop: StopRequest
+    quiet: bool
+    held: list[logging.LogRecord] = field(default_factory=list)
+    deadline: float | None = None
+    resumes: bool = False
+
+
+def _record(simulation: Simulation, place: Path, around: _Circumstances) -> None:
+    scene, comm, state = simulation.scene, simulation.domain.mesh.comm, simulation.state
     header = "as run: all values, also those of preset and defaults\n" + "\n".join(
         f"{name} {version}" for name, version in versions().items()
     )
+    text = scene.to_toml(header)
+    columns = [column.name for column in simulation.observer.columns]
+    after = LastStep(columns, state.number, state.time) if state.number else None
+    if around.resumes and after is None and comm.rank == 0:
+        forget_steps(place)
     with ExitStack() as stack:
-        record = stack.enter_context(RunFolder(place, scene.to_toml(header), comm.rank))
-        stack.enter_context(open_log(place / "run.log", comm.rank, quiet=quiet, held=held))
-        progress = stack.enter_context(Progress(scene.time.number_of_steps, scene.name, -1 if quiet else comm.rank))
+        record = stack.enter_context(_agreed(comm, lambda: RunFolder(place, text, comm.rank, after)))
+        stack.enter_context(open_log(place / "run.log", comm.rank, quiet=around.quiet, held=around.held))
+        progress = stack.enter_context(
+            Progress(scene.time.number_of_steps, scene.name, -1 if around.quiet else comm.rank, done=state.number)
+        )
         log.info("scene %s on %d ranks, results in %s", scene.name, comm.size, place)
         log.info("%s", scene.summary())
         for warning in scene.warnings():
             log.warning("%s", warning)
         watchers: list[Watcher] = []
         if scene.output.fields:
-            fields = Fields(place, scene.geometry, simulation.stepper, scene.output.every)
-            watchers.append(stack.enter_context(fields))
-        watchers += [record, _Report(scene, progress)]
-        simulation.stepper.stop_signal = lambda: stop.number
+            parts = place, scene.geometry, simulation.stepper, scene.output.every, after and after.time
+            watchers.append(stack.enter_context(_agreed(comm, lambda: Fields(*parts))))
+        checkpoints = Checkpoints(place, state, text, scene.output.checkpoint)
+        pause = Pause(comm, place, lambda: around.stop.pause, around.deadline)
+        watchers += [record, _Report(scene, progress), checkpoints, pause]
+        simulation.stepper.stop_signal = lambda: around.stop.number
         try:
             for _ in simulation.steps(watchers):
                 pass
-        except (StepFailure, Interrupted) as reason:
+        except (StepFailure, Interrupted, Paused) as reason:
             log.info("ended: %s", reason)
-            simulation.close()  # all ranks have this exception; after any other one they would wait for ever
+            if getattr(reason, "on_all_ranks", True):
+                checkpoints.write()
             raise
-        simulation.close()
         log.info("finished")
+
+
+T = TypeVar("T")
+
+
+def _agreed(comm: MPI.Intracomm, make: Callable[[], T]) -> T:
+    """What `make` makes of the files of a run that goes on, or its refusal on all ranks. Collective."""
+    made = refusal = None
+    try:
+        made = make()
+    except RecordingError as error:  # rank 0 alone reads
+        refusal = error
+    refusal = comm.bcast(refusal)
+    if refusal is not None:
+        raise refusal
+    return cast(T, made)
 
 
 class _Report(Watcher):

@@ -18,6 +18,7 @@ from remodel_fenicsx.evolution.remodeling import RemodelingPass
 from remodel_fenicsx.evolution.state import State
 from remodel_fenicsx.evolution.stepper import Stepper
 from remodel_fenicsx.evolution.unit_cells import UnitCells
+from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.fem.kinematics import FullKinematics
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.scene.parameters import Cells, Material, Remodeling
@@ -63,11 +64,13 @@ class Body:
     cells: UnitCells
     loading: Loading
     kinematics: FullKinematics = field(default_factory=FullKinematics)
+    formulation: str = "displacement"
 
     def state(self) -> State:
         """Its state, with the loads as they are."""
         loads = dict(self.loading.values)
-        state = State(self.displacement, self.kinematics, self.cells, self.loading)
+        formulation = FORMULATIONS[self.formulation]
+        state = State(self.displacement, self.kinematics, self.cells, self.loading, formulation)
         self.loading.set(loads)
         return state
 

@@ -1,5 +1,5 @@
 """A test session's own rules, as a plugin of pytest's: limits that find a hang, launcher tests only when its files have
-changed, and how many kernels were compiled.
+changed, how many kernels were compiled, and which files start first.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from types import FrameType
 from typing import Any
 
 import pytest
+from xdist.scheduler import LoadFileScheduling
 
 PROJECT = Path(__file__).resolve().parents[1]
 SLOW_LIMIT = 3600  # seconds for a test marked slow; pyproject.toml has the limit of all others
@@ -55,6 +56,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addini(
         "timeout_grace", "seconds after a test's limit: if it goes on then, its process is ended", default="60"
     )
+    parser.addini("start_first", "test files that take longest, for pytest-xdist", type="args")
 
 
 @pytest.hookimpl(wrapper=True, optionalhook=True)
@@ -136,6 +138,28 @@ def launcher_key() -> str:
         path = PROJECT / name
         key.update(f"{name} {path.stat().st_mode:o} {path.stat().st_size}\n".encode() + path.read_bytes())
     return key.hexdigest()[:16]
+
+
+# ---------------------------------------------------------------- which files start first
+class LongFilesFirst(LoadFileScheduling):  # type: ignore[misc]
+    """One file goes to one worker, as with --dist loadfile; those of `start_first` (pyproject.toml) come first.
+
+    By itself pytest-xdist starts with the files of most tests. Those that run through time have few, would come last,
+    and one worker would wait for the other.
+    """
+
+    def _assign_work_unit(self, node: Any) -> None:
+        long_files = self.config.getini("start_first")
+        waiting = [scope for name in long_files for scope in self.workqueue if Path(scope).name == name]
+        if waiting:
+            self.workqueue.move_to_end(waiting[0], last=False)
+        super()._assign_work_unit(node)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """For --dist loadfile, which tests/run asks for."""
+    return LongFilesFirst(config, log) if config.getoption("dist") == "loadfile" else None
 
 
 # ---------------------------------------------------------------- the session

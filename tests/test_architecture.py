@@ -16,7 +16,8 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGE = "remodel_fenicsx"
 # what a room may import: itself, and those before it
-ROOMS = ("system", "schema", "tissue", "fem", "body", "scene", "evolution", "results", "paper", "simulation", "cli")
+ROOMS = ("system", "schema", "tissue", "fem", "body", "scene", "evolution", "results", "paper", "simulation",
+         "stability", "cli")  # fmt: skip
 LONGEST = 400
 # imports that only the type checker follows: of what is there without dolfinx, to what is not
 TYPES_ONLY = {
@@ -196,9 +197,11 @@ def test_no_module_is_longer_than_one_can_hold_in_mind() -> None:
 
 # ---------------------------------------------------------------- what to touch to add something
 THINGS = (
-    "a chain law", "a matrix energy", "a driver", "a frame", "a law towards a target, by rank", "any other law",
-    "initial axes of the cells", "a load", "a column of every shape", "a column of one shape", "a shape",
-    "a kinematics", "a solver method", "a coupling", "a key of a scene",
+    "a chain law", "a matrix energy", "a repulsive energy", "a driver", "a frame",
+    "a law towards a target, by rank", "any other law",
+    "a pairing of values and dimensions", "initial axes of the cells", "a load", "a column of every shape",
+    "a column of one shape", "a shape", "a kinematics", "a formulation", "a solver method", "a coupling",
+    "a key of a scene",
 )  # fmt: skip
 
 

@@ -56,7 +56,7 @@ def test_the_python_of_the_readme_runs_as_it_stands(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["README.md", "CONTRIBUTING.md", *(f"docs/{name}.md" for name in (
-    "architecture", "commands", "environment", "theory", "verification"))])  # fmt: skip
+    "architecture", "commands", "environment", "laws", "locking", "theory", "verification"))])  # fmt: skip
 def test_files_and_modules_that_a_page_names_are_there(name: str) -> None:
     """Paths in backticks or links, and modules after the package's name."""
     text = re.sub(r"```.*?```", "", page(name), flags=re.DOTALL)
@@ -110,6 +110,21 @@ for point in points:
     assert point["passes"] == 0 and point["largest_stress"] < 1e-7 and 1 < point["radius"] < 3, point
 print(sorted(points[0]))
 """
+
+
+LAWS = """
+import compare_laws as laws
+page = laws.PAGE.read_text(encoding="utf-8")
+assert laws.MARKS[0] + laws.comparison() + laws.MARKS[1] in page, "make the table again: docs/compare_laws.py"
+case, law = laws.CASES["cube"], laws.LAWS["relaxation-continuous"]
+rows = laws.history(case, law, **{"time.end": 2.0})
+assert [row[0] for row in rows] == [1.0, 2.0] and 60 < rows[-1][1] < 70 and rows[-1][2] < 1 < rows[-1][4], rows
+"""
+
+
+def test_the_laws_beside_each_other_are_those_of_their_table_and_run(tmp_path: Path) -> None:
+    """A short run of the cube whose load turns: it becomes shorter along z, while it is pulled along x."""
+    script(["-c", LAWS], tmp_path)
 
 
 def test_the_studies_of_the_verification_page_run(tmp_path: Path) -> None:

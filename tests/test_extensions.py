@@ -25,6 +25,7 @@ from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.shape import uniaxial_columns
 from remodel_fenicsx.evolution import coupling
 from remodel_fenicsx.fem import jit
+from remodel_fenicsx.fem.formulations import FORMULATIONS, Selective
 from remodel_fenicsx.fem.kinematics import KINEMATICS, FullKinematics
 from remodel_fenicsx.fem.solver_methods import METHODS
 from remodel_fenicsx.results.columns import COLUMNS, Measurement
@@ -37,6 +38,8 @@ from remodel_fenicsx.tissue.chains import CHAINS, Chain
 from remodel_fenicsx.tissue.drivers import DRIVERS, FRAMES, Driver, Frame
 from remodel_fenicsx.tissue.energy import MATRICES, neo_hookean
 from remodel_fenicsx.tissue.laws import LAWS, Drive, Law, ranked
+from remodel_fenicsx.tissue.repulsion import REPULSIONS, Repulsion, axes_sum, squared_end_to_end_length
+from remodel_fenicsx.tissue.spectral import PAIRINGS, principal
 
 KAPPA = 0.1
 SCENE: dict[str, Any] = {
@@ -124,6 +127,21 @@ def test_a_matrix_energy(monkeypatch: pytest.MonkeyPatch) -> None:
     assert expected[-1] > 1.5
 
 
+def test_a_repulsion(monkeypatch: pytest.MonkeyPatch) -> None:
+    """M = r^2 cancels the chains' stress at F = I as the logarithms do; the network is then softer."""
+    monkeypatch.setitem(REPULSIONS, "again", Repulsion(axes_sum))
+    monkeypatch.setitem(REPULSIONS, "squared", Repulsion(lambda F, cells, r0: squared_end_to_end_length(F, cells)))
+    expected = column(rows_of(scene(**{"remodeling": {"law": "none"}})), "mean_stretch")
+    found = {
+        name: column(rows_of(scene(material={"repulsion": name}, remodeling={"law": "none"})), "mean_stretch")
+        for name in ("again", "squared")
+    }
+    assert found["again"] == expected
+    assert found["squared"][0] > expected[0] > 1.0
+    with simulated(scene(material={"repulsion": "squared"}).with_values({"loads.force.value": 0.0})) as (simulation, _):
+        assert np.abs(simulation.unknown.x.array).max() < 1e-14
+
+
 def test_a_driver(monkeypatch: pytest.MonkeyPatch) -> None:
     """The Kirchhoff stress is J times Cauchy's: the same axes, the same ratios, the same cells."""
     monkeypatch.setitem(DRIVERS, "kirchhoff", Driver(lambda F, s: ufl.det(F) * s.cauchy, False))
@@ -197,6 +215,22 @@ def test_a_law_of_another_kind(monkeypatch: pytest.MonkeyPatch) -> None:
     stretch = column(rows, "mean_stretch")
     assert stretch[1] < stretch[2] < stretch[3]  # under the same load
     assert all(row["remodeling_power"] != 0 for row in rows)
+
+
+def test_a_pairing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The largest tension belongs to the last dimension: the start of a cell is another one, eq. (11) is the same."""
+
+    def ascending(*tensors: Any, **limits: Any) -> Any:
+        values, axes = principal(*tensors, **limits)
+        return values[:, ::-1], axes[:, ::-1]
+
+    monkeypatch.setitem(PAIRINGS, "ascending", ascending)
+    for pairing, along, across in (("sorted", 0.8, 0.6), ("ascending", 0.0, 1.0)):
+        rows = rows_of(scene(cells={"initial": [0.8, 0.6, 0.0]}, remodeling={"pairing": pairing}))
+        for passes, row in enumerate(rows[1:], start=1):
+            left = np.exp(-KAPPA * passes)
+            angle = np.degrees(np.arctan2(across * left, along * left + 1 - left))
+            assert row["mean_fibre_angle"] == pytest.approx(angle, abs=1e-6), (pairing, passes)
 
 
 def test_initial_axes(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -345,7 +379,9 @@ def test_a_coupling(monkeypatch: pytest.MonkeyPatch) -> None:
             return super().remodel(time) if time > 2.0 else 0.0
 
     monkeypatch.setitem(coupling.COUPLINGS, "late", Late)
-    with pytest.raises(SceneError, match="^remodeling.coupling = 'late': allowed are 'staggered', 'relaxed'$"):
+    with pytest.raises(
+        SceneError, match="^remodeling.coupling = 'late': allowed are 'staggered', 'relaxed', 'extrapolated'$"
+    ):
         scene(remodeling={"coupling": "late"})
     monkeypatch.setitem(parameters.COUPLINGS, "late", "as staggered, but the cells stay as they are up to t = 2")
     angles = column(rows_of(scene(remodeling={"coupling": "late"})), "mean_fibre_angle")
@@ -379,6 +415,20 @@ def test_a_kinematics(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("mean_stretch", "min_stretch", "min_jacobian", "stored_energy"):
         np.testing.assert_allclose(column(found, name), column(expected, name), rtol=1e-9, err_msg=name)
     assert 2 * top == pytest.approx(found[-1]["mean_stretch"] - 1)
+
+
+def test_a_formulation(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The two parts apart, but by the same rule: rows as with the whole energy, pressure and remodeling too."""
+    monkeypatch.setitem(FORMULATIONS, "apart", Selective("both parts at all points", {("hexahedron", 1): 2}))
+    with pytest.raises(
+        SceneError, match="^mesh.formulation = 'apart': allowed for elements 'hexahedron' of degree 2 is"
+    ):
+        scene(mesh={"formulation": "apart", "degree": 2})
+    expected = rows_of(scene(cells={"initial": "random"}))
+    with simulated(scene(cells={"initial": "random"}, mesh={"formulation": "apart"})) as (simulation, found):
+        assert simulation.state.dilatation.jacobians().shape == (1, 8)
+    for name in ("mean_stretch", "mean_fibre_angle", "stored_energy", "remodeling_power"):
+        np.testing.assert_allclose(column(found, name), column(expected, name), rtol=1e-8, err_msg=name)
 
 
 def test_a_solver_method(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -204,7 +204,7 @@ def test_without_chains_nothing_locks(law: str) -> None:
     assert {row["max_chain_extension"] for row in rows} == {0.0}
     assert {row["remodeling_power"] for row in rows} == {0.0}
     # no chain is in the kernels: two constants of the matrix, and of the fields the displacement alone
-    energy = simulation.stepper.coupling.equilibrium.energy
+    (energy,) = simulation.stepper.coupling.equilibrium.energies
     assert energy.coefficients() == (simulation.unknown,)
     assert {float(c.value) for c in energy.constants()} == {27.293, 3.103}
     simulation.close()

@@ -23,7 +23,7 @@ RANDOM = Cells(initial="random", seed=3)
 def assembled_vector(problem: parts.Problem) -> np.ndarray:
     """Internal forces minus loads at the present displacement, no support applied."""
     total = np.zeros_like(problem.state.unknown.x.array)
-    for form in (problem.internal_form, problem.external_form):
+    for form in (*problem.internal_forms, problem.external_form):
         if form is not None:
             total += dolfinx.fem.assemble_vector(form).array
     return total
@@ -220,9 +220,10 @@ def test_wrong_branch_is_there_and_refused(monkeypatch: pytest.MonkeyPatch) -> N
     made = stretched_bar(4.0)
     start = made.displacement.x.array.copy()
     problem = made.problem(parts.TIGHT.model_copy(update={"petsc_options": {"snes_linesearch_type": "bt"}}))
-    real, harmless = problem.extension, Extension(0.5, 0.5, (0.0, 0.0, 0.0))
+    real, harmless = problem.extension_and_stretches, (Extension(0.5, 0.5, (0.0, 0.0, 0.0)), np.zeros(0))
     problem.newton._snes.setLineSearchPreCheck(lambda x, step: False)
-    monkeypatch.setattr(problem, "extension", lambda: real() if problem.newton._snes.getConvergedReason() else harmless)
+    guard = lambda: real() if problem.newton._snes.getConvergedReason() else harmless  # noqa: E731
+    monkeypatch.setattr(problem, "extension_and_stretches", guard)
     with pytest.raises(SolveFailure, match=r"reached r/L = 2\.72") as caught:
         problem.solve()
     assert problem.newton._snes.getConvergedReason() > 0 and problem.newton._snes.getFunctionNorm() < 1e-9

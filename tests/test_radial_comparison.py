@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from _pytest.mark.structures import ParameterSet
 
 from tests.radial_comparison import (
     CURVED,
@@ -39,9 +40,15 @@ from tests.radial_comparison import (
 )
 
 
-def names(settings: tuple[Setting, ...]) -> list[str]:
-    """Loads as names of test cases."""
-    return [f"{100 * setting.stretch:g}-{setting.pressure:g}" for setting in settings]
+def load_cases() -> list[ParameterSet]:
+    """The load cases, those that say less slow: docs/verification.md is made from all of them."""
+    always = {"10-4.8", "0-4.8"}
+    names = {f"{100 * setting.stretch:g}-{setting.pressure:g}": setting for setting in LOAD_CASES}
+    assert always < set(names)
+    return [
+        pytest.param(setting, id=name, marks=[] if name in always else pytest.mark.slow)
+        for name, setting in names.items()
+    ]
 
 
 def checked(setting: Setting) -> Errors:
@@ -53,7 +60,7 @@ def checked(setting: Setting) -> Errors:
     return found
 
 
-@pytest.mark.parametrize("setting", LOAD_CASES, ids=names(LOAD_CASES))
+@pytest.mark.parametrize("setting", load_cases())
 def test_the_five_load_cases_of_figure_9(setting: Setting) -> None:
     found = checked(setting)
     # the front, where the angle rises by up to 290 degrees per unit radius, is a small part of the wall
@@ -70,12 +77,14 @@ def test_the_other_drivers(setting: Setting) -> None:
     assert beyond_a_shift(setting, 2.0 / CURVED[1] / 8) < 0.3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("setting", [PK2_FREE, FINGER_FREE], ids=["pk2", "finger"])
 def test_the_other_drivers_with_the_scenes_supports_while_small_tilts_are_small(setting: Setting) -> None:
     """Without planes of symmetry: the same, as long as what grows out of rounding has not arrived."""
     assert checked(setting).outside < 1.0
 
 
+@pytest.mark.slow
 def test_the_rate_law_outside_its_front() -> None:
     """Eq. (10): a jump of 16 degrees in the reference near R = 2.25, by axes that turn near R = 2 here."""
     found, run = errors(RATE), finite_elements(RATE)
@@ -93,7 +102,7 @@ def test_the_frames_agree_where_nothing_turns() -> None:
     assert np.abs(runs[0].angle - runs[1].angle).max() < 0.05
 
 
-@pytest.mark.parametrize("degree", [1, 2])
+@pytest.mark.parametrize("degree", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_the_error_falls_at_the_elements_rate(degree: int) -> None:
     """Angles follow the stresses: order k. Radii: k + 1 (over the steps; the largest error is that at full load)."""
     found, orders = convergence(degree)

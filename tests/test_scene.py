@@ -112,7 +112,8 @@ BAD_SCENES = [
     (
         TUBE,
         {"output.pictures!": True},
-        "output.'pictures!' = true: unknown key; allowed are output.fields, output.columns, output.every",
+        "output.'pictures!' = true: unknown key; allowed are output.fields, output.columns, output.every, "
+        "output.checkpoint",
     ),
     (TUBE, {"time.x\ny": 1}, "time.'x\\ny' = 1: unknown key; allowed are time.end, time.step"),
     # material
@@ -291,11 +292,25 @@ BAD_SCENES = [
     ),
     # remodeling, model, mesh
     (CUBE, {"remodeling.kappa": -0.1}, "remodeling.kappa = -0.1: must be a finite number at least 0"),
-    (CUBE, {"remodeling.law": "foo"}, "remodeling.law = 'foo': allowed are 'explicit', 'rate', 'relaxation', 'none'"),
-    (CUBE, {"remodeling.law": 1}, "remodeling.law = 1: allowed are 'explicit', 'rate', 'relaxation', 'none'"),
+    (CUBE, {"remodeling.rotation_time": 0.0}, "remodeling.rotation_time = 0.0: must be a finite number greater than 0"),
+    (CUBE, {"remodeling.pairing": "rank"}, "remodeling.pairing = 'rank': allowed are 'sorted', 'continuous'"),
+    (
+        CUBE,
+        {"remodeling.law": "foo"},
+        "remodeling.law = 'foo': allowed are 'explicit', 'rate', 'relaxation', 'tensor', 'rotation', 'none'",
+    ),
+    (
+        CUBE,
+        {"remodeling.law": 1},
+        "remodeling.law = 1: allowed are 'explicit', 'rate', 'relaxation', 'tensor', 'rotation', 'none'",
+    ),
     (CUBE, {"remodeling.driver": "strain"}, "remodeling.driver = 'strain': allowed are 'cauchy', 'pk2', 'finger'"),
     (CUBE, {"remodeling.frame": "corotated"}, "remodeling.frame = 'corotated': allowed are 'material', 'spatial'"),
-    (CUBE, {"remodeling.coupling": "implicit"}, "remodeling.coupling = 'implicit': allowed are 'staggered', 'relaxed'"),
+    (
+        CUBE,
+        {"remodeling.coupling": "implicit"},
+        "remodeling.coupling = 'implicit': allowed are 'staggered', 'relaxed', 'extrapolated'",
+    ),
     (CUBE, {"model.kinematics": "radial"}, "model.kinematics = 'radial': allowed is 'full'"),
     (CUBE, {"geometry.side": 1e7}, "geometry.side = 10000000.0: a length of 1e+07 here; allowed are 1e-06 to 1e+06"),
     (
@@ -384,8 +399,12 @@ BAD_SCENES = [
         "name = 'a\\nb': must be a file name: letters, digits, spaces and . + - _, at most 100, "
         "a letter or digit first",
     ),
-    (CUBE, {"preset": "kuhl-2007"}, "preset = 'kuhl-2007': allowed are 'kuhl-holzapfel-2007', 'sun-2002'"),
-    (CUBE, {"preset": 2007}, "preset = 2007: allowed are 'kuhl-holzapfel-2007', 'sun-2002'"),
+    (
+        CUBE,
+        {"preset": "kuhl-2007"},
+        "preset = 'kuhl-2007': allowed are 'kuhl-holzapfel-2007', 'consistent', 'sun-2002'",
+    ),
+    (CUBE, {"preset": 2007}, "preset = 2007: allowed are 'kuhl-holzapfel-2007', 'consistent', 'sun-2002'"),
     (
         TUBE,
         {"preset": PAPER, "geometry.inner_radius": 4.0},
@@ -550,6 +569,7 @@ def test_the_preset_is_the_printed_method():
         "remodeling.driver": "cauchy",
         "remodeling.law": "explicit",
         "remodeling.frame": "spatial",
+        "remodeling.pairing": "sorted",
         "remodeling.coupling": "staggered",
         "remodeling.kappa": 0.025,
         "material.lame_lambda": 27.293,
@@ -680,7 +700,9 @@ def test_the_demos_are_the_preset():
 
 def test_a_preset_by_name():
     assert preset_scene(PAPER, "tube") == read_scene(ROOT / "demos" / "artery.toml", ["name=tube"])
-    with pytest.raises(SceneError, match=r"^preset = 'none': allowed are 'kuhl-holzapfel-2007', 'sun-2002'$"):
+    with pytest.raises(
+        SceneError, match=r"^preset = 'none': allowed are 'kuhl-holzapfel-2007', 'consistent', 'sun-2002'$"
+    ):
         preset_scene("none", "tube")
     with pytest.raises(SceneError, match=r"^geometry\.shape = 'heart': allowed are 'cube', 'tendon', 'tube'$"):
         preset_scene(PAPER, "heart")

@@ -205,4 +205,4 @@ def test_a_usage_error_is_said_by_the_first_rank_alone() -> None:
         done = subprocess.run(words, capture_output=True, text=True, timeout=100, env=environment)
         assert done.returncode == 2
         said.append(done.stderr + done.stdout)
-    assert "required: SCENE" in said[0] and said[1] == ""
+    assert "one of the arguments SCENE --resume is required" in said[0] and said[1] == ""

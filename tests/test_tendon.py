@@ -19,7 +19,7 @@ def tendon_scene(**cells: object) -> dict:
     return {"preset": "kuhl-holzapfel-2007", "geometry": {"shape": "tendon"}, "cells": cells}
 
 
-@pytest.fixture(scope="module", params=[1, 2, 3])
+@pytest.fixture(scope="module", params=[1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (2, 3))])
 def random_tendon(request: pytest.FixtureRequest, case: Case) -> dict:
     """150 steps of a seed."""
     return case(tendon_scene(seed=request.param), snapshots=SNAPSHOTS)

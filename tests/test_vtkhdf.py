@@ -16,14 +16,9 @@ import h5py
 import numpy as np
 import pytest
 
+from remodel_fenicsx.results.chain_lines import chain_displacement, chain_lines
 from remodel_fenicsx.results.staged_file import StagedFile
-from remodel_fenicsx.results.vtkhdf import (
-    LINE,
-    TransientGrid,
-    cell_type_and_permutation,
-    chain_displacement,
-    chain_lines,
-)
+from remodel_fenicsx.results.vtkhdf import LINE, TransientGrid, cell_type_and_permutation
 
 # In a process of its own, as users do. Steps are read forwards and backwards: VTK keeps the meshes of earlier steps.
 READER = """
@@ -386,3 +381,70 @@ def test_what_was_staged_can_be_read_back(tmp_path):
         assert count == min(size, len(expected) - start) and buffer[:count] == expected[start : start + size]
     assert staged.seek(0, os.SEEK_END) == len(expected)
     staged.close()
+
+
+# ---------------------------------------------------------------- going on
+@pytest.mark.parametrize("steps", [2, 64])
+def test_a_file_cut_off_between_any_two_writes_goes_on(tmp_path, monkeypatch, steps):
+    field = np.arange(70 * 24.0).reshape(70, 8, 3)
+    path, copies, write = tmp_path / "f.vtkhdf", [], os.pwrite
+
+    def copy_and_write(descriptor, data, offset):
+        write(descriptor, bytes(data)[: len(data) // 2], offset)
+        copies.append(shutil.copy(path, tmp_path / f"{len(copies)}.vtkhdf"))
+        return write(descriptor, data, offset)
+
+    with TransientGrid(path, CUBE, VTK_CUBE, 12) as grid:
+        for k in range(steps):
+            grid.append(k, {"u": field[k]}, {"c": np.zeros(1)}, points=CUBE + k)
+        monkeypatch.setattr(os, "pwrite", copy_and_write)
+        grid.append(steps, {"u": field[steps]}, {"c": np.zeros(1)}, points=CUBE + steps)
+        monkeypatch.setattr(os, "pwrite", write)
+    for number, copy in enumerate(copies):
+        kept = steps - 1 if number % 2 else steps  # another time, without the last whole step
+        with TransientGrid.continued(copy, kept - 0.5) as grid:
+            assert grid.number_of_steps == kept and grid.last_time == kept - 1
+            for k in range(kept, steps + 2):
+                grid.append(k, {"u": -field[k]}, {"c": np.ones(1)}, points=CUBE - k)
+        expected = [*field[:kept], *-field[kept : steps + 2]]
+        assert np.array_equal(raw_series(copy, "u", 8), expected)
+        with h5py.File(copy) as file:
+            moved = file["VTKHDF/Points"][:].reshape(-1, 8, 3)
+            assert np.array_equal(
+                moved[1:], [CUBE + k for k in range(kept)] + [CUBE - k for k in range(kept, steps + 2)]
+            )
+
+
+def test_a_commit_that_was_cut_off_is_finished_by_who_opens_the_file(tmp_path, monkeypatch):
+    path, write, done = tmp_path / "f", os.pwrite, []
+    staged = StagedFile(path)
+    staged.write(bytes(100))
+    staged.commit()
+    for start in (10, 0, 50):
+        staged.seek(start)
+        staged.write(b"changed")
+    staged.seek(100)
+    staged.write(b"new")
+
+    def killed(descriptor, data, offset):
+        if len(done) == 2:  # the new end, and one of three changes
+            raise KeyboardInterrupt
+        done.append(offset)
+        return write(descriptor, data, offset)
+
+    monkeypatch.setattr(os, "pwrite", killed)
+    with pytest.raises(KeyboardInterrupt):
+        staged.commit()
+    monkeypatch.setattr(os, "pwrite", write)
+    staged.close()
+    expected = bytearray(bytes(100) + b"new")
+    for start in (10, 0, 50):
+        expected[start : start + 7] = b"changed"
+    assert path.read_bytes()[:103] != expected and len(path.read_bytes()) > 103
+    for _ in range(2):  # a second time it is whole already
+        StagedFile(path, existing=True).close()
+        assert path.read_bytes() == expected
+    with path.open("ab") as file:
+        file.write(b"remodel1")  # the mark alone says nothing
+    StagedFile(path, existing=True).close()
+    assert path.read_bytes() == expected + b"remodel1"

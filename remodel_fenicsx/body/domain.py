@@ -90,6 +90,23 @@ class Domain:
         owned = topology.index_map(topology.dim).size_local
         return self._gather(np.asarray(values), self.element_number[:owned], self.number_of_elements)
 
+    def scatter_elements(self, values: npt.NDArray[Any] | None) -> npt.NDArray[Any]:
+        """Give every rank the rows of its elements, ghosts included: the way back of `gather_elements`. Collective.
+
+        Parameters
+        ----------
+        values
+            (number_of_elements, ...) on rank 0, in input order; elsewhere it is not looked at.
+
+        Returns
+        -------
+        array
+            One row per local element.
+        """
+        wanted = self.comm.gather(self.element_number, root=0)
+        parts = None if wanted is None or values is None else [values[numbers] for numbers in wanted]
+        return np.asarray(self.comm.scatter(parts, root=0))
+
     def gather_nodes(self, values: npt.ArrayLike) -> npt.NDArray[Any] | None:
         """Bring what belongs to the geometry nodes to rank 0, in input order. Collective.
 

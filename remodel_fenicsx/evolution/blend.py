@@ -27,7 +27,8 @@ class Blend:
         self.theta = dolfinx.fem.Constant(state.cells.quadrature.mesh, PETSc.ScalarType(0.0))
         old, new = state.equilibrium_cells.ufl_cell, state.cells.ufl_cell
         shares = [UnitCell(*old[:2], 1 - self.theta), UnitCell(*new[:2], self.theta)]
-        self.equilibrium = Equilibrium(state, tissue, shares)
+        self.state = state
+        self.equilibrium = Equilibrium(state, tissue, shares, self._point_shares)
         self._newton: GuardedNewton | None = None
 
     @property
@@ -42,6 +43,11 @@ class Blend:
         if self._newton is not None:
             self._newton.close()
             self._newton = None
+
+    def _point_shares(self) -> list[UnitCell]:
+        theta = float(np.real(self.theta.value))
+        old, new = self.state.equilibrium_cells.point_cells, self.state.cells.point_cells
+        return [UnitCell(*old[:2], 1 - theta), UnitCell(*new[:2], theta)]
 
     def set(self, fraction: float) -> None:
         """theta."""

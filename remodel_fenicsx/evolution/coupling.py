@@ -6,6 +6,9 @@ import logging
 from collections.abc import Callable
 from typing import Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
 from remodel_fenicsx.body.loading import LoadValues
 from remodel_fenicsx.evolution.blend import Blend
 from remodel_fenicsx.evolution.equilibrium import Equilibrium
@@ -14,8 +17,12 @@ from remodel_fenicsx.evolution.parts import Change, Work
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
 from remodel_fenicsx.evolution.state import State
 from remodel_fenicsx.tissue.energy import Tissue
+from remodel_fenicsx.tissue.tensor_law import Target
 
+Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
+
+NEVER = -1.0  # time of a target that there has not been
 
 
 class Coupling(Protocol):
@@ -25,11 +32,14 @@ class Coupling(Protocol):
     ----------
     equilibrium
         The forms of the solved state.
+    newton
+        What solved it.
     share
         Share of a pass's change of the cells that is made.
     """
 
     equilibrium: Equilibrium
+    newton: GuardedNewton
     share: float
 
     def solve(self, time: float, loads: LoadValues) -> Work:
@@ -112,7 +122,7 @@ class Staggered:
         if self.blend is not None and self._cells_changed():
             blend = self.blend
             stage = "the change of the cells"
-            Change(time, stage, blend.set, blend.newton, halvings, blend.largest_part).advance(work)
+            Change(time, stage, blend.set, blend.newton, halvings, blend.largest_part, roughly=True).advance(work)
             failure = None  # the loads have not been tried from here
 
         def set_load_fraction(fraction: float) -> None:
@@ -138,5 +148,76 @@ class Relaxed(Staggered):
         self.share = remodeling.settings.relaxation_factor
 
 
+class Extrapolated(Staggered):
+    """Remodel, then solve: E + h/2 dE/dt from the targets of the last two states, h the step (docs/theory.md).
+
+    Cells, stress and row belong together at the end of a step. The first step, before which there is no stress, takes
+    the target at its end: it solves, remodels, and solves again. For laws with a `target`.
+    """
+
+    def __init__(self, state: State, tissue: Tissue, remodeling: RemodelingPass, settings: SolverSettings):
+        super().__init__(state, tissue, remodeling, settings)
+        self._targets = state.cells.quadrature.function("targets", (2, 11))  # the last first: E, s, its time
+        self._values[..., 10] = NEVER
+        state.remember(self._targets)
+        self._power = 0.0
+
+    @property
+    def _values(self) -> Array:
+        return self.state.cells.quadrature.values(self._targets, (2, 11))
+
+    def solve(self, time: float, loads: LoadValues) -> Work:
+        """New cells, and equilibrium at `time` with them.
+
+        Raises
+        ------
+        StepFailure
+            If no admissible equilibrium is found.
+        """
+        if self.state.number == 0:
+            work = super().solve(time, loads)
+            self._follow(self.remodeling.target(self._residual), time)
+            again = super().solve(time, loads)
+            return Work(
+                work.newton_iterations + again.newton_iterations,
+                work.linear_iterations + again.linear_iterations,
+                work.substeps + again.substeps - 1,
+                again.residual,
+            )
+        self._follow(self._extrapolated(time), time)
+        return super().solve(time, loads)
+
+    def remodel(self, time: float) -> float:
+        """Remember the target of the solved state; the cells are those of the row."""
+        target, values = self.remodeling.target(self._residual), self._values
+        values[:, :, 1] = values[:, :, 0]
+        if self.state.number == 0:  # its own target has been taken for the whole of the first step
+            values[:, :, 1, 10] = NEVER
+        values[:, :, 0, :9] = target.direction.reshape(*values.shape[:2], 9)
+        values[:, :, 0, 9] = target.share.reshape(values.shape[:2])
+        values[:, :, 0, 10] = time
+        return self._power
+
+    def _extrapolated(self, time: float) -> Target:
+        last, before = self._values.reshape(-1, 2, 11)[:, 0], self._values.reshape(-1, 2, 11)[:, 1]
+        slope = np.zeros(len(last))
+        known = before[:, 10] != NEVER
+        slope[known] = (time - last[known, 10]) / 2 / (last[known, 10] - before[known, 10])
+        ahead = last[:, :10] + slope[:, None] * (last[:, :10] - before[:, :10])
+        return Target(ahead[:, :9].reshape(-1, 3, 3), np.clip(ahead[:, 9], 0.0, 1.0))
+
+    def _follow(self, target: Target, time: float) -> None:
+        """Cells after the step; where an extrapolated target would make A indefinite, the last target itself counts."""
+        duration = time - self.state.time
+        asked, F = self.remodeling.followed(target, duration)
+        lost = ~np.isfinite(asked.dimensions).all(axis=-1)
+        if lost.any():
+            last = self._values.reshape(-1, 2, 11)[:, 0]
+            direction = np.where(lost[:, None, None], last[:, :9].reshape(-1, 3, 3), target.direction)
+            asked, F = self.remodeling.followed(Target(direction, target.share), duration)
+            log.info("time %g: %d points follow the last stress, not the extrapolated one", time, int(lost.sum()))
+        self._power = self.remodeling.replace(asked, F, duration)
+
+
 Maker = Callable[[State, Tissue, RemodelingPass, SolverSettings], Coupling]
-COUPLINGS: dict[str, Maker] = {"staggered": Staggered, "relaxed": Relaxed}
+COUPLINGS: dict[str, Maker] = {"staggered": Staggered, "relaxed": Relaxed, "extrapolated": Extrapolated}

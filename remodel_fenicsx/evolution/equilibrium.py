@@ -14,10 +14,12 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
+from remodel_fenicsx.evolution.pointwise import Shares, pointwise_repulsion
 from remodel_fenicsx.evolution.state import State
 from remodel_fenicsx.fem import coefficients, jit
 from remodel_fenicsx.tissue.cells import UnitCell
-from remodel_fenicsx.tissue.energy import Tissue, squared_end_to_end_length
+from remodel_fenicsx.tissue.energy import Tissue
+from remodel_fenicsx.tissue.repulsion import squared_end_to_end_length
 
 
 @dataclass(frozen=True)
@@ -47,8 +49,9 @@ class Equilibrium:
         Unknowns, cells and loads.
     tissue
         Its parameters; numbers become Constants of the mesh.
-    shares
-        The cells as the energy takes them, when not simply the state's (a blend of two).
+    shares, point_shares
+        The cells as the energy takes them, when not simply the state's (a blend of two), and a function that gives them
+        as arrays.
 
     Raises
     ------
@@ -56,7 +59,13 @@ class Equilibrium:
         If a parameter is neither a number, nor a Constant, nor a DG0 Function of the mesh.
     """
 
-    def __init__(self, state: State, tissue: Tissue, shares: Sequence[UnitCell] | None = None):
+    def __init__(
+        self,
+        state: State,
+        tissue: Tissue,
+        shares: Sequence[UnitCell] | None = None,
+        point_shares: Shares | None = None,
+    ):
         self.state, self.quadrature = state, state.cells.quadrature
         mesh = self.quadrature.mesh
         self.comm = mesh.comm
@@ -66,22 +75,35 @@ class Equilibrium:
         u, shares, loading = state.unknown, shares or [state.cells.ufl_cell], state.loading
         test, trial = ufl.TestFunction(u.function_space), ufl.TrialFunction(u.function_space)
         F = state.kinematics.deformation_gradient(u)
-        self.energy = self.tissue.strain_energy(F, shares) * state.kinematics.weight(mesh) * self.quadrature.dx
-        internal, external = ufl.derivative(self.energy, u, test), loading.external_residual(test)
-        self.internal_form = jit.form(internal)
+        self.energies = state.dilatation.energies(self.tissue, F, shares, state.kinematics.weight(mesh))
+        internal = [ufl.derivative(energy, u, test) for energy in self.energies]
+        tangents = [ufl.derivative(form, u, trial) for form in internal]
+        external = loading.external_residual(test)
+        self.pointwise = pointwise_repulsion(state, self.tissue, point_shares)
+        if self.pointwise is not None:
+            weight, dx = state.kinematics.weight(mesh), self.quadrature.dx
+            internal[0] += self.pointwise.residual(u, F, test) * weight * dx
+            tangents[0] += self.pointwise.tangent(u, F, test, trial) * weight * dx
+        self.internal_forms = [jit.form(form) for form in internal]
         self.external_form = None if external is None else jit.form(external)
         # apart, so that bodies with other loads share the costly one
-        self.tangent_forms = [jit.form(ufl.derivative(internal, u, trial))]
+        self.tangent_forms = [jit.form(form) for form in tangents]
         if external is not None and _depends_on(external, u):
             self.tangent_forms.append(jit.form(ufl.derivative(external, u, trial)))
         squared = squared_end_to_end_length(F, shares) if self.tissue.chain is not None else ufl.as_ufl(0.0)
         self._limits = jit.expression(ufl.as_vector([squared, ufl.det(F)]), self.quadrature.points)
-        self._energy_form: Any = None
+        self._energy_forms: list[Any] = []
 
     # ------------------------------------------------------------ what users ask
     def extension(self) -> Extension:
         """Largest r/L and smallest J of the present unknowns over all points of all ranks."""
-        squared, jacobian = (self.quadrature.owned(values) for values in self.limit_values())
+        return self.extension_and_stretches()[0]
+
+    def extension_and_stretches(self) -> tuple[Extension, NDArray[np.float64]]:
+        """The extension, and r/L at the points of this rank's own elements, (elements, points); infinite for NaN."""
+        squared, at_points = self.limit_values()
+        jacobian = np.hstack([at_points, self.state.dilatation.jacobians()])
+        squared, jacobian = self.quadrature.owned(squared), self.quadrature.owned(jacobian)
         with np.errstate(invalid="ignore"):
             stretch = np.sqrt(squared) / self.quadrature.owned(self.locking_length())
         stretch = np.where(np.isfinite(stretch), stretch, np.inf)
@@ -94,7 +116,19 @@ class Equilibrium:
             local = (-np.inf, (np.nan, np.nan, np.nan))
         ranks = self.comm.allgather((*local, float(np.min(jacobian, initial=np.inf)), self.stop_signal()))
         largest, worst_point = max((rank[:2] for rank in ranks), key=lambda pair: pair[0])
-        return Extension(largest, min(rank[2] for rank in ranks), worst_point, max(rank[3] for rank in ranks))
+        extension = Extension(largest, min(rank[2] for rank in ranks), worst_point, max(rank[3] for rank in ranks))
+        return extension, stretch
+
+    def keeps_reserve(self, before: Any, after: Any, share: float, nearer_than: float = 0.0) -> bool:
+        """Whether every point of all ranks keeps a share of its 1 - r/L; `nearer_than`: only those with r/L above it.
+
+        Parameters
+        ----------
+        before, after
+            r/L at the points, from `extension_and_stretches`.
+        """
+        lost = bool(np.any((after > nearer_than) & (1 - after < share * (1 - before))))
+        return not self.comm.allreduce(lost, MPI.LOR)
 
     def limit_values(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """r^2 in squared link lengths (0 without chains) and J at all points, each (elements, points)."""
@@ -110,36 +144,40 @@ class Equilibrium:
 
     def stored_energy(self) -> float:
         """Integral of W over the body."""
-        if self._energy_form is None:
+        if not self._energy_forms:
             self.compile_energy()
-        local = np.real(dolfinx.fem.assemble_scalar(self._energy_form))
-        return float(self.comm.allreduce(local, MPI.SUM))
+        local = sum(np.real(dolfinx.fem.assemble_scalar(form)) for form in self._energy_forms)
+        pointwise = 0.0 if self.pointwise is None else self.pointwise.energy()
+        return float(self.comm.allreduce(local, MPI.SUM)) + pointwise
 
     def compile_energy(self) -> None:
         """Make `stored_energy` ready; apart, because a blend needs none."""
-        self._energy_form = jit.form(self.energy)
+        self._energy_forms = [jit.form(energy) for energy in self.energies]
 
     # ------------------------------------------------------------ what a solver asks
     def assemble_internal(self, vector: Any) -> None:
         """Internal nodal forces of the present unknowns."""
-        self._assemble(vector, self.internal_form)
+        if self.pointwise is not None:
+            self.pointwise.update()
+        self._assemble(vector, self.internal_forms)
 
     def assemble_external(self, vector: Any) -> None:
         """Minus the nodal forces of the loads."""
-        self._assemble(vector, self.external_form)
+        self._assemble(vector, [] if self.external_form is None else [self.external_form])
 
-    def _assemble(self, vector: Any, form: Any) -> None:
+    def _assemble(self, vector: Any, forms: Sequence[Any]) -> None:
         with vector.localForm() as local:
             local.set(0.0)
-        if form is not None:
+        for form in forms:
             dolfinx.fem.petsc.assemble_vector(vector, form)
-            vector.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
+        vector.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
 
     def assemble_lifting(self, vector: Any, x: Any) -> None:
         """What the tangent makes of the distance between prescribed values and x: K (u_prescribed - x)."""
         with vector.localForm() as local:
             local.set(0.0)
         conditions = self.state.loading.boundary_conditions
+        self._update_tangent()
         for form in self.tangent_forms:
             dolfinx.fem.petsc.apply_lifting(vector, [form], bcs=[conditions], x0=[x], alpha=-1.0)
         vector.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
@@ -151,12 +189,24 @@ class Equilibrium:
     def assemble_tangent(self, matrix: Any) -> None:
         """Derivative of the residual at the present unknowns, one on the diagonal where they are prescribed."""
         matrix.zeroEntries()
+        self._update_tangent()
         for form in self.tangent_forms:
             # mypy sees the other overload of a single-dispatch function
             dolfinx.fem.petsc.assemble_matrix(
                 matrix, form, bcs=self.state.loading.boundary_conditions  # type: ignore[misc]
             )
             matrix.assemble()
+
+    def _update_tangent(self) -> None:
+        if self.pointwise is not None:
+            self.pointwise.update(stiffness=True)
+
+    def prescribed_values(self) -> NDArray[np.float64]:
+        """What supports and loads prescribe of this rank's unknowns, ghosts included; NaN where they are free."""
+        values = np.full_like(self.state.unknown.x.array, np.nan)
+        for condition in self.state.loading.boundary_conditions:
+            condition.set(values)
+        return values
 
     def prescribed_gap(self, x: Any) -> float:
         """Largest distance of a prescribed value from its target, over all ranks."""

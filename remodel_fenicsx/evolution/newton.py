@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
 import dolfinx.fem.petsc
 import numpy as np
+from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from remodel_fenicsx.evolution.equilibrium import Equilibrium, Extension, stress_rounding
@@ -19,6 +20,10 @@ log = logging.getLogger(__name__)
 
 LINE_SEARCH_HALVINGS = 20  # of one Newton step, before the solve is given up
 ROUNDINGS = 8.0  # how many times the rounding of assembled forces a residual may be
+PRESCRIBED_MET = 1e-10  # of the body's size: how far a prescribed displacement may be missed; no force measures it
+ON_THE_WAY = 1e-3  # of the nodal forces: residual of a part that others follow
+NEAR_LOCKING, KEPT_RESERVE = 0.95, 0.3  # a Newton step that ends above this r/L keeps this share of 1 - r/L
+NEARLY_LOCKED, COARSE, GOES_DOWN = 0.99, 1e-8, 0.25  # see GuardedNewton._is_small
 
 
 class SolverSettings(Protocol):
@@ -65,8 +70,16 @@ class Solution:
 class SolveFailure(RuntimeError):
     """SNES did not find an admissible equilibrium; the unknowns before the call are restored."""
 
-    def __init__(self, reason: str, newton_iterations: int, linear_iterations: int, extension: Extension):
+    def __init__(
+        self,
+        reason: str,
+        newton_iterations: int,
+        linear_iterations: int,
+        extension: Extension,
+        residual_over_tolerance: float = np.inf,
+    ):
         super().__init__(reason)
+        self.residual_over_tolerance = residual_over_tolerance
         self.reason = reason
         self.newton_iterations = newton_iterations
         self.linear_iterations = linear_iterations
@@ -92,9 +105,12 @@ class GuardedNewton:
         self._residual = self._x.duplicate()
         self._external = self._x.duplicate()
         self._matrix = equilibrium.create_matrix()
-        self._force_scale = self._stress_rounding = 0.0
+        self._force_scale = self._stress_rounding = self._extension = 0.0
         self._area = equilibrium.quadrature.norm(equilibrium.quadrature.largest_areas)
+        self.on_the_way = False  # whether the solution is only the start of a further one: then it may be coarser
         self._lost = False
+        self._gap = self._last_norm = np.inf
+        self._stretches: NDArray[np.float64] | None = None
         self._options_checked = False
         snes: Any = PETSc.SNES().create(equilibrium.comm)
         snes.setFunction(self._assemble_residual, self._residual)
@@ -144,8 +160,42 @@ class GuardedNewton:
             self.unknown.x.array[:] = start
             if extension.stop_signal:
                 raise Interrupted(extension.stop_signal)
-            raise SolveFailure(self._failure_text(reason, extension), newton, linear, extension)
+            left = float(self._snes.getFunctionNorm()) / max(self._tolerance(), float(np.finfo(np.float64).tiny))
+            raise SolveFailure(self._failure_text(reason, extension), newton, linear, extension, left)
         return Solution(newton, linear, float(self._snes.getFunctionNorm()))
+
+    def tangent_direction(self, set_fraction: Callable[[float], None], done: float, distance: float) -> Any:
+        """Change of the unknowns per fraction of a change of the problem, at a solved state; one linear solve.
+
+        Parameters
+        ----------
+        set_fraction, done
+            Applies a fraction of the change; the one that is solved. It is applied at the end.
+        distance
+            Fraction over which the residual's slope is taken.
+        """
+        self._pull(self._x)
+        slope, direction = self._x.duplicate(), self._x.duplicate()
+        set_fraction(done + distance)
+        self._assemble_residual(self._snes, self._x, slope)
+        set_fraction(done)
+        self._assemble_residual(self._snes, self._x, self._residual)
+        slope.axpy(-1.0, self._residual)
+        self.equilibrium.assemble_tangent(self._matrix)
+        solver = self._snes.getKSP()
+        solver.setOperators(self._matrix)
+        solver.solve(slope, direction)
+        direction.ghostUpdate(addv=PETSc.InsertMode.INSERT, mode=PETSc.ScatterMode.FORWARD)
+        with direction.localForm() as local:
+            values = -local.array_r / distance
+        slope.destroy()
+        direction.destroy()
+        return values
+
+    def factorisation(self) -> Any | None:
+        """PETSc's preconditioner with the factors of the last tangent; None where the method does not factorise."""
+        preconditioner = self._snes.getKSP().getPC()
+        return preconditioner if preconditioner.getType() in ("lu", "cholesky") else None
 
     def _warn_of_unused_options(self) -> None:
         """Once, after the first solve; on all ranks, for each has a database of options."""
@@ -180,30 +230,36 @@ class GuardedNewton:
         # forces at the nodes, reactions included: what the residual must be small against
         self._force_scale = max(residual.norm(), self._external.norm())
         residual.axpy(1.0, self._external)
-        if equilibrium.prescribed_gap(x) > 1e-13 * loading.domain.size:
+        self._gap = equilibrium.prescribed_gap(x) / loading.domain.size
+        if self._gap > 1e-13:
             # lifting assembles tangents of the constrained elements; it adds exactly zero once x meets the conditions
             equilibrium.assemble_lifting(self._external, x)
             residual.axpy(1.0, self._external)
         dolfinx.fem.petsc.set_bc(residual, loading.boundary_conditions, x, -1.0)
-        extension = equilibrium.extension()
+        extension, self._stretches = equilibrium.extension_and_stretches()
         self._lost = not extension.admissible or extension.stop_signal > 0
         if self._lost:
             residual.set(np.nan)
             return
         mesh = equilibrium.quadrature.mesh
-        self._stress_rounding = stress_rounding(equilibrium.tissue, mesh, extension.max_chain_extension)
+        self._extension = extension.max_chain_extension
+        self._stress_rounding = stress_rounding(equilibrium.tissue, mesh, self._extension)
 
     def _assemble_tangent(self, snes: Any, x: Any, matrix: Any, preconditioner: Any) -> None:
         self.equilibrium.assemble_tangent(matrix)
 
     def _keep_admissible(self, x: Any, step: Any) -> bool:
-        """Halve the Newton step until r < L and J > 0 everywhere (trial: x - step). True when it changed the step."""
+        """Halve the Newton step until r < L and J > 0 everywhere (trial: x - step). True when it changed the step.
+
+        Near L each point also keeps a share of its 1 - r/L: from a point much too near, where forces are huge, Newton's
+        method comes back only by a factor of 1.5 an iteration.
+        """
         trial = x.duplicate()
         for halving in range(LINE_SEARCH_HALVINGS + 1):
             trial.waxpy(-1.0, step, x)
             self._push(trial)
-            extension = self.equilibrium.extension()
-            if extension.admissible or extension.stop_signal:
+            extension, stretches = self.equilibrium.extension_and_stretches()
+            if extension.stop_signal or (extension.admissible and self._keeps_reserve(stretches)):
                 break
             step.scale(0.5)
         else:
@@ -213,16 +269,35 @@ class GuardedNewton:
             log.debug("Newton step shortened to 1/%d to keep r < L and J > 0", 2**halving)
         return halving > 0
 
+    def _keeps_reserve(self, stretches: NDArray[np.float64]) -> bool:
+        before = self._stretches
+        return before is None or self.equilibrium.keeps_reserve(before, stretches, KEPT_RESERVE, NEAR_LOCKING)
+
     def _converged(self, snes: Any, iteration: int, norms: tuple[float, float, float]) -> int:
         """|R| <= absolute_tolerance + relative_tolerance * |nodal forces|: a scale that does not vanish in a hold."""
         norm = norms[2]
         if not np.isfinite(norm):
             return PETSc.SNES.ConvergedReason.DIVERGED_FNORM_NAN
-        if norm <= self._tolerance():
+        last, self._last_norm = self._last_norm if iteration else np.inf, norm
+        if self._gap <= PRESCRIBED_MET and self._is_small(norm, last):
             return PETSc.SNES.ConvergedReason.CONVERGED_FNORM_ABS
         if iteration >= snes.getTolerances()[3]:
             return PETSc.SNES.ConvergedReason.DIVERGED_MAX_IT
         return PETSc.SNES.ConvergedReason.ITERATING
+
+    def _is_small(self, norm: float, last: float) -> bool:
+        """Whether a residual may be accepted; `last`: that of the iteration before.
+
+        Near L the rounding of the worst point may be far above that of all others. There what is below it counts as
+        solved only when it goes no further down.
+        """
+        if self.on_the_way and norm <= ON_THE_WAY * self._force_scale:
+            return True
+        if norm > self._tolerance():
+            return False
+        relative = self.settings.absolute_tolerance + self.settings.relative_tolerance * self._force_scale
+        coarse = self._extension > NEARLY_LOCKED and self._tolerance() > COARSE * self._force_scale
+        return norm <= relative or not coarse or norm > GOES_DOWN * last
 
     def _tolerance(self) -> float:
         """Relative to the forces at the nodes, not below the rounding of forces that add up to nothing there."""

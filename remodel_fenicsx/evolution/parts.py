@@ -4,10 +4,16 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
+import numpy as np
+from numpy.typing import NDArray
+
+from remodel_fenicsx.evolution.blend import KEPT_RESERVE
 from remodel_fenicsx.evolution.newton import GuardedNewton, Solution, SolveFailure
+from remodel_fenicsx.evolution.refusals import Refusal, diagnosed
 
+SLOPE_SHARE = 1e-3  # of the bounded part: over it the slope of the residual is taken
 log = logging.getLogger(__name__)
 
 
@@ -29,16 +35,29 @@ class Work:
 
 
 class StepFailure(RuntimeError):
-    """A step cannot be solved even in the smallest parts; the state is that of the last accepted step."""
+    """A step cannot be solved, or is not wanted; the state is that of the last accepted step.
 
-    def __init__(self, time: float, stage: str, fraction: float, cause: SolveFailure):
-        point = ", ".join(f"{c:.3f}" for c in cause.extension.worst_point)
-        super().__init__(
-            f"no equilibrium at time {time:g}: {stage} stops at {100 * fraction:.3g} % of the step ({cause.reason}; "
-            f"largest r/L = {cause.extension.max_chain_extension:.4f} at ({point}), "
-            f"smallest J = {cause.extension.min_jacobian:.4g})"
-        )
-        self.time = time
+    Attributes
+    ----------
+    time
+        Of the step.
+    refusal
+        Why, and what helps.
+    """
+
+    def __init__(self, time: float, text: str, refusal: Refusal):
+        super().__init__(text)
+        self.time, self.refusal = time, refusal
+
+
+def failure_text(time: float, stage: str, fraction: float, cause: SolveFailure) -> str:
+    """Where a change of the problem has stopped, and why."""
+    point = ", ".join(f"{c:.3f}" for c in cause.extension.worst_point)
+    return (
+        f"no equilibrium at time {time:g}: {stage} stops at {100 * fraction:.3g} % of the step ({cause.reason}; "
+        f"largest r/L = {cause.extension.max_chain_extension:.4f} at ({point}), "
+        f"smallest J = {cause.extension.min_jacobian:.4g})"
+    )
 
 
 @dataclass
@@ -57,6 +76,8 @@ class Change:
         How often the whole is halved before it has failed.
     largest_part
         Largest further part from a fraction on, where there is a bound.
+    roughly
+        Whether all parts but the last may be solved coarsely. Not near a limit of the load: it would be passed.
     """
 
     time: float
@@ -65,6 +86,8 @@ class Change:
     newton: GuardedNewton
     maximum_halvings: int
     largest_part: Callable[[float], float] = lambda done: 1.0
+    roughly: bool = False
+    _direction: NDArray[np.float64] | None = field(default=None, init=False)  # of the unknowns over the last part
 
     def advance(self, work: Work, failure: SolveFailure | None = None) -> None:
         """Go from 0 to 1; `failure`: that of the whole, if it was tried.
@@ -78,20 +101,59 @@ class Change:
         if failure is not None:
             part = self._halved(part, done, failure)
         while done < 1.0:
-            part = min(part, self.largest_part(done), 1.0 - done)
-            self.set_fraction(1.0 if done + part > 1.0 - 1e-12 else done + part)
+            before = self.newton.unknown.x.array.copy()
+            part = self._started(min(part, 1.0 - done), done, work)
+            is_last = done + part > 1.0 - 1e-12
+            self.set_fraction(1.0 if is_last else done + part)
+            self.newton.on_the_way = self.roughly and not is_last
             try:
                 work.add(self.newton.solve())
             except SolveFailure as failed:
+                self.newton.unknown.x.array[:] = before
                 work.add(failed)
                 part = self._halved(part, done, failed)
             else:
-                done = 1.0 if done + part > 1.0 - 1e-12 else done + part
+                done = 1.0 if is_last else done + part
+                self._direction = (self.newton.unknown.x.array - before) / part
                 part *= 2
                 work.substeps += 1
+            finally:
+                self.newton.on_the_way = False
+
+    def _started(self, wanted: float, done: float, work: Work) -> float:
+        """The next part, with the unknowns that it starts from.
+
+        Where the bound at the present unknowns is smaller than what is wanted, they go on as over the last part: along
+        that way chains keep about their length, and parts can be larger. Every point keeps its reserve there too.
+        """
+        bound = min(wanted, self.largest_part(done))
+        if bound >= wanted:
+            return bound
+        if self._direction is None:
+            self._direction = self.newton.tangent_direction(self.set_fraction, done, SLOPE_SHARE * bound)
+            work.newton_iterations += 1
+            work.linear_iterations += 1
+        if not np.all(np.isfinite(self._direction)):
+            self._direction = None
+            return bound
+        unknown, equilibrium = self.newton.unknown.x.array, self.newton.equilibrium
+        before = unknown.copy()
+        self.set_fraction(done)
+        _, present = equilibrium.extension_and_stretches()
+        while wanted > bound:
+            self.set_fraction(done + wanted)
+            unknown[:] = before + wanted * self._direction
+            extension, expected = equilibrium.extension_and_stretches()
+            if extension.admissible and equilibrium.keeps_reserve(present, expected, KEPT_RESERVE):
+                return wanted
+            wanted /= 2
+        unknown[:] = before
+        return bound
 
     def _halved(self, part: float, done: float, failure: SolveFailure) -> float:
         if part / 2 < 2.0**-self.maximum_halvings:
-            raise StepFailure(self.time, self.stage, done, failure) from failure
+            text = failure_text(self.time, self.stage, done, failure)
+            self.set_fraction(done)  # the last state that was solved
+            raise StepFailure(self.time, text, diagnosed(self.newton, failure, self._direction)) from failure
         log.debug("%s: %s; next part %g", self.stage, failure.reason, part / 2)
         return part / 2

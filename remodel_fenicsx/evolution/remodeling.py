@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from typing import Any, Protocol
 
 import numpy as np
@@ -10,16 +9,18 @@ import ufl
 from numpy.typing import NDArray
 
 from remodel_fenicsx.evolution.equilibrium import at_points, on_mesh, stress_rounding
+from remodel_fenicsx.evolution.pointwise import pointwise_repulsion
 from remodel_fenicsx.evolution.state import State
 from remodel_fenicsx.fem import coefficients, jit
 from remodel_fenicsx.tissue import spectral
 from remodel_fenicsx.tissue.cells import UnitCell, structure_tensor
-from remodel_fenicsx.tissue.drivers import DRIVERS, FRAMES
-from remodel_fenicsx.tissue.energy import Tissue, squared_end_to_end_length
-from remodel_fenicsx.tissue.laws import LAWS, Drive, relaxed
+from remodel_fenicsx.tissue.drivers import DRIVERS, FRAMES, carried_axes
+from remodel_fenicsx.tissue.energy import Tissue
+from remodel_fenicsx.tissue.laws import LAWS, Drive
+from remodel_fenicsx.tissue.repulsion import squared_end_to_end_length
+from remodel_fenicsx.tissue.tensor_law import Target
 
 Array = NDArray[np.float64]
-log = logging.getLogger(__name__)
 
 RESIDUAL_SHARE = 20.0  # an eighth of an element's nodes share a face's force; a pulled-back stress is larger still
 ROUNDINGS = 64.0  # how many times the rounding of a stress its principal values may be off
@@ -46,6 +47,12 @@ class RemodelingSettings(Protocol):
     @property
     def kappa(self) -> float: ...
 
+    @property
+    def pairing(self) -> str: ...
+
+    @property
+    def rotation_time(self) -> float: ...
+
 
 class RemodelingPass:
     """Updates the unit cells of a solved state.
@@ -57,7 +64,7 @@ class RemodelingPass:
     tissue
         Parameters of matrix and chains.
     settings
-        Driver, law, frame and kappa.
+        Driver, law, frame, pairing, kappa and rotation time.
     """
 
     def __init__(self, state: State, tissue: Tissue, settings: RemodelingSettings):
@@ -70,31 +77,20 @@ class RemodelingPass:
         self._change: tuple[UnitCell, UnitCell] | None = None
         self._smallest_area = self.quadrature.minimum(self.quadrature.smallest_areas)
         F = state.kinematics.deformation_gradient(state.unknown)
-        tensor = self.driver.tensor(F, self.tissue.stresses(F, [state.cells.ufl_cell]))
+        stresses = state.dilatation.stresses(self.tissue, F, [state.cells.ufl_cell])
+        self._pointwise = pointwise_repulsion(state, self.tissue)
+        if self._pointwise is not None:
+            stresses = stresses.plus(F, self._pointwise.stress)
+        tensor = self.driver.tensor(F, stresses)
         # one stacked expression: the deformation gradient comes at no cost with the driver
         stacked = ufl.as_vector([t[i, j] for t in (F, tensor) for i in range(3) for j in range(3)])
         self._expression = jit.expression(stacked, self.quadrature.points)
 
-    def warn_of_overcorrection(self, share: float = 1.0) -> None:
-        """Log a warning where driver and frame are known to over-correct (docs/theory.md, Stability of the pass).
-
-        Parameters
-        ----------
-        share
-            Share of a pass's change that is made.
-        """
-        factor = 1 - share * (1 - self.driver.overcorrection.get(self.settings.frame, 1.0))
-        if factor < -1 and self.law.remodels and self.state.comm.rank == 0:
-            log.warning(
-                "remodeling.driver = %r with frame = %r over-corrects: a pass multiplies small tilts of the axes by "
-                "about %g, so late results may drift (docs/theory.md, Stability of the pass)",
-                self.settings.driver,
-                self.settings.frame,
-                factor,
-            )
-
     def driving_tensor(self) -> tuple[Array, Array]:
         """F and the symmetric driving tensor at all points, each (elements * points, 3, 3)."""
+        self.state.dilatation.refresh()
+        if self._pointwise is not None:
+            self._pointwise.update()
         values = self.quadrature.evaluate(self._expression, (2, 3, 3)).reshape(-1, 2, 3, 3)
         driver = values[:, 1]
         return values[:, 0], (driver + np.swapaxes(driver, 1, 2)) / 2
@@ -102,16 +98,24 @@ class RemodelingPass:
     def drive(self, residual: float = 0.0) -> Drive:
         """What acts on the cells in the present state, which was accepted with this norm of out-of-balance forces."""
         F, tensor = self.driving_tensor()
+        noise = self.stress_noise(F, residual) if self.driver.is_stress else spectral.ROUNDING
         return Drive(
             F,
-            tensor,
+            spectral.without_noise(tensor, self._steady_axes(F), noise),
             self.driver,
             self.frame,
-            self.stress_noise(F, residual) if self.driver.is_stress else spectral.ROUNDING,
+            noise,
             self.state.cells.initial_dimensions.reshape(-1, 3),
             coefficients.point_values(self.tissue.end_to_end_length, self.quadrature).reshape(-1),
             self.settings.kappa,
+            spectral.PAIRINGS[self.settings.pairing],
+            self.settings.rotation_time,
         )
+
+    def _steady_axes(self, F: Array) -> Array:
+        """The driver's principal axes if the cells' axes are to stay, as rows (n, 3, 3)."""
+        axes = self.state.cells.point_cells.axes
+        return carried_axes(F, axes) if not self.driver.material and self.frame.carries_axes else axes
 
     def stress_noise(self, F: Array, residual: float) -> float:
         """Size up to which a principal stress may be an error: of rounding, or of the equilibrium as it was accepted.
@@ -138,27 +142,43 @@ class RemodelingPass:
         drive = self.drive(residual)
         return self.law.update(self.state.cells.point_cells, drive, time_old, time_new), drive.deformation_gradient
 
+    def target(self, residual: float = 0.0) -> Target:
+        """What the structure tensor tends to in the present state; of laws that have one."""
+        assert self.law.target is not None
+        return self.law.target(self.drive(residual))
+
+    def followed(self, target: Target, duration: float) -> tuple[UnitCell, Array]:
+        """Cells of all points in one row after a time with this target, and F (n, 3, 3). Changes nothing."""
+        assert self.law.follow is not None
+        r0 = coefficients.point_values(self.tissue.end_to_end_length, self.quadrature).reshape(-1)
+        F, _ = self.driving_tensor()
+        return self.law.follow(self.state.cells.point_cells, target, r0, self.settings.kappa * duration), F
+
     def apply(self, time_old: float, time_new: float, residual: float = 0.0, factor: float = 1.0) -> float:
         """Remodel over a step with the stress of the solved state at time_new; returns the power of remodeling.
 
         The power is the stored energy that the pass releases at frozen deformation, per time, to first order
         (`Tissue.energy_increment`; Remark 6). A principal stress counts as tension beyond `stress_noise`. Of the change
-        of the cells a share `factor` is made (`laws.relaxed`).
+        of the cells a share `factor` is made (`Law.share`).
 
         Raises
         ------
         FloatingPointError
             If the driving tensor is not finite anywhere.
         """
-        cells, shape = self.state.cells, self.quadrature.shape
         asked, F = self.updated_cells(time_old, time_new, residual)
+        return self.replace(asked, F, time_new - time_old, factor)
+
+    def replace(self, asked: UnitCell, F: Array, duration: float, factor: float = 1.0) -> float:
+        """Give the state other cells, or a share of the change; returns the power of remodeling at frozen F."""
+        cells, shape = self.state.cells, self.quadrature.shape
         self._change = (
             UnitCell(cells.dimension_values.reshape(-1, 3).copy(), cells.axis_values.reshape(-1, 3, 3).copy()),
             asked,
         )
-        updated = relaxed(self._change[0], asked, factor)
+        updated = self.law.share(self._change[0], asked, factor)
         increment: Any = at_points(self.tissue, self.quadrature).energy_increment(F, cells.point_cells, updated)
-        power: float = 0.0 - self.quadrature.integral(increment.reshape(shape)) / (time_new - time_old)
+        power: float = 0.0 - self.quadrature.integral(increment.reshape(shape)) / duration
         cells.set(updated.dimensions.reshape(*shape, 3), updated.axes.reshape(*shape, 3, 3))
         return power
 

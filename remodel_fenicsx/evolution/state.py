@@ -12,17 +12,19 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.body.loading import Loading
 from remodel_fenicsx.evolution.unit_cells import CellField, UnitCells
+from remodel_fenicsx.fem.formulations import FORMULATIONS, Formulation
 from remodel_fenicsx.fem.kinematics import Kinematics
 
 
 @dataclass(frozen=True)
 class Snapshot:
-    """Values of a state: arrays by the names of `State.functions`, loads, time, number of steps."""
+    """Values of a state: arrays by the names of `State.functions`, loads, time, number of steps, further numbers."""
 
     arrays: dict[str, NDArray[np.float64]]
     loads: dict[str, float]
     time: float
     number: int
+    numbers: dict[str, float]
 
 
 class State:
@@ -38,21 +40,37 @@ class State:
         The unit cells.
     loading
         Supports and loads; its magnitudes are part of the state.
+    formulation
+        Where the elements take the change of volume; default: "displacement".
 
     Attributes
     ----------
+    dilatation
+        The formulation for these unknowns.
     equilibrium_cells
         The cells with which the unknowns are in equilibrium. After a staggered step the cells themselves are one pass
         ahead of them.
     time, number
         Time of the last committed step, and how many there were.
+    numbers
+        What else is remembered from step to step, by name: a coupling puts its own here, its functions by `remember`.
     """
 
-    def __init__(self, unknown: Any, kinematics: Kinematics, cells: UnitCells, loading: Loading):
+    def __init__(
+        self,
+        unknown: Any,
+        kinematics: Kinematics,
+        cells: UnitCells,
+        loading: Loading,
+        formulation: Formulation = FORMULATIONS["displacement"],
+    ):
         self.unknown, self.kinematics, self.cells, self.loading = unknown, kinematics, cells, loading
+        self.dilatation = formulation.on(kinematics, unknown, cells.quadrature)
         self.equilibrium_cells = CellField(cells.quadrature, "equilibrium_cell")
         self.settle_cells()
         self.time, self.number = 0.0, 0
+        self.numbers: dict[str, float] = {}
+        self._remembered: list[Any] = []
         # the body starts unloaded; a load that is there from t = 0 on comes with the first step
         loading.set(dict.fromkeys(loading.values, 0.0))
 
@@ -65,7 +83,21 @@ class State:
         """Every dolfinx function of the state by its name."""
         cells, solved = self.cells, self.equilibrium_cells
         functions = (self.unknown, cells.dimensions, cells.axes, solved.dimensions, solved.axes)
-        return {function.name: function for function in functions}
+        return {function.name: function for function in (*functions, *self._remembered)}
+
+    def remember(self, function: Any) -> None:
+        """From now on a dolfinx function (with a name of its own) is part of the state.
+
+        For what a coupling carries from step to step: transactions restore it, checkpoints hold it.
+
+        Raises
+        ------
+        ValueError
+            If the state has a function of this name.
+        """
+        if function.name in self.functions():
+            raise ValueError(f"the state has a function {function.name!r} already")
+        self._remembered.append(function)
 
     def settle_cells(self) -> None:
         """The present cells are those with which the unknowns are in equilibrium."""
@@ -74,7 +106,7 @@ class State:
     def snapshot(self) -> Snapshot:
         """A copy of all values."""
         arrays = {name: function.x.array.copy() for name, function in self.functions().items()}
-        return Snapshot(arrays, dict(self.loading.values), self.time, self.number)
+        return Snapshot(arrays, dict(self.loading.values), self.time, self.number, dict(self.numbers))
 
     def restore(self, snapshot: Snapshot) -> None:
         """Take all values from a snapshot."""
@@ -82,6 +114,7 @@ class State:
             function.x.array[:] = snapshot.arrays[name]
         self.loading.set(snapshot.loads)
         self.time, self.number = snapshot.time, snapshot.number
+        self.numbers = dict(snapshot.numbers)
 
     @contextmanager
     def transaction(self) -> Iterator[None]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time as clock
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -38,6 +39,8 @@ class Step:
         Wall time; known once it is complete.
     is_last
         Whether it is the last one of the way.
+    negative_eigenvalues
+        Of the tangent at the solved state, where somebody has counted them; NaN where not (`monitor.StabilityWatcher`).
     row
         Its columns by name, where somebody measures (`results.columns.Observer`).
     """
@@ -50,6 +53,7 @@ class Step:
     remodeling_power: float = 0.0
     seconds: float = 0.0
     is_last: bool = False
+    negative_eigenvalues: float = math.nan
     row: dict[str, float] = field(default_factory=dict)
 
 
@@ -61,6 +65,9 @@ class Watcher:
 
     def started(self, step: Step) -> None:
         """Before the first step: the unloaded body, as a step of its own."""
+
+    def resumed(self, step: Step) -> None:
+        """In place of `started` where a run goes on: the last step that was committed, its cells already remodeled."""
 
     def solved(self, step: Step) -> None:
         """The state is the solved one, which the step's row describes."""
@@ -113,7 +120,10 @@ class Stepper:
         state = self.state
         step = Step(state.time, state.number, dict(state.loading.values), self.coupling.equilibrium.extension(), Work())
         for watcher in watchers:
-            watcher.started(step)
+            if step.number:
+                watcher.resumed(step)
+            else:
+                watcher.started(step)
         return step
 
     def advance(self, time: float, watchers: Sequence[Watcher] = (), is_last: bool = False) -> Step:

@@ -26,7 +26,7 @@ from ufl.corealg.map_dag import map_expr_dag
 from ufl.corealg.multifunction import MultiFunction
 from ufl.domain import extract_unique_domain
 
-from remodel_fenicsx.system.interrupts import SIGNALS, Interrupted, stopping_at_once
+from remodel_fenicsx.system.interrupts import SIGNALS, Interrupted, pause_held_back, stopping_at_once
 from remodel_fenicsx.system.terminal import NOTICE
 
 log = logging.getLogger(__name__)
@@ -159,7 +159,7 @@ def _compiler_watched(comm: MPI.Intracomm, what: str, seconds: int) -> Iterator[
 @contextmanager
 def _compiling(kernel: str, what: str, seconds: int) -> Iterator[None]:
     """The only process that compiles; stopped by a signal at once, and then nothing of the kernel stays."""
-    with stopping_at_once(), _alone():
+    with stopping_at_once(), pause_held_back(), _alone():
         if _is_cached(kernel):  # by the run that this one has waited for
             yield
             return

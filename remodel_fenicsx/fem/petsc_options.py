@@ -42,6 +42,8 @@ class ProblemOptions:
             if value is not False:
                 PETSc.Options().setValue(self.prefix + key, None if value is True else value)
                 self._names.add(key)
+        for key in METHODS[method].keys() - options.keys():
+            PETSc.Options().hasName(self.prefix + key)  # asked for: PETSc does not call it left over
 
     def apply(self, snes: Any) -> None:
         """Give them to SNES.

@@ -12,5 +12,6 @@ METHODS: dict[str, dict[str, Any]] = {
         "ksp_type": "preonly",
         "pc_type": "lu",
         "pc_factor_mat_solver_type": "mumps",
+        "mat_mumps_icntl_33": 1,  # the determinant, whose sign tells of unstable equilibria; costs nothing
     },
 }

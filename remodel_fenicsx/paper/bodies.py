@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.paper.snapshots import Snapshot
 from remodel_fenicsx.paper.rendering import AMBIENT, Patch, Pixels
-from remodel_fenicsx.results.vtkhdf import chain_lines
+from remodel_fenicsx.results.chain_lines import chain_lines
 
 Array = NDArray[np.float64]
 

@@ -68,6 +68,12 @@ COLUMNS_ON_REQUEST: dict[str, Column] = {
             lambda m: m.observer.stepper.remodeling.residual(),
             after_pass=True,
         ),
+        Column(
+            "negative_eigenvalues",
+            "",
+            "negative eigenvalues of the tangent's symmetric part: 0 where the equilibrium is stable",
+            lambda m: m.step.negative_eigenvalues,
+        ),
     )
 }
 """Columns that a scene may name in `output.columns`; a script adds its own."""
@@ -111,6 +117,10 @@ class Observer(Watcher):
         """Measure the start; every form that a column needs is compiled now."""
         self.solved(step)
         self.completed(step)
+
+    def resumed(self, step: Step) -> None:
+        """Compile every form that a column needs; nobody keeps this row."""
+        self.started(step)
 
     def solved(self, step: Step) -> None:
         """Measure the solved state."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -13,20 +14,19 @@ from numpy.typing import NDArray
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.shape import Shape
 from remodel_fenicsx.evolution.equilibrium import at_points
+from remodel_fenicsx.evolution.pointwise import pointwise_repulsion
 from remodel_fenicsx.evolution.state import State
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
 from remodel_fenicsx.fem import compat, jit
-from remodel_fenicsx.results.vtkhdf import (
-    LINE,
-    TransientGrid,
-    cell_type_and_permutation,
-    chain_displacement,
-    chain_lines,
-)
+from remodel_fenicsx.results.chain_lines import chain_displacement, chain_lines
+from remodel_fenicsx.results.recording import CHAINS, FIELDS, RecordingError
+from remodel_fenicsx.results.vtkhdf import LINE, TransientGrid, cell_type_and_permutation
+from remodel_fenicsx.schema.times import SAME_TIME
 from remodel_fenicsx.tissue import spectral
 from remodel_fenicsx.tissue.cells import structure_tensor
 
 Array = NDArray[np.float64]
+log = logging.getLogger(__name__)
 
 
 class ElementFields:
@@ -46,7 +46,11 @@ class ElementFields:
         self.tissue = stepper.tissue
         state = self.state
         F = state.kinematics.deformation_gradient(state.unknown)
-        cauchy = self.tissue.stresses(F, [state.cells.ufl_cell]).cauchy
+        stresses = state.dilatation.stresses(self.tissue, F, [state.cells.ufl_cell])
+        self._pointwise = pointwise_repulsion(state, self.tissue)
+        if self._pointwise is not None:
+            stresses = stresses.plus(F, self._pointwise.stress)
+        cauchy = stresses.cauchy
         entries = [t[i, j] for t in (F, cauchy) for i in range(3) for j in range(3)]
         displacement = state.kinematics.displacement(state.unknown)
         expressions = ufl.as_vector([*entries, *(displacement[i] for i in range(3))])
@@ -60,6 +64,9 @@ class ElementFields:
         to the load axis, or in a tube from circumferential to axial); `chain_extension` (largest r/L in the element; 0
         where no chain locks).
         """
+        self.state.dilatation.refresh()
+        if self._pointwise is not None:
+            self._pointwise.update()
         values = self.quadrature.evaluate(self._state, (21,))
         F, cauchy = values[..., :9].reshape(*values.shape[:2], 3, 3), values[..., 9:18]
         dimensions, axes = self.state.cells.dimension_values, self.state.cells.axis_values
@@ -104,9 +111,20 @@ class Fields(Watcher):
         What is written.
     every
         Every so many steps; the first and the last one always.
+    after
+        Where a run goes on: time of the last step that was done. Fields of later ones are dropped.
+
+    Raises
+    ------
+    FileExistsError
+        If a new run finds such files.
+    OSError
+        If they cannot be written.
+    RecordingError
+        On rank 0, if those to go on with are damaged.
     """
 
-    def __init__(self, folder: Path, shape: Shape, stepper: Stepper, every: int = 1):
+    def __init__(self, folder: Path, shape: Shape, stepper: Stepper, every: int = 1, after: float | None = None):
         self.state, self.every = stepper.state, every
         self.domain = domain = self.state.loading.domain
         self._element_fields = ElementFields(shape, stepper)
@@ -119,7 +137,10 @@ class Fields(Watcher):
         if points is not None and elements is not None:
             geometry = domain.mesh.geometry.cmap
             cell_type, order = cell_type_and_permutation(domain.mesh.topology.cell_name(), geometry.degree)
-            self._grid = TransientGrid(folder / "fields.vtkhdf", points, elements[:, order], cell_type)
+            self._grid = _continued(folder / FIELDS, after) or TransientGrid(
+                folder / FIELDS, points, elements[:, order], cell_type
+            )
+            self._chains = _continued(folder / CHAINS, after)
             self._centres = points[elements].mean(axis=1)
             self._elements = elements
             # a chain reaches half of the smallest mean distance between elements, so that pictures stay readable
@@ -159,9 +180,7 @@ class Fields(Watcher):
         moved = chain_displacement(points, self._centres, displacement[self._elements].mean(axis=1), gradient)
         if self._chains is None:
             assert self._grid is not None
-            self._chains = TransientGrid(
-                self._grid.path.with_name("fields_chains.vtkhdf"), points, lines, LINE, point_dtype=np.float32
-            )
+            self._chains = TransientGrid(self._grid.path.with_name(CHAINS), points, lines, LINE, point_dtype=np.float32)
         angle = np.repeat(fields["fibre_angle"], len(lines) // len(self._centres))
         self._chains.append(time, {"displacement": moved}, {"fibre_angle": angle}, points=points)
 
@@ -178,6 +197,19 @@ class Fields(Watcher):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+def _continued(path: Path, after: float | None) -> TransientGrid | None:
+    """The file without the steps after this time, if a run goes on and has it."""
+    if after is None:
+        return None
+    if not path.exists():
+        log.warning("%s is not there: a new one begins with the next step", path.name)
+        return None
+    try:
+        return TransientGrid.continued(path, after * (1 + SAME_TIME))
+    except ValueError as error:
+        raise RecordingError(f"{error}; the run goes on without this file") from error
 
 
 class NodalGather:

@@ -4,17 +4,64 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 import os
+from collections.abc import Sequence
 from pathlib import Path
+
+from remodel_fenicsx.results.recording import RecordingError
+from remodel_fenicsx.schema.times import same_time
 
 
 class History:
-    """history.csv: one row per accepted step, complete on disk as soon as the step is accepted."""
+    """history.csv: one row per accepted step, complete on disk as soon as the step is accepted.
+
+    Parameters
+    ----------
+    path
+        A new file.
+
+    Raises
+    ------
+    FileExistsError, OSError
+        If the file is there or cannot be made.
+    """
 
     def __init__(self, path: Path):
         self._file = path.open("xb", buffering=0)
         self._columns: list[str] | None = None
         self._sizes = [0]  # bytes up to the end of each whole row
+
+    @classmethod
+    def continued(cls, path: Path, columns: Sequence[str], rows: int, time: float) -> History:
+        """Open a file again, to go on behind its first `rows` rows, the last of which is that of `time`.
+
+        What comes after them is cut off.
+
+        Raises
+        ------
+        RecordingError
+            If it has not these columns and rows; nothing has changed then.
+        OSError
+            If it cannot be opened or written.
+        """
+        lines = path.read_bytes().splitlines(keepends=True)[: rows + 1]
+        try:
+            texts = [line.decode("utf-8") for line in lines]
+            found, *read = csv.reader(texts)
+            whole = len(read) == rows and texts[-1].endswith("\n")
+            right = whole and same_time(float(read[-1][found.index("time")]), time)
+        except (ValueError, IndexError, csv.Error):
+            right = False
+        if not right:
+            raise RecordingError(f"{path}: has not the {rows} rows up to time {time:g} that belong to the checkpoint")
+        if found != list(columns):
+            raise RecordingError(f"{path}: has other columns than this run; output.columns must stay what it was")
+        history = cls.__new__(cls)
+        history._file, history._columns = path.open("r+b", buffering=0), found
+        history._sizes = [sum(map(len, lines))]
+        history._cut()
+        return history
 
     def append(self, row: dict[str, float]) -> None:
         """Write one row; the first one decides the columns.
@@ -61,5 +108,7 @@ class History:
 
 
 def _number(value: float) -> str:
-    """Shortest text that reads back as the same number."""
+    """Shortest text that reads back as the same number; none for what was not computed."""
+    if math.isnan(value):
+        return ""
     return str(value) if isinstance(value, int) else repr(float(value))

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-HISTORY, FIELDS, SCENE = "history.csv", "fields.vtkhdf", "scene.toml"
+HISTORY, FIELDS, CHAINS, SCENE = "history.csv", "fields.vtkhdf", "fields_chains.vtkhdf", "scene.toml"
 
 
 class RecordingError(ValueError):

@@ -1,22 +1,28 @@
-"""What a run leaves in its folder: history.csv, fields, the scene as run. Only rank 0 writes.
-
-A checkpoint of the state belongs here too, beside `Fields`; it does not exist yet.
-"""
+"""What a run leaves in its folder: history.csv and the scene as run. Only rank 0 writes."""
 
 from __future__ import annotations
 
-import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
+from typing import NamedTuple
 
 from mpi4py import MPI
 
 from remodel_fenicsx.evolution.stepper import Step, Watcher
 from remodel_fenicsx.results.history import History
+from remodel_fenicsx.results.recording import CHAINS, FIELDS, HISTORY, SCENE
+from remodel_fenicsx.results.run_lock import FolderTaken, RunLock
+from remodel_fenicsx.results.whole_file import write_whole
 
 
-class FolderTaken(ValueError):
-    """The folder asked for holds something already."""
+class LastStep(NamedTuple):
+    """Where a run goes on."""
+
+    columns: Sequence[str]
+    number: int
+    time: float
 
 
 def choose_folder(requested: Path | None, name: str) -> Path:
@@ -70,6 +76,60 @@ def chosen_folder(requested: Path | str | None, name: str, comm: MPI.Intracomm) 
     return verdict
 
 
+@contextmanager
+def locked(folder: Path, comm: MPI.Intracomm, new: bool) -> Iterator[None]:
+    """Within, this run alone writes in the folder. Collective.
+
+    Parameters
+    ----------
+    folder
+        The folder of a run; a new one is made.
+    comm
+        Communicator.
+    new
+        Whether the run is new to it, or goes on.
+
+    Raises
+    ------
+    FolderTaken
+        If another one writes there, or there is a run where there must be none, or none where there must be one; on
+        all ranks.
+    OSError
+        On rank 0, if the folder cannot be made or written.
+    """
+    lock = refusal = None
+    if comm.rank == 0:
+        try:
+            if not new and not (folder / SCENE).is_file():
+                raise FolderTaken(f"{folder}: is not the folder of a run, it has no {SCENE}")
+            lock = RunLock(folder, comm.size)
+            if new and (folder / SCENE).exists():
+                lock.close()
+                raise FolderTaken(f"-o {folder}: is not empty; allowed is a new or an empty folder")
+        except FolderTaken as taken:
+            refusal = taken
+    refusal = comm.bcast(refusal)
+    if refusal is not None:
+        raise refusal
+    try:
+        yield
+    finally:
+        if lock is not None:
+            lock.close()
+
+
+def forget_steps(folder: Path) -> None:
+    """Take away what a run has kept that was killed before its first checkpoint: it starts again.
+
+    Raises
+    ------
+    OSError
+        If that cannot be done.
+    """
+    for name in (HISTORY, FIELDS, CHAINS):
+        (folder / name).unlink(missing_ok=True)
+
+
 class RunFolder(Watcher):
     """A run's folder, open for writing; as a watcher it writes the row of every step.
 
@@ -81,24 +141,32 @@ class RunFolder(Watcher):
         The scene as run, written to scene.toml.
     rank
         Rank in the communicator: all but rank 0 write nothing.
+    after
+        Where a run goes on: columns of its history, number and time of the last step that was done. The history is cut
+        there.
 
     Raises
     ------
+    FileExistsError
+        If a new run finds another one's history.
     OSError
         If the folder cannot be made or written.
+    RecordingError
+        If the history does not hold the steps that were done; nothing has changed then.
     """
 
-    def __init__(self, folder: Path, scene_text: str, rank: int = 0):
+    def __init__(self, folder: Path, scene_text: str, rank: int = 0, after: LastStep | None = None):
         self.folder = Path(folder)
         self.history: History | None = None
         self._last_row = -1  # number of its step
         if rank == 0:
             self.folder.mkdir(parents=True, exist_ok=True)
-            with (self.folder / "scene.toml").open("x", encoding="utf-8") as file:
-                file.write(scene_text)
-                file.flush()
-                os.fsync(file.fileno())
-            self.history = History(self.folder / "history.csv")
+            history, scene = self.folder / HISTORY, self.folder / SCENE
+            if after is not None:  # what is refused leaves the scene as it is
+                self.history = History.continued(history, after.columns, after.number + 1, after.time)
+            write_whole(scene, scene_text.encode("utf-8"))
+            if after is None:
+                self.history = History(history)
 
     def started(self, step: Step) -> None:
         """Write the row at the start."""

@@ -5,11 +5,17 @@ from __future__ import annotations
 import io
 import os
 import signal
+import struct
 import threading
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+_CHANGE = struct.Struct("<QQ")  # offset and length, before the bytes
+_END = struct.Struct("<QI8s")  # length and check sum of the changes before it
+_MARK = b"remodel1"
 
 
 @contextmanager
@@ -40,14 +46,31 @@ class StagedFile(io.RawIOBase):
     HDF5 spoils a file when the disk fills up, or the process is killed, between its own writes. Here the disk can only
     be full while the new end is written, which nothing refers to yet; then the few changed bytes of the old part follow
     (those of the headers and chunk indices), in HDF5's order. HDF5 itself never meets an error.
+
+    Whoever is killed between two of these changes leaves a file that can be read, but perhaps not be written any more.
+    So the changes stand behind the new end until all are made; who opens the file again makes them to the end.
+
+    Parameters
+    ----------
+    path
+        The file.
+    existing
+        Open a file that is there; without, make a new one.
+
+    Raises
+    ------
+    FileExistsError, FileNotFoundError, OSError
+        If it is there, is not there, or cannot be opened.
     """
 
-    def __init__(self, path: Path):
+    def __init__(self, path: Path, existing: bool = False):
         self._descriptor = -1
         super().__init__()
         self._path = path
-        self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
-        self._committed = 0  # bytes on the disk
+        self._descriptor = os.open(path, os.O_RDWR | (0 if existing else os.O_CREAT | os.O_EXCL), 0o666)
+        if existing:
+            self._finish_changes()
+        self._committed = os.fstat(self._descriptor).st_size  # bytes on the disk
         self._changes: list[tuple[int, bytes]] = []  # to write over these, in order
         self._tail = bytearray()  # to write after these
         self._position = 0
@@ -103,17 +126,38 @@ class StagedFile(io.RawIOBase):
 
     def commit(self) -> None:
         """Bring everything to the disk, or raise OSError and keep it for the next time."""
+        # HDF5's superblock, at offset 0, says how long the file is: first, for chunk indices will name the new end
+        changes = sorted(self._changes, key=lambda item: item[0] > 0)
+        end = self._committed + len(self._tail)
         try:
-            self._write_all(self._committed, self._tail)
+            self._write_all(self._committed, self._tail + _journal(changes))
             os.fdatasync(self._descriptor)  # some file systems find out only now that they are full
         except OSError:
             os.ftruncate(self._descriptor, self._committed)
             raise
-        # HDF5's superblock, at offset 0, says how long the file is: first, for chunk indices will name the new end
-        for offset, change in sorted(self._changes, key=lambda item: item[0] > 0):
+        self._make_changes(changes, end)
+        self._committed, self._tail, self._changes = end, bytearray(), []
+
+    def _make_changes(self, changes: list[tuple[int, bytes]], end: int) -> None:
+        """Write over the old part, and only then forget what was to be written, which stands behind `end`."""
+        for offset, change in changes:
             self._write_all(offset, change)
-        self._committed += len(self._tail)
-        self._tail, self._changes = bytearray(), []
+        if changes:
+            os.fdatasync(self._descriptor)
+            os.ftruncate(self._descriptor, end)
+
+    def _finish_changes(self) -> None:
+        """Make the changes of a commit that was cut off."""
+        size = os.fstat(self._descriptor).st_size
+        if size < _END.size:
+            return
+        length, check_sum, mark = _END.unpack(os.pread(self._descriptor, _END.size, size - _END.size))
+        start = size - _END.size - length
+        if mark != _MARK or start < 0:
+            return
+        journal = os.pread(self._descriptor, length, start)
+        if zlib.crc32(journal) == check_sum:
+            self._make_changes(_changes(journal), start)
 
     def discard(self) -> None:
         """Close and remove a file that was not even begun."""
@@ -131,3 +175,21 @@ class StagedFile(io.RawIOBase):
         while view:
             written = os.pwrite(self._descriptor, view, offset)
             view, offset = view[written:], offset + written
+
+
+def _journal(changes: list[tuple[int, bytes]]) -> bytes:
+    """Changes as bytes; nothing for none."""
+    if not changes:
+        return b""
+    whole = b"".join(_CHANGE.pack(offset, len(change)) + change for offset, change in changes)
+    return whole + _END.pack(len(whole), zlib.crc32(whole), _MARK)
+
+
+def _changes(journal: bytes) -> list[tuple[int, bytes]]:
+    """The changes of a journal without its end."""
+    found, position = [], 0
+    while position < len(journal):
+        offset, length = _CHANGE.unpack_from(journal, position)
+        position += _CHANGE.size + length
+        found.append((offset, journal[position - length : position]))
+    return found

@@ -34,6 +34,8 @@ CELL_TYPES = {
 LINE = 3
 _NODES = {3: 2, 5: 3, 9: 4, 10: 4, 12: 8}
 _STEPS_PER_CHUNK = 256
+# with these bounds HDF5 sets no "open for writing" mark, which a killed process would leave for ever
+_VERSIONS = ("earliest", "v110")
 # shuffle and deflate are built into every HDF5; on noisy floats level 1 saves as much as level 9
 _COMPRESSION: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
 
@@ -87,8 +89,7 @@ class TransientGrid:
         self._point_blocks = 1  # block 0 of Points is the reference configuration
         with signals_held_back():
             self._staged = StagedFile(self.path)
-            # with these bounds HDF5 sets no "open for writing" mark, which a killed process would leave for ever
-            self._file = h5py.File(self._staged, "w", libver=("earliest", "v110"))
+            self._file = h5py.File(self._staged, "w", libver=_VERSIONS)
             try:
                 self._root = self._file.create_group("VTKHDF")
                 self._write_mesh(coordinates, connectivity, cell_type)
@@ -99,6 +100,47 @@ class TransientGrid:
                 self._file.close()
                 self._staged.discard()
                 raise
+
+    @classmethod
+    def continued(
+        cls, path: str | os.PathLike[str], time: float, *, field_dtype: DTypeLike = np.float32
+    ) -> TransientGrid:
+        """Open a file again, to append behind its steps up to `time`; later ones are dropped.
+
+        Raises
+        ------
+        OSError
+            If it cannot be opened or written.
+        ValueError
+            If it is damaged or of another kind; one line.
+        """
+        grid = cls.__new__(cls)
+        grid.path, grid._field_dtype = Path(path), field_dtype
+        with signals_held_back():
+            grid._staged = StagedFile(grid.path, existing=True)
+            try:
+                # what is no HDF5 file is not closed here: h5py still flushes it when it lets go of it
+                grid._file = h5py.File(grid._staged, "r+", libver=_VERSIONS)
+                try:
+                    grid._read_back(time)
+                    grid._file.flush()
+                    grid._staged.commit()
+                except BaseException:
+                    grid._file.close()
+                    grid._staged.close()
+                    raise
+            except (KeyError, ValueError, TypeError, IndexError, RuntimeError, OSError) as error:
+                if isinstance(error, OSError) and error.errno is not None:  # the disk's have a number, HDF5's none
+                    raise
+                raise ValueError(f"{path}: is damaged or of another kind: {' '.join(str(error).split())}") from error
+        return grid
+
+    def _read_back(self, time: float) -> None:
+        self._root = root = self._file["VTKHDF"]
+        self.number_of_points, self.number_of_cells = (int(root[f"NumberOf{kind}"][0]) for kind in ("Points", "Cells"))
+        self._point_dtype = root["Points"].dtype
+        times = root["Steps/Values"][: int(root["Steps"].attrs["NSteps"])]
+        self._keep(int(np.searchsorted(times, time, side="right")))
 
     def __enter__(self) -> TransientGrid:
         return self
@@ -159,11 +201,15 @@ class TransientGrid:
     def drop_last(self) -> None:
         """Take the last step back; the next `append`, or `close`, brings that to the disk."""
         with signals_held_back():
-            self.number_of_steps = left = self.number_of_steps - 1
-            steps = self._root["Steps"]
-            self._last_time = float(steps["Values"][left - 1]) if left else -np.inf
-            self._point_blocks = 1 + int(steps["PointOffsets"][left - 1]) // self.number_of_points if left else 1
-            steps.attrs.modify("NSteps", np.int64(left))
+            self._keep(self.number_of_steps - 1)
+
+    def _keep(self, number: int) -> None:
+        """The first so many steps, and none after them."""
+        steps = self._root["Steps"]
+        self.number_of_steps = number
+        self._last_time = float(steps["Values"][number - 1]) if number else -np.inf
+        self._point_blocks = 1 + int(steps["PointOffsets"][number - 1]) // self.number_of_points if number else 1
+        steps.attrs.modify("NSteps", np.int64(number))
 
     @property
     def last_time(self) -> float:
@@ -278,51 +324,6 @@ def cell_type_and_permutation(cell_name: str, degree: int) -> tuple[int, NDArray
                                  basix.LagrangeVariant.equispaced).dim  # fmt: skip
     from_vtk = np.asarray(cpp.io.perm_vtk(to_type(cell_name), nodes))
     return CELL_TYPES[cell_name][degree > 1], np.argsort(from_vtk)
-
-
-def chain_lines(
-    centres: ArrayLike, lengths: ArrayLike, axes: ArrayLike, scale: float
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """The four chains of unit cells, +-l_1 n_1 +-l_2 n_2 +-l_3 n_3 through each centre (paper, Fig. 2).
-
-    Eight corners do not depend on the order or the sign of the axes. Where l_3 = 0 the four lines lie on two.
-
-    Parameters
-    ----------
-    centres
-        Reference coordinates, shape (m, 3).
-    lengths
-        l_I in link lengths, shape (m, 3).
-    axes
-        n_I as rows, shape (m, 3, 3).
-    scale
-        Length in the mesh's unit that one link length is drawn with; a line is 2 |l| scale long.
-
-    Returns
-    -------
-    points
-        Ends, shape (8 m, 3): element by element, line by line, the two ends of a line after one another.
-    lines
-        Numbers of the two ends, shape (4 m, 2). Data of the elements go with `numpy.repeat(values, 4, axis=0)`.
-    """
-    middle = np.asarray(centres, dtype=np.float64)
-    edges = np.asarray(lengths, dtype=np.float64)[:, :, None] * np.asarray(axes, dtype=np.float64)
-    signs = np.array([(1, 1, 1), (1, 1, -1), (1, -1, 1), (1, -1, -1)])
-    half = scale * np.einsum("kI,mIi->mki", signs, edges)
-    ends = middle[:, None, None, :] + np.stack([half, -half], axis=2)
-    return ends.reshape(-1, 3), np.arange(8 * len(middle)).reshape(-1, 2)
-
-
-def chain_displacement(
-    points: ArrayLike, centres: ArrayLike, displacement: ArrayLike, deformation_gradient: ArrayLike
-) -> NDArray[np.float64]:
-    """Displacement of the ends that `chain_lines` gives, shape (8 m, 3): u + (F - I)(X_end - X_centre).
-
-    With u (m, 3) and F (m, 3, 3) of the centres. ParaView's "Warp By Vector" then shows the deformed chains.
-    """
-    ends = np.asarray(points, dtype=np.float64).reshape(-1, 8, 3) - np.asarray(centres)[:, None, :]
-    gradient = np.asarray(deformation_gradient) - np.eye(3)
-    return (np.asarray(displacement)[:, None, :] + np.einsum("mij,mkj->mki", gradient, ends)).reshape(-1, 3)
 
 
 def _checked_points(points: Array) -> int:

@@ -18,14 +18,19 @@ from remodel_fenicsx.tissue.chains import BOLTZMANN_CONSTANT, CHAINS
 from remodel_fenicsx.tissue.drivers import DRIVERS, FRAMES
 from remodel_fenicsx.tissue.energy import MATRICES, Tissue
 from remodel_fenicsx.tissue.laws import LAWS
+from remodel_fenicsx.tissue.repulsion import REPULSIONS
+from remodel_fenicsx.tissue.spectral import PAIRINGS
 from remodel_fenicsx.schema.units import NUMBER_DENSITY, STRESS, TEMPERATURE
 
 COUPLINGS = {
     "staggered": "solve with the cells of the step before, then remodel once",
-    "relaxed": "the same with a share, relaxation_factor, of what the pass changes: stable for every driver and frame, "
-    "where 'staggered' over-corrects with 'pk2' and 'finger'",
+    "relaxed": "the same with a share, relaxation_factor, of what the pass changes: half of it is stable for every "
+    "driver and frame but under weak loads, where 'staggered' over-corrects with 'pk2' and 'finger'",
+    "extrapolated": "remodel first, towards the stress of the middle of the step, extrapolated from the two steps "
+    "before; then solve: of second order, for the law 'tensor'",
 }
 """What each of `evolution.coupling.COUPLINGS` does; that room is above this one, and a test holds the two together."""
+FOR_LAWS_WITH_A_TARGET = ("extrapolated",)
 STRESS_UNITS = {"Pa": 1.0, "kPa": 1.0e3, "MPa": 1.0e6}  # in Pa
 INITIAL_CELLS = ("random", "isotropic", "aligned")
 FORMAT = 2  # of recorded scenes: raised where a reader of the one before would not understand them
@@ -63,10 +68,11 @@ class Material(Table):
     )
     matrix: Annotated[str, one_of(MATRICES)] = Field(default="neo-hookean", description="Energy of the matrix.")
     chain: Annotated[str, one_of(CHAINS)] = Field(default="wormlike", description="Force law of a single chain.")
-    repulsion: Literal["axes"] = Field(
+    repulsion: Annotated[str, one_of(REPULSIONS)] = Field(
         default="axes",
         description="Form of the repulsive energy that makes the reference state stress-free: 'axes' is the paper's, "
-        "in the stretches along the three cell axes.",
+        "in the stretches along the three cell axes; 'log' sees the structure tensor alone (A : ln C), equals it where "
+        "both have the same axes and suits the law 'tensor'; 'length' is a function of the chains' length alone.",
     )
     stress_unit: Literal["Pa", "kPa", "MPa"] = Field(
         default="Pa",
@@ -96,6 +102,7 @@ class Material(Table):
             end_to_end_length,
             CHAINS[self.chain] if self.chain_density > 0 else None,
             MATRICES[self.matrix],
+            REPULSIONS[self.repulsion],
         )
 
     def summary(self, loads: Mapping[str, float]) -> str:
@@ -202,14 +209,22 @@ class Remodeling(Table):
     )
     law: Annotated[str, one_of(LAWS)] = Field(
         default="explicit",
-        description="Evolution of the cell dimensions: 'explicit' is eq. (11), in absolute time; 'rate' integrates eq. "
-        "(10); 'relaxation' is dl/dt = kappa (r0 e - l), right for changing loads; 'none' leaves the cells alone.",
+        description="Evolution of the cells: 'explicit' is eq. (11), in absolute time; 'rate' integrates eq. (10); "
+        "'relaxation' is dl/dt = kappa (r0 e - l), right for changing loads; 'rotation' (Remark 5) turns the axis of "
+        "the largest dimension gradually and leaves the dimensions alone; 'tensor' is 'relaxation' for the "
+        "structure tensor as a whole, without ranks and axes; 'none' leaves the cells alone.",
     )
     frame: Annotated[str, one_of(FRAMES)] = Field(
         default="material",
         description="Axes of the remodeled cells, for the drivers 'cauchy' and 'finger': 'material' takes the fibres "
         "that the deformation carries onto the principal directions (objective), 'spatial' the principal directions "
         "themselves, as printed. The driver 'pk2' has material eigenvectors of its own.",
+    )
+    pairing: Annotated[str, one_of(PAIRINGS)] = Field(
+        default="sorted",
+        description="Which dimension follows which principal value: 'sorted' by rank, as printed (where two values "
+        "cross, the cell turns by 90 degrees at once), 'continuous' by axis (each principal direction goes on from the "
+        "axis that it overlaps most). The law 'rotation' does not ask.",
     )
     coupling: Annotated[str, one_of(COUPLINGS)] = Field(
         default="staggered", description="; ".join(f"{name!r}: {text}" for name, text in COUPLINGS.items()) + "."
@@ -223,6 +238,21 @@ class Remodeling(Table):
     kappa: float = Field(
         default=0.025, ge=0, description="Speed of remodeling kappa, in 1/time; a difference fades like exp(-kappa t)."
     )
+    rotation_time: float = Field(
+        default=40.0,
+        gt=0,
+        description="Time of the law 'rotation': a small angle between fibre and tension fades like "
+        "exp(-t / rotation_time).",
+    )
+
+    @model_validator(mode="after")
+    def _coupling_fits_the_law(self) -> Remodeling:
+        if self.coupling in FOR_LAWS_WITH_A_TARGET and LAWS[self.law].target is None:
+            laws = ", ".join(repr(name) for name, law in LAWS.items() if law.target is not None)
+            raise fault(
+                f"needs a remodeling.law with a target that can be extrapolated: {laws}", "coupling", self.coupling
+            )
+        return self
 
 
 # ---------------------------------------------------------------- presets
@@ -244,7 +274,7 @@ def _printed_method(
     }
     return {
         "geometry": geometry,
-        "mesh": {"refinement": 1, "element": "hexahedron", "degree": 1},
+        "mesh": {"refinement": 1, "element": "hexahedron", "degree": 1, "formulation": "displacement"},
         "model": {"kinematics": "full"},
         "material": common_material | material,
         "cells": {"end_to_end_length": 1.0} | cells,
@@ -253,6 +283,7 @@ def _printed_method(
             "driver": "cauchy",
             "law": "explicit",
             "frame": "spatial",
+            "pairing": "sorted",
             "coupling": "staggered",
             "kappa": 0.025,
         },
@@ -305,8 +336,17 @@ def _with_measured_collagen(scene: dict[str, dict[str, Any]]) -> dict[str, dict[
     }
 
 
+def _consistent(scene: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    changes = {"law": "tensor", "frame": "material", "coupling": "extrapolated"}
+    return scene | {
+        "material": scene["material"] | {"repulsion": "log"},
+        "remodeling": {name: value for name, value in (scene["remodeling"] | changes).items() if name != "pairing"},
+    }
+
+
 PRESETS: dict[str, dict[str, dict[str, Any]]] = {
     "kuhl-holzapfel-2007": _PAPER,
+    "consistent": {shape: _consistent(scene) for shape, scene in _PAPER.items()},
     "sun-2002": {shape: _with_measured_collagen(scene) for shape, scene in _PAPER.items()},
 }
 """Preset name -> shape -> scene keys; they lie under the keys of the scene that names the preset."""
@@ -314,7 +354,9 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
 PRESET_NOTES = {
     "kuhl-holzapfel-2007": "The printed method on the three bodies of the paper: Fig. 5 (cube), Fig. 6 (tendon), "
     "Figs. 7 to 11 (tube). The frame is 'spatial', as printed in eq. (9).",
-    "sun-2002": "The same with collagen I as measured with optical tweezers (paper, Remark 2): contour length 309 nm, "
-    "persistence length 14.5 nm, all chain lengths in nm. End-to-end length (that of a free chain) and chain density "
-    "(the same initial stiffness of the network) are choices of this project, not of the paper.",
+    "consistent": "The paper's bodies and parameters with a law and an energy that see the structure tensor alone "
+    "(docs/theory.md, The consistent variant), second order in the time step.",
+    "sun-2002": "The printed method with collagen I as measured with optical tweezers (paper, Remark 2): contour "
+    "length 309 nm, persistence length 14.5 nm, all chain lengths in nm. End-to-end length (that of a free chain) and "
+    "chain density (the same initial stiffness of the network) are choices of this project, not of the paper.",
 }

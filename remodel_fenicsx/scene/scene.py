@@ -16,6 +16,7 @@ from typing import Annotated, Any, ClassVar
 from pydantic import BaseModel, Field, SerializeAsAny, model_validator
 
 from remodel_fenicsx.body import SHAPES, Shape
+from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.scene.parameters import FORMAT, PRESETS, RENAMED, Cells, Material, Remodeling
 from remodel_fenicsx.scene.settings import Load, Mesh, Model, Output, Solver, Time, nearest_multiples
 from remodel_fenicsx.scene.values import base_material, in_own_units, in_present_format, known_shape
@@ -24,6 +25,7 @@ from remodel_fenicsx.schema.times import is_multiple
 from remodel_fenicsx.schema.toml import merged, parse_override, put, read_toml, toml_text
 from remodel_fenicsx.schema.units import FORCE, STRESS
 from remodel_fenicsx.tissue.chains import CHAINS
+from remodel_fenicsx.tissue.energy import MATRICES, Matrix
 
 LARGEST_MESH = 10_000_000  # hexahedra; Gmsh, which is serial, needs about 10 GB for them
 
@@ -98,6 +100,10 @@ class Scene(Table):
         if cells.axes not in geometry.axis_kinds:
             rule = f"allowed for shape {geometry.name!r} is " + ", ".join(map(repr, geometry.axis_kinds))
             raise fault(rule, "cells.axes", cells.axes)
+        formulation = self.mesh.formulation
+        if FORMULATIONS[formulation].takes_parts and not isinstance(MATRICES[material.matrix], Matrix):
+            rule = f"needs the volumetric part of material.matrix = {material.matrix!r}: an energy made as a Matrix"
+            raise fault(rule, "mesh.formulation", formulation)
         elements = geometry.number_of_elements * self.mesh.refinement**3
         if elements > LARGEST_MESH:
             largest = math.floor((LARGEST_MESH / geometry.number_of_elements) ** (1 / 3))

@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
+from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.fem.solver_methods import METHODS
 from remodel_fenicsx.schema.tables import Table, checked, fault, is_number, one_of, quoted, shown
@@ -32,6 +33,21 @@ class Mesh(Table):
     degree: Annotated[int, one_of((1, 2))] = Field(
         default=1, description="Polynomial degree of the displacement: 1 (the paper's) or 2."
     )
+    formulation: Annotated[str, one_of(FORMULATIONS)] = Field(
+        default="displacement",
+        description="Where the elements take the change of volume: "
+        + "; ".join(f"{name!r}: {formulation.meaning}" for name, formulation in FORMULATIONS.items())
+        + ".",
+    )
+
+    @model_validator(mode="after")
+    def _formulation_has_the_element(self) -> Mesh:
+        pair = self.element, self.degree
+        if not FORMULATIONS[self.formulation].has(*pair):
+            able = [name for name, formulation in FORMULATIONS.items() if formulation.has(*pair)]
+            rule = f"allowed for elements {self.element!r} of degree {self.degree} is {', '.join(map(repr, able))}"
+            raise fault(rule, "formulation", self.formulation)
+        return self
 
 
 class Model(Table):
@@ -164,6 +180,12 @@ class Solver(Table):
     maximum_halvings: int = Field(
         default=12, ge=0, description="How often a failed step is halved before the run ends with an error."
     )
+    unstable: Literal["warn", "stop"] = Field(
+        default="warn",
+        description="What happens at an equilibrium that the body would leave, one with more negative eigenvalues of "
+        "the tangent than before: a warning that says where, or, looked for in every step, the end of the run after "
+        "the last stable step (exit code 3).",
+    )
     petsc_options: Annotated[dict[str, Any], checked(_petsc_options)] = Field(
         default_factory=dict,
         description="PETSc options that override the method's, without the leading '-': snes_..., ksp_..., pc_....",
@@ -188,7 +210,16 @@ class Output(Table):
     fields: bool = Field(default=True, description="Whether to write fields for ParaView.")
     columns: Annotated[tuple[str, ...], checked(_columns)] = Field(
         default=(),
-        description="Columns of the history beside those that it always has: 'pass_residual' (docs/commands.md).",
+        description="Columns of the history beside those that it always has: 'pass_residual', "
+        "'negative_eigenvalues' (docs/commands.md).",
         json_schema_extra={"allowed": "a list of names of columns"},
     )
     every: int = Field(default=1, ge=1, description="Write the fields of every n-th step; the last one always.")
+    checkpoint: int | None = Field(
+        default=None,
+        ge=0,
+        description="Steps between two checkpoints, from which a run can be resumed; 0: only at the end. Without it "
+        "they are chosen by time: at most 10 minutes are lost, and they cost below 5 % of the run. There is always one "
+        "at the end, however the run ends.",
+        json_schema_extra={"allowed": "a whole number at least 0"},
+    )

@@ -1,4 +1,5 @@
-"""Signals: Ctrl-C, SIGTERM and SIGHUP, remembered until the run is at a place where it can stop cleanly.
+"""Signals: Ctrl-C, SIGTERM and SIGHUP, remembered until the run is at a place where it can stop cleanly; SIGUSR1, which
+lets the step under way end.
 
 Importing this module changes nothing; an application calls what it wants.
 """
@@ -17,6 +18,9 @@ from pathlib import Path
 from types import FrameType, TracebackType
 
 SIGNALS: tuple[int, ...] = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # ask a process to end
+
+PAUSE = signal.SIGUSR1  # asks a run to end with the step under way; batch systems send it before they kill
+PAUSED = 4  # exit code
 
 _EXIT_CODE_BASE = 128
 _ONE_SIGNAL = 0.2  # seconds: timeout, for one, sends its signal to the process, and then to the group that this is in
@@ -43,6 +47,22 @@ class Interrupted(Exception):  # noqa: N818 - no error: somebody asked for it
         self.on_all_ranks = on_all_ranks
         self.exit_code = _EXIT_CODE_BASE + number
         self.kept = "every finished step is kept"
+
+
+class Paused(Exception):  # noqa: N818 - no error: somebody asked for it
+    """The run stopped on purpose between two steps, on all ranks, and can go on.
+
+    Attributes
+    ----------
+    time
+        Of the last step.
+    folder
+        Where all is kept.
+    """
+
+    def __init__(self, reason: str, time: float, folder: Path):
+        super().__init__(reason)
+        self.time, self.folder = time, folder
 
 
 def take_back_signals() -> None:
@@ -104,7 +124,7 @@ def ending_at_once() -> Iterator[None]:
     """
     before: dict[int, object] = {}
     if _is_main_thread():
-        for number in SIGNALS:
+        for number in (*SIGNALS, PAUSE):
             if signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
                 before[number] = signal.signal(number, _end)
     try:
@@ -119,7 +139,7 @@ def _end(number: int, frame: FrameType | None) -> None:
     if is_first_rank():
         with suppress(OSError):  # the terminal is gone
             os.write(2, f"remodel-fenicsx: stopped by {signal.Signals(number).name}\n".encode())
-    os._exit(_EXIT_CODE_BASE + number)
+    os._exit(PAUSED if number == PAUSE else _EXIT_CODE_BASE + number)
 
 
 # ---------------------------------------------------------------- a run
@@ -128,12 +148,15 @@ def _end(number: int, frame: FrameType | None) -> None:
 class StopRequest:
     """Context that turns the first SIGINT, SIGTERM or SIGHUP into a request; a second one stops at once.
 
+    SIGUSR1 sets `pause`.
+
     PETSc must not see an exception from a callback, so a handler that raises is not enough: the solver asks `number`.
     Elsewhere see `stopping_at_once`. A signal that is ignored (a background job of a script, nohup) stays ignored.
     """
 
     def __init__(self) -> None:
         self.number = 0
+        self.pause = False
         self.raises = False
         self._previous: dict[int, object] = {}
 
@@ -141,6 +164,8 @@ class StopRequest:
         for number in SIGNALS if _is_main_thread() else ():
             if signal.getsignal(number) != signal.SIG_IGN:
                 self._previous[number] = signal.signal(number, self._remember)
+        if _is_main_thread() and signal.getsignal(PAUSE) != signal.SIG_IGN:
+            self._previous[PAUSE] = signal.signal(PAUSE, self._remember_pause)
         _requests.append(self)
         return self
 
@@ -153,6 +178,9 @@ class StopRequest:
         if self.raises:
             _end_children(number)
             raise Interrupted(number, on_all_ranks=False)
+
+    def _remember_pause(self, number: int, frame: FrameType | None) -> None:
+        self.pause = True
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -193,6 +221,16 @@ def stopping_at_once() -> Iterator[None]:
         raise
     finally:
         request.raises = before
+
+
+@contextmanager
+def pause_held_back() -> Iterator[None]:
+    """Within, SIGUSR1 waits, also for programs that are started: one sent to the whole group would kill a compiler."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {PAUSE})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _check(request: StopRequest) -> None:

@@ -42,10 +42,12 @@ class Progress:
         Rank of this process; all but 0 are silent.
     interval
         Seconds between plain lines, at least. The first and the last step always get one.
+    done
+        Steps that were done before.
     """
 
-    def __init__(self, total_steps: int, title: str, comm_rank: int = 0, *, interval: float = 5.0):
-        self._total, self._title = total_steps, title
+    def __init__(self, total_steps: int, title: str, comm_rank: int = 0, *, interval: float = 60.0, done: int = 0):
+        self._total, self._title, self._done = total_steps, title, done
         self._interval = interval
         self._start = self._last_line = clock.monotonic()
         self._started = False
@@ -63,7 +65,7 @@ class Progress:
                 _Line(console), console=console, refresh_per_second=4, redirect_stdout=sys.stdout.isatty()
             )
             self._task = self._bar.add_task(
-                self._title, total=self._total, time="starting", loads="", newton="", left=""
+                self._title, total=self._total, completed=self._done, time="starting", loads="", newton="", left=""
             )
             self._bar.start()
         return self
@@ -122,7 +124,7 @@ class Progress:
         remaining = self._total - index
         if remaining < 1:
             return ""
-        return f"{_duration((clock.monotonic() - self._start) / index * remaining)} left"
+        return f"{duration((clock.monotonic() - self._start) / (index - self._done) * remaining)} left"
 
     def _print(self, line: str) -> None:
         announce(line)
@@ -295,7 +297,7 @@ def _is_terminal() -> bool:
     return sys.stderr is not None and sys.stderr.isatty() and os.environ.get("TERM", "dumb") not in ("dumb", "unknown")
 
 
-def _duration(seconds: float) -> str:
+def duration(seconds: float) -> str:
     """Seconds as people say them: 42 s, 3:05 min, 2:10 h."""
     whole = round(seconds)
     if whole < 60:

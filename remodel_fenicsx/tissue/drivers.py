@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -32,8 +32,6 @@ class Driver:
     tensor: Callable[[Any, Stresses], Any]
     material: bool
     is_stress: bool = True
-    # by frame: factor by which a pass multiplies a small tilt of the axes, where it is below -1 (docs/theory.md)
-    overcorrection: dict[str, float] = field(default_factory=dict)
 
 
 def finger_tensor(deformation_gradient: Any, stresses: Stresses) -> Any:
@@ -45,18 +43,17 @@ def finger_tensor(deformation_gradient: Any, stresses: Stresses) -> Any:
 
 DRIVERS: dict[str, Driver] = {
     "cauchy": Driver(lambda F, s: s.cauchy, material=False),
-    "pk2": Driver(
-        lambda F, s: s.second_piola_kirchhoff,
-        material=True,
-        overcorrection={"material": -1.5, "spatial": -1.5},
-    ),
-    "finger": Driver(
-        finger_tensor,
-        material=False,
-        is_stress=False,
-        overcorrection={"material": -2.6, "spatial": -1.9},
-    ),
+    "pk2": Driver(lambda F, s: s.second_piola_kirchhoff, material=True),
+    "finger": Driver(finger_tensor, material=False, is_stress=False),
 }
+
+
+def rotated_back(F: Array, spatial_tensor: Array) -> Array:
+    """R^T t R with the rotation R of F = R U: objective. For t = sigma it is U S U / J, for t = b it is C."""
+    u, _, vt = np.linalg.svd(F)
+    R = u @ vt
+    back: Array = np.swapaxes(R, 1, 2) @ spatial_tensor @ R
+    return (back + np.swapaxes(back, 1, 2)) / 2
 
 
 @dataclass(frozen=True)
@@ -69,10 +66,13 @@ class Frame:
         n_I from (F (n, 3, 3), m_I as rows (n, 3, 3)).
     carries_axes
         Whether the cells' axes move with the material, so that F n_I are the previous axes in space.
+    tensor
+        A spatial tensor as one in material space, from (F (n, 3, 3), tensor (n, 3, 3)): for laws that need no axes.
     """
 
     axes: Callable[[Array, Array], Array]
     carries_axes: bool
+    tensor: Callable[[Array, Array], Array] = rotated_back
 
 
 def spatial_frame(F: Array, spatial_axes: Array) -> Array:
@@ -94,7 +94,7 @@ def material_frame(F: Array, spatial_axes: Array) -> Array:
 
 FRAMES: dict[str, Frame] = {
     "material": Frame(material_frame, carries_axes=True),
-    "spatial": Frame(spatial_frame, carries_axes=False),
+    "spatial": Frame(spatial_frame, carries_axes=False, tensor=lambda F, tensor: tensor),
 }
 
 

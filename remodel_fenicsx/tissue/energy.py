@@ -16,40 +16,56 @@ from typing import Any, NamedTuple
 
 from remodel_fenicsx.tissue.cells import UnitCell, structure_tensor
 from remodel_fenicsx.tissue.chains import CHAINS, Chain
-from remodel_fenicsx.tissue.operators import component, det, ln, sqrt, squared_norm
+from remodel_fenicsx.tissue.operators import det, is_array, ln, sqrt, squared_norm
+from remodel_fenicsx.tissue.repulsion import REPULSIONS, Repulsion, squared_end_to_end_length
 
 
-def neo_hookean(deformation_gradient: Any, lame_lambda: Any, lame_mu: Any) -> Any:
-    """W_iso = lambda/2 ln^2 J + mu/2 (tr C - 3) - mu ln J (eq. 4a)."""
-    log_jacobian = ln(det(deformation_gradient))
-    return (
-        lame_lambda / 2 * log_jacobian**2
-        + lame_mu / 2 * (squared_norm(deformation_gradient) - 3)
-        - lame_mu * log_jacobian
-    )
+Term = Callable[[Any, Any, Any], Any]
 
 
-Matrix = Callable[[Any, Any, Any], Any]
-MATRICES: dict[str, Matrix] = {"neo-hookean": neo_hookean}
-"""Energies of the matrix by name: functions of F, lambda and mu (UFL or arrays), zero and stress-free at F = I."""
+class Matrix:
+    """An energy of the matrix whose volumetric part is told apart, as `fem.formulations` need it.
+
+    Called with F, lambda and mu it is the whole energy. Its terms are added one after the other: grouped otherwise, the
+    last digits would be others.
+
+    Parameters
+    ----------
+    volumetric
+        What resists a change of volume, a function of J, lambda and mu: zero and without slope at J = 1.
+    others
+        All other terms, functions of F, lambda and mu; together zero and stress-free at F = I.
+    """
+
+    def __init__(self, volumetric: Term, *others: Term):
+        self.volumetric, self.others = volumetric, others
+
+    def __call__(self, deformation_gradient: Any, lame_lambda: Any, lame_mu: Any) -> Any:
+        """The whole energy."""
+        volumetric = self.volumetric(det(deformation_gradient), lame_lambda, lame_mu)
+        return sum((term(deformation_gradient, lame_lambda, lame_mu) for term in self.others), volumetric)
+
+    def distortional(self, deformation_gradient: Any, lame_lambda: Any, lame_mu: Any) -> Any:
+        """All but the volumetric part."""
+        first, *rest = (term(deformation_gradient, lame_lambda, lame_mu) for term in self.others)
+        return sum(rest, first)
 
 
-def squared_end_to_end_length(deformation_gradient: Any, cells: Sequence[UnitCell]) -> Any:
-    """r^2 = sum_I l_I^2 n_I . C n_I (eq. 5)."""
-    return sum(
-        cell.weight * component(cell.dimensions, i) ** 2 * stretch
-        for cell in cells
-        for i, stretch in enumerate(cell.squared_stretches(deformation_gradient))
-    )
+def logarithmic_dilatation(jacobian: Any, lame_lambda: Any, lame_mu: Any) -> Any:
+    """U = lambda/2 ln^2 J, the volumetric part of eq. (4a): its Kirchhoff pressure is lambda ln J."""
+    return lame_lambda / 2 * ln(jacobian) ** 2
 
 
-def repulsion_sum(deformation_gradient: Any, cells: Sequence[UnitCell]) -> Any:
-    """M = sum_I l_I^2 ln(n_I . C n_I), of which W_rep is made."""
-    return sum(
-        cell.weight * component(cell.dimensions, i) ** 2 * ln(stretch)
-        for cell in cells
-        for i, stretch in enumerate(cell.squared_stretches(deformation_gradient))
-    )
+neo_hookean = Matrix(
+    logarithmic_dilatation,
+    lambda F, lame_lambda, lame_mu: lame_mu / 2 * (squared_norm(F) - 3),
+    lambda F, lame_lambda, lame_mu: -(lame_mu * ln(det(F))),
+)
+"""W_iso = lambda/2 ln^2 J + mu/2 (tr C - 3) - mu ln J (eq. 4a)."""
+
+MATRICES: dict[str, Term] = {"neo-hookean": neo_hookean}
+"""Energies of the matrix by name: functions of F, lambda and mu (UFL or arrays), zero and stress-free at F = I; those
+that formulations other than "displacement" can take are a `Matrix`."""
 
 
 class Stresses(NamedTuple):
@@ -58,6 +74,15 @@ class Stresses(NamedTuple):
     first_piola_kirchhoff: Any
     second_piola_kirchhoff: Any
     cauchy: Any
+
+    def plus(self, deformation_gradient: Any, second_piola_kirchhoff: Any) -> Stresses:
+        """With what `Tissue.strain_energy` leaves out of UFL, a second Piola-Kirchhoff stress."""
+        import ufl
+
+        F, S = deformation_gradient, second_piola_kirchhoff
+        P = ufl.dot(F, S)
+        first, second, cauchy = self
+        return Stresses(first + P, second + S, cauchy + ufl.dot(P, F.T) / ufl.det(F))
 
 
 @dataclass(frozen=True)
@@ -81,6 +106,8 @@ class Tissue:
         Law of a single chain; None for a matrix without chains, which does not lock.
     matrix
         Energy of the matrix (`MATRICES`).
+    repulsion
+        Form of the repulsive energy (`REPULSIONS`).
     """
 
     lame_lambda: Any
@@ -89,7 +116,8 @@ class Tissue:
     contour_length: Any
     end_to_end_length: Any
     chain: Chain | None = CHAINS["wormlike"]
-    matrix: Matrix = neo_hookean
+    matrix: Term = neo_hookean
+    repulsion: Repulsion = REPULSIONS["axes"]
 
     @property
     def locking_length(self) -> Any:
@@ -124,23 +152,61 @@ class Tissue:
             F, UFL of shape (3, 3) or array (..., 3, 3).
         cells
             The unit cell: one whole cell, or shares whose weights add up to one.
+
+        In UFL a repulsion that has derivatives of its own (`Repulsion.derivatives`) is left out: these enter forms as
+        values at the quadrature points (`evolution.pointwise`).
         """
         energy = self.matrix(deformation_gradient, self.lame_lambda, self.lame_mu)
+        return self._with_network(energy, deformation_gradient, cells)
+
+    def distortional_energy(self, deformation_gradient: Any, cells: Sequence[UnitCell]) -> Any:
+        """W without the volumetric part of the matrix; as `strain_energy`, which it makes together with that part."""
+        energy = self._parts().distortional(deformation_gradient, self.lame_lambda, self.lame_mu)
+        return self._with_network(energy, deformation_gradient, cells)
+
+    def volumetric_energy(self, jacobian: Any) -> Any:
+        """The volumetric part of the matrix, U(J)."""
+        return self._parts().volumetric(jacobian, self.lame_lambda, self.lame_mu)
+
+    def _parts(self) -> Matrix:
+        if isinstance(self.matrix, Matrix):
+            return self.matrix
+        raise TypeError(
+            "the volumetric part of this matrix energy is not told apart: it must be a tissue.energy.Matrix"
+        )
+
+    def _with_network(self, energy: Any, deformation_gradient: Any, cells: Sequence[UnitCell]) -> Any:
+        """An energy plus that of the chains, where there are any."""
         if self.chain is None:
             return energy
         length = sqrt(squared_end_to_end_length(deformation_gradient, cells))
         chains = self.chain.energy(length, self.contour_length)
+        if not is_array(deformation_gradient) and self.repulsion.derivatives is not None:
+            return energy + self.network_modulus * chains
         stiffness = self.chain.stiffness(self.end_to_end_length, self.contour_length)
-        repulsion = -stiffness / 2 * repulsion_sum(deformation_gradient, cells)
+        repulsion = -stiffness / 2 * self.repulsion.sum(deformation_gradient, cells, self.end_to_end_length)
         return energy + self.network_modulus * (chains + repulsion)
+
+    @property
+    def repulsion_modulus(self) -> Any:
+        """c g(r0): W_rep = -c g(r0) M / 2."""
+        assert self.chain is not None
+        return self.network_modulus * self.chain.stiffness(self.end_to_end_length, self.contour_length)
 
     def stresses(self, deformation_gradient: Any, cells: Sequence[UnitCell]) -> Stresses:
         """P = dW/dF, S = F^-1 P and sigma = P F^T / J (eqs. 6 and 7 with erratum 5), by differentiation of W; UFL."""
         import ufl
 
         F = ufl.variable(deformation_gradient)
-        first = ufl.diff(self.strain_energy(F, cells), F)
-        return Stresses(first, ufl.dot(ufl.inv(F), first), ufl.dot(first, F.T) / ufl.det(F))
+        return _stresses(F, ufl.diff(self.strain_energy(F, cells), F))
+
+    def stresses_of_parts(self, deformation_gradient: Any, cells: Sequence[UnitCell], jacobian: Any) -> Stresses:
+        """The same with U at another J than det F: P = d(W - U)/dF + J U'(J) F^-T, J U' the Kirchhoff pressure; UFL."""
+        import ufl
+
+        F, J = ufl.variable(deformation_gradient), ufl.variable(jacobian)
+        pressure = J * ufl.diff(self.volumetric_energy(J), J)
+        return _stresses(F, ufl.diff(self.distortional_energy(F, cells), F) + pressure * ufl.inv(F).T)
 
     def energy_increment(self, deformation_gradient: Any, old: UnitCell, new: UnitCell) -> Any:
         """First-order change of W at frozen F when the cells become others, per reference volume; arrays.
@@ -155,7 +221,15 @@ class Tissue:
         C = F.swapaxes(-1, -2) @ F
         squared = (structure_tensor(*old[:2]) * C).sum(axis=(-1, -2))
         squared_change = (structure_tensor(*new[:2]) * C).sum(axis=(-1, -2)) - squared
-        repulsion_change = repulsion_sum(F, [new]) - repulsion_sum(F, [old])
+        r0 = self.end_to_end_length
+        repulsion_change = self.repulsion.sum(F, [new], r0) - self.repulsion.sum(F, [old], r0)
         stiffness = self.chain.stiffness(sqrt(squared), self.contour_length)
         initial = self.chain.stiffness(self.end_to_end_length, self.contour_length)
         return self.network_modulus / 2 * (stiffness * squared_change - initial * repulsion_change)
+
+
+def _stresses(F: Any, first: Any) -> Stresses:
+    """All of them from P; UFL."""
+    import ufl
+
+    return Stresses(first, ufl.dot(ufl.inv(F), first), ufl.dot(first, F.T) / ufl.det(F))

@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 
 
-def _is_array(value: Any) -> bool:
+def is_array(value: Any) -> bool:
+    """Whether a value is a number or an array, not UFL."""
     return isinstance(value, (np.ndarray, np.generic, float, int, complex))
 
 
 def ln(value: Any) -> Any:
     """Natural logarithm."""
-    if _is_array(value):
+    if is_array(value):
         return np.log(value)
     import ufl
 
@@ -26,7 +27,7 @@ def ln(value: Any) -> Any:
 
 def sqrt(value: Any) -> Any:
     """Square root."""
-    if _is_array(value):
+    if is_array(value):
         return np.sqrt(value)
     import ufl
 
@@ -35,7 +36,7 @@ def sqrt(value: Any) -> Any:
 
 def det(tensor: Any) -> Any:
     """Determinant."""
-    if _is_array(tensor):
+    if is_array(tensor):
         return np.linalg.det(tensor)
     import ufl
 
@@ -44,7 +45,7 @@ def det(tensor: Any) -> Any:
 
 def squared_norm(tensor: Any) -> Any:
     """A : A, the sum of the squares of all nine entries."""
-    if _is_array(tensor):
+    if is_array(tensor):
         return np.einsum("...ij,...ij->...", tensor, tensor)
     import ufl
 
@@ -53,7 +54,7 @@ def squared_norm(tensor: Any) -> Any:
 
 def squared_stretch(deformation_gradient: Any, directions: Any, row: int) -> Any:
     """n . C n of the unit vector n in a row of `directions` (..., 3, 3), C = F^T F."""
-    if _is_array(deformation_gradient):
+    if is_array(deformation_gradient):
         fibre = np.einsum("...ij,...j->...i", deformation_gradient, directions[..., row, :])
         return np.einsum("...i,...i->...", fibre, fibre)
     import ufl
@@ -64,4 +65,4 @@ def squared_stretch(deformation_gradient: Any, directions: Any, row: int) -> Any
 
 def component(vector: Any, index: int) -> Any:
     """Component of a UFL vector, or of vectors in the last dimension of an array."""
-    return vector[..., index] if _is_array(vector) else vector[index]
+    return vector[..., index] if is_array(vector) else vector[index]

@@ -5,10 +5,14 @@ between machines and between numbers of ranks. The axes enter the stress (erratu
 choice that the tensor itself does not make is made here by the previous axes.
 """
 
+from collections.abc import Callable
+from itertools import permutations
+
 import numpy as np
 import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
 
 ROUNDING = 64 * float(np.finfo(np.float64).eps)
 """Relative size below which a principal value is rounding error (eigh is accurate to a few eps)."""
@@ -57,31 +61,42 @@ def principal(
     FloatingPointError
         If a tensor or a previous axis holds NaN or infinity; names the first one.
     """
-    tensors = np.asarray(tensors, dtype=np.float64)
-    previous = np.asarray(previous, dtype=np.float64)
-    _require_finite(tensors, "tensor")
-    _require_finite(previous, "triad of previous axes")
+    values, axes, reference = _decomposed(tensors, previous)
+    return values, _settled(axes, reference, *_agreeing(values, tolerance, threshold))
 
-    ascending, columns = np.linalg.eigh(0.5 * tensors + 0.5 * np.swapaxes(tensors, 1, 2))
-    values = ascending[:, ::-1].copy()
-    axes = np.swapaxes(columns, 1, 2)[:, ::-1].copy()
 
-    reference = _normalised(previous)
-    equal = np.maximum(tolerance * _largest(values), threshold)
-    upper = values[:, 0] - values[:, 1] <= equal
-    lower = values[:, 1] - values[:, 2] <= equal
-    for cluster, normal_rank, first, second in (upper & ~lower, 2, 0, 1), (lower & ~upper, 0, 1, 2):
-        at = np.flatnonzero(cluster)
-        if at.size:
-            normal = axes[at, normal_rank]
-            axes[at, first] = _project(normal, _candidates(reference[at], first))
-            axes[at, second] = np.cross(normal, axes[at, first])
-    at = np.flatnonzero(upper & lower)
-    if at.size:
-        axes[at, 0] = _project(np.zeros((at.size, 3)), _candidates(reference[at], 0))
-        axes[at, 1] = _project(axes[at, 0], _candidates(reference[at], 1))
-        axes[at, 2] = np.cross(axes[at, 0], axes[at, 1])
-    return values, _with_signs_of(reference, axes)
+def continued(
+    tensors: npt.ArrayLike, previous: npt.ArrayLike, tolerance: float = 1e-8, threshold: npt.ArrayLike = 0.0
+) -> tuple[Array, Array]:
+    """Return the principal values and axes of symmetric tensors in the order of the previous axes.
+
+    Each principal axis takes the place of the previous axis that it continues: of the six ways to pair them, the one
+    with the largest sum of squared cosines. So values that cross do not exchange their places. Where values agree,
+    their common eigenspace counts as a whole, and the previous axes that it is paired with are kept in it as by
+    `principal`. Of ways whose sums agree within ``DECISIVE`` the first in lexicographic order is taken, so that
+    rounding does not choose.
+
+    Parameters and errors are those of `principal`.
+
+    Returns
+    -------
+    values : (n, 3)
+        In the order of the previous axes, no longer descending.
+    axes : (n, 3, 3)
+        Rows are orthonormal, row I belongs to value I and continues previous axis I.
+    """
+    values, axes, reference = _decomposed(tensors, previous)
+    upper, lower = _agreeing(values, tolerance, threshold)
+    place = _places(axes, reference, upper, lower)
+    axes = _settled(axes, np.take_along_axis(reference, place[:, :, None], axis=1), upper, lower)
+    rank = np.argsort(place, axis=1)
+    return np.take_along_axis(values, rank, axis=1), np.take_along_axis(axes, rank[:, :, None], axis=1)
+
+
+Pairing = Callable[..., tuple[Array, Array]]
+
+PAIRINGS: dict[str, Pairing] = {"sorted": principal, "continuous": continued}
+"""Which dimension of a cell belongs to which principal value: by rank, or by the axis that it continues."""
 
 
 def positive_direction(values: npt.ArrayLike, threshold: npt.ArrayLike = 0.0) -> tuple[Array, npt.NDArray[np.bool_]]:
@@ -116,6 +131,78 @@ def positive_direction(values: npt.ArrayLike, threshold: npt.ArrayLike = 0.0) ->
     norm = _length(positive)
     active = norm > 0.0
     return positive / np.where(active, norm, 1.0)[:, None], active
+
+
+def without_noise(tensors: Array, axes: Array, noise: npt.ArrayLike) -> Array:
+    """Return the symmetric tensors with the given axes as principal axes, where they are so within the tensors' error.
+
+    Where two principal values are close, an error of the tensor turns its axes by far more than its own size. What
+    decides is therefore what the tensor has across the given axes: up to `noise` it is taken for zero.
+
+    Parameters
+    ----------
+    tensors : (n, 3, 3)
+        Symmetric.
+    axes : (n, 3, 3)
+        Rows are independent vectors; they are orthonormalised in their order.
+    noise : float or (n,)
+        Error of a component, in the unit of the tensors.
+    """
+    first = _normalised(axes[:, 0])
+    second = _normalised(axes[:, 1] - np.einsum("na,na->n", axes[:, 1], first)[:, None] * first)
+    frame = np.stack([first, second, np.cross(first, second)], axis=1)
+    components = frame @ tensors @ np.swapaxes(frame, 1, 2)
+    across = _largest(np.stack([components[:, 0, 1], components[:, 1, 2], components[:, 0, 2]], axis=1))
+    values = np.einsum("nii->ni", components)
+    steady = np.swapaxes(frame, 1, 2) @ (values[:, :, None] * frame)
+    return np.where((across <= np.asarray(noise, dtype=np.float64))[:, None, None], steady, tensors)
+
+
+def _decomposed(tensors: npt.ArrayLike, previous: npt.ArrayLike) -> tuple[Array, Array, Array]:
+    """Return descending values, LAPACK's axes for them as rows, and the previous axes normalised."""
+    tensors = np.asarray(tensors, dtype=np.float64)
+    previous = np.asarray(previous, dtype=np.float64)
+    _require_finite(tensors, "tensor")
+    _require_finite(previous, "triad of previous axes")
+
+    ascending, columns = np.linalg.eigh(0.5 * tensors + 0.5 * np.swapaxes(tensors, 1, 2))
+    values = ascending[:, ::-1].copy()
+    axes = np.swapaxes(columns, 1, 2)[:, ::-1].copy()
+    return values, axes, _normalised(previous)
+
+
+def _agreeing(values: Array, tolerance: float, threshold: npt.ArrayLike) -> tuple[Flags, Flags]:
+    """Return where the first two and where the last two values agree."""
+    equal = np.maximum(tolerance * _largest(values), threshold)
+    return values[:, 0] - values[:, 1] <= equal, values[:, 1] - values[:, 2] <= equal
+
+
+def _settled(axes: Array, reference: Array, upper: Flags, lower: Flags) -> Array:
+    """Return the axes with what values that agree leave open, and with all signs, as `reference` chooses them."""
+    for cluster, normal_rank, first, second in (upper & ~lower, 2, 0, 1), (lower & ~upper, 0, 1, 2):
+        at = np.flatnonzero(cluster)
+        if at.size:
+            normal = axes[at, normal_rank]
+            axes[at, first] = _project(normal, _candidates(reference[at], first))
+            axes[at, second] = np.cross(normal, axes[at, first])
+    at = np.flatnonzero(upper & lower)
+    if at.size:
+        axes[at, 0] = _project(np.zeros((at.size, 3)), _candidates(reference[at], 0))
+        axes[at, 1] = _project(axes[at, 0], _candidates(reference[at], 1))
+        axes[at, 2] = np.cross(axes[at, 0], axes[at, 1])
+    return with_signs_of(reference, axes)
+
+
+def _places(axes: Array, reference: Array, upper: Flags, lower: Flags) -> npt.NDArray[np.intp]:
+    """Return for each rank the number of the previous axis that it continues, (n, 3)."""
+    overlap = np.einsum("nia,nja->nij", axes, reference) ** 2
+    # of an eigenspace only the sum over any of its bases has a meaning
+    for cluster, ranks in (upper & ~lower, [0, 1]), (lower & ~upper, [1, 2]), (upper & lower, [0, 1, 2]):
+        at = np.flatnonzero(cluster)
+        overlap[at[:, None], ranks] = overlap[at][:, ranks].mean(axis=1, keepdims=True)
+    ways = np.array(list(permutations(range(3))))
+    sums = sum(overlap[:, rank, ways[:, rank]] for rank in range(3))
+    return ways[np.argmax(sums >= sums.max(axis=1, keepdims=True) - DECISIVE, axis=1)]
 
 
 def _require_finite(values: Array, noun: str) -> None:
@@ -170,8 +257,8 @@ def _project(normal: Array, candidates: list[Array]) -> Array:
     return _normalised(chosen - np.einsum("na,na->n", chosen, normal)[:, None] * normal)
 
 
-def _with_signs_of(reference: Array, axes: Array) -> Array:
-    """Return the axes with the signs that `principal` promises."""
+def with_signs_of(reference: Array, axes: Array) -> Array:
+    """Return the axes (n, 3, 3) with the signs that `principal` promises; reference (n, 3, 3): unit rows."""
     decisive = np.einsum("nia,nia->ni", axes, reference)
     for shift in (1, 2):
         point, rank = np.nonzero(np.abs(decisive) <= DECISIVE)

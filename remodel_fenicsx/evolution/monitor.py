@@ -1,0 +1,198 @@
+"""Watches whether equilibria are stable: cheap signs from Newton's factorisations decide when to count."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+import numpy as np
+
+from remodel_fenicsx.evolution.inertia import FactorisationFailed, Inertia, Mode, of_the_unloaded_body, uneven
+from remodel_fenicsx.evolution.parts import StepFailure
+from remodel_fenicsx.evolution.refusals import UNSTABLE
+from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
+
+log = logging.getLogger(__name__)
+
+ITERATIONS_BETWEEN_LOOKS = 100  # Newton iterations, each of about the cost of a look
+FIRST_INVERSE_ITERATIONS = 3  # later steps go on from the vector of the step before: one each
+
+
+class StabilityWatcher(Watcher):
+    """Knows the number of negative eigenvalues of the tangent at solved states, and says when it changes.
+
+    A count costs about as much as a Newton iteration. So it is made where somebody wants it in every row, at the last
+    step, after ITERATIONS_BETWEEN_LOOKS, and at once where `Signs` speak of a negative eigenvalue that is not known.
+
+    Parameters
+    ----------
+    stepper
+        What is watched; nothing here changes its state.
+    unstable
+        "warn": the run goes on; "stop": an equilibrium with more negative eigenvalues than before ends it.
+    every_step
+        Count in every step, whatever the signs say.
+    """
+
+    def __init__(self, stepper: Stepper, unstable: str = "warn", every_step: bool = False):
+        self.stepper, self.state = stepper, stepper.state
+        self.stops, self.every_step = unstable == "stop", every_step or unstable == "stop"
+        self.inertia = Inertia(stepper.coupling.equilibrium)
+        self.signs = Signs(stepper)
+        self._known = self._known_before = 0
+        self._iterations = self._iterations_before = 0  # since the last look
+        self._unloaded: tuple[int, float] | None = None
+
+    def close(self) -> None:
+        """Free PETSc's objects."""
+        self.inertia.close()
+        self.signs.close()
+
+    # ------------------------------------------------------------ as a watcher
+    def started(self, step: Step) -> None:
+        """Count at the start, where it is a row that somebody wants."""
+        if self.every_step:
+            step.negative_eigenvalues = self._count()
+
+    def solved(self, step: Step) -> None:
+        """Count, if it is time.
+
+        Raises
+        ------
+        StepFailure
+            If the equilibrium is unstable and the run is to stop there.
+        """
+        self._known_before, self._iterations_before = self._known, self._iterations
+        self._iterations += step.work.newton_iterations
+        suspicious = self.signs.differ(self._known) if step.work.newton_iterations else False
+        overdue = self._iterations >= ITERATIONS_BETWEEN_LOOKS or (step.is_last and self._iterations > 0)
+        if not (suspicious or overdue or self.every_step):
+            return
+        step.negative_eigenvalues = count = self._count()
+        if np.isnan(count):
+            return
+        self._iterations = 0
+        self.signs.settle()
+        if count != self._known:
+            self._known = int(count)
+            self._say(step, self._known_before, self._known)
+
+    def undone(self, step: Step) -> None:
+        """What was found out belongs to a state that is not there any more."""
+        self._known, self._iterations = self._known_before, self._iterations_before
+
+    # ------------------------------------------------------------ what it means
+    def _count(self) -> float:
+        try:
+            return self.inertia.negative_eigenvalues()
+        except FactorisationFailed as failure:
+            self._warn("the stability of the equilibrium is not known: %s", failure)
+            return float("nan")
+
+    def _say(self, step: Step, before: int, now: int) -> None:
+        if now < before:
+            self._info("time %g: %s of the tangent, %d before", step.time, eigenvalues(now), before)
+            return
+        unloaded, scale = self._of_the_unloaded_body()
+        if now <= unloaded:
+            self._info(
+                "time %g: %s of the tangent, as the unloaded body has %d: stress that its cells have from the start, "
+                "no lost equilibrium", step.time, eigenvalues(now), unloaded,
+            )  # fmt: skip
+            return
+        text = f"{eigenvalues(now)} of the tangent ({before} before); {described(self.inertia.lowest(), scale)}"
+        if self.stops:
+            raise StepFailure(step.time, f"the equilibrium at time {step.time:g} is unstable: {text}", UNSTABLE)
+        self._warn("time %g: the equilibrium is unstable, the body would leave it: %s", step.time, text)
+
+    def _of_the_unloaded_body(self) -> tuple[int, float]:
+        """`inertia.of_the_unloaded_body`, once."""
+        if self._unloaded is None:
+            self._unloaded = of_the_unloaded_body(self.inertia)
+        return self._unloaded
+
+    def _warn(self, *message: Any) -> None:
+        if self.state.comm.rank == 0:
+            log.warning(*message)
+
+    def _info(self, *message: Any) -> None:
+        if self.state.comm.rank == 0:
+            log.info(*message)
+
+
+class Signs:
+    """What the factors of Newton's last tangent tell for nothing, or for one substitution, about its eigenvalues.
+
+    - The sign of its determinant (MUMPS, ICNTL(33)): it changes with each eigenvalue that changes sign.
+    - The curvature w.K w / w.w of w = K^-1 v. From step to step this is inverse iteration: v turns to the mode of the
+      eigenvalue that is nearest to zero, so that it is there when one passes through. It sees pairs as well.
+
+    Parameters
+    ----------
+    stepper
+        Whose solver it asks. One that does not factorise tells nothing.
+    """
+
+    def __init__(self, stepper: Stepper):
+        self.newton, self.equilibrium = stepper.coupling.newton, stepper.coupling.equilibrium
+        self._vector: Any = None
+        self._sign = self._sign_at_look = 1
+
+    def close(self) -> None:
+        """Free PETSc's objects."""
+        if self._vector is not None:
+            self._vector.destroy()
+            self._vector = None
+
+    def differ(self, known: int) -> bool:
+        """Whether they contradict what is known: a number of negative eigenvalues."""
+        factorisation = self.newton.factorisation()
+        if factorisation is None:
+            return False
+        self._sign = determinant_sign(factorisation) or self._sign_at_look
+        return self._sign != self._sign_at_look or (self._curvature(factorisation) < 0 and known == 0)
+
+    def settle(self) -> None:
+        """The eigenvalues have been counted: from now on what differs from the present signs is news."""
+        self._sign_at_look = self._sign
+
+    def _curvature(self, factorisation: Any) -> float:
+        """Of the remembered vector after one more inverse iteration."""
+        first = self._vector is None
+        if first:
+            self._vector = uneven(factorisation.getOperators()[0].createVecRight())
+            free = np.isnan(self.equilibrium.prescribed_values()[: self._vector.getLocalSize()])
+            self._vector.array[:] *= free  # prescribed ones have an eigenvalue of their own, one
+        image = self._vector.duplicate()
+        curvature = np.inf
+        for _ in range(FIRST_INVERSE_ITERATIONS if first else 1):
+            factorisation.apply(self._vector, image)
+            size = image.norm()
+            curvature = image.dot(self._vector) / size**2
+            if not np.isfinite(curvature):
+                break
+            image.scale(1.0 / size)
+            image.copy(self._vector)
+        image.destroy()
+        return float(curvature)
+
+
+def determinant_sign(factorisation: Any) -> int:
+    """1 or -1, on all ranks; 0 where the factorisation does not tell."""
+    if factorisation.getFactorSolverType() != "mumps":
+        return 0
+    factor = factorisation.getFactorMatrix()
+    sign = int(np.sign(factor.getMumpsRinfog(12))) if factor.getMumpsIcntl(33) else 0
+    return int(factorisation.comm.tompi4py().bcast(sign))  # the first rank knows it
+
+
+def eigenvalues(number: int) -> str:
+    """In words."""
+    return f"{number or 'no'} negative eigenvalue{'' if number == 1 else 's'}"
+
+
+def described(mode: Mode, unloaded: float) -> str:
+    """A mode in words; `unloaded`: the lowest eigenvalue of the unloaded body, which is the unit where positive."""
+    place = ", ".join(f"{c:.4g}" for c in mode.place)
+    size = f"{mode.eigenvalue / unloaded:.3g} of its unloaded value" if unloaded > 0 else f"{mode.eigenvalue:.3g}"
+    return f"the lowest is {size}, its mode largest at ({place})"

@@ -1,0 +1,96 @@
+"""The repulsion where it is no closed expression for UFL: stress and stiffness as values at the quadrature points."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import ufl
+from numpy.typing import NDArray
+
+from remodel_fenicsx.evolution.state import State
+from remodel_fenicsx.fem import coefficients, jit
+from remodel_fenicsx.tissue.cells import UnitCell
+from remodel_fenicsx.tissue.energy import Tissue
+from remodel_fenicsx.tissue.repulsion import whole_structure_tensor
+
+Array = NDArray[np.float64]
+Shares = Callable[[], Sequence[UnitCell]]
+
+
+class PointwiseRepulsion:
+    """Second Piola-Kirchhoff stress of the repulsion and its derivative, as quadrature functions that forms take.
+
+    They belong to the unknowns with which `update` was called last.
+
+    Parameters
+    ----------
+    state
+        Unknowns and kinematics.
+    tissue
+        With a repulsion that has derivatives of its own; its parameters are Constants or DG0 Functions.
+    shares
+        Function that gives the cells at all points in one row, arrays, with numbers for weights.
+
+    Attributes
+    ----------
+    stress, stiffness
+        S (3, 3) and 2 dS/dC (3, 3, 3, 3), dolfinx functions.
+    """
+
+    def __init__(self, state: State, tissue: Tissue, shares: Shares):
+        self.quadrature, self.tissue, self.shares = state.cells.quadrature, tissue, shares
+        self.stress = self.quadrature.function("repulsion_stress", (3, 3))
+        self.stiffness = self.quadrature.function("repulsion_stiffness", (3, 3, 3, 3))
+        F = state.kinematics.deformation_gradient(state.unknown)
+        self._expression = jit.expression(F, self.quadrature.points)
+
+    def deformation_gradient(self) -> Array:
+        """F at all points in one row, (n, 3, 3)."""
+        return self.quadrature.evaluate(self._expression, (3, 3)).reshape(-1, 3, 3)
+
+    def update(self, stiffness: bool = False) -> None:
+        """Stress, and stiffness on request, of the present unknowns and cells."""
+        derivatives = self.tissue.repulsion.derivatives
+        assert derivatives is not None
+        F, modulus = self.deformation_gradient(), self._modulus()
+        first, second = derivatives(np.swapaxes(F, 1, 2) @ F, whole_structure_tensor(self.shares()), stiffness)
+        shape = self.quadrature.shape
+        # W_rep = -c g(r0)/2 M: S = 2 dW/dC and 2 dS/dC = 4 d2W/dC2
+        self.quadrature.values(self.stress, (3, 3))[:] = (-modulus[:, None, None] * first).reshape(*shape, 3, 3)
+        if second is not None:
+            values = self.quadrature.values(self.stiffness, (3, 3, 3, 3))
+            values[:] = (-2 * modulus[:, None, None, None, None] * second).reshape(*shape, 3, 3, 3, 3)
+
+    def energy(self) -> float:
+        """Its part of the stored energy, over all ranks."""
+        F = self.deformation_gradient()
+        r0 = coefficients.point_values(self.tissue.end_to_end_length, self.quadrature).reshape(-1)
+        values = -self._modulus() / 2 * self.tissue.repulsion.sum(F, self.shares(), r0)
+        return self.quadrature.integral(values.reshape(self.quadrature.shape))
+
+    def residual(self, u: Any, F: Any, test: Any) -> Any:
+        """Its virtual work per reference volume, UFL."""
+        variation = ufl.derivative(F, u, test)
+        return ufl.inner(ufl.dot(F, self.stress), variation)
+
+    def tangent(self, u: Any, F: Any, test: Any, trial: Any) -> Any:
+        """Derivative of `residual`, UFL."""
+        variation, increment = ufl.derivative(F, u, test), ufl.derivative(F, u, trial)
+        geometric = ufl.inner(ufl.dot(increment, self.stress), variation)
+        strains = [ufl.sym(ufl.dot(ufl.transpose(F), direction)) for direction in (increment, variation)]
+        i, j, k, l = ufl.indices(4)
+        return geometric + strains[1][i, j] * self.stiffness[i, j, k, l] * strains[0][k, l]
+
+    def _modulus(self) -> Array:
+        points = self.tissue.map(lambda name, value: coefficients.point_values(value, self.quadrature).reshape(-1))
+        modulus: Array = points.repulsion_modulus
+        return modulus
+
+
+def pointwise_repulsion(state: State, tissue: Tissue, shares: Shares | None = None) -> PointwiseRepulsion | None:
+    """The part of a tissue's energy that UFL leaves out, with the state's cells or shares of them; None without one."""
+    if tissue.chain is None or tissue.repulsion.derivatives is None:
+        return None
+    return PointwiseRepulsion(state, tissue, shares or (lambda: [state.cells.point_cells]))

@@ -1,0 +1,222 @@
+"""Formulations: where an element takes the change of volume, which decides whether it locks in a stiff bulk.
+
+An element of low degree cannot keep J = 1 at all of its points and bend; where lambda is much larger than every
+stiffness against shear it then hardly moves (docs/theory.md, Volumetric locking). dolfinx is imported when needed:
+scenes, which name formulations, are read without it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+class TwoParts(Protocol):
+    """What a formulation needs of a material (`tissue.energy.Tissue`), cells as it takes them."""
+
+    def strain_energy(self, deformation_gradient: Any, cells: Any) -> Any:
+        """All of W."""
+
+    def distortional_energy(self, deformation_gradient: Any, cells: Any) -> Any:
+        """W without its volumetric part."""
+
+    def volumetric_energy(self, jacobian: Any) -> Any:
+        """The volumetric part."""
+
+    def stresses(self, deformation_gradient: Any, cells: Any) -> Any:
+        """Stresses of W."""
+
+    def stresses_of_parts(self, deformation_gradient: Any, cells: Any, jacobian: Any) -> Any:
+        """Stresses of W with the Kirchhoff pressure that belongs to another J."""
+
+
+class Dilatation(Protocol):
+    """A formulation on a mesh: the energy's integral, and stresses and J to go with it."""
+
+    def energies(self, tissue: TwoParts, deformation_gradient: Any, cells: Any, weight: Any) -> list[Any]:
+        """UFL forms whose sum is the integral of W over the body; `weight` is the body's volume per unit of mesh.
+
+        They are compiled one by one: FFCx mixes up values of two quadrature rules that meet in one kernel.
+        """
+
+    def stresses(self, tissue: TwoParts, deformation_gradient: Any, cells: Any) -> Any:
+        """Stresses (UFL) at the quadrature points, as the residual has them. They belong to the last `refresh`."""
+
+    def refresh(self) -> None:
+        """Take what `stresses` needs beside F from the present unknowns."""
+
+    def jacobians(self) -> Array:
+        """J of the present unknowns where the formulation takes it beside the quadrature points, (elements, any)."""
+
+
+class Locking(NamedTuple):
+    """From where on elements lock: both must be exceeded (`evolution.locking`).
+
+    Attributes
+    ----------
+    stiffness_ratio
+        lambda/mu up to which they never do.
+    energy_share
+        Share of the work that changes of volume inside single elements may take.
+    """
+
+    stiffness_ratio: float
+    energy_share: float
+
+
+class Formulation(Protocol):
+    """What scenes, states and warnings ask of a formulation.
+
+    Attributes
+    ----------
+    meaning
+        What it does, for docs/scene.md.
+    takes_parts
+        Whether it needs a matrix energy whose volumetric part is told apart (`tissue.energy.Matrix`).
+    """
+
+    @property
+    def meaning(self) -> str: ...
+
+    @property
+    def takes_parts(self) -> bool: ...
+
+    def locks(self, element: str, degree: int) -> Locking | None:
+        """From where on elements of this kind and degree lock; None if they never do."""
+
+    def has(self, element: str, degree: int) -> bool:
+        """Whether it changes anything for such an element."""
+
+    def on(self, kinematics: Any, unknown: Any, quadrature: Any) -> Dilatation:
+        """The formulation for these unknowns at these points."""
+
+
+# ---------------------------------------------------------------- J at all points
+
+
+@dataclass(frozen=True)
+class AtAllPoints:
+    """W as it stands, at all quadrature points."""
+
+    meaning: str
+    limits: Mapping[int, Locking]  # by degree
+    takes_parts: bool = False
+
+    def locks(self, element: str, degree: int) -> Locking | None:
+        """By degree."""
+        return self.limits.get(degree)
+
+    def has(self, element: str, degree: int) -> bool:
+        """Always."""
+        return True
+
+    def on(self, kinematics: Any, unknown: Any, quadrature: Any) -> Dilatation:
+        """Nothing to prepare."""
+        return _WholeEnergy(quadrature)
+
+
+class _WholeEnergy:
+    def __init__(self, quadrature: Any):
+        self.quadrature = quadrature
+
+    def energies(self, tissue: TwoParts, deformation_gradient: Any, cells: Any, weight: Any) -> list[Any]:
+        return [tissue.strain_energy(deformation_gradient, cells) * weight * self.quadrature.dx]
+
+    def stresses(self, tissue: TwoParts, deformation_gradient: Any, cells: Any) -> Any:
+        return tissue.stresses(deformation_gradient, cells)
+
+    def refresh(self) -> None:
+        pass
+
+    def jacobians(self) -> Array:
+        return np.empty((len(self.quadrature.elements), 0))
+
+
+# ---------------------------------------------------------------- J at fewer points
+
+
+@dataclass(frozen=True)
+class Selective:
+    """The volumetric part by a rule of fewer points; in between, its J is the polynomial through them.
+
+    Attributes
+    ----------
+    degrees
+        Degree of that rule by element and degree; what is not in it would lock all the same.
+    """
+
+    meaning: str
+    degrees: Mapping[tuple[str, int], int]
+    takes_parts: bool = True
+
+    def locks(self, element: str, degree: int) -> Locking | None:
+        """Never."""
+        return None
+
+    def has(self, element: str, degree: int) -> bool:
+        """Where there is a rule."""
+        return (element, degree) in self.degrees
+
+    def on(self, kinematics: Any, unknown: Any, quadrature: Any) -> Dilatation:
+        """With J at the points of the rule."""
+        degree = unknown.function_space.ufl_element().degree
+        return _PartsApart(kinematics, unknown, quadrature, self.degrees[quadrature.element_kind, degree])
+
+
+class _PartsApart:
+    def __init__(self, kinematics: Any, unknown: Any, quadrature: Any, degree: int):
+        import basix
+        import ufl
+
+        from remodel_fenicsx.fem import jit
+
+        self.quadrature = quadrature
+        self.dx = ufl.Measure("dx", domain=quadrature.mesh, metadata={"quadrature_degree": degree})
+        kind = basix.CellType[quadrature.element_kind]
+        points = np.asarray(basix.make_quadrature(kind, degree)[0], dtype=np.float64)
+        jacobian = ufl.det(kinematics.deformation_gradient(unknown))
+        self._expression = jit.expression(jacobian, points, "J where the formulation takes it")
+        polynomials = basix.create_element(basix.ElementFamily.P, kind, degree // 2, discontinuous=True)
+        there, here = (np.asarray(polynomials.tabulate(0, p))[0, :, :, 0] for p in (points, quadrature.points))
+        self._interpolation = here @ np.linalg.pinv(there)  # exactly one and the same where the rule has one point
+        self._jacobian = quadrature.function("jacobian_of_the_formulation", ())
+        self.refresh()
+
+    def energies(self, tissue: TwoParts, deformation_gradient: Any, cells: Any, weight: Any) -> list[Any]:
+        import ufl
+
+        distortional = tissue.distortional_energy(deformation_gradient, cells)
+        volumetric = tissue.volumetric_energy(ufl.det(deformation_gradient))
+        return [distortional * weight * self.quadrature.dx, volumetric * weight * self.dx]
+
+    def stresses(self, tissue: TwoParts, deformation_gradient: Any, cells: Any) -> Any:
+        return tissue.stresses_of_parts(deformation_gradient, cells, self._jacobian)
+
+    def refresh(self) -> None:
+        self.quadrature.values(self._jacobian, ())[:] = self.jacobians() @ self._interpolation.T
+
+    def jacobians(self) -> Array:
+        elements = self.quadrature.elements
+        values: Array = self._expression.eval(self.quadrature.mesh, elements).reshape(len(elements), -1)
+        return values
+
+
+FORMULATIONS: dict[str, Formulation] = {
+    # docs/theory.md, Volumetric locking, has the measurements behind these numbers
+    "displacement": AtAllPoints(
+        "at all quadrature points, right while lambda/mu is below about 100",
+        {1: Locking(50.0, 0.03), 2: Locking(500.0, 0.15)},
+    ),
+    "selective-integration": Selective(
+        "the volumetric part of the matrix at fewer points, in linear hexahedra at the centroid; hexahedra do not lock "
+        "with it",
+        {("hexahedron", 1): 1, ("hexahedron", 2): 2},
+    ),
+}
+"""Formulations by the name that a scene gives them."""

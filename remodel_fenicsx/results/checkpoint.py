@@ -1,0 +1,166 @@
+"""Checkpoints of a state: written as a watcher, brought back on any number of ranks."""
+
+from __future__ import annotations
+
+import time as clock
+from pathlib import Path
+
+import numpy as np
+
+from remodel_fenicsx.body.domain import Domain
+from remodel_fenicsx.evolution.state import State
+from remodel_fenicsx.evolution.stepper import Step, Watcher
+from remodel_fenicsx.results.checkpoint_file import Array, Checkpoint, CheckpointError, write_checkpoint
+from remodel_fenicsx.system.environment import versions
+
+LONGEST_LOSS = 600.0  # seconds
+SHORTEST_PAUSE = 10.0  # seconds between two that are chosen by time: below it nothing worth a write is lost
+LARGEST_SHARE = 0.04  # of the time of a run, that checkpoints chosen by time may cost
+
+
+class Checkpoints(Watcher):
+    """Writes a checkpoint of the state now and then, and of the last step always.
+
+    Parameters
+    ----------
+    folder
+        The run's.
+    state
+        What is kept: it must be that of the last committed step whenever something is written.
+    scene_text
+        The scene as run.
+    every
+        Steps between two; 0: only at the end; None: chosen by time.
+    """
+
+    def __init__(self, folder: Path, state: State, scene_text: str, every: int | None = None):
+        self.folder, self.state, self.scene_text, self.every = folder, state, scene_text, every
+        self._mesh = mesh_arrays(state.loading.domain)
+        self._versions = versions() if state.comm.rank == 0 else {}
+        self._written_at, self._cost, self._step_seconds = clock.monotonic(), 0.0, 0.0
+        self._number = 0  # of the newest checkpoint; where none is, the run starts again at t = 0
+
+    # ------------------------------------------------------------ as a watcher
+    def resumed(self, step: Step) -> None:
+        """The state is that of a checkpoint."""
+        self._number = step.number
+
+    def committed(self, step: Step) -> None:
+        """Write it, if it is its turn."""
+        self._step_seconds = max(0.5 * self._step_seconds, step.seconds)
+        if step.is_last or self._is_due(step.number):
+            self.write()
+
+    def _is_due(self, number: int) -> bool:
+        """The same on all ranks."""
+        if self.every is not None:
+            return self.every > 0 and number % self.every == 0
+        pause = max(SHORTEST_PAUSE, self._cost / LARGEST_SHARE)
+        # what would be lost next is all since the last one, with the step that comes
+        pause = min(pause, LONGEST_LOSS - self._step_seconds - self._cost)
+        due = clock.monotonic() - self._written_at >= pause
+        return bool(self.state.comm.bcast(due, root=0))
+
+    # ------------------------------------------------------------ writing
+    def write(self) -> None:
+        """Write the state, unless the newest checkpoint is of this step. Collective.
+
+        Raises
+        ------
+        OSError
+            On rank 0, if it cannot be written (disk full); the one before still counts.
+        """
+        if self.state.number == self._number:
+            return
+        start = clock.monotonic()
+        arrays = gather_state(self.state)
+        if arrays is not None and self._mesh is not None:
+            state = self.state
+            write_checkpoint(
+                self.folder,
+                Checkpoint(
+                    state.time,
+                    state.number,
+                    self.scene_text,
+                    self._versions,
+                    dict(state.loading.values),
+                    dict(state.numbers),
+                    list(state.functions()),
+                    {f"function/{name}": values for name, values in arrays.items()} | self._mesh,
+                ),
+            )
+        self._number, self._written_at = self.state.number, clock.monotonic()
+        self._cost = self._written_at - start
+
+
+def mesh_arrays(domain: Domain) -> dict[str, Array] | None:
+    """The mesh by the input's numbering, on rank 0. Collective."""
+    points, elements = domain.gather_mesh()
+    return None if points is None or elements is None else {"points": points, "elements": elements}
+
+
+def gather_state(state: State) -> dict[str, Array] | None:
+    """Every function of a state by name, (elements, values of one) in input order, on rank 0. Collective.
+
+    The values of an element stand in the element's own order, which no partition changes.
+    """
+    domain, gathered = state.loading.domain, {}
+    for name, function in state.functions().items():
+        places = _places(function)
+        gathered[name] = domain.gather_elements(function.x.array[places])
+    return gathered if domain.comm.rank == 0 else None  # type: ignore[return-value]
+
+
+def restore_state(state: State, checkpoint: Checkpoint | None) -> None:
+    """Bring a state to a checkpoint. Collective.
+
+    Parameters
+    ----------
+    state
+        Of the same scene, on any number of ranks.
+    checkpoint
+        On rank 0; elsewhere it is not looked at.
+
+    Raises
+    ------
+    CheckpointError
+        If it does not belong to this mesh or to these functions; on all ranks, and nothing has changed.
+    """
+    domain, comm = state.loading.domain, state.comm
+    mesh = mesh_arrays(domain)
+    fault = None
+    if comm.rank == 0:
+        assert checkpoint is not None and mesh is not None
+        fault = _fault(state, domain, checkpoint, mesh)
+    fault = comm.bcast(fault, root=0)
+    if fault is not None:
+        raise CheckpointError(fault)
+    for name, function in state.functions().items():
+        values = None if checkpoint is None or comm.rank else checkpoint.arrays[f"function/{name}"]
+        function.x.array[_places(function)] = domain.scatter_elements(values)
+    told = None if checkpoint is None or comm.rank else (checkpoint.loads, checkpoint.time, checkpoint.number)
+    numbers = None if checkpoint is None or comm.rank else checkpoint.numbers
+    loads, state.time, state.number = comm.bcast(told, root=0)
+    state.numbers = comm.bcast(numbers, root=0)
+    state.loading.set(loads)
+
+
+def _fault(state: State, domain: Domain, checkpoint: Checkpoint, mesh: dict[str, Array]) -> str | None:
+    """Why the checkpoint is not one of this state."""
+    here, there = list(state.functions()), checkpoint.functions
+    if here != there:
+        return f"the checkpoint has the functions {', '.join(there)}, this run has {', '.join(here)}"
+    if set(checkpoint.loads) != set(state.loading.values):
+        return f"the checkpoint has the loads {sorted(checkpoint.loads)}, this run has {sorted(state.loading.values)}"
+    points, elements = checkpoint.arrays["points"], checkpoint.arrays["elements"]
+    same = points.shape == mesh["points"].shape and np.array_equal(elements, mesh["elements"])
+    if not same or not np.allclose(points, mesh["points"], rtol=0.0, atol=1e-9 * domain.size):
+        return "the checkpoint has another mesh: perhaps Gmsh is of another version, run.log says which it was"
+    return None
+
+
+def _places(function: object) -> Array:
+    """Where the values of each local element stand in the function's array, (elements, values of one)."""
+    space = function.function_space  # type: ignore[attr-defined]
+    dofs, size = np.asarray(space.dofmap.list, dtype=np.int64), space.dofmap.bs
+    return (dofs[..., None] * size + np.arange(size)).reshape(len(dofs), -1)

@@ -1,0 +1,164 @@
+"""Checkpoints as files: numpy's .npz with a JSON header, in two generations, and the pointer that names them.
+
+The pointer, checkpoint.json, is written last: what it names is whole. It holds the check sum of each generation, the
+newest first; a file that does not fit is damaged, and the one before counts. This needs numpy alone.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import logging
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from remodel_fenicsx.results.whole_file import write_whole
+
+log = logging.getLogger(__name__)
+Array = NDArray[Any]
+
+POINTER, FORMAT = "checkpoint.json", 1
+GENERATIONS = ("checkpoint-a.npz", "checkpoint-b.npz")
+_HEADER = "header"  # name of the array that holds the JSON
+
+
+class CheckpointError(ValueError):
+    """A checkpoint is damaged or does not belong to the run; one line."""
+
+
+@dataclass(frozen=True)
+class Generation:
+    """What the pointer says of a checkpoint."""
+
+    file: str
+    number: int
+    time: float
+    sha256: str
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A state by the input mesh's numbering.
+
+    Attributes
+    ----------
+    time, number
+        Time of the last committed step, and how many there were.
+    scene
+        The scene as run (TOML).
+    versions
+        Versions of package and libraries.
+    loads, numbers
+        As the state has them.
+    functions
+        Names of the state's functions.
+    arrays
+        ``function/NAME``: the values of a function, (elements, values of one); ``points``, ``elements``: the mesh.
+    """
+
+    time: float
+    number: int
+    scene: str
+    versions: dict[str, str]
+    loads: dict[str, float]
+    numbers: dict[str, float]
+    functions: list[str]
+    arrays: dict[str, Array]
+
+
+def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
+    """Write a checkpoint over the older generation, then the pointer.
+
+    Raises
+    ------
+    OSError
+        If it cannot be written (disk full); the newest one before it still counts.
+    """
+    header = {name: value for name, value in vars(checkpoint).items() if name != "arrays"} | {"format": FORMAT}
+    text = np.frombuffer(json.dumps(header, allow_nan=False).encode(), dtype=np.uint8)
+    whole = io.BytesIO()
+    np.savez(whole, **{_HEADER: text}, **checkpoint.arrays)  # type: ignore[arg-type]
+    data = whole.getvalue()
+    try:
+        newest = read_pointer(folder)[:1]
+    except CheckpointError:  # whoever resumed has been told
+        newest = []
+    file = next(name for name in GENERATIONS if name not in [one.file for one in newest])
+    write_whole(folder / file, data)
+    generation = Generation(file, checkpoint.number, checkpoint.time, hashlib.sha256(data).hexdigest())
+    pointer = {"format": FORMAT, "generations": [asdict(one) for one in (generation, *newest)]}
+    write_whole(folder / POINTER, (json.dumps(pointer, indent=1) + "\n").encode())
+
+
+def read_pointer(folder: Path) -> list[Generation]:
+    """What checkpoint.json names, the newest first; nothing if there is none.
+
+    Raises
+    ------
+    CheckpointError
+        If it is damaged or of another kind.
+    OSError
+        If it cannot be read.
+    """
+    path = folder / POINTER
+    try:
+        pointer = json.loads(path.read_bytes())
+        if pointer["format"] > FORMAT:
+            raise CheckpointError(f"{path}: was written by a newer version")
+        generations = [Generation(**one) for one in pointer["generations"]]
+        good = all(
+            one.file in GENERATIONS and type(one.number) is int and one.number >= 0
+            and type(one.time) is float and math.isfinite(one.time) and isinstance(one.sha256, str)
+            for one in generations
+        )  # fmt: skip
+    except FileNotFoundError:
+        return []
+    except CheckpointError:
+        raise
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise CheckpointError(f"{path}: is damaged or of another kind") from error
+    if not good or not generations:
+        raise CheckpointError(f"{path}: is damaged or of another kind")
+    return generations
+
+
+def read_checkpoint(folder: Path) -> Checkpoint | None:
+    """The newest checkpoint that is whole, with a warning where it is not the newest; None where there never was one.
+
+    Raises
+    ------
+    CheckpointError
+        If none is whole.
+    OSError
+        If one cannot be read.
+    """
+    generations = read_pointer(folder)
+    for generation in generations:
+        try:
+            return _read(folder / generation.file, generation)
+        except CheckpointError as error:
+            log.warning("%s", error)
+    if generations:
+        remedy = "without its files checkpoint* the run starts again at t = 0"
+        raise CheckpointError(f"{folder}: has no checkpoint that is whole; {remedy}")
+    return None
+
+
+def _read(path: Path, generation: Generation) -> Checkpoint:
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        raise CheckpointError(f"{path}: is missing") from None
+    if hashlib.sha256(data).hexdigest() != generation.sha256:
+        raise CheckpointError(f"{path}: is damaged: it is not the file that {POINTER} names")
+    with np.load(io.BytesIO(data), allow_pickle=False) as file:
+        arrays = {name: file[name] for name in file.files if name != _HEADER}
+        header: Mapping[str, Any] = json.loads(file[_HEADER].tobytes())
+    return Checkpoint(**{name: value for name, value in header.items() if name != "format"}, arrays=arrays)
