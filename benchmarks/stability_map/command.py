@@ -24,6 +24,7 @@ def main(description: str | None, arguments: list[str] | None = None) -> int:
     parser.add_argument("--only", action="append", default=[], metavar="TEXT", help="only cases whose key contains it")
     parser.add_argument("--reduced", action="store_true", help="only the cases of the test")
     parser.add_argument("--again", action="store_true", help="run also what has been measured")
+    parser.add_argument("--judge", action="store_true", help="only what has been measured with any reference before")
     parser.add_argument("--list", action="store_true", help="print the cases, run nothing")
     parser.add_argument(
         "--jobs", type=int, default=os.cpu_count() or 1, metavar="N", help="cases at a time (all cores)"
@@ -45,6 +46,9 @@ def main(description: str | None, arguments: list[str] | None = None) -> int:
     source = source_of(checkout)
     file = options.results / f"{source.partition('+')[0]}.jsonl"
     done = {} if options.again else measured(file, source, cases, options.limit)
+    if options.judge:
+        known = {record["key"] for record in report.read_records(file) if record["source"] == source}
+        cases = {key: case for key, case in cases.items() if key in known}
     missing = spread([key for key in cases if key not in done], cases)
     print(f"{source}: {len(cases)} cases, {len(missing)} to run with {options.jobs} processes; {file}", file=sys.stderr)
     done |= run(missing, checkout, source, file, options)

@@ -25,7 +25,7 @@ import numpy as np
 import tomlkit
 
 MESH_MODULES = ("remodel_fenicsx.body", "remodel_fenicsx.geometry")  # of this version, of 0.1.0
-UNKNOWN = re.compile(r"unknown key|allowed are|has no such")  # another version's words for what it does not have
+UNKNOWN = re.compile(r"unknown key|allowed (is|are)\b|has no such")  # another version's words for what it does not have
 WANTED_FIELDS = ("deformation_gradient", "cauchy_stress", "cell_dimensions", "axis_1", "axis_2", "axis_3")
 
 
