@@ -841,3 +841,11 @@ def test_every_key_is_described():
             else:
                 assert field.description is not None and field.description.endswith("."), (key, name)
                 assert f"| `{name}` |" in page
+
+
+def test_a_law_that_shares_of_passes_make_slower_is_said() -> None:
+    relaxed = {"coupling": "relaxed"}
+    (line,) = scene_from_dict(CUBE | {"remodeling": relaxed | {"law": "rate"}}).warnings()
+    assert "remodel at about 0.5 times the speed" in line and "'rate'" in line
+    for quiet in (relaxed | {"law": "explicit"}, relaxed | {"law": "none"}, {"law": "rate"}):
+        assert scene_from_dict(CUBE | {"remodeling": quiet}).warnings() == []

@@ -168,6 +168,8 @@ class Signs:
         for _ in range(FIRST_INVERSE_ITERATIONS if first else 1):
             factorisation.apply(self._vector, image)
             size = image.norm()
+            if size == 0.0:  # supports and loads leave nothing free
+                break
             curvature = image.dot(self._vector) / size**2
             if not np.isfinite(curvature):
                 break

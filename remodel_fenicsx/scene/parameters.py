@@ -30,6 +30,7 @@ COUPLINGS = {
     "before; then solve: of second order, for the law 'tensor'",
 }
 """What each of `evolution.coupling.COUPLINGS` does; that room is above this one, and a test holds the two together."""
+OF_SHARES = ("relaxed",)
 FOR_LAWS_WITH_A_TARGET = ("extrapolated",)
 STRESS_UNITS = {"Pa": 1.0, "kPa": 1.0e3, "MPa": 1.0e6}  # in Pa
 INITIAL_CELLS = ("random", "isotropic", "aligned")
@@ -244,6 +245,16 @@ class Remodeling(Table):
         description="Time of the law 'rotation': a small angle between fibre and tension fades like "
         "exp(-t / rotation_time).",
     )
+
+    def warnings(self) -> list[str]:
+        """A line on a law that a share of each pass makes slower."""
+        law, share = LAWS[self.law], self.relaxation_factor
+        if self.coupling not in OF_SHARES or share == 1 or not law.remodels or law.of_absolute_time:
+            return []
+        return [
+            f"remodeling.coupling = {self.coupling!r} makes a share of {share:g} of each pass, and the law "
+            f"{self.law!r} does not make up for the rest: cells remodel at about {share:g} times the speed"
+        ]
 
     @model_validator(mode="after")
     def _coupling_fits_the_law(self) -> Remodeling:

@@ -139,7 +139,7 @@ class Scene(Table):
     def warnings(self) -> list[str]:
         """What is allowed but hardly meant, each on one line."""
         under = {} if self.preset is None else PRESETS[self.preset][self.geometry.name].get("material", {})
-        return self.material.warnings(base_material(under))
+        return self.material.warnings(base_material(under)) + self.remodeling.warnings()
 
     def with_values(self, changes: Mapping[str, Any]) -> Scene:
         """A validated copy with other values by dotted key: ``scene.with_values({"loads.pressure.value": 2.4})``.

@@ -85,6 +85,9 @@ class Law:
         Whether the cells tend to a limit under a constant drive that does not depend on the way there.
     remodels
         False where cells never change: then there is no pass at all.
+    of_absolute_time
+        Whether a pass makes up for what the ones before have left out. The cells of other laws change by steps: those
+        that make a share of each are slower.
     target, follow
         Of laws whose cells tend to a tensor: ``target(drive)`` and ``follow(cells, target, r0, kappa dt)``, of which
         `update` is made. A scheme of second order needs them apart.
@@ -95,6 +98,7 @@ class Law:
     update: Callable[[UnitCell, Drive, float, float], UnitCell]
     has_limit: bool = False
     remodels: bool = True
+    of_absolute_time: bool = False
     target: Callable[[Drive], tensor_law.Target] | None = None
     follow: Callable[[UnitCell, tensor_law.Target, Array | float, float], UnitCell] | None = None
     share: Callable[[UnitCell, UnitCell, float], UnitCell] = relaxed
@@ -103,7 +107,7 @@ class Law:
 RankedFunction = Callable[[Array, Array, Array, float, float, float], Array]
 
 
-def ranked(function: RankedFunction, has_limit: bool = False) -> Law:
+def ranked(function: RankedFunction, has_limit: bool = False, of_absolute_time: bool = False) -> Law:
     """A law of the paper's kind: axes at the drive's principal directions, dimensions by rank from `function`.
 
     Parameters
@@ -112,7 +116,7 @@ def ranked(function: RankedFunction, has_limit: bool = False) -> Law:
         ``function(l, l0, target, kappa, time_old, time_new) -> l_new`` with l and l0 (n, 3) by rank (column 0: largest
         principal value; with the pairing "continuous" by axis instead), target = r0 e, e = lambda^+ / |lambda^+|.
         Points without a positive value keep their cells.
-    has_limit
+    has_limit, of_absolute_time
         As in `Law`.
     """
 
@@ -127,7 +131,7 @@ def ranked(function: RankedFunction, has_limit: bool = False) -> Law:
             np.where(active[:, None, None], axes, cells.axes),
         )
 
-    return Law(update, has_limit)
+    return Law(update, has_limit, of_absolute_time=of_absolute_time)
 
 
 def _principal(drive: Drive, previous: Array, pairing: spectral.Pairing) -> tuple[Array, Array]:
@@ -269,7 +273,7 @@ def tensor(cells: UnitCell, drive: Drive, time_old: float, time_new: float) -> U
 
 
 LAWS: dict[str, Law] = {
-    "explicit": ranked(explicit, has_limit=True),
+    "explicit": ranked(explicit, has_limit=True, of_absolute_time=True),
     "rate": ranked(rate),
     "relaxation": ranked(relaxation, has_limit=True),
     "tensor": Law(tensor, has_limit=True, target=tensor_target, follow=follow_tensor),
