@@ -68,10 +68,22 @@ def test_second_derivative_against_central_differences() -> None:
     _, second = repulsion.log_derivatives(C, A)
     assert second is not None
     number = (repulsion.log_derivatives(C + h * H, A)[0] - repulsion.log_derivatives(C - h * H, A)[0]) / (2 * h)
-    found = np.einsum("nijkl,nkl->nij", second, H)
+    found = from_mandel(np.einsum("nab,nb->na", second, to_mandel(H)))
     error = np.abs(found - number).max(axis=(1, 2)) / np.abs(number).max(axis=(1, 2))
     assert np.median(error) < 1e-8 and error.max() < 1e-7
-    np.testing.assert_allclose(second, np.einsum("nijkl->nklij", second), atol=1e-12 * np.abs(second).max())
+    np.testing.assert_allclose(second, np.swapaxes(second, 1, 2), atol=1e-12 * np.abs(second).max())
+
+
+def to_mandel(tensors: Array) -> Array:
+    root = np.sqrt([1, 1, 1, 2, 2, 2])
+    return root * np.stack([tensors[:, i, j] for i, j in logarithm.MANDEL], axis=1)
+
+
+def from_mandel(vectors: Array) -> Array:
+    tensors = np.empty((len(vectors), 3, 3))
+    for number, (i, j) in enumerate(logarithm.MANDEL):
+        tensors[:, i, j] = tensors[:, j, i] = vectors[:, number] / np.sqrt(1 if i == j else 2)
+    return tensors
 
 
 def test_series_and_quotient_meet() -> None:

@@ -13,6 +13,7 @@ from remodel_fenicsx.evolution.state import State
 from remodel_fenicsx.fem import coefficients, jit
 from remodel_fenicsx.tissue.cells import UnitCell
 from remodel_fenicsx.tissue.energy import Tissue
+from remodel_fenicsx.tissue.logarithm import MANDEL
 from remodel_fenicsx.tissue.repulsion import whole_structure_tensor
 
 Array = NDArray[np.float64]
@@ -36,13 +37,13 @@ class PointwiseRepulsion:
     Attributes
     ----------
     stress, stiffness
-        S (3, 3) and 2 dS/dC (3, 3, 3, 3), dolfinx functions.
+        S (3, 3), and 2 dS/dC as a Mandel matrix (6, 6), dolfinx functions.
     """
 
     def __init__(self, state: State, tissue: Tissue, shares: Shares):
         self.quadrature, self.tissue, self.shares = state.cells.quadrature, tissue, shares
         self.stress = self.quadrature.function("repulsion_stress", (3, 3))
-        self.stiffness = self.quadrature.function("repulsion_stiffness", (3, 3, 3, 3))
+        self.stiffness = self.quadrature.function("repulsion_stiffness", (6, 6))
         F = state.kinematics.deformation_gradient(state.unknown)
         self._expression = jit.expression(F, self.quadrature.points)
 
@@ -60,8 +61,8 @@ class PointwiseRepulsion:
         # W_rep = -c g(r0)/2 M: S = 2 dW/dC and 2 dS/dC = 4 d2W/dC2
         self.quadrature.values(self.stress, (3, 3))[:] = (-modulus[:, None, None] * first).reshape(*shape, 3, 3)
         if second is not None:
-            values = self.quadrature.values(self.stiffness, (3, 3, 3, 3))
-            values[:] = (-2 * modulus[:, None, None, None, None] * second).reshape(*shape, 3, 3, 3, 3)
+            values = self.quadrature.values(self.stiffness, (6, 6))
+            values[:] = (-2 * modulus[:, None, None] * second).reshape(*shape, 6, 6)
 
     def energy(self) -> float:
         """Its part of the stored energy, over all ranks."""
@@ -80,13 +81,18 @@ class PointwiseRepulsion:
         variation, increment = ufl.derivative(F, u, test), ufl.derivative(F, u, trial)
         geometric = ufl.inner(ufl.dot(increment, self.stress), variation)
         strains = [ufl.sym(ufl.dot(ufl.transpose(F), direction)) for direction in (increment, variation)]
-        i, j, k, l = ufl.indices(4)
-        return geometric + strains[1][i, j] * self.stiffness[i, j, k, l] * strains[0][k, l]
+        along, across = (mandel_vector(strain) for strain in strains)
+        return geometric + ufl.inner(ufl.dot(self.stiffness, along), across)
 
     def _modulus(self) -> Array:
         points = self.tissue.map(lambda name, value: coefficients.point_values(value, self.quadrature).reshape(-1))
         modulus: Array = points.repulsion_modulus
         return modulus
+
+
+def mandel_vector(tensor: Any) -> Any:
+    """Six Mandel components of a symmetric UFL tensor."""
+    return ufl.as_vector([tensor[i, j] if i == j else np.sqrt(2.0) * tensor[i, j] for i, j in MANDEL])
 
 
 def pointwise_repulsion(state: State, tissue: Tissue, shares: Shares | None = None) -> PointwiseRepulsion | None:

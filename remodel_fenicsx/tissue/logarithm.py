@@ -18,6 +18,9 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+MANDEL = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
+"""Entries of a symmetric tensor in the order of its six Mandel components; those off the diagonal times sqrt(2)."""
+
 CLOSE = 1e-3
 """Relative distance of three eigenvalues below which a series stands for a quotient of differences: the quotient loses
 eps / CLOSE, the series CLOSE^5."""
@@ -34,22 +37,29 @@ def first_divided_difference(a: Array, b: Array) -> Array:
 
 def second_divided_difference(a: Array, b: Array, c: Array) -> Array:
     """f[a, b, c] of positive numbers; -1/(2 a^2) where they agree."""
-    ordered = np.sort(np.stack(np.broadcast_arrays(a, b, c), axis=-1), axis=-1)
-    least, middle, largest = (ordered[..., i] for i in range(3))
-    mean = (least + middle + largest) / 3
+    least, middle, largest = np.moveaxis(np.sort(np.stack(np.broadcast_arrays(a, b, c), axis=-1), axis=-1), -1, 0)
+    first, last = first_divided_difference(middle, least), first_divided_difference(largest, middle)
+    return _second_of_ordered(least, middle, largest, first, last)
+
+
+def _second_of_ordered(least: Array, middle: Array, largest: Array, first: Array, last: Array) -> Array:
+    """f[a, b, c] of ascending numbers, from f[a, b] and f[b, c]."""
     gap = largest - least
-    close = gap < CLOSE * mean
-    difference = first_divided_difference(largest, middle) - first_divided_difference(middle, least)
-    quotient = difference / np.where(close, 1.0, gap)
-    # Taylor: sum_n f^(n)(mean)/n! h_(n-2)(deviations), f^(n)/n! = (-1)^(n-1)/(n mean^n); h_1 = 0 about the mean
-    relative = (ordered - mean[..., None]) / mean[..., None]
-    p2, p3 = (relative**2).sum(-1), (relative**3).sum(-1)
-    series = -(1 / 2 + p2 / 8 - p3 / 15 + p2**2 / 48 + (relative**4).sum(-1) / 24) / mean**2
-    return np.where(close, series, quotient)
+    close = gap < CLOSE * largest
+    result: Array = (last - first) / np.where(close, 1.0, gap)
+    at = np.nonzero(close)
+    if at[0].size:
+        # Taylor: sum_n f^(n)(mean)/n! h_(n-2)(deviations), f^(n)/n! = (-1)^(n-1)/(n mean^n); h_1 = 0 about the mean
+        three = np.stack([least[at], middle[at], largest[at]])
+        mean = three.mean(axis=0)
+        relative = three / mean - 1
+        p2, p3, p4 = ((relative**power).sum(axis=0) for power in (2, 3, 4))
+        result[at] = -(1 / 2 + p2 / 8 - p3 / 15 + p2**2 / 48 + p4 / 24) / mean**2
+    return result
 
 
 def eigen(tensors: Array) -> tuple[Array, Array]:
-    """Eigenvalues (n, 3) and eigenvectors as columns (n, 3, 3) of symmetric tensors (n, 3, 3)."""
+    """Eigenvalues (n, 3), ascending, and eigenvectors as columns (n, 3, 3) of symmetric tensors (n, 3, 3)."""
     values, vectors = np.linalg.eigh(tensors)
     return values, vectors
 
@@ -71,23 +81,42 @@ def derivative(values: Array, components: Array) -> Array:
 
 
 def second_derivative(values: Array, components: Array) -> Array:
-    """T of D^2 ln(C)[A, H]_ij = T_ijpq H_pq in the eigenbasis of C, with all symmetries, (n, 3, 3, 3, 3)."""
+    """Mandel matrix (n, 6, 6) of H -> D^2 ln(C)[A, H] in the eigenbasis of C; symmetric."""
     quotients = _all_second_differences(values)
-    scaled = quotients * components[:, :, :, None]  # f[c_i, c_k, c_j] A_ik, j last
-    whole = np.zeros((len(values), 3, 3, 3, 3))
-    for j in range(3):
-        whole[:, :, j, :, j] += scaled[..., j]  # A_ik H_kj: p = k, q = j
-        whole[:, j, :, j, :] += scaled[..., j]  # H_ik A_kj: p = i, q = k; symmetric in the other two
-    return (whole + np.swapaxes(whole, -1, -2)) / 2
+    result = np.zeros((len(values), 6, 6))
+    for row, (i, j) in enumerate(MANDEL):
+        for column, (p, q) in enumerate(MANDEL):
+            if {i, j} & {p, q} and column >= row:
+                term = sum(_entry(quotients, components, i, j, *pair) for pair in ((p, q), (q, p)))
+                weight = (1 if i == j else np.sqrt(2)) * (1 if p == q else np.sqrt(2)) / 2
+                result[:, row, column] = result[:, column, row] = weight * term
+    return result
+
+
+def _entry(quotients: Array, components: Array, i: int, j: int, p: int, q: int) -> Array | float:
+    """sum_k f[i, k, j] (A_ik H_kj + H_ik A_kj) for H = e_p e_q."""
+    first = quotients[:, i, p, j] * components[:, i, p] if q == j else 0.0
+    other = quotients[:, i, q, j] * components[:, q, j] if p == i else 0.0
+    return first + other
+
+
+def mandel_rotation(vectors: Array) -> Array:
+    """Matrix (n, 6, 6) that takes a symmetric tensor's Mandel components in the basis of columns to the global ones."""
+    result = np.empty((len(vectors), 6, 6))
+    for row, (i, j) in enumerate(MANDEL):
+        for column, (a, b) in enumerate(MANDEL):
+            product = vectors[:, i, a] * vectors[:, j, b] + vectors[:, i, b] * vectors[:, j, a]
+            weight = (1 if i == j else np.sqrt(2)) * (1 if a == b else np.sqrt(2)) / 2
+            result[:, row, column] = weight * product
+    return result
 
 
 def _all_second_differences(values: Array) -> Array:
-    """f[c_i, c_j, c_k], (n, 3, 3, 3): ten different numbers."""
-    triples = list(itertools.combinations_with_replacement(range(3), 3))
-    columns = np.array(triples).T
-    different = second_divided_difference(*(values[:, column] for column in columns))
+    """f[c_i, c_j, c_k] of ascending values, (n, 3, 3, 3): ten different numbers."""
     result = np.empty((len(values), 3, 3, 3))
-    for number, triple in enumerate(triples):
-        for i, j, k in set(itertools.permutations(triple)):
-            result[:, i, j, k] = different[:, number]
+    pairs = {(i, j): first_divided_difference(values[:, j], values[:, i]) for i in range(3) for j in range(i, 3)}
+    for i, j, k in itertools.combinations_with_replacement(range(3), 3):
+        number = _second_of_ordered(values[:, i], values[:, j], values[:, k], pairs[i, j], pairs[j, k])
+        for one, two, three in set(itertools.permutations((i, j, k))):
+            result[:, one, two, three] = number
     return result

@@ -59,21 +59,15 @@ def whole_structure_tensor(cells: Sequence[UnitCell]) -> Array:
 
 
 def log_derivatives(C: Array, A: Array, second: bool = True) -> tuple[Array, Array | None]:
-    """dM/dC (n, 3, 3) and d^2M/dC^2 (n, 3, 3, 3, 3) of M = A : ln C, the second on request."""
+    """dM/dC (n, 3, 3) and d^2M/dC^2 as Mandel matrices (n, 6, 6) of M = A : ln C, the second on request."""
     values, vectors = logarithm.eigen(C)
     components = logarithm.rotated(A, vectors)
     back = np.swapaxes(vectors, -1, -2)
     first = logarithm.rotated(logarithm.derivative(values, components), back)
     if not second:
         return first, None
-    return first, rotated_tensor(logarithm.second_derivative(values, components), vectors)
-
-
-def rotated_tensor(tensor: Array, vectors: Array) -> Array:
-    """T_ijpq in the basis of the columns of `vectors` (n, 3, 3), as components in the global basis."""
-    number = len(tensor)
-    pair = np.einsum("nia,njb->nijab", vectors, vectors).reshape(number, 9, 9)
-    return (pair @ tensor.reshape(number, 9, 9) @ np.swapaxes(pair, 1, 2)).reshape(number, 3, 3, 3, 3)
+    rotation = logarithm.mandel_rotation(vectors)
+    return first, rotation @ logarithm.second_derivative(values, components) @ np.swapaxes(rotation, 1, 2)
 
 
 @dataclass(frozen=True)
@@ -85,7 +79,8 @@ class Repulsion:
     sum
         M from (F, cells, r0): arrays, and UFL too where there are no `derivatives`.
     derivatives
-        Where M is no closed expression for UFL: dM/dC and, on request, d^2M/dC^2 from (C, A, second), arrays.
+        Where M is no closed expression for UFL: dM/dC and, on request, d^2M/dC^2 as Mandel matrices from (C, A,
+        second), arrays.
     """
 
     sum: Callable[[Any, Sequence[UnitCell], Any], Any]
