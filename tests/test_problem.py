@@ -206,6 +206,25 @@ def test_one_oversized_step_ends_on_the_branch_or_where_it_began(line_search: st
         np.testing.assert_allclose(made.displacement.x.array, small_steps, atol=1e-9)
 
 
+def test_a_step_is_shortened_for_where_it_ends() -> None:
+    """SNES subtracts a step: the one that would crush the body is halved, its opposite is not."""
+    made = held_cube()
+    problem = made.problem(parts.TIGHT)
+    newton = problem.newton
+    x, step = newton._x, newton._x.duplicate()
+    lift = np.zeros_like(made.nodes)
+    lift[:, 2] = 1.2 * made.nodes[:, 2]  # of the height: down by it the body is turned inside out
+    for sign, shortened in ((1.0, True), (-0.2, False)):
+        made.set_displacement(0 * lift)
+        newton._pull(x)
+        newton._assemble_residual(None, x, newton._residual)
+        step.array[:] = sign * lift.ravel()
+        assert newton._keep_admissible(x, step) is shortened
+        newton._push(x - step)
+        assert problem.extension().admissible
+        assert np.abs(step.array).max() == pytest.approx(0.6 if shortened else 0.24)
+
+
 def stretched_bar(stretch: float) -> parts.Body:
     """A cube free to contract, its chains along the load, stretched this far along z."""
     made = parts.body(cube(refinement=2), Cells(initial="aligned"))

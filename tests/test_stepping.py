@@ -140,6 +140,21 @@ def test_each_part_of_the_exchange_leaves_a_reserve_at_every_point(
         assert reserve[0] < 0.2 + 1e-6  # the bound decides, not a failed solve
 
 
+def test_the_bound_of_a_part_is_where_the_first_point_has_lost_its_share() -> None:
+    """From any fraction, at the present unknowns: a fifth of 1 - r/L is left at one point, more elsewhere."""
+    _, stepper = loaded_and_remodeled("cauchy", "material", 60.0)
+    blend: Any = stepper.coupling.blend  # type: ignore[attr-defined]
+
+    def left(theta: float) -> np.ndarray:
+        blend.set(theta)
+        return 1 - np.sqrt(blend.equilibrium.limit_values()[0]) / parts.MATERIAL.contour_length
+
+    first = blend.largest_part(0.0)
+    for done in (0.0, first / 2):
+        before = left(done)
+        assert np.min(left(done + blend.largest_part(done)) / before) == pytest.approx(0.2, abs=1e-9)
+
+
 # ---------------------------------------------------------------- failures
 def small_tube(load_values: Any, **solver: Any) -> tuple[parts.Body, Stepper]:
     """A short artery with random cells."""
