@@ -207,22 +207,22 @@ def test_one_oversized_step_ends_on_the_branch_or_where_it_began(line_search: st
 
 
 def test_a_step_is_shortened_for_where_it_ends() -> None:
-    """SNES subtracts a step: the one that would crush the body is halved, its opposite is not."""
+    """SNES subtracts a step: one that would stretch chains beyond L is halved, its opposite is not."""
     made = held_cube()
     problem = made.problem(parts.TIGHT)
     newton = problem.newton
     x, step = newton._x, newton._x.duplicate()
     lift = np.zeros_like(made.nodes)
-    lift[:, 2] = 1.2 * made.nodes[:, 2]  # of the height: down by it the body is turned inside out
-    for sign, shortened in ((1.0, True), (-0.2, False)):
+    lift[:, 2] = 0.9 * made.nodes[:, 2]  # of the height
+    for sign, shortened in ((-1.0, True), (1.0, False)):
         made.set_displacement(0 * lift)
         newton._pull(x)
         newton._assemble_residual(None, x, newton._residual)
         step.array[:] = sign * lift.ravel()
         assert newton._keep_admissible(x, step) is shortened
+        assert np.abs(step.array).max() == pytest.approx(0.45 if shortened else 0.9)
         newton._push(x - step)
         assert problem.extension().admissible
-        assert np.abs(step.array).max() == pytest.approx(0.6 if shortened else 0.24)
 
 
 def stretched_bar(stretch: float) -> parts.Body:
