@@ -102,6 +102,26 @@ def test_the_tangent_is_the_derivative_of_the_residual() -> None:
         np.testing.assert_allclose(orders, 2.0, atol=0.1)
 
 
+def test_the_ends_of_a_blend_are_the_plain_model() -> None:
+    """With the share 1 the new cells alone, with 0 those of the last equilibrium."""
+    simulation = short_tube(3.0)
+    run(simulation)
+    coupling: Any = simulation.stepper.coupling
+    blend, plain, cells = coupling.blend, coupling.equilibrium, simulation.cells
+    forces = [simulation.unknown.x.petsc_vec.duplicate() for _ in range(2)]
+
+    def difference(share: float) -> float:
+        blend.set(share)
+        for equilibrium, force in zip((blend.equilibrium, plain), forces, strict=True):
+            equilibrium.assemble_internal(force)
+        return float(np.abs(forces[0].array - forces[1].array).max())
+
+    assert difference(1.0) < 1e-12 < difference(0.0)
+    old = simulation.state.equilibrium_cells
+    cells.set(old.dimension_values, old.axis_values)
+    assert difference(0.0) < 1e-12
+
+
 def test_the_driving_stress_is_that_of_the_energy() -> None:
     """The pass sees the repulsion too: unloaded, with any A, no stress."""
     simulation = short_tube(1.0)
