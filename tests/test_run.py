@@ -307,7 +307,7 @@ def test_an_exception_in_a_script_on_two_ranks_ends_both(kind: str, tmp_path: Pa
     program = tmp_path / "program.py"
     program.write_text(
         "from remodel_fenicsx.scene.scene import preset_scene\n"
-        "from remodel_fenicsx.simulation import run\n"
+        "from remodel_fenicsx.running import run\n"
         f"run(preset_scene('kuhl-holzapfel-2007', 'cube'), {str(tmp_path / 'file' / 'below')!r})\n"
     )
     words = [str(program)] if kind == "script" else [str(PROJECT / "demos" / "cube.py"), "2", str(tmp_path)]
