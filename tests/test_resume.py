@@ -19,15 +19,20 @@ import pytest
 from mpi4py import MPI
 
 from remodel_fenicsx import Recording, Scene, SceneError, Simulation
+from remodel_fenicsx.body.domain import Domain
+from remodel_fenicsx.evolution import chatter, monitor
+from remodel_fenicsx.evolution.chatter import Chatter
+from remodel_fenicsx.evolution.coupling import COUPLINGS, Staggered
+from remodel_fenicsx.evolution.locking import LockingWarning
+from remodel_fenicsx.evolution.monitor import StabilityWatcher
 from remodel_fenicsx.evolution.parts import StepFailure, Work
 from remodel_fenicsx.evolution.state import State
-from remodel_fenicsx.body.domain import Domain
-from remodel_fenicsx.evolution.coupling import COUPLINGS, Staggered
 from remodel_fenicsx.results.checkpoint import Checkpoints, gather_state, restore_state
 from remodel_fenicsx.results.checkpoint_file import Checkpoint, CheckpointError, _read, read_checkpoint, read_pointer
 from remodel_fenicsx.results.recording import RecordingError
 from remodel_fenicsx.results.run_lock import FolderTaken, RunLock, lock_holder
 from remodel_fenicsx.results.status import status
+from remodel_fenicsx.scene import preset_scene
 from remodel_fenicsx.simulation import resume, run
 from remodel_fenicsx.system.interrupts import Paused
 from remodel_fenicsx.tissue.cells import structure_tensor
@@ -431,8 +436,55 @@ def test_what_a_coupling_remembers_is_kept(tmp_path: Path, monkeypatch: pytest.M
     second, first = (_read(tmp_path / "run" / one.file, one) for one in read_pointer(tmp_path / "run"))
     earlier = second.arrays["function/earlier_displacement"]
     np.testing.assert_array_equal(earlier, first.arrays["function/displacement"])
-    assert np.ptp(earlier) > 0 and second.numbers == {"part": 0.125} and second.number == 2
+    assert np.ptp(earlier) > 0 and second.numbers["part"] == 0.125 and second.number == 2
     fails = False
     resume(tmp_path / "run", [], SELF)
     kept = read_checkpoint(tmp_path / "run")
-    assert kept is not None and kept.numbers == {"part": 0.5**5}
+    assert kept is not None and kept.numbers["part"] == 0.5**5
+
+
+# ---------------------------------------------------------------- what is said
+def test_runs_that_go_on_say_what_one_run_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Stopped after every step: nobody has forgotten what was seen, nothing is said twice."""
+    push = {"loads.force.value": -30.0, "loads.force.ramp": [[0.0, 0.0], [3.0, 1.0]], "time.end": 8.0}
+    cube = preset_scene("kuhl-holzapfel-2007", "cube").with_values({**push, "remodeling.kappa": 0.1})
+    monkeypatch.setattr(chatter, "GROWTH", np.inf)  # five passes are warned of, whatever they do
+    monkeypatch.setattr(chatter, "CELL_TOLERANCE", 0.0)
+    monkeypatch.setattr(Chatter, "_advice", lambda watcher, factor: "nothing")
+    monkeypatch.setattr(LockingWarning, "stiffness_ratio", lambda watcher: 1e9)
+    monkeypatch.setattr(LockingWarning, "energy_share", lambda watcher: 1.0)
+    monkeypatch.setattr(monitor, "ITERATIONS_BETWEEN_LOOKS", 9)
+    counts: list[int] = []
+    count = StabilityWatcher._count
+
+    def counted(watcher: StabilityWatcher) -> float:
+        counts.append(watcher.state.number)
+        return count(watcher)
+
+    monkeypatch.setattr(StabilityWatcher, "_count", counted)
+    expected = said(run(cube, tmp_path / "whole", SELF))
+    looks = counts.copy()
+    counts.clear()
+    for words in ("over-corrects", "the elements lock", "the equilibrium is unstable"):
+        assert sum(words in line for line in expected) == (2 if "unstable" in words else 1), expected
+    solve, folder = Staggered.solve, tmp_path / "run"
+
+    def signalled(coupling: Staggered, *arguments: Any) -> Any:
+        signal.raise_signal(signal.SIGUSR1)
+        return solve(coupling, *arguments)
+
+    monkeypatch.setattr(Staggered, "solve", signalled)
+    with pytest.raises(Paused):
+        run(cube, folder, SELF)
+    for _ in range(6):
+        with pytest.raises(Paused):
+            resume(folder, [], SELF)
+    resume(folder, [], SELF)
+    assert rows(folder) == rows(tmp_path / "whole")
+    assert said(folder) == expected and counts == looks
+
+
+def said(folder: Path) -> list[str]:
+    """What the log tells of equilibria and passes, without its clock."""
+    lines = [line.split(" ", 2)[2] for line in (folder / "run.log").read_text().splitlines()]
+    return [line for line in lines if re.match(r"\S+ time \d+:", line)]
