@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
@@ -40,6 +41,7 @@ from tests.conftest import mpirun
 from tests.parts import pulled_cube
 
 END = 9.0
+LOST_AT = 6.0  # when tests/on_two_ranks.py loses one
 SELF = MPI.COMM_SELF
 
 
@@ -285,9 +287,9 @@ def test_fields_that_are_gone_begin_with_the_next_step(half: Path) -> None:
 
 
 # ---------------------------------------------------------------- other numbers of ranks
-def command(*words: str | Path, ranks: int = 1) -> subprocess.CompletedProcess[str]:
+def command(*words: str | Path) -> subprocess.CompletedProcess[str]:
     """remodel-fenicsx WORDS."""
-    line = mpirun(ranks, sys.executable, "-m", "remodel_fenicsx.cli", *map(str, words))
+    line = [sys.executable, "-m", "remodel_fenicsx.cli", *map(str, words)]
     return subprocess.run(line, capture_output=True, text=True, timeout=300)
 
 
@@ -314,13 +316,47 @@ def structure(checkpoint: Checkpoint) -> np.ndarray:
     return structure_tensor(dimensions, checkpoint.arrays["function/cell_axes"].reshape(*shape, 3, 3))
 
 
-def test_it_goes_on_with_another_number_of_ranks(half: Path, whole: Path) -> None:
+@pytest.fixture(scope="module")
+def two_ranks(first_half: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """What tests/on_two_ranks.py makes, and what it says; mpirun ends all when the killed rank is gone."""
+    folder = tmp_path_factory.mktemp("two")
+    shutil.copytree(first_half, folder / "half")
+    line = mpirun(2, sys.executable, str(Path(__file__).with_name("on_two_ranks.py")), str(folder))
+    done = subprocess.run(line, capture_output=True, text=True, timeout=300)
+    assert done.returncode != 0 and (folder / "lost").exists(), done.stderr
+    return folder, done.stderr
+
+
+def test_two_ranks_go_on_to_the_last_bit(two_ranks: tuple[Path, str], whole: Path) -> None:
+    folder, _ = two_ranks
+    assert_same(folder / "resumed", folder / "whole")
+    assert_close(folder / "whole", whole)
+
+
+def test_it_goes_on_with_another_number_of_ranks(two_ranks: tuple[Path, str], tmp_path: Path, whole: Path) -> None:
     """One, then two, then one."""
-    done = command("run", "--resume", half, "--set", "time.end=8.0", "-q", ranks=2)
-    assert done.returncode == 0 and done.stdout == f"results in {half}\n", done.stderr
-    assert rows(half)[:8] == rows(whole)[:8] != rows(half)
+    half = shutil.copytree(two_ranks[0] / "half", tmp_path / "half")
+    assert Recording(half).history["time"][-1] == 8.0
+    assert rows(half)[:8] == rows(whole)[:8] != rows(half)[: len(rows(whole))]
     go_on(half)
     assert_close(half, whole)
+
+
+def test_a_wall_time_that_is_over_is_exit_code_4(two_ranks: tuple[Path, str]) -> None:
+    folder, errors = two_ranks
+    assert json.loads((folder / "codes.json").read_text()) == {"wall time": 4}
+    assert errors.count("remodel-fenicsx: stopped before --max-wall-time is over: all is kept up to time 8; ") == 1
+
+
+def test_a_lost_rank_loses_the_steps_since_the_checkpoint(
+    two_ranks: tuple[Path, str], tmp_path: Path, whole: Path
+) -> None:
+    """The other rank does not go on alone; nobody holds the folder."""
+    lost = shutil.copytree(two_ranks[0] / "lost", tmp_path / "lost")
+    assert read_pointer(lost)[0].time == 4.0 and Recording(lost).history["time"][-1] == LOST_AT - 1
+    assert not lock_holder(lost)[1]
+    resume(lost, [], SELF)
+    assert_close(lost, whole)
 
 
 # ---------------------------------------------------------------- the command
@@ -334,9 +370,8 @@ def test_a_signal_is_exit_code_4_and_one_line_says_how_to_go_on(half: Path, whol
     while clock.monotonic() < deadline and len(rows(half)) < 12:
         clock.sleep(0.02)
         assert process.poll() is None
-    refused = command(*words)
-    line = f"remodel-fenicsx: {half}: process {process.pid} on {socket.gethostname()} writes in it\n"
-    assert (refused.returncode, refused.stderr) == (2, line)
+    with pytest.raises(FolderTaken, match=f"process {process.pid} on {socket.gethostname()} writes in it"):
+        resume(half, [], SELF)
     assert f"running: process {process.pid} on " in "\n".join(status(half))
     os.killpg(process.pid, signal.SIGUSR1)
     errors = process.communicate(timeout=100)[1]
@@ -353,18 +388,12 @@ def test_a_signal_is_exit_code_4_and_one_line_says_how_to_go_on(half: Path, whol
     assert said[3] == f"checkpoint at time {last:g}; it goes on with: remodel-fenicsx run --resume {half}"
 
 
-def test_a_wall_time_that_is_over_is_exit_code_4(half: Path) -> None:
-    done = command("run", "--resume", half, "--set", "time.end=10", "--max-wall-time", "0.1s", ranks=2)
-    assert done.returncode == 4
-    assert done.stderr.count("remodel-fenicsx: stopped before --max-wall-time is over: all is kept up to time 6; ") == 1
-
-
-@pytest.mark.parametrize("name", ["history.csv", "fields.vtkhdf"])
-def test_what_is_damaged_is_said_in_one_line_and_nothing_else(name: str, half: Path) -> None:
-    (half / name).write_bytes(b"")
+def test_what_is_damaged_is_said_in_one_line_and_nothing_else(half: Path) -> None:
+    """HDF5 too stays silent."""
+    (half / "fields.vtkhdf").write_bytes(b"")
     done = command("run", "--resume", half, "--set", "time.end=10")
     assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr.startswith(f"remodel-fenicsx: {half / name}: ") and done.stderr.count("\n") == 1, done.stderr
+    assert done.stderr.startswith(f"remodel-fenicsx: {half}/fields.vtkhdf: ") and done.stderr.count("\n") == 1
 
 
 def test_the_status_of_a_run(half: Path) -> None:
