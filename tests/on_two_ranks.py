@@ -17,7 +17,7 @@ from mpi4py import MPI
 
 from remodel_fenicsx import cli
 from remodel_fenicsx.evolution.coupling import Staggered
-from remodel_fenicsx.simulation import resume, run
+from remodel_fenicsx.running import resume, run
 from tests.test_resume import LOST_AT, scene
 
 
