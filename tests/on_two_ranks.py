@@ -25,7 +25,7 @@ def main(folder: Path) -> None:
     """All of them, the killed one last."""
     comm = MPI.COMM_WORLD
     run(scene(), folder / "whole")
-    run(scene(5.0), folder / "resumed")
+    run(scene(6.0), folder / "resumed")
     resume(folder / "resumed", ["time.end=9.0"])
     resume(folder / "half", ["time.end=8.0"])
     words = ["run", "--resume", str(folder / "half"), "--set", "time.end=10", "-q"]

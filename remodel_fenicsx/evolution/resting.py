@@ -36,7 +36,8 @@ class Resting(Watcher):
         self._cells = Earlier(self.state, "resting_cells", lambda: self.quadrature.function("", (3, 3)), 2)
         self._moved = Earlier(self.state, "resting_moved", lambda: self.quadrature.function("", ()), 1)
         self._numbers = Numbers(self.state, "resting", {"said": 0})
-        self._squares: Array = np.zeros(self.quadrature.shape)  # of the last pass: |change of A|^2 where it was made up for
+        # of the last pass: |change of A|^2 where it was made up for
+        self._squares: Array = np.zeros(self.quadrature.shape)
 
     def started(self, step: Step) -> None:
         """No pass yet."""
