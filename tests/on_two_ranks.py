@@ -1,7 +1,7 @@
 """Runs on this process group that tests/test_resume.py looks at: mpirun -n 2 python3 on_two_ranks.py FOLDER.
 
-FOLDER holds `half`, a run on one rank. Made are: `whole`, `resumed` (the same, stopped and gone on), what `half` becomes on
-these ranks, `codes.json` (exit codes of commands), and `lost`: there the last rank is killed in a step.
+FOLDER holds `half`, a run on one rank. Made are: `whole`, `resumed` (the same, ended early and gone on), what `half`
+becomes on these ranks, `codes.json` (exit codes of commands), and `lost`: there the last rank is killed in a step.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def main(folder: Path) -> None:
     """All of them, the killed one last."""
     comm = MPI.COMM_WORLD
     run(scene(), folder / "whole")
-    run(scene(5.0), folder / "resumed")
+    run(scene(6.0), folder / "resumed")
     resume(folder / "resumed", ["time.end=9.0"])
     resume(folder / "half", ["time.end=8.0"])
     words = ["run", "--resume", str(folder / "half"), "--set", "time.end=10", "-q"]

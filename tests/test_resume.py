@@ -41,6 +41,7 @@ from tests.conftest import mpirun
 from tests.parts import pulled_cube
 
 END = 9.0
+COUNTED = ("newton_iterations", "linear_iterations", "substeps", "seconds")
 LOST_AT = 6.0  # when tests/on_two_ranks.py loses one
 SELF = MPI.COMM_SELF
 
@@ -299,8 +300,7 @@ def assert_close(found: Path, expected: Path, history: float = 1e-9, values: flo
     assert list(mine.history) == list(others.history)
     assert mine.times.tolist() == others.times.tolist()
     np.testing.assert_array_equal(mine.history["time"], others.history["time"])
-    counted = ("newton_iterations", "linear_iterations", "substeps", "seconds")
-    for name in set(others.history) - set(counted):
+    for name in set(others.history) - set(COUNTED):
         np.testing.assert_allclose(mine.history[name], others.history[name], rtol=history, atol=history, err_msg=name)
     kept, wanted = read_checkpoint(found), read_checkpoint(expected)
     assert kept is not None and wanted is not None and kept.number == wanted.number
