@@ -12,6 +12,7 @@ from remodel_fenicsx.body.loading import Loading, LoadValues
 from remodel_fenicsx.evolution.chatter import Chatter
 from remodel_fenicsx.evolution.locking import LockingWarning
 from remodel_fenicsx.evolution.monitor import StabilityWatcher
+from remodel_fenicsx.evolution.resting import Resting
 from remodel_fenicsx.evolution.state import State
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher, times
 from remodel_fenicsx.evolution.unit_cells import UnitCells
@@ -71,6 +72,8 @@ class Simulation:
         self.warnings: list[Watcher] = [LockingWarning(self.stepper, locks)]
         if self.stepper.remodeling.law.remodels:
             self.warnings.insert(0, Chatter(self.stepper))
+        if self.stepper.remodeling.law.of_absolute_time:
+            self.warnings.append(Resting(self.stepper))
 
     def load_values(self, time: float) -> LoadValues:
         """Magnitude of every load at a time."""

@@ -1,6 +1,6 @@
 """Runs on this process group that tests/test_resume.py looks at: mpirun -n 2 python3 on_two_ranks.py FOLDER.
 
-FOLDER holds `half`, a run on one rank. Made are: `whole`, `resumed` (the same, ended early and gone on), what `half`
+FOLDER holds `half`, a run on one rank. Made are: `whole`, `resumed` (the same, stopped and gone on), what `half`
 becomes on these ranks, `codes.json` (exit codes of commands), and `lost`: there the last rank is killed in a step.
 """
 

@@ -471,6 +471,7 @@ def test_runs_that_go_on_say_what_one_run_says(tmp_path: Path, monkeypatch: pyte
     cube = preset_scene("kuhl-holzapfel-2007", "cube").with_values({**push, "remodeling.kappa": 0.1})
     monkeypatch.setattr(chatter, "GROWTH", np.inf)  # five passes are warned of, whatever they do
     monkeypatch.setattr(chatter, "CELL_TOLERANCE", 0.0)
+    monkeypatch.setattr(chatter, "MOST", 1.0)
     monkeypatch.setattr(Chatter, "_advice", lambda watcher, factor: "nothing")
     monkeypatch.setattr(LockingWarning, "stiffness_ratio", lambda watcher: 1e9)
     monkeypatch.setattr(LockingWarning, "energy_share", lambda watcher: 1.0)

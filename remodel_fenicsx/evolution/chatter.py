@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from math import comb
 from typing import Any
 
@@ -22,9 +23,11 @@ log = logging.getLogger(__name__)
 ORDER = 3  # of the difference over passes that takes a smooth course away and keeps what changes its sign each time
 GAIN = 2.0**ORDER  # by which it magnifies that
 # the beginning of an instability: measured, all bodies that left their solution did so; none that stayed on it
-GROWTH, GROWING_PASSES, CELL_TOLERANCE = -1.2, 2, 1e-3  # factor of a pass, passes in a row, swing of A over r0^2
+# (factor of a pass, passes in a row, swing of A over r0^2 after the next)
+GROWTH, GROWING_PASSES, CELL_TOLERANCE = -1.2, 2, 1e-2
 # its end: random cells swing for ever at single points, each its own way, which the body hardly feels
 SUSTAINED, SUSTAINED_PASSES, BODY_TOLERANCE = -0.9, 3, 0.02  # the same of the displacement, over the displacement
+MOST = 0.5  # of the body
 LOAD_JUMP = 1e-3  # share of a load by which it may swing itself
 
 
@@ -105,7 +108,7 @@ class Chatter(Watcher):
         if self._cells.known > ORDER:
             cells, body = [structure, *self._cells.values], [self.state.unknown.x.array, *self._body.values]
             self.swing = self._measured(cells, body)
-            tells = not self._loads_jump(step)
+            tells = not self._loads_jump(step) and not self._rested(cells)
             self._count("growing", tells and self.swing.cells_factor < GROWTH)
             self._count("sustained", tells and self.swing.body_factor < SUSTAINED)
         self._keep(step, structure)
@@ -114,7 +117,8 @@ class Chatter(Watcher):
         """Warn."""
         if self.warned or self.swing is None:
             return
-        begins = self._numbers["growing"] >= GROWING_PASSES and self.swing.cells >= CELL_TOLERANCE
+        next_one = self.swing.cells * abs(self.swing.cells_factor)  # as large as it will be after one pass more
+        begins = self._numbers["growing"] >= GROWING_PASSES and next_one >= CELL_TOLERANCE
         lasts = self._numbers["sustained"] >= SUSTAINED_PASSES and self.swing.body >= BODY_TOLERANCE
         if begins or lasts:
             self._numbers["warned"] = True
@@ -135,6 +139,12 @@ class Chatter(Watcher):
         """A at all points, six Mandel components after each other."""
         tensor = self.state.cells.structure_tensor()
         return np.stack([tensor[..., i, j] * (1.0 if i == j else np.sqrt(2.0)) for i, j in MANDEL], axis=-1).reshape(-1)
+
+    def _rested(self, cells: list[Array]) -> bool:
+        """Whether one of the passes has left most cells as they were: what goes on after that jumps (`resting`)."""
+        count = self.quadrature.shape
+        same = [np.all((a == b).reshape(*count, -1), axis=-1) for a, b in pairwise(cells[: ORDER + 1])]
+        return any(self.quadrature.mean(passed.astype(np.float64)) > MOST for passed in same)
 
     def _loads_jump(self, step: Step) -> bool:
         times = [self._numbers[f"time_{age}"] for age in range(ORDER)]

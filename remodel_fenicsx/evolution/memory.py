@@ -1,4 +1,4 @@
-"""What somebody remembers of earlier steps: functions and numbers of the state, which resumed runs have too."""
+"""What somebody remembers of earlier steps: functions and numbers of the state, so that resumed runs have them too."""
 
 from __future__ import annotations
 
