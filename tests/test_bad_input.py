@@ -305,7 +305,7 @@ def test_some_through_the_shell(place: Path) -> None:
 JSON = st.recursive(
     st.one_of(st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=5)),
     lambda inner: st.one_of(st.lists(inner, max_size=3), st.dictionaries(st.text(max_size=5), inner, max_size=3)),
-    max_leaves=8,
+    max_leaves=4,
 )
 KEYS = st.sampled_from(["format", "generations", "file", "number", "time", "sha256"])
 
