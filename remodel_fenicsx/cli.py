@@ -208,8 +208,8 @@ def _run(options: argparse.Namespace, task: Callable[..., Path] | None = None) -
     except (FolderTaken, SceneError, GeometryError, CheckpointError, RecordingError) as error:
         return _fail(" ".join(str(error).split()), BAD_INPUT)
     except StepFailure as failure:
-        text = f"{failure}. {failure.refusal}; every finished step is kept"
-        return _fail(f"{text}, and run --resume goes on from there", SOLVE_FAILED)
+        way = "" if task is not None else ", and run --resume goes on from there"
+        return _fail(f"{failure}. {failure.refusal}; every finished step is kept{way}", SOLVE_FAILED)
     except interrupts.Paused as pause:
         way = f"it goes on with: remodel-fenicsx run --resume {shlex.quote(str(pause.folder))}"
         return _fail(f"{pause}: all is kept up to time {pause.time:g}; {way}", STOPPED)

@@ -22,7 +22,7 @@ from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.fem.kinematics import FullKinematics
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.scene.parameters import Cells, Material, Remodeling
-from remodel_fenicsx.scene.scene import Solver
+from remodel_fenicsx.scene.scene import Scene, Solver
 
 MATERIAL = Material()
 TIGHT = Solver(absolute_tolerance=1e-11, relative_tolerance=1e-13)
@@ -34,6 +34,20 @@ def rotation(axis: tuple[float, float, float], degrees: float) -> np.ndarray:
     cross = np.array([[0.0, -a[2], a[1]], [a[2], 0.0, -a[0]], [-a[1], a[0], 0.0]])
     angle = np.radians(degrees)
     return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+
+
+def pulled_cube(end: float, **tables: Any) -> Scene:
+    """A cube of eight elements with random cells, pulled for four of `end` units of time and remodeled."""
+    return Scene(
+        preset="kuhl-holzapfel-2007",
+        geometry={"shape": "cube"},
+        mesh={"refinement": 2},
+        cells={"initial": "random"},
+        loads={"force": {"value": 8.0, "ramp": [[0.0, 0.0], [4.0, 1.0]]}},
+        remodeling={"kappa": 0.1},
+        time={"end": end},
+        **tables,
+    )
 
 
 def random_rotations(rng: np.random.Generator, count: int) -> np.ndarray:

@@ -32,23 +32,15 @@ from remodel_fenicsx.running import resume, run
 from remodel_fenicsx.system.interrupts import Paused
 from remodel_fenicsx.tissue.cells import structure_tensor
 from tests.conftest import mpirun
+from tests.parts import pulled_cube
 
 END = 9.0
 SELF = MPI.COMM_SELF
 
 
 def scene(end: float = END, **output: Any) -> Scene:
-    """Random cells in eight elements, pulled and remodeled."""
-    return Scene(
-        preset="kuhl-holzapfel-2007",
-        geometry={"shape": "cube"},
-        mesh={"refinement": 2},
-        cells={"initial": "random"},
-        loads={"force": {"value": 8.0, "ramp": [[0.0, 0.0], [4.0, 1.0]]}},
-        remodeling={"kappa": 0.1},
-        time={"end": end},
-        output={"every": 2, **output},
-    )
+    """The pulled cube with fields in every second step."""
+    return pulled_cube(end, output={"every": 2, **output})
 
 
 def rows(folder: Path) -> list[list[str]]:

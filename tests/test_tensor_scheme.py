@@ -168,6 +168,31 @@ def test_isotropic_cells_keep_the_tube_symmetric() -> None:
         assert scatter < 1e-8
 
 
+def test_where_the_extrapolated_target_would_break_the_cells_the_last_one_counts(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """Chains along z whose target came from y: the target ahead is negative along y, and so would be A."""
+    simulation = short_tube(4.0, coupling="extrapolated")
+    run(simulation)
+    coupling: Any = simulation.stepper.coupling
+    state, cells = simulation.state, simulation.cells
+    points = cells.dimension_values.shape[1]
+    dimensions, axes = cells.dimension_values.copy(), cells.axis_values.copy()
+    dimensions[0], axes[0] = [0.0, 0.0, 1.0], np.eye(3)
+    cells.set(dimensions, axes)
+    along_y, along_z = np.diag([0.0, 1.0, 0.0]).ravel(), np.diag([0.0, 0.0, 1.0]).ravel()
+    coupling._values[0, :, :, :10] = np.stack([[*along_z, 1.0], [*along_y, 1.0]])
+    before, target = cells.structure_tensor(), coupling._extrapolated(state.time + 1.0)
+    with caplog.at_level("INFO"):
+        coupling._follow(target, state.time + 1.0)
+    assert f"time 5: {points} points follow the last stress" in caplog.text
+    A = cells.structure_tensor()
+    np.testing.assert_allclose(A[0], np.broadcast_to(np.diag([0.0, 0.0, 1.0]), A[0].shape), atol=1e-14)
+    share = -np.expm1(-KAPPA * target.share)[:, None, None]
+    expected = before.reshape(-1, 3, 3) + share * (target.direction - before.reshape(-1, 3, 3))
+    np.testing.assert_allclose(A.reshape(-1, 3, 3)[points:], expected[points:], atol=1e-13)
+
+
 def test_only_a_law_with_a_target_can_be_extrapolated() -> None:
     with pytest.raises(SceneError) as caught:
         scene("cube", remodeling={"law": "explicit", "coupling": "extrapolated"})

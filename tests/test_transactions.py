@@ -22,23 +22,15 @@ from remodel_fenicsx.results.fields import Fields
 from remodel_fenicsx.results.recording import Recording
 from remodel_fenicsx.results.run_folder import RunFolder
 from remodel_fenicsx.results.vtkhdf import TransientGrid
+from tests.parts import pulled_cube
 
 END, FAILS = 5, 3.0
 WITHOUT_LIMIT = resource.getrlimit(resource.RLIMIT_FSIZE)
 
 
 def scene(**solver: Any) -> Scene:
-    """Random cells in eight elements, pulled and remodeled."""
-    return Scene(
-        preset="kuhl-holzapfel-2007",
-        geometry={"shape": "cube"},
-        mesh={"refinement": 2},
-        cells={"initial": "random"},
-        loads={"force": {"value": 8.0, "ramp": [[0.0, 0.0], [4.0, 1.0]]}},
-        remodeling={"kappa": 0.1},
-        time={"end": float(END)},
-        solver=solver,
-    )
+    """The pulled cube to the end of these tests."""
+    return pulled_cube(float(END), solver=solver)
 
 
 def everything(simulation: Simulation) -> dict[str, Any]:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from benchmarks.stability_map.cases import Case, Finding, Run, family, with_values
+from benchmarks.stability_map.cases import Case, Check, Finding, Run, family, with_values
 from benchmarks.stability_map.point import Path, diagonal_path
 from benchmarks.stability_map.solid import smallest_eigenvalue
 from tests.reference.radial import RadialMaterial
@@ -359,12 +360,17 @@ TRIAXIAL: dict[str, tuple[dict[str, tuple[float, list[list[float]]]], float]] = 
 }
 
 
-def block_case(family_name: str, changes: dict[str, Any], place: dict[str, Any], **more: Any) -> Case:
-    """The block of `extensions`."""
-    base = {**CUBE, "geometry": {"shape": "block", "side": 1.0}, "loads": {}}
+def case_of_shape(
+    shape: str, check: Check, family_name: str, changes: dict[str, Any], place: dict[str, Any], **more: Any
+) -> Case:
+    """A shape of `extensions` of the cube's size and material."""
+    base = {**CUBE, "geometry": {"shape": shape, "side": 1.0}, "loads": {}}
     key = f"{family_name}: " + ", ".join(f"{name} {value}" for name, value in place.items())
     options = {"reference": REFERENCE, "place": place, "extended": True, **more}
-    return Case(family_name, key, with_values(base, changes), check_point, **options)
+    return Case(family_name, key, with_values(base, changes), check, **options)
+
+
+block_case = partial(case_of_shape, "block", check_point)
 
 
 @family("three axes")

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from benchmarks.stability_map.cases import Case, Finding, Run, family, with_values
+from benchmarks.stability_map.cases import Case, Finding, Run, family
 from benchmarks.stability_map.homogeneous import (
     COUPLINGS,
-    CUBE,
     DRIVERS,
     FRAMES,
+    case_of_shape,
     factor,
     initial,
     material,
@@ -67,12 +68,7 @@ def check_limit(case: Case, run: Run) -> Finding:
     return Finding(float(max(cells, patch)), words)
 
 
-def driven_case(family_name: str, changes: dict[str, Any], place: dict[str, Any], **more: Any) -> Case:
-    """The driven block of `extensions`."""
-    base = {**CUBE, "geometry": {"shape": "driven", "side": 1.0}, "loads": {}}
-    key = f"{family_name}: " + ", ".join(f"{name} {value}" for name, value in place.items())
-    options = {"reference": REFERENCE, "place": place, "extended": True, **more}
-    return Case(family_name, key, with_values(base, changes), check_limit, **options)
+driven_case = partial(case_of_shape, "driven", check_limit, reference=REFERENCE)
 
 
 @family("shear")

@@ -213,12 +213,7 @@ class LinearPass:
         parts = [2 * inside[:, i, j] ** 2 for i, j in PAIRS]
         parts.append(square - np.sum(parts, axis=0))
         shares = [float(comm.allreduce(np.sum(volumes * part))) / first for part in parts]
-        points = self.quadrature.owned(self.quadrature.coordinates).reshape(-1, 3)
-        local = (-1.0, (np.nan, np.nan, np.nan))
-        if square.size:
-            point = points[int(np.argmax(square))]
-            local = (float(square.max()), (float(point[0]), float(point[1]), float(point[2])))
-        place: tuple[float, float, float] = max(comm.allgather(local), key=lambda pair: pair[0])[1]
+        place = self.quadrature.place_of_largest(square.reshape(-1, self.quadrature.shape[1]))
         return Mode(factor, place, first**2 / second / whole, dict(zip(SHARE_NAMES, shares, strict=True)))
 
     # ------------------------------------------------------------ tensors as vectors

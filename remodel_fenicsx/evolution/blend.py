@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import dolfinx.fem
 import numpy as np
 from petsc4py import PETSc
@@ -25,10 +27,12 @@ class Blend:
     def __init__(self, state: State, tissue: Tissue, settings: SolverSettings):
         self.settings = settings
         self.theta = dolfinx.fem.Constant(state.cells.quadrature.mesh, PETSc.ScalarType(0.0))
-        old, new = state.equilibrium_cells.ufl_cell, state.cells.ufl_cell
-        shares = [UnitCell(*old[:2], 1 - self.theta), UnitCell(*new[:2], self.theta)]
-        self.state = state
-        self.equilibrium = Equilibrium(state, tissue, shares, self._point_shares)
+        old, new = state.equilibrium_cells, state.cells
+
+        def at_points() -> list[UnitCell]:
+            return shares(old.point_cells, new.point_cells, float(np.real(self.theta.value)))
+
+        self.equilibrium = Equilibrium(state, tissue, shares(old.ufl_cell, new.ufl_cell, self.theta), at_points)
         self._newton: GuardedNewton | None = None
 
     @property
@@ -43,11 +47,6 @@ class Blend:
         if self._newton is not None:
             self._newton.close()
             self._newton = None
-
-    def _point_shares(self) -> list[UnitCell]:
-        theta = float(np.real(self.theta.value))
-        old, new = self.state.equilibrium_cells.point_cells, self.state.cells.point_cells
-        return [UnitCell(*old[:2], 1 - theta), UnitCell(*new[:2], theta)]
 
     def set(self, fraction: float) -> None:
         """theta."""
@@ -68,3 +67,8 @@ class Blend:
         growth = end - now
         room = np.where(growth > 0, (allowed - now) / np.where(growth > 0, growth, 1.0), np.inf)
         return (1.0 - done) * quadrature.minimum(room)
+
+
+def shares(old: UnitCell, new: UnitCell, theta: Any) -> list[UnitCell]:
+    """(1 - theta) of an old cell and theta of a new one, UFL or arrays."""
+    return [UnitCell(*old[:2], 1 - theta), UnitCell(*new[:2], theta)]

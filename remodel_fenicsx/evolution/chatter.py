@@ -183,13 +183,7 @@ class Chatter(Watcher):
 
     def _place(self) -> tuple[float, float, float]:
         """Reference place of the largest swing of the cells."""
-        size = self.quadrature.owned(np.linalg.norm(self._course.cells[ORDER], axis=(-1, -2)))
-        local = (-np.inf, (np.nan, np.nan, np.nan))
-        if size.size:
-            point = self.quadrature.coordinates[np.unravel_index(int(np.argmax(size)), size.shape)]
-            local = (float(size.max()), (float(point[0]), float(point[1]), float(point[2])))
-        place: tuple[float, float, float] = max(self.state.comm.allgather(local), key=lambda found: found[0])[1]
-        return place
+        return self.quadrature.place_of_largest(np.linalg.norm(self._course.cells[ORDER], axis=(-1, -2)))
 
 
 def _ratio(value: float, size: float) -> float:

@@ -209,14 +209,17 @@ class Extrapolated(Staggered):
     def _follow(self, target: Target, time: float) -> None:
         """Cells after the step; where an extrapolated target would make A indefinite, the last target itself counts."""
         duration = time - self.state.time
-        asked, F = self.remodeling.followed(target, duration)
+        asked = self.remodeling.followed(target, duration)
         lost = ~np.isfinite(asked.dimensions).all(axis=-1)
         if lost.any():
             last = self._values.reshape(-1, 2, 11)[:, 0]
             direction = np.where(lost[:, None, None], last[:, :9].reshape(-1, 3, 3), target.direction)
-            asked, F = self.remodeling.followed(Target(direction, target.share), duration)
-            log.info("time %g: %d points follow the last stress, not the extrapolated one", time, int(lost.sum()))
-        self._power = self.remodeling.replace(asked, F, duration)
+            asked = self.remodeling.followed(Target(direction, target.share), duration)
+        quadrature = self.state.cells.quadrature
+        points = self.state.comm.allreduce(int(quadrature.owned(lost.reshape(quadrature.shape)).sum()))
+        if points and self.state.comm.rank == 0:
+            log.info("time %g: %d points follow the last stress, not the extrapolated one", time, points)
+        self._power = self.remodeling.replace(asked, self.remodeling.driving_tensor()[0], duration)
 
 
 Maker = Callable[[State, Tissue, RemodelingPass, SolverSettings], Coupling]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from remodel_fenicsx.evolution.state import State
 from remodel_fenicsx.fem import coefficients, jit
 from remodel_fenicsx.tissue.cells import UnitCell
-from remodel_fenicsx.tissue.energy import Tissue
+from remodel_fenicsx.tissue.energy import Stresses, Tissue
 from remodel_fenicsx.tissue.logarithm import MANDEL
 from remodel_fenicsx.tissue.repulsion import whole_structure_tensor
 
@@ -88,6 +88,36 @@ class PointwiseRepulsion:
         points = self.tissue.map(lambda name, value: coefficients.point_values(value, self.quadrature).reshape(-1))
         modulus: Array = points.repulsion_modulus
         return modulus
+
+
+class PointStresses:
+    """Stresses at the quadrature points as the residual has them: with what the formulation and the repulsion add.
+
+    Parameters
+    ----------
+    state
+        Unknowns, cells and formulation.
+    tissue
+        Its parameters are Constants or DG0 Functions.
+
+    Attributes
+    ----------
+    ufl
+        The stresses as expressions, for those who compile them. They belong to the last `refresh`.
+    """
+
+    def __init__(self, state: State, tissue: Tissue):
+        self._dilatation, self._repulsion = state.dilatation, pointwise_repulsion(state, tissue)
+        F = state.kinematics.deformation_gradient(state.unknown)
+        self.ufl: Stresses = state.dilatation.stresses(tissue, F, [state.cells.ufl_cell])
+        if self._repulsion is not None:
+            self.ufl = self.ufl.plus(F, self._repulsion.stress)
+
+    def refresh(self) -> None:
+        """Take what the expressions need beside F from the present unknowns and cells."""
+        self._dilatation.refresh()
+        if self._repulsion is not None:
+            self._repulsion.update()
 
 
 def mandel_vector(tensor: Any) -> Any:

@@ -9,7 +9,7 @@ import ufl
 from numpy.typing import NDArray
 
 from remodel_fenicsx.evolution.equilibrium import at_points, on_mesh, stress_rounding
-from remodel_fenicsx.evolution.pointwise import pointwise_repulsion
+from remodel_fenicsx.evolution.pointwise import PointStresses
 from remodel_fenicsx.evolution.state import State
 from remodel_fenicsx.fem import coefficients, jit
 from remodel_fenicsx.tissue import spectral
@@ -77,20 +77,15 @@ class RemodelingPass:
         self._change: tuple[UnitCell, UnitCell] | None = None
         self._smallest_area = self.quadrature.minimum(self.quadrature.smallest_areas)
         F = state.kinematics.deformation_gradient(state.unknown)
-        stresses = state.dilatation.stresses(self.tissue, F, [state.cells.ufl_cell])
-        self._pointwise = pointwise_repulsion(state, self.tissue)
-        if self._pointwise is not None:
-            stresses = stresses.plus(F, self._pointwise.stress)
-        tensor = self.driver.tensor(F, stresses)
+        self._stresses = PointStresses(state, self.tissue)
+        tensor = self.driver.tensor(F, self._stresses.ufl)
         # one stacked expression: the deformation gradient comes at no cost with the driver
         stacked = ufl.as_vector([t[i, j] for t in (F, tensor) for i in range(3) for j in range(3)])
         self._expression = jit.expression(stacked, self.quadrature.points)
 
     def driving_tensor(self) -> tuple[Array, Array]:
         """F and the symmetric driving tensor at all points, each (elements * points, 3, 3)."""
-        self.state.dilatation.refresh()
-        if self._pointwise is not None:
-            self._pointwise.update()
+        self._stresses.refresh()
         values = self.quadrature.evaluate(self._expression, (2, 3, 3)).reshape(-1, 2, 3, 3)
         driver = values[:, 1]
         return values[:, 0], (driver + np.swapaxes(driver, 1, 2)) / 2
@@ -147,12 +142,11 @@ class RemodelingPass:
         assert self.law.target is not None
         return self.law.target(self.drive(residual))
 
-    def followed(self, target: Target, duration: float) -> tuple[UnitCell, Array]:
-        """Cells of all points in one row after a time with this target, and F (n, 3, 3). Changes nothing."""
+    def followed(self, target: Target, duration: float) -> UnitCell:
+        """Cells of all points in one row after a time with this target. Changes nothing."""
         assert self.law.follow is not None
         r0 = coefficients.point_values(self.tissue.end_to_end_length, self.quadrature).reshape(-1)
-        F, _ = self.driving_tensor()
-        return self.law.follow(self.state.cells.point_cells, target, r0, self.settings.kappa * duration), F
+        return self.law.follow(self.state.cells.point_cells, target, r0, self.settings.kappa * duration)
 
     def apply(self, time_old: float, time_new: float, residual: float = 0.0, factor: float = 1.0) -> float:
         """Remodel over a step with the stress of the solved state at time_new; returns the power of remodeling.

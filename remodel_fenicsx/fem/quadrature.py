@@ -112,6 +112,16 @@ class Quadrature:
         local = float(np.max(self.owned(values), initial=-np.inf))
         return float(self.mesh.comm.allreduce(local, MPI.MAX))
 
+    def place_of_largest(self, values: NDArray[np.float64]) -> tuple[float, float, float]:
+        """Reference place of the largest of values (elements, points), over all ranks."""
+        owned = self.owned(values)
+        local = (-np.inf, (np.nan, np.nan, np.nan))
+        if owned.size:
+            point = self.coordinates[np.unravel_index(int(np.argmax(owned)), owned.shape)]
+            local = (float(owned.max()), (float(point[0]), float(point[1]), float(point[2])))
+        place: tuple[float, float, float] = max(self.mesh.comm.allgather(local), key=lambda found: found[0])[1]
+        return place
+
     def minimum(self, values: NDArray[np.float64]) -> float:
         """Smallest of values (elements, ...) over all ranks."""
         return -self.maximum(-values)

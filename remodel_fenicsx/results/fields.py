@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.shape import Shape
 from remodel_fenicsx.evolution.equilibrium import at_points
-from remodel_fenicsx.evolution.pointwise import pointwise_repulsion
+from remodel_fenicsx.evolution.pointwise import PointStresses
 from remodel_fenicsx.evolution.state import State
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
 from remodel_fenicsx.fem import compat, jit
@@ -46,11 +46,8 @@ class ElementFields:
         self.tissue = stepper.tissue
         state = self.state
         F = state.kinematics.deformation_gradient(state.unknown)
-        stresses = state.dilatation.stresses(self.tissue, F, [state.cells.ufl_cell])
-        self._pointwise = pointwise_repulsion(state, self.tissue)
-        if self._pointwise is not None:
-            stresses = stresses.plus(F, self._pointwise.stress)
-        cauchy = stresses.cauchy
+        self._stresses = PointStresses(state, self.tissue)
+        cauchy = self._stresses.ufl.cauchy
         entries = [t[i, j] for t in (F, cauchy) for i in range(3) for j in range(3)]
         displacement = state.kinematics.displacement(state.unknown)
         expressions = ufl.as_vector([*entries, *(displacement[i] for i in range(3))])
@@ -64,9 +61,7 @@ class ElementFields:
         to the load axis, or in a tube from circumferential to axial); `chain_extension` (largest r/L in the element; 0
         where no chain locks).
         """
-        self.state.dilatation.refresh()
-        if self._pointwise is not None:
-            self._pointwise.update()
+        self._stresses.refresh()
         values = self.quadrature.evaluate(self._state, (21,))
         F, cauchy = values[..., :9].reshape(*values.shape[:2], 3, 3), values[..., 9:18]
         dimensions, axes = self.state.cells.dimension_values, self.state.cells.axis_values
