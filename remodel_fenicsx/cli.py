@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import NoReturn
 
 import remodel_fenicsx
+from remodel_fenicsx.body.reductions import explained
 from remodel_fenicsx.system import interrupts
 from remodel_fenicsx.system.environment import reason_unusable, versions
 from remodel_fenicsx.scene.parameters import PRESETS
@@ -272,6 +273,7 @@ def _validate(options: argparse.Namespace) -> int:
     scene = read_scene(options.scene, options.set)
     _say(f"{options.scene}: a valid scene ({scene.geometry.name}, {scene.time.number_of_steps} steps)")
     _say(scene.summary())
+    _say("\n".join(explained(scene)))
     if _rank() == 0:
         for warning in scene.warnings():
             _complain(f"warning: {warning}")

@@ -311,7 +311,7 @@ BAD_SCENES = [
         {"remodeling.coupling": "implicit"},
         "remodeling.coupling = 'implicit': allowed are 'staggered', 'relaxed', 'extrapolated'",
     ),
-    (CUBE, {"model.kinematics": "radial"}, "model.kinematics = 'radial': allowed is 'full'"),
+    (CUBE, {"model.kinematics": "radial"}, "model.kinematics = 'radial': a cube has no such reduction; it has 'point'"),
     (CUBE, {"geometry.side": 1e7}, "geometry.side = 10000000.0: a length of 1e+07 here; allowed are 1e-06 to 1e+06"),
     (
         TUBE,

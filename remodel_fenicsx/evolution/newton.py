@@ -14,6 +14,7 @@ from petsc4py import PETSc
 
 from remodel_fenicsx.evolution.equilibrium import Equilibrium, Extension, stress_rounding
 from remodel_fenicsx.fem.petsc_options import ProblemOptions
+from remodel_fenicsx.fem.solver_methods import suited_options
 from remodel_fenicsx.system.interrupts import Interrupted
 
 log = logging.getLogger(__name__)
@@ -100,8 +101,10 @@ class GuardedNewton:
     def __init__(self, equilibrium: Equilibrium, settings: SolverSettings):
         self.equilibrium, self.settings = equilibrium, settings
         self.unknown = equilibrium.state.unknown
-        self._options = ProblemOptions(settings.method, settings.petsc_options)
         self._x = self.unknown.x.petsc_vec.duplicate()
+        reduced, number = equilibrium.state.kinematics.reduced, self._x.getSize()
+        suited = suited_options(settings.method, reduced, number, equilibrium.comm.size)
+        self._options = ProblemOptions(settings.method, settings.petsc_options, suited)
         self._residual = self._x.duplicate()
         self._external = self._x.duplicate()
         self._matrix = equilibrium.create_matrix()

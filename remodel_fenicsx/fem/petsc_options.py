@@ -8,6 +8,7 @@ from __future__ import annotations
 import ctypes
 import itertools
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any
 
 from petsc4py import PETSc
@@ -32,13 +33,15 @@ class ProblemOptions:
         Key of `METHODS`.
     options
         The scene's: names without the leading '-'; True for a flag, False to leave one of the method's away.
+    suited
+        What the problem needs other than its method says.
     """
 
-    def __init__(self, method: str, options: Mapping[str, Any]):
+    def __init__(self, method: str, options: Mapping[str, Any], suited: Mapping[str, Any] = MappingProxyType({})):
         self.prefix = f"{USERS_PREFIX}{next(_numbers)}_"
         self._given = dict(options)
         self._names: set[str] = set()
-        for key, value in {**METHODS[method], **options, **_users_options()}.items():
+        for key, value in {**METHODS[method], **suited, **options, **_users_options()}.items():
             if value is not False:
                 PETSc.Options().setValue(self.prefix + key, None if value is True else value)
                 self._names.add(key)
