@@ -56,7 +56,7 @@ class Simulation:
                 log.info("%s", line)
         self.scene = scene = with_kinematics(scene, domain)
         shape = scene.geometry
-        self.domain = domain = build(scene, comm) if domain is None else checked_domain(domain, scene)
+        self.domain = domain = checked_domain(build(scene, comm) if domain is None else domain, scene)
         mesh = domain.mesh
         kinematics = KINEMATICS[scene.model.kinematics].on(mesh, shape)
         self.unknown = kinematics.unknown(mesh, scene.mesh.degree)

@@ -11,12 +11,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from remodel_fenicsx.fem.kinematics import KINEMATICS
-from remodel_fenicsx.tissue.cells import initial_dimensions
+from remodel_fenicsx.tissue.cells import cylindrical_axes, global_axes, initial_dimensions
 from remodel_fenicsx.tissue.laws import LAWS
 
 Rule = Callable[[Any], str | None]
+Turn = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 AUTO = "auto"
 POINTS = {
     ("interval", 1): 2, ("interval", 2): 3, ("quadrilateral", 1): 4, ("quadrilateral", 2): 9,
@@ -38,11 +40,14 @@ class Reduction:
         How many elements it has, from the scene.
     rules
         Why it may be wrong.
+    turn
+        Q (n, 3, 3) for places X (n, 3) of the body: Q^T X lies in, or beside, the part that stands for it.
     """
 
     build: Callable[[Any, Any], Any]
     elements: Callable[[Any], int]
     rules: tuple[Rule, ...]
+    turn: Turn
 
 
 @dataclass(frozen=True)
@@ -115,7 +120,9 @@ def _step_cost(scene: Any, name: str) -> float:
 
 def _cost(scene: Any, name: str) -> str:
     cost = expected_cost(scene, name)
-    return f"about 1/{float(f'{1 / cost:.1g}') if cost < 0.1 else round(1 / cost):g} of the cost of 'full'" if cost < 0.7 else "about the cost of 'full'"
+    if cost > 0.7:
+        return "about the cost of 'full'"
+    return f"about 1/{float(f'{1 / cost:.1g}'):g} of the cost of 'full'"
 
 
 def _leaves_symmetry(scene: Any) -> str:
@@ -126,6 +133,25 @@ def _leaves_symmetry(scene: Any) -> str:
     if remodeling.driver in OVER_CORRECTED and LAWS[remodeling.law].remodels:
         return f"remodeling.driver = {remodeling.driver!r}"
     return f"remodeling.law = {remodeling.law!r}" if remodeling.law == "rate" else ""
+
+
+# ---------------------------------------------------------------- where the body's places are in the reduction
+def unturned(places: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The same everywhere."""
+    return global_axes(places)
+
+
+def about_z(places: NDArray[np.float64]) -> NDArray[np.float64]:
+    """x, y, z become the radial, circumferential and axial direction."""
+    circumferential, axial, radial = np.moveaxis(cylindrical_axes(places), -2, 0)
+    return np.stack([radial, circumferential, axial], axis=-1)
+
+
+def mirrored(places: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The quarter x > 0, y > 0 becomes each of the four."""
+    signs = np.where(places < -1e-9 * np.abs(places).max(), -1.0, 1.0)
+    signs[:, 2] = 1.0
+    return signs[:, :, None] * np.eye(3)
 
 
 # ---------------------------------------------------------------- rules

@@ -13,7 +13,7 @@ from pydantic import Field
 
 from remodel_fenicsx.body.column import Column
 from remodel_fenicsx.body.gmsh_model import length_fault
-from remodel_fenicsx.body.reductions import Reduction, homogeneous, known_loads, same_cells, symmetric_law
+from remodel_fenicsx.body.reductions import Reduction, homogeneous, known_loads, same_cells, symmetric_law, unturned
 from remodel_fenicsx.schema.tables import Table, fault
 from remodel_fenicsx.schema.units import Dimension, LengthUnit
 from remodel_fenicsx.tissue.cells import angle_to_axis
@@ -222,4 +222,4 @@ def homogeneous_bar(bottom: str, top: str, dimensions: Callable[[Any], dict[str,
         ends = (length, 0.0, 0.0), (length, 0.0, length)
         return interval_domain(*ends, 1, scene.mesh.degree, faces, shape.name, dimensions(shape), comm)
 
-    return Reduction(build, lambda scene: 1, (same_cells, symmetric_law, homogeneous, known_loads("point")))
+    return Reduction(build, lambda scene: 1, (same_cells, symmetric_law, homogeneous, known_loads("point")), unturned)

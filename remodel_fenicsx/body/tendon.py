@@ -46,7 +46,9 @@ class Tendon(Shape):
     number_of_elements: ClassVar[int] = 480
     faces: ClassVar[tuple[str, ...]] = ("bottom", "top", "side")
     reductions: ClassVar[dict[str, Reduction]] = {
-        "point": homogeneous_bar("bottom", "top", lambda shape: _dimensions(shape.length, shape.area, shape.radius)),
+        "point": homogeneous_bar(
+            "bottom", "top", lambda shape: _dimensions(shape.length, shape.area, math.sqrt(shape.area / math.pi))
+        ),
     }
 
     shape: Literal["tendon"] = Field(default="tendon", description="Which body it is.")
@@ -61,11 +63,6 @@ class Tendon(Shape):
     def loaded_area(self) -> float:
         """Area that carries `force`."""
         return self.area
-
-    @property
-    def radius(self) -> float:
-        """Of a round section."""
-        return math.sqrt(self.area / math.pi)
 
     @property
     def axial_length(self) -> float:

@@ -9,8 +9,10 @@ import numpy as np
 from remodel_fenicsx.body import gmsh_model as model
 from remodel_fenicsx.body.reductions import (
     Reduction,
+    about_z,
     free_ends,
     known_loads,
+    mirrored,
     round_about_z,
     same_cells,
     symmetric_law,
@@ -103,16 +105,19 @@ REDUCTIONS = {
         build_ray,
         lambda scene: PAPER[1] * scene.mesh.refinement,
         (*_EVERYWHERE, round_about_z, free_ends, known_loads("radial")),
+        about_z,
     ),
     "axisymmetric": Reduction(
         build_half_plane,
         lambda scene: PAPER[1] * PAPER[2] * scene.mesh.refinement**2,
         (*_EVERYWHERE, round_about_z, known_loads("axisymmetric")),
+        about_z,
     ),
     "sector": Reduction(
         build_quarter,
         lambda scene: PAPER[0] * PAPER[1] * scene.mesh.refinement**2 * layers(scene) // 4,
         (*_EVERYWHERE, symmetric_planes, known_loads("sector")),
+        mirrored,
     ),
 }
 """The cheapest first."""
