@@ -14,7 +14,7 @@ from petsc4py import PETSc
 
 from remodel_fenicsx.evolution.equilibrium import Equilibrium, Extension, stress_rounding
 from remodel_fenicsx.fem.petsc_options import ProblemOptions
-from remodel_fenicsx.fem.solver_methods import suited_options
+from remodel_fenicsx.fem.solver_methods import SMALL
 from remodel_fenicsx.system.interrupts import Interrupted
 
 log = logging.getLogger(__name__)
@@ -102,9 +102,9 @@ class GuardedNewton:
         self.equilibrium, self.settings = equilibrium, settings
         self.unknown = equilibrium.state.unknown
         self._x = self.unknown.x.petsc_vec.duplicate()
-        reduced, number = equilibrium.state.kinematics.reduced, self._x.getSize()
-        suited = suited_options(settings.method, reduced, number, equilibrium.comm.size)
-        self._options = ProblemOptions(settings.method, settings.petsc_options, suited)
+        # problems in three dimensions stay with their method: its numbers shall not depend on their size
+        small = equilibrium.state.kinematics.reduced and self._x.getSize() <= SMALL
+        self._options = ProblemOptions(settings.method, settings.petsc_options, equilibrium.comm.size, small)
         self._residual = self._x.duplicate()
         self._external = self._x.duplicate()
         self._matrix = equilibrium.create_matrix()
@@ -198,7 +198,7 @@ class GuardedNewton:
     def factorisation(self) -> Any | None:
         """PETSc's preconditioner with the factors of the last tangent; None where the method does not factorise."""
         preconditioner = self._snes.getKSP().getPC()
-        return preconditioner if preconditioner.getType() in ("lu", "cholesky") else None
+        return preconditioner if preconditioner.getType() in ("lu", "cholesky", "telescope") else None
 
     def _warn_of_unused_options(self) -> None:
         """Once, after the first solve; on all ranks, for each has a database of options."""

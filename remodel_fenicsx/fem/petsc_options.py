@@ -8,12 +8,11 @@ from __future__ import annotations
 import ctypes
 import itertools
 from collections.abc import Mapping
-from types import MappingProxyType
 from typing import Any
 
 from petsc4py import PETSc
 
-from remodel_fenicsx.fem.solver_methods import METHODS
+from remodel_fenicsx.fem.solver_methods import method_options
 from remodel_fenicsx.schema.tables import SceneError
 
 USERS_PREFIX = "remodel_"
@@ -33,19 +32,22 @@ class ProblemOptions:
         Key of `METHODS`.
     options
         The scene's: names without the leading '-'; True for a flag, False to leave one of the method's away.
-    suited
-        What the problem needs other than its method says.
+    ranks
+        How many there are.
+    small
+        Whether the problem is a small one (`method_options`).
     """
 
-    def __init__(self, method: str, options: Mapping[str, Any], suited: Mapping[str, Any] = MappingProxyType({})):
+    def __init__(self, method: str, options: Mapping[str, Any], ranks: int = 1, small: bool = False):
         self.prefix = f"{USERS_PREFIX}{next(_numbers)}_"
         self._given = dict(options)
         self._names: set[str] = set()
-        for key, value in {**METHODS[method], **suited, **options, **_users_options()}.items():
+        own = method_options(method, ranks, small)
+        for key, value in {**own, **options, **_users_options()}.items():
             if value is not False:
                 PETSc.Options().setValue(self.prefix + key, None if value is True else value)
                 self._names.add(key)
-        for key in METHODS[method].keys() - options.keys():
+        for key in own.keys() - options.keys():
             PETSc.Options().hasName(self.prefix + key)  # asked for: PETSc does not call it left over
 
     def apply(self, snes: Any) -> None:
