@@ -89,7 +89,8 @@ def objections(scene: Any, name: str) -> list[str]:
 def explained(scene: Any) -> list[str]:
     """The choice in words: what it costs, why nothing cheaper, what it cannot show."""
     made = choice(scene)
-    lines = [f"kinematics {made.name!r}: {KINEMATICS[made.name].meaning} ({_cost(scene, made.name)})"]
+    cost = f" ({_cost(scene, made.name)})" if KINEMATICS[made.name].reduced else ""
+    lines = [f"kinematics {made.name!r}: {KINEMATICS[made.name].meaning}{cost}"]
     for name, reasons in made.objections.items():
         if name != made.name:
             lines.append(f"{name!r}{', allowed' if not reasons else ''} ({_cost(scene, name)})")
