@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from remodel_fenicsx.body.loading import LoadValues
 from remodel_fenicsx.evolution.blend import Blend
 from remodel_fenicsx.evolution.equilibrium import Equilibrium
+from remodel_fenicsx.evolution.implicit import Implicit
 from remodel_fenicsx.evolution.newton import GuardedNewton, SolveFailure, SolverSettings
 from remodel_fenicsx.evolution.parts import Change, Work
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
@@ -223,4 +224,9 @@ class Extrapolated(Staggered):
 
 
 Maker = Callable[[State, Tissue, RemodelingPass, SolverSettings], Coupling]
-COUPLINGS: dict[str, Maker] = {"staggered": Staggered, "relaxed": Relaxed, "extrapolated": Extrapolated}
+COUPLINGS: dict[str, Maker] = {
+    "staggered": Staggered,
+    "relaxed": Relaxed,
+    "extrapolated": Extrapolated,
+    "implicit": Implicit,
+}
