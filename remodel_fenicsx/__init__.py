@@ -10,13 +10,15 @@ __all__ = ["Recording", "Scene", "SceneError", "Simulation", "preset_scene", "re
 
 if TYPE_CHECKING:
     from remodel_fenicsx.results.recording import Recording
+    from remodel_fenicsx.running import run
     from remodel_fenicsx.scene import Scene, SceneError, preset_scene, read_scene
-    from remodel_fenicsx.simulation import Simulation, run
+    from remodel_fenicsx.simulation import Simulation
 
 _PLACES = {
     "Recording": "results.recording",
+    "run": "running",
     **dict.fromkeys(("Scene", "SceneError", "preset_scene", "read_scene"), "scene"),
-    **dict.fromkeys(("Simulation", "run"), "simulation"),
+    "Simulation": "simulation",
 }
 
 

@@ -196,7 +196,7 @@ def _run(options: argparse.Namespace, task: Callable[..., Path] | None = None) -
     from remodel_fenicsx.results.checkpoint_file import CheckpointError
     from remodel_fenicsx.results.recording import RecordingError
     from remodel_fenicsx.results.run_folder import FolderTaken
-    from remodel_fenicsx.simulation import resume, run
+    from remodel_fenicsx.running import resume, run
 
     try:
         if scene is None:

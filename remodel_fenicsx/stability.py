@@ -60,7 +60,7 @@ def stability(
     SceneError
         If nothing remodels.
     FolderTaken, StepFailure, Interrupted, OSError
-        As `simulation.run` does.
+        As `running.run` does.
     """
     if not LAWS[scene.remodeling.law].remodels:
         raise SceneError(f"remodeling.law = {scene.remodeling.law!r}: nothing remodels, so there is no pass to analyse")

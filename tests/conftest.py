@@ -26,13 +26,18 @@ def mpirun(ranks: int, *command: str) -> list[str]:
 
 @pytest.fixture(scope="session")
 def case(tmp_path_factory: pytest.TempPathFactory) -> Case:
-    """case(scene, ranks=1, snapshots=()) -> what tests/run_case.py saved, by name."""
+    """case(scene, ranks=1, snapshots=(), divisions=None) -> what tests/run_case.py saved, by name."""
     base = tmp_path_factory.getbasetemp()
     folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "cases"
     folder.mkdir(exist_ok=True)
 
-    def run(scene: dict[str, Any], ranks: int = 1, snapshots: tuple[float, ...] = ()) -> dict[str, Any]:
-        request = json.dumps({"scene": scene, "snapshots": list(snapshots)}, sort_keys=True)
+    def run(
+        scene: dict[str, Any],
+        ranks: int = 1,
+        snapshots: tuple[float, ...] = (),
+        divisions: tuple[int, int, int] | None = None,
+    ) -> dict[str, Any]:
+        request = json.dumps({"scene": scene, "snapshots": list(snapshots), "divisions": divisions}, sort_keys=True)
         out = folder / (hashlib.sha256(f"{ranks} {request}".encode()).hexdigest()[:16] + ".npz")
         with out.with_suffix(".lock").open("w") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)

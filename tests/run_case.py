@@ -1,6 +1,7 @@
 """Runs a scene on the ranks of this process group and saves what tests look at: python3 run_case.py OUT.npz JSON.
 
-JSON: {"scene": {...}, "snapshots": [times]}. Saved: the history's columns; at each snapshot the state after the solve
+JSON: {"scene": {...}, "snapshots": [times], "divisions": elements of a tube around, through the wall and along, or null
+for the scene's own mesh}. Saved: the history's columns; at each snapshot the state after the solve
 of that time (u_T by node, stretch_T and angle_T by element); at the end l, n by element and point, the reference
 coordinates of the points, the initial l, and whether the third principal Cauchy stress was ever positive.
 """
@@ -13,6 +14,7 @@ import sys
 import numpy as np
 from mpi4py import MPI
 
+from remodel_fenicsx.body import tube
 from remodel_fenicsx.evolution.stepper import Step, Watcher
 from remodel_fenicsx.results.columns import Measurement
 from remodel_fenicsx.results.fields import NodalGather
@@ -23,7 +25,13 @@ from remodel_fenicsx.simulation import Simulation
 def main(out: str, request: dict) -> None:
     """Run and save; everything is gathered in the mesh file's order."""
     scene = scene_from_dict(request["scene"])
-    simulation = Simulation(scene, MPI.COMM_WORLD)
+    domain = None
+    if request.get("divisions"):
+        body = scene.geometry
+        domain = tube(
+            body.inner_radius, body.outer_radius, body.length, scene.mesh.degree, divisions=request["divisions"]
+        )
+    simulation = Simulation(scene, MPI.COMM_WORLD, domain)
     domain, cells, quadrature = simulation.domain, simulation.cells, simulation.quadrature
     displacement = NodalGather(domain, simulation.state)
     saved: dict[str, object] = {}

@@ -17,11 +17,11 @@ ROOT = Path(__file__).parents[1]
 PACKAGE = "remodel_fenicsx"
 # what a room may import: itself, and those before it
 ROOMS = ("system", "schema", "tissue", "fem", "body", "scene", "evolution", "results", "paper", "simulation",
-         "stability", "cli")  # fmt: skip
+         "running", "stability", "cli")  # fmt: skip
 LONGEST = 400
 # imports that only the type checker follows: of what is there without dolfinx, to what is not
 TYPES_ONLY = {
-    "__init__": {"results.recording", "scene", "simulation"},
+    "__init__": {"results.recording", "running", "scene", "simulation"},
     "body.cube": {"body.domain", "body.loading"},
     "body.shape": {"body.domain", "body.loading"},
     "body.tendon": {"body.domain", "body.loading"},

@@ -1,6 +1,8 @@
-"""Figs. 7 and 8: the artery with the preset's random cells."""
+"""Figs. 7 and 8: the artery with the preset's random cells; the whole one is slow, two of its twelve layers are not."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,10 +16,24 @@ ARTERY = {
 }
 
 
-@pytest.fixture(scope="module")
-def artery(case: Case) -> dict:
+LAYERS = 2  # of elements along the axis, each 8/12 long
+
+
+def slice_of(scene: dict, layers: int = LAYERS) -> dict[str, Any]:
+    """Arguments of `case` for a short piece of the artery with elements like the whole one's."""
+    geometry = {**scene["geometry"], "length": 8.0 / 12 * layers}
+    return {"scene": {**scene, "geometry": geometry}, "divisions": (16, 8, layers)}
+
+
+@pytest.fixture(scope="module", params=["slice", pytest.param("whole", marks=pytest.mark.slow)])
+def artery(request: pytest.FixtureRequest, case: Case) -> dict:
     """150 steps."""
-    return case(ARTERY, snapshots=(24.0, 150.0))
+    return case(**(slice_of(ARTERY) if request.param == "slice" else {"scene": ARTERY}), snapshots=(24.0, 150.0))
+
+
+def is_whole(artery: dict) -> bool:
+    """All twelve layers along the axis."""
+    return len(artery["x"]) == 16 * 8 * 12
 
 
 def test_outer_radius_peaks_at_full_load_and_shrinks_as_the_wall_stiffens(artery: dict) -> None:
@@ -25,7 +41,8 @@ def test_outer_radius_peaks_at_full_load_and_shrinks_as_the_wall_stiffens(artery
     assert 22 <= peak <= 26
     assert artery["outer_radius"].max() - artery["outer_radius"][-1] >= 0.15
     assert artery["outer_radius"].max() - artery["outer_radius"][-1] <= 0.20
-    assert artery["outer_radius"][23] == pytest.approx(3.243, abs=2e-3)  # symmetry planes would give 3.228
+    # symmetry planes would give 3.228; a slice has a sixth of the whole's random cells
+    assert artery["outer_radius"][23] == pytest.approx(3.243, abs=2e-3 if is_whole(artery) else 6e-3)
 
 
 def layer_angles(artery: dict) -> np.ndarray:
@@ -38,14 +55,16 @@ def layer_angles(artery: dict) -> np.ndarray:
         np.arctan2(np.sqrt(tensor[..., 2, 2]), np.sqrt(np.einsum("epi,epij,epj->ep", around, tensor, around)))
     )
     layer = np.floor((radius.mean(axis=1) - 1.0) / 0.25 + 1e-6).astype(int)
-    assert np.array_equal(np.bincount(layer), np.full(8, 192))
+    assert np.array_equal(np.bincount(layer), np.full(8, len(x) // 8))
     return np.array([pitch[layer == k].mean() for k in range(8)])
 
 
 def test_fibre_angle_rises_from_layer_to_layer(artery: dict) -> None:
     angles = layer_angles(artery)
     assert np.all(np.diff(angles) > 0)
-    np.testing.assert_allclose(angles, [1.1, 4.2, 14.0, 36.9, 60.2, 66.7, 70.3, 72.7], rtol=0, atol=1.5)
+    np.testing.assert_allclose(
+        angles, [1.1, 4.2, 14.0, 36.9, 60.2, 66.7, 70.3, 72.7], rtol=0, atol=1.5 if is_whole(artery) else 2
+    )
 
 
 def test_history_columns_are_the_means_of_their_layers(artery: dict) -> None:

@@ -26,7 +26,7 @@ import tomlkit
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from remodel_fenicsx import Recording, SceneError, cli, simulation
+from remodel_fenicsx import Recording, SceneError, cli, running
 from remodel_fenicsx.results.checkpoint_file import CheckpointError, read_checkpoint, read_pointer
 from remodel_fenicsx.results.recording import RecordingError
 from remodel_fenicsx.results.vtkhdf import TransientGrid
@@ -192,7 +192,7 @@ def place(tmp_path_factory: pytest.TempPathFactory, first_half: Path) -> Iterato
     shutil.copytree(first_half, folder / "run")
     before = Path.cwd()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(simulation, "run", lambda scene, output, **_: output or Path("results"))
+        patch.setattr(running, "run", lambda scene, output, **_: output or Path("results"))
         patch.setitem(cli.COMMANDS, "figures", lambda options: 0)
         os.chdir(folder)
         yield folder
@@ -219,7 +219,7 @@ COMMANDS = st.tuples(st.sampled_from(["run", "run", "status", "validate", "new"]
 @given(command=COMMANDS)
 def test_a_command_line(command: tuple[str, list[str]], place: Path) -> None:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(simulation, "resume", lambda folder, changes, **_: _kept(folder, changes))
+        patch.setattr(running, "resume", lambda folder, changes, **_: _kept(folder, changes))
         before = sorted(path.name for path in place.iterdir())
         answer(command[0], *command[1], codes=(0, 2, 5))
         assert sorted(path.name for path in place.iterdir()) == before
@@ -230,7 +230,7 @@ def _kept(folder: Path, changes: list[str]) -> Path:
     from remodel_fenicsx.results.run_folder import locked
 
     with locked(folder, SELF, new=False):
-        simulation._kept(folder, changes, SELF)
+        running._kept(folder, changes, SELF)
     return folder
 
 

@@ -25,7 +25,7 @@ from remodel_fenicsx.results.history import History
 from remodel_fenicsx.results.recording import read_history
 from remodel_fenicsx.results.run_folder import FolderTaken
 from remodel_fenicsx.results.vtkhdf import TransientGrid
-from remodel_fenicsx.simulation import resume, run
+from remodel_fenicsx.running import resume, run
 from tests.conftest import mpirun
 from tests.processes import session_members
 from tests.test_resume import LONGER, SELF, assert_close, assert_same, half, first_half, rows, scene, whole

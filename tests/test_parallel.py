@@ -9,7 +9,7 @@ import pytest
 
 from remodel_fenicsx.scene.scene import read_scene
 from tests.conftest import Case
-from tests.test_artery import ARTERY
+from tests.test_artery import ARTERY, slice_of
 
 TIGHT = {"absolute_tolerance": 1e-10, "relative_tolerance": 0.0}
 SCENES = {
@@ -43,7 +43,8 @@ def compare(one: dict, two: dict, steps: int) -> None:
 def test_one_and_two_ranks_agree(case: Case, name: str) -> None:
     """Through the ramp and a little beyond."""
     scene = SCENES[name] | {"time": {"end": 30.0}}
-    one, two = (case(scene, ranks=ranks) for ranks in (1, 2))
+    arguments = slice_of(scene) if name == "artery" else {"scene": scene}
+    one, two = (case(**arguments, ranks=ranks) for ranks in (1, 2))
     compare(one, two, 30)
 
 

@@ -14,6 +14,7 @@ from remodel_fenicsx.body import cube, tube
 from remodel_fenicsx.evolution.equilibrium import Extension
 from remodel_fenicsx.evolution.newton import SolveFailure
 from remodel_fenicsx.scene.parameters import Cells, Material
+from remodel_fenicsx.tissue.operators import passes_through_zero
 from tests import parts
 
 RANDOM = Cells(initial="random", seed=3)
@@ -249,6 +250,33 @@ def test_wrong_branch_is_there_and_refused(monkeypatch: pytest.MonkeyPatch) -> N
     assert caught.value.newton_iterations < 10
     assert caught.value.extension.max_chain_extension == pytest.approx(2.7212, abs=1e-3)
     np.testing.assert_array_equal(made.displacement.x.array, start)
+
+
+def test_a_straight_way_through_a_collapsed_volume_is_seen() -> None:
+    """Against the determinant at many places of the way, for ends that are both in order."""
+    rng = np.random.default_rng(4)
+    before, after = (np.eye(3) + 0.7 * rng.standard_normal((20_000, 3, 3)) for _ in range(2))
+    good = (np.linalg.det(before) > 0) & (np.linalg.det(after) > 0)
+    before, after = before[good], after[good]
+    lowest = np.min([np.linalg.det(before + s * (after - before)) for s in np.linspace(0, 1, 401)], axis=0)
+    found = passes_through_zero(before, after)
+    assert np.all(found[lowest <= 0]) and np.all(lowest[found] < 1e-3)
+    assert 0.02 < found.mean() < 0.2
+    half_a_turn = np.diag([-1.0, -1.0, 1.0])[None]
+    assert passes_through_zero(np.eye(3)[None], half_a_turn) and not passes_through_zero(half_a_turn, half_a_turn)
+    assert not passes_through_zero(np.eye(3)[None], np.full((1, 3, 3), np.nan))  # others refuse that
+
+
+def test_a_newton_step_does_not_turn_elements_inside_out() -> None:
+    """Half a turn as a step: J = 1 at its end, zero on the way."""
+    made = parts.body(cube(refinement=1), Cells(initial="isotropic"))
+    made.supported()
+    newton = made.problem().newton
+    x, step = newton.unknown.x.petsc_vec.duplicate(), newton.unknown.x.petsc_vec.duplicate()
+    step.array[:] = -(made.nodes @ (np.diag([-1.0, -1.0, 1.0]) - np.eye(3)).T).ravel()
+    asked = step.array.copy()
+    assert newton._keep_admissible(x, step)
+    np.testing.assert_allclose(step.array, asked / 4)  # at a half it is zero
 
 
 @pytest.mark.parametrize("stretch", [2.5, 4.0, 8.0])

@@ -28,7 +28,7 @@ from remodel_fenicsx.results.checkpoint_file import Checkpoint, CheckpointError,
 from remodel_fenicsx.results.recording import RecordingError
 from remodel_fenicsx.results.run_lock import FolderTaken, RunLock, lock_holder
 from remodel_fenicsx.results.status import status
-from remodel_fenicsx.simulation import resume, run
+from remodel_fenicsx.running import resume, run
 from remodel_fenicsx.system.interrupts import Paused
 from remodel_fenicsx.tissue.cells import structure_tensor
 from tests.conftest import mpirun

@@ -240,7 +240,7 @@ def test_a_load_beyond_floating_point_is_exit_code_3_and_said_in_words(tmp_path:
     assert "no equilibrium at time 1: " in done.stderr and "too large or too small for floating-point" in done.stderr
 
 
-@pytest.mark.parametrize("ranks", [1, 2])
+@pytest.mark.parametrize("ranks", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_an_impossible_load_is_exit_code_3_and_says_where(tmp_path: Path, ranks: int) -> None:
     # axial chains lock at a stretch of L / r0 = 1.594: reached between t = 2 and t = 3
     settings = ["cells.initial=aligned", "cells.aligned_axis=2", "loads.elongation.value=1.0", "loads.pressure.value=0"]
@@ -307,7 +307,7 @@ def test_an_exception_in_a_script_on_two_ranks_ends_both(kind: str, tmp_path: Pa
     program = tmp_path / "program.py"
     program.write_text(
         "from remodel_fenicsx.scene.scene import preset_scene\n"
-        "from remodel_fenicsx.simulation import run\n"
+        "from remodel_fenicsx.running import run\n"
         f"run(preset_scene('kuhl-holzapfel-2007', 'cube'), {str(tmp_path / 'file' / 'below')!r})\n"
     )
     words = [str(program)] if kind == "script" else [str(PROJECT / "demos" / "cube.py"), "2", str(tmp_path)]
@@ -465,7 +465,10 @@ def test_validate_new_and_info(tmp_path: Path, capsys: pytest.CaptureFixture[str
 # ---------------------------------------------------------------- demos
 
 
-@pytest.mark.parametrize(("name", "end"), [("cube", None), ("tendon", "14"), ("artery", "27")])  # into the hold
+WHOLE_RAMP = [pytest.param(*case, marks=pytest.mark.slow) for case in (("tendon", "14"), ("artery", "27"))]
+
+
+@pytest.mark.parametrize(("name", "end"), [("cube", None), ("tendon", "3"), ("artery", "2"), *WHOLE_RAMP])
 def test_the_script_and_the_scene_of_a_demo_are_the_same_simulation(name: str, end: str | None, tmp_path: Path) -> None:
     script = subprocess.run(
         [sys.executable, str(PROJECT / "demos" / f"{name}.py"), *([end] if end else [])], cwd=tmp_path,

@@ -70,7 +70,7 @@ def test_a_signal_that_was_ignored_from_the_start_stays_ignored(number: signal.S
         ("mpi4py", signal.SIGTERM),
         ("petsc4py.PETSc", signal.SIGINT),
         ("dolfinx", signal.SIGTERM),
-        ("remodel_fenicsx.simulation", signal.SIGHUP),  # PETSc is there by then, and has taken it
+        ("remodel_fenicsx.running", signal.SIGHUP),  # PETSc is there by then, and has taken it
     ],
 )
 def test_a_signal_among_the_imports_ends_with_a_line(module: str, number: signal.Signals, tmp_path: Path) -> None:
@@ -90,7 +90,7 @@ runpy.run_path({str(PROJECT / "bin" / "remodel-fenicsx")!r}, run_name="__main__"
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("module", ["simulation", "evolution.equilibrium", "system.interrupts", "cli"])
+@pytest.mark.parametrize("module", ["running", "evolution.equilibrium", "system.interrupts", "cli"])
 def test_an_import_changes_no_handler(module: str) -> None:
     """What Python knows of; PETSc puts some of its own below (take_back_signals)."""
     program = f"""
@@ -126,11 +126,11 @@ except BrokenPipeError:
 def test_a_signal_before_the_first_step_ends_the_run_where_it_comes(tmp_path: Path) -> None:
     program = f"""
 import os, signal, sys
-from remodel_fenicsx import cli, simulation
+from remodel_fenicsx import cli, running
 def meshing(scene, comm):
     os.kill(os.getpid(), signal.SIGTERM)
     raise AssertionError("it goes on")
-simulation.Simulation = meshing
+running.Simulation = meshing
 sys.exit(cli.main({[*CUBE, "-o", str(tmp_path / "out")]!r}))
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=100)

@@ -90,9 +90,9 @@ def test_only_the_stress_as_printed_ends_near_140_percent(case: Case) -> None:
 
 
 def test_isotropic_cells_stay_homogeneous_and_follow_the_point_solution(case: Case) -> None:
-    result = case(tendon_scene(initial="isotropic"), snapshots=SNAPSHOTS)
+    result = case(tendon_scene(initial="isotropic") | {"time": {"end": 50.0}})
     np.testing.assert_allclose(result["max_stretch"], result["min_stretch"], rtol=0, atol=1e-8)
-    for time in (1.0, 6.0, 12.0, 13.0, 50.0, 150.0):
+    for time in (1.0, 6.0, 12.0, 13.0, 50.0):
         row = int(np.flatnonzero(result["time"] == time)[0])
         s = 1 - np.exp(-KAPPA * (time - 1.0))
         across = (1 - s) / np.sqrt(3)

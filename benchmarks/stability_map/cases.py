@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -140,6 +141,7 @@ def with_values(scene: Mapping[str, Any], changes: Mapping[str, Any]) -> Values:
 
 
 Family = Callable[[], Iterator[Case]]
+MODULES = ("homogeneous", "bodies", "prescribed", "consistent", "variants")
 FAMILIES: dict[str, Family] = {}
 """Generators of cases by name, in the order of the table."""
 
@@ -162,8 +164,8 @@ def all_cases() -> dict[str, Case]:
     ValueError
         If two have the same key.
     """
-    from benchmarks.stability_map import bodies, homogeneous, prescribed  # noqa: F401  they register their families
-
+    for name in MODULES:
+        import_module(f"benchmarks.stability_map.{name}")  # it registers its families
     found: dict[str, Case] = {}
     for make in FAMILIES.values():
         for case in make():

@@ -106,12 +106,16 @@ def path_of(scene: dict[str, Any]) -> Path:
 
 def check_point(case: Case, run: Run) -> Finding:
     """Stretch and angle by step, and the cells at the end."""
-    path = path_of(case.scene)
-    unstable = saddle(case.scene, path)
+    return compared(case.scene, run, path_of(case.scene))
+
+
+def compared(scene: dict[str, Any], run: Run, path: Path) -> Finding:
+    """A run held against a path."""
+    unstable = saddle(scene, path)
     rows = min(len(path.times), len(run.column("time")))
     if rows == 0:
         return Finding(np.inf if run.code == 0 else 0.0, "no row", unstable, not path.ended)
-    found = deviations(case.scene, run, path, rows)
+    found = deviations(scene, run, path, rows)
     words, ratio = max(found.items(), key=lambda pair: pair[1])
     said = f"{words} off by {ratio:.3g} tolerances" + (f"; reference: {path.ended}" if path.ended else "")
     if path.ended and run.code == 0:
@@ -158,12 +162,14 @@ def deviations(scene: dict[str, Any], run: Run, path: Path, rows: int) -> dict[s
 
 
 # ---------------------------------------------------------------- families
-def cube_case(family_name: str, changes: dict[str, Any], place: dict[str, Any], **more: Any) -> Case:
+def cube_case(
+    family_name: str, changes: dict[str, Any], place: dict[str, Any], check: Check = check_point, **more: Any
+) -> Case:
     """The demo's cube with other values."""
     scene = with_values(CUBE, changes)
     key = f"{family_name}: " + ", ".join(f"{name} {value}" for name, value in place.items())
     options = {"reference": REFERENCE, "place": place, "base": ("demos/cube.toml", changes), **more}
-    return Case(family_name, key, scene, check_point, **options)
+    return Case(family_name, key, scene, check, **options)
 
 
 LOADS = (0.0, 1e-4, 1e-3, 0.01, 0.03, 0.1, 0.3, 0.5, 1.0, 3.0, 10.0, 30.0, 100.0, 1e3, 1e4, 1e6, 1e9)

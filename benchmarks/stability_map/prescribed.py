@@ -55,13 +55,17 @@ def limit(scene: dict[str, Any], finer: int) -> np.ndarray:
 
 def check_limit(case: Case, run: Run) -> Finding:
     """F everywhere as on the boundary, and A as for dt -> 0."""
+    return compared_with_limit(case.scene, run, limit(case.scene, FINER), limit(case.scene, FINER // 2))
+
+
+def compared_with_limit(scene: dict[str, Any], run: Run, expected: np.ndarray, coarser: np.ndarray) -> Finding:
+    """A run held against A for a small step, and for one twice as large."""
     if "time" not in run.fields:
         return Finding(0.0, "no field")
-    r0 = case.scene["cells"]["end_to_end_length"]
-    expected, coarser = limit(case.scene, FINER), limit(case.scene, FINER // 2)
+    r0 = scene["cells"]["end_to_end_length"]
     if np.abs(expected - coarser).max() / r0**2 > SETTLED:
         return Finding(np.nan, "the reference does not converge with dt")
-    F = gradients(case.scene, step_times(case.scene))[-1]
+    F = gradients(scene, step_times(scene))[-1]
     patch = np.abs(run.tensor("deformation_gradient") - F).max() / np.abs(F).max() / 1e-5
     cells = np.abs(run.structure_tensor() - expected).max() / r0**2 / LIMIT_TOLERANCE
     words = f"A differs from dt -> 0 by {cells * LIMIT_TOLERANCE:.3g} r0^2" if cells > patch else "F is not uniform"

@@ -251,15 +251,20 @@ class GuardedNewton:
     def _keep_admissible(self, x: Any, step: Any) -> bool:
         """Halve the Newton step until r < L and J > 0 everywhere (trial: x - step). True when it changed the step.
 
+        J > 0 all the way there: a step that turns two axes of an element has J > 0 at its end again.
         Near L each point also keeps a share of its 1 - r/L: from a point much too near, where forces are huge, Newton's
         method comes back only by a factor of 1.5 an iteration.
         """
+        self._push(x)
+        before = self.equilibrium.deformation_gradients()
         trial = x.duplicate()
         for halving in range(LINE_SEARCH_HALVINGS + 1):
             trial.waxpy(-1.0, step, x)
             self._push(trial)
             extension, stretches = self.equilibrium.extension_and_stretches()
-            if extension.stop_signal or (extension.admissible and self._keeps_reserve(stretches)):
+            if extension.stop_signal:
+                break
+            if extension.admissible and self._keeps_reserve(stretches) and self._keeps_sense(before):
                 break
             step.scale(0.5)
         else:
@@ -272,6 +277,9 @@ class GuardedNewton:
     def _keeps_reserve(self, stretches: NDArray[np.float64]) -> bool:
         before = self._stretches
         return before is None or self.equilibrium.keeps_reserve(before, stretches, KEPT_RESERVE, NEAR_LOCKING)
+
+    def _keeps_sense(self, before: NDArray[np.float64]) -> bool:
+        return not self.equilibrium.turns_inside_out(before, self.equilibrium.deformation_gradients())
 
     def _converged(self, snes: Any, iteration: int, norms: tuple[float, float, float]) -> int:
         """|R| <= absolute_tolerance + relative_tolerance * |nodal forces|: a scale that does not vanish in a hold."""

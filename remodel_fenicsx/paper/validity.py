@@ -66,7 +66,7 @@ def source_fingerprint(package: Path = Path(remodel_fenicsx.__file__).parent) ->
     imports from the package counts by the source that it comes from, not by its path.
     """
     finder = ModuleFinder([str(package.parent)])  # finds neither libraries nor Python's own modules
-    finder.import_hook(f"{package.name}.simulation")
+    finder.import_hook(f"{package.name}.running")
     imports: dict[str, list[tuple[str, str, str]]] = {}
     bodies: dict[str, str] = {}
     for name, module in finder.modules.items():

@@ -1,0 +1,234 @@
+"""Families of the consistent variant: law `tensor`, repulsion `log`, staggered and extrapolated, typed by hand here."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from benchmarks.stability_map.bodies import tendon_case
+from benchmarks.stability_map.cases import Case, Finding, Run, family
+from benchmarks.stability_map.homogeneous import (
+    DRIVERS,
+    ELEMENTS,
+    RAMP,
+    TRIAXIAL,
+    case_of_shape,
+    compared,
+    cube_case,
+    initial,
+    material,
+    nominal_stress,
+    step_times,
+)
+from benchmarks.stability_map.point import Array, NoEquilibrium, Path, advance
+from benchmarks.stability_map.prescribed import FINER, compared_with_limit, gradients
+from tests.reference.radial import RadialMaterial, cauchy_stress, driving_values, secant_stiffness
+
+SCHEMES = ("staggered", "extrapolated")
+VARIANT = {"remodeling.law": "tensor", "remodeling.frame": "material", "material.repulsion": "log"}
+COMPRESSION = 0.1
+
+
+# ---------------------------------------------------------------- the law, along fixed axes
+class Target:
+    """E (3) and s of a state with axes along x, y, z."""
+
+    def __init__(self, direction: Array, share: float, time: float):
+        self.direction, self.share, self.time = direction, share, time
+
+    @classmethod
+    def of(cls, driver: str, stretches: Array, squares: Array, m: RadialMaterial, time: float) -> Target:
+        """For `finger` C, for the others sigma or S, as their positive parts."""
+        values = driving_values(driver, stretches[None], cauchy_stress(stretches[None], squares[None], m))[0]
+        positive, negative = np.maximum(values, 0.0) ** 2, np.minimum(values, 0.0) ** 2
+        tension = positive.sum()
+        # what is below rounding of the stress remodels nothing
+        floor = 0.0 if driver == "finger" else (1e-7 * (m.lame_lambda + 2 * m.lame_mu + m.network_modulus)) ** 2
+        share = tension / (tension + COMPRESSION**2 * negative.sum() + floor)
+        return cls(positive / (tension or 1.0), float(share), time)
+
+    def ahead(self, before: Target | None, time: float) -> Target:
+        """In the middle of the step to `time`, along the line through two states."""
+        if before is None:
+            return self
+        slope = (time - self.time) / 2 / (self.time - before.time)
+        direction = self.direction + slope * (self.direction - before.direction)
+        return Target(direction, float(np.clip(self.share + slope * (self.share - before.share), 0, 1)), time)
+
+    def follow(self, squares: Array, r0: float, rate: float) -> Array:
+        """dA/dt = kappa s (r0^2 E - A), exactly."""
+        return squares + (r0**2 * self.direction - squares) * -np.expm1(-rate * self.share)
+
+
+def diagonal_path(
+    m: RadialMaterial, forces: Array, times: Array, dimensions: Array, driver: str, scheme: str, kappa: float
+) -> Path:
+    """As `point.diagonal_path`, for the law `tensor`. Coaxial, the repulsion `log` is the paper's."""
+    squares, stretches, load, path = dimensions**2, np.ones(3), np.zeros(3), Path()
+    old, last, before, r0, start = squares, None, None, m.end_to_end_length, 0.0
+    for time, new_load in zip(times, forces, strict=True):
+        now, rate = float(time), kappa * (float(time) - start)
+        try:
+            if scheme == "extrapolated" and last is not None:
+                squares = last.ahead(before, now).follow(old, r0, rate)
+            stretches = advance(stretches, (old[None], load), (squares[None], new_load), m)
+            if scheme == "extrapolated" and last is None:
+                old, load = squares, new_load
+                squares = Target.of(driver, stretches, squares, m, now).follow(squares, r0, rate)
+                stretches = advance(stretches, (old[None], load), (squares[None], new_load), m)
+        except NoEquilibrium as error:
+            path.ended = f"no equilibrium at t = {now:g}: {error}"
+            return path
+        path.times.append(now)
+        path.stretches.append(stretches)
+        path.squares.append(squares)
+        old, load = squares, new_load
+        if scheme == "extrapolated":
+            before, last = last, Target.of(driver, stretches, squares, m, now)
+        else:
+            squares = Target.of(driver, stretches, squares, m, now).follow(squares, r0, rate)
+        start = now
+    return path
+
+
+def check_point(case: Case, run: Run) -> Finding:
+    """Stretch and angle by step, and the cells at the end."""
+    scene, times = case.scene, step_times(case.scene)
+    r = scene["remodeling"]
+    path = diagonal_path(
+        material(scene), nominal_stress(scene, times), times, initial(scene), r["driver"], r["coupling"], r["kappa"]
+    )
+    return compared(scene, run, path)
+
+
+# ---------------------------------------------------------------- any deformation, prescribed
+def cauchy(F: Array, A: Array, m: RadialMaterial) -> Array:
+    """sigma of W_iso + W_chn(r), r^2 = A : C, - c/2 g(r0) A : ln C."""
+    C, J = F.T @ F, np.linalg.det(F)
+    squares, Q = np.linalg.eigh(C)
+    near = np.abs(squares[:, None] - squares) < 1e-7 * squares.max()
+    middle = (squares[:, None] + squares) / 2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        quotients = (np.log(squares)[:, None] - np.log(squares)) / (squares[:, None] - squares)
+    dlnC = Q @ (np.where(near, 1 / middle, quotients) * (Q.T @ A @ Q)) @ Q.T
+    g, g0 = (secant_stiffness(r, m.contour_length) for r in (np.sqrt(np.sum(A * C)), np.array(m.end_to_end_length)))
+    inner = m.lame_mu * np.eye(3) + m.network_modulus * (g * A - g0 * dlnC)
+    return np.asarray(((m.lame_lambda * np.log(J) - m.lame_mu) * np.eye(3) + F @ inner @ F.T) / J)
+
+
+def material_driver(driver: str, F: Array, sigma: Array) -> Array:
+    """R^T sigma R, S or C."""
+    C = F.T @ F
+    if driver == "finger":
+        return C
+    if driver == "pk2":
+        inverse = np.linalg.inv(F)
+        return inverse @ sigma @ inverse.T
+    squares, Q = np.linalg.eigh(C)
+    R = F @ (Q / np.sqrt(squares)) @ Q.T
+    return R.T @ sigma @ R
+
+
+def prescribed_end(m: RadialMaterial, F: Array, times: Array, start: Array, driver: str, kappa: float) -> Array:
+    """A at the last time but one step, for small steps: remodeled after each state."""
+    A, before, r0 = np.diag(start**2), 0.0, m.end_to_end_length
+    for time, gradient in zip(times[:-1], F[:-1], strict=True):
+        values, vectors = np.linalg.eigh(material_driver(driver, gradient, cauchy(gradient, A, m)))
+        positive, negative = np.maximum(values, 0.0) ** 2, np.minimum(values, 0.0) ** 2
+        if positive.sum() > 0:
+            share = positive.sum() / (positive.sum() + COMPRESSION**2 * negative.sum())
+            direction = (vectors * positive / positive.sum()) @ vectors.T
+            A = A + (r0**2 * direction - A) * -np.expm1(-kappa * (float(time) - before) * share)
+        before = float(time)
+    return A
+
+
+def check_limit(case: Case, run: Run) -> Finding:
+    """F everywhere as on the boundary, and A as for dt -> 0; the staggered row is a pass behind."""
+    scene, r = case.scene, case.scene["remodeling"]
+    behind = scene["time"]["step"] if r["coupling"] == "staggered" else 0.0
+    end = step_times(scene)[-1] - behind
+
+    def limit(finer: int) -> Array:
+        step = scene["time"]["step"] / finer
+        times = step * np.arange(1, round(end / step) + 2)
+        return prescribed_end(
+            material(scene), gradients(scene, times), times, initial(scene), r["driver"], r["kappa"]
+        )  # fmt: skip
+
+    return compared_with_limit(scene, run, limit(FINER), limit(FINER // 2))
+
+
+# ---------------------------------------------------------------- families
+variant_case = partial(cube_case, check=check_point)
+
+
+def _changes(driver: str, scheme: str, **more: Any) -> dict[str, Any]:
+    return {**VARIANT, "remodeling.driver": driver, "remodeling.coupling": scheme, **more}
+
+
+@family("consistent")
+def homogeneous() -> Iterator[Case]:
+    """Loads, speeds, elements on the cube."""
+    for driver in DRIVERS:
+        for scheme in SCHEMES:
+            for load in (0.01, 0.1, 1.0, 10.0, 100.0, 1e4, -3.0):
+                changes = _changes(driver, scheme, **{"loads.force.value": load, "time.end": 40.0})
+                place = {"driver": driver, "coupling": scheme, "force": load}
+                yield variant_case("consistent", changes, place, reduced=driver == "cauchy" and load == 10)
+            for speed in (1e-3, 0.25, 1.0, 10.0, 1e3):
+                changes = _changes(driver, scheme, **{"remodeling.kappa": speed, "time.end": 20.0})
+                yield variant_case("consistent", changes, {"driver": driver, "coupling": scheme, "kappa dt": speed})
+        for element, (kind, degree) in ELEMENTS.items():
+            changes = _changes(driver, "extrapolated", **{"mesh.element": kind, "mesh.degree": degree})
+            changes |= {"time.end": 20.0, "time.step": 2.0}
+            yield variant_case("consistent", changes, {"driver": driver, "element": element})
+
+
+@family("consistent, three axes")
+def three_axes() -> Iterator[Case]:
+    """Repeated and crossing principal stresses, loads that turn."""
+    block = partial(case_of_shape, "block", check_point)
+    for name, (forces, end) in TRIAXIAL.items():
+        for driver in DRIVERS:
+            for scheme in SCHEMES if driver == "cauchy" else SCHEMES[1:]:
+                changes = {f"loads.force_{a}": {"value": v, "ramp": ramp} for a, (v, ramp) in forces.items()}
+                changes |= _changes(driver, scheme, **{"time.end": end})
+                place = {"load": name, "driver": driver, "coupling": scheme}
+                yield block("consistent, three axes", changes, place)
+
+
+@family("consistent, shear")
+def shears() -> Iterator[Case]:
+    """Axes that are not coaxial, and a shear that changes its sign."""
+    driven = partial(case_of_shape, "driven", check_limit, reference="material point, dt -> 0")
+    reversed_ramp = [[0, 0], [10, 1], [30, 1], [50, -1]]
+    for driver in DRIVERS:
+        for scheme in SCHEMES:
+            for amount, ramp, end in ((0.3, RAMP, 40.0), (1.0, RAMP, 40.0), (0.3, reversed_ramp, 80.0)):
+                loads = {"loads.h_xz": {"value": amount, "ramp": ramp}, "time.end": end}
+                history = "reversed" if end > 40 else "held"
+                place = {"shear": amount, "history": history, "driver": driver, "coupling": scheme}
+                reduced = (driver, amount, history) == ("cauchy", 0.3, "held")
+                yield driven("consistent, shear", _changes(driver, scheme, **loads), place, reduced=reduced)
+
+
+@family("consistent, bodies")
+def bodies() -> Iterator[Case]:
+    """Random cells from weak loads to locking, and a twisted bar."""
+    for driver in DRIVERS:
+        for scheme in SCHEMES:
+            for force in (30.0, 300.0, 1000.0):
+                changes = _changes(driver, scheme, **{"loads.force.value": force})
+                place = {"cells": "random", "driver": driver, "coupling": scheme, "force": force}
+                yield tendon_case("consistent, bodies", changes, place)
+            for twist in (0.5, 3.0):
+                loads = {"twist": {"value": twist, "ramp": RAMP}, "elongation": {"value": 0.1, "ramp": RAMP}}
+                changes = _changes(driver, scheme, **{"geometry.shape": "twisted", "loads": loads})
+                changes |= {"cells.initial": "isotropic"}
+                place = {"driver": driver, "coupling": scheme, "twist": twist}
+                options = {"options": {"column": "stored_energy"}, "extended": True}
+                yield tendon_case("consistent, bodies", changes, place, **options)

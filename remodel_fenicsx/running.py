@@ -1,0 +1,265 @@
+"""Recorded runs: a scene run in a folder, or a run in a folder that goes on."""
+
+from __future__ import annotations
+
+import logging
+import tomllib
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TypeVar, cast
+
+from mpi4py import MPI
+
+from remodel_fenicsx.evolution.parts import StepFailure
+from remodel_fenicsx.evolution.pause import Pause
+from remodel_fenicsx.evolution.stepper import Step, Watcher
+from remodel_fenicsx.results.checkpoint import Checkpoints, restore_state
+from remodel_fenicsx.results.checkpoint_file import Checkpoint, CheckpointError, read_checkpoint
+from remodel_fenicsx.results.fields import Fields
+from remodel_fenicsx.results.recording import SCENE, RecordingError
+from remodel_fenicsx.results.run_folder import FolderTaken, LastStep, RunFolder, chosen_folder, forget_steps, locked
+from remodel_fenicsx.scene import Scene, SceneError, read_scene, scene_from_dict
+from remodel_fenicsx.scene.continuation import check_continuation
+from remodel_fenicsx.simulation import Simulation
+from remodel_fenicsx.system.environment import versions
+from remodel_fenicsx.system.interrupts import (
+    Interrupted,
+    Paused,
+    StopRequest,
+    end_all_ranks_on_exception,
+    stopping_at_once,
+)
+from remodel_fenicsx.system.terminal import Progress, hold_log, open_log
+
+log = logging.getLogger(__name__)
+
+
+def run(
+    scene: Scene,
+    folder: Path | str | None = None,
+    comm: MPI.Intracomm = MPI.COMM_WORLD,
+    quiet: bool = True,
+    deadline: float | None = None,
+) -> Path:
+    """Run a scene and record it.
+
+    Parameters
+    ----------
+    scene
+        The validated scene.
+    folder
+        New or empty folder for the results; default: results/NAME, numbered when taken.
+    comm
+        MPI communicator.
+    quiet
+        No progress on the terminal.
+    deadline
+        `time.monotonic` before which it shall stop, between two steps; None: never.
+
+    Returns
+    -------
+    The folder with history.csv, fields.vtkhdf, fields_chains.vtkhdf, scene.toml, run.log and the checkpoints.
+
+    Raises
+    ------
+    FolderTaken
+        If the folder is not empty.
+    StepFailure
+        If a step has no admissible equilibrium; all steps before it are recorded, with a checkpoint.
+    Interrupted
+        On SIGINT, SIGTERM or SIGHUP; all accepted steps are recorded.
+    Paused
+        On SIGUSR1, or before the deadline; all is recorded, with a checkpoint.
+    OSError
+        If the results cannot be written.
+    """
+    end_all_ranks_on_exception()
+    # what the scene asks for is built before anything is written
+    place = None if folder is None else chosen_folder(folder, scene.name, comm)
+    with StopRequest() as stop:
+        with hold_log(comm.rank, quiet=quiet) as held:
+            simulation = _built(scene, comm)
+            place = place or chosen_folder(None, scene.name, comm)
+        with _closing(simulation), locked(place, comm, new=True):
+            _record(simulation, place, _Circumstances(stop, quiet, held, deadline))
+    return place
+
+
+def resume(
+    folder: Path | str,
+    overrides: Sequence[str] = (),
+    comm: MPI.Intracomm = MPI.COMM_WORLD,
+    quiet: bool = True,
+    deadline: float | None = None,
+) -> Path:
+    """Go on with a recorded run from its last checkpoint, or from t = 0 where it has none yet.
+
+    Parameters
+    ----------
+    folder
+        The run's.
+    overrides
+        "KEY=VALUE": keys that may change are time.end, output, solver, and loads after the checkpoint.
+    comm, quiet, deadline
+        As for `run`; the number of ranks may be another one.
+
+    Returns
+    -------
+    The folder.
+
+    Raises
+    ------
+    FolderTaken
+        If it is not the folder of a run, or a run writes in it.
+    SceneError, CheckpointError, RecordingError
+        If the scene is another one, no checkpoint is whole, or history or fields are damaged.
+    StepFailure, Interrupted, Paused, OSError
+        As `run` does.
+    """
+    end_all_ranks_on_exception()
+    place = Path(folder)
+    with StopRequest() as stop, locked(place, comm, new=False):
+        with hold_log(comm.rank, quiet=quiet) as held:
+            scene, checkpoint = _kept(place, overrides, comm)
+            simulation = _built(scene, comm)
+        with _closing(simulation):
+            if comm.bcast(checkpoint is not None):
+                restore_state(simulation.state, checkpoint)
+            _record(simulation, place, _Circumstances(stop, quiet, held, deadline, resumes=True))
+    return place
+
+
+def _kept(place: Path, overrides: Sequence[str], comm: MPI.Intracomm) -> tuple[Scene, Checkpoint | None]:
+    """Scene, and checkpoint on rank 0, of a run that goes on; or the refusal on all ranks."""
+    scene = checkpoint = refusal = None
+    if comm.rank == 0:
+        try:
+            scene = read_scene(place / SCENE, overrides)
+            checkpoint = read_checkpoint(place)
+            if checkpoint is not None:
+                check_continuation(scene_from_dict(tomllib.loads(checkpoint.scene)), scene, checkpoint.time)
+                _say_where(checkpoint)
+            else:
+                log.info("no checkpoint yet: starts again at t = 0")
+        except (SceneError, CheckpointError) as error:
+            refusal = error
+    refusal = comm.bcast(refusal)
+    if refusal is not None:
+        raise refusal
+    return comm.bcast(scene), checkpoint
+
+
+def _say_where(checkpoint: Checkpoint) -> None:
+    log.info("goes on from the checkpoint of time %g, step %d", checkpoint.time, checkpoint.number)
+    now = versions()
+    for name, version in checkpoint.versions.items():
+        if now.get(name) != version:
+            log.warning("goes on with %s %s, was %s", name, now.get(name), version)
+
+
+def _built(scene: Scene, comm: MPI.Intracomm) -> Simulation:
+    try:
+        with stopping_at_once():
+            return Simulation(scene, comm)
+    except Interrupted as interruption:
+        interruption.kept = "nothing was computed"
+        raise
+
+
+@contextmanager
+def _closing(simulation: Simulation) -> Iterator[None]:
+    """Close it at the end, if all ranks come there: the others would wait for ever."""
+    try:
+        yield
+    except (StepFailure, Interrupted, Paused, FolderTaken, SceneError, CheckpointError, RecordingError):
+        simulation.close()
+        raise
+    except BaseException:
+        if simulation.domain.comm.size == 1:
+            simulation.close()
+        raise
+    simulation.close()
+
+
+@dataclass
+class _Circumstances:
+    """Of a run: who may stop it, what was logged before it had a folder, whether it goes on."""
+
+    stop: StopRequest
+    quiet: bool
+    held: list[logging.LogRecord] = field(default_factory=list)
+    deadline: float | None = None
+    resumes: bool = False
+
+
+def _record(simulation: Simulation, place: Path, around: _Circumstances) -> None:
+    scene, comm, state = simulation.scene, simulation.domain.mesh.comm, simulation.state
+    header = "as run: all values, also those of preset and defaults\n" + "\n".join(
+        f"{name} {version}" for name, version in versions().items()
+    )
+    text = scene.to_toml(header)
+    columns = [column.name for column in simulation.observer.columns]
+    after = LastStep(columns, state.number, state.time) if state.number else None
+    if around.resumes and after is None and comm.rank == 0:
+        forget_steps(place)
+    with ExitStack() as stack:
+        record = stack.enter_context(_agreed(comm, lambda: RunFolder(place, text, comm.rank, after)))
+        stack.enter_context(open_log(place / "run.log", comm.rank, quiet=around.quiet, held=around.held))
+        progress = stack.enter_context(
+            Progress(scene.time.number_of_steps, scene.name, -1 if around.quiet else comm.rank, done=state.number)
+        )
+        log.info("scene %s on %d ranks, results in %s", scene.name, comm.size, place)
+        log.info("%s", scene.summary())
+        for warning in scene.warnings():
+            log.warning("%s", warning)
+        watchers: list[Watcher] = []
+        if scene.output.fields:
+            parts = place, scene.geometry, simulation.stepper, scene.output.every, after and after.time
+            watchers.append(stack.enter_context(_agreed(comm, lambda: Fields(*parts))))
+        checkpoints = Checkpoints(place, state, text, scene.output.checkpoint)
+        pause = Pause(comm, place, lambda: around.stop.pause, around.deadline)
+        watchers += [record, _Report(scene, progress), checkpoints, pause]
+        simulation.stepper.stop_signal = lambda: around.stop.number
+        try:
+            for _ in simulation.steps(watchers):
+                pass
+        except (StepFailure, Interrupted, Paused) as reason:
+            log.info("ended: %s", reason)
+            if getattr(reason, "on_all_ranks", True):
+                checkpoints.write()
+            raise
+        log.info("finished")
+
+
+T = TypeVar("T")
+
+
+def _agreed(comm: MPI.Intracomm, make: Callable[[], T]) -> T:
+    """What `make` makes of the files of a run that goes on, or its refusal on all ranks. Collective."""
+    made = refusal = None
+    try:
+        made = make()
+    except RecordingError as error:  # rank 0 alone reads
+        refusal = error
+    refusal = comm.bcast(refusal)
+    if refusal is not None:
+        raise refusal
+    return cast(T, made)
+
+
+class _Report(Watcher):
+    """Each accepted step in the log and on the terminal."""
+
+    def __init__(self, scene: Scene, progress: Progress):
+        self.progress = progress
+        self.loads = [kind.column or name for name, kind in scene.geometry.loads.items()]
+
+    def committed(self, step: Step) -> None:
+        """Say it."""
+        log.info("%s", ", ".join(f"{name} {value:.6g}" for name, value in step.row.items()))
+        parts = step.work.substeps
+        message = f"time {step.time:g} solved in {parts} parts" if parts > 1 else None
+        loads = ", ".join(f"{name} {step.row[name]:.4g}" for name in self.loads if name in step.row)
+        self.progress.step(step.number, step.time, loads, step.work.newton_iterations, message)
