@@ -7,7 +7,7 @@ import logging
 from remodel_fenicsx.body.loading import LoadValues
 from remodel_fenicsx.evolution.condensed import AnsweringCells, AnsweringEquilibrium, AnsweringNewton
 from remodel_fenicsx.evolution.equilibrium import Equilibrium
-from remodel_fenicsx.evolution.newton import SolveFailure, SolverSettings
+from remodel_fenicsx.evolution.newton import GuardedNewton, SolveFailure, SolverSettings
 from remodel_fenicsx.evolution.parts import Change, Work
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
 from remodel_fenicsx.evolution.state import State
@@ -26,17 +26,15 @@ class Implicit:
     as they are. Cells, stress and row belong together at the end of a step.
     """
 
-    share = 1.0
-
     def __init__(self, state: State, tissue: Tissue, remodeling: RemodelingPass, settings: SolverSettings):
         self.state, self.remodeling, self.settings = state, remodeling, settings
-        self.equilibrium = Equilibrium(state, tissue)  # of solved states
+        self.equilibrium: Equilibrium = Equilibrium(state, tissue)  # of solved states
         self.equilibrium.compile_energy()
         self.answering = AnsweringCells(state, self.equilibrium.tissue, remodeling)
         solved = AnsweringEquilibrium(state, tissue, self.answering)
         solved.stop_signal = lambda: self.equilibrium.stop_signal()
-        self.newton = AnsweringNewton(solved, settings)
-        self._power = 0.0
+        self.newton: GuardedNewton = AnsweringNewton(solved, settings)
+        self.share, self._power = 1.0, 0.0
         state.numbers[RESIDUAL] = 0.0
 
     def solve(self, time: float, loads: LoadValues) -> Work:

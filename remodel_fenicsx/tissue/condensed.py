@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from remodel_fenicsx.tissue import mandel, network
+from remodel_fenicsx.tissue import mandel, network, tangents
 from remodel_fenicsx.tissue.cells import UnitCell
 from remodel_fenicsx.tissue.drivers import DRIVERS, FRAMES, Driver, Frame
 from remodel_fenicsx.tissue.energy import Matrix, Tissue
@@ -50,8 +50,9 @@ def _cauchy(strain: Strain, stress: Stress, derivatives: bool) -> tuple[Array, A
         return D, None, None
     by_stress = mandel.diagonal(scales)
     by_stretch = mandel.symmetric_product(stress.value * u[:, None, :] / jacobian)
-    by_strain = by_stretch @ _stretch_by_strain(strain)
-    return D, by_stress, by_strain - mandel.dyads(mandel.vectors(D), mandel.on_diagonal(0.5 / strain.squared))
+    by_strain: Array = by_stretch @ _stretch_by_strain(strain)
+    inverse: Any = 0.5 / strain.squared
+    return D, by_stress, by_strain - mandel.dyads(mandel.vectors(D), mandel.on_diagonal(inverse))
 
 
 def _second_piola_kirchhoff(strain: Strain, stress: Stress, derivatives: bool) -> tuple[Array, Any, Any]:
@@ -220,7 +221,8 @@ class CondensedPoints:
         strain = Strain.of(F)
         found = self._at_tensor(strain, strain.inside(start))
         if self.step.driver is DRIVERS["finger"]:
-            return replace(found, converged=np.isfinite(found.stress.value).all(axis=(1, 2)))
+            finite: Any = np.isfinite(found.stress.value).all(axis=(1, 2))
+            return replace(found, converged=finite)
         if left_out is not None:
             found.converged[left_out] = True
         self._iterate(found)
@@ -267,7 +269,8 @@ class CondensedPoints:
         strain = found.strain
         answer, stress, by_stress, _ = self._derivatives(found)
         matrix, missing = self._equation(found, answer, stress, by_stress)
-        change = mandel.tensors(np.linalg.solve(matrix, missing[:, :, None])[:, :, 0])
+        steps: Any = np.linalg.solve(matrix, missing[:, :, None])[:, :, 0]
+        change = mandel.tensors(steps)
         change = np.where(np.isfinite(change).all(axis=(1, 2), keepdims=True), change, 0.0)
         size, length = (np.linalg.norm(tensor, axis=(1, 2)) for tensor in (found.tensor, change))
         size = np.maximum(size, np.linalg.norm(missing, axis=1))
@@ -281,6 +284,12 @@ class CondensedPoints:
             tensors = found.tensor[lost] + share[lost, None, None] * change[lost]
             put(best, lost, self.at(lost)._at_tensor(strain.at(lost), tensors))
         return best
+
+    def _frozen(self, strain: Strain, cells: Cells) -> Array:
+        """dS/dC of cells that do not answer."""
+        by_strain = self.stress(strain, cells, derivatives=True).by_strain
+        assert by_strain is not None
+        return by_strain
 
     def _derivatives(self, found: Solution) -> tuple[Response, Stress, Array, Array]:
         strain = found.strain
@@ -309,6 +318,8 @@ class CondensedPoints:
         matrix, _ = self._equation(found, answer, stress, by_stress)
         frozen = held | ~found.converged
         direct = stress.by_strain
+        if frozen.any():  # their cells need not be those of D
+            direct[frozen] = self.at(frozen)._frozen(strain.at(frozen), _some_cells(found.response.cells, frozen))
         own = np.zeros_like(direct)
         if answer.by_stretch is not None:
             own = answer.by_stretch @ _stretch_by_strain(strain)
@@ -320,63 +331,21 @@ class CondensedPoints:
         total = direct + np.where(frozen[:, None, None], 0.0, by_cells @ (answers + own))
         outside = mandel.congruence(strain.basis)
         total = outside @ total @ np.swapaxes(outside, 1, 2)
-        result = _of_deformation_gradient(strain, found.stress, total)
+        result = tangents.of_deformation_gradient(strain, found.stress.value, total)
         if turn is not None:
-            turned = _turned(strain, found.tensor)
+            turned = tangents.turned(strain, found.tensor)
             moved = by_tensor @ turned
             moved = moved + by_tensor @ turn @ np.linalg.solve(matrix, by_stress @ by_cells @ moved)
             of_turns = np.where(frozen[:, None, None], 0.0, outside @ by_cells @ moved)
-            result += _of_rotation(strain, of_turns)
+            result += tangents.of_rotation(strain, of_turns)
         return result
 
 
-def _of_deformation_gradient(strain: Strain, stress: Stress, by_strain: Array) -> Array:
-    """dP/dF of P = F S(C) from S and dS/dC in the global basis."""
-    F, S = strain.gradient, strain.outside(stress.value)
-    full = _full(2 * by_strain)  # dS_IJ = full_IJAL F_kA dF_kL
-    result: Array = np.einsum("niI,nIJAL->niJAL", F, full, optimize=True)
-    result = np.einsum("nkA,niJAL->niJkL", F, result, optimize=True)
-    for i in range(3):
-        result[:, i, :, i, :] += S
-    return result
-
-
-def _full(matrices: Array) -> Array:
-    """Fourth-order tensors (n, 3, 3, 3, 3) of Mandel matrices (n, 6, 6)."""
-    number = np.zeros((3, 3), dtype=int)
-    for index, (i, j) in enumerate(mandel.MANDEL):
-        number[i, j] = number[j, i] = index
-    flat = number.reshape(-1)
-    scaled = matrices / (mandel.FACTORS[:, None] * mandel.FACTORS[None, :])
-    full: Array = scaled[:, flat[:, None], flat[None, :]].reshape(-1, 3, 3, 3, 3)
-    return full
-
-
-def _turned(strain: Strain, tensor: Array) -> Array:
-    """dX/dw of X = R D R^T for turns dR = R W, W_ij = w, W_ji = -w: Mandel vectors as columns (n, 6, 3)."""
-    R = strain.rotation
-    columns = []
-    for i, j in mandel.PAIRS:
-        change = np.zeros_like(tensor)
-        change[:, i] = tensor[:, j]
-        change[:, j] = -tensor[:, i]
-        change = change + np.swapaxes(change, 1, 2)
-        columns.append(mandel.vectors(R @ change @ np.swapaxes(R, 1, 2)))
-    return np.stack(columns, axis=2)
-
-
-def _of_rotation(strain: Strain, by_turns: Array) -> Array:
-    """dP/dF through the turns alone: F dS/dw dw/dF, w_ij = ((R^T dF)_ij - (R^T dF)_ji)/(u_i + u_j) in the basis."""
-    F, Q, u = strain.gradient, strain.basis, strain.stretches
-    RQ = F @ Q / u[:, None, :]
-    result = np.zeros((len(F), 3, 3, 3, 3))
-    for number, (i, j) in enumerate(mandel.PAIRS):
-        stress = F @ mandel.tensors(by_turns[:, :, number])
-        one = RQ[:, :, i, None] * Q[:, None, :, j]
-        other = RQ[:, :, j, None] * Q[:, None, :, i]
-        turn = (one - other) / (u[:, i] + u[:, j])[:, None, None]
-        result += stress[:, :, :, None, None] * turn[:, None, None, :, :]
-    return result
+def _some_cells(cells: Cells, chosen: Any) -> Cells:
+    """Of some of the points."""
+    if isinstance(cells, OrthotropicCells):
+        return OrthotropicCells(UnitCell(cells.cell.dimensions[chosen], cells.cell.axes[chosen]))
+    return StructureCells(cells.structure[chosen])
 
 
 # ---------------------------------------------------------------- some of the points

@@ -94,7 +94,7 @@ class StructureCells:
 
 @dataclass(frozen=True)
 class OrthotropicCells:
-    """Cells with lengths and axes (rows): y is dl, and the turns w_ij of `mandel.PAIRS`, dn_i = w n_j, dn_j = -w n_i."""
+    """Cells with lengths and axes (rows): y is dl, and turns w_ij (`mandel.PAIRS`), dn_i = w n_j, dn_j = -w n_i."""
 
     cell: UnitCell
 

@@ -1,7 +1,7 @@
 """What cells a driving tensor makes at the end of a step, with the derivative: the laws, for Newton's method.
 
-Everything is in the eigenbasis of C (`network`). The tensor X lives where the law looks for its eigenvectors: in material
-space, or, for a spatial driver and the frame `spatial`, in space. The cells themselves are those of `laws`.
+Everything is in the eigenbasis of C (`network`). The tensor X lives where the law looks for its eigenvectors: in
+material space, or, for a spatial driver and the frame `spatial`, in space. The cells themselves are those of `laws`.
 """
 
 from __future__ import annotations
@@ -141,7 +141,7 @@ def ranked_response(step: StepOfCells, strain: Strain, tensor: Array, derivative
     e, active = found.direction, found.active
     size = np.linalg.norm(np.where(e > 0, found.values, 0.0), axis=1)
     steepness = found.slope * (step.end_to_end_length / np.where(active, size, 1.0))[:, None]
-    by_tensor = np.zeros((len(e), 6, 6))
+    by_tensor: Array = np.zeros((len(e), 6, 6))
     by_tensor[:, :3, :3] = steepness[:, :, None] * (np.eye(3) - e[:, :, None] * e[:, None, :]) * (e > 0)[:, None, :]
     largest = np.abs(found.values).max(axis=1)
     for row, (i, j) in enumerate(mandel.PAIRS, start=3):
@@ -178,9 +178,7 @@ def _principal(step: StepOfCells, strain: Strain, tensor: Array) -> _Principal:
     target, tiny = step.end_to_end_length[:, None] * direction, 1e-30
     # elementwise in its arguments: the slope by a complex step
     law: Any = step.law.dimensions
-    lengths = law(
-        old.dimensions, step.initial_dimensions, target + 1j * tiny, step.kappa, step.time_old, step.time_new
-    )
+    lengths = law(old.dimensions, step.initial_dimensions, target + 1j * tiny, step.kappa, step.time_old, step.time_new)
     dimensions, slope = np.real(lengths), np.imag(lengths) / tiny
     by_rank = step.pairing is spectral.principal
     cell_axes = framed(drive, axes, None if by_rank else dimensions)
