@@ -11,6 +11,7 @@ from remodel_fenicsx.body.loading import Loading, LoadValues
 from remodel_fenicsx.evolution.chatter import Chatter
 from remodel_fenicsx.evolution.locking import LockingWarning
 from remodel_fenicsx.evolution.monitor import StabilityWatcher
+from remodel_fenicsx.evolution.resting import Resting
 from remodel_fenicsx.evolution.state import State
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher, times
 from remodel_fenicsx.evolution.unit_cells import UnitCells
@@ -38,6 +39,8 @@ class Simulation:
     ----------
     domain, unknown, quadrature, cells, loading, state, tissue, stepper, observer
         The parts, each usable by itself (see demos/).
+    stability, warnings
+        Watchers of stability, over-correction and locking; what they remember is part of the state.
 
     Raises
     ------
@@ -64,6 +67,12 @@ class Simulation:
         counted = "negative_eigenvalues" in scene.output.columns
         self.stability = StabilityWatcher(self.stepper, scene.solver.unstable, every_step=counted)
         self.observer = Observer(shape, self.stepper, columns_of(shape, checked_columns(scene.output.columns)))
+        locks = formulation.locks(scene.mesh.element, scene.mesh.degree)
+        self.warnings: list[Watcher] = [LockingWarning(self.stepper, locks)]
+        if self.stepper.remodeling.law.remodels:
+            self.warnings.insert(0, Chatter(self.stepper))
+        if self.stepper.remodeling.law.of_absolute_time:
+            self.warnings.append(Resting(self.stepper))
 
     def load_values(self, time: float) -> LoadValues:
         """Magnitude of every load at a time."""
@@ -86,10 +95,7 @@ class Simulation:
             If a step has no admissible equilibrium.
         """
         remaining = list(times(self.scene.time.end, self.scene.time.step))[self.state.number :]
-        chatter = [Chatter(self.stepper)] if self.stepper.remodeling.law.remodels else []
-        locks = FORMULATIONS[self.scene.mesh.formulation].locks(self.scene.mesh.element, self.scene.mesh.degree)
-        locking = LockingWarning(self.stepper, locks)
-        return self.stepper.march(remaining, [self.stability, self.observer, *chatter, locking, *watchers])
+        return self.stepper.march(remaining, [self.stability, self.observer, *self.warnings, *watchers])
 
     def close(self) -> None:
         """Free PETSc's objects and options."""

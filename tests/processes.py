@@ -8,6 +8,8 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
+COMPILER, TICKS = "cc1", 2  # its name, and hundredths of a second of work after which it has read its source
+
 
 def session_members(session: int) -> dict[int, str]:
     """Number and name of every process of a session that has not ended."""
@@ -32,14 +34,19 @@ def all_end(session: int, timeout: float = 10) -> bool:
     return not session_members(session)
 
 
-def wait_for_compiler(process: subprocess.Popen[str], program: str = "cc1", timeout: float = 120) -> int:
-    """Wait until the C compiler itself is at work in this process's session; the number of the gcc that called it."""
+def wait_for_compiler(process: subprocess.Popen[str], program: str = COMPILER, timeout: float = 120) -> int:
+    """Wait until the C compiler itself is at work in this process's session; the number of the gcc that called it.
+
+    At work is a compiler that has used processor time: it has opened its source.
+    """
     deadline = time.monotonic() + timeout
     while time.monotonic() < deadline:
         for number, name in session_members(process.pid).items():
             if name == program:
                 with suppress(OSError):  # it has ended meanwhile
-                    return int(Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()[1])
+                    numbers = Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()
+                    if program != COMPILER or int(numbers[11]) >= TICKS:
+                        return int(numbers[1])
         assert process.poll() is None, process.communicate()
         time.sleep(0.01)
     os.killpg(process.pid, 9)

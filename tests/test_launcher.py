@@ -34,7 +34,7 @@ timeout 2 cat > /dev/null
 case ${STUB_BUILD:-} in
     fail) echo "E: no such mirror" >&2; exit 1 ;;
     killed) sleep 100 & echo $! > "$RECORD/orphan"; kill -KILL $$ ;;
-    slow) touch "$RECORD/begun"; sleep 4 ;;
+    slow) touch "$RECORD/begun"; sleep "${STUB_SECONDS:-4}" ;;
     hang) touch "$RECORD/begun"; sleep 300 ;;
 esac
 ln -s /usr /etc "$target"; mkdir -p "$target/var/lib/dpkg"; rm "$target/half"
@@ -415,7 +415,9 @@ def test_the_next_start_removes_what_a_killed_build_left(rooted, tmp_path, other
 
 def test_what_a_build_that_goes_on_needs_is_not_removed(rooted, tmp_path):
     environment = a_user_builds(rooted, tmp_path)
-    first = rooted.start("echo", "first", environment=environment | {"STUB_BUILD": "slow"})
+    # long enough for the whole second build, on a busy machine too
+    slow = {"STUB_BUILD": "slow", "STUB_SECONDS": "15"}
+    first = rooted.start("echo", "first", environment=environment | slow)
     wait_for((rooted.record / "begun").exists, "the first build")
     other = Clone(tmp_path / "other", cache=rooted.cache)
     other.packages.write_text(other.packages.read_text() + "one-more\n")
@@ -424,7 +426,7 @@ def test_what_a_build_that_goes_on_needs_is_not_removed(rooted, tmp_path):
     assert (second.returncode, second.stdout) == (0, "second\n")
     assert "removing" not in second.stderr
     assert list((tmp_path / "temporary").glob("remodel-fenicsx-build-*/*/half"))
-    out, err = first.communicate(timeout=20)
+    out, err = first.communicate(timeout=60)
     assert (first.returncode, out) == (0, "first\n"), err
     assert list((tmp_path / "temporary").iterdir()) == []
     # what mmdebstrap leaves behind when it is killed must not hold up all later starts

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
@@ -19,22 +20,29 @@ import pytest
 from mpi4py import MPI
 
 from remodel_fenicsx import Recording, Scene, SceneError, Simulation
+from remodel_fenicsx.body.domain import Domain
+from remodel_fenicsx.evolution import chatter, monitor
+from remodel_fenicsx.evolution.chatter import Chatter
+from remodel_fenicsx.evolution.coupling import COUPLINGS, Staggered
+from remodel_fenicsx.evolution.locking import LockingWarning
+from remodel_fenicsx.evolution.monitor import StabilityWatcher
 from remodel_fenicsx.evolution.parts import StepFailure, Work
 from remodel_fenicsx.evolution.state import State
-from remodel_fenicsx.body.domain import Domain
-from remodel_fenicsx.evolution.coupling import COUPLINGS, Staggered
 from remodel_fenicsx.results.checkpoint import Checkpoints, gather_state, restore_state
 from remodel_fenicsx.results.checkpoint_file import Checkpoint, CheckpointError, _read, read_checkpoint, read_pointer
 from remodel_fenicsx.results.recording import RecordingError
 from remodel_fenicsx.results.run_lock import FolderTaken, RunLock, lock_holder
 from remodel_fenicsx.results.status import status
 from remodel_fenicsx.running import resume, run
+from remodel_fenicsx.scene import preset_scene
 from remodel_fenicsx.system.interrupts import Paused
 from remodel_fenicsx.tissue.cells import structure_tensor
 from tests.conftest import mpirun
 from tests.parts import pulled_cube
 
 END = 9.0
+COUNTED = ("newton_iterations", "linear_iterations", "substeps", "seconds")
+LOST_AT = 6.0  # when tests/on_two_ranks.py loses one
 SELF = MPI.COMM_SELF
 
 
@@ -280,9 +288,9 @@ def test_fields_that_are_gone_begin_with_the_next_step(half: Path) -> None:
 
 
 # ---------------------------------------------------------------- other numbers of ranks
-def command(*words: str | Path, ranks: int = 1) -> subprocess.CompletedProcess[str]:
+def command(*words: str | Path) -> subprocess.CompletedProcess[str]:
     """remodel-fenicsx WORDS."""
-    line = mpirun(ranks, sys.executable, "-m", "remodel_fenicsx.cli", *map(str, words))
+    line = [sys.executable, "-m", "remodel_fenicsx.cli", *map(str, words)]
     return subprocess.run(line, capture_output=True, text=True, timeout=300)
 
 
@@ -292,8 +300,7 @@ def assert_close(found: Path, expected: Path, history: float = 1e-9, values: flo
     assert list(mine.history) == list(others.history)
     assert mine.times.tolist() == others.times.tolist()
     np.testing.assert_array_equal(mine.history["time"], others.history["time"])
-    counted = ("newton_iterations", "linear_iterations", "substeps", "seconds")
-    for name in set(others.history) - set(counted):
+    for name in set(others.history) - set(COUNTED):
         np.testing.assert_allclose(mine.history[name], others.history[name], rtol=history, atol=history, err_msg=name)
     kept, wanted = read_checkpoint(found), read_checkpoint(expected)
     assert kept is not None and wanted is not None and kept.number == wanted.number
@@ -309,13 +316,47 @@ def structure(checkpoint: Checkpoint) -> np.ndarray:
     return structure_tensor(dimensions, checkpoint.arrays["function/cell_axes"].reshape(*shape, 3, 3))
 
 
-def test_it_goes_on_with_another_number_of_ranks(half: Path, whole: Path) -> None:
+@pytest.fixture(scope="module")
+def two_ranks(first_half: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """What tests/on_two_ranks.py makes, and what it says; mpirun ends all when the killed rank is gone."""
+    folder = tmp_path_factory.mktemp("two")
+    shutil.copytree(first_half, folder / "half")
+    line = mpirun(2, sys.executable, str(Path(__file__).with_name("on_two_ranks.py")), str(folder))
+    done = subprocess.run(line, capture_output=True, text=True, timeout=300)
+    assert done.returncode != 0 and (folder / "lost").exists(), done.stderr
+    return folder, done.stderr
+
+
+def test_two_ranks_go_on_to_the_last_bit(two_ranks: tuple[Path, str], whole: Path) -> None:
+    folder, _ = two_ranks
+    assert_same(folder / "resumed", folder / "whole")
+    assert_close(folder / "whole", whole)
+
+
+def test_it_goes_on_with_another_number_of_ranks(two_ranks: tuple[Path, str], tmp_path: Path, whole: Path) -> None:
     """One, then two, then one."""
-    done = command("run", "--resume", half, "--set", "time.end=8.0", "-q", ranks=2)
-    assert done.returncode == 0 and done.stdout == f"results in {half}\n", done.stderr
-    assert rows(half)[:8] == rows(whole)[:8] != rows(half)
+    half = shutil.copytree(two_ranks[0] / "half", tmp_path / "half")
+    assert Recording(half).history["time"][-1] == 8.0
+    assert rows(half)[:8] == rows(whole)[:8] != rows(half)[: len(rows(whole))]
     go_on(half)
     assert_close(half, whole)
+
+
+def test_a_wall_time_that_is_over_is_exit_code_4(two_ranks: tuple[Path, str]) -> None:
+    folder, errors = two_ranks
+    assert json.loads((folder / "codes.json").read_text()) == {"wall time": 4}
+    assert errors.count("remodel-fenicsx: stopped before --max-wall-time is over: all is kept up to time 8; ") == 1
+
+
+def test_a_lost_rank_loses_the_steps_since_the_checkpoint(
+    two_ranks: tuple[Path, str], tmp_path: Path, whole: Path
+) -> None:
+    """The other rank does not go on alone; nobody holds the folder."""
+    lost = shutil.copytree(two_ranks[0] / "lost", tmp_path / "lost")
+    assert read_pointer(lost)[0].time == 4.0 and Recording(lost).history["time"][-1] == LOST_AT - 1
+    assert not lock_holder(lost)[1]
+    resume(lost, [], SELF)
+    assert_close(lost, whole)
 
 
 # ---------------------------------------------------------------- the command
@@ -329,9 +370,8 @@ def test_a_signal_is_exit_code_4_and_one_line_says_how_to_go_on(half: Path, whol
     while clock.monotonic() < deadline and len(rows(half)) < 12:
         clock.sleep(0.02)
         assert process.poll() is None
-    refused = command(*words)
-    line = f"remodel-fenicsx: {half}: process {process.pid} on {socket.gethostname()} writes in it\n"
-    assert (refused.returncode, refused.stderr) == (2, line)
+    with pytest.raises(FolderTaken, match=f"process {process.pid} on {socket.gethostname()} writes in it"):
+        resume(half, [], SELF)
     assert f"running: process {process.pid} on " in "\n".join(status(half))
     os.killpg(process.pid, signal.SIGUSR1)
     errors = process.communicate(timeout=100)[1]
@@ -348,18 +388,12 @@ def test_a_signal_is_exit_code_4_and_one_line_says_how_to_go_on(half: Path, whol
     assert said[3] == f"checkpoint at time {last:g}; it goes on with: remodel-fenicsx run --resume {half}"
 
 
-def test_a_wall_time_that_is_over_is_exit_code_4(half: Path) -> None:
-    done = command("run", "--resume", half, "--set", "time.end=10", "--max-wall-time", "0.1s", ranks=2)
-    assert done.returncode == 4
-    assert done.stderr.count("remodel-fenicsx: stopped before --max-wall-time is over: all is kept up to time 6; ") == 1
-
-
-@pytest.mark.parametrize("name", ["history.csv", "fields.vtkhdf"])
-def test_what_is_damaged_is_said_in_one_line_and_nothing_else(name: str, half: Path) -> None:
-    (half / name).write_bytes(b"")
+def test_what_is_damaged_is_said_in_one_line_and_nothing_else(half: Path) -> None:
+    """HDF5 too stays silent."""
+    (half / "fields.vtkhdf").write_bytes(b"")
     done = command("run", "--resume", half, "--set", "time.end=10")
     assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr.startswith(f"remodel-fenicsx: {half / name}: ") and done.stderr.count("\n") == 1, done.stderr
+    assert done.stderr.startswith(f"remodel-fenicsx: {half}/fields.vtkhdf: ") and done.stderr.count("\n") == 1
 
 
 def test_the_status_of_a_run(half: Path) -> None:
@@ -423,8 +457,56 @@ def test_what_a_coupling_remembers_is_kept(tmp_path: Path, monkeypatch: pytest.M
     second, first = (_read(tmp_path / "run" / one.file, one) for one in read_pointer(tmp_path / "run"))
     earlier = second.arrays["function/earlier_displacement"]
     np.testing.assert_array_equal(earlier, first.arrays["function/displacement"])
-    assert np.ptp(earlier) > 0 and second.numbers == {"part": 0.125} and second.number == 2
+    assert np.ptp(earlier) > 0 and second.numbers["part"] == 0.125 and second.number == 2
     fails = False
     resume(tmp_path / "run", [], SELF)
     kept = read_checkpoint(tmp_path / "run")
-    assert kept is not None and kept.numbers == {"part": 0.5**5}
+    assert kept is not None and kept.numbers["part"] == 0.5**5
+
+
+# ---------------------------------------------------------------- what is said
+def test_runs_that_go_on_say_what_one_run_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Stopped after every step: nobody has forgotten what was seen, nothing is said twice."""
+    push = {"loads.force.value": -30.0, "loads.force.ramp": [[0.0, 0.0], [3.0, 1.0]], "time.end": 8.0}
+    cube = preset_scene("kuhl-holzapfel-2007", "cube").with_values({**push, "remodeling.kappa": 0.1})
+    monkeypatch.setattr(chatter, "GROWTH", np.inf)  # five passes are warned of, whatever they do
+    monkeypatch.setattr(chatter, "CELL_TOLERANCE", 0.0)
+    monkeypatch.setattr(chatter, "MOST", 1.0)
+    monkeypatch.setattr(Chatter, "_advice", lambda watcher, factor: "nothing")
+    monkeypatch.setattr(LockingWarning, "stiffness_ratio", lambda watcher: 1e9)
+    monkeypatch.setattr(LockingWarning, "energy_share", lambda watcher: 1.0)
+    monkeypatch.setattr(monitor, "ITERATIONS_BETWEEN_LOOKS", 9)
+    counts: list[int] = []
+    count = StabilityWatcher._count
+
+    def counted(watcher: StabilityWatcher) -> float:
+        counts.append(watcher.state.number)
+        return count(watcher)
+
+    monkeypatch.setattr(StabilityWatcher, "_count", counted)
+    expected = said(run(cube, tmp_path / "whole", SELF))
+    looks = counts.copy()
+    counts.clear()
+    for words in ("over-corrects", "the elements lock", "the equilibrium is unstable"):
+        assert sum(words in line for line in expected) == (2 if "unstable" in words else 1), expected
+    solve, folder = Staggered.solve, tmp_path / "run"
+
+    def signalled(coupling: Staggered, *arguments: Any) -> Any:
+        signal.raise_signal(signal.SIGUSR1)
+        return solve(coupling, *arguments)
+
+    monkeypatch.setattr(Staggered, "solve", signalled)
+    with pytest.raises(Paused):
+        run(cube, folder, SELF)
+    for _ in range(6):
+        with pytest.raises(Paused):
+            resume(folder, [], SELF)
+    resume(folder, [], SELF)
+    assert rows(folder) == rows(tmp_path / "whole")
+    assert said(folder) == expected and counts == looks
+
+
+def said(folder: Path) -> list[str]:
+    """What the log tells of equilibria and passes, without its clock."""
+    lines = [line.split(" ", 2)[2] for line in (folder / "run.log").read_text().splitlines()]
+    return [line for line in lines if re.match(r"\S+ time \d+:", line)]

@@ -36,7 +36,8 @@ TENDON: dict[str, Any] = {
 RAMP = [[0.0, 0.0], [10.0, 1.0]]
 COARSE_TENDON = {"tendon": {"AROUND": 8, "CORE": 2, "RINGS": 1, "ALONG": 3}}
 RADIUS_TOLERANCE, STEP_TOLERANCE = 0.01, 0.01
-ANGLE_TOLERANCE = 1.5  # degrees, of the mean over a body of random cells
+ANGLE_TOLERANCE = 1.5  # degrees, of the mean over a body
+OUTER_ANGLE_TOLERANCE = 5.0  # degrees: a coarse layer of elements
 REFERENCE = "tube in one dimension"
 
 
@@ -72,7 +73,7 @@ def reference(scene: dict[str, Any]) -> tuple[RadialHistory | None, bool]:
 
 
 def check_tube(case: Case, run: Run) -> Finding:
-    """Inner and outer radius by step."""
+    """Inner and outer radius by step, and the fibre angle of the outermost elements, where it is no steep function."""
     expected, whole = reference(case.scene)
     rows = min(len(run.column("time")), 0 if expected is None else len(expected.times))
     known = case.options.get("unstable")
@@ -84,9 +85,13 @@ def check_tube(case: Case, run: Run) -> Finding:
         for name, radii in (("inner_radius", inner), ("outer_radius", outer))
     }
     words = ", ".join(f"{name} off by {100 * value:.3g} %" for name, value in off.items())
+    layer = 2.0 / case.counts["tube"]["PAPER"][1]
+    angles = [expected.mean_fibre_angle(3.0 - layer, 3.0, row) for row in range(rows)]
+    angle = float(np.max(np.abs(run.column("fibre_angle_outer")[:rows] - angles)))
+    words += f", outer angle by {angle:.3g} degrees"
     if not whole:
         words += f"; the reference ends at t = {expected.times[-1]:g}"
-    ratio = max(off.values()) / RADIUS_TOLERANCE
+    ratio = max(*(value / RADIUS_TOLERANCE for value in off.values()), angle / OUTER_ANGLE_TOLERANCE)
     return Finding(np.inf if run.code == 0 and not whole else ratio, words, known, whole)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 
 from mpi4py import MPI
@@ -31,6 +32,8 @@ def build_domain(
         On all ranks, if `draw` fails on rank 0.
     """
     comm = comm or MPI.COMM_WORLD
+    # with several threads Scotch parts the same mesh differently from run to run
+    os.environ.setdefault("SCOTCH_PTHREAD_NUMBER", "1")
     if comm.rank != 0:
         verdict, faces = comm.bcast(None, root=0)
         if verdict:

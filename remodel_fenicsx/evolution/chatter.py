@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
+from math import comb
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
+from remodel_fenicsx.evolution.memory import Earlier, Numbers
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
+from remodel_fenicsx.tissue.logarithm import MANDEL
 
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
@@ -17,29 +23,17 @@ log = logging.getLogger(__name__)
 ORDER = 3  # of the difference over passes that takes a smooth course away and keeps what changes its sign each time
 GAIN = 2.0**ORDER  # by which it magnifies that
 # the beginning of an instability: measured, all bodies that left their solution did so; none that stayed on it
-GROWTH, GROWING_PASSES, CELL_TOLERANCE = -1.2, 2, 1e-3  # factor of a pass, passes in a row, swing of A over r0^2
+# (factor of a pass, passes in a row, swing of A over r0^2 after the next)
+GROWTH, GROWING_PASSES, CELL_TOLERANCE = -1.2, 2, 1e-2
 # its end: random cells swing for ever at single points, each its own way, which the body hardly feels
 SUSTAINED, SUSTAINED_PASSES, BODY_TOLERANCE = -0.9, 3, 0.02  # the same of the displacement, over the displacement
+MOST = 0.5  # of the body
 LOAD_JUMP = 1e-3  # share of a load by which it may swing itself
 
 
-def _differences(before: tuple[Array, ...], value: Array) -> tuple[Array, ...]:
-    """All differences over the passes up to ORDER with one more value: those of order 0, 1, ..."""
-    found = [value]
-    for difference in before[:ORDER]:
-        found.append(found[-1] - difference)
-    return tuple(found)
-
-
-@dataclass(frozen=True)
-class _Course:
-    """What is kept from pass to pass: differences of A, displacement and loads, and how often in a row they swung."""
-
-    cells: tuple[Array, ...] = ()
-    body: tuple[Array, ...] = ()
-    loads: tuple[Array, ...] = ()
-    growing: int = 0
-    sustained: int = 0
+def _difference(values: Sequence[Any]) -> Any:
+    """The difference of order ORDER over passes, the newest value first: a - 3 b + 3 c - d."""
+    return sum((-1) ** age * comb(ORDER, age) * values[age] for age in range(ORDER + 1))
 
 
 @dataclass(frozen=True)
@@ -76,7 +70,7 @@ class Chatter(Watcher):
     Parameters
     ----------
     stepper
-        Whose state is followed.
+        Whose state is followed; what is remembered of the passes before is part of it from now on.
 
     Attributes
     ----------
@@ -88,67 +82,92 @@ class Chatter(Watcher):
 
     def __init__(self, stepper: Stepper):
         self.stepper, self.state = stepper, stepper.state
-        self.quadrature = stepper.state.cells.quadrature
+        state, self.quadrature = self.state, stepper.state.cells.quadrature
         self.swing: Swing | None = None
-        self.warned = False
-        self._course = self._before = _Course()
+        # of the passes before, with the newest one
+        self._cells = Earlier(state, "chatter_cells", lambda: self.quadrature.function("", (6,)), ORDER + 1)
+        self._body = Earlier(state, "chatter_body", state.unknown.copy, ORDER + 1)
+        times = {f"time_{age}": 0.0 for age in range(ORDER + 1)}
+        self._numbers = Numbers(state, "chatter", {"growing": 0, "sustained": 0, "warned": 0} | times)
+
+    @property
+    def warned(self) -> bool:
+        """Whether the warning has been given."""
+        return bool(self._numbers["warned"])
 
     def started(self, step: Step) -> None:
         """The cells before the first pass."""
-        self._course = self._before = self._continued(_Course(), step)
-
-    def resumed(self, step: Step) -> None:
-        """The cells after the last pass before; the passes before that one are forgotten."""
-        self.started(step)
+        for memory in (self._cells, self._body, self._numbers):
+            memory.forget()
+        self._keep(step, self._structure())
 
     def completed(self, step: Step) -> None:
         """One pass more."""
-        self._before = self._course
-        self._course = self._continued(self._before, step)
-
-    def undone(self, step: Step) -> None:
-        """The pass has not been."""
-        self._course = self._before
+        structure = self._structure()
+        self.swing = None
+        if self._cells.known > ORDER:
+            cells, body = [structure, *self._cells.values], [self.state.unknown.x.array, *self._body.values]
+            self.swing = self._measured(cells, body)
+            tells = not self._loads_jump(step) and not self._rested(cells)
+            self._count("growing", tells and self.swing.cells_factor < GROWTH)
+            self._count("sustained", tells and self.swing.body_factor < SUSTAINED)
+        self._keep(step, structure)
 
     def committed(self, step: Step) -> None:
         """Warn."""
-        self._before = self._course
         if self.warned or self.swing is None:
             return
-        begins = self._course.growing >= GROWING_PASSES and self.swing.cells >= CELL_TOLERANCE
-        lasts = self._course.sustained >= SUSTAINED_PASSES and self.swing.body >= BODY_TOLERANCE
+        next_one = self.swing.cells * abs(self.swing.cells_factor)  # as large as it will be after one pass more
+        begins = self._numbers["growing"] >= GROWING_PASSES and next_one >= CELL_TOLERANCE
+        lasts = self._numbers["sustained"] >= SUSTAINED_PASSES and self.swing.body >= BODY_TOLERANCE
         if begins or lasts:
-            self.warned = True
+            self._numbers["warned"] = True
             self._warn(step, self.swing)
 
-    def _continued(self, before: _Course, step: Step) -> _Course:
-        """The course with the present state."""
-        unknown = self.state.unknown
-        owned = unknown.function_space.dofmap.index_map.size_local * unknown.function_space.dofmap.index_map_bs
-        cells = _differences(before.cells, self.state.cells.structure_tensor())
-        body = _differences(before.body, unknown.x.array[:owned].copy())
-        loads = _differences(before.loads, np.array(list(step.loads.values())))
-        course = _Course(cells, body, loads)
-        self.swing = None
-        if len(before.cells) <= ORDER:
-            return course
-        self.swing = self._measured(course, before)
-        if np.any(np.abs(loads[ORDER]) > LOAD_JUMP * GAIN * np.abs(loads[0])):
-            return course
-        growing = before.growing + 1 if self.swing.cells_factor < GROWTH else 0
-        sustained = before.sustained + 1 if self.swing.body_factor < SUSTAINED else 0
-        return _Course(cells, body, loads, growing, sustained)
+    def _count(self, name: str, once_more: bool) -> None:
+        """Passes in a row."""
+        self._numbers[name] = self._numbers[name] + 1 if once_more else 0
 
-    def _measured(self, course: _Course, before: _Course) -> Swing:
+    def _keep(self, step: Step, structure: Array) -> None:
+        self._cells.push(structure)
+        self._body.push(self.state.unknown.x.array)
+        for age in range(ORDER, 0, -1):
+            self._numbers[f"time_{age}"] = self._numbers[f"time_{age - 1}"]
+        self._numbers["time_0"] = step.time
+
+    def _structure(self) -> Array:
+        """A at all points, six Mandel components after each other."""
+        tensor = self.state.cells.structure_tensor()
+        return np.stack([tensor[..., i, j] * (1.0 if i == j else np.sqrt(2.0)) for i, j in MANDEL], axis=-1).reshape(-1)
+
+    def _rested(self, cells: list[Array]) -> bool:
+        """Whether one of the passes has left most cells as they were: what goes on after that jumps (`resting`)."""
+        count = self.quadrature.shape
+        same = [np.all((a == b).reshape(*count, -1), axis=-1) for a, b in pairwise(cells[: ORDER + 1])]
+        return any(self.quadrature.mean(passed.astype(np.float64)) > MOST for passed in same)
+
+    def _loads_jump(self, step: Step) -> bool:
+        times = [self._numbers[f"time_{age}"] for age in range(ORDER)]
+        earlier = [self.stepper.load_values(time) if time else {} for time in times]  # the body starts unloaded
+        return any(
+            abs(_difference([value, *(loads.get(name, 0.0) for loads in earlier)])) > LOAD_JUMP * GAIN * abs(value)
+            for name, value in step.loads.items()
+        )
+
+    def _measured(self, cells: list[Array], body: list[Array]) -> Swing:
+        """Of the last passes, the newest first."""
+        owned = self.state.unknown.function_space.dofmap.index_map.size_local
+        owned *= self.state.unknown.function_space.dofmap.index_map_bs
+
         def of_cells(a: Array, b: Array) -> float:
-            return self.quadrature.integral(np.einsum("epij,epij->ep", a, b))
+            return self.quadrature.integral(np.sum((a * b).reshape(*self.quadrature.shape, 6), axis=-1))
 
         def of_body(a: Array, b: Array) -> float:
-            return float(self.state.comm.allreduce(float(np.dot(a, b)), MPI.SUM))
+            return float(self.state.comm.allreduce(float(np.dot(a[:owned], b[:owned])), MPI.SUM))
 
         volume = self.quadrature.integral(np.ones(self.quadrature.shape))
-        now, last = course.cells[ORDER], before.cells[ORDER]
-        moved, moved_last, place = course.body[ORDER], before.body[ORDER], course.body[0]
+        now, last = _difference(cells), _difference(cells[1:])
+        moved, moved_last, place = _difference(body), _difference(body[1:]), body[0]
         return Swing(
             np.sqrt(of_cells(now, now) / volume) / GAIN / self.state.cells.settings.end_to_end_length**2,
             _ratio(of_cells(now, last), of_cells(last, last)),
@@ -183,7 +202,8 @@ class Chatter(Watcher):
 
     def _place(self) -> tuple[float, float, float]:
         """Reference place of the largest swing of the cells."""
-        return self.quadrature.place_of_largest(np.linalg.norm(self._course.cells[ORDER], axis=(-1, -2)))
+        swing = _difference(self._cells.values).reshape(*self.quadrature.shape, 6)
+        return self.quadrature.place_of_largest(np.linalg.norm(swing, axis=-1))
 
 
 def _ratio(value: float, size: float) -> float:

@@ -9,6 +9,7 @@ import numpy as np
 from mpi4py import MPI
 
 from remodel_fenicsx.evolution.equilibrium import at_points
+from remodel_fenicsx.evolution.memory import Numbers
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
 from remodel_fenicsx.fem.formulations import Locking
 
@@ -43,6 +44,7 @@ class LockingWarning(Watcher):
         self.stepper, self.quadrature = stepper, stepper.state.cells.quadrature
         self.tissue = at_points(stepper.tissue, self.quadrature)
         self.limits = limits if limits is not None and self.stiffness_ratio() > limits.stiffness_ratio else None
+        self._numbers = Numbers(stepper.state, "locking", {"said": 0})
 
     def stiffness_ratio(self) -> float:
         """Largest lambda/mu in the body."""
@@ -72,12 +74,12 @@ class LockingWarning(Watcher):
 
     def solved(self, step: Step) -> None:
         """Look, until it was said."""
-        if self.limits is None:
+        if self.limits is None or self._numbers["said"]:
             return
         share = self.energy_share()
         if share <= self.limits.energy_share:
             return
-        self.limits = None
+        self._numbers["said"] = True
         if self.stepper.state.comm.rank == 0:
             inside = f"{100 * share:.2g} % of the work goes into changes of volume inside single elements"
             log.warning(

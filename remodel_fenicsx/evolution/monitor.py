@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from remodel_fenicsx.evolution.inertia import FactorisationFailed, Inertia, Mode, of_the_unloaded_body, uneven
+from remodel_fenicsx.evolution.memory import Earlier, Numbers
 from remodel_fenicsx.evolution.parts import StepFailure
 from remodel_fenicsx.evolution.refusals import UNSTABLE
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
@@ -27,7 +28,7 @@ class StabilityWatcher(Watcher):
     Parameters
     ----------
     stepper
-        What is watched; nothing here changes its state.
+        What is watched; nothing here changes its state, but what is remembered is part of it from now on.
     unstable
         "warn": the run goes on; "stop": an equilibrium with more negative eigenvalues than before ends it.
     every_step
@@ -39,14 +40,13 @@ class StabilityWatcher(Watcher):
         self.stops, self.every_step = unstable == "stop", every_step or unstable == "stop"
         self.inertia = Inertia(stepper.coupling.equilibrium)
         self.signs = Signs(stepper)
-        self._known = self._known_before = 0
-        self._iterations = self._iterations_before = 0  # since the last look
+        # eigenvalues that are known, and Newton iterations since the last look
+        self._numbers = Numbers(self.state, "stability", {"known": 0, "iterations": 0})
         self._unloaded: tuple[int, float] | None = None
 
     def close(self) -> None:
         """Free PETSc's objects."""
         self.inertia.close()
-        self.signs.close()
 
     # ------------------------------------------------------------ as a watcher
     def started(self, step: Step) -> None:
@@ -62,24 +62,20 @@ class StabilityWatcher(Watcher):
         StepFailure
             If the equilibrium is unstable and the run is to stop there.
         """
-        self._known_before, self._iterations_before = self._known, self._iterations
-        self._iterations += step.work.newton_iterations
-        suspicious = self.signs.differ(self._known) if step.work.newton_iterations else False
-        overdue = self._iterations >= ITERATIONS_BETWEEN_LOOKS or (step.is_last and self._iterations > 0)
+        known = int(self._numbers["known"])
+        self._numbers["iterations"] = iterations = self._numbers["iterations"] + step.work.newton_iterations
+        suspicious = self.signs.differ(known) if step.work.newton_iterations else False
+        overdue = iterations >= ITERATIONS_BETWEEN_LOOKS or (step.is_last and iterations > 0)
         if not (suspicious or overdue or self.every_step):
             return
         step.negative_eigenvalues = count = self._count()
         if np.isnan(count):
             return
-        self._iterations = 0
+        self._numbers["iterations"] = 0
         self.signs.settle()
-        if count != self._known:
-            self._known = int(count)
-            self._say(step, self._known_before, self._known)
-
-    def undone(self, step: Step) -> None:
-        """What was found out belongs to a state that is not there any more."""
-        self._known, self._iterations = self._known_before, self._iterations_before
+        if count != known:
+            self._numbers["known"] = count
+            self._say(step, known, int(count))
 
     # ------------------------------------------------------------ what it means
     def _count(self) -> float:
@@ -135,46 +131,46 @@ class Signs:
 
     def __init__(self, stepper: Stepper):
         self.newton, self.equilibrium = stepper.coupling.newton, stepper.coupling.equilibrium
-        self._vector: Any = None
-        self._sign = self._sign_at_look = 1
-
-    def close(self) -> None:
-        """Free PETSc's objects."""
-        if self._vector is not None:
-            self._vector.destroy()
-            self._vector = None
+        state = stepper.state
+        self._vector = Earlier(state, "stability_vector", state.unknown.copy, 1)
+        self._numbers = Numbers(state, "stability_sign", {"now": 1, "at_look": 1})  # of the determinant
 
     def differ(self, known: int) -> bool:
         """Whether they contradict what is known: a number of negative eigenvalues."""
         factorisation = self.newton.factorisation()
         if factorisation is None:
             return False
-        self._sign = determinant_sign(factorisation) or self._sign_at_look
-        return self._sign != self._sign_at_look or (self._curvature(factorisation) < 0 and known == 0)
+        self._numbers["now"] = determinant_sign(factorisation) or self._numbers["at_look"]
+        differs = self._numbers["now"] != self._numbers["at_look"]
+        return differs or (self._curvature(factorisation) < 0 and known == 0)
 
     def settle(self) -> None:
         """The eigenvalues have been counted: from now on what differs from the present signs is news."""
-        self._sign_at_look = self._sign
+        self._numbers["at_look"] = self._numbers["now"]
 
     def _curvature(self, factorisation: Any) -> float:
         """Of the remembered vector after one more inverse iteration."""
-        first = self._vector is None
+        vector, image = factorisation.getOperators()[0].createVecs()
+        first = not self._vector.known
         if first:
-            self._vector = uneven(factorisation.getOperators()[0].createVecRight())
-            free = np.isnan(self.equilibrium.prescribed_values()[: self._vector.getLocalSize()])
-            self._vector.array[:] *= free  # prescribed ones have an eigenvalue of their own, one
-        image = self._vector.duplicate()
+            uneven(vector)
+            free = np.isnan(self.equilibrium.prescribed_values()[: vector.getLocalSize()])
+            vector.array[:] *= free  # prescribed ones have an eigenvalue of their own, one
+        else:
+            vector.array[:] = self._vector.values[0][: vector.getLocalSize()]
         curvature = np.inf
         for _ in range(FIRST_INVERSE_ITERATIONS if first else 1):
-            factorisation.apply(self._vector, image)
+            factorisation.apply(vector, image)
             size = image.norm()
             if size == 0.0:  # supports and loads leave nothing free
                 break
-            curvature = image.dot(self._vector) / size**2
+            curvature = image.dot(vector) / size**2
             if not np.isfinite(curvature):
                 break
             image.scale(1.0 / size)
-            image.copy(self._vector)
+            image.copy(vector)
+        self._vector.push_owned(vector.array_r)
+        vector.destroy()
         image.destroy()
         return float(curvature)
 

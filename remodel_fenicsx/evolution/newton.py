@@ -100,7 +100,7 @@ class GuardedNewton:
     def __init__(self, equilibrium: Equilibrium, settings: SolverSettings):
         self.equilibrium, self.settings = equilibrium, settings
         self.unknown = equilibrium.state.unknown
-        self._options = ProblemOptions(settings.method, settings.petsc_options)
+        self._options = ProblemOptions(settings.method, settings.petsc_options, equilibrium.comm.size)
         self._x = self.unknown.x.petsc_vec.duplicate()
         self._residual = self._x.duplicate()
         self._external = self._x.duplicate()
@@ -195,7 +195,7 @@ class GuardedNewton:
     def factorisation(self) -> Any | None:
         """PETSc's preconditioner with the factors of the last tangent; None where the method does not factorise."""
         preconditioner = self._snes.getKSP().getPC()
-        return preconditioner if preconditioner.getType() in ("lu", "cholesky") else None
+        return preconditioner if preconditioner.getType() in ("lu", "cholesky", "telescope") else None
 
     def _warn_of_unused_options(self) -> None:
         """Once, after the first solve; on all ranks, for each has a database of options."""

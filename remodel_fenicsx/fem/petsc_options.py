@@ -12,7 +12,7 @@ from typing import Any
 
 from petsc4py import PETSc
 
-from remodel_fenicsx.fem.solver_methods import METHODS
+from remodel_fenicsx.fem.solver_methods import method_options
 from remodel_fenicsx.schema.tables import SceneError
 
 USERS_PREFIX = "remodel_"
@@ -32,17 +32,20 @@ class ProblemOptions:
         Key of `METHODS`.
     options
         The scene's: names without the leading '-'; True for a flag, False to leave one of the method's away.
+    ranks
+        How many there are.
     """
 
-    def __init__(self, method: str, options: Mapping[str, Any]):
+    def __init__(self, method: str, options: Mapping[str, Any], ranks: int = 1):
         self.prefix = f"{USERS_PREFIX}{next(_numbers)}_"
         self._given = dict(options)
         self._names: set[str] = set()
-        for key, value in {**METHODS[method], **options, **_users_options()}.items():
+        own = method_options(method, ranks)
+        for key, value in {**own, **options, **_users_options()}.items():
             if value is not False:
                 PETSc.Options().setValue(self.prefix + key, None if value is True else value)
                 self._names.add(key)
-        for key in METHODS[method].keys() - options.keys():
+        for key in own.keys() - options.keys():
             PETSc.Options().hasName(self.prefix + key)  # asked for: PETSc does not call it left over
 
     def apply(self, snes: Any) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-# MUMPS: robust for indefinite tangents too, one factorisation pattern for all steps, any number of ranks
+# MUMPS: robust for indefinite tangents too, one factorisation pattern for all steps
 METHODS: dict[str, dict[str, Any]] = {
     "direct": {
         "snes_type": "newtonls",
@@ -15,3 +15,24 @@ METHODS: dict[str, dict[str, Any]] = {
         "mat_mumps_icntl_33": 1,  # the determinant, whose sign tells of unstable equilibria; costs nothing
     },
 }
+
+# MUMPS on several ranks adds up in the order in which messages come: its last digits differ from run to run. So one
+# rank has the whole matrix and factorises it, which for the sizes that are factorised at all costs little
+ON_SEVERAL_RANKS: dict[str, dict[str, Any]] = {
+    "direct": {
+        "pc_type": "telescope",
+        "telescope_ksp_type": "preonly",
+        "telescope_pc_type": "lu",
+        "telescope_pc_factor_mat_solver_type": "mumps",
+    },
+}
+
+
+def method_options(method: str, ranks: int) -> dict[str, Any]:
+    """PETSc options of a method on so many ranks."""
+    options = dict(METHODS[method])
+    if ranks > 1:
+        options |= ON_SEVERAL_RANKS.get(method, {})
+        if options.get("pc_type") == "telescope":
+            options["pc_telescope_reduction_factor"] = ranks
+    return options

@@ -6,6 +6,10 @@ CHAINS = (
 PEELED = "the outer layers of elements cut shorter than the inner ones"
 WALL = "coloured by the deformed angle of the chains in the wall"
 PROFILE = "reference fibre angle over the radius at t = 150; lines: means of the element layers, bands: all elements"
+RELAXED = (
+    "The printed pass over-corrects with {}: here it is relaxed by one half, in the material frame "
+    "(docs/theory.md, Stability of the pass)."
+)
 
 CAPTIONS: dict[str, tuple[str, str]] = {
     "fig1": (
@@ -37,12 +41,11 @@ CAPTIONS: dict[str, tuple[str, str]] = {
     ),
     "fig10": (
         "Remodeling driven by the Cauchy or the second Piola-Kirchhoff stress (Fig. 10)",
-        f"(a) {PROFILE.capitalize()}. (b), (c) The wall, {PEELED}. {CHAINS}",
+        f"(a) {PROFILE.capitalize()}. (b), (c) The wall, {PEELED}. {CHAINS} {RELAXED.format('S')}",
     ),
     "fig11": (
         "Remodeling driven by the Cauchy stress or the Finger tensor (Fig. 11)",
-        f"(a) {PROFILE.capitalize()}. (b), (c) The wall, {PEELED}. {CHAINS} With b the printed pass over-corrects and "
-        "shears these elements to and fro: its curve is not that of the theory (docs/verification.md).",
+        f"(a) {PROFILE.capitalize()}. (b), (c) The wall, {PEELED}. {CHAINS} {RELAXED.format('b')}",
     ),
     "rate": (
         "Eqs. (10) and (11) on the same artery (erratum 7)",

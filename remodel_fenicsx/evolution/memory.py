@@ -1,0 +1,95 @@
+"""What somebody remembers of earlier steps: functions and numbers of the state, so that resumed runs have them too."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from remodel_fenicsx.evolution.state import State
+
+Array = NDArray[np.float64]
+
+
+class Numbers:
+    """Numbers of the state under a name of their own: transactions restore them, checkpoints hold them.
+
+    Parameters
+    ----------
+    state
+        Whose `numbers` they are.
+    name
+        What all their keys begin with.
+    initial
+        Names of the numbers, and what they are at the start.
+    """
+
+    def __init__(self, state: State, name: str, initial: Mapping[str, float]):
+        self.state, self.name, self.initial = state, name, dict(initial)
+
+    def __getitem__(self, key: str) -> float:
+        return self.state.numbers.get(f"{self.name}_{key}", self.initial[key])
+
+    def __setitem__(self, key: str, value: float) -> None:
+        """The same value on all ranks."""
+        self.state.numbers[f"{self.name}_{key}"] = float(value)
+
+    def forget(self) -> None:
+        """As at the start."""
+        for key, value in self.initial.items():
+            self[key] = value
+
+
+class Earlier:
+    """The last values of a field, as functions of the state.
+
+    Parameters
+    ----------
+    state
+        Which has them from now on.
+    name
+        What the names of the functions begin with.
+    make
+        Makes a dolfinx function.
+    count
+        How many values are kept.
+    """
+
+    def __init__(self, state: State, name: str, make: Callable[[], Any], count: int):
+        self._functions = []
+        for age in range(count):
+            function = make()
+            function.name = f"{name}_{age}"
+            state.remember(function)
+            self._functions.append(function)
+        self._numbers = Numbers(state, name, {"known": 0})
+
+    @property
+    def known(self) -> int:
+        """How many values there are."""
+        return int(self._numbers["known"])
+
+    @property
+    def values(self) -> list[Array]:
+        """The newest first, the functions' own memory, ghosts included."""
+        return [function.x.array for function in self._functions[: self.known]]
+
+    def push(self, values: Array) -> None:
+        """One value more, for owned unknowns and ghosts; the oldest goes."""
+        for older, newer in reversed(list(zip(self._functions[1:], self._functions, strict=False))):
+            older.x.array[:] = newer.x.array
+        self._functions[0].x.array[:] = values
+        self._numbers["known"] = min(self.known + 1, len(self._functions))
+
+    def push_owned(self, values: Array) -> None:
+        """The same without ghosts; collective."""
+        whole = np.zeros_like(self._functions[0].x.array)
+        whole[: len(values)] = values
+        self.push(whole)
+        self._functions[0].x.scatter_forward()
+
+    def forget(self) -> None:
+        """There have been none."""
+        self._numbers.forget()
