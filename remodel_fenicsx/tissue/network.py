@@ -129,7 +129,7 @@ class Terms(NamedTuple):
 def log_terms(strain: Strain, cells: Cells, r0: Array, derivatives: bool) -> Terms:
     """Of M = A : ln C."""
     values, A = strain.squared, cells.structure
-    quotients = logarithm.first_divided_difference(values[:, :, None], values[:, None, :])
+    quotients = logarithm.first_divided_differences(values)
     if not derivatives:
         return Terms(quotients * A, None, None)
     by_cells = quotients[:, mandel.ROWS, mandel.COLUMNS][:, :, None] * cells.structure_by_cells()
