@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import NoReturn
 
 import remodel_fenicsx
+from remodel_fenicsx.body.reductions import explained
 from remodel_fenicsx.system import interrupts
 from remodel_fenicsx.system.environment import reason_unusable, versions
 from remodel_fenicsx.scene.parameters import PRESETS
@@ -83,9 +84,20 @@ def parser() -> argparse.ArgumentParser:
     stability.add_argument("--times", type=_positive, default=10, metavar="N", help="times to analyse (default: 10)")
     stability.add_argument("-q", "--quiet", action="store_true", help="no progress")
     stability.set_defaults(resume=None, max_wall_time=None)
+    ensemble = scene_command("ensemble", "Run a scene of random cells with many seeds, and with isotropic cells.")
+    ensemble.add_argument("--seeds", type=_positive, default=32, metavar="N", help="how many (default: 32; at least 2)")
+    ensemble.add_argument(
+        "-o", "--output", type=Path, metavar="DIR",
+        help="folder (default: results/NAME-ensemble); what it holds of the same scene is used, and gone on with",
+    )  # fmt: skip
+    ensemble.add_argument("--jobs", type=_positive, metavar="N", help="runs at a time (default: as many as cores)")
+    ensemble.add_argument("-q", "--quiet", action="store_true", help="no progress")
     text = "Say where the run in DIR is, how fast, and whether it is alive."
     status = commands.add_parser("status", help=text, description=text)
     status.add_argument("folder", type=Path, metavar="DIR", help="folder of a run")
+    text = "Write the fields of a reduced run in DIR on the whole body: fields_body.vtkhdf."
+    revolve = commands.add_parser("revolve", help=text, description=text)
+    revolve.add_argument("folder", type=Path, metavar="DIR", help="folder of a run")
     scene_command("validate", "Check a scene without running it.")
     new = commands.add_parser("new", help="Print a scene of a preset.", description="Print a scene of a preset.")
     new.add_argument("preset", metavar="PRESET", help=", ".join(PRESETS))
@@ -243,6 +255,29 @@ def _stability(options: argparse.Namespace) -> int:
     return _run(options, analyse)
 
 
+def _ensemble(options: argparse.Namespace) -> int:
+    scene = read_scene(options.scene, options.set)
+    reason = reason_unusable()
+    if reason is not None:
+        return _fail(f"the environment is not usable: {reason}; run through ./with-fenicsx", BAD_ENVIRONMENT)
+    if options.seeds < 2:
+        return _fail(f"--seeds {options.seeds}: allowed is a whole number at least 2", BAD_INPUT)
+    from remodel_fenicsx.studies import ensemble as study
+
+    try:
+        with interrupts.StopRequest(), interrupts.stopping_at_once():
+            folder, found = study.ensemble(scene, options.output, options.seeds, options.jobs, options.quiet)
+    except interrupts.Interrupted as interruption:
+        return _fail("stopped; all that is recorded is kept, the same command goes on", interruption.exit_code)
+    except OSError as error:
+        return _fail(f"cannot write the results: {error}", BAD_ENVIRONMENT)
+    _say(study.in_words(found, study.chosen_times(scene)))
+    _say(f"results in {folder}")
+    for name, words in found.failed.items():
+        _complain(f"{name} has failed: {words}")
+    return SOLVE_FAILED if found.failed else 0
+
+
 def _end_all(message: str, code: int) -> int:
     """End the run on all ranks: an error on one of them leaves the others waiting for ever."""
     from mpi4py import MPI
@@ -268,10 +303,30 @@ def _status(options: argparse.Namespace) -> int:
     return 0
 
 
+def _revolve(options: argparse.Namespace) -> int:
+    reason = reason_unusable()
+    if reason is not None:
+        return _fail(f"the environment is not usable: {reason}; run through ./with-fenicsx", BAD_ENVIRONMENT)
+    if not interrupts.is_first_rank():  # the work of one process
+        return 0
+    from remodel_fenicsx.results.recording import RecordingError
+    from remodel_fenicsx.results.revolve import revolve
+
+    try:
+        written = revolve(options.folder)
+    except RecordingError as error:
+        return _fail(str(error), BAD_INPUT)
+    except OSError as error:
+        return _fail(f"cannot write the fields: {error}", BAD_ENVIRONMENT)
+    _say("\n".join(map(str, written)))
+    return 0
+
+
 def _validate(options: argparse.Namespace) -> int:
     scene = read_scene(options.scene, options.set)
     _say(f"{options.scene}: a valid scene ({scene.geometry.name}, {scene.time.number_of_steps} steps)")
     _say(scene.summary())
+    _say("\n".join(explained(scene)))
     if _rank() == 0:
         for warning in scene.warnings():
             _complain(f"warning: {warning}")
@@ -319,7 +374,9 @@ def _info(options: argparse.Namespace) -> int:
 COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
     "run": _run,
     "stability": _stability,
+    "ensemble": _ensemble,
     "status": _status,
+    "revolve": _revolve,
     "validate": _validate,
     "new": _new,
     "figures": _figures,

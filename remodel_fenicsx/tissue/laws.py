@@ -97,6 +97,8 @@ class Law:
     dimensions
         Of laws towards a target by rank (`ranked`): the function of which `update` is made. The coupling "implicit"
         asks for its slope.
+    keeps_symmetry
+        Whether planes of symmetry of cells and drive stay such: False where the law turns an axis to one of two sides.
     share
         Cells that have made a share of a change, from (old, new, factor); `relaxed` where the law has none of its own.
     """
@@ -109,6 +111,7 @@ class Law:
     follow: Callable[[UnitCell, tensor_law.Target, Array | float, float], UnitCell] | None = None
     dimensions: RankedFunction | None = None
     share: Callable[[UnitCell, UnitCell, float], UnitCell] = relaxed
+    keeps_symmetry: bool = False
 
 
 def ranked(function: RankedFunction, has_limit: bool = False, of_absolute_time: bool = False) -> Law:
@@ -135,7 +138,7 @@ def ranked(function: RankedFunction, has_limit: bool = False, of_absolute_time: 
             np.where(active[:, None, None], axes, cells.axes),
         )
 
-    return Law(update, has_limit, of_absolute_time=of_absolute_time, dimensions=function)
+    return Law(update, has_limit, of_absolute_time=of_absolute_time, dimensions=function, keeps_symmetry=True)
 
 
 def principal_directions(drive: Drive, previous: Array, pairing: spectral.Pairing) -> tuple[Array, Array]:
@@ -280,7 +283,7 @@ LAWS: dict[str, Law] = {
     "explicit": ranked(explicit, has_limit=True, of_absolute_time=True),
     "rate": ranked(rate),
     "relaxation": ranked(relaxation, has_limit=True),
-    "tensor": Law(tensor, has_limit=True, target=tensor_target, follow=follow_tensor),
+    "tensor": Law(tensor, has_limit=True, target=tensor_target, follow=follow_tensor, keeps_symmetry=True),
     "rotation": Law(rotation, share=turned_in_part),
-    "none": Law(keep, remodels=False),
+    "none": Law(keep, remodels=False, keeps_symmetry=True),
 }
