@@ -380,7 +380,8 @@ def test_a_coupling(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setitem(coupling.COUPLINGS, "late", Late)
     with pytest.raises(
-        SceneError, match="^remodeling.coupling = 'late': allowed are 'staggered', 'relaxed', 'extrapolated'$"
+        SceneError,
+        match="^remodeling.coupling = 'late': allowed are 'staggered', 'relaxed', 'extrapolated', 'implicit'$",
     ):
         scene(remodeling={"coupling": "late"})
     monkeypatch.setitem(parameters.COUPLINGS, "late", "as staggered, but the cells stay as they are up to t = 2")

@@ -71,6 +71,32 @@ def test_radial_is_the_independent_solution(driver: str, end: float) -> None:
     simulation.close()
 
 
+@pytest.mark.parametrize("driver", ["cauchy", "pk2", "finger"])
+def test_the_consistent_law_is_the_independent_solution(driver: str) -> None:
+    """Its law, typed by hand in the reference too."""
+    changes = {"driver": driver, "law": "tensor", "frame": "material"}
+    tables: dict[str, Any] = {"mesh": {"degree": 2, "refinement": 8}, "material": {"repulsion": "log"}}
+    simulation = Simulation(scene("tube", "radial", 10.0, remodeling=changes, **tables), SELF)
+    steps = list(simulation.steps())
+    exact, printed = (solve_radial(driver=driver, law=law, end=10.0, elements=150) for law in ("tensor", "explicit"))
+    inner = [step.row["inner_radius"] for step in steps]
+    np.testing.assert_allclose(inner, exact.inner_radii, rtol=1e-5)
+    assert np.abs(printed.inner_radii / exact.inner_radii - 1).max() > 1e-3
+    angle = Measurement(simulation.observer, steps[-1]).fibre_angle
+    expected = np.interp(simulation.quadrature.coordinates[..., 0], exact.points, exact.fibre_angle())
+    np.testing.assert_allclose(angle, expected, rtol=0, atol=0.02)
+    simulation.close()
+
+
+def test_the_implicit_coupling_is_that_of_every_kinematics() -> None:
+    """A ray and a half plane of it; and eq. (11) has no error of the step."""
+    changes = {"coupling": "implicit", "frame": "material"}
+    assert difference(*(scene("tube", name, 3.0, remodeling=changes) for name in ("axisymmetric", "radial"))) < 1e-9
+    steps = (scene("tube", "radial", 10.0, remodeling=changes, time={"end": 10.0, "step": h}) for h in (1.0, 5.0))
+    ends = [history(each)["inner_radius"][-1] for each in steps]
+    np.testing.assert_allclose(ends[0], ends[1], rtol=1e-8)
+
+
 @pytest.mark.parametrize("cells", [ISOTROPIC, {"initial": [0.6, 0.0, 0.8]}, {"initial": "random"}])
 def test_a_cube_is_a_point(cells: dict[str, Any]) -> None:
     assert difference(*(scene("cube", name, 40.0, cells=cells) for name in ("point", "full"))) < 1e-9

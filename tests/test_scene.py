@@ -308,8 +308,30 @@ BAD_SCENES = [
     (CUBE, {"remodeling.frame": "corotated"}, "remodeling.frame = 'corotated': allowed are 'material', 'spatial'"),
     (
         CUBE,
-        {"remodeling.coupling": "implicit"},
-        "remodeling.coupling = 'implicit': allowed are 'staggered', 'relaxed', 'extrapolated'",
+        {"remodeling.coupling": "monolithic"},
+        "remodeling.coupling = 'monolithic': allowed are 'staggered', 'relaxed', 'extrapolated', 'implicit'",
+    ),
+    (
+        CUBE,
+        {"remodeling.coupling": "implicit", "remodeling.law": "rotation"},
+        "remodeling.coupling = 'implicit': needs a remodeling.law towards a target: 'explicit', 'rate', 'relaxation', "
+        "'tensor'",
+    ),
+    (
+        CUBE,
+        {"remodeling.coupling": "implicit", "remodeling.law": "tensor"},
+        "remodeling.coupling = 'implicit': needs a material.repulsion that sees no axes, as its law: 'log', 'length'",
+    ),
+    (
+        CUBE,
+        {"remodeling.coupling": "implicit", "mesh.formulation": "selective-integration"},
+        "remodeling.coupling = 'implicit': needs mesh.formulation = 'displacement': with another one the stress at a "
+        "point belongs to its element",
+    ),
+    (
+        CUBE,
+        {"remodeling.coupling": "implicit", "material.chain_density": 0.0},
+        "remodeling.coupling = 'implicit': needs chains: material.chain_density above 0",
     ),
     (CUBE, {"model.kinematics": "radial"}, "model.kinematics = 'radial': a cube has no such reduction; it has 'point'"),
     (CUBE, {"geometry.side": 1e7}, "geometry.side = 10000000.0: a length of 1e+07 here; allowed are 1e-06 to 1e+06"),

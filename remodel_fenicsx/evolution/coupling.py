@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from remodel_fenicsx.body.loading import LoadValues
 from remodel_fenicsx.evolution.blend import Blend
 from remodel_fenicsx.evolution.equilibrium import Equilibrium
+from remodel_fenicsx.evolution.implicit import Implicit
 from remodel_fenicsx.evolution.newton import GuardedNewton, SolveFailure, SolverSettings
 from remodel_fenicsx.evolution.parts import Change, Work
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
@@ -219,8 +220,13 @@ class Extrapolated(Staggered):
         points = self.state.comm.allreduce(int(quadrature.owned(lost.reshape(quadrature.shape)).sum()))
         if points and self.state.comm.rank == 0:
             log.info("time %g: %d points follow the last stress, not the extrapolated one", time, points)
-        self._power = self.remodeling.replace(asked, self.remodeling.driving_tensor()[0], duration)
+        self._power = self.remodeling.replace(asked, self.remodeling.deformation_gradient(), duration)
 
 
 Maker = Callable[[State, Tissue, RemodelingPass, SolverSettings], Coupling]
-COUPLINGS: dict[str, Maker] = {"staggered": Staggered, "relaxed": Relaxed, "extrapolated": Extrapolated}
+COUPLINGS: dict[str, Maker] = {
+    "staggered": Staggered,
+    "relaxed": Relaxed,
+    "extrapolated": Extrapolated,
+    "implicit": Implicit,
+}

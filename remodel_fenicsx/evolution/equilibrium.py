@@ -77,14 +77,9 @@ class Equilibrium:
         test, trial = ufl.TestFunction(u.function_space), ufl.TrialFunction(u.function_space)
         F = state.kinematics.deformation_gradient(u)
         self.energies = state.dilatation.energies(self.tissue, F, shares, state.kinematics.weight(mesh))
-        internal = [ufl.derivative(energy, u, test) for energy in self.energies]
-        tangents = [ufl.derivative(form, u, trial) for form in internal]
         external = loading.external_residual(test)
         self.pointwise = pointwise_repulsion(state, self.tissue, point_shares)
-        if self.pointwise is not None:
-            weight, dx = state.kinematics.weight(mesh), self.quadrature.dx
-            internal[0] += self.pointwise.residual(u, F, test) * weight * dx
-            tangents[0] += self.pointwise.tangent(u, F, test, trial) * weight * dx
+        internal, tangents = self.internal_and_tangents(F, test, trial)
         self.internal_forms = [jit.form(form) for form in internal]
         self.external_form = None if external is None else jit.form(external)
         # apart, so that bodies with other loads share the costly one
@@ -97,6 +92,17 @@ class Equilibrium:
             ufl.as_vector([F[i, j] for i in range(3) for j in range(3)]), self.quadrature.points
         )
         self._energy_forms: list[Any] = []
+
+    def internal_and_tangents(self, F: Any, test: Any, trial: Any) -> tuple[list[Any], list[Any]]:
+        """Virtual work of the stresses and its derivative by the unknowns, UFL forms to be added up."""
+        u = self.state.unknown
+        internal = [ufl.derivative(energy, u, test) for energy in self.energies]
+        tangents = [ufl.derivative(form, u, trial) for form in internal]
+        if self.pointwise is not None:
+            weight, dx = self.state.kinematics.weight(self.quadrature.mesh), self.quadrature.dx
+            internal[0] += self.pointwise.residual(u, F, test) * weight * dx
+            tangents[0] += self.pointwise.tangent(u, F, test, trial) * weight * dx
+        return internal, tangents
 
     # ------------------------------------------------------------ what users ask
     def extension(self) -> Extension:

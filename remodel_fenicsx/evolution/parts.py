@@ -25,6 +25,7 @@ class Work:
     linear_iterations: int = 0
     substeps: int = 0
     residual: float = 0.0  # of the last solution, in the unit of force
+    held_points: int = 0  # points whose cells do not belong to their stress, of the coupling "implicit"
 
     def add(self, done: Solution | SolveFailure) -> None:
         """Count a solve."""

@@ -46,17 +46,24 @@ class PointwiseRepulsion:
         self.stiffness = self.quadrature.function("repulsion_stiffness", (6, 6))
         F = state.kinematics.deformation_gradient(state.unknown)
         self._expression = jit.expression(F, self.quadrature.points)
+        self._known: list[Array] = []  # F, A and c g(r0) of the values that are there
+        self._stiffness_is_known = False
 
     def deformation_gradient(self) -> Array:
         """F at all points in one row, (n, 3, 3)."""
         return self.quadrature.evaluate(self._expression, (3, 3)).reshape(-1, 3, 3)
 
     def update(self, stiffness: bool = False) -> None:
-        """Stress, and stiffness on request, of the present unknowns and cells."""
+        """Stress, and stiffness on request, of the present unknowns and cells: what is there already stays."""
         derivatives = self.tissue.repulsion.derivatives
         assert derivatives is not None
-        F, modulus = self.deformation_gradient(), self._modulus()
-        first, second = derivatives(np.swapaxes(F, 1, 2) @ F, whole_structure_tensor(self.shares()), stiffness)
+        F, A, modulus = self.deformation_gradient(), whole_structure_tensor(self.shares()), self._modulus()
+        asked = [F, A, modulus]
+        known = bool(self._known) and all(map(np.array_equal, asked, self._known))
+        if known and (self._stiffness_is_known or not stiffness):
+            return
+        self._known, self._stiffness_is_known = asked, stiffness
+        first, second = derivatives(np.swapaxes(F, 1, 2) @ F, A, stiffness)
         shape = self.quadrature.shape
         # W_rep = -c g(r0)/2 M: S = 2 dW/dC and 2 dS/dC = 4 d2W/dC2
         self.quadrature.values(self.stress, (3, 3))[:] = (-modulus[:, None, None] * first).reshape(*shape, 3, 3)

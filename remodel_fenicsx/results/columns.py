@@ -74,6 +74,12 @@ COLUMNS_ON_REQUEST: dict[str, Column] = {
             "negative eigenvalues of the tangent's symmetric part: 0 where the equilibrium is stable",
             lambda m: m.step.negative_eigenvalues,
         ),
+        Column(
+            "held_points",
+            "",
+            "points at which the coupling 'implicit' found no cells that belong to their stress",
+            lambda m: m.step.work.held_points,
+        ),
     )
 }
 """Columns that a scene may name in `output.columns`; a script adds its own."""

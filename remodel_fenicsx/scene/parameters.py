@@ -28,6 +28,8 @@ COUPLINGS = {
     "driver and frame but under weak loads, where 'staggered' over-corrects with 'pk2' and 'finger'",
     "extrapolated": "remodel first, towards the stress of the middle of the step, extrapolated from the two steps "
     "before; then solve: of second order, for the law 'tensor'",
+    "implicit": "the cells belong to the stress of the same step: Newton's method on both, for the law 'tensor' (with "
+    "a repulsion that sees no axes) and the laws of the paper",
 }
 """What each of `evolution.coupling.COUPLINGS` does; that room is above this one, and a test holds the two together."""
 OF_SHARES = ("relaxed",)

@@ -26,7 +26,11 @@ from remodel_fenicsx.schema.times import is_multiple
 from remodel_fenicsx.schema.toml import merged, parse_override, put, read_toml, toml_text
 from remodel_fenicsx.schema.units import FORCE, STRESS
 from remodel_fenicsx.tissue.chains import CHAINS
+from remodel_fenicsx.tissue.condensed import refused
+from remodel_fenicsx.tissue.drivers import DRIVERS, FRAMES
 from remodel_fenicsx.tissue.energy import MATRICES, Matrix
+from remodel_fenicsx.tissue.laws import LAWS
+from remodel_fenicsx.tissue.repulsion import REPULSIONS
 
 LARGEST_MESH = 10_000_000  # hexahedra; Gmsh, which is serial, needs about 10 GB for them
 
@@ -106,6 +110,9 @@ class Scene(Table):
         if FORMULATIONS[formulation].takes_parts and not isinstance(MATRICES[material.matrix], Matrix):
             rule = f"needs the volumetric part of material.matrix = {material.matrix!r}: an energy made as a Matrix"
             raise fault(rule, "mesh.formulation", formulation)
+        missing = self._missing_for_implicit() if self.remodeling.coupling == "implicit" else None
+        if missing is not None:
+            raise fault(f"needs {missing}", "remodeling.coupling", "implicit")
         elements = geometry.number_of_elements * self.mesh.refinement**3
         if elements > LARGEST_MESH:
             largest = math.floor((LARGEST_MESH / geometry.number_of_elements) ** (1 / 3))
@@ -119,6 +126,16 @@ class Scene(Table):
         if self.model.kinematics != AUTO and (reasons := objections(self, self.model.kinematics)):
             raise fault("; ".join(reasons), "model.kinematics", self.model.kinematics)
         return self
+
+    def _missing_for_implicit(self) -> str | None:
+        """What the coupling "implicit" would need."""
+        if self.mesh.formulation != "displacement":
+            return "mesh.formulation = 'displacement': with another one the stress at a point belongs to its element"
+        if not self.material.chain_density:
+            return "chains: material.chain_density above 0"
+        remodeling, material = self.remodeling, self.material
+        parts = LAWS[remodeling.law], DRIVERS[remodeling.driver], FRAMES[remodeling.frame]
+        return refused(*parts, MATRICES[material.matrix], REPULSIONS[material.repulsion])
 
     def _check_load(self, name: str, load: Load) -> None:
         step, key = self.time.step, f"loads.{name}"

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from remodel_fenicsx.tissue.energy import Stresses
+from remodel_fenicsx.tissue.logarithm import eigen
 
 Array = NDArray[np.float64]
 
@@ -50,8 +51,8 @@ DRIVERS: dict[str, Driver] = {
 
 def rotated_back(F: Array, spatial_tensor: Array) -> Array:
     """R^T t R with the rotation R of F = R U: objective. For t = sigma it is U S U / J, for t = b it is C."""
-    u, _, vt = np.linalg.svd(F)
-    R = u @ vt
+    squared, basis = eigen(np.swapaxes(F, 1, 2) @ F)
+    R = F @ (basis / np.sqrt(squared)[:, None, :]) @ np.swapaxes(basis, 1, 2)  # F U^-1
     back: Array = np.swapaxes(R, 1, 2) @ spatial_tensor @ R
     return (back + np.swapaxes(back, 1, 2)) / 2
 

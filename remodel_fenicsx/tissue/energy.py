@@ -14,8 +14,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from remodel_fenicsx.tissue.cells import UnitCell, structure_tensor
 from remodel_fenicsx.tissue.chains import CHAINS, Chain
+from remodel_fenicsx.tissue.logarithm import MANDEL
 from remodel_fenicsx.tissue.operators import det, is_array, ln, sqrt, squared_norm
 from remodel_fenicsx.tissue.repulsion import REPULSIONS, Repulsion, squared_end_to_end_length
 
@@ -35,10 +38,13 @@ class Matrix:
         What resists a change of volume, a function of J, lambda and mu: zero and without slope at J = 1.
     others
         All other terms, functions of F, lambda and mu; together zero and stress-free at F = I.
+    derivatives
+        S and dS/dC of the whole energy at points, from (eigenvalues of C (n, 3), lambda, mu, whether dS/dC is asked
+        for), in the eigenbasis of C: tensors (n, 3, 3) and Mandel matrices (n, 6, 6). The coupling "implicit" needs it.
     """
 
-    def __init__(self, volumetric: Term, *others: Term):
-        self.volumetric, self.others = volumetric, others
+    def __init__(self, volumetric: Term, *others: Term, derivatives: Callable[..., tuple[Any, Any]] | None = None):
+        self.volumetric, self.others, self.derivatives = volumetric, others, derivatives
 
     def __call__(self, deformation_gradient: Any, lame_lambda: Any, lame_mu: Any) -> Any:
         """The whole energy."""
@@ -56,10 +62,26 @@ def logarithmic_dilatation(jacobian: Any, lame_lambda: Any, lame_mu: Any) -> Any
     return lame_lambda / 2 * ln(jacobian) ** 2
 
 
+def neo_hookean_derivatives(squared: Any, lame_lambda: Any, lame_mu: Any, second: bool) -> tuple[Any, Any]:
+    """S = (lambda ln J - mu) C^-1 + mu I and dS/dC in the eigenbasis of C; arrays of n points."""
+    inverse = 1 / squared
+    volumetric = lame_lambda * np.log(squared).sum(axis=1) / 2 - lame_mu
+    value = np.zeros((len(squared), 3, 3))
+    value[:, range(3), range(3)] = volumetric[:, None] * inverse + np.reshape(lame_mu, (-1, 1))
+    if not second:
+        return value, None
+    entries = np.concatenate([inverse, np.zeros_like(inverse)], axis=1)
+    dyad = np.reshape(lame_lambda, (-1, 1, 1)) / 2 * entries[:, :, None] * entries[:, None, :]
+    rows, columns = np.array(MANDEL).T
+    dyad[:, range(6), range(6)] -= volumetric[:, None] * inverse[:, rows] * inverse[:, columns]
+    return value, dyad
+
+
 neo_hookean = Matrix(
     logarithmic_dilatation,
     lambda F, lame_lambda, lame_mu: lame_mu / 2 * (squared_norm(F) - 3),
     lambda F, lame_lambda, lame_mu: -(lame_mu * ln(det(F))),
+    derivatives=neo_hookean_derivatives,
 )
 """W_iso = lambda/2 ln^2 J + mu/2 (tr C - 3) - mu ln J (eq. 4a)."""
 

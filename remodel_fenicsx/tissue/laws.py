@@ -73,6 +73,9 @@ def relaxed(old: UnitCell, new: UnitCell, factor: float) -> UnitCell:
     return UnitCell(np.sqrt(np.maximum(squared, 0.0)), axes)
 
 
+RankedFunction = Callable[[Array, Array, Array, float, float, float], Array]
+
+
 @dataclass(frozen=True)
 class Law:
     """An evolution law.
@@ -91,6 +94,9 @@ class Law:
     target, follow
         Of laws whose cells tend to a tensor: ``target(drive)`` and ``follow(cells, target, r0, kappa dt)``, of which
         `update` is made. A scheme of second order needs them apart.
+    dimensions
+        Of laws towards a target by rank (`ranked`): the function of which `update` is made. The coupling "implicit"
+        asks for its slope.
     keeps_symmetry
         Whether planes of symmetry of cells and drive stay such: False where the law turns an axis to one of two sides.
     share
@@ -103,11 +109,9 @@ class Law:
     of_absolute_time: bool = False
     target: Callable[[Drive], tensor_law.Target] | None = None
     follow: Callable[[UnitCell, tensor_law.Target, Array | float, float], UnitCell] | None = None
+    dimensions: RankedFunction | None = None
     share: Callable[[UnitCell, UnitCell, float], UnitCell] = relaxed
     keeps_symmetry: bool = False
-
-
-RankedFunction = Callable[[Array, Array, Array, float, float, float], Array]
 
 
 def ranked(function: RankedFunction, has_limit: bool = False, of_absolute_time: bool = False) -> Law:
@@ -124,27 +128,27 @@ def ranked(function: RankedFunction, has_limit: bool = False, of_absolute_time: 
     """
 
     def update(cells: UnitCell, drive: Drive, time_old: float, time_new: float) -> UnitCell:
-        values, axes = _principal(drive, cells.axes, drive.pairing)
+        values, axes = principal_directions(drive, cells.axes, drive.pairing)
         direction, active = spectral.positive_direction(values, threshold=drive.threshold)
         target = np.reshape(drive.end_to_end_length, (-1, 1)) * direction
         dimensions = function(cells.dimensions, drive.initial_dimensions, target, drive.kappa, time_old, time_new)
-        axes = _framed(drive, axes, None if drive.pairing is spectral.principal else dimensions)
+        axes = framed(drive, axes, None if drive.pairing is spectral.principal else dimensions)
         return UnitCell(
             np.where(active[:, None], dimensions, cells.dimensions),
             np.where(active[:, None, None], axes, cells.axes),
         )
 
-    return Law(update, has_limit, of_absolute_time=of_absolute_time, keeps_symmetry=True)
+    return Law(update, has_limit, of_absolute_time=of_absolute_time, dimensions=function, keeps_symmetry=True)
 
 
-def _principal(drive: Drive, previous: Array, pairing: spectral.Pairing) -> tuple[Array, Array]:
+def principal_directions(drive: Drive, previous: Array, pairing: spectral.Pairing) -> tuple[Array, Array]:
     """Principal values and directions of the drive, in the space in which it lives; `previous`: the cells' axes."""
     if not drive.driver.material and drive.frame.carries_axes:
         previous = carried_axes(drive.deformation_gradient, previous)
     return pairing(drive.tensor, previous, threshold=drive.threshold)
 
 
-def _framed(drive: Drive, axes: Array, dimensions: Array | None = None) -> Array:
+def framed(drive: Drive, axes: Array, dimensions: Array | None = None) -> Array:
     """Axes of the cells from the drive's principal directions, by rank or in an order of their own.
 
     A frame may treat its axes in their order (the material one takes the first as it is). By rank it is the largest
@@ -186,9 +190,9 @@ def rotation(cells: UnitCell, drive: Drive, time_old: float, time_new: float) ->
     """
     order = (np.argmax(cells.dimensions, axis=1)[:, None] + np.arange(3)) % 3
     axes = np.take_along_axis(cells.axes, order[:, :, None], axis=1)
-    values, towards = _principal(drive, axes, spectral.principal)
+    values, towards = principal_directions(drive, axes, spectral.principal)
     _, active = spectral.positive_direction(values, threshold=drive.threshold)
-    largest = spectral.with_signs_of(axes, _framed(drive, towards))[:, 0]
+    largest = spectral.with_signs_of(axes, framed(drive, towards))[:, 0]
     vectors = _turn_towards(axes[:, 0], largest, (time_new - time_old) / drive.rotation_time)
     return UnitCell(cells.dimensions, turned(cells.axes, np.where(active[:, None], vectors, 0.0)))
 

@@ -58,9 +58,22 @@ def _second_of_ordered(least: Array, middle: Array, largest: Array, first: Array
     return result
 
 
+_last: list[tuple[Array, Array, Array]] = []  # tensors, values, vectors of the last question
+
+
 def eigen(tensors: Array) -> tuple[Array, Array]:
-    """Eigenvalues (n, 3), ascending, and eigenvectors as columns (n, 3, 3) of symmetric tensors (n, 3, 3)."""
+    """Eigenvalues (n, 3), ascending, and eigenvectors as columns (n, 3, 3) of symmetric tensors (n, 3, 3), read-only.
+
+    The last answer is kept: residual, tangent, driving stress, energy and power ask one after the other for the same
+    tensors, and the decomposition is half of their work.
+    """
+    for known, *answer in _last:
+        if np.array_equal(known, tensors):
+            return answer[0], answer[1]
     values, vectors = np.linalg.eigh(tensors)
+    for array in (values, vectors):
+        array.flags.writeable = False
+    _last[:] = [(tensors.copy(), values, vectors)]
     return values, vectors
 
 
@@ -77,7 +90,16 @@ def logarithm(tensors: Array) -> Array:
 
 def derivative(values: Array, components: Array) -> Array:
     """D ln(C)[A] in the eigenbasis of C, from eigenvalues (n, 3) and the components of A there (n, 3, 3)."""
-    return first_divided_difference(values[..., :, None], values[..., None, :]) * components
+    return first_divided_differences(values) * components
+
+
+def first_divided_differences(values: Array) -> Array:
+    """f[c_i, c_j], (n, 3, 3): three quotients, and 1/c_i."""
+    result = np.empty((*values.shape, 3))
+    for i, j in ((0, 1), (0, 2), (1, 2)):
+        result[..., i, j] = result[..., j, i] = first_divided_difference(values[..., j], values[..., i])
+    result[..., range(3), range(3)] = 1 / values
+    return result
 
 
 def second_derivative(values: Array, components: Array) -> Array:

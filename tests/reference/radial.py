@@ -295,6 +295,10 @@ def remodel(
     """Return the dimensions by rank and the direction of each rank after one remodeling pass."""
     if law == "none":
         return ranked, ranks
+    if law == "tensor":
+        by_direction = np.empty_like(ranked)
+        np.put_along_axis(by_direction, ranks, ranked, axis=1)
+        return np.take_along_axis(np.sqrt(structure(by_direction**2, values, kappa * step, r0)), ranks, axis=1), ranks
     largest = np.max(np.abs(values), axis=1, keepdims=True)
     positive = np.where(values > np.maximum(1e-14 * largest, noise), values, 0.0)
     norm = np.linalg.norm(positive, axis=1, keepdims=True)
@@ -303,6 +307,18 @@ def remodel(
     direction = np.take_along_axis(positive / np.where(active, norm, 1.0), new_ranks, axis=1)
     new = updated(law, ranked, start, r0 * direction, kappa, time, step)
     return np.where(active, new, ranked), new_ranks
+
+
+def structure(squares: Array, values: Array, rate: float, r0: float) -> Array:
+    """Return the squares by direction after a step of dA/dt = kappa s (r0^2 E - A), A diagonal; rate: kappa times step.
+
+    E = (d+)^2 / |d+|^2 with the driver's eigenvalues d, and s = |d+|^2 / (|d+|^2 + |d-|^2 / 100): no ranks.
+    """
+    tension, compression = np.maximum(values, 0.0) ** 2, np.minimum(values, 0.0) ** 2
+    pulled, pushed = (np.sum(part, axis=1, keepdims=True) for part in (tension, compression))
+    share = np.divide(pulled, pulled + 0.1**2 * pushed, out=np.zeros_like(pulled), where=pulled > 0)
+    towards = np.divide(tension, pulled, out=np.zeros_like(tension), where=pulled > 0)
+    return squares + (1 - np.exp(-rate * share)) * (r0**2 * towards - squares)
 
 
 def solve_radial(
@@ -329,7 +345,8 @@ def solve_radial(
     pressure, stretch
         Final inner pressure (Pa, follower) and axial stretch minus one; both rise linearly over `ramp_time`.
     driver : "cauchy" | "pk2" | "finger"
-    law : "explicit" (eq. 11) | "rate" (eq. 10) | "relaxation" | "none"
+    law : "explicit" (eq. 11) | "rate" (eq. 10) | "relaxation" | "tensor" (of the consistent variant, whose repulsion
+        is the paper's where cells and stretches have the same axes, as here) | "none"
     elements
         Quadratic elements through the wall.
 

@@ -1,0 +1,250 @@
+"""Cells that answer within a solve: equilibrium with stress and consistent tangent as values at the points."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import ufl
+from numpy.typing import NDArray
+
+from remodel_fenicsx.evolution.equilibrium import Equilibrium, at_points
+from remodel_fenicsx.evolution.newton import GuardedNewton, Solution, SolveFailure, SolverSettings
+from remodel_fenicsx.evolution.remodeling import RemodelingPass
+from remodel_fenicsx.evolution.state import State
+from remodel_fenicsx.fem import jit
+from remodel_fenicsx.tissue import condensed, spectral
+from remodel_fenicsx.tissue.cells import UnitCell, structure_tensor
+from remodel_fenicsx.tissue.energy import Tissue
+from remodel_fenicsx.tissue.responses import StepOfCells
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+BEFORE_HOLDING = 5
+"""Newton iterations after which cells that still jump stay as they are (by rank there are states without a solution),
+or after which states where cells are not found are refused (other laws)."""
+JUMP = 0.02
+"""Change of A over r0^2 from one iteration to the next that is a jump after so many."""
+
+
+class AnsweringCells:
+    """The cells at the end of a step as a function of the unknowns, at all points of this rank in one row.
+
+    Parameters
+    ----------
+    state
+        Its cells are those at the start of the step.
+    tissue
+        On the mesh.
+    remodeling
+        Driver, law, frame and speed.
+
+    Attributes
+    ----------
+    stress, tangent
+        P (3, 3) and dP/dF (9, 9), row by row: dolfinx functions that belong to the last `update`.
+    held
+        Points whose cells answer no more in this solve.
+    keeps
+        Whether no cells answer at all: those at the start of the step stay.
+    """
+
+    def __init__(self, state: State, tissue: Tissue, remodeling: RemodelingPass):
+        self.state, self.tissue, self.remodeling = state, tissue, remodeling
+        self.quadrature = state.cells.quadrature
+        self.stress = self.quadrature.function("answering_stress", (3, 3))
+        self.tangent = self.quadrature.function("answering_tangent", (9, 9))
+        F = state.kinematics.deformation_gradient(state.unknown)
+        self._expression = jit.expression(F, self.quadrature.points)
+        self.keeps = False
+        self.held: Flags = np.zeros(int(np.prod(self.quadrature.shape)), dtype=bool)
+        self._points: condensed.CondensedPoints
+        self._found: condensed.Solution
+        self._gradient: Array | None = None  # F of what was found
+        self._tangent_is_there = False
+        self._start: Array
+        self._accepted: Array
+        self._iterations = 0
+        self._last_structure: Array | None = None
+
+    def deformation_gradient(self) -> Array:
+        """F at all points, (n, 3, 3)."""
+        return self.quadrature.evaluate(self._expression, (3, 3)).reshape(-1, 3, 3)
+
+    # ------------------------------------------------------------ a step
+    def begin(self, time: float, residual: float) -> None:
+        """The present state is the start of a step to this time; it was accepted with these out-of-balance forces."""
+        settings, cells = self.remodeling.settings, self.state.cells
+        tissue, F = at_points(self.tissue, self.quadrature), self.deformation_gradient()
+        is_stress = self.remodeling.driver.is_stress
+        old = UnitCell(*(values.copy() for values in cells.point_cells[:2]))
+        step = StepOfCells(
+            self.remodeling.law,
+            self.remodeling.driver,
+            self.remodeling.frame,
+            spectral.PAIRINGS[settings.pairing],
+            old,
+            structure_tensor(*old[:2]),
+            cells.initial_dimensions.reshape(-1, 3),
+            tissue.end_to_end_length,
+            settings.kappa,
+            self.state.time,
+            time,
+            self.remodeling.stress_noise(F, residual) if is_stress else spectral.ROUNDING,
+        )
+        self._points = condensed.CondensedPoints(tissue, step)
+        self._accepted = self._points.kept(F, old, step.structure).driving_tensor
+        self.release()
+
+    def set_time(self, time: float) -> None:
+        """Another end of the step, which starts with the same cells."""
+        self._points = replace(self._points, step=replace(self._points.step, time_new=time))
+        self.release()
+
+    def release(self) -> None:
+        """All cells answer again, from the driving tensor of the last accepted state."""
+        self.held = np.zeros_like(self.held)
+        self._start, self._gradient, self._last_structure, self._iterations = self._accepted, None, None, 0
+
+    def accept(self) -> None:
+        """The present state is a solved one."""
+        self.update()
+        self._accepted = self._found.driving_tensor
+
+    @property
+    def asked(self) -> UnitCell:
+        """The cells of the last update."""
+        if self._points.step.law.dimensions is not None:
+            return self._found.cells
+        squared, axes = spectral.continued(self._found.structure, self._points.step.cells.axes)
+        return UnitCell(np.sqrt(np.maximum(squared, 0.0)), axes)
+
+    @property
+    def _may_hold(self) -> bool:
+        return self._points.step.law.dimensions is not None
+
+    def complete(self) -> bool:
+        """Whether the cells of the present unknowns may end a step: all belong to their stress, or the law may jump."""
+        self.update()
+        return self._may_hold or self.held_points() == 0
+
+    def held_points(self) -> int:
+        """At how many points of all ranks the cells do not belong to the stress."""
+        points = self.quadrature.owned((self.held | ~self._found.converged).reshape(self.quadrature.shape))
+        return int(self.state.comm.allreduce(int(points.sum())))
+
+    # ------------------------------------------------------------ values
+    def update(self, tangent: bool = False) -> None:
+        """Stress, and tangent on request, of the present unknowns."""
+        F = self.deformation_gradient()
+        if self._gradient is None or not np.array_equal(F, self._gradient):
+            self._solve(F)
+            self._gradient, self._tangent_is_there = F, False
+            stress = self._found.first_piola_kirchhoff.reshape(*self.quadrature.shape, 3, 3)
+            self.quadrature.values(self.stress, (3, 3))[:] = stress
+        if tangent and not self._tangent_is_there:
+            self._hold_what_jumps()
+            self._start = self._found.driving_tensor
+            kept = np.ones_like(self.held) if self.keeps else self.held
+            values = self._points.tangent(self._found, kept).reshape(*self.quadrature.shape, 9, 9)
+            self.quadrature.values(self.tangent, (9, 9))[:] = values
+            self._tangent_is_there = True
+
+    def _solve(self, F: Array) -> None:
+        with np.errstate(invalid="ignore"):
+            usable = np.linalg.det(F) > 0
+        F = np.where(usable[:, None, None], F, np.eye(3))
+        step = self._points.step
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            if self.keeps:
+                self._found = self._points.kept(F, step.cells, step.structure)
+                return
+            before = getattr(self, "_found", None)
+            found = self._points.solve(F, self._start, self.held)
+            if self.held.any():
+                assert before is not None
+                cells = before.cells
+                some = self._points.at(self.held)
+                held = UnitCell(cells.dimensions[self.held], cells.axes[self.held])
+                condensed.put(found, self.held, some.kept(F[self.held], held, step.structure[self.held]))
+        self._found = found
+
+    def _hold_what_jumps(self) -> None:
+        """From an iteration on; only laws by rank jump, others fail and the step is made in parts."""
+        self._iterations += 1
+        structure = self._found.structure
+        if self._may_hold and self._iterations > BEFORE_HOLDING and not self.keeps:
+            assert self._last_structure is not None
+            change = np.linalg.norm(structure - self._last_structure, axis=(1, 2))
+            jumps = change > JUMP * self._points.step.end_to_end_length**2
+            self.held = self.held | jumps | ~self._found.converged
+        self._last_structure = structure
+
+    def squared_lengths(self) -> Array:
+        """r^2 at all points, (elements, points); infinite where there are no cells for these unknowns."""
+        self.update()
+        lengths = self._found.response.cells.structure
+        squared = np.einsum("nii,ni->n", lengths, self._found.strain.squared)
+        if not self._may_hold and self._iterations > BEFORE_HOLDING:
+            squared = np.where(self._found.converged, squared, np.inf)
+        return squared.reshape(self.quadrature.shape)
+
+
+class AnsweringEquilibrium(Equilibrium):
+    """Equilibrium whose stress and tangent come from `AnsweringCells`.
+
+    Parameters
+    ----------
+    state, tissue
+        As for `Equilibrium`.
+    answering
+        The cells.
+    """
+
+    def __init__(self, state: State, tissue: Tissue, answering: AnsweringCells):
+        self.answering = answering
+        super().__init__(state, tissue)
+
+    def internal_and_tangents(self, F: Any, test: Any, trial: Any) -> tuple[list[Any], list[Any]]:
+        """Virtual work of P, and with it dP/dF."""
+        u, weight, dx = self.state.unknown, self.state.kinematics.weight(self.quadrature.mesh), self.quadrature.dx
+        variation, increment = (ufl.derivative(F, u, function) for function in (test, trial))
+        row, column = (ufl.as_vector([F_[i, j] for i in range(3) for j in range(3)]) for F_ in (variation, increment))
+        internal = ufl.inner(self.answering.stress, variation) * weight * dx
+        return [internal], [ufl.inner(ufl.dot(self.answering.tangent, column), row) * weight * dx]
+
+    def limit_values(self) -> tuple[Array, Array]:
+        """As of `Equilibrium`, with the cells that belong to the present unknowns."""
+        jacobian = np.linalg.det(self.answering.deformation_gradient()).reshape(self.quadrature.shape)
+        return self.answering.squared_lengths(), jacobian
+
+    def assemble_internal(self, vector: Any) -> None:
+        """Internal nodal forces of the present unknowns."""
+        self.answering.update()
+        super().assemble_internal(vector)
+
+    def _update_tangent(self) -> None:
+        self.answering.update(tangent=True)
+
+
+class AnsweringNewton(GuardedNewton):
+    """Newton's method for cells that answer."""
+
+    def __init__(self, equilibrium: AnsweringEquilibrium, settings: SolverSettings):
+        super().__init__(equilibrium, settings)
+        self.answering = equilibrium.answering
+
+    def solve(self) -> Solution:
+        """As of `GuardedNewton`; at first no cells are held."""
+        self.answering.release()
+        start = self.unknown.x.array.copy()
+        solution = super().solve()
+        if not self.answering.complete():
+            extension = self.equilibrium.extension()
+            self.unknown.x.array[:] = start
+            iterations = solution.newton_iterations, solution.linear_iterations
+            raise SolveFailure("points without cells that belong to their stress", *iterations, extension)
+        self.answering.accept()
+        return solution

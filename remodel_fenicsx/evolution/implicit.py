@@ -1,0 +1,94 @@
+"""The implicit coupling: the cells at the end of a step belong to the stress of its end (docs/theory.md)."""
+
+from __future__ import annotations
+
+import logging
+
+from remodel_fenicsx.body.loading import LoadValues
+from remodel_fenicsx.evolution.condensed import AnsweringCells, AnsweringEquilibrium, AnsweringNewton
+from remodel_fenicsx.evolution.equilibrium import Equilibrium
+from remodel_fenicsx.evolution.newton import GuardedNewton, SolveFailure, SolverSettings
+from remodel_fenicsx.evolution.parts import Change, Work
+from remodel_fenicsx.evolution.remodeling import RemodelingPass
+from remodel_fenicsx.evolution.state import State
+from remodel_fenicsx.tissue.energy import Tissue
+
+log = logging.getLogger(__name__)
+
+RESIDUAL = "residual of the last step"
+
+
+class Implicit:
+    """Newton's method on the unknowns with cells that follow at each point (`evolution.condensed`).
+
+    A step that does not converge in one piece is made in parts of its time and loads, each from the cells at its start:
+    the end is that of the whole step. The first step, before which there is no stress, is first solved with the cells
+    as they are. Cells, stress and row belong together at the end of a step.
+    """
+
+    def __init__(self, state: State, tissue: Tissue, remodeling: RemodelingPass, settings: SolverSettings):
+        self.state, self.remodeling, self.settings = state, remodeling, settings
+        self.equilibrium: Equilibrium = Equilibrium(state, tissue)  # of solved states
+        self.equilibrium.compile_energy()
+        self.answering = AnsweringCells(state, self.equilibrium.tissue, remodeling)
+        solved = AnsweringEquilibrium(state, tissue, self.answering)
+        solved.stop_signal = lambda: self.equilibrium.stop_signal()
+        self.newton: GuardedNewton = AnsweringNewton(solved, settings)
+        self.share, self._power = 1.0, 0.0
+        state.numbers[RESIDUAL] = 0.0
+
+    def solve(self, time: float, loads: LoadValues) -> Work:
+        """Equilibrium at `time` with the cells that belong to it.
+
+        Raises
+        ------
+        StepFailure
+            If none is found.
+        """
+        work, start = Work(), self.answering.deformation_gradient()
+        self.answering.begin(time, self.state.numbers[RESIDUAL])
+        if self.state.number == 0:
+            self._solve(time, loads, work, answering=False)
+            self.answering.begin(time, work.residual)
+        self._solve(time, loads, work, answering=True)
+        work.substeps -= int(self.state.number == 0)
+        self.state.numbers[RESIDUAL] = work.residual
+        work.held_points = self.answering.held_points()
+        if work.held_points and self.state.comm.rank == 0:
+            log.info("time %g: %d points have no cells that belong to their stress", time, work.held_points)
+        self._power = self.remodeling.replace(self.answering.asked, start, time - self.state.time)
+        self.state.settle_cells()
+        return work
+
+    def remodel(self, time: float) -> float:
+        """Nothing is left to do."""
+        return self._power
+
+    def close(self) -> None:
+        """Free PETSc's objects."""
+        self.newton.close()
+
+    def _solve(self, time: float, loads: LoadValues, work: Work, answering: bool) -> None:
+        """In one piece, or in parts of time and loads."""
+        loading, answers, start = self.state.loading, self.answering, self.state.time
+        old = dict(loading.values)
+
+        def set_fraction(fraction: float) -> None:
+            loading.set({name: old[name] + fraction * (loads[name] - old[name]) for name in loads})
+            answers.set_time(start + fraction * (time - start))
+
+        answers.keeps = not answering
+        try:
+            set_fraction(1.0)
+            loading.set(loads)
+            work.add(self.newton.solve())
+            work.substeps += 1
+        except SolveFailure as failure:
+            work.add(failure)
+            log.info("solving in parts: %s", failure.reason)
+            stage = "the step" if answering else "the change of the loads"
+            Change(time, stage, set_fraction, self.newton, self.settings.maximum_halvings).advance(work, failure)
+            loading.set(loads)
+            log.info("time %g solved in %d parts", time, work.substeps)
+        finally:
+            answers.keeps = False

@@ -1,0 +1,199 @@
+"""Condensed cells at points, without a mesh: the local equation, stress and consistent tangent."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import product
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from remodel_fenicsx.tissue import spectral
+from remodel_fenicsx.tissue.cells import UnitCell, structure_tensor
+from remodel_fenicsx.tissue.condensed import CondensedPoints, Solution
+from remodel_fenicsx.tissue.drivers import DRIVERS, FRAMES
+from remodel_fenicsx.tissue.energy import Tissue
+from remodel_fenicsx.tissue.laws import LAWS, Drive
+from remodel_fenicsx.tissue.repulsion import REPULSIONS
+from remodel_fenicsx.tissue.responses import StepOfCells
+
+Array = NDArray[np.float64]
+
+COMBINATIONS = [
+    (law, repulsion, driver, frame)
+    for (law, repulsion), driver, frame in product(
+        [("tensor", "log"), ("tensor", "length"), ("explicit", "axes"), ("relaxation", "axes"), ("rate", "log")],
+        ("cauchy", "pk2", "finger"),
+        ("material", "spatial"),
+    )
+    if (driver, frame) != ("pk2", "spatial")
+]
+
+
+def deformations(number: int, rng: np.random.Generator) -> Array:
+    """Stretches apart, with a rotation: under tension."""
+    R = Rotation.random(2 * number, random_state=rng).as_matrix()
+    stretches = np.array([1.35, 1.12, 0.8]) + rng.uniform(-0.06, 0.06, (number, 3))
+    return R[:number] @ (stretches[:, :, None] * R[number:])
+
+
+def points(
+    law: str, repulsion: str, driver: str, frame: str, number: int, initial: str = "isotropic", **changes: Any
+) -> CondensedPoints:
+    rng = np.random.default_rng(5)
+    tissue = Tissue(27.3, 3.1, 1.57, 1.594, 1.0, repulsion=REPULSIONS[repulsion])
+    lengths = np.full((number, 3), 1 / np.sqrt(3))
+    if initial == "random":
+        lengths = np.abs(rng.standard_normal((number, 3)))
+        lengths /= np.linalg.norm(lengths, axis=1, keepdims=True)
+    cells = UnitCell(lengths, Rotation.random(number, random_state=rng).as_matrix())
+    settings: dict[str, Any] = {"kappa": 0.025, "time_old": 8.0, "time_new": 12.0, "noise": 1e-13} | changes
+    step = StepOfCells(
+        LAWS[law],
+        DRIVERS[driver],
+        FRAMES[frame],
+        spectral.PAIRINGS["sorted"],
+        cells,
+        structure_tensor(*cells[:2]),
+        lengths.copy(),
+        np.ones(number),
+        **settings,
+    )
+    return CondensedPoints(tissue.map(lambda name, value: np.full(number, value)), step)
+
+
+def solved(some: CondensedPoints, F: Array, start: Array | None = None) -> Solution:
+    """From the axes of C, on which isotropic cells lie."""
+    return some.solve(F, np.swapaxes(F, 1, 2) @ F if start is None else start)
+
+
+def difference_quotient(some: CondensedPoints, F: Array, H: Array, h: float, start: Array) -> Array:
+    up, down = (solved(some, F + sign * h * H, start).first_piola_kirchhoff for sign in (1, -1))
+    return (up - down) / (2 * h)
+
+
+@pytest.mark.parametrize("law, repulsion, driver, frame", COMBINATIONS)
+def test_the_tangent_is_the_derivative(law: str, repulsion: str, driver: str, frame: str) -> None:
+    rng = np.random.default_rng(1)
+    some, F = points(law, repulsion, driver, frame, 40), deformations(40, rng)
+    found = solved(some, F)
+    assert found.converged.all()
+    tangent = some.tangent(found, np.zeros(40, dtype=bool))
+    errors = []
+    for _ in range(3):
+        H = rng.standard_normal((40, 3, 3))
+        expected = difference_quotient(some, F, H, 1e-6, found.driving_tensor)
+        error = np.einsum("niJkL,nkL->niJ", tangent, H) - expected
+        errors.append(np.linalg.norm(error, axis=(1, 2)) / np.linalg.norm(expected, axis=(1, 2)))
+    assert np.median(errors) < 1e-7 and np.max(errors) < 1e-5
+
+
+@pytest.mark.parametrize("law, repulsion, driver, frame", COMBINATIONS)
+def test_the_cells_belong_to_the_stress(law: str, repulsion: str, driver: str, frame: str) -> None:
+    """A pass of the law with the stress that the energy has with these cells gives the same cells again."""
+    some, F = points(law, repulsion, driver, frame, 12), deformations(12, np.random.default_rng(2))
+    found, step = solved(some, F), some.step
+    cells = cells_of(found)
+    P = stress_of_the_energy(some.tissue, F, cells)
+    np.testing.assert_allclose(found.first_piola_kirchhoff, P, rtol=1e-7, atol=1e-7 * np.abs(P).max())
+    S, J = np.linalg.solve(F, P), np.linalg.det(F)[:, None, None]
+    b = F @ np.swapaxes(F, 1, 2)
+    tensor = {"cauchy": P @ np.swapaxes(F, 1, 2) / J, "pk2": S, "finger": b}[driver]
+    drive = Drive(
+        F,
+        (tensor + np.swapaxes(tensor, 1, 2)) / 2,
+        step.driver,
+        step.frame,
+        1e-13,
+        step.initial_dimensions,
+        step.end_to_end_length,
+        step.kappa,
+    )
+    again = LAWS[law].update(step.cells, drive, step.time_old, step.time_new)
+    np.testing.assert_allclose(structure_tensor(*again[:2]), structure_tensor(*cells[:2]), atol=1e-6)
+
+
+def cells_of(found: Solution) -> UnitCell:
+    """Of the law for A the roots and axes of A."""
+    if found.response.place is not None:
+        return found.cells
+    values, vectors = np.linalg.eigh(found.structure)
+    return UnitCell(np.sqrt(values), np.swapaxes(vectors, 1, 2))
+
+
+def stress_of_the_energy(tissue: Tissue, F: Array, cells: UnitCell) -> Array:
+    """P by central differences of W, the only place where the energy is written."""
+    P, h = np.zeros_like(F), 1e-6
+    for i, j in product(range(3), range(3)):
+        H = np.zeros((3, 3))
+        H[i, j] = h
+        up, down = (tissue.strain_energy(F + sign * H, [cells]) for sign in (1, -1))
+        P[:, i, j] = (up - down) / (2 * h)
+    return P
+
+
+@pytest.mark.parametrize("driver", ["cauchy", "pk2", "finger"])
+@pytest.mark.parametrize("initial", ["isotropic", "random"])
+def test_equal_eigenvalues_leave_the_tangent_exact(driver: str, initial: str) -> None:
+    """C, D and A with two and three equal values: the law for A sees no axes."""
+    rng = np.random.default_rng(3)
+    stretches = np.repeat([[1.2, 1.2, 0.85], [1.3, 0.9, 0.9], [1.15, 1.15, 1.15], [1.2, 1.2 + 1e-9, 0.8]], 4, axis=0)
+    R = Rotation.random(32, random_state=rng).as_matrix()
+    F = R[:16] @ np.swapaxes(R[16:], 1, 2) @ (stretches[:, :, None] * R[16:])
+    some = points("tensor", "log", driver, "material", 16, initial)
+    found = solved(some, F)
+    assert found.converged.all()
+    tangent = some.tangent(found, np.zeros(16, dtype=bool))
+    errors = []
+    for _ in range(4):
+        H = rng.standard_normal(F.shape)
+        expected = difference_quotient(some, F, H, 1e-6, found.driving_tensor)
+        error = np.einsum("niJkL,nkL->niJ", tangent, H) - expected
+        errors.append(np.linalg.norm(error, axis=(1, 2)) / np.linalg.norm(expected, axis=(1, 2)))
+    assert np.median(errors) < 1e-7 and np.max(errors) < 1e-5
+
+
+def test_the_order_of_the_axes_is_the_laws_own() -> None:
+    """With the continuous pairing lengths and axes come back in the order of the cells, whatever the frame's is."""
+    rng = np.random.default_rng(4)
+    some, F = points("relaxation", "axes", "cauchy", "material", 20, "random"), deformations(20, rng)
+    some = replace(some, step=replace(some.step, pairing=spectral.continued))
+    found = solved(some, F)
+    turned = np.argmax(np.abs(found.cells.axes @ np.swapaxes(some.step.cells.axes, 1, 2)), axis=2)
+    belongs = (np.sort(turned, axis=1) == np.arange(3)).all(axis=1)
+    assert belongs.sum() > 10 and (turned[belongs] == np.arange(3)).all()
+    tangent, ok = some.tangent(found, np.zeros(20, dtype=bool)), found.converged
+    H = rng.standard_normal(F.shape)
+    expected = difference_quotient(some, F, H, 1e-6, found.driving_tensor)
+    error = np.linalg.norm(np.einsum("niJkL,nkL->niJ", tangent, H) - expected, axis=(1, 2))
+    assert ok.sum() > 10 and np.median(error[ok] / np.linalg.norm(expected[ok], axis=(1, 2))) < 1e-7
+
+
+def test_held_points_have_the_tangent_of_their_cells() -> None:
+    """And points without tension keep their cells: there nothing answers."""
+    rng = np.random.default_rng(6)
+    some, F = points("explicit", "axes", "cauchy", "material", 10), deformations(10, rng)
+    H, other = rng.standard_normal((10, 3, 3)), points("explicit", "axes", "cauchy", "material", 10, "random").step
+    kept = [some.kept(F + h * H, other.cells, other.structure) for h in (0.0, 1e-6, -1e-6)]
+    tangent = some.tangent(kept[0], np.ones(10, dtype=bool))
+    up, down = (found.first_piola_kirchhoff for found in kept[1:])
+    np.testing.assert_allclose(np.einsum("niJkL,nkL->niJ", tangent, H), (up - down) / 2e-6, rtol=1e-5, atol=1e-6)
+    pressed = solved(some, np.tile(0.8 * np.eye(3), (10, 1, 1)), np.tile(-np.eye(3), (10, 1, 1)))
+    np.testing.assert_allclose(structure_tensor(*pressed.cells[:2]), some.step.structure, atol=1e-14)
+
+
+def test_a_long_step_is_followed_where_newtons_method_does_not_find_its_end() -> None:
+    """kappa dt = 10 from random cells: the branch that the cells at the start lead to, up to the last point."""
+    rng = np.random.default_rng(8)
+    R = Rotation.random(60, random_state=rng).as_matrix()
+    F = np.swapaxes(R, 1, 2) @ ((1 + rng.uniform(-0.2, 0.3, (60, 3)))[:, :, None] * R)
+    some = points("tensor", "log", "cauchy", "material", 60, "random", kappa=2.5)
+    start = some.kept(F, some.step.cells, some.step.structure).driving_tensor
+    found = some.solve(F, start)
+    assert found.converged.mean() > 0.98
+    A = found.structure
+    np.testing.assert_allclose(np.trace(A, axis1=1, axis2=2)[found.converged], 1.0, atol=1e-12)
+    assert (np.linalg.eigvalsh(A) > -1e-12).all()

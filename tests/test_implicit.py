@@ -1,0 +1,163 @@
+"""The implicit coupling on bodies: cells that belong to the stress of the same step."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from remodel_fenicsx.body import tube
+from remodel_fenicsx.evolution.implicit import Implicit
+from remodel_fenicsx.scene.scene import scene_from_dict
+from remodel_fenicsx.results.recording import Recording
+from remodel_fenicsx.running import resume
+from remodel_fenicsx.running import run as record
+from remodel_fenicsx.simulation import Simulation
+from remodel_fenicsx.tissue.cells import structure_tensor
+from tests.conftest import Case
+
+Array = NDArray[np.float64]
+
+
+def short_tube(end: float, step: float = 1.0, law: str = "tensor", comm: Any = MPI.COMM_SELF, **changes: Any) -> Any:
+    """One layer of elements along the axis, coarse."""
+    values: dict[str, Any] = {
+        "preset": "kuhl-holzapfel-2007",
+        "geometry": {"shape": "tube", "length": 1.0},
+        "material": {"repulsion": "log" if law == "tensor" else "axes"},
+        "cells": {"initial": changes.pop("cells", "random")},
+        "time": {"end": end, "step": step},
+        "output": {"columns": ["held_points", "pass_residual"]},
+        "remodeling": {"law": law, "coupling": "implicit", "frame": "material"} | changes,
+    }
+    domain = tube(1.0, 3.0, 1.0, degree=1, divisions=(12, 3, 1), comm=comm)
+    return Simulation(scene_from_dict(values), comm, domain)
+
+
+def run(simulation: Simulation) -> list[dict[str, float]]:
+    return [step.row for step in simulation.steps()]
+
+
+def missed(simulation: Simulation, time: float) -> Array:
+    """By how much a pass with the present stress, from the cells of the step before, would make other cells."""
+    pass_ = simulation.stepper.remodeling
+    assert pass_._change is not None
+    before, now = pass_._change
+    law, drive = pass_.law, pass_.drive(simulation.state.numbers["residual of the last step"])
+    asked = law.update(before, drive, time - 1.0, time)
+    return np.linalg.norm(structure_tensor(*asked[:2]) - structure_tensor(*now[:2]), axis=(1, 2))
+
+
+@pytest.mark.parametrize("driver", ["cauchy", "pk2", "finger"])
+def test_random_cells_belong_to_their_stress(driver: str) -> None:
+    """The law for A: no point is held, no step made in parts, four iterations a step in the mean; tr A stays."""
+    simulation = short_tube(8.0, driver=driver)
+    rows = run(simulation)
+    assert all(row["held_points"] == 0 and row["substeps"] == 1 for row in rows)
+    assert np.mean([row["newton_iterations"] for row in rows[1:]]) <= 4
+    assert missed(simulation, 8.0).max() < 1e-8
+    A = simulation.cells.structure_tensor()
+    np.testing.assert_allclose(np.trace(A, axis1=-2, axis2=-1), 1.0, atol=1e-13)
+
+
+@pytest.mark.parametrize("driver, frame", [("cauchy", "spatial"), ("pk2", "material"), ("finger", "material")])
+def test_the_printed_law_from_isotropic_cells(driver: str, frame: str) -> None:
+    """At most six iterations a step (the first one, from cells that do not answer, apart), and a symmetric tube."""
+    simulation = short_tube(8.0, law="explicit", cells="isotropic", driver=driver, frame=frame)
+    rows = run(simulation)
+    assert max(row["newton_iterations"] for row in rows[1:]) <= 6
+    assert all(row["held_points"] == 0 and row["substeps"] == 1 for row in rows)
+    assert missed(simulation, 8.0).max() < 1e-6
+    radii = np.round(np.linalg.norm(simulation.quadrature.coordinates[..., :2], axis=-1), 6)
+    lengths = simulation.cells.dimension_values
+    assert max(np.ptp(lengths[radii == radius], axis=0).max() for radius in np.unique(radii)) < 1e-8
+
+
+def test_eq_11_has_no_error_of_the_time_step() -> None:
+    """It is a function of the present stress and of absolute time: so is the implicit state."""
+    ends = []
+    for step in (5.0, 1.25):
+        simulation = short_tube(10.0, step, law="explicit", cells="isotropic", frame="spatial")
+        run(simulation)
+        ends.append(simulation.cells.structure_tensor())
+    assert np.abs(ends[0] - ends[1]).max() < 1e-7 < np.abs(ends[0] - np.eye(3) / 3).max()
+
+
+def test_points_that_jump_are_held_and_counted() -> None:
+    """Random cells by rank: some equations have no solution."""
+    simulation = short_tube(4.0, law="explicit", driver="finger")
+    rows = run(simulation)
+    held = [row["held_points"] for row in rows]
+    assert 0 < max(held) < 100 and all(count == int(count) for count in held)
+    assert (missed(simulation, 4.0) > 1e-6).sum() <= max(2 * held[-1], 2)
+
+
+def test_the_tangent_is_the_derivative_of_the_residual() -> None:
+    """Order 2 of the Taylor remainder of the assembled forces, cells and deformation at random."""
+    simulation = short_tube(3.0)
+    run(simulation)
+    coupling: Any = simulation.stepper.coupling
+    assert isinstance(coupling, Implicit)
+    answering, equilibrium, unknown = coupling.answering, coupling.newton.equilibrium, simulation.unknown
+    answering.begin(5.0, 0.0)
+    residual, matrix = unknown.x.petsc_vec.duplicate(), equilibrium.create_matrix()
+    direction = np.random.default_rng(3).standard_normal(len(unknown.x.array)) * 1e-4
+    free = np.isnan(equilibrium.prescribed_values())
+    direction[~free] = 0.0
+    start = unknown.x.array.copy()
+
+    def force(h: float) -> Array:
+        unknown.x.array[:] = start + h * direction
+        equilibrium.assemble_internal(residual)
+        loads = residual.duplicate()
+        equilibrium.assemble_external(loads)
+        total: Array = (residual.array + loads.array)[free]
+        return total
+
+    zero = force(0.0)
+    equilibrium.assemble_tangent(matrix)
+    change, step = matrix.createVecLeft(), matrix.createVecRight()
+    step.array[:] = direction
+    matrix.mult(step, change)
+    remainders = [np.linalg.norm(force(h) - zero - h * change.array[free]) for h in (1.0, 0.5, 0.25)]
+    np.testing.assert_allclose(np.log2(np.array(remainders[:-1]) / remainders[1:]), 2.0, atol=0.15)
+
+
+def cube(law: str, end: float) -> dict[str, Any]:
+    """Eight elements with random cells, pulled."""
+    return {
+        "preset": "kuhl-holzapfel-2007",
+        "geometry": {"shape": "cube"},
+        "mesh": {"refinement": 2},
+        "material": {"repulsion": "log" if law == "tensor" else "axes"},
+        "cells": {"initial": "random"},
+        "remodeling": {"law": law, "coupling": "implicit", "frame": "material"},
+        "time": {"end": end},
+        "solver": {"absolute_tolerance": 1e-10, "relative_tolerance": 0.0},
+        "output": {"columns": ["held_points"], "fields": False},
+    }
+
+
+@pytest.mark.parametrize("law", ["tensor", "relaxation"])
+def test_one_and_two_ranks_agree(case: Case, law: str) -> None:
+    """With points that are held too."""
+    one, two = (case(cube(law, 8.0), ranks=ranks) for ranks in (1, 2))
+    for name in ("u", "l"):
+        np.testing.assert_allclose(two[name], one[name], atol=1e-8)
+    np.testing.assert_array_equal(two["held_points"], one["held_points"])
+    assert (max(one["held_points"]) > 0) == (law == "relaxation")
+
+
+def test_a_run_goes_on_as_if_nothing_had_happened(tmp_path: Path) -> None:
+    whole, parts = (tmp_path / name for name in ("whole", "parts"))
+    record(scene_from_dict(cube("tensor", 6.0)), whole, MPI.COMM_SELF)
+    record(scene_from_dict(cube("tensor", 3.0)), parts, MPI.COMM_SELF)
+    resume(parts, ["time.end=6.0"], MPI.COMM_SELF)
+    histories = [Recording(folder).history for folder in (whole, parts)]
+    for name in histories[0]:
+        if name != "seconds":
+            np.testing.assert_array_equal(histories[1][name], histories[0][name], err_msg=name)
