@@ -9,6 +9,7 @@ from mpi4py import MPI
 
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.loading import Loading, LoadValues
+from remodel_fenicsx.body import Shape
 from remodel_fenicsx.body.reductions import AUTO, choice, explained
 from remodel_fenicsx.evolution.chatter import Chatter
 from remodel_fenicsx.evolution.locking import LockingWarning
@@ -21,6 +22,7 @@ from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.results.columns import COLUMNS_ON_REQUEST, Observer, columns_of
+from remodel_fenicsx.results.fields import field_names
 from remodel_fenicsx.scene import Scene, SceneError
 from remodel_fenicsx.system.interrupts import take_back_signals
 
@@ -74,7 +76,8 @@ class Simulation:
         self.tissue = self.stepper.tissue
         counted = "negative_eigenvalues" in scene.output.columns
         self.stability = StabilityWatcher(self.stepper, scene.solver.unstable, every_step=counted)
-        self.observer = Observer(shape, self.stepper, columns_of(shape, checked_columns(scene.output.columns)))
+        field_names(scene.output.fields)
+        self.observer = Observer(shape, self.stepper, columns_of(shape, checked_columns(scene.output.columns, shape)))
         locks = formulation.locks(scene.mesh.element, scene.mesh.degree)
         self.warnings: list[Watcher] = [LockingWarning(self.stepper, locks)]
         if self.stepper.remodeling.law.remodels:
@@ -111,8 +114,8 @@ class Simulation:
         self.stepper.close()
 
 
-def checked_columns(names: Sequence[str]) -> Sequence[str]:
-    """The names, if they are columns on request.
+def checked_columns(names: Sequence[str], shape: Shape) -> Sequence[str]:
+    """The names, if they are columns of the shape that a scene may ask for.
 
     Raises
     ------
@@ -120,9 +123,11 @@ def checked_columns(names: Sequence[str]) -> Sequence[str]:
         If one is not; one line that names the key.
     """
     for name in names:
-        if name not in COLUMNS_ON_REQUEST:
-            known = ", ".join(map(repr, COLUMNS_ON_REQUEST))
-            raise SceneError(f"output.columns = {name!r}: no such column on request; allowed are {known}")
+        known = [*COLUMNS_ON_REQUEST, *(column.name for column in columns_of(shape))]
+        if name not in known:
+            raise SceneError(
+                f"output.columns = {name!r}: no such column on request; allowed are {', '.join(map(repr, known))}"
+            )
     return names
 
 

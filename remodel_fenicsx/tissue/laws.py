@@ -93,6 +93,8 @@ class Law:
         `update` is made. A scheme of second order needs them apart.
     keeps_symmetry
         Whether planes of symmetry of cells and drive stay such: False where the law turns an axis to one of two sides.
+    asks_kappa
+        Whether kappa = 0 means that cells never change, so that there is no pass at all.
     share
         Cells that have made a share of a change, from (old, new, factor); `relaxed` where the law has none of its own.
     """
@@ -105,6 +107,7 @@ class Law:
     follow: Callable[[UnitCell, tensor_law.Target, Array | float, float], UnitCell] | None = None
     share: Callable[[UnitCell, UnitCell, float], UnitCell] = relaxed
     keeps_symmetry: bool = False
+    asks_kappa: bool = False
 
 
 RankedFunction = Callable[[Array, Array, Array, float, float, float], Array]
@@ -134,7 +137,7 @@ def ranked(function: RankedFunction, has_limit: bool = False, of_absolute_time: 
             np.where(active[:, None, None], axes, cells.axes),
         )
 
-    return Law(update, has_limit, of_absolute_time=of_absolute_time, keeps_symmetry=True)
+    return Law(update, has_limit, of_absolute_time=of_absolute_time, keeps_symmetry=True, asks_kappa=True)
 
 
 def _principal(drive: Drive, previous: Array, pairing: spectral.Pairing) -> tuple[Array, Array]:
