@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator, Sequence
 
+import numpy as np
 from mpi4py import MPI
 
 from remodel_fenicsx.body.domain import Domain
@@ -170,6 +171,11 @@ def checked_domain(domain: Domain, scene: Scene) -> Domain:
         raise SceneError(f"geometry.shape = {shape.name!r}: the mesh has no face {', '.join(missing)}")
     for name, value in domain.dimensions.items():
         wanted = getattr(shape, name, value)
-        if abs(wanted - value) > 1e-9 * domain.size:
+        if not abs(wanted - value) <= 1e-9 * abs(wanted):  # NaN too
             raise SceneError(f"geometry.{name} = {wanted:g}: that of the mesh is {value:g}")
+    empty = [name for name in shape.faces if not domain.comm.allreduce(domain.facet_tags.find(domain.faces[name]).size)]
+    if empty:
+        raise SceneError(f"geometry.shape = {shape.name!r}: the mesh has no facets with the tag of {', '.join(empty)}")
+    if not domain.comm.allreduce(bool(np.isfinite(mesh.geometry.x).all()), MPI.LAND):
+        raise SceneError(f"geometry.shape = {shape.name!r}: the mesh has nodes that are not finite")
     return domain

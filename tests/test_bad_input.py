@@ -7,6 +7,9 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import ctypes
+import dataclasses
+import functools
 import io
 import json
 import math
@@ -16,7 +19,8 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Callable, Iterator
 from datetime import date
 from pathlib import Path
 from typing import Any
@@ -26,25 +30,45 @@ import tomlkit
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from remodel_fenicsx import Recording, SceneError, cli, running
+from remodel_fenicsx import Recording, Scene, SceneError, cli, running
+from remodel_fenicsx.body.domain import Domain
+from remodel_fenicsx.body.tube import Tube, tube
 from remodel_fenicsx.results.checkpoint_file import CheckpointError, read_checkpoint, read_pointer
 from remodel_fenicsx.results.recording import RecordingError
 from remodel_fenicsx.results.vtkhdf import TransientGrid
 from remodel_fenicsx.scene.scene import preset_scene, read_scene
 from remodel_fenicsx.schema.tables import SceneError as SchemaError
 from remodel_fenicsx.schema.toml import parse_override
+from remodel_fenicsx.simulation import checked_domain
 from tests.test_resume import SELF, first_half, rows
 
 __all__ = ["first_half"]  # a fixture
 FACTOR = int(os.environ.get("BAD_INPUTS", "1"))
 
 
-def examples(number: int) -> Any:
-    """So many inputs, times BAD_INPUTS."""
-    return settings(
+INPUTS: dict[str, tuple[int, str]] = {}  # kind: number, and of what
+MADE: Counter[str] = Counter()  # kind: how many there have been
+
+
+def bad(
+    kind: str, number: int, what: str, /, **strategies: Any
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """A test with so many inputs, times BAD_INPUTS; the table of docs/reliability.md has them."""
+    INPUTS[kind] = number, what
+    chosen = settings(
         max_examples=number * FACTOR, derandomize=FACTOR == 1, deadline=None, database=None,
         suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
     )  # fmt: skip
+
+    def decorate(test: Callable[..., None]) -> Callable[..., None]:
+        @functools.wraps(test)
+        def counted(*arguments: Any, **options: Any) -> None:
+            MADE[kind] += 1
+            test(*arguments, **options)
+
+        return chosen(given(**strategies)(counted))
+
+    return decorate
 
 
 def ask(*words: str) -> tuple[int, str, str]:
@@ -144,8 +168,13 @@ def written(values: dict[str, Any]) -> str | None:
         return None
 
 
-@examples(400)
-@given(shape=st.sampled_from(sorted(SHAPES)), changes=CHANGES)
+@bad(
+    "scenes with odd values",
+    400,
+    "NaN, infinities, huge and tiny numbers, other types, keys missing or unknown, units that are none",
+    shape=st.sampled_from(sorted(SHAPES)),
+    changes=CHANGES,
+)
 def test_a_scene_with_odd_values(shape: str, changes: list[tuple[int, str, Any]], tmp_path: Path) -> None:
     text = written(changed(shape, changes))
     path = tmp_path / "scene.toml"
@@ -158,8 +187,7 @@ def test_a_scene_with_odd_values(shape: str, changes: list[tuple[int, str, Any]]
         assert read_scene(tmp_path / "again.toml") == good
 
 
-@examples(200)
-@given(data=st.data())
+@bad("scenes of damaged text", 200, "cut off, other bytes, holes of zeros, foreign, empty", data=st.data())
 def test_a_scene_that_is_damaged_text(data: st.DataObject, tmp_path: Path) -> None:
     (tmp_path / "scene.toml").write_bytes(damaged(data, preset_scene("kuhl-holzapfel-2007", "tube").to_toml().encode()))
     answer("validate", str(tmp_path / "scene.toml"))
@@ -215,8 +243,12 @@ WORDS = st.one_of(
 COMMANDS = st.tuples(st.sampled_from(["run", "run", "status", "validate", "new"]), st.lists(WORDS, max_size=5))
 
 
-@examples(300)
-@given(command=COMMANDS)
+@bad(
+    "command lines",
+    300,
+    "words in any order; scenes that are folders, links in a circle, binary; settings that are none",
+    command=COMMANDS,
+)
 def test_a_command_line(command: tuple[str, list[str]], place: Path) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(running, "resume", lambda folder, changes, **_: _kept(folder, changes))
@@ -234,8 +266,7 @@ def _kept(folder: Path, changes: list[str]) -> Path:
     return folder
 
 
-@examples(100)
-@given(text=st.text(max_size=20))
+@bad("`--set`", 100, "any text", text=st.text(max_size=20))
 def test_an_override(text: str) -> None:
     try:
         key, _ = parse_override(text)
@@ -245,18 +276,25 @@ def test_an_override(text: str) -> None:
         assert all(key.split("."))
 
 
-@examples(100)
-@given(text=st.one_of(st.text(max_size=8), st.from_regex(r"-?[0-9.e]{1,6} ?(s|min|h|d|y)", fullmatch=True)))
+@bad(
+    "`--max-wall-time`",
+    100,
+    "any text",
+    text=st.one_of(st.text(max_size=8), st.from_regex(r"-?[0-9.e]{1,6} ?(s|min|h|d|y)", fullmatch=True)),
+)
 def test_a_wall_time(text: str) -> None:
     code, _, errors = ask("run", "nowhere", f"--max-wall-time={text}")
     assert code == 2 and errors.splitlines()[-1].startswith("remodel-fenicsx")
+
+
+INPUTS["commands through the shell"] = 30, "as command lines"
 
 
 def test_some_through_the_shell(place: Path) -> None:
     """As a user types them."""
     chosen = random.Random(1)
     words = [word for word in (*FILES, *SETTINGS, "--set", "-o", "--resume") if word not in ("run", "scene.toml")]
-    for _ in range(30 * FACTOR):
+    for _ in range(INPUTS["commands through the shell"][0] * FACTOR):
         line = [chosen.choice(["run", "validate", "status"]), *(chosen.choice(words) for _ in range(3))]
         done = subprocess.run([sys.executable, "-m", "remodel_fenicsx.cli", *line], capture_output=True, text=True)
         assert done.returncode in (0, 2, 5), (line, done.stderr)
@@ -267,13 +305,17 @@ def test_some_through_the_shell(place: Path) -> None:
 JSON = st.recursive(
     st.one_of(st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=5)),
     lambda inner: st.one_of(st.lists(inner, max_size=3), st.dictionaries(st.text(max_size=5), inner, max_size=3)),
-    max_leaves=8,
+    max_leaves=4,
 )
 KEYS = st.sampled_from(["format", "generations", "file", "number", "time", "sha256"])
 
 
-@examples(150)
-@given(pointer=st.one_of(JSON, st.dictionaries(KEYS, st.one_of(JSON, st.lists(st.dictionaries(KEYS, JSON))))))
+@bad(
+    "pointers of checkpoints",
+    150,
+    "any JSON",
+    pointer=st.one_of(JSON, st.dictionaries(KEYS, st.one_of(JSON, st.lists(st.dictionaries(KEYS, JSON))))),
+)
 def test_a_pointer_of_another_kind(pointer: Any, tmp_path: Path) -> None:
     (tmp_path / "checkpoint.json").write_text(json.dumps(pointer))
     with pytest.raises(CheckpointError) as refusal:
@@ -281,8 +323,7 @@ def test_a_pointer_of_another_kind(pointer: Any, tmp_path: Path) -> None:
     assert len(str(refusal.value).splitlines()) == 1
 
 
-@examples(150)
-@given(data=st.data())
+@bad("damaged checkpoints", 150, "cut off, other bytes, holes, foreign, empty", data=st.data())
 def test_a_checkpoint_that_is_damaged(data: st.DataObject, first_half: Path, tmp_path: Path) -> None:
     """Whatever one file holds, a state that is read is one that was written."""
     name = data.draw(st.sampled_from(["checkpoint.json", "checkpoint-a.npz", "checkpoint-b.npz"]))
@@ -297,8 +338,7 @@ def test_a_checkpoint_that_is_damaged(data: st.DataObject, first_half: Path, tmp
 
 
 # ---------------------------------------------------------------- recordings
-@examples(200)
-@given(data=st.data())
+@bad("damaged recordings", 200, "history, fields, scene; read as a whole, and by `status`", data=st.data())
 def test_a_recording_that_is_damaged(data: st.DataObject, first_half: Path, tmp_path: Path) -> None:
     name = data.draw(st.sampled_from(["history.csv", "fields.vtkhdf", "scene.toml"]))
     folder = shutil.copytree(first_half, tmp_path / "copy", dirs_exist_ok=True)
@@ -314,8 +354,7 @@ def test_a_recording_that_is_damaged(data: st.DataObject, first_half: Path, tmp_
     answer("status", str(folder))
 
 
-@examples(100)
-@given(data=st.data())
+@bad("damaged fields to go on with", 100, "fields.vtkhdf", data=st.data())
 def test_fields_that_are_damaged_are_not_written_on(data: st.DataObject, first_half: Path, tmp_path: Path) -> None:
     path = tmp_path / "fields.vtkhdf"
     path.write_bytes(damaged(data, (first_half / path.name).read_bytes()))
@@ -325,8 +364,12 @@ def test_fields_that_are_damaged_are_not_written_on(data: st.DataObject, first_h
         assert len(str(error).splitlines()) == 1
 
 
-@examples(20)
-@given(data=st.data())
+@bad(
+    "damaged runs to resume",
+    20,
+    "any file of the folder damaged, missing, a folder, a link in a circle",
+    data=st.data(),
+)
 def test_a_damaged_run_goes_on_or_is_refused(data: st.DataObject, first_half: Path, tmp_path: Path) -> None:
     """Cut off, overwritten, missing, a folder: the run is the right one or there is one line."""
     expected = rows(first_half)
@@ -345,3 +388,92 @@ def test_a_damaged_run_goes_on_or_is_refused(data: st.DataObject, first_half: Pa
     if answer("run", "--resume", str(folder), "-q", codes=(0, 2, 5)) == 0:
         found = rows(folder)
         assert found == expected or name == "history.csv"
+
+
+# ---------------------------------------------------------------- meshes
+DIMENSIONS = st.sampled_from(["inner_radius", "outer_radius", "length"])
+
+
+@pytest.fixture(scope="module")
+def body() -> tuple[Scene, Domain]:
+    """A tube and its scene."""
+    scene = preset_scene("kuhl-holzapfel-2007", "tube").with_values({"geometry.length": 2.0})
+    return scene, tube(length=2.0, divisions=(8, 2, 1), comm=SELF)
+
+
+@bad("meshes", 60, "another shape, element or size; faces missing, tags on no facet; nodes NaN or infinite",
+     kind=st.sampled_from(["shape", "face", "tag", "size", "node", "element"]), face=st.sampled_from(Tube.faces),
+     number=st.integers(5, 10**6), size=DIMENSIONS, value=st.sampled_from(ODD_NUMBERS),
+     node=st.integers(0, 40))  # fmt: skip
+def test_a_mesh_of_another_kind(
+    body: tuple[Scene, Domain], kind: str, face: str, number: int, size: str, value: float, node: int
+) -> None:
+    scene, domain = body
+    faces = dict(domain.faces)
+    if kind == "shape":
+        domain = dataclasses.replace(domain, shape="cube")
+    elif kind == "face":
+        del faces[face]
+    elif kind == "tag":
+        faces[face] = number
+    elif kind == "size":
+        domain = dataclasses.replace(domain, dimensions={**domain.dimensions, size: float(value)})
+    elif kind == "element":
+        scene = scene.with_values({"mesh.element": "tetrahedron"})
+    domain = dataclasses.replace(domain, faces=faces)
+    points = domain.mesh.geometry.x
+    before = points[node].copy()
+    if kind == "node":
+        points[node, number % 3] = value if not math.isfinite(value) else math.nan
+    try:
+        with pytest.raises(SceneError) as refusal:
+            checked_domain(domain, scene)
+    finally:
+        points[node] = before
+    assert len(str(refusal.value).splitlines()) == 1 and checked_domain(body[1], body[0]) is body[1]
+
+
+# ---------------------------------------------------------------- permissions
+@contextlib.contextmanager
+def like_a_user() -> Iterator[None]:
+    """Within, modes of files count for root too (capset(2) without CAP_DAC_OVERRIDE and CAP_DAC_READ_SEARCH)."""
+    library = ctypes.CDLL(None, use_errno=True)
+    header, held = (ctypes.c_uint32 * 2)(0x20080522, 0), (ctypes.c_uint32 * 6)()
+    if library.capget(header, held):
+        raise OSError(ctypes.get_errno(), "capget")
+    without = (ctypes.c_uint32 * 6)(*held)
+    without[0] &= ~0b110
+    library.capset(header, without)
+    try:
+        yield
+    finally:
+        library.capset(header, held)
+
+
+@pytest.mark.parametrize("mode", [0o000, 0o500])
+def test_what_may_not_be_read_or_written(mode: int, first_half: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(first_half, tmp_path / "run")
+    (tmp_path / "scene.toml").write_text(preset_scene("kuhl-holzapfel-2007", "cube").to_toml())
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    (tmp_path / "scene.toml").chmod(0)
+    folder.chmod(mode)
+    try:
+        with like_a_user():
+            assert answer("validate", str(tmp_path / "scene.toml"), codes=(2,)) == 2
+            assert answer("run", str(folder / "scene.toml"), "-o", str(folder / "new"), codes=(2, 5)) in (2, 5)
+            assert answer("run", "--resume", str(folder), codes=(2, 5)) in (2, 5)
+            assert answer("status", str(folder), codes=(0, 5)) == (5 if mode == 0 else 0)
+    finally:
+        folder.chmod(0o700)
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+
+
+# ---------------------------------------------------------------- how many
+def test_docs_say_how_many_there_are() -> None:
+    """At least 1,000, and no test has made fewer than it says."""
+    assert sum(number for number, _ in INPUTS.values()) >= 1000
+    for kind, made in MADE.items():
+        assert made >= INPUTS[kind][0] * FACTOR, kind
+    text = (Path(__file__).parents[1] / "docs" / "reliability.md").read_text()
+    lines = [f"| {kind} | {number} | {what} |" for kind, (number, what) in INPUTS.items()]
+    assert "\n".join(["| kind | inputs | of what |", "|---|---|---|", *lines]) in text, "\n".join(lines)
