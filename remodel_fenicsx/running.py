@@ -17,7 +17,7 @@ from remodel_fenicsx.evolution.pause import Pause
 from remodel_fenicsx.evolution.stepper import Step, Watcher
 from remodel_fenicsx.results.checkpoint import Checkpoints, restore_state
 from remodel_fenicsx.results.checkpoint_file import Checkpoint, CheckpointError, read_checkpoint
-from remodel_fenicsx.results.fields import Fields
+from remodel_fenicsx.results.fields import Fields, field_names
 from remodel_fenicsx.results.recording import SCENE, RecordingError
 from remodel_fenicsx.results.run_folder import FolderTaken, LastStep, RunFolder, chosen_folder, forget_steps, locked
 from remodel_fenicsx.scene import Scene, SceneError, read_scene, scene_from_dict
@@ -216,9 +216,10 @@ def _record(simulation: Simulation, place: Path, around: _Circumstances) -> None
             log.warning("%s", warning)
         watchers: list[Watcher] = []
         if scene.output.fields:
-            parts = place, scene.geometry, simulation.stepper, scene.output.every, after and after.time
+            names = field_names(scene.output.fields)
+            parts = place, scene.geometry, simulation.stepper, scene.output.every, after and after.time, names
             watchers.append(stack.enter_context(_agreed(comm, lambda: Fields(*parts))))
-        checkpoints = Checkpoints(place, state, text, scene.output.checkpoint)
+        checkpoints = Checkpoints(place, state, text, scene.output.checkpoint, record.flush)
         pause = Pause(comm, place, lambda: around.stop.pause, around.deadline)
         watchers += [record, _Report(scene, progress), checkpoints, pause]
         simulation.stepper.stop_signal = lambda: around.stop.number

@@ -10,6 +10,7 @@ from mpi4py import MPI
 
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.loading import Loading, LoadValues
+from remodel_fenicsx.body import Shape
 from remodel_fenicsx.body.reductions import AUTO, choice, explained
 from remodel_fenicsx.evolution.chatter import Chatter
 from remodel_fenicsx.evolution.locking import LockingWarning
@@ -22,6 +23,7 @@ from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.results.columns import COLUMNS_ON_REQUEST, Observer, columns_of
+from remodel_fenicsx.results.fields import field_names
 from remodel_fenicsx.scene import Scene, SceneError
 from remodel_fenicsx.system.interrupts import take_back_signals
 
@@ -75,7 +77,8 @@ class Simulation:
         self.tissue = self.stepper.tissue
         counted = "negative_eigenvalues" in scene.output.columns
         self.stability = StabilityWatcher(self.stepper, scene.solver.unstable, every_step=counted)
-        self.observer = Observer(shape, self.stepper, columns_of(shape, checked_columns(scene.output.columns)))
+        field_names(scene.output.fields)
+        self.observer = Observer(shape, self.stepper, columns_of(shape, checked_columns(scene.output.columns, shape)))
         locks = formulation.locks(scene.mesh.element, scene.mesh.degree)
         self.warnings: list[Watcher] = [LockingWarning(self.stepper, locks)]
         if self.stepper.remodeling.law.remodels:
@@ -112,8 +115,8 @@ class Simulation:
         self.stepper.close()
 
 
-def checked_columns(names: Sequence[str]) -> Sequence[str]:
-    """The names, if they are columns on request.
+def checked_columns(names: Sequence[str], shape: Shape) -> Sequence[str]:
+    """The names, if they are columns of the shape that a scene may ask for.
 
     Raises
     ------
@@ -121,9 +124,11 @@ def checked_columns(names: Sequence[str]) -> Sequence[str]:
         If one is not; one line that names the key.
     """
     for name in names:
-        if name not in COLUMNS_ON_REQUEST:
-            known = ", ".join(map(repr, COLUMNS_ON_REQUEST))
-            raise SceneError(f"output.columns = {name!r}: no such column on request; allowed are {known}")
+        known = [*COLUMNS_ON_REQUEST, *(column.name for column in columns_of(shape))]
+        if name not in known:
+            raise SceneError(
+                f"output.columns = {name!r}: no such column on request; allowed are {', '.join(map(repr, known))}"
+            )
     return names
 
 
@@ -168,8 +173,7 @@ def checked_domain(domain: Domain, scene: Scene) -> Domain:
         wanted = getattr(shape, name, value)
         if not abs(wanted - value) <= 1e-9 * abs(wanted):  # NaN too
             raise SceneError(f"geometry.{name} = {wanted:g}: that of the mesh is {value:g}")
-    tags = {name: domain.facet_tags.find(domain.faces[name]).size for name in needed}
-    empty = [name for name, count in tags.items() if not domain.comm.allreduce(count)]
+    empty = [name for name in needed if not domain.comm.allreduce(domain.facet_tags.find(domain.faces[name]).size)]
     if empty:
         raise SceneError(f"geometry.shape = {shape.name!r}: the mesh has no facets with the tag of {', '.join(empty)}")
     if not domain.comm.allreduce(bool(np.isfinite(mesh.geometry.x).all()), MPI.LAND):

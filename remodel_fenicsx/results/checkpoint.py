@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time as clock
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -31,9 +32,19 @@ class Checkpoints(Watcher):
         The scene as run.
     every
         Steps between two; 0: only at the end; None: chosen by time.
+    before
+        Called on every rank before one is written: what it builds on, the rows of its steps, must be on the disk.
     """
 
-    def __init__(self, folder: Path, state: State, scene_text: str, every: int | None = None):
+    def __init__(
+        self,
+        folder: Path,
+        state: State,
+        scene_text: str,
+        every: int | None = None,
+        before: Callable[[], None] = lambda: None,
+    ):
+        self.before = before
         self.folder, self.state, self.scene_text, self.every = folder, state, scene_text, every
         self._mesh = mesh_arrays(state.loading.domain)
         self._versions = versions() if state.comm.rank == 0 else {}
@@ -73,6 +84,7 @@ class Checkpoints(Watcher):
         if self.state.number == self._number:
             return
         start = clock.monotonic()
+        self.before()
         arrays = gather_state(self.state)
         if arrays is not None and self._mesh is not None:
             state = self.state

@@ -86,16 +86,21 @@ COLUMNS_ON_REQUEST: dict[str, Column] = {
 
 
 def columns_of(shape: Shape | type[Shape], requested: Sequence[str] = ()) -> tuple[Column, ...]:
-    """All columns of a shape's history, in the order of the file, those on request last.
+    """The columns of a shape's history, in the order of the file, those on request last.
+
+    Where some of the others are requested too, only they are there, with time and loads.
 
     Raises
     ------
     KeyError
         If a column that is requested does not exist.
     """
-    loads = (kind.make_column(name) for name, kind in shape.loads.items())
-    extra = (COLUMNS_ON_REQUEST[name] for name in requested)
-    return (FIRST_COLUMN, *loads, *shape.columns, *COLUMNS.values(), *extra)
+    always = (FIRST_COLUMN, *(kind.make_column(name) for name, kind in shape.loads.items()))
+    others = (*shape.columns, *COLUMNS.values())
+    chosen = [column for column in others if column.name in requested]
+    known = {column.name for column in (*always, *others)}
+    extra = (COLUMNS_ON_REQUEST[name] for name in requested if name not in known)
+    return (*always, *(chosen or others), *extra)
 
 
 class Observer(Watcher):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -21,12 +22,40 @@ from remodel_fenicsx.fem import compat, jit
 from remodel_fenicsx.results.chain_lines import chain_displacement, chain_lines
 from remodel_fenicsx.results.recording import CHAINS, FIELDS, RecordingError
 from remodel_fenicsx.results.vtkhdf import LINE, TransientGrid, cell_type_and_permutation
+from remodel_fenicsx.schema.tables import SceneError
 from remodel_fenicsx.schema.times import SAME_TIME
 from remodel_fenicsx.tissue import spectral
 from remodel_fenicsx.tissue.cells import structure_tensor
 
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
+
+
+AXES = ("axis_1", "axis_2", "axis_3")
+OF_ELEMENTS = (
+    "deformation_gradient", "cauchy_stress", "cell_dimensions", *AXES, "fibre_angle", "fibre_angle_deformed",
+    "chain_extension",
+)  # fmt: skip
+FIELDS_BY_NAME = ("displacement", *OF_ELEMENTS, "chains")
+"""What a scene may name in `output.fields`; "chains" are the lines of fields_chains.vtkhdf."""
+OF_CHAINS = ("cell_dimensions", *AXES, "deformation_gradient", "fibre_angle")  # what the lines are made of
+
+
+def field_names(asked: bool | Sequence[str]) -> tuple[str, ...]:
+    """The fields that a scene's `output.fields` asks for.
+
+    Raises
+    ------
+    SceneError
+        If there is no such field; one line.
+    """
+    if isinstance(asked, bool):
+        return FIELDS_BY_NAME if asked else ()
+    for name in asked:
+        if name not in FIELDS_BY_NAME:
+            known = ", ".join(map(repr, FIELDS_BY_NAME))
+            raise SceneError(f"output.fields = {name!r}: no such field; allowed are {known}")
+    return tuple(asked)
 
 
 class ElementFields:
@@ -38,17 +67,21 @@ class ElementFields:
         Says what the fibre angle is.
     stepper
         Its state and tissue; nothing here changes them.
+    names
+        Which of OF_ELEMENTS are wanted; nothing else is computed.
     """
 
-    def __init__(self, shape: Shape, stepper: Stepper):
-        self.shape, self.state = shape, stepper.state
+    def __init__(self, shape: Shape, stepper: Stepper, names: Sequence[str] = OF_ELEMENTS):
+        self.shape, self.state, self.names = shape, stepper.state, tuple(names)
         self.quadrature = self.state.cells.quadrature
         self.tissue = stepper.tissue
         state = self.state
         F = state.kinematics.deformation_gradient(state.unknown)
-        self._stresses = PointStresses(state, self.tissue)
-        cauchy = self._stresses.ufl.cauchy
-        entries = [t[i, j] for t in (F, cauchy) for i in range(3) for j in range(3)]
+        tensors = [F]
+        self._stresses = PointStresses(state, self.tissue) if "cauchy_stress" in self.names else None
+        if self._stresses is not None:
+            tensors.append(self._stresses.ufl.cauchy)
+        entries = [t[i, j] for t in tensors for i in range(3) for j in range(3)]
         displacement = state.kinematics.displacement(state.unknown)
         expressions = ufl.as_vector([*entries, *(displacement[i] for i in range(3))])
         self._state = jit.expression(expressions, self.quadrature.points)
@@ -61,24 +94,30 @@ class ElementFields:
         to the load axis, or in a tube from circumferential to axial); `chain_extension` (largest r/L in the element; 0
         where no chain locks).
         """
-        self._stresses.refresh()
-        values = self.quadrature.evaluate(self._state, (21,))
-        F, cauchy = values[..., :9].reshape(*values.shape[:2], 3, 3), values[..., 9:18]
+        if self._stresses is not None:
+            self._stresses.refresh()
+        values = self.quadrature.evaluate(self._state, (12 if self._stresses is None else 21,))
+        F = values[..., :9].reshape(*values.shape[:2], 3, 3)
         dimensions, axes = self.state.cells.dimension_values, self.state.cells.axis_values
+        mean, fibre_angle, wanted = self.quadrature.element_mean, self.shape.fibre_angle, set(self.names)
+        found: dict[str, Array] = {}
+        if "deformation_gradient" in wanted:
+            found["deformation_gradient"] = mean(values[..., :9])
+        if self._stresses is not None:
+            found["cauchy_stress"] = mean(values[..., 9:18])
+        if wanted & {"cell_dimensions", *AXES}:
+            found["cell_dimensions"], mean_axes = self.mean_cells()
+            found |= {name: mean_axes[:, i] for i, name in enumerate(AXES)}
+        if "fibre_angle" in wanted:
+            found["fibre_angle"] = mean(fibre_angle(dimensions, axes, self.quadrature.coordinates))
         deformed_axes = axes @ np.swapaxes(F, -1, -2)
-        position = self.quadrature.coordinates + values[..., 18:]
-        lengths, mean_axes = self.mean_cells()
-        squared = np.sum((dimensions[..., None] * deformed_axes) ** 2, axis=(-1, -2))
-        mean, fibre_angle = self.quadrature.element_mean, self.shape.fibre_angle
-        return {
-            "deformation_gradient": mean(values[..., :9]),
-            "cauchy_stress": mean(cauchy),
-            "cell_dimensions": lengths,
-            **{f"axis_{i + 1}": mean_axes[:, i] for i in range(3)},
-            "fibre_angle": mean(fibre_angle(dimensions, axes, self.quadrature.coordinates)),
-            "fibre_angle_deformed": mean(fibre_angle(dimensions, deformed_axes, position)),
-            "chain_extension": np.max(np.sqrt(squared) / self._locking_length(), axis=1),
-        }
+        if "fibre_angle_deformed" in wanted:
+            position = self.quadrature.coordinates + values[..., -3:]
+            found["fibre_angle_deformed"] = mean(fibre_angle(dimensions, deformed_axes, position))
+        if "chain_extension" in wanted:
+            squared = np.sum((dimensions[..., None] * deformed_axes) ** 2, axis=(-1, -2))
+            found["chain_extension"] = np.max(np.sqrt(squared) / self._locking_length(), axis=1)
+        return {name: found[name] for name in OF_ELEMENTS if name in wanted}
 
     def mean_cells(self) -> tuple[Array, Array]:
         """Lengths (elements, 3) and axes as rows (elements, 3, 3) of the mean structure tensor, longest first."""
@@ -108,6 +147,8 @@ class Fields(Watcher):
         Every so many steps; the first and the last one always.
     after
         Where a run goes on: time of the last step that was done. Fields of later ones are dropped.
+    names
+        Of FIELDS_BY_NAME, what is written; the lines only with "chains".
 
     Raises
     ------
@@ -119,10 +160,19 @@ class Fields(Watcher):
         On rank 0, if those to go on with are damaged.
     """
 
-    def __init__(self, folder: Path, shape: Shape, stepper: Stepper, every: int = 1, after: float | None = None):
-        self.state, self.every = stepper.state, every
+    def __init__(
+        self,
+        folder: Path,
+        shape: Shape,
+        stepper: Stepper,
+        every: int = 1,
+        after: float | None = None,
+        names: Sequence[str] = FIELDS_BY_NAME,
+    ):
+        self.state, self.every, self.names = stepper.state, every, tuple(names)
         self.domain = domain = self.state.loading.domain
-        self._element_fields = ElementFields(shape, stepper)
+        needed = {*self.names, *(OF_CHAINS if "chains" in self.names else ())}
+        self._element_fields = ElementFields(shape, stepper, [name for name in OF_ELEMENTS if name in needed])
         self._displacement = NodalGather(domain, self.state)
         quadrature = self.state.cells.quadrature
         points, elements = domain.gather_mesh()
@@ -134,7 +184,7 @@ class Fields(Watcher):
             self._grid = _continued(folder / FIELDS, after) or TransientGrid(
                 folder / FIELDS, points, elements[:, order], cell_type
             )
-            self._chains = _continued(folder / CHAINS, after)
+            self._chains = _continued(folder / CHAINS, after) if "chains" in self.names else None
             self._centres = points[elements].mean(axis=1)
             self._elements = elements
             # a chain reaches half of the smallest mean distance between elements, so that pictures stay readable
@@ -164,8 +214,10 @@ class Fields(Watcher):
         if self._grid is None or displacement is None:
             return
         fields = {name: values for name, values in gathered.items() if values is not None}
-        self._grid.append(time, {"displacement": displacement}, fields)
-        self._append_chains(time, displacement, fields)
+        at_nodes = {"displacement": displacement} if "displacement" in self.names else {}
+        self._grid.append(time, at_nodes, {name: fields[name] for name in fields if name in self.names})
+        if "chains" in self.names:
+            self._append_chains(time, displacement, fields)
 
     def _append_chains(self, time: float, displacement: Array, fields: dict[str, Array]) -> None:
         axes = np.stack([fields[f"axis_{i + 1}"] for i in range(3)], axis=1)

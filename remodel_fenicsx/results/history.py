@@ -6,6 +6,7 @@ import csv
 import io
 import math
 import os
+import time as clock
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,8 +14,15 @@ from remodel_fenicsx.results.recording import RecordingError
 from remodel_fenicsx.schema.times import same_time
 
 
+FLUSHED_AFTER = 0.5  # seconds: rows that come faster are brought to the disk together
+
+
 class History:
-    """history.csv: one row per accepted step, complete on disk as soon as the step is accepted.
+    """history.csv: one row per accepted step, in the file as soon as the step is accepted.
+
+    That is enough for whoever reads it, and whatever happens to the process. To be there after a power cut a row must
+    also be flushed to the disk, which costs more than a small problem's step: that happens at most twice a second, at
+    `flush` and at the end.
 
     Parameters
     ----------
@@ -31,6 +39,7 @@ class History:
         self._file = path.open("xb", buffering=0)
         self._columns: list[str] | None = None
         self._sizes = [0]  # bytes up to the end of each whole row
+        self._flushed_at, self._is_flushed = -math.inf, True
 
     @classmethod
     def continued(cls, path: Path, columns: Sequence[str], rows: int, time: float) -> History:
@@ -60,6 +69,7 @@ class History:
         history = cls.__new__(cls)
         history._file, history._columns = path.open("r+b", buffering=0), found
         history._sizes = [sum(map(len, lines))]
+        history._flushed_at, history._is_flushed = -math.inf, True
         history._cut()
         return history
 
@@ -87,11 +97,25 @@ class History:
         try:
             while view:
                 view = view[self._file.write(view) :]
-            os.fsync(self._file.fileno())
+            self._is_flushed = False
+            if clock.monotonic() - self._flushed_at >= FLUSHED_AFTER:
+                self.flush()
         except OSError:
             self._cut()
             raise
         self._sizes = [self._sizes[-1], self._sizes[-1] + len(data)]
+
+    def flush(self) -> None:
+        """Bring all rows to the disk.
+
+        Raises
+        ------
+        OSError
+            If that fails (disk full).
+        """
+        if not self._is_flushed:
+            os.fsync(self._file.fileno())
+            self._flushed_at, self._is_flushed = clock.monotonic(), True
 
     def drop_last(self) -> None:
         """Take the last row back; only once after each row."""
@@ -103,8 +127,12 @@ class History:
         self._file.seek(self._sizes[-1])
 
     def close(self) -> None:
-        """Close the file."""
-        self._file.close()
+        """Flush and close the file; more than once does no harm."""
+        if not self._file.closed:
+            try:
+                self.flush()
+            finally:
+                self._file.close()
 
 
 def _number(value: float) -> str:

@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from remodel_fenicsx.body.reductions import Turn
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.results.chain_lines import chain_displacement, chain_lines
+from remodel_fenicsx.results.fields import AXES, OF_CHAINS
 from remodel_fenicsx.results.recording import Recording, RecordingError
 from remodel_fenicsx.results.vtkhdf import LINE, TransientGrid, cell_type_and_permutation
 
 Array = NDArray[np.float64]
 
 BODY, BODY_CHAINS = "fields_body.vtkhdf", "fields_body_chains.vtkhdf"
-VECTORS, TENSORS = ("axis_1", "axis_2", "axis_3"), ("deformation_gradient", "cauchy_stress")
-OF_CHAINS = (*VECTORS, "cell_dimensions", "deformation_gradient", "fibre_angle")
+TENSORS = ("deformation_gradient", "cauchy_stress")
 AT_ONCE = 1_000_000  # distances that are compared at a time
 
 
@@ -94,7 +94,7 @@ class _Image:
     def __call__(self, fields: dict[str, Array]) -> tuple[Array | None, dict[str, Array]]:
         """Displacement of the body's nodes, where it was recorded, and fields of its elements."""
         found = {name: values[self.sources] for name, values in fields.items() if name != "displacement"}
-        for name in set(found) & set(VECTORS):
+        for name in set(found) & set(AXES):
             found[name] = np.einsum("nij,nj->ni", self.element_turns, found[name])
         for name in set(found) & set(TENSORS):
             tensors = found[name].reshape(-1, 3, 3)
@@ -110,7 +110,7 @@ class _Image:
         self, chains: TransientGrid | None, path: Path, time: float, displacement: Array, fields: dict[str, Array]
     ) -> TransientGrid:
         """The chain lines of every element, as `Fields` writes them."""
-        axes = np.stack([fields[name] for name in VECTORS], axis=1)
+        axes = np.stack([fields[name] for name in AXES], axis=1)
         points, lines = chain_lines(self.centres, fields["cell_dimensions"], axes, self.scale)
         gradient = fields["deformation_gradient"].reshape(-1, 3, 3)
         moved = chain_displacement(points, self.centres, displacement[self.elements].mean(axis=1), gradient)

@@ -184,6 +184,11 @@ class RunFolder(Watcher):
             self.history.drop_last()
             self._last_row = -1
 
+    def flush(self) -> None:
+        """Bring the rows to the disk."""
+        if self.history is not None:
+            self.history.flush()
+
     def close(self) -> None:
         """Close the history."""
         if self.history is not None:

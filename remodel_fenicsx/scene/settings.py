@@ -219,6 +219,14 @@ class Solver(Table):
         return self
 
 
+def _fields(value: Any) -> Any:
+    if isinstance(value, bool):
+        return value
+    if not isinstance(value, (list, tuple)) or not all(isinstance(name, str) for name in value):
+        raise fault("must be true, false or a list of names of fields")
+    return tuple(value)
+
+
 def _columns(value: Any) -> Any:
     if not isinstance(value, (list, tuple)) or not all(isinstance(name, str) for name in value):
         raise fault("must be a list of names of columns")
@@ -228,11 +236,17 @@ def _columns(value: Any) -> Any:
 class Output(Table):
     """What a run writes beside its history table."""
 
-    fields: bool = Field(default=True, description="Whether to write fields for ParaView.")
+    fields: Annotated[bool | tuple[str, ...], checked(_fields)] = Field(
+        default=True,
+        description="Fields to write for ParaView: true for all, false for none, or names (docs/commands.md), 'chains' "
+        "for the chain lines. What no name asks for is not computed.",
+        json_schema_extra={"allowed": "true, false or a list of names of fields"},
+    )
     columns: Annotated[tuple[str, ...], checked(_columns)] = Field(
         default=(),
-        description="Columns of the history beside those that it always has: 'pass_residual', "
-        "'negative_eigenvalues' (docs/commands.md).",
+        description="Columns of the history: 'pass_residual' and 'negative_eigenvalues' come beside those that it "
+        "has without being asked; where some of these are named, only they are measured, with time and loads "
+        "(docs/commands.md).",
         json_schema_extra={"allowed": "a list of names of columns"},
     )
     every: int = Field(default=1, ge=1, description="Write the fields of every n-th step; the last one always.")

@@ -99,6 +99,8 @@ class Law:
         asks for its slope.
     keeps_symmetry
         Whether planes of symmetry of cells and drive stay such: False where the law turns an axis to one of two sides.
+    asks_kappa
+        Whether kappa = 0 means that cells never change, so that there is no pass at all.
     share
         Cells that have made a share of a change, from (old, new, factor); `relaxed` where the law has none of its own.
     """
@@ -112,6 +114,7 @@ class Law:
     dimensions: RankedFunction | None = None
     share: Callable[[UnitCell, UnitCell, float], UnitCell] = relaxed
     keeps_symmetry: bool = False
+    asks_kappa: bool = False
 
 
 def ranked(function: RankedFunction, has_limit: bool = False, of_absolute_time: bool = False) -> Law:
@@ -138,7 +141,14 @@ def ranked(function: RankedFunction, has_limit: bool = False, of_absolute_time: 
             np.where(active[:, None, None], axes, cells.axes),
         )
 
-    return Law(update, has_limit, of_absolute_time=of_absolute_time, dimensions=function, keeps_symmetry=True)
+    return Law(
+        update,
+        has_limit,
+        of_absolute_time=of_absolute_time,
+        dimensions=function,
+        keeps_symmetry=True,
+        asks_kappa=True,
+    )
 
 
 def principal_directions(drive: Drive, previous: Array, pairing: spectral.Pairing) -> tuple[Array, Array]:

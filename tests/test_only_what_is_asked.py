@@ -1,0 +1,141 @@
+"""Nothing is computed, stored or written that nobody asked for: counted, not timed."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from remodel_fenicsx import Recording, Scene, SceneError, Simulation, run
+from remodel_fenicsx.evolution.equilibrium import Equilibrium
+from remodel_fenicsx.evolution.remodeling import RemodelingPass
+from remodel_fenicsx.fem import jit
+from remodel_fenicsx.results import history
+from remodel_fenicsx.results.fields import FIELDS_BY_NAME
+from remodel_fenicsx.scene import scene_from_dict
+
+SELF = MPI.COMM_SELF
+
+
+def scene(**tables: Any) -> Scene:
+    """A cube as a point, three steps."""
+    base: dict[str, Any] = {"preset": "kuhl-holzapfel-2007", "geometry": {"shape": "cube"}, "time": {"end": 3.0}}
+    return scene_from_dict(base | {"model": {"kinematics": "point"}} | tables)
+
+
+class Calls:
+    """Counts the calls of a function."""
+
+    def __init__(self, patch: pytest.MonkeyPatch, owner: Any, name: str):
+        self.number, function = 0, getattr(owner, name)
+
+        def counted(*arguments: Any, **options: Any) -> Any:
+            self.number += 1
+            return function(*arguments, **options)
+
+        patch.setattr(owner, name, counted)
+
+
+@pytest.mark.parametrize(
+    ("remodeling", "passes"),
+    [({}, 3), ({"kappa": 0.0}, 0), ({"law": "none"}, 0), ({"law": "rotation", "kappa": 0.0}, 3)],
+)
+def test_cells_that_never_move_have_no_pass(
+    remodeling: dict[str, Any], passes: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither a pass nor its kernel; the law of rotation has a time of its own in place of kappa."""
+    calls, kernels = Calls(monkeypatch, RemodelingPass, "apply"), Calls(monkeypatch, jit, "expression")
+    cells = {"initial": [0.6, 0.0, 0.8]}
+    model = {"kinematics": "full" if "rotation" in remodeling.values() else "point"}
+    simulation = Simulation(scene(remodeling=remodeling, cells=cells, model=model), SELF)
+    needed, before = kernels.number, simulation.cells.structure_tensor().copy()
+    list(simulation.steps())
+    assert calls.number == passes
+    assert np.array_equal(before, simulation.cells.structure_tensor()) == (passes == 0)
+    simulation.close()
+    if not passes:
+        Simulation(scene(cells=cells), SELF).close()
+        assert kernels.number - needed > needed
+
+
+def test_columns_that_are_named_are_the_only_ones_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    energy = Calls(monkeypatch, Equilibrium, "stored_energy")
+    simulation = Simulation(scene(output={"columns": ["mean_stretch"]}), SELF)
+    rows = [step.row for step in simulation.steps()]
+    simulation.close()
+    assert list(rows[0]) == ["time", "force", "mean_stretch"] and energy.number == 0
+    simulation = Simulation(scene(output={"columns": ["pass_residual"]}), SELF)
+    rows = [step.row for step in simulation.steps()]
+    simulation.close()
+    assert {"mean_stretch", "stored_energy", "pass_residual"} < set(rows[0]) and energy.number == 4
+    with pytest.raises(SceneError, match="output.columns = 'inner_radius': no such column"):
+        Simulation(scene(output={"columns": ["inner_radius"]}), SELF)
+
+
+def test_fields_that_are_named_are_the_only_ones_written(tmp_path: Path) -> None:
+    asked: dict[str, Any] = {"all": True, "two": ["displacement", "fibre_angle"], "chains": ["chains"], "none": False}
+    folders = {name: run(scene(output={"fields": fields}), tmp_path / name, SELF) for name, fields in asked.items()}
+    whole = Recording(folders["all"]).fields(3.0)
+    assert set(whole) == set(FIELDS_BY_NAME) - {"chains"}
+    two = Recording(folders["two"]).fields(3.0)
+    assert set(two) == {"displacement", "fibre_angle"}
+    assert all(np.array_equal(two[name], whole[name]) for name in two)
+    written = {name: {path.name for path in folder.glob("fields*")} for name, folder in folders.items()}
+    assert written["all"] == {"fields.vtkhdf", "fields_chains.vtkhdf"}
+    assert written["two"] == {"fields.vtkhdf"} and written["none"] == set()
+    sizes = {name: (folders[name] / "fields.vtkhdf").stat().st_size for name in ("all", "two")}
+    assert sizes["two"] < 0.6 * sizes["all"]
+    chains = [(folders[name] / "fields_chains.vtkhdf").stat().st_size for name in ("all", "chains")]
+    assert chains[0] == chains[1]
+    with pytest.raises(SceneError, match="output.fields = 'stress': no such field"):
+        Simulation(scene(output={"fields": ["stress"]}), SELF)
+
+
+def test_stress_that_nobody_writes_is_not_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
+    from remodel_fenicsx.results.fields import ElementFields
+
+    simulation = Simulation(scene(), SELF)
+    sizes = {}
+    for names in (("cauchy_stress",), ("fibre_angle",)):
+        fields = ElementFields(simulation.scene.geometry, simulation.stepper, names)
+        assert set(fields()) == set(names)
+        sizes[names] = fields._state.ufl_expression.ufl_shape
+    assert list(sizes.values()) == [(21,), (12,)]
+    simulation.close()
+
+
+def test_rows_that_come_fast_are_flushed_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Twice a second, before a checkpoint, and at the end; every row is in the file at once."""
+    flushes, now = Calls(monkeypatch, os, "fsync"), 0.0
+    monkeypatch.setattr(history.clock, "monotonic", lambda: now)
+    written = history.History(tmp_path / "history.csv")
+    for number in range(101):
+        now = number / 50
+        written.append({"time": float(number)})
+        assert (tmp_path / "history.csv").read_text().count("\n") == number + 2
+    assert flushes.number == 5  # at 0, 0.5, 1, 1.5, 2 s
+    written.append({"time": 101.0})
+    written.flush()
+    written.flush()
+    assert flushes.number == 6
+    written.append({"time": 102.0})
+    written.close()
+    written.close()
+    assert flushes.number == 7
+
+
+def test_the_rows_of_a_checkpoint_are_on_the_disk_before_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    order: list[str] = []
+    from remodel_fenicsx.results import checkpoint
+
+    write, flush = checkpoint.write_checkpoint, history.History.flush
+    monkeypatch.setattr(checkpoint, "write_checkpoint", lambda *a: (order.append("checkpoint"), write(*a)))
+    monkeypatch.setattr(history.History, "flush", lambda self: (order.append("rows"), flush(self)))
+    monkeypatch.setattr(history, "FLUSHED_AFTER", 1e9)
+    run(scene(output={"fields": False, "checkpoint": 2}), tmp_path / "run", SELF)
+    assert [entry for entry in order if entry][-3:] == ["rows", "checkpoint", "rows"]
+    assert order.count("checkpoint") == 2
