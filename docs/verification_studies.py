@@ -24,7 +24,7 @@ from remodel_fenicsx.evolution.remodeling import RemodelingPass  # noqa: E402
 from remodel_fenicsx.evolution.stepper import Step, Watcher  # noqa: E402
 from remodel_fenicsx.paper.output import Page, read_table  # noqa: E402
 from remodel_fenicsx.paper.cases import scenes  # noqa: E402
-from remodel_fenicsx.paper.runs import cores  # noqa: E402
+from remodel_fenicsx.system.children import cores  # noqa: E402
 from remodel_fenicsx.paper.validity import library_versions, source_fingerprint  # noqa: E402
 from remodel_fenicsx.results.columns import Measurement  # noqa: E402
 from remodel_fenicsx.simulation import Simulation  # noqa: E402

@@ -83,6 +83,14 @@ def parser() -> argparse.ArgumentParser:
     stability.add_argument("--times", type=_positive, default=10, metavar="N", help="times to analyse (default: 10)")
     stability.add_argument("-q", "--quiet", action="store_true", help="no progress")
     stability.set_defaults(resume=None, max_wall_time=None)
+    ensemble = scene_command("ensemble", "Run a scene of random cells with many seeds, and with isotropic cells.")
+    ensemble.add_argument("--seeds", type=_positive, default=32, metavar="N", help="how many (default: 32; at least 2)")
+    ensemble.add_argument(
+        "-o", "--output", type=Path, metavar="DIR",
+        help="folder (default: results/NAME-ensemble); what it holds of the same scene is used, and gone on with",
+    )  # fmt: skip
+    ensemble.add_argument("--jobs", type=_positive, metavar="N", help="runs at a time (default: as many as cores)")
+    ensemble.add_argument("-q", "--quiet", action="store_true", help="no progress")
     text = "Say where the run in DIR is, how fast, and whether it is alive."
     status = commands.add_parser("status", help=text, description=text)
     status.add_argument("folder", type=Path, metavar="DIR", help="folder of a run")
@@ -243,6 +251,29 @@ def _stability(options: argparse.Namespace) -> int:
     return _run(options, analyse)
 
 
+def _ensemble(options: argparse.Namespace) -> int:
+    scene = read_scene(options.scene, options.set)
+    reason = reason_unusable()
+    if reason is not None:
+        return _fail(f"the environment is not usable: {reason}; run through ./with-fenicsx", BAD_ENVIRONMENT)
+    if options.seeds < 2:
+        return _fail(f"--seeds {options.seeds}: allowed is a whole number at least 2", BAD_INPUT)
+    from remodel_fenicsx.studies import ensemble as study
+
+    try:
+        with interrupts.StopRequest(), interrupts.stopping_at_once():
+            folder, found = study.ensemble(scene, options.output, options.seeds, options.jobs, options.quiet)
+    except interrupts.Interrupted as interruption:
+        return _fail("stopped; all that is recorded is kept, the same command goes on", interruption.exit_code)
+    except OSError as error:
+        return _fail(f"cannot write the results: {error}", BAD_ENVIRONMENT)
+    _say(study.in_words(found, study.chosen_times(scene)))
+    _say(f"results in {folder}")
+    for name, words in found.failed.items():
+        _complain(f"{name} has failed: {words}")
+    return SOLVE_FAILED if found.failed else 0
+
+
 def _end_all(message: str, code: int) -> int:
     """End the run on all ranks: an error on one of them leaves the others waiting for ever."""
     from mpi4py import MPI
@@ -319,6 +350,7 @@ def _info(options: argparse.Namespace) -> int:
 COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
     "run": _run,
     "stability": _stability,
+    "ensemble": _ensemble,
     "status": _status,
     "validate": _validate,
     "new": _new,

@@ -18,7 +18,9 @@ from remodel_fenicsx.paper.captions import CAPTIONS
 from remodel_fenicsx.paper.cases import KAPPAS, LOAD_CASES, load_case_name, scenes
 from remodel_fenicsx.paper.errors import FigureError
 from remodel_fenicsx.paper.output import FORMATS, STYLE, Page, check_folder
-from remodel_fenicsx.paper.runs import Line, RunCache, cores
+from remodel_fenicsx.paper.runs import RunCache
+from remodel_fenicsx.system.children import cores
+from remodel_fenicsx.system.terminal import Line
 from remodel_fenicsx.results.recording import Recording
 
 __all__ = ["DEFAULT_FOLDER", "DEFAULT_RUNS", "FIGURES", "FigureError", "draw"]
@@ -102,9 +104,9 @@ def draw(
     needed = dict.fromkeys(run for name in chosen for run in FIGURES[name].runs)
     recorded = RunCache(runs).obtain([known[run] for run in needed], jobs or cores())
     recordings = {name: Recording(path) for name, path in recorded.items()}
-    progress, written = Line(), []
+    progress, written = Line("figures"), []
     for number, name in enumerate(chosen, start=1):
-        progress.show(f"figures: drawing {name} ({number}/{len(chosen)})", at_once=True)
+        progress.show(f"drawing {name} ({number}/{len(chosen)})", at_once=True)
         title, caption = CAPTIONS[name]
         page = Page(folder, name, title, caption, bodies.scale_colours(), tuple(dict.fromkeys(formats)), stamp)
         with matplotlib.rc_context(STYLE):

@@ -29,8 +29,8 @@ def scenes() -> dict[str, Scene]:
         changes = {f"loads.{ELONGATION_LOAD}.value": elongation, "loads.pressure.value": pressure}
         found.setdefault(load_case_name(elongation, pressure), found["artery"].with_values(changes | last_only))
     for driver in ("pk2", "finger"):
-        changes = {"remodeling.driver": driver, "remodeling.frame": "material", "remodeling.coupling": "relaxed"}
-        found[f"artery-{driver}"] = found["artery"].with_values(changes | last_only)
+        method = {"remodeling.driver": driver, "remodeling.frame": "material", "remodeling.coupling": "relaxed"}
+        found[f"artery-{driver}"] = found["artery"].with_values(method | last_only)
     found["artery-rate"] = found["artery"].with_values({"remodeling.law": "rate"} | last_only)
     for kappa in KAPPAS:
         changes = {"remodeling.kappa": kappa, "output.fields": False}

@@ -5,9 +5,6 @@ from __future__ import annotations
 import fcntl
 import os
 import shutil
-import signal
-import subprocess
-import sys
 import tempfile
 import time as clock
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -15,16 +12,16 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import remodel_fenicsx
 from remodel_fenicsx.paper.errors import FigureError
 from remodel_fenicsx.paper.validity import fault, library_versions, run_key, source_fingerprint
 from remodel_fenicsx.results.recording import HISTORY
 from remodel_fenicsx.scene.scene import Scene
+from remodel_fenicsx.system.children import Child
 from remodel_fenicsx.system.interrupts import StopRequest
-from remodel_fenicsx.system.terminal import announce
+from remodel_fenicsx.system.terminal import Line, announce
 
 _WORK = ".part-"  # and letters: a folder of unfinished runs, locked by the command they belong to and by each of them
-_POLL, _LINE_EVERY, _PATIENCE = 0.25, 10.0, 30.0  # seconds
+_POLL = 0.25  # seconds
 _COST = {"tendon": 0.2, "cube": 0.01}  # of a step, beside those of other shapes
 
 
@@ -80,7 +77,7 @@ class RunCache:
         waiting = sorted(missing, key=lambda scene: _COST.get(scene.geometry.name, 1.0) * scene.time.number_of_steps)
         running: list[_Run] = []
         finished, total = 0, sum(scene.time.number_of_steps for scene in missing)
-        progress = Line()
+        progress = Line("figures")
         with StopRequest() as stop, _work_folder(self.folder) as (work, lock):
             try:
                 while waiting or running:
@@ -88,25 +85,25 @@ class RunCache:
                         raise FigureError("stopped; finished runs are kept", 128 + stop.number)
                     while waiting and len(running) < jobs:
                         running.append(_Run(waiting.pop(), work, lock))
-                    for run in [run for run in running if run.process.poll() is not None]:
+                    for run in [run for run in running if run.child.process.poll() is not None]:
                         running.remove(run)
                         self._keep(run)
                         finished += run.scene.time.number_of_steps
                     done = 100 * (finished + sum(run.steps_done() for run in running)) // total
                     parts = [f"{run.scene.name} {run.steps_done()}/{run.scene.time.number_of_steps}" for run in running]
                     more = f", {len(waiting)} more to start" if waiting else ""
-                    progress.show(f"figures: {done} % of the runs: {', '.join(parts)}{more}")
+                    progress.show(f"{done} % of the runs: {', '.join(parts)}{more}")
                     clock.sleep(_POLL)
             finally:
                 for run in running:
-                    run.stop()
+                    run.child.stop()
                 progress.end()
 
     def _keep(self, run: _Run) -> None:
         """Give the folder of a run that has ended its name, or say why there is none."""
-        code, name, target = run.process.returncode, run.scene.name, self.path(run.scene)
+        code, name, target = run.child.process.returncode, run.scene.name, self.path(run.scene)
         if code != 0:
-            message = f"the run {name} in {run.folder}: {run.last_words()}"
+            message = f"the run {name} in {run.folder}: {run.child.last_words()}"
             raise _RunFailed(message, code if code > 0 else 128 - code)
         if source_fingerprint() != self.source:
             raise FigureError(f"the package's source changed during the run {name}: start again", 1)
@@ -125,21 +122,14 @@ class _RunFailed(FigureError):
 
 
 class _Run:
-    """One scene in one process, which ends with this one, even if that is killed (where there is setpriv)."""
+    """One scene in one process."""
 
     def __init__(self, scene: Scene, work: Path, lock: int):
         self.scene, self.folder = scene, work / scene.name
-        scene_file, self.messages = work / f"{scene.name}.toml", work / f"{scene.name}.txt"
+        scene_file = work / f"{scene.name}.toml"
         scene_file.write_text(scene.to_toml(), encoding="utf-8")
-        command = [sys.executable, "-m", "remodel_fenicsx.cli", "run", str(scene_file), "-o", str(self.folder), "-q"]
-        if shutil.which("setpriv"):
-            command = ["setpriv", "--pdeathsig", signal.SIGTERM.name, *command]
-        # this very package, wherever it was imported from; one thread each, as there are jobs for the cores
-        paths = [str(Path(remodel_fenicsx.__file__).parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])]
-        environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"}
-        with self.messages.open("w") as output:
-            self.process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=output, stderr=output,
-                                            env=environment, pass_fds=(lock,))  # fmt: skip
+        arguments = ["run", str(scene_file), "-o", str(self.folder), "-q"]
+        self.child = Child(arguments, work / f"{scene.name}.txt", [lock])
 
     def steps_done(self) -> int:
         try:
@@ -147,18 +137,6 @@ class _Run:
         except OSError:
             return 0
         return min(max(0, rows), self.scene.time.number_of_steps)
-
-    def last_words(self) -> str:
-        said = self.messages.read_text(errors="replace").strip().splitlines()
-        return said[-1].removeprefix("remodel-fenicsx: ") if said else "it said nothing"
-
-    def stop(self) -> None:
-        self.process.terminate()
-        try:
-            self.process.wait(timeout=_PATIENCE)
-        except subprocess.TimeoutExpired:
-            self.process.kill()
-            self.process.wait()
 
 
 # ---------------------------------------------------------------- unfinished runs
@@ -204,34 +182,3 @@ def _lock(folder: Path, how: int = 0) -> Iterator[None]:
         yield
     finally:
         os.close(descriptor)
-
-
-# ---------------------------------------------------------------- progress
-
-
-class Line:
-    """The progress on stderr: one line that changes on a terminal, else a plain line now and then."""
-
-    def __init__(self) -> None:
-        self._last, self._terminal, self._width = -1e9, sys.stderr.isatty(), 0
-
-    def show(self, text: str, at_once: bool = False) -> None:
-        """Show a line; where lines stay, only now and then unless it is wanted at once."""
-        if self._terminal:
-            text = text[: max(20, shutil.get_terminal_size().columns - 1)]
-            announce(f"\r{text:{self._width}}", end="")
-            self._width = len(text)
-        elif at_once or clock.monotonic() - self._last >= _LINE_EVERY:
-            announce(text)
-            self._last = clock.monotonic()
-
-    def end(self) -> None:
-        """Leave the last line as it is."""
-        if self._width:
-            announce("")
-            self._width = 0
-
-
-def cores() -> int:
-    """How many cores this process may use."""
-    return len(os.sched_getaffinity(0))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import shutil
 import sys
 import time as clock
 from collections.abc import Iterator, Sequence
@@ -21,6 +22,7 @@ from rich.text import Text
 
 LOGGER = "remodel_fenicsx"
 LOG_FORMAT = "%(asctime)s %(levelname)s %(message)s"
+LINE_EVERY = 10.0  # seconds, of lines that stay
 
 # for the log, and for the terminal unless it is to be quiet: a wait with its reason. No warning: all is well
 NOTICE = (logging.INFO + logging.WARNING) // 2
@@ -174,6 +176,31 @@ def announce(line: str, end: str = "\n") -> None:
     """Print a line on stderr; if whoever read it is gone (a closed pipe), that is no reason to lose a long run."""
     with suppress(OSError):
         print(line, end=end, file=sys.stderr, flush=True)
+
+
+class Line:
+    """What several runs do, on stderr: one line that changes on a terminal, else a plain line now and then."""
+
+    def __init__(self, title: str) -> None:
+        self._title = title
+        self._last, self._terminal, self._width = -1e9, sys.stderr.isatty(), 0
+
+    def show(self, text: str, at_once: bool = False) -> None:
+        """Show a line; where lines stay, only now and then unless it is wanted at once."""
+        text = f"{self._title}: {text}"
+        if self._terminal:
+            text = text[: max(20, shutil.get_terminal_size().columns - 1)]
+            announce(f"\r{text:{self._width}}", end="")
+            self._width = len(text)
+        elif at_once or clock.monotonic() - self._last >= LINE_EVERY:
+            announce(text)
+            self._last = clock.monotonic()
+
+    def end(self) -> None:
+        """Leave the last line as it is."""
+        if self._width:
+            announce("")
+            self._width = 0
 
 
 @contextmanager

@@ -1,0 +1,1 @@
+"""Several runs of a scene that answer one question."""

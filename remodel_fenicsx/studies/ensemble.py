@@ -1,0 +1,216 @@
+"""`remodel-fenicsx ensemble SCENE`: what random cells mean, by many seeds and by isotropic cells in their place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from remodel_fenicsx.paper.output import COLOURS, STYLE, Page
+from remodel_fenicsx.scene.scene import Scene, SceneError
+from remodel_fenicsx.schema.times import same_time
+from remodel_fenicsx.studies.members import Member, run_members
+from remodel_fenicsx.system.children import cores
+from remodel_fenicsx.system.environment import versions
+
+Array = NDArray[np.float64]
+
+NAME, ISOTROPIC = "ensemble", "isotropic"
+NOT_COMPARED = ("time", "seconds", "newton_iterations", "linear_iterations", "substeps")
+WITHIN = 2.0  # standard deviations
+PANELS = 6
+
+
+@dataclass(frozen=True)
+class Ensemble:
+    """Columns of the history over the seeds.
+
+    Attributes
+    ----------
+    time
+        (rows,).
+    columns
+        Values by name, (seeds, rows).
+    isotropic
+        The same of the model with isotropic cells, (rows,); empty if it has failed.
+    failed
+        Last words of runs that have failed, by name.
+    """
+
+    time: Array
+    columns: dict[str, Array]
+    isotropic: dict[str, Array]
+    failed: dict[str, str]
+
+    @property
+    def seeds(self) -> int:
+        """How many there are."""
+        return len(next(iter(self.columns.values())))
+
+    def table(self) -> dict[str, Array]:
+        """Columns of ensemble.csv: of each column mean, standard deviation, least, most, and isotropic cells."""
+        found = {"time": self.time}
+        for name, values in self.columns.items():
+            found[f"{name}_mean"], found[f"{name}_deviation"] = values.mean(axis=0), values.std(axis=0, ddof=1)
+            found[f"{name}_least"], found[f"{name}_most"] = values.min(axis=0), values.max(axis=0)
+            if name in self.isotropic:
+                found[f"{name}_isotropic"] = self.isotropic[name]
+        return found
+
+
+def members_of(scene: Scene, folder: Path, seeds: int) -> list[Member]:
+    """A run for each seed from the scene's own on, and one with isotropic cells.
+
+    Raises
+    ------
+    SceneError
+        If the scene has no random cells.
+    """
+    if scene.cells.initial != "random":
+        raise SceneError(f"cells.initial = {scene.cells.initial!r}: an ensemble is one of 'random' cells")
+    numbers = range(scene.cells.seed, scene.cells.seed + seeds)
+    every: dict[str, dict[str, Any]] = {f"seed-{number}": {"cells.seed": number} for number in numbers}
+    every[ISOTROPIC] = {"cells.initial": ISOTROPIC}
+    return [
+        Member(name, scene.with_values({"output.fields": False, "name": name, **change}), folder / name)
+        for name, change in every.items()
+    ]
+
+
+def ensemble(
+    scene: Scene, folder: Path | str | None = None, seeds: int = 32, jobs: int | None = None, quiet: bool = True
+) -> tuple[Path, Ensemble]:
+    """Run a scene with many seeds, and with isotropic cells.
+
+    Parameters
+    ----------
+    scene
+        With random cells.
+    folder
+        Default: results/NAME-ensemble. What is recorded there of the same scene is not run again; runs that have
+        stopped go on.
+    seeds
+        At least 2: the scene's own seed and those after it.
+    jobs
+        Runs at a time; default: the number of cores.
+    quiet
+        No progress.
+
+    Returns
+    -------
+    The folder with ensemble.csv, ensemble.png and the runs; and what they hold.
+
+    Raises
+    ------
+    SceneError
+        If the scene has no random cells, if a folder holds another one, or if fewer than two runs reach the end.
+    Interrupted
+        If a signal asked for the end; the same call goes on from there.
+    OSError
+        If a file cannot be written.
+    """
+    place = Path(folder or Path("results") / f"{scene.name}-{NAME}")
+    members = members_of(scene, place, seeds)
+    failed = run_members(members, jobs or cores(), f"{scene.name} {NAME}", quiet)
+    found = gathered(members, failed)
+    draw(found, place, scene)
+    return place, found
+
+
+def gathered(members: list[Member], failed: dict[str, str]) -> Ensemble:
+    """The histories of all that have not failed.
+
+    Raises
+    ------
+    SceneError
+        If fewer than two seeds have reached the end.
+    """
+    histories = {member.name: member.history() for member in members if member.name not in failed}
+    isotropic = dict(histories.pop(ISOTROPIC, {}))
+    if len(histories) < 2:
+        words = "; ".join(f"{name}: {text}" for name, text in failed.items())
+        raise SceneError(
+            f"{len(histories)} of {len(members) - 1} seeds reached the end, at least 2 are needed ({words})"
+        )
+    first = next(iter(histories.values()))
+    columns = {
+        name: np.stack([history[name] for history in histories.values()]) for name in first if name not in NOT_COMPARED
+    }
+    return Ensemble(first["time"], columns, {name: isotropic[name] for name in columns if name in isotropic}, failed)
+
+
+# ---------------------------------------------------------------- in words
+def in_words(found: Ensemble, times: list[float]) -> str:
+    """A table for a terminal: the columns that differ between seeds, at some times."""
+    table, lines = found.table(), []
+    width = max(len(name) for name in found.columns)
+    head = f"{'':{width}} {'mean':>11} {'deviation':>11} {'least':>11} {'most':>11} {'isotropic':>11}"
+    for time in times:
+        row = next(row for row, recorded in enumerate(found.time) if same_time(float(recorded), time))
+        lines += [f"time {time:g}, {found.seeds} seeds", head]
+        for name, values in found.columns.items():
+            if np.ptp(values[:, row]) == 0:
+                continue  # a load
+            numbers = [float(table[f"{name}_{kind}"][row]) for kind in ("mean", "deviation", "least", "most")]
+            shown = " ".join(f"{number:11.5g}" for number in numbers)
+            lines.append(f"{name:{width}} {shown} {_beside(found, name, row, *numbers[:2])}")
+    return "\n".join(lines)
+
+
+def _beside(found: Ensemble, name: str, row: int, mean: float, deviation: float) -> str:
+    """Isotropic cells, and by how many standard deviations they miss the mean."""
+    if name not in found.isotropic:
+        return f"{'failed':>11}"
+    value = float(found.isotropic[name][row])
+    if not np.isfinite(value) or deviation == 0:
+        return f"{value:11.5g}"
+    away = (value - mean) / deviation
+    words = "within the spread" if abs(away) <= WITHIN else "outside of it"
+    return f"{value:11.5g}  {away:+.1f} deviations: {words}"
+
+
+def chosen_times(scene: Scene) -> list[float]:
+    """The end of the last ramp, and the end."""
+    ramps = [load.ramp[-1][0] for load in scene.loads.values()]
+    step, end = scene.time.step, scene.time.end
+    last = step * round(max(ramps, default=end) / step)
+    return [last, end] if step <= last < end else [end]
+
+
+# ---------------------------------------------------------------- picture
+def draw(found: Ensemble, folder: Path, scene: Scene) -> None:
+    """Write ensemble.csv and ensemble.png."""
+    title = f"{scene.name}: {found.seeds} seeds of random cells, and isotropic cells"
+    caption = "Lines: means over the seeds; dark: mean and one standard deviation; light: least and most of all seeds."
+    page = Page(folder, NAME, title, caption)
+    made_with = ", ".join(f"{name} {version}" for name, version in versions().items() if name != "BLAS")
+    table = found.table()
+    page.save_table(table, [title, made_with])
+    varying = [name for name, values in found.columns.items() if np.nanmax(np.ptp(values, axis=0)) > 0]
+    shown = sorted(varying, key=lambda name: name not in _own_columns(scene))[:PANELS]
+    with rc_context(STYLE):
+        rows = -(-len(shown) // 2)
+        figure = Figure(figsize=(7.2, 2.2 * rows + 0.4), layout="constrained")
+        grid = figure.subplots(rows, 2, squeeze=False).ravel()
+        for axes, name in zip(grid, shown, strict=False):
+            mean, deviation = table[f"{name}_mean"], table[f"{name}_deviation"]
+            axes.fill_between(found.time, table[f"{name}_least"], table[f"{name}_most"], color=COLOURS[0], alpha=0.15)
+            axes.fill_between(found.time, mean - deviation, mean + deviation, color=COLOURS[0], alpha=0.35)
+            axes.plot(found.time, mean, color=COLOURS[0], label="random cells, mean over the seeds")
+            if name in found.isotropic:
+                axes.plot(found.time, found.isotropic[name], "--", color=COLOURS[1], label="isotropic cells")
+            axes.set(xlabel="time", ylabel=name, xlim=(0, found.time[-1]))
+        for axes in grid[len(shown) :]:
+            axes.set_axis_off()
+        figure.legend(*grid[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
+        page.save_figure(figure, made_with)
+
+
+def _own_columns(scene: Scene) -> set[str]:
+    """The shape's own columns."""
+    return {column.name for column in scene.geometry.columns}

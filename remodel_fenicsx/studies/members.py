@@ -1,0 +1,119 @@
+"""The runs of a study: each in a folder of its own, several at a time, gone on with where they have stopped."""
+
+from __future__ import annotations
+
+import time as clock
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from remodel_fenicsx.results.recording import HISTORY, SCENE, HistoryColumns, Recording, RecordingError, read_history
+from remodel_fenicsx.scene.scene import Scene, SceneError
+from remodel_fenicsx.schema.times import same_time
+from remodel_fenicsx.system.children import Child
+from remodel_fenicsx.system.interrupts import Interrupted, StopRequest
+from remodel_fenicsx.system.terminal import Line
+
+POLL = 0.1  # seconds
+
+
+@dataclass(frozen=True)
+class Member:
+    """One run of a study.
+
+    Attributes
+    ----------
+    name
+        Of its folder, unique in the study.
+    scene
+        What is run.
+    folder
+        Where its record is.
+    """
+
+    name: str
+    scene: Scene
+    folder: Path
+
+    @property
+    def steps_done(self) -> int:
+        """How many steps are recorded."""
+        try:
+            rows = (self.folder / HISTORY).read_bytes().count(b"\n") - 2  # the head, and t = 0
+        except OSError:
+            return 0
+        return min(max(0, rows), self.scene.time.number_of_steps)
+
+    def is_complete(self) -> bool:
+        """Whether this very scene is recorded to its end.
+
+        Raises
+        ------
+        SceneError
+            If the folder holds another scene.
+        """
+        if not (self.folder / SCENE).exists() or not (self.folder / HISTORY).exists():
+            return False
+        recording = Recording(self.folder)
+        if recording.scene != self.scene:
+            raise SceneError(f"{self.folder}: holds a run of another scene; choose another folder with -o")
+        with suppress(RecordingError):  # a last row that is not whole is done again
+            times = recording.history["time"]
+            return bool(len(times)) and same_time(float(times[-1]), self.scene.time.end)
+        return False
+
+    def history(self) -> HistoryColumns:
+        """What it has recorded."""
+        return read_history(self.folder)
+
+
+def run_members(members: Sequence[Member], jobs: int, title: str, quiet: bool = False) -> dict[str, str]:
+    """Run what is not complete; returns the last words of those that have failed, by name.
+
+    Raises
+    ------
+    SceneError
+        If a folder holds another scene.
+    Interrupted
+        If a signal asked for the end: what is recorded stays, and the same call goes on from there.
+    OSError
+        If a folder cannot be written.
+    """
+    waiting = [member for member in reversed(members) if not member.is_complete()]
+    running: dict[str, tuple[Member, Child]] = {}
+    total, failed, line = sum(member.scene.time.number_of_steps for member in members), {}, Line(title)
+    with StopRequest() as stop:
+        try:
+            while waiting or running:
+                if stop.number:
+                    raise Interrupted(stop.number)
+                while waiting and len(running) < jobs:
+                    member = waiting.pop()
+                    running[member.name] = (member, _started(member))
+                for member, child in list(running.values()):
+                    code = child.process.poll()
+                    if code is not None:
+                        del running[member.name]
+                        if code != 0:
+                            failed[member.name] = child.last_words()
+                if not quiet:
+                    done = sum(member.steps_done for member in members)
+                    line.show(f"{100 * done // total} % of {len(members)} runs: {', '.join(running) or 'done'}")
+                clock.sleep(POLL)
+        finally:
+            for _, child in running.values():
+                child.stop()
+            line.end()
+    return failed
+
+
+def _started(member: Member) -> Child:
+    """Begin, or go on with what is there."""
+    member.folder.parent.mkdir(parents=True, exist_ok=True)
+    messages = member.folder.with_suffix(".txt")
+    if (member.folder / SCENE).exists():
+        return Child(["run", "--resume", str(member.folder), "-q"], messages)
+    scene = member.folder.with_suffix(".toml")
+    scene.write_text(member.scene.to_toml(), encoding="utf-8")
+    return Child(["run", str(scene), "-o", str(member.folder), "-q"], messages)
