@@ -81,10 +81,10 @@ class Autoregressive:
         increments = self._increments.values
         if not increments or not self._goes_on(step):
             return None
-        if len(increments) < ORDER + FITTED:
-            increment: Array = increments[0]
-        else:
-            increment = np.tensordot(self._weights(increments), np.array(increments[:ORDER]), axes=1)
+        increment = increments[0]
+        if len(increments) == ORDER + FITTED:
+            weighted = np.tensordot(self._weights(increments), np.array(increments[:ORDER]), axes=1)
+            increment = np.asarray(weighted, dtype=np.float64)
         values: Array = self.state.unknown.x.array + increment
         for condition in self.state.loading.boundary_conditions:
             condition.set(values)
