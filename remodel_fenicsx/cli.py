@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import NoReturn
 
 import remodel_fenicsx
+from remodel_fenicsx.body.reductions import explained
 from remodel_fenicsx.system import interrupts
 from remodel_fenicsx.system.environment import reason_unusable, versions
 from remodel_fenicsx.scene.parameters import PRESETS
@@ -94,6 +95,9 @@ def parser() -> argparse.ArgumentParser:
     text = "Say where the run in DIR is, how fast, and whether it is alive."
     status = commands.add_parser("status", help=text, description=text)
     status.add_argument("folder", type=Path, metavar="DIR", help="folder of a run")
+    text = "Write the fields of a reduced run in DIR on the whole body: fields_body.vtkhdf."
+    revolve = commands.add_parser("revolve", help=text, description=text)
+    revolve.add_argument("folder", type=Path, metavar="DIR", help="folder of a run")
     scene_command("validate", "Check a scene without running it.")
     new = commands.add_parser("new", help="Print a scene of a preset.", description="Print a scene of a preset.")
     new.add_argument("preset", metavar="PRESET", help=", ".join(PRESETS))
@@ -299,10 +303,30 @@ def _status(options: argparse.Namespace) -> int:
     return 0
 
 
+def _revolve(options: argparse.Namespace) -> int:
+    reason = reason_unusable()
+    if reason is not None:
+        return _fail(f"the environment is not usable: {reason}; run through ./with-fenicsx", BAD_ENVIRONMENT)
+    if not interrupts.is_first_rank():  # the work of one process
+        return 0
+    from remodel_fenicsx.results.recording import RecordingError
+    from remodel_fenicsx.results.revolve import revolve
+
+    try:
+        written = revolve(options.folder)
+    except RecordingError as error:
+        return _fail(str(error), BAD_INPUT)
+    except OSError as error:
+        return _fail(f"cannot write the fields: {error}", BAD_ENVIRONMENT)
+    _say("\n".join(map(str, written)))
+    return 0
+
+
 def _validate(options: argparse.Namespace) -> int:
     scene = read_scene(options.scene, options.set)
     _say(f"{options.scene}: a valid scene ({scene.geometry.name}, {scene.time.number_of_steps} steps)")
     _say(scene.summary())
+    _say("\n".join(explained(scene)))
     if _rank() == 0:
         for warning in scene.warnings():
             _complain(f"warning: {warning}")
@@ -352,6 +376,7 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
     "stability": _stability,
     "ensemble": _ensemble,
     "status": _status,
+    "revolve": _revolve,
     "validate": _validate,
     "new": _new,
     "figures": _figures,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -9,6 +10,7 @@ from mpi4py import MPI
 
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.loading import Loading, LoadValues
+from remodel_fenicsx.body.reductions import AUTO, choice, explained
 from remodel_fenicsx.evolution.chatter import Chatter
 from remodel_fenicsx.evolution.locking import LockingWarning
 from remodel_fenicsx.evolution.monitor import StabilityWatcher
@@ -22,6 +24,8 @@ from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.results.columns import COLUMNS_ON_REQUEST, Observer, columns_of
 from remodel_fenicsx.scene import Scene, SceneError
 from remodel_fenicsx.system.interrupts import take_back_signals
+
+log = logging.getLogger(__name__)
 
 
 class Simulation:
@@ -51,15 +55,19 @@ class Simulation:
 
     def __init__(self, scene: Scene, comm: MPI.Intracomm = MPI.COMM_WORLD, domain: Domain | None = None):
         take_back_signals()
-        self.scene, shape = scene, scene.geometry
-        self.domain = checked_domain(shape.build(scene.mesh, comm) if domain is None else domain, scene)
-        mesh, kinematics = self.domain.mesh, KINEMATICS[scene.model.kinematics]
+        if scene.model.kinematics == AUTO and domain is None and comm.rank == 0:
+            for line in explained(scene):
+                log.info("%s", line)
+        self.scene = scene = with_kinematics(scene, domain)
+        shape = scene.geometry
+        self.domain = domain = checked_domain(build(scene, comm) if domain is None else domain, scene)
+        mesh = domain.mesh
+        kinematics = KINEMATICS[scene.model.kinematics].on(mesh, shape)
         self.unknown = kinematics.unknown(mesh, scene.mesh.degree)
-        self.quadrature = Quadrature(mesh, scene.mesh.degree)
-        domain = self.domain
+        self.quadrature = Quadrature(mesh, scene.mesh.degree, kinematics.weight(mesh))
         self.cells = UnitCells(self.quadrature, domain.element_number, domain.number_of_elements, scene.cells)
         self.loading = Loading(domain, self.unknown, kinematics)
-        shape.support(self.loading)
+        shape.support(self.loading, scene.supports.ends)
         formulation = FORMULATIONS[scene.mesh.formulation]
         self.state = State(self.unknown, kinematics, self.cells, self.loading, formulation)
         tissue = scene.material.tissue(scene.cells.end_to_end_length)
@@ -119,6 +127,22 @@ def checked_columns(names: Sequence[str]) -> Sequence[str]:
     return names
 
 
+def with_kinematics(scene: Scene, domain: Domain | None = None) -> Scene:
+    """The scene with the kinematics that it is run with, where it leaves the choice. A mesh of one's own is full."""
+    if scene.model.kinematics != AUTO:
+        return scene
+    name = choice(scene).name if domain is None else "full"
+    return scene.with_values({"model.kinematics": name})
+
+
+def build(scene: Scene, comm: MPI.Intracomm) -> Domain:
+    """The mesh of a scene: of its body, or of the part that stands for it. Collective."""
+    if KINEMATICS[scene.model.kinematics].reduced:
+        domain: Domain = scene.geometry.reductions[scene.model.kinematics].build(scene, comm)
+        return domain
+    return scene.geometry.build(scene.mesh, comm)
+
+
 def checked_domain(domain: Domain, scene: Scene) -> Domain:
     """The domain, if it is a mesh of the scene's body and elements.
 
@@ -131,18 +155,21 @@ def checked_domain(domain: Domain, scene: Scene) -> Domain:
     kind, degree = mesh.topology.cell_name(), mesh.geometry.cmap.degree
     if domain.shape != shape.name:
         raise SceneError(f"geometry.shape = {shape.name!r}: the mesh is a {domain.shape!r}")
-    if kind != scene.mesh.element:
+    element = KINEMATICS[scene.model.kinematics].element(scene.mesh.element)
+    if kind != element:
         raise SceneError(f"mesh.element = {scene.mesh.element!r}: the mesh has elements of type {kind!r}")
     if degree != scene.mesh.degree:
         raise SceneError(f"mesh.degree = {scene.mesh.degree}: the mesh has degree {degree}")
-    missing = [face for face in shape.faces if face not in domain.faces]
+    needed = () if KINEMATICS[scene.model.kinematics].reduced else shape.faces
+    missing = [face for face in needed if face not in domain.faces]
     if missing:
         raise SceneError(f"geometry.shape = {shape.name!r}: the mesh has no face {', '.join(missing)}")
     for name, value in domain.dimensions.items():
         wanted = getattr(shape, name, value)
         if not abs(wanted - value) <= 1e-9 * abs(wanted):  # NaN too
             raise SceneError(f"geometry.{name} = {wanted:g}: that of the mesh is {value:g}")
-    empty = [name for name in shape.faces if not domain.comm.allreduce(domain.facet_tags.find(domain.faces[name]).size)]
+    tags = {name: domain.facet_tags.find(domain.faces[name]).size for name in needed}
+    empty = [name for name, count in tags.items() if not domain.comm.allreduce(count)]
     if empty:
         raise SceneError(f"geometry.shape = {shape.name!r}: the mesh has no facets with the tag of {', '.join(empty)}")
     if not domain.comm.allreduce(bool(np.isfinite(mesh.geometry.x).all()), MPI.LAND):

@@ -66,6 +66,7 @@ def stability(
         raise SceneError(f"remodeling.law = {scene.remodeling.law!r}: nothing remodels, so there is no pass to analyse")
     end_all_ranks_on_exception()
     simulation = Simulation(scene, comm)
+    scene = simulation.scene  # with the kinematics that was chosen
     place = chosen_folder(folder, f"{scene.name}-{NAME}", comm)
     steps, share = scene.time.number_of_steps, simulation.stepper.coupling.share
     chosen = {round(steps * (index + 1) / number) for index in range(number)}

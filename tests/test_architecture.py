@@ -25,6 +25,7 @@ TYPES_ONLY = {
     "body.cube": {"body.domain", "body.loading"},
     "body.shape": {"body.domain", "body.loading"},
     "body.tendon": {"body.domain", "body.loading"},
+    "body.tube_reductions": {"body.domain"},
     "body.tube": {"body.domain", "body.loading"},
     "results.recording": {"scene.scene"},
 }

@@ -401,17 +401,10 @@ def body() -> tuple[Scene, Domain]:
     return scene, tube(length=2.0, divisions=(8, 2, 1), comm=SELF)
 
 
-@bad(
-    "meshes",
-    60,
-    "another shape, element or size; faces missing, tags on no facet; nodes NaN or infinite",
-    kind=st.sampled_from(["shape", "face", "tag", "size", "node", "element"]),
-    face=st.sampled_from(Tube.faces),
-    number=st.integers(5, 10**6),
-    size=DIMENSIONS,
-    value=st.sampled_from(ODD_NUMBERS),
-    node=st.integers(0, 40),
-)
+@bad("meshes", 60, "another shape, element or size; faces missing, tags on no facet; nodes NaN or infinite",
+     kind=st.sampled_from(["shape", "face", "tag", "size", "node", "element"]), face=st.sampled_from(Tube.faces),
+     number=st.integers(5, 10**6), size=DIMENSIONS, value=st.sampled_from(ODD_NUMBERS),
+     node=st.integers(0, 40))  # fmt: skip
 def test_a_mesh_of_another_kind(
     body: tuple[Scene, Domain], kind: str, face: str, number: int, size: str, value: float, node: int
 ) -> None:

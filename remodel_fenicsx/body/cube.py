@@ -9,7 +9,8 @@ from pydantic import Field, model_validator
 
 from remodel_fenicsx.body import gmsh_model as model
 from remodel_fenicsx.body.column import Column
-from remodel_fenicsx.body.shape import LoadKind, MeshSettings, Shape, check_lengths, uniaxial_columns
+from remodel_fenicsx.body.reductions import Reduction
+from remodel_fenicsx.body.shape import LoadKind, MeshSettings, Shape, check_lengths, homogeneous_bar, uniaxial_columns
 from remodel_fenicsx.schema.units import FORCE, LENGTH
 
 if TYPE_CHECKING:
@@ -27,11 +28,15 @@ class Cube(Shape):
             lambda shape, loading, name: loading.add_dead_force(name, "z1", component=2),
             "total dead force along z on the top",
             FORCE,
+            reductions=("point",),
         )
     }
     columns: ClassVar[tuple[Column, ...]] = uniaxial_columns("z1", "side")
     number_of_elements: ClassVar[int] = 1
     faces: ClassVar[tuple[str, ...]] = ("x0", "x1", "y0", "y1", "z0", "z1")
+    reductions: ClassVar[dict[str, Reduction]] = {
+        "point": homogeneous_bar("z0", "z1", lambda shape: {"side": shape.side}),
+    }
 
     shape: Literal["cube"] = Field(default="cube", description="Which body it is.")
     side: Annotated[float, LENGTH] = Field(
@@ -41,6 +46,16 @@ class Cube(Shape):
     @property
     def loaded_area(self) -> float:
         """Area that carries `force`."""
+        return self.side**2
+
+    @property
+    def axial_length(self) -> float:
+        """The side."""
+        return self.side
+
+    @property
+    def section_area(self) -> float:
+        """Across z."""
         return self.side**2
 
     @model_validator(mode="after")

@@ -55,13 +55,15 @@ class Loading:
         self._prescribe_face(face, component, self._constant(0.0))
 
     def hold_node(self, point: tuple[float, float, float], component: int) -> None:
-        """u_component = 0 at the mesh node at `point`.
+        """u_component = 0 at the mesh node at `point`, where the body could move as a whole.
 
         Raises
         ------
         ValueError
             If the mesh has no node there.
         """
+        if not self.kinematics.moves_rigidly:
+            return
         tolerance = 1e-9 * self.domain.size
         subspace = self.kinematics.subspace(self.space, component)
         if subspace is None:
@@ -95,6 +97,10 @@ class Loading:
 
     def add_prescribed_elongation(self, name: str, face: str, component: int, length: float) -> None:
         """u_component = elongation * length on a face: the engineering strain of the whole length."""
+        strain = self.kinematics.uniform_strain(component)
+        if strain is not None:
+            self._take(name, strain, 1.0)
+            return
         self._prescribe_face(face, component, self.magnitude(name, length))
 
     def add_term(self, term: Callable[[Any, Any], Any]) -> None:
@@ -112,9 +118,13 @@ class Loading:
     def magnitude(self, name: str, scale: float = 1.0) -> Any:
         """A Constant that is the named load's present magnitude times `scale`: what a term is made of."""
         constant = self._constant(0.0)
-        self._magnitudes.setdefault(name, []).append((constant, scale))
-        self.values[name] = 0.0
+        self._take(name, constant, scale)
         return constant
+
+    def leave_out(self, name: str) -> None:
+        """A load that these kinematics lack and no scene asks for: it has a magnitude, zero, and does nothing."""
+        self._magnitudes.setdefault(name, [])
+        self.values[name] = 0.0
 
     def surface_measure(self, face: str) -> Any:
         """Measure over a named face of the mesh; times `weight` it is one over the body's face."""
@@ -150,6 +160,11 @@ class Loading:
     # ------------------------------------------------------------ inside
     def _constant(self, value: float) -> Any:
         return dolfinx.fem.Constant(self.domain.mesh, PETSc.ScalarType(value))
+
+    def _take(self, name: str, constant: Any, scale: float) -> None:
+        """From now on the constant is the named load's magnitude times `scale`."""
+        self._magnitudes.setdefault(name, []).append((constant, scale))
+        self.values[name] = 0.0
 
     def _prescribe_face(self, face: str, component: int, value: Any) -> None:
         subspace = self.kinematics.subspace(self.space, component)

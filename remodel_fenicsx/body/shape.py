@@ -13,6 +13,7 @@ from pydantic import Field
 
 from remodel_fenicsx.body.column import Column
 from remodel_fenicsx.body.gmsh_model import length_fault
+from remodel_fenicsx.body.reductions import Reduction, homogeneous, known_loads, same_cells, symmetric_law, unturned
 from remodel_fenicsx.schema.tables import Table, fault
 from remodel_fenicsx.schema.units import Dimension, LengthUnit
 from remodel_fenicsx.tissue.cells import angle_to_axis
@@ -55,6 +56,8 @@ class LoadKind:
         Name of its column; default: its own.
     above
         Values must be greater than this.
+    reductions
+        Names of the reduced kinematics that have it.
     """
 
     add: Callable[[Any, Loading, str], None]
@@ -62,6 +65,7 @@ class LoadKind:
     dimension: Dimension | None = None
     column: str = ""
     above: float = -np.inf
+    reductions: tuple[str, ...] = ()
 
     def make_column(self, name: str) -> Column:
         """Its column, for the load of this name."""
@@ -84,6 +88,11 @@ class Shape(Table):
         Hexahedra of the mesh with refinement 1.
     faces
         Names of the faces that supports, loads and columns refer to.
+    reductions
+        What is cheaper than the displacement in three dimensions and exact for some scenes, by name of the kinematics,
+        the cheapest first.
+    ends
+        How the body may be held, by what `supports.ends` says: functions of shape and loading.
     defaults
         Defaults of other tables that this shape changes, under the keys of preset and scene.
     """
@@ -93,6 +102,8 @@ class Shape(Table):
     axis_kinds: ClassVar[tuple[str, ...]] = ("global",)
     number_of_elements: ClassVar[int]
     faces: ClassVar[tuple[str, ...]] = ()
+    reductions: ClassVar[dict[str, Reduction]] = {}
+    ends: ClassVar[dict[str, Callable[[Any, Loading], None]]] = {"free": lambda shape, loading: shape.hold(loading)}
     defaults: ClassVar[dict[str, Any]] = {}
 
     shape: str = Field(description="Which body it is.")
@@ -102,6 +113,16 @@ class Shape(Table):
     def loaded_area(self) -> float:
         """Reference area that carries a force, in the scene's unit of length squared."""
         raise NotImplementedError(f"a {self.name} has no loads of the dimension of a force")
+
+    @property
+    def axial_length(self) -> float:
+        """Length along z, for reduced kinematics."""
+        raise NotImplementedError(f"a {self.name} has no length along z")
+
+    @property
+    def section_area(self) -> float:
+        """Area of every section across z, for reduced kinematics."""
+        raise NotImplementedError(f"a {self.name} has no section across z")
 
     @property
     def name(self) -> str:
@@ -122,13 +143,27 @@ class Shape(Table):
 
     @abstractmethod
     def hold(self, loading: Loading) -> None:
-        """Hold the body as it is held without loads."""
+        """Hold the body as it is held without loads, its ends free."""
 
-    def support(self, loading: Loading) -> None:
-        """Hold the body and add every load that it knows, each zero."""
-        self.hold(loading)
+    def support(self, loading: Loading, ends: str = "free") -> None:
+        """Hold the body and add every load that it knows, each zero.
+
+        Parameters
+        ----------
+        loading
+            Of the body or of its reduction, which has planes of symmetry of its own and may lack a load.
+        ends
+            Of `Shape.ends`.
+        """
+        self.ends[ends](self, loading)
+        kinematics = loading.kinematics
+        for face, component in kinematics.symmetry_planes.items():
+            loading.hold_face(face, component)
         for name, kind in self.loads.items():
-            kind.add(self, loading, name)
+            if kinematics.reduced and kinematics.name not in kind.reductions:
+                loading.leave_out(name)
+            else:
+                kind.add(self, loading, name)
 
     def fibre_angle(self, dimensions: Array, axes: Array, coordinates: Array) -> Array:
         """Angle of the chain direction in degrees; here to the load axis z.
@@ -166,3 +201,25 @@ def uniaxial_columns(top: str, length: str) -> tuple[Column, ...]:
             lambda m: m.quadrature.mean(m.fibre_angle),
         ),
     )
+
+
+def homogeneous_bar(bottom: str, top: str, dimensions: Callable[[Any], dict[str, float]]) -> Reduction:
+    """The reduction "point" of a body between two faces across z, the same strain everywhere: one bar beside the axis.
+
+    Parameters
+    ----------
+    bottom, top
+        Names of the faces.
+    dimensions
+        Function of the shape: the dimensions of its `Domain`.
+    """
+
+    def build(scene: Any, comm: Any = None) -> Domain:
+        from remodel_fenicsx.body.lattice import interval_domain
+
+        shape, length = scene.geometry, scene.geometry.axial_length
+        faces = {bottom: lambda x: np.isclose(x[2], 0.0), top: lambda x: np.isclose(x[2], length)}
+        ends = (length, 0.0, 0.0), (length, 0.0, length)
+        return interval_domain(*ends, 1, scene.mesh.degree, faces, shape.name, dimensions(shape), comm)
+
+    return Reduction(build, lambda scene: 1, (same_cells, symmetric_law, homogeneous, known_loads("point")), unturned)

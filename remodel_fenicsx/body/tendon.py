@@ -11,7 +11,8 @@ from pydantic import Field, model_validator
 
 from remodel_fenicsx.body import gmsh_model as model
 from remodel_fenicsx.body.column import Column
-from remodel_fenicsx.body.shape import LoadKind, MeshSettings, Shape, check_lengths, uniaxial_columns
+from remodel_fenicsx.body.reductions import Reduction
+from remodel_fenicsx.body.shape import LoadKind, MeshSettings, Shape, check_lengths, homogeneous_bar, uniaxial_columns
 from remodel_fenicsx.schema.units import AREA, FORCE, LENGTH
 
 if TYPE_CHECKING:
@@ -37,12 +38,18 @@ class Tendon(Shape):
             lambda shape, loading, name: loading.add_dead_force(name, "top", component=2),
             "total dead force along z on the top",
             FORCE,
+            reductions=("point",),
         )
     }
     columns: ClassVar[tuple[Column, ...]] = uniaxial_columns("top", "length")
     axis_kinds: ClassVar[tuple[str, ...]] = ("global", "cylindrical")
     number_of_elements: ClassVar[int] = 480
     faces: ClassVar[tuple[str, ...]] = ("bottom", "top", "side")
+    reductions: ClassVar[dict[str, Reduction]] = {
+        "point": homogeneous_bar(
+            "bottom", "top", lambda shape: _dimensions(shape.length, shape.area, math.sqrt(shape.area / math.pi))
+        ),
+    }
 
     shape: Literal["tendon"] = Field(default="tendon", description="Which body it is.")
     length: Annotated[float, LENGTH] = Field(
@@ -55,6 +62,16 @@ class Tendon(Shape):
     @property
     def loaded_area(self) -> float:
         """Area that carries `force`."""
+        return self.area
+
+    @property
+    def axial_length(self) -> float:
+        """The length."""
+        return self.length
+
+    @property
+    def section_area(self) -> float:
+        """The area."""
         return self.area
 
     @model_validator(mode="after")
@@ -112,10 +129,14 @@ def tendon(
     """
     model.check_arguments({"length": length, "area": area}, refinement, element, degree)
     model.check_lengths({"length": length, "area": math.sqrt(area)})
-    dimensions = {"length": float(length), "area": float(area), "radius": outer_radius(area, refinement, degree)}
+    dimensions = _dimensions(length, area, outer_radius(area, refinement, degree))
     from remodel_fenicsx.body.meshing import build_domain
 
     return build_domain(lambda: draw_tendon(length, area, refinement, element, degree), "tendon", dimensions, comm)
+
+
+def _dimensions(length: float, area: float, radius: float) -> dict[str, float]:
+    return {"length": float(length), "area": float(area), "radius": float(radius)}
 
 
 def outer_radius(area: float, refinement: int = 1, degree: int = 1) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
@@ -10,6 +11,7 @@ from pydantic import Field, model_validator
 
 from remodel_fenicsx.body import gmsh_model as model
 from remodel_fenicsx.body.column import Column
+from remodel_fenicsx.body.reductions import Reduction
 from remodel_fenicsx.body.shape import Array, LoadKind, MeshSettings, Shape, check_lengths
 from remodel_fenicsx.schema.tables import fault, shown
 from remodel_fenicsx.schema.units import LENGTH, STRESS
@@ -21,7 +23,7 @@ if TYPE_CHECKING:
     from remodel_fenicsx.body.domain import Domain
     from remodel_fenicsx.body.loading import Loading
 
-PAPER = (16, 8, 12)  # the paper's elements around, through the wall, and along
+from remodel_fenicsx.body.tube_reductions import PAPER, REDUCTIONS
 
 
 def _mean_radius(face: str) -> Callable[[Any], float]:
@@ -48,8 +50,8 @@ _ANGLE = "mean of the reference angle, from circumferential (0) to axial (90 deg
 class Tube(Shape):
     """A thick-walled tube about z under inner pressure and axial elongation: the artery of the paper's Fig. 7.
 
-    Its ends stay in their planes and are free to move radially. Inner radius, wall thickness and length: 1e-6 to 1e6,
-    one up to 10,000 times the other.
+    Its ends stay in their planes; they are free to move radially, or clamped (`supports.ends`). Inner radius, wall
+    thickness and length: 1e-6 to 1e6, one up to 10,000 times the other.
     """
 
     loads: ClassVar[dict[str, LoadKind]] = {
@@ -57,12 +59,14 @@ class Tube(Shape):
             lambda shape, loading, name: loading.add_follower_pressure(name, "inner"),
             "pressure on the deformed inner face",
             STRESS,
+            reductions=("radial", "axisymmetric", "sector"),
         ),
         "elongation": LoadKind(
             lambda shape, loading, name: loading.add_prescribed_elongation(name, "top", 2, shape.length),
             "prescribed engineering strain of the length (0.1: 10 % longer)",
             column="axial_elongation",
             above=-1.0,
+            reductions=("radial", "axisymmetric", "sector"),
         ),
     }
     columns: ClassVar[tuple[Column, ...]] = (
@@ -79,6 +83,11 @@ class Tube(Shape):
     axis_kinds: ClassVar[tuple[str, ...]] = ("global", "cylindrical")
     number_of_elements: ClassVar[int] = 1536
     faces: ClassVar[tuple[str, ...]] = ("bottom", "top", "inner", "outer")
+    reductions: ClassVar[dict[str, Reduction]] = REDUCTIONS
+    ends: ClassVar[dict[str, Callable[[Any, Loading], None]]] = {
+        "free": lambda shape, loading: shape.hold(loading),
+        "clamped": lambda shape, loading: shape.clamp(loading),
+    }
     # with global axes a tube of isotropic cells would not stay round in the first step
     defaults: ClassVar[dict[str, Any]] = {"cells": {"axes": "cylindrical"}}
 
@@ -97,7 +106,7 @@ class Tube(Shape):
         return self
 
     def build(self, mesh: MeshSettings, comm: MPI.Intracomm | None = None) -> Domain:
-        """Mesh the tube."""
+        """Mesh the whole tube."""
         size = self.inner_radius, self.outer_radius, self.length
         return tube(*size, mesh.refinement, mesh.element, mesh.degree, comm)
 
@@ -107,6 +116,23 @@ class Tube(Shape):
         loading.hold_node((self.inner_radius, 0.0, 0.0), 1)
         loading.hold_node((-self.inner_radius, 0.0, 0.0), 1)
         loading.hold_node((0.0, self.inner_radius, 0.0), 0)
+
+    def clamp(self, loading: Loading) -> None:
+        """The ends keep their circles: u_z = 0 at the bottom, u_x = u_y = 0 there and at the top."""
+        loading.hold_face("bottom", 2)
+        for face in ("bottom", "top"):
+            for component in (0, 1):
+                loading.hold_face(face, component)
+
+    @property
+    def axial_length(self) -> float:
+        """The length."""
+        return self.length
+
+    @property
+    def section_area(self) -> float:
+        """Of the wall."""
+        return math.pi * (self.outer_radius**2 - self.inner_radius**2)
 
     def fibre_angle(self, dimensions: Array, axes: Array, coordinates: Array) -> Array:
         """Angle of the chain direction in the wall in degrees, from circumferential (0) to axial (90)."""

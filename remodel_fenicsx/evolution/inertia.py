@@ -194,7 +194,7 @@ class Inertia:
         function.x.array[:owned] = vector.array_r
         function.x.scatter_forward()
         amplitude = np.linalg.norm(state.kinematics.nodal_displacement(function), axis=1)
-        nodes = function.function_space.tabulate_dof_coordinates()
+        nodes = state.kinematics.nodal_space(state.unknown).tabulate_dof_coordinates()
         largest = self.equilibrium.comm.allreduce(float(np.max(amplitude, initial=0.0)), MPI.MAX)
         # of nodes that symmetry makes equal the first one in space, whatever the number of ranks
         candidates = [

@@ -14,6 +14,7 @@ from petsc4py import PETSc
 
 from remodel_fenicsx.evolution.equilibrium import Equilibrium, Extension, stress_rounding
 from remodel_fenicsx.fem.petsc_options import ProblemOptions
+from remodel_fenicsx.fem.solver_methods import SMALL
 from remodel_fenicsx.system.interrupts import Interrupted
 
 log = logging.getLogger(__name__)
@@ -103,8 +104,10 @@ class GuardedNewton:
     def __init__(self, equilibrium: Equilibrium, settings: SolverSettings):
         self.equilibrium, self.settings = equilibrium, settings
         self.unknown = equilibrium.state.unknown
-        self._options = ProblemOptions(settings.method, settings.petsc_options, equilibrium.comm.size)
         self._x = self.unknown.x.petsc_vec.duplicate()
+        # problems in three dimensions stay with their method: its numbers shall not depend on their size
+        small = equilibrium.state.kinematics.reduced and self._x.getSize() <= SMALL
+        self._options = ProblemOptions(settings.method, settings.petsc_options, equilibrium.comm.size, small)
         self._residual = self._x.duplicate()
         self._external = self._x.duplicate()
         self._matrix = equilibrium.create_matrix()

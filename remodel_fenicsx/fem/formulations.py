@@ -165,8 +165,8 @@ class Selective:
 
     def on(self, kinematics: Any, unknown: Any, quadrature: Any) -> Dilatation:
         """With J at the points of the rule."""
-        degree = unknown.function_space.ufl_element().degree
-        return _PartsApart(kinematics, unknown, quadrature, self.degrees[quadrature.element_kind, degree])
+        degree = self.degrees[quadrature.element_kind, quadrature.element_degree]
+        return _PartsApart(kinematics, unknown, quadrature, degree)
 
 
 class _PartsApart:
@@ -216,7 +216,7 @@ FORMULATIONS: dict[str, Formulation] = {
     "selective-integration": Selective(
         "the volumetric part of the matrix at fewer points, in linear hexahedra at the centroid; hexahedra do not lock "
         "with it",
-        {("hexahedron", 1): 1, ("hexahedron", 2): 2},
+        {(kind, degree): degree for kind in ("hexahedron", "quadrilateral", "interval") for degree in (1, 2)},
     ),
 }
 """Formulations by the name that a scene gives them."""

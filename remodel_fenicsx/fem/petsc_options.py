@@ -34,13 +34,15 @@ class ProblemOptions:
         The scene's: names without the leading '-'; True for a flag, False to leave one of the method's away.
     ranks
         How many there are.
+    small
+        Whether the problem is a small one (`method_options`).
     """
 
-    def __init__(self, method: str, options: Mapping[str, Any], ranks: int = 1):
+    def __init__(self, method: str, options: Mapping[str, Any], ranks: int = 1, small: bool = False):
         self.prefix = f"{USERS_PREFIX}{next(_numbers)}_"
         self._given = dict(options)
         self._names: set[str] = set()
-        own = method_options(method, ranks)
+        own = method_options(method, ranks, small)
         for key, value in {**own, **options, **_users_options()}.items():
             if value is not False:
                 PETSc.Options().setValue(self.prefix + key, None if value is True else value)

@@ -15,7 +15,11 @@ from numpy.typing import NDArray
 from remodel_fenicsx.fem import jit
 
 # the rule that the element wants; UFL's estimate for this energy is huge
-DEGREES = {("hexahedron", 1): 2, ("hexahedron", 2): 4, ("tetrahedron", 1): 1, ("tetrahedron", 2): 2}
+DEGREES = {
+    **{(kind, degree): 2 * degree for kind in ("interval", "quadrilateral", "hexahedron") for degree in (1, 2)},
+    ("tetrahedron", 1): 1,
+    ("tetrahedron", 2): 2,
+}
 
 
 class Quadrature:
@@ -30,6 +34,8 @@ class Quadrature:
         dolfinx mesh.
     element_degree
         Degree of the displacement element (1 or 2); decides the rule.
+    weight
+        Volume of the body per unit of mesh, a number or UFL (`Kinematics.weight`).
 
     Attributes
     ----------
@@ -37,13 +43,15 @@ class Quadrature:
         Reference coordinates of the points, (elements, points, 3).
     volumes
         Weight of the points in integrals over the body, (elements, points).
+    extent
+        Mean length of an element in every direction of the mesh.
     largest_areas, smallest_areas
         Volume over the least and over the largest extent, (elements,): a stress times these is about the largest and
         the smallest force that it means for a node of the element.
     """
 
-    def __init__(self, mesh: Any, element_degree: int):
-        self.mesh = mesh
+    def __init__(self, mesh: Any, element_degree: int, weight: Any = 1):
+        self.mesh, self.element_degree = mesh, element_degree
         self.element_kind = mesh.topology.cell_name()
         self.degree = DEGREES[self.element_kind, element_degree]
         points, weights = basix.make_quadrature(basix.CellType[self.element_kind], self.degree)
@@ -59,9 +67,18 @@ class Quadrature:
         geometry = self.evaluate(jit.expression(values, self.points, "the geometry"), (4 + len(entries),))
         self.coordinates: NDArray[np.float64] = geometry[..., :3]
         self.volumes: NDArray[np.float64] = np.abs(geometry[..., 3]) * self.weights
+        number = mesh.topology.index_map(mesh.topology.dim).size_global
+        self.extent = float((self.integral(np.ones(self.shape)) / number) ** (1 / mesh.topology.dim))
+        self.volumes = self.volumes * self._values_of(weight)
         lengths = np.linalg.svd(geometry[..., 4:].reshape(*self.shape, *jacobian.ufl_shape), compute_uv=False)
         self.largest_areas: NDArray[np.float64] = (self.volumes / lengths[..., -1]).sum(axis=1)
         self.smallest_areas: NDArray[np.float64] = (self.volumes / lengths[..., 0]).sum(axis=1)
+
+    def _values_of(self, weight: Any) -> Any:
+        """A number, or UFL at the points."""
+        if isinstance(weight, (int, float)):
+            return weight
+        return self.evaluate(jit.expression(weight, self.points, "the volume of the body per unit of mesh"), ())
 
     @property
     def dx(self) -> ufl.Measure:

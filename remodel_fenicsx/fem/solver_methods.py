@@ -28,9 +28,14 @@ ON_SEVERAL_RANKS: dict[str, dict[str, Any]] = {
 }
 
 
-def method_options(method: str, ranks: int) -> dict[str, Any]:
-    """PETSc options of a method on so many ranks."""
+SMALL = 2000  # unknowns up to which MUMPS costs more than all the rest of a problem: then PETSc factorises by itself
+
+
+def method_options(method: str, ranks: int, small: bool = False) -> dict[str, Any]:
+    """PETSc options of a method on so many ranks; `small`: for a problem of up to `SMALL` unknowns, on one rank."""
     options = dict(METHODS[method])
+    if small and ranks == 1 and options.get("pc_factor_mat_solver_type") == "mumps":
+        options |= {"pc_factor_mat_solver_type": "petsc", "mat_mumps_icntl_33": False}
     if ranks > 1:
         options |= ON_SEVERAL_RANKS.get(method, {})
         if options.get("pc_type") == "telescope":

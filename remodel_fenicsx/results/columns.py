@@ -168,7 +168,7 @@ class Measurement:
     @cached_property
     def position(self) -> Array:
         """Deformed place of the local nodes, (nodes, 3)."""
-        nodes: Array = self.state.unknown.function_space.tabulate_dof_coordinates()
+        nodes: Array = self.state.kinematics.nodal_space(self.state.unknown).tabulate_dof_coordinates()
         return nodes + self.displacement
 
     @cached_property
@@ -220,19 +220,20 @@ class _FaceMean:
 
     def __init__(self, observer: Observer, face: str, deformed: bool):
         domain, state = observer.domain, observer.state
-        space = state.unknown.function_space
         # first component of a function of the displacement's space: surely the same order of nodes
-        self.field = dolfinx.fem.Function(space)
+        self.field = dolfinx.fem.Function(state.kinematics.nodal_space(state.unknown))
+        self._size = self.field.function_space.dofmap.index_map_bs
+        value = self.field[0] if self.field.ufl_shape else self.field
         normal = ufl.FacetNormal(domain.mesh)
         F = state.kinematics.deformation_gradient(state.unknown)
         stretched = ufl.cofac(F) * normal if deformed else normal
         weight = ufl.sqrt(ufl.inner(stretched, stretched)) * state.kinematics.weight(domain.mesh)
         measure = state.loading.surface_measure(face)
-        self._weighted, self._area = jit.form(self.field[0] * weight * measure), jit.form(weight * measure)
+        self._weighted, self._area = jit.form(value * weight * measure), jit.form(weight * measure)
         self._comm = domain.comm
 
     def __call__(self, nodal_values: Array) -> float:
-        self.field.x.array.reshape(-1, 3)[:, 0] = nodal_values
+        self.field.x.array.reshape(-1, self._size)[:, 0] = nodal_values
         both = np.array([np.real(dolfinx.fem.assemble_scalar(form)) for form in (self._weighted, self._area)])
         weighted, area = self._comm.allreduce(both, MPI.SUM)
         return float(weighted / area)

@@ -126,7 +126,6 @@ class Fields(Watcher):
         self._displacement = NodalGather(domain, self.state)
         quadrature = self.state.cells.quadrature
         points, elements = domain.gather_mesh()
-        volume = quadrature.integral(np.ones(quadrature.shape))
         self._grid: TransientGrid | None = None
         self._chains: TransientGrid | None = None
         if points is not None and elements is not None:
@@ -139,7 +138,7 @@ class Fields(Watcher):
             self._centres = points[elements].mean(axis=1)
             self._elements = elements
             # a chain reaches half of the smallest mean distance between elements, so that pictures stay readable
-            self._scale = 0.4 * (volume / len(elements)) ** (1 / 3)
+            self._scale = 0.4 * quadrature.extent
 
     # ------------------------------------------------------------ as a watcher
     def started(self, step: Step) -> None:
@@ -212,7 +211,7 @@ class NodalGather:
 
     def __init__(self, domain: Domain, state: State):
         self.domain, self.state = domain, state
-        dofs = state.unknown.function_space.dofmap.list.reshape(-1)
+        dofs = state.kinematics.nodal_space(state.unknown).dofmap.list.reshape(-1)
         nodes = compat.geometry_dofmap(domain.mesh).reshape(-1)
         # the element and the geometry have the same degree: node k of an element is dof k of that element
         self._dof_of_node = np.zeros(len(domain.node_number), dtype=np.int64)

@@ -16,9 +16,10 @@ from typing import Annotated, Any, ClassVar
 from pydantic import BaseModel, Field, SerializeAsAny, model_validator
 
 from remodel_fenicsx.body import SHAPES, Shape
+from remodel_fenicsx.body.reductions import AUTO, objections
 from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.scene.parameters import FORMAT, PRESETS, RENAMED, Cells, Material, Remodeling
-from remodel_fenicsx.scene.settings import Load, Mesh, Model, Output, Solver, Time, nearest_multiples
+from remodel_fenicsx.scene.settings import Load, Mesh, Model, Output, Solver, Supports, Time, nearest_multiples
 from remodel_fenicsx.scene.values import base_material, in_own_units, in_present_format, known_shape
 from remodel_fenicsx.schema.tables import SceneError, Table, checked, fault, quoted, shown, variant_of
 from remodel_fenicsx.schema.times import is_multiple
@@ -65,6 +66,7 @@ class Scene(Table):
     model: Model = Model()
     material: Material = Material()
     cells: Cells = Cells()
+    supports: Supports = Supports()
     loads: dict[str, Load] = {}
     remodeling: Remodeling = Remodeling()
     time: Time
@@ -109,8 +111,13 @@ class Scene(Table):
             largest = math.floor((LARGEST_MESH / geometry.number_of_elements) ** (1 / 3))
             rule = f"must be at most {largest} for a {geometry.name}: more makes over {LARGEST_MESH:g} elements"
             raise fault(rule, "mesh.refinement", self.mesh.refinement)
+        if self.supports.ends not in geometry.ends:
+            rule = f"allowed for shape {geometry.name!r} is " + ", ".join(map(repr, geometry.ends))
+            raise fault(rule, "supports.ends", self.supports.ends)
         for name, load in self.loads.items():
             self._check_load(name, load)
+        if self.model.kinematics != AUTO and (reasons := objections(self, self.model.kinematics)):
+            raise fault("; ".join(reasons), "model.kinematics", self.model.kinematics)
         return self
 
     def _check_load(self, name: str, load: Load) -> None:

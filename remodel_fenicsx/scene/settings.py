@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
+from remodel_fenicsx.body.reductions import AUTO
 from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.fem.solver_methods import METHODS
@@ -50,11 +51,31 @@ class Mesh(Table):
         return self
 
 
+def _kinematics(value: Any) -> Any:
+    if value not in (AUTO, *KINEMATICS):
+        raise fault("allowed are " + ", ".join(map(repr, (AUTO, *KINEMATICS))))
+    return value
+
+
 class Model(Table):
     """Which unknowns describe the deformation."""
 
-    kinematics: Annotated[str, one_of(KINEMATICS)] = Field(
-        default="full", description="'full': the displacement in three dimensions."
+    kinematics: Annotated[str, checked(_kinematics)] = Field(
+        default=AUTO,
+        description="'auto': the cheapest that is exact for the scene; a scene as run has its name. "
+        + "; ".join(f"{name!r}: {kinematics.meaning}" for name, kinematics in KINEMATICS.items())
+        + ". One that would be wrong for the scene is refused with the reason (docs/kinematics.md).",
+        json_schema_extra={"allowed": "one of " + ", ".join(map(repr, (AUTO, *KINEMATICS)))},
+    )
+
+
+class Supports(Table):
+    """How the body is held."""
+
+    ends: str = Field(
+        default="free",
+        description="Ends of a tube: 'free' to move radially in their planes, or 'clamped', which keeps their circles.",
+        json_schema_extra={"allowed": "'free', for a tube also 'clamped'"},
     )
 
 

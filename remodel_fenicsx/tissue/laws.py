@@ -91,6 +91,8 @@ class Law:
     target, follow
         Of laws whose cells tend to a tensor: ``target(drive)`` and ``follow(cells, target, r0, kappa dt)``, of which
         `update` is made. A scheme of second order needs them apart.
+    keeps_symmetry
+        Whether planes of symmetry of cells and drive stay such: False where the law turns an axis to one of two sides.
     share
         Cells that have made a share of a change, from (old, new, factor); `relaxed` where the law has none of its own.
     """
@@ -102,6 +104,7 @@ class Law:
     target: Callable[[Drive], tensor_law.Target] | None = None
     follow: Callable[[UnitCell, tensor_law.Target, Array | float, float], UnitCell] | None = None
     share: Callable[[UnitCell, UnitCell, float], UnitCell] = relaxed
+    keeps_symmetry: bool = False
 
 
 RankedFunction = Callable[[Array, Array, Array, float, float, float], Array]
@@ -131,7 +134,7 @@ def ranked(function: RankedFunction, has_limit: bool = False, of_absolute_time: 
             np.where(active[:, None, None], axes, cells.axes),
         )
 
-    return Law(update, has_limit, of_absolute_time=of_absolute_time)
+    return Law(update, has_limit, of_absolute_time=of_absolute_time, keeps_symmetry=True)
 
 
 def _principal(drive: Drive, previous: Array, pairing: spectral.Pairing) -> tuple[Array, Array]:
@@ -276,7 +279,7 @@ LAWS: dict[str, Law] = {
     "explicit": ranked(explicit, has_limit=True, of_absolute_time=True),
     "rate": ranked(rate),
     "relaxation": ranked(relaxation, has_limit=True),
-    "tensor": Law(tensor, has_limit=True, target=tensor_target, follow=follow_tensor),
+    "tensor": Law(tensor, has_limit=True, target=tensor_target, follow=follow_tensor, keeps_symmetry=True),
     "rotation": Law(rotation, share=turned_in_part),
-    "none": Law(keep, remodels=False),
+    "none": Law(keep, remodels=False, keeps_symmetry=True),
 }

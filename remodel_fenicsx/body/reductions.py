@@ -1,0 +1,219 @@
+"""Which kinematics a scene allows: rules with reasons, and the cheapest kinematics that none of them objects to.
+
+A rule is a function of a scene that returns why a reduced kinematics would be wrong for it, or None. Every shape names
+its own (`Shape.reductions`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from remodel_fenicsx.fem.kinematics import KINEMATICS
+from remodel_fenicsx.tissue.cells import cylindrical_axes, global_axes, initial_dimensions
+from remodel_fenicsx.tissue.laws import LAWS
+
+Rule = Callable[[Any], str | None]
+Turn = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+AUTO = "auto"
+POINTS = {
+    ("interval", 1): 2, ("interval", 2): 3, ("quadrilateral", 1): 4, ("quadrilateral", 2): 9,
+    ("hexahedron", 1): 8, ("hexahedron", 2): 27, ("tetrahedron", 1): 1, ("tetrahedron", 2): 4,
+}  # fmt: skip
+POINTS_OF_THE_REST = 60.0  # what a step costs whatever the mesh, in quadrature points of hexahedra
+OVER_CORRECTED = ("pk2", "finger")  # drivers with which the staggered pass leaves the symmetric solution
+
+
+@dataclass(frozen=True)
+class Reduction:
+    """A kinematics that is exact for some scenes of a shape.
+
+    Attributes
+    ----------
+    build
+        The mesh, from the scene and the communicator.
+    elements
+        How many elements it has, from the scene.
+    rules
+        Why it may be wrong.
+    turn
+        Q (n, 3, 3) for places X (n, 3) of the body: Q^T X lies in, or beside, the part that stands for it.
+    """
+
+    build: Callable[[Any, Any], Any]
+    elements: Callable[[Any], int]
+    rules: tuple[Rule, ...]
+    turn: Turn
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A kinematics for a scene.
+
+    Attributes
+    ----------
+    name
+        Of `KINEMATICS`.
+    objections
+        By name of each cheaper or other reduced kinematics of the shape: why it is not allowed; empty where it is.
+    """
+
+    name: str
+    objections: dict[str, list[str]]
+
+
+def choice(scene: Any) -> Choice:
+    """The scene's kinematics, or the cheapest that it allows where it leaves the choice."""
+    reductions = scene.geometry.reductions  # the cheapest first
+    found = {name: objections(scene, name) for name in reductions}
+    if scene.model.kinematics != AUTO:
+        return Choice(scene.model.kinematics, found)
+    return Choice(next((name for name, reasons in found.items() if not reasons), "full"), found)
+
+
+def objections(scene: Any, name: str) -> list[str]:
+    """Why a kinematics would be wrong for a scene; nothing if it is right."""
+    if not KINEMATICS[name].reduced:
+        return []
+    shape = scene.geometry
+    if name not in shape.reductions:
+        known = " or ".join(map(repr, shape.reductions)) or "none"
+        return [f"a {shape.name} has no such reduction; it has {known}"]
+    return [reason for rule in shape.reductions[name].rules if (reason := rule(scene)) is not None]
+
+
+def explained(scene: Any) -> list[str]:
+    """The choice in words: what it costs, why nothing cheaper, what it cannot show."""
+    made = choice(scene)
+    cost = f" ({_cost(scene, made.name)})" if KINEMATICS[made.name].reduced else ""
+    lines = [f"kinematics {made.name!r}: {KINEMATICS[made.name].meaning}{cost}"]
+    for name, reasons in made.objections.items():
+        if name != made.name:
+            lines.append(f"{name!r}{', allowed' if not reasons else ''} ({_cost(scene, name)})")
+            lines[-1] += "".join(f"{': not allowed: ' if not index else '; '}{r}" for index, r in enumerate(reasons))
+    if KINEMATICS[made.name].reduced and (swinging := _leaves_symmetry(scene)):
+        lines.append(
+            f"{made.name!r} is the symmetric solution; with {swinging} the full body leaves it after a while, because "
+            "the pass over-corrects (docs/theory.md, Stability of the pass)"
+        )
+    return lines
+
+
+def expected_cost(scene: Any, name: str) -> float:
+    """Of a step, in that of the full kinematics; a rough figure from the number of quadrature points."""
+    return _step_cost(scene, name) / _step_cost(scene, "full")
+
+
+def _step_cost(scene: Any, name: str) -> float:
+    """In that of one point of a hexahedron."""
+    kinematics, mesh = KINEMATICS[name], scene.mesh
+    element, number = kinematics.element(mesh.element), scene.geometry.number_of_elements * mesh.refinement**3
+    if element == "tetrahedron":
+        number *= 6
+    if kinematics.reduced:
+        number = scene.geometry.reductions[name].elements(scene)
+    return POINTS_OF_THE_REST + kinematics.cost * number * POINTS[element, mesh.degree]
+
+
+def _cost(scene: Any, name: str) -> str:
+    cost = expected_cost(scene, name)
+    if cost > 0.7:
+        return "about the cost of 'full'"
+    return f"about 1/{float(f'{1 / cost:.1g}'):g} of the cost of 'full'"
+
+
+def _leaves_symmetry(scene: Any) -> str:
+    """What of a scene makes the full body leave the symmetric solution, in words."""
+    remodeling = scene.remodeling
+    if remodeling.coupling != "staggered" or scene.geometry.axis_kinds == ("global",):
+        return ""
+    if remodeling.driver in OVER_CORRECTED and LAWS[remodeling.law].remodels:
+        return f"remodeling.driver = {remodeling.driver!r}"
+    return f"remodeling.law = {remodeling.law!r}" if remodeling.law == "rate" else ""
+
+
+# ---------------------------------------------------------------- where the body's places are in the reduction
+def unturned(places: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The same everywhere."""
+    return global_axes(places)
+
+
+def about_z(places: NDArray[np.float64]) -> NDArray[np.float64]:
+    """x, y, z become the radial, circumferential and axial direction."""
+    circumferential, axial, radial = np.moveaxis(cylindrical_axes(places), -2, 0)
+    return np.stack([radial, circumferential, axial], axis=-1)
+
+
+def mirrored(places: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The quarter x > 0, y > 0 becomes each of the four."""
+    signs = np.where(places < -1e-9 * np.abs(places).max(), -1.0, 1.0)
+    signs[:, 2] = 1.0
+    return signs[:, :, None] * np.eye(3)
+
+
+# ---------------------------------------------------------------- rules
+def same_cells(scene: Any) -> str | None:
+    """Random cells are other ones in every element."""
+    number = scene.geometry.number_of_elements * scene.mesh.refinement**3
+    if scene.cells.initial != "random" or (number == 1 and scene.mesh.element == "hexahedron"):
+        return None
+    return f"cells.initial = 'random' draws other cells for each of {number} elements"
+
+
+def symmetric_law(scene: Any) -> str | None:
+    """A law that turns axes to one of two sides leaves the symmetry of body and loads."""
+    law = scene.remodeling.law
+    return None if LAWS[law].keeps_symmetry else f"remodeling.law = {law!r} may turn axes out of planes of symmetry"
+
+
+def round_about_z(scene: Any) -> str | None:
+    """Cells that are the same in every half-plane through the z axis."""
+    axes, (first, second, _) = scene.cells.axes, _dimensions(scene)
+    if axes == "cylindrical" or (axes == "global" and first == second == 0):
+        return None
+    return f"cells.axes = {axes!r} makes another tube along x than along the diagonal"
+
+
+def symmetric_planes(scene: Any) -> str | None:
+    """Cells whose mirror images in x = 0 and y = 0 are cells of the body."""
+    axes = scene.cells.axes
+    return None if axes in ("cylindrical", "global") else f"cells.axes = {axes!r} may have no planes of symmetry"
+
+
+def homogeneous(scene: Any) -> str | None:
+    """Cells that are the same everywhere, and stay so."""
+    axes, (first, second, third) = scene.cells.axes, _dimensions(scene)
+    if axes == "global":
+        return None
+    if axes != "cylindrical":
+        return f"cells.axes = {axes!r} may make cells that are not the same everywhere"
+    # passes give dimensions to ranks: with l1 = l3 != l2 the cells would differ after the first one
+    stays = first == third and (second == first or not LAWS[scene.remodeling.law].remodels)
+    return None if stays else "cells.axes = 'cylindrical' makes cells, and stress, that are not the same everywhere"
+
+
+def free_ends(scene: Any) -> str | None:
+    """Ends that move radially as all other sections do."""
+    ends = scene.supports.ends
+    return None if ends == "free" else f"supports.ends = {ends!r}: the sections are not alike"
+
+
+def known_loads(name: str) -> Rule:
+    """Loads that the kinematics of this name has."""
+
+    def rule(scene: Any) -> str | None:
+        kinds = scene.geometry.loads
+        unknown = [f"loads.{load}" for load in scene.loads if name not in kinds[load].reductions]
+        return f"{', '.join(unknown)} would have to be applied to the whole body" if unknown else None
+
+    return rule
+
+
+def _dimensions(scene: Any) -> tuple[float, float, float]:
+    """l1, l2, l3 of the first cell at the start."""
+    first, second, third = np.asarray(initial_dimensions(scene.cells, 1)[0], dtype=float)
+    return float(first), float(second), float(third)
