@@ -126,7 +126,9 @@ def resume(
             simulation = _built(scene, comm)
         with _closing(simulation):
             if comm.bcast(checkpoint is not None):
-                restore_state(simulation.state, checkpoint)
+                with hold_log(comm.rank, quiet=quiet) as more:
+                    restore_state(simulation.state, checkpoint)
+                held += more
             _record(simulation, place, _Circumstances(stop, quiet, held, deadline, resumes=True))
     return place
 

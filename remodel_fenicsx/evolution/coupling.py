@@ -15,6 +15,7 @@ from remodel_fenicsx.evolution.equilibrium import Equilibrium
 from remodel_fenicsx.evolution.implicit import Implicit
 from remodel_fenicsx.evolution.newton import GuardedNewton, SolveFailure, SolverSettings
 from remodel_fenicsx.evolution.parts import Change, Work
+from remodel_fenicsx.evolution.predictor import PREDICTORS, LoadStep
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
 from remodel_fenicsx.evolution.state import State
 from remodel_fenicsx.tissue.energy import Tissue
@@ -65,6 +66,7 @@ class Staggered:
         self.equilibrium = Equilibrium(state, tissue)
         self.equilibrium.compile_energy()
         self.newton = GuardedNewton(self.equilibrium, settings)
+        self.predictor = PREDICTORS[settings.predictor](state)
         self.share, self._residual = 1.0, 0.0
         self.blend: Blend | None = None
         if remodeling.law.remodels:
@@ -79,12 +81,15 @@ class Staggered:
         StepFailure
             If no admissible equilibrium is found.
         """
-        work = Work()
+        work, before, old_loads = Work(), self.state.unknown.x.array.copy(), dict(self.state.loading.values)
+        step = LoadStep.between(self.state.time, old_loads, time, loads)
         if self.equilibrium.extension().admissible:
-            self._solve_in_one(time, loads, work)
+            if not self._solved_as_expected(step, loads, work):
+                self._solve_in_one(time, loads, work)
         else:
             log.info("solving in parts: the remodeled cells have r >= L at the old displacement")
-            self._solve_in_parts(time, dict(self.state.loading.values), loads, work, failure=None)
+            self._solve_in_parts(time, old_loads, loads, work, failure=None)
+        self.predictor.solved(step, before)
         self.state.settle_cells()
         self._residual = work.residual
         return work
@@ -102,6 +107,26 @@ class Staggered:
             self.blend.close()
 
     # ------------------------------------------------------------ in one piece: the paper's step
+    def _solved_as_expected(self, step: LoadStep, loads: LoadValues, work: Work) -> bool:
+        """Solve from where the predictor expects the solution; if that fails, all is as before."""
+        unknown, loading = self.state.unknown.x.array, self.state.loading
+        before, old_loads = unknown.copy(), dict(loading.values)
+        loading.set(loads)  # what they prescribe is part of what is expected
+        expected = self.predictor.expected(step)
+        try:
+            if expected is not None:
+                unknown[:] = expected
+            if expected is not None and self.equilibrium.extension().admissible:
+                work.add(self.newton.solve())
+                work.substeps = 1
+                return True
+        except SolveFailure as failure:
+            work.add(failure)
+            log.info("not solved from where it was expected: %s", failure.reason)
+        unknown[:] = before
+        loading.set(old_loads)
+        return False
+
     def _solve_in_one(self, time: float, loads: LoadValues, work: Work) -> None:
         old_loads = dict(self.state.loading.values)
         self.state.loading.set(loads)

@@ -62,7 +62,7 @@ class Earlier:
         for age in range(count):
             function = make()
             function.name = f"{name}_{age}"
-            state.remember(function)
+            state.remember(function, f"{name}_known")
             self._functions.append(function)
         self._numbers = Numbers(state, name, {"known": 0})
 

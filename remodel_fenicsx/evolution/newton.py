@@ -34,6 +34,9 @@ class SolverSettings(Protocol):
     def method(self) -> str: ...
 
     @property
+    def predictor(self) -> str: ...
+
+    @property
     def absolute_tolerance(self) -> float: ...
 
     @property

@@ -54,6 +54,8 @@ class State:
         Time of the last committed step, and how many there were.
     numbers
         What else is remembered from step to step, by name: a coupling puts its own here, its functions by `remember`.
+    counts
+        Functions that a checkpoint may lack, each with the name of the number that is 0 then: how many are known.
     """
 
     def __init__(
@@ -71,6 +73,7 @@ class State:
         self.time, self.number = 0.0, 0
         self.numbers: dict[str, float] = {}
         self._remembered: list[Any] = []
+        self.counts: dict[str, str] = {}
         # the body starts unloaded; a load that is there from t = 0 on comes with the first step
         loading.set(dict.fromkeys(loading.values, 0.0))
 
@@ -85,10 +88,17 @@ class State:
         functions = (self.unknown, cells.dimensions, cells.axes, solved.dimensions, solved.axes)
         return {function.name: function for function in (*functions, *self._remembered)}
 
-    def remember(self, function: Any) -> None:
+    def remember(self, function: Any, count: str | None = None) -> None:
         """From now on a dolfinx function (with a name of its own) is part of the state.
 
         For what a coupling carries from step to step: transactions restore it, checkpoints hold it.
+
+        Parameters
+        ----------
+        function
+            The function.
+        count
+            Name of the number that says how many of its kind are known; with it a checkpoint may lack the function.
 
         Raises
         ------
@@ -98,6 +108,8 @@ class State:
         if function.name in self.functions():
             raise ValueError(f"the state has a function {function.name!r} already")
         self._remembered.append(function)
+        if count is not None:
+            self.counts[function.name] = count
 
     def settle_cells(self) -> None:
         """The present cells are those with which the unknowns are in equilibrium."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time as clock
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +14,8 @@ from remodel_fenicsx.evolution.state import State
 from remodel_fenicsx.evolution.stepper import Step, Watcher
 from remodel_fenicsx.results.checkpoint_file import Array, Checkpoint, CheckpointError, write_checkpoint
 from remodel_fenicsx.system.environment import versions
+
+log = logging.getLogger(__name__)
 
 LONGEST_LOSS = 600.0  # seconds
 SHORTEST_PAUSE = 10.0  # seconds between two that are chosen by time: below it nothing worth a write is lost
@@ -147,20 +150,26 @@ def restore_state(state: State, checkpoint: Checkpoint | None) -> None:
     fault = comm.bcast(fault, root=0)
     if fault is not None:
         raise CheckpointError(fault)
+    kept = comm.bcast(None if checkpoint is None or comm.rank else checkpoint.functions, root=0)
+    missing = [name for name in state.functions() if name not in kept]
     for name, function in state.functions().items():
+        if name in missing:
+            continue
         values = None if checkpoint is None or comm.rank else checkpoint.arrays[f"function/{name}"]
         function.x.array[_places(function)] = domain.scatter_elements(values)
     told = None if checkpoint is None or comm.rank else (checkpoint.loads, checkpoint.time, checkpoint.number)
     numbers = None if checkpoint is None or comm.rank else checkpoint.numbers
     loads, state.time, state.number = comm.bcast(told, root=0)
-    state.numbers = comm.bcast(numbers, root=0)
+    state.numbers = comm.bcast(numbers, root=0) | {state.counts[name]: 0.0 for name in missing}
+    if missing and comm.rank == 0:
+        log.info("what the checkpoint does not hold begins anew: %s", ", ".join(missing))
     state.loading.set(loads)
 
 
 def _fault(state: State, domain: Domain, checkpoint: Checkpoint, mesh: dict[str, Array]) -> str | None:
     """Why the checkpoint is not one of this state."""
-    here, there = list(state.functions()), checkpoint.functions
-    if here != there:
+    here, there = state.functions(), checkpoint.functions
+    if any(name not in there and name not in state.counts for name in here):
         return f"the checkpoint has the functions {', '.join(there)}, this run has {', '.join(here)}"
     if set(checkpoint.loads) != set(state.loading.values):
         return f"the checkpoint has the loads {sorted(checkpoint.loads)}, this run has {sorted(state.loading.values)}"

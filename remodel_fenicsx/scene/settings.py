@@ -184,6 +184,12 @@ class Solver(Table):
     method: Annotated[str, one_of(METHODS)] = Field(
         default="direct", description="'direct': Newton's method, each system factorised."
     )
+    predictor: Literal["none", "autoregressive"] = Field(
+        default="none",
+        description="Where Newton's method starts a step: 'none': at the displacement of the step before; "
+        "'autoregressive': where the last increments let expect the solution. The solutions are the same to the "
+        "tolerance.",
+    )
     absolute_tolerance: Annotated[float, FORCE] = Field(
         default=0.0,
         ge=0,

@@ -1,0 +1,126 @@
+"""Where steps start: a predictor changes the work, not the solution."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from remodel_fenicsx import Recording, Simulation
+from remodel_fenicsx.evolution.newton import GuardedNewton, SolveFailure
+from remodel_fenicsx.evolution.predictor import Autoregressive, LoadStep
+from remodel_fenicsx.results.checkpoint_file import read_checkpoint
+from remodel_fenicsx.running import resume, run
+from tests.parts import pulled_cube
+from tests.test_resume import SELF, rows
+
+RATES = {"force": 2.0}
+PREDICTED = {"predictor": "autoregressive"}
+
+
+@pytest.fixture
+def simulation() -> Any:
+    made = Simulation(pulled_cube(9.0), SELF)
+    yield made
+    made.close()
+
+
+def follow(simulation: Simulation, increments: list[np.ndarray], rates: dict[str, float] = RATES) -> Autoregressive:
+    """A predictor that has seen these, one a step."""
+    state = simulation.state
+    predictor = Autoregressive(state)
+    for number, increment in enumerate(increments, start=1):
+        before = state.unknown.x.array.copy()
+        state.unknown.x.array[:] += increment
+        predictor.solved(LoadStep(float(number), 1.0, rates), before)
+    return predictor
+
+
+def alternating(size: int) -> list[np.ndarray]:
+    """A trend, and what alternates from step to step as a staggered pass does."""
+    rng = np.random.default_rng(1)
+    trend, swing = rng.standard_normal((2, size))
+    return [1e-3 * (0.9**k * trend + (-0.8) ** k * swing) for k in range(8)]
+
+
+def test_a_trend_and_a_swing_are_both_continued(simulation: Simulation) -> None:
+    unknown = simulation.state.unknown.x.array
+    increments = alternating(len(unknown))
+    predictor = follow(simulation, increments[:-1])
+    found = predictor.expected(LoadStep(8.0, 1.0, RATES))
+    assert found is not None
+    free = np.isnan(simulation.stepper.coupling.equilibrium.prescribed_values())
+    np.testing.assert_allclose((found - unknown)[free], increments[-1][free], rtol=0, atol=1e-12)
+    assert np.all(found[~free] == 0.0)  # what supports prescribe
+
+
+@pytest.mark.parametrize("step", [LoadStep(8.0, 1.0, {"force": 0.0}), LoadStep(7.5, 0.5, RATES)])
+def test_another_rate_or_step_is_a_new_beginning(simulation: Simulation, step: LoadStep) -> None:
+    unknown = simulation.state.unknown.x.array
+    predictor = follow(simulation, alternating(len(unknown))[:-1])
+    assert predictor.expected(step) is None
+    predictor.solved(step, unknown - 1e-3)
+    found = predictor.expected(LoadStep(step.time + step.duration, step.duration, step.rates))
+    free = np.isnan(simulation.stepper.coupling.equilibrium.prescribed_values())
+    assert found is not None
+    np.testing.assert_allclose((found - unknown)[free], 1e-3, rtol=1e-12)
+
+
+def iterations(folder: Path) -> int:
+    return int(sum(Recording(folder).history["newton_iterations"]))
+
+
+@pytest.fixture(scope="module")
+def predicted(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    scene = pulled_cube(16.0, solver=PREDICTED, output={"fields": False, "checkpoint": 1})
+    return run(scene, tmp_path_factory.mktemp("predicted") / "run", SELF)
+
+
+def test_the_solutions_are_the_same_with_less_work(predicted: Path, tmp_path: Path) -> None:
+    plain = run(pulled_cube(16.0, output={"fields": False}), tmp_path / "plain", SELF)
+    found, expected = Recording(predicted).history, Recording(plain).history
+    for name in ("mean_stretch", "stored_energy", "max_chain_extension", "remodeling_power"):
+        np.testing.assert_allclose(found[name], expected[name], rtol=1e-8, err_msg=name)
+    assert iterations(predicted) <= 0.9 * iterations(plain)
+
+
+def test_it_is_resumed_with_what_it_remembers(predicted: Path, tmp_path: Path) -> None:
+    folder = run(pulled_cube(11.0, solver=PREDICTED, output={"fields": False}), tmp_path / "run", SELF)
+    shutil.copytree(folder, tmp_path / "other")
+    resume(folder, ["time.end=16.0"], SELF)
+    assert rows(folder) == rows(predicted)
+    # and without it, and again with it
+    resume(tmp_path / "other", ["time.end=13.0", "solver.predictor='none'"], SELF)
+    resume(tmp_path / "other", ["time.end=16.0", "solver.predictor='autoregressive'"], SELF)
+    assert (
+        "what the checkpoint does not hold begins anew: predictor_increment_0"
+        in (tmp_path / "other" / "run.log").read_text()
+    )
+    kept, wanted = (read_checkpoint(one) for one in (tmp_path / "other", predicted))
+    assert kept is not None and wanted is not None and kept.numbers["predictor_increment_known"] == 3
+    displacements = [one.arrays["function/displacement"] for one in (kept, wanted)]
+    np.testing.assert_allclose(*displacements, rtol=0, atol=1e-9)
+
+
+def test_what_is_expected_wrongly_costs_no_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not admissible, or a start from which the solve fails: the step is solved as without."""
+    scene = pulled_cube(4.0, solver=PREDICTED, output={"fields": False})
+    plain = run(pulled_cube(4.0, output={"fields": False}), tmp_path / "plain", SELF)
+    monkeypatch.setattr(Autoregressive, "expected", lambda self, step: -50.0 * self.state.unknown.x.array)
+    assert rows(run(scene, tmp_path / "far", SELF)) == rows(plain)
+    solve, failed = GuardedNewton.solve, []
+
+    def failing(newton: GuardedNewton) -> Any:
+        if not failed or failed[-1] != newton.equilibrium.state.number:
+            failed.append(newton.equilibrium.state.number)
+            raise SolveFailure("made to fail", 3, 3, newton.equilibrium.extension())
+        return solve(newton)
+
+    monkeypatch.setattr(Autoregressive, "expected", lambda self, step: self.state.unknown.x.array + 0.0)
+    monkeypatch.setattr(GuardedNewton, "solve", failing)
+    folder = run(scene, tmp_path / "failing", SELF)
+    assert failed == [0, 1, 2, 3] and iterations(folder) == iterations(plain) + 12
+    assert Recording(folder).history["substeps"].tolist()[1:] == [1, 1, 1, 1]
