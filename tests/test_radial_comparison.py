@@ -71,9 +71,8 @@ def test_the_five_load_cases_of_figure_9(setting: Setting) -> None:
     assert np.all(finite_elements(setting).columns["substeps"] == 1)
 
 
-@pytest.mark.parametrize(
-    "setting", [pytest.param(PK2, id="pk2"), pytest.param(FINGER, id="finger", marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("setting", [PK2, FINGER], ids=["pk2", "finger"])
 def test_the_other_drivers(setting: Setting) -> None:
     assert checked(setting).outside < 1.0
     assert beyond_a_shift(setting, 2.0 / CURVED[1] / 8) < 0.3

@@ -30,7 +30,7 @@ def main(description: str | None, arguments: list[str] | None = None) -> int:
         "--jobs", type=int, default=os.cpu_count() or 1, metavar="N", help="cases at a time (all cores)"
     )
     parser.add_argument(
-        "--limit", type=float, default=30, metavar="SECONDS", help="of processor time for one scene (30)"
+        "--limit", type=float, default=120, metavar="SECONDS", help="of processor time for one scene (120)"
     )
     parser.add_argument("--checkout", type=Path, default=PROJECT, metavar="PATH", help="of another version")
     parser.add_argument("--results", type=Path, default=PROJECT / "results" / "stability", help="folder of the results")

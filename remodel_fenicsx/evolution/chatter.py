@@ -24,7 +24,7 @@ ORDER = 3  # of the difference over passes that takes a smooth course away and k
 GAIN = 2.0**ORDER  # by which it magnifies that
 # the beginning of an instability: measured, all bodies that left their solution did so; none that stayed on it
 # (factor of a pass, passes in a row, swing of A over r0^2 after the next)
-GROWTH, GROWING_PASSES, CELL_TOLERANCE = -1.2, 2, 1e-2
+GROWTH, GROWING_PASSES, CELL_TOLERANCE = -1.2, 2, 2e-2
 # its end: random cells swing for ever at single points, each its own way, which the body hardly feels
 SUSTAINED, SUSTAINED_PASSES, BODY_TOLERANCE = -0.9, 3, 0.02  # the same of the displacement, over the displacement
 MOST = 0.5  # of the body

@@ -13,7 +13,7 @@ from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
-JUMP = 0.02  # root mean square over the body of what the resumed cells change in A in one pass, over r0^2
+JUMP = 0.03  # root mean square over the body of what the resumed cells change in A in one pass, over r0^2
 
 
 class Resting(Watcher):
