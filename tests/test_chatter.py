@@ -103,7 +103,7 @@ class Scripted:
     """Sets the cells and the displacement after each pass to A_0 + a smooth course + a swing, instead of a law."""
 
     def __init__(self, factor: float, size: float):
-        self.simulation = cube(1.0, remodeling__kappa=0.0, loads__force__ramp=[[0.0, 1.0]])
+        self.simulation = cube(1.0, loads__force__ramp=[[0.0, 1.0]])
         self.stepper: Stepper = self.simulation.stepper
         (self.watcher,) = (watcher for watcher in self.simulation.warnings if isinstance(watcher, Chatter))
         self.factor, self.size = factor, size
