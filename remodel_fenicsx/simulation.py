@@ -168,7 +168,8 @@ def checked_domain(domain: Domain, scene: Scene) -> Domain:
         wanted = getattr(shape, name, value)
         if not abs(wanted - value) <= 1e-9 * abs(wanted):  # NaN too
             raise SceneError(f"geometry.{name} = {wanted:g}: that of the mesh is {value:g}")
-    empty = [name for name in shape.faces if not domain.comm.allreduce(domain.facet_tags.find(domain.faces[name]).size)]
+    tags = {name: domain.facet_tags.find(domain.faces[name]).size for name in needed}
+    empty = [name for name, count in tags.items() if not domain.comm.allreduce(count)]
     if empty:
         raise SceneError(f"geometry.shape = {shape.name!r}: the mesh has no facets with the tag of {', '.join(empty)}")
     if not domain.comm.allreduce(bool(np.isfinite(mesh.geometry.x).all()), MPI.LAND):
