@@ -55,7 +55,8 @@ def test_cells_that_never_move_have_no_pass(
     needed, before = kernels.number, simulation.cells.structure_tensor().copy()
     list(simulation.steps())
     assert calls.number == passes
-    assert np.array_equal(before, simulation.cells.structure_tensor()) == (passes == 0)
+    if not remodeling or not passes:  # the axis that the law of rotation turns lies along the load already
+        assert np.array_equal(before, simulation.cells.structure_tensor()) == (passes == 0)
     simulation.close()
     if not passes:
         Simulation(scene(cells=cells), SELF).close()
