@@ -143,7 +143,7 @@ class Chatter(Watcher):
     def _rested(self, cells: list[Array]) -> bool:
         """Whether one of the passes has left most cells as they were: what goes on after that jumps (`resting`)."""
         count = self.quadrature.shape
-        same = [np.all((a == b).reshape(*count, -1), axis=-1) for a, b in pairwise(cells[: ORDER + 1])]
+        same = [np.all((a == b).reshape(*count, len(MANDEL)), axis=-1) for a, b in pairwise(cells[: ORDER + 1])]
         return any(self.quadrature.mean(passed.astype(np.float64)) > MOST for passed in same)
 
     def _loads_jump(self, step: Step) -> bool:
