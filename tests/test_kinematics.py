@@ -356,3 +356,17 @@ def test_a_full_run_has_nothing_to_revolve(tmp_path: Path, capsys: pytest.Captur
     folder = run(scene("cube", "full", 1.0), tmp_path / "run", SELF)
     assert cli.main(["revolve", str(folder)]) == 2
     assert "'full': the fields are those of the body already" in capsys.readouterr().err
+
+
+# ---------------------------------------------------------------- what buckles
+@pytest.mark.parametrize(("force", "unstable", "name"), [(10.0, "warn", "point"), (-30.0, "warn", "full")])
+def test_auto_is_full_where_a_load_presses(force: float, unstable: str, name: str) -> None:
+    """The cube under -30 leaves its shape by a mode that a point does not have."""
+    scene = scene_from_dict({
+        "geometry": {"shape": "cube"}, "cells": {"initial": "isotropic"}, "time": {"end": 3.0},
+        "loads": {"force": {"value": force, "ramp": [[0.0, 0.0], [3.0, 1.0]]}},
+    })  # fmt: skip
+    assert choice(scene).name == name
+    assert ("buckle" in " ".join(explained(scene))) == (name == "full")
+    stops = scene.with_values({"solver.unstable": "stop"})
+    assert choice(stops).name == "full" and "modes of the whole body" in " ".join(explained(stops))

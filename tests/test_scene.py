@@ -392,7 +392,7 @@ BAD_SCENES = [
         "solver.petsc_options.ksp_type = ['cg']: must be a string, a finite number, true or false",
     ),
     (CUBE, {"solver.petsc_options": "-ksp_type cg"}, "solver.petsc_options = '-ksp_type cg': must be a table"),
-    (CUBE, {"output.fields": 1}, "output.fields = 1: must be true or false"),
+    (CUBE, {"output.fields": 1}, "output.fields = 1: must be true, false or a list of names of fields"),
     (CUBE, {"output.every": 0}, "output.every = 0: must be a whole number at least 1"),
     # format
     (

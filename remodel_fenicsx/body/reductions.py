@@ -67,11 +67,16 @@ class Choice:
 
 
 def choice(scene: Any) -> Choice:
-    """The scene's kinematics, or the cheapest that it allows where it leaves the choice."""
+    """The scene's kinematics, or the cheapest that it allows where it leaves the choice.
+
+    Under loads that press it chooses none that is reduced: what buckles leaves the symmetry.
+    """
     reductions = scene.geometry.reductions  # the cheapest first
     found = {name: objections(scene, name) for name in reductions}
     if scene.model.kinematics != AUTO:
         return Choice(scene.model.kinematics, found)
+    if pressing(scene):
+        return Choice("full", found)
     return Choice(next((name for name, reasons in found.items() if not reasons), "full"), found)
 
 
@@ -83,7 +88,10 @@ def objections(scene: Any, name: str) -> list[str]:
     if name not in shape.reductions:
         known = " or ".join(map(repr, shape.reductions)) or "none"
         return [f"a {shape.name} has no such reduction; it has {known}"]
-    return [reason for rule in shape.reductions[name].rules if (reason := rule(scene)) is not None]
+    reasons = [reason for rule in shape.reductions[name].rules if (reason := rule(scene)) is not None]
+    if scene.solver.unstable == "stop":
+        reasons.append("solver.unstable = 'stop' asks for modes of the whole body")
+    return reasons
 
 
 def explained(scene: Any) -> list[str]:
@@ -100,7 +108,20 @@ def explained(scene: Any) -> list[str]:
             f"{made.name!r} is the symmetric solution; with {swinging} the full body leaves it after a while, because "
             "the pass over-corrects (docs/theory.md, Stability of the pass)"
         )
+    if names := pressing(scene):
+        words = f"{' and '.join(names)} press: the body may buckle out of the symmetry of a reduction"
+        lines.append(f"{words}{', which this one cannot show' if KINEMATICS[made.name].reduced else ''}")
     return lines
+
+
+def pressing(scene: Any) -> list[str]:
+    """Loads below zero: compression, suction."""
+    factors = {name: [factor for _, factor in load.ramp] for name, load in scene.loads.items()}
+    return [
+        f"loads.{name}"
+        for name, load in scene.loads.items()
+        if scene.geometry.reductions and min(load.value * factor for factor in factors[name]) < 0
+    ]
 
 
 def expected_cost(scene: Any, name: str) -> float:
