@@ -66,7 +66,10 @@ def run_request(request: dict[str, Any]) -> dict[str, Any]:
     start, version = clock.perf_counter(), importlib.import_module("remodel_fenicsx").__version__
     with tempfile.TemporaryDirectory(prefix="remodel-fenicsx-stability-") as folder:
         scene, results = Path(folder) / "scene.toml", Path(folder) / "run"
-        scene.write_text(tomlkit.dumps(in_words_of(version, request["scene"])), encoding="utf-8")
+        tables = in_words_of(version, request["scene"])
+        if not request.get("other"):  # without it scenes without a preset take the cheapest kinematics
+            tables = {"model": {"kinematics": "full"}, **tables}
+        scene.write_text(tomlkit.dumps(tables), encoding="utf-8")
         said = io.StringIO()
         with element_counts(request.get("counts", {})), contextlib.redirect_stderr(said):
             with contextlib.redirect_stdout(io.StringIO()):
