@@ -95,7 +95,7 @@ def diagonal_path(
 
 
 def check_point(case: Case, run: Run) -> Finding:
-    """Stretch and angle by step, and the cells at the end."""
+    """Stretch and angle by step, and the cells at the end; `saddle` is that of another repulsion."""
     scene, times = case.scene, step_times(case.scene)
     r = scene["remodeling"]
     path = diagonal_path(

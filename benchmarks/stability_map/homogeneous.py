@@ -106,12 +106,12 @@ def path_of(scene: dict[str, Any]) -> Path:
 
 def check_point(case: Case, run: Run) -> Finding:
     """Stretch and angle by step, and the cells at the end."""
-    return compared(case.scene, run, path_of(case.scene))
+    path = path_of(case.scene)
+    return compared(case.scene, run, path, saddle(case.scene, path))
 
 
-def compared(scene: dict[str, Any], run: Run, path: Path) -> Finding:
-    """A run held against a path."""
-    unstable = saddle(scene, path)
+def compared(scene: dict[str, Any], run: Run, path: Path, unstable: bool | None = None) -> Finding:
+    """A run held against a path, of which it may be known whether it comes to a saddle."""
     rows = min(len(path.times), len(run.column("time")))
     if rows == 0:
         return Finding(np.inf if run.code == 0 else 0.0, "no row", unstable, not path.ended)
