@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
-import re
 import shlex
 import sys
 import time as clock
@@ -18,6 +17,7 @@ from typing import NoReturn
 import remodel_fenicsx
 from remodel_fenicsx.body.reductions import explained
 from remodel_fenicsx.system import interrupts
+from remodel_fenicsx.system.arguments import positive, wall_time
 from remodel_fenicsx.system.environment import reason_unusable, versions
 from remodel_fenicsx.scene.parameters import PRESETS
 from remodel_fenicsx.scene.scene import Scene, SceneError, preset_scene, read_scene
@@ -81,17 +81,20 @@ def parser() -> argparse.ArgumentParser:
     stability.add_argument(
         "-o", "--output", type=Path, metavar="DIR", help="new or empty folder (default: results/NAME-stability)"
     )
-    stability.add_argument("--times", type=_positive, default=10, metavar="N", help="times to analyse (default: 10)")
+    stability.add_argument("--times", type=positive, default=10, metavar="N", help="times to analyse (default: 10)")
     stability.add_argument("-q", "--quiet", action="store_true", help="no progress")
     stability.set_defaults(resume=None, max_wall_time=None)
     ensemble = scene_command("ensemble", "Run a scene of random cells with many seeds, and with isotropic cells.")
-    ensemble.add_argument("--seeds", type=_positive, default=32, metavar="N", help="how many (default: 32; at least 2)")
-    ensemble.add_argument(
-        "-o", "--output", type=Path, metavar="DIR",
-        help="folder (default: results/NAME-ensemble); what it holds of the same scene is used, and gone on with",
-    )  # fmt: skip
-    ensemble.add_argument("--jobs", type=_positive, metavar="N", help="runs at a time (default: as many as cores)")
-    ensemble.add_argument("-q", "--quiet", action="store_true", help="no progress")
+    ensemble.add_argument("--seeds", type=positive, default=32, metavar="N", help="how many (default: 32; at least 2)")
+    trade = scene_command("trade", "Run a scene with a ladder of settings: what each costs, and how far off it is.")
+    meaning = "wall time for the runs: 90s, 10min, 2h (default: 10min); cheap settings first"
+    trade.add_argument("--budget", type=wall_time, default=600.0, metavar="TIME", help=meaning)
+    meaning = "what it holds of the same scene is used, and gone on with"
+    for study, name in ((ensemble, "ensemble"), (trade, "trade")):
+        folder = f"folder (default: results/NAME-{name}); {meaning}"
+        study.add_argument("-o", "--output", type=Path, metavar="DIR", help=folder)
+        study.add_argument("--jobs", type=positive, metavar="N", help="runs at a time (default: as many as cores)")
+        study.add_argument("-q", "--quiet", action="store_true", help="no progress")
     text = "Say where the run in DIR is, how fast, and whether it is alive."
     status = commands.add_parser("status", help=text, description=text)
     status.add_argument("folder", type=Path, metavar="DIR", help="folder of a run")
@@ -121,21 +124,6 @@ def parser() -> argparse.ArgumentParser:
     return main_parser
 
 
-def wall_time(text: str) -> float:
-    """Seconds of a time such as 90s, 30min, 2h.
-
-    Raises
-    ------
-    ArgumentTypeError
-        If it is none.
-    """
-    found = re.fullmatch(r"([0-9]{1,9}(?:\.[0-9]{1,9})?)\s*(s|min|h|d)", text)
-    seconds = float(found[1]) * {"s": 1, "min": 60, "h": 3600, "d": 86400}[found[2]] if found else 0.0
-    if seconds <= 0:
-        raise argparse.ArgumentTypeError(f"{text!r}: must be a time greater than 0 with its unit: 90s, 30min, 2h, 1.5d")
-    return seconds
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code of docs/commands.md (0, 2, 3, 4, 5, 129, 130, 143)."""
     with interrupts.ending_at_once():
@@ -151,13 +139,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 return 0
             return _fail(f"cannot write to the standard output: {error.strerror}", BAD_ENVIRONMENT)
         return code
-
-
-def _positive(text: str) -> int:
-    number = int(text)
-    if number < 1:
-        raise argparse.ArgumentTypeError(f"{text}: allowed is a whole number at least 1")
-    return number
 
 
 def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -260,29 +241,49 @@ def _missing_for_pictures() -> str | None:
     return f"the environment is not usable: no {missing[0]}; run through ./with-fenicsx" if missing else None
 
 
-def _ensemble(options: argparse.Namespace) -> int:
+def _study(options: argparse.Namespace, task: Callable[[Scene], tuple[Path, str, dict[str, str]]]) -> int:
+    """Several runs that answer one question: `task` makes the folder, the answer in words, and what has failed."""
     scene = read_scene(options.scene, options.set)
     reason = reason_unusable()
     if reason is not None:
         return _fail(f"the environment is not usable: {reason}; run through ./with-fenicsx", BAD_ENVIRONMENT)
-    if options.seeds < 2:
-        return _fail(f"--seeds {options.seeds}: allowed is a whole number at least 2", BAD_INPUT)
     if missing := _missing_for_pictures():
         return _fail(missing, BAD_ENVIRONMENT)
-    from remodel_fenicsx.studies import ensemble as study
-
     try:
         with interrupts.StopRequest(), interrupts.stopping_at_once():
-            folder, found = study.ensemble(scene, options.output, options.seeds, options.jobs, options.quiet)
+            folder, words, failed = task(scene)
     except interrupts.Interrupted as interruption:
         return _fail("stopped; all that is recorded is kept, the same command goes on", interruption.exit_code)
     except OSError as error:
         return _fail(f"cannot write the results: {error}", BAD_ENVIRONMENT)
-    _say(study.in_words(found, study.chosen_times(scene)))
+    _say(words)
     _say(f"results in {folder}")
-    for name, words in found.failed.items():
-        _complain(f"{name} has failed: {words}")
-    return SOLVE_FAILED if found.failed else 0
+    for name, last_words in failed.items():
+        _complain(f"{name} has failed: {last_words}")
+    return SOLVE_FAILED if failed else 0
+
+
+def _ensemble(options: argparse.Namespace) -> int:
+    def task(scene: Scene) -> tuple[Path, str, dict[str, str]]:
+        from remodel_fenicsx.studies import ensemble as study
+
+        if options.seeds < 2:
+            raise SceneError(f"--seeds {options.seeds}: allowed is a whole number at least 2")
+        folder, found = study.ensemble(scene, options.output, options.seeds, options.jobs, options.quiet)
+        return folder, study.in_words(found, study.chosen_times(scene)), found.failed
+
+    return _study(options, task)
+
+
+def _trade(options: argparse.Namespace) -> int:
+    def task(scene: Scene) -> tuple[Path, str, dict[str, str]]:
+        from remodel_fenicsx.studies import trade as study, trade_output
+
+        say = None if options.quiet else _say
+        folder, found = study.trade(scene, options.output, options.budget, options.jobs, say)
+        return folder, trade_output.in_words(found), found.failed
+
+    return _study(options, task)
 
 
 def _end_all(message: str, code: int) -> int:
@@ -331,7 +332,7 @@ def _revolve(options: argparse.Namespace) -> int:
 
 def _validate(options: argparse.Namespace) -> int:
     scene = read_scene(options.scene, options.set)
-    _say(f"{options.scene}: a valid scene ({scene.geometry.name}, {scene.time.number_of_steps} steps)")
+    _say(f"{options.scene}: a valid scene ({scene.geometry.name}, {scene.time.in_words()})")
     _say(scene.summary())
     _say("\n".join(explained(scene)))
     if _rank() == 0:
@@ -382,6 +383,7 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
     "run": _run,
     "stability": _stability,
     "ensemble": _ensemble,
+    "trade": _trade,
     "status": _status,
     "revolve": _revolve,
     "validate": _validate,

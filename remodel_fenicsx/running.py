@@ -210,7 +210,12 @@ def _record(simulation: Simulation, place: Path, around: _Circumstances) -> None
         record = stack.enter_context(_agreed(comm, lambda: RunFolder(place, text, comm.rank, after)))
         stack.enter_context(open_log(place / "run.log", comm.rank, quiet=around.quiet, held=around.held))
         progress = stack.enter_context(
-            Progress(scene.time.number_of_steps, scene.name, -1 if around.quiet else comm.rank, done=state.number)
+            Progress(
+                scene.time.number_of_steps,
+                scene.name,
+                -1 if around.quiet else comm.rank,
+                done=scene.time.progress(state.number, state.time),
+            )
         )
         log.info("scene %s on %d ranks, results in %s", scene.name, comm.size, place)
         log.info("%s", scene.summary())
@@ -220,7 +225,8 @@ def _record(simulation: Simulation, place: Path, around: _Circumstances) -> None
         if scene.output.fields:
             names = field_names(scene.output.fields)
             parts = place, scene.geometry, simulation.stepper, scene.output.every, after and after.time, names
-            watchers.append(stack.enter_context(_agreed(comm, lambda: Fields(*parts))))
+            times = scene.output.times
+            watchers.append(stack.enter_context(_agreed(comm, lambda: Fields(*parts, times))))
         checkpoints = Checkpoints(place, state, text, scene.output.checkpoint, record.flush)
         pause = Pause(comm, place, lambda: around.stop.pause, around.deadline)
         watchers += [record, _Report(scene, progress), checkpoints, pause]
@@ -256,7 +262,7 @@ class _Report(Watcher):
     """Each accepted step in the log and on the terminal."""
 
     def __init__(self, scene: Scene, progress: Progress):
-        self.progress = progress
+        self.progress, self.time = progress, scene.time
         self.loads = [kind.column or name for name, kind in scene.geometry.loads.items()]
 
     def committed(self, step: Step) -> None:
@@ -265,4 +271,5 @@ class _Report(Watcher):
         parts = step.work.substeps
         message = f"time {step.time:g} solved in {parts} parts" if parts > 1 else None
         loads = ", ".join(f"{name} {step.row[name]:.4g}" for name in self.loads if name in step.row)
-        self.progress.step(step.number, step.time, loads, step.work.newton_iterations, message)
+        done = self.time.progress(step.number, step.time)
+        self.progress.step(done, step.time, loads, step.work.newton_iterations, message)

@@ -17,7 +17,9 @@ from remodel_fenicsx.evolution.locking import LockingWarning
 from remodel_fenicsx.evolution.monitor import StabilityWatcher
 from remodel_fenicsx.evolution.resting import Resting
 from remodel_fenicsx.evolution.state import State
+from remodel_fenicsx.evolution.step_control import StepControl
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher, times
+from remodel_fenicsx.evolution.time_error import TimeError
 from remodel_fenicsx.evolution.unit_cells import UnitCells
 from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.fem.kinematics import KINEMATICS
@@ -28,6 +30,8 @@ from remodel_fenicsx.scene import Scene, SceneError
 from remodel_fenicsx.system.interrupts import take_back_signals
 
 log = logging.getLogger(__name__)
+
+TIME_ERROR = "time_error"  # the column
 
 
 class Simulation:
@@ -46,6 +50,8 @@ class Simulation:
     ----------
     domain, unknown, quadrature, cells, loading, state, tissue, stepper, observer
         The parts, each usable by itself (see demos/).
+    control
+        Chooses the steps, where the scene has a tolerance.
     stability, warnings
         Watchers of stability, over-correction and locking; what they remember is part of the state.
 
@@ -78,7 +84,15 @@ class Simulation:
         counted = "negative_eigenvalues" in scene.output.columns
         self.stability = StabilityWatcher(self.stepper, scene.solver.unstable, every_step=counted)
         field_names(scene.output.fields)
-        self.observer = Observer(shape, self.stepper, columns_of(shape, checked_columns(scene.output.columns, shape)))
+        columns = list(checked_columns(scene.output.columns, shape))
+        self.control: StepControl | None = None
+        if scene.time.tolerance is not None:
+            settings = scene.time.tolerance, scene.time.step, scene.stops()
+            self.control = StepControl(self.stepper, shape.fibre_angle, *settings)
+            columns += [TIME_ERROR] if TIME_ERROR not in columns else []
+        elif TIME_ERROR in columns:
+            self.stepper.judge = TimeError(self.stepper, shape.fibre_angle).measure
+        self.observer = Observer(shape, self.stepper, columns_of(shape, columns))
         locks = formulation.locks(scene.mesh.element, scene.mesh.degree)
         self.warnings: list[Watcher] = [LockingWarning(self.stepper, locks)]
         if self.stepper.remodeling.law.remodels:
@@ -107,8 +121,11 @@ class Simulation:
         StepFailure
             If a step has no admissible equilibrium.
         """
+        watchers = [self.stability, self.observer, *self.warnings, *watchers]
+        if self.control is not None:
+            return self.control.march(watchers)
         remaining = list(times(self.scene.time.end, self.scene.time.step))[self.state.number :]
-        return self.stepper.march(remaining, [self.stability, self.observer, *self.warnings, *watchers])
+        return self.stepper.march(remaining, watchers)
 
     def close(self) -> None:
         """Free PETSc's objects and options."""

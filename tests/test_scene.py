@@ -113,9 +113,9 @@ BAD_SCENES = [
         TUBE,
         {"output.pictures!": True},
         "output.'pictures!' = true: unknown key; allowed are output.fields, output.columns, output.every, "
-        "output.checkpoint",
+        "output.times, output.checkpoint",
     ),
-    (TUBE, {"time.x\ny": 1}, "time.'x\\ny' = 1: unknown key; allowed are time.end, time.step"),
+    (TUBE, {"time.x\ny": 1}, "time.'x\\ny' = 1: unknown key; allowed are time.end, time.step, time.tolerance"),
     # material
     (CUBE, {"material.lame_mu": -3.0}, "material.lame_mu = -3.0: must be a finite number greater than 0"),
     (CUBE, {"material.lame_lambda": -0.1}, "material.lame_lambda = -0.1: must be a finite number at least 0"),

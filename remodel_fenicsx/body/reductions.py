@@ -124,10 +124,10 @@ def pressing(scene: Any) -> list[str]:
 
 def expected_cost(scene: Any, name: str) -> float:
     """Of a step, in that of the full kinematics; a rough figure from the number of quadrature points."""
-    return _step_cost(scene, name) / _step_cost(scene, "full")
+    return step_cost(scene, name) / step_cost(scene, "full")
 
 
-def _step_cost(scene: Any, name: str) -> float:
+def step_cost(scene: Any, name: str) -> float:
     """In that of one point of a hexahedron."""
     kinematics, mesh = KINEMATICS[name], scene.mesh
     element, number = kinematics.element(mesh.element), scene.geometry.number_of_elements * mesh.refinement**3

@@ -124,6 +124,11 @@ class Shape(Table):
         """Area of every section across z, for reduced kinematics."""
         raise NotImplementedError(f"a {self.name} has no section across z")
 
+    def depth(self, coordinates: Array) -> Array:
+        """How far places (..., 3) are through the body, from 0 to 1: here along z."""
+        depth: Array = coordinates[..., 2] / self.axial_length
+        return depth
+
     @property
     def name(self) -> str:
         """The shape's name."""

@@ -134,6 +134,12 @@ class Tube(Shape):
         """Of the wall."""
         return math.pi * (self.outer_radius**2 - self.inner_radius**2)
 
+    def depth(self, coordinates: Array) -> Array:
+        """From the inner (0) to the outer face (1); plane faces of elements lie inside of the cylinders."""
+        radii = np.linalg.norm(coordinates[..., :2], axis=-1)
+        depth: Array = np.clip((radii - self.inner_radius) / (self.outer_radius - self.inner_radius), 0.0, 1.0)
+        return depth
+
     def fibre_angle(self, dimensions: Array, axes: Array, coordinates: Array) -> Array:
         """Angle of the chain direction in the wall in degrees, from circumferential (0) to axial (90)."""
         return pitch_angle(dimensions, axes, coordinates)

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from math import comb
+from math import prod
 from typing import Any
 
 import numpy as np
@@ -28,12 +28,19 @@ GROWTH, GROWING_PASSES, CELL_TOLERANCE = -1.2, 2, 2e-2
 # its end: random cells swing for ever at single points, each its own way, which the body hardly feels
 SUSTAINED, SUSTAINED_PASSES, BODY_TOLERANCE = -0.9, 3, 0.02  # the same of the displacement, over the displacement
 MOST = 0.5  # of the body
+UNEVEN = 1.5  # ratio of two steps up to which they are about alike
 LOAD_JUMP = 1e-3  # share of a load by which it may swing itself
 
 
-def _difference(values: Sequence[Any]) -> Any:
-    """The difference of order ORDER over passes, the newest value first: a - 3 b + 3 c - d."""
-    return sum((-1) ** age * comb(ORDER, age) * values[age] for age in range(ORDER + 1))
+def _difference(values: Sequence[Any], times: Sequence[float]) -> Any:
+    """The difference of order ORDER over passes, the newest value first: a - 3 b + 3 c - d.
+
+    Of passes that are not equally far from each other it is the divided difference, made as large.
+    """
+    used = range(ORDER + 1)
+    weights = [prod(1.0 / (times[age] - times[other]) for other in used if other != age) for age in used]
+    total = sum(map(abs, weights))
+    return sum(GAIN * weights[age] / total * values[age] for age in used)
 
 
 @dataclass(frozen=True)
@@ -112,8 +119,8 @@ class Chatter(Watcher):
         self.swing = None
         if self._cells.known > ORDER:
             cells, body = [structure, *self._cells.values], [self.state.unknown.x.array, *self._body.values]
-            self.swing = self._measured(cells, body)
-            tells = not self._loads_jump(step) and not self._rested(cells)
+            self.swing = self._measured(cells, body, [step.time, *self._times])
+            tells = not self._loads_jump(step) and not self._rested(cells) and self._evenly(step)
             self._count("growing", tells and self.swing.cells_factor < GROWTH)
             self._count("sustained", tells and self.swing.body_factor < SUSTAINED)
         self._keep(step, structure)
@@ -140,6 +147,11 @@ class Chatter(Watcher):
             self._numbers[f"time_{age}"] = self._numbers[f"time_{age - 1}"]
         self._numbers["time_0"] = step.time
 
+    @property
+    def _times(self) -> list[float]:
+        """Of the passes that are remembered, the newest first."""
+        return [self._numbers[f"time_{age}"] for age in range(ORDER + 1)]
+
     def _structure(self) -> Array:
         """A at all points, six Mandel components after each other."""
         return mandel.vectors(self.state.cells.structure_tensor().reshape(-1, 3, 3)).ravel()
@@ -153,15 +165,21 @@ class Chatter(Watcher):
         same = [np.all(self._at_points(a == b), axis=-1) for a, b in pairwise(cells[: ORDER + 1])]
         return any(self.quadrature.mean(passed.astype(np.float64)) > MOST for passed in same)
 
-    def _loads_jump(self, step: Step) -> bool:
-        times = [self._numbers[f"time_{age}"] for age in range(ORDER)]
-        earlier = [self.stepper.load_values(time) if time else {} for time in times]  # the body starts unloaded
-        return any(
-            abs(_difference([value, *(loads.get(name, 0.0) for loads in earlier)])) > LOAD_JUMP * GAIN * abs(value)
-            for name, value in step.loads.items()
-        )
+    def _evenly(self, step: Step) -> bool:
+        """Whether the passes are about as far from each other: of others a single jump looks like a swing."""
+        lengths = [later - earlier for later, earlier in pairwise([step.time, *self._times])]
+        return max(lengths) <= UNEVEN * min(lengths)
 
-    def _measured(self, cells: list[Array], body: list[Array]) -> Swing:
+    def _loads_jump(self, step: Step) -> bool:
+        times = self._times[:ORDER]
+        earlier = [self.stepper.load_values(time) if time else {} for time in times]  # the body starts unloaded
+
+        def jump(name: str, value: float) -> float:
+            return abs(_difference([value, *(loads.get(name, 0.0) for loads in earlier)], [step.time, *times]))
+
+        return any(jump(name, value) > LOAD_JUMP * GAIN * abs(value) for name, value in step.loads.items())
+
+    def _measured(self, cells: list[Array], body: list[Array], times: list[float]) -> Swing:
         """Of the last passes, the newest first."""
         owned = self.state.number_of_owned_unknowns
 
@@ -172,8 +190,8 @@ class Chatter(Watcher):
             return float(self.state.comm.allreduce(float(np.dot(a[:owned], b[:owned])), MPI.SUM))
 
         volume = self.quadrature.integral(np.ones(self.quadrature.shape))
-        now, last = _difference(cells), _difference(cells[1:])
-        moved, moved_last, place = _difference(body), _difference(body[1:]), body[0]
+        now, last = _difference(cells, times), _difference(cells[1:], times[1:])
+        moved, moved_last, place = _difference(body, times), _difference(body[1:], times[1:]), body[0]
         return Swing(
             np.sqrt(of_cells(now, now) / volume) / GAIN / self.state.cells.settings.end_to_end_length**2,
             _ratio(of_cells(now, last), of_cells(last, last)),
@@ -208,7 +226,7 @@ class Chatter(Watcher):
 
     def _place(self) -> tuple[float, float, float]:
         """Reference place of the largest swing of the cells."""
-        swing = self._at_points(_difference(self._cells.values))
+        swing = self._at_points(_difference(self._cells.values, self._times))
         return self.quadrature.place_of_largest(np.linalg.norm(swing, axis=-1))
 
 

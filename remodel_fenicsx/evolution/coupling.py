@@ -18,6 +18,7 @@ from remodel_fenicsx.evolution.parts import Change, Work
 from remodel_fenicsx.evolution.predictor import PREDICTORS, LoadStep
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
 from remodel_fenicsx.evolution.state import State
+from remodel_fenicsx.tissue.cells import UnitCell
 from remodel_fenicsx.tissue.energy import Tissue
 from remodel_fenicsx.tissue.tensor_law import Target
 
@@ -38,11 +39,25 @@ class Coupling(Protocol):
         What solved it.
     share
         Share of a pass's change of the cells that is made.
+    order
+        Power of the step with which the error in time falls.
+    accumulates
+        Whether the errors in time of steps add up; where not, a row lags behind.
+    compares
+        Whether `better` is wanted; set it before the first step.
+    better
+        After `remodel`: cells at all points in one row that a better rule gives for the row; None if it has no error.
     """
 
     equilibrium: Equilibrium
     newton: GuardedNewton
     share: float
+    order: int
+    accumulates: bool
+    compares: bool
+
+    @property
+    def better(self) -> UnitCell | None: ...
 
     def solve(self, time: float, loads: LoadValues) -> Work:
         """Bring the state to equilibrium with the loads of `time`; `state.equilibrium_cells` are those of the row."""
@@ -61,13 +76,15 @@ class Staggered:
     loads are applied in parts (docs/theory.md, "Steps that are too large"): the state at the end is the same.
     """
 
+    order, accumulates = 1, False
+
     def __init__(self, state: State, tissue: Tissue, remodeling: RemodelingPass, settings: SolverSettings):
         self.state, self.remodeling, self.settings = state, remodeling, settings
         self.equilibrium = Equilibrium(state, tissue)
         self.equilibrium.compile_energy()
         self.newton = GuardedNewton(self.equilibrium, settings)
         self.predictor = PREDICTORS[settings.predictor](state)
-        self.share, self._residual = 1.0, 0.0
+        self.share, self.compares, self._residual = 1.0, False, 0.0
         self.blend: Blend | None = None
         if remodeling.law.remodels:
             self.blend = Blend(state, tissue, settings)
@@ -99,6 +116,11 @@ class Staggered:
         if not self.remodeling.law.remodels:
             return 0.0
         return self.remodeling.apply(self.state.time, time, self._residual, self.share)
+
+    @property
+    def better(self) -> UnitCell | None:
+        """The cells that the whole pass with the row's own stress asks for: those of the row are a step behind."""
+        return self.remodeling.asked
 
     def close(self) -> None:
         """Free PETSc's objects."""
@@ -181,12 +203,21 @@ class Extrapolated(Staggered):
     the target at its end: it solves, remodels, and solves again. For laws with a `target`.
     """
 
+    order, accumulates = 2, True
+
     def __init__(self, state: State, tissue: Tissue, remodeling: RemodelingPass, settings: SolverSettings):
         super().__init__(state, tissue, remodeling, settings)
         self._targets = state.cells.quadrature.function("targets", (2, 11))  # the last first: E, s, its time
         self._values[..., 10] = NEVER
         state.remember(self._targets)
         self._power = 0.0
+        self._start: UnitCell | None = None  # the cells at the start of the step
+        self._better: UnitCell | None = None
+
+    @property
+    def better(self) -> UnitCell | None:
+        """The cells that the mean of the targets at both ends gives; in the first step the target of its end."""
+        return self._better
 
     @property
     def _values(self) -> Array:
@@ -216,6 +247,8 @@ class Extrapolated(Staggered):
     def remodel(self, time: float) -> float:
         """Remember the target of the solved state; the cells are those of the row."""
         target, values = self.remodeling.target(self._residual), self._values
+        if self.compares:
+            self._better = self.remodeling.followed(self._mean(target), time - self.state.time, self._start)
         values[:, :, 1] = values[:, :, 0]
         if self.state.number == 0:  # its own target has been taken for the whole of the first step
             values[:, :, 1, 10] = NEVER
@@ -223,6 +256,14 @@ class Extrapolated(Staggered):
         values[:, :, 0, 9] = target.share.reshape(values.shape[:2])
         values[:, :, 0, 10] = time
         return self._power
+
+    def _mean(self, target: Target) -> Target:
+        """Of the targets at the start, if there was one, and at the end of the step."""
+        if self.state.number == 0:
+            return target
+        last = self._values.reshape(-1, 2, 11)[:, 0]
+        start = Target(last[:, :9].reshape(-1, 3, 3), last[:, 9])
+        return Target((start.direction + target.direction) / 2, (start.share + target.share) / 2)
 
     def _extrapolated(self, time: float) -> Target:
         last, before = self._values.reshape(-1, 2, 11)[:, 0], self._values.reshape(-1, 2, 11)[:, 1]
@@ -235,6 +276,8 @@ class Extrapolated(Staggered):
     def _follow(self, target: Target, time: float) -> None:
         """Cells after the step; where an extrapolated target would make A indefinite, the last target itself counts."""
         duration = time - self.state.time
+        if self.compares:
+            self._start = UnitCell(*(values.copy() for values in self.state.cells.point_cells[:2]))
         asked = self.remodeling.followed(target, duration)
         lost = ~np.isfinite(asked.dimensions).all(axis=-1)
         if lost.any():

@@ -27,8 +27,8 @@ class Work:
     residual: float = 0.0  # of the last solution, in the unit of force
     held_points: int = 0  # points whose cells do not belong to their stress, of the coupling "implicit"
 
-    def add(self, done: Solution | SolveFailure) -> None:
-        """Count a solve."""
+    def add(self, done: Solution | SolveFailure | Work) -> None:
+        """Count a solve, or the work of a step that was taken back."""
         self.newton_iterations += done.newton_iterations
         self.linear_iterations += done.linear_iterations
         if isinstance(done, Solution):

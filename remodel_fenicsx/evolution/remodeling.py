@@ -144,11 +144,16 @@ class RemodelingPass:
         assert self.law.target is not None
         return self.law.target(self.drive(residual))
 
-    def followed(self, target: Target, duration: float) -> UnitCell:
-        """Cells of all points in one row after a time with this target. Changes nothing."""
+    def followed(self, target: Target, duration: float, cells: UnitCell | None = None) -> UnitCell:
+        """Cells of all points in one row, the present or others, after a time with this target. Changes nothing."""
         assert self.law.follow is not None
         r0 = coefficients.point_values(self.tissue.end_to_end_length, self.quadrature).reshape(-1)
-        return self.law.follow(self.state.cells.point_cells, target, r0, self.settings.kappa * duration)
+        return self.law.follow(cells or self.state.cells.point_cells, target, r0, self.settings.kappa * duration)
+
+    @property
+    def asked(self) -> UnitCell | None:
+        """What the last pass has asked for, whatever share of it was made; None before it."""
+        return self._change[1] if self.law.remodels and self._change is not None else None
 
     def apply(self, time_old: float, time_new: float, residual: float = 0.0, factor: float = 1.0) -> float:
         """Remodel over a step with the stress of the solved state at time_new; returns the power of remodeling.

@@ -35,10 +35,12 @@ class Step:
         Solver work.
     remodeling_power
         Stored energy per time that the remodeling pass released; known once it is complete.
-    seconds
-        Wall time; known once it is complete.
+    seconds, processor_seconds
+        Wall time, and time of this rank's processor; known once it is complete.
     is_last
         Whether it is the last one of the way.
+    time_error
+        Estimated error in time of the solved state, degrees; NaN where nobody estimates it (`time_error.TimeError`).
     negative_eigenvalues
         Of the tangent at the solved state, where somebody has counted them; NaN where not (`monitor.StabilityWatcher`).
     row
@@ -52,7 +54,9 @@ class Step:
     work: Work
     remodeling_power: float = 0.0
     seconds: float = 0.0
+    processor_seconds: float = 0.0
     is_last: bool = False
+    time_error: float = math.nan
     negative_eigenvalues: float = math.nan
     row: dict[str, float] = field(default_factory=dict)
 
@@ -114,6 +118,8 @@ class Stepper:
         # asked on each rank in every solve: the signal (SIGINT, SIGTERM) that should end it, or 0
         self.stop_signal: Callable[[], int] = lambda: 0
         self.coupling.equilibrium.stop_signal = lambda: self.stop_signal()
+        # asked when a step's pass is done; what it raises takes the step back (`step_control`)
+        self.judge: Callable[[Step], object] = lambda step: None
 
     def start(self, watchers: Sequence[Watcher] = ()) -> Step:
         """The present state as the step that watchers see before all others."""
@@ -126,8 +132,19 @@ class Stepper:
                 watcher.started(step)
         return step
 
-    def advance(self, time: float, watchers: Sequence[Watcher] = (), is_last: bool = False) -> Step:
+    def advance(
+        self, time: float, watchers: Sequence[Watcher] = (), is_last: bool = False, rejected: Sequence[Step] = ()
+    ) -> Step:
         """One step: equilibrium with the loads of `time`, and remodeling.
+
+        Parameters
+        ----------
+        time
+            Its end.
+        watchers, is_last
+            Who follows it, and whether it is the last one.
+        rejected
+            Attempts at it that were taken back: their work and seconds are its own.
 
         Raises
         ------
@@ -138,20 +155,25 @@ class Stepper:
         BaseException
             Whatever is raised, by a watcher too: the state is then that of the last committed step.
         """
-        state, start = self.state, clock.perf_counter()
+        state, start, processor_start = self.state, clock.perf_counter(), clock.process_time()
         if time <= state.time:
             raise ValueError(f"time {time!r} does not come after {state.time!r}, that of the last step")
         with state.transaction():
             work = self.coupling.solve(time, self.load_values(time))
             extension = self.coupling.equilibrium.extension()
+            for attempt in rejected:
+                work.add(attempt.work)
             loads = dict(state.loading.values)  # those that nobody has named too
             step = Step(time, state.number + 1, loads, extension, work, is_last=is_last)
             with undone_by_all(watchers, step):
                 for watcher in watchers:
                     watcher.solved(step)
                 step.remodeling_power = self.coupling.remodel(time)
+                step.seconds = clock.perf_counter() - start + sum(attempt.seconds for attempt in rejected)
+                step.processor_seconds = clock.process_time() - processor_start
+                step.processor_seconds += sum(attempt.processor_seconds for attempt in rejected)
+                self.judge(step)
                 state.time, state.number = time, step.number
-                step.seconds = clock.perf_counter() - start
                 for watcher in watchers:
                     watcher.completed(step)
         for watcher in watchers:

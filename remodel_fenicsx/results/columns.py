@@ -18,6 +18,7 @@ from remodel_fenicsx.body.shape import Shape
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
 from remodel_fenicsx.fem import compat, jit
 from remodel_fenicsx.fem.quadrature import Quadrature
+from remodel_fenicsx.results import profile
 
 Array = NDArray[np.float64]
 
@@ -69,6 +70,14 @@ COLUMNS_ON_REQUEST: dict[str, Column] = {
             after_pass=True,
         ),
         Column(
+            "time_error",
+            "degrees",
+            "estimated error in time of the fibre angle, root mean square over the body; there without request with "
+            "`time.tolerance`",
+            lambda m: m.step.time_error,
+            after_pass=True,
+        ),
+        Column(
             "negative_eigenvalues",
             "",
             "negative eigenvalues of the tangent's symmetric part: 0 where the equilibrium is stable",
@@ -80,6 +89,14 @@ COLUMNS_ON_REQUEST: dict[str, Column] = {
             "points at which the coupling 'implicit' found no cells that belong to their stress",
             lambda m: m.step.work.held_points,
         ),
+        Column(
+            "processor_seconds",
+            "s",
+            "time of the first rank's processor in the step: on a machine that others use it says more than `seconds`",
+            lambda m: m.step.processor_seconds,
+            after_pass=True,
+        ),
+        *profile.COLUMNS,
     )
 }
 """Columns that a scene may name in `output.columns`; a script adds its own."""
@@ -164,6 +181,7 @@ class Measurement:
 
     def __init__(self, observer: Observer, step: Step):
         self.step, self.observer = step, observer
+        self._of_step: dict[Any, Any] = {}
         self.domain, self.quadrature, self.state = observer.domain, observer.quadrature, observer.state
 
     @property
@@ -220,6 +238,12 @@ class Measurement:
         if key not in self.observer.tools:
             self.observer.tools[key] = make()
         return self.observer.tools[key]
+
+    def tool_of_step(self, key: Any, make: Callable[[], Any]) -> Any:
+        """What several columns of one step share: made once for the step."""
+        if key not in self._of_step:
+            self._of_step[key] = make()
+        return self._of_step[key]
 
     def _compile_axial_stretch(self) -> Any:
         F = self.state.kinematics.deformation_gradient(self.state.unknown)

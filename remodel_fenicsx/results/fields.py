@@ -23,7 +23,7 @@ from remodel_fenicsx.results.chain_lines import chain_displacement, chain_lines
 from remodel_fenicsx.results.recording import CHAINS, FIELDS, RecordingError
 from remodel_fenicsx.results.vtkhdf import LINE, TransientGrid, cell_type_and_permutation
 from remodel_fenicsx.schema.tables import SceneError
-from remodel_fenicsx.schema.times import SAME_TIME
+from remodel_fenicsx.schema.times import SAME_TIME, same_time
 from remodel_fenicsx.tissue import spectral
 from remodel_fenicsx.tissue.cells import structure_tensor
 
@@ -149,6 +149,8 @@ class Fields(Watcher):
         Where a run goes on: time of the last step that was done. Fields of later ones are dropped.
     names
         Of FIELDS_BY_NAME, what is written; the lines only with "chains".
+    times
+        Further times that are written.
 
     Raises
     ------
@@ -168,7 +170,9 @@ class Fields(Watcher):
         every: int = 1,
         after: float | None = None,
         names: Sequence[str] = FIELDS_BY_NAME,
+        times: Sequence[float] = (),
     ):
+        self.times = tuple(times)
         self.state, self.every, self.names = stepper.state, every, tuple(names)
         self.domain = domain = self.state.loading.domain
         needed = {*self.names, *(OF_CHAINS if "chains" in self.names else ())}
@@ -197,7 +201,8 @@ class Fields(Watcher):
 
     def solved(self, step: Step) -> None:
         """Write the solved state, if it is its turn."""
-        if step.number % self.every == 0 or step.is_last:
+        asked = any(same_time(time, step.time) for time in self.times)
+        if step.number % self.every == 0 or step.is_last or asked:
             self.append(step.time)
 
     def undone(self, step: Step) -> None:

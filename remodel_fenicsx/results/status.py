@@ -36,14 +36,17 @@ def status(folder: Path) -> list[str]:
     scene, history = recording.scene, _rows(recording, lives)
     times = history["time"]
     end, time = scene.time.end, float(times[-1]) if len(times) else 0.0
-    steps, number = scene.time.number_of_steps, max(0, len(times) - 1)
+    number = max(0, len(times) - 1)
+    steps, behind = scene.time.number_of_steps, scene.time.progress(number, time)
+    of = f" of {steps}" if scene.time.tolerance is None else ""
     done = same_time(time, end)
-    lines = [f"{folder}: {scene.name}, step {number} of {steps}, time {time:g} of {end:g}"]
+    lines = [f"{folder}: {scene.name}, step {number}{of}, time {time:g} of {end:g}"]
     seconds = history.get("seconds", np.zeros(0))[1:][-RECENT:]
     rate = float(np.mean(seconds)) if len(seconds) else 0.0
     if lives:
         age = clock.time() - os.stat(folder / HISTORY).st_mtime
-        left = f", {duration(rate * (steps - number))} left" if rate else ""
+        per_step = number / behind if behind else 1.0  # those of a tolerance are longer or shorter than the first
+        left = f", {duration(rate * per_step * (steps - behind))} left" if rate else ""
         lines.append(f"running: {holder or 'a process'}{left}; the last step was done {duration(max(0.0, age))} ago")
     elif done:
         lines.append("finished")

@@ -22,7 +22,6 @@ from remodel_fenicsx.scene.parameters import FORMAT, PRESETS, RENAMED, Cells, Ma
 from remodel_fenicsx.scene.settings import Load, Mesh, Model, Output, Solver, Supports, Time, nearest_multiples
 from remodel_fenicsx.scene.values import base_material, in_own_units, in_present_format, known_shape
 from remodel_fenicsx.schema.tables import SceneError, Table, checked, fault, quoted, shown, variant_of
-from remodel_fenicsx.schema.times import is_multiple
 from remodel_fenicsx.schema.toml import merged, parse_override, put, read_toml, toml_text
 from remodel_fenicsx.schema.units import FORCE, STRESS
 from remodel_fenicsx.tissue.chains import CHAINS
@@ -123,6 +122,7 @@ class Scene(Table):
             raise fault(rule, "supports.ends", self.supports.ends)
         for name, load in self.loads.items():
             self._check_load(name, load)
+        self._check_output_times()
         if self.model.kinematics != AUTO and (reasons := objections(self, self.model.kinematics)):
             raise fault("; ".join(reasons), "model.kinematics", self.model.kinematics)
         return self
@@ -140,7 +140,7 @@ class Scene(Table):
     def _check_load(self, name: str, load: Load) -> None:
         step, key = self.time.step, f"loads.{name}"
         for index, (time, factor) in enumerate(load.ramp):
-            if time <= self.time.end and not is_multiple(time, step):
+            if time <= self.time.end and not self.time.is_hit(time):
                 raise fault(nearest_multiples(time, step, "time.step"), f"{key}.ramp[{index}][0]", time)
             value, above = load.value * factor, self.geometry.loads[name].above
             if value <= above:
@@ -148,6 +148,19 @@ class Scene(Table):
                     f"must be greater than {above:g} at every time; with the factor {shown(factor)} it is {value:.6g}"
                 )
                 raise fault(rule, f"{key}.value", load.value)
+
+    def _check_output_times(self) -> None:
+        for index, time in enumerate(self.output.times):
+            if time > self.time.end:
+                raise fault(f"must be at most time.end = {shown(self.time.end)}", f"output.times[{index}]", time)
+            if not self.time.is_hit(time):
+                rule = nearest_multiples(time, self.time.step, "time.step")
+                raise fault(rule, f"output.times[{index}]", time)
+
+    def stops(self) -> list[float]:
+        """Times at which a step ends, however long steps are: corners of ramps, output.times and the end."""
+        times = {time for load in self.loads.values() for time, _ in load.ramp if 0 < time < self.time.end}
+        return sorted({*times, *self.output.times, self.time.end})
 
     def summary(self) -> str:
         """Stiffness of network and matrix and the largest loads, in one unit and on one line."""

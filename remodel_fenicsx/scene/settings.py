@@ -111,7 +111,8 @@ class Load(Table):
     )
     ramp: Annotated[tuple[tuple[float, float], ...], checked(_ramp)] = Field(
         description="Factor on the value over time, as [time, factor] pairs with increasing times: linear in between, "
-        "held before the first and after the last pair. Times up to time.end must be multiples of time.step.",
+        "held before the first and after the last pair. Times up to time.end must be multiples of time.step; with "
+        "time.tolerance they are hit.",
         json_schema_extra={"allowed": "a list of pairs [time, factor] with increasing times"},
     )
 
@@ -137,8 +138,17 @@ class Load(Table):
 class Time(Table):
     """Simulated time, in the unit of 1/kappa. It starts at 0 with the unloaded body."""
 
-    end: float = Field(gt=0, description="Last time; a whole number of steps.")
-    step: float = Field(default=1.0, gt=0, description="Time between two remodeling passes.")
+    end: float = Field(gt=0, description="Last time; a whole number of steps, or any time with a tolerance.")
+    step: float = Field(
+        default=1.0, gt=0, description="Time between two remodeling passes; with a tolerance the first step."
+    )
+    tolerance: float | None = Field(
+        default=None,
+        gt=0,
+        description="Where it is given, steps are as long as the estimated error in time of the fibre angle, in "
+        "degrees, root mean square over the body, stays below it. Times of ramps and output.times are hit.",
+        json_schema_extra={"allowed": "a number greater than 0, in degrees"},
+    )
 
     @model_validator(mode="after")
     def _whole_number_of_steps(self) -> Time:
@@ -147,14 +157,28 @@ class Time(Table):
         if self.end / self.step > MOST_STEPS:
             rule = f"must be at least time.end / {MOST_STEPS} = {self.end / MOST_STEPS:.6g}"
             raise fault(rule, "step", self.step)
-        if not is_multiple(self.end, self.step):
+        if not self.is_hit(self.end):
             raise fault(nearest_multiples(self.end, self.step, "time.step"), "end", self.end)
         return self
 
     @property
     def number_of_steps(self) -> int:
-        """Number of steps from 0 to the end."""
+        """Number of steps from 0 to the end; with a tolerance the run's own are others."""
         return round(self.end / self.step)
+
+    def is_hit(self, time: float) -> bool:
+        """Whether a step ends at a time, or may end there."""
+        return self.tolerance is not None or is_multiple(time, self.step)
+
+    def progress(self, number: int, time: float) -> int:
+        """How many of `number_of_steps` are behind a step; with a tolerance, by its time."""
+        return number if self.tolerance is None else math.floor(time / self.step * (1 + 1e-12))
+
+    def in_words(self) -> str:
+        """How it is divided."""
+        if self.tolerance is None:
+            return f"{self.number_of_steps} steps"
+        return f"steps of an error below {self.tolerance:g} degrees"
 
 
 def nearest_multiples(time: float, step: float, name: str) -> str:
@@ -239,6 +263,15 @@ def _columns(value: Any) -> Any:
     return tuple(value)
 
 
+def _times(value: Any) -> Any:
+    if not isinstance(value, (list, tuple)) or not all(is_number(time) and time > 0 for time in value):
+        raise fault("must be a list of times above 0")
+    times = tuple(map(float, value))
+    if any(later <= time for time, later in zip(times, times[1:], strict=False)):
+        raise fault("must increase from time to time")
+    return times
+
+
 class Output(Table):
     """What a run writes beside its history table."""
 
@@ -256,6 +289,12 @@ class Output(Table):
         json_schema_extra={"allowed": "a list of names of columns"},
     )
     every: int = Field(default=1, ge=1, description="Write the fields of every n-th step; the last one always.")
+    times: Annotated[tuple[float, ...], checked(_times)] = Field(
+        default=(),
+        description="Times up to time.end that have a row and whose fields are written beside those of every n-th "
+        "step: multiples of time.step; with time.tolerance a step ends there.",
+        json_schema_extra={"allowed": "a list of increasing times above 0"},
+    )
     checkpoint: int | None = Field(
         default=None,
         ge=0,

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import time as clock
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -47,7 +48,12 @@ class Member:
     @property
     def steps_done(self) -> int:
         """How many steps are recorded."""
-        return min(steps_recorded(self.folder), self.scene.time.number_of_steps)
+        if self.scene.time.tolerance is None:
+            return min(steps_recorded(self.folder), self.scene.time.number_of_steps)
+        with suppress(RecordingError):  # none yet, or a row that is being written
+            times = self.history()["time"]
+            return self.scene.time.progress(len(times) - 1, float(times[-1])) if len(times) else 0
+        return 0
 
     def is_complete(self) -> bool:
         """Whether this very scene is recorded to its end.
@@ -72,8 +78,29 @@ class Member:
         return read_history(self.folder)
 
 
-def run_members(members: Sequence[Member], jobs: int, title: str, quiet: bool = False) -> dict[str, str]:
+def run_members(
+    members: Sequence[Member],
+    jobs: int,
+    title: str,
+    quiet: bool = False,
+    deadline: float = math.inf,
+    fits: Callable[[Member], bool] = lambda member: True,
+    finished: Callable[[], None] = lambda: None,
+) -> dict[str, str]:
     """Run what is not complete; returns the last words of those that have failed, by name.
+
+    Parameters
+    ----------
+    members
+        In the order in which they begin.
+    jobs, title, quiet
+        Runs at a time; what progress begins with; no progress.
+    deadline
+        `time.monotonic` at which runs are stopped; what they have recorded stays.
+    fits
+        Asked before a run begins: whether it shall.
+    finished
+        Called when a run has ended.
 
     Raises
     ------
@@ -92,15 +119,19 @@ def run_members(members: Sequence[Member], jobs: int, title: str, quiet: bool = 
             while waiting or running:
                 if stop.number:
                     raise Interrupted(stop.number)
+                if clock.monotonic() > deadline:
+                    break
                 while waiting and len(running) < jobs:
                     member = waiting.pop()
-                    running[member.name] = (member, _started(member))
+                    if fits(member):
+                        running[member.name] = (member, _started(member))
                 for member, child in list(running.values()):
                     code = child.process.poll()
                     if code is not None:
                         del running[member.name]
                         if code != 0:
                             failed[member.name] = child.last_words()
+                        finished()
                 if not quiet:
                     done = sum(member.steps_done for member in members)
                     line.show(f"{100 * done // total} % of {len(members)} runs: {', '.join(running) or 'done'}")

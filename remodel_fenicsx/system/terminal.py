@@ -85,7 +85,7 @@ class Progress:
     def step(
         self, index: int, time: float, load_text: str = "", newton_iterations: int = 0, message: str | None = None
     ) -> None:
-        """Step `index` (1 to total_steps) is done.
+        """Step `index` (1 to total_steps) is done; of steps that are no whole ones, 0 to total_steps.
 
         Parameters
         ----------
@@ -124,7 +124,7 @@ class Progress:
     def _time_left(self, index: int) -> str:
         """The mean of this run's steps so far, times the steps that are left; steps alike take alike long."""
         remaining = self._total - index
-        if remaining < 1:
+        if remaining < 1 or index <= self._done:
             return ""
         return f"{duration((clock.monotonic() - self._start) / (index - self._done) * remaining)} left"
 

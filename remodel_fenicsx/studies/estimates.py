@@ -1,0 +1,225 @@
+"""The errors of settings from what all of them give: the table of a trade, and what it rests on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from remodel_fenicsx.schema.times import same_time
+from remodel_fenicsx.studies.convergence import Limit, limit, pareto, typical
+from remodel_fenicsx.studies.ladder import KINEMATIC, Setting, is_reduced
+
+Array = NDArray[np.float64]
+
+CLOSE = 0.5  # of an error: what is left unknown may be so much of it
+SPREAD = 2.0  # noise of the mean over the seeds that an error must be above
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a setting gives: means over its seeds.
+
+    Attributes
+    ----------
+    setting
+        Which.
+    angles
+        Fibre angles through the body at the times that are compared, (times, places), degrees.
+    lengths
+        Radii or stretch there, (times, columns).
+    seconds
+        Of the processor in the steps of one run.
+    wall_seconds
+        That have passed in them.
+    noise
+        Standard error of the mean of the angles over the seeds, root mean square; 0 of one seed.
+    single
+        Angles and lengths of the first seed alone.
+    """
+
+    setting: Setting
+    angles: Array
+    lengths: Array
+    seconds: float
+    wall_seconds: float
+    noise: float
+    single: tuple[Array, Array]
+
+
+@dataclass(frozen=True)
+class Row:
+    """A row of the table.
+
+    Attributes
+    ----------
+    result
+        The setting and what it gives.
+    angle_error
+        Estimated error of the fibre angle, degrees, root mean square over places and times.
+    length_error
+        The same of radii or stretch: the largest relative one.
+    best
+        Whether no other row is as good for less.
+    doubt
+        Why the estimate is not to be trusted; empty where it is.
+    """
+
+    result: Result
+    angle_error: float
+    length_error: float
+    best: bool = False
+    doubt: str = ""
+
+
+@dataclass(frozen=True)
+class Trade:
+    """The table, and what it rests on.
+
+    Attributes
+    ----------
+    rows
+        The cheapest first.
+    notes
+        Sentences on what was seen: orders, doubts.
+    left_out
+        Names of settings that the budget was too small for.
+    failed
+        Last words of runs that failed, by name.
+    """
+
+    rows: list[Row]
+    notes: list[str]
+    left_out: list[str]
+    failed: dict[str, str]
+
+
+def estimated(results: Sequence[Result]) -> tuple[list[Row], list[str]]:
+    """Rows with errors against the best guess of the exact result, and what it rests on."""
+    notes: list[str] = []
+    results = _on_the_mean(results)
+    fixed = [result for result in results if result.setting.step is not None]
+    if not fixed:
+        return [Row(result, np.nan, np.nan, doubt="nothing to compare with") for result in results], notes
+    finest = min(fixed, key=_fineness)
+    angles, lengths, unknown = finest.angles, finest.lengths, 0.0
+    for factor, (sweep, words) in {"time": _time_sweep(results), "mesh": _mesh_sweep(results)}.items():
+        if not sweep:
+            notes.append(f"{factor}: fewer than two settings of it: its error is in no estimate")
+            unknown = np.inf
+            continue
+        found, found_lengths = limit([r.angles for r in sweep]), limit([r.lengths for r in sweep])
+        # what the sweep has still before it where the finest of all stands
+        ahead = next((r for r in sweep if _same_level(r, finest, factor)), sweep[-1])
+        angles = angles + found.beyond + sweep[-1].angles - ahead.angles
+        lengths = lengths + found_lengths.beyond + sweep[-1].lengths - ahead.lengths
+        notes.append(_words(factor, words, found))
+        if not found.trusted:
+            unknown = max(unknown, typical(found.last)) if np.isfinite(found.last).any() else np.inf
+    rows = [_row(result, angles, lengths, unknown) for result in results]
+    rows.sort(key=lambda row: row.result.seconds)
+    best = pareto([row.result.seconds for row in rows], [row.angle_error for row in rows])
+    notes += _about_kinematics(results)
+    return [replace(row, best=on_front) for row, on_front in zip(rows, best, strict=True)], notes
+
+
+def _row(result: Result, angles: Array, lengths: Array, unknown: float) -> Row:
+    error = typical(result.angles - angles)
+    length = float(np.nanmax(np.abs(result.lengths / lengths - 1)))
+    doubt = ""
+    if unknown > CLOSE * error:
+        doubt = "no order seen" if np.isfinite(unknown) else "a factor was not varied"
+    if SPREAD * result.noise > error:
+        doubt = f"cells' noise {result.noise:.2g}"
+    return Row(result, error, length, doubt=doubt)
+
+
+def _on_the_mean(results: Sequence[Result]) -> list[Result]:
+    """Settings of one seed moved by what the mean over the seeds is beside it, on the mesh that they share."""
+    several = {result.setting.mesh: result for result in results if len(result.setting.seeds) > 1}
+    found = []
+    for result in results:
+        other = several.get(result.setting.mesh)
+        if other is not None and len(result.setting.seeds) == 1:
+            angles = result.angles + other.angles - other.single[0]
+            lengths = result.lengths + other.lengths - other.single[1]
+            result = replace(result, angles=angles, lengths=lengths, noise=other.noise)
+        found.append(result)
+    return found
+
+
+def _fineness(result: Result) -> tuple[float, ...]:
+    """Smaller is finer: the size of elements over their degree, and the step."""
+    _, refinement, degree = result.setting.mesh
+    return (result.setting.step or np.inf) / (refinement * degree**2), not is_reduced(result.setting)
+
+
+def _time_sweep(results: Sequence[Result]) -> tuple[list[Result], str]:
+    """The longest chain of halved steps on one mesh."""
+    chains = []
+    for mesh in {result.setting.mesh for result in results}:
+        steps = {r.setting.step: r for r in results if r.setting.mesh == mesh and r.setting.step is not None}
+        chains.append(_halved({step: result for step, result in steps.items() if step is not None}))
+    found = max(chains, key=len)
+    return (found, f"steps {', '.join(f'{r.setting.step:g}' for r in found)}") if len(found) > 1 else ([], "")
+
+
+def _mesh_sweep(results: Sequence[Result]) -> tuple[list[Result], str]:
+    """The longest chain of doubled refinements with one step and degree; of alike ones that of the higher degree."""
+    chains = []
+    for step, degree in {(r.setting.step, r.setting.mesh[2]) for r in results if r.setting.step is not None}:
+        same = [r for r in results if r.setting.step == step and r.setting.mesh[2] == degree]
+        for kinematics in {r.setting.mesh[0] for r in same}:
+            sizes = {1.0 / r.setting.mesh[1]: r for r in same if r.setting.mesh[0] == kinematics}
+            chains.append(_halved(sizes))
+    found = max(chains, key=lambda chain: (len(chain) > 2, len(chain) > 1, chain[-1].setting.mesh[2], len(chain)))
+    if len(found) < 2:
+        return [], ""
+    words = f"refinements {', '.join(str(r.setting.mesh[1]) for r in found)} of degree {found[-1].setting.mesh[2]}"
+    return found, words
+
+
+def _halved(by_size: dict[float, Result]) -> list[Result]:
+    """The longest chain of sizes that are each half of the one before, the finest last."""
+    chains = []
+    for size in by_size:
+        chain = [size]
+        while (finer := next((s for s in by_size if same_time(2 * s, chain[-1])), None)) is not None:
+            chain.append(finer)
+        chains.append(chain)
+    longest = max(chains, key=lambda chain: (len(chain), -chain[-1]), default=[])
+    return [by_size[size] for size in longest]
+
+
+def _same_level(result: Result, finest: Result, factor: str) -> bool:
+    if factor == "time":
+        return result.setting.step == finest.setting.step
+    return result.setting.mesh[1:] == finest.setting.mesh[1:]
+
+
+def _words(factor: str, words: str, found: Limit) -> str:
+    if found.trusted:
+        return f"{factor}: order {found.order:.2g} ({words}); the finest is {typical(found.beyond):.2g} degrees off"
+    return (
+        f"{factor}: no order seen ({words}), the last two differ by {typical(found.last):.2g} degrees: the estimates "
+        "are differences to the finest, and no better than that"
+    )
+
+
+def _about_kinematics(results: Sequence[Result]) -> list[str]:
+    """Whether the whole body does what a part of it does."""
+    notes = []
+    for result in results:
+        if result.setting.factor != KINEMATIC or is_reduced(result.setting):
+            continue
+        part = next((r for r in results if is_reduced(r.setting) and r.setting.mesh[1:] == result.setting.mesh[1:]
+                     and r.setting.step == result.setting.step), None)  # fmt: skip
+        if part is not None:
+            apart = typical(result.angles - part.angles)
+            notes.append(
+                f"kinematics: {result.setting.mesh[0]} and {part.setting.mesh[0]} on alike elements are {apart:.2g} "
+                "degrees apart; where finer meshes do not bring them together the body has several solutions"
+            )
+    return notes

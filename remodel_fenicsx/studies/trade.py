@@ -1,0 +1,144 @@
+"""`remodel-fenicsx trade SCENE`: what each setting of a scene costs and how far off it is, measured on the scene."""
+
+from __future__ import annotations
+
+import time as clock
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from remodel_fenicsx.results.profile import PROFILE
+from remodel_fenicsx.scene.scene import Scene, SceneError
+from remodel_fenicsx.schema.times import same_time
+from remodel_fenicsx.studies import trade_output
+from remodel_fenicsx.studies.convergence import typical
+from remodel_fenicsx.studies.estimates import Result, Trade, estimated
+from remodel_fenicsx.studies.ladder import Setting, as_run, compared_times, ladder
+from remodel_fenicsx.studies.members import Member, run_members
+from remodel_fenicsx.system.children import cores
+
+NAME = "trade"
+BUDGET = 600.0  # seconds
+
+
+def trade(
+    scene: Scene,
+    folder: Path | str | None = None,
+    budget: float = BUDGET,
+    jobs: int | None = None,
+    say: Callable[[str], None] | None = None,
+) -> tuple[Path, Trade]:
+    """Run a scene with a ladder of settings, and estimate the error of each.
+
+    Parameters
+    ----------
+    scene
+        The user's.
+    folder
+        Default: results/NAME-trade. What is recorded there of the same scene is not run again; runs that were stopped
+        go on.
+    budget
+        Wall time in seconds for the runs of this call: cheap ones first; what would take longer is left out.
+    jobs
+        Runs at a time; default: the number of cores.
+    say
+        Takes a line whenever a setting is done.
+
+    Returns
+    -------
+    The folder with trade.csv, trade.png, a scene of each row in rows/, and the runs; and the table.
+
+    Raises
+    ------
+    SceneError
+        If a folder holds another scene, or if fewer than two settings reach the end.
+    Interrupted
+        If a signal asked for the end: the same call goes on from there.
+    OSError
+        If a file cannot be written.
+    """
+    place = Path(folder or Path("results") / f"{scene.name}-{NAME}")
+    settings = ladder(scene)
+    times = compared_times(scene, settings)
+    members = {
+        setting.name: [
+            Member(f"{setting.name}-{seed}", as_run(setting, seed, times), place / f"{setting.name}-{seed}")
+            for seed in setting.seeds
+        ]
+        for setting in settings
+    }
+    runner = _Runner(settings, members, times, budget, say)
+    failed = runner.run(jobs or cores(), f"{scene.name} {NAME}")
+    results = runner.results()
+    if len(results) < 2:
+        words = "; ".join(f"{name}: {text}" for name, text in failed.items())
+        raise SceneError(f"{len(results)} settings reached the end within the budget, at least 2 are needed ({words})")
+    rows, notes = estimated(results)
+    left = [setting.name for setting in settings if setting.name not in {row.result.setting.name for row in rows}]
+    found = Trade(rows, notes, [name for name in left if not any(key.startswith(name) for key in failed)], failed)
+    trade_output.write(found, place, scene)
+    return place, found
+
+
+class _Runner:
+    """The runs of a study in the order of their cost, within a budget."""
+
+    def __init__(
+        self,
+        settings: Sequence[Setting],
+        members: dict[str, list[Member]],
+        times: list[float],
+        budget: float,
+        say: Callable[[str], None] | None,
+    ):
+        self.settings, self.members, self.times, self.say = settings, members, times, say
+        self.deadline = clock.monotonic() + budget
+        self._results: dict[str, Result] = {}
+        self._pace: dict[str, float] = {}  # seconds over those expected, by kinematics
+
+    def run(self, jobs: int, title: str) -> dict[str, str]:
+        """All that fits; returns the last words of those that failed."""
+        self._finished()
+        every = [member for setting in self.settings for member in self.members[setting.name]]
+        return run_members(every, jobs, title, self.say is None, self.deadline, self._fits, self._finished)
+
+    def results(self) -> list[Result]:
+        """Of the settings all of whose runs have reached the end, the cheapest expected first."""
+        return [self._results[setting.name] for setting in self.settings if setting.name in self._results]
+
+    def _fits(self, member: Member) -> bool:
+        """Whether a run that begins now would end in time."""
+        setting = next(setting for setting in self.settings if member in self.members[setting.name])
+        pace = self._pace.get(setting.scene.model.kinematics, 1.0)
+        return clock.monotonic() + pace * setting.expected_seconds < self.deadline
+
+    def _finished(self) -> None:
+        """Read, say and learn from what is new."""
+        for setting in self.settings:
+            members = self.members[setting.name]
+            if setting.name in self._results or not all(member.is_complete() for member in members):
+                continue
+            result = self._results[setting.name] = read(setting, members, self.times)
+            self._pace[setting.scene.model.kinematics] = max(result.wall_seconds / setting.expected_seconds, 0.1)
+            if self.say is not None:
+                rows, _ = estimated(self.results()) if len(self._results) > 1 else ([], [])
+                error = next((row.angle_error for row in rows if row.result.setting == setting), np.nan)
+                self.say(f"{setting.in_words()}: {result.seconds:.2g} s, so far {error:.2g} degrees")
+
+
+def read(setting: Setting, members: Sequence[Member], times: Sequence[float]) -> Result:
+    """The rows at some times of the runs of a setting."""
+    angles, lengths, seconds, wall = [], [], [], []
+    for member in members:
+        history = member.history()
+        rows = [next(r for r, time in enumerate(history["time"]) if same_time(float(time), t)) for t in times]
+        angles.append(np.array([history[name] for name in PROFILE]).T[rows])
+        known = [column.name for column in setting.scene.geometry.columns if column.name in history]
+        lengths.append(np.array([history[name] for name in known]).T[rows])
+        seconds.append(float(np.nansum(history["processor_seconds"])))
+        wall.append(float(np.nansum(history["seconds"])))
+    noise = np.std(angles, axis=0, ddof=1) / np.sqrt(len(angles)) if len(angles) > 1 else np.zeros(1)
+    single = angles[0], lengths[0]
+    means = np.mean(angles, axis=0), np.mean(lengths, axis=0)
+    return Result(setting, *means, float(np.mean(seconds)), float(np.mean(wall)), typical(noise), single)

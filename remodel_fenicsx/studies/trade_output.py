@@ -1,0 +1,93 @@
+"""The table of a trade: on a terminal, as CSV, as a picture, and a scene for each row."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+from matplotlib import rc_context
+from matplotlib.figure import Figure
+
+from remodel_fenicsx.paper.output import COLOURS, STYLE, Page
+from remodel_fenicsx.scene.scene import Scene
+from remodel_fenicsx.studies.estimates import Row, Trade
+from remodel_fenicsx.system.environment import versions
+
+ROWS = "rows"  # folder of the scenes
+
+
+def in_words(found: Trade) -> str:
+    """The table for a terminal."""
+    head = f"{'':2}{'seconds':>9} {'degrees':>9} {'length %':>9}  setting"
+    lines = [head]
+    for row in found.rows:
+        setting = row.result.setting
+        doubt = f"  ({row.doubt})" if row.doubt else ""
+        lines.append(
+            f"{'* ' if row.best else '  '}{row.result.seconds:9.3g} {row.angle_error:9.2g} "
+            f"{100 * row.length_error:9.2g}  {setting.in_words()}{doubt}"
+        )
+    lines.append("*: no other one is as good for less. Errors are estimates; degrees: fibre angle, root mean square.")
+    lines += found.notes
+    if found.left_out:
+        lines.append(f"left out, over the budget: {', '.join(found.left_out)}")
+    return "\n".join(lines)
+
+
+def write(found: Trade, folder: Path, scene: Scene) -> None:
+    """Write trade.csv, trade.png and a scene of each row."""
+    title = f"{scene.name}: error and cost of its settings"
+    made_with = ", ".join(f"{name} {version}" for name, version in versions().items() if name != "BLAS")
+    page = Page(folder, "trade", title, "Estimated errors; filled: no other setting is as good for less.")
+    rows = found.rows
+    table = {
+        "setting": [row.result.setting.name for row in rows],
+        "seconds": [row.result.seconds for row in rows],
+        "angle_error": [row.angle_error for row in rows],
+        "length_error": [row.length_error for row in rows],
+        "noise": [row.result.noise for row in rows],
+        "best": [int(row.best) for row in rows],
+        "doubt": [row.doubt for row in rows],
+    }
+    page.save_table(table, [title, *found.notes, made_with])
+    (folder / ROWS).mkdir(exist_ok=True)
+    for row in rows:
+        setting = row.result.setting
+        doubt = f" ({row.doubt})" if row.doubt else ""
+        header = (
+            f"{scene.name}: {row.angle_error:.2g} degrees and {100 * row.length_error:.2g} % off for "
+            f"{row.result.seconds:.2g} s, as estimated by remodel-fenicsx trade{doubt}"
+        )
+        (folder / ROWS / f"{setting.name}.toml").write_text(setting.scene.to_toml(header), encoding="utf-8")
+    _draw(page, rows, made_with)
+
+
+def _draw(page: Page, rows: list[Row], made_with: str) -> None:
+    kinds = list(dict.fromkeys(row.result.setting.mesh[0] for row in rows))
+    with rc_context(STYLE):
+        figure = Figure(figsize=(6.0, 4.2), layout="constrained")
+        axes = figure.subplots()
+        for colour, kind in zip(COLOURS, kinds, strict=False):
+            for best in (True, False):
+                shown = [r for r in rows if r.result.setting.mesh[0] == kind and r.best == best and r.angle_error > 0]
+                axes.plot(
+                    [row.result.seconds for row in shown],
+                    [row.angle_error for row in shown],
+                    "o",
+                    color=colour,
+                    markerfacecolor=colour if best else "white",
+                    label=kind if best or not any(r.best for r in rows if r.result.setting.mesh[0] == kind) else None,
+                )
+        front = [row for row in rows if row.best and row.angle_error > 0]
+        axes.plot([r.result.seconds for r in front], [r.angle_error for r in front], color="0.6", zorder=0, lw=0.8)
+        for row in front:
+            _, refinement, degree = row.result.setting.mesh
+            time = row.result.setting.scene.time
+            step = f"step {time.step:g}" if time.tolerance is None else f"{time.tolerance:g} degrees"
+            text = f"{refinement} x, degree {degree}, {step}"
+            at = (row.result.seconds, row.angle_error)
+            axes.annotate(text, at, xytext=(5, 3), textcoords="offset points", fontsize=6.5, color="0.3")
+        axes.set(xscale="log", yscale="log", xlabel="seconds of its steps", ylabel="error of the fibre angle, degrees")
+        if any(math.isfinite(row.angle_error) for row in rows):
+            axes.legend()
+        page.save_figure(figure, made_with)

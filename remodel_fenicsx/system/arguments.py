@@ -1,0 +1,35 @@
+"""Values that are typed on the command line."""
+
+from __future__ import annotations
+
+import argparse
+import re
+
+
+def wall_time(text: str) -> float:
+    """Seconds of a time such as 90s, 30min, 2h.
+
+    Raises
+    ------
+    ArgumentTypeError
+        If it is none.
+    """
+    found = re.fullmatch(r"([0-9]{1,9}(?:\.[0-9]{1,9})?)\s*(s|min|h|d)", text)
+    seconds = float(found[1]) * {"s": 1, "min": 60, "h": 3600, "d": 86400}[found[2]] if found else 0.0
+    if seconds <= 0:
+        raise argparse.ArgumentTypeError(f"{text!r}: must be a time greater than 0 with its unit: 90s, 30min, 2h, 1.5d")
+    return seconds
+
+
+def positive(text: str) -> int:
+    """A whole number from 1 on.
+
+    Raises
+    ------
+    ArgumentTypeError
+        If it is none.
+    """
+    number = int(text)
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"{text}: allowed is a whole number at least 1")
+    return number

@@ -1,0 +1,258 @@
+"""Steps chosen by a tolerance: they keep it, hit what must be hit, and go on as if nothing had happened."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from remodel_fenicsx import Recording, SceneError, Simulation, cli
+from remodel_fenicsx.evolution.parts import StepFailure
+from remodel_fenicsx.evolution.refusals import TOO_LARGE
+from remodel_fenicsx.evolution.stepper import Step, Watcher
+from remodel_fenicsx.running import resume, run
+from remodel_fenicsx.scene.scene import Scene, scene_from_dict
+from remodel_fenicsx.scene.settings import MOST_STEPS, Time
+
+END = 40.0
+COUPLINGS = {
+    "staggered": "kuhl-holzapfel-2007",
+    "relaxed": "kuhl-holzapfel-2007",
+    "extrapolated": "consistent",
+    "implicit": "consistent",
+}
+PRESETS = tuple(dict.fromkeys(COUPLINGS.values()))
+
+
+def tube(coupling: str, end: float = END, **changes: Any) -> Scene:
+    """The wall of the paper's artery, of isotropic cells."""
+    scene = scene_from_dict(
+        {
+            "preset": COUPLINGS[coupling],
+            "geometry": {"shape": "tube"},
+            "model": {"kinematics": "radial"},
+            "cells": {"initial": "isotropic"},
+            "remodeling": {"frame": "material", "coupling": coupling},
+            "output": {"fields": False},
+        }
+    )
+    return scene.with_values({"time.end": end, **changes})
+
+
+class Angles(Watcher):
+    """Fibre angles of the accepted rows by time."""
+
+    def __init__(self, simulation: Simulation):
+        self.simulation, self.by_time = simulation, dict[float, np.ndarray]()
+
+    def committed(self, step: Step) -> None:
+        simulation = self.simulation
+        cells, places = simulation.state.equilibrium_cells, simulation.quadrature.coordinates
+        angles = simulation.scene.geometry.fibre_angle(cells.dimension_values, cells.axis_values, places)
+        self.by_time[step.time] = angles.copy()
+
+
+def marched(scene: Scene) -> tuple[list[Step], Angles]:
+    """All steps, and the angles of their rows."""
+    simulation = Simulation(scene, MPI.COMM_SELF)
+    angles = Angles(simulation)
+    steps = list(simulation.steps([angles]))
+    simulation.close()
+    return steps, angles
+
+
+@pytest.fixture(scope="module")
+def artery() -> dict[str, tuple[list[Step], Angles]]:
+    """One controlled run of each coupling."""
+    return {name: marched(tube(name, **{"time.tolerance": 1.0})) for name in COUPLINGS}
+
+
+def distance(simulation: Simulation, first: np.ndarray, second: np.ndarray) -> float:
+    """Root mean square over the body."""
+    return float(np.sqrt(simulation.quadrature.mean((first - second) ** 2)))
+
+
+@pytest.fixture(scope="module")
+def exact() -> dict[str, dict[float, np.ndarray]]:
+    """Eq. (11) with the implicit coupling has no error in time; of the law `tensor`, small steps of second order."""
+    printed = tube("staggered", **{"remodeling.coupling": "implicit", "time.step": 5.0})
+    tensor = tube("extrapolated", **{"time.step": 0.5})
+    return {preset: marched(scene)[1].by_time for preset, scene in zip(PRESETS, (printed, tensor), strict=True)}
+
+
+@pytest.mark.parametrize("coupling", COUPLINGS)
+def test_the_estimate_is_the_error(
+    coupling: str, artery: dict[str, tuple[list[Step], Angles]], exact: dict[str, dict[float, np.ndarray]]
+) -> None:
+    """At the end of the ramp and of the run; errors that cancel over time are not counted on."""
+    steps, angles = artery[coupling]
+    for time in (25.0, END):
+        step = next(step for step in steps if step.time == time)
+        error = distance(angles.simulation, angles.by_time[time], exact[COUPLINGS[coupling]][time])
+        assert step.time_error / 4 < error < 2.5 * step.time_error, (coupling, time, error, step.time_error)
+
+
+@pytest.mark.parametrize("coupling", COUPLINGS)
+def test_no_step_is_above_the_tolerance_and_few_are_far_below(
+    coupling: str, artery: dict[str, tuple[list[Step], Angles]]
+) -> None:
+    steps, _ = artery[coupling]
+    errors = np.array([step.time_error for step in steps])
+    assert errors.max() <= 1.0
+    assert [step.row["time_error"] for step in steps] == errors.tolist()
+    assert len(steps) < 50 and np.diff([step.time for step in steps])[-3:].max() > 1.5
+
+
+def test_smaller_tolerances_are_smaller_errors(exact: dict[str, dict[float, np.ndarray]]) -> None:
+    """In the proportion of the tolerances, whatever the order."""
+    errors, counts = [], []
+    for tolerance in (0.4, 0.1):
+        steps, angles = marched(tube("extrapolated", **{"time.tolerance": tolerance}))
+        errors.append(distance(angles.simulation, angles.by_time[END], exact["consistent"][END]))
+        counts.append(len(steps))
+    assert 2.5 < errors[0] / errors[1] < 6.5
+    assert counts[1] < 2.8 * counts[0]  # second order: twice as many
+
+
+def test_corners_and_asked_times_are_hit_and_no_step_is_left_over() -> None:
+    asked = (7.3, 33.0)
+    steps, _ = marched(tube("extrapolated", 61.7, **{"time.tolerance": 2.0, "output.times": asked}))
+    times = np.array([step.time for step in steps])
+    assert {*asked, 25.0, 61.7} <= set(times.tolist()) and times[-1] == 61.7
+    lengths = np.diff([0.0, *times])
+    assert (lengths[1:] / lengths[:-1]).min() > 0.2
+    assert [step.is_last for step in steps] == [False] * (len(steps) - 1) + [True]
+
+
+def test_fields_of_asked_times_are_written(tmp_path: Path) -> None:
+    values = {"output.fields": ["displacement"], "output.every": 1000, "output.times": [3.0]}
+    folder = run(tube("staggered", 5.0, **values), tmp_path / "run", MPI.COMM_SELF)
+    assert Recording(folder).times.tolist() == [0.0, 3.0, 5.0]
+
+
+def test_a_rejected_step_leaves_no_trace_but_its_work() -> None:
+    """The rows are those of fixed steps of the same lengths."""
+    first = 20.0
+    scene = tube("staggered", 25.0, **{"time.tolerance": 1.5, "time.step": first, "output.columns": ["inner_radius"]})
+    simulation = Simulation(scene, MPI.COMM_SELF)
+    undone: list[float] = []
+
+    class Undone(Watcher):
+        def undone(self, step: Step) -> None:
+            undone.append(step.time)
+
+    steps = list(simulation.steps([Undone()]))
+    assert undone and undone[0] == 12.5 and steps[0].time < 12.5
+    plain = Simulation(tube("staggered", 25.0, **{"output.columns": ["inner_radius"]}), MPI.COMM_SELF)
+    again = list(plain.stepper.march([step.time for step in steps], [plain.observer]))
+    assert [step.row["inner_radius"] for step in again] == [step.row["inner_radius"] for step in steps]
+    assert steps[0].work.newton_iterations > again[0].work.newton_iterations
+    np.testing.assert_array_equal(plain.cells.dimension_values, simulation.cells.dimension_values)
+
+
+def test_a_run_that_goes_on_takes_the_same_steps(tmp_path: Path) -> None:
+    scene = tube("extrapolated", 40.0, **{"time.tolerance": 0.3, "output.checkpoint": 5})
+    whole = run(scene, tmp_path / "whole", MPI.COMM_SELF)
+    stopped = Simulation(scene, MPI.COMM_SELF)
+    times = [step.time for step in stopped.steps()]
+    stopped.close()
+    rows = (whole / "history.csv").read_text().splitlines(keepends=True)
+    part = tmp_path / "part"
+    with pytest.MonkeyPatch.context() as patch:
+        from remodel_fenicsx.evolution import pause
+        from remodel_fenicsx.system.interrupts import Paused
+
+        def stops(self: pause.Pause, step: Step) -> None:
+            if step.number == 7:
+                raise Paused("stopped by a test", step.time, part)
+
+        patch.setattr(pause.Pause, "committed", stops)
+        with pytest.raises(Paused):
+            run(scene, part, MPI.COMM_SELF)
+    resume(part, comm=MPI.COMM_SELF)
+    assert len(rows) == len(times) + 2
+    first, second = Recording(whole).history, Recording(part).history
+    for name in first:
+        if name != "seconds":
+            np.testing.assert_array_equal(first[name], second[name], err_msg=name)
+    with pytest.raises(SceneError, match=r"time\.tolerance = 0\.5: was 0\.3; a resumed run may change"):
+        resume(part, ["time.tolerance=0.5"], MPI.COMM_SELF)
+
+
+def test_where_no_step_is_short_enough_the_run_goes_on_and_says_so(caplog: pytest.LogCaptureFixture) -> None:
+    """Cells of other lengths than their stress asks for turn over in the first pass, however short it is."""
+    lengths = [0.2, 0.4, float(np.sqrt(0.8))]
+    steps, _ = marched(tube("staggered", 10.0, **{"cells.initial": lengths, "time.tolerance": 0.5}))
+    errors = [step.time_error for step in steps]
+    assert errors[0] > 10.0 and np.median(errors) < 0.5 and len(steps) < 60
+    assert sum("does not fall to time.tolerance" in record.message for record in caplog.records) == 1
+
+
+def test_a_step_that_cannot_be_solved_is_tried_shorter(monkeypatch: pytest.MonkeyPatch) -> None:
+    simulation = Simulation(tube("staggered", 4.0, **{"time.tolerance": 5.0, "time.step": 4.0}), MPI.COMM_SELF)
+    solve = simulation.stepper.coupling.solve
+
+    def fails(time: float, loads: Any) -> Any:
+        if time - simulation.state.time > 1.5:
+            raise StepFailure(time, "too long", TOO_LARGE)
+        return solve(time, loads)
+
+    monkeypatch.setattr(simulation.stepper.coupling, "solve", fails)
+    steps = list(simulation.steps())
+    assert steps[0].time == 1.0 and steps[-1].time == 4.0
+    monkeypatch.setattr(simulation.stepper.coupling, "solve", lambda *_: fails(1e9, {}))
+    simulation.control.stops.append(8.0)  # type: ignore[union-attr]
+    with pytest.raises(StepFailure):
+        list(simulation.steps())
+    assert simulation.state.time == 4.0
+
+
+def test_fixed_steps_tell_their_error_where_it_is_asked_for() -> None:
+    scene = tube("staggered", 5.0, **{"output.columns": ["time_error"]})
+    steps, _ = marched(scene)
+    assert [step.time for step in steps] == [1.0, 2.0, 3.0, 4.0, 5.0]
+    assert all(0.1 < step.row["time_error"] < 1.0 for step in steps)
+    plain, _ = marched(tube("staggered", 5.0))
+    assert "time_error" not in plain[0].row
+    for step, other in zip(steps, plain, strict=True):
+        assert step.row["inner_radius"] == other.row["inner_radius"]
+
+
+def test_nothing_that_remodels_has_no_error() -> None:
+    steps, _ = marched(tube("staggered", 50.0, **{"remodeling.kappa": 0.0, "time.tolerance": 0.1, "time.step": 5.0}))
+    assert [step.time_error for step in steps] == [0.0] * len(steps) and len(steps) < 6
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"time.tolerance": 0.0}, "time.tolerance = 0.0: must be a number greater than 0, in degrees"),
+        ({"output.times": [3.0, 2.0]}, "output.times = [3.0, 2.0]: must increase from time to time"),
+        ({"output.times": [41.0]}, "output.times[0] = 41.0: must be at most time.end = 40.0"),
+        ({"output.times": [2.5]}, "output.times[0] = 2.5: must be a multiple of time.step = 1.0; the nearest"),
+        ({"time.end": 40.5}, "time.end = 40.5: must be a multiple of time.step"),
+    ],
+)
+def test_what_is_refused(changes: dict[str, Any], words: str) -> None:
+    with pytest.raises(SceneError) as caught:
+        tube("staggered", **changes)
+    assert words in str(caught.value)
+
+
+def test_with_a_tolerance_any_time_may_be_hit() -> None:
+    ramp = [[0.0, 0.0], [10.3, 1.0]]
+    scene = tube("staggered", 60.5, **{"time.tolerance": 1.0, "loads.pressure.ramp": ramp})
+    assert scene.stops() == [10.3, 25.0, 60.5]
+    assert Time(end=MOST_STEPS, tolerance=1.0).in_words() == "steps of an error below 1 degrees"
+
+
+def test_studies_of_equal_steps_refuse_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "scene.toml"
+    path.write_text(tube("staggered", **{"time.tolerance": 1.0}).to_toml())
+    assert cli.main(["stability", str(path), "-o", str(tmp_path / "a")]) == 2
+    assert "time.tolerance = 1: the analysis is one of equal steps" in capsys.readouterr().err
+    assert cli.main(["ensemble", str(path), "--set", "cells.initial=random", "--set", "model.kinematics=full"]) == 2
+    assert "time.tolerance = 1: each seed would have other steps" in capsys.readouterr().err

@@ -1,0 +1,178 @@
+"""What settings cost and how far off they are: the estimates, what is said of them, and the command."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from remodel_fenicsx import Recording, cli, read_scene
+from remodel_fenicsx.results.profile import PLACES, weights
+from remodel_fenicsx.scene.scene import Scene, preset_scene
+from remodel_fenicsx.studies import ladder as rungs
+from remodel_fenicsx.studies.convergence import limit, pareto, typical
+from remodel_fenicsx.studies.estimates import Result, Trade, estimated
+from remodel_fenicsx.studies.ladder import Setting, compared_times, ladder
+from remodel_fenicsx.studies.trade_output import in_words
+
+PAPER = "kuhl-holzapfel-2007"
+SMOOTH = np.array([[1.0, 2.0, -1.0], [0.5, 1.0, 0.0]])
+
+
+def artery(**changes: Any) -> Scene:
+    """Isotropic cells."""
+    return preset_scene(PAPER, "tube").with_values({"cells.initial": "isotropic", **changes})
+
+
+def made_up(setting: Setting, noise: float = 0.0, jagged: float = 0.0) -> Result:
+    """A result with an error of first order in the step and of second in the size of elements over their degree."""
+    kinematics, refinement, degree = setting.mesh
+    step = setting.step or setting.scene.time.tolerance or 0.0
+    error = 0.4 * step * SMOOTH + 1.6 / (refinement * degree**2) ** 2 * SMOOTH[:, ::-1]
+    if jagged:
+        error = jagged * np.sin(1e3 * step + refinement) * SMOOTH
+    angles, lengths = 45.0 + error, 2.0 * (1 + 0.01 * error[:, :2])
+    cost = refinement * degree / step * (100.0 if kinematics == "full" else 1.0)
+    return Result(setting, angles, lengths, cost, cost, noise, (angles, lengths))
+
+
+def exact(result: Result) -> float:
+    return typical(result.angles - 45.0)
+
+
+# ---------------------------------------------------------------- estimates
+def test_an_order_is_seen_and_what_is_left_with_it() -> None:
+    for order in (1, 2, 4):
+        found = limit([10.0 + 0.5 ** (order * k) * SMOOTH for k in range(4)])
+        assert found.trusted and found.order == pytest.approx(order)
+        np.testing.assert_allclose(found.beyond, -(0.5 ** (3 * order)) * SMOOTH, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "results",
+    [
+        [SMOOTH, 0 * SMOOTH, SMOOTH],  # to and fro
+        [SMOOTH, 1.1 * SMOOTH, 1.21 * SMOOTH],  # growing
+        [SMOOTH, 0.5 * SMOOTH],  # too few
+        [SMOOTH, 0 * SMOOTH, np.array([[0.3, -0.3, 0.0], [0.0, 0.3, 0.3]])],  # another way
+    ],
+)
+def test_where_no_order_shows_nothing_is_extrapolated(results: list[np.ndarray]) -> None:
+    found = limit(results)
+    assert not found.trusted and not found.beyond.any()
+
+
+def test_estimates_are_the_errors_of_a_smooth_problem() -> None:
+    results = [made_up(setting) for setting in ladder(artery())]
+    rows, notes = estimated(results)
+    for row in rows:
+        assert row.angle_error == pytest.approx(exact(row.result), rel=0.05, abs=2e-3), row.result.setting.name
+        assert not row.doubt
+    assert any(note.startswith("time: order 1 (steps 1, 0.5, 0.25, 0.125)") for note in notes)
+    assert any(note.startswith("mesh: order 2 (refinements 1, 2, 4 of degree 2)") for note in notes)
+
+
+def test_a_budget_that_ends_early_still_estimates_both_factors() -> None:
+    """The finest of each sweep stand beside each other; nothing has both."""
+    results = [made_up(s) for s in ladder(artery()) if s.factor != "both" and s.mesh[0] == "radial"]
+    for row in estimated(results)[0]:
+        assert row.angle_error == pytest.approx(exact(row.result), rel=0.05, abs=2e-3)
+
+
+def test_doubts_are_said() -> None:
+    rows, notes = estimated([made_up(setting, jagged=1.0) for setting in ladder(artery())])
+    assert any("no order seen" in note for note in notes)
+    assert any(row.doubt == "no order seen" for row in rows)
+    rows, _ = estimated([made_up(setting, noise=1.0) for setting in ladder(artery())])
+    assert {row.doubt for row in rows if row.angle_error < 1.0} == {"cells' noise 1"}
+    only_time = [made_up(s) for s in ladder(artery()) if s.mesh == ("radial", 1, 1)]
+    rows, notes = estimated(only_time)
+    assert "mesh: fewer than two settings of it: its error is in no estimate" in notes
+    assert {row.doubt for row in rows} == {"a factor was not varied"}
+
+
+def test_random_cells_are_compared_in_the_mean() -> None:
+    """A step on the cells of one seed is compared with another step on the same cells."""
+    shift = 5.0
+    results = []
+    for setting in ladder(artery(**{"cells.initial": "random"})):
+        result = made_up(setting)
+        single = result.angles + shift, result.lengths
+        if len(setting.seeds) == 1:
+            result = replace(result, angles=result.angles + shift, single=single)
+        else:
+            result = replace(result, noise=0.01, single=single)
+        results.append(result)
+    assert {len(result.setting.seeds) for result in results} == {1, rungs.SEEDS}
+    for row in estimated(results)[0]:
+        assert row.angle_error < 5.0
+
+
+def test_the_front() -> None:
+    assert pareto([1.0, 2.0, 3.0, 3.0], [4.0, 2.0, 3.0, 1.0]) == [True, True, False, True]
+    assert pareto([1.0, 2.0], [np.nan, 1.0]) == [False, True]
+
+
+# ---------------------------------------------------------------- the ladder
+def test_the_ladder_has_each_setting_once_and_all_can_be_run() -> None:
+    scene = artery()
+    settings = ladder(scene)
+    assert len({setting.name for setting in settings}) == len(settings) > 20
+    assert {setting.mesh[0] for setting in settings} == {"radial", "sector", "full"}
+    assert sorted(s.step for s in settings if s.mesh == ("radial", 1, 1) and s.step) == [0.125, 0.25, 0.5, 1, 2.5, 5]
+    times = compared_times(scene, settings)
+    assert times[0] == 5.0 and 25.0 in times and times[-1] == 150.0
+    for setting in settings:
+        run = rungs.as_run(setting, 3, times)
+        assert run.cells.seed == 3 and run.output.times == tuple(times) and not run.output.fields
+        assert setting.scene.output == scene.output
+
+
+def test_a_tendon_of_random_cells_stays_whole_and_has_seeds() -> None:
+    settings = ladder(preset_scene(PAPER, "tendon"))
+    assert {setting.mesh[0] for setting in settings} == {"full"}
+    assert {setting.seeds for setting in settings} == {(1,), (1, 2, 3)}
+
+
+def test_hats_add_up_to_one_and_are_one_at_their_places() -> None:
+    np.testing.assert_allclose(weights(np.linspace(0, 1, 37)).sum(axis=-1), 1.0)
+    np.testing.assert_allclose(weights(np.linspace(0, 1, PLACES)), np.eye(PLACES), atol=1e-15)
+
+
+# ---------------------------------------------------------------- the command
+def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """On a cube whose stress is the same everywhere: three steps; again: nothing is run; a row is a scene."""
+    for name, value in (("STEPS", (2.0,)), ("HALVINGS", 1), ("MESHES", ()), ("TOGETHER", ()), ("TOLERANCES", ())):
+        monkeypatch.setattr(rungs, name, value)
+    path, out = tmp_path / "cube.toml", tmp_path / "out"
+    changes = {"model.kinematics": "point", "time.end": 20.0, "remodeling.kappa": 0.1}
+    path.write_text(preset_scene(PAPER, "cube").with_values(changes).to_toml())
+    monkeypatch.setattr(rungs, "objections", lambda scene, name: ["left out by the test"])
+    assert cli.main(["trade", str(path), "-o", str(out), "--budget", "10min"]) == 0
+    words = capsys.readouterr().out
+    assert "time: order 1 (steps 2, 1, 0.5)" in words and "mesh: fewer than two settings" in words
+    names = [f"point-1-degree-1-step-{step}" for step in ("2", "1", "0.5")]
+    assert [name in (out / "trade.csv").read_text() for name in names] == [True] * 3
+    assert (out / "trade.png").stat().st_size > 10_000
+    row = read_scene(out / "rows" / f"{names[2]}.toml")
+    assert row.time.step == 0.5 and row.output.fields is True and row.name == "cube"
+    # the closed form of the printed scheme: a row of fixed steps has the angle of one step before
+    last = Recording(out / f"{names[0]}-1").history["angle_profile_4"][-1]
+    s = 1 - np.exp(-0.1 * 18.0)
+    assert last == pytest.approx(np.degrees(np.arctan(np.sqrt(2) * (1 - s) / (1 - s + np.sqrt(3) * s))), abs=1e-6)
+
+    before = {file: file.stat().st_mtime_ns for file in out.glob("*/history.csv")}
+    assert len(before) == 3
+    assert cli.main(["trade", str(path), "-o", str(out), "-q"]) == 0
+    assert {file: file.stat().st_mtime_ns for file in out.glob("*/history.csv")} == before
+    assert cli.main(["trade", str(path), "-o", str(tmp_path / "none"), "--budget", "0.001s"]) == 2
+    assert "0 settings reached the end within the budget" in capsys.readouterr().err
+
+
+def test_words() -> None:
+    rows, notes = estimated([made_up(setting) for setting in ladder(artery())])
+    text = in_words(Trade(rows, notes, ["full-1-degree-1-step-1"], {}))
+    assert "left out, over the budget: full-1-degree-1-step-1" in text and "order 1" in text
+    assert sum(line.startswith("* ") for line in text.splitlines()) == sum(row.best for row in rows) > 2
