@@ -10,7 +10,7 @@ import ufl
 from numpy.typing import NDArray
 
 from remodel_fenicsx.evolution.state import State
-from remodel_fenicsx.fem import coefficients, jit
+from remodel_fenicsx.fem import coefficients
 from remodel_fenicsx.tissue.cells import UnitCell
 from remodel_fenicsx.tissue.energy import Stresses, Tissue
 from remodel_fenicsx.tissue.logarithm import MANDEL
@@ -41,23 +41,18 @@ class PointwiseRepulsion:
     """
 
     def __init__(self, state: State, tissue: Tissue, shares: Shares):
-        self.quadrature, self.tissue, self.shares = state.cells.quadrature, tissue, shares
+        self.state, self.tissue, self.shares = state, tissue, shares
+        self.quadrature = state.cells.quadrature
         self.stress = self.quadrature.function("repulsion_stress", (3, 3))
         self.stiffness = self.quadrature.function("repulsion_stiffness", (6, 6))
-        F = state.kinematics.deformation_gradient(state.unknown)
-        self._expression = jit.expression(F, self.quadrature.points)
         self._known: list[Array] = []  # F, A and c g(r0) of the values that are there
         self._stiffness_is_known = False
-
-    def deformation_gradient(self) -> Array:
-        """F at all points in one row, (n, 3, 3)."""
-        return self.quadrature.evaluate(self._expression, (3, 3)).reshape(-1, 3, 3)
 
     def update(self, stiffness: bool = False) -> None:
         """Stress, and stiffness on request, of the present unknowns and cells: what is there already stays."""
         derivatives = self.tissue.repulsion.derivatives
         assert derivatives is not None
-        F, A, modulus = self.deformation_gradient(), whole_structure_tensor(self.shares()), self._modulus()
+        F, A, modulus = self.state.deformation_gradient(), whole_structure_tensor(self.shares()), self._modulus()
         asked = [F, A, modulus]
         known = bool(self._known) and all(map(np.array_equal, asked, self._known))
         if known and (self._stiffness_is_known or not stiffness):
@@ -73,7 +68,7 @@ class PointwiseRepulsion:
 
     def energy(self) -> float:
         """Its part of the stored energy, over all ranks."""
-        F = self.deformation_gradient()
+        F = self.state.deformation_gradient()
         r0 = coefficients.point_values(self.tissue.end_to_end_length, self.quadrature).reshape(-1)
         values = -self._modulus() / 2 * self.tissue.repulsion.sum(F, self.shares(), r0)
         return self.quadrature.integral(values.reshape(self.quadrature.shape))

@@ -92,11 +92,6 @@ class RemodelingPass:
         values = self.quadrature.evaluate(self._expression, (2, 3, 3)).reshape(-1, 2, 3, 3)
         return self.kernels.gradient_and_driver(values)
 
-    def deformation_gradient(self) -> Array:
-        """F at all points, (elements * points, 3, 3)."""
-        values = self.quadrature.evaluate(self._expression, (2, 3, 3))
-        return np.ascontiguousarray(values[:, :, 0]).reshape(-1, 3, 3)
-
     def drive(self, residual: float = 0.0) -> Drive:
         """What acts on the cells in the present state, which was accepted with this norm of out-of-balance forces."""
         F, tensor = self.driving_tensor()
