@@ -13,9 +13,10 @@ from mpi4py import MPI
 from remodel_fenicsx import Recording, Scene, SceneError, Simulation, cli, run
 from remodel_fenicsx.scene import scene_from_dict
 from remodel_fenicsx.body.reductions import AUTO, choice, explained, objections
+from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.results.columns import Measurement
-from tests.conftest import Case
+from tests.conftest import Case, slowly
 from tests.reference.radial import solve_radial
 
 SELF = MPI.COMM_SELF
@@ -71,7 +72,7 @@ def test_radial_is_the_independent_solution(driver: str, end: float) -> None:
     simulation.close()
 
 
-@pytest.mark.parametrize("driver", ["cauchy", "pk2", "finger"])
+@pytest.mark.parametrize("driver", ["cauchy", *slowly("pk2", "finger")])
 def test_the_consistent_law_is_the_independent_solution(driver: str) -> None:
     """Its law, typed by hand in the reference too."""
     changes = {"driver": driver, "law": "tensor", "frame": "material"}
@@ -88,6 +89,7 @@ def test_the_consistent_law_is_the_independent_solution(driver: str) -> None:
     simulation.close()
 
 
+@pytest.mark.slow
 def test_the_implicit_coupling_is_that_of_every_kinematics() -> None:
     """A ray and a half plane of it; and eq. (11) has no error of the step."""
     changes = {"coupling": "implicit", "frame": "material"}
@@ -263,6 +265,18 @@ def test_validate_says_it_and_a_forbidden_one_ends_with_2(tmp_path: Path, capsys
         and "\n" not in error[:-1]
     )
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("shape", "name", "size"), [("cube", "point", {"side": 2.5}), ("tendon", "point", {"area": 3.0}),
+                                ("tube", "radial", {"length": 2.5})]
+)  # fmt: skip
+def test_another_size_compiles_nothing(shape: str, name: str, size: dict[str, float]) -> None:
+    """The size of the body is no literal of the kernels."""
+    history(scene(shape, name, 1.0))
+    before = len(jit.compiled_kernels())
+    history(scene(shape, name, 1.0, geometry={"shape": shape, **size}))
+    assert len(jit.compiled_kernels()) == before
 
 
 def test_small_reduced_problems_are_factorised_by_petsc_itself() -> None:
