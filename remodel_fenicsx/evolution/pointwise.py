@@ -9,12 +9,13 @@ import numpy as np
 import ufl
 from numpy.typing import NDArray
 
+from remodel_fenicsx.evolution.compiled_tensor import TensorKernels
 from remodel_fenicsx.evolution.state import State
 from remodel_fenicsx.fem import coefficients, jit
 from remodel_fenicsx.tissue.cells import UnitCell
 from remodel_fenicsx.tissue.energy import Stresses, Tissue
 from remodel_fenicsx.tissue.logarithm import MANDEL
-from remodel_fenicsx.tissue.repulsion import whole_structure_tensor
+from remodel_fenicsx.tissue.repulsion import REPULSIONS, whole_structure_tensor
 
 Array = NDArray[np.float64]
 Shares = Callable[[], Sequence[UnitCell]]
@@ -46,7 +47,12 @@ class PointwiseRepulsion:
         self.stiffness = self.quadrature.function("repulsion_stiffness", (6, 6))
         F = state.kinematics.deformation_gradient(state.unknown)
         self._expression = jit.expression(F, self.quadrature.points)
+        self._derivatives = tissue.repulsion.derivatives
+        if tissue.repulsion is REPULSIONS["log"]:
+            self._derivatives = TensorKernels(state.comm).log_derivatives
         self._known: list[Array] = []  # F, A and c g(r0) of the values that are there
+        self._cells: list[Array] = []  # what A was made of
+        self._structure: Array
         self._stiffness_is_known = False
 
     def deformation_gradient(self) -> Array:
@@ -55,21 +61,28 @@ class PointwiseRepulsion:
 
     def update(self, stiffness: bool = False) -> None:
         """Stress, and stiffness on request, of the present unknowns and cells: what is there already stays."""
-        derivatives = self.tissue.repulsion.derivatives
-        assert derivatives is not None
-        F, A, modulus = self.deformation_gradient(), whole_structure_tensor(self.shares()), self._modulus()
+        assert self._derivatives is not None
+        F, A, modulus = self.deformation_gradient(), self._structure_tensor(), self._modulus()
         asked = [F, A, modulus]
         known = bool(self._known) and all(map(np.array_equal, asked, self._known))
         if known and (self._stiffness_is_known or not stiffness):
             return
         self._known, self._stiffness_is_known = asked, stiffness
-        first, second = derivatives(np.swapaxes(F, 1, 2) @ F, A, stiffness)
+        first, second = self._derivatives(np.swapaxes(F, 1, 2) @ F, A, stiffness)
         shape = self.quadrature.shape
         # W_rep = -c g(r0)/2 M: S = 2 dW/dC and 2 dS/dC = 4 d2W/dC2
         self.quadrature.values(self.stress, (3, 3))[:] = (-modulus[:, None, None] * first).reshape(*shape, 3, 3)
         if second is not None:
             values = self.quadrature.values(self.stiffness, (6, 6))
             values[:] = (-2 * modulus[:, None, None] * second).reshape(*shape, 6, 6)
+
+    def _structure_tensor(self) -> Array:
+        """A of the present cells; they stay through a solve."""
+        shares = self.shares()
+        cells = [np.asarray(part) for cell in shares for part in cell]
+        if not self._cells or not all(map(np.array_equal, cells, self._cells)):
+            self._structure, self._cells = whole_structure_tensor(shares), [part.copy() for part in cells]
+        return self._structure
 
     def energy(self) -> float:
         """Its part of the stored energy, over all ranks."""

@@ -136,6 +136,12 @@ class Solution:
         return self.strain.outside(self.tensor)
 
     @property
+    def squared_lengths(self) -> Array:
+        """r^2 = A : C, (n,)."""
+        found: Array = np.einsum("nii,ni->n", self.response.cells.structure, self.strain.squared)
+        return found
+
+    @property
     def structure(self) -> Array:
         """A in the global basis, (n, 3, 3)."""
         return self.strain.outside(self.response.cells.structure)
