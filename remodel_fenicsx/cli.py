@@ -241,9 +241,8 @@ def _run(options: argparse.Namespace, task: Callable[..., Path] | None = None) -
 
 
 def _stability(options: argparse.Namespace) -> int:
-    missing = [name for name in ("matplotlib", "PIL") if find_spec(name) is None]
-    if missing:
-        return _fail(f"the environment is not usable: no {missing[0]}; run through ./with-fenicsx", BAD_ENVIRONMENT)
+    if missing := _missing_for_pictures():
+        return _fail(missing, BAD_ENVIRONMENT)
 
     def analyse(scene: Scene, folder: Path | None, quiet: bool) -> Path:
         from remodel_fenicsx.stability import in_words, stability
@@ -255,6 +254,12 @@ def _stability(options: argparse.Namespace) -> int:
     return _run(options, analyse)
 
 
+def _missing_for_pictures() -> str | None:
+    """What keeps this environment from drawing, in words."""
+    missing = [name for name in ("matplotlib", "PIL") if find_spec(name) is None]
+    return f"the environment is not usable: no {missing[0]}; run through ./with-fenicsx" if missing else None
+
+
 def _ensemble(options: argparse.Namespace) -> int:
     scene = read_scene(options.scene, options.set)
     reason = reason_unusable()
@@ -262,6 +267,8 @@ def _ensemble(options: argparse.Namespace) -> int:
         return _fail(f"the environment is not usable: {reason}; run through ./with-fenicsx", BAD_ENVIRONMENT)
     if options.seeds < 2:
         return _fail(f"--seeds {options.seeds}: allowed is a whole number at least 2", BAD_INPUT)
+    if missing := _missing_for_pictures():
+        return _fail(missing, BAD_ENVIRONMENT)
     from remodel_fenicsx.studies import ensemble as study
 
     try:

@@ -82,9 +82,10 @@ class Simulation:
         locks = formulation.locks(scene.mesh.element, scene.mesh.degree)
         self.warnings: list[Watcher] = [LockingWarning(self.stepper, locks)]
         if self.stepper.remodeling.law.remodels:
-            self.warnings.insert(0, Chatter(self.stepper))
-        if self.stepper.remodeling.law.of_absolute_time:
-            self.warnings.append(Resting(self.stepper))
+            chatter = Chatter(self.stepper)
+            self.warnings.insert(0, chatter)
+            if self.stepper.remodeling.law.of_absolute_time:
+                self.warnings.append(Resting(self.stepper, chatter))
 
     def load_values(self, time: float) -> LoadValues:
         """Magnitude of every load at a time."""

@@ -12,10 +12,13 @@ from scipy.spatial.transform import Rotation
 from remodel_fenicsx.evolution import compiled_tensor
 from remodel_fenicsx.evolution.compiled_tensor import CompiledPoints, TensorKernels
 from remodel_fenicsx.tissue import repulsion
+from remodel_fenicsx.tissue.cells import UnitCell
 from remodel_fenicsx.tissue.chains import CHAINS
 from remodel_fenicsx.tissue.condensed import CondensedPoints
+from remodel_fenicsx.tissue.drivers import DRIVERS, FRAMES
+from remodel_fenicsx.tissue.laws import Drive, tensor_target
 from tests.test_condensed import deformations, points
-from tests.test_tensor_law import right_cauchy_green, structures
+from tests.test_tensor_law import cells_of, right_cauchy_green, structures
 
 COUNT = 60
 
@@ -30,12 +33,39 @@ def test_derivatives_of_the_logarithm(kernels: TensorKernels, second: bool) -> N
     """Equal and nearly equal eigenvalues too, on both sides of the series' threshold."""
     C = right_cauchy_green()
     A = structures(len(C))
-    expected, found = (derivatives(C, A, second) for derivatives in (repulsion.log_derivatives, kernels.log_derivatives))
+    expected, found = (
+        derivatives(C, A, second) for derivatives in (repulsion.log_derivatives, kernels.log_derivatives)
+    )
     np.testing.assert_allclose(found[0], expected[0], atol=1e-13)
     if not second:
         assert found[1] is None
         return
     np.testing.assert_allclose(found[1], expected[1], atol=1e-11 * np.abs(expected[1]).max())
+
+
+def test_the_sum_of_the_energy(kernels: TensorKernels) -> None:
+    F, cells = np.linalg.cholesky(right_cauchy_green()), cells_of(structures(26))
+    expected = repulsion.log_sum(F, [cells], 1.0)
+    np.testing.assert_allclose(kernels.log_sum(F, [cells], 1.0), expected, atol=1e-13)
+    half = [UnitCell(*cells[:2], weight=0.5)] * 2
+    np.testing.assert_allclose(kernels.log_sum(F, half, 1.0), expected, atol=1e-13)
+
+
+@pytest.mark.parametrize("driver", ["cauchy", "pk2"])
+@pytest.mark.parametrize("frame", ["material", "spatial"])
+def test_the_target(kernels: TensorKernels, driver: str, frame: str) -> None:
+    """Tension, compression, nothing, and values near the switch."""
+    rng = np.random.default_rng(2)
+    tensors = rng.standard_normal((40, 3, 3))
+    tensors = tensors + np.swapaxes(tensors, 1, 2)
+    tensors[:4] = np.array([0.0, -1.0, 3e-11, 1e200])[:, None, None] * np.eye(3)
+    F = deformations(40, rng)
+    drive = Drive(F, tensors, DRIVERS[driver], FRAMES[frame], 1e-14, np.zeros((40, 3)), np.ones(40), 0.025)
+    for threshold in (1e-14, rng.uniform(0, 1e-4, 40)):
+        asked = drive._replace(threshold=threshold)
+        expected, found = tensor_target(asked), kernels.target(asked)
+        np.testing.assert_allclose(found.direction, expected.direction, atol=1e-12)
+        np.testing.assert_allclose(found.share, expected.share, atol=1e-12)
 
 
 def compiled_twin(kernels: TensorKernels, some: CondensedPoints) -> CompiledPoints:

@@ -116,12 +116,10 @@ def explained(scene: Any) -> list[str]:
 
 def pressing(scene: Any) -> list[str]:
     """Loads below zero: compression, suction."""
-    factors = {name: [factor for _, factor in load.ramp] for name, load in scene.loads.items()}
-    return [
-        f"loads.{name}"
-        for name, load in scene.loads.items()
-        if scene.geometry.reductions and min(load.value * factor for factor in factors[name]) < 0
-    ]
+    if not scene.geometry.reductions:
+        return []
+    smallest = {name: min(load.value * factor for _, factor in load.ramp) for name, load in scene.loads.items()}
+    return [f"loads.{name}" for name, value in smallest.items() if value < 0]
 
 
 def expected_cost(scene: Any, name: str) -> float:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.evolution.memory import Earlier, Numbers
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
-from remodel_fenicsx.tissue.logarithm import MANDEL
+from remodel_fenicsx.tissue import mandel
 
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
@@ -91,6 +91,11 @@ class Chatter(Watcher):
         self._numbers = Numbers(state, "chatter", {"growing": 0, "sustained": 0, "warned": 0} | times)
 
     @property
+    def structures(self) -> list[Array]:
+        """A of the last passes as Mandel components (elements, points, 6), the newest first."""
+        return [self._at_points(values) for values in self._cells.values]
+
+    @property
     def warned(self) -> bool:
         """Whether the warning has been given."""
         return bool(self._numbers["warned"])
@@ -137,13 +142,15 @@ class Chatter(Watcher):
 
     def _structure(self) -> Array:
         """A at all points, six Mandel components after each other."""
-        tensor = self.state.cells.structure_tensor()
-        return np.stack([tensor[..., i, j] * (1.0 if i == j else np.sqrt(2.0)) for i, j in MANDEL], axis=-1).reshape(-1)
+        return mandel.vectors(self.state.cells.structure_tensor().reshape(-1, 3, 3)).ravel()
+
+    def _at_points(self, components: Any) -> Any:
+        """What stands after each other by points, (elements, points, 6)."""
+        return components.reshape(*self.quadrature.shape, len(mandel.MANDEL))
 
     def _rested(self, cells: list[Array]) -> bool:
         """Whether one of the passes has left most cells as they were: what goes on after that jumps (`resting`)."""
-        count = self.quadrature.shape
-        same = [np.all((a == b).reshape(*count, len(MANDEL)), axis=-1) for a, b in pairwise(cells[: ORDER + 1])]
+        same = [np.all(self._at_points(a == b), axis=-1) for a, b in pairwise(cells[: ORDER + 1])]
         return any(self.quadrature.mean(passed.astype(np.float64)) > MOST for passed in same)
 
     def _loads_jump(self, step: Step) -> bool:
@@ -156,11 +163,10 @@ class Chatter(Watcher):
 
     def _measured(self, cells: list[Array], body: list[Array]) -> Swing:
         """Of the last passes, the newest first."""
-        owned = self.state.unknown.function_space.dofmap.index_map.size_local
-        owned *= self.state.unknown.function_space.dofmap.index_map_bs
+        owned = self.state.number_of_owned_unknowns
 
         def of_cells(a: Array, b: Array) -> float:
-            return self.quadrature.integral(np.sum((a * b).reshape(*self.quadrature.shape, 6), axis=-1))
+            return self.quadrature.integral(np.sum(self._at_points(a * b), axis=-1))
 
         def of_body(a: Array, b: Array) -> float:
             return float(self.state.comm.allreduce(float(np.dot(a[:owned], b[:owned])), MPI.SUM))
@@ -202,7 +208,7 @@ class Chatter(Watcher):
 
     def _place(self) -> tuple[float, float, float]:
         """Reference place of the largest swing of the cells."""
-        swing = _difference(self._cells.values).reshape(*self.quadrature.shape, 6)
+        swing = self._at_points(_difference(self._cells.values))
         return self.quadrature.place_of_largest(np.linalg.norm(swing, axis=-1))
 
 

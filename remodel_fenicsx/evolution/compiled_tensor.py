@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,13 +12,15 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.tissue import condensed, tensor_kernels
+from remodel_fenicsx.tissue.cells import UnitCell
 from remodel_fenicsx.tissue.chains import CHAINS
 from remodel_fenicsx.tissue.condensed import CondensedPoints
-from remodel_fenicsx.tissue.drivers import DRIVERS
+from remodel_fenicsx.tissue.drivers import DRIVERS, rotated_back
 from remodel_fenicsx.tissue.energy import MATRICES, Tissue
-from remodel_fenicsx.tissue.laws import LAWS
-from remodel_fenicsx.tissue.repulsion import REPULSIONS
+from remodel_fenicsx.tissue.laws import LAWS, Drive
+from remodel_fenicsx.tissue.repulsion import REPULSIONS, Repulsion, whole_structure_tensor
 from remodel_fenicsx.tissue.responses import StepOfCells
+from remodel_fenicsx.tissue.tensor_law import Target
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -53,6 +56,24 @@ class TensorKernels:
         module = jit.library(comm, declarations, source, "the law for the structure tensor", 5)
         self.call, self._ffi = module.lib, module.ffi
 
+    def target(self, drive: Drive) -> Target:
+        """`laws.tensor_target`."""
+        F, tensors = np.ascontiguousarray(drive.deformation_gradient), np.ascontiguousarray(drive.tensor)
+        n, turned_back = len(F), not drive.driver.material
+        if turned_back and drive.frame.tensor is not rotated_back:
+            turned_back, tensors = False, np.ascontiguousarray(drive.frame.tensor(F, tensors))
+        noise = np.ascontiguousarray(np.broadcast_to(np.asarray(drive.threshold, np.float64), (n,)))
+        direction, share = np.empty((n, 3, 3)), np.empty(n)
+        out = self.pointer(noise), self.pointer(direction), self.pointer(share)
+        self.call.target(n, self.pointer(F), self.pointer(tensors), turned_back, *out)
+        return Target(direction, share)
+
+    def log_sum(self, F: Array, cells: Sequence[UnitCell], end_to_end_length: Any) -> Array:
+        """`repulsion.log_sum`."""
+        F, A, result = np.ascontiguousarray(F), np.ascontiguousarray(whole_structure_tensor(cells)), np.empty(len(F))
+        self.call.log_sum(len(F), self.pointer(F), self.pointer(A), self.pointer(result))
+        return result
+
     def log_derivatives(self, C: Array, A: Array, second: bool = True) -> tuple[Array, Array | None]:
         """`repulsion.log_derivatives`."""
         first, matrices = np.empty(C.shape), np.empty((len(C), 6, 6)) if second else None
@@ -68,6 +89,14 @@ class TensorKernels:
     def pointers(self, arrays: list[Array]) -> Any:
         """To several."""
         return self._ffi.new("double *[]", [self.pointer(array) for array in arrays])
+
+
+def with_kernels(tissue: Tissue, comm: MPI.Intracomm) -> Tissue:
+    """The tissue with its repulsion compiled, where it is `log`."""
+    if tissue.chain is None or tissue.repulsion is not REPULSIONS["log"]:
+        return tissue
+    kernels = TensorKernels(comm)
+    return replace(tissue, repulsion=Repulsion(kernels.log_sum, kernels.log_derivatives))
 
 
 def points(kernels: TensorKernels | None, tissue: Tissue, step: StepOfCells) -> CondensedPoints:
@@ -118,7 +147,7 @@ class CompiledPoints(CondensedPoints):
         rest = self.at(lost).solve(found.gradient[lost], start)
         for name in ("driving_tensor", "structure", "first_piola_kirchhoff", "squared_lengths", "converged"):
             getattr(found, name)[lost] = getattr(rest, name)
-        return CompiledSolution(**{**vars(found), "rest": (lost, rest)})
+        return replace(found, rest=(lost, rest))
 
     def tangent(self, found: Any, held: Flags) -> Array:
         """As `CondensedPoints.tangent`."""

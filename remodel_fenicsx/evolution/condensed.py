@@ -14,7 +14,6 @@ from remodel_fenicsx.evolution.equilibrium import Equilibrium, at_points
 from remodel_fenicsx.evolution.newton import GuardedNewton, Solution, SolveFailure, SolverSettings
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
 from remodel_fenicsx.evolution.state import State
-from remodel_fenicsx.fem import jit
 from remodel_fenicsx.tissue import condensed, spectral
 from remodel_fenicsx.tissue.cells import UnitCell, structure_tensor
 from remodel_fenicsx.tissue.energy import Tissue
@@ -57,8 +56,6 @@ class AnsweringCells:
         self.quadrature = state.cells.quadrature
         self.stress = self.quadrature.function("answering_stress", (3, 3))
         self.tangent = self.quadrature.function("answering_tangent", (9, 9))
-        F = state.kinematics.deformation_gradient(state.unknown)
-        self._expression = jit.expression(F, self.quadrature.points)
         self.keeps = False
         self.held: Flags = np.zeros(int(np.prod(self.quadrature.shape)), dtype=bool)
         self._kernels = None
@@ -73,15 +70,11 @@ class AnsweringCells:
         self._iterations = 0
         self._last_structure: Array | None = None
 
-    def deformation_gradient(self) -> Array:
-        """F at all points, (n, 3, 3)."""
-        return self.quadrature.evaluate(self._expression, (3, 3)).reshape(-1, 3, 3)
-
     # ------------------------------------------------------------ a step
     def begin(self, time: float, residual: float) -> None:
         """The present state is the start of a step to this time; it was accepted with these out-of-balance forces."""
         settings, cells = self.remodeling.settings, self.state.cells
-        tissue, F = at_points(self.tissue, self.quadrature), self.deformation_gradient()
+        tissue, F = at_points(self.tissue, self.quadrature), self.state.deformation_gradient()
         is_stress = self.remodeling.driver.is_stress
         old = UnitCell(*(values.copy() for values in cells.point_cells[:2]))
         step = StepOfCells(
@@ -142,7 +135,7 @@ class AnsweringCells:
     # ------------------------------------------------------------ values
     def update(self, tangent: bool = False) -> None:
         """Stress, and tangent on request, of the present unknowns."""
-        F = self.deformation_gradient()
+        F = self.state.deformation_gradient()
         if self._gradient is None or not np.array_equal(F, self._gradient):
             self._solve(F)
             self._gradient, self._tangent_is_there = F, False
@@ -220,7 +213,7 @@ class AnsweringEquilibrium(Equilibrium):
 
     def limit_values(self) -> tuple[Array, Array]:
         """As of `Equilibrium`, with the cells that belong to the present unknowns."""
-        jacobian = np.linalg.det(self.answering.deformation_gradient()).reshape(self.quadrature.shape)
+        jacobian = np.linalg.det(self.state.deformation_gradient()).reshape(self.quadrature.shape)
         return self.answering.squared_lengths(), jacobian
 
     def assemble_internal(self, vector: Any) -> None:

@@ -245,7 +245,7 @@ class Extrapolated(Staggered):
         points = self.state.comm.allreduce(int(quadrature.owned(lost.reshape(quadrature.shape)).sum()))
         if points and self.state.comm.rank == 0:
             log.info("time %g: %d points follow the last stress, not the extrapolated one", time, points)
-        self._power = self.remodeling.replace(asked, self.remodeling.deformation_gradient(), duration)
+        self._power = self.remodeling.replace(asked, self.state.deformation_gradient(), duration)
 
 
 Maker = Callable[[State, Tissue, RemodelingPass, SolverSettings], Coupling]

@@ -88,9 +88,6 @@ class Equilibrium:
             self.tangent_forms.append(jit.form(ufl.derivative(external, u, trial)))
         squared = squared_end_to_end_length(F, shares) if self.tissue.chain is not None else ufl.as_ufl(0.0)
         self._limits = jit.expression(ufl.as_vector([squared, ufl.det(F)]), self.quadrature.points)
-        self._gradient = jit.expression(
-            ufl.as_vector([F[i, j] for i in range(3) for j in range(3)]), self.quadrature.points
-        )
         self._energy_forms: list[Any] = []
 
     def internal_and_tangents(self, F: Any, test: Any, trial: Any) -> tuple[list[Any], list[Any]]:
@@ -139,10 +136,6 @@ class Equilibrium:
         """
         lost = bool(np.any((after > nearer_than) & (1 - after < share * (1 - before))))
         return not self.comm.allreduce(lost, MPI.LOR)
-
-    def deformation_gradients(self) -> NDArray[np.float64]:
-        """F at the points of this rank's own elements, (elements * points, 3, 3)."""
-        return self.quadrature.owned(self.quadrature.evaluate(self._gradient, (3, 3))).reshape(-1, 3, 3)
 
     def turns_inside_out(self, before: NDArray[np.float64], after: NDArray[np.float64]) -> bool:
         """Whether J vanishes on the straight way between two states at a point of any rank; F from both."""

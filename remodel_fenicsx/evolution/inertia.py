@@ -119,8 +119,7 @@ class Inertia:
 
     def cosine(self, mode: Mode, direction: Array) -> float:
         """Of the angle between a mode and another change of the unknowns, without its sign."""
-        unknown = self.equilibrium.state.unknown
-        owned = unknown.function_space.dofmap.index_map.size_local * unknown.function_space.dofmap.index_map_bs
+        owned = self.equilibrium.state.number_of_owned_unknowns
         mine, other = mode.displacement[:owned], direction[:owned]
         products = self.equilibrium.comm.allreduce(np.array([mine @ other, mine @ mine, other @ other]), MPI.SUM)
         return float(abs(products[0]) / np.sqrt(max(products[1] * products[2], np.finfo(np.float64).tiny)))

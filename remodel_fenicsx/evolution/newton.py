@@ -262,7 +262,7 @@ class GuardedNewton:
         method comes back only by a factor of 1.5 an iteration.
         """
         self._push(x)
-        before = self.equilibrium.deformation_gradients()
+        before = self.equilibrium.state.deformation_gradient()
         trial = x.duplicate()
         for halving in range(LINE_SEARCH_HALVINGS + 1):
             trial.waxpy(-1.0, step, x)
@@ -285,7 +285,7 @@ class GuardedNewton:
         return before is None or self.equilibrium.keeps_reserve(before, stretches, KEPT_RESERVE, NEAR_LOCKING)
 
     def _keeps_sense(self, before: NDArray[np.float64]) -> bool:
-        return not self.equilibrium.turns_inside_out(before, self.equilibrium.deformation_gradients())
+        return not self.equilibrium.turns_inside_out(before, self.equilibrium.state.deformation_gradient())
 
     def _converged(self, snes: Any, iteration: int, norms: tuple[float, float, float]) -> int:
         """|R| <= absolute_tolerance + relative_tolerance * |nodal forces|: a scale that does not vanish in a hold."""

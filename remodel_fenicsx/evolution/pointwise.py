@@ -9,13 +9,13 @@ import numpy as np
 import ufl
 from numpy.typing import NDArray
 
-from remodel_fenicsx.evolution.compiled_tensor import TensorKernels
+from remodel_fenicsx.evolution.compiled_tensor import with_kernels
 from remodel_fenicsx.evolution.state import State
-from remodel_fenicsx.fem import coefficients, jit
+from remodel_fenicsx.fem import coefficients
 from remodel_fenicsx.tissue.cells import UnitCell
 from remodel_fenicsx.tissue.energy import Stresses, Tissue
 from remodel_fenicsx.tissue.logarithm import MANDEL
-from remodel_fenicsx.tissue.repulsion import REPULSIONS, whole_structure_tensor
+from remodel_fenicsx.tissue.repulsion import whole_structure_tensor
 
 Array = NDArray[np.float64]
 Shares = Callable[[], Sequence[UnitCell]]
@@ -42,33 +42,27 @@ class PointwiseRepulsion:
     """
 
     def __init__(self, state: State, tissue: Tissue, shares: Shares):
-        self.quadrature, self.tissue, self.shares = state.cells.quadrature, tissue, shares
+        self.state, self.shares = state, shares
+        self.tissue = with_kernels(tissue, state.comm)
+        self.quadrature = state.cells.quadrature
         self.stress = self.quadrature.function("repulsion_stress", (3, 3))
         self.stiffness = self.quadrature.function("repulsion_stiffness", (6, 6))
-        F = state.kinematics.deformation_gradient(state.unknown)
-        self._expression = jit.expression(F, self.quadrature.points)
-        self._derivatives = tissue.repulsion.derivatives
-        if tissue.repulsion is REPULSIONS["log"]:
-            self._derivatives = TensorKernels(state.comm).log_derivatives
         self._known: list[Array] = []  # F, A and c g(r0) of the values that are there
         self._cells: list[Array] = []  # what A was made of
         self._structure: Array
         self._stiffness_is_known = False
 
-    def deformation_gradient(self) -> Array:
-        """F at all points in one row, (n, 3, 3)."""
-        return self.quadrature.evaluate(self._expression, (3, 3)).reshape(-1, 3, 3)
-
     def update(self, stiffness: bool = False) -> None:
         """Stress, and stiffness on request, of the present unknowns and cells: what is there already stays."""
-        assert self._derivatives is not None
-        F, A, modulus = self.deformation_gradient(), self._structure_tensor(), self._modulus()
+        derivatives = self.tissue.repulsion.derivatives
+        assert derivatives is not None
+        F, A, modulus = self.state.deformation_gradient(), self._structure_tensor(), self._modulus()
         asked = [F, A, modulus]
         known = bool(self._known) and all(map(np.array_equal, asked, self._known))
         if known and (self._stiffness_is_known or not stiffness):
             return
         self._known, self._stiffness_is_known = asked, stiffness
-        first, second = self._derivatives(np.swapaxes(F, 1, 2) @ F, A, stiffness)
+        first, second = derivatives(np.swapaxes(F, 1, 2) @ F, A, stiffness)
         shape = self.quadrature.shape
         # W_rep = -c g(r0)/2 M: S = 2 dW/dC and 2 dS/dC = 4 d2W/dC2
         self.quadrature.values(self.stress, (3, 3))[:] = (-modulus[:, None, None] * first).reshape(*shape, 3, 3)
@@ -86,7 +80,7 @@ class PointwiseRepulsion:
 
     def energy(self) -> float:
         """Its part of the stored energy, over all ranks."""
-        F = self.deformation_gradient()
+        F = self.state.deformation_gradient()
         r0 = coefficients.point_values(self.tissue.end_to_end_length, self.quadrature).reshape(-1)
         values = -self._modulus() / 2 * self.tissue.repulsion.sum(F, self.shares(), r0)
         return self.quadrature.integral(values.reshape(self.quadrature.shape))

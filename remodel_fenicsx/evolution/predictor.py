@@ -110,9 +110,7 @@ class Autoregressive:
         return all(abs(a - b) <= SAME_RATE * max(abs(a), abs(b)) for a, b in pairs)
 
     def _weights(self, increments: list[Array]) -> Array:
-        space = self.state.unknown.function_space.dofmap
-        owned = space.index_map.size_local * space.index_map_bs
-        rows = np.array([increment[:owned] for increment in increments])
+        rows = np.array([increment[: self.state.number_of_owned_unknowns] for increment in increments])
         products = self.state.comm.allreduce(rows @ rows.T, MPI.SUM)
         matrix, right = np.zeros((ORDER, ORDER)), np.zeros(ORDER)
         for k in range(FITTED):

@@ -7,6 +7,7 @@ import logging
 import numpy as np
 from numpy.typing import NDArray
 
+from remodel_fenicsx.evolution.chatter import Chatter
 from remodel_fenicsx.evolution.memory import Earlier, Numbers
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
 
@@ -27,13 +28,14 @@ class Resting(Watcher):
     Parameters
     ----------
     stepper
-        Whose state is followed; what is remembered of the passes before is part of it from now on.
+        Whose state is followed; where cells have moved is part of it from now on.
+    chatter
+        Remembers the cells of the passes before; it watches the same steps, and is asked first.
     """
 
-    def __init__(self, stepper: Stepper):
-        self.stepper, self.state = stepper, stepper.state
+    def __init__(self, stepper: Stepper, chatter: Chatter):
+        self.stepper, self.state, self.chatter = stepper, stepper.state, chatter
         self.quadrature = stepper.state.cells.quadrature
-        self._cells = Earlier(self.state, "resting_cells", lambda: self.quadrature.function("", (3, 3)), 2)
         self._moved = Earlier(self.state, "resting_moved", lambda: self.quadrature.function("", ()), 1)
         self._numbers = Numbers(self.state, "resting", {"said": 0})
         # of the last pass: |change of A|^2 where it was made up for
@@ -41,29 +43,29 @@ class Resting(Watcher):
 
     def started(self, step: Step) -> None:
         """No pass yet."""
-        for memory in (self._cells, self._moved, self._numbers):
-            memory.forget()
-        self._cells.push(self.state.cells.structure_tensor().ravel())
+        self._moved.forget()
+        self._numbers.forget()
         self._moved.push(np.zeros(self.quadrature.shape).ravel())
 
     def completed(self, step: Step) -> None:
         """One pass more."""
-        structure = self.state.cells.structure_tensor()
-        earlier = [values.reshape(structure.shape) for values in self._cells.values]
-        now = _differ(structure, earlier[0])
-        moved = self._moved.values[0].reshape(self.quadrature.shape) > 0
+        cells = self.chatter.structures
+        nowhere = np.zeros(self.quadrature.shape, dtype=bool)  # where memory begins anew there is nothing to tell
+        now = _differ(cells[0], cells[1]) if len(cells) > 1 else nowhere
+        moved = self._moved.values[0].reshape(self.quadrature.shape) > 0 if self._moved.known else nowhere
         self._squares = np.zeros(self.quadrature.shape)
-        if len(earlier) > 1 and not self._numbers["said"]:
-            resumed = now & moved & ~_differ(earlier[0], earlier[1])
-            self._squares = np.where(resumed, np.sum((structure - earlier[0]) ** 2, axis=(-2, -1)), 0.0)
-        self._cells.push(structure.ravel())
+        if len(cells) > 2 and not self._numbers["said"]:
+            resumed = now & moved & ~_differ(cells[1], cells[2])
+            self._squares = np.where(resumed, np.sum((cells[0] - cells[1]) ** 2, axis=-1), 0.0)
         self._moved.push((now | moved).astype(np.float64).ravel())
 
     def committed(self, step: Step) -> None:
         """Warn."""
+        if self._numbers["said"]:
+            return
         squares = self._squares
         jump = np.sqrt(self.quadrature.mean(squares)) / self.state.cells.settings.end_to_end_length**2
-        if self._numbers["said"] or jump < JUMP:
+        if jump < JUMP:
             return
         self._numbers["said"] = True
         share, place = self.quadrature.mean((squares > 0).astype(float)), self.quadrature.place_of_largest(squares)
@@ -81,6 +83,6 @@ class Resting(Watcher):
 
 
 def _differ(one: Array, other: Array) -> NDArray[np.bool_]:
-    """Where tensors (elements, points, 3, 3) are not the same to the last bit."""
-    differ: NDArray[np.bool_] = np.any(one != other, axis=(-2, -1))
+    """Where tensors (elements, points, 6) are not the same to the last bit."""
+    differ: NDArray[np.bool_] = np.any(one != other, axis=-1)
     return differ

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.body.loading import Loading
 from remodel_fenicsx.evolution.unit_cells import CellField, UnitCells
+from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.formulations import FORMULATIONS, Formulation
 from remodel_fenicsx.fem.kinematics import Kinematics
 
@@ -68,6 +69,8 @@ class State:
     ):
         self.unknown, self.kinematics, self.cells, self.loading = unknown, kinematics, cells, loading
         self.dilatation = formulation.on(kinematics, unknown, cells.quadrature)
+        F = kinematics.deformation_gradient(unknown)
+        self._deformation_gradient = jit.expression(F, cells.quadrature.points)
         self.equilibrium_cells = CellField(cells.quadrature, "equilibrium_cell")
         self.settle_cells()
         self.time, self.number = 0.0, 0
@@ -81,6 +84,16 @@ class State:
     def comm(self) -> Any:
         """Communicator of the mesh."""
         return self.cells.quadrature.mesh.comm
+
+    @property
+    def number_of_owned_unknowns(self) -> int:
+        """How many of this rank's unknowns are its own: they come first, ghosts follow."""
+        space = self.unknown.function_space.dofmap
+        return int(space.index_map.size_local * space.index_map_bs)
+
+    def deformation_gradient(self) -> NDArray[np.float64]:
+        """F of the present unknowns at all points of this rank in one row, ghosts included, (n, 3, 3)."""
+        return self.cells.quadrature.evaluate(self._deformation_gradient, (3, 3)).reshape(-1, 3, 3)
 
     def functions(self) -> dict[str, Any]:
         """Every dolfinx function of the state by its name."""

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from remodel_fenicsx.paper.errors import FigureError
 from remodel_fenicsx.paper.validity import fault, library_versions, run_key, source_fingerprint
-from remodel_fenicsx.results.recording import HISTORY
+from remodel_fenicsx.results.recording import steps_recorded
 from remodel_fenicsx.scene.scene import Scene
 from remodel_fenicsx.system.children import Child
 from remodel_fenicsx.system.interrupts import StopRequest
@@ -132,11 +132,7 @@ class _Run:
         self.child = Child(arguments, work / f"{scene.name}.txt", [lock])
 
     def steps_done(self) -> int:
-        try:
-            rows = (self.folder / HISTORY).read_bytes().count(b"\n") - 1
-        except OSError:
-            return 0
-        return min(max(0, rows), self.scene.time.number_of_steps)
+        return min(steps_recorded(self.folder), self.scene.time.number_of_steps)
 
 
 # ---------------------------------------------------------------- unfinished runs

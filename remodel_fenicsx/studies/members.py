@@ -8,7 +8,15 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from remodel_fenicsx.results.recording import HISTORY, SCENE, HistoryColumns, Recording, RecordingError, read_history
+from remodel_fenicsx.results.recording import (
+    HISTORY,
+    SCENE,
+    HistoryColumns,
+    Recording,
+    RecordingError,
+    read_history,
+    steps_recorded,
+)
 from remodel_fenicsx.scene.scene import Scene, SceneError
 from remodel_fenicsx.schema.times import same_time
 from remodel_fenicsx.system.children import Child
@@ -39,11 +47,7 @@ class Member:
     @property
     def steps_done(self) -> int:
         """How many steps are recorded."""
-        try:
-            rows = (self.folder / HISTORY).read_bytes().count(b"\n") - 2  # the head, and t = 0
-        except OSError:
-            return 0
-        return min(max(0, rows), self.scene.time.number_of_steps)
+        return min(steps_recorded(self.folder), self.scene.time.number_of_steps)
 
     def is_complete(self) -> bool:
         """Whether this very scene is recorded to its end.

@@ -50,6 +50,15 @@ static inline void rotated(tensor t, tensor q, int back, tensor result)
     }
 }
 
+/* C = F^T F. */
+static inline void strain_of(tensor F, tensor C)
+{
+    ALL(i) ALL(j) {
+        C[i][j] = 0;
+        ALL(k) C[i][j] += F[k][i] * F[k][j];
+    }
+}
+
 /* logarithm.mandel_rotation. */
 static void congruence(tensor q, matrix result)
 {
@@ -197,6 +206,24 @@ static void second_derivative(const double *c, tensor first, tensor A, matrix re
             if (p == i) sum += f[i][q][j] * A[q][j];
         }
         result[r][s] = result[s][r] = FACTOR[r] * FACTOR[s] / 2 * sum;
+    }
+}
+
+/* repulsion.log_sum: A : ln C. */
+void log_sum(int64_t n, const double *F, const double *A, double *result)
+{
+    for (int64_t at = 0; at < n; ++at) {
+        tensor gradient, strain, basis;
+        double c[3];
+        memcpy(gradient, F + 9 * at, sizeof(tensor));
+        strain_of(gradient, strain);
+        eigen(strain, c, basis);
+        result[at] = 0;
+        ALL(k) {
+            double along = 0;
+            ALL(i) ALL(j) along += basis[i][k] * A[9 * at + 3 * i + j] * basis[j][k];
+            result[at] += log(c[k]) * along;
+        }
     }
 }
 

@@ -9,6 +9,9 @@ from __future__ import annotations
 from remodel_fenicsx.tissue.tensor_algebra import ALGEBRA, LOGARITHM
 
 DECLARATIONS = """
+void log_sum(int64_t n, const double *F, const double *A, double *result);
+void target(int64_t n, const double *F, const double *tensors, int turned_back, const double *noise, double *direction,
+            double *share);
 void log_derivatives(int64_t n, const double *C, const double *A, double *first, double *second);
 void solve(int64_t n, const double *F, const double *start, const double *old, const double *const *parameters,
            double noise, double rate, int driver, int repulsion, double *tensor, double *structure, double *stress,
@@ -40,10 +43,7 @@ static void prepare(point *p, int64_t at, const double *F, const double *old, co
 {
     tensor C, global;
     memcpy(p->F, F + 9 * at, sizeof(tensor)), memcpy(global, old + 9 * at, sizeof(tensor));
-    ALL(i) ALL(j) {
-        C[i][j] = 0;
-        ALL(k) C[i][j] += p->F[k][i] * p->F[k][j];
-    }
+    strain_of(p->F, C);
     eigen(C, p->c, p->basis);
     rotated(global, p->basis, 0, p->old);
     ALL(i) p->u[i] = sqrt(p->c[i]);
@@ -92,22 +92,58 @@ static void stress(point *p, state *s, matrix *by_cells, matrix *by_strain)
     }
 }
 
+/* tensor_law.target: the principal values of E, and s, from those of D. */
+static double weights(const double *values, double noise, double *direction)
+{
+    double largest = 0, tension = 0, compression = 0;
+    ALL(i) largest = fmax(largest, fabs(values[i]));
+    const double unit = largest > 0 ? largest : 1, floor = 7000 * noise / unit;
+    ALL(i) {
+        const double value = values[i] / unit;
+        direction[i] = value > 0 ? value * value : 0;
+        tension += direction[i], compression += value < 0 ? value * value : 0;
+    }
+    const double total = tension + 0.01 * compression + floor * floor;
+    ALL(i) direction[i] /= tension > 0 ? tension : 1;
+    return tension / (total > 0 ? total : 1);
+}
+
+/* The same from F and tensors, of a spatial driver turned back by drivers.rotated_back. */
+void target(int64_t n, const double *F, const double *tensors, int turned_back, const double *noise, double *direction,
+            double *share)
+{
+    for (int64_t at = 0; at < n; ++at) {
+        tensor D, R, basis, vectors;
+        double values[3], weight[3], c[3];
+        memcpy(D, tensors + 9 * at, sizeof(tensor));
+        if (turned_back) {
+            tensor gradient, C, in_basis;
+            memcpy(gradient, F + 9 * at, sizeof(tensor));
+            strain_of(gradient, C);
+            eigen(C, c, basis);
+            ALL(i) ALL(j) {
+                R[i][j] = 0;
+                ALL(k) R[i][j] += gradient[i][k] * basis[k][j] / sqrt(c[j]);
+            }
+            rotated(D, R, 0, in_basis);
+            rotated(in_basis, basis, 1, D);
+        }
+        eigen(D, values, vectors);
+        share[at] = weights(values, noise[at], weight);
+        ALL(i) ALL(j) {
+            double sum = 0;
+            ALL(k) sum += vectors[i][k] * weight[k] * vectors[j][k];
+            direction[9 * at + 3 * i + j] = sum;
+        }
+    }
+}
+
 /* tensor_law.target and tensor_law.follow: A from D. */
 static void cells(point *p, state *s)
 {
     const double squared = p->parameter[END_TO_END_LENGTH] * p->parameter[END_TO_END_LENGTH];
-    double largest = 0, tension = 0, compression = 0;
     eigen(s->D, s->values, s->vectors);
-    ALL(i) largest = fmax(largest, fabs(s->values[i]));
-    const double unit = largest > 0 ? largest : 1, floor = 7000 * p->noise / unit;
-    ALL(i) {
-        const double value = s->values[i] / unit;
-        s->direction[i] = value > 0 ? value * value : 0;
-        tension += s->direction[i], compression += value < 0 ? value * value : 0;
-    }
-    const double total = tension + 0.01 * compression + floor * floor;
-    s->share = tension / (total > 0 ? total : 1);
-    ALL(i) s->direction[i] /= tension > 0 ? tension : 1;
+    s->share = weights(s->values, p->noise, s->direction);
     const double weight = -expm1(-p->rate * s->share);
     ALL(i) ALL(j) {
         double direction = 0;
