@@ -120,7 +120,7 @@ def expression(ufl_expression: Any, points: Any, name: str | None = None) -> Any
 
 
 def library(comm: MPI.Intracomm, declarations: str, source: str, what: str, seconds: int = 2) -> Any:
-    """Compile C functions of our own, or take them from the cache. Collective; as `form` in all that is said and raised.
+    """Compile C functions of our own, or take them from the cache. Collective; says and raises what `form` does.
 
     Parameters
     ----------

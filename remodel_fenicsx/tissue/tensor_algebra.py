@@ -121,7 +121,8 @@ static inline void rotate(tensor a, tensor v, int p, int q)
     if (a[p][q] == 0) return;
     const int r = 3 - p - q;
     const double difference = a[q][q] - a[p][p], twice = 2 * a[p][q];
-    const double t = copysign(1, difference) * twice / (fabs(difference) + sqrt(difference * difference + twice * twice));
+    const double distance = sqrt(difference * difference + twice * twice);
+    const double t = copysign(1, difference) * twice / (fabs(difference) + distance);
     const double c = 1 / sqrt(1 + t * t), s = t * c, rp = a[r][p], rq = a[r][q];
     a[p][p] -= t * a[p][q];
     a[q][q] += t * a[p][q];
