@@ -126,7 +126,7 @@ class CompiledPoints(CondensedPoints):
         repulsion = next(i for i, name in enumerate(COMPILED_REPULSIONS) if tissue.repulsion is REPULSIONS[name])
         old, rate = np.ascontiguousarray(step.structure), step.kappa * (step.time_new - step.time_old)
         pointers = self.kernels.pointer(old), self.kernels.pointers(arrays)
-        return [*pointers, step.noise, rate, driver, repulsion], [*arrays, old]
+        return [*pointers, step.noise, step.solved, rate, driver, repulsion], [*arrays, old]
 
     def solve(self, F: Array, start: Array, left_out: Flags | None = None) -> Any:
         """As `CondensedPoints.solve`."""

@@ -90,6 +90,7 @@ class AnsweringCells:
             self.state.time,
             time,
             self.remodeling.stress_noise(F, residual) if is_stress else spectral.ROUNDING,
+            self.remodeling.stress_noise(F, 0.0) if is_stress else spectral.ROUNDING,
         )
         self._points = compiled_tensor.points(self._kernels, tissue, step)
         self._accepted = self._points.kept(F, old, step.structure).driving_tensor

@@ -14,10 +14,10 @@ void target(int64_t n, const double *F, const double *tensors, int turned_back, 
             double *share);
 void log_derivatives(int64_t n, const double *C, const double *A, double *first, double *second);
 void solve(int64_t n, const double *F, const double *start, const double *old, const double *const *parameters,
-           double noise, double rate, int driver, int repulsion, double *tensor, double *structure, double *stress,
-           double *squared, uint8_t *converged);
+           double noise, double solved, double rate, int driver, int repulsion, double *tensor, double *structure,
+           double *stress, double *squared, uint8_t *converged);
 void tangent(int64_t n, const double *F, const double *tensor, const double *old, const double *const *parameters,
-             double noise, double rate, int driver, int repulsion, double *result);
+             double noise, double solved, double rate, int driver, int repulsion, double *result);
 """
 
 POINT = r"""
@@ -27,7 +27,7 @@ enum { LAMBDA, MU, MODULUS, CONTOUR_LENGTH, END_TO_END_LENGTH, PARAMETERS };
 
 typedef struct {               /* in the eigenbasis of C */
     tensor F, basis, old;      /* F and the basis in the global one; A at the start of the step */
-    double c[3], u[3], J, parameter[PARAMETERS], noise, rate;
+    double c[3], u[3], J, parameter[PARAMETERS], noise, solved, rate;
     int driver, repulsion;
 } point;
 
@@ -39,7 +39,7 @@ typedef struct {
 } state;
 
 static void prepare(point *p, int64_t at, const double *F, const double *old, const double *const *parameters,
-                    double noise, double rate, int driver, int repulsion)
+                    double noise, double solved, double rate, int driver, int repulsion)
 {
     tensor C, global;
     memcpy(p->F, F + 9 * at, sizeof(tensor)), memcpy(global, old + 9 * at, sizeof(tensor));
@@ -49,7 +49,7 @@ static void prepare(point *p, int64_t at, const double *F, const double *old, co
     ALL(i) p->u[i] = sqrt(p->c[i]);
     p->J = p->u[0] * p->u[1] * p->u[2];
     for (int k = 0; k < PARAMETERS; ++k) p->parameter[k] = parameters[k][at];
-    p->noise = noise, p->rate = rate, p->driver = driver, p->repulsion = repulsion;
+    p->noise = noise, p->solved = solved, p->rate = rate, p->driver = driver, p->repulsion = repulsion;
 }
 
 /* chains.wormlike_stiffness, and its slope by r. */
@@ -234,7 +234,7 @@ static void evaluate(point *p, state *s)
     drive(p, s->S, D);
     ALL(i) ALL(j) s->missing[i][j] = D[i][j] - s->D[i][j];
     const double extension = sqrt(s->squared) / p->parameter[CONTOUR_LENGTH];
-    s->converged = norm(s->missing) <= 1e-12 * norm(s->D) + p->noise && extension < 1;
+    s->converged = norm(s->missing) <= 1e-12 * norm(s->D) + p->solved && extension < 1;
     if (p->driver == RIGHT_CAUCHY_GREEN) s->converged = isfinite(norm(s->S));
 }
 
@@ -272,14 +272,14 @@ static void iterate(point *p, state *s)
 
 /* condensed.CondensedPoints.solve, from start; all results in the global basis. */
 void solve(int64_t n, const double *F, const double *start, const double *old, const double *const *parameters,
-           double noise, double rate, int driver, int repulsion, double *tensors, double *structure, double *stresses,
-           double *squared, uint8_t *converged)
+           double noise, double solved, double rate, int driver, int repulsion, double *tensors, double *structure,
+           double *stresses, double *squared, uint8_t *converged)
 {
     for (int64_t at = 0; at < n; ++at) {
         point p;
         state s;
         tensor global, P;
-        prepare(&p, at, F, old, parameters, noise, rate, driver, repulsion);
+        prepare(&p, at, F, old, parameters, noise, solved, rate, driver, repulsion);
         memcpy(global, start + 9 * at, sizeof(tensor));
         rotated(global, p.basis, 0, s.D);
         evaluate(&p, &s);
@@ -334,14 +334,14 @@ static void by_gradient(point *p, tensor S, matrix by_strain, double *result)
 
 /* condensed.CondensedPoints.tangent at solved points. */
 void tangent(int64_t n, const double *F, const double *tensors, const double *old, const double *const *parameters,
-             double noise, double rate, int driver, int repulsion, double *result)
+             double noise, double solved, double rate, int driver, int repulsion, double *result)
 {
     for (int64_t at = 0; at < n; ++at) {
         point p;
         state s;
         tensor global;
         matrix left, answers, direct, right, change;
-        prepare(&p, at, F, old, parameters, noise, rate, driver, repulsion);
+        prepare(&p, at, F, old, parameters, noise, solved, rate, driver, repulsion);
         memcpy(global, tensors + 9 * at, sizeof(tensor));
         rotated(global, p.basis, 0, s.D);
         evaluate(&p, &s);
