@@ -25,6 +25,7 @@ from remodel_fenicsx import paper as figures  # noqa: E402
 from remodel_fenicsx.paper.captions import CAPTIONS  # noqa: E402
 from remodel_fenicsx.paper.cases import LOAD_CASES  # noqa: E402
 from remodel_fenicsx.paper.output import COLOURS, STYLE, Page, read_table  # noqa: E402
+from compare_consistent import page_values  # noqa: E402
 from tests.reference.radial import RadialHistory, solve_radial  # noqa: E402
 from verification_studies import study  # noqa: E402
 
@@ -396,7 +397,7 @@ def made_with(folder: Path) -> str:
 
 def page(kept: Path = KEPT) -> str:
     """docs/verification.md from the tables in docs/figures."""
-    values = all_numbers(kept) | {
+    values = all_numbers(kept) | page_values(kept) | {
         "table_layers": layer_table(kept),
         "table_cases": case_table(kept),
         "table_errors_cases": error_table(kept, "comparison-cases", "stretch, pressure",

@@ -14,6 +14,7 @@ import pytest
 
 from remodel_fenicsx.scene import parameters
 from remodel_fenicsx.tissue.chains import wormlike_stiffness
+from remodel_fenicsx.tissue.laws import LAWS
 from remodel_fenicsx.scene.parameters import PRESET_NOTES, PRESETS, Cells, Material, Remodeling
 from remodel_fenicsx.body import Cube, Tendon, Tube
 from remodel_fenicsx.scene.scene import Scene, preset_scene, read_scene, scene_from_dict
@@ -687,9 +688,29 @@ def test_a_tube_starts_with_cylindrical_axes_unless_the_scene_says_otherwise():
     assert scene_from_dict({**CUBE, "geometry": {"shape": "tendon"}}).cells.axes == "global"
 
 
-def test_without_a_preset_the_frame_is_material():
-    printed_but_for_the_frame = Remodeling(driver="cauchy", law="explicit", frame="material", kappa=0.025)
-    assert scene_from_dict(CUBE).remodeling == printed_but_for_the_frame
+def test_without_a_preset_law_repulsion_and_coupling_are_what_measures_best():
+    scene = scene_from_dict(CUBE)
+    assert scene.material.repulsion == "log"
+    assert scene.remodeling == Remodeling(
+        driver="cauchy", law="tensor", frame="material", kappa=0.025, coupling="extrapolated"
+    )
+    assert scene_from_dict(changed(CUBE, {"remodeling.coupling": "staggered"})).remodeling.coupling == "staggered"
+
+
+@pytest.mark.parametrize("law", [law for law in LAWS if law != "tensor"])
+def test_without_a_preset_another_law_has_what_goes_with_it(law):
+    scene = scene_from_dict(changed(CUBE, {"remodeling.law": law}))
+    assert (scene.material.repulsion, scene.remodeling.coupling) == ("axes", "staggered")
+    assert scene.remodeling.frame == "material"
+
+
+def test_the_default_method_changes_no_preset():
+    scene = preset_scene("kuhl-holzapfel-2007", "tube")
+    assert (scene.material.repulsion, scene.remodeling.law, scene.remodeling.coupling) == (
+        "axes",
+        "explicit",
+        "staggered",
+    )
 
 
 def test_the_network_modulus():

@@ -9,6 +9,7 @@ import numpy as np
 import ufl
 from numpy.typing import NDArray
 
+from remodel_fenicsx.evolution import compiled_tensor
 from remodel_fenicsx.evolution.equilibrium import Equilibrium, at_points
 from remodel_fenicsx.evolution.newton import GuardedNewton, Solution, SolveFailure, SolverSettings
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
@@ -57,6 +58,9 @@ class AnsweringCells:
         self.tangent = self.quadrature.function("answering_tangent", (9, 9))
         self.keeps = False
         self.held: Flags = np.zeros(int(np.prod(self.quadrature.shape)), dtype=bool)
+        self._kernels = None
+        if remodeling.law.target is not None:
+            self._kernels = compiled_tensor.TensorKernels(state.comm)
         self._points: condensed.CondensedPoints
         self._found: condensed.Solution
         self._gradient: Array | None = None  # F of what was found
@@ -86,8 +90,9 @@ class AnsweringCells:
             self.state.time,
             time,
             self.remodeling.stress_noise(F, residual) if is_stress else spectral.ROUNDING,
+            self.remodeling.stress_noise(F, 0.0) if is_stress else spectral.ROUNDING,
         )
-        self._points = condensed.CondensedPoints(tissue, step)
+        self._points = compiled_tensor.points(self._kernels, tissue, step)
         self._accepted = self._points.kept(F, old, step.structure).driving_tensor
         self.release()
 
@@ -178,8 +183,7 @@ class AnsweringCells:
     def squared_lengths(self) -> Array:
         """r^2 at all points, (elements, points); infinite where there are no cells for these unknowns."""
         self.update()
-        lengths = self._found.response.cells.structure
-        squared = np.einsum("nii,ni->n", lengths, self._found.strain.squared)
+        squared = self._found.squared_lengths
         if not self._may_hold and self._iterations > BEFORE_HOLDING:
             squared = np.where(self._found.converged, squared, np.inf)
         return squared.reshape(self.quadrature.shape)

@@ -9,6 +9,7 @@ import numpy as np
 import ufl
 from numpy.typing import NDArray
 
+from remodel_fenicsx.evolution.compiled_tensor import with_kernels
 from remodel_fenicsx.evolution.state import State
 from remodel_fenicsx.fem import coefficients
 from remodel_fenicsx.tissue.cells import UnitCell
@@ -41,18 +42,21 @@ class PointwiseRepulsion:
     """
 
     def __init__(self, state: State, tissue: Tissue, shares: Shares):
-        self.state, self.tissue, self.shares = state, tissue, shares
+        self.state, self.shares = state, shares
+        self.tissue = with_kernels(tissue, state.comm)
         self.quadrature = state.cells.quadrature
         self.stress = self.quadrature.function("repulsion_stress", (3, 3))
         self.stiffness = self.quadrature.function("repulsion_stiffness", (6, 6))
         self._known: list[Array] = []  # F, A and c g(r0) of the values that are there
+        self._cells: list[Array] = []  # what A was made of
+        self._structure: Array
         self._stiffness_is_known = False
 
     def update(self, stiffness: bool = False) -> None:
         """Stress, and stiffness on request, of the present unknowns and cells: what is there already stays."""
         derivatives = self.tissue.repulsion.derivatives
         assert derivatives is not None
-        F, A, modulus = self.state.deformation_gradient(), whole_structure_tensor(self.shares()), self._modulus()
+        F, A, modulus = self.state.deformation_gradient(), self._structure_tensor(), self._modulus()
         asked = [F, A, modulus]
         known = bool(self._known) and all(map(np.array_equal, asked, self._known))
         if known and (self._stiffness_is_known or not stiffness):
@@ -65,6 +69,14 @@ class PointwiseRepulsion:
         if second is not None:
             values = self.quadrature.values(self.stiffness, (6, 6))
             values[:] = (-2 * modulus[:, None, None] * second).reshape(*shape, 6, 6)
+
+    def _structure_tensor(self) -> Array:
+        """A of the present cells; they stay through a solve."""
+        shares = self.shares()
+        cells = [np.asarray(part) for cell in shares for part in cell]
+        if not self._cells or not all(map(np.array_equal, cells, self._cells)):
+            self._structure, self._cells = whole_structure_tensor(shares), [part.copy() for part in cells]
+        return self._structure
 
     def energy(self) -> float:
         """Its part of the stored energy, over all ranks."""

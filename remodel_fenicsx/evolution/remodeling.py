@@ -8,6 +8,7 @@ import numpy as np
 import ufl
 from numpy.typing import NDArray
 
+from remodel_fenicsx.evolution.compiled_tensor import TensorKernels, with_kernels
 from remodel_fenicsx.evolution.equilibrium import at_points, on_mesh, stress_rounding
 from remodel_fenicsx.evolution.pointwise import PointStresses
 from remodel_fenicsx.evolution.state import State
@@ -16,7 +17,7 @@ from remodel_fenicsx.tissue import spectral
 from remodel_fenicsx.tissue.cells import UnitCell, structure_tensor
 from remodel_fenicsx.tissue.drivers import DRIVERS, FRAMES, carried_axes
 from remodel_fenicsx.tissue.energy import Tissue
-from remodel_fenicsx.tissue.laws import LAWS, Drive
+from remodel_fenicsx.tissue.laws import LAWS, Drive, tensor_target
 from remodel_fenicsx.tissue.repulsion import axes_sum
 from remodel_fenicsx.tissue.tensor_law import Target
 
@@ -70,7 +71,7 @@ class RemodelingPass:
     def __init__(self, state: State, tissue: Tissue, settings: RemodelingSettings):
         self.state, self.settings = state, settings
         self.quadrature = state.cells.quadrature
-        self.tissue = on_mesh(tissue, self.quadrature.mesh)
+        self.tissue = with_kernels(on_mesh(tissue, self.quadrature.mesh), state.comm)
         self.driver, self.law, self.frame = DRIVERS[settings.driver], LAWS[settings.law], FRAMES[settings.frame]
         if settings.kappa == 0.0 and self.law.asks_kappa:  # cells that never move need no pass
             self.law = LAWS["none"]
@@ -142,8 +143,9 @@ class RemodelingPass:
 
     def target(self, residual: float = 0.0) -> Target:
         """What the structure tensor tends to in the present state; of laws that have one."""
-        assert self.law.target is not None
-        return self.law.target(self.drive(residual))
+        drive, target = self.drive(residual), self.law.target
+        assert target is not None
+        return TensorKernels(self.state.comm).target(drive) if target is tensor_target else target(drive)
 
     def followed(self, target: Target, duration: float, cells: UnitCell | None = None) -> UnitCell:
         """Cells of all points in one row, the present or others, after a time with this target. Changes nothing."""

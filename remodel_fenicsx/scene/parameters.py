@@ -75,7 +75,8 @@ class Material(Table):
         default="axes",
         description="Form of the repulsive energy that makes the reference state stress-free: 'axes' is the paper's, "
         "in the stretches along the three cell axes; 'log' sees the structure tensor alone (A : ln C), equals it where "
-        "both have the same axes and suits the law 'tensor'; 'length' is a function of the chains' length alone.",
+        "both have the same axes and suits the law 'tensor'; 'length' is a function of the chains' length alone. Where "
+        "neither scene nor preset says it: 'log' with the law 'tensor'.",
     )
     stress_unit: Literal["Pa", "kPa", "MPa"] = Field(
         default="Pa",
@@ -215,7 +216,8 @@ class Remodeling(Table):
         description="Evolution of the cells: 'explicit' is eq. (11), in absolute time; 'rate' integrates eq. (10); "
         "'relaxation' is dl/dt = kappa (r0 e - l), right for changing loads; 'rotation' (Remark 5) turns the axis of "
         "the largest dimension gradually and leaves the dimensions alone; 'tensor' is 'relaxation' for the "
-        "structure tensor as a whole, without ranks and axes; 'none' leaves the cells alone.",
+        "structure tensor as a whole, without ranks and axes; 'none' leaves the cells alone. Where neither scene nor "
+        "preset says it: 'tensor'.",
     )
     frame: Annotated[str, one_of(FRAMES)] = Field(
         default="material",
@@ -230,7 +232,9 @@ class Remodeling(Table):
         "axis that it overlaps most). The law 'rotation' does not ask.",
     )
     coupling: Annotated[str, one_of(COUPLINGS)] = Field(
-        default="staggered", description="; ".join(f"{name!r}: {text}" for name, text in COUPLINGS.items()) + "."
+        default="staggered",
+        description="; ".join(f"{name!r}: {text}" for name, text in COUPLINGS.items())
+        + ". Where neither scene nor preset says it: 'extrapolated' with the law 'tensor'.",
     )
     relaxation_factor: float = Field(
         default=0.5,
@@ -266,6 +270,24 @@ class Remodeling(Table):
                 f"needs a remodeling.law with a target that can be extrapolated: {laws}", "coupling", self.coupling
             )
         return self
+
+
+# ---------------------------------------------------------------- without a preset
+
+DEFAULT_LAW = "tensor"
+_METHODS: dict[str, dict[str, dict[str, Any]]] = {
+    DEFAULT_LAW: {"material": {"repulsion": "log"}, "remodeling": {"law": DEFAULT_LAW, "coupling": "extrapolated"}},
+}
+
+
+def default_method(values: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """What lies under the keys of a scene without a preset: the law, and what goes with the law that it has.
+
+    It is what measures best (docs/couplings.md); a scene that names another law has the defaults of the tables.
+    """
+    remodeling = values.get("remodeling")
+    law = remodeling.get("law", DEFAULT_LAW) if isinstance(remodeling, Mapping) else DEFAULT_LAW
+    return _METHODS.get(law, {}) if isinstance(law, str) else {}
 
 
 # ---------------------------------------------------------------- presets

@@ -18,7 +18,7 @@ from pydantic import BaseModel, Field, SerializeAsAny, model_validator
 from remodel_fenicsx.body import SHAPES, Shape
 from remodel_fenicsx.body.reductions import AUTO, objections
 from remodel_fenicsx.fem.formulations import FORMULATIONS
-from remodel_fenicsx.scene.parameters import FORMAT, PRESETS, RENAMED, Cells, Material, Remodeling
+from remodel_fenicsx.scene.parameters import FORMAT, PRESETS, RENAMED, Cells, Material, Remodeling, default_method
 from remodel_fenicsx.scene.settings import Load, Mesh, Model, Output, Solver, Supports, Time, nearest_multiples
 from remodel_fenicsx.scene.values import base_material, in_own_units, in_present_format, known_shape
 from remodel_fenicsx.schema.tables import SceneError, Table, checked, fault, quoted, shown, variant_of
@@ -89,7 +89,9 @@ class Scene(Table):
         shape = known_shape(plain.get("geometry", {}), SHAPES)
         _check_load_names(shape, plain.get("loads"))
         base = SHAPES[shape].defaults
-        if preset is not None:
+        if preset is None:
+            base = merged(base, default_method(plain))
+        else:
             if shape not in PRESETS[preset]:
                 known = ", ".join(map(repr, PRESETS[preset]))
                 raise fault(f"the preset {preset!r} has {known}", "geometry.shape", shape)

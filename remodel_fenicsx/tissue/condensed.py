@@ -136,6 +136,12 @@ class Solution:
         return self.strain.outside(self.tensor)
 
     @property
+    def squared_lengths(self) -> Array:
+        """r^2 = A : C, (n,)."""
+        found: Array = np.einsum("nii,ni->n", self.response.cells.structure, self.strain.squared)
+        return found
+
+    @property
     def structure(self) -> Array:
         """A in the global basis, (n, 3, 3)."""
         return self.strain.outside(self.response.cells.structure)
@@ -261,7 +267,7 @@ class CondensedPoints:
         stress = self.stress(strain, answer.cells)
         missing = self._tensor(strain, stress, False)[0] - tensor
         size = np.linalg.norm(tensor, axis=(1, 2))
-        converged = np.linalg.norm(missing, axis=(1, 2)) <= TOLERANCE * size + self.step.noise
+        converged = np.linalg.norm(missing, axis=(1, 2)) <= TOLERANCE * size + self.step.solved
         return Solution(strain, tensor, answer, stress, converged & (stress.extension < 1.0))
 
     def _iterated(self, found: Solution) -> Solution:

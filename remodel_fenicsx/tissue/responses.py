@@ -42,6 +42,9 @@ class StepOfCells:
         Of the step.
     noise
         Size up to which a principal value of the driving tensor may be an error.
+    rounding
+        Size down to which the driving tensor can be solved for; `noise` where it is not given. It is the smaller one:
+        what is missing here is missing in the balance of forces.
     """
 
     law: Law
@@ -56,6 +59,12 @@ class StepOfCells:
     time_old: float
     time_new: float
     noise: float
+    rounding: float | None = None
+
+    @property
+    def solved(self) -> float:
+        """What of the driving tensor may be missing at a solved point."""
+        return self.noise if self.rounding is None else self.rounding
 
     def at(self, chosen: Any) -> StepOfCells:
         """Of some of the points."""

@@ -1,0 +1,212 @@
+"""The consistent law beside the paper's on Figs. 5 to 11, for docs/verification.md.
+
+    ./with-fenicsx python3 docs/compare_consistent.py [--page]
+
+Runs the preset `consistent` with the paper's kappa and with twice of it, and the printed method, where a reduced model
+is exact (cube: a point; artery with isotropic cells: a ray); the tendon of Fig. 6 with its random cells is whole, and
+the printed one is that of docs/figures/fig6.csv. Tables and picture go to docs/figures/; then the page is made again from
+what is there. `--page`: only that, without a run. A few minutes.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from mpi4py import MPI
+
+DOCS = Path(__file__).resolve().parent
+sys.path[:0] = [str(DOCS), str(DOCS.parent)]
+
+from remodel_fenicsx import Simulation  # noqa: E402
+from remodel_fenicsx.paper.output import COLOURS, STYLE, Page, panel_letters, read_table  # noqa: E402
+from remodel_fenicsx.results.columns import Measurement  # noqa: E402
+from remodel_fenicsx.scene import preset_scene  # noqa: E402
+
+END, KAPPA = 150.0, 0.025
+VARIANTS: dict[str, tuple[str, float, str, str]] = {
+    "paper": ("kuhl-holzapfel-2007", 1.0, "the paper's law", COLOURS[0]),
+    "once": ("consistent", 1.0, r"consistent, $\kappa$", COLOURS[1]),
+    "twice": ("consistent", 2.0, r"consistent, $2\kappa$", COLOURS[2]),
+}
+KAPPAS = (0.01, 0.025, 0.05, 0.1)  # of Fig. 5
+LOADS = {"10_0": (0.1, 0.0), "10_2.4": (0.1, 2.4), "10_4.8": (0.1, 4.8), "5_4.8": (0.05, 4.8), "0_4.8": (0.0, 4.8)}
+DRIVERS = ("pk2", "finger")
+EDGES = np.linspace(1.0, 3.0, 9)  # of the layers
+CAPTION = (
+    "The consistent law beside the paper's",
+    "Lines by law. (a) Mean angle to the load in the cube of Fig. 5; (b) stretch of the tendon of Fig. 6; (c) outer and "
+    "inner radius of the artery of Fig. 7, isotropic cells; (d) its reference fibre angle over the radius at t = 150, "
+    "Fig. 8; (e) the same for the other loads of Fig. 9; (f) for the drivers S (full lines) and b (dashed), Figs. 10 "
+    "and 11.",
+)
+Columns = dict[str, np.ndarray]
+
+
+# ---------------------------------------------------------------- runs
+def run(variant: str, shape: str, kinematics: str, **values: Any) -> tuple[list[dict[str, float]], np.ndarray]:
+    """Rows, and means over the layers of the wall of the fibre angle at the end (of a tube)."""
+    preset, factor, *_ = VARIANTS[variant]
+    kappa = factor * values.pop("remodeling.kappa", KAPPA)
+    changes = {"model.kinematics": kinematics, "output.fields": False, "time.end": END, "remodeling.kappa": kappa}
+    simulation = Simulation(preset_scene(preset, shape).with_values(changes | values), MPI.COMM_SELF)
+    steps = list(simulation.steps())
+    means = np.zeros(0)
+    if shape == "tube":
+        angle, volume = Measurement(simulation.observer, steps[-1]).fibre_angle, simulation.quadrature.volumes
+        radius = simulation.quadrature.coordinates[..., 0]
+        inside = [(radius > a) & (radius < b) for a, b in zip(EDGES, EDGES[1:], strict=False)]
+        means = np.array([np.average(angle[at], weights=volume[at]) for at in inside])
+    simulation.close()
+    print(variant, shape, values, flush=True)
+    return [step.row for step in steps], means
+
+
+def column(rows: Sequence[dict[str, float]], name: str) -> np.ndarray:
+    return np.array([row[name] for row in rows])
+
+
+def histories() -> Columns:
+    """By time: the cubes of Fig. 5, the tendon of Fig. 6, the artery of Fig. 7."""
+    table: Columns = {"time": np.arange(1.0, END + 1)}
+    for variant in VARIANTS:
+        for kappa in KAPPAS:
+            rows, _ = run(variant, "cube", "point", **{"remodeling.kappa": kappa})
+            table[f"cube_{kappa:g}_{variant}"] = column(rows, "mean_fibre_angle")
+        if variant != "paper":
+            table[f"tendon_{variant}"] = column(run(variant, "tendon", "full")[0], "mean_stretch")
+    return table
+
+
+def artery() -> tuple[Columns, Columns]:
+    """By time the radii of Fig. 7, and by layer the angles of Figs. 8 to 11."""
+    history: Columns = {}
+    layers: Columns = {"layer": np.arange(1.0, 9.0), "radius": (EDGES[1:] + EDGES[:-1]) / 2}
+    ray = {"cells.initial": "isotropic", "mesh.refinement": 2}
+    for variant in VARIANTS:
+        for case, (elongation, pressure) in LOADS.items():
+            loads = {"loads.elongation.value": elongation, "loads.pressure.value": pressure}
+            rows, layers[f"{case}_{variant}"] = run(variant, "tube", "radial", **ray, **loads)
+            if case == "10_4.8":
+                history |= {f"{face}_{variant}": column(rows, f"{face}_radius") for face in ("inner", "outer")}
+        for driver in DRIVERS:
+            layers[f"{driver}_{variant}"] = run(variant, "tube", "radial", **ray, **{"remodeling.driver": driver})[1]
+    return history, layers
+
+
+# ---------------------------------------------------------------- picture
+def draw(table: Columns, layers: Columns, tendon: Columns) -> Figure:
+    """Six panels; a colour is a law."""
+    figure = Figure(figsize=(7.2, 5.6))
+    panels = figure.subplots(2, 3).ravel()
+    time, radius = table["time"], layers["radius"]
+    for variant, (_, _, label, colour) in VARIANTS.items():
+        style: dict[str, Any] = {"color": colour, "lw": 1.2}
+        panels[0].plot(time, table[f"cube_0.025_{variant}"], label=label, **style)
+        if variant == "paper":
+            panels[1].plot(tendon["time"], tendon["mean_stretch"], **style)
+        else:
+            panels[1].plot(time, table[f"tendon_{variant}"], **style)
+        for face in ("outer", "inner"):
+            panels[2].plot(time, table[f"{face}_{variant}"], **style)
+        panels[3].plot(radius, layers[f"10_4.8_{variant}"], "o-", ms=3, **style)
+        for case in LOADS:
+            if case != "10_4.8":
+                panels[4].plot(radius, layers[f"{case}_{variant}"], "-", **style)
+        for driver, line in zip(DRIVERS, ("-", "--"), strict=True):
+            panels[5].plot(radius, layers[f"{driver}_{variant}"], line, **style)
+    _label(panels)
+    return figure
+
+
+def _label(panels: Sequence[Axes]) -> None:
+    names = ("angle to the load (degrees)", "mean stretch", "radius")
+    for axes, name in zip(panels[:3], names, strict=True):
+        axes.set(xlabel="$t$", ylabel=name, xlim=(0, END))
+    for axes in panels[3:]:
+        axes.set(xlabel="reference radius $R$", ylabel="fibre angle (degrees)", xlim=(1, 3), ylim=(-3, 93))
+        axes.set_yticks(range(0, 91, 30))
+    panels[0].set_ylim(0, 60)
+    panels[0].legend(loc="upper right", fontsize=7)
+    for words, height in (("10 %, $p$ = 0", 81), ("10 %, 2.4", 66), ("5 %, 4.8", 30), ("0 %, 4.8", 3)):
+        panels[4].text(2.97, height, words, fontsize=7, ha="right")
+    figure = panels[0].get_figure()
+    assert isinstance(figure, Figure)
+    figure.subplots_adjust(left=0.08, right=0.985, bottom=0.085, top=0.945, wspace=0.33, hspace=0.33)
+    panel_letters(list(panels))
+
+
+# ---------------------------------------------------------------- the numbers on the page
+def numbers(path: Path) -> Columns:
+    """Columns of a table."""
+    return {name: np.array(values, dtype=float) for name, values in read_table(path).items()}
+
+
+def page_values(folder: Path) -> dict[str, str]:
+    """What the page shows of the tables."""
+    table, layers, tendon = (numbers(folder / f"{name}.csv") for name in ("consistent", "consistent-layers", "fig6"))
+    at_12, peak = table["time"] == 12.0, tendon["time"] == 12.0
+    found = {"consistent_table": layer_table(layers), "caption_consistent": CAPTION[1]}
+    found["paper_peak"] = f"{100 * tendon['mean_stretch'][peak].item():.0f}"
+    found["paper_end"] = f"{100 * tendon['mean_stretch'][-1]:.0f}"
+    for variant in ("once", "twice"):
+        cubes = [np.abs(table[f"cube_{k:g}_{variant}"] - table[f"cube_{k:g}_paper"]).max() for k in KAPPAS]
+        found |= {
+            f"{variant}_cube": f"{max(cubes):.1f}",
+            f"{variant}_cube_end": f"{table[f'cube_0.025_{variant}'][-1]:.1f}",
+            f"{variant}_peak": f"{100 * table[f'tendon_{variant}'][at_12].item():.0f}",
+            f"{variant}_end": f"{100 * table[f'tendon_{variant}'][-1]:.0f}",
+        }
+        for case in (*LOADS, *DRIVERS):
+            apart = np.abs(layers[f"{case}_{variant}"] - layers[f"{case}_paper"])
+            found[f"{variant}_{case.replace('.', '')}"] = f"{apart.max():.1f}"
+    for variant in VARIANTS:
+        found |= {
+            f"{variant}_inner": f"{table[f'inner_{variant}'][-1]:.3f}",
+            f"{variant}_outer": f"{table[f'outer_{variant}'][-1]:.3f}",
+            f"{variant}_outer_24": f"{table[f'outer_{variant}'][23]:.3f}",
+            f"{variant}_stretched": f"{layers[f'10_0_{variant}'].mean():.1f}",
+            f"{variant}_pressed": f"{layers[f'0_4.8_{variant}'][-1]:.1f}",
+        }
+        for driver, case in (("cauchy", "10_4.8"), ("pk2", "pk2"), ("finger", "finger")):
+            found[f"{variant}_variation_{driver}"] = f"{np.ptp(layers[f'{case}_{variant}']):.1f}"
+    found["cube_end_paper"] = f"{table['cube_0.025_paper'][-1]:.1f}"
+    return found
+
+
+def layer_table(layers: Columns) -> str:
+    """Angles of Figs. 8, 10 and 11, layer by layer."""
+    cases = {"σ": "10_4.8", "S": "pk2", "b": "finger"}
+    short = {"paper": "the paper's", "once": "κ", "twice": "2κ"}
+    lines = [["layer", *(f"{symbol}, {short[variant]}" for symbol in cases for variant in VARIANTS)]]
+    lines.append(["---"] * len(lines[0]))
+    for k in range(8):
+        angles = (layers[f"{case}_{variant}"][k] for case in cases.values() for variant in VARIANTS)
+        lines.append([str(k + 1), *(f"{angle:.1f}" for angle in angles)])
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def main() -> None:
+    """Run, draw, write the page."""
+    from make_verification import KEPT, page
+
+    if "--page" not in sys.argv[1:]:
+        table = histories()
+        history, layers = artery()
+        source = ["docs/compare_consistent.py"]
+        Page(KEPT, "consistent", *CAPTION).save_table(table | history, source)
+        Page(KEPT, "consistent").save_table(layers, source, "layers")
+    tables = (numbers(KEPT / f"{name}.csv") for name in ("consistent", "consistent-layers", "fig6"))
+    with matplotlib.rc_context(STYLE):
+        Page(KEPT, "consistent", *CAPTION).save_figure(draw(*tables), "docs/compare_consistent.py")
+    (DOCS / "verification.md").write_text(page(), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,252 @@
+"""Tensors of one point in C: eigenvalues, Mandel matrices, ln C. For the kernels of `tensor_kernels`.
+
+The numpy functions that these stand for are named beside each.
+"""
+
+from __future__ import annotations
+
+ALGEBRA = r"""
+#include <math.h>
+#include <stdint.h>
+#include <string.h>
+
+#define ROOT_2 1.4142135623730951
+#define ALL(i) for (int i = 0; i < 3; ++i)
+#define MANDEL(i) for (int i = 0; i < 6; ++i)
+typedef double vector[6];      /* Mandel components of a symmetric tensor */
+typedef double tensor[3][3];
+typedef double matrix[6][6];   /* a linear map between symmetric tensors */
+
+static const int ROW[6] = {0, 1, 2, 1, 0, 0}, COLUMN[6] = {0, 1, 2, 2, 2, 1};
+static const int PLACE[3][3] = {{0, 5, 4}, {5, 1, 3}, {4, 3, 2}};
+static const double FACTOR[6] = {1, 1, 1, ROOT_2, ROOT_2, ROOT_2};
+
+static inline void to_vector(tensor t, vector v) { MANDEL(a) v[a] = FACTOR[a] * t[ROW[a]][COLUMN[a]]; }
+
+static inline void to_tensor(const vector v, tensor t)
+{
+    ALL(i) ALL(j) t[i][j] = v[PLACE[i][j]] / FACTOR[PLACE[i][j]];
+}
+
+static inline double norm(tensor t)
+{
+    double sum = 0;
+    ALL(i) ALL(j) sum += t[i][j] * t[i][j];
+    return sqrt(sum);
+}
+
+/* logarithm.rotated: Q^T t Q, or Q t Q^T. */
+static inline void rotated(tensor t, tensor q, int back, tensor result)
+{
+    tensor half;
+    ALL(i) ALL(j) {
+        half[i][j] = 0;
+        ALL(k) half[i][j] += t[i][k] * (back ? q[j][k] : q[k][j]);
+    }
+    ALL(i) ALL(j) {
+        double sum = 0;
+        ALL(k) sum += (back ? q[i][k] : q[k][i]) * half[k][j];
+        result[i][j] = sum;
+    }
+}
+
+/* C = F^T F. */
+static inline void strain_of(tensor F, tensor C)
+{
+    ALL(i) ALL(j) {
+        C[i][j] = 0;
+        ALL(k) C[i][j] += F[k][i] * F[k][j];
+    }
+}
+
+/* logarithm.mandel_rotation. */
+static void congruence(tensor q, matrix result)
+{
+    MANDEL(r) MANDEL(s) {
+        const int i = ROW[r], j = COLUMN[r], a = ROW[s], b = COLUMN[s];
+        result[r][s] = (q[i][a] * q[j][b] + q[i][b] * q[j][a]) * FACTOR[r] * FACTOR[s] / 2;
+    }
+}
+
+static void product(matrix a, matrix b, matrix result)
+{
+    memset(result, 0, sizeof(matrix));
+    MANDEL(i) MANDEL(k) MANDEL(j) result[i][j] += a[i][k] * b[k][j];
+}
+
+/* T M T^T. */
+static void turned(matrix turn, matrix m, matrix result)
+{
+    matrix half;
+    product(turn, m, half);
+    MANDEL(i) MANDEL(j) {
+        double sum = 0;
+        MANDEL(k) sum += half[i][k] * turn[j][k];
+        result[i][j] = sum;
+    }
+}
+
+/* The columns of x become those of m^-1 x, by elimination; m is lost. */
+static void divide(matrix m, double *x, int columns)
+{
+    for (int p = 0; p < 6; ++p) {
+        int pivot = p;
+        for (int i = p + 1; i < 6; ++i)
+            if (fabs(m[i][p]) > fabs(m[pivot][p])) pivot = i;
+        for (int j = p; j < 6; ++j) {
+            const double swap = m[p][j];
+            m[p][j] = m[pivot][j], m[pivot][j] = swap;
+        }
+        for (int j = 0; j < columns; ++j) {
+            const double swap = x[p * columns + j];
+            x[p * columns + j] = x[pivot * columns + j], x[pivot * columns + j] = swap;
+        }
+        const double inverse = 1 / m[p][p];
+        for (int i = p + 1; i < 6; ++i) {
+            const double share = m[i][p] * inverse;
+            for (int j = p + 1; j < 6; ++j) m[i][j] -= share * m[p][j];
+            for (int j = 0; j < columns; ++j) x[i * columns + j] -= share * x[p * columns + j];
+        }
+    }
+    for (int p = 5; p >= 0; --p)
+        for (int j = 0; j < columns; ++j) {
+            for (int k = p + 1; k < 6; ++k) x[p * columns + j] -= m[p][k] * x[k * columns + j];
+            x[p * columns + j] /= m[p][p];
+        }
+}
+
+/* One rotation of Jacobi's method in the plane of the axes p and q. */
+static inline void rotate(tensor a, tensor v, int p, int q)
+{
+    if (a[p][q] == 0) return;
+    const int r = 3 - p - q;
+    const double difference = a[q][q] - a[p][p], twice = 2 * a[p][q];
+    const double distance = sqrt(difference * difference + twice * twice);
+    const double t = copysign(1, difference) * twice / (fabs(difference) + distance);
+    const double c = 1 / sqrt(1 + t * t), s = t * c, rp = a[r][p], rq = a[r][q];
+    a[p][p] -= t * a[p][q];
+    a[q][q] += t * a[p][q];
+    a[p][q] = a[q][p] = 0;
+    a[r][p] = a[p][r] = c * rp - s * rq;
+    a[r][q] = a[q][r] = s * rp + c * rq;
+    ALL(i) {
+        const double x = v[i][p], y = v[i][q];
+        v[i][p] = c * x - s * y;
+        v[i][q] = s * x + c * y;
+    }
+}
+
+/* logarithm.eigen: ascending values, vectors as columns. */
+static void eigen(tensor t, double *values, tensor vectors)
+{
+    tensor a;
+    double scale = 0;
+    ALL(i) ALL(j) {
+        scale = fmax(scale, fabs(t[i][j]));
+        vectors[i][j] = i == j;
+    }
+    if (!(scale > 0)) scale = 1;
+    ALL(i) ALL(j) a[i][j] = (t[i][j] + t[j][i]) / 2 / scale;
+    for (int sweep = 0; sweep < 20 && fabs(a[0][1]) + fabs(a[0][2]) + fabs(a[1][2]) > 1e-20; ++sweep)
+        rotate(a, vectors, 0, 1), rotate(a, vectors, 0, 2), rotate(a, vectors, 1, 2);
+    ALL(i) values[i] = scale * a[i][i];
+    for (int pass = 0; pass < 3; ++pass) {
+        const int i = pass == 1, j = i + 1;
+        if (values[i] <= values[j]) continue;
+        const double swap = values[i];
+        values[i] = values[j], values[j] = swap;
+        ALL(k) {
+            const double component = vectors[k][i];
+            vectors[k][i] = vectors[k][j], vectors[k][j] = component;
+        }
+    }
+}
+"""
+
+LOGARITHM = r"""
+/* logarithm.first_divided_difference. */
+static inline double first_difference(double a, double b)
+{
+    const double x = (a - b) / (a + b), square = x * x;
+    return 2 / (a + b) * (fabs(x) < 1e-3 ? 1 + square / 3 + square * square / 5 : atanh(x) / x);
+}
+
+/* logarithm.second_divided_difference of ascending numbers, from f[a, b] and f[b, c]. */
+static inline double second_difference(double a, double b, double c, double first, double last)
+{
+    if (!(c - a < 1e-3 * c)) return (last - first) / (c - a);
+    const double mean = (a + b + c) / 3, three[3] = {a / mean - 1, b / mean - 1, c / mean - 1};
+    double p2 = 0, p3 = 0, p4 = 0;
+    ALL(i) {
+        const double square = three[i] * three[i];
+        p2 += square, p3 += square * three[i], p4 += square * square;
+    }
+    return -(0.5 + p2 / 8 - p3 / 15 + p2 * p2 / 48 + p4 / 24) / (mean * mean);
+}
+
+/* logarithm.first_divided_differences. */
+static void first_differences(const double *c, tensor result)
+{
+    ALL(i) ALL(j) if (i <= j) result[i][j] = result[j][i] = i == j ? 1 / c[i] : first_difference(c[j], c[i]);
+}
+
+/* logarithm.second_derivative. */
+static void second_derivative(const double *c, tensor first, tensor A, matrix result)
+{
+    double f[3][3][3];
+    ALL(i) ALL(j) ALL(k) if (i <= j && j <= k) {
+        const double value = second_difference(c[i], c[j], c[k], first[i][j], first[j][k]);
+        f[i][j][k] = f[i][k][j] = f[j][i][k] = f[j][k][i] = f[k][i][j] = f[k][j][i] = value;
+    }
+    MANDEL(r) for (int s = r; s < 6; ++s) {
+        const int i = ROW[r], j = COLUMN[r];
+        double sum = 0;
+        for (int side = 0; side < 2; ++side) {
+            const int p = side ? COLUMN[s] : ROW[s], q = side ? ROW[s] : COLUMN[s];
+            if (q == j) sum += f[i][p][j] * A[i][p];
+            if (p == i) sum += f[i][q][j] * A[q][j];
+        }
+        result[r][s] = result[s][r] = FACTOR[r] * FACTOR[s] / 2 * sum;
+    }
+}
+
+/* repulsion.log_sum: A : ln C. */
+void log_sum(int64_t n, const double *F, const double *A, double *result)
+{
+    for (int64_t at = 0; at < n; ++at) {
+        tensor gradient, strain, basis;
+        double c[3];
+        memcpy(gradient, F + 9 * at, sizeof(tensor));
+        strain_of(gradient, strain);
+        eigen(strain, c, basis);
+        result[at] = 0;
+        ALL(k) {
+            double along = 0;
+            ALL(i) ALL(j) along += basis[i][k] * A[9 * at + 3 * i + j] * basis[j][k];
+            result[at] += log(c[k]) * along;
+        }
+    }
+}
+
+/* repulsion.log_derivatives; second may be null. */
+void log_derivatives(int64_t n, const double *C, const double *A, double *first, double *second)
+{
+    for (int64_t at = 0; at < n; ++at) {
+        tensor strain, cells, basis, inside, quotients, value;
+        double c[3];
+        memcpy(strain, C + 9 * at, sizeof(tensor)), memcpy(cells, A + 9 * at, sizeof(tensor));
+        eigen(strain, c, basis);
+        rotated(cells, basis, 0, inside);
+        first_differences(c, quotients);
+        ALL(i) ALL(j) value[i][j] = quotients[i][j] * inside[i][j];
+        rotated(value, basis, 1, strain);
+        memcpy(first + 9 * at, strain, sizeof(tensor));
+        if (!second) continue;
+        matrix derivative, turn, outside;
+        second_derivative(c, quotients, inside, derivative);
+        congruence(basis, turn);
+        turned(turn, derivative, outside);
+        memcpy(second + 36 * at, outside, sizeof(matrix));
+    }
+}
+"""

@@ -1,0 +1,359 @@
+"""The law `tensor` and the repulsion `log` at every point, in C: compiled like the forms, held against numpy by tests.
+
+Plain arrays in, plain arrays out. The numpy functions that these stand for are named beside each: `network.stress`,
+`tensor_law.target`, `condensed.CondensedPoints`. What is not solved here is marked, and numpy solves it.
+"""
+
+from __future__ import annotations
+
+from remodel_fenicsx.tissue.tensor_algebra import ALGEBRA, LOGARITHM
+
+DECLARATIONS = """
+void log_sum(int64_t n, const double *F, const double *A, double *result);
+void target(int64_t n, const double *F, const double *tensors, int turned_back, const double *noise, double *direction,
+            double *share);
+void log_derivatives(int64_t n, const double *C, const double *A, double *first, double *second);
+void solve(int64_t n, const double *F, const double *start, const double *old, const double *const *parameters,
+           double noise, double solved, double rate, int driver, int repulsion, double *tensor, double *structure,
+           double *stress, double *squared, uint8_t *converged);
+void tangent(int64_t n, const double *F, const double *tensor, const double *old, const double *const *parameters,
+             double noise, double solved, double rate, int driver, int repulsion, double *result);
+"""
+
+POINT = r"""
+enum { CAUCHY, SECOND_PIOLA_KIRCHHOFF, RIGHT_CAUCHY_GREEN };
+enum { LOG, LENGTH };
+enum { LAMBDA, MU, MODULUS, CONTOUR_LENGTH, END_TO_END_LENGTH, PARAMETERS };
+
+typedef struct {               /* in the eigenbasis of C */
+    tensor F, basis, old;      /* F and the basis in the global one; A at the start of the step */
+    double c[3], u[3], J, parameter[PARAMETERS], noise, solved, rate;
+    int driver, repulsion;
+} point;
+
+typedef struct {
+    tensor D, A, S, missing;   /* missing: what the cells make of D, less D */
+    double values[3], direction[3], share, squared;   /* of D, of E in its basis; s; r^2 */
+    tensor vectors;
+    int converged;
+} state;
+
+static void prepare(point *p, int64_t at, const double *F, const double *old, const double *const *parameters,
+                    double noise, double solved, double rate, int driver, int repulsion)
+{
+    tensor C, global;
+    memcpy(p->F, F + 9 * at, sizeof(tensor)), memcpy(global, old + 9 * at, sizeof(tensor));
+    strain_of(p->F, C);
+    eigen(C, p->c, p->basis);
+    rotated(global, p->basis, 0, p->old);
+    ALL(i) p->u[i] = sqrt(p->c[i]);
+    p->J = p->u[0] * p->u[1] * p->u[2];
+    for (int k = 0; k < PARAMETERS; ++k) p->parameter[k] = parameters[k][at];
+    p->noise = noise, p->solved = solved, p->rate = rate, p->driver = driver, p->repulsion = repulsion;
+}
+
+/* chains.wormlike_stiffness, and its slope by r. */
+static inline double stiffness(double r, double L, double *slope)
+{
+    const double x = r / L, left = 1 - x;
+    *slope = (3 - x) / (4 * left * left * left) / (L * L);
+    return (1 + (2 - x) / (4 * left * left)) / L;
+}
+
+/* network.stress with energy.neo_hookean_derivatives; the derivatives by A and by C may be null. */
+static void stress(point *p, state *s, matrix *by_cells, matrix *by_strain)
+{
+    const double *q = p->parameter, L = q[CONTOUR_LENGTH], r0 = q[END_TO_END_LENGTH];
+    const double volumetric = q[LAMBDA] * log(p->J) - q[MU];
+    double slope, ignored, squared = 0;
+    ALL(i) squared += s->A[i][i] * p->c[i];
+    const double r = sqrt(squared), along = q[MODULUS] * stiffness(r, L, &slope);
+    const double against = q[MODULUS] * stiffness(r0, L, &ignored), steep = q[MODULUS] * slope / (2 * r);
+    tensor quotients;
+    if (p->repulsion == LOG) first_differences(p->c, quotients);
+    else ALL(i) ALL(j) quotients[i][j] = r0 * r0 / squared;
+    s->squared = squared;
+    ALL(i) ALL(j) s->S[i][j] = (along - against * quotients[i][j]) * s->A[i][j];
+    ALL(i) s->S[i][i] += volumetric / p->c[i] + q[MU];
+    if (!by_cells) return;
+    vector a;
+    to_vector(s->A, a);
+    if (p->repulsion == LOG) second_derivative(p->c, quotients, s->A, *by_strain);
+    MANDEL(i) MANDEL(j) {
+        const double across = p->repulsion == LOG ? 0 : against * r0 * r0 / (squared * squared);
+        const double second = p->repulsion == LOG ? -against * (*by_strain)[i][j] : across * a[i] * a[j];
+        const double matrix_part = i < 3 && j < 3 ? q[LAMBDA] / 2 / (p->c[i] * p->c[j]) : 0;
+        (*by_strain)[i][j] = matrix_part + steep * a[i] * a[j] + second;
+        (*by_cells)[i][j] = j < 3 ? (steep + across) * a[i] * p->c[j] : 0;
+    }
+    MANDEL(i) {
+        (*by_strain)[i][i] -= volumetric / (p->c[ROW[i]] * p->c[COLUMN[i]]);
+        (*by_cells)[i][i] += along - against * quotients[ROW[i]][COLUMN[i]];
+    }
+}
+
+/* tensor_law.target: the principal values of E, and s, from those of D. */
+static double weights(const double *values, double noise, double *direction)
+{
+    double largest = 0, tension = 0, compression = 0;
+    ALL(i) largest = fmax(largest, fabs(values[i]));
+    const double unit = largest > 0 ? largest : 1, floor = 7000 * noise / unit;
+    ALL(i) {
+        const double value = values[i] / unit;
+        direction[i] = value > 0 ? value * value : 0;
+        tension += direction[i], compression += value < 0 ? value * value : 0;
+    }
+    const double total = tension + 0.01 * compression + floor * floor;
+    ALL(i) direction[i] /= tension > 0 ? tension : 1;
+    return tension / (total > 0 ? total : 1);
+}
+
+/* The same from F and tensors, of a spatial driver turned back by drivers.rotated_back. */
+void target(int64_t n, const double *F, const double *tensors, int turned_back, const double *noise, double *direction,
+            double *share)
+{
+    for (int64_t at = 0; at < n; ++at) {
+        tensor D, R, basis, vectors;
+        double values[3], weight[3], c[3];
+        memcpy(D, tensors + 9 * at, sizeof(tensor));
+        if (turned_back) {
+            tensor gradient, C, in_basis;
+            memcpy(gradient, F + 9 * at, sizeof(tensor));
+            strain_of(gradient, C);
+            eigen(C, c, basis);
+            ALL(i) ALL(j) {
+                R[i][j] = 0;
+                ALL(k) R[i][j] += gradient[i][k] * basis[k][j] / sqrt(c[j]);
+            }
+            rotated(D, R, 0, in_basis);
+            rotated(in_basis, basis, 1, D);
+        }
+        eigen(D, values, vectors);
+        share[at] = weights(values, noise[at], weight);
+        ALL(i) ALL(j) {
+            double sum = 0;
+            ALL(k) sum += vectors[i][k] * weight[k] * vectors[j][k];
+            direction[9 * at + 3 * i + j] = sum;
+        }
+    }
+}
+
+/* tensor_law.target and tensor_law.follow: A from D. */
+static void cells(point *p, state *s)
+{
+    const double squared = p->parameter[END_TO_END_LENGTH] * p->parameter[END_TO_END_LENGTH];
+    eigen(s->D, s->values, s->vectors);
+    s->share = weights(s->values, p->noise, s->direction);
+    const double weight = -expm1(-p->rate * s->share);
+    ALL(i) ALL(j) {
+        double direction = 0;
+        ALL(k) direction += s->vectors[i][k] * s->direction[k] * s->vectors[j][k];
+        s->A[i][j] = p->old[i][j] + weight * (squared * direction - p->old[i][j]);
+    }
+}
+
+/* responses.tensor_response with tensor_law.target_derivatives: dA/dD at a state that is there. */
+static void cells_by_tensor(point *p, state *s, matrix result)
+{
+    const double squared = p->parameter[END_TO_END_LENGTH] * p->parameter[END_TO_END_LENGTH];
+    double largest = 0, positive = 0, negative = 0, v[3], tension[3], slope[3];
+    ALL(i) largest = fmax(largest, fabs(s->values[i]));
+    const double unit = largest > 0 ? largest : 1;
+    ALL(i) {
+        v[i] = s->values[i] / unit, tension[i] = fmax(v[i], 0);
+        positive += tension[i] * tension[i], negative += fmin(v[i], 0) * fmin(v[i], 0);
+    }
+    const double some = positive > 0 ? positive : 1, noise = 7000 * p->noise / unit;
+    matrix by_values, turn;
+    memset(by_values, 0, sizeof(matrix));
+    ALL(i) ALL(j) by_values[i][j] = 2 * tension[j] / some * ((i == j) - tension[i] * tension[i] / some) / unit;
+    for (int row = 3; row < 6; ++row) {
+        const int i = ROW[row], j = COLUMN[row];
+        const double more = fmax(tension[i], tension[j]), apart = fmax(fabs(v[i] - v[j]), 1e-300);
+        by_values[row][row] = (v[i] > 0 && v[j] > 0 ? v[i] + v[j] : more * more / apart) / some / unit;
+    }
+    congruence(s->vectors, turn);
+    turned(turn, by_values, result);
+    const double floor = 0.01 * negative + noise * noise, total = positive + floor > 0 ? positive + floor : 1;
+    ALL(i) slope[i] = 2 * (tension[i] * floor - 0.01 * positive * fmin(v[i], 0)) / (total * total * unit);
+    const double left = exp(-p->rate * s->share), weight = squared * -expm1(-p->rate * s->share);
+    MANDEL(a) {
+        double way = 0;
+        ALL(k) way += turn[a][k] * s->direction[k];
+        way = squared * way - FACTOR[a] * p->old[ROW[a]][COLUMN[a]];
+        MANDEL(b) {
+            double share = 0;
+            ALL(k) share += turn[b][k] * slope[k];
+            result[a][b] = weight * result[a][b] + p->rate * left * way * share;
+        }
+    }
+}
+
+/* condensed.TENSORS: what a stress makes of D, and the factors of its derivative by the stress. */
+static inline double by_stress(point *p, int i, int j)
+{
+    return p->driver == CAUCHY ? p->u[i] * p->u[j] / p->J : p->driver == SECOND_PIOLA_KIRCHHOFF;
+}
+
+static void drive(point *p, tensor S, tensor D)
+{
+    ALL(i) ALL(j) D[i][j] = p->driver == RIGHT_CAUCHY_GREEN ? (i == j) * p->c[i] : by_stress(p, i, j) * S[i][j];
+}
+
+/* Its derivative by C at fixed stress. */
+static void drive_by_strain(point *p, tensor S, matrix result)
+{
+    memset(result, 0, sizeof(matrix));
+    if (p->driver == RIGHT_CAUCHY_GREEN) MANDEL(a) result[a][a] = 1;
+    if (p->driver != CAUCHY) return;
+    tensor D;
+    drive(p, S, D);
+    MANDEL(b) {
+        tensor stretch, change;
+        memset(stretch, 0, sizeof(tensor));
+        const int k = ROW[b], l = COLUMN[b];
+        stretch[k][l] = stretch[l][k] = 1 / FACTOR[b] / (p->u[k] + p->u[l]);
+        ALL(i) ALL(j) {
+            change[i][j] = 0;
+            ALL(m) change[i][j] += (stretch[i][m] * S[m][j] * p->u[j] + p->u[i] * S[i][m] * stretch[m][j]) / p->J;
+            if (b < 3) change[i][j] -= D[i][j] / (2 * p->c[b]);
+        }
+        MANDEL(a) result[a][b] = FACTOR[a] * change[ROW[a]][COLUMN[a]];
+    }
+}
+"""
+
+LOCAL = r"""
+/* condensed.CondensedPoints._at_tensor: all that D says. */
+static void evaluate(point *p, state *s)
+{
+    tensor D;
+    if (p->driver == RIGHT_CAUCHY_GREEN) drive(p, s->S, s->D);
+    cells(p, s);
+    stress(p, s, 0, 0);
+    drive(p, s->S, D);
+    ALL(i) ALL(j) s->missing[i][j] = D[i][j] - s->D[i][j];
+    const double extension = sqrt(s->squared) / p->parameter[CONTOUR_LENGTH];
+    s->converged = norm(s->missing) <= 1e-12 * norm(s->D) + p->solved && extension < 1;
+    if (p->driver == RIGHT_CAUCHY_GREEN) s->converged = isfinite(norm(s->S));
+}
+
+/* 1 - dD/dS dS/dA dA/dD, and dS/dA dA/dD and dS/dC with it. */
+static void equation(point *p, state *s, matrix result, matrix answers, matrix direct)
+{
+    matrix by_cells, by_tensor;
+    stress(p, s, &by_cells, (matrix *)direct);
+    cells_by_tensor(p, s, by_tensor);
+    product(by_cells, by_tensor, answers);
+    MANDEL(a) MANDEL(b) result[a][b] = (a == b) - by_stress(p, ROW[a], COLUMN[a]) * answers[a][b];
+}
+
+/* condensed.CondensedPoints._iterated: a step not longer than D, halved where it leads to r >= L. */
+static void iterate(point *p, state *s)
+{
+    matrix left, answers, direct;
+    vector change;
+    tensor step;
+    state next;
+    equation(p, s, left, answers, direct);
+    to_vector(s->missing, change);
+    divide(left, change, 1);
+    to_tensor(change, step);
+    const double length = norm(step), size = fmax(norm(s->D), norm(s->missing));
+    double share = length > 0 ? fmin(1, size / length) : 1;
+    const int finite = isfinite(length);
+    for (int halving = 0; halving <= 12; ++halving, share /= 2) {
+        ALL(i) ALL(j) next.D[i][j] = s->D[i][j] + (finite ? share * step[i][j] : 0);
+        evaluate(p, &next);
+        if (sqrt(next.squared) < p->parameter[CONTOUR_LENGTH]) break;
+    }
+    *s = next;
+}
+
+/* condensed.CondensedPoints.solve, from start; all results in the global basis. */
+void solve(int64_t n, const double *F, const double *start, const double *old, const double *const *parameters,
+           double noise, double solved, double rate, int driver, int repulsion, double *tensors, double *structure,
+           double *stresses, double *squared, uint8_t *converged)
+{
+    for (int64_t at = 0; at < n; ++at) {
+        point p;
+        state s;
+        tensor global, P;
+        prepare(&p, at, F, old, parameters, noise, solved, rate, driver, repulsion);
+        memcpy(global, start + 9 * at, sizeof(tensor));
+        rotated(global, p.basis, 0, s.D);
+        evaluate(&p, &s);
+        for (int iteration = 0; iteration < 25 && !s.converged && p.driver != RIGHT_CAUCHY_GREEN; ++iteration)
+            iterate(&p, &s);
+        rotated(s.D, p.basis, 1, global);
+        memcpy(tensors + 9 * at, global, sizeof(tensor));
+        rotated(s.A, p.basis, 1, global);
+        memcpy(structure + 9 * at, global, sizeof(tensor));
+        rotated(s.S, p.basis, 1, global);
+        ALL(i) ALL(j) {
+            P[i][j] = 0;
+            ALL(k) P[i][j] += p.F[i][k] * global[k][j];
+        }
+        memcpy(stresses + 9 * at, P, sizeof(tensor));
+        squared[at] = s.squared;
+        converged[at] = s.converged;
+    }
+}
+
+/* tangents.of_deformation_gradient: dP/dF (9, 9) from S and dS/dC in the eigenbasis of C. */
+static void by_gradient(point *p, tensor S, matrix by_strain, double *result)
+{
+    double F[3][3], one[3][3][3][3], two[3][3][3][3];
+    ALL(i) ALL(j) {
+        F[i][j] = 0;
+        ALL(k) F[i][j] += p->F[i][k] * p->basis[k][j];
+    }
+    ALL(i) ALL(J) ALL(A) ALL(L) {
+        double sum = 0;
+        ALL(I) {
+            const int r = PLACE[I][J], c = PLACE[A][L];
+            sum += F[i][I] * 2 * by_strain[r][c] / (FACTOR[r] * FACTOR[c]);
+        }
+        one[i][J][A][L] = sum;
+    }
+    ALL(i) ALL(J) ALL(k) ALL(L) {
+        double sum = i == k ? S[J][L] : 0;
+        ALL(A) sum += F[k][A] * one[i][J][A][L];
+        two[i][J][k][L] = sum;
+    }
+    ALL(i) ALL(J) ALL(k) ALL(L) {
+        one[i][J][k][L] = 0;
+        ALL(M) one[i][J][k][L] += p->basis[J][M] * two[i][M][k][L];
+    }
+    ALL(i) ALL(J) ALL(k) ALL(L) {
+        double sum = 0;
+        ALL(M) sum += p->basis[L][M] * one[i][J][k][M];
+        result[9 * (3 * i + J) + 3 * k + L] = sum;
+    }
+}
+
+/* condensed.CondensedPoints.tangent at solved points. */
+void tangent(int64_t n, const double *F, const double *tensors, const double *old, const double *const *parameters,
+             double noise, double solved, double rate, int driver, int repulsion, double *result)
+{
+    for (int64_t at = 0; at < n; ++at) {
+        point p;
+        state s;
+        tensor global;
+        matrix left, answers, direct, right, change;
+        prepare(&p, at, F, old, parameters, noise, solved, rate, driver, repulsion);
+        memcpy(global, tensors + 9 * at, sizeof(tensor));
+        rotated(global, p.basis, 0, s.D);
+        evaluate(&p, &s);
+        equation(&p, &s, left, answers, direct);
+        drive_by_strain(&p, s.S, right);
+        MANDEL(a) MANDEL(b) right[a][b] += by_stress(&p, ROW[a], COLUMN[a]) * direct[a][b];
+        divide(left, &right[0][0], 6);
+        product(answers, right, change);
+        MANDEL(a) MANDEL(b) direct[a][b] += change[a][b];
+        by_gradient(&p, s.S, direct, result + 81 * at);
+    }
+}
+"""
+
+SOURCE = ALGEBRA + LOGARITHM + POINT + LOCAL
