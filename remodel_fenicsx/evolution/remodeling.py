@@ -178,6 +178,12 @@ class RemodelingPass:
         cells.set(updated.dimensions.reshape(*shape, 3), updated.axes.reshape(*shape, 3, 3))
         return power
 
+    def look_ahead(self, time: float, residual: float = 0.0) -> None:
+        """What a pass to the limit would make of the present cells, for `residual`; nothing changes."""
+        cells = self.state.cells.point_cells
+        asked, _ = self.updated_cells(time, 2 * time, residual)
+        self._change = (UnitCell(cells.dimensions.copy(), cells.axes.copy()), asked)
+
     def residual(self) -> float:
         """max |A_pass - A| of the last pass over all points, A those of the solved state, in squared link lengths.
 
