@@ -217,3 +217,39 @@ def test_a_signal_for_one_process_ends_the_compilers_own_children(tmp_path: Path
     if not ended:
         os.killpg(process.pid, signal.SIGKILL)
     assert ended
+
+
+LIBRARY = """
+import logging
+from mpi4py import MPI
+from remodel_fenicsx.fem import jit
+logging.basicConfig(level=logging.INFO)
+source = "double twice(double x) { return 2.0 * x; }"
+module = jit.library(MPI.COMM_WORLD, "double twice(double);", source, "what doubles")
+assert module.lib.twice(4.0) == 8.0
+print(MPI.COMM_WORLD.allreduce(len(jit.compiled_kernels())), flush=True)
+"""
+
+
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_functions_in_c_are_compiled_once_like_forms(ranks: int, tmp_path: Path) -> None:
+    def run() -> subprocess.CompletedProcess[str]:
+        command, environment = program(tmp_path, LIBRARY)
+        command = mpirun(ranks, *command)
+        return subprocess.run(command, capture_output=True, text=True, timeout=120, env=environment)
+
+    first, again = run(), run()
+    assert (first.returncode, again.returncode) == (0, 0), first.stderr[-2000:]
+    assert first.stderr.count("compiling what doubles, once on this machine: about 2 s") == 1
+    assert "compil" not in again.stderr
+    assert (first.stdout, again.stdout) == ("1\n" * ranks, "0\n" * ranks)
+    one_file(tmp_path, "libremodel_*.so").unlink()
+    assert "removing a compilation that was cut off" in run().stderr
+
+
+def test_functions_in_c_that_do_not_compile_leave_nothing(tmp_path: Path) -> None:
+    command, environment = program(tmp_path, LIBRARY.replace("return", "retrun"))
+    done = subprocess.run(mpirun(2, *command), capture_output=True, text=True, timeout=120, env=environment)
+    assert done.returncode != 0
+    assert "the first rank could not compile what doubles" in done.stderr  # said by the second
+    assert not list(tmp_path.rglob("libremodel_*.*"))

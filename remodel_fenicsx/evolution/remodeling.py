@@ -17,7 +17,7 @@ from remodel_fenicsx.tissue.cells import UnitCell, structure_tensor
 from remodel_fenicsx.tissue.drivers import DRIVERS, FRAMES, carried_axes
 from remodel_fenicsx.tissue.energy import Tissue
 from remodel_fenicsx.tissue.laws import LAWS, Drive
-from remodel_fenicsx.tissue.repulsion import squared_end_to_end_length
+from remodel_fenicsx.tissue.repulsion import axes_sum
 from remodel_fenicsx.tissue.tensor_law import Target
 
 Array = NDArray[np.float64]
@@ -77,6 +77,7 @@ class RemodelingPass:
         if not self.law.remodels:
             return
         self._change: tuple[UnitCell, UnitCell] | None = None
+        self.kernels = state.cells.kernels
         self._smallest_area = self.quadrature.minimum(self.quadrature.smallest_areas)
         F = state.kinematics.deformation_gradient(state.unknown)
         self._stresses = PointStresses(state, self.tissue)
@@ -89,8 +90,7 @@ class RemodelingPass:
         """F and the symmetric driving tensor at all points, each (elements * points, 3, 3)."""
         self._stresses.refresh()
         values = self.quadrature.evaluate(self._expression, (2, 3, 3)).reshape(-1, 2, 3, 3)
-        driver = values[:, 1]
-        return values[:, 0], (driver + np.swapaxes(driver, 1, 2)) / 2
+        return self.kernels.gradient_and_driver(values)
 
     def drive(self, residual: float = 0.0) -> Drive:
         """What acts on the cells in the present state, which was accepted with this norm of out-of-balance forces."""
@@ -98,7 +98,7 @@ class RemodelingPass:
         noise = self.stress_noise(F, residual) if self.driver.is_stress else spectral.ROUNDING
         return Drive(
             F,
-            spectral.without_noise(tensor, self._steady_axes(F), noise),
+            self.kernels.without_noise(tensor, self._steady_axes(F), noise),
             self.driver,
             self.frame,
             noise,
@@ -107,6 +107,7 @@ class RemodelingPass:
             self.settings.kappa,
             spectral.PAIRINGS[self.settings.pairing],
             self.settings.rotation_time,
+            self.kernels.twins,
         )
 
     def _steady_axes(self, F: Array) -> Array:
@@ -131,7 +132,7 @@ class RemodelingPass:
         length = at_points(self.tissue, self.quadrature).locking_length
         if length is None:
             return 0.0
-        squared = squared_end_to_end_length(F, [self.state.cells.point_cells]) / length**2
+        squared = self.kernels.squared_length(F, self.state.cells.point_cells) / length**2
         return float(np.sqrt(self.quadrature.maximum(squared.reshape(self.quadrature.shape))))
 
     def updated_cells(self, time_old: float, time_new: float, residual: float = 0.0) -> tuple[UnitCell, Array]:
@@ -173,7 +174,7 @@ class RemodelingPass:
             asked,
         )
         updated = self.law.share(self._change[0], asked, factor)
-        increment: Any = at_points(self.tissue, self.quadrature).energy_increment(F, cells.point_cells, updated)
+        increment = self._energy_increment(F, self._change[0], updated)
         power: float = 0.0 - self.quadrature.integral(increment.reshape(shape)) / duration
         cells.set(updated.dimensions.reshape(*shape, 3), updated.axes.reshape(*shape, 3, 3))
         return power
@@ -183,6 +184,17 @@ class RemodelingPass:
         cells = self.state.cells.point_cells
         asked, _ = self.updated_cells(time, 2 * time, residual)
         self._change = (UnitCell(cells.dimensions.copy(), cells.axes.copy()), asked)
+
+    def _energy_increment(self, F: Array, old: UnitCell, new: UnitCell) -> Array:
+        """`Tissue.energy_increment` at all points, with the sums over the axes compiled."""
+        tissue = at_points(self.tissue, self.quadrature)
+        increment: Any
+        if tissue.chain is None or tissue.repulsion.sum is not axes_sum:
+            increment = tissue.energy_increment(F, old, new)
+        else:
+            (before, sum_before), (after, sum_after) = (self.kernels.squared_length_and_sum(F, c) for c in (old, new))
+            increment = tissue.increment(before, after - before, sum_after - sum_before)
+        return np.asarray(increment)
 
     def residual(self) -> float:
         """max |A_pass - A| of the last pass over all points, A those of the solved state, in squared link lengths.

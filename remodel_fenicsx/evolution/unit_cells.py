@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 from numpy.typing import NDArray
 
+from remodel_fenicsx.evolution.compiled import PointKernels
 from remodel_fenicsx.fem.quadrature import Quadrature
-from remodel_fenicsx.tissue.cells import CellSettings, UnitCell, initial_axes, initial_dimensions, structure_tensor
+from remodel_fenicsx.tissue.cells import CellSettings, UnitCell, initial_axes, initial_dimensions
 
 Array = NDArray[np.float64]
 
@@ -55,9 +58,14 @@ class CellField:
         mine, others = (self.dimensions, self.axes), (other.dimensions, other.axes)
         return all(np.array_equal(a.x.array, b.x.array) for a, b in zip(mine, others, strict=True))
 
+    @cached_property
+    def kernels(self) -> PointKernels:
+        """The compiled functions of a pass. Collective, the first time."""
+        return PointKernels(self.quadrature.mesh.comm)
+
     def structure_tensor(self) -> Array:
-        """A = sum_I l_I^2 n_I (x) n_I, shape (cells, points, 3, 3), in squared link lengths."""
-        return structure_tensor(self.dimension_values, self.axis_values)
+        """A = sum_I l_I^2 n_I (x) n_I, shape (cells, points, 3, 3), in squared link lengths. Collective at first."""
+        return self.kernels.structure_tensor(self.dimension_values, self.axis_values)
 
 
 class UnitCells(CellField):

@@ -6,18 +6,22 @@ import fcntl
 import functools
 import hashlib
 import importlib.machinery
+import importlib.util
 import logging
 import os
 import platform
 import resource
 import subprocess
+import sysconfig
 import tempfile
 import time as clock
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
+from types import ModuleType
 from typing import IO, Any
 
+import cffi
 import dolfinx.fem
 import ffcx.codegeneration.jit
 from mpi4py import MPI
@@ -39,6 +43,9 @@ COMPILER_FLAGS = [
     "-O2", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros", "-freciprocal-math",
     "-fassociative-math", "-w",
 ]  # fmt: skip
+
+# of our own C functions: no sum is taken in another order than it is written in
+LIBRARY_FLAGS = ["-std=c17", "-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-w"]
 
 # By number of arguments: what a form is, and the seconds that it takes (the energy here, hexahedra, one core)
 _KINDS = {0: ("an integral", 1), 1: ("the residual", 1), 2: ("the tangent", 5)}
@@ -110,6 +117,58 @@ def expression(ufl_expression: Any, points: Any, name: str | None = None) -> Any
     """Compile a UFL expression for evaluation at reference points of shape (n, 3); otherwise like `form`."""
     with _compiler_watched(extract_unique_domain(ufl_expression).ufl_cargo().comm, name or "an expression", 1):
         return dolfinx.fem.Expression(map_expr_dag(_OwnLabels(), ufl_expression), points, jit_options=jit_options())
+
+
+def library(comm: MPI.Intracomm, declarations: str, source: str, what: str, seconds: int = 2) -> Any:
+    """Compile C functions of our own, or take them from the cache. Collective; says and raises what `form` does.
+
+    Parameters
+    ----------
+    comm
+        Its first rank compiles.
+    declarations, source
+        What can be called, and the code; for every architecture, in ISO C.
+    what, seconds
+        What is being compiled, and about how long it takes, for people.
+
+    Returns
+    -------
+    module
+        cffi's: `module.lib` has the functions, `module.ffi` makes pointers.
+    """
+    text = "\0".join([declarations, source, *LIBRARY_FLAGS, cffi.__version__, sysconfig.get_python_version()])
+    name = f"libremodel_{hashlib.sha256(text.encode()).hexdigest()[:40]}"
+    failure: BaseException | None = None
+    if comm.rank == 0 and not _is_cached(name):
+        try:
+            with _compiling(name, what, seconds):
+                _build(name, declarations, source)
+        except BaseException as error:
+            failure = error
+    if comm.bcast(failure is not None):
+        raise failure or RuntimeError(f"the first rank could not compile {what}")
+    return _loaded(name)
+
+
+def _build(name: str, declarations: str, source: str) -> None:
+    """What FFCx does with its kernels: the source, the library, and last the end mark."""
+    if _is_cached(name):
+        return
+    builder = cffi.FFI()
+    builder.cdef(declarations)
+    builder.set_source(name, source, extra_compile_args=LIBRARY_FLAGS, libraries=["m"])
+    builder.compile(tmpdir=str(cache_folder()))
+    (cache_folder() / f"{name}.c.cached").touch()
+
+
+@functools.cache
+def _loaded(name: str) -> ModuleType:
+    path = cache_folder() / f"{name}{importlib.machinery.EXTENSION_SUFFIXES[0]}"
+    spec = importlib.util.spec_from_file_location(name, path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 class _OwnLabels(MultiFunction):

@@ -245,6 +245,11 @@ class Tissue:
         squared_change = (structure_tensor(*new[:2]) * C).sum(axis=(-1, -2)) - squared
         r0 = self.end_to_end_length
         repulsion_change = self.repulsion.sum(F, [new], r0) - self.repulsion.sum(F, [old], r0)
+        return self.increment(squared, squared_change, repulsion_change)
+
+    def increment(self, squared: Any, squared_change: Any, repulsion_change: Any) -> Any:
+        """The same from the old r^2, its change and that of M: for those who have them already; arrays."""
+        assert self.chain is not None
         stiffness = self.chain.stiffness(sqrt(squared), self.contour_length)
         initial = self.chain.stiffness(self.end_to_end_length, self.contour_length)
         return self.network_modulus / 2 * (stiffness * squared_change - initial * repulsion_change)

@@ -8,8 +8,9 @@ the dimensions stay.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -45,6 +46,8 @@ class Drive(NamedTuple):
         Of `spectral.PAIRINGS`: principal values and axes, in the order in which they belong to the cell's dimensions.
     rotation_time
         Time in which the law `rotation` turns a small angle to 1/e of it.
+    twins
+        Compiled functions that stand for pairings.
     """
 
     deformation_gradient: Array
@@ -57,6 +60,7 @@ class Drive(NamedTuple):
     kappa: float
     pairing: spectral.Pairing = spectral.principal
     rotation_time: float = 40.0
+    twins: Mapping[spectral.Pairing, spectral.Pairing] = MappingProxyType({})
 
 
 def relaxed(old: UnitCell, new: UnitCell, factor: float) -> UnitCell:
@@ -136,6 +140,8 @@ def ranked(function: RankedFunction, has_limit: bool = False, of_absolute_time: 
         target = np.reshape(drive.end_to_end_length, (-1, 1)) * direction
         dimensions = function(cells.dimensions, drive.initial_dimensions, target, drive.kappa, time_old, time_new)
         axes = framed(drive, axes, None if drive.pairing is spectral.principal else dimensions)
+        if active.all():
+            return UnitCell(dimensions, axes)
         return UnitCell(
             np.where(active[:, None], dimensions, cells.dimensions),
             np.where(active[:, None, None], axes, cells.axes),
@@ -155,7 +161,7 @@ def principal_directions(drive: Drive, previous: Array, pairing: spectral.Pairin
     """Principal values and directions of the drive, in the space in which it lives; `previous`: the cells' axes."""
     if not drive.driver.material and drive.frame.carries_axes:
         previous = carried_axes(drive.deformation_gradient, previous)
-    return pairing(drive.tensor, previous, threshold=drive.threshold)
+    return drive.twins.get(pairing, pairing)(drive.tensor, previous, threshold=drive.threshold)
 
 
 def framed(drive: Drive, axes: Array, dimensions: Array | None = None) -> Array:

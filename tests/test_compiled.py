@@ -1,0 +1,154 @@
+"""The compiled pass does what numpy's does: eigenpairs, noise, stretches, and a whole pass of a tube."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from remodel_fenicsx.body.tube import tube
+from remodel_fenicsx.evolution.compiled import PointKernels
+from remodel_fenicsx.evolution.stepper import Step, Watcher
+from remodel_fenicsx.scene import preset_scene
+from remodel_fenicsx.simulation import Simulation
+from remodel_fenicsx.tissue import repulsion, spectral
+from remodel_fenicsx.tissue.cells import UnitCell, structure_tensor
+
+COUNT = 203  # no multiple of the eight that are done at once
+
+
+@pytest.fixture(scope="module")
+def kernels() -> PointKernels:
+    return PointKernels(MPI.COMM_SELF)
+
+
+def random_axes(rng: np.random.Generator) -> spectral.Array:
+    return np.linalg.qr(rng.normal(size=(COUNT, 3, 3)))[0].copy()
+
+
+def tensors_of_every_kind(rng: np.random.Generator) -> tuple[spectral.Array, spectral.Array]:
+    """Random ones; every fifth with two or three equal values, one zero, one diagonal; axes with weak signs too."""
+    axes = random_axes(rng)
+    values = rng.normal(size=(COUNT, 3))
+    values[::5, 1] = values[::5, 0]
+    values[::10] = values[::10, :1]
+    values[7] = 0.0
+    tensors = np.swapaxes(axes, 1, 2) @ (values[:, :, None] * axes)
+    tensors[8] = np.diag([1.0, -2.0, 3.0])
+    previous = 3.0 * random_axes(rng)
+    previous[1::7] = np.roll(axes[1::7], 1, axis=1)  # orthogonal to what they shall decide
+    return tensors, previous
+
+
+@pytest.mark.parametrize("size", [1e-200, 1e-6, 1.0, 1e200])
+@pytest.mark.parametrize("threshold", [0.0, 0.1, "each its own"])
+def test_eigenpairs(kernels: PointKernels, size: float, threshold: float | str) -> None:
+    rng = np.random.default_rng(4)
+    tensors, previous = tensors_of_every_kind(rng)
+    limit = size * (rng.random(COUNT) if isinstance(threshold, str) else np.asarray(threshold))
+    values, axes = spectral.principal(size * tensors, previous, threshold=limit)
+    found, found_axes = kernels.principal(size * tensors, previous, threshold=limit)
+    np.testing.assert_allclose(found / size, values / size, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(found_axes, axes, rtol=0, atol=1e-12)
+
+
+def test_close_values_are_told_apart_as_far_as_their_distance_allows(kernels: PointKernels) -> None:
+    rng = np.random.default_rng(5)
+    axes, gap = random_axes(rng), np.geomspace(3e-8, 1e-1, COUNT)
+    values = np.stack([1 + gap, np.ones(COUNT), -np.ones(COUNT)], axis=1)
+    found, found_axes = kernels.principal(np.swapaxes(axes, 1, 2) @ (values[:, :, None] * axes), axes)
+    np.testing.assert_allclose(found, values, rtol=0, atol=2e-15)
+    assert np.max(np.abs(found_axes - axes) * gap[:, None, None]) < 2e-15
+    np.testing.assert_allclose(
+        found_axes @ np.swapaxes(found_axes, 1, 2), np.tile(np.eye(3), (COUNT, 1, 1)), atol=3e-15
+    )
+
+
+def test_what_is_not_finite_is_named(kernels: PointKernels) -> None:
+    tensors, axes = np.tile(np.diag([3.0, 2.0, 1.0]), (20, 1, 1)), np.tile(np.eye(3), (20, 1, 1))
+    tensors[17, 0, 1] = np.nan
+    with pytest.raises(FloatingPointError, match="tensor 17 of 20 is not finite .1 in all."):
+        kernels.principal(tensors, axes)
+    with pytest.raises(FloatingPointError, match="triad of previous axes 3 of 20"):
+        kernels.principal(axes, np.where(np.arange(20)[:, None, None] == 3, np.inf, axes))
+
+
+def test_noise_across_the_axes(kernels: PointKernels) -> None:
+    rng = np.random.default_rng(6)
+    tensors, axes = tensors_of_every_kind(rng)
+    steady = tensors + 1e-3 * rng.normal(size=tensors.shape)
+    steady = steady + np.swapaxes(steady, 1, 2)
+    near = np.linalg.eigh(tensors)[1].swapaxes(1, 2)
+    for limit in (0.0, 1e-2, 0.5, rng.random(COUNT)):
+        for given in (axes, near):
+            wanted = spectral.without_noise(steady, given, limit)
+            np.testing.assert_allclose(kernels.without_noise(steady, given, limit), wanted, rtol=0, atol=1e-14)
+
+
+def test_stretches_and_structure(kernels: PointKernels) -> None:
+    rng = np.random.default_rng(7)
+    F, cell = np.eye(3) + 0.2 * rng.normal(size=(COUNT, 3, 3)), UnitCell(rng.random((COUNT, 3)), random_axes(rng))
+    squared, logarithms = kernels.squared_length_and_sum(F, cell)
+    np.testing.assert_allclose(squared, repulsion.squared_end_to_end_length(F, [cell]), rtol=1e-14)
+    np.testing.assert_allclose(logarithms, repulsion.axes_sum(F, [cell], 1.0), rtol=0, atol=1e-14)
+    np.testing.assert_array_equal(kernels.squared_length(F, cell), squared)
+    wanted = structure_tensor(*cell[:2])
+    np.testing.assert_allclose(kernels.structure_tensor(*cell[:2]), wanted, rtol=0, atol=1e-15)
+
+
+# ---------------------------------------------------------------- a whole pass
+class InNumpy:
+    """In place of the kernels: what they are twins of."""
+
+    twins: dict[spectral.Pairing, spectral.Pairing] = {}
+    without_noise = staticmethod(spectral.without_noise)
+
+    @staticmethod
+    def squared_length(F: spectral.Array, cell: UnitCell) -> spectral.Array:
+        return np.asarray(repulsion.squared_end_to_end_length(F, [cell]))
+
+    @staticmethod
+    def squared_length_and_sum(F: spectral.Array, cell: UnitCell) -> tuple[spectral.Array, spectral.Array]:
+        return InNumpy.squared_length(F, cell), np.asarray(repulsion.axes_sum(F, [cell], 1.0))
+
+    @staticmethod
+    def gradient_and_driver(both: spectral.Array) -> tuple[spectral.Array, spectral.Array]:
+        return both[:, 0], (both[:, 1] + np.swapaxes(both[:, 1], 1, 2)) / 2
+
+
+class Compare(Watcher):
+    """Makes the pass of every solved state twice, from the same cells, and keeps how far apart they are."""
+
+    def __init__(self, simulation: Simulation):
+        self.simulation, self.axes, self.dimensions, self.power = simulation, 0.0, 0.0, 0.0
+
+    def solved(self, step: Step) -> None:
+        """Both passes; the state is as before afterwards."""
+        stepper, cells = self.simulation.stepper, self.simulation.cells
+        state, compiled, found = self.simulation.state, cells.kernels, []
+        before = state.snapshot()
+        for kernels in (compiled, InNumpy):
+            stepper.remodeling.kernels = kernels
+            power = stepper.remodeling.apply(state.time, step.time, step.work.residual)
+            found.append((cells.dimension_values.copy(), cells.axis_values.copy(), power))
+            state.restore(before)
+        stepper.remodeling.kernels = compiled
+        dimensions, axes, power = (np.max(np.abs(a - b)) for a, b in zip(*found, strict=True))
+        self.dimensions, self.axes = max(self.dimensions, dimensions), max(self.axes, axes)
+        self.power = max(self.power, power / abs(found[1][2]))
+
+
+@pytest.mark.parametrize(
+    "changes", [{}, {"remodeling.frame": "material"}, {"cells.initial": "isotropic", "remodeling.law": "relaxation"}]
+)
+def test_a_pass_of_a_tube(changes: dict[str, str]) -> None:
+    """Random cells; the other frame; cells that are all alike, so that nothing but rounding tells some axes apart."""
+    scene = preset_scene("kuhl-holzapfel-2007", "tube").with_values({"geometry.length": 2.0, "time.end": 6.0} | changes)
+    simulation = Simulation(scene, MPI.COMM_SELF, tube(length=2.0, divisions=(8, 2, 1), comm=MPI.COMM_SELF))
+    compare = Compare(simulation)
+    for _ in simulation.steps([compare]):
+        pass
+    simulation.close()
+    assert compare.dimensions < 1e-13
+    assert compare.axes < 1e-12
+    assert 0.0 < compare.power < 1e-12  # they differ by rounding: both have been made
