@@ -12,9 +12,11 @@ from typing import TypeVar, cast
 
 from mpi4py import MPI
 
+from remodel_fenicsx.evolution.homeostasis import Homeostasis
 from remodel_fenicsx.evolution.parts import StepFailure
 from remodel_fenicsx.evolution.pause import Pause
 from remodel_fenicsx.evolution.stepper import Step, Watcher
+from remodel_fenicsx.evolution.uniqueness import check_uniqueness
 from remodel_fenicsx.results.checkpoint import Checkpoints, restore_state
 from remodel_fenicsx.results.checkpoint_file import Checkpoint, CheckpointError, read_checkpoint
 from remodel_fenicsx.results.fields import Fields, field_names
@@ -42,6 +44,7 @@ def run(
     comm: MPI.Intracomm = MPI.COMM_WORLD,
     quiet: bool = True,
     deadline: float | None = None,
+    other_starts: bool = False,
 ) -> Path:
     """Run a scene and record it.
 
@@ -57,6 +60,8 @@ def run(
         No progress on the terminal.
     deadline
         `time.monotonic` before which it shall stop, between two steps; None: never.
+    other_starts
+        Whether other starts are tried at the end of a run to the equilibrium (`evolution.uniqueness`).
 
     Returns
     -------
@@ -83,7 +88,7 @@ def run(
             simulation = _built(scene, comm)
             place = place or chosen_folder(None, scene.name, comm)
         with _closing(simulation), locked(place, comm, new=True):
-            _record(simulation, place, _Circumstances(stop, quiet, held, deadline))
+            _record(simulation, place, _Circumstances(stop, quiet, held, deadline, other_starts=other_starts))
     return place
 
 
@@ -93,6 +98,7 @@ def resume(
     comm: MPI.Intracomm = MPI.COMM_WORLD,
     quiet: bool = True,
     deadline: float | None = None,
+    other_starts: bool = False,
 ) -> Path:
     """Go on with a recorded run from its last checkpoint, or from t = 0 where it has none yet.
 
@@ -102,7 +108,7 @@ def resume(
         The run's.
     overrides
         "KEY=VALUE": keys that may change are time.end, output, solver, and loads after the checkpoint.
-    comm, quiet, deadline
+    comm, quiet, deadline, other_starts
         As for `run`; the number of ranks may be another one.
 
     Returns
@@ -129,7 +135,8 @@ def resume(
                 with hold_log(comm.rank, quiet=quiet) as more:
                     restore_state(simulation.state, checkpoint)
                 held += more
-            _record(simulation, place, _Circumstances(stop, quiet, held, deadline, resumes=True))
+            around = _Circumstances(stop, quiet, held, deadline, resumes=True, other_starts=other_starts)
+            _record(simulation, place, around)
     return place
 
 
@@ -187,13 +194,14 @@ def _closing(simulation: Simulation) -> Iterator[None]:
 
 @dataclass
 class _Circumstances:
-    """Of a run: who may stop it, what was logged before it had a folder, whether it goes on."""
+    """Of a run: who may stop it, what was logged before it had a folder, whether it goes on, what else is asked."""
 
     stop: StopRequest
     quiet: bool
     held: list[logging.LogRecord] = field(default_factory=list)
     deadline: float | None = None
     resumes: bool = False
+    other_starts: bool = False
 
 
 def _record(simulation: Simulation, place: Path, around: _Circumstances) -> None:
@@ -209,14 +217,9 @@ def _record(simulation: Simulation, place: Path, around: _Circumstances) -> None
     with ExitStack() as stack:
         record = stack.enter_context(_agreed(comm, lambda: RunFolder(place, text, comm.rank, after)))
         stack.enter_context(open_log(place / "run.log", comm.rank, quiet=around.quiet, held=around.held))
-        progress = stack.enter_context(
-            Progress(
-                scene.time.number_of_steps,
-                scene.name,
-                -1 if around.quiet else comm.rank,
-                done=scene.time.progress(state.number, state.time),
-            )
-        )
+        steps = scene.time.number_of_steps if simulation.control else state.number + len(simulation.remaining())
+        rank, done = -1 if around.quiet else comm.rank, scene.time.progress(state.number, state.time)
+        progress = stack.enter_context(Progress(steps, scene.name, rank, done=done))
         log.info("scene %s on %d ranks, results in %s", scene.name, comm.size, place)
         log.info("%s", scene.summary())
         for warning in scene.warnings():
@@ -234,6 +237,8 @@ def _record(simulation: Simulation, place: Path, around: _Circumstances) -> None
         try:
             for _ in simulation.steps(watchers):
                 pass
+            if around.other_starts and isinstance(simulation.stepper.coupling, Homeostasis):
+                check_uniqueness(simulation.stepper.coupling, dict(state.loading.values))
         except (StepFailure, Interrupted, Paused) as reason:
             log.info("ended: %s", reason)
             if getattr(reason, "on_all_ranks", True):

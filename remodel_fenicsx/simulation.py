@@ -13,6 +13,7 @@ from remodel_fenicsx.body.loading import Loading, LoadValues
 from remodel_fenicsx.body import Shape
 from remodel_fenicsx.body.reductions import AUTO, choice, explained
 from remodel_fenicsx.evolution.chatter import Chatter
+from remodel_fenicsx.evolution.homeostasis import Homeostasis
 from remodel_fenicsx.evolution.locking import LockingWarning
 from remodel_fenicsx.evolution.monitor import StabilityWatcher
 from remodel_fenicsx.evolution.resting import Resting
@@ -79,7 +80,11 @@ class Simulation:
         formulation = FORMULATIONS[scene.mesh.formulation]
         self.state = State(self.unknown, kinematics, self.cells, self.loading, formulation)
         tissue = scene.material.tissue(scene.cells.end_to_end_length)
-        self.stepper = Stepper(self.state, tissue, scene.remodeling, scene.solver, self.load_values)
+        at_once = scene.time.is_equilibrium
+        # a predictor goes by the steps before; on the way to an equilibrium there are none like these
+        solver = scene.solver.model_copy(update={"predictor": "none"}) if at_once else scene.solver
+        coupling = Homeostasis if at_once else None
+        self.stepper = Stepper(self.state, tissue, scene.remodeling, solver, self.load_values, coupling)
         self.tissue = self.stepper.tissue
         counted = "negative_eigenvalues" in scene.output.columns
         self.stability = StabilityWatcher(self.stepper, scene.solver.unstable, every_step=counted)
@@ -95,7 +100,7 @@ class Simulation:
         self.observer = Observer(shape, self.stepper, columns_of(shape, columns))
         locks = formulation.locks(scene.mesh.element, scene.mesh.degree)
         self.warnings: list[Watcher] = [LockingWarning(self.stepper, locks)]
-        if self.stepper.remodeling.law.remodels:
+        if self.stepper.remodeling.law.remodels and not at_once:
             chatter = Chatter(self.stepper)
             self.warnings.insert(0, chatter)
             if self.stepper.remodeling.law.of_absolute_time:
@@ -124,8 +129,14 @@ class Simulation:
         watchers = [self.stability, self.observer, *self.warnings, *watchers]
         if self.control is not None:
             return self.control.march(watchers)
-        remaining = list(times(self.scene.time.end, self.scene.time.step))[self.state.number :]
-        return self.stepper.march(remaining, watchers)
+        return self.stepper.march(self.remaining(), watchers)
+
+    def remaining(self) -> list[float]:
+        """Times of the steps that are left, where they are fixed."""
+        scene, state = self.scene, self.state
+        if scene.time.is_equilibrium:
+            return [scene.last_time] if state.time < scene.last_time else []
+        return list(times(scene.time.end, scene.time.step))[state.number :]
 
     def close(self) -> None:
         """Free PETSc's objects and options."""

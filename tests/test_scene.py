@@ -363,8 +363,8 @@ BAD_SCENES = [
     (CUBE, {"mesh.degree": True}, "mesh.degree = true: allowed are 1, 2"),
     # time
     ({"geometry": {"shape": "cube"}}, {}, "time: missing; must be a table with end"),
-    (CUBE, {"time": {"step": 1.0}}, "time.end: missing; must be a finite number greater than 0"),
-    (CUBE, {"time.end": 0.0}, "time.end = 0.0: must be a finite number greater than 0"),
+    (CUBE, {"time": {"step": 1.0}}, "time.end: missing; must be a finite number greater than 0, or 'equilibrium'"),
+    (CUBE, {"time.end": 0.0}, "time.end = 0.0: must be a finite number greater than 0, or 'equilibrium'"),
     (CUBE, {"time.step": -1.0}, "time.step = -1.0: must be a finite number greater than 0"),
     (CUBE, {"time.step": 11.0}, "time.step = 11.0: must be at most time.end = 10.0"),
     (CUBE, {"time.step": 3.0}, "time.end = 10.0: must be a multiple of time.step = 3.0; the nearest are 9 and 12"),
@@ -543,10 +543,10 @@ BAD_OVERRIDES = [
     ("time.end.last=3", "time.end.last = 3: time.end = 100.0 is a value, not a table"),
     ("mesh.refinement.x=3", "mesh.refinement = {x = 3}: must be a whole number at least 1"),
     ("loads.pressure.value=3", "loads.pressure = {value = 3}: a cube has no such load; allowed: loads.force"),
-    ("time.end=nan", "time.end = nan: must be a finite number greater than 0"),
+    ("time.end=nan", "time.end = nan: must be a finite number greater than 0, or 'equilibrium'"),
     ("time=3", "time = 3: must be a table with end"),
     ("cells.initial=[1,", "--set cells.initial = '[1,': must be a TOML value or a bare word"),
-    ("time.end=2007-01-01", "time.end = 2007-01-01: must be a finite number greater than 0"),
+    ("time.end=2007-01-01", "time.end = 2007-01-01: must be a finite number greater than 0, or 'equilibrium'"),
 ]
 
 

@@ -49,6 +49,8 @@ class AnsweringCells:
         Points whose cells answer no more in this solve.
     keeps
         Whether no cells answer at all: those at the start of the step stay.
+    holds
+        Whether points of laws by rank may be held; otherwise a state with points that have no solution is refused.
     """
 
     def __init__(self, state: State, tissue: Tissue, remodeling: RemodelingPass):
@@ -57,6 +59,7 @@ class AnsweringCells:
         self.stress = self.quadrature.function("answering_stress", (3, 3))
         self.tangent = self.quadrature.function("answering_tangent", (9, 9))
         self.keeps = False
+        self.holds = True
         self.held: Flags = np.zeros(int(np.prod(self.quadrature.shape)), dtype=bool)
         self._kernels = None
         if remodeling.law.target is not None:
@@ -121,7 +124,7 @@ class AnsweringCells:
 
     @property
     def _may_hold(self) -> bool:
-        return self._points.step.law.dimensions is not None
+        return self.holds and self._points.step.law.dimensions is not None
 
     def complete(self) -> bool:
         """Whether the cells of the present unknowns may end a step: all belong to their stress, or the law may jump."""

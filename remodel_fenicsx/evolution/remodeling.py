@@ -186,6 +186,12 @@ class RemodelingPass:
         cells.set(updated.dimensions.reshape(*shape, 3), updated.axes.reshape(*shape, 3, 3))
         return power
 
+    def look_ahead(self, time: float, residual: float = 0.0) -> None:
+        """What a pass to the limit would make of the present cells, for `residual`; nothing changes."""
+        cells = self.state.cells.point_cells
+        asked, _ = self.updated_cells(time, 2 * time, residual)
+        self._change = (UnitCell(cells.dimensions.copy(), cells.axes.copy()), asked)
+
     def _energy_increment(self, F: Array, old: UnitCell, new: UnitCell) -> Array:
         """`Tissue.energy_increment` at all points, with the sums over the axes compiled."""
         tissue = at_points(self.tissue, self.quadrature)

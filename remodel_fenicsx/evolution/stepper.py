@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from decimal import Decimal
 
 from remodel_fenicsx.body.loading import LoadValues
-from remodel_fenicsx.evolution.coupling import COUPLINGS, Coupling
+from remodel_fenicsx.evolution.coupling import COUPLINGS, Coupling, Maker
 from remodel_fenicsx.evolution.equilibrium import Extension, on_mesh
 from remodel_fenicsx.evolution.newton import SolverSettings
 from remodel_fenicsx.evolution.parts import Work
@@ -101,6 +101,8 @@ class Stepper:
         Solver settings.
     load_values
         Function of time: magnitudes of all loads.
+    coupling
+        Makes a coupling in place of the one that `remodeling` names.
     """
 
     def __init__(
@@ -110,11 +112,13 @@ class Stepper:
         remodeling: RemodelingSettings,
         solver: SolverSettings,
         load_values: Callable[[float], LoadValues],
+        coupling: Maker | None = None,
     ):
         self.state, self.load_values = state, load_values
         self.tissue = on_mesh(tissue, state.cells.quadrature.mesh)
         self.remodeling = RemodelingPass(state, self.tissue, remodeling)
-        self.coupling: Coupling = COUPLINGS[remodeling.coupling](state, self.tissue, self.remodeling, solver)
+        make = coupling or COUPLINGS[remodeling.coupling]
+        self.coupling: Coupling = make(state, self.tissue, self.remodeling, solver)
         # asked on each rank in every solve: the signal (SIGINT, SIGTERM) that should end it, or 0
         self.stop_signal: Callable[[], int] = lambda: 0
         self.coupling.equilibrium.stop_signal = lambda: self.stop_signal()

@@ -35,7 +35,7 @@ def status(folder: Path) -> list[str]:
         return [f"{folder}: starting, {holder or 'a process'} is at work"]
     scene, history = recording.scene, _rows(recording, lives)
     times = history["time"]
-    end, time = scene.time.end, float(times[-1]) if len(times) else 0.0
+    end, time = scene.last_time, float(times[-1]) if len(times) else 0.0
     number = max(0, len(times) - 1)
     steps, behind = scene.time.number_of_steps, scene.time.progress(number, time)
     of = f" of {steps}" if scene.time.tolerance is None else ""

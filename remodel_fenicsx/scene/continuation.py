@@ -36,7 +36,7 @@ def check_continuation(old: Scene, new: Scene, time: float) -> None:
             old_value, value = (0.0 if one is None else one.value * one.factor(moment) for one in (first, second))
             if moment <= time and abs(old_value - value) > SAME_LOAD * max(abs(old_value), abs(value)):
                 raise SceneError(f"loads.{name} = {value:g} at time {moment:g}: was {old_value:g}; {rule}")
-    if new.time.end < time:
+    if new.last_time < time:
         raise SceneError(f"time.end = {shown(new.time.end)}: must be at least {time:g}, where the checkpoint is")
 
 

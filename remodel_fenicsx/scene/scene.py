@@ -31,6 +31,7 @@ from remodel_fenicsx.tissue.energy import MATRICES, Matrix
 from remodel_fenicsx.tissue.laws import LAWS
 from remodel_fenicsx.tissue.repulsion import REPULSIONS
 
+LIMIT = 1000.0  # times 1/kappa after which nothing is left of a start, of cells under a hundredth of a tension too
 LARGEST_MESH = 10_000_000  # hexahedra; Gmsh, which is serial, needs about 10 GB for them
 
 
@@ -114,6 +115,8 @@ class Scene(Table):
         missing = self._missing_for_implicit() if self.remodeling.coupling == "implicit" else None
         if missing is not None:
             raise fault(f"needs {missing}", "remodeling.coupling", "implicit")
+        if self.time.is_equilibrium and (missing := self._missing_for_equilibrium()) is not None:
+            raise fault(missing, "time.end", self.time.end)
         elements = geometry.number_of_elements * self.mesh.refinement**3
         if elements > LARGEST_MESH:
             largest = math.floor((LARGEST_MESH / geometry.number_of_elements) ** (1 / 3))
@@ -139,10 +142,28 @@ class Scene(Table):
         parts = LAWS[remodeling.law], DRIVERS[remodeling.driver], FRAMES[remodeling.frame]
         return refused(*parts, MATRICES[material.matrix], REPULSIONS[material.repulsion])
 
+    def _missing_for_equilibrium(self) -> str | None:
+        """Why time has no end that does not depend on the way there."""
+        law, laws = self.remodeling.law, ", ".join(repr(name) for name, law in LAWS.items() if law.has_limit)
+        if not LAWS[law].has_limit:
+            return f"remodeling.law = {law!r} has no limit that the way there does not decide; those with one: {laws}"
+        if self.remodeling.kappa == 0:
+            return "remodeling.kappa = 0: the cells never change"
+        missing = self._missing_for_implicit()
+        return None if missing is None else f"needs {missing}"
+
+    @property
+    def last_time(self) -> float:
+        """The time of the last row: where the equilibrium is asked for, one at which nothing is left of the start."""
+        if not self.time.is_equilibrium:
+            return float(self.time.end)
+        ramps = [load.ramp[-1][0] for load in self.loads.values()]
+        return max(ramps, default=0.0) + LIMIT / self.remodeling.kappa
+
     def _check_load(self, name: str, load: Load) -> None:
         step, key = self.time.step, f"loads.{name}"
         for index, (time, factor) in enumerate(load.ramp):
-            if time <= self.time.end and not self.time.is_hit(time):
+            if not self.time.is_equilibrium and time <= self.time.end and not self.time.is_hit(time):
                 raise fault(nearest_multiples(time, step, "time.step"), f"{key}.ramp[{index}][0]", time)
             value, above = load.value * factor, self.geometry.loads[name].above
             if value <= above:
@@ -153,6 +174,8 @@ class Scene(Table):
 
     def _check_output_times(self) -> None:
         for index, time in enumerate(self.output.times):
+            if self.time.is_equilibrium:
+                raise fault("there are no times on the way to an equilibrium", f"output.times[{index}]", time)
             if time > self.time.end:
                 raise fault(f"must be at most time.end = {shown(self.time.end)}", f"output.times[{index}]", time)
             if not self.time.is_hit(time):
@@ -168,7 +191,7 @@ class Scene(Table):
         """Stiffness of network and matrix and the largest loads, in one unit and on one line."""
         loads = {}
         for name, load in self.loads.items():
-            largest, dimension = load.largest(self.time.end), self.geometry.loads[name].dimension
+            largest, dimension = load.largest(self.last_time), self.geometry.loads[name].dimension
             if dimension == STRESS:
                 loads[f"largest {name}"] = largest
             elif dimension == FORCE:

@@ -135,10 +135,29 @@ class Load(Table):
         return max((self.value * self.factor(time) for time in times), key=abs)
 
 
+EQUILIBRIUM = "equilibrium"
+"""What `time.end` says where the way there is not asked for."""
+
+
+def _end(value: Any) -> Any:
+    """A time, or the word."""
+    if value == EQUILIBRIUM:
+        return value
+    if not is_number(value) or not value > 0:
+        raise fault(f"must be a finite number greater than 0, or {EQUILIBRIUM!r}")
+    return float(value)
+
+
 class Time(Table):
     """Simulated time, in the unit of 1/kappa. It starts at 0 with the unloaded body."""
 
-    end: float = Field(gt=0, description="Last time; a whole number of steps, or any time with a tolerance.")
+    # a number for all who step through time; those who take the word ask `is_equilibrium` first
+    end: Annotated[Any, checked(_end)] = Field(
+        description="Last time, a whole number of steps, or any time with a tolerance; or 'equilibrium': straight to "
+        "the state that remodeling comes to under the loads at the end of their ramps (docs/theory.md, Equilibrium at "
+        "once).",
+        json_schema_extra={"allowed": "a finite number greater than 0, or 'equilibrium'"},
+    )
     step: float = Field(
         default=1.0, gt=0, description="Time between two remodeling passes; with a tolerance the first step."
     )
@@ -152,6 +171,10 @@ class Time(Table):
 
     @model_validator(mode="after")
     def _whole_number_of_steps(self) -> Time:
+        if self.is_equilibrium:
+            if self.tolerance is not None:
+                raise fault(f"has no effect with time.end = {EQUILIBRIUM!r}", "tolerance", self.tolerance)
+            return self
         if self.step > self.end:
             raise fault(f"must be at most time.end = {shown(self.end)}", "step", self.step)
         if self.end / self.step > MOST_STEPS:
@@ -162,9 +185,14 @@ class Time(Table):
         return self
 
     @property
+    def is_equilibrium(self) -> bool:
+        """Whether the end is no time."""
+        return bool(self.end == EQUILIBRIUM)
+
+    @property
     def number_of_steps(self) -> int:
-        """Number of steps from 0 to the end; with a tolerance the run's own are others."""
-        return round(self.end / self.step)
+        """Number of steps from 0 to the end, the equilibrium is one; with a tolerance the run's own are others."""
+        return 1 if self.is_equilibrium else round(self.end / self.step)
 
     def is_hit(self, time: float) -> bool:
         """Whether a step ends at a time, or may end there."""

@@ -179,7 +179,9 @@ def _beside(found: Ensemble, name: str, row: int, mean: float, deviation: float)
 def chosen_times(scene: Scene) -> list[float]:
     """The end of the last ramp, and the end."""
     ramps = [load.ramp[-1][0] for load in scene.loads.values()]
-    step, end = scene.time.step, scene.time.end
+    step, end = scene.time.step, scene.last_time
+    if scene.time.is_equilibrium:
+        return [end]
     last = step * round(max(ramps, default=end) / step)
     return [last, end] if step <= last < end else [end]
 

@@ -70,7 +70,7 @@ class Member:
             raise SceneError(f"{self.folder}: holds a run of another scene; choose another folder with -o")
         with suppress(RecordingError):  # a last row that is not whole is done again
             times = recording.history["time"]
-            return bool(len(times)) and same_time(float(times[-1]), self.scene.time.end)
+            return bool(len(times)) and same_time(float(times[-1]), self.scene.last_time)
         return False
 
     def history(self) -> HistoryColumns:
