@@ -13,6 +13,7 @@ from mpi4py import MPI
 from remodel_fenicsx import Recording, Scene, SceneError, Simulation, cli, run
 from remodel_fenicsx.scene import scene_from_dict
 from remodel_fenicsx.body.reductions import AUTO, choice, explained, objections
+from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.results.columns import Measurement
 from tests.conftest import Case
@@ -263,6 +264,18 @@ def test_validate_says_it_and_a_forbidden_one_ends_with_2(tmp_path: Path, capsys
         and "\n" not in error[:-1]
     )
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("shape", "name", "size"), [("cube", "point", {"side": 2.5}), ("tendon", "point", {"area": 3.0}),
+                                ("tube", "radial", {"length": 2.5})]
+)  # fmt: skip
+def test_another_size_compiles_nothing(shape: str, name: str, size: dict[str, float]) -> None:
+    """The size of the body is no literal of the kernels."""
+    history(scene(shape, name, 1.0))
+    before = len(jit.compiled_kernels())
+    history(scene(shape, name, 1.0, geometry={"shape": shape, **size}))
+    assert len(jit.compiled_kernels()) == before
 
 
 def test_small_reduced_problems_are_factorised_by_petsc_itself() -> None:

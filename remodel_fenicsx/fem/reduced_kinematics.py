@@ -43,6 +43,9 @@ class _Reduced:
 
     def __init__(self, mesh: Any = None, body: Body | None = None):
         self.mesh, self.body = mesh, body
+        if mesh is not None and body is not None:  # Constants, so that another body compiles nothing
+            self.axial_length = _constant(mesh, body.axial_length)
+            self.section_area = _constant(mesh, body.section_area)
 
     def element(self, kind: str) -> str:
         """Of fewer dimensions."""
@@ -120,10 +123,7 @@ class RadialKinematics(_Reduced):
     def __init__(self, mesh: Any = None, body: Body | None = None):
         super().__init__(mesh, body)
         if mesh is not None:
-            import dolfinx.fem
-            from petsc4py import PETSc
-
-            self.axial_strain = dolfinx.fem.Constant(mesh, PETSc.ScalarType(0.0))  # type: ignore[attr-defined]
+            self.axial_strain = _constant(mesh, 0.0)
 
     def unknown(self, mesh: Any, degree: int) -> Any:
         """u_r, zero."""
@@ -145,8 +145,7 @@ class RadialKinematics(_Reduced):
 
     def weight(self, mesh: Any) -> Any:
         """2 pi r times the length."""
-        assert self.body is not None
-        return self.body.axial_length * _circumference(mesh)
+        return self.axial_length * _circumference(mesh)
 
     def uniform_strain(self, component: int) -> Any:
         """The axial strain."""
@@ -183,22 +182,19 @@ class PointKinematics(_Reduced):
         """u_i x_i / length."""
         import ufl
 
-        assert self.body is not None
         x = ufl.SpatialCoordinate(self.mesh)
-        return ufl.as_vector([unknown[i] * x[i] / self.body.axial_length for i in range(3)])
+        return ufl.as_vector([unknown[i] * x[i] / self.axial_length for i in range(3)])
 
     def deformation_gradient(self, unknown: Any) -> Any:
         """Diagonal and constant."""
         import ufl
 
-        assert self.body is not None
-        stretches = (_along(i, unknown[i] / self.body.axial_length) for i in range(3))
+        stretches = (_along(i, unknown[i] / self.axial_length) for i in range(3))
         return sum(stretches, ufl.Identity(3))
 
     def weight(self, mesh: Any) -> Any:
         """Area of the section."""
-        assert self.body is not None
-        return self.body.section_area
+        return self.section_area
 
     def nodal_space(self, unknown: Any) -> Any:
         """Continuous on the bar."""
@@ -210,6 +206,13 @@ class PointKinematics(_Reduced):
         places: Array = self._nodes.tabulate_dof_coordinates()
         # a rank without the element has neither nodes nor numbers
         return places * unknown.x.array.reshape(-1, 3)[:1] / self.body.axial_length if len(places) else places
+
+
+def _constant(mesh: Any, value: float) -> Any:
+    import dolfinx.fem
+    from petsc4py import PETSc
+
+    return dolfinx.fem.Constant(mesh, PETSc.ScalarType(value))  # type: ignore[attr-defined]
 
 
 def _along(axis: int, value: Any) -> Any:
