@@ -381,7 +381,11 @@ BAD_SCENES = [
         {"solver.relative_tolerance": 1.0},
         "solver.relative_tolerance = 1.0: must be a finite number at least 0 and less than 1",
     ),
-    (CUBE, {"solver.method": "magic"}, "solver.method = 'magic': allowed is 'direct'"),
+    (
+        CUBE,
+        {"solver.method": "magic"},
+        "solver.method = 'magic': allowed are 'auto', 'direct', 'lagged', 'exact', 'iterative'",
+    ),
     (
         CUBE,
         {"solver.petsc_options": {"-ksp_type": "cg"}},

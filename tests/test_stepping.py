@@ -96,7 +96,7 @@ def test_a_remodeling_increment_beyond_the_contour_length_ends_where_a_good_star
 
 def test_a_step_that_needs_no_parts_is_one_solve() -> None:
     made = clamped_cube()
-    stepper = made.stepper(lambda t: {"force": t})
+    stepper = made.stepper(lambda t: {"force": t}, parts.TIGHT.model_copy(update={"predictor": "none"}))
     stepper.advance(1.0)
     start = state(made)
     work = solve(stepper, 2.0)

@@ -17,6 +17,7 @@ import h5py
 import numpy as np
 import pytest
 
+from remodel_fenicsx.results import vtkhdf
 from remodel_fenicsx.results.chain_lines import chain_displacement, chain_lines
 from remodel_fenicsx.results.staged_file import StagedFile
 from remodel_fenicsx.results.vtkhdf import LINE, TransientGrid, cell_type_and_permutation
@@ -453,3 +454,40 @@ def test_a_mark_without_its_changes_says_nothing(tmp_path):
         (tmp_path / "f").write_bytes(b"good" + changes + end)
         StagedFile(tmp_path / "f", existing=True).close()
         assert (tmp_path / "f").read_bytes() == b"good" + changes + end
+
+
+def test_fields_of_a_run_that_began_with_filters_go_on(tmp_path, monkeypatch):
+    """0.1.0 compressed fields; new steps of such a file stand in it as they are, and are read like the others."""
+    path, field = tmp_path / "f.vtkhdf", np.random.default_rng(1).random((4, 8, 3))
+    create = h5py.Group.create_dataset
+    with monkeypatch.context() as patch:
+        filters = {"compression": "gzip", "shuffle": True}
+        patch.setattr(h5py.Group, "create_dataset", lambda self, *a, **k: create(self, *a, **(filters | k)))
+        patch.setattr(vtkhdf, "_write_block", lambda data, n, block: _through_h5py(data, n, block))
+        with TransientGrid(path, CUBE, VTK_CUBE, 12, field_dtype=np.float64) as grid:
+            for k in range(3):
+                grid.append(k, {"u": field[k]}, {"c": np.full(1, k)}, points=CUBE + k)
+    with TransientGrid.continued(path, 1.0, field_dtype=np.float64) as grid:
+        for k in (2, 3):
+            grid.append(k, {"u": field[k]}, {"c": np.full(1, k)}, points=CUBE + k)
+    with h5py.File(path) as file:
+        assert file["VTKHDF/PointData/u"].compression == "gzip"
+    np.testing.assert_array_equal(raw_series(path, "u", 8), field)
+    assert [float(points[0, 0]) for points in read_points(path)] == [CUBE[0, 0] + k for k in (0, 0, 1, 2, 3)]
+
+
+def _through_h5py(dataset, number, block):
+    dataset.resize((number + 1) * len(block), axis=0)
+    dataset[number * len(block) :] = block
+
+
+def read_points(path: Path) -> np.ndarray:
+    with h5py.File(path) as file:
+        return file["VTKHDF/Points"][:].reshape(-1, len(CUBE), 3)
+
+
+def test_steps_are_not_compressed(tmp_path):
+    with TransientGrid(tmp_path / "f.vtkhdf", CUBE, VTK_CUBE, 12) as grid:
+        grid.append(0.0, {"u": CUBE})
+    with h5py.File(tmp_path / "f.vtkhdf") as file:
+        assert file["VTKHDF/PointData/u"].compression is None and file["VTKHDF/PointData/u"].chunks == (8, 3)

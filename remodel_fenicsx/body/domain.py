@@ -49,10 +49,12 @@ class Domain:
     node_number: npt.NDArray[np.int64] = field(init=False)
     number_of_elements: int = field(init=False)
     number_of_nodes: int = field(init=False)
+    _orders: dict[str, _Order] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         topology, geometry = self.mesh.topology, self.mesh.geometry
-        settle = object.__setattr__  # the dataclass is frozen: these four follow from the mesh
+        settle = object.__setattr__  # the dataclass is frozen: these follow from the mesh
+        settle(self, "_orders", {})
         settle(self, "element_number", np.asarray(topology.original_cell_index, dtype=np.int64))
         settle(self, "node_number", np.asarray(geometry.input_global_indices, dtype=np.int64))
         settle(self, "number_of_elements", int(topology.index_map(topology.dim).size_global))
@@ -88,7 +90,7 @@ class Domain:
         """
         topology = self.mesh.topology
         owned = topology.index_map(topology.dim).size_local
-        return self._gather(np.asarray(values), self.element_number[:owned], self.number_of_elements)
+        return self._gather(np.asarray(values), "elements", self.element_number[:owned])
 
     def scatter_elements(self, values: npt.NDArray[Any] | None) -> npt.NDArray[Any]:
         """Give every rank the rows of its elements, ghosts included: the way back of `gather_elements`. Collective.
@@ -126,7 +128,7 @@ class Domain:
             If there are fewer rows than owned nodes.
         """
         owned = self.mesh.geometry.index_map().size_local
-        return self._gather(np.asarray(values), self.node_number[:owned], self.number_of_nodes)
+        return self._gather(np.asarray(values), "nodes", self.node_number[:owned])
 
     def gather_mesh(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]] | tuple[None, None]:
         """The whole mesh on rank 0, in input order, the same for every number of ranks. Collective.
@@ -141,14 +143,37 @@ class Domain:
         elements = self.gather_elements(self.node_number[compat.geometry_dofmap(self.mesh)])
         return (None, None) if points is None or elements is None else (points, elements)
 
-    def _gather(self, values: npt.NDArray[Any], number: npt.NDArray[np.int64], total: int) -> npt.NDArray[Any] | None:
+    def _gather(self, values: npt.NDArray[Any], kind: str, number: npt.NDArray[np.int64]) -> npt.NDArray[Any] | None:
+        """Rows as buffers, without pickle; their numbers are sent once only."""
         short = self.comm.allreduce(len(values) < len(number), MPI.LOR)
         if short:
             raise ValueError(f"{len(values)} rows for {len(number)} owned entities on rank {self.comm.rank}")
-        parts = self.comm.gather((number, values[: len(number)]), root=0)
-        if parts is None:
+        if kind not in self._orders:
+            self._orders[kind] = _Order.gathered(self.comm, number)
+        order, rows = self._orders[kind], np.ascontiguousarray(values[: len(number)])
+        row_bytes = rows.itemsize * int(np.prod(rows.shape[1:], dtype=np.int64))
+        row = MPI.BYTE.Create_contiguous(row_bytes).Commit()  # counts of bytes would overflow
+        by_rank = np.empty((sum(order.counts), *rows.shape[1:]), rows.dtype)
+        self.comm.Gatherv([rows, len(rows), row], [by_rank, order.counts, row] if self.comm.rank == 0 else None, root=0)
+        row.Free()
+        if self.comm.rank != 0:
             return None
-        whole = np.empty((total, *values.shape[1:]), dtype=values.dtype)
-        for numbers, rows in parts:
-            whole[numbers] = rows
+        whole = np.empty_like(by_rank)
+        whole[order.numbers] = by_rank
         return whole
+
+
+@dataclass(frozen=True)
+class _Order:
+    """On rank 0: the numbers of what all ranks own, rank after rank, and how many each has; elsewhere nothing."""
+
+    numbers: npt.NDArray[np.int64]
+    counts: list[int]
+
+    @classmethod
+    def gathered(cls, comm: MPI.Intracomm, number: npt.NDArray[np.int64]) -> _Order:
+        counts = comm.gather(len(number)) or []
+        numbers = np.empty(sum(counts), dtype=np.int64)
+        target = [numbers, counts, MPI.INT64_T] if comm.rank == 0 else None
+        comm.Gatherv([np.ascontiguousarray(number), len(number), MPI.INT64_T], target)
+        return cls(numbers, counts)

@@ -39,7 +39,7 @@ class Blend:
     def newton(self) -> GuardedNewton:
         """The solver."""
         if self._newton is None:
-            self._newton = GuardedNewton(self.equilibrium, self.settings)
+            self._newton = GuardedNewton(self.equilibrium, self.settings, robust=True)
         return self._newton
 
     def close(self) -> None:

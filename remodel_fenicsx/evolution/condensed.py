@@ -14,6 +14,7 @@ from remodel_fenicsx.evolution.equilibrium import Equilibrium, at_points
 from remodel_fenicsx.evolution.newton import GuardedNewton, Solution, SolveFailure, SolverSettings
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
 from remodel_fenicsx.evolution.state import State
+from remodel_fenicsx.fem.solver_methods import AUTO
 from remodel_fenicsx.tissue import condensed, spectral
 from remodel_fenicsx.tissue.cells import UnitCell, structure_tensor
 from remodel_fenicsx.tissue.energy import Tissue
@@ -233,7 +234,8 @@ class AnsweringNewton(GuardedNewton):
     """Newton's method for cells that answer."""
 
     def __init__(self, equilibrium: AnsweringEquilibrium, settings: SolverSettings):
-        super().__init__(equilibrium, settings)
+        # cells that answer make steps far more nonlinear, and tangents unsymmetric: nothing is gained by old factors
+        super().__init__(equilibrium, settings, robust=settings.method == AUTO)
         self.answering = equilibrium.answering
 
     def solve(self) -> Solution:

@@ -240,6 +240,7 @@ class Extrapolated(Staggered):
                 work.linear_iterations + again.linear_iterations,
                 work.substeps + again.substeps - 1,
                 again.residual,
+                work.tangents + again.tangents,
             )
         self._follow(self._extrapolated(time), time)
         return super().solve(time, loads)

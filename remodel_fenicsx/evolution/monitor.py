@@ -15,7 +15,8 @@ from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
 
 log = logging.getLogger(__name__)
 
-ITERATIONS_BETWEEN_LOOKS = 100  # Newton iterations, each of about the cost of a look
+ITERATIONS_BETWEEN_LOOKS = 100  # Newton iterations with a tangent, each of about the cost of a look
+OLD_FACTOR = 1 / 8  # of these, what an iteration without a new tangent counts
 FIRST_INVERSE_ITERATIONS = 3  # later steps go on from the vector of the step before: one each
 
 
@@ -63,7 +64,9 @@ class StabilityWatcher(Watcher):
             If the equilibrium is unstable and the run is to stop there.
         """
         known = int(self._numbers["known"])
-        self._numbers["iterations"] = iterations = self._numbers["iterations"] + step.work.newton_iterations
+        work = step.work
+        effort = work.tangents + OLD_FACTOR * max(0, work.newton_iterations - work.tangents)
+        self._numbers["iterations"] = iterations = self._numbers["iterations"] + effort
         suspicious = self.signs.differ(known) if step.work.newton_iterations else False
         overdue = iterations >= ITERATIONS_BETWEEN_LOOKS or (step.is_last and iterations > 0)
         if not (suspicious or overdue or self.every_step):
@@ -176,7 +179,9 @@ class Signs:
 
 
 def determinant_sign(factorisation: Any) -> int:
-    """1 or -1, on all ranks; 0 where the factorisation does not tell."""
+    """1 or -1, on all ranks; 0 where the factorisation does not tell. CHOLMOD takes positive definite matrices only."""
+    if factorisation.getFactorSolverType() == "cholmod":
+        return 1
     if factorisation.getFactorSolverType() != "mumps":
         return 0
     factor = factorisation.getFactorMatrix()

@@ -9,18 +9,21 @@ from typing import Any, Protocol
 
 import dolfinx.fem.petsc
 import numpy as np
-from numpy.typing import NDArray
+from mpi4py import MPI
 from petsc4py import PETSc
 
 from remodel_fenicsx.evolution.equilibrium import Equilibrium, Extension, stress_rounding
+from remodel_fenicsx.evolution.limits import Limits
+from remodel_fenicsx.evolution.linear import BY_METHOD, EveryTangent
 from remodel_fenicsx.fem.petsc_options import ProblemOptions
-from remodel_fenicsx.fem.solver_methods import SMALL
+from remodel_fenicsx.fem.solver_methods import AUTO, EXACT, LAGGED, SMALL, chosen, method_options
 from remodel_fenicsx.system.interrupts import Interrupted
 
 log = logging.getLogger(__name__)
 
 LINE_SEARCH_HALVINGS = 20  # of one Newton step, before the solve is given up
 ROUNDINGS = 8.0  # how many times the rounding of assembled forces a residual may be
+MET = 1e-13  # of the body's size: prescribed values that are met to rounding
 PRESCRIBED_MET = 1e-10  # of the body's size: how far a prescribed displacement may be missed; no force measures it
 ON_THE_WAY = 1e-3  # of the nodal forces: residual of a part that others follow
 NEAR_LOCKING, KEPT_RESERVE = 0.95, 0.3  # a Newton step that ends above this r/L keeps this share of 1 - r/L
@@ -69,6 +72,14 @@ class Solution:
     linear_iterations: int
     residual: float = 0.0
     """Norm of the out-of-balance nodal forces that was accepted."""
+    tangents: int = 0
+    """How many were assembled."""
+
+    def after(self, failure: SolveFailure) -> Solution:
+        """With the work of an attempt that had failed before."""
+        newton = self.newton_iterations + failure.newton_iterations
+        linear = self.linear_iterations + failure.linear_iterations
+        return Solution(newton, linear, self.residual, self.tangents + failure.tangents)
 
 
 class SolveFailure(RuntimeError):
@@ -81,8 +92,10 @@ class SolveFailure(RuntimeError):
         linear_iterations: int,
         extension: Extension,
         residual_over_tolerance: float = np.inf,
+        tangents: int = 0,
     ):
         super().__init__(reason)
+        self.tangents = tangents
         self.residual_over_tolerance = residual_over_tolerance
         self.reason = reason
         self.newton_iterations = newton_iterations
@@ -98,16 +111,27 @@ class GuardedNewton:
     equilibrium
         Residual, tangent and limits.
     settings
-        Tolerances, limits and PETSc options.
+        Method, tolerances, limits and PETSc options.
+    robust
+        Take new factors in every iteration, where the method would keep them.
+
+    Attributes
+    ----------
+    method
+        Name of the method, where the settings leave it open.
     """
 
-    def __init__(self, equilibrium: Equilibrium, settings: SolverSettings):
+    def __init__(self, equilibrium: Equilibrium, settings: SolverSettings, robust: bool = False):
         self.equilibrium, self.settings = equilibrium, settings
         self.unknown = equilibrium.state.unknown
         self._x = self.unknown.x.petsc_vec.duplicate()
-        # problems in three dimensions stay with their method: its numbers shall not depend on their size
-        small = equilibrium.state.kinematics.reduced and self._x.getSize() <= SMALL
-        self._options = ProblemOptions(settings.method, settings.petsc_options, equilibrium.comm.size, small)
+        unknowns, ranks = self._x.getSize(), equilibrium.comm.size
+        self.method = chosen(settings.method, unknowns, ranks)
+        if robust and self.method in (LAGGED, EXACT):
+            self.method = "direct"
+        # where a method is named, three dimensions stay with it: its numbers shall not depend on their size
+        small = unknowns <= SMALL and (equilibrium.state.kinematics.reduced or settings.method == AUTO)
+        self._options = ProblemOptions(method_options(self.method, ranks, small), settings.petsc_options)
         self._residual = self._x.duplicate()
         self._external = self._x.duplicate()
         self._matrix = equilibrium.create_matrix()
@@ -116,21 +140,24 @@ class GuardedNewton:
         self.on_the_way = False  # whether the solution is only the start of a further one: then it may be coarser
         self._lost = False
         self._gap = self._last_norm = np.inf
-        self._stretches: NDArray[np.float64] | None = None
+        bounded = self.method == LAGGED and "snes_linesearch_type" not in self._options.given
+        self.limits = Limits(equilibrium, bounded)
+        self._spared = False  # whether the present trial is admissible by the bound alone
         self._options_checked = False
         snes: Any = PETSc.SNES().create(equilibrium.comm)
         snes.setFunction(self._assemble_residual, self._residual)
         snes.setJacobian(self._assemble_tangent, self._matrix)
-        snes.setTolerances(rtol=0.0, atol=0.0, stol=0.0, max_it=settings.maximum_iterations)
         snes.setLineSearchPreCheck(self._keep_admissible)
         self._options.apply(snes)
         snes.setConvergenceTest(self._converged)
         self._snes: Any = snes
+        self._linear = BY_METHOD.get(self.method, EveryTangent)(equilibrium, snes, self._matrix, self._options)
 
     def close(self) -> None:
         """Free PETSc's objects and take the options out of its database; calling it again does nothing."""
         if self._snes is None:
             return
+        self._linear.close()
         for thing in (self._snes, self._matrix, self._x, self._residual, self._external):
             thing.destroy()
         self._options.close()
@@ -153,9 +180,31 @@ class GuardedNewton:
         Interrupted
             If a signal asked for the end; the unknowns are restored.
         """
-        start = self.unknown.x.array.copy()
+        try:
+            return self._attempt(self._linear.more_iterations)
+        except SolveFailure as failure:
+            second = self._linear.second_try()
+            if second is None:
+                raise
+            words, other_way = second
+            log.info("solved once more, %s: %s", words, failure.reason)
+            with other_way:
+                try:
+                    return self._attempt().after(failure)
+                except SolveFailure as again:
+                    again.newton_iterations += failure.newton_iterations
+                    again.linear_iterations += failure.linear_iterations
+                    again.tangents += failure.tangents
+                    raise
+
+    def _attempt(self, more_iterations: int = 1) -> Solution:
+        start, tangents = self.unknown.x.array.copy(), self._linear.tangents
+        most = more_iterations * self.settings.maximum_iterations
+        self._snes.setTolerances(rtol=0.0, atol=0.0, stol=0.0, max_it=most)
         self._pull(self._x)
-        self._lost = False
+        self._lost = self._spared = False
+        self.limits.forget()
+        self._linear.begin()
         self._snes.solve(None, self._x)
         self._warn_of_unused_options()
         reason = self._snes.getConvergedReason()
@@ -167,8 +216,10 @@ class GuardedNewton:
             if extension.stop_signal:
                 raise Interrupted(extension.stop_signal)
             left = float(self._snes.getFunctionNorm()) / max(self._tolerance(), float(np.finfo(np.float64).tiny))
-            raise SolveFailure(self._failure_text(reason, extension), newton, linear, extension, left)
-        return Solution(newton, linear, float(self._snes.getFunctionNorm()))
+            text, tangents = self._failure_text(reason, extension), self._linear.tangents - tangents
+            raise SolveFailure(text, newton, linear, extension, left, tangents)
+        self._linear.ended(newton)
+        return Solution(newton, linear, float(self._snes.getFunctionNorm()), self._linear.tangents - tangents)
 
     def tangent_direction(self, set_fraction: Callable[[float], None], done: float, distance: float) -> Any:
         """Change of the unknowns per fraction of a change of the problem, at a solved state; one linear solve.
@@ -183,11 +234,13 @@ class GuardedNewton:
         self._pull(self._x)
         slope, direction = self._x.duplicate(), self._x.duplicate()
         set_fraction(done + distance)
+        self.limits.forget()
         self._assemble_residual(self._snes, self._x, slope)
         set_fraction(done)
+        self.limits.forget()
         self._assemble_residual(self._snes, self._x, self._residual)
         slope.axpy(-1.0, self._residual)
-        self.equilibrium.assemble_tangent(self._matrix)
+        self._linear.renew()
         solver = self._snes.getKSP()
         solver.setOperators(self._matrix)
         solver.solve(slope, direction)
@@ -200,8 +253,7 @@ class GuardedNewton:
 
     def factorisation(self) -> Any | None:
         """PETSc's preconditioner with the factors of the last tangent; None where the method does not factorise."""
-        preconditioner = self._snes.getKSP().getPC()
-        return preconditioner if preconditioner.getType() in ("lu", "cholesky", "telescope") else None
+        return self._linear.factorisation()
 
     def _warn_of_unused_options(self) -> None:
         """Once, after the first solve; on all ranks, for each has a database of options."""
@@ -237,22 +289,24 @@ class GuardedNewton:
         self._force_scale = max(residual.norm(), self._external.norm())
         residual.axpy(1.0, self._external)
         self._gap = equilibrium.prescribed_gap(x) / loading.domain.size
-        if self._gap > 1e-13:
+        if self._gap > MET:
             # lifting assembles tangents of the constrained elements; it adds exactly zero once x meets the conditions
             equilibrium.assemble_lifting(self._external, x)
             residual.axpy(1.0, self._external)
         dolfinx.fem.petsc.set_bc(residual, loading.boundary_conditions, x, -1.0)
-        extension, self._stretches = equilibrium.extension_and_stretches()
-        self._lost = not extension.admissible or extension.stop_signal > 0
+        if self._spared:
+            self._lost = equilibrium.comm.allreduce(equilibrium.stop_signal(), MPI.MAX) > 0
+        else:
+            extension = self.limits.look()[0]
+            self._lost = not extension.admissible or extension.stop_signal > 0
+            self._extension = extension.max_chain_extension
         if self._lost:
             residual.set(np.nan)
             return
-        mesh = equilibrium.quadrature.mesh
-        self._extension = extension.max_chain_extension
-        self._stress_rounding = stress_rounding(equilibrium.tissue, mesh, self._extension)
+        self._stress_rounding = stress_rounding(equilibrium.tissue, equilibrium.quadrature.mesh, self._extension)
 
     def _assemble_tangent(self, snes: Any, x: Any, matrix: Any, preconditioner: Any) -> None:
-        self.equilibrium.assemble_tangent(matrix)
+        self._linear.tangent(self._last_norm, self._tolerance())
 
     def _keep_admissible(self, x: Any, step: Any) -> bool:
         """Halve the Newton step until r < L and J > 0 everywhere (trial: x - step). True when it changed the step.
@@ -261,16 +315,24 @@ class GuardedNewton:
         Near L each point also keeps a share of its 1 - r/L: from a point much too near, where forces are huge, Newton's
         method comes back only by a factor of 1.5 an iteration.
         """
+        improved = self._linear.improve(x, self._snes.getFunction()[0], step, self._gap <= MET)
+        self._spared = self.limits.bounded and self.limits.spare(np.sqrt(3) * step.norm(PETSc.NormType.NORM_INFINITY))
+        if self._spared:
+            return improved
         self._push(x)
-        before = self.equilibrium.state.deformation_gradient()
+        before, (_, stretches_before) = self.limits.gradient(), self.limits.look()
         trial = x.duplicate()
         for halving in range(LINE_SEARCH_HALVINGS + 1):
             trial.waxpy(-1.0, step, x)
             self._push(trial)
-            extension, stretches = self.equilibrium.extension_and_stretches()
+            extension, stretches = self.limits.look()
             if extension.stop_signal:
                 break
-            if extension.admissible and self._keeps_reserve(stretches) and self._keeps_sense(before):
+            if (
+                extension.admissible
+                and self.equilibrium.keeps_reserve(stretches_before, stretches, KEPT_RESERVE, NEAR_LOCKING)
+                and not self.equilibrium.turns_inside_out(before, self.limits.gradient())
+            ):
                 break
             step.scale(0.5)
         else:
@@ -278,14 +340,7 @@ class GuardedNewton:
         trial.destroy()
         if halving:
             log.debug("Newton step shortened to 1/%d to keep r < L and J > 0", 2**halving)
-        return halving > 0
-
-    def _keeps_reserve(self, stretches: NDArray[np.float64]) -> bool:
-        before = self._stretches
-        return before is None or self.equilibrium.keeps_reserve(before, stretches, KEPT_RESERVE, NEAR_LOCKING)
-
-    def _keeps_sense(self, before: NDArray[np.float64]) -> bool:
-        return not self.equilibrium.turns_inside_out(before, self.equilibrium.state.deformation_gradient())
+        return improved or halving > 0
 
     def _converged(self, snes: Any, iteration: int, norms: tuple[float, float, float]) -> int:
         """|R| <= absolute_tolerance + relative_tolerance * |nodal forces|: a scale that does not vanish in a hold."""

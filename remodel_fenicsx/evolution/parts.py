@@ -25,12 +25,14 @@ class Work:
     linear_iterations: int = 0
     substeps: int = 0
     residual: float = 0.0  # of the last solution, in the unit of force
+    tangents: int = 0  # that were assembled
     held_points: int = 0  # points whose cells do not belong to their stress, of the coupling "implicit"
 
     def add(self, done: Solution | SolveFailure | Work) -> None:
         """Count a solve, or the work of a step that was taken back."""
         self.newton_iterations += done.newton_iterations
         self.linear_iterations += done.linear_iterations
+        self.tangents += done.tangents
         if isinstance(done, Solution):
             self.residual = done.residual
 

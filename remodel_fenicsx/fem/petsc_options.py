@@ -12,7 +12,6 @@ from typing import Any
 
 from petsc4py import PETSc
 
-from remodel_fenicsx.fem.solver_methods import method_options
 from remodel_fenicsx.schema.tables import SceneError
 
 USERS_PREFIX = "remodel_"
@@ -28,21 +27,16 @@ class ProblemOptions:
 
     Parameters
     ----------
-    method
-        Key of `METHODS`.
+    own
+        The method's (`solver_methods.method_options`).
     options
         The scene's: names without the leading '-'; True for a flag, False to leave one of the method's away.
-    ranks
-        How many there are.
-    small
-        Whether the problem is a small one (`method_options`).
     """
 
-    def __init__(self, method: str, options: Mapping[str, Any], ranks: int = 1, small: bool = False):
+    def __init__(self, own: Mapping[str, Any], options: Mapping[str, Any]):
         self.prefix = f"{USERS_PREFIX}{next(_numbers)}_"
         self._given = dict(options)
         self._names: set[str] = set()
-        own = method_options(method, ranks, small)
         for key, value in {**own, **options, **_users_options()}.items():
             if value is not False:
                 PETSc.Options().setValue(self.prefix + key, None if value is True else value)
@@ -50,8 +44,13 @@ class ProblemOptions:
         for key in own.keys() - options.keys():
             PETSc.Options().hasName(self.prefix + key)  # asked for: PETSc does not call it left over
 
+    @property
+    def given(self) -> set[str]:
+        """Names of those that are not the method's."""
+        return {*self._given, *_users_options()}
+
     def apply(self, snes: Any) -> None:
-        """Give them to SNES.
+        """Give them to SNES, or to another of PETSc's solvers.
 
         Raises
         ------
@@ -71,8 +70,7 @@ class ProblemOptions:
 
     def unused(self) -> list[str]:
         """The scene's and the user's options that PETSc has not asked for: misspelt, or without effect so far."""
-        own = {*self._given, *_users_options()}
-        return sorted(key for key in self._names & own if not _was_used(self.prefix + key))
+        return sorted(key for key in self._names & self.given if not _was_used(self.prefix + key))
 
     def close(self) -> None:
         """Take them out of PETSc's database."""

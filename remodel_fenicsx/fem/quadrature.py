@@ -45,6 +45,8 @@ class Quadrature:
         Weight of the points in integrals over the body, (elements, points).
     extent
         Mean length of an element in every direction of the mesh.
+    smallest_lengths
+        Least extent of the elements at the points, per unit of the reference element, (elements, points).
     largest_areas, smallest_areas
         Volume over the least and over the largest extent, (elements,): a stress times these is about the largest and
         the smallest force that it means for a node of the element.
@@ -71,6 +73,7 @@ class Quadrature:
         self.extent = float((self.integral(np.ones(self.shape)) / number) ** (1 / mesh.topology.dim))
         self.volumes = self.volumes * self._values_of(weight)
         lengths = np.linalg.svd(geometry[..., 4:].reshape(*self.shape, *jacobian.ufl_shape), compute_uv=False)
+        self.smallest_lengths: NDArray[np.float64] = np.asarray(lengths[..., -1], dtype=np.float64)
         self.largest_areas: NDArray[np.float64] = (self.volumes / lengths[..., -1]).sum(axis=1)
         self.smallest_areas: NDArray[np.float64] = (self.volumes / lengths[..., 0]).sum(axis=1)
 

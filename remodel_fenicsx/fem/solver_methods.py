@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+AUTO = "auto"
+LAGGED, EXACT = "lagged", "exact"  # those whose factors may be of an earlier tangent (`evolution.linear`)
+
 # MUMPS: robust for indefinite tangents too, one factorisation pattern for all steps
 METHODS: dict[str, dict[str, Any]] = {
     "direct": {
@@ -14,7 +17,30 @@ METHODS: dict[str, dict[str, Any]] = {
         "pc_factor_mat_solver_type": "mumps",
         "mat_mumps_icntl_33": 1,  # the determinant, whose sign tells of unstable equilibria; costs nothing
     },
+    LAGGED: {"snes_type": "newtonls", "snes_linesearch_type": "basic", "ksp_type": "preonly"},
+    EXACT: {"snes_type": "newtonls", "snes_linesearch_type": "basic", "ksp_type": "cg", "ksp_rtol": 1e-4},
+    "iterative": {
+        "snes_type": "newtonls",
+        "snes_linesearch_type": "basic",
+        "ksp_type": "cg",
+        "ksp_rtol": 1e-3,
+        "ksp_max_it": 300,
+        "pc_type": "gamg",
+        "pc_gamg_threshold": 0.01,
+        "pc_gamg_reuse_interpolation": True,
+        "mg_levels_ksp_type": "chebyshev",
+        "mg_levels_pc_type": "jacobi",
+    },
 }
+
+MEANINGS = {
+    "direct": "Newton's method, each system factorised by MUMPS; runs on so many ranks are the same "
+    "to the last digit",
+    LAGGED: "few tangents are factorised, and quasi-Newton steps (L-BFGS) make up for it",
+    EXACT: "a new tangent in every iteration, its system solved by CG with an earlier factor",
+    "iterative": "Newton's method with CG and algebraic multigrid (GAMG)",
+}
+"""In words, for docs/scene.md; those of one's own need none."""
 
 # MUMPS on several ranks adds up in the order in which messages come: its last digits differ from run to run. So one
 # rank has the whole matrix and factorises it, which for the sizes that are factorised at all costs little
@@ -27,8 +53,35 @@ ON_SEVERAL_RANKS: dict[str, dict[str, Any]] = {
     },
 }
 
+# Factors that are kept, by what is known of the tangent, the best first; each but the last may be refused
+DEFINITE, SYMMETRIC, GENERAL = "positive definite", "symmetric", "general"
+FACTORS: dict[str, dict[str, Any]] = {
+    DEFINITE: {
+        "pc_type": "cholesky",
+        "pc_factor_mat_solver_type": "cholmod",
+        "mat_cholmod_factor": "SUPERNODAL",
+        "mat_cholmod_print": 0,
+    },
+    SYMMETRIC: {
+        "pc_type": "cholesky",
+        "pc_factor_mat_solver_type": "mumps",
+        "mat_mumps_icntl_7": 0,  # AMD; PORD is faster by a quarter, but ends the process for some small matrices
+        "mat_mumps_icntl_33": 1,
+    },
+    GENERAL: METHODS["direct"],
+}
 
 SMALL = 2000  # unknowns up to which MUMPS costs more than all the rest of a problem: then PETSc factorises by itself
+LARGE = 40_000  # unknowns from which on factors cost more than multigrid, in time and in memory
+
+
+def chosen(method: str, unknowns: int, ranks: int) -> str:
+    """The method that `auto` stands for."""
+    if method != AUTO:
+        return method
+    if unknowns > LARGE:
+        return "iterative"
+    return "direct" if unknowns <= SMALL or ranks > 1 else LAGGED
 
 
 def method_options(method: str, ranks: int, small: bool = False) -> dict[str, Any]:
@@ -36,6 +89,16 @@ def method_options(method: str, ranks: int, small: bool = False) -> dict[str, An
     options = dict(METHODS[method])
     if small and ranks == 1 and options.get("pc_factor_mat_solver_type") == "mumps":
         options |= {"pc_factor_mat_solver_type": "petsc", "mat_mumps_icntl_33": False}
+    return _on_ranks(options, method, ranks)
+
+
+def factor_options(kind: str, ranks: int) -> dict[str, Any]:
+    """PETSc options of a preconditioner that factorises, a key of `FACTORS`."""
+    options = {name: value for name, value in FACTORS[kind].items() if name.startswith(("pc_", "mat_"))}
+    return _on_ranks(options, "direct", ranks)
+
+
+def _on_ranks(options: dict[str, Any], method: str, ranks: int) -> dict[str, Any]:
     if ranks > 1:
         options |= ON_SEVERAL_RANKS.get(method, {})
         if options.get("pc_type") == "telescope":

@@ -33,8 +33,8 @@ def chain_lines(
     """
     middle = np.asarray(centres, dtype=np.float64)
     edges = np.asarray(lengths, dtype=np.float64)[:, :, None] * np.asarray(axes, dtype=np.float64)
-    signs = np.array([(1, 1, 1), (1, 1, -1), (1, -1, 1), (1, -1, -1)])
-    half = scale * np.einsum("kI,mIi->mki", signs, edges)
+    signs = np.array([(1.0, 1, 1), (1, 1, -1), (1, -1, 1), (1, -1, -1)])
+    half = scale * (signs @ edges)
     ends = middle[:, None, None, :] + np.stack([half, -half], axis=2)
     return ends.reshape(-1, 3), np.arange(8 * len(middle)).reshape(-1, 2)
 
@@ -48,4 +48,4 @@ def chain_displacement(
     """
     ends = np.asarray(points, dtype=np.float64).reshape(-1, 8, 3) - np.asarray(centres)[:, None, :]
     gradient = np.asarray(deformation_gradient) - np.eye(3)
-    return (np.asarray(displacement)[:, None, :] + np.einsum("mij,mkj->mki", gradient, ends)).reshape(-1, 3)
+    return (np.asarray(displacement)[:, None, :] + ends @ np.swapaxes(gradient, 1, 2)).reshape(-1, 3)

@@ -24,8 +24,6 @@ from remodel_fenicsx.results.recording import CHAINS, FIELDS, RecordingError
 from remodel_fenicsx.results.vtkhdf import LINE, TransientGrid, cell_type_and_permutation
 from remodel_fenicsx.schema.tables import SceneError
 from remodel_fenicsx.schema.times import SAME_TIME, same_time
-from remodel_fenicsx.tissue import spectral
-from remodel_fenicsx.tissue.cells import structure_tensor
 
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
@@ -110,20 +108,21 @@ class ElementFields:
             found |= {name: mean_axes[:, i] for i, name in enumerate(AXES)}
         if "fibre_angle" in wanted:
             found["fibre_angle"] = mean(fibre_angle(dimensions, axes, self.quadrature.coordinates))
-        deformed_axes = axes @ np.swapaxes(F, -1, -2)
         if "fibre_angle_deformed" in wanted:
-            position = self.quadrature.coordinates + values[..., -3:]
+            position, deformed_axes = self.quadrature.coordinates + values[..., -3:], axes @ np.swapaxes(F, -1, -2)
             found["fibre_angle_deformed"] = mean(fibre_angle(dimensions, deformed_axes, position))
         if "chain_extension" in wanted:
-            squared = np.sum((dimensions[..., None] * deformed_axes) ** 2, axis=(-1, -2))
+            cells = self.state.cells
+            squared = cells.kernels.squared_length(F.reshape(-1, 3, 3), cells.point_cells).reshape(F.shape[:2])
             found["chain_extension"] = np.max(np.sqrt(squared) / self._locking_length(), axis=1)
         return {name: found[name] for name in OF_ELEMENTS if name in wanted}
 
     def mean_cells(self) -> tuple[Array, Array]:
         """Lengths (elements, 3) and axes as rows (elements, 3, 3) of the mean structure tensor, longest first."""
         cells = self.state.cells
-        tensor = self.quadrature.element_mean(structure_tensor(cells.dimension_values, cells.axis_values))
-        squared, axes = spectral.principal(tensor, cells.axis_values[:, 0])
+        squared, axes = cells.kernels.principal(
+            self.quadrature.element_mean(cells.structure_tensor()), cells.axis_values[:, 0]
+        )
         return np.sqrt(np.maximum(squared, 0.0)), axes
 
     def _locking_length(self) -> Any:

@@ -13,7 +13,8 @@ from pydantic import Field, model_validator
 from remodel_fenicsx.body.reductions import AUTO
 from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.fem.kinematics import KINEMATICS
-from remodel_fenicsx.fem.solver_methods import METHODS
+from remodel_fenicsx.fem.solver_methods import AUTO as AUTOMATIC
+from remodel_fenicsx.fem.solver_methods import LARGE, MEANINGS, METHODS, SMALL
 from remodel_fenicsx.schema.tables import Table, checked, fault, is_number, one_of, quoted, shown
 from remodel_fenicsx.schema.times import is_multiple, same_time
 from remodel_fenicsx.schema.units import FORCE
@@ -230,14 +231,25 @@ def _petsc_options(value: Any) -> Any:
     return value
 
 
+def _method(value: Any) -> Any:
+    if value not in (AUTOMATIC, *METHODS):
+        raise fault("allowed are " + ", ".join(map(repr, (AUTOMATIC, *METHODS))))
+    return value
+
+
 class Solver(Table):
     """Solution of the nonlinear problem of each step."""
 
-    method: Annotated[str, one_of(METHODS)] = Field(
-        default="direct", description="'direct': Newton's method, each system factorised."
+    method: Annotated[str, checked(_method)] = Field(
+        default=AUTOMATIC,
+        description=f"'auto': 'direct' up to {SMALL} unknowns or on more ranks, "
+        f"'iterative' above {LARGE}, else 'lagged'; "
+        + "; ".join(f"{name!r}: {meaning}" for name, meaning in MEANINGS.items())
+        + " (docs/speed.md).",
+        json_schema_extra={"allowed": "one of " + ", ".join(map(repr, (AUTOMATIC, *METHODS)))},
     )
     predictor: Literal["none", "autoregressive"] = Field(
-        default="none",
+        default="autoregressive",
         description="Where Newton's method starts a step: 'none': at the displacement of the step before; "
         "'autoregressive': where the last increments let expect the solution. The solutions are the same to the "
         "tolerance.",

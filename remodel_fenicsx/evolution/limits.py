@@ -1,0 +1,101 @@
+"""The limits r < L and J > 0 along Newton's way: each state is looked at once, and those near it need no look."""
+
+from __future__ import annotations
+
+import basix
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from remodel_fenicsx.evolution.equilibrium import Equilibrium, Extension
+from remodel_fenicsx.fem.quadrature import Quadrature
+
+Array = NDArray[np.float64]
+
+FAR_FROM_LOCKING = 0.95  # r/L up to which no point has to keep a reserve
+
+
+class Limits:
+    """Extension, r/L and F of the states that Newton's method comes to, within one solve.
+
+    Parameters
+    ----------
+    equilibrium
+        Whose states they are.
+    bounded
+        Whether a bound may stand for a look: |dF| <= G max |du|, |dr| <= |l| |dF|, and J > 0 while |dF| < 2 J / (F:F).
+        It needs displacements for unknowns, and J at the quadrature points alone.
+    """
+
+    def __init__(self, equilibrium: Equilibrium, bounded: bool):
+        self.equilibrium, state = equilibrium, equilibrium.state
+        self.bounded = bounded and not state.kinematics.reduced and state.dilatation.jacobians().shape[1] == 0
+        self._gain = largest_gradient_of_displacement(equilibrium.quadrature) if self.bounded else np.inf
+        self.looks = 0
+        self.forget()
+
+    def forget(self) -> None:
+        """Cells or loads may be others from now on."""
+        self._place: Array | None = None
+        self._gradient: Array | None = None
+        self._room, self._travelled = 0.0, np.inf
+
+    def look(self) -> tuple[Extension, Array]:
+        """`Equilibrium.extension_and_stretches` of the present unknowns."""
+        if not self._is_here():
+            self._place, self._gradient = self.equilibrium.state.unknown.x.array.copy(), None
+            self._found = self.equilibrium.extension_and_stretches()
+            self.looks += 1
+            if self.bounded:
+                self._room, self._travelled = self._room_around(*self._found), 0.0
+        return self._found
+
+    def gradient(self) -> Array:
+        """F of the present unknowns at the points of this rank, (elements * points, 3, 3)."""
+        self.look()
+        if self._gradient is None:
+            self._gradient = self.equilibrium.state.deformation_gradient()
+        return self._gradient
+
+    def spare(self, largest_displacement: float) -> bool:
+        """Whether a further step is certainly admissible, so that nobody need look; it is then as if it were made.
+
+        Parameters
+        ----------
+        largest_displacement
+            Bound of the change of a node's displacement, over all ranks.
+        """
+        further = self._travelled + self._gain * largest_displacement
+        if not further < self._room:
+            return False
+        self._travelled = further
+        return True
+
+    def _is_here(self) -> bool:
+        here = self._place is not None and np.array_equal(self._place, self.equilibrium.state.unknown.x.array)
+        return bool(self.equilibrium.comm.allreduce(here, MPI.LAND))
+
+    def _room_around(self, extension: Extension, stretches: Array) -> float:
+        """Largest |dF| at which J > 0 and r/L < FAR_FROM_LOCKING at every point of all ranks."""
+        if not extension.admissible:
+            return 0.0
+        quadrature, cells = self.equilibrium.quadrature, self.equilibrium.state.cells
+        F = self.gradient().reshape(*quadrature.shape, 3, 3)
+        _, J = self.equilibrium.limit_values()
+        of_volume = quadrature.minimum(2 * J / np.einsum("epij,epij->ep", F, F))
+        length = np.linalg.norm(cells.dimension_values, axis=-1) / self.equilibrium.locking_length()
+        of_chains = (FAR_FROM_LOCKING - stretches) / np.maximum(quadrature.owned(length), 1e-300)
+        return min(of_volume, quadrature.minimum(of_chains))
+
+
+def largest_gradient_of_displacement(quadrature: Quadrature) -> float:
+    """G with |grad u| <= G max |u_node| at every quadrature point: the shape functions' slopes, added up in size."""
+    element = basix.create_element(
+        basix.ElementFamily.P,
+        basix.CellType[quadrature.element_kind],
+        quadrature.element_degree,
+        basix.LagrangeVariant.gll_warped,
+    )
+    slopes = np.asarray(element.tabulate(1, quadrature.points))[1:, :, :, 0]  # by reference coordinate, point and node
+    sums = np.linalg.norm(slopes, axis=0).sum(axis=-1)
+    return quadrature.maximum(sums / quadrature.smallest_lengths)

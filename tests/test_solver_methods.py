@@ -1,0 +1,256 @@
+"""Solver methods: all come to the same states, each with its own work, and what each falls back to when it must."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from remodel_fenicsx import Simulation
+from remodel_fenicsx.body.tube import tube
+from remodel_fenicsx.evolution import linear
+from remodel_fenicsx.evolution.limits import Limits, largest_gradient_of_displacement
+from remodel_fenicsx.evolution.linear import KeptFactor, Lagged
+from remodel_fenicsx.evolution.quasi_newton import Secants
+from remodel_fenicsx.fem.solver_methods import LARGE, METHODS, SMALL, chosen
+from remodel_fenicsx.scene import preset_scene
+from tests import parts
+
+SELF = MPI.COMM_SELF
+TUBE = {"geometry.length": 2.0, "time.end": 8.0, "loads.pressure.ramp": [[0.0, 0.0], [5.0, 1.0]],
+        "loads.elongation.ramp": [[0.0, 0.0], [5.0, 1.0]]}  # fmt: skip
+
+
+def simulated(method: str, **changes: Any) -> tuple[Simulation, list[dict[str, float]]]:
+    """A tube of two layers with random cells, loaded at full within five steps."""
+    values = TUBE | {"solver.method": method} | {name.replace("__", "."): value for name, value in changes.items()}
+    scene = preset_scene("kuhl-holzapfel-2007", "tube").with_values(values)
+    simulation = Simulation(scene, SELF, tube(length=2.0, divisions=(8, 2, 1), comm=SELF))
+    return simulation, [step.row for step in simulation.steps()]
+
+
+@pytest.fixture(scope="module")
+def direct() -> list[dict[str, float]]:
+    simulation, rows = simulated("direct")
+    simulation.close()
+    return rows
+
+
+def assert_same(found: list[dict[str, float]], expected: list[dict[str, float]]) -> None:
+    """To what the tolerance leaves open."""
+    for name in ("inner_radius", "outer_radius", "stored_energy", "fibre_angle_inner", "max_chain_extension"):
+        np.testing.assert_allclose([row[name] for row in found], [row[name] for row in expected], rtol=1e-8)
+
+
+# ---------------------------------------------------------------- what is chosen
+@pytest.mark.parametrize(
+    ("unknowns", "ranks", "method"),
+    [(SMALL, 1, "direct"), (SMALL + 1, 1, "lagged"), (SMALL + 1, 2, "direct"), (LARGE, 1, "lagged"),
+     (LARGE + 1, 1, "iterative"), (LARGE + 1, 2, "iterative")],
+)  # fmt: skip
+def test_auto_goes_by_the_size(unknowns: int, ranks: int, method: str) -> None:
+    assert chosen("auto", unknowns, ranks) == method
+    assert all(chosen(name, unknowns, ranks) == name for name in METHODS)
+
+
+def test_presets_name_their_method() -> None:
+    for shape in ("cube", "tendon", "tube"):
+        solver = preset_scene("kuhl-holzapfel-2007", shape).solver
+        assert (solver.method, solver.predictor) == ("direct", "none")
+
+
+# ---------------------------------------------------------------- same states, other work
+@pytest.mark.parametrize("predictor", ["none", "autoregressive"])
+@pytest.mark.parametrize("method", ["lagged", "exact", "iterative"])
+def test_all_methods_come_to_the_same_states(
+    method: str, predictor: str, direct: list[dict[str, float]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    factors = []
+    renew = KeptFactor.renew
+    monkeypatch.setattr(KeptFactor, "renew", lambda self, matrix: (factors.append(1), renew(self, matrix)))
+    simulation, rows = simulated(method, solver__predictor=predictor)
+    assert_same(rows, direct)
+    newton, iterations = simulation.stepper.coupling.newton, sum(row["newton_iterations"] for row in rows)
+    tangents, krylov = newton._linear.tangents, sum(row["linear_iterations"] for row in rows)
+    if method == "lagged":
+        assert len(factors) == tangents < iterations / 2 and krylov == iterations
+    elif method == "exact":
+        assert len(factors) < iterations / 2 <= tangents / 2 and krylov > iterations
+    else:
+        assert not factors and krylov > 4 * iterations
+    simulation.close()
+
+
+def test_options_of_ones_own_lie_over_the_methods(direct: list[dict[str, float]]) -> None:
+    """A preconditioner of one's own is kept like the factors."""
+    options = {"pc_type": "lu", "pc_factor_mat_solver_type": "mumps"}
+    simulation, rows = simulated("lagged", solver__petsc_options=options)
+    assert simulation.stepper.coupling.newton.factorisation().getFactorSolverType() == "mumps"
+    assert simulation.stepper.coupling.newton._linear.tangents < sum(row["newton_iterations"] for row in rows) / 2
+    assert_same(rows, direct)
+    simulation.close()
+
+
+# ---------------------------------------------------------------- factors
+def matrix_of(values: np.ndarray) -> Any:
+    matrix = PETSc.Mat().createAIJ(values.shape, nnz=len(values), comm=PETSc.COMM_SELF)
+    matrix.setValues(range(len(values)), range(len(values)), values)
+    matrix.assemble()
+    return matrix
+
+
+def test_factors_of_every_kind(caplog: pytest.LogCaptureFixture) -> None:
+    """CHOLMOD, MUMPS for the indefinite and the unsymmetric one, and back again; without factors there is no answer."""
+    caplog.set_level(logging.INFO)
+    rng = np.random.default_rng(3)
+    some = rng.standard_normal((30, 30))
+    definite, indefinite, general = some @ some.T + np.eye(30), some + some.T, some + 30 * np.eye(30)
+    factor, kinds = KeptFactor(PETSc.COMM_SELF), []
+    for values in (definite, indefinite, general, definite, 2 * definite):
+        matrix = matrix_of(values)
+        x, y = matrix.createVecs()
+        x.array[:] = rng.standard_normal(30)
+        factor.renew(matrix)
+        factor.apply(None, x, y)
+        np.testing.assert_allclose(values @ y.array, x.array, rtol=0, atol=1e-11)
+        kinds.append((factor.preconditioner.getFactorSolverType(), factor.preconditioner.getType()))
+    cholmod, symmetric, unsymmetric = ("cholmod", "cholesky"), ("mumps", "cholesky"), ("mumps", "lu")
+    assert kinds == [cholmod, symmetric, unsymmetric, cholmod, cholmod]
+    assert [record.message for record in caplog.records] == ["the tangent cannot be factorised as positive definite"]
+    factor.renew(matrix_of(np.zeros((30, 30))))
+    factor.apply(None, x, y)
+    assert np.isnan(y.array).all() and "cannot be factorised as general" in caplog.text
+    factor.close()
+
+
+def test_a_kept_factor_stays_when_its_matrix_changes() -> None:
+    matrix, factor = matrix_of(2 * np.eye(5)), KeptFactor(PETSc.COMM_SELF)
+    x, y = matrix.createVecs()
+    x.set(1.0)
+    factor.renew(matrix)
+    matrix.scale(5.0)
+    factor.apply(None, x, y)
+    np.testing.assert_allclose(y.array, 0.5)
+    factor.close()
+
+
+# ---------------------------------------------------------------- fall-backs
+def test_where_old_factors_do_not_do_every_tangent_is_taken(
+    direct: list[dict[str, float]], caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Never renewed, and all of the load in two steps: the first factor is of no use for what follows."""
+    caplog.set_level(logging.INFO)
+    monkeypatch.setattr(Lagged, "_costs_more", lambda self, tolerance: False)
+    changes = {"loads.pressure.ramp": [[0.0, 0.0], [2.0, 1.0]], "time.end": 3.0, "solver.maximum_iterations": 8}
+    rows = [simulated(method, **changes)[1] for method in ("direct", "lagged")]
+    assert "solved once more, with new factors in every iteration: no equilibrium within 24 Newton" in caplog.text
+    assert_same(rows[1], rows[0])
+
+
+@pytest.mark.parametrize(
+    ("norms", "renewed"),
+    [([1.0, 0.1, 0.01, 1e-3], False), ([1.0, 0.9, 0.8, 0.7], True), ([1.0, 1.0, 2.0, 3.0], True), ([1.0, 3.0], False)],
+)
+def test_a_factor_is_renewed_where_that_costs_less(norms: list[float], renewed: bool) -> None:
+    lagged = object.__new__(Lagged)
+    lagged._norms = norms
+    assert lagged._costs_more(1e-8) is renewed
+
+
+def test_an_indefinite_tangent_is_solved_by_every_method(caplog: pytest.LogCaptureFixture) -> None:
+    """The paper's artery begins with one, by the stress of random cells. Neither CHOLMOD nor CG can take it."""
+    caplog.set_level(logging.INFO)
+    scene, rows, said = preset_scene("kuhl-holzapfel-2007", "tube"), {}, {}
+    for method in ("direct", "lagged", "exact", "iterative"):
+        simulation = Simulation(scene.with_values({"time.end": 1.0, "solver.method": method}), SELF)
+        rows[method] = [step.row for step in simulation.steps()]
+        said[method] = caplog.text
+        assert simulation.stepper.coupling.newton._snes.getKSP().getType() == METHODS[method]["ksp_type"]
+        caplog.clear()
+        simulation.close()
+        assert_same(rows[method], rows["direct"])
+    again = "solved once more, with"
+    assert again not in said["direct"] and again not in said["lagged"]
+    assert "cannot be factorised as positive definite" in said["lagged"]
+    assert f"{again} new factors in every iteration: the linear solver failed" in said["exact"]
+    assert f"{again} GMRES: the linear solver failed" in said["iterative"]
+
+
+# ---------------------------------------------------------------- quasi-Newton steps
+def test_the_newest_secant_is_met_and_a_linear_problem_is_soon_solved() -> None:
+    """H z = s for the last pair; L-BFGS around the diagonal solves a linear problem many times faster than it alone."""
+    rng = np.random.default_rng(2)
+    some = rng.standard_normal((40, 40))
+    values = np.diag(np.linspace(1.0, 8.0, 40)) + 0.1 * (some + some.T)
+    matrix, right = matrix_of(values), rng.standard_normal(40)
+    norms = {}
+    for most in (0, 20):
+        secants = Secants()
+        x, residual = matrix.createVecs()
+        for _ in range(25):
+            residual.array[:] = values @ x.array - right
+            step = residual.copy()
+            step.array[:] /= 8.0
+            if most:
+                secants.improve(x, residual, step)
+            x.axpy(-1.0, step)
+        norms[most] = residual.norm()
+        if most:
+            pair = secants._pairs[-1]
+            secants.interrupt()
+            found = pair.image.copy()
+            secants.improve(x, pair.change, found)
+            np.testing.assert_allclose(found.array, pair.step.array, rtol=0, atol=1e-10 * pair.step.norm())
+    assert norms[20] < 5e-3 * norms[0]
+
+
+# ---------------------------------------------------------------- the bound that spares looks
+def test_no_displacement_changes_f_by_more_than_the_bound() -> None:
+    """And some come near it: an element that one of its nodes leaves."""
+    made = parts.body(tube(length=2.0, divisions=(8, 2, 1), comm=SELF), preset_scene(
+        "kuhl-holzapfel-2007", "tube").cells)  # fmt: skip
+    state, bound, rng = made.state(), largest_gradient_of_displacement(made.quadrature), np.random.default_rng(1)
+    largest = 0.0
+    for _ in range(20):
+        u = rng.standard_normal(made.nodes.shape)
+        u /= np.linalg.norm(u, axis=1).max() if rng.random() < 0.5 else np.linalg.norm(u, axis=1)[:, None]
+        made.set_displacement(u)
+        change = np.linalg.norm(state.deformation_gradient() - np.eye(3), axis=(1, 2))
+        largest = max(largest, float(change.max()))
+    assert 0.2 * bound < largest < bound
+
+
+def test_what_the_bound_spares_is_admissible(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each state that nobody looked at is looked at here; far more are spared than not."""
+    spared = []
+    spare = Limits.spare
+
+    def checked(self: Limits, largest_displacement: float) -> bool:
+        found = spare(self, largest_displacement)
+        spared.append(found)
+        return found
+
+    monkeypatch.setattr(Limits, "spare", checked)
+    simulation, _ = simulated("lagged", solver__predictor="autoregressive", time__end=4.0)
+    newton = simulation.stepper.coupling.newton
+    assert sum(spared) > len(spared) / 2
+    newton.limits.forget()
+    newton.limits.look()
+    x, step = newton.unknown.x.array.copy(), np.random.default_rng(1).standard_normal(newton.unknown.x.array.shape)
+    step /= np.linalg.norm(step.reshape(-1, 3), axis=1).max()
+    size = 1.0
+    while not spare(newton.limits, size):
+        size /= 1.1
+    newton.unknown.x.array[:] = x + size * step
+    extension = newton.equilibrium.extension()
+    assert extension.admissible and extension.max_chain_extension < 0.95
+    assert not spare(newton.limits, size)  # it counts what has been travelled already
+    simulation.close()
+
+
+def test_the_registry_names_no_method_without_options() -> None:
+    assert set(linear.BY_METHOD) < set(METHODS)
