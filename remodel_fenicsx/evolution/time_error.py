@@ -38,9 +38,9 @@ class TimeError:
     """Compares the cells of each row with better ones, which the coupling has from the same step (docs/theory.md).
 
     A staggered row is solved with cells that lag a step behind: the cells that its own pass makes are better. Rows of
-    the other couplings lag nothing, but their cells follow a target that changes within the step: better is the mean of
-    the targets at both ends. Each step then adds an error, and kappa forgets it: it ends at the error of a step over
-    1 - exp(-kappa dt), if all steps are alike.
+    the other couplings lag nothing, but their cells follow a target that changes within the step: better is one that
+    goes from that of its start to that of its end. Each step then adds an error, and kappa forgets it: it ends at the
+    error of a step over 1 - exp(-kappa dt), if all steps are alike.
 
     Parameters
     ----------
