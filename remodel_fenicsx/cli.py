@@ -20,6 +20,7 @@ from remodel_fenicsx.system import interrupts
 from remodel_fenicsx.system.arguments import positive, wall_time
 from remodel_fenicsx.system.environment import reason_unusable, versions
 from remodel_fenicsx.scene.parameters import PRESETS
+from remodel_fenicsx.scene.profiles import PROFILES
 from remodel_fenicsx.scene.scene import Scene, SceneError, preset_scene, read_scene
 from remodel_fenicsx.schema.tables import printable
 
@@ -61,6 +62,7 @@ def parser() -> argparse.ArgumentParser:
             metavar="KEY=VALUE",
             help="set a key of the scene, e.g. cells.seed=2 or time.end=10; may be repeated",
         )
+        command.add_argument("--profile", choices=PROFILES, help="lay the settings of a profile over the scene's own")
         return command
 
     text = "Run a scene; mpirun -n N remodel-fenicsx run ... is the same run on N ranks."
@@ -121,8 +123,7 @@ def parser() -> argparse.ArgumentParser:
     )
     figures.add_argument("--stamp", action="store_true", help="show in each picture what it was made with")
     figures.add_argument("--jobs", type=int, metavar="N", help="runs at a time (default: as many as there are cores)")
-    text = "Print versions, solvers and BLAS."
-    commands.add_parser("info", help=text, description=text)
+    commands.add_parser("info", help="Print versions, solvers and BLAS.", description="Print versions and solvers.")
     return main_parser
 
 
@@ -179,12 +180,12 @@ def _fail(message: str, code: int) -> int:
 
 def _run(options: argparse.Namespace, task: Callable[..., Path] | None = None) -> int:
     deadline = None if options.max_wall_time is None else clock.monotonic() + options.max_wall_time
-    scene = None if options.resume else read_scene(options.scene, options.set)
+    scene = None if options.resume else read_scene(options.scene, options.set, options.profile)
     wishes: Any = {"quiet": options.quiet, "deadline": deadline, "other_starts": options.check_uniqueness}
     if options.check_uniqueness and scene is not None and not scene.time.is_equilibrium:
         return _fail("--check-uniqueness: only with time.end = 'equilibrium'", BAD_INPUT)
-    if options.resume and options.output:
-        return _fail("-o: a run goes on in its own folder", BAD_INPUT)
+    if options.resume and (options.output or options.profile):
+        return _fail(f"{'-o' if options.output else '--profile'}: a run goes on in its own folder, as it is", BAD_INPUT)
     reason = reason_unusable()
     if reason is not None:
         return _fail(f"the environment is not usable: {reason}; run through ./with-fenicsx", BAD_ENVIRONMENT)
@@ -248,7 +249,7 @@ def _missing_for_pictures() -> str | None:
 
 def _study(options: argparse.Namespace, task: Callable[[Scene], tuple[Path, str, dict[str, str]]]) -> int:
     """Several runs that answer one question: `task` makes the folder, the answer in words, and what has failed."""
-    scene = read_scene(options.scene, options.set)
+    scene = read_scene(options.scene, options.set, options.profile)
     reason = reason_unusable()
     if reason is not None:
         return _fail(f"the environment is not usable: {reason}; run through ./with-fenicsx", BAD_ENVIRONMENT)
@@ -336,10 +337,12 @@ def _revolve(options: argparse.Namespace) -> int:
 
 
 def _validate(options: argparse.Namespace) -> int:
-    scene = read_scene(options.scene, options.set)
+    scene = read_scene(options.scene, options.set, options.profile)
     _say(f"{options.scene}: a valid scene ({scene.geometry.name}, {scene.time.in_words()})")
     _say(scene.summary())
     _say("\n".join(explained(scene)))
+    if scene.profile is not None:
+        _say(PROFILES[scene.profile].in_words(scene.profile))
     if _rank() == 0:
         for warning in scene.warnings():
             _complain(f"warning: {warning}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,11 +12,12 @@ import pytest
 from remodel_fenicsx import Recording, cli, read_scene
 from remodel_fenicsx.results.profile import PLACES, weights
 from remodel_fenicsx.scene.scene import Scene, preset_scene
-from remodel_fenicsx.studies import ladder as rungs
+from remodel_fenicsx.studies import ladder as rungs, trade as study
 from remodel_fenicsx.studies.convergence import limit, pareto, typical
 from remodel_fenicsx.studies.estimates import Result, Trade, estimated
 from remodel_fenicsx.studies.ladder import Setting, compared_times, ladder
 from remodel_fenicsx.studies.trade_output import in_words
+from tests.reference.radial import solve_radial
 
 PAPER = "kuhl-holzapfel-2007"
 SMOOTH = np.array([[1.0, 2.0, -1.0], [0.5, 1.0, 0.0]])
@@ -70,7 +72,7 @@ def test_estimates_are_the_errors_of_a_smooth_problem() -> None:
     for row in rows:
         assert row.angle_error == pytest.approx(exact(row.result), rel=0.05, abs=2e-3), row.result.setting.name
         assert not row.doubt
-    assert any(note.startswith("time: order 1 (steps 1, 0.5, 0.25, 0.125)") for note in notes)
+    assert any(note.startswith("time: order 1 (steps 1, 0.5, 0.25 on refinement 2, degree 2)") for note in notes)
     assert any(note.startswith("mesh: order 2 (refinements 1, 2, 4 of degree 2)") for note in notes)
 
 
@@ -152,14 +154,17 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     monkeypatch.setattr(rungs, "objections", lambda scene, name: ["left out by the test"])
     assert cli.main(["trade", str(path), "-o", str(out), "--budget", "10min"]) == 0
     words = capsys.readouterr().out
-    assert "time: order 1 (steps 2, 1, 0.5)" in words and "mesh: fewer than two settings" in words
+    assert (
+        "time: order 1.1 (steps 2, 1, 0.5 on refinement 1, degree 1)" in words
+        and "mesh: fewer than two settings" in words
+    )
     names = [f"point-1-degree-1-step-{step}" for step in ("2", "1", "0.5")]
     assert [name in (out / "trade.csv").read_text() for name in names] == [True] * 3
     assert (out / "trade.png").stat().st_size > 10_000
     row = read_scene(out / "rows" / f"{names[2]}.toml")
     assert row.time.step == 0.5 and row.output.fields is True and row.name == "cube"
     # the closed form of the printed scheme: a row of fixed steps has the angle of one step before
-    last = Recording(out / f"{names[0]}-1").history["angle_profile_4"][-1]
+    last = Recording(out / f"{names[0]}-1").history["angle_profile_2"][-1]
     s = 1 - np.exp(-0.1 * 18.0)
     assert last == pytest.approx(np.degrees(np.arctan(np.sqrt(2) * (1 - s) / (1 - s + np.sqrt(3) * s))), abs=1e-6)
 
@@ -176,3 +181,24 @@ def test_words() -> None:
     text = in_words(Trade(rows, notes, ["full-1-degree-1-step-1"], {}))
     assert "left out, over the budget: full-1-degree-1-step-1" in text and "order 1" in text
     assert sum(line.startswith("* ") for line in text.splitlines()) == sum(row.best for row in rows) > 2
+
+
+@pytest.mark.slow
+def test_estimates_of_the_artery_are_the_true_errors(tmp_path: Path) -> None:
+    """Against the one-dimensional reference with small steps: eight of ten rows within a factor of two."""
+    scene = artery(**{"model.kinematics": "radial"})
+    folder, found = study.trade(scene, tmp_path / "out", budget=3000.0)
+    times = compared_times(scene, ladder(scene))
+    coarse, fine = (_reference(step, times) for step in (1 / 8, 1 / 16))
+    true = {row.result.setting.name: typical(row.result.angles - (2 * fine - coarse)) for row in found.rows}
+    ratios = [row.angle_error / true[row.result.setting.name] for row in found.rows]
+    assert np.mean([0.5 <= ratio <= 2.0 for ratio in ratios]) >= 0.8, sorted(ratios)
+
+
+def _reference(step: float, times: list[float]) -> np.ndarray:
+    """Angles of the reference, at the times and places that are compared."""
+    history = solve_radial(step=step, elements=150)
+    hats = weights((history.points - 1.0) / 2.0) * history.areas[:, None]
+    rows = [history.dimensions[round(time / step) - 1] for time in times]
+    angles = np.array([np.degrees(np.arctan2(row[:, 1], row[:, 0])) for row in rows])
+    return np.asarray(angles @ hats / hats.sum(axis=0))

@@ -126,8 +126,7 @@ class Shape(Table):
 
     def depth(self, coordinates: Array) -> Array:
         """How far places (..., 3) are through the body, from 0 to 1: here along z."""
-        depth: Array = coordinates[..., 2] / self.axial_length
-        return depth
+        return np.asarray(coordinates[..., 2] / self.axial_length, dtype=np.float64)
 
     @property
     def name(self) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable
 from typing import Protocol
 
@@ -20,7 +21,7 @@ from remodel_fenicsx.evolution.remodeling import RemodelingPass
 from remodel_fenicsx.evolution.state import State
 from remodel_fenicsx.tissue.cells import UnitCell
 from remodel_fenicsx.tissue.energy import Tissue
-from remodel_fenicsx.tissue.tensor_law import Target
+from remodel_fenicsx.tissue.tensor_law import Target, weight_of_the_end
 
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
@@ -43,6 +44,8 @@ class Coupling(Protocol):
         Power of the step with which the error in time falls.
     accumulates
         Whether the errors in time of steps add up; where not, a row lags behind.
+    longest
+        kappa times the longest step that may be chosen for its error: longer ones of an explicit rule swing.
     compares
         Whether `better` is wanted; set it before the first step.
     better
@@ -54,6 +57,7 @@ class Coupling(Protocol):
     share: float
     order: int
     accumulates: bool
+    longest: float
     compares: bool
 
     @property
@@ -76,7 +80,7 @@ class Staggered:
     loads are applied in parts (docs/theory.md, "Steps that are too large"): the state at the end is the same.
     """
 
-    order, accumulates = 1, False
+    order, accumulates, longest = 1, False, math.inf
 
     def __init__(self, state: State, tissue: Tissue, remodeling: RemodelingPass, settings: SolverSettings):
         self.state, self.remodeling, self.settings = state, remodeling, settings
@@ -203,7 +207,7 @@ class Extrapolated(Staggered):
     the target at its end: it solves, remodels, and solves again. For laws with a `target`.
     """
 
-    order, accumulates = 2, True
+    order, accumulates, longest = 2, True, 0.5
 
     def __init__(self, state: State, tissue: Tissue, remodeling: RemodelingPass, settings: SolverSettings):
         super().__init__(state, tissue, remodeling, settings)
@@ -216,7 +220,7 @@ class Extrapolated(Staggered):
 
     @property
     def better(self) -> UnitCell | None:
-        """The cells that the mean of the targets at both ends gives; in the first step the target of its end."""
+        """The cells that the targets at both ends give together; in the first step the target of its end."""
         return self._better
 
     @property
@@ -249,7 +253,8 @@ class Extrapolated(Staggered):
         """Remember the target of the solved state; the cells are those of the row."""
         target, values = self.remodeling.target(self._residual), self._values
         if self.compares:
-            self._better = self.remodeling.followed(self._mean(target), time - self.state.time, self._start)
+            duration = time - self.state.time
+            self._better = self.remodeling.followed(self._mean(target, duration), duration, self._start)
         values[:, :, 1] = values[:, :, 0]
         if self.state.number == 0:  # its own target has been taken for the whole of the first step
             values[:, :, 1, 10] = NEVER
@@ -258,13 +263,14 @@ class Extrapolated(Staggered):
         values[:, :, 0, 10] = time
         return self._power
 
-    def _mean(self, target: Target) -> Target:
-        """Of the targets at the start, if there was one, and at the end of the step."""
+    def _mean(self, target: Target, duration: float) -> Target:
+        """What counts of the targets at the start, if there was one, and at the end of the step."""
         if self.state.number == 0:
             return target
         last = self._values.reshape(-1, 2, 11)[:, 0]
         start = Target(last[:, :9].reshape(-1, 3, 3), last[:, 9])
-        return Target((start.direction + target.direction) / 2, (start.share + target.share) / 2)
+        weight = weight_of_the_end(self.remodeling.settings.kappa * duration)
+        return Target(*(old + weight * (new - old) for old, new in zip(start, target, strict=True)))
 
     def _extrapolated(self, time: float) -> Target:
         last, before = self._values.reshape(-1, 2, 11)[:, 0], self._values.reshape(-1, 2, 11)[:, 1]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 
 from remodel_fenicsx.body.loading import LoadValues
 from remodel_fenicsx.evolution.condensed import AnsweringCells, AnsweringEquilibrium, AnsweringNewton
@@ -14,6 +15,7 @@ from remodel_fenicsx.evolution.state import State
 from remodel_fenicsx.tissue.cells import UnitCell
 from remodel_fenicsx.tissue.energy import Tissue
 from remodel_fenicsx.tissue.laws import relaxed
+from remodel_fenicsx.tissue.tensor_law import weight_of_the_end
 
 log = logging.getLogger(__name__)
 
@@ -28,7 +30,7 @@ class Implicit:
     as they are. Cells, stress and row belong together at the end of a step.
     """
 
-    order, accumulates = 1, True
+    order, accumulates, longest = 1, True, math.inf
 
     def __init__(self, state: State, tissue: Tissue, remodeling: RemodelingPass, settings: SolverSettings):
         self.state, self.remodeling, self.settings = state, remodeling, settings
@@ -58,7 +60,8 @@ class Implicit:
         from_start = self._from_start(time, work.residual if self.state.number == 0 else self.state.numbers[RESIDUAL])
         self._solve(time, loads, work, answering=True)
         if from_start is not None:
-            self._better = relaxed(from_start, self.answering.asked, 0.5)
+            weight = weight_of_the_end(self.remodeling.settings.kappa * (time - self.state.time))
+            self._better = relaxed(from_start, self.answering.asked, weight)
         work.substeps -= int(self.state.number == 0)
         self.state.numbers[RESIDUAL] = work.residual
         work.held_points = self.answering.held_points()
@@ -74,7 +77,7 @@ class Implicit:
 
     @property
     def better(self) -> UnitCell | None:
-        """The mean of what the stresses at both ends of the step ask for; eq. (11) asks for the end alone."""
+        """What the stresses at both ends of the step ask for together; eq. (11) asks for the end alone."""
         return self._better
 
     def _from_start(self, time: float, residual: float) -> UnitCell | None:

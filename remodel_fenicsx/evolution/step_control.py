@@ -132,6 +132,8 @@ class StepControl:
         else:
             was_cut = not self._rejected and duration < wanted
             wanted = max(duration * self._ratio(error), wanted if was_cut else 0.0)
+        kappa = self.stepper.remodeling.settings.kappa
+        wanted = min(wanted, self.stepper.coupling.longest / kappa if kappa else wanted)
         numbers["wanted"], numbers["before"] = max(wanted, SMALLEST * self.first), max(error, LEAST)
 
     def _level(self) -> float:

@@ -10,7 +10,7 @@ from remodel_fenicsx.scene.settings import Load
 from remodel_fenicsx.schema.tables import SceneError, shown
 
 # what decides no number of the steps done, or only how they were solved
-FREE = ("format", "name", "preset", "output", "solver", "loads", "time.end")
+FREE = ("format", "name", "preset", "profile", "output", "solver", "loads", "time.end")
 SAME_LOAD = 1e-12  # relative difference of two loads that are the same
 
 

@@ -8,6 +8,7 @@ import tomlkit
 
 from remodel_fenicsx.body import SHAPES
 from remodel_fenicsx.scene.parameters import PRESET_NOTES, PRESETS
+from remodel_fenicsx.scene.profiles import PROFILES
 from remodel_fenicsx.scene.scene import Scene
 from remodel_fenicsx.schema.tables import markdown_reference
 from remodel_fenicsx.schema.toml import merged
@@ -22,9 +23,9 @@ string for a number, `true` for a number), NaN, or values that do not fit togeth
 what is allowed. Lengths of the geometry are in any one unit of length, chain lengths in link lengths of the chain,
 stresses in `material.stress_unit`, time in the unit of 1/`remodeling.kappa`.
 
-Where a key has several sources, the first of these wins: `--set KEY=VALUE` on the command line, the file, the preset
-for the shape, the defaults below. Tables are merged key by key, lists are replaced whole. A preset's load stays when
-the scene names only another one; to take it away set its `value` to 0.
+Where a key has several sources, the first of these wins: `--set KEY=VALUE` on the command line, `--profile` there, the
+file, the profile that it names, the preset for the shape, the defaults below. Tables are merged key by key, lists are
+replaced whole. A preset's load stays when the scene names only another one; to take it away set its `value` to 0.
 
 `--set` takes a dotted key and a TOML value; a bare word is a string, and so is a number with a unit:
 `--set cells.seed=2`, `--set remodeling.frame=spatial`, `--set 'loads.pressure.ramp=[[0, 0], [25, 1]]'`,
@@ -49,6 +50,7 @@ def scene_reference() -> str:
     """The page docs/scene.md: every key with default, what is allowed and meaning, and the presets."""
     text = _REFERENCE + _UNITS + "\n".join(_unit_rows()) + "\n\n" + markdown_reference(Scene)
     text += "\n## Loads of the shapes\n\n| load | shape | meaning |\n|---|---|---|\n" + "\n".join(_load_rows()) + "\n"
+    text += "\n## Profiles\n\n" + "\n".join(f"- {one.in_words(name)}" for name, one in PROFILES.items()) + "\n"
     for name, shapes in PRESETS.items():
         text += f"\n## Preset `{name}`\n\n{PRESET_NOTES[name]}\n"
         for shape, values in shapes.items():

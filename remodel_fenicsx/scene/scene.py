@@ -19,6 +19,7 @@ from remodel_fenicsx.body import SHAPES, Shape
 from remodel_fenicsx.body.reductions import AUTO, objections
 from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.scene.parameters import FORMAT, PRESETS, RENAMED, Cells, Material, Remodeling, default_method
+from remodel_fenicsx.scene.profiles import PROFILES, known_profile
 from remodel_fenicsx.scene.settings import Load, Mesh, Model, Output, Solver, Supports, Time, nearest_multiples
 from remodel_fenicsx.scene.values import base_material, in_own_units, in_present_format, known_shape
 from remodel_fenicsx.schema.tables import SceneError, Table, checked, fault, quoted, shown, variant_of
@@ -65,6 +66,12 @@ class Scene(Table):
         description="Named parameters that lie under the scene's own keys, table by table (see Presets below).",
         json_schema_extra={"allowed": "one of " + ", ".join(map(repr, PRESETS))},
     )
+    profile: str | None = Field(
+        default=None,
+        description="How much accuracy: settings of mesh, kinematics and steps that lie over the preset's and under "
+        "the scene's own keys (docs/speed_and_accuracy.md has their errors and costs). `--profile` lays them over all.",
+        json_schema_extra={"allowed": "one of " + ", ".join(map(repr, PROFILES))},
+    )
     geometry: Annotated[SerializeAsAny[Shape], variant_of(SHAPES, "shape")]
     mesh: Mesh = Mesh()
     model: Model = Model()
@@ -97,6 +104,9 @@ class Scene(Table):
                 known = ", ".join(map(repr, PRESETS[preset]))
                 raise fault(f"the preset {preset!r} has {known}", "geometry.shape", shape)
             base = merged(base, PRESETS[preset][shape])
+        profile = plain.get("profile")
+        if profile is not None:
+            base = merged(base, known_profile(profile).tables())
         return in_own_units(merged(base, plain), cls, SHAPES[shape], Load)
 
     @model_validator(mode="after")
@@ -277,7 +287,7 @@ def preset_scene(preset: str, shape: str) -> Scene:
     return scene_from_dict({"name": shape, "preset": preset, "geometry": {"shape": shape}})
 
 
-def read_scene(path: str | os.PathLike[str], overrides: Iterable[str] = ()) -> Scene:
+def read_scene(path: str | os.PathLike[str], overrides: Iterable[str] = (), profile: str | None = None) -> Scene:
     """A scene from a TOML file.
 
     Parameters
@@ -287,6 +297,8 @@ def read_scene(path: str | os.PathLike[str], overrides: Iterable[str] = ()) -> S
     overrides
         "KEY=VALUE" with a dotted key and a TOML value (a bare word is a string): laid over the file's keys, before the
         preset is.
+    profile
+        Name of a profile whose settings are laid over the file's keys, under those of `overrides`.
 
     Raises
     ------
@@ -294,6 +306,8 @@ def read_scene(path: str | os.PathLike[str], overrides: Iterable[str] = ()) -> S
         One line: file and line, or key, value and what is allowed.
     """
     values = read_toml(Path(path))
+    if profile is not None:
+        values = merged(values, {"profile": profile} | PROFILES[profile].tables())
     for override in overrides:
         key, value = parse_override(override)
         put(values, key, value)

@@ -55,7 +55,7 @@ def limit(results: Sequence[Array]) -> Limit:
     cosine = float(np.nansum(before * last) / max(np.nansum(before**2) ** 0.5 * np.nansum(last**2) ** 0.5, 1e-300))
     if not RATIOS[0] < ratio < RATIOS[1] or cosine < ALIGNED:
         return Limit(np.zeros_like(last), np.nan, last)
-    return Limit(last / (ratio - 1), float(np.log2(ratio)), last)
+    return Limit(np.asarray(last / (ratio - 1), dtype=np.float64), float(np.log2(ratio)), last)
 
 
 def _norm(values: Array) -> float:

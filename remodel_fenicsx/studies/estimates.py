@@ -97,7 +97,10 @@ class Trade:
 
 
 def estimated(results: Sequence[Result]) -> tuple[list[Row], list[str]]:
-    """Rows with errors against the best guess of the exact result, and what it rests on."""
+    """Rows with errors against the best guess of the exact result, and what it rests on.
+
+    What is not known of that guess, where a sweep shows no order, counts as an error too.
+    """
     notes: list[str] = []
     results = _on_the_mean(results)
     fixed = [result for result in results if result.setting.step is not None]
@@ -127,6 +130,8 @@ def estimated(results: Sequence[Result]) -> tuple[list[Row], list[str]]:
 
 def _row(result: Result, angles: Array, lengths: Array, unknown: float) -> Row:
     error = typical(result.angles - angles)
+    if np.isfinite(unknown):
+        error = float(np.hypot(error, unknown))
     length = float(np.nanmax(np.abs(result.lengths / lengths - 1)))
     doubt = ""
     if unknown > CLOSE * error:
@@ -157,28 +162,38 @@ def _fineness(result: Result) -> tuple[float, ...]:
 
 
 def _time_sweep(results: Sequence[Result]) -> tuple[list[Result], str]:
-    """The longest chain of halved steps on one mesh."""
+    """A chain of halved steps on one mesh: of chains that may tell an order that on the finest mesh."""
     chains = []
-    for mesh in {result.setting.mesh for result in results}:
-        steps = {r.setting.step: r for r in results if r.setting.mesh == mesh and r.setting.step is not None}
-        chains.append(_halved({step: result for step, result in steps.items() if step is not None}))
-    found = max(chains, key=len)
-    return (found, f"steps {', '.join(f'{r.setting.step:g}' for r in found)}") if len(found) > 1 else ([], "")
+    for mesh in sorted({result.setting.mesh for result in results}, key=lambda mesh: mesh[1] * mesh[2] ** 2):
+        same = [r for r in results if r.setting.mesh == mesh]
+        chains.append(_halved({r.setting.step: r for r in same if r.setting.step is not None}))
+    found = _last_of_the_longest(chains)
+    return found, f"steps {', '.join(f'{r.setting.step:g}' for r in found)} on {_mesh_in_words(found)}"
 
 
 def _mesh_sweep(results: Sequence[Result]) -> tuple[list[Result], str]:
-    """The longest chain of doubled refinements with one step and degree; of alike ones that of the higher degree."""
+    """A chain of doubled refinements: of chains that may tell an order that of the highest degree, with small steps."""
     chains = []
-    for step, degree in {(r.setting.step, r.setting.mesh[2]) for r in results if r.setting.step is not None}:
-        same = [r for r in results if r.setting.step == step and r.setting.mesh[2] == degree]
-        for kinematics in {r.setting.mesh[0] for r in same}:
-            sizes = {1.0 / r.setting.mesh[1]: r for r in same if r.setting.mesh[0] == kinematics}
-            chains.append(_halved(sizes))
-    found = max(chains, key=lambda chain: (len(chain) > 2, len(chain) > 1, chain[-1].setting.mesh[2], len(chain)))
-    if len(found) < 2:
-        return [], ""
-    words = f"refinements {', '.join(str(r.setting.mesh[1]) for r in found)} of degree {found[-1].setting.mesh[2]}"
-    return found, words
+    fixed = [(r.setting.step, r) for r in results if r.setting.step is not None]
+    kinds = {(r.setting.mesh[2], -step, r.setting.mesh[0]) for step, r in fixed}
+    for degree, negative, kinematics in sorted(kinds):
+        same = [r for step, r in fixed if step == -negative and r.setting.mesh[::2] == (kinematics, degree)]
+        chains.append(_halved({1.0 / r.setting.mesh[1]: r for r in same}))
+    found = _last_of_the_longest(chains)
+    refinements = ", ".join(str(r.setting.mesh[1]) for r in found)
+    return found, f"refinements {refinements} of degree {found[-1].setting.mesh[2] if found else 0}"
+
+
+def _last_of_the_longest(chains: Sequence[list[Result]]) -> list[Result]:
+    """The last chain of three or more, or of two; nothing where there is none."""
+    for length in (3, 2):
+        if long := [chain for chain in chains if len(chain) >= length]:
+            return long[-1]
+    return []
+
+
+def _mesh_in_words(found: Sequence[Result]) -> str:
+    return f"refinement {found[-1].setting.mesh[1]}, degree {found[-1].setting.mesh[2]}" if found else "no mesh"
 
 
 def _halved(by_size: dict[float, Result]) -> list[Result]:

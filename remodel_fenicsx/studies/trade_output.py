@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 from matplotlib import rc_context
@@ -14,6 +13,7 @@ from remodel_fenicsx.studies.estimates import Row, Trade
 from remodel_fenicsx.system.environment import versions
 
 ROWS = "rows"  # folder of the scenes
+APART = 0.9  # ratio of two errors whose points both have a name
 
 
 def in_words(found: Trade) -> str:
@@ -40,7 +40,7 @@ def write(found: Trade, folder: Path, scene: Scene) -> None:
     made_with = ", ".join(f"{name} {version}" for name, version in versions().items() if name != "BLAS")
     page = Page(folder, "trade", title, "Estimated errors; filled: no other setting is as good for less.")
     rows = found.rows
-    table = {
+    table: dict[str, list[str] | list[float] | list[int]] = {
         "setting": [row.result.setting.name for row in rows],
         "seconds": [row.result.seconds for row in rows],
         "angle_error": [row.angle_error for row in rows],
@@ -63,31 +63,38 @@ def write(found: Trade, folder: Path, scene: Scene) -> None:
 
 
 def _draw(page: Page, rows: list[Row], made_with: str) -> None:
-    kinds = list(dict.fromkeys(row.result.setting.mesh[0] for row in rows))
+    shown = [row for row in rows if row.angle_error > 0]
+    kinds = dict(zip(dict.fromkeys(row.result.setting.mesh[0] for row in shown), COLOURS, strict=False))
     with rc_context(STYLE):
-        figure = Figure(figsize=(6.0, 4.2), layout="constrained")
+        figure = Figure(figsize=(6.4, 4.2), layout="constrained")
         axes = figure.subplots()
-        for colour, kind in zip(COLOURS, kinds, strict=False):
-            for best in (True, False):
-                shown = [r for r in rows if r.result.setting.mesh[0] == kind and r.best == best and r.angle_error > 0]
-                axes.plot(
-                    [row.result.seconds for row in shown],
-                    [row.angle_error for row in shown],
-                    "o",
-                    color=colour,
-                    markerfacecolor=colour if best else "white",
-                    label=kind if best or not any(r.best for r in rows if r.result.setting.mesh[0] == kind) else None,
-                )
-        front = [row for row in rows if row.best and row.angle_error > 0]
+        for row in shown:
+            colour = kinds[row.result.setting.mesh[0]]
+            filled = colour if row.best else "white"
+            axes.plot(row.result.seconds, row.angle_error, "o", color=colour, markerfacecolor=filled)
+        for kind, colour in kinds.items():
+            axes.plot([], [], "o", color=colour, label=kind)
+        front = [row for row in shown if row.best]
         axes.plot([r.result.seconds for r in front], [r.angle_error for r in front], color="0.6", zorder=0, lw=0.8)
-        for row in front:
+        for row in _named(front):
             _, refinement, degree = row.result.setting.mesh
             time = row.result.setting.scene.time
-            step = f"step {time.step:g}" if time.tolerance is None else f"{time.tolerance:g} degrees"
-            text = f"{refinement} x, degree {degree}, {step}"
-            at = (row.result.seconds, row.angle_error)
+            step = f"step {time.step:g}" if time.tolerance is None else f"tolerance {time.tolerance:g}"
+            text, at = f"mesh {refinement}, degree {degree}, {step}", (row.result.seconds, row.angle_error)
             axes.annotate(text, at, xytext=(5, 3), textcoords="offset points", fontsize=6.5, color="0.3")
-        axes.set(xscale="log", yscale="log", xlabel="seconds of its steps", ylabel="error of the fibre angle, degrees")
-        if any(math.isfinite(row.angle_error) for row in rows):
+        axes.set(xscale="log", yscale="log")
+        axes.set(xlabel="seconds of the processor", ylabel="error of the fibre angle, degrees")
+        for axis in (axes.xaxis, axes.yaxis):
+            axis.set_major_formatter("{x:g}")
+        if kinds:
             axes.legend()
         page.save_figure(figure, made_with)
+
+
+def _named(front: list[Row]) -> list[Row]:
+    """Those whose names do not lie on each other."""
+    named: list[Row] = []
+    for row in front:
+        if not named or row.angle_error < APART * named[-1].angle_error:
+            named.append(row)
+    return named

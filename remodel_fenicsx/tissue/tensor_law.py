@@ -63,6 +63,17 @@ def target(tensor: Array, noise: Array | float) -> Target:
     return Target(direction, tension / np.where(total > 0, total, 1.0))
 
 
+def weight_of_the_end(rate: float) -> float:
+    """Weight of the target at the end of a step in the one that acts, if targets change linearly over it.
+
+    A forgets: A(h) = (1 - w) A(0) + w (E_0 + weight (E_1 - E_0)), w = 1 - exp(-z), weight = 1/w - 1/z, z = kappa h:
+    one half for short steps, one for long ones.
+    """
+    if rate < 1e-3:
+        return 0.5 + rate / 12
+    return float(-1.0 / np.expm1(-rate) - 1.0 / rate)
+
+
 def target_derivatives(tensor: Array, noise: Array | float) -> tuple[Array, Array]:
     """dE/dD as Mandel matrices (n, 6, 6) and ds/dD as Mandel vectors (n, 6); arguments as for `target`.
 

@@ -1,0 +1,50 @@
+"""Profiles: settings that lie over the preset's and under the scene's own, or over all of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from remodel_fenicsx import SceneError, cli, read_scene
+from remodel_fenicsx.scene.profiles import PROFILES
+from remodel_fenicsx.scene.scene import preset_scene, scene_from_dict
+
+TUBE = {"preset": "kuhl-holzapfel-2007", "geometry": {"shape": "tube"}}
+
+
+@pytest.mark.parametrize("name", PROFILES)
+def test_a_profile_lies_over_the_preset_and_under_the_scene(name: str) -> None:
+    scene = scene_from_dict(TUBE | {"profile": name})
+    assert scene.model.kinematics == "auto" and scene.time.tolerance == PROFILES[name].values["time.tolerance"]
+    assert scene.mesh.degree == PROFILES[name].values["mesh.degree"]
+    assert scene.remodeling == preset_scene(TUBE["preset"], "tube").remodeling  # type: ignore[arg-type]
+    own = scene_from_dict(TUBE | {"profile": name, "mesh": {"refinement": 5}, "model": {"kinematics": "full"}})
+    assert own.mesh.refinement == 5 and own.model.kinematics == "full"
+    assert own.mesh.degree == PROFILES[name].values["mesh.degree"]
+
+
+def test_each_is_finer_than_the_one_before() -> None:
+    errors = [(profile.degrees, profile.values["time.tolerance"]) for profile in PROFILES.values()]
+    assert errors == sorted(errors, reverse=True)
+    assert [profile.seconds for profile in PROFILES.values()] == sorted(p.seconds for p in PROFILES.values())
+
+
+def test_on_the_command_line_it_lies_over_the_scene(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "artery.toml"
+    path.write_text(preset_scene("kuhl-holzapfel-2007", "tube").to_toml())
+    assert read_scene(path).mesh.degree == 1
+    scene = read_scene(path, ["mesh.refinement=3"], "balanced")
+    assert scene.mesh.degree == 2 and scene.mesh.refinement == 3 and scene.profile == "balanced"
+    assert read_scene(path, [], "balanced").with_values({}) == read_scene(path, [], "balanced")
+    assert cli.main(["validate", str(path), "--profile", "fast"]) == 0
+    words = capsys.readouterr().out
+    assert "steps of an error below 1 degrees" in words
+    assert PROFILES["fast"].in_words("fast") in words
+    assert cli.main(["run", "--resume", str(tmp_path), "--profile", "fast"]) == 2
+    assert "--profile: a run goes on in its own folder, as it is" in capsys.readouterr().err
+
+
+def test_an_unknown_one_is_refused() -> None:
+    with pytest.raises(SceneError, match="profile = 'best': allowed are 'fast', 'balanced', 'reference'"):
+        scene_from_dict(TUBE | {"profile": "best"})
