@@ -425,16 +425,17 @@ def test_a_kinematics(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_formulation(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The two parts apart, but by the same rule: rows as with the whole energy, pressure and remodeling too."""
+    """The two parts apart, but by the same rule: rows as with the whole energy."""
     monkeypatch.setitem(FORMULATIONS, "apart", Selective("both parts at all points", {("hexahedron", 1): 2}))
     with pytest.raises(
         SceneError, match="^mesh.formulation = 'apart': allowed for elements 'hexahedron' of degree 2 is"
     ):
         whole(mesh={"formulation": "apart", "degree": 2})
-    expected = rows_of(whole(cells={"initial": "random"}))
-    with simulated(whole(cells={"initial": "random"}, mesh={"formulation": "apart"})) as (simulation, found):
+    matrix = whole().with_values(WITHOUT_CHAINS)  # whose kernels compile fastest
+    expected = rows_of(matrix)
+    with simulated(matrix.with_values({"mesh.formulation": "apart"})) as (simulation, found):
         assert simulation.state.dilatation.jacobians().shape == (1, 8)
-    for name in ("mean_stretch", "mean_fibre_angle", "stored_energy", "remodeling_power"):
+    for name in ("mean_stretch", "min_stretch", "min_jacobian", "stored_energy"):
         np.testing.assert_allclose(column(found, name), column(expected, name), rtol=1e-8, err_msg=name)
 
 
