@@ -47,10 +47,10 @@ DRIVERS = ("pk2", "finger")
 EDGES = np.linspace(1.0, 3.0, 9)  # of the layers
 CAPTION = (
     "The consistent law beside the paper's",
-    "Lines by law. (a) Mean angle to the load in the cube of Fig. 5; (b) stretch of the tendon of Fig. 6; (c) outer "
-    "and inner radius of the artery of Fig. 7, isotropic cells; (d) its reference fibre angle over the radius at t = 150, "
-    "Fig. 8; (e) the same for the other loads of Fig. 9; (f) for the drivers S (full lines) and b (dashed), Figs. 10 "
-    "and 11.",
+    "Lines by law. (a) Mean angle to the load in the cube of Fig. 5; (b) stretch of the tendon of Fig. 6; (c) "
+    "outer and inner radius of the artery of Fig. 7, isotropic cells; (d) its reference fibre angle over the "
+    "radius at t = 150, Fig. 8; (e) the same for the other loads of Fig. 9; (f) for the drivers S (full lines) "
+    "and b (dashed), Figs. 10 and 11.",
 )
 Columns = dict[str, np.ndarray]
 
