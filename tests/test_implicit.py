@@ -87,6 +87,41 @@ def test_eq_11_has_no_error_of_the_time_step() -> None:
     assert np.abs(ends[0] - ends[1]).max() < 1e-7 < np.abs(ends[0] - np.eye(3) / 3).max()
 
 
+@pytest.mark.parametrize("law", ["relaxation", pytest.param("rate", marks=pytest.mark.slow)])
+def test_the_other_printed_laws_are_of_first_order(law: str) -> None:
+    ends = []
+    for step in (2.5, 1.25, 0.3125):
+        simulation = short_tube(5.0, step, law=law, cells="isotropic")
+        run(simulation)
+        ends.append(simulation.cells.structure_tensor())
+    coarse, fine = (np.abs(end - ends[2]).max() for end in ends[:2])
+    assert 0.8 < np.log2(coarse / fine) < 1.4  # (2.5 - 0.3125)/(1.25 - 0.3125) is 2.33
+
+
+@pytest.mark.parametrize("law, cells", [("explicit", "isotropic"), ("tensor", "random")])
+def test_long_steps_run(law: str, cells: str) -> None:
+    """kappa times the step is ten."""
+    simulation = short_tube(5.0, law=law, cells=cells, kappa=10.0)
+    rows = run(simulation)
+    assert all(row["held_points"] == 0 for row in rows)
+    assert rows[-1]["newton_iterations"] <= 4 and rows[-1]["substeps"] == 1
+    assert missed(simulation, 5.0).max() < 1e-6
+
+
+def test_both_laws_have_the_same_biological_equilibrium() -> None:
+    """From isotropic cells; kappa t = 30. The angle in the wall within 0.1 degrees, from below 10 to above 40."""
+    angles = []
+    for law in ("explicit", "tensor"):
+        simulation = short_tube(60.0, 5.0, law=law, cells="isotropic", kappa=0.5)
+        run(simulation)
+        A, x = simulation.cells.structure_tensor(), simulation.quadrature.coordinates
+        around = np.stack([-x[..., 1], x[..., 0], 0 * x[..., 0]], axis=-1) / np.hypot(x[..., 0], x[..., 1])[..., None]
+        along = np.einsum("epi,epij,epj->ep", around, A, around)
+        angles.append(np.degrees(np.arctan(np.sqrt(A[..., 2, 2] / along))))
+    assert angles[0].min() < 10 and angles[0].max() > 40
+    np.testing.assert_allclose(angles[0], angles[1], atol=0.1)
+
+
 def test_points_that_jump_are_held_and_counted() -> None:
     """Random cells by rank: some equations have no solution."""
     simulation = short_tube(4.0, law="explicit", driver="finger")

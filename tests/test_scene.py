@@ -320,7 +320,7 @@ BAD_SCENES = [
     ),
     (
         CUBE,
-        {"remodeling.coupling": "implicit", "remodeling.law": "tensor"},
+        {"remodeling.coupling": "implicit", "remodeling.law": "tensor", "material.repulsion": "axes"},
         "remodeling.coupling = 'implicit': needs a material.repulsion that sees no axes, as its law: 'log', 'length'",
     ),
     (

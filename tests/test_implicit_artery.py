@@ -1,0 +1,84 @@
+"""The laws of the paper and the consistent one on the paper's artery, implicit and extrapolated: minutes each."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from remodel_fenicsx.scene.scene import Scene, scene_from_dict
+from remodel_fenicsx.simulation import Simulation
+from tests.conftest import Case
+
+pytestmark = pytest.mark.slow
+COLUMNS = ["newton_iterations", "substeps", "held_points", "inner_radius", "outer_radius"]
+SECTOR = {"geometry": {"shape": "tube"}, "model": {"kinematics": "sector"}, "cells": {"initial": "isotropic"}}
+
+
+def artery(end: float, step: float = 1.0, law: str = "tensor", **changes: Any) -> dict[str, Any]:
+    """Values of a scene; `tables` lie over them."""
+    tables = changes.pop("tables", {"geometry": {"shape": "tube"}})
+    remodeling = {"law": law, "coupling": "implicit", "frame": "material"} | changes
+    return {
+        "preset": "kuhl-holzapfel-2007",
+        "material": {"repulsion": "log" if law == "tensor" else "axes"},
+        "remodeling": remodeling,
+        "time": {"end": end, "step": step},
+        "output": {"columns": COLUMNS, "fields": False},
+    } | tables
+
+
+def history(scene: Scene) -> tuple[dict[str, np.ndarray], Simulation]:
+    """Columns by step, and the end."""
+    simulation = Simulation(scene, MPI.COMM_SELF)
+    rows = [step.row for step in simulation.steps()]
+    return {name: np.array([row[name] for row in rows]) for name in rows[0]}, simulation
+
+
+@pytest.mark.parametrize(
+    ("driver", "frame", "inner", "outer"),
+    [
+        ("finger", "material", 1.546, 3.126),
+        ("finger", "spatial", 1.548, 3.127),
+        ("cauchy", "material", 1.421, 3.062),
+        ("cauchy", "spatial", 1.424, 3.063),
+        ("pk2", "material", 1.422, 3.062),
+    ],
+)
+def test_the_printed_law_to_the_end(driver: str, frame: str, inner: float, outer: float) -> None:
+    """A quarter of the paper's mesh, which is exact for isotropic cells: six iterations a step at most, none held."""
+    found, _ = history(scene_from_dict(artery(150.0, law="explicit", driver=driver, frame=frame, tables=SECTOR)))
+    assert found["newton_iterations"][1:].max() <= 6
+    assert found["held_points"].max() == 0 and found["substeps"].max() == 1
+    assert abs(found["inner_radius"][-1] - inner) < 2e-3 and abs(found["outer_radius"][-1] - outer) < 2e-3
+
+
+def test_the_end_does_not_depend_on_the_step() -> None:
+    """Eq. (11), steps of 5 and 1.25 to t = 50."""
+    ends = [history(scene_from_dict(artery(50.0, step, law="explicit", tables=SECTOR)))[1] for step in (5.0, 1.25)]
+    A, other = (simulation.cells.structure_tensor() for simulation in ends)
+    assert np.abs(A - other).max() < 1e-7
+
+
+@pytest.mark.parametrize("coupling", ["implicit", "extrapolated"])
+def test_the_consistent_law_on_one_and_two_ranks(case: Case, coupling: str) -> None:
+    """The whole mesh, random cells, 24 steps: no point held, no step in parts, four iterations a step in the mean."""
+    scene = artery(24.0, coupling=coupling)
+    one, two = (case(scene, ranks=ranks) for ranks in (1, 2))
+    assert max(one["held_points"]) == 0 and max(one["substeps"]) == 1
+    assert np.mean(one["newton_iterations"]) <= (4 if coupling == "implicit" else 5)
+    for name in ("u", "l"):
+        np.testing.assert_allclose(two[name], one[name], atol=1e-7)
+    np.testing.assert_allclose((np.asarray(one["l"]) ** 2).sum(axis=-1), 1.0, atol=1e-13)
+
+
+@pytest.mark.parametrize("driver", ["cauchy", "pk2", "finger"])
+def test_isotropic_cells_stay_symmetric_with_the_consistent_law(driver: str) -> None:
+    """The whole mesh, 24 steps: lengths of a radius differ by rounding."""
+    whole = {"geometry": {"shape": "tube"}, "cells": {"initial": "isotropic"}}
+    _, simulation = history(scene_from_dict(artery(24.0, driver=driver, coupling="extrapolated", tables=whole)))
+    radii = np.round(np.linalg.norm(simulation.quadrature.coordinates[..., :2], axis=-1), 6)
+    squares = np.linalg.eigvalsh(simulation.cells.structure_tensor())
+    assert max(np.ptp(squares[radii == radius], axis=0).max() for radius in np.unique(radii)) < 1e-10
