@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -21,6 +22,7 @@ from remodel_fenicsx.evolution.state import State
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher, times
 from remodel_fenicsx.evolution.unit_cells import UnitCells
 from remodel_fenicsx.fem.formulations import FORMULATIONS
+from remodel_fenicsx.fem.free_length import FreeLength
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.results.columns import COLUMNS_ON_REQUEST, Observer, columns_of
@@ -65,7 +67,9 @@ class Simulation:
         shape = scene.geometry
         self.domain = domain = checked_domain(build(scene, comm) if domain is None else domain, scene)
         mesh = domain.mesh
-        kinematics = KINEMATICS[scene.model.kinematics].on(mesh, shape)
+        kinematics: Any = KINEMATICS[scene.model.kinematics].on(mesh, shape)
+        if scene.has_free_length:
+            kinematics = FreeLength(kinematics, shape)
         self.unknown = kinematics.unknown(mesh, scene.mesh.degree)
         self.quadrature = Quadrature(mesh, scene.mesh.degree, kinematics.weight(mesh))
         self.cells = UnitCells(self.quadrature, domain.element_number, domain.number_of_elements, scene.cells)
@@ -83,7 +87,9 @@ class Simulation:
         counted = "negative_eigenvalues" in scene.output.columns
         self.stability = StabilityWatcher(self.stepper, scene.solver.unstable, every_step=counted)
         field_names(scene.output.fields)
-        self.observer = Observer(shape, self.stepper, columns_of(shape, checked_columns(scene.output.columns, shape)))
+        columns = columns_of(shape, checked_columns(scene.output.columns, shape))
+        unasked = [name for name, kind in shape.loads.items() if kind.frees_length and name not in scene.loads]
+        self.observer = Observer(shape, self.stepper, [column for column in columns if column.name not in unasked])
         locks = formulation.locks(scene.mesh.element, scene.mesh.degree)
         self.warnings: list[Watcher] = [LockingWarning(self.stepper, locks)]
         if self.stepper.remodeling.law.remodels and not at_once:
