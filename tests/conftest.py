@@ -24,6 +24,11 @@ def mpirun(ranks: int, *command: str) -> list[str]:
     return [*command] if ranks == 1 else ["mpirun", "--oversubscribe", "-n", str(ranks), *command]
 
 
+def slowly(*cases: Any) -> list[Any]:
+    """Cases of a parametrised test that only `-m slow` runs, where the others already show what it tells."""
+    return [pytest.param(*(one if isinstance(one, tuple) else (one,)), marks=pytest.mark.slow) for one in cases]
+
+
 @pytest.fixture(scope="session")
 def case(tmp_path_factory: pytest.TempPathFactory) -> Case:
     """case(scene, ranks=1, snapshots=(), divisions=None) -> what tests/run_case.py saved, by name."""

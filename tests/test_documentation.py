@@ -123,6 +123,7 @@ assert [row[0] for row in rows] == [1.0, 2.0] and 60 < rows[-1][1] < 70 and rows
 """
 
 
+@pytest.mark.slow
 def test_the_laws_beside_each_other_are_those_of_their_table_and_run(tmp_path: Path) -> None:
     """A short run of the cube whose load turns: it becomes shorter along z, while it is pulled along x."""
     script(["-c", LAWS], tmp_path)

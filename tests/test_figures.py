@@ -219,6 +219,7 @@ def test_only_source_that_decides_numbers_makes_runs_stale(copy: Path) -> None:
     assert validity.source_fingerprint(copy) == before
 
 
+@pytest.mark.slow
 def test_a_moved_module_leaves_runs_valid_and_another_of_its_names_does_not(copy: Path) -> None:
     """Where a file lies and what it is called decides no number; from which source a name comes does."""
     user = copy / "simulation.py"

@@ -18,7 +18,7 @@ from remodel_fenicsx.running import resume
 from remodel_fenicsx.running import run as record
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.tissue.cells import structure_tensor
-from tests.conftest import Case
+from tests.conftest import Case, slowly
 
 Array = NDArray[np.float64]
 
@@ -52,7 +52,7 @@ def missed(simulation: Simulation, time: float) -> Array:
     return np.linalg.norm(structure_tensor(*asked[:2]) - structure_tensor(*now[:2]), axis=(1, 2))
 
 
-@pytest.mark.parametrize("driver", ["cauchy", "pk2", "finger"])
+@pytest.mark.parametrize("driver", ["cauchy", *slowly("pk2", "finger")])
 def test_random_cells_belong_to_their_stress(driver: str) -> None:
     """The law for A: no point is held, no step made in parts, four iterations a step in the mean; tr A stays."""
     simulation = short_tube(8.0, driver=driver)
@@ -64,7 +64,7 @@ def test_random_cells_belong_to_their_stress(driver: str) -> None:
     np.testing.assert_allclose(np.trace(A, axis1=-2, axis2=-1), 1.0, atol=1e-13)
 
 
-@pytest.mark.parametrize("driver, frame", [("cauchy", "spatial"), ("pk2", "material"), ("finger", "material")])
+@pytest.mark.parametrize("driver, frame", [("cauchy", "spatial"), *slowly(("pk2", "material"), ("finger", "material"))])
 def test_the_printed_law_from_isotropic_cells(driver: str, frame: str) -> None:
     """At most six iterations a step (the first one, from cells that do not answer, apart), and a symmetric tube."""
     simulation = short_tube(8.0, law="explicit", cells="isotropic", driver=driver, frame=frame)
@@ -142,7 +142,7 @@ def cube(law: str, end: float) -> dict[str, Any]:
     }
 
 
-@pytest.mark.parametrize("law", ["tensor", "relaxation"])
+@pytest.mark.parametrize("law", ["tensor", *slowly("relaxation")])
 def test_one_and_two_ranks_agree(case: Case, law: str) -> None:
     """With points that are held too."""
     one, two = (case(cube(law, 8.0), ranks=ranks) for ranks in (1, 2))

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.conftest import mpirun
+from tests.conftest import mpirun, slowly
 from tests.processes import all_end, wait_for_compiler
 
 PROGRAM = """
@@ -103,7 +103,7 @@ def test_other_kernels_are_compiled_at_the_same_time(tmp_path: Path) -> None:
     assert "compiling the moment" in other.stderr and "waiting" not in other.stderr
 
 
-@pytest.mark.parametrize(("ranks", "lost"), [(1, ".c"), (2, ".c"), (2, ".c.cached"), (1, ".so")])
+@pytest.mark.parametrize(("ranks", "lost"), [(1, ".c"), (2, ".c.cached"), *slowly((2, ".c"), (1, ".so"))])
 def test_a_compilation_that_was_cut_off_is_done_again_at_once(ranks: int, lost: str, tmp_path: Path) -> None:
     assert compile_and_use(tmp_path, ranks).returncode == 0
     library, source = one_file(tmp_path, "libffcx_forms_*.so"), one_file(tmp_path, "libffcx_forms_*.c")

@@ -16,7 +16,7 @@ from remodel_fenicsx.body.reductions import AUTO, choice, explained, objections
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.results.columns import Measurement
-from tests.conftest import Case
+from tests.conftest import Case, slowly
 from tests.reference.radial import solve_radial
 
 SELF = MPI.COMM_SELF
@@ -72,7 +72,7 @@ def test_radial_is_the_independent_solution(driver: str, end: float) -> None:
     simulation.close()
 
 
-@pytest.mark.parametrize("driver", ["cauchy", "pk2", "finger"])
+@pytest.mark.parametrize("driver", ["cauchy", *slowly("pk2", "finger")])
 def test_the_consistent_law_is_the_independent_solution(driver: str) -> None:
     """Its law, typed by hand in the reference too."""
     changes = {"driver": driver, "law": "tensor", "frame": "material"}
@@ -89,6 +89,7 @@ def test_the_consistent_law_is_the_independent_solution(driver: str) -> None:
     simulation.close()
 
 
+@pytest.mark.slow
 def test_the_implicit_coupling_is_that_of_every_kinematics() -> None:
     """A ray and a half plane of it; and eq. (11) has no error of the step."""
     changes = {"coupling": "implicit", "frame": "material"}

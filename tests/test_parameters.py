@@ -203,10 +203,10 @@ def test_without_chains_nothing_locks(law: str) -> None:
     assert rows[-1]["mean_stretch"] == pytest.approx(exact, rel=1e-8)
     assert {row["max_chain_extension"] for row in rows} == {0.0}
     assert {row["remodeling_power"] for row in rows} == {0.0}
-    # no chain is in the kernels: two constants of the matrix, and of the fields the displacement alone
+    # no chain is in the kernels: two constants of the matrix, the size of the body; the only field is the displacement
     (energy,) = simulation.stepper.coupling.equilibrium.energies
     assert energy.coefficients() == (simulation.unknown,)
-    assert {float(c.value) for c in energy.constants()} == {27.293, 3.103}
+    assert {float(c.value) for c in energy.constants()} == {27.293, 3.103, scene.geometry.side}
     simulation.close()
 
 

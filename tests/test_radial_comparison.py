@@ -53,6 +53,7 @@ def checked(setting: Setting) -> Errors:
     return found
 
 
+@pytest.mark.slow
 def test_the_papers_loads_into_the_hold() -> None:
     checked(Setting(end=50.0))
 
@@ -93,6 +94,7 @@ def test_the_rate_law_outside_its_front() -> None:
     assert explicit.columns["fibre_angle_outer"][-1] - run.columns["fibre_angle_outer"][-1] > 20.0  # erratum 7
 
 
+@pytest.mark.slow
 def test_the_frames_agree_where_nothing_turns() -> None:
     """In the reference the principal directions never leave the axes; here they do by the error of the mesh."""
     settings = [Setting(divisions=(8, 4, 1), end=30.0, frame=frame) for frame in ("spatial", "material")]
@@ -110,6 +112,7 @@ def test_the_error_falls_at_the_elements_rate(degree: int) -> None:
     assert np.all(orders[0] > np.array([degree + 1, degree + 1, degree]) - 0.7)
 
 
+@pytest.mark.slow
 def test_a_comparison_can_fail() -> None:
     """Held against the reference of other loads, the errors are large."""
     run, other = finite_elements(Setting(divisions=(8, 4, 1), end=30.0)), reference(Setting(pressure=2.4, end=30.0))

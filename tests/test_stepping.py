@@ -17,6 +17,7 @@ from remodel_fenicsx.scene.parameters import Cells
 from remodel_fenicsx.scene.scene import Load, preset_scene
 from remodel_fenicsx.simulation import Simulation
 from tests import parts
+from tests.conftest import slowly
 
 FORCE = 14.0
 
@@ -363,8 +364,11 @@ def test_an_unloaded_step_converges_in_any_unit_of_stress(unit: float) -> None:
     assert second.row["mean_stretch"] == pytest.approx(1.2034, abs=1e-3)  # as with the paper's numbers
 
 
-@pytest.mark.parametrize(("metre", "unit", "pascal"), [(1.0, "MPa", 1e6), (1e-3, "kPa", 1e3), (1e-3, "MPa", 1e6)])
-@pytest.mark.parametrize("shape", ["cube", "tube"])
+@pytest.mark.parametrize(
+    ("shape", "metre", "unit", "pascal"),
+    [("cube", 1.0, "MPa", 1e6), ("cube", 1e-3, "kPa", 1e3), ("cube", 1e-3, "MPa", 1e6), ("tube", 1e-3, "MPa", 1e6),
+     *slowly(("tube", 1.0, "MPa", 1e6), ("tube", 1e-3, "kPa", 1e3))],
+)  # fmt: skip
 def test_the_answer_does_not_depend_on_the_units(shape: str, metre: float, unit: str, pascal: float) -> None:
     """The same body in metres and MPa, say: no tolerance may be hidden in a unit."""
     scene = preset_scene("kuhl-holzapfel-2007", shape).with_values({"time.end": 4.0, "cells.initial": "isotropic"})

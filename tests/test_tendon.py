@@ -89,6 +89,7 @@ def test_only_the_stress_as_printed_ends_near_140_percent(case: Case) -> None:
     assert final[4] == pytest.approx(1.27, abs=5e-3)
 
 
+@pytest.mark.slow
 def test_isotropic_cells_stay_homogeneous_and_follow_the_point_solution(case: Case) -> None:
     result = case(tendon_scene(initial="isotropic") | {"time": {"end": 50.0}})
     np.testing.assert_allclose(result["max_stretch"], result["min_stretch"], rtol=0, atol=1e-8)

@@ -37,6 +37,7 @@ RAMP = [[0.0, 0.0], [10.0, 1.0]]
 COARSE_TENDON = {"tendon": {"AROUND": 8, "CORE": 2, "RINGS": 1, "ALONG": 3}}
 RADIUS_TOLERANCE, STEP_TOLERANCE = 0.01, 0.01
 ANGLE_TOLERANCE = 1.5  # degrees, of the mean over a body
+CELL_TOLERANCE = 0.1  # of A over r0^2, root mean square over the elements: a mean may hide that they swing
 OUTER_ANGLE_TOLERANCE = 5.0  # degrees: a coarse layer of elements
 REFERENCE = "tube in one dimension"
 
@@ -130,7 +131,8 @@ def tubes() -> Iterator[Case]:
         for stretch in (-0.2, 0.0, 0.1, 0.3, 0.55):
             changes = {"loads.pressure.value": pressure, "loads.elongation.value": stretch}
             place, reduced = {"pressure": pressure, "stretch": stretch}, (pressure, stretch) == (2.4, 0.1)
-            counts = ring(8, 4) if pressure < 10 else ring(16, 8)  # larger strains need smaller elements
+            # larger strains need smaller elements: at 48 the radius is off by 1.3 % on 8, by 0.7 % on 12 of them
+            counts = ring(8, 4) if pressure < 10 else ring(16, 8) if pressure < 40 else ring(24, 12)
             yield tube_case("tube", changes, place, reduced=reduced, counts=counts)
     for driver in DRIVERS:
         for frame in FRAMES:
@@ -200,7 +202,7 @@ ELASTIC = {"material.chain_density": 0.0, "remodeling.law": "none", "loads.elong
 MESHES = {
     "hex1 16x8": ("hexahedron", 1, ring(16, 8), 0.05), "hex1 32x16": ("hexahedron", 1, ring(32, 16), 0.035),
     "hex2 8x4": ("hexahedron", 2, ring(8, 4), 0.035), "tet1 16x8": ("tetrahedron", 1, ring(16, 8), 0.1),
-    "tet2 8x4": ("tetrahedron", 2, ring(8, 4), 0.035),
+    "tet2 16x8": ("tetrahedron", 2, ring(16, 8), 0.035),  # 8 x 4 of them: 1.1 to 5.6 % off, eight times as much
 }  # fmt: skip
 
 
@@ -220,15 +222,19 @@ def locking() -> Iterator[Case]:
 
 # ---------------------------------------------------------------- tendons
 def check_half_step(case: Case, run: Run) -> Finding:
-    """The same with half of the step: a column and the mean angle at the end."""
+    """The same with half of the step: a column, the mean angle and A of the elements at the end."""
     other = run.companion
     if other is None or other.code != 0 or run.code != 0:
         return Finding(np.nan if run.code == 0 else 0.0, "half of the step does not come to the end")
     name = case.options.get("column", "mean_stretch")
     share = abs(run.column(name)[-1] / other.column(name)[-1] - 1)
     angle = abs(run.column("mean_fibre_angle")[-1] - other.column("mean_fibre_angle")[-1])
-    ratio = max(share / STEP_TOLERANCE, angle / ANGLE_TOLERANCE)
-    return Finding(float(ratio), f"half of the step: {name} {100 * share:.3g} %, angle {angle:.3g} degrees")
+    swing = run.structure_tensor() - other.structure_tensor()
+    r0 = case.scene["cells"]["end_to_end_length"]
+    cells = np.sqrt(np.mean(np.sum(swing**2, axis=(1, 2)))) / r0**2
+    ratio = max(share / STEP_TOLERANCE, angle / ANGLE_TOLERANCE, cells / CELL_TOLERANCE)
+    words = f"half of the step: {name} {100 * share:.3g} %, angle {angle:.3g} degrees, A {cells:.2g} r0^2"
+    return Finding(float(ratio), words)
 
 
 def tendon_case(family_name: str, changes: dict[str, Any], place: dict[str, Any], **more: Any) -> Case:
