@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -23,6 +24,7 @@ from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher, times
 from remodel_fenicsx.evolution.time_error import TimeError
 from remodel_fenicsx.evolution.unit_cells import UnitCells
 from remodel_fenicsx.fem.formulations import FORMULATIONS
+from remodel_fenicsx.fem.free_length import FreeLength
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.results.columns import COLUMNS_ON_REQUEST, Observer, columns_of
@@ -71,7 +73,9 @@ class Simulation:
         shape = scene.geometry
         self.domain = domain = checked_domain(build(scene, comm) if domain is None else domain, scene)
         mesh = domain.mesh
-        kinematics = KINEMATICS[scene.model.kinematics].on(mesh, shape)
+        kinematics: Any = KINEMATICS[scene.model.kinematics].on(mesh, shape)
+        if scene.has_free_length:
+            kinematics = FreeLength(kinematics, shape)
         self.unknown = kinematics.unknown(mesh, scene.mesh.degree)
         self.quadrature = Quadrature(mesh, scene.mesh.degree, kinematics.weight(mesh))
         self.cells = UnitCells(self.quadrature, domain.element_number, domain.number_of_elements, scene.cells)
@@ -97,7 +101,9 @@ class Simulation:
             columns += [TIME_ERROR] if TIME_ERROR not in columns else []
         elif TIME_ERROR in columns:
             self.stepper.judge = TimeError(self.stepper, shape.fibre_angle).measure
-        self.observer = Observer(shape, self.stepper, columns_of(shape, columns))
+        unasked = [name for name, kind in shape.loads.items() if kind.frees_length and name not in scene.loads]
+        wanted = [column for column in columns_of(shape, columns) if column.name not in unasked]
+        self.observer = Observer(shape, self.stepper, wanted)
         locks = formulation.locks(scene.mesh.element, scene.mesh.degree)
         self.warnings: list[Watcher] = [LockingWarning(self.stepper, locks)]
         if self.stepper.remodeling.law.remodels and not at_once:

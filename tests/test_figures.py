@@ -373,7 +373,7 @@ def test_figures_say_with_what_they_were_made(drawn: Path) -> None:
     version = validity.library_versions()["fenics-dolfinx"].split(".post")[0]
     for text in (notes["Source"], (drawn / "fig5.csv").read_text().splitlines()[1]):
         assert f"remodel_fenicsx {remodel_fenicsx.__version__}, dolfinx {version}" in text
-        assert "preset kuhl-holzapfel-2007, frame spatial, isotropic cells" in text
+        assert "preset kuhl-holzapfel-2007 with kinematics point, frame spatial, isotropic cells" in text
 
 
 @pytest.fixture(scope="module")

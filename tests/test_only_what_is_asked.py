@@ -40,9 +40,40 @@ class Calls:
         patch.setattr(owner, name, counted)
 
 
+def test_a_state_is_looked_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """How far it is from its limits: at the start of a step, of its solve, and for each Newton iteration."""
+    calls = Calls(monkeypatch, Equilibrium, "_extension_and_stretches")
+    simulation = Simulation(scene(), SELF)
+    iterations = sum(step.work.newton_iterations for step in simulation.stepper.march([1.0, 2.0, 3.0]))
+    assert iterations >= 6 and calls.number <= iterations + 2 * 3 + 1
+    simulation.close()
+
+
+def test_what_is_remembered_follows_every_change() -> None:
+    """Of cells, unknowns and live parameters."""
+    simulation = Simulation(scene(), SELF)
+    equilibrium, cells = simulation.stepper.coupling.equilibrium, simulation.cells
+    seen = [equilibrium.extension().max_chain_extension]
+    simulation.unknown.x.array[:] = 0.05
+    seen.append(equilibrium.extension().max_chain_extension)
+    cells.dimension_values[:] *= 1.1
+    seen.append(equilibrium.extension().max_chain_extension)
+    equilibrium.tissue.contour_length.value *= 2
+    seen.append(equilibrium.extension().max_chain_extension)
+    np.testing.assert_allclose(np.array(seen[1:]) / seen[:-1], [1.05, 1.1, 0.5], rtol=1e-12)
+    simulation.close()
+
+
 @pytest.mark.parametrize(
     ("remodeling", "passes"),
-    [({}, 3), ({"kappa": 0.0}, 0), ({"law": "none"}, 0), ({"law": "rotation", "kappa": 0.0}, 3)],
+    [
+        ({}, 3),
+        ({"kappa": 0.0}, 0),
+        ({"law": "none"}, 0),
+        ({"law": "tensor", "kappa": 0.0}, 0),
+        ({"coupling": "implicit", "kappa": 0.0}, 0),
+        ({"law": "rotation", "kappa": 0.0}, 3),
+    ],
 )
 def test_cells_that_never_move_have_no_pass(
     remodeling: dict[str, Any], passes: int, monkeypatch: pytest.MonkeyPatch

@@ -196,7 +196,8 @@ BAD_SCENES = [
     (
         TUBE,
         {"loads.force": {"value": 1.0}},
-        "loads.force = {value = 1.0}: a tube has no such load; allowed: loads.pressure, loads.elongation",
+        "loads.force = {value = 1.0}: a tube has no such load; "
+        "allowed: loads.pressure, loads.elongation, loads.axial_force",
     ),
     (
         CUBE,

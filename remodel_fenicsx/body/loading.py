@@ -13,6 +13,7 @@ from petsc4py import PETSc
 
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.body.domain import Domain
+from remodel_fenicsx.fem.free_length import field_degree
 from remodel_fenicsx.fem.kinematics import FullKinematics, Kinematics
 
 LoadValues = dict[str, float]
@@ -38,6 +39,8 @@ class Loading:
         dolfinx Dirichlet conditions.
     values
         Present magnitude of each named load.
+    has_caps
+        Whether a pressure inside acts on caps at the ends too: a support says so.
     """
 
     def __init__(self, domain: Domain, unknown: Any, kinematics: Kinematics | None = None):
@@ -48,6 +51,8 @@ class Loading:
         self.values: LoadValues = {}
         self._magnitudes: dict[str, list[tuple[Any, float]]] = {}
         self._terms: list[Callable[[Any, Any], Any]] = []
+        self._potentials: list[Callable[[Any], Any]] = []
+        self.has_caps = False
 
     # ------------------------------------------------------------ supports
     def hold_face(self, face: str, component: int) -> None:
@@ -95,6 +100,34 @@ class Loading:
         F = self.kinematics.deformation_gradient
         self.add_term(lambda u, v: pressure * ufl.inner(ufl.cofac(F(u)) * normal, v) * self.weight * measure)
 
+    def add_cavity_pressure(self, name: str, face: str) -> None:
+        """A pressure in the cavity inside a face and two plane caps across z, on the deformed face and on the caps.
+
+        Its potential is -p V with the volume V = -1/2 integral of (x e_x + y e_y) . cof(F) N over the face: the caps,
+        across which z alone changes, add nothing to it.
+        """
+        pressure, normal, measure = self.magnitude(name), ufl.FacetNormal(self.domain.mesh), self.surface_measure(face)
+
+        def potential(u: Any) -> Any:
+            place = ufl.SpatialCoordinate(self.domain.mesh) + self.kinematics.displacement(u)
+            across = ufl.as_vector([place[0], place[1], 0.0])
+            cofactor = ufl.cofac(self.kinematics.deformation_gradient(u))
+            return pressure / 2 * ufl.inner(across, cofactor * normal) * self.weight * measure
+
+        self.add_potential(potential)
+
+    def add_axial_force(self, name: str) -> None:
+        """A force on the ends along z, of kinematics whose length is an unknown (`fem.free_length`); others lack it."""
+        change = getattr(self.kinematics, "change_of_length", None)
+        if change is None:
+            return
+        dx = ufl.Measure("dx", domain=self.domain.mesh)
+        one = dolfinx.fem.Constant(self.domain.mesh, PETSc.ScalarType(1.0))
+        local = dolfinx.fem.assemble_scalar(jit.form(one * self.weight * dx))
+        volume = float(np.real(self.domain.mesh.comm.allreduce(local, MPI.SUM)))
+        force = self.magnitude(name, 1.0 / volume)  # spread over the body: the change of the length has no place
+        self.add_potential(lambda u: -force * change(u) * self.weight * dx)
+
     def add_prescribed_elongation(self, name: str, face: str, component: int, length: float) -> None:
         """u_component = elongation * length on a face: the engineering strain of the whole length."""
         strain = self.kinematics.uniform_strain(component)
@@ -115,6 +148,10 @@ class Loading:
         """
         self._terms.append(term)
 
+    def add_potential(self, potential: Callable[[Any], Any]) -> None:
+        """Any other load, as its potential: a function of the unknown that returns a UFL form."""
+        self._potentials.append(potential)
+
     def magnitude(self, name: str, scale: float = 1.0) -> Any:
         """A Constant that is the named load's present magnitude times `scale`: what a term is made of."""
         constant = self._constant(0.0)
@@ -129,13 +166,14 @@ class Loading:
     def surface_measure(self, face: str) -> Any:
         """Measure over a named face of the mesh; times `weight` it is one over the body's face."""
         measure = ufl.Measure("ds", domain=self.domain.mesh, subdomain_data=self.domain.facet_tags)
-        degree = self.space.element.basix_element.degree
+        degree = field_degree(self.space)
         return measure(self.domain.faces[face], metadata={"quadrature_degree": 2 * degree})
 
     def external_residual(self, test: Any) -> Any:
         """Minus the virtual work of the external forces, a UFL form; None without loads on faces or volumes."""
         virtual = self.kinematics.displacement(test)
         terms = [term(self.unknown, virtual) for term in self._terms]
+        terms += [ufl.derivative(potential(self.unknown), self.unknown, test) for potential in self._potentials]
         return sum(terms[1:], terms[0]) if terms else None
 
     def set(self, values: Mapping[str, float]) -> None:

@@ -58,6 +58,10 @@ class LoadKind:
         Values must be greater than this.
     reductions
         Names of the reduced kinematics that have it.
+    value
+        What its column shows; default: the load's magnitude.
+    frees_length
+        Whether the body's length is an unknown where a scene has it.
     """
 
     add: Callable[[Any, Loading, str], None]
@@ -66,11 +70,13 @@ class LoadKind:
     column: str = ""
     above: float = -np.inf
     reductions: tuple[str, ...] = ()
+    value: Callable[[Any], float] | None = None
+    frees_length: bool = False
 
     def make_column(self, name: str) -> Column:
         """Its column, for the load of this name."""
         unit = self.dimension.name if self.dimension else ""
-        return Column(self.column or name, unit, self.meaning, lambda m: float(m.step.loads[name]))
+        return Column(self.column or name, unit, self.meaning, self.value or (lambda m: float(m.step.loads[name])))
 
 
 class Shape(Table):
@@ -93,6 +99,8 @@ class Shape(Table):
         the cheapest first.
     ends
         How the body may be held, by what `supports.ends` says: functions of shape and loading.
+    ends_that_free_length
+        Those of `ends` with which the body's length is an unknown.
     defaults
         Defaults of other tables that this shape changes, under the keys of preset and scene.
     """
@@ -104,6 +112,7 @@ class Shape(Table):
     faces: ClassVar[tuple[str, ...]] = ()
     reductions: ClassVar[dict[str, Reduction]] = {}
     ends: ClassVar[dict[str, Callable[[Any, Loading], None]]] = {"free": lambda shape, loading: shape.hold(loading)}
+    ends_that_free_length: ClassVar[tuple[str, ...]] = ()
     defaults: ClassVar[dict[str, Any]] = {}
 
     shape: str = Field(description="Which body it is.")

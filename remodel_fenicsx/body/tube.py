@@ -14,7 +14,7 @@ from remodel_fenicsx.body.column import Column
 from remodel_fenicsx.body.reductions import Reduction
 from remodel_fenicsx.body.shape import Array, LoadKind, MeshSettings, Shape, check_lengths
 from remodel_fenicsx.schema.tables import fault, shown
-from remodel_fenicsx.schema.units import LENGTH, STRESS
+from remodel_fenicsx.schema.units import FORCE, LENGTH, STRESS
 from remodel_fenicsx.tissue.cells import pitch_angle
 
 if TYPE_CHECKING:
@@ -44,29 +44,48 @@ def _layer_angle(share: float) -> Callable[[Any], float]:
     return value
 
 
+def _add_pressure(loading: Loading, name: str) -> None:
+    (loading.add_cavity_pressure if loading.has_caps else loading.add_follower_pressure)(name, "inner")
+
+
+def _elongation(m: Any) -> float:
+    """As prescribed, or as found where the length is an unknown."""
+    strain = getattr(m.state.kinematics, "strain_of_length", None)
+    return float(m.step.loads["elongation"]) if strain is None else float(strain(m.state.unknown))
+
+
 _ANGLE = "mean of the reference angle, from circumferential (0) to axial (90 degrees), over the elements that touch"
 
 
 class Tube(Shape):
     """A thick-walled tube about z under inner pressure and axial elongation: the artery of the paper's Fig. 7.
 
-    Its ends stay in their planes; they are free to move radially, or clamped (`supports.ends`). Inner radius, wall
-    thickness and length: 1e-6 to 1e6, one up to 10,000 times the other.
+    Its ends stay in their planes; they are free to move radially, clamped, or closed by caps (`supports.ends`). Inner
+    radius, wall thickness and length: 1e-6 to 1e6, one up to 10,000 times the other.
     """
 
     loads: ClassVar[dict[str, LoadKind]] = {
         "pressure": LoadKind(
-            lambda shape, loading, name: loading.add_follower_pressure(name, "inner"),
-            "pressure on the deformed inner face",
+            lambda shape, loading, name: _add_pressure(loading, name),
+            "pressure on the deformed inner face, with closed ends also on their caps",
             STRESS,
             reductions=("radial", "axisymmetric", "sector"),
         ),
         "elongation": LoadKind(
             lambda shape, loading, name: loading.add_prescribed_elongation(name, "top", 2, shape.length),
-            "prescribed engineering strain of the length (0.1: 10 % longer)",
+            "engineering strain of the length (0.1: 10 % longer), prescribed; its column shows what was found where "
+            "the length is an unknown",
             column="axial_elongation",
             above=-1.0,
             reductions=("radial", "axisymmetric", "sector"),
+            value=_elongation,
+        ),
+        "axial_force": LoadKind(
+            lambda shape, loading, name: loading.add_axial_force(name),
+            "dead force along z on the ends, which move in parallel; the length is then an unknown",
+            FORCE,
+            reductions=("radial", "axisymmetric", "sector"),
+            frees_length=True,
         ),
     }
     columns: ClassVar[tuple[Column, ...]] = (
@@ -87,7 +106,9 @@ class Tube(Shape):
     ends: ClassVar[dict[str, Callable[[Any, Loading], None]]] = {
         "free": lambda shape, loading: shape.hold(loading),
         "clamped": lambda shape, loading: shape.clamp(loading),
+        "closed": lambda shape, loading: shape.close(loading),
     }
+    ends_that_free_length: ClassVar[tuple[str, ...]] = ("closed",)
     # with global axes a tube of isotropic cells would not stay round in the first step
     defaults: ClassVar[dict[str, Any]] = {"cells": {"axes": "cylindrical"}}
 
@@ -123,6 +144,16 @@ class Tube(Shape):
         for face in ("bottom", "top"):
             for component in (0, 1):
                 loading.hold_face(face, component)
+
+    def close(self, loading: Loading) -> None:
+        """As with free ends, with caps on which the pressure acts."""
+        self.hold(loading)
+        loading.has_caps = True
+
+    @property
+    def loaded_area(self) -> float:
+        """Of the wall."""
+        return self.section_area
 
     @property
     def axial_length(self) -> float:

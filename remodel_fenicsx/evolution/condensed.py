@@ -10,7 +10,7 @@ import ufl
 from numpy.typing import NDArray
 
 from remodel_fenicsx.evolution import compiled_tensor
-from remodel_fenicsx.evolution.equilibrium import Equilibrium, at_points
+from remodel_fenicsx.evolution.equilibrium import Equilibrium, Extension, at_points
 from remodel_fenicsx.evolution.newton import GuardedNewton, Solution, SolveFailure, SolverSettings
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
 from remodel_fenicsx.evolution.state import State
@@ -215,6 +215,10 @@ class AnsweringEquilibrium(Equilibrium):
         row, column = (ufl.as_vector([F_[i, j] for i in range(3) for j in range(3)]) for F_ in (variation, increment))
         internal = ufl.inner(self.answering.stress, variation) * weight * dx
         return [internal], [ufl.inner(ufl.dot(self.answering.tangent, column), row) * weight * dx]
+
+    def extension_and_stretches(self) -> tuple[Extension, Array]:
+        """As of `Equilibrium`, which knows nothing of cells that answer: nothing is remembered."""
+        return self._extension_and_stretches()
 
     def limit_values(self) -> tuple[Array, Array]:
         """As of `Equilibrium`, with the cells that belong to the present unknowns."""

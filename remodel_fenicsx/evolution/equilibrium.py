@@ -17,10 +17,13 @@ from petsc4py import PETSc
 from remodel_fenicsx.evolution.pointwise import Shares, pointwise_repulsion
 from remodel_fenicsx.evolution.state import State
 from remodel_fenicsx.fem import coefficients, jit
+from remodel_fenicsx.fem.remembered import Remembered
 from remodel_fenicsx.tissue.cells import UnitCell
 from remodel_fenicsx.tissue.energy import Tissue
 from remodel_fenicsx.tissue.operators import passes_through_zero
 from remodel_fenicsx.tissue.repulsion import squared_end_to_end_length
+
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -87,7 +90,10 @@ class Equilibrium:
         if external is not None and _depends_on(external, u):
             self.tangent_forms.append(jit.form(ufl.derivative(external, u, trial)))
         squared = squared_end_to_end_length(F, shares) if self.tissue.chain is not None else ufl.as_ufl(0.0)
-        self._limits = jit.expression(ufl.as_vector([squared, ufl.det(F)]), self.quadrature.points)
+        limits = ufl.as_vector([squared, ufl.det(F)])
+        self._limits = jit.expression(limits, self.quadrature.points)
+        length = ufl.as_ufl(0.0 if self.tissue.locking_length is None else self.tissue.locking_length)
+        self._known_extension: Remembered[tuple[Extension, Array]] = Remembered(self.comm, limits, length)
         self._energy_forms: list[Any] = []
 
     def internal_and_tangents(self, F: Any, test: Any, trial: Any) -> tuple[list[Any], list[Any]]:
@@ -108,6 +114,9 @@ class Equilibrium:
 
     def extension_and_stretches(self) -> tuple[Extension, NDArray[np.float64]]:
         """The extension, and r/L at the points of this rank's own elements, (elements, points); infinite for NaN."""
+        return self._known_extension(self._extension_and_stretches)
+
+    def _extension_and_stretches(self) -> tuple[Extension, Array]:
         squared, at_points = self.limit_values()
         jacobian = np.hstack([at_points, self.state.dilatation.jacobians()])
         squared, jacobian = self.quadrature.owned(squared), self.quadrature.owned(jacobian)

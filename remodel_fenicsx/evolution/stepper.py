@@ -117,7 +117,9 @@ class Stepper:
         self.state, self.load_values = state, load_values
         self.tissue = on_mesh(tissue, state.cells.quadrature.mesh)
         self.remodeling = RemodelingPass(state, self.tissue, remodeling)
-        make = coupling or COUPLINGS[remodeling.coupling]
+        # cells that never change are coupled to nothing
+        name = remodeling.coupling if self.remodeling.law.remodels else "staggered"
+        make = coupling or COUPLINGS[name]
         self.coupling: Coupling = make(state, self.tissue, self.remodeling, solver)
         # asked on each rank in every solve: the signal (SIGINT, SIGTERM) that should end it, or 0
         self.stop_signal: Callable[[], int] = lambda: 0

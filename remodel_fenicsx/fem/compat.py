@@ -23,3 +23,31 @@ def geometry_dofmap(mesh: Any) -> Any:
     """Geometry nodes of the local cells, (local cells, nodes per cell)."""
     geometry = mesh.geometry
     return geometry.dofmaps[0] if hasattr(geometry, "dofmaps") else geometry.dofmap
+
+
+def space_with_dofs(space: Any, size: int, ghosts: Any, owners: Any, dofs: Any) -> Any:
+    """A function space like another one whose elements have other degrees of freedom, of block size 1.
+
+    Parameters
+    ----------
+    space
+        Its mesh, element and layout stay.
+    size
+        Number of those that this rank owns.
+    ghosts, owners
+        Global numbers of the others that it knows, int64, and their ranks, int32.
+    dofs
+        Local numbers in each local element, (elements, dofs), int32.
+    """
+    import dolfinx.cpp
+    import dolfinx.fem
+    import dolfinx.graph
+
+    index_map = dolfinx.cpp.common.IndexMap(space.mesh.comm, size, ghosts, owners)
+    adjacency: Any = dolfinx.graph.adjacencylist(dofs)
+    adjacency = getattr(adjacency, "_cpp_object", adjacency)  # of Python from 0.10 on
+    dofmap = dolfinx.cpp.fem.DofMap(space.dofmap.dof_layout, index_map, 1, adjacency, 1)
+    old = space._cpp_object
+    shape = [list(old.value_shape)] if hasattr(old, "value_shape") else []  # of the element itself from 0.10 on
+    made = type(old)(space.mesh._cpp_object, old.element, dofmap, *shape)
+    return dolfinx.fem.FunctionSpace(space.mesh, space.ufl_element(), made)

@@ -27,7 +27,9 @@ def made_with(run: Recording, cells: str | None = None) -> str:
     """Package, library and scene of a run, in a line; `cells` says more than `first_cells` of this run alone."""
     scene, versions = run.scene, run.versions
     libraries = ", ".join(f"{name} {versions.get(name, '?')}" for name in ("remodel_fenicsx", "dolfinx"))
-    return f"{libraries}; preset {scene.preset}, frame {scene.remodeling.frame}, {cells or first_cells(run)}"
+    kinematics = "" if scene.model.kinematics == "full" else f" with kinematics {scene.model.kinematics}"
+    method = f"preset {scene.preset}{kinematics}, frame {scene.remodeling.frame}"
+    return f"{libraries}; {method}, {cells or first_cells(run)}"
 
 
 @dataclass(frozen=True)

@@ -138,6 +138,7 @@ class Scene(Table):
         for name, load in self.loads.items():
             self._check_load(name, load)
         self._check_output_times()
+        self._check_length()
         if self.model.kinematics != AUTO and (reasons := objections(self, self.model.kinematics)):
             raise fault("; ".join(reasons), "model.kinematics", self.model.kinematics)
         return self
@@ -196,6 +197,21 @@ class Scene(Table):
         """Times at which a step ends, however long steps are: corners of ramps, output.times and the end."""
         times = {time for load in self.loads.values() for time, _ in load.ramp if 0 < time < self.time.end}
         return sorted({*times, *self.output.times, self.time.end})
+
+    @property
+    def has_free_length(self) -> bool:
+        """Whether the body's length is an unknown."""
+        kinds = self.geometry.loads
+        return self.supports.ends in self.geometry.ends_that_free_length or any(
+            kinds[name].frees_length for name in self.loads
+        )
+
+    def _check_length(self) -> None:
+        """A length is prescribed or unknown."""
+        load = self.loads.get("elongation")
+        if self.has_free_length and load is not None and any(load.value * factor for _, factor in load.ramp):
+            rule = "must be 0 where the length is an unknown, with loads.axial_force or closed ends"
+            raise fault(rule, "loads.elongation.value", load.value)
 
     def summary(self) -> str:
         """Stiffness of network and matrix and the largest loads, in one unit and on one line."""

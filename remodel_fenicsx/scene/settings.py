@@ -75,8 +75,9 @@ class Supports(Table):
 
     ends: str = Field(
         default="free",
-        description="Ends of a tube: 'free' to move radially in their planes, or 'clamped', which keeps their circles.",
-        json_schema_extra={"allowed": "'free', for a tube also 'clamped'"},
+        description="Ends of a tube: 'free' to move radially in their planes; 'clamped', which keeps their circles; "
+        "or 'closed': free, with caps on which the pressure acts, and the length an unknown.",
+        json_schema_extra={"allowed": "'free', for a tube also 'clamped' and 'closed'"},
     )
 
 
@@ -103,7 +104,8 @@ class Load(Table):
     """A load by name: `force` of cube and tendon, `pressure` and `elongation` of a tube; zero if it is not listed.
 
     `force` is the total dead force along z on the top; `pressure` acts on the deformed inner face; `elongation` is the
-    prescribed engineering strain of the length (0.1: 10 % longer).
+    prescribed engineering strain of the length (0.1: 10 % longer). A tube with `axial_force` in place of `elongation`
+    has a length that is an unknown.
     """
 
     value: float = Field(

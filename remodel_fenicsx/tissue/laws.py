@@ -299,7 +299,9 @@ LAWS: dict[str, Law] = {
     "explicit": ranked(explicit, has_limit=True, of_absolute_time=True),
     "rate": ranked(rate),
     "relaxation": ranked(relaxation, has_limit=True),
-    "tensor": Law(tensor, has_limit=True, target=tensor_target, follow=follow_tensor, keeps_symmetry=True),
+    "tensor": Law(
+        tensor, has_limit=True, target=tensor_target, follow=follow_tensor, keeps_symmetry=True, asks_kappa=True
+    ),
     "rotation": Law(rotation, share=turned_in_part),
     "none": Law(keep, remodels=False, keeps_symmetry=True),
 }

@@ -1,0 +1,196 @@
+"""A length that is an unknown: axial force given, and ends closed by caps on which the pressure acts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import ufl
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from remodel_fenicsx import Recording, Scene, SceneError, Simulation, cli
+from remodel_fenicsx.body import tube
+from remodel_fenicsx.body.reductions import AUTO, choice
+from remodel_fenicsx.evolution.pointwise import PointStresses
+from remodel_fenicsx.fem import jit
+from remodel_fenicsx.running import resume, run
+from remodel_fenicsx.scene import scene_from_dict
+from tests.conftest import Case
+
+SELF = MPI.COMM_SELF
+END = 4.0
+PRESSURE = {"value": 4.8, "ramp": [[0, 0], [END, 1]]}
+NO_ELONGATION = {"value": 0.0, "ramp": [[0, 0], [END, 1]]}
+
+
+def values(kinematics: str, loads: dict[str, Any], **tables: Any) -> dict[str, Any]:
+    base: dict[str, Any] = {
+        "preset": "kuhl-holzapfel-2007",
+        "geometry": {"shape": "tube"},
+        "model": {"kinematics": kinematics},
+        "cells": {"initial": "isotropic"},
+        "loads": {"pressure": PRESSURE, "elongation": NO_ELONGATION} | loads,
+        "remodeling": {"kappa": 0.1},
+        "time": {"end": END},
+    }
+    return base | tables
+
+
+def rows_of(scene: Scene, force_of: Any = None) -> tuple[list[dict[str, float]], list[float]]:
+    """Rows of all steps, and what `force_of` says of each solved state."""
+    domain = None
+    if scene.model.kinematics == "full":
+        domain = tube(1.0, 3.0, 1.0, degree=1, divisions=(12, 3, 1), comm=SELF)
+    simulation = Simulation(scene, SELF, domain)
+    rows, forces = [], []
+    for step in simulation.steps([Looking(simulation, force_of, forces)] if force_of else []):
+        rows.append(step.row)
+    simulation.close()
+    return rows, forces
+
+
+class Looking:
+    """Watches solved states."""
+
+    def __init__(self, simulation: Simulation, force_of: Any, forces: list[float]):
+        self.simulation, self.force_of, self.forces = simulation, force_of, forces
+
+    def solved(self, step: Any) -> None:
+        self.forces.append(self.force_of(self.simulation))
+
+    def __getattr__(self, name: str) -> Any:
+        return lambda step: None
+
+
+def nodal_reaction(simulation: Simulation) -> float:
+    """Sum of the internal forces along z at the nodes of the top."""
+    equilibrium = simulation.stepper.coupling.equilibrium
+    vector = simulation.unknown.x.petsc_vec.duplicate()
+    equilibrium.assemble_internal(vector)
+    forces: NDArray[np.float64] = vector.array.reshape(-1, 3)
+    top = np.isclose(simulation.unknown.function_space.tabulate_dof_coordinates()[:, 2], 1.0)
+    return float(forces[top, 2].sum())
+
+
+def integral_of_stress(simulation: Simulation) -> float:
+    """Integral of P_zz over the body over its length."""
+    state, quadrature = simulation.state, simulation.quadrature
+    stresses = PointStresses(state, simulation.tissue)
+    stresses.refresh()
+    P = stresses.ufl.first_piola_kirchhoff
+    found = quadrature.evaluate(jit.expression(ufl.as_vector([P[2, 2]]), quadrature.points), (1,))[..., 0]
+    return quadrature.integral(found) / simulation.scene.geometry.axial_length
+
+
+def as_load(forces: list[float]) -> dict[str, Any]:
+    return {"value": 1.0, "ramp": [[0.0, 0.0], *([float(n), force] for n, force in enumerate(forces, start=1))]}
+
+
+@pytest.mark.parametrize(
+    ("kinematics", "force_of"),
+    [("radial", integral_of_stress), pytest.param("full", nodal_reaction, marks=pytest.mark.slow)],
+)
+def test_the_reaction_of_a_prescribed_length_gives_that_length(kinematics: str, force_of: Any) -> None:
+    length = {"length": 1.0} if kinematics == "full" else {}
+    geometry = {"shape": "tube"} | length
+    elongation = {"elongation": {"value": 0.1, "ramp": [[0, 0], [END / 2, 1]]}}
+    prescribed, forces = rows_of(scene_from_dict(values(kinematics, elongation, geometry=geometry)), force_of)
+    assert min(forces) > 1.0 and np.ptp(forces) > 1.0
+    scene = scene_from_dict(values(kinematics, {"axial_force": as_load(forces)}, geometry=geometry))
+    found, _ = rows_of(scene)
+    for name in ("axial_elongation", "inner_radius", "stored_energy"):
+        np.testing.assert_allclose([row[name] for row in found], [row[name] for row in prescribed], rtol=1e-9)
+    np.testing.assert_allclose([row["axial_force"] for row in found], forces, rtol=1e-14)
+    assert max(row["newton_iterations"] for row in found) <= 6  # one method for field and length
+
+
+def test_closed_ends_carry_the_force_on_the_caps() -> None:
+    """p pi r_i^2 of the deformed inner radius."""
+    closed, _ = rows_of(scene_from_dict(values("radial", {}, supports={"ends": "closed"})))
+    assert "axial_force" not in closed[0] and closed[-1]["axial_elongation"] > 1e-3
+    forces = [row["pressure"] * np.pi * row["inner_radius"] ** 2 for row in closed]
+    pulled, _ = rows_of(scene_from_dict(values("radial", {"axial_force": as_load(forces)})))
+    for name in ("axial_elongation", "inner_radius"):
+        np.testing.assert_allclose([row[name] for row in pulled], [row[name] for row in closed], rtol=1e-9)
+    free, _ = rows_of(scene_from_dict(values("radial", {"axial_force": NO_ELONGATION})))
+    assert free[-1]["axial_elongation"] < 0.0 < closed[-1]["axial_elongation"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["axisymmetric", "sector"])
+def test_the_other_kinematics_say_the_same(name: str) -> None:
+    """A half-plane is the ray; the quarter has plane elements around."""
+    for tables in (
+        {"supports": {"ends": "closed"}},
+        {"loads": {"axial_force": {"value": 20.0, "ramp": [[0, 0], [END, 1]]}}},
+    ):
+        tables = dict(tables)
+        loads = tables.pop("loads", {})
+        ray, other = (rows_of(scene_from_dict(values(kind, loads, **tables)))[0][-1] for kind in ("radial", name))
+        for column in ("axial_elongation", "inner_radius"):
+            assert other[column] == pytest.approx(ray[column], abs=1e-9 if name == "axisymmetric" else 0.01)
+
+
+def test_the_equilibrium_of_a_closed_tube() -> None:
+    """The cells take the length with them."""
+    tables = {"supports": {"ends": "closed"}, "output": {"columns": ["pass_residual"]}}
+    at_once, _ = rows_of(scene_from_dict(values("radial", {}, **tables) | {"time": {"end": "equilibrium"}}))
+    in_time, _ = rows_of(scene_from_dict(values("radial", {}, **tables) | {"time": {"end": 240.0, "step": 2.0}}))
+    assert at_once[-1]["pass_residual"] < 1e-8
+    assert at_once[-1]["axial_elongation"] == pytest.approx(in_time[-1]["axial_elongation"], abs=1e-6)
+    assert abs(in_time[-1]["axial_elongation"] - in_time[1]["axial_elongation"]) > 0.01
+
+
+@pytest.mark.slow
+def test_one_and_two_ranks_agree(case: Case) -> None:
+    scene = values("radial", {}, supports={"ends": "closed"})
+    one, two = (case(scene, ranks=ranks) for ranks in (1, 2))
+    for name in ("u", "l", "axial_elongation"):
+        np.testing.assert_allclose(two[name], one[name], rtol=1e-11, atol=1e-11)
+
+
+# ---------------------------------------------------------------- scenes and records
+@pytest.mark.parametrize(
+    ("changes", "allowed", "words"),
+    [
+        ({"supports.ends": "closed"}, {"supports.ends": "clamped"}, "loads.elongation.value = 0.1: must be 0 where"),
+        (
+            {"loads.axial_force.value": 1.0, "loads.axial_force.ramp": [[0, 1]]},
+            {"loads.axial_force.value": 1.0, "loads.axial_force.ramp": [[0, 1]], "loads.elongation.value": 0.0},
+            "loads.elongation.value = 0.1: must be 0 where",
+        ),
+    ],
+)
+def test_a_length_is_prescribed_or_unknown(changes: dict[str, Any], allowed: dict[str, Any], words: str) -> None:
+    scene = scene_from_dict(values(AUTO, {"elongation": {"value": 0.1, "ramp": [[0, 1]]}}))
+    with pytest.raises(SceneError, match=words):
+        scene.with_values(changes)
+    assert choice(scene.with_values(allowed)).name in ("radial", "axisymmetric")
+
+
+def test_only_a_tube_can_be_closed() -> None:
+    with pytest.raises(SceneError, match="supports.ends = 'closed': allowed for shape 'cube' is 'free'"):
+        scene_from_dict(
+            {"preset": "kuhl-holzapfel-2007", "geometry": {"shape": "cube"}, "supports": {"ends": "closed"}}
+        )
+
+
+def test_a_recorded_run_goes_on_and_is_revolved(tmp_path: Path) -> None:
+    scene = scene_from_dict(values(AUTO, {}, supports={"ends": "closed"}))
+    whole, parts = (tmp_path / name for name in ("whole", "parts"))
+    run(scene, whole, SELF)
+    run(scene.with_values({"time.end": 2.0}), parts, SELF)
+    resume(parts, [f"time.end={END}"], SELF)
+    first, second = (Recording(folder) for folder in (whole, parts))
+    assert first.scene.model.kinematics == "radial"
+    for name in ("axial_elongation", "inner_radius", "stored_energy"):
+        np.testing.assert_array_equal(first.history[name], second.history[name])
+    assert cli.main(["revolve", str(whole)]) == 0
+    (whole / "fields.vtkhdf").write_bytes((whole / "fields_body.vtkhdf").read_bytes())
+    body = Recording(whole)
+    top = np.isclose(body.points[:, 2], 8.0)
+    moved = body.fields(END)["displacement"][top, 2]
+    np.testing.assert_allclose(moved, 8.0 * first.history["axial_elongation"][-1], rtol=1e-6)
