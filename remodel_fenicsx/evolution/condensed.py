@@ -251,6 +251,7 @@ class AnsweringNewton(GuardedNewton):
             extension = self.equilibrium.extension()
             self.unknown.x.array[:] = start
             iterations = solution.newton_iterations, solution.linear_iterations
-            raise SolveFailure("points without cells that belong to their stress", *iterations, extension)
+            text = "points without cells that belong to their stress"
+            raise SolveFailure(text, *iterations, extension, tangents=solution.tangents)
         self.answering.accept()
         return solution

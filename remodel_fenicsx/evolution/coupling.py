@@ -104,9 +104,10 @@ class Staggered:
         """
         work, before, old_loads = Work(), self.state.unknown.x.array.copy(), dict(self.state.loading.values)
         step = LoadStep.between(self.state.time, old_loads, time, loads)
-        if self.equilibrium.extension().admissible:
-            if not self._solved_as_expected(step, loads, work):
-                self._solve_in_one(time, loads, work)
+        if self._solved_as_expected(step, loads, work):
+            pass
+        elif self.equilibrium.extension().admissible:
+            self._solve_in_one(time, loads, work)
         else:
             log.info("solving in parts: the remodeled cells have r >= L at the old displacement")
             self._solve_in_parts(time, old_loads, loads, work, failure=None)

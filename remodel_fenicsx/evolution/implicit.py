@@ -67,6 +67,7 @@ class Implicit:
         work.held_points = self.answering.held_points()
         if work.held_points and self.state.comm.rank == 0:
             log.info("time %g: %d points have no cells that belong to their stress", time, work.held_points)
+        work.extension = None  # the row's is with the cells that are taken over now
         self._power = self.remodeling.replace(self.answering.asked, start, time - self.state.time)
         self.state.settle_cells()
         return work

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import dolfinx.fem.petsc
@@ -74,12 +74,16 @@ class Solution:
     """Norm of the out-of-balance nodal forces that was accepted."""
     tangents: int = 0
     """How many were assembled."""
+    extension: Extension | None = None
+    """Of the solution."""
 
     def after(self, failure: SolveFailure) -> Solution:
         """With the work of an attempt that had failed before."""
         newton = self.newton_iterations + failure.newton_iterations
         linear = self.linear_iterations + failure.linear_iterations
-        return Solution(newton, linear, self.residual, self.tangents + failure.tangents)
+        return replace(
+            self, newton_iterations=newton, linear_iterations=linear, tangents=self.tangents + failure.tangents
+        )
 
 
 class SolveFailure(RuntimeError):
@@ -219,7 +223,8 @@ class GuardedNewton:
             text, tangents = self._failure_text(reason, extension), self._linear.tangents - tangents
             raise SolveFailure(text, newton, linear, extension, left, tangents)
         self._linear.ended(newton)
-        return Solution(newton, linear, float(self._snes.getFunctionNorm()), self._linear.tangents - tangents)
+        norm, tangents = float(self._snes.getFunctionNorm()), self._linear.tangents - tangents
+        return Solution(newton, linear, norm, tangents, extension)
 
     def tangent_direction(self, set_fraction: Callable[[float], None], done: float, distance: float) -> Any:
         """Change of the unknowns per fraction of a change of the problem, at a solved state; one linear solve.

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from remodel_fenicsx.evolution.blend import KEPT_RESERVE
+from remodel_fenicsx.evolution.equilibrium import Extension
 from remodel_fenicsx.evolution.newton import GuardedNewton, Solution, SolveFailure
 from remodel_fenicsx.evolution.refusals import Refusal, diagnosed
 
@@ -26,6 +27,7 @@ class Work:
     substeps: int = 0
     residual: float = 0.0  # of the last solution, in the unit of force
     tangents: int = 0  # that were assembled
+    extension: Extension | None = None  # of the last solution, where it was looked at with the cells of the row
     held_points: int = 0  # points whose cells do not belong to their stress, of the coupling "implicit"
 
     def add(self, done: Solution | SolveFailure | Work) -> None:
@@ -34,7 +36,7 @@ class Work:
         self.linear_iterations += done.linear_iterations
         self.tangents += done.tangents
         if isinstance(done, Solution):
-            self.residual = done.residual
+            self.residual, self.extension = done.residual, done.extension
 
 
 class StepFailure(RuntimeError):

@@ -166,7 +166,7 @@ class Stepper:
             raise ValueError(f"time {time!r} does not come after {state.time!r}, that of the last step")
         with state.transaction():
             work = self.coupling.solve(time, self.load_values(time))
-            extension = self.coupling.equilibrium.extension()
+            extension = work.extension or self.coupling.equilibrium.extension()
             for attempt in rejected:
                 work.add(attempt.work)
             loads = dict(state.loading.values)  # those that nobody has named too
