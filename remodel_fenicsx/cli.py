@@ -10,7 +10,6 @@ import sys
 import time as clock
 import traceback
 from collections.abc import Callable, Sequence
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -18,7 +17,7 @@ import remodel_fenicsx
 from remodel_fenicsx.body.reductions import explained
 from remodel_fenicsx.system import interrupts
 from remodel_fenicsx.system.arguments import positive, wall_time
-from remodel_fenicsx.system.environment import reason_unusable, versions
+from remodel_fenicsx.system.environment import reason_undrawable, reason_unusable, versions
 from remodel_fenicsx.scene.parameters import PRESETS
 from remodel_fenicsx.scene.profiles import PROFILES
 from remodel_fenicsx.scene.scene import Scene, SceneError, preset_scene, read_scene
@@ -228,8 +227,8 @@ def _run(options: argparse.Namespace, task: Callable[..., Path] | None = None) -
 
 
 def _stability(options: argparse.Namespace) -> int:
-    if missing := _missing_for_pictures():
-        return _fail(missing, BAD_ENVIRONMENT)
+    if missing := reason_undrawable():
+        return _fail(f"the environment is not usable: {missing}; run through ./with-fenicsx", BAD_ENVIRONMENT)
 
     def analyse(scene: Scene, folder: Path | None, quiet: bool) -> Path:
         from remodel_fenicsx.stability import in_words, stability
@@ -241,20 +240,11 @@ def _stability(options: argparse.Namespace) -> int:
     return _run(options, analyse)
 
 
-def _missing_for_pictures() -> str | None:
-    """What keeps this environment from drawing, in words."""
-    missing = [name for name in ("matplotlib", "PIL") if find_spec(name) is None]
-    return f"the environment is not usable: no {missing[0]}; run through ./with-fenicsx" if missing else None
-
-
 def _study(options: argparse.Namespace, task: Callable[[Scene], tuple[Path, str, dict[str, str]]]) -> int:
     """Several runs that answer one question: `task` makes the folder, the answer in words, and what has failed."""
     scene = read_scene(options.scene, options.set, options.profile)
-    reason = reason_unusable()
-    if reason is not None:
+    if reason := reason_unusable() or reason_undrawable():
         return _fail(f"the environment is not usable: {reason}; run through ./with-fenicsx", BAD_ENVIRONMENT)
-    if missing := _missing_for_pictures():
-        return _fail(missing, BAD_ENVIRONMENT)
     try:
         with interrupts.StopRequest(), interrupts.stopping_at_once():
             folder, words, failed = task(scene)
