@@ -64,7 +64,7 @@ def test_the_cubes_angle_is_the_closed_form(coupling: str, passes: int, force: f
     _, A, rows = run(simulation)
     for number, row in enumerate(rows, start=1):
         left = 2 / 3 * np.exp(-KAPPA * (number - 1 + passes))
-        assert row["mean_fibre_angle"] == pytest.approx(np.degrees(np.arctan(np.sqrt(left / (1 - left)))), abs=1e-7)
+        assert row["mean_fibre_angle"] == pytest.approx(np.degrees(np.arctan(np.sqrt(left / (1 - left)))), abs=1e-9)
     np.testing.assert_allclose(np.trace(A, axis1=-2, axis2=-1), 1.0, atol=1e-13)
     assert np.abs(A - A[0, 0] * np.eye(3)).max() < 1e-12  # nothing turns
 
