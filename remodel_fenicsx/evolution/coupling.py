@@ -143,7 +143,7 @@ class Staggered:
         try:
             if expected is not None:
                 unknown[:] = expected
-            if expected is not None and self.equilibrium.extension().admissible:
+            if expected is not None and self.newton.may_start():
                 work.add(self.newton.solve())
                 work.substeps = 1
                 return True

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.evolution.equilibrium import Equilibrium, Extension
 from remodel_fenicsx.fem.quadrature import Quadrature
+from remodel_fenicsx.tissue.operators import determinant, squared_norm
 
 Array = NDArray[np.float64]
 
@@ -38,6 +39,7 @@ class Limits:
         """Cells or loads may be others from now on."""
         self._place: Array | None = None
         self._gradient: Array | None = None
+        self._chains: Array | None = None  # |l|/L at the points
         self._room, self._travelled = 0.0, np.inf
 
     def look(self) -> tuple[Extension, Array]:
@@ -80,12 +82,18 @@ class Limits:
         if not extension.admissible:
             return 0.0
         quadrature, cells = self.equilibrium.quadrature, self.equilibrium.state.cells
-        F = self.gradient().reshape(*quadrature.shape, 3, 3)
-        _, J = self.equilibrium.limit_values()
-        of_volume = quadrature.minimum(2 * J / np.einsum("epij,epij->ep", F, F))
-        length = np.linalg.norm(cells.dimension_values, axis=-1) / self.equilibrium.locking_length()
-        of_chains = (FAR_FROM_LOCKING - stretches) / np.maximum(quadrature.owned(length), 1e-300)
-        return min(of_volume, quadrature.minimum(of_chains))
+        F = self.gradient()
+        of_volume = quadrature.minimum((2 * determinant(F) / squared_norm(F)).reshape(quadrature.shape))
+        if self._chains is None:
+            length = np.sqrt(squares_of(cells.dimension_values)) / self.equilibrium.locking_length()
+            self._chains = np.maximum(quadrature.owned(length), 1e-300)
+        return min(of_volume, quadrature.minimum((FAR_FROM_LOCKING - stretches) / self._chains))
+
+
+def squares_of(vectors: Array) -> Array:
+    """Squared length of vectors (..., 3)."""
+    squares: Array = vectors[..., 0] ** 2 + vectors[..., 1] ** 2 + vectors[..., 2] ** 2
+    return squares
 
 
 def largest_gradient_of_displacement(quadrature: Quadrature) -> float:

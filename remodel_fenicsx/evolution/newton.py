@@ -146,6 +146,7 @@ class GuardedNewton:
         self._gap = self._last_norm = np.inf
         bounded = self.method == LAGGED and "snes_linesearch_type" not in self._options.given
         self.limits = Limits(equilibrium, bounded)
+        self._looked = False  # whether the limits of the start are known
         self._spared = False  # whether the present trial is admissible by the bound alone
         self._options_checked = False
         snes: Any = PETSc.SNES().create(equilibrium.comm)
@@ -201,20 +202,28 @@ class GuardedNewton:
                     again.tangents += failure.tangents
                     raise
 
+    def may_start(self) -> bool:
+        """Whether the present unknowns, from which `solve` is to start, are admissible."""
+        self.limits.forget()
+        self._looked = self.limits.look()[0].admissible
+        return self._looked
+
     def _attempt(self, more_iterations: int = 1) -> Solution:
         start, tangents = self.unknown.x.array.copy(), self._linear.tangents
         most = more_iterations * self.settings.maximum_iterations
         self._snes.setTolerances(rtol=0.0, atol=0.0, stol=0.0, max_it=most)
         self._pull(self._x)
         self._lost = self._spared = False
-        self.limits.forget()
+        if not self._looked:
+            self.limits.forget()
+        self._looked = False
         self._linear.begin()
         self._snes.solve(None, self._x)
         self._warn_of_unused_options()
         reason = self._snes.getConvergedReason()
         newton, linear = self._snes.getIterationNumber(), self._snes.getLinearSolveIterations()
         self._push(self._x)
-        extension = self.equilibrium.extension()
+        extension = self.limits.look()[0] if self.limits.bounded else self.equilibrium.extension()
         if reason < 0 or self._lost or not extension.admissible:
             self.unknown.x.array[:] = start
             if extension.stop_signal:
