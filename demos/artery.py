@@ -104,7 +104,7 @@ remodeling = Remodeling(driver="cauchy", law="explicit", frame="spatial", kappa=
 
 # %%
 state = State(displacement, kinematics, cells, loading)
-stepper = Stepper(state, tissue, remodeling, Solver(), load_values)
+stepper = Stepper(state, tissue, remodeling, Solver(method="direct", predictor="none"), load_values)
 line = (
     "t = {time:5.1f}  outer radius {outer_radius:.4f}  "
     "angles {fibre_angle_inner:5.1f} {fibre_angle_middle:5.1f} {fibre_angle_outer:5.1f}"

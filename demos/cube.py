@@ -83,7 +83,7 @@ def load_values(time: float) -> dict[str, float]:
 kappa = 0.025
 remodeling = Remodeling(driver="cauchy", law="explicit", frame="spatial", kappa=kappa)
 state = State(displacement, kinematics, cells, loading)
-stepper = Stepper(state, tissue, remodeling, Solver(), load_values)
+stepper = Stepper(state, tissue, remodeling, Solver(method="direct", predictor="none"), load_values)
 
 
 def closed_form(time: float) -> float:

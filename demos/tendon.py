@@ -97,7 +97,7 @@ remodeling = Remodeling(driver="cauchy", law="explicit", frame="spatial", kappa=
 
 # %%
 state = State(displacement, kinematics, cells, loading)
-stepper = Stepper(state, tissue, remodeling, Solver(), load_values)
+stepper = Stepper(state, tissue, remodeling, Solver(method="direct", predictor="none"), load_values)
 line = "t = {time:5.1f}  stretch {mean_stretch:.4f}  angle {mean_fibre_angle:5.1f}"
 with RunFolder(folder, "# made by demos/tendon.py\n", comm.rank) as record:
     for step in stepper.march(times(end, step=1.0), [Observer(body, stepper), record]):

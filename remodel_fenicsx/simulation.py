@@ -101,9 +101,7 @@ class Simulation:
             columns += [TIME_ERROR] if TIME_ERROR not in columns else []
         elif TIME_ERROR in columns:
             self.stepper.judge = TimeError(self.stepper, shape.fibre_angle).measure
-        unasked = [name for name, kind in shape.loads.items() if kind.frees_length and name not in scene.loads]
-        wanted = [column for column in columns_of(shape, columns) if column.name not in unasked]
-        self.observer = Observer(shape, self.stepper, wanted)
+        self.observer = Observer(shape, self.stepper, columns_of(shape, columns))
         locks = formulation.locks(scene.mesh.element, scene.mesh.degree)
         self.warnings: list[Watcher] = [LockingWarning(self.stepper, locks)]
         if self.stepper.remodeling.law.remodels and not at_once:

@@ -179,4 +179,5 @@ def thick_tube(ratio: float, formulation: str, pressure: float = 2.0, **material
         },
         remodeling={"law": "none"},
         time={"end": 4.0},
+        solver={"method": "direct"},
     )

@@ -176,7 +176,7 @@ REFUSALS = [
     ("material.persistence_length=1 nm", f"material.persistence_length = '1 nm': {POSITIVE}, without a unit"),
     ("cells.end_to_end_length=1 nm", f"cells.end_to_end_length = '1 nm': {POSITIVE}, without a unit"),
     ("remodeling.kappa=1/day", "remodeling.kappa = '1/day': must be a finite number at least 0, without a unit"),
-    ("time.end=150 s", "time.end = '150 s': must be a finite number greater than 0, without a unit"),
+    ("time.end=150 s", "time.end = '150 s': must be a finite number greater than 0, or 'equilibrium'"),
     ("cells.seed=1 mm", "cells.seed = '1 mm': must be a whole number at least 0"),
     ("geometry.length_unit=km", "geometry.length_unit = 'km': must be one of 'm', 'cm', 'mm', 'um'"),
     ("geometry.length_unit=[1]", "geometry.length_unit = [1]: must be one of 'm', 'cm', 'mm', 'um'"),

@@ -153,7 +153,9 @@ class GuardedNewton:
         snes.setFunction(self._assemble_residual, self._residual)
         snes.setJacobian(self._assemble_tangent, self._matrix)
         snes.setLineSearchPreCheck(self._keep_admissible)
+        snes.setTolerances(rtol=0.0, atol=0.0, stol=0.0, max_it=settings.maximum_iterations)
         self._options.apply(snes)
+        self._most_iterations = snes.getTolerances()[3]  # the user's PETSc option may have changed it
         snes.setConvergenceTest(self._converged)
         self._snes: Any = snes
         self._linear = BY_METHOD.get(self.method, EveryTangent)(equilibrium, snes, self._matrix, self._options)
@@ -210,8 +212,7 @@ class GuardedNewton:
 
     def _attempt(self, more_iterations: int = 1) -> Solution:
         start, tangents = self.unknown.x.array.copy(), self._linear.tangents
-        most = more_iterations * self.settings.maximum_iterations
-        self._snes.setTolerances(rtol=0.0, atol=0.0, stol=0.0, max_it=most)
+        self._snes.setTolerances(max_it=more_iterations * self._most_iterations)
         self._pull(self._x)
         self._lost = self._spared = False
         if not self._looked:

@@ -135,7 +135,12 @@ class Observer(Watcher):
 
     def __init__(self, shape: Shape, stepper: Stepper, columns: Sequence[Column] | None = None):
         self.shape, self.stepper, self.state = shape, stepper, stepper.state
-        self.columns = columns_of(shape) if columns is None else tuple(columns)
+        loads, asked = shape.loads, self.state.loading.values
+        self.columns = tuple(
+            column
+            for column in (columns_of(shape) if columns is None else columns)
+            if column.name in asked or column.name not in loads or not loads[column.name].frees_length
+        )
         self.quadrature: Quadrature = self.state.cells.quadrature
         self.domain: Domain = self.state.loading.domain
         self.tools: dict[Any, Any] = {}
