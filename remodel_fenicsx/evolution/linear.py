@@ -21,6 +21,7 @@ SAME = 1e-10  # relative to the largest row: what a symmetric tangent may be uns
 WORTH = 12  # iterations that a new factor must save: it costs about as much as they do
 OVER = 3  # iterations over which the rate of convergence is taken
 SLOW_STEP = 8  # iterations after which the next step starts with a new factor
+MOST_RENEWALS = 6  # of one solve: what needs more is no matter of old factors
 MANY_KRYLOV = 12  # iterations of CG after which the next tangent is factorised
 
 
@@ -92,6 +93,7 @@ class EveryTangent:
         Those of the problem.
     """
 
+    given_up = False  # whether this way leads to nothing
     more_iterations = 1  # times solver.maximum_iterations before a solve has failed
 
     def __init__(self, equilibrium: Equilibrium, snes: Any, matrix: Any, options: ProblemOptions):
@@ -194,12 +196,18 @@ class Lagged(_Kept):
     def __init__(self, equilibrium: Equilibrium, snes: Any, matrix: Any, options: ProblemOptions):
         super().__init__(equilibrium, snes, matrix, options)
         self.secants = Secants()
+        self._before = 0  # tangents before the solve
         self._norms: list[float] = []  # since the tangent was renewed, of this solve
         self._due = True
 
     def begin(self) -> None:
         self._norms = []
+        self._before = self.tangents
         self.secants.interrupt()
+
+    @property
+    def given_up(self) -> bool:  # type: ignore[override]
+        return not self._always and self.tangents - self._before > MOST_RENEWALS
 
     def tangent(self, norm: float, tolerance: float) -> None:
         self._norms.append(norm)

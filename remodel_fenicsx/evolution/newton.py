@@ -365,7 +365,7 @@ class GuardedNewton:
         last, self._last_norm = self._last_norm if iteration else np.inf, norm
         if self._gap <= PRESCRIBED_MET and self._is_small(norm, last):
             return PETSc.SNES.ConvergedReason.CONVERGED_FNORM_ABS
-        if iteration >= snes.getTolerances()[3]:
+        if iteration >= snes.getTolerances()[3] or self._linear.given_up:
             return PETSc.SNES.ConvergedReason.DIVERGED_MAX_IT
         return PETSc.SNES.ConvergedReason.ITERATING
 
@@ -392,5 +392,5 @@ class GuardedNewton:
         if reason >= 0 or self._lost:
             return f"reached r/L = {extension.max_chain_extension:.4f}, J = {extension.min_jacobian:.4g}"
         if reason == PETSc.SNES.ConvergedReason.DIVERGED_MAX_IT:
-            return f"no equilibrium within {self._snes.getTolerances()[3]} Newton iterations"
+            return f"no equilibrium within {self._snes.getIterationNumber()} Newton iterations"
         return FAILURES.get(reason, f"SNES stopped with reason {reason}")
