@@ -256,7 +256,16 @@ def at_points(tissue: Tissue, quadrature: Any) -> Tissue:
 
 def stress_rounding(tissue: Tissue, mesh: Any, max_chain_extension: float) -> float:
     """Rounding error of a stress in a body, from the stiffness of matrix and network at the largest r/L."""
-    numbers = tissue.map(lambda name, value: coefficients.largest(value, mesh))
+    return rounding_of(largest_parameters(tissue, mesh), max_chain_extension)
+
+
+def largest_parameters(tissue: Tissue, mesh: Any) -> Tissue:
+    """A tissue on a mesh with the largest value of each parameter in the body, numbers."""
+    return tissue.map(lambda name, value: coefficients.largest(value, mesh))
+
+
+def rounding_of(numbers: Tissue, max_chain_extension: float) -> float:
+    """`stress_rounding` from the largest parameters."""
     length = numbers.end_to_end_length
     if numbers.locking_length is not None:
         length = max(length, max_chain_extension * numbers.locking_length)

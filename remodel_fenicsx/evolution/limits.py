@@ -53,8 +53,7 @@ class Limits:
         return self._found
 
     def gradient(self) -> Array:
-        """F of the present unknowns at the points of this rank, (elements * points, 3, 3)."""
-        self.look()
+        """F of the state that was looked at last at the points of this rank, (elements * points, 3, 3)."""
         if self._gradient is None:
             self._gradient = self.equilibrium.state.deformation_gradient()
         return self._gradient

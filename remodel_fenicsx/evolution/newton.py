@@ -12,7 +12,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from remodel_fenicsx.evolution.equilibrium import Equilibrium, Extension, stress_rounding
+from remodel_fenicsx.evolution.equilibrium import Equilibrium, Extension, largest_parameters, rounding_of
 from remodel_fenicsx.evolution.limits import Limits
 from remodel_fenicsx.evolution.linear import BY_METHOD, EveryTangent
 from remodel_fenicsx.fem.petsc_options import ProblemOptions
@@ -140,6 +140,7 @@ class GuardedNewton:
         self._external = self._x.duplicate()
         self._matrix = equilibrium.create_matrix()
         self._force_scale = self._stress_rounding = self._extension = 0.0
+        self._largest = largest_parameters(equilibrium.tissue, equilibrium.quadrature.mesh)
         self._area = equilibrium.quadrature.norm(equilibrium.quadrature.largest_areas)
         self.on_the_way = False  # whether the solution is only the start of a further one: then it may be coarser
         self._lost = False
@@ -213,6 +214,8 @@ class GuardedNewton:
     def _attempt(self, more_iterations: int = 1) -> Solution:
         start, tangents = self.unknown.x.array.copy(), self._linear.tangents
         self._snes.setTolerances(max_it=more_iterations * self._most_iterations)
+        # they may be others from solve to solve, not within one
+        self._largest = largest_parameters(self.equilibrium.tissue, self.equilibrium.quadrature.mesh)
         self._pull(self._x)
         self._lost = self._spared = False
         if not self._looked:
@@ -318,7 +321,7 @@ class GuardedNewton:
         if self._lost:
             residual.set(np.nan)
             return
-        self._stress_rounding = stress_rounding(equilibrium.tissue, equilibrium.quadrature.mesh, self._extension)
+        self._stress_rounding = rounding_of(self._largest, self._extension)
 
     def _assemble_tangent(self, snes: Any, x: Any, matrix: Any, preconditioner: Any) -> None:
         self._linear.tangent(self._last_norm, self._tolerance())
@@ -335,7 +338,7 @@ class GuardedNewton:
         if self._spared:
             return improved
         self._push(x)
-        before, (_, stretches_before) = self.limits.gradient(), self.limits.look()
+        (_, stretches_before), before = self.limits.look(), self.limits.gradient()
         trial = x.duplicate()
         for halving in range(LINE_SEARCH_HALVINGS + 1):
             trial.waxpy(-1.0, step, x)
