@@ -180,6 +180,9 @@ def pytest_configure(config: pytest.Config) -> None:
         folder = tempfile.TemporaryDirectory(prefix="remodel-fenicsx-tests-")
         os.environ[COMPILED] = str(Path(folder.name) / "compiled")
         config.add_cleanup(lambda: (os.environ.pop(COMPILED), folder.cleanup()))
+        # hundreds of processes start: the first one leaves its bytecode to the others, outside of the tree
+        os.environ["PYTHONPYCACHEPREFIX"] = str(Path(folder.name) / "bytecode")
+        os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 
 def pytest_terminal_summary(terminalreporter: Any) -> None:
