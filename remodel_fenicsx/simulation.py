@@ -27,7 +27,7 @@ from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.fem.free_length import FreeLength
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.fem.quadrature import Quadrature
-from remodel_fenicsx.results.columns import COLUMNS_ON_REQUEST, Observer, columns_of
+from remodel_fenicsx.results.columns import COLUMNS_ON_REQUEST, Observer, columns_of, without_free_length
 from remodel_fenicsx.results.fields import field_names
 from remodel_fenicsx.scene import Scene, SceneError
 from remodel_fenicsx.system.interrupts import take_back_signals
@@ -101,7 +101,8 @@ class Simulation:
             columns += [TIME_ERROR] if TIME_ERROR not in columns else []
         elif TIME_ERROR in columns:
             self.stepper.judge = TimeError(self.stepper, shape.fibre_angle).measure
-        self.observer = Observer(shape, self.stepper, columns_of(shape, columns))
+        wanted = without_free_length(columns_of(shape, columns), shape, scene.loads)
+        self.observer = Observer(shape, self.stepper, wanted)
         locks = formulation.locks(scene.mesh.element, scene.mesh.degree)
         self.warnings: list[Watcher] = [LockingWarning(self.stepper, locks)]
         if self.stepper.remodeling.law.remodels and not at_once:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -120,6 +120,12 @@ def columns_of(shape: Shape | type[Shape], requested: Sequence[str] = ()) -> tup
     return (*always, *(chosen or others), *extra)
 
 
+def without_free_length(columns: Sequence[Column], shape: Shape, loads: Container[str]) -> tuple[Column, ...]:
+    """The columns but those of loads that free the length of the body, where these are not among the loads."""
+    free = {name for name, kind in shape.loads.items() if kind.frees_length and name not in loads}
+    return tuple(column for column in columns if column.name not in free)
+
+
 class Observer(Watcher):
     """Gives every step its row.
 
@@ -135,12 +141,9 @@ class Observer(Watcher):
 
     def __init__(self, shape: Shape, stepper: Stepper, columns: Sequence[Column] | None = None):
         self.shape, self.stepper, self.state = shape, stepper, stepper.state
-        loads, asked = shape.loads, self.state.loading.values
-        self.columns = tuple(
-            column
-            for column in (columns_of(shape) if columns is None else columns)
-            if column.name in asked or column.name not in loads or not loads[column.name].frees_length
-        )
+        if columns is None:
+            columns = without_free_length(columns_of(shape), shape, self.state.loading.values)
+        self.columns = tuple(columns)
         self.quadrature: Quadrature = self.state.cells.quadrature
         self.domain: Domain = self.state.loading.domain
         self.tools: dict[Any, Any] = {}
