@@ -227,7 +227,9 @@ logging.basicConfig(level=logging.INFO)
 source = "double twice(double x) { return 2.0 * x; }"
 module = jit.library(MPI.COMM_WORLD, "double twice(double);", source, "what doubles")
 assert module.lib.twice(4.0) == 8.0
-print(MPI.COMM_WORLD.allreduce(len(jit.compiled_kernels())), flush=True)
+compiled = MPI.COMM_WORLD.gather(len(jit.compiled_kernels()))
+if compiled:  # one rank writes: lines of two may come mixed
+    print(*compiled)
 """
 
 
@@ -242,7 +244,8 @@ def test_functions_in_c_are_compiled_once_like_forms(ranks: int, tmp_path: Path)
     assert (first.returncode, again.returncode) == (0, 0), first.stderr[-2000:]
     assert first.stderr.count("compiling what doubles, once on this machine: about 2 s") == 1
     assert "compil" not in again.stderr
-    assert (first.stdout, again.stdout) == ("1\n" * ranks, "0\n" * ranks)
+    assert again.stdout.split() == ["0"] * ranks
+    assert sorted(first.stdout.split()) == ["0"] * (ranks - 1) + ["1"]
     one_file(tmp_path, "libremodel_*.so").unlink()
     assert "removing a compilation that was cut off" in run().stderr
 
