@@ -19,6 +19,7 @@ from remodel_fenicsx.fem.solver_methods import AUTO
 from remodel_fenicsx.tissue import condensed, spectral
 from remodel_fenicsx.tissue.cells import UnitCell, structure_tensor
 from remodel_fenicsx.tissue.energy import Tissue
+from remodel_fenicsx.tissue.operators import determinant
 from remodel_fenicsx.tissue.responses import StepOfCells
 
 Array = NDArray[np.float64]
@@ -157,7 +158,7 @@ class AnsweringCells:
 
     def _solve(self, F: Array) -> None:
         with np.errstate(invalid="ignore"):
-            usable = np.linalg.det(F) > 0
+            usable = determinant(F) > 0
         F = np.where(usable[:, None, None], F, np.eye(3))
         step = self._points.step
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
