@@ -11,7 +11,7 @@ import ufl
 
 from remodel_fenicsx.fem import jit, quadrature
 from remodel_fenicsx.body import cube, tube
-from remodel_fenicsx.evolution.equilibrium import Extension
+from remodel_fenicsx.evolution.equilibrium import Extension, Look
 from remodel_fenicsx.evolution.newton import SolveFailure
 from remodel_fenicsx.scene.parameters import Cells, Material
 from remodel_fenicsx.tissue.operators import passes_through_zero
@@ -241,10 +241,10 @@ def test_wrong_branch_is_there_and_refused(monkeypatch: pytest.MonkeyPatch) -> N
     made = stretched_bar(4.0)
     start = made.displacement.x.array.copy()
     problem = made.problem(parts.TIGHT.model_copy(update={"petsc_options": {"snes_linesearch_type": "bt"}}))
-    real, harmless = problem.extension_and_stretches, (Extension(0.5, 0.5, (0.0, 0.0, 0.0)), np.zeros(0))
+    real, harmless = problem.look, Look(Extension(0.5, 0.5, (0.0, 0.0, 0.0)), np.zeros(0), np.zeros((0, 11)))
     problem.newton._snes.setLineSearchPreCheck(lambda x, step: False)
     guard = lambda: real() if problem.newton._snes.getConvergedReason() else harmless  # noqa: E731
-    monkeypatch.setattr(problem, "extension_and_stretches", guard)
+    monkeypatch.setattr(problem, "look", guard)
     with pytest.raises(SolveFailure, match=r"reached r/L = 2\.72") as caught:
         problem.solve()
     assert problem.newton._snes.getConvergedReason() > 0 and problem.newton._snes.getFunctionNorm() < 1e-9
