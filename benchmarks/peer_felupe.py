@@ -3,8 +3,8 @@
     python3 peer_felupe.py PROBLEM.npz STEPS TOLERANCE RESULT.npz
 
 PROBLEM has the mesh, the cells before the first pass, the numbers of the material and of the loads. W is differentiated
-by tensortrax; the follower pressure, Newton's method and SciPy's sparse solver are FElupe's. The pass is eq. (8) to (11)
-of the paper, typed here. It imports nothing of this project.
+by tensortrax; the follower pressure, Newton's method and SciPy's sparse solver are FElupe's. The pass is eqs. (8) to
+(11) of the paper, typed here. It imports nothing of this project.
 """
 
 from __future__ import annotations
