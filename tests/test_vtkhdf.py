@@ -463,7 +463,7 @@ def test_fields_of_a_run_that_began_with_filters_go_on(tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         filters = {"compression": "gzip", "shuffle": True}
         patch.setattr(h5py.Group, "create_dataset", lambda self, *a, **k: create(self, *a, **(filters | k)))
-        patch.setattr(vtkhdf, "_write_block", lambda data, n, block: _through_h5py(data, n, block))
+        patch.setattr(vtkhdf._Rows, "write", lambda self, n, block: _through_h5py(h5py.Dataset(self._id), n, block))
         with TransientGrid(path, CUBE, VTK_CUBE, 12, field_dtype=np.float64) as grid:
             for k in range(3):
                 grid.append(k, {"u": field[k]}, {"c": np.full(1, k)}, points=CUBE + k)

@@ -10,6 +10,7 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 from remodel_fenicsx.fem import compat
+from remodel_fenicsx.fem.ranks import over_ranks
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,12 +146,16 @@ class Domain:
 
     def _gather(self, values: npt.NDArray[Any], kind: str, number: npt.NDArray[np.int64]) -> npt.NDArray[Any] | None:
         """Rows as buffers, without pickle; their numbers are sent once only."""
-        short = self.comm.allreduce(len(values) < len(number), MPI.LOR)
+        short = over_ranks(self.comm, len(values) < len(number), MPI.LOR)
         if short:
             raise ValueError(f"{len(values)} rows for {len(number)} owned entities on rank {self.comm.rank}")
         if kind not in self._orders:
             self._orders[kind] = _Order.gathered(self.comm, number)
         order, rows = self._orders[kind], np.ascontiguousarray(values[: len(number)])
+        if self.comm.size == 1:
+            whole = np.empty_like(rows)
+            whole[order.numbers] = rows
+            return whole
         row_bytes = rows.itemsize * int(np.prod(rows.shape[1:], dtype=np.int64))
         row = MPI.BYTE.Create_contiguous(row_bytes).Commit()  # counts of bytes would overflow
         by_rank = np.empty((sum(order.counts), *rows.shape[1:]), rows.dtype)

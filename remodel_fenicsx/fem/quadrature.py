@@ -58,6 +58,7 @@ class Quadrature:
 
     def __init__(self, mesh: Any, element_degree: int, weight: Any = 1):
         self.mesh, self.element_degree = mesh, element_degree
+        self._spaces: dict[tuple[int, ...], Any] = {}
         self.element_kind = mesh.topology.cell_name()
         self.degree = DEGREES[self.element_kind, element_degree]
         points, weights = basix.make_quadrature(basix.CellType[self.element_kind], self.degree)
@@ -95,8 +96,10 @@ class Quadrature:
 
     def function(self, name: str, value_shape: tuple[int, ...]) -> Any:
         """A dolfinx function with values of `value_shape` at the points."""
-        element = basix.ufl.quadrature_element(self.element_kind, value_shape=value_shape, degree=self.degree)
-        return dolfinx.fem.Function(dolfinx.fem.functionspace(self.mesh, element), name=name)
+        if value_shape not in self._spaces:  # one for each shape: its dofmap takes time and memory
+            element = basix.ufl.quadrature_element(self.element_kind, value_shape=value_shape, degree=self.degree)
+            self._spaces[value_shape] = dolfinx.fem.functionspace(self.mesh, element)
+        return dolfinx.fem.Function(self._spaces[value_shape], name=name)
 
     def values(self, function: Any, value_shape: tuple[int, ...]) -> NDArray[np.float64]:
         """The function's own memory as an array (elements, points, *value_shape)."""
@@ -129,8 +132,13 @@ class Quadrature:
 
     def element_mean(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Volume mean over each element: (elements, points, ...) to (elements, ...)."""
-        share = self.volumes / self.volumes.sum(axis=1, keepdims=True)
-        return np.einsum("ep,ep...->e...", share, values)
+        return np.einsum("ep,ep...->e...", self._shares, values)
+
+    @cached_property
+    def _shares(self) -> NDArray[np.float64]:
+        """Of the points in the volume of their element, (elements, points)."""
+        shares: NDArray[np.float64] = self.volumes / self.volumes.sum(axis=1, keepdims=True)
+        return shares
 
     def maximum(self, values: NDArray[np.float64]) -> float:
         """Largest of values (elements, ...) over all ranks."""

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.shape import Shape
-from remodel_fenicsx.evolution.parameters import at_points
 from remodel_fenicsx.evolution.pointwise import PointStresses
 from remodel_fenicsx.evolution.state import State
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
@@ -72,7 +71,7 @@ class ElementFields:
     def __init__(self, shape: Shape, stepper: Stepper, names: Sequence[str] = OF_ELEMENTS):
         self.shape, self.state, self.names = shape, stepper.state, tuple(names)
         self.quadrature = self.state.cells.quadrature
-        self.tissue = stepper.tissue
+        self.tissue, self._parameters = stepper.tissue, stepper.coupling.equilibrium.parameters
         state = self.state
         F = state.kinematics.deformation_gradient(state.unknown)
         tensors = [F]
@@ -125,9 +124,8 @@ class ElementFields:
         )
         return np.sqrt(np.maximum(squared, 0.0)), axes
 
-    def _locking_length(self) -> Any:
-        length = at_points(self.tissue, self.quadrature).locking_length
-        return np.inf if length is None else length.reshape(self.quadrature.shape)
+    def _locking_length(self) -> Array:
+        return self._parameters.locking_length()
 
 
 class Fields(Watcher):

@@ -90,7 +90,7 @@ class TransientGrid:
         self._field_dtype, self._point_dtype = field_dtype, coordinates.dtype
         self._last_time = -np.inf
         self._point_blocks = 1  # block 0 of Points is the reference configuration
-        self._datasets: dict[str, h5py.Dataset] = {}
+        self._datasets: dict[str, _Rows] = {}
         import h5py
 
         with signals_held_back():
@@ -196,7 +196,7 @@ class TransientGrid:
             raise ValueError(f"{self.path.name}: {len(moved)} points where the grid has {self.number_of_points}")
         with signals_held_back():
             if moved is not None:
-                _write_block(self._dataset("Points"), self._point_blocks, moved)
+                self._dataset("Points").write(self._point_blocks, moved)
                 self._point_blocks += 1
             self._write_step(time, blocks)
             self._file.flush()
@@ -248,7 +248,7 @@ class TransientGrid:
         root["NumberOfPoints"] = np.array([len(points)], dtype=np.int64)
         root["NumberOfCells"] = np.array([len(cells)], dtype=np.int64)
         root["NumberOfConnectivityIds"] = np.array([cells.size], dtype=np.int64)
-        _write_block(_create(root, "Points", points), 0, points)
+        _Rows(_create(root, "Points", points)).write(0, points)
         root.create_dataset("Connectivity", data=cells.ravel(), **_COMPRESSION)
         root.create_dataset("Offsets", data=cells.shape[1] * np.arange(len(cells) + 1), **_COMPRESSION)
         root.create_dataset("Types", data=np.full(len(cells), cell_type, dtype=np.uint8), **_COMPRESSION)
@@ -268,27 +268,27 @@ class TransientGrid:
 
     def _write_step(self, time: float, blocks: Mapping[str, Mapping[str, Array]]) -> None:
         """Write rows and blocks number `number_of_steps`."""
-        step, steps = self.number_of_steps, self._root["Steps"]
+        step = self.number_of_steps
         for kind, fields in blocks.items():
             for name, values in fields.items():
-                if name not in self._root[kind]:
+                if f"{kind}/{name}" not in self._datasets and name not in self._root[kind]:
                     _create(self._root[kind], name, values)
-                    _create_row_dataset(steps[f"{kind}Offsets"], name, np.int64)
-                _write_block(self._dataset(f"{kind}/{name}"), step, values)
-                _write_block(self._dataset(f"Steps/{kind}Offsets/{name}"), step, np.array([step * len(values)]))
+                    _create_row_dataset(self._root[f"Steps/{kind}Offsets"], name, np.int64)
+                self._dataset(f"{kind}/{name}").write(step, values)
+                self._dataset(f"Steps/{kind}Offsets/{name}").write(step, np.array([step * len(values)]))
         # offsets that stay 0 say that the mesh is the one of the first step
         rows = {
             "Values": time, "PartOffsets": 0, "NumberOfParts": 1, "CellOffsets": 0, "ConnectivityIdOffsets": 0,
             "PointOffsets": (self._point_blocks - 1) * self.number_of_points,
         }  # fmt: skip
         for name, value in rows.items():
-            dataset = self._dataset(f"Steps/{name}")
-            _write_block(dataset, step, np.full((1, *dataset.shape[1:]), value, dataset.dtype))
+            rows_of = self._dataset(f"Steps/{name}")
+            rows_of.write(step, np.full((1, *rows_of.trailing), value, rows_of.dtype))
 
-    def _dataset(self, path: str) -> h5py.Dataset:
+    def _dataset(self, path: str) -> _Rows:
         """Found once: looking for it costs as much as writing a few numbers."""
         if path not in self._datasets:
-            self._datasets[path] = self._root[path]
+            self._datasets[path] = _Rows(self._root[path])
         return self._datasets[path]
 
     def _checked_fields(self, kind: str, fields: Fields, length: int) -> dict[str, Array]:
@@ -303,7 +303,7 @@ class TransientGrid:
                 array = array.reshape(len(array), 9)
             if array.ndim not in (1, 2) or len(array) != length or not array.size or "/" in name or name in ("", "."):
                 raise ValueError(f"{self.path.name}: {kind} {name!r} of shape {array.shape}, wanted ({length}, ...)")
-            if self.number_of_steps and array.shape[1:] != group[name].shape[1:]:
+            if self.number_of_steps and array.shape[1:] != self._dataset(f"{kind}/{name}").trailing:
                 raise ValueError(f"{self.path.name}: {kind} {name!r} has another number of components than at first")
             if array.dtype.kind not in "fiub":
                 raise ValueError(f"{self.path.name}: {kind} {name!r} holds {array.dtype}, not real numbers")
@@ -367,21 +367,29 @@ def _create_row_dataset(group: h5py.Group, name: str, dtype: DTypeLike, trailing
     group.create_dataset(name, (0, *trailing), dtype, maxshape=(None, *trailing), chunks=(_STEPS_PER_CHUNK, *trailing))
 
 
-def _write_block(dataset: h5py.Dataset, number: int, block: Array) -> None:
-    """Write block `number` of a dataset whose blocks have this one's length.
+class _Rows:
+    """A dataset that grows by blocks of rows, with what h5py would look for at each of them."""
 
-    By HDF5's own functions: for a few numbers h5py's selections cost ten times as much. A block that is a chunk goes
-    to the file as it is; a file of 0.1.0 has filters, which its new chunks pass over.
-    """
-    start, rest = number * len(block), (0,) * (block.ndim - 1)
-    target, block = dataset.id, np.ascontiguousarray(block, dataset.dtype)
-    target.set_extent((start + len(block), *block.shape[1:]))
-    if dataset.chunks == block.shape:
-        filters = target.get_create_plist().get_nfilters()
-        target.write_direct_chunk((start, *rest), block, filter_mask=(1 << filters) - 1)
-        return
-    place = target.get_space()
-    place.select_hyperslab((start, *rest), block.shape)
-    import h5py
+    def __init__(self, dataset: h5py.Dataset):
+        self._id, self.dtype = dataset.id, dataset.dtype
+        self.trailing, self._chunks = tuple(dataset.shape[1:]), dataset.chunks
+        # of 0.1.0's files, which new chunks pass over
+        self._no_filters = (1 << dataset.id.get_create_plist().get_nfilters()) - 1
 
-    target.write(h5py.h5s.create_simple(block.shape), place, block)
+    def write(self, number: int, block: Array) -> None:
+        """Write block `number` of a dataset whose blocks have this one's length.
+
+        By HDF5's own functions: for a few numbers h5py's selections cost ten times as much. A block that is a chunk
+        goes to the file as it is.
+        """
+        start, rest = number * len(block), (0,) * (block.ndim - 1)
+        block = np.ascontiguousarray(block, self.dtype)
+        self._id.set_extent((start + len(block), *block.shape[1:]))
+        if self._chunks == block.shape:
+            self._id.write_direct_chunk((start, *rest), block, filter_mask=self._no_filters)
+            return
+        import h5py
+
+        place = self._id.get_space()
+        place.select_hyperslab((start, *rest), block.shape)
+        self._id.write(h5py.h5s.create_simple(block.shape), place, block)
