@@ -17,8 +17,9 @@ import sys
 import tempfile
 import time
 import traceback
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 
 class Forks:
@@ -36,13 +37,28 @@ class Forks:
         )
 
     def run(
-        self, program: str, *words: str | Path, cwd: Path | None = None, seconds: float | None = None
+        self,
+        program: str,
+        *words: str | Path,
+        cwd: Path | None = None,
+        seconds: float | None = None,
+        imports: tuple[str, ...] = (),
     ) -> subprocess.CompletedProcess[str]:
-        """A program of `PROGRAMS` in a child, killed after these seconds of its processor time; as subprocess.run."""
+        """A program of `PROGRAMS` in a child, as subprocess.run.
+
+        Parameters
+        ----------
+        program, words, cwd
+            What runs where.
+        seconds
+            Of its processor time, after which it is killed; None: never.
+        imports
+            What else it shall find imported.
+        """
         assert self.process.stdin is not None and self.process.stdout is not None
         with tempfile.TemporaryDirectory() as folder:
             streams = [os.path.join(folder, name) for name in ("output", "errors")]
-            request = [program, [*map(str, words)], str(cwd or Path.cwd()), dict(os.environ), streams, seconds]
+            request = [program, [*map(str, words)], str(cwd or Path.cwd()), dict(os.environ), streams, imports, seconds]
             print(json.dumps(request), file=self.process.stdin, flush=True)
             answer = self.process.stdout.readline()
             assert answer, f"it has ended: {self.process.wait()}"
@@ -61,6 +77,20 @@ def forked(program: str, *words: str | Path, **options: Any) -> subprocess.Compl
     if not started or started[-1].process.poll() is not None:
         started.append(Forks())
     return started[-1].run(program, *words, **options)
+
+
+class ForkedChild:
+    """Stands for subprocess.Popen in `remodel_fenicsx.system.children`, for commands that nobody stops."""
+
+    def __init__(self, command: Sequence[str], stdout: IO[str], **_: Any):
+        words = command[command.index("remodel_fenicsx.cli") + 1 :]
+        done = forked("remodel-fenicsx", *words)
+        stdout.write(done.stdout + done.stderr)
+        self.returncode = done.returncode
+
+    def poll(self) -> int:
+        """It has ended."""
+        return self.returncode
 
 
 # ---------------------------------------------------------------- the process itself
@@ -85,7 +115,14 @@ def run_case(words: list[str]) -> int:
     return 0
 
 
-PROGRAMS = {"remodel-fenicsx": remodel_fenicsx, "four layers": four_layers, "case": run_case}
+def python(words: list[str]) -> int:
+    """`python3 -c`."""
+    sys.argv = ["-c", *words[1:]]
+    exec(compile(words[0], "<string>", "exec"), {"__name__": "__main__"})
+    return 0
+
+
+PROGRAMS = {"remodel-fenicsx": remodel_fenicsx, "four layers": four_layers, "case": run_case, "python": python}
 
 
 def begin(program: str, words: list[str], folder: str, variables: dict[str, str], streams: list[str]) -> int:
@@ -124,7 +161,9 @@ def status_of(child: int, seconds: float | None) -> int:
 def serve() -> None:
     """Until there are no more requests."""
     for line in sys.stdin:
-        *request, seconds = json.loads(line)
+        *request, imports, seconds = json.loads(line)
+        for module in imports:
+            importlib.import_module(module)
         child = os.fork()
         if not child:
             os._exit(begin(*request))
