@@ -16,6 +16,7 @@ from remodel_fenicsx.tissue.cells import UnitCell, structure_tensor
 from remodel_fenicsx.tissue.drivers import DRIVERS, FRAMES
 from remodel_fenicsx.tissue.energy import Tissue
 from remodel_fenicsx.tissue.laws import LAWS, Drive
+from remodel_fenicsx.tissue.mandel import MANDEL
 from remodel_fenicsx.tissue.tensor_law import Target, follow, target
 
 Array = NDArray[np.float64]
@@ -76,12 +77,12 @@ def test_second_derivative_against_central_differences() -> None:
 
 def to_mandel(tensors: Array) -> Array:
     root = np.sqrt([1, 1, 1, 2, 2, 2])
-    return root * np.stack([tensors[:, i, j] for i, j in logarithm.MANDEL], axis=1)
+    return root * np.stack([tensors[:, i, j] for i, j in MANDEL], axis=1)
 
 
 def from_mandel(vectors: Array) -> Array:
     tensors = np.empty((len(vectors), 3, 3))
-    for number, (i, j) in enumerate(logarithm.MANDEL):
+    for number, (i, j) in enumerate(MANDEL):
         tensors[:, i, j] = tensors[:, j, i] = vectors[:, number] / np.sqrt(1 if i == j else 2)
     return tensors
 

@@ -18,6 +18,7 @@ from remodel_fenicsx.fem.solver_methods import AUTO
 from remodel_fenicsx.tissue import condensed, spectral
 from remodel_fenicsx.tissue.cells import UnitCell, structure_tensor
 from remodel_fenicsx.tissue.energy import Tissue
+from remodel_fenicsx.tissue.operators import determinant
 from remodel_fenicsx.tissue.responses import StepOfCells
 
 Array = NDArray[np.float64]
@@ -156,7 +157,7 @@ class AnsweringCells:
 
     def _solve(self, F: Array) -> None:
         with np.errstate(invalid="ignore"):
-            usable = np.linalg.det(F) > 0
+            usable = determinant(F) > 0
         F = np.where(usable[:, None, None], F, np.eye(3))
         step = self._points.step
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
@@ -222,7 +223,7 @@ class AnsweringEquilibrium(Equilibrium):
 
     def limit_values(self) -> tuple[Array, Array]:
         """As of `Equilibrium`, with the cells that belong to the present unknowns."""
-        jacobian = np.linalg.det(self.state.deformation_gradient()).reshape(self.quadrature.shape)
+        jacobian = determinant(self.state.deformation_gradient()).reshape(self.quadrature.shape)
         return self.answering.squared_lengths(), jacobian
 
     def assemble_internal(self, vector: Any) -> None:

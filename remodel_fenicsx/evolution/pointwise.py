@@ -14,7 +14,7 @@ from remodel_fenicsx.evolution.state import State
 from remodel_fenicsx.fem import coefficients
 from remodel_fenicsx.tissue.cells import UnitCell
 from remodel_fenicsx.tissue.energy import Stresses, Tissue
-from remodel_fenicsx.tissue.logarithm import MANDEL
+from remodel_fenicsx.tissue.mandel import MANDEL
 from remodel_fenicsx.tissue.repulsion import whole_structure_tensor
 
 Array = NDArray[np.float64]

@@ -18,7 +18,7 @@ import numpy as np
 
 from remodel_fenicsx.tissue.cells import UnitCell, structure_tensor
 from remodel_fenicsx.tissue.chains import CHAINS, Chain
-from remodel_fenicsx.tissue.logarithm import MANDEL
+from remodel_fenicsx.tissue.mandel import MANDEL
 from remodel_fenicsx.tissue.operators import det, is_array, ln, sqrt, squared_norm
 from remodel_fenicsx.tissue.repulsion import REPULSIONS, Repulsion, squared_end_to_end_length
 

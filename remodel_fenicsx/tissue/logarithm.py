@@ -16,10 +16,9 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from remodel_fenicsx.tissue.mandel import MANDEL
 
-MANDEL = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
-"""Entries of a symmetric tensor in the order of its six Mandel components; those off the diagonal times sqrt(2)."""
+Array = NDArray[np.float64]
 
 CLOSE = 1e-3
 """Relative distance of three eigenvalues below which a series stands for a quotient of differences: the quotient loses
@@ -120,17 +119,6 @@ def _entry(quotients: Array, components: Array, i: int, j: int, p: int, q: int) 
     first = quotients[:, i, p, j] * components[:, i, p] if q == j else 0.0
     other = quotients[:, i, q, j] * components[:, q, j] if p == i else 0.0
     return first + other
-
-
-def mandel_rotation(vectors: Array) -> Array:
-    """Matrix (n, 6, 6) that takes a symmetric tensor's Mandel components in the basis of columns to the global ones."""
-    result = np.empty((len(vectors), 6, 6))
-    for row, (i, j) in enumerate(MANDEL):
-        for column, (a, b) in enumerate(MANDEL):
-            product = vectors[:, i, a] * vectors[:, j, b] + vectors[:, i, b] * vectors[:, j, a]
-            weight = (1 if i == j else np.sqrt(2)) * (1 if a == b else np.sqrt(2)) / 2
-            result[:, row, column] = weight * product
-    return result
 
 
 def _all_second_differences(values: Array) -> Array:

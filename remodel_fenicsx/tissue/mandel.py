@@ -1,6 +1,6 @@
 """Symmetric tensors of many points as six Mandel components, and linear maps between them as 6 x 6 matrices.
 
-Components are in the order of `logarithm.MANDEL`; those off the diagonal are times sqrt(2), so that the product of two
+Components are in the order of `MANDEL`; those off the diagonal are times sqrt(2), so that the product of two
 vectors is the product A : B of the tensors, and the matrix of a map is transposed where the map is.
 """
 
@@ -9,10 +9,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from remodel_fenicsx.tissue.logarithm import MANDEL, mandel_rotation
-
 Array = NDArray[np.float64]
 
+MANDEL = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
+"""Entries of a symmetric tensor in the order of its components."""
 ROWS, COLUMNS = (np.array(index) for index in zip(*MANDEL, strict=True))
 PAIRS = MANDEL[3:]
 """Planes of two axes, in the order in which their turns stand after three lengths."""
@@ -40,8 +40,14 @@ def diagonal(entries: Array) -> Array:
 
 
 def congruence(matrices: Array) -> Array:
-    """Matrix (n, 6, 6) of H -> X H X^T, from X (n, 3, 3)."""
-    return mandel_rotation(matrices)
+    """Matrix (n, 6, 6) of H -> X H X^T, from X (n, 3, 3); of a rotation: from its columns to the global axes."""
+    result = np.empty((len(matrices), 6, 6))
+    for row, (i, j) in enumerate(MANDEL):
+        for column, (a, b) in enumerate(MANDEL):
+            product = matrices[:, i, a] * matrices[:, j, b] + matrices[:, i, b] * matrices[:, j, a]
+            weight = (1 if i == j else np.sqrt(2)) * (1 if a == b else np.sqrt(2)) / 2
+            result[:, row, column] = weight * product
+    return result
 
 
 def symmetric_product(matrices: Array) -> Array:

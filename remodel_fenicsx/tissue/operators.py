@@ -90,7 +90,7 @@ def passes_through_zero(before: Any, after: Any) -> Any:
     near = np.flatnonzero(size * square >= 2 * determinant(before))
     if not near.size:
         return crossing
-    at = [np.linalg.det(before[near] + s * change[near]) for s in (0.0, 1 / 3, 2 / 3, 1.0)]
+    at = [determinant(before[near] + s * change[near]) for s in (0.0, 1 / 3, 2 / 3, 1.0)]
     coefficients = np.linalg.solve(np.vander([0.0, 1 / 3, 2 / 3, 1.0], 4, increasing=True), np.stack(at))
     _, linear, quadratic, cubic = coefficients
     with np.errstate(invalid="ignore", divide="ignore"):

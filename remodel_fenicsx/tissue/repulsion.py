@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from remodel_fenicsx.tissue import logarithm
+from remodel_fenicsx.tissue import logarithm, mandel
 from remodel_fenicsx.tissue.cells import UnitCell, structure_tensor
 from remodel_fenicsx.tissue.operators import component, ln
 
@@ -66,7 +66,7 @@ def log_derivatives(C: Array, A: Array, second: bool = True) -> tuple[Array, Arr
     first = logarithm.rotated(logarithm.derivative(values, components), back)
     if not second:
         return first, None
-    rotation = logarithm.mandel_rotation(vectors)
+    rotation = mandel.congruence(vectors)
     return first, rotation @ logarithm.second_derivative(values, components) @ np.swapaxes(rotation, 1, 2)
 
 

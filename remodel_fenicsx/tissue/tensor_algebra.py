@@ -59,7 +59,7 @@ static inline void strain_of(tensor F, tensor C)
     }
 }
 
-/* logarithm.mandel_rotation. */
+/* mandel.congruence. */
 static void congruence(tensor q, matrix result)
 {
     MANDEL(r) MANDEL(s) {
