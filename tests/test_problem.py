@@ -14,6 +14,7 @@ from remodel_fenicsx.body import cube, tube
 from remodel_fenicsx.evolution.equilibrium import Extension, Look
 from remodel_fenicsx.evolution.newton import SolveFailure
 from remodel_fenicsx.scene.parameters import Cells, Material
+from remodel_fenicsx.system.interrupts import Interrupted
 from remodel_fenicsx.tissue.operators import passes_through_zero
 from tests import parts
 from tests.conftest import slowly
@@ -296,6 +297,19 @@ def test_collapsed_start_fails_and_stays() -> None:
     with pytest.raises(SolveFailure, match="J = -0.125"):
         made.problem().solve()
     np.testing.assert_array_equal(made.displacement.x.array, turned_inside_out.ravel())
+
+
+def test_a_request_to_stop_that_is_taken_back_is_forgotten() -> None:
+    """Looks at a state are remembered; the request that came with one is none of the state's."""
+    made = held_cube()
+    problem = made.problem()
+    made.loading.set({"force": 1.0})
+    problem.stop_signal = lambda: 15
+    with pytest.raises(Interrupted):
+        problem.solve()
+    problem.stop_signal = lambda: 0
+    assert problem.extension().stop_signal == 0
+    assert problem.solve().newton_iterations > 1
 
 
 @pytest.mark.parametrize("where", ["displacement", "dimensions", "axes"])

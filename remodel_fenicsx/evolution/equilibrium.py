@@ -135,7 +135,10 @@ class Equilibrium:
 
     def look(self) -> Look:
         """Extension, and what it was made of, of the present unknowns; one state is looked at once."""
-        return self._known(self._look)
+        look = self._known(self._look)
+        if look.extension.stop_signal:
+            self._known.forget()  # who asked for the end may take it back
+        return look
 
     def _look(self) -> Look:
         number = self.quadrature.number_of_owned_elements

@@ -46,10 +46,14 @@ class Remembered(Generic[T]):
         if self._comm is not None:
             known = bool(over_ranks(self._comm, known, MPI.LAND))
         if not known:
-            self._seen_numbers = None  # should `make` fail
+            self.forget()  # should `make` fail
             self._value = make()
             self._remember(numbers)
         return self._value
+
+    def forget(self) -> None:
+        """The next value is made anew."""
+        self._seen_numbers = None
 
     def _remember(self, numbers: list[bytes]) -> None:
         if not self._seen:
