@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +14,7 @@ import pytest
 from mpi4py import MPI
 
 from remodel_fenicsx import Recording, Scene, SceneError, Simulation, run
+from remodel_fenicsx.evolution.blend import Blend
 from remodel_fenicsx.evolution.equilibrium import Equilibrium
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
 from remodel_fenicsx.fem import coefficients, jit
@@ -185,3 +189,32 @@ def test_the_rows_of_a_checkpoint_are_on_the_disk_before_it(tmp_path: Path, monk
     run(scene(output={"fields": False, "checkpoint": 2}), tmp_path / "run", SELF)
     assert [entry for entry in order if entry][-3:] == ["rows", "checkpoint", "rows"]
     assert order.count("checkpoint") == 2
+
+
+def test_a_run_imports_only_what_it_needs(tmp_path: Path) -> None:
+    """No Gmsh for a lattice, no HDF5 without fields, no bar without a terminal, no units where none are written."""
+    text = dict(scene(output={"fields": False}, time={"end": 1.0}).model_dump(mode="json"))
+    program = (
+        "import json, sys\nfrom remodel_fenicsx import run\nfrom remodel_fenicsx.scene import scene_from_dict\n"
+        f"run(scene_from_dict(json.loads({json.dumps(text)!r})), {str(tmp_path / 'run')!r})\n"
+        "print(*sorted({module.split('.')[0] for module in sys.modules}))"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    imported = set(done.stdout.split())
+    assert {"dolfinx", "petsc4py", "ufl"} < imported
+    assert not imported & {"gmsh", "h5py", "rich", "pint", "scipy", "matplotlib", "pyvista", "pandas", "PIL"}
+    assert "gmsh 4" in (tmp_path / "run" / "scene.toml").read_text()  # its version is known all the same
+
+
+def test_what_parts_of_a_step_need_is_made_where_a_step_needs_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The blend of old and new cells has forms of its own: none is compiled, or looked for, before."""
+    forms, expressions = Calls(monkeypatch, jit, "form"), Calls(monkeypatch, jit, "expression")
+    simulation = Simulation(scene(), SELF)
+    list(simulation.stepper.march([1.0, 2.0]))
+    before = forms.number, expressions.number
+    coupling: Any = simulation.stepper.coupling
+    assert isinstance(coupling.blend, Blend) and coupling.blend is coupling.blend
+    # of the energy there are internal forces and tangent, and r, J and F of both cells
+    assert forms.number - before[0] >= 2 and expressions.number - before[1] == 1
+    simulation.close()
