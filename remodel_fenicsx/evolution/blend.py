@@ -20,8 +20,8 @@ KEPT_RESERVE = 0.2  # share of 1 - r/L that a part of a remodeling increment lea
 class Blend:
     """Equilibrium with (1 - theta) old + theta new cells in r^2 and in W_rep: the old and the new model at the ends.
 
-    Old are the cells with which the unknowns are in equilibrium, new the state's present ones. PETSc's
-    objects are made when they are first needed.
+    Old are the cells with which the unknowns are in equilibrium, new the state's present ones. Everything is compiled
+    at once; PETSc's objects are made when they are first needed.
     """
 
     def __init__(self, state: State, tissue: Tissue, settings: SolverSettings):

@@ -89,16 +89,10 @@ class Staggered:
         self.newton = GuardedNewton(self.equilibrium, settings)
         self.predictor = PREDICTORS[settings.predictor](state)
         self.share, self.compares, self._residual = 1.0, False, 0.0
-        self._tissue = tissue
-        self._blend: Blend | None = None
-
-    @property
-    def blend(self) -> Blend | None:
-        """The change of the cells in parts, made where it is asked for first; None where cells never change."""
-        if self._blend is None and self.remodeling.law.remodels:
-            self._blend = Blend(self.state, self._tissue, self.settings)
-            self._blend.equilibrium.stop_signal = lambda: self.equilibrium.stop_signal()
-        return self._blend
+        self.blend: Blend | None = None
+        if remodeling.law.remodels:  # now, for no form is compiled in the middle of a run
+            self.blend = Blend(state, tissue, settings)
+            self.blend.equilibrium.stop_signal = lambda: self.equilibrium.stop_signal()
 
     def solve(self, time: float, loads: LoadValues) -> Work:
         """Equilibrium at `time` with the present cells.
@@ -136,8 +130,8 @@ class Staggered:
     def close(self) -> None:
         """Free PETSc's objects."""
         self.newton.close()
-        if self._blend is not None:
-            self._blend.close()
+        if self.blend is not None:
+            self.blend.close()
 
     # ------------------------------------------------------------ in one piece: the paper's step
     def _solved_as_expected(self, step: LoadStep, loads: LoadValues, work: Work) -> bool:
@@ -178,7 +172,8 @@ class Staggered:
         """First the change of the cells, then that of the loads; `failure`: that of the whole step, if it was tried."""
         loading, halvings = self.state.loading, self.settings.maximum_halvings
         loading.set(old_loads)
-        if self._cells_changed() and (blend := self.blend) is not None:
+        if self.blend is not None and self._cells_changed():
+            blend = self.blend
             stage = "the change of the cells"
             Change(time, stage, blend.set, blend.newton, halvings, blend.largest_part, roughly=True).advance(work)
             failure = None  # the loads have not been tried from here

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -70,6 +69,8 @@ class State:
     ):
         self.unknown, self.kinematics, self.cells, self.loading = unknown, kinematics, cells, loading
         self.dilatation = formulation.on(kinematics, unknown, cells.quadrature)
+        F = kinematics.deformation_gradient(unknown)
+        self._deformation_gradient = jit.expression(F, cells.quadrature.points)
         self.equilibrium_cells = CellField(cells.quadrature, "equilibrium_cell")
         self.settle_cells()
         solved = self.equilibrium_cells
@@ -97,11 +98,6 @@ class State:
     def deformation_gradient(self) -> NDArray[np.float64]:
         """F of the present unknowns at all points of this rank in one row, ghosts included, (n, 3, 3)."""
         return self.cells.quadrature.evaluate(self._deformation_gradient, (3, 3)).reshape(-1, 3, 3)
-
-    @cached_property
-    def _deformation_gradient(self) -> Any:
-        """Compiled where somebody asks for F alone."""
-        return jit.expression(self.kinematics.deformation_gradient(self.unknown), self.cells.quadrature.points)
 
     def functions(self) -> dict[str, Any]:
         """Every dolfinx function of the state by its name."""
