@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import mpirun, slowly
+from tests.forks import forked
 
 PROJECT = Path(__file__).resolve().parents[1]
 RANK = "import os, sys, time; from mpi4py import MPI; open(f'{sys.argv[1]}/{os.getpid()}', 'w'); MPI.COMM_WORLD.recv()"
@@ -23,11 +24,19 @@ HANGS = {
 
 def session(folder: Path, *arguments: str, **variables: str) -> subprocess.CompletedProcess[str]:
     """Run pytest with the plugin on a folder's tests."""
-    words = ["-p", "tests.session", "-c", str(PROJECT / "pyproject.toml"), "--rootdir", str(folder), *arguments]
+    command = [sys.executable, "-m", "pytest", *words_of(folder, *arguments)]
+    return subprocess.run(command, cwd=folder, env=environment_of(**variables), capture_output=True, text=True)
+
+
+def words_of(folder: Path, *arguments: str) -> list[str]:
+    """Of pytest's command line."""
+    return ["-p", "tests.session", "-c", str(PROJECT / "pyproject.toml"), "--rootdir", str(folder), *arguments]
+
+
+def environment_of(**variables: str) -> dict[str, str]:
+    """This one, but for what belongs to this session."""
     inherited = {name: value for name, value in os.environ.items() if not name.startswith(("PYTEST_", "REMODEL_"))}
-    environment = {**inherited, "PYTHONPATH": str(PROJECT), **variables}
-    command = [sys.executable, "-m", "pytest", *words]
-    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
+    return {**inherited, "PYTHONPATH": str(PROJECT), **variables}
 
 
 def has_ended(process: int) -> bool:
@@ -66,17 +75,27 @@ def test_a_slow_test_has_a_longer_limit(tmp_path: Path) -> None:
     assert "FAILED test_it.py::test_quick" in done.stdout and "1 failed, 1 passed" in done.stdout
 
 
+MAIN = "import sys, pytest; sys.exit(pytest.main(sys.argv[1:]))"
+
+
 def launcher_session(folder: Path, *arguments: str, **variables: str) -> dict[str, str]:
-    """What pytest says at its end, with a cache of the test's own."""
-    done = session(folder, *arguments, **{"XDG_CACHE_HOME": str(folder / "cache"), **variables})
+    """What pytest says at its end, with a cache of the test's own; forked, for nothing in it looks at processes."""
+    words, environment = words_of(folder, *arguments), environment_of(XDG_CACHE_HOME=str(folder / "cache"), **variables)
+    plugins = ("pytest", "xdist.plugin", "pytest_timeout", "_hypothesis_pytestplugin")
+    done = forked("python", MAIN, *words, cwd=folder, variables=environment, imports=plugins)
     said = done.stdout.splitlines()
     return {"summary": said[-1], "skipped": "\n".join(line for line in said if line.startswith("SKIPPED"))}
 
 
 def test_the_launchers_tests_are_skipped_after_they_have_passed_until_its_files_change(tmp_path: Path) -> None:
-    (tmp_path / "test_launcher.py").write_text("def test_one(): pass\ndef test_two(): pass\n")
-    (tmp_path / "test_other.py").write_text("def test_three(): pass\n")
-    assert "3 passed" in launcher_session(tmp_path, "-n", "2", "--dist", "loadfile")["summary"]
+    """And the number of kernels that all processes have compiled is said at the end."""
+    compile_one = "open(os.environ['REMODEL_FENICSX_COMPILED'], 'a').write('a form\\n')"
+    launcher = f"import os\ndef test_one(): {compile_one}\ndef test_two(): pass\n"
+    (tmp_path / "test_launcher.py").write_text(launcher)
+    (tmp_path / "test_other.py").write_text(f"import os\ndef test_three(): {compile_one}\n")
+    done = session(tmp_path, "-n", "2", "--dist", "loadfile", XDG_CACHE_HOME=str(tmp_path / "cache"))
+    assert "3 passed" in done.stdout
+    assert "\nkernels compiled: 2\n" in done.stdout  # by both workers
     again = launcher_session(tmp_path)
     assert "1 passed, 2 skipped" in again["summary"]
     assert again["skipped"].startswith("SKIPPED [2] test_launcher.py: they passed here on 2")
@@ -101,7 +120,7 @@ def test_the_launchers_tests_leave_no_stamp_if_not_all_have_passed(
 ) -> None:
     (tmp_path / "test_launcher.py").write_text(text)
     assert "1 passed" in launcher_session(tmp_path, *arguments)["summary"]
-    assert "they passed here" not in launcher_session(tmp_path)["skipped"]
+    assert not list(tmp_path.rglob("launcher-tests"))
 
 
 def test_the_launchers_key_changes_with_its_files(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -118,10 +137,3 @@ def test_the_launchers_key_changes_with_its_files(monkeypatch: pytest.MonkeyPatc
         with (tmp_path / name).open("a") as file:
             file.write("\n")
         assert plugin.launcher_key() != last, name
-
-
-def test_the_number_of_compiled_kernels_is_said_at_the_end(tmp_path: Path) -> None:
-    lines = "import os\ndef test_it(): open(os.environ['REMODEL_FENICSX_COMPILED'], 'a').write('a form\\n')\n"
-    for name in ("test_one.py", "test_two.py"):
-        (tmp_path / name).write_text(lines)
-    assert "\nkernels compiled: 2\n" in session(tmp_path, "-n", "2").stdout
