@@ -47,9 +47,9 @@ ENDS = {"cube": 16, "tendon": 16, "artery": 30}  # the ramp and a little beyond
 
 @pytest.fixture(scope="module")
 def on_one_and_two_ranks(cases: Cases) -> dict[str, tuple[dict, dict]]:
-    """Short pieces of the long ones."""
+    """Short pieces of the long ones; one layer of an artery is so unstable that rounding grows."""
     scenes = {name: SCENES[name] | {"time": {"end": float(end)}} for name, end in ENDS.items()}
-    wanted = [SLICES[name](scene, layers=1) if name in SLICES else {"scene": scene} for name, scene in scenes.items()]
+    wanted = [SLICES[name](scene) if name in SLICES else {"scene": scene} for name, scene in scenes.items()]
     return dict(zip(scenes, zip(cases(wanted, 1), cases(wanted, 2), strict=True), strict=True))
 
 

@@ -16,10 +16,21 @@ PROJECT = Path(__file__).resolve().parents[1]
 RANK = "import os, sys, time; from mpi4py import MPI; open(f'{sys.argv[1]}/{os.getpid()}', 'w'); MPI.COMM_WORLD.recv()"
 HANGS = {
     "sleep": "import time; time.sleep(1000)",
-    "mpirun": f"import subprocess; subprocess.run({mpirun(2, sys.executable, '-c', RANK, 'FOLDER')!r})",
+    "mpirun": "ranks.wait()",
     # in C, where no handler of Python's is called
     "deaf": "import itertools; sum(itertools.repeat(0))",
 }
+# ranks are there before the time begins to count, however long mpirun takes
+RANKS = f"""
+import os, subprocess, time, pytest
+@pytest.fixture
+def ranks():
+    process = subprocess.Popen({mpirun(2, sys.executable, '-c', RANK, 'FOLDER')!r})
+    while len(os.listdir('FOLDER')) < 2:
+        time.sleep(0.05)
+    return process
+pytestmark = pytest.mark.timeout(2, func_only=True)
+"""
 
 
 def session(folder: Path, *arguments: str, **variables: str) -> subprocess.CompletedProcess[str]:
@@ -52,17 +63,17 @@ def has_ended(process: int) -> bool:
 def test_a_test_that_hangs_fails_and_the_others_go_on(name: str, workers: str, tmp_path: Path) -> None:
     ranks = tmp_path / "ranks"
     ranks.mkdir()
-    hang = HANGS[name].replace("FOLDER", str(ranks))
-    (tmp_path / "test_it.py").write_text(f"def test_hangs():\n    {hang}\ndef test_after(): pass\n")
-    limit = "8" if name == "mpirun" else "1"
-    done = session(tmp_path, "-n", workers, f"--timeout={limit}", "-o", "timeout_grace=1", "test_it.py")
+    before, argument = (RANKS.replace("FOLDER", str(ranks)), "ranks") if name == "mpirun" else ("", "")
+    text = f"{before}\ndef test_hangs({argument}):\n    {HANGS[name]}\ndef test_after(): pass\n"
+    (tmp_path / "test_it.py").write_text(text)
+    done = session(tmp_path, "-n", workers, "--timeout=2", "-o", "timeout_grace=1", "test_it.py")
     assert done.returncode == 1, done.stdout + done.stderr
     if name == "deaf":
-        assert 'test_it.py", line 2 in test_hangs' in done.stderr
+        assert 'test_it.py", line 3 in test_hangs' in done.stderr
         # it can only be ended with its process: one of several is replaced
         assert workers == "0" or "1 failed, 1 passed" in done.stdout and "crashed while running" in done.stdout
     else:
-        assert f"Timeout >{limit}.0s" in done.stdout and "1 failed, 1 passed" in done.stdout
+        assert "Timeout >2.0s" in done.stdout and "1 failed, 1 passed" in done.stdout
     pids = list(ranks.iterdir())
     assert len(pids) == (2 if name == "mpirun" else 0)
     assert all(has_ended(int(rank.name)) for rank in pids)
