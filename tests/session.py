@@ -184,6 +184,8 @@ def pytest_configure(config: pytest.Config) -> None:
         os.environ["PYTHONPYCACHEPREFIX"] = str(Path(folder.name) / "bytecode")
         os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
         os.environ.pop("PYTHONUNBUFFERED", None)  # it writes a line in pieces, and those of two ranks come mixed
+        # an mpirun that was killed leaves a folder, in the way of a later one with the same process number
+        os.environ["PRTE_MCA_prte_tmpdir_base"] = os.environ["OMPI_MCA_orte_tmpdir_base"] = folder.name
 
 
 def pytest_terminal_summary(terminalreporter: Any) -> None:

@@ -13,7 +13,8 @@ from mpi4py import MPI
 from remodel_fenicsx import Recording, Scene, SceneError, Simulation, run
 from remodel_fenicsx.evolution.equilibrium import Equilibrium
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
-from remodel_fenicsx.fem import jit
+from remodel_fenicsx.fem import coefficients, jit
+from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.results import history
 from remodel_fenicsx.results.fields import FIELDS_BY_NAME
 from remodel_fenicsx.scene import scene_from_dict
@@ -42,10 +43,23 @@ class Calls:
 
 def test_a_state_is_looked_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """How far it is from its limits: at the start of a step, of its solve, and for each Newton iteration."""
-    calls = Calls(monkeypatch, Equilibrium, "_extension_and_stretches")
+    calls = Calls(monkeypatch, Equilibrium, "_look")
     simulation = Simulation(scene(), SELF)
     iterations = sum(step.work.newton_iterations for step in simulation.stepper.march([1.0, 2.0, 3.0]))
     assert iterations >= 6 and calls.number <= iterations + 2 * 3 + 1
+    simulation.close()
+
+
+def test_a_state_is_evaluated_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """r, J and F together where it is looked at, F and the driver in the pass; parameters only where they change."""
+    simulation = Simulation(scene(), SELF)
+    march = simulation.stepper.march([1.0, 2.0, 3.0])
+    next(march)
+    evaluations, parameters = Calls(monkeypatch, Quadrature, "evaluate"), Calls(
+        monkeypatch, coefficients, "point_values"
+    )
+    iterations = sum(step.work.newton_iterations for step in march)
+    assert evaluations.number <= iterations + 2 * 2 and parameters.number == 0
     simulation.close()
 
 

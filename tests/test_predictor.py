@@ -57,9 +57,24 @@ def test_a_trend_and_a_swing_are_both_continued(simulation: Simulation) -> None:
     assert np.all(found[~free] == 0.0)  # what supports prescribe
 
 
-@pytest.mark.parametrize("step", [LoadStep(8.0, 1.0, {"force": 0.0}), LoadStep(7.5, 0.5, RATES)])
-def test_another_rate_or_step_is_a_new_beginning(simulation: Simulation, step: LoadStep) -> None:
-    unknown = simulation.state.unknown.x.array
+def test_steps_of_other_lengths_go_on_at_the_same_speed(simulation: Simulation) -> None:
+    """What moves evenly is expected exactly, however long the steps were and the next one is."""
+    state = simulation.state
+    predictor, speed = Autoregressive(state), np.random.default_rng(1).standard_normal(len(state.unknown.x.array))
+    free, time = np.isnan(simulation.stepper.coupling.equilibrium.prescribed_values()), 0.0
+    for number, duration in enumerate([1.0, 2.0, 0.5, 4.0, 3.0, 1.5, 0.7], start=1):
+        time += duration
+        if number > 1:
+            found = predictor.expected(LoadStep(time, duration, RATES))
+            assert found is not None
+            np.testing.assert_allclose((found - state.unknown.x.array)[free], 1e-3 * duration * speed[free], rtol=1e-9)
+        before = state.unknown.x.array.copy()
+        state.unknown.x.array[:] += 1e-3 * duration * speed
+        predictor.solved(LoadStep(time, duration, RATES), before)
+
+
+def test_another_rate_is_a_new_beginning(simulation: Simulation) -> None:
+    step, unknown = LoadStep(8.0, 1.0, {"force": 0.0}), simulation.state.unknown.x.array
     predictor = follow(simulation, alternating(len(unknown))[:-1])
     assert predictor.expected(step) is None
     predictor.solved(step, unknown - 1e-3)

@@ -117,6 +117,15 @@ def test_smaller_tolerances_are_smaller_errors(exact: dict[str, dict[float, np.n
     assert counts[1] < 2.8 * counts[0]  # second order: twice as many
 
 
+def test_a_predictor_spares_iterations_of_steps_of_all_lengths(artery: dict[str, tuple[list[Step], Angles]]) -> None:
+    predicted = {"time.tolerance": 1.0, "solver.predictor": "autoregressive"}
+    steps, _ = marched(tube("extrapolated", **predicted))
+    plain, _ = artery["extrapolated"]
+    assert len(steps) == len(plain) and len(set(np.diff([step.time for step in steps]).round(9))) > 5
+    spent, before = (sum(step.work.newton_iterations for step in each) for each in (steps, plain))
+    assert spent <= 0.9 * before, (spent, before)
+
+
 def test_corners_and_asked_times_are_hit_and_no_step_is_left_over() -> None:
     asked = (7.3, 33.0)
     steps, _ = marched(tube("extrapolated", 61.7, **{"time.tolerance": 2.0, "output.times": asked}))

@@ -15,7 +15,7 @@ from remodel_fenicsx.evolution.state import State
 Array = NDArray[np.float64]
 
 ORDER, FITTED = 3, 2  # increments that predict the next one; increments to which the weights are fitted
-SAME_RATE = 1e-9  # relative difference of two rates of a load, and of two steps in time, that are the same
+SAME = 1e-9  # relative difference of two rates of a load, and of two steps in time, that are the same
 INDEPENDENT = 1e-12  # of increments: what is less is rounding
 
 
@@ -61,8 +61,8 @@ class Autoregressive:
 
     The weights a are those with which the last two increments follow best from the three before each (least squares
     over all unknowns). So they know a trend, and the part of a staggered pass that alternates from step to step, which
-    polynomials only make worse. With fewer increments the last one is expected again. Where the rate of a load or the
-    step in time changes, what was is forgotten.
+    polynomials only make worse. With fewer increments the last one is expected again. Increments of steps of another
+    length count as at their own speed over the next one. Where the rate of a load changes, what was is forgotten.
 
     Parameters
     ----------
@@ -74,13 +74,14 @@ class Autoregressive:
         self.state = state
         self._increments = Earlier(state, "predictor_increment", state.unknown.copy, ORDER + FITTED)
         rates = {f"rate_{name}": 0.0 for name in state.loading.values}
-        self._numbers = Numbers(state, "predictor", {"time": 0.0, "duration": 0.0} | rates)
+        durations = {f"duration_{age}": 0.0 for age in range(ORDER + FITTED)}  # of the increments, the newest first
+        self._numbers = Numbers(state, "predictor", {"time": 0.0} | durations | rates)
 
     def expected(self, step: LoadStep) -> Array | None:
         """The unknowns plus the next increment, with the values that supports and loads prescribe."""
-        increments = self._increments.values
-        if not increments or not self._goes_on(step):
+        if not self._increments.known or not self._goes_on(step):
             return None
+        increments = self._as_of(step.duration)
         increment = increments[0]
         if len(increments) == ORDER + FITTED:
             weighted = np.tensordot(self._weights(increments), np.array(increments[:ORDER]), axes=1)
@@ -99,15 +100,23 @@ class Autoregressive:
         if not self._goes_on(step):
             self._increments.forget()
         self._increments.push(increment)
-        self._numbers["time"], self._numbers["duration"] = step.time, step.duration
+        for age in reversed(range(1, ORDER + FITTED)):
+            self._numbers[f"duration_{age}"] = self._numbers[f"duration_{age - 1}"]
+        self._numbers["time"], self._numbers["duration_0"] = step.time, step.duration
         for name, rate in step.rates.items():
             self._numbers[f"rate_{name}"] = rate
 
     def _goes_on(self, step: LoadStep) -> bool:
-        """Whether a step is as long as the last one, with the same rates."""
-        pairs = [(rate, self._numbers[f"rate_{name}"]) for name, rate in step.rates.items()]
-        pairs.append((step.duration, self._numbers["duration"]))
-        return all(abs(a - b) <= SAME_RATE * max(abs(a), abs(b)) for a, b in pairs)
+        """Whether the rates are those of the last step."""
+        return all(_same(rate, self._numbers[f"rate_{name}"]) for name, rate in step.rates.items())
+
+    def _as_of(self, duration: float) -> list[Array]:
+        """The increments as they would be over a step of that length, at their own speeds."""
+        scaled = []
+        for age, increment in enumerate(self._increments.values):
+            own = self._numbers[f"duration_{age}"]
+            scaled.append(increment if _same(own, duration) else (duration / own) * increment)
+        return scaled
 
     def _weights(self, increments: list[Array]) -> Array:
         rows = np.array([increment[: self.state.number_of_owned_unknowns] for increment in increments])
@@ -117,6 +126,10 @@ class Autoregressive:
             matrix += products[k + 1 : k + 1 + ORDER, k + 1 : k + 1 + ORDER]
             right += products[k + 1 : k + 1 + ORDER, k]
         return np.asarray(np.linalg.lstsq(matrix, right, rcond=INDEPENDENT)[0], dtype=np.float64)
+
+
+def _same(first: float, second: float) -> bool:
+    return abs(first - second) <= SAME * max(abs(first), abs(second))
 
 
 PREDICTORS: dict[str, Callable[[State], Predictor]] = {"none": NoPredictor, "autoregressive": Autoregressive}

@@ -13,6 +13,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from remodel_fenicsx.fem import jit
+from remodel_fenicsx.fem.ranks import of_all_ranks, over_ranks
 
 # the rule that the element wants; UFL's estimate for this energy is huge
 DEGREES = {
@@ -113,7 +114,7 @@ class Quadrature:
     def integral(self, values: NDArray[np.float64]) -> float:
         """Integral over the body of values (elements, points), over all ranks."""
         local = float(np.sum(self.owned(values) * self.owned(self.volumes)))
-        return self.mesh.comm.allreduce(local, MPI.SUM)
+        return float(over_ranks(self.mesh.comm, local, MPI.SUM))
 
     def mean(self, values: NDArray[np.float64], elements: NDArray[np.bool_] | None = None) -> float:
         """Volume mean of values (elements, points), over all elements or those selected by a mask (elements,)."""
@@ -130,7 +131,7 @@ class Quadrature:
     def maximum(self, values: NDArray[np.float64]) -> float:
         """Largest of values (elements, ...) over all ranks."""
         local = float(np.max(self.owned(values), initial=-np.inf))
-        return float(self.mesh.comm.allreduce(local, MPI.MAX))
+        return float(over_ranks(self.mesh.comm, local, MPI.MAX))
 
     def place_of_largest(self, values: NDArray[np.float64]) -> tuple[float, float, float]:
         """Reference place of the largest of values (elements, points), over all ranks."""
@@ -139,7 +140,7 @@ class Quadrature:
         if owned.size:
             point = self.coordinates[np.unravel_index(int(np.argmax(owned)), owned.shape)]
             local = (float(owned.max()), (float(point[0]), float(point[1]), float(point[2])))
-        place: tuple[float, float, float] = max(self.mesh.comm.allgather(local), key=lambda found: found[0])[1]
+        place: tuple[float, float, float] = max(of_all_ranks(self.mesh.comm, local), key=lambda found: found[0])[1]
         return place
 
     def minimum(self, values: NDArray[np.float64]) -> float:
