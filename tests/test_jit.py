@@ -204,7 +204,7 @@ def test_a_signal_ends_the_compiler_and_leaves_nothing(target: str, number: sign
         time.sleep(0.01)
     if "group" in target:
         os.killpg(process.pid, number)
-    errors = process.communicate(timeout=60)[1]
+    errors = process.communicate(timeout=200)[1]
     assert (process.returncode, errors) == (128 + number, "")
     if target != "compiler":  # whoever ends gcc alone leaves gcc's own children to themselves
         assert all_end(process.pid)
@@ -221,7 +221,7 @@ def test_a_signal_for_one_process_ends_the_compilers_own_children(tmp_path: Path
     process = subprocess.Popen(command, stderr=subprocess.DEVNULL, env=environment, text=True, start_new_session=True)
     wait_for_compiler(process, "sleep")
     process.terminate()
-    assert process.wait(timeout=60) == 143
+    assert process.wait(timeout=200) == 143
     ended = all_end(process.pid)
     if not ended:
         os.killpg(process.pid, signal.SIGKILL)

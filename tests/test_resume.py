@@ -371,7 +371,7 @@ def test_a_signal_is_exit_code_4_and_one_line_says_how_to_go_on(half: Path, whol
     process = subprocess.Popen(
         [sys.executable, "-m", "remodel_fenicsx.cli", *words], stderr=subprocess.PIPE, text=True, process_group=0
     )
-    deadline = clock.monotonic() + 100
+    deadline = clock.monotonic() + 200
     while clock.monotonic() < deadline and len(rows(half)) < 12:
         clock.sleep(0.02)
         assert process.poll() is None

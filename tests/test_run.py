@@ -295,7 +295,7 @@ def test_a_signal_ends_the_run_and_keeps_finished_steps(tmp_path: Path, number: 
         time.sleep(0.05)
         assert process.poll() is None, process.communicate()[1]
     os.killpg(process.pid, number)
-    _, errors = process.communicate(timeout=60)
+    _, errors = process.communicate(timeout=200)
     if ranks == 1:
         assert process.returncode == 128 + number
         assert errors.endswith(f"stopped by {number.name}; every finished step is kept\n")

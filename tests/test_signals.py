@@ -163,7 +163,7 @@ def test_a_signal_to_the_group_while_the_compiler_runs(number: signal.Signals, t
     process = start_cold(tmp_path)
     wait_for_compiler(process)
     os.killpg(process.pid, number)
-    output, errors = process.communicate(timeout=60)
+    output, errors = process.communicate(timeout=200)
     lines = errors.splitlines()
     assert (process.returncode, output) == (128 + number, "")
     assert lines[-1] == f"remodel-fenicsx: stopped by {number.name}; nothing was computed"
@@ -174,7 +174,7 @@ def test_a_signal_to_the_group_while_the_compiler_runs(number: signal.Signals, t
 def test_a_limit_of_time_while_the_compiler_runs(tmp_path: Path) -> None:
     """timeout sends its signal to the process, then to the group; wherever the run is by then."""
     process = start_cold(tmp_path, "timeout", "--preserve-status", "3")
-    errors = process.communicate(timeout=60)[1]
+    errors = process.communicate(timeout=200)[1]
     assert process.returncode == 143, errors
     rest = [line for line in errors.splitlines() if not line.startswith("compiling ")]
     assert len(rest) == 1 and rest[0].startswith("remodel-fenicsx: stopped by SIGTERM")
@@ -238,7 +238,7 @@ def test_what_was_done_before_a_signal_is_resumed(number: signal.Signals, tmp_pa
         time.sleep(0.02)
         assert process.poll() is None
     process.send_signal(number)
-    assert process.wait(100) == 128 + number
+    assert process.wait(200) == 128 + number
     last = read_history(out)["time"][-1]
     done = subprocess.run([*COMMAND[:3], "run", "--resume", out, "--set", f"time.end={last + 2}"], text=True,
                           capture_output=True)  # fmt: skip
