@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from remodel_fenicsx.system import children
-from tests.forks import ForkedChild, forked
+from tests.forks import ForkedChild, end_forks, forked
 
 CASE = Path(__file__).with_name("run_case.py")
 Case = Callable[..., dict[str, Any]]
@@ -41,6 +41,13 @@ def forked_children() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(children, "subprocess", SimpleNamespace(Popen=ForkedChild, DEVNULL=subprocess.DEVNULL))
         yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def forks_end_with_the_session() -> Iterator[None]:
+    """Whoever asked for them."""
+    yield
+    end_forks()
 
 
 @pytest.fixture(scope="session")

@@ -36,6 +36,12 @@ class Forks:
             env=inherited,
         )
 
+    def close(self) -> None:
+        """End it, and wait for it: its processor time is this session's."""
+        assert self.process.stdin is not None
+        self.process.stdin.close()
+        self.process.wait()
+
     def run(
         self,
         program: str,
@@ -79,6 +85,13 @@ def forked(program: str, *words: str | Path, **options: Any) -> subprocess.Compl
     if not started or started[-1].process.poll() is not None:
         started.append(Forks())
     return started[-1].run(program, *words, **options)
+
+
+def end_forks() -> None:
+    """At the end of a session."""
+    for each in _started():
+        if each.process.poll() is None:
+            each.close()
 
 
 class ForkedChild:
