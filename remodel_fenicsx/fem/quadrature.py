@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Any
 
 import basix
@@ -40,6 +41,8 @@ class Quadrature:
 
     Attributes
     ----------
+    shape
+        (elements of this rank with ghosts, points per element).
     coordinates
         Reference coordinates of the points, (elements, points, 3).
     volumes
@@ -64,6 +67,7 @@ class Quadrature:
         self.elements = np.arange(
             self.number_of_owned_elements + mesh.topology.index_map(mesh.topology.dim).num_ghosts, dtype=np.int32
         )
+        self.shape = len(self.elements), len(self.weights)
         x, jacobian = ufl.SpatialCoordinate(mesh), ufl.Jacobian(mesh)
         entries = [jacobian[i, j] for i in range(jacobian.ufl_shape[0]) for j in range(jacobian.ufl_shape[1])]
         values = ufl.as_vector([*x, ufl.JacobianDeterminant(mesh), *entries])
@@ -89,11 +93,6 @@ class Quadrature:
         """Volume measure at exactly these points."""
         return ufl.Measure("dx", domain=self.mesh, metadata={"quadrature_degree": self.degree})
 
-    @property
-    def shape(self) -> tuple[int, int]:
-        """(elements of this rank with ghosts, points per element)."""
-        return len(self.elements), len(self.weights)
-
     def function(self, name: str, value_shape: tuple[int, ...]) -> Any:
         """A dolfinx function with values of `value_shape` at the points."""
         element = basix.ufl.quadrature_element(self.element_kind, value_shape=value_shape, degree=self.degree)
@@ -113,15 +112,20 @@ class Quadrature:
 
     def integral(self, values: NDArray[np.float64]) -> float:
         """Integral over the body of values (elements, points), over all ranks."""
-        local = float(np.sum(self.owned(values) * self.owned(self.volumes)))
+        local = float((self.owned(values) * self.owned(self.volumes)).sum())
         return float(over_ranks(self.mesh.comm, local, MPI.SUM))
 
     def mean(self, values: NDArray[np.float64], elements: NDArray[np.bool_] | None = None) -> float:
         """Volume mean of values (elements, points), over all elements or those selected by a mask (elements,)."""
-        chosen = np.ones(self.shape)
-        if elements is not None:
-            chosen *= elements[:, None]
+        if elements is None:
+            return self.integral(values) / self.volume
+        chosen = np.repeat(elements[:, None], self.shape[1], axis=1).astype(np.float64)
         return self.integral(values * chosen) / self.integral(chosen)
+
+    @cached_property
+    def volume(self) -> float:
+        """Of the body, over all ranks. Collective, the first time."""
+        return self.integral(np.ones(self.shape))
 
     def element_mean(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Volume mean over each element: (elements, points, ...) to (elements, ...)."""

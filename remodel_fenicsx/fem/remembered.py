@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Generic, TypeVar
 
+import dolfinx.fem
 import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
+from ufl.corealg.traversal import traverse_unique_terminals
 
 from remodel_fenicsx.fem.ranks import over_ranks
 
@@ -27,11 +29,10 @@ class Remembered(Generic[T]):
     """
 
     def __init__(self, comm: MPI.Intracomm | None, *expressions: Any):
-        from ufl.algorithms.analysis import extract_coefficients, extract_constants
-
         self._comm = comm
-        functions = {f for expression in expressions for f in extract_coefficients(expression)}
-        constants = {c for expression in expressions for c in extract_constants(expression)}
+        terminals = {terminal for expression in expressions for terminal in traverse_unique_terminals(expression)}
+        functions = [terminal for terminal in terminals if isinstance(terminal, dolfinx.fem.Function)]
+        constants = [terminal for terminal in terminals if isinstance(terminal, dolfinx.fem.Constant)]
         # their own memory; what is small is asked first, for one difference is enough
         self._arrays: list[NDArray[np.float64]] = sorted((f.x.array for f in functions), key=lambda array: array.size)
         self._numbers = [np.asarray(c.value) for c in constants]
