@@ -187,7 +187,7 @@ def serve() -> None:
 
 
 if __name__ == "__main__":
-    for module in ("gmsh", "remodel_fenicsx.running", "remodel_fenicsx.cli", "tests.run_case"):
+    for module in ("gmsh", "h5py", "remodel_fenicsx.body.meshing", "remodel_fenicsx.running", "tests.run_case"):
         importlib.import_module(module)
     if sys.argv[1:]:
         sys.exit(four_layers(sys.argv[1:]))
