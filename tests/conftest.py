@@ -8,8 +8,8 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -18,10 +18,11 @@ import numpy as np
 import pytest
 
 from remodel_fenicsx.system import children
-from tests.forks import ForkedChild, forked
+from tests.forks import ForkedChild, end_forks, forked
 
 CASE = Path(__file__).with_name("run_case.py")
 Case = Callable[..., dict[str, Any]]
+Cases = Callable[[Sequence[dict[str, Any]], int], list[dict[str, Any]]]
 
 
 def mpirun(ranks: int, *command: str) -> list[str]:
@@ -42,33 +43,53 @@ def forked_children() -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="session", autouse=True)
+def forks_end_with_the_session() -> Iterator[None]:
+    """Whoever asked for them."""
+    yield
+    end_forks()
+
+
 @pytest.fixture(scope="session")
-def case(tmp_path_factory: pytest.TempPathFactory) -> Case:
-    """case(scene, ranks=1, snapshots=(), divisions=None) -> what tests/run_case.py saved, by name."""
+def cases(tmp_path_factory: pytest.TempPathFactory) -> Cases:
+    """cases(arguments of `case`, ranks) -> what each of them saved; those that are not there yet start together."""
     base = tmp_path_factory.getbasetemp()
     folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "cases"
     folder.mkdir(exist_ok=True)
 
-    def run(
-        scene: dict[str, Any],
-        ranks: int = 1,
-        snapshots: tuple[float, ...] = (),
-        divisions: tuple[int, int, int] | None = None,
-    ) -> dict[str, Any]:
-        request = json.dumps({"scene": scene, "snapshots": list(snapshots), "divisions": divisions}, sort_keys=True)
-        out = folder / (hashlib.sha256(f"{ranks} {request}".encode()).hexdigest()[:16] + ".npz")
-        with out.with_suffix(".lock").open("w") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)
-            if not out.exists():
-                part = out.with_suffix(".part.npz")
-                command = mpirun(ranks, sys.executable, "-m", "mpi4py", str(CASE), str(part), request)
-                if ranks == 1:
-                    done = forked("case", part, request)
-                else:
-                    done = subprocess.run(command, capture_output=True, text=True, timeout=900)
-                assert done.returncode == 0, done.stderr[-3000:]
+    def run(wanted: Sequence[dict[str, Any]], ranks: int) -> list[dict[str, Any]]:
+        requests: dict[Path, str] = {}
+        for arguments in wanted:
+            text = json.dumps({"snapshots": [], "divisions": None} | arguments, sort_keys=True)
+            requests[folder / (hashlib.sha256(f"{ranks} {text}".encode()).hexdigest()[:16] + ".npz")] = text
+        with ExitStack() as locked:
+            for out in sorted(requests):
+                fcntl.flock(locked.enter_context(out.with_suffix(".lock").open("w")), fcntl.LOCK_EX)
+            parts = {out: out.with_suffix(".part.npz") for out in requests if not out.exists()}
+            words = [str(word) for out, part in parts.items() for word in (part, requests[out])]
+            if words and ranks == 1:
+                done = forked("case", *words)
+            elif words:
+                command = mpirun(ranks, sys.executable, "-m", "mpi4py", str(CASE), *words)
+                done = subprocess.run(command, capture_output=True, text=True, timeout=900)
+            assert not words or done.returncode == 0, done.stderr[-3000:]
+            for out, part in parts.items():
                 part.rename(out)
-        with np.load(out) as data:
-            return dict(data)
+        found = []
+        for out in requests:
+            with np.load(out) as data:
+                found.append(dict(data))
+        return found
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def case(cases: Cases) -> Case:
+    """case(scene, ranks=1, snapshots=(), divisions=None) -> what tests/run_case.py saved, by name."""
+
+    def run(scene: dict[str, Any], ranks: int = 1, **others: Any) -> dict[str, Any]:
+        (found,) = cases([{"scene": scene, **others}], ranks)
+        return found
 
     return run

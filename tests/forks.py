@@ -17,7 +17,7 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any
 
@@ -36,11 +36,18 @@ class Forks:
             env=inherited,
         )
 
+    def close(self) -> None:
+        """End it, and wait for it: its processor time is this session's."""
+        assert self.process.stdin is not None
+        self.process.stdin.close()
+        self.process.wait()
+
     def run(
         self,
         program: str,
         *words: str | Path,
         cwd: Path | None = None,
+        variables: Mapping[str, str] | None = None,
         seconds: float | None = None,
         imports: tuple[str, ...] = (),
     ) -> subprocess.CompletedProcess[str]:
@@ -48,8 +55,8 @@ class Forks:
 
         Parameters
         ----------
-        program, words, cwd
-            What runs where.
+        program, words, cwd, variables
+            What runs where, and the environment; PETSc has read its own long before.
         seconds
             Of its processor time, after which it is killed; None: never.
         imports
@@ -58,7 +65,8 @@ class Forks:
         assert self.process.stdin is not None and self.process.stdout is not None
         with tempfile.TemporaryDirectory() as folder:
             streams = [os.path.join(folder, name) for name in ("output", "errors")]
-            request = [program, [*map(str, words)], str(cwd or Path.cwd()), dict(os.environ), streams, imports, seconds]
+            environment = dict(os.environ if variables is None else variables)
+            request = [program, [*map(str, words)], str(cwd or Path.cwd()), environment, streams, imports, seconds]
             print(json.dumps(request), file=self.process.stdin, flush=True)
             answer = self.process.stdout.readline()
             assert answer, f"it has ended: {self.process.wait()}"
@@ -77,6 +85,13 @@ def forked(program: str, *words: str | Path, **options: Any) -> subprocess.Compl
     if not started or started[-1].process.poll() is not None:
         started.append(Forks())
     return started[-1].run(program, *words, **options)
+
+
+def end_forks() -> None:
+    """At the end of a session."""
+    for each in _started():
+        if each.process.poll() is None:
+            each.close()
 
 
 class ForkedChild:
@@ -111,7 +126,8 @@ def run_case(words: list[str]) -> int:
     """What tests/conftest.py asks for."""
     from tests import run_case
 
-    run_case.main(words[0], json.loads(words[1]))
+    for path, text in zip(words[::2], words[1::2], strict=True):
+        run_case.main(path, json.loads(text))
     return 0
 
 
@@ -171,7 +187,7 @@ def serve() -> None:
 
 
 if __name__ == "__main__":
-    for module in ("gmsh", "remodel_fenicsx.running", "remodel_fenicsx.cli", "tests.run_case"):
+    for module in ("gmsh", "h5py", "remodel_fenicsx.body.meshing", "remodel_fenicsx.running", "tests.run_case"):
         importlib.import_module(module)
     if sys.argv[1:]:
         sys.exit(four_layers(sys.argv[1:]))

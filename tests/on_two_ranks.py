@@ -1,7 +1,8 @@
 """Runs on this process group that tests/test_resume.py looks at: mpirun -n 2 python3 on_two_ranks.py FOLDER.
 
 FOLDER holds `half`, a run on one rank. Made are: `whole`, `resumed` (the same, stopped and gone on), what `half`
-becomes on these ranks, `codes.json` (exit codes of commands), and `lost`: there the last rank is killed in a step.
+becomes on these ranks, `one element` (so that a rank has none), `codes.json` (exit codes of commands), and `lost`:
+there the last rank is killed in a step.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ def main(folder: Path) -> None:
     run(scene(6.0), folder / "resumed")
     resume(folder / "resumed", ["time.end=9.0"])
     resume(folder / "half", ["time.end=8.0"])
+    run(scene(2.0).with_values({"mesh.refinement": 1}), folder / "one element")
     words = ["run", "--resume", str(folder / "half"), "--set", "time.end=10", "-q"]
     codes = {"wall time": cli.main([*words, "--max-wall-time", "0.1s"])}
     if comm.rank == 0:

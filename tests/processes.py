@@ -26,7 +26,7 @@ def session_members(session: int) -> dict[int, str]:
     return found
 
 
-def all_end(session: int, timeout: float = 10) -> bool:
+def all_end(session: int, timeout: float = 60) -> bool:
     """Whether all processes of a session end by themselves: what was killed does so in its own time."""
     deadline = time.monotonic() + timeout
     while session_members(session) and time.monotonic() < deadline:

@@ -1,4 +1,4 @@
-"""Runs a scene on the ranks of this process group and saves what tests look at: python3 run_case.py OUT.npz JSON.
+"""Runs scenes on the ranks of this process group and saves what tests look at: python3 run_case.py OUT.npz JSON ...
 
 JSON: {"scene": {...}, "snapshots": [times], "divisions": elements of a tube around, through the wall and along, of a
 tendon the last of these, or null for the scene's own mesh}. Saved: the history's columns; at each snapshot the state
@@ -27,9 +27,9 @@ def main(out: str, request: dict) -> None:
     scene = scene_from_dict(request["scene"])
     domain = None
     body = scene.geometry
-    if request.get("divisions") and body.shape == "tendon":
-        sys.modules["remodel_fenicsx.body.tendon"].ALONG = request["divisions"][-1]  # type: ignore[attr-defined]
-    elif request.get("divisions"):
+    if body.shape == "tendon":
+        sys.modules["remodel_fenicsx.body.tendon"].ALONG = (request["divisions"] or [10])[-1]  # type: ignore
+    elif request["divisions"]:
         domain = tube(
             body.inner_radius, body.outer_radius, body.length, scene.mesh.degree, divisions=request["divisions"]
         )
@@ -44,7 +44,7 @@ def main(out: str, request: dict) -> None:
 
         def solved(self, step: Step) -> None:
             nonlocal tension
-            if any(abs(step.time - wanted) < 1e-9 for wanted in request.get("snapshots", [])):
+            if any(abs(step.time - wanted) < 1e-9 for wanted in request["snapshots"]):
                 measured = Measurement(simulation.observer, step)
                 saved[f"u_{step.time:g}"] = displacement()
                 saved[f"stretch_{step.time:g}"] = domain.gather_elements(measured.axial_stretch)
@@ -67,7 +67,9 @@ def main(out: str, request: dict) -> None:
     if MPI.COMM_WORLD.rank == 0:
         columns = {name: np.array([row[name] for row in rows]) for name in rows[0]}
         np.savez(out, **columns, **saved)  # type: ignore[arg-type]
+    simulation.close()
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], json.loads(sys.argv[2]))
+    for path, text in zip(sys.argv[1::2], sys.argv[2::2], strict=True):
+        main(path, json.loads(text))

@@ -200,7 +200,7 @@ def test_a_uniform_body_never_locks(element: str, caplog: Any) -> None:
     scene = Scene(
         geometry={"shape": "cube"},
         mesh={"element": element, "refinement": 2},
-        material={"lame_lambda": 3.103e5},
+        material={"lame_lambda": 3.103e5, "chain_density": 0.0},
         cells={"initial": "isotropic"},
         loads={"force": {"value": 3.0, "ramp": [[0.0, 0.0], [2.0, 1.0]]}},
         time={"end": 3.0},
@@ -235,7 +235,7 @@ def test_one_and_two_ranks_agree(case: Case) -> None:
         "preset": "kuhl-holzapfel-2007",
         "geometry": {"shape": "cube"},
         "mesh": {"refinement": 2, "formulation": SELECTIVE},
-        "material": {"lame_lambda": 3.103e4},
+        "material": {"lame_lambda": 3.103e4, "chain_density": 0.0},
         "cells": {"initial": "random"},
         "time": {"end": 6.0},
         "solver": {"absolute_tolerance": 1e-9, "relative_tolerance": 0.0},

@@ -18,7 +18,7 @@ from remodel_fenicsx.evolution.uniqueness import STARTS, check_uniqueness
 from remodel_fenicsx.results.columns import Measurement
 from remodel_fenicsx.running import resume, run
 from remodel_fenicsx.scene import scene_from_dict
-from tests.conftest import Case
+from tests.conftest import Case, slowly
 
 SELF = MPI.COMM_SELF
 Array = NDArray[np.float64]
@@ -56,7 +56,7 @@ def solved(simulation: Simulation) -> dict[str, float]:
 
 
 # ---------------------------------------------------------------- what it is
-@pytest.mark.parametrize("driver", ["cauchy", "pk2", "finger"])
+@pytest.mark.parametrize("driver", ["cauchy", "finger", *slowly("pk2")])
 def test_it_is_where_time_leads(driver: str) -> None:
     """Staggered steps to t = 1000, relaxed where they over-correct: the same lengths."""
     at_once = Simulation(artery(remodeling={"driver": driver}), SELF)
@@ -85,7 +85,7 @@ def test_relaxation_and_tensor_have_the_same_limit_as_eq_11() -> None:
     np.testing.assert_allclose(found[2], found[0], atol=1e-9)
 
 
-@pytest.mark.parametrize("law", ["explicit", "tensor"])
+@pytest.mark.parametrize("law", ["tensor", *slowly("explicit")])
 def test_random_cells_come_to_the_same_state(law: str, caplog: pytest.LogCaptureFixture) -> None:
     """By passes; isotropic ones go along the path."""
     found = []

@@ -10,24 +10,44 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import mpirun, slowly
+from tests.forks import forked
 
 PROJECT = Path(__file__).resolve().parents[1]
 RANK = "import os, sys, time; from mpi4py import MPI; open(f'{sys.argv[1]}/{os.getpid()}', 'w'); MPI.COMM_WORLD.recv()"
 HANGS = {
     "sleep": "import time; time.sleep(1000)",
-    "mpirun": f"import subprocess; subprocess.run({mpirun(2, sys.executable, '-c', RANK, 'FOLDER')!r})",
+    "mpirun": "ranks.wait()",
     # in C, where no handler of Python's is called
     "deaf": "import itertools; sum(itertools.repeat(0))",
 }
+# ranks are there before the time begins to count, however long mpirun takes
+RANKS = f"""
+import os, subprocess, time, pytest
+@pytest.fixture
+def ranks():
+    process = subprocess.Popen({mpirun(2, sys.executable, '-c', RANK, 'FOLDER')!r})
+    while len(os.listdir('FOLDER')) < 2:
+        time.sleep(0.05)
+    return process
+pytestmark = pytest.mark.timeout(2, func_only=True)
+"""
 
 
 def session(folder: Path, *arguments: str, **variables: str) -> subprocess.CompletedProcess[str]:
     """Run pytest with the plugin on a folder's tests."""
-    words = ["-p", "tests.session", "-c", str(PROJECT / "pyproject.toml"), "--rootdir", str(folder), *arguments]
+    command = [sys.executable, "-m", "pytest", *words_of(folder, *arguments)]
+    return subprocess.run(command, cwd=folder, env=environment_of(**variables), capture_output=True, text=True)
+
+
+def words_of(folder: Path, *arguments: str) -> list[str]:
+    """Of pytest's command line."""
+    return ["-p", "tests.session", "-c", str(PROJECT / "pyproject.toml"), "--rootdir", str(folder), *arguments]
+
+
+def environment_of(**variables: str) -> dict[str, str]:
+    """This one, but for what belongs to this session."""
     inherited = {name: value for name, value in os.environ.items() if not name.startswith(("PYTEST_", "REMODEL_"))}
-    environment = {**inherited, "PYTHONPATH": str(PROJECT), **variables}
-    command = [sys.executable, "-m", "pytest", *words]
-    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
+    return {**inherited, "PYTHONPATH": str(PROJECT), **variables}
 
 
 def has_ended(process: int) -> bool:
@@ -43,17 +63,17 @@ def has_ended(process: int) -> bool:
 def test_a_test_that_hangs_fails_and_the_others_go_on(name: str, workers: str, tmp_path: Path) -> None:
     ranks = tmp_path / "ranks"
     ranks.mkdir()
-    hang = HANGS[name].replace("FOLDER", str(ranks))
-    (tmp_path / "test_it.py").write_text(f"def test_hangs():\n    {hang}\ndef test_after(): pass\n")
-    limit = "8" if name == "mpirun" else "1"
-    done = session(tmp_path, "-n", workers, f"--timeout={limit}", "-o", "timeout_grace=1", "test_it.py")
+    before, argument = (RANKS.replace("FOLDER", str(ranks)), "ranks") if name == "mpirun" else ("", "")
+    text = f"{before}\ndef test_hangs({argument}):\n    {HANGS[name]}\ndef test_after(): pass\n"
+    (tmp_path / "test_it.py").write_text(text)
+    done = session(tmp_path, "-n", workers, "--timeout=2", "-o", "timeout_grace=1", "test_it.py")
     assert done.returncode == 1, done.stdout + done.stderr
     if name == "deaf":
-        assert 'test_it.py", line 2 in test_hangs' in done.stderr
+        assert 'test_it.py", line 3 in test_hangs' in done.stderr
         # it can only be ended with its process: one of several is replaced
         assert workers == "0" or "1 failed, 1 passed" in done.stdout and "crashed while running" in done.stdout
     else:
-        assert f"Timeout >{limit}.0s" in done.stdout and "1 failed, 1 passed" in done.stdout
+        assert "Timeout >2.0s" in done.stdout and "1 failed, 1 passed" in done.stdout
     pids = list(ranks.iterdir())
     assert len(pids) == (2 if name == "mpirun" else 0)
     assert all(has_ended(int(rank.name)) for rank in pids)
@@ -66,17 +86,27 @@ def test_a_slow_test_has_a_longer_limit(tmp_path: Path) -> None:
     assert "FAILED test_it.py::test_quick" in done.stdout and "1 failed, 1 passed" in done.stdout
 
 
+MAIN = "import sys, pytest; sys.exit(pytest.main(sys.argv[1:]))"
+
+
 def launcher_session(folder: Path, *arguments: str, **variables: str) -> dict[str, str]:
-    """What pytest says at its end, with a cache of the test's own."""
-    done = session(folder, *arguments, **{"XDG_CACHE_HOME": str(folder / "cache"), **variables})
+    """What pytest says at its end, with a cache of the test's own; forked, for nothing in it looks at processes."""
+    words, environment = words_of(folder, *arguments), environment_of(XDG_CACHE_HOME=str(folder / "cache"), **variables)
+    plugins = ("pytest", "xdist.plugin", "pytest_timeout", "_hypothesis_pytestplugin")
+    done = forked("python", MAIN, *words, cwd=folder, variables=environment, imports=plugins)
     said = done.stdout.splitlines()
     return {"summary": said[-1], "skipped": "\n".join(line for line in said if line.startswith("SKIPPED"))}
 
 
 def test_the_launchers_tests_are_skipped_after_they_have_passed_until_its_files_change(tmp_path: Path) -> None:
-    (tmp_path / "test_launcher.py").write_text("def test_one(): pass\ndef test_two(): pass\n")
-    (tmp_path / "test_other.py").write_text("def test_three(): pass\n")
-    assert "3 passed" in launcher_session(tmp_path, "-n", "2", "--dist", "loadfile")["summary"]
+    """And the number of kernels that all processes have compiled is said at the end."""
+    compile_one = "open(os.environ['REMODEL_FENICSX_COMPILED'], 'a').write('a form\\n')"
+    launcher = f"import os\ndef test_one(): {compile_one}\ndef test_two(): pass\n"
+    (tmp_path / "test_launcher.py").write_text(launcher)
+    (tmp_path / "test_other.py").write_text(f"import os\ndef test_three(): {compile_one}\n")
+    done = session(tmp_path, "-n", "2", "--dist", "loadfile", XDG_CACHE_HOME=str(tmp_path / "cache"))
+    assert "3 passed" in done.stdout
+    assert "\nkernels compiled: 2\n" in done.stdout  # by both workers
     again = launcher_session(tmp_path)
     assert "1 passed, 2 skipped" in again["summary"]
     assert again["skipped"].startswith("SKIPPED [2] test_launcher.py: they passed here on 2")
@@ -101,7 +131,7 @@ def test_the_launchers_tests_leave_no_stamp_if_not_all_have_passed(
 ) -> None:
     (tmp_path / "test_launcher.py").write_text(text)
     assert "1 passed" in launcher_session(tmp_path, *arguments)["summary"]
-    assert "they passed here" not in launcher_session(tmp_path)["skipped"]
+    assert not list(tmp_path.rglob("launcher-tests"))
 
 
 def test_the_launchers_key_changes_with_its_files(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -118,10 +148,3 @@ def test_the_launchers_key_changes_with_its_files(monkeypatch: pytest.MonkeyPatc
         with (tmp_path / name).open("a") as file:
             file.write("\n")
         assert plugin.launcher_key() != last, name
-
-
-def test_the_number_of_compiled_kernels_is_said_at_the_end(tmp_path: Path) -> None:
-    lines = "import os\ndef test_it(): open(os.environ['REMODEL_FENICSX_COMPILED'], 'a').write('a form\\n')\n"
-    for name in ("test_one.py", "test_two.py"):
-        (tmp_path / name).write_text(lines)
-    assert "\nkernels compiled: 2\n" in session(tmp_path, "-n", "2").stdout

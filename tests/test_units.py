@@ -228,5 +228,5 @@ def test_pint_is_loaded_only_where_there_is_a_unit(value, loaded):
         "print('pint' in sys.modules)"
     )
     command = [sys.executable, "-c", code, str(ARTERY), f"loads.pressure.value={value}"]
-    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60)
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=200)
     assert done.stdout == f"{loaded}\n"

@@ -184,4 +184,5 @@ def _places(function: object) -> Array:
     """Where the values of each local element stand in the function's array, (elements, values of one)."""
     space = function.function_space  # type: ignore[attr-defined]
     dofs, size = np.asarray(space.dofmap.list, dtype=np.int64), space.dofmap.bs
-    return (dofs[..., None] * size + np.arange(size)).reshape(len(dofs), -1)
+    # not -1: a rank may have no element at all
+    return (dofs[..., None] * size + np.arange(size)).reshape(len(dofs), dofs.shape[1] * size)
