@@ -224,7 +224,7 @@ def _words(factor: str, words: str, found: Limit) -> str:
 
 
 def _about_steps_on_the_same_cells(results: Sequence[Result]) -> list[str]:
-    """What steps alone cost, where the noise of random cells hides it: the first seed's cells are those of all steps."""
+    """What steps alone cost, where the noise of random cells hides it: all of them have the first seed's cells."""
     if not any(result.noise for result in results):
         return []
     by_mesh: dict[tuple[str, int, int], list[Result]] = {}
