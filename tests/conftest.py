@@ -8,12 +8,17 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+
+from remodel_fenicsx.system import children
+from tests.forks import ForkedChild, forked
 
 CASE = Path(__file__).with_name("run_case.py")
 Case = Callable[..., dict[str, Any]]
@@ -27,6 +32,14 @@ def mpirun(ranks: int, *command: str) -> list[str]:
 def slowly(*cases: Any) -> list[Any]:
     """Cases of a parametrised test that only `-m slow` runs, where the others already show what it tells."""
     return [pytest.param(*(one if isinstance(one, tuple) else (one,)), marks=pytest.mark.slow) for one in cases]
+
+
+@contextmanager
+def forked_children() -> Iterator[None]:
+    """Within, the runs that figures, ensembles and trades start are forked, one after the other."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(children, "subprocess", SimpleNamespace(Popen=ForkedChild, DEVNULL=subprocess.DEVNULL))
+        yield
 
 
 @pytest.fixture(scope="session")
@@ -49,7 +62,10 @@ def case(tmp_path_factory: pytest.TempPathFactory) -> Case:
             if not out.exists():
                 part = out.with_suffix(".part.npz")
                 command = mpirun(ranks, sys.executable, "-m", "mpi4py", str(CASE), str(part), request)
-                done = subprocess.run(command, capture_output=True, text=True, timeout=900)
+                if ranks == 1:
+                    done = forked("case", part, request)
+                else:
+                    done = subprocess.run(command, capture_output=True, text=True, timeout=900)
                 assert done.returncode == 0, done.stderr[-3000:]
                 part.rename(out)
         with np.load(out) as data:

@@ -1,45 +1,178 @@
-"""Runs of a tube of four layers. `python3 forks.py WORDS` is remodel-fenicsx WORDS with that tube.
+"""remodel-fenicsx in children of one process that has imported all that takes time: that is most of a short run.
 
-Without words each line on stdin is JSON, [seconds, WORDS]: the command in a child of this process, which has imported
-all that takes time; after these seconds of processor time it is killed, null: never. The answer is a line with its exit
-status, negative for a signal.
+`python3 forks.py` is that process. Each line on stdin is a request in JSON, see `Forks.run`; its answer is a line with
+the exit status, negative for a signal. `python3 forks.py WORDS` is remodel-fenicsx WORDS with a tube of four layers.
 """
 
 from __future__ import annotations
 
+import contextlib
+import functools
+import importlib
 import json
 import os
 import signal
+import subprocess
 import sys
+import tempfile
 import time
+import traceback
+from collections.abc import Sequence
 from pathlib import Path
-
-import gmsh
-
-from remodel_fenicsx import cli, running
-
-assert gmsh and running  # imported here, not by each child
-sys.modules["remodel_fenicsx.body.tube"].PAPER = (8, 4, 1)  # type: ignore[attr-defined]  # around, through, along
+from typing import IO, Any
 
 
-def status_of(words: list[str], seconds: float | None) -> int:
-    """Exit status of a command, killed when it has worked for so long, however busy the machine is."""
-    child = os.fork()
-    if not child:
-        os._exit(cli.main(words))
+class Forks:
+    """The process and who asks it: what takes a start of its own (signals, PETSC_OPTIONS, ranks) is not for it."""
+
+    def __init__(self) -> None:
+        inherited = {name: value for name, value in os.environ.items() if name != "PETSC_OPTIONS"}
+        self.process = subprocess.Popen(
+            [sys.executable, __file__],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            bufsize=1,
+            env=inherited,
+        )
+
+    def run(
+        self,
+        program: str,
+        *words: str | Path,
+        cwd: Path | None = None,
+        seconds: float | None = None,
+        imports: tuple[str, ...] = (),
+    ) -> subprocess.CompletedProcess[str]:
+        """A program of `PROGRAMS` in a child, as subprocess.run.
+
+        Parameters
+        ----------
+        program, words, cwd
+            What runs where.
+        seconds
+            Of its processor time, after which it is killed; None: never.
+        imports
+            What else it shall find imported.
+        """
+        assert self.process.stdin is not None and self.process.stdout is not None
+        with tempfile.TemporaryDirectory() as folder:
+            streams = [os.path.join(folder, name) for name in ("output", "errors")]
+            request = [program, [*map(str, words)], str(cwd or Path.cwd()), dict(os.environ), streams, imports, seconds]
+            print(json.dumps(request), file=self.process.stdin, flush=True)
+            answer = self.process.stdout.readline()
+            assert answer, f"it has ended: {self.process.wait()}"
+            output, errors = (Path(name).read_text() for name in streams)
+        return subprocess.CompletedProcess(words, int(answer), output, errors)
+
+
+@functools.cache
+def _started() -> list[Forks]:
+    return []
+
+
+def forked(program: str, *words: str | Path, **options: Any) -> subprocess.CompletedProcess[str]:
+    """`Forks.run` by the one process that this one has, started anew if a test's limit has ended it."""
+    started = _started()
+    if not started or started[-1].process.poll() is not None:
+        started.append(Forks())
+    return started[-1].run(program, *words, **options)
+
+
+class ForkedChild:
+    """Stands for subprocess.Popen in `remodel_fenicsx.system.children`, for commands that nobody stops."""
+
+    def __init__(self, command: Sequence[str], stdout: IO[str], **_: Any):
+        words = command[command.index("remodel_fenicsx.cli") + 1 :]
+        done = forked("remodel-fenicsx", *words)
+        stdout.write(done.stdout + done.stderr)
+        self.returncode = done.returncode
+
+    def poll(self) -> int:
+        """It has ended."""
+        return self.returncode
+
+
+# ---------------------------------------------------------------- the process itself
+def four_layers(words: list[str]) -> int:
+    """remodel-fenicsx with another mesh of the tube: around, through, along."""
+    sys.modules["remodel_fenicsx.body.tube"].PAPER = (8, 4, 1)  # type: ignore[attr-defined]
+    return remodel_fenicsx(words)
+
+
+def remodel_fenicsx(words: list[str]) -> int:
+    """The command."""
+    from remodel_fenicsx import cli
+
+    return cli.main(words)
+
+
+def run_case(words: list[str]) -> int:
+    """What tests/conftest.py asks for."""
+    from tests import run_case
+
+    run_case.main(words[0], json.loads(words[1]))
+    return 0
+
+
+def python(words: list[str]) -> int:
+    """`python3 -c`."""
+    sys.argv = ["-c", *words[1:]]
+    exec(compile(words[0], "<string>", "exec"), {"__name__": "__main__"})
+    return 0
+
+
+PROGRAMS = {"remodel-fenicsx": remodel_fenicsx, "four layers": four_layers, "case": run_case, "python": python}
+
+
+def begin(program: str, words: list[str], folder: str, variables: dict[str, str], streams: list[str]) -> int:
+    """In a child: the program with a folder, an environment and streams of its own."""
+    for number, name in enumerate([os.devnull, *streams]):
+        os.dup2(os.open(name, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o600), number)
+    os.chdir(folder)
+    os.environ.clear()
+    os.environ.update(variables)
+    try:
+        status = PROGRAMS[program](words)
+    except SystemExit as end:  # argparse's way
+        status = int(end.code or 0)
+    except BaseException:
+        traceback.print_exc()
+        status = 1
+    with contextlib.suppress(BrokenPipeError):
+        sys.stdout.flush()
+    return status
+
+
+def status_of(child: int, seconds: float | None) -> int:
+    """Exit status of a child, killed when it has worked for so long, however busy the machine is."""
+    if seconds is None:
+        return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
     while True:
         found, status = os.waitpid(child, os.WNOHANG)
         if found:
             return os.waitstatus_to_exitcode(status)
-        if seconds is not None and int(Path(f"/proc/{child}/schedstat").read_text().split()[0]) > 1e9 * seconds:
+        if int(Path(f"/proc/{child}/schedstat").read_text().split()[0]) > 1e9 * seconds:
             os.kill(child, signal.SIGKILL)
             return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
         time.sleep(0.002)
 
 
-if __name__ == "__main__":
-    if sys.argv[1:]:
-        sys.exit(cli.main(sys.argv[1:]))
+def serve() -> None:
+    """Until there are no more requests."""
     for line in sys.stdin:
-        limit, command = json.loads(line)
-        print(status_of(command, limit), flush=True)
+        *request, imports, seconds = json.loads(line)
+        for module in imports:
+            importlib.import_module(module)
+        child = os.fork()
+        if not child:
+            os._exit(begin(*request))
+        print(status_of(child, seconds), flush=True)
+
+
+if __name__ == "__main__":
+    for module in ("gmsh", "remodel_fenicsx.running", "remodel_fenicsx.cli", "tests.run_case"):
+        importlib.import_module(module)
+    if sys.argv[1:]:
+        sys.exit(four_layers(sys.argv[1:]))
+    serve()

@@ -1,9 +1,9 @@
 """Runs a scene on the ranks of this process group and saves what tests look at: python3 run_case.py OUT.npz JSON.
 
-JSON: {"scene": {...}, "snapshots": [times], "divisions": elements of a tube around, through the wall and along, or null
-for the scene's own mesh}. Saved: the history's columns; at each snapshot the state after the solve
-of that time (u_T by node, stretch_T and angle_T by element); at the end l, n by element and point, the reference
-coordinates of the points, the initial l, and whether the third principal Cauchy stress was ever positive.
+JSON: {"scene": {...}, "snapshots": [times], "divisions": elements of a tube around, through the wall and along, of a
+tendon the last of these, or null for the scene's own mesh}. Saved: the history's columns; at each snapshot the state
+after the solve of that time (u_T by node, stretch_T and angle_T by element); at the end l, n by element and point, the
+reference coordinates of the points, the initial l, and whether the third principal Cauchy stress was ever positive.
 """
 
 from __future__ import annotations
@@ -26,8 +26,10 @@ def main(out: str, request: dict) -> None:
     """Run and save; everything is gathered in the mesh file's order."""
     scene = scene_from_dict(request["scene"])
     domain = None
-    if request.get("divisions"):
-        body = scene.geometry
+    body = scene.geometry
+    if request.get("divisions") and body.shape == "tendon":
+        sys.modules["remodel_fenicsx.body.tendon"].ALONG = request["divisions"][-1]  # type: ignore[attr-defined]
+    elif request.get("divisions"):
         domain = tube(
             body.inner_radius, body.outer_radius, body.length, scene.mesh.degree, divisions=request["divisions"]
         )

@@ -183,6 +183,8 @@ def pytest_configure(config: pytest.Config) -> None:
         # hundreds of processes start: the first one leaves its bytecode to the others, outside of the tree
         os.environ["PYTHONPYCACHEPREFIX"] = str(Path(folder.name) / "bytecode")
         os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+        # an mpirun that was killed leaves a folder, in the way of a later one with the same process number
+        os.environ["PRTE_MCA_prte_tmpdir_base"] = os.environ["OMPI_MCA_orte_tmpdir_base"] = folder.name
 
 
 def pytest_terminal_summary(terminalreporter: Any) -> None:

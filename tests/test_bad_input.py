@@ -17,8 +17,6 @@ import os
 import random
 import re
 import shutil
-import subprocess
-import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
 from datetime import date
@@ -40,6 +38,7 @@ from remodel_fenicsx.scene.scene import preset_scene, read_scene
 from remodel_fenicsx.schema.tables import SceneError as SchemaError
 from remodel_fenicsx.schema.toml import parse_override
 from remodel_fenicsx.simulation import checked_domain
+from tests.forks import forked
 from tests.test_resume import SELF, first_half, rows
 
 __all__ = ["first_half"]  # a fixture
@@ -291,12 +290,12 @@ INPUTS["commands through the shell"] = 30, "as command lines"
 
 
 def test_some_through_the_shell(place: Path) -> None:
-    """As a user types them."""
+    """As a user types them: in processes of their own."""
     chosen = random.Random(1)
     words = [word for word in (*FILES, *SETTINGS, "--set", "-o", "--resume") if word not in ("run", "scene.toml")]
     for _ in range(INPUTS["commands through the shell"][0] * FACTOR):
         line = [chosen.choice(["run", "validate", "status"]), *(chosen.choice(words) for _ in range(3))]
-        done = subprocess.run([sys.executable, "-m", "remodel_fenicsx.cli", *line], capture_output=True, text=True)
+        done = forked("remodel-fenicsx", *line)
         assert done.returncode in (0, 2, 5), (line, done.stderr)
         assert "Traceback" not in done.stderr and (done.returncode == 0 or "remodel-fenicsx" in done.stderr), line
 

@@ -19,6 +19,7 @@ from remodel_fenicsx.scene.scene import Scene
 from remodel_fenicsx.studies import ensemble as study
 from remodel_fenicsx.studies.members import Member, run_members
 from remodel_fenicsx.system.interrupts import Interrupted, Paused
+from tests.conftest import forked_children
 from tests.parts import pulled_cube
 
 END = 5.0
@@ -35,7 +36,8 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, study.Ensemble
     folder = tmp_path_factory.mktemp("ensemble") / "out"
     folder.mkdir()
     (folder / "seed-2").write_text("a file of the user's\n")
-    return study.ensemble(scene(), folder, seeds=3)
+    with forked_children():
+        return study.ensemble(scene(), folder, seeds=3)
 
 
 def test_one_that_fails_loses_only_itself(made: tuple[Path, study.Ensemble]) -> None:
@@ -66,7 +68,8 @@ def test_the_table_is_that_of_the_runs(made: tuple[Path, study.Ensemble]) -> Non
 def test_what_is_there_is_not_run_again(made: tuple[Path, study.Ensemble]) -> None:
     folder, found = made
     before = {path: path.stat().st_mtime_ns for path in folder.glob("*/history.csv")}
-    _, again = study.ensemble(scene(), folder, seeds=3)
+    with forked_children():
+        _, again = study.ensemble(scene(), folder, seeds=3)
     assert {path: path.stat().st_mtime_ns for path in folder.glob("*/history.csv")} == before
     np.testing.assert_array_equal(again.columns["mean_stretch"], found.columns["mean_stretch"])
     with pytest.raises(SceneError, match="holds a run of another scene"):
@@ -89,7 +92,8 @@ def test_what_was_stopped_goes_on(
     with pytest.raises(Paused):
         run(member.scene, member.folder, MPI.COMM_SELF)
     assert member.steps_done == 2 and not member.is_complete()
-    assert run_members([member], 1, "test", quiet=True) == {}
+    with forked_children():
+        assert run_members([member], 1, "test", quiet=True) == {}
     assert member.is_complete()
     whole = Recording(made[0] / "seed-3").history
     np.testing.assert_array_equal(member.history()["mean_stretch"], whole["mean_stretch"])

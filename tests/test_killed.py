@@ -5,10 +5,8 @@ from __future__ import annotations
 import ctypes
 import errno
 import gc
-import json
 import os
 import random
-import re
 import shutil
 import signal
 import subprocess
@@ -30,6 +28,7 @@ from remodel_fenicsx.results.run_folder import FolderTaken
 from remodel_fenicsx.results.vtkhdf import TransientGrid
 from remodel_fenicsx.running import resume, run
 from tests.conftest import mpirun
+from tests.forks import forked
 from tests.processes import session_members
 from tests.test_resume import COUNTED, LONGER, SELF, assert_close, assert_same, half, first_half, rows, scene, whole
 
@@ -189,24 +188,15 @@ def test_a_run_that_is_killed_20_times_goes_on(tmp_path: Path) -> None:
     (tmp_path / "tube.toml").write_text(TUBE)
     seed = random.randrange(10**6)
     print(f"seed {seed}")
-    server = subprocess.Popen(
-        [sys.executable, *FOUR_LAYERS], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1
-    )
-    assert server.stdin is not None
-    with server, server.stdin as commands:
 
-        def status(folder: str, seconds: float | None) -> int:
-            words = words_for(tmp_path / folder, tmp_path / "tube.toml")
-            print(json.dumps([seconds, words]), file=commands, flush=True)
-            for line in server.stdout or ():
-                if re.fullmatch(r"-?[0-9]+\n", line):
-                    return int(line)
-            raise AssertionError("it has ended")
+    def status(folder: str, seconds: float | None) -> int:
+        words = words_for(tmp_path / folder, tmp_path / "tube.toml")
+        return forked("four layers", *words, seconds=seconds).returncode
 
-        assert status("expected", None) == 0
-        found = [status("run", random.Random(seed + number).uniform(0.1, 0.6)) for number in range(20)]
-        assert found.count(-signal.SIGKILL) >= 10, found
-        assert status("run", None) == 0
+    assert status("expected", None) == 0
+    found = [status("run", random.Random(seed + number).uniform(0.1, 0.6)) for number in range(20)]
+    assert found.count(-signal.SIGKILL) >= 10, found
+    assert status("run", None) == 0
     assert_same(tmp_path / "run", tmp_path / "expected")
 
 

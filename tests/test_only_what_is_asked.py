@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +14,12 @@ import pytest
 from mpi4py import MPI
 
 from remodel_fenicsx import Recording, Scene, SceneError, Simulation, run
+from remodel_fenicsx.evolution.blend import Blend
 from remodel_fenicsx.evolution.equilibrium import Equilibrium
+from remodel_fenicsx.evolution.parts import Work
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
-from remodel_fenicsx.fem import jit
+from remodel_fenicsx.fem import coefficients, jit
+from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.results import history
 from remodel_fenicsx.results.fields import FIELDS_BY_NAME
 from remodel_fenicsx.scene import scene_from_dict
@@ -42,10 +48,23 @@ class Calls:
 
 def test_a_state_is_looked_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """How far it is from its limits: at the start of a step, of its solve, and for each Newton iteration."""
-    calls = Calls(monkeypatch, Equilibrium, "_extension_and_stretches")
+    calls = Calls(monkeypatch, Equilibrium, "_look")
     simulation = Simulation(scene(), SELF)
     iterations = sum(step.work.newton_iterations for step in simulation.stepper.march([1.0, 2.0, 3.0]))
     assert iterations >= 6 and calls.number <= iterations + 2 * 3 + 1
+    simulation.close()
+
+
+def test_a_state_is_evaluated_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """r, J and F together where it is looked at, F and the driver in the pass; parameters only where they change."""
+    simulation = Simulation(scene(), SELF)
+    march = simulation.stepper.march([1.0, 2.0, 3.0])
+    next(march)
+    evaluations, parameters = Calls(monkeypatch, Quadrature, "evaluate"), Calls(
+        monkeypatch, coefficients, "point_values"
+    )
+    iterations = sum(step.work.newton_iterations for step in march)
+    assert evaluations.number <= iterations + 2 * 2 and parameters.number == 0
     simulation.close()
 
 
@@ -171,3 +190,34 @@ def test_the_rows_of_a_checkpoint_are_on_the_disk_before_it(tmp_path: Path, monk
     run(scene(output={"fields": False, "checkpoint": 2}), tmp_path / "run", SELF)
     assert [entry for entry in order if entry][-3:] == ["rows", "checkpoint", "rows"]
     assert order.count("checkpoint") == 2
+
+
+def test_a_run_imports_only_what_it_needs(tmp_path: Path) -> None:
+    """No Gmsh for a lattice, no HDF5 without fields, no bar without a terminal, no units where none are written."""
+    text = dict(scene(output={"fields": False}, time={"end": 1.0}).model_dump(mode="json"))
+    program = (
+        "import json, sys\nfrom remodel_fenicsx import run\nfrom remodel_fenicsx.scene import scene_from_dict\n"
+        f"run(scene_from_dict(json.loads({json.dumps(text)!r})), {str(tmp_path / 'run')!r})\n"
+        "print(*sorted({module.split('.')[0] for module in sys.modules}))"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    imported = set(done.stdout.split())
+    assert {"dolfinx", "petsc4py", "ufl"} < imported
+    assert not imported & {"gmsh", "h5py", "rich", "pint", "scipy", "matplotlib", "pyvista", "pandas", "PIL"}
+    assert "gmsh 4" in (tmp_path / "run" / "scene.toml").read_text()  # its version is known all the same
+
+
+def test_no_form_is_made_in_the_middle_of_a_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a step in parts needs is there before the first step."""
+    simulation = Simulation(scene(), SELF)
+    forms, expressions = Calls(monkeypatch, jit, "form"), Calls(monkeypatch, jit, "expression")
+    coupling: Any = simulation.stepper.coupling
+    assert isinstance(coupling.blend, Blend)
+    list(simulation.stepper.march([1.0, 2.0]))
+    work, before = Work(), dict(simulation.state.loading.values)
+    loads = {name: 1.1 * value for name, value in before.items()}
+    coupling._solve_in_parts(3.0, before, loads, work, failure=None)
+    assert work.substeps >= 2  # the cells', the loads'
+    assert forms.number == 0 and expressions.number == 0
+    simulation.close()

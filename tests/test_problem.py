@@ -11,9 +11,10 @@ import ufl
 
 from remodel_fenicsx.fem import jit, quadrature
 from remodel_fenicsx.body import cube, tube
-from remodel_fenicsx.evolution.equilibrium import Extension
+from remodel_fenicsx.evolution.equilibrium import Extension, Look
 from remodel_fenicsx.evolution.newton import SolveFailure
 from remodel_fenicsx.scene.parameters import Cells, Material
+from remodel_fenicsx.system.interrupts import Interrupted
 from remodel_fenicsx.tissue.operators import passes_through_zero
 from tests import parts
 from tests.conftest import slowly
@@ -241,10 +242,10 @@ def test_wrong_branch_is_there_and_refused(monkeypatch: pytest.MonkeyPatch) -> N
     made = stretched_bar(4.0)
     start = made.displacement.x.array.copy()
     problem = made.problem(parts.TIGHT.model_copy(update={"petsc_options": {"snes_linesearch_type": "bt"}}))
-    real, harmless = problem.extension_and_stretches, (Extension(0.5, 0.5, (0.0, 0.0, 0.0)), np.zeros(0))
+    real, harmless = problem.look, Look(Extension(0.5, 0.5, (0.0, 0.0, 0.0)), np.zeros(0), np.zeros((0, 11)))
     problem.newton._snes.setLineSearchPreCheck(lambda x, step: False)
     guard = lambda: real() if problem.newton._snes.getConvergedReason() else harmless  # noqa: E731
-    monkeypatch.setattr(problem, "extension_and_stretches", guard)
+    monkeypatch.setattr(problem, "look", guard)
     with pytest.raises(SolveFailure, match=r"reached r/L = 2\.72") as caught:
         problem.solve()
     assert problem.newton._snes.getConvergedReason() > 0 and problem.newton._snes.getFunctionNorm() < 1e-9
@@ -296,6 +297,19 @@ def test_collapsed_start_fails_and_stays() -> None:
     with pytest.raises(SolveFailure, match="J = -0.125"):
         made.problem().solve()
     np.testing.assert_array_equal(made.displacement.x.array, turned_inside_out.ravel())
+
+
+def test_a_request_to_stop_that_is_taken_back_is_forgotten() -> None:
+    """Looks at a state are remembered; the request that came with one is none of the state's."""
+    made = held_cube()
+    problem = made.problem()
+    made.loading.set({"force": 1.0})
+    problem.stop_signal = lambda: 15
+    with pytest.raises(Interrupted):
+        problem.solve()
+    problem.stop_signal = lambda: 0
+    assert problem.extension().stop_signal == 0
+    assert problem.solve().newton_iterations > 1
 
 
 @pytest.mark.parametrize("where", ["displacement", "dimensions", "axes"])

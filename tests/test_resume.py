@@ -38,6 +38,7 @@ from remodel_fenicsx.scene import preset_scene
 from remodel_fenicsx.system.interrupts import Paused
 from remodel_fenicsx.tissue.cells import structure_tensor
 from tests.conftest import mpirun
+from tests.forks import forked
 from tests.parts import pulled_cube
 
 END = 9.0
@@ -290,8 +291,7 @@ def test_fields_that_are_gone_begin_with_the_next_step(half: Path) -> None:
 # ---------------------------------------------------------------- other numbers of ranks
 def command(*words: str | Path) -> subprocess.CompletedProcess[str]:
     """remodel-fenicsx WORDS."""
-    line = [sys.executable, "-m", "remodel_fenicsx.cli", *map(str, words)]
-    return subprocess.run(line, capture_output=True, text=True, timeout=300)
+    return forked("remodel-fenicsx", *words)
 
 
 def assert_close(found: Path, expected: Path, history: float = 1e-9, values: float = 1e-8) -> None:

@@ -17,6 +17,7 @@ from remodel_fenicsx.studies.convergence import limit, pareto, typical
 from remodel_fenicsx.studies.estimates import Result, Trade, estimated
 from remodel_fenicsx.studies.ladder import Setting, compared_times, ladder
 from remodel_fenicsx.studies.trade_output import in_words
+from tests.conftest import forked_children
 from tests.reference.radial import solve_radial
 
 PAPER = "kuhl-holzapfel-2007"
@@ -158,7 +159,8 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     changes = {"model.kinematics": "point", "time.end": 20.0, "remodeling.kappa": 0.1}
     path.write_text(preset_scene(PAPER, "cube").with_values(changes).to_toml())
     monkeypatch.setattr(rungs, "objections", lambda scene, name: ["left out by the test"])
-    assert cli.main(["trade", str(path), "-o", str(out), "--budget", "10min"]) == 0
+    with forked_children():
+        assert cli.main(["trade", str(path), "-o", str(out), "--budget", "10min"]) == 0
     words = capsys.readouterr().out
     assert (
         "time: order 1.1 (steps 2, 1, 0.5 on refinement 1, degree 1)" in words

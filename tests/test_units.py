@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given, settings, strategies
+from hypothesis import example, given, settings, strategies
 
 from remodel_fenicsx import cli
 from remodel_fenicsx.scene.scene import read_scene, scene_from_dict
@@ -204,7 +204,8 @@ def test_the_unit_of_the_scene_is_judged_before_values_in_it():
     assert refusal(ARTERY, "geometry.length_unit=km", "geometry.length=8 mm") == line
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
+@example("²1_")  # pint reads with Python's tokenizer, which has errors of its own
 @given(strategies.text("19.eE+-*/^()[]{}%°·²³_ \n'mkNPasgHK€", max_size=30))
 def test_any_text_becomes_a_number_or_one_line(text):
     # towers of powers and exponents of many digits among them: neither takes long nor ends otherwise

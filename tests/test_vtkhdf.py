@@ -21,6 +21,7 @@ from remodel_fenicsx.results import vtkhdf
 from remodel_fenicsx.results.chain_lines import chain_displacement, chain_lines
 from remodel_fenicsx.results.staged_file import StagedFile
 from remodel_fenicsx.results.vtkhdf import LINE, TransientGrid, cell_type_and_permutation
+from tests.forks import forked
 
 # In a process of its own, as users do. Steps are read forwards and backwards: VTK keeps the meshes of earlier steps.
 READER = """
@@ -54,7 +55,7 @@ VTK_CUBE = [[0, 1, 3, 2, 4, 5, 7, 6]]
 def read(path: Path) -> dict[str, np.ndarray]:
     """What PyVista finds: "STEP NAME" -> array, and "steps"."""
     target = path.with_suffix(".npz")
-    done = subprocess.run([sys.executable, "-c", READER, str(path), str(target)], capture_output=True, text=True)
+    done = forked("python", READER, path, target, imports=("pyvista",))
     assert done.returncode == 0, done.stderr
     assert "rror" not in done.stderr, done.stderr  # VTK reports errors there and goes on
     return dict(np.load(target))

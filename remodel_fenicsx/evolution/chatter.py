@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.evolution.memory import Earlier, Numbers
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
+from remodel_fenicsx.fem.ranks import over_ranks
 from remodel_fenicsx.tissue import mandel
 
 Array = NDArray[np.float64]
@@ -162,7 +163,7 @@ class Chatter(Watcher):
 
     def _rested(self, cells: list[Array]) -> bool:
         """Whether one of the passes has left most cells as they were: what goes on after that jumps (`resting`)."""
-        same = [np.all(self._at_points(a == b), axis=-1) for a, b in pairwise(cells[: ORDER + 1])]
+        same = [self._at_points(a == b).all(axis=-1) for a, b in pairwise(cells[: ORDER + 1])]
         return any(self.quadrature.mean(passed.astype(np.float64)) > MOST for passed in same)
 
     def _evenly(self, step: Step) -> bool:
@@ -184,16 +185,17 @@ class Chatter(Watcher):
         owned = self.state.number_of_owned_unknowns
 
         def of_cells(a: Array, b: Array) -> float:
-            return self.quadrature.integral(np.sum(self._at_points(a * b), axis=-1))
+            return self.quadrature.integral(self._at_points(a * b).sum(axis=-1))
 
         def of_body(a: Array, b: Array) -> float:
-            return float(self.state.comm.allreduce(float(np.dot(a[:owned], b[:owned])), MPI.SUM))
+            return float(over_ranks(self.state.comm, float(np.dot(a[:owned], b[:owned])), MPI.SUM))
 
-        volume = self.quadrature.integral(np.ones(self.quadrature.shape))
         now, last = _difference(cells, times), _difference(cells[1:], times[1:])
         moved, moved_last, place = _difference(body, times), _difference(body[1:], times[1:]), body[0]
         return Swing(
-            np.sqrt(of_cells(now, now) / volume) / GAIN / self.state.cells.settings.end_to_end_length**2,
+            np.sqrt(of_cells(now, now) / self.quadrature.volume)
+            / GAIN
+            / self.state.cells.settings.end_to_end_length**2,
             _ratio(of_cells(now, last), of_cells(last, last)),
             np.sqrt(_ratio(of_body(moved, moved), of_body(place, place))) / GAIN,
             _ratio(of_body(moved, moved_last), of_body(moved_last, moved_last)),

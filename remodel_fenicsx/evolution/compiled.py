@@ -96,6 +96,37 @@ class PointKernels:
         self._call.structure(axes.size // 9, self._in(dimensions), self._in(axes), self._out(tensor))
         return tensor
 
+    def extension(self, states: Array, length: Array) -> tuple[Array, int, float]:
+        """How far points are from their limits: r/L (n,), the number of the largest, and the smallest J.
+
+        Parameters
+        ----------
+        states
+            r^2, J and F of n points (n, 11), as `Equilibrium.states` has them.
+        length
+            L (n,).
+
+        Returns
+        -------
+        r/L is infinite where it is no finite number; J is minus infinity if one is none, and infinity without points.
+        """
+        stretch, smallest = np.empty(len(length)), np.empty(1)
+        worst = self._call.extension(
+            len(length), self._in(states), self._in(length), self._out(stretch), self._out(smallest)
+        )
+        return stretch, worst, smallest.item()
+
+    def may_turn(self, before: Array, after: Array) -> NDArray[np.intp]:
+        """Which points `operators.passes_through_zero` has to be asked for, by number; states (n, 11) of both ends."""
+        found = np.empty(len(before), np.uint8)
+        out = self._ffi.from_buffer("uint8_t[]", found, require_writable=True)
+        count = self._call.may_turn(len(before), self._in(before), self._in(after), out)
+        return np.flatnonzero(found) if count else np.empty(0, np.intp)
+
+    def room(self, states: Array, stretch: Array, chain: Array, far: float) -> float:
+        """Largest |dF| at which J > 0 and r/L < far at all points; chain: |l|/L (n,)."""
+        return float(self._call.room(len(stretch), self._in(states), self._in(stretch), self._in(chain), far))
+
     def _in(self, values: Array) -> Any:
         return self._ffi.from_buffer("double[]", np.ascontiguousarray(values, np.float64))
 

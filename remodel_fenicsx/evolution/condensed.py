@@ -10,8 +10,9 @@ import ufl
 from numpy.typing import NDArray
 
 from remodel_fenicsx.evolution import compiled_tensor
-from remodel_fenicsx.evolution.equilibrium import Equilibrium, Extension, at_points
+from remodel_fenicsx.evolution.equilibrium import Equilibrium, Look
 from remodel_fenicsx.evolution.newton import GuardedNewton, Solution, SolveFailure, SolverSettings
+from remodel_fenicsx.evolution.parameters import at_points
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
 from remodel_fenicsx.evolution.state import State
 from remodel_fenicsx.fem.solver_methods import AUTO
@@ -217,14 +218,15 @@ class AnsweringEquilibrium(Equilibrium):
         internal = ufl.inner(self.answering.stress, variation) * weight * dx
         return [internal], [ufl.inner(ufl.dot(self.answering.tangent, column), row) * weight * dx]
 
-    def extension_and_stretches(self) -> tuple[Extension, Array]:
+    def look(self) -> Look:
         """As of `Equilibrium`, which knows nothing of cells that answer: nothing is remembered."""
-        return self._extension_and_stretches()
+        return self._look()
 
-    def limit_values(self) -> tuple[Array, Array]:
+    def states(self) -> Array:
         """As of `Equilibrium`, with the cells that belong to the present unknowns."""
-        jacobian = determinant(self.state.deformation_gradient()).reshape(self.quadrature.shape)
-        return self.answering.squared_lengths(), jacobian
+        squared, states = self.answering.squared_lengths(), super().states()
+        states[..., 0] = squared
+        return states
 
     def assemble_internal(self, vector: Any) -> None:
         """Internal nodal forces of the present unknowns."""

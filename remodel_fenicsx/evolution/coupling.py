@@ -90,7 +90,7 @@ class Staggered:
         self.predictor = PREDICTORS[settings.predictor](state)
         self.share, self.compares, self._residual = 1.0, False, 0.0
         self.blend: Blend | None = None
-        if remodeling.law.remodels:
+        if remodeling.law.remodels:  # now, for no form is compiled in the middle of a run
             self.blend = Blend(state, tissue, settings)
             self.blend.equilibrium.stop_signal = lambda: self.equilibrium.stop_signal()
 

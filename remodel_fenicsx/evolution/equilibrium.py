@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import dolfinx.fem
 import dolfinx.fem.petsc
@@ -14,9 +14,11 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
+from remodel_fenicsx.evolution.parameters import Parameters, on_mesh
 from remodel_fenicsx.evolution.pointwise import Shares, pointwise_repulsion
 from remodel_fenicsx.evolution.state import State
-from remodel_fenicsx.fem import coefficients, jit
+from remodel_fenicsx.fem import jit
+from remodel_fenicsx.fem.ranks import of_all_ranks, over_ranks
 from remodel_fenicsx.fem.remembered import Remembered
 from remodel_fenicsx.tissue.cells import UnitCell
 from remodel_fenicsx.tissue.energy import Tissue
@@ -42,6 +44,24 @@ class Extension:
     def admissible(self) -> bool:
         """True when every chain is shorter than its contour length and no volume has collapsed; False for NaN."""
         return self.max_chain_extension < 1.0 and self.min_jacobian > 0.0
+
+
+class Look(NamedTuple):
+    """At a state: how far it is from its limits.
+
+    Attributes
+    ----------
+    extension
+        Over all points of all ranks.
+    stretches
+        r/L at the points of this rank's own elements, (elements, points); infinite where it is no finite number.
+    states
+        `Equilibrium.states` of these points, in one row.
+    """
+
+    extension: Extension
+    stretches: Array
+    states: Array
 
 
 class Equilibrium:
@@ -74,6 +94,7 @@ class Equilibrium:
         mesh = self.quadrature.mesh
         self.comm = mesh.comm
         self.tissue = on_mesh(tissue, mesh)
+        self.parameters = Parameters(self.tissue, self.quadrature)
         # asked on each rank whenever limits are reduced: the signal (SIGINT, SIGTERM) that should end the solve, or 0
         self.stop_signal: Callable[[], int] = lambda: 0
         u, shares, loading = state.unknown, shares or [state.cells.ufl_cell], state.loading
@@ -90,10 +111,10 @@ class Equilibrium:
         if external is not None and _depends_on(external, u):
             self.tangent_forms.append(jit.form(ufl.derivative(external, u, trial)))
         squared = squared_end_to_end_length(F, shares) if self.tissue.chain is not None else ufl.as_ufl(0.0)
-        limits = ufl.as_vector([squared, ufl.det(F)])
+        limits = ufl.as_vector([squared, ufl.det(F), *(F[i, j] for i in range(3) for j in range(3))])
         self._limits = jit.expression(limits, self.quadrature.points)
         length = ufl.as_ufl(0.0 if self.tissue.locking_length is None else self.tissue.locking_length)
-        self._known_extension: Remembered[tuple[Extension, Array]] = Remembered(self.comm, limits, length)
+        self._known: Remembered[Look] = Remembered(self.comm, limits, length)
         self._energy_forms: list[Any] = []
 
     def internal_and_tangents(self, F: Any, test: Any, trial: Any) -> tuple[list[Any], list[Any]]:
@@ -110,30 +131,30 @@ class Equilibrium:
     # ------------------------------------------------------------ what users ask
     def extension(self) -> Extension:
         """Largest r/L and smallest J of the present unknowns over all points of all ranks."""
-        return self.extension_and_stretches()[0]
+        return self.look().extension
 
-    def extension_and_stretches(self) -> tuple[Extension, NDArray[np.float64]]:
-        """The extension, and r/L at the points of this rank's own elements, (elements, points); infinite for NaN."""
-        return self._known_extension(self._extension_and_stretches)
+    def look(self) -> Look:
+        """Extension, and what it was made of, of the present unknowns; one state is looked at once."""
+        look = self._known(self._look)
+        if look.extension.stop_signal:
+            self._known.forget()  # who asked for the end may take it back
+        return look
 
-    def _extension_and_stretches(self) -> tuple[Extension, Array]:
-        squared, at_points = self.limit_values()
-        jacobian = np.hstack([at_points, self.state.dilatation.jacobians()])
-        squared, jacobian = self.quadrature.owned(squared), self.quadrature.owned(jacobian)
-        with np.errstate(invalid="ignore"):
-            stretch = np.sqrt(squared) / self.quadrature.owned(self.locking_length())
-        stretch = np.where(np.isfinite(stretch), stretch, np.inf)
-        jacobian = np.where(np.isfinite(jacobian), jacobian, -np.inf)
+    def _look(self) -> Look:
+        number = self.quadrature.number_of_owned_elements
+        states, shape = self.quadrature.owned(self.states()).reshape(-1, 11), (number, self.quadrature.shape[1])
+        lengths = self.quadrature.owned(self.locking_length()).reshape(-1)
+        stretch, worst, smallest = self.state.cells.kernels.extension(states, lengths)
+        of_formulation = self.quadrature.owned(self.state.dilatation.jacobians())
+        if of_formulation.size:
+            smallest = min(smallest, float(of_formulation.min()) if np.isfinite(of_formulation).all() else -np.inf)
+        local: tuple[float, tuple[float, ...]] = (-np.inf, (np.nan,) * 3)
         if stretch.size:
-            worst = np.unravel_index(int(np.argmax(stretch)), stretch.shape)
-            point = self.quadrature.coordinates[worst]
-            local = (float(stretch[worst]), (float(point[0]), float(point[1]), float(point[2])))
-        else:
-            local = (-np.inf, (np.nan, np.nan, np.nan))
-        ranks = self.comm.allgather((*local, float(np.min(jacobian, initial=np.inf)), self.stop_signal()))
-        largest, worst_point = max((rank[:2] for rank in ranks), key=lambda pair: pair[0])
+            local = stretch.item(worst), tuple(self.quadrature.coordinates.reshape(-1, 3)[worst].tolist())
+        ranks = of_all_ranks(self.comm, (*local, smallest, self.stop_signal()))
+        largest, worst_point, _, _ = max(ranks, key=lambda rank: rank[0])
         extension = Extension(largest, min(rank[2] for rank in ranks), worst_point, max(rank[3] for rank in ranks))
-        return extension, stretch
+        return Look(extension, stretch.reshape(shape), states)
 
     def keeps_reserve(self, before: Any, after: Any, share: float, nearer_than: float = 0.0) -> bool:
         """Whether every point of all ranks keeps a share of its 1 - r/L; `nearer_than`: only those with r/L above it.
@@ -144,23 +165,26 @@ class Equilibrium:
             r/L at the points, from `extension_and_stretches`.
         """
         lost = bool(np.any((after > nearer_than) & (1 - after < share * (1 - before))))
-        return not self.comm.allreduce(lost, MPI.LOR)
+        return not over_ranks(self.comm, lost, MPI.LOR)
 
-    def turns_inside_out(self, before: NDArray[np.float64], after: NDArray[np.float64]) -> bool:
-        """Whether J vanishes on the straight way between two states at a point of any rank; F from both."""
-        return bool(self.comm.allreduce(bool(passes_through_zero(before, after).any()), MPI.LOR))
+    def turns_inside_out(self, before: Array, after: Array) -> bool:
+        """Whether J vanishes on the straight way between two states at a point of any rank; `Look.states` of both."""
+        at = self.state.cells.kernels.may_turn(before, after)
+        turns = at.size > 0 and bool(passes_through_zero(*(_gradients(ends[at]) for ends in (before, after))).any())
+        return bool(over_ranks(self.comm, turns, MPI.LOR))
 
-    def limit_values(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def states(self) -> Array:
+        """r^2 in squared link lengths (0 without chains), J and F, eleven numbers: (elements, points, 11)."""
+        return self.quadrature.evaluate(self._limits, (11,))
+
+    def limit_values(self) -> tuple[Array, Array]:
         """r^2 in squared link lengths (0 without chains) and J at all points, each (elements, points)."""
-        values = self.quadrature.evaluate(self._limits, (2,))
-        return values[..., 0], values[..., 1]
+        states = self.states()
+        return states[..., 0], states[..., 1]
 
     def locking_length(self) -> NDArray[np.float64]:
         """Length at which a chain locks at all points, (elements, points); infinite where nothing locks."""
-        length = self.tissue.locking_length
-        if length is None:
-            return np.full(self.quadrature.shape, np.inf)
-        return coefficients.point_values(length, self.quadrature)
+        return self.parameters.locking_length()
 
     def stored_energy(self) -> float:
         """Integral of W over the body."""
@@ -168,7 +192,7 @@ class Equilibrium:
             self.compile_energy()
         local = sum(np.real(dolfinx.fem.assemble_scalar(form)) for form in self._energy_forms)
         pointwise = 0.0 if self.pointwise is None else self.pointwise.energy()
-        return float(self.comm.allreduce(local, MPI.SUM)) + pointwise
+        return float(over_ranks(self.comm, local, MPI.SUM)) + pointwise
 
     def compile_energy(self) -> None:
         """Make `stored_energy` ready; apart, because a blend needs none."""
@@ -187,9 +211,10 @@ class Equilibrium:
 
     def _assemble(self, vector: Any, forms: Sequence[Any]) -> None:
         with vector.localForm() as local:
-            local.set(0.0)
-        for form in forms:
-            dolfinx.fem.petsc.assemble_vector(vector, form)
+            values = local.array_w
+            values.fill(0.0)
+            for form in forms:
+                dolfinx.fem.assemble_vector(values, form)
         vector.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
 
     def assemble_lifting(self, vector: Any, x: Any) -> None:
@@ -230,46 +255,21 @@ class Equilibrium:
 
     def prescribed_gap(self, x: Any) -> float:
         """Largest distance of a prescribed value from its target, over all ranks."""
+        conditions = self.state.loading.boundary_conditions
+        if not conditions:
+            return 0.0
         with x.localForm() as local:
-            values = local.array_r.copy()
-        target = values.copy()
-        for condition in self.state.loading.boundary_conditions:
-            condition.set(target)
-        return float(self.comm.allreduce(float(np.max(np.abs(target - values), initial=0.0)), MPI.MAX))
+            values = local.array_r
+            target = values.copy()
+            for condition in conditions:
+                condition.set(target)
+            target -= values
+        return float(over_ranks(self.comm, float(np.abs(target).max(initial=0.0)), MPI.MAX))
 
 
-def on_mesh(tissue: Tissue, mesh: Any) -> Tissue:
-    """The tissue with Constants in place of numbers, so that other numbers compile nothing.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If a parameter is neither a number, nor a Constant, nor a DG0 Function of the mesh.
-    """
-    return tissue.map(lambda name, value: coefficients.coefficient(mesh, name, value))
-
-
-def at_points(tissue: Tissue, quadrature: Any) -> Tissue:
-    """A tissue on a mesh with its parameters as arrays over the points in one row, (elements * points,)."""
-    return tissue.map(lambda name, value: coefficients.point_values(value, quadrature).reshape(-1))
-
-
-def stress_rounding(tissue: Tissue, mesh: Any, max_chain_extension: float) -> float:
-    """Rounding error of a stress in a body, from the stiffness of matrix and network at the largest r/L."""
-    return rounding_of(largest_parameters(tissue, mesh), max_chain_extension)
-
-
-def largest_parameters(tissue: Tissue, mesh: Any) -> Tissue:
-    """A tissue on a mesh with the largest value of each parameter in the body, numbers."""
-    return tissue.map(lambda name, value: coefficients.largest(value, mesh))
-
-
-def rounding_of(numbers: Tissue, max_chain_extension: float) -> float:
-    """`stress_rounding` from the largest parameters."""
-    length = numbers.end_to_end_length
-    if numbers.locking_length is not None:
-        length = max(length, max_chain_extension * numbers.locking_length)
-    return float(np.finfo(np.float64).eps * numbers.stiffness(length))
+def _gradients(states: Array) -> Array:
+    """F (n, 3, 3) of states (n, 11)."""
+    return states[:, 2:].reshape(-1, 3, 3)
 
 
 def _depends_on(form: Any, unknown: Any) -> bool:

@@ -7,9 +7,9 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from remodel_fenicsx.evolution.equilibrium import Equilibrium, Extension
+from remodel_fenicsx.evolution.equilibrium import Equilibrium, Look
 from remodel_fenicsx.fem.quadrature import Quadrature
-from remodel_fenicsx.tissue.operators import determinant, squared_norm
+from remodel_fenicsx.fem.ranks import over_ranks
 
 Array = NDArray[np.float64]
 
@@ -17,7 +17,7 @@ FAR_FROM_LOCKING = 0.95  # r/L up to which no point has to keep a reserve
 
 
 class Limits:
-    """Extension, r/L and F of the states that Newton's method comes to, within one solve.
+    """How far from their limits the states are that Newton's method comes to, within one solve.
 
     Parameters
     ----------
@@ -30,6 +30,7 @@ class Limits:
 
     def __init__(self, equilibrium: Equilibrium, bounded: bool):
         self.equilibrium, state = equilibrium, equilibrium.state
+        self._unknown: Array = state.unknown.x.array
         self.bounded = bounded and not state.kinematics.reduced and state.dilatation.jacobians().shape[1] == 0
         self._gain = largest_gradient_of_displacement(equilibrium.quadrature) if self.bounded else np.inf
         self.looks = 0
@@ -38,25 +39,18 @@ class Limits:
     def forget(self) -> None:
         """Cells or loads may be others from now on."""
         self._place: Array | None = None
-        self._gradient: Array | None = None
         self._chains: Array | None = None  # |l|/L at the points
         self._room, self._travelled = 0.0, np.inf
 
-    def look(self) -> tuple[Extension, Array]:
-        """`Equilibrium.extension_and_stretches` of the present unknowns."""
+    def look(self) -> Look:
+        """`Equilibrium.look` of the present unknowns."""
         if not self._is_here():
-            self._place, self._gradient = self.equilibrium.state.unknown.x.array.copy(), None
-            self._found = self.equilibrium.extension_and_stretches()
+            self._place = self._unknown.copy()
+            self._found = self.equilibrium.look()
             self.looks += 1
             if self.bounded:
-                self._room, self._travelled = self._room_around(*self._found), 0.0
+                self._room, self._travelled = self._room_around(self._found), 0.0
         return self._found
-
-    def gradient(self) -> Array:
-        """F of the state that was looked at last at the points of this rank, (elements * points, 3, 3)."""
-        if self._gradient is None:
-            self._gradient = self.equilibrium.state.deformation_gradient()
-        return self._gradient
 
     def spare(self, largest_displacement: float) -> bool:
         """Whether a further step is certainly admissible, so that nobody need look; it is then as if it were made.
@@ -73,20 +67,19 @@ class Limits:
         return True
 
     def _is_here(self) -> bool:
-        here = self._place is not None and np.array_equal(self._place, self.equilibrium.state.unknown.x.array)
-        return bool(self.equilibrium.comm.allreduce(here, MPI.LAND))
+        here = self._place is not None and bool((self._place == self._unknown).all())
+        return bool(over_ranks(self.equilibrium.comm, here, MPI.LAND))
 
-    def _room_around(self, extension: Extension, stretches: Array) -> float:
+    def _room_around(self, look: Look) -> float:
         """Largest |dF| at which J > 0 and r/L < FAR_FROM_LOCKING at every point of all ranks."""
-        if not extension.admissible:
+        if not look.extension.admissible:
             return 0.0
         quadrature, cells = self.equilibrium.quadrature, self.equilibrium.state.cells
-        F = self.gradient()
-        of_volume = quadrature.minimum((2 * determinant(F) / squared_norm(F)).reshape(quadrature.shape))
         if self._chains is None:
             length = np.sqrt(squares_of(cells.dimension_values)) / self.equilibrium.locking_length()
-            self._chains = np.maximum(quadrature.owned(length), 1e-300)
-        return min(of_volume, quadrature.minimum((FAR_FROM_LOCKING - stretches) / self._chains))
+            self._chains = np.maximum(quadrature.owned(length), 1e-300).reshape(-1)
+        room = cells.kernels.room(look.states, look.stretches.reshape(-1), self._chains, FAR_FROM_LOCKING)
+        return float(over_ranks(self.equilibrium.comm, room, MPI.MIN))
 
 
 def squares_of(vectors: Array) -> Array:

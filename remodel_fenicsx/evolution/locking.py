@@ -8,7 +8,7 @@ import dolfinx.fem
 import numpy as np
 from mpi4py import MPI
 
-from remodel_fenicsx.evolution.equilibrium import at_points
+from remodel_fenicsx.evolution.parameters import at_points
 from remodel_fenicsx.evolution.memory import Numbers
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
 from remodel_fenicsx.fem.formulations import Locking

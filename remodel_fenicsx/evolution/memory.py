@@ -64,6 +64,7 @@ class Earlier:
             function.name = f"{name}_{age}"
             state.remember(function, f"{name}_known")
             self._functions.append(function)
+        self._arrays: list[Array] = [function.x.array for function in self._functions]
         self._numbers = Numbers(state, name, {"known": 0})
 
     @property
@@ -74,18 +75,18 @@ class Earlier:
     @property
     def values(self) -> list[Array]:
         """The newest first, the functions' own memory, ghosts included."""
-        return [function.x.array for function in self._functions[: self.known]]
+        return self._arrays[: self.known]
 
     def push(self, values: Array) -> None:
         """One value more, for owned unknowns and ghosts; the oldest goes."""
-        for older, newer in reversed(list(zip(self._functions[1:], self._functions, strict=False))):
-            older.x.array[:] = newer.x.array
-        self._functions[0].x.array[:] = values
-        self._numbers["known"] = min(self.known + 1, len(self._functions))
+        for age in range(len(self._arrays) - 1, 0, -1):
+            self._arrays[age][:] = self._arrays[age - 1]
+        self._arrays[0][:] = values
+        self._numbers["known"] = min(self.known + 1, len(self._arrays))
 
     def push_owned(self, values: Array) -> None:
         """The same without ghosts; collective."""
-        whole = np.zeros_like(self._functions[0].x.array)
+        whole = np.zeros_like(self._arrays[0])
         whole[: len(values)] = values
         self.push(whole)
         self._functions[0].x.scatter_forward()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import dolfinx.fem.petsc
@@ -12,10 +11,13 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from remodel_fenicsx.evolution.equilibrium import Equilibrium, Extension, largest_parameters, rounding_of
+from remodel_fenicsx.evolution.equilibrium import Equilibrium, Extension, Look
 from remodel_fenicsx.evolution.limits import Limits
 from remodel_fenicsx.evolution.linear import BY_METHOD, EveryTangent
+from remodel_fenicsx.evolution.parameters import stress_rounding
+from remodel_fenicsx.evolution.solution import Solution, SolveFailure
 from remodel_fenicsx.fem.petsc_options import ProblemOptions
+from remodel_fenicsx.fem.ranks import over_ranks
 from remodel_fenicsx.fem.solver_methods import AUTO, EXACT, LAGGED, SMALL, chosen, method_options
 from remodel_fenicsx.system.interrupts import Interrupted
 
@@ -64,49 +66,6 @@ FAILURES = {
 }
 
 
-@dataclass(frozen=True)
-class Solution:
-    """Work of a solve."""
-
-    newton_iterations: int
-    linear_iterations: int
-    residual: float = 0.0
-    """Norm of the out-of-balance nodal forces that was accepted."""
-    tangents: int = 0
-    """How many were assembled."""
-    extension: Extension | None = None
-    """Of the solution."""
-
-    def after(self, failure: SolveFailure) -> Solution:
-        """With the work of an attempt that had failed before."""
-        newton = self.newton_iterations + failure.newton_iterations
-        linear = self.linear_iterations + failure.linear_iterations
-        return replace(
-            self, newton_iterations=newton, linear_iterations=linear, tangents=self.tangents + failure.tangents
-        )
-
-
-class SolveFailure(RuntimeError):
-    """SNES did not find an admissible equilibrium; the unknowns before the call are restored."""
-
-    def __init__(
-        self,
-        reason: str,
-        newton_iterations: int,
-        linear_iterations: int,
-        extension: Extension,
-        residual_over_tolerance: float = np.inf,
-        tangents: int = 0,
-    ):
-        super().__init__(reason)
-        self.tangents = tangents
-        self.residual_over_tolerance = residual_over_tolerance
-        self.reason = reason
-        self.newton_iterations = newton_iterations
-        self.linear_iterations = linear_iterations
-        self.extension = extension
-
-
 class GuardedNewton:
     """Solves an equilibrium from the present unknowns; use `close` (or `with`) when it is needed no more.
 
@@ -128,6 +87,7 @@ class GuardedNewton:
     def __init__(self, equilibrium: Equilibrium, settings: SolverSettings, robust: bool = False):
         self.equilibrium, self.settings = equilibrium, settings
         self.unknown = equilibrium.state.unknown
+        self._values = self.unknown.x.array
         self._x = self.unknown.x.petsc_vec.duplicate()
         unknowns, ranks = self._x.getSize(), equilibrium.comm.size
         self.method = chosen(settings.method, unknowns, ranks)
@@ -136,11 +96,11 @@ class GuardedNewton:
         # where a method is named, three dimensions stay with it: its numbers shall not depend on their size
         small = unknowns <= SMALL and (equilibrium.state.kinematics.reduced or settings.method == AUTO)
         self._options = ProblemOptions(method_options(self.method, ranks, small), settings.petsc_options)
-        self._residual = self._x.duplicate()
-        self._external = self._x.duplicate()
+        self._residual, self._external, self._trial = (self._x.duplicate() for _ in range(3))
         self._matrix = equilibrium.create_matrix()
-        self._force_scale = self._stress_rounding = self._extension = 0.0
-        self._largest = largest_parameters(equilibrium.tissue, equilibrium.quadrature.mesh)
+        self._force_scale = self._extension = 0.0
+        self._largest = equilibrium.parameters.largest()
+        self._rounds_at, self._rounding = 0.0, (np.nan, 0.0)  # r/L of an admissible state; r/L and its rounding
         self._area = equilibrium.quadrature.norm(equilibrium.quadrature.largest_areas)
         self.on_the_way = False  # whether the solution is only the start of a further one: then it may be coarser
         self._lost = False
@@ -166,7 +126,7 @@ class GuardedNewton:
         if self._snes is None:
             return
         self._linear.close()
-        for thing in (self._snes, self._matrix, self._x, self._residual, self._external):
+        for thing in (self._snes, self._matrix, self._x, self._residual, self._external, self._trial):
             thing.destroy()
         self._options.close()
         self._snes = None
@@ -208,14 +168,14 @@ class GuardedNewton:
     def may_start(self) -> bool:
         """Whether the present unknowns, from which `solve` is to start, are admissible."""
         self.limits.forget()
-        self._looked = self.limits.look()[0].admissible
+        self._looked = self.limits.look().extension.admissible
         return self._looked
 
     def _attempt(self, more_iterations: int = 1) -> Solution:
-        start, tangents = self.unknown.x.array.copy(), self._linear.tangents
+        start, tangents = self._values.copy(), self._linear.tangents
         self._snes.setTolerances(max_it=more_iterations * self._most_iterations)
         # they may be others from solve to solve, not within one
-        self._largest = largest_parameters(self.equilibrium.tissue, self.equilibrium.quadrature.mesh)
+        self._largest, self._rounding = self.equilibrium.parameters.largest(), (np.nan, 0.0)
         self._pull(self._x)
         self._lost = self._spared = False
         if not self._looked:
@@ -227,9 +187,9 @@ class GuardedNewton:
         reason = self._snes.getConvergedReason()
         newton, linear = self._snes.getIterationNumber(), self._snes.getLinearSolveIterations()
         self._push(self._x)
-        extension = self.limits.look()[0] if self.limits.bounded else self.equilibrium.extension()
+        extension = self.limits.look().extension if self.limits.bounded else self.equilibrium.extension()
         if reason < 0 or self._lost or not extension.admissible:
-            self.unknown.x.array[:] = start
+            self._values[:] = start
             if extension.stop_signal:
                 raise Interrupted(extension.stop_signal)
             left = float(self._snes.getFunctionNorm()) / max(self._tolerance(), float(np.finfo(np.float64).tiny))
@@ -286,13 +246,16 @@ class GuardedNewton:
     def _pull(self, x: Any) -> None:
         """Copy the unknowns into a PETSc vector."""
         with x.localForm() as local:
-            local.array[:] = self.unknown.x.array
+            local.array[:] = self._values
 
     def _push(self, x: Any) -> None:
         """Copy a PETSc vector into the unknowns, ghosts included."""
+        if self.equilibrium.comm.size == 1:
+            self._values[:] = x.array_r
+            return
         x.ghostUpdate(addv=PETSc.InsertMode.INSERT, mode=PETSc.ScatterMode.FORWARD)
         with x.localForm() as local:
-            self.unknown.x.array[:] = local.array_r
+            self._values[:] = local.array_r
 
     def _assemble_residual(self, snes: Any, x: Any, residual: Any) -> None:
         """R = internal forces - loads, zero where displacements are prescribed and met.
@@ -313,15 +276,15 @@ class GuardedNewton:
             residual.axpy(1.0, self._external)
         dolfinx.fem.petsc.set_bc(residual, loading.boundary_conditions, x, -1.0)
         if self._spared:
-            self._lost = equilibrium.comm.allreduce(equilibrium.stop_signal(), MPI.MAX) > 0
+            self._lost = over_ranks(equilibrium.comm, equilibrium.stop_signal(), MPI.MAX) > 0
         else:
-            extension = self.limits.look()[0]
+            extension = self.limits.look().extension
             self._lost = not extension.admissible or extension.stop_signal > 0
             self._extension = extension.max_chain_extension
         if self._lost:
             residual.set(np.nan)
             return
-        self._stress_rounding = rounding_of(self._largest, self._extension)
+        self._rounds_at = self._extension
 
     def _assemble_tangent(self, snes: Any, x: Any, matrix: Any, preconditioner: Any) -> None:
         self._linear.tangent(self._last_norm, self._tolerance())
@@ -338,27 +301,29 @@ class GuardedNewton:
         if self._spared:
             return improved
         self._push(x)
-        (_, stretches_before), before = self.limits.look(), self.limits.gradient()
-        trial = x.duplicate()
+        before, trial = self.limits.look(), self._trial
         for halving in range(LINE_SEARCH_HALVINGS + 1):
             trial.waxpy(-1.0, step, x)
             self._push(trial)
-            extension, stretches = self.limits.look()
-            if extension.stop_signal:
-                break
-            if (
-                extension.admissible
-                and self.equilibrium.keeps_reserve(stretches_before, stretches, KEPT_RESERVE, NEAR_LOCKING)
-                and not self.equilibrium.turns_inside_out(before, self.limits.gradient())
-            ):
+            after = self.limits.look()
+            if after.extension.stop_signal or self._may_go(before, after):
                 break
             step.scale(0.5)
         else:
             log.debug("no admissible step after %d halvings", LINE_SEARCH_HALVINGS)
-        trial.destroy()
         if halving:
             log.debug("Newton step shortened to 1/%d to keep r < L and J > 0", 2**halving)
         return improved or halving > 0
+
+    def _may_go(self, before: Look, after: Look) -> bool:
+        """Whether a Newton step ends at an admissible state, with some reserve, and turns nothing inside out."""
+        if not after.extension.admissible:
+            return False
+        near = after.extension.max_chain_extension > NEAR_LOCKING
+        stretches = before.stretches, after.stretches
+        if near and not self.equilibrium.keeps_reserve(*stretches, KEPT_RESERVE, NEAR_LOCKING):
+            return False
+        return not self.equilibrium.turns_inside_out(before.states, after.states)
 
     def _converged(self, snes: Any, iteration: int, norms: tuple[float, float, float]) -> int:
         """|R| <= absolute_tolerance + relative_tolerance * |nodal forces|: a scale that does not vanish in a hold."""
@@ -389,7 +354,13 @@ class GuardedNewton:
     def _tolerance(self) -> float:
         """Relative to the forces at the nodes, not below the rounding of forces that add up to nothing there."""
         relative = self.settings.relative_tolerance * self._force_scale
-        return self.settings.absolute_tolerance + max(relative, ROUNDINGS * self._stress_rounding * self._area)
+        return self.settings.absolute_tolerance + max(relative, ROUNDINGS * self._stress_rounding() * self._area)
+
+    def _stress_rounding(self) -> float:
+        """At the last admissible state."""
+        if self._rounding[0] != self._rounds_at:
+            self._rounding = self._rounds_at, stress_rounding(self._largest, self._rounds_at)
+        return self._rounding[1]
 
     def _failure_text(self, reason: int, extension: Extension) -> str:
         if reason >= 0 or self._lost:

@@ -144,12 +144,12 @@ class Change:
         unknown, equilibrium = self.newton.unknown.x.array, self.newton.equilibrium
         before = unknown.copy()
         self.set_fraction(done)
-        _, present = equilibrium.extension_and_stretches()
+        present = equilibrium.look().stretches
         while wanted > bound:
             self.set_fraction(done + wanted)
             unknown[:] = before + wanted * self._direction
-            extension, expected = equilibrium.extension_and_stretches()
-            if extension.admissible and equilibrium.keeps_reserve(present, expected, KEPT_RESERVE):
+            expected = equilibrium.look()
+            if expected.extension.admissible and equilibrium.keeps_reserve(present, expected.stretches, KEPT_RESERVE):
                 return wanted
             wanted /= 2
         unknown[:] = before

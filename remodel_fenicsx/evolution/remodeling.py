@@ -9,10 +9,10 @@ import ufl
 from numpy.typing import NDArray
 
 from remodel_fenicsx.evolution.compiled_tensor import TensorKernels, with_kernels
-from remodel_fenicsx.evolution.equilibrium import at_points, on_mesh, stress_rounding
+from remodel_fenicsx.evolution.parameters import Parameters, on_mesh, stress_rounding
 from remodel_fenicsx.evolution.pointwise import PointStresses
 from remodel_fenicsx.evolution.state import State
-from remodel_fenicsx.fem import coefficients, jit
+from remodel_fenicsx.fem import jit
 from remodel_fenicsx.tissue import spectral
 from remodel_fenicsx.tissue.cells import UnitCell, structure_tensor
 from remodel_fenicsx.tissue.drivers import DRIVERS, FRAMES, carried_axes
@@ -72,6 +72,7 @@ class RemodelingPass:
         self.state, self.settings = state, settings
         self.quadrature = state.cells.quadrature
         self.tissue = with_kernels(on_mesh(tissue, self.quadrature.mesh), state.comm)
+        self.parameters = Parameters(self.tissue, self.quadrature)
         self.driver, self.law, self.frame = DRIVERS[settings.driver], LAWS[settings.law], FRAMES[settings.frame]
         if settings.kappa == 0.0 and self.law.asks_kappa:  # cells that never move need no pass
             self.law = LAWS["none"]
@@ -104,7 +105,7 @@ class RemodelingPass:
             self.frame,
             noise,
             self.state.cells.initial_dimensions.reshape(-1, 3),
-            coefficients.point_values(self.tissue.end_to_end_length, self.quadrature).reshape(-1),
+            self.parameters.at_points().end_to_end_length,
             self.settings.kappa,
             spectral.PAIRINGS[self.settings.pairing],
             self.settings.rotation_time,
@@ -126,11 +127,11 @@ class RemodelingPass:
         residual
             Norm of the out-of-balance nodal forces, in the unit of force.
         """
-        rounding = stress_rounding(self.tissue, self.quadrature.mesh, self._max_chain_extension(F))
+        rounding = stress_rounding(self.parameters.largest(), self._max_chain_extension(F))
         return RESIDUAL_SHARE * residual / self._smallest_area + ROUNDINGS * rounding
 
     def _max_chain_extension(self, F: Array) -> float:
-        length = at_points(self.tissue, self.quadrature).locking_length
+        length = self.parameters.at_points().locking_length
         if length is None:
             return 0.0
         squared = self.kernels.squared_length(F, self.state.cells.point_cells) / length**2
@@ -150,7 +151,7 @@ class RemodelingPass:
     def followed(self, target: Target, duration: float, cells: UnitCell | None = None) -> UnitCell:
         """Cells of all points in one row, the present or others, after a time with this target. Changes nothing."""
         assert self.law.follow is not None
-        r0 = coefficients.point_values(self.tissue.end_to_end_length, self.quadrature).reshape(-1)
+        r0 = self.parameters.at_points().end_to_end_length
         return self.law.follow(cells or self.state.cells.point_cells, target, r0, self.settings.kappa * duration)
 
     @property
@@ -194,7 +195,7 @@ class RemodelingPass:
 
     def _energy_increment(self, F: Array, old: UnitCell, new: UnitCell) -> Array:
         """`Tissue.energy_increment` at all points, with the sums over the axes compiled."""
-        tissue = at_points(self.tissue, self.quadrature)
+        tissue = self.parameters.at_points()
         increment: Any
         if tissue.chain is None or tissue.repulsion.sum is not axes_sum:
             increment = tissue.energy_increment(F, old, new)

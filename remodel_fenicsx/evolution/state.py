@@ -73,9 +73,13 @@ class State:
         self._deformation_gradient = jit.expression(F, cells.quadrature.points)
         self.equilibrium_cells = CellField(cells.quadrature, "equilibrium_cell")
         self.settle_cells()
+        solved = self.equilibrium_cells
+        self._functions: dict[str, Any] = {}
+        self._arrays: dict[str, NDArray[np.float64]] = {}  # the functions' own memory
+        for function in (self.unknown, cells.dimensions, cells.axes, solved.dimensions, solved.axes):
+            self._add(function)
         self.time, self.number = 0.0, 0
         self.numbers: dict[str, float] = {}
-        self._remembered: list[Any] = []
         self.counts: dict[str, str] = {}
         # the body starts unloaded; a load that is there from t = 0 on comes with the first step
         loading.set(dict.fromkeys(loading.values, 0.0))
@@ -97,9 +101,10 @@ class State:
 
     def functions(self) -> dict[str, Any]:
         """Every dolfinx function of the state by its name."""
-        cells, solved = self.cells, self.equilibrium_cells
-        functions = (self.unknown, cells.dimensions, cells.axes, solved.dimensions, solved.axes)
-        return {function.name: function for function in (*functions, *self._remembered)}
+        return dict(self._functions)
+
+    def _add(self, function: Any) -> None:
+        self._functions[function.name], self._arrays[function.name] = function, function.x.array
 
     def remember(self, function: Any, count: str | None = None) -> None:
         """From now on a dolfinx function (with a name of its own) is part of the state.
@@ -118,9 +123,9 @@ class State:
         ValueError
             If the state has a function of this name.
         """
-        if function.name in self.functions():
+        if function.name in self._functions:
             raise ValueError(f"the state has a function {function.name!r} already")
-        self._remembered.append(function)
+        self._add(function)
         if count is not None:
             self.counts[function.name] = count
 
@@ -130,13 +135,13 @@ class State:
 
     def snapshot(self) -> Snapshot:
         """A copy of all values."""
-        arrays = {name: function.x.array.copy() for name, function in self.functions().items()}
+        arrays = {name: array.copy() for name, array in self._arrays.items()}
         return Snapshot(arrays, dict(self.loading.values), self.time, self.number, dict(self.numbers))
 
     def restore(self, snapshot: Snapshot) -> None:
         """Take all values from a snapshot."""
-        for name, function in self.functions().items():
-            function.x.array[:] = snapshot.arrays[name]
+        for name, array in self._arrays.items():
+            array[:] = snapshot.arrays[name]
         self.loading.set(snapshot.loads)
         self.time, self.number = snapshot.time, snapshot.number
         self.numbers = dict(snapshot.numbers)

@@ -21,32 +21,24 @@ class CellField:
     ----------
     dimensions, axes
         dolfinx quadrature functions of shape (3,) and (3, 3); row I of `axes` is n_I.
+    dimension_values, axis_values
+        l_I (cells, points, 3), and n_I as rows (cells, points, 3, 3): the functions' own memory.
+    point_cells
+        The cells of all points in one row, (cells * points, ...): the functions' own memory.
     """
 
     def __init__(self, quadrature: Quadrature, name: str):
         self.quadrature = quadrature
         self.dimensions = quadrature.function(f"{name}_dimensions", (3,))
         self.axes = quadrature.function(f"{name}_axes", (3, 3))
-
-    @property
-    def dimension_values(self) -> Array:
-        """l_I, shape (cells, points, 3): the functions' own memory."""
-        return self.quadrature.values(self.dimensions, (3,))
-
-    @property
-    def axis_values(self) -> Array:
-        """n_I as rows, shape (cells, points, 3, 3): the functions' own memory."""
-        return self.quadrature.values(self.axes, (3, 3))
+        self.dimension_values: Array = quadrature.values(self.dimensions, (3,))
+        self.axis_values: Array = quadrature.values(self.axes, (3, 3))
+        self.point_cells = UnitCell(self.dimension_values.reshape(-1, 3), self.axis_values.reshape(-1, 3, 3))
 
     @property
     def ufl_cell(self) -> UnitCell:
         """The cell as the energy takes it."""
         return UnitCell(self.dimensions, self.axes)
-
-    @property
-    def point_cells(self) -> UnitCell:
-        """The cells of all points in one row, (cells * points, ...): views of the functions' own memory."""
-        return UnitCell(self.dimension_values.reshape(-1, 3), self.axis_values.reshape(-1, 3, 3))
 
     def set(self, dimensions: Array, axes: Array) -> None:
         """Replace all dimensions (cells, points, 3) and axes (cells, points, 3, 3)."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Any
 
 import basix
@@ -13,6 +14,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from remodel_fenicsx.fem import jit
+from remodel_fenicsx.fem.ranks import of_all_ranks, over_ranks
 
 # the rule that the element wants; UFL's estimate for this energy is huge
 DEGREES = {
@@ -39,6 +41,8 @@ class Quadrature:
 
     Attributes
     ----------
+    shape
+        (elements of this rank with ghosts, points per element).
     coordinates
         Reference coordinates of the points, (elements, points, 3).
     volumes
@@ -63,6 +67,7 @@ class Quadrature:
         self.elements = np.arange(
             self.number_of_owned_elements + mesh.topology.index_map(mesh.topology.dim).num_ghosts, dtype=np.int32
         )
+        self.shape = len(self.elements), len(self.weights)
         x, jacobian = ufl.SpatialCoordinate(mesh), ufl.Jacobian(mesh)
         entries = [jacobian[i, j] for i in range(jacobian.ufl_shape[0]) for j in range(jacobian.ufl_shape[1])]
         values = ufl.as_vector([*x, ufl.JacobianDeterminant(mesh), *entries])
@@ -88,11 +93,6 @@ class Quadrature:
         """Volume measure at exactly these points."""
         return ufl.Measure("dx", domain=self.mesh, metadata={"quadrature_degree": self.degree})
 
-    @property
-    def shape(self) -> tuple[int, int]:
-        """(elements of this rank with ghosts, points per element)."""
-        return len(self.elements), len(self.weights)
-
     def function(self, name: str, value_shape: tuple[int, ...]) -> Any:
         """A dolfinx function with values of `value_shape` at the points."""
         element = basix.ufl.quadrature_element(self.element_kind, value_shape=value_shape, degree=self.degree)
@@ -112,15 +112,20 @@ class Quadrature:
 
     def integral(self, values: NDArray[np.float64]) -> float:
         """Integral over the body of values (elements, points), over all ranks."""
-        local = float(np.sum(self.owned(values) * self.owned(self.volumes)))
-        return self.mesh.comm.allreduce(local, MPI.SUM)
+        local = float((self.owned(values) * self.owned(self.volumes)).sum())
+        return float(over_ranks(self.mesh.comm, local, MPI.SUM))
 
     def mean(self, values: NDArray[np.float64], elements: NDArray[np.bool_] | None = None) -> float:
         """Volume mean of values (elements, points), over all elements or those selected by a mask (elements,)."""
-        chosen = np.ones(self.shape)
-        if elements is not None:
-            chosen *= elements[:, None]
+        if elements is None:
+            return self.integral(values) / self.volume
+        chosen = np.repeat(elements[:, None], self.shape[1], axis=1).astype(np.float64)
         return self.integral(values * chosen) / self.integral(chosen)
+
+    @cached_property
+    def volume(self) -> float:
+        """Of the body, over all ranks. Collective, the first time."""
+        return self.integral(np.ones(self.shape))
 
     def element_mean(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Volume mean over each element: (elements, points, ...) to (elements, ...)."""
@@ -130,7 +135,7 @@ class Quadrature:
     def maximum(self, values: NDArray[np.float64]) -> float:
         """Largest of values (elements, ...) over all ranks."""
         local = float(np.max(self.owned(values), initial=-np.inf))
-        return float(self.mesh.comm.allreduce(local, MPI.MAX))
+        return float(over_ranks(self.mesh.comm, local, MPI.MAX))
 
     def place_of_largest(self, values: NDArray[np.float64]) -> tuple[float, float, float]:
         """Reference place of the largest of values (elements, points), over all ranks."""
@@ -139,7 +144,7 @@ class Quadrature:
         if owned.size:
             point = self.coordinates[np.unravel_index(int(np.argmax(owned)), owned.shape)]
             local = (float(owned.max()), (float(point[0]), float(point[1]), float(point[2])))
-        place: tuple[float, float, float] = max(self.mesh.comm.allgather(local), key=lambda found: found[0])[1]
+        place: tuple[float, float, float] = max(of_all_ranks(self.mesh.comm, local), key=lambda found: found[0])[1]
         return place
 
     def minimum(self, values: NDArray[np.float64]) -> float:

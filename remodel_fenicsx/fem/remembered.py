@@ -2,46 +2,68 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, Generic, TypeVar
 
+import dolfinx.fem
 import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
+from ufl.corealg.traversal import traverse_unique_terminals
+
+from remodel_fenicsx.fem.ranks import over_ranks
 
 T = TypeVar("T")
 
 
 class Remembered(Generic[T]):
-    """The last value, as long as nothing has changed that it depends on. Collective, as what it spares may be.
+    """The last value, as long as nothing has changed that it depends on.
 
     Parameters
     ----------
     comm
-        Ranks that must agree on whether something has changed.
+        Ranks that must agree on whether something has changed: collective, as what it spares may be. None where each
+        rank has values of its own.
     expressions
         UFL: the value depends on their functions and constants, and on nothing else.
     """
 
-    def __init__(self, comm: MPI.Intracomm, *expressions: Any):
-        from ufl.algorithms.analysis import extract_coefficients, extract_constants
-
+    def __init__(self, comm: MPI.Intracomm | None, *expressions: Any):
         self._comm = comm
-        self._functions = {f for expression in expressions for f in extract_coefficients(expression)}
-        self._constants = {c for expression in expressions for c in extract_constants(expression)}
-        self._seen: list[NDArray[np.float64]] | None = None
+        terminals = {terminal for expression in expressions for terminal in traverse_unique_terminals(expression)}
+        functions = [terminal for terminal in terminals if isinstance(terminal, dolfinx.fem.Function)]
+        constants = [terminal for terminal in terminals if isinstance(terminal, dolfinx.fem.Constant)]
+        # their own memory; what is small is asked first, for one difference is enough
+        self._arrays: list[NDArray[np.float64]] = sorted((f.x.array for f in functions), key=lambda array: array.size)
+        self._numbers = [np.asarray(c.value) for c in constants]
+        self._seen: list[NDArray[np.float64]] = []
+        self._seen_numbers: list[bytes] | None = None
         self._value: T
 
     def __call__(self, make: Callable[[], T]) -> T:
         """The value, of `make` where it is not known yet."""
-        now = self._state()
-        known = self._seen is not None and all(map(np.array_equal, self._seen, now))
-        if self._comm.size > 1:
-            known = bool(self._comm.allreduce(known, MPI.LAND))
+        numbers = [number.tobytes() for number in self._numbers]
+        known = numbers == self._seen_numbers and all(map(_same, self._arrays, self._seen))
+        if self._comm is not None:
+            known = bool(over_ranks(self._comm, known, MPI.LAND))
         if not known:
-            self._seen = [array.copy() for array in now]
+            self.forget()  # should `make` fail
             self._value = make()
+            self._remember(numbers)
         return self._value
 
-    def _state(self) -> Sequence[NDArray[np.float64]]:
-        return [f.x.array for f in self._functions] + [np.asarray(c.value) for c in self._constants]
+    def forget(self) -> None:
+        """The next value is made anew."""
+        self._seen_numbers = None
+
+    def _remember(self, numbers: list[bytes]) -> None:
+        if not self._seen:
+            self._seen = [array.copy() for array in self._arrays]
+        for array, seen in zip(self._arrays, self._seen, strict=True):
+            if not _same(array, seen):
+                seen[:] = array
+        self._seen_numbers = numbers
+
+
+def _same(one: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
+    return bool((one == other).all())

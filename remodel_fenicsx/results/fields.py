@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.shape import Shape
-from remodel_fenicsx.evolution.equilibrium import at_points
+from remodel_fenicsx.evolution.parameters import at_points
 from remodel_fenicsx.evolution.pointwise import PointStresses
 from remodel_fenicsx.evolution.state import State
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher

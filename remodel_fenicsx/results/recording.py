@@ -10,13 +10,14 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from remodel_fenicsx.schema.times import same_time
 
 if TYPE_CHECKING:
+    import h5py
+
     from remodel_fenicsx.scene.scene import Scene
 
 Array = NDArray[np.float64]
@@ -196,6 +197,8 @@ class Recording:
 
     @contextmanager
     def _fields_file(self) -> Iterator[h5py.Group]:
+        import h5py  # late: a run without fields needs none
+
         path = self.path / FIELDS
         if not path.exists():
             raise RecordingError(f"{self.path}: the run recorded no fields, there is no {FIELDS}")

@@ -11,13 +11,15 @@ import os
 from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import h5py
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from remodel_fenicsx.results.staged_file import StagedFile, signals_held_back
+
+if TYPE_CHECKING:
+    import h5py  # late everywhere: a run without fields needs none
 
 Array = NDArray[Any]
 Fields = Mapping[str, ArrayLike]
@@ -89,6 +91,8 @@ class TransientGrid:
         self._last_time = -np.inf
         self._point_blocks = 1  # block 0 of Points is the reference configuration
         self._datasets: dict[str, h5py.Dataset] = {}
+        import h5py
+
         with signals_held_back():
             self._staged = StagedFile(self.path)
             self._file = h5py.File(self._staged, "w", libver=_VERSIONS)
@@ -116,6 +120,8 @@ class TransientGrid:
         ValueError
             If it is damaged or of another kind; one line.
         """
+        import h5py
+
         grid = cls.__new__(cls)
         grid.path, grid._field_dtype, grid._datasets = Path(path), field_dtype, {}
         with signals_held_back():
@@ -376,4 +382,6 @@ def _write_block(dataset: h5py.Dataset, number: int, block: Array) -> None:
         return
     place = target.get_space()
     place.select_hyperslab((start, *rest), block.shape)
+    import h5py
+
     target.write(h5py.h5s.create_simple(block.shape), place, block)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import functools
 import math
 import re
+import tokenize
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
@@ -169,7 +170,7 @@ def _unit(text: str) -> pint.Unit | None:
         return None
     try:
         return _registry().parse_units(re.sub("^/", "1 /", text.replace("·", "*")))
-    except (pint.PintError, ValueError):  # not defined, or not to be understood
+    except (pint.PintError, ValueError, tokenize.TokenError):  # not defined, or not to be understood
         return None
 
 

@@ -9,16 +9,8 @@ import sys
 import time as clock
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from datetime import timedelta
 from types import TracebackType
 from typing import Any
-
-from rich.cells import cell_len, set_cell_size
-from rich.console import Console
-from rich.progress import Progress as RichProgress, ProgressColumn, Task, TaskID
-from rich.progress_bar import ProgressBar
-from rich.table import Table
-from rich.text import Text
 
 LOGGER = "remodel_fenicsx"
 LOG_FORMAT = "%(asctime)s %(levelname)s %(message)s"
@@ -55,21 +47,14 @@ class Progress:
         self._started = False
         self._pending: str | None = None  # the newest line that was not printed
         self._silent = comm_rank != 0
-        self._bar: RichProgress | None = None
-        self._task = TaskID(0)
+        self._bar: Any = None  # `bar.Bar`, on a terminal
 
     def __enter__(self) -> Progress:
         self._start = clock.monotonic()
         if not self._silent and _is_terminal():
-            # rich leads what others print, warnings of the log for one, around the bar; what goes to a file stays there
-            console = Console(stderr=True)
-            self._bar = RichProgress(
-                _Line(console), console=console, refresh_per_second=4, redirect_stdout=sys.stdout.isatty()
-            )
-            self._task = self._bar.add_task(
-                self._title, total=self._total, completed=self._done, time="starting", loads="", newton="", left=""
-            )
-            self._bar.start()
+            from remodel_fenicsx.system.bar import Bar  # late: most runs have no terminal
+
+            self._bar = Bar(self._title, self._total, self._done)
         return self
 
     def __exit__(
@@ -105,7 +90,7 @@ class Progress:
         if message is not None:
             self.message(message)
         if self._bar is not None:
-            self._bar.update(self._task, completed=index, left=left, **state)
+            self._bar.update(index, left=left, **state)
             return
         self._pending = f"{self._title}: " + _joined(f"step {index}/{self._total}", *state.values(), left)
         now = clock.monotonic()
@@ -117,7 +102,7 @@ class Progress:
         """Print a line above the bar, or between the plain lines."""
         if self._bar is not None:
             with suppress(OSError):
-                self._bar.console.print(Text(text), soft_wrap=True)
+                self._bar.say(text)
         elif not self._silent:
             self._print(f"{self._title}: {text}")
 
@@ -130,42 +115,6 @@ class Progress:
 
     def _print(self, line: str) -> None:
         announce(line)
-
-
-class _Line(ProgressColumn):
-    """The whole line: title, bar, step, state, time so far, time left; what counts least goes where it is narrow."""
-
-    _WIDEST_BAR, _NARROWEST_BAR = 24, 10
-    _GAPS = 2  # one on each side of the bar
-    # a line that reaches the edge is broken by the ^C that a terminal shows, and then stands there twice
-    _MARGIN = 3
-
-    def __init__(self, console: Console):
-        super().__init__()
-        self._console = console
-
-    def render(self, task: Task) -> Table:
-        """The line, for the terminal's present width."""
-        title = task.description
-        room = self._console.width - self._MARGIN - self._GAPS - cell_len(title)
-        texts = [_behind_bar(task, extras) for extras in (4, 3, 2, 1, 0)]
-        text = next((text for text in texts if cell_len(text) <= room - self._WIDEST_BAR), texts[-1])
-        bar_width = min(self._WIDEST_BAR, max(self._NARROWEST_BAR, room - cell_len(text)))
-        excess = bar_width + cell_len(text) - room
-        if excess > 0:
-            title = set_cell_size(title, max(0, cell_len(title) - excess - 1)) + "…"
-        line = Table.grid(padding=(0, 1, 0, 0))
-        line.add_row(Text(title), ProgressBar(task.total, task.completed, width=bar_width), Text(text, no_wrap=True))
-        return line
-
-
-def _behind_bar(task: Task, extras: int) -> str:
-    """Step and time left, and so many of time, time so far, Newton iterations and loads."""
-    shown = ("time", "elapsed", "newton", "loads")[:extras]
-    state = _joined(*(task.fields[name] for name in ("time", "loads", "newton") if name in shown))
-    elapsed = str(timedelta(seconds=int(task.elapsed or 0))) if "elapsed" in shown else ""
-    number = f"{task.completed:.0f}/{task.total:.0f}"
-    return " ".join(filter(None, [number, state, elapsed, task.fields["left"]]))
 
 
 def _joined(*parts: str) -> str:

@@ -15,6 +15,9 @@ void without_noise(int64_t n, const double *tensors, const double *axes, const d
 void stretches(int64_t n, const double *F, const double *dimensions, const double *axes, double *squared, double *sum);
 void parts(int64_t n, const double *both, double *F, double *driver);
 void structure(int64_t n, const double *dimensions, const double *axes, double *tensor);
+int64_t extension(int64_t n, const double *states, const double *length, double *stretch, double *smallest);
+int64_t may_turn(int64_t n, const double *before, const double *after, uint8_t *found);
+double room(int64_t n, const double *states, const double *stretch, const double *chain, double far);
 """
 
 SOURCE = r"""
@@ -243,5 +246,57 @@ void structure(int64_t n, const double *dimensions, const double *axes, double *
             for (int j = 0; j < 3; ++j)
                 tensor[9 * at + 3 * i + j] = s[i] * s[j] + s[3 + i] * s[3 + j] + s[6 + i] * s[6 + j];
     }
+}
+
+/* The state of a point as its limits see it: r^2, J and F, eleven numbers (`Equilibrium.states`). */
+#define STATE 11
+
+static inline double squared(const double *F)
+{
+    double sum = 0.0;
+    for (int i = 0; i < 9; ++i) sum += F[i] * F[i];
+    return sum;
+}
+
+/* r/L, infinite where it is no number; the point where it is largest; the smallest J, minus infinity if one is none. */
+int64_t extension(int64_t n, const double *states, const double *length, double *stretch, double *smallest)
+{
+    int64_t worst = 0;
+    *smallest = INFINITY;
+    for (int64_t at = 0; at < n; ++at) {
+        const double ratio = sqrt(states[STATE * at]) / length[at], J = states[STATE * at + 1];
+        stretch[at] = isfinite(ratio) ? ratio : INFINITY;
+        if (stretch[at] > stretch[worst]) worst = at;
+        if (!isfinite(J) || J < *smallest) *smallest = isfinite(J) ? J : -INFINITY;
+    }
+    return worst;
+}
+
+/* Marks where a change of F is so large that F may become singular on the straight way: |F^-1| <= F:F / (2 det F), and
+   nearer than its inverse nothing is singular. Returns how many there are. */
+int64_t may_turn(int64_t n, const double *before, const double *after, uint8_t *found)
+{
+    int64_t count = 0;
+    for (int64_t at = 0; at < n; ++at) {
+        const double *F = before + STATE * at + 2, *G = after + STATE * at + 2, J = F[-1];
+        double size = 0.0;
+        for (int i = 0; i < 9; ++i) size += (G[i] - F[i]) * (G[i] - F[i]);
+        found[at] = J <= 0.0 || sqrt(size) * squared(F) >= 2.0 * J;
+        count += found[at];
+    }
+    return count;
+}
+
+/* Largest |dF| at which J > 0 and r/L < far at every point; chain: |l|/L. */
+double room(int64_t n, const double *states, const double *stretch, const double *chain, double far)
+{
+    double least = INFINITY;
+    for (int64_t at = 0; at < n; ++at) {
+        const double volume = 2.0 * states[STATE * at + 1] / squared(states + STATE * at + 2);
+        const double length = (far - stretch[at]) / chain[at];
+        const double both = volume < length ? volume : length;
+        least = both < least ? both : least;
+    }
+    return least;
 }
 """
