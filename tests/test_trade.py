@@ -109,8 +109,14 @@ def test_random_cells_are_compared_in_the_mean() -> None:
             result = replace(result, noise=0.01, single=single)
         results.append(result)
     assert {len(result.setting.seeds) for result in results} == {1, rungs.SEEDS}
-    for row in estimated(results)[0]:
+    rows, notes = estimated(results)
+    for row in rows:
         assert row.angle_error < 5.0
+    # what steps cost does not drown in the noise of cells: 0.4 of SMOOTH for a step of one
+    cost = 0.4 * typical(SMOOTH)
+    words = next(note for note in notes if note.startswith("steps alone, on the same cells"))
+    assert "an order shows" in words and f"step 2.5 {2.5 * cost:.2g}, " in words and f"step 1 {cost:.2g}, " in words
+    assert not any("same cells" in note for note in estimated([made_up(setting) for setting in ladder(artery())])[1])
 
 
 def test_the_front() -> None:

@@ -101,7 +101,7 @@ def estimated(results: Sequence[Result]) -> tuple[list[Row], list[str]]:
 
     What is not known of that guess, where a sweep shows no order, counts as an error too.
     """
-    notes: list[str] = []
+    notes = _about_steps_on_the_same_cells(results)
     results = _on_the_mean(results)
     fixed = [result for result in results if result.setting.step is not None]
     if not fixed:
@@ -221,6 +221,26 @@ def _words(factor: str, words: str, found: Limit) -> str:
         f"{factor}: no order seen ({words}), the last two differ by {typical(found.last):.2g} degrees: the estimates "
         "are differences to the finest, and no better than that"
     )
+
+
+def _about_steps_on_the_same_cells(results: Sequence[Result]) -> list[str]:
+    """What steps alone cost, where the noise of random cells hides it: all of them have the first seed's cells."""
+    if not any(result.noise for result in results):
+        return []
+    by_mesh: dict[tuple[str, int, int], list[Result]] = {}
+    for result in results:
+        by_mesh.setdefault(result.setting.mesh, []).append(replace(result, angles=result.single[0]))
+    same = max(by_mesh.values(), key=len)  # the mesh on which most steps were tried
+    sweep = _halved({result.setting.step: result for result in same if result.setting.step is not None})
+    if len(sweep) < 2:
+        return []
+    found = limit([result.angles for result in sweep])
+    exact, finest = sweep[-1].angles + found.beyond, sweep[-1].setting
+    costs = ", ".join(
+        f"{r.setting.steps_in_words} {typical(r.angles - exact):.2g}" for r in same if r.setting is not finest
+    )
+    last = "an order shows" if found.trusted else f"no order shows, {finest.steps_in_words} counts as exact"
+    return [f"steps alone, on the same cells ({_mesh_in_words(sweep)}; {last}), cost in degrees: {costs}"]
 
 
 def _about_kinematics(results: Sequence[Result]) -> list[str]:

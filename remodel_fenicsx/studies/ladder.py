@@ -68,11 +68,15 @@ class Setting:
         steps = time.number_of_steps if time.tolerance is None else DEGREES_PER_RUN / time.tolerance
         return SECONDS_PER_POINT * step_cost(self.scene, self.scene.model.kinematics) * steps
 
+    @property
+    def steps_in_words(self) -> str:
+        """How long they are, or their tolerance."""
+        return f"step {self.step:g}" if self.step is not None else f"tolerance {self.scene.time.tolerance:g}"
+
     def in_words(self) -> str:
         """Kinematics, mesh and steps on a line."""
         kinematics, refinement, degree = self.mesh
-        step = f"step {self.step:g}" if self.step is not None else f"tolerance {self.scene.time.tolerance:g}"
-        return f"{kinematics:12} refinement {refinement} degree {degree} {step}"
+        return f"{kinematics:12} refinement {refinement} degree {degree} {self.steps_in_words}"
 
 
 def ladder(scene: Scene) -> list[Setting]:
