@@ -1,0 +1,40 @@
+"""The paper's mesh at its quadrature points: what means over places smooth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from remodel_fenicsx.scene.scene import Scene
+from remodel_fenicsx.simulation import Simulation
+from tests.reference.radial import solve_radial
+
+Array = NDArray[np.float64]
+
+
+def run(scene: Scene, folder: Path) -> None:
+    """Errors of the fibre angle in degrees at the end, by radius, against the reference with the scene's own steps."""
+    kept = folder / "places.npz"
+    if kept.exists():
+        return
+    simulation = Simulation(scene.with_values({"model.kinematics": "sector", "output.fields": False}), MPI.COMM_SELF)
+    for _ in simulation.steps():
+        pass
+    coordinates, cells = simulation.quadrature.coordinates, simulation.cells
+    angles = scene.geometry.fibre_angle(cells.dimension_values, cells.axis_values, coordinates).ravel()
+    radii = np.hypot(coordinates[..., 0], coordinates[..., 1]).ravel()
+    simulation.close()
+    exact = solve_radial(end=scene.time.end, step=scene.time.step)
+    error = np.abs(angles - np.interp(radii, exact.points, exact.fibre_angle()))
+    np.savez(kept, radii=radii, error=error)
+
+
+def words(folder: Path) -> str:
+    """What the page says of it."""
+    with np.load(folder / "places.npz") as kept:
+        radii, error = kept["radii"], kept["error"]
+    worst = radii[error.argmax()]
+    return f"{error.mean():.1f} degrees in the mean over the points, {error.max():.1f} in the front, at R = {worst:.2g}"
