@@ -162,7 +162,7 @@ class Equilibrium:
         Parameters
         ----------
         before, after
-            r/L at the points, from `extension_and_stretches`.
+            r/L at the points, `Look.stretches`.
         """
         lost = bool(np.any((after > nearer_than) & (1 - after < share * (1 - before))))
         return not over_ranks(self.comm, lost, MPI.LOR)

@@ -33,7 +33,6 @@ class Limits:
         self._unknown: Array = state.unknown.x.array
         self.bounded = bounded and not state.kinematics.reduced and state.dilatation.jacobians().shape[1] == 0
         self._gain = largest_gradient_of_displacement(equilibrium.quadrature) if self.bounded else np.inf
-        self.looks = 0
         self.forget()
 
     def forget(self) -> None:
@@ -47,7 +46,6 @@ class Limits:
         if not self._is_here():
             self._place = self._unknown.copy()
             self._found = self.equilibrium.look()
-            self.looks += 1
             if self.bounded:
                 self._room, self._travelled = self._room_around(self._found), 0.0
         return self._found

@@ -44,7 +44,11 @@ def gmsh_version() -> str:
     spec = importlib.util.find_spec("gmsh")
     head = Path(spec.origin).read_text(encoding="utf-8") if spec is not None and spec.origin else ""
     found = re.search(r'^GMSH_API_VERSION = "(.+)"$', head, re.MULTILINE)
-    return found[1] if found else "unknown"
+    if found is not None:
+        return found[1]
+    import gmsh
+
+    return str(gmsh.__version__)
 
 
 def reason_unusable() -> str | None:
