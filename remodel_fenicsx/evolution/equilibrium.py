@@ -21,6 +21,7 @@ from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.ranks import of_all_ranks, over_ranks
 from remodel_fenicsx.fem.remembered import Remembered
 from remodel_fenicsx.fem.second_derivative import second_derivative
+from remodel_fenicsx.fem.tangent_matrix import assemble_matrix, create_matrix
 from remodel_fenicsx.tissue.cells import UnitCell
 from remodel_fenicsx.tissue.energy import Tissue
 from remodel_fenicsx.tissue.operators import passes_through_zero
@@ -230,18 +231,12 @@ class Equilibrium:
 
     def create_matrix(self) -> Any:
         """An empty matrix with the pattern of the tangent."""
-        return dolfinx.fem.petsc.create_matrix(self.tangent_forms[0])
+        return create_matrix(self.tangent_forms[0])
 
     def assemble_tangent(self, matrix: Any) -> None:
         """Derivative of the residual at the present unknowns, one on the diagonal where they are prescribed."""
-        matrix.zeroEntries()
         self._update_tangent()
-        for form in self.tangent_forms:
-            # mypy sees the other overload of a single-dispatch function
-            dolfinx.fem.petsc.assemble_matrix(
-                matrix, form, bcs=self.state.loading.boundary_conditions  # type: ignore[misc]
-            )
-            matrix.assemble()
+        assemble_matrix(matrix, self.tangent_forms, self.state.loading.boundary_conditions)
 
     def _update_tangent(self) -> None:
         if self.pointwise is not None:
