@@ -22,7 +22,8 @@ WORTH = 12  # iterations that a new factor must save: it costs about as much as 
 OVER = 3  # iterations over which the rate of convergence is taken
 SLOW_STEP = 8  # iterations after which the next step starts with a new factor
 MOST_RENEWALS = 6  # of one solve: what needs more is no matter of old factors
-MANY_KRYLOV = 12  # iterations of CG after which the next tangent is factorised
+FIRST_ACCURACY, MOST_ACCURACY, LEAST_ACCURACY = 1e-3, 1e-10, 1e-2  # of a linear system's solution, relative
+ENOUGH = 0.3  # of the tolerance: what the last linear system may leave of the residual
 
 
 class KeptFactor:
@@ -241,13 +242,48 @@ class Lagged(_Kept):
 
 
 class Exact(_Kept):
-    """The tangent of every iteration, by CG with the factors of an earlier one."""
+    """The tangent of every iteration, by GMRES with the factors of an earlier one: any tangent, any factors.
+
+    Systems are solved as accurately as Newton's method has use for. Factors are renewed where a system takes more
+    iterations than the average since they were made, their own cost included: sooner or later would both cost more.
+    """
+
+    def __init__(self, equilibrium: Equilibrium, snes: Any, matrix: Any, options: ProblemOptions):
+        super().__init__(equilibrium, snes, matrix, options)
+        self._sets_tolerance = "ksp_rtol" not in options.given
+        self._systems = self._iterations = 0  # since the factors were made
+        self._before = np.inf  # norm of the residual at the last system of this solve
+
+    def begin(self) -> None:
+        self._before = np.inf
 
     def tangent(self, norm: float, tolerance: float) -> None:
         EveryTangent.renew(self)
-        many = self.snes.getKSP().getIterationNumber() > MANY_KRYLOV
-        if self._always or many or self.factor.preconditioner is None:
+        solver = self.snes.getKSP()
+        if self._always or self.factor.preconditioner is None or self._costs_more(solver.getIterationNumber()):
             self._factorise()
+            self._systems = self._iterations = 0
+        if self._sets_tolerance:
+            solver.setTolerances(rtol=useful_accuracy(norm, self._before, tolerance))
+        self._before = norm
+
+    def _costs_more(self, last: int) -> bool:
+        """Whether the last system took more than the average of all since the factors were made, these included."""
+        self._systems, self._iterations = self._systems + 1, self._iterations + last
+        return last * self._systems > WORTH + self._iterations
+
+
+def useful_accuracy(norm: float, before: float, tolerance: float) -> float:
+    """Relative accuracy of a linear system: what it does not solve is below what Newton's method leaves.
+
+    Parameters
+    ----------
+    norm, before, tolerance
+        Of the residual, of the one before (infinite for the first system), and the one that is asked for.
+    """
+    if not np.isfinite(before):
+        return FIRST_ACCURACY
+    return float(np.clip(max((norm / before) ** 2, ENOUGH * tolerance / norm), MOST_ACCURACY, LEAST_ACCURACY))
 
 
 @contextmanager

@@ -18,7 +18,7 @@ METHODS: dict[str, dict[str, Any]] = {
         "mat_mumps_icntl_33": 1,  # the determinant, whose sign tells of unstable equilibria; costs nothing
     },
     LAGGED: {"snes_type": "newtonls", "snes_linesearch_type": "basic", "ksp_type": "preonly"},
-    EXACT: {"snes_type": "newtonls", "snes_linesearch_type": "basic", "ksp_type": "cg", "ksp_rtol": 1e-4},
+    EXACT: {"snes_type": "newtonls", "snes_linesearch_type": "basic", "ksp_type": "fgmres", "ksp_max_it": 60},
     "iterative": {
         "snes_type": "newtonls",
         "snes_linesearch_type": "basic",
@@ -37,7 +37,7 @@ MEANINGS = {
     "direct": "Newton's method, each system factorised by MUMPS; runs on so many ranks are the same "
     "to the last digit",
     LAGGED: "few tangents are factorised, and quasi-Newton steps (L-BFGS) make up for it",
-    EXACT: "a new tangent in every iteration, its system solved by CG with an earlier factor",
+    EXACT: "a new tangent in every iteration, its system solved by GMRES with an earlier factor",
     "iterative": "Newton's method with CG and algebraic multigrid (GAMG)",
 }
 """In words, for docs/scene.md; those of one's own need none."""

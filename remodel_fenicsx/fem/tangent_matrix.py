@@ -33,11 +33,10 @@ def create_matrix(form: Any) -> Any:
 def assemble_matrix(matrix: Any, forms: Sequence[Any], conditions: Sequence[Any]) -> None:
     """The sum of compiled bilinear forms; zero in the rows and columns of conditions, one on their diagonal."""
     matrix.zeroEntries()
-    shared = matrix.getAttr(SHARED)
+    target: Any = matrix.getAttr(SHARED)
+    assemble: Any = dolfinx.fem.assemble_matrix  # mypy sees one overload of a single-dispatch function
+    if target is None:
+        target, assemble = matrix, dolfinx.fem.petsc.assemble_matrix
     for form in forms:
-        if shared is None:
-            # mypy sees the other overload of a single-dispatch function
-            dolfinx.fem.petsc.assemble_matrix(matrix, form, bcs=conditions)  # type: ignore[misc]
-        else:
-            dolfinx.fem.assemble_matrix(shared, form, bcs=list(conditions))
+        assemble(target, form, bcs=list(conditions))
         matrix.assemble()
