@@ -61,6 +61,8 @@ CONVERGENCE = {
     degree: tuple(Setting(divisions=mesh, degree=degree, end=40.0) for mesh in meshes)
     for degree, meshes in MESHES.items()
 }
+# to the end of the ramp, where the errors of the radii are largest
+COARSE = tuple(Setting(divisions=mesh, degree=1, end=26.0) for mesh in ((4, 2, 1), (8, 4, 1), (16, 8, 1)))
 
 
 @dataclass(frozen=True)
@@ -178,8 +180,8 @@ def beyond_a_shift(setting: Setting, shift: float) -> float:
     return float(np.max(np.maximum(run.angle - band.max(axis=1), band.min(axis=1) - run.angle)))
 
 
-def convergence(degree: int) -> tuple[np.ndarray, np.ndarray]:
+def convergence(ladder: tuple[Setting, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Errors of inner radius, outer radius and mean angle by mesh, (3, 3), and the orders between them, (2, 3)."""
-    found = [errors(setting) for setting in CONVERGENCE[degree]]
+    found = [errors(setting) for setting in ladder]
     table = np.array([[error.inner_radius, error.outer_radius, error.mean] for error in found])
     return table, np.log2(table[:-1] / table[1:])

@@ -12,10 +12,13 @@ import pytest
 import ufl
 from mpi4py import MPI
 
+from remodel_fenicsx.body import cube
+from remodel_fenicsx.evolution.blend import shares
+from remodel_fenicsx.evolution.equilibrium import Equilibrium
 from remodel_fenicsx.fem import jit
-from remodel_fenicsx.fem.kinematics import FullKinematics
-from remodel_fenicsx.scene.parameters import Material
+from remodel_fenicsx.scene.parameters import Cells, Material
 from remodel_fenicsx.tissue.cells import UnitCell
+from tests import parts
 
 Array = npt.NDArray[np.float64]
 
@@ -272,47 +275,38 @@ def test_equal_dimensions_are_isotropic_only_along_the_principal_axes(points: Po
 
 
 @pytest.fixture(scope="module")
-def forms() -> tuple:
-    """Energy, residual and tangent of a cube of 48 tetrahedra with random, blended cells; their kernels are small."""
-    mesh = dolfinx.mesh.create_unit_cube(MPI.COMM_SELF, 2, 2, 2)
-    space = dolfinx.fem.functionspace(mesh, ("Lagrange", 1, (3,)))
-    u = dolfinx.fem.Function(space)
-    cells, rng = [], np.random.default_rng(5)
-    for weight in (0.3, 0.7):
-        functions = []
-        for shape in ((3,), (3, 3)):
-            element = basix.ufl.quadrature_element("tetrahedron", value_shape=shape, degree=1)
-            functions.append(dolfinx.fem.Function(dolfinx.fem.functionspace(mesh, element)))
+def blended() -> Equilibrium:
+    """A cube of 48 tetrahedra with two random cells at each point; the kernels are those of a run on tetrahedra."""
+    made = parts.body(cube(refinement=2, element="tetrahedron", comm=MPI.COMM_SELF), Cells(initial="isotropic"))
+    state, rng = made.state(), np.random.default_rng(5)
+    old, new = state.equilibrium_cells, state.cells
+    for cells in (old, new):
         _, l, n = random_state("orthotropic")  # noqa: E741
         order = rng.permutation(len(l))[:48]
-        functions[0].x.array[:], functions[1].x.array[:] = l[order].ravel(), n[order].ravel()
-        cells.append(UnitCell(functions[0], functions[1], weight))
-    F = FullKinematics().deformation_gradient(u)
-    energy = MATERIAL.tissue(R0).strain_energy(F, cells) * ufl.dx(metadata={"quadrature_degree": 1})
-    residual = ufl.derivative(energy, u)
-    return u, jit.form(energy), jit.form(residual), jit.form(ufl.derivative(residual, u))
+        cells.set(l[order].reshape(cells.dimension_values.shape), n[order].reshape(cells.axis_values.shape))
+    theta = dolfinx.fem.Constant(made.domain.mesh, 0.7)
+    return Equilibrium(state, MATERIAL.tissue(R0), shares(old.ufl_cell, new.ufl_cell, theta))
 
 
-def assembled(forms: tuple, values: Array) -> tuple[float, Array, Array]:
+def assembled(equilibrium: Equilibrium, values: Array) -> tuple[float, Array, Array]:
     """Energy, residual and dense tangent at nodal displacements."""
-    u, energy, residual, tangent = forms
-    u.x.array[:] = values
+    equilibrium.state.unknown.x.array[:] = values
+    (residual,), (tangent,) = equilibrium.internal_forms, equilibrium.tangent_forms
     matrix = dolfinx.fem.assemble_matrix(tangent)
     matrix.scatter_reverse()
-    total = float(np.real(dolfinx.fem.assemble_scalar(energy)))
-    return total, dolfinx.fem.assemble_vector(residual).array.copy(), matrix.to_dense()
+    return equilibrium.stored_energy(), dolfinx.fem.assemble_vector(residual).array.copy(), matrix.to_dense()
 
 
-def test_taylor_remainders_of_energy_residual_and_tangent(forms: tuple) -> None:
+def test_taylor_remainders_of_energy_residual_and_tangent(blended: Equilibrium) -> None:
     """|W(u+hv) - W - h R.v| = O(h^2), - h^2/2 v.K v = O(h^3); |R(u+hv) - R - h K v| = O(h^2)."""
     rng = np.random.default_rng(6)
-    size = len(forms[0].x.array)
+    size = len(blended.state.unknown.x.array)
     state, direction = rng.uniform(-0.04, 0.04, size), rng.uniform(-0.04, 0.04, size)
-    energy, residual, tangent = assembled(forms, state)
+    energy, residual, tangent = assembled(blended, state)
     steps = 2.0 ** -np.arange(2, 7)
     first, second, third = [], [], []
     for h in steps:
-        new_energy, new_residual, _ = assembled(forms, state + h * direction)
+        new_energy, new_residual, _ = assembled(blended, state + h * direction)
         first.append(abs(new_energy - energy - h * residual @ direction))
         second.append(abs(new_energy - energy - h * residual @ direction - h**2 / 2 * direction @ tangent @ direction))
         third.append(np.linalg.norm(new_residual - residual - h * tangent @ direction))
@@ -323,10 +317,9 @@ def test_taylor_remainders_of_energy_residual_and_tangent(forms: tuple) -> None:
     np.testing.assert_allclose(tangent, tangent.T, atol=1e-12 * np.max(np.abs(tangent)))
 
 
-def test_rigid_motion_has_no_force(forms: tuple) -> None:
-    u = forms[0]
-    x = u.function_space.tabulate_dof_coordinates()
+def test_rigid_motion_has_no_force(blended: Equilibrium) -> None:
+    x = blended.state.unknown.function_space.tabulate_dof_coordinates()
     motion = x @ np.array(QUARTER_TURN).T - x + [0.3, -0.2, 0.1]
-    energy, residual, _ = assembled(forms, motion.ravel())
+    energy, residual, _ = assembled(blended, motion.ravel())
     np.testing.assert_allclose(residual, 0.0, atol=1e-13)
-    assert energy == pytest.approx(assembled(forms, np.zeros(x.size))[0], rel=1e-13)
+    assert energy == pytest.approx(assembled(blended, np.zeros(x.size))[0], rel=1e-13)

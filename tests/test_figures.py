@@ -577,18 +577,28 @@ def test_a_recording_gives_back_what_was_run(tiny_run: Recording) -> None:
     assert np.all(snapshot.fields["cell_dimensions"][:, 0] >= snapshot.fields["cell_dimensions"][:, 1])
 
 
-def test_a_snapshot_is_really_drawn(tiny_run: Recording) -> None:
+@pytest.fixture(scope="module")
+def pictures(tiny_run: Recording) -> list[np.ndarray]:
+    """Of the tendon with and without chains, of chains on the near side and on the far one; drawn by one process."""
     snapshot = snapshots.Snapshot.of(tiny_run, 2.0)
     middle = (0.0, 0.0, snapshot.deformed[:, 2].max() / 2)
     view = rendering.View((0.3, -1.0, 0.14), middle, 14.0, (120, 320))
     patches = bodies.body(snapshot)
-    both, bare = rendering.render([rendering.Picture(view, patches), rendering.Picture(view, patches[:1])])
+    _, ribbons = bodies.body(two_hexahedra())  # on the face x = 3
+    sides = [rendering.View((side, 0.0, 0.0), (3.0, 0.0, 1.0), 2.0, (160, 160)) for side in (1.0, -1.0)]
+    wanted = [(view, patches), (view, patches[:1]), *((side, [ribbons]) for side in sides)]
+    return rendering.render([rendering.Picture(*one) for one in wanted])
+
+
+def test_a_snapshot_is_really_drawn(tiny_run: Recording, pictures: list[np.ndarray]) -> None:
+    both, bare, *_ = pictures
+    length = snapshots.Snapshot.of(tiny_run, 2.0).deformed[:, 2].max()
     assert both.shape == bare.shape == (320, 120, 3)
     assert np.all(both[0, 0] == 255)
     body = np.any(bare < 245, axis=2)
     # length along z of the body over the height of the picture, its width over the same; seen nearly from the side
     rows, columns = np.flatnonzero(body.any(axis=1)), np.flatnonzero(body.any(axis=0))
-    assert np.ptp(rows) / 320 == pytest.approx(2 * middle[2] / 14.0, abs=0.06)
+    assert np.ptp(rows) / 320 == pytest.approx(length / 14.0, abs=0.06)
     assert np.ptp(columns) / 320 == pytest.approx(2 * math.sqrt(10 / math.pi) / 14.0, abs=0.03)
     red, green, blue = np.moveaxis(bare[body].astype(int), -1, 0)
     assert np.mean(red - blue > 60) > 0.1 and np.mean(blue - red > 40) > 0.1
@@ -598,10 +608,8 @@ def test_a_snapshot_is_really_drawn(tiny_run: Recording) -> None:
     assert 0.02 < dark.sum() / body.sum() < 0.4 and not np.any(np.all(bare < 70, axis=2))
 
 
-def test_chains_on_the_far_side_are_not_drawn() -> None:
-    _, ribbons = bodies.body(two_hexahedra())  # on the face x = 3
-    views = [rendering.View((side, 0.0, 0.0), (3.0, 0.0, 1.0), 2.0, (160, 160)) for side in (1.0, -1.0)]
-    front, behind = rendering.render([rendering.Picture(view, [ribbons]) for view in views])
+def test_chains_on_the_far_side_are_not_drawn(pictures: list[np.ndarray]) -> None:
+    *_, front, behind = pictures
     assert front.min() < 70 and np.all(behind == 255)
 
 

@@ -218,7 +218,8 @@ def test_a_load_that_a_scene_does_not_name_is_zero() -> None:
 
 
 # ---------------------------------------------------------------- a mesh of the user's
-TUBE = {"geometry": {"shape": "tube", "inner_radius": 1.0, "outer_radius": 2.0, "length": 1.0}, "time": {"end": 1.0}}
+TUBE = {"preset": "kuhl-holzapfel-2007", "time": {"end": 1.0},
+        "geometry": {"shape": "tube", "inner_radius": 1.0, "outer_radius": 2.0, "length": 1.0}}  # fmt: skip
 
 
 @pytest.mark.parametrize(("changes", "line"), [

@@ -19,7 +19,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tests.conftest import slowly
 from tests.radial_comparison import (
+    COARSE,
+    CONVERGENCE,
     CURVED,
     FINE,
     FINGER,
@@ -103,10 +106,11 @@ def test_the_frames_agree_where_nothing_turns() -> None:
     assert np.abs(runs[0].angle - runs[1].angle).max() < 0.05
 
 
-@pytest.mark.parametrize("degree", [1, pytest.param(2, marks=pytest.mark.slow)])
-def test_the_error_falls_at_the_elements_rate(degree: int) -> None:
+@pytest.mark.parametrize("ladder", [COARSE, *slowly((CONVERGENCE[1],), (CONVERGENCE[2],))], ids=["coarse", "1", "2"])
+def test_the_error_falls_at_the_elements_rate(ladder: tuple[Setting, ...]) -> None:
     """Angles follow the stresses: order k. Radii: k + 1 (over the steps; the largest error is that at full load)."""
-    found, orders = convergence(degree)
+    degree = ladder[0].degree
+    found, orders = convergence(ladder)
     print(f"degree {degree}: errors {found.tolist()}, orders {orders.tolist()}")
     np.testing.assert_allclose(orders[-1], [degree + 1, degree + 1, degree], atol=0.25)
     assert np.all(orders[0] > np.array([degree + 1, degree + 1, degree]) - 0.7)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import ast
+import functools
 import hashlib
 import importlib.metadata
 import json
 from collections.abc import Mapping
-from modulefinder import ModuleFinder
 from pathlib import Path
 from typing import Any
 
@@ -65,26 +65,46 @@ def source_fingerprint(package: Path = Path(remodel_fenicsx.__file__).parent) ->
     Comments, docstrings, layout and the order of imports do not change it, nor does moving a module. What a module
     imports from the package counts by the source that it comes from, not by its path.
     """
-    finder = ModuleFinder([str(package.parent)])  # finds neither libraries nor Python's own modules
-    finder.import_hook(f"{package.name}.running")
-    imports: dict[str, list[tuple[str, str, str]]] = {}
-    bodies: dict[str, str] = {}
-    for name, module in finder.modules.items():
-        path = getattr(module, "__file__", None)
-        if path is not None:
-            reader = _ImportsAndTexts()
-            tree = reader.visit(ast.parse(Path(path).read_text(encoding="utf-8")))
-            imports[name], bodies[name] = reader.imports, _hash(ast.dump(tree))
+    read = _imported(package)
+    bodies = {name: body for name, (_, body) in read.items()}
     whole = []
     for name, body in bodies.items():
         taken = set()
-        for source, part, alias in imports[name]:
+        for source, part, alias in read[name][0]:
             if f"{source}.{part}" in bodies:  # a module of the package
                 taken.add((bodies[f"{source}.{part}"], "", alias))
             else:  # what stands in one, or a library
                 taken.add((bodies.get(source, source), part, alias))
         whole.append(_hash(repr((body, sorted(taken)))))
     return _hash(repr(sorted(set(whole))))
+
+
+Imports = tuple[tuple[str, str, str], ...]
+
+
+def _imported(package: Path) -> dict[str, tuple[Imports, str]]:
+    """What a run imports from the package, by module name: what each module imports, and the hash of the rest of it."""
+    found: dict[str, tuple[Imports, str]] = {}
+    waiting = [f"{package.name}.running"]
+    while waiting:
+        name = waiting.pop()
+        if name in found or name.partition(".")[0] != package.name:
+            continue
+        place = package.parent.joinpath(*name.split("."))
+        path = next((file for file in (place.with_suffix(".py"), place / "__init__.py") if file.is_file()), None)
+        if path is not None:  # and no name that stands in a module
+            found[name] = _read(path.read_text(encoding="utf-8"))
+            waiting.append(name.rpartition(".")[0])
+            waiting += [module for source, part, _ in found[name][0] for module in (source, f"{source}.{part}")]
+    return found
+
+
+@functools.cache
+def _read(text: str) -> tuple[Imports, str]:
+    """Of a module's source; read once, for a command asks before and after its runs."""
+    reader = _ImportsAndTexts()
+    tree = reader.visit(ast.parse(text))
+    return tuple(reader.imports), _hash(ast.dump(tree))
 
 
 class _ImportsAndTexts(ast.NodeTransformer):
