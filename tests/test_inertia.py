@@ -98,6 +98,19 @@ def test_nobody_counts_without_a_sign_but_at_the_end() -> None:
     assert np.isnan(counts[:-1]).all() and counts[-1] == 0
 
 
+def test_a_large_body_is_counted_on_request_only(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    monkeypatch.setattr(monitor, "MOST_UNKNOWNS", 23)  # the cube has 24
+    monkeypatch.setattr(monitor, "ITERATIONS_BETWEEN_LOOKS", 1)
+    assert np.isnan([step.negative_eigenvalues for step in run(pushed_cube(10.0))]).all()
+    assert caplog.text.count("the stability of equilibria was not looked at: with 24 unknowns") == 1
+    assert [step.negative_eigenvalues for step in run(pushed_cube(10.0, **COLUMN))] == [0] * 4
+    monkeypatch.setattr(monitor, "MOST_UNKNOWNS", 24)
+    assert run(pushed_cube(10.0))[-1].negative_eigenvalues == 0
+
+
 def test_the_sign_of_the_determinant_tells_at_once(caplog: pytest.LogCaptureFixture) -> None:
     steps = run(pushed_cube(-30.0, **{"time.end": 2.0, "loads.force.ramp": [[0.0, 0.0], [12.0, 4.0]]}))
     assert [step.negative_eigenvalues for step in steps][-1] == 1 and len(warnings(caplog)) == 1

@@ -20,6 +20,7 @@ from remodel_fenicsx.evolution.state import State
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.ranks import of_all_ranks, over_ranks
 from remodel_fenicsx.fem.remembered import Remembered
+from remodel_fenicsx.fem.second_derivative import second_derivative
 from remodel_fenicsx.tissue.cells import UnitCell
 from remodel_fenicsx.tissue.energy import Tissue
 from remodel_fenicsx.tissue.operators import passes_through_zero
@@ -121,7 +122,7 @@ class Equilibrium:
         """Virtual work of the stresses and its derivative by the unknowns, UFL forms to be added up."""
         u = self.state.unknown
         internal = [ufl.derivative(energy, u, test) for energy in self.energies]
-        tangents = [ufl.derivative(form, u, trial) for form in internal]
+        tangents = [second_derivative(energy, u, test, trial) for energy in self.energies]
         if self.pointwise is not None:
             weight, dx = self.state.kinematics.weight(self.quadrature.mesh), self.quadrature.dx
             internal[0] += self.pointwise.residual(u, F, test) * weight * dx

@@ -133,7 +133,7 @@ class EveryTangent:
 
 
 class Multigrid(EveryTangent):
-    """Needs to know the motions of a rigid body, and an answer to tangents that are not positive definite: GMRES."""
+    """Needs to know the motions of a rigid body; keeps its levels as long as PETSc's options say."""
 
     def __init__(self, equilibrium: Equilibrium, snes: Any, matrix: Any, options: ProblemOptions):
         super().__init__(equilibrium, snes, matrix, options)
@@ -143,9 +143,26 @@ class Multigrid(EveryTangent):
             place.array[:] = nodes[: place.getLocalSize() // 3].ravel()
             matrix.setNearNullSpace(PETSc.NullSpace().createRigidBody(place))
             place.destroy()
+        self._always = False
+
+    def renew(self) -> None:
+        super().renew()
+        if self._always:
+            preconditioner = self.snes.getKSP().getPC()
+            preconditioner.setReusePreconditioner(False)
+            preconditioner.setOperators(self.matrix)
+            preconditioner.setUp()
 
     def second_try(self) -> tuple[str, AbstractContextManager[None]] | None:
-        return "with GMRES", _krylov(self.snes, "gmres")
+        return "with new levels in every iteration", self._with_new_levels()
+
+    @contextmanager
+    def _with_new_levels(self) -> Iterator[None]:
+        self._always = True
+        try:
+            yield
+        finally:
+            self._always = False
 
 
 class _Kept(EveryTangent):

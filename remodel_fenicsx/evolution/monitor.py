@@ -17,6 +17,7 @@ log = logging.getLogger(__name__)
 
 ITERATIONS_BETWEEN_LOOKS = 100  # Newton iterations with a tangent, each of about the cost of a look
 OLD_FACTOR = 1 / 8  # of these, what an iteration without a new tangent counts
+MOST_UNKNOWNS = 200_000  # of a look that nobody has asked for: factors of more take minutes and gigabytes
 FIRST_INVERSE_ITERATIONS = 3  # later steps go on from the vector of the step before: one each
 
 
@@ -25,6 +26,7 @@ class StabilityWatcher(Watcher):
 
     A count costs about as much as a Newton iteration. So it is made where somebody wants it in every row, at the last
     step, after ITERATIONS_BETWEEN_LOOKS, and at once where `Signs` speak of a negative eigenvalue that is not known.
+    With more than MOST_UNKNOWNS it is made on request only.
 
     Parameters
     ----------
@@ -41,6 +43,7 @@ class StabilityWatcher(Watcher):
         self.stops, self.every_step = unstable == "stop", every_step or unstable == "stop"
         self.inertia = Inertia(stepper.coupling.equilibrium)
         self.signs = Signs(stepper)
+        self.unknowns = int(self.state.comm.allreduce(self.state.number_of_owned_unknowns))
         # eigenvalues that are known, and Newton iterations since the last look
         self._numbers = Numbers(self.state, "stability", {"known": 0, "iterations": 0})
         self._unloaded: tuple[int, float] | None = None
@@ -69,6 +72,13 @@ class StabilityWatcher(Watcher):
         self._numbers["iterations"] = iterations = self._numbers["iterations"] + effort
         suspicious = self.signs.differ(known) if step.work.newton_iterations else False
         overdue = iterations >= ITERATIONS_BETWEEN_LOOKS or (step.is_last and iterations > 0)
+        if overdue and not suspicious and self._is_too_large():
+            overdue = False
+            if step.is_last:
+                self._info(
+                    "the stability of equilibria was not looked at: with %d unknowns it is on request only, by the "
+                    "column negative_eigenvalues or solver.unstable = 'stop'", self.unknowns,
+                )  # fmt: skip
         if not (suspicious or overdue or self.every_step):
             return
         step.negative_eigenvalues = count = self._count()
@@ -81,6 +91,9 @@ class StabilityWatcher(Watcher):
             self._say(step, known, int(count))
 
     # ------------------------------------------------------------ what it means
+    def _is_too_large(self) -> bool:
+        return not self.every_step and self.unknowns > MOST_UNKNOWNS
+
     def _count(self) -> float:
         try:
             return self.inertia.negative_eigenvalues()

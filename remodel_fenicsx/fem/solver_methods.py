@@ -19,17 +19,22 @@ METHODS: dict[str, dict[str, Any]] = {
     },
     LAGGED: {"snes_type": "newtonls", "snes_linesearch_type": "basic", "ksp_type": "preonly"},
     EXACT: {"snes_type": "newtonls", "snes_linesearch_type": "basic", "ksp_type": "cg", "ksp_rtol": 1e-4},
+    # GMRES, because tangents of random cells are not always definite; levels cost as much as 20 of its iterations, and
+    # those of an older tangent serve as well
     "iterative": {
         "snes_type": "newtonls",
         "snes_linesearch_type": "basic",
-        "ksp_type": "cg",
+        "snes_lag_preconditioner": 20,
+        "snes_lag_preconditioner_persists": True,
+        "ksp_type": "gmres",
+        "ksp_gmres_restart": 100,
         "ksp_rtol": 1e-3,
         "ksp_max_it": 300,
         "pc_type": "gamg",
         "pc_gamg_threshold": 0.01,
         "pc_gamg_reuse_interpolation": True,
         "mg_levels_ksp_type": "chebyshev",
-        "mg_levels_pc_type": "jacobi",
+        "mg_levels_pc_type": "sor",
     },
 }
 
@@ -38,7 +43,7 @@ MEANINGS = {
     "to the last digit",
     LAGGED: "few tangents are factorised, and quasi-Newton steps (L-BFGS) make up for it",
     EXACT: "a new tangent in every iteration, its system solved by CG with an earlier factor",
-    "iterative": "Newton's method with CG and algebraic multigrid (GAMG)",
+    "iterative": "Newton's method with GMRES and algebraic multigrid (GAMG), whose levels are kept for some iterations",
 }
 """In words, for docs/scene.md; those of one's own need none."""
 
@@ -65,21 +70,22 @@ FACTORS: dict[str, dict[str, Any]] = {
     SYMMETRIC: {
         "pc_type": "cholesky",
         "pc_factor_mat_solver_type": "mumps",
-        "mat_mumps_icntl_7": 0,  # AMD; PORD is faster by a quarter, but ends the process for some small matrices
+        "mat_mumps_icntl_7": 3,  # SCOTCH, as fast as any; PORD ends the process for some small matrices
         "mat_mumps_icntl_33": 1,
     },
     GENERAL: METHODS["direct"],
 }
 
 SMALL = 2000  # unknowns up to which MUMPS costs more than all the rest of a problem: then PETSc factorises by itself
-LARGE = 40_000  # unknowns from which on factors cost more than multigrid, in time and in memory
+LARGE = 100_000  # unknowns from which on even a few factors cost more than multigrid, in time and in memory
+LARGE_ON_RANKS = 20_000  # the same on several ranks, where every tangent is factorised, on one of them
 
 
 def chosen(method: str, unknowns: int, ranks: int) -> str:
     """The method that `auto` stands for."""
     if method != AUTO:
         return method
-    if unknowns > LARGE:
+    if unknowns > (LARGE if ranks == 1 else LARGE_ON_RANKS):
         return "iterative"
     return "direct" if unknowns <= SMALL or ranks > 1 else LAGGED
 

@@ -14,7 +14,7 @@ from remodel_fenicsx.body.reductions import AUTO
 from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.fem.solver_methods import AUTO as AUTOMATIC
-from remodel_fenicsx.fem.solver_methods import LARGE, MEANINGS, METHODS, SMALL
+from remodel_fenicsx.fem.solver_methods import LARGE, LARGE_ON_RANKS, MEANINGS, METHODS, SMALL
 from remodel_fenicsx.schema.tables import Table, checked, fault, is_number, one_of, quoted, shown
 from remodel_fenicsx.schema.times import is_multiple, same_time
 from remodel_fenicsx.schema.units import FORCE
@@ -244,8 +244,8 @@ class Solver(Table):
 
     method: Annotated[str, checked(_method)] = Field(
         default=AUTOMATIC,
-        description=f"'auto': 'direct' up to {SMALL} unknowns or on more ranks, "
-        f"'iterative' above {LARGE}, else 'lagged'; "
+        description=f"'auto': 'direct' up to {SMALL} unknowns, then 'lagged', above {LARGE} 'iterative'; "
+        f"on more ranks 'direct' up to {LARGE_ON_RANKS}, then 'iterative'; "
         + "; ".join(f"{name!r}: {meaning}" for name, meaning in MEANINGS.items())
         + " (docs/speed.md).",
         json_schema_extra={"allowed": "one of " + ", ".join(map(repr, (AUTOMATIC, *METHODS)))},
