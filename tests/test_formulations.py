@@ -199,6 +199,7 @@ def test_a_uniform_body_never_locks(element: str, caplog: Any) -> None:
     """However stiff the bulk: nothing is asked of its elements that they cannot do."""
     scene = Scene(
         geometry={"shape": "cube"},
+        model={"kinematics": "full"},
         mesh={"element": element, "refinement": 2},
         material={"lame_lambda": 3.103e5, "chain_density": 0.0},
         cells={"initial": "isotropic"},
