@@ -18,7 +18,7 @@ from remodel_fenicsx.scene.parameters import Cells, Material
 from remodel_fenicsx.tissue.drivers import DRIVERS
 from remodel_fenicsx.tissue.energy import MATRICES, neo_hookean
 from tests import parts
-from tests.conftest import Case
+from tests.conftest import Case, slowly
 from tests.locking_bodies import EXACT_TUBE, bar_scene, membrane_scene, registered, thick_tube
 
 SELECTIVE = "selective-integration"
@@ -158,7 +158,7 @@ def simulated(scene: Scene, divisions: tuple[int, int, int] | None = None) -> It
         simulation.close()
 
 
-@pytest.mark.parametrize(("around", "through", "tolerance"), [(16, 8, 0.035), (32, 16, 0.01)])
+@pytest.mark.parametrize(("around", "through", "tolerance"), [(16, 8, 0.035), *slowly((32, 16, 0.01))])
 def test_a_thick_tube_does_not_lock(around: int, through: int, tolerance: float, caplog: Any) -> None:
     """Incompressible, closed form."""
     with caplog.at_level(logging.WARNING), simulated(thick_tube(1e4, SELECTIVE), (around, through, 1)) as (_, rows):

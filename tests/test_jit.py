@@ -188,10 +188,9 @@ with StopRequest():
     ("target", "number"),
     [
         ("group", signal.SIGINT),
-        ("group", signal.SIGTERM),
-        ("group", signal.SIGHUP),
         ("process and group", signal.SIGTERM),
         ("compiler", signal.SIGTERM),
+        *slowly(("group", signal.SIGTERM), ("group", signal.SIGHUP)),
     ],
 )
 def test_a_signal_ends_the_compiler_and_leaves_nothing(target: str, number: signal.Signals, tmp_path: Path) -> None:
@@ -244,21 +243,21 @@ if compiled:  # one rank writes: lines of two may come mixed
 
 @pytest.mark.parametrize("ranks", [1, 2])
 def test_functions_in_c_are_compiled_once_like_forms(ranks: int, tmp_path: Path) -> None:
-    def run() -> subprocess.CompletedProcess[str]:
+    def run(ranks: int) -> subprocess.CompletedProcess[str]:
         command, environment = program(tmp_path, LIBRARY)
         if ranks == 1:
             return forked("python", LIBRARY, variables=environment)
         command = mpirun(ranks, *command)
         return subprocess.run(command, capture_output=True, text=True, timeout=120, env=environment)
 
-    first, again = run(), run()
+    first, again = run(ranks), run(ranks)
     assert (first.returncode, again.returncode) == (0, 0), first.stderr[-2000:]
     assert first.stderr.count("compiling what doubles, once on this machine: about 2 s") == 1
     assert "compil" not in again.stderr
     assert again.stdout.split() == ["0"] * ranks
     assert sorted(first.stdout.split()) == ["0"] * (ranks - 1) + ["1"]
     one_file(tmp_path, "libremodel_*.so").unlink()
-    assert "removing a compilation that was cut off" in run().stderr
+    assert "removing a compilation that was cut off" in run(1).stderr
 
 
 def test_functions_in_c_that_do_not_compile_leave_nothing(tmp_path: Path) -> None:

@@ -178,8 +178,8 @@ def kill_all(session: int) -> None:
 TUBE = """
 preset = "kuhl-holzapfel-2007"
 geometry = {shape = "tube", inner_radius = 1.0, outer_radius = 3.0, length = 2.0}
-time = {end = 24.0}
-output = {every = 4, checkpoint = 3}
+time = {end = 12.0}
+output = {every = 4, checkpoint = 2}
 """
 
 
@@ -196,7 +196,7 @@ def test_a_run_that_is_killed_20_times_goes_on(tmp_path: Path) -> None:
 
     assert status("expected", None) == 0
     while kills < 20:
-        ended = status(f"run-{whole}", moments.uniform(0.1, 0.6))
+        ended = status(f"run-{whole}", moments.uniform(0.1, 0.4))
         assert ended in (0, -signal.SIGKILL)
         kills, whole = kills + (ended != 0), whole + (ended == 0)
     assert status(f"run-{whole}", None) == 0
@@ -234,7 +234,7 @@ def test_an_artery_that_is_killed_20_times_goes_on(ranks: tuple[int, int], tmp_p
 @pytest.mark.slow
 def test_one_and_two_ranks_by_turns_to_the_end(tmp_path: Path) -> None:
     """150 steps of a tube of four layers, killed on one and two ranks by turns: rounding stays rounding."""
-    (tmp_path / "tube.toml").write_text(TUBE.replace("24.0", "150.0").replace("every = 4", "fields = false"))
+    (tmp_path / "tube.toml").write_text(TUBE.replace("12.0", "150.0").replace("every = 4", "fields = false"))
     assert start(tmp_path / "expected", tmp_path / "tube.toml", program=FOUR_LAYERS).wait() == 0
     for number, last in enumerate([30, 60, 90, 120]):
         process = start(tmp_path / "run", tmp_path / "tube.toml", 1 + number % 2, FOUR_LAYERS)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -380,13 +382,21 @@ def test_every_kinematics_says_what_it_is() -> None:
 
 
 # ---------------------------------------------------------------- records
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """Folder of a shape's full run of one step, made once."""
+    return cache(lambda shape: run(scene(shape, "full", 1.0), tmp_path_factory.mktemp("full") / shape, SELF))
+
+
 @pytest.mark.parametrize(
     ("shape", "name", "cell"),
     [("cube", "point", 3), ("tube", "radial", 3), ("tube", "axisymmetric", 9), ("tube", "sector", 12)],
 )
-def test_recorded_fields_are_revolved_into_the_body(shape: str, name: str, cell: int, tmp_path: Path) -> None:
+def test_recorded_fields_are_revolved_into_the_body(
+    shape: str, name: str, cell: int, whole: Callable[[str], Path], tmp_path: Path
+) -> None:
     """Held against the full run: nodes and elements of its own mesh. Elements of `full` lie between chords."""
-    folders = {kind: run(scene(shape, kind, 1.0), tmp_path / kind, SELF) for kind in (name, "full")}
+    folders = {name: run(scene(shape, name, 1.0), tmp_path / name, SELF), "full": whole(shape)}
     with h5py.File(folders[name] / "fields.vtkhdf") as file:
         assert set(file["VTKHDF/Types"][:]) == {cell}
     assert cli.main(["revolve", str(folders[name])]) == 0

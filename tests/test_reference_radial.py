@@ -261,6 +261,6 @@ def test_figures_10_and_11() -> None:
     finger = run(driver="finger")
     assert finger.fibre_angle_at(1.0) == pytest.approx(27.0, abs=0.2)
     assert finger.fibre_angle_at(3.0) == pytest.approx(48.0, abs=0.2)
-    equilibrium = {driver: run(driver=driver, end=500.0).fibre_angle_at(3.0) for driver in ("cauchy", "pk2")}
-    assert equilibrium["cauchy"] == pytest.approx(76.0, abs=0.5)
-    assert equilibrium["pk2"] == pytest.approx(73.0, abs=0.5)
+    for driver, angle in (("cauchy", 76.0), ("pk2", 73.0)):
+        coarse = radial.solve_radial(elements=40, driver=driver, end=500.0)
+        assert coarse.fibre_angle_at(3.0) == pytest.approx(angle, abs=0.5)

@@ -29,7 +29,7 @@ def ranks():
     while len(os.listdir('FOLDER')) < 2:
         time.sleep(0.05)
     return process
-pytestmark = pytest.mark.timeout(2, func_only=True)
+pytestmark = pytest.mark.timeout(1, func_only=True)
 """
 
 
@@ -66,14 +66,14 @@ def test_a_test_that_hangs_fails_and_the_others_go_on(name: str, workers: str, t
     before, argument = (RANKS.replace("FOLDER", str(ranks)), "ranks") if name == "mpirun" else ("", "")
     text = f"{before}\ndef test_hangs({argument}):\n    {HANGS[name]}\ndef test_after(): pass\n"
     (tmp_path / "test_it.py").write_text(text)
-    done = session(tmp_path, "-n", workers, "--timeout=2", "-o", "timeout_grace=1", "test_it.py")
+    done = session(tmp_path, "-n", workers, "--timeout=1", "-o", "timeout_grace=0.5", "test_it.py")
     assert done.returncode == 1, done.stdout + done.stderr
     if name == "deaf":
         assert 'test_it.py", line 3 in test_hangs' in done.stderr
         # it can only be ended with its process: one of several is replaced
         assert workers == "0" or "1 failed, 1 passed" in done.stdout and "crashed while running" in done.stdout
     else:
-        assert "Timeout >2.0s" in done.stdout and "1 failed, 1 passed" in done.stdout
+        assert "Timeout >1.0s" in done.stdout and "1 failed, 1 passed" in done.stdout
     pids = list(ranks.iterdir())
     assert len(pids) == (2 if name == "mpirun" else 0)
     assert all(has_ended(int(rank.name)) for rank in pids)

@@ -45,7 +45,7 @@ def test_a_full_disk_below_stdout_is_exit_code_5(tmp_path: Path) -> None:
     assert read_history(tmp_path / "out")["time"][-1] == 10
 
 
-@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGINT])
+@pytest.mark.parametrize("number", [signal.SIGHUP, *slowly(signal.SIGINT)])
 def test_a_signal_that_was_ignored_from_the_start_stays_ignored(number: signal.Signals, tmp_path: Path) -> None:
     """nohup ignores SIGHUP, a shell script SIGINT for its jobs in the background."""
     history = tmp_path / "out" / "history.csv"
@@ -67,11 +67,10 @@ def test_a_signal_that_was_ignored_from_the_start_stays_ignored(number: signal.S
     ("module", "number"),
     [
         ("pydantic", signal.SIGINT),
-        ("pydantic", signal.SIGTERM),
         ("mpi4py", signal.SIGTERM),
         ("petsc4py.PETSc", signal.SIGINT),
-        ("dolfinx", signal.SIGTERM),
         ("remodel_fenicsx.running", signal.SIGHUP),  # PETSc is there by then, and has taken it
+        *slowly(("pydantic", signal.SIGTERM), ("dolfinx", signal.SIGTERM)),
     ],
 )
 def test_a_signal_among_the_imports_ends_with_a_line(module: str, number: signal.Signals, tmp_path: Path) -> None:
@@ -158,7 +157,7 @@ def nothing_is_left(tmp_path: Path) -> bool:
     return sources == finished and not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, *slowly(signal.SIGTERM)])
 def test_a_signal_to_the_group_while_the_compiler_runs(number: signal.Signals, tmp_path: Path) -> None:
     process = start_cold(tmp_path)
     wait_for_compiler(process)

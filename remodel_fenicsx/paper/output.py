@@ -167,13 +167,17 @@ def with_palette(picture: Image.Image, colours: NDArray[np.float64]) -> Image.Im
     chosen = picture.quantize(256 - len(kept), method=Image.Quantize.MAXCOVERAGE, kmeans=2, dither=Image.Dither.NONE)
     found = np.array(chosen.getpalette(), dtype=np.uint8).reshape(-1, 3)[: 256 - len(kept)]
     palette = np.concatenate([kept, found])
-    pixels = np.asarray(picture)
-    distinct, where = np.unique(pixels.reshape(-1, 3), axis=0, return_inverse=True)
+    numbers = np.asarray(picture) @ np.array([1 << 16, 1 << 8, 1])
+    seen = np.zeros(1 << 24, dtype=bool)
+    seen[numbers] = True
+    distinct = np.flatnonzero(seen)
     nearest = np.concatenate([
-        np.abs(part[:, None].astype(int) - palette.astype(int)).sum(axis=2).argmin(axis=1)
-        for part in np.array_split(distinct, 1 + len(distinct) // 5000)
+        np.abs(part[:, None] - palette.astype(int)).sum(axis=2).argmin(axis=1)
+        for part in np.array_split(distinct[:, None] >> [16, 8, 0] & 255, 1 + len(distinct) // 5000)
     ])  # fmt: skip
-    result = Image.fromarray(nearest[np.ravel(where)].reshape(pixels.shape[:2]).astype(np.uint8), mode="P")
+    table = np.zeros(1 << 24, dtype=np.uint8)
+    table[distinct] = nearest
+    result = Image.fromarray(table[numbers], mode="P")
     result.putpalette(palette.tobytes())
     return result
 

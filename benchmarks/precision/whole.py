@@ -1,0 +1,32 @@
+"""The whole tube in three dimensions, from coarse to fine: the price where no part stands for the body."""
+
+from __future__ import annotations
+
+from remodel_fenicsx.scene.scene import Scene
+from remodel_fenicsx.studies import ladder as rungs
+
+# as a user would solve them; the presets solve with every tangent, as 0.1.0 did
+SOLVED = {"model.kinematics": "full", "solver.method": "auto", "solver.predictor": "autoregressive"}
+# refinement, degree, and steps or tolerances of the steps in degrees
+STEPS = {
+    "printed": {(1, 1): (5.0, 2.5, 1.0), (1, 2): (5.0, 2.5, 1.0, 0.5, 0.25), (2, 1): (1.0,)},
+    "consistent": {(1, 1): (5.0, 1.0), (1, 2): (5.0, 1.0)},
+}
+TOLERANCES = {name: {(1, 1): (1.0,), (1, 2): (0.5,)} for name in STEPS}  # as in the profiles `fast` and `balanced`
+
+
+def settings(method: str, base: Scene) -> list[rungs.Setting]:
+    """Those of a method (a key of `STEPS`; others have none), the cheapest first."""
+    found = [
+        _setting(base, refinement, degree, f"{key} {value:g}", {f"time.{key}": value})
+        for key, table in (("step", STEPS), ("tolerance", TOLERANCES))
+        for (refinement, degree), values in table.get(method, {}).items()
+        for value in values
+    ]
+    return sorted(found, key=lambda setting: setting.expected_seconds)
+
+
+def _setting(base: Scene, refinement: int, degree: int, steps: str, time: dict[str, float]) -> rungs.Setting:
+    values = SOLVED | {"mesh.refinement": refinement, "mesh.degree": degree} | time
+    name = f"whole-{refinement}-degree-{degree}-{steps.replace(' ', '-')}"
+    return rungs.Setting(name, rungs.BOTH, values, base.with_values(values), (1,))
