@@ -10,7 +10,7 @@ SOLVED = {"model.kinematics": "full", "solver.method": "auto", "solver.predictor
 # refinement, degree, and steps or tolerances of the steps in degrees
 STEPS = {
     "printed": {(1, 1): (5.0, 2.5, 1.0), (1, 2): (5.0, 2.5, 1.0, 0.5, 0.25), (2, 1): (1.0,)},
-    "consistent": {(1, 1): (5.0, 1.0), (1, 2): (5.0, 1.0, 0.25)},
+    "consistent": {(1, 1): (5.0, 1.0), (1, 2): (5.0, 1.0, 0.25, 0.125)},
 }
 TOLERANCES = {name: {(1, 1): (1.0,), (1, 2): (0.5,)} for name in STEPS}  # as in the profiles `fast` and `balanced`
 
