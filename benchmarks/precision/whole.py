@@ -14,6 +14,17 @@ STEPS = {
 }
 TOLERANCES = {name: {(1, 1): (1.0,), (1, 2): (0.5,)} for name in STEPS}  # as in the profiles `fast` and `balanced`
 
+# one other thing at a time, of the printed method on the paper's mesh with steps of 1
+OTHERS = {
+    "tetrahedra": {"mesh.element": "tetrahedron"},
+    "selective integration": {"mesh.formulation": "selective-integration"},
+    "residual to 1e-6": {"solver.relative_tolerance": 1e-6},
+    "residual to 1e-4": {"solver.relative_tolerance": 1e-4},
+    "method exact": {"solver.method": "exact"},
+    "method iterative": {"solver.method": "iterative"},
+    "no predictor": {"solver.predictor": "none"},
+}
+
 
 def settings(method: str, base: Scene) -> list[rungs.Setting]:
     """Those of a method (a key of `STEPS`; others have none), the cheapest first."""
@@ -23,10 +34,21 @@ def settings(method: str, base: Scene) -> list[rungs.Setting]:
         for (refinement, degree), values in table.get(method, {}).items()
         for value in values
     ]
+    others = OTHERS if method == "printed" else {}
+    found += [_setting(base, 1, 1, f"step 1 {words}", {"time.step": 1.0, **values}) for words, values in others.items()]
     return sorted(found, key=lambda setting: setting.expected_seconds)
+
+
+def other_words(name: str) -> str:
+    """What a setting's name says of `OTHERS`."""
+    return next((f", {words}" for words in OTHERS if name.endswith(_slug(words))), "")
+
+
+def _slug(words: str) -> str:
+    return words.replace(" ", "-")
 
 
 def _setting(base: Scene, refinement: int, degree: int, steps: str, time: dict[str, float]) -> rungs.Setting:
     values = SOLVED | {"mesh.refinement": refinement, "mesh.degree": degree} | time
-    name = f"whole-{refinement}-degree-{degree}-{steps.replace(' ', '-')}"
+    name = f"whole-{refinement}-degree-{degree}-{_slug(steps)}"
     return rungs.Setting(name, rungs.BOTH, values, base.with_values(values), (1,))
