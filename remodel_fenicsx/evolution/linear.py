@@ -100,6 +100,7 @@ class EveryTangent:
     def __init__(self, equilibrium: Equilibrium, snes: Any, matrix: Any, options: ProblemOptions):
         self.equilibrium, self.snes, self.matrix, self.options = equilibrium, snes, matrix, options
         self.tangents = 0
+        self._always = False  # whether what may be kept is made anew in every iteration
 
     def begin(self) -> None:
         """A solve begins."""
@@ -124,6 +125,15 @@ class EveryTangent:
         """A slower and safer way for a solve that has failed, and in words; None where this was it."""
         return None
 
+    @contextmanager
+    def _anew(self) -> Iterator[None]:
+        """Meanwhile nothing is kept from one iteration to the next."""
+        self._always = True
+        try:
+            yield
+        finally:
+            self._always = False
+
     def factorisation(self) -> Any | None:
         """PETSc's preconditioner with the factors of the last tangent; None where there are none."""
         preconditioner = self.snes.getKSP().getPC()
@@ -144,7 +154,6 @@ class Multigrid(EveryTangent):
             place.array[:] = nodes[: place.getLocalSize() // 3].ravel()
             matrix.setNearNullSpace(PETSc.NullSpace().createRigidBody(place))
             place.destroy()
-        self._always = False
 
     def renew(self) -> None:
         super().renew()
@@ -155,15 +164,7 @@ class Multigrid(EveryTangent):
             preconditioner.setUp()
 
     def second_try(self) -> tuple[str, AbstractContextManager[None]] | None:
-        return "with new levels in every iteration", self._with_new_levels()
-
-    @contextmanager
-    def _with_new_levels(self) -> Iterator[None]:
-        self._always = True
-        try:
-            yield
-        finally:
-            self._always = False
+        return "with new levels in every iteration", self._anew()
 
 
 class _Kept(EveryTangent):
@@ -177,7 +178,6 @@ class _Kept(EveryTangent):
             preconditioner = snes.getKSP().getPC()
             preconditioner.setType(PETSc.PC.Type.PYTHON)
             preconditioner.setPythonContext(self.factor)
-        self._always = False
 
     def renew(self) -> None:
         super().renew()
@@ -192,12 +192,8 @@ class _Kept(EveryTangent):
 
     @contextmanager
     def _with_every_tangent(self) -> Iterator[None]:
-        self._always = True
-        try:
-            with _krylov(self.snes, "preonly"):
-                yield
-        finally:
-            self._always = False
+        with self._anew(), _krylov(self.snes, "preonly"):
+            yield
 
     def factorisation(self) -> Any | None:
         return self.factor.preconditioner if self._own else super().factorisation()
