@@ -21,6 +21,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any
 
+# before a program: a mesh of few elements for every tube
+COARSE = "import sys, remodel_fenicsx.body; sys.modules['remodel_fenicsx.body.tube'].PAPER = (8, 4, 1)\n"
+
 
 class Forks:
     """The process and who asks it: what takes a start of its own (signals, PETSC_OPTIONS, ranks) is not for it."""

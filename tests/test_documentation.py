@@ -12,7 +12,7 @@ import pytest
 
 import remodel_fenicsx
 from remodel_fenicsx.results.reference import column_reference
-from tests.forks import forked
+from tests.forks import COARSE, forked
 
 ROOT = Path(__file__).parents[1]
 
@@ -38,10 +38,6 @@ def test_every_column_of_every_shape_is_in_the_table() -> None:
                      "axial_elongation", "inner_radius", "outer_radius", "mean_fibre_angle", "fibre_angle_inner",
                      "fibre_angle_middle", "fibre_angle_outer", "min_stretch", "max_stretch"}  # fmt: skip
     assert "| `force` | cube, tendon | force |" in column_reference()
-
-
-# before a program: a mesh of few elements for every tube
-COARSE = "import sys, remodel_fenicsx.body; sys.modules['remodel_fenicsx.body.tube'].PAPER = (8, 4, 1)\n"
 
 
 def test_the_python_of_the_readme_runs_as_it_stands(tmp_path: Path) -> None:

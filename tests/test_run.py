@@ -19,7 +19,7 @@ from remodel_fenicsx.results.columns import COLUMNS
 from remodel_fenicsx.results.recording import read_history
 from remodel_fenicsx.scene.scene import read_scene
 from tests.conftest import mpirun, slowly
-from tests.forks import forked
+from tests.forks import COARSE, forked
 
 PROJECT = Path(__file__).parents[1]
 COMMAND = [sys.executable, "-m", "remodel_fenicsx.cli"]
@@ -502,8 +502,7 @@ WHOLE_RAMP = slowly(("tendon", "3"), ("tendon", "14"), ("artery", "27"))
 @pytest.mark.parametrize(("name", "end"), [("cube", None), ("artery", "2"), *WHOLE_RAMP])
 def test_the_script_and_the_scene_of_a_demo_are_the_same_simulation(name: str, end: str | None, tmp_path: Path) -> None:
     """On a coarse mesh of the tube, which both take by themselves."""
-    coarse = "import remodel_fenicsx.body, sys; sys.modules['remodel_fenicsx.body.tube'].PAPER = (8, 4, 1)"
-    program = f"{coarse}; import runpy; runpy.run_path({str(PROJECT / 'demos' / name)!r} + '.py', run_name='__main__')"
+    program = f"{COARSE}import runpy; runpy.run_path({str(PROJECT / 'demos' / name)!r} + '.py', run_name='__main__')"
     script = forked("python", program, *([end] if end else []), cwd=tmp_path)
     assert script.returncode == 0, script.stderr
     settings = ["output.fields=false", *([f"time.end={end}"] if end else [])]
