@@ -30,12 +30,10 @@ from ufl.corealg.map_dag import map_expr_dag
 from ufl.corealg.multifunction import MultiFunction
 from ufl.domain import extract_unique_domain
 
-from remodel_fenicsx.fem.done_once import packages_read_once, share_cells
 from remodel_fenicsx.system.interrupts import SIGNALS, Interrupted, pause_held_back, stopping_at_once
 from remodel_fenicsx.system.terminal import NOTICE
 
 log = logging.getLogger(__name__)
-share_cells()
 
 TIMEOUT = 600  # seconds that FFCx waits for another process to compile a form; none was cut off (_compiling)
 COMPILED = "REMODEL_FENICSX_COMPILED"  # names a file that gets a line for each kernel that is really compiled
@@ -229,8 +227,7 @@ def _compiling(kernel: str, what: str, seconds: int) -> Iterator[None]:
         start, before = clock.monotonic(), resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
         handlers = logging.getLogger().handlers.copy()
         try:
-            with packages_read_once():
-                yield
+            yield
         except BaseException as error:
             logging.getLogger().handlers = handlers  # FFCx has put others there, and gives them back on success only
             _remove(kernel)
