@@ -30,12 +30,10 @@ from ufl.corealg.map_dag import map_expr_dag
 from ufl.corealg.multifunction import MultiFunction
 from ufl.domain import extract_unique_domain
 
-from remodel_fenicsx.fem.done_once import packages_read_once, share_cells
 from remodel_fenicsx.system.interrupts import SIGNALS, Interrupted, pause_held_back, stopping_at_once
 from remodel_fenicsx.system.terminal import NOTICE
 
 log = logging.getLogger(__name__)
-share_cells()
 
 TIMEOUT = 600  # seconds that FFCx waits for another process to compile a form; none was cut off (_compiling)
 COMPILED = "REMODEL_FENICSX_COMPILED"  # names a file that gets a line for each kernel that is really compiled
@@ -198,19 +196,18 @@ def _compiler_watched(comm: MPI.Intracomm, what: str, seconds: int) -> Iterator[
 
     FFCx computes a kernel's name and looks for it by `get_cached_module`: nothing else knows without doing that work
     twice whether the compiler is going to run. So this stands before that function. What is in the cache passes at
-    once: no lock, no waiting, and no list of the cache's thousands of files, which FFCx makes at every look. Of several
-    ranks the first compiles; the others ask when it is done.
+    once: no lock, no waiting. Of several ranks the first compiles; the others ask when it is done.
     """
+    if comm.rank != 0:
+        yield
+        return
     look_up: Callable[..., Any] = ffcx.codegeneration.jit.get_cached_module
     with ExitStack() as until_compiled:
 
-        def watched(kernel: str, names: list[str], *arguments: Any, **options: Any) -> Any:
-            if _is_cached(kernel):
-                module = _loaded(kernel)
-                return [getattr(module.lib, name) for name in names], module
-            if comm.rank == 0:
+        def watched(kernel: str, *arguments: Any, **options: Any) -> Any:
+            if not _is_cached(kernel):
                 until_compiled.enter_context(_compiling(kernel, what, seconds))
-            return look_up(kernel, names, *arguments, **options)
+            return look_up(kernel, *arguments, **options)
 
         ffcx.codegeneration.jit.get_cached_module = watched
         try:
@@ -230,8 +227,7 @@ def _compiling(kernel: str, what: str, seconds: int) -> Iterator[None]:
         start, before = clock.monotonic(), resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
         handlers = logging.getLogger().handlers.copy()
         try:
-            with packages_read_once():
-                yield
+            yield
         except BaseException as error:
             logging.getLogger().handlers = handlers  # FFCx has put others there, and gives them back on success only
             _remove(kernel)
