@@ -355,13 +355,14 @@ TWICE = {
     "axisymmetric": values("tube", "axisymmetric", 5.0, supports={"ends": "clamped"}),
     "sector": values("tube", "sector", 5.0),
 }
+ON_ONE_AND_TWO_RANKS = [{"scene": scene | {"solver": {"relative_tolerance": 1e-13}}} for scene in TWICE.values()]
 
 
 @pytest.fixture(scope="module")
 def on_one_and_two_ranks(cases: Cases) -> dict[str, tuple[dict[str, Any], dict[str, Any]]]:
     """What each of them saves."""
-    wanted = [{"scene": scene | {"solver": {"relative_tolerance": 1e-13}}} for scene in TWICE.values()]
-    return dict(zip(TWICE, zip(cases(wanted, 1), cases(wanted, 2), strict=True), strict=True))
+    found = (cases(ON_ONE_AND_TWO_RANKS, ranks) for ranks in (1, 2))
+    return dict(zip(TWICE, zip(*found, strict=True), strict=True))
 
 
 @pytest.mark.parametrize("name", TWICE)
