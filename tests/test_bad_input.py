@@ -169,7 +169,7 @@ def written(values: dict[str, Any]) -> str | None:
 
 @bad(
     "scenes with odd values",
-    200,
+    120,
     "NaN, infinities, huge and tiny numbers, other types, keys missing or unknown, units that are none",
     shape=st.sampled_from(sorted(SHAPES)),
     changes=CHANGES,
@@ -311,7 +311,7 @@ KEYS = st.sampled_from(["format", "generations", "file", "number", "time", "sha2
 
 @bad(
     "pointers of checkpoints",
-    100,
+    60,
     "any JSON",
     pointer=st.one_of(JSON, st.dictionaries(KEYS, st.one_of(JSON, st.lists(st.dictionaries(KEYS, JSON))))),
 )
@@ -337,7 +337,7 @@ def test_a_checkpoint_that_is_damaged(data: st.DataObject, first_half: Path, tmp
 
 
 # ---------------------------------------------------------------- recordings
-@bad("damaged recordings", 120, "history, fields, scene; read as a whole, and by `status`", data=st.data())
+@bad("damaged recordings", 80, "history, fields, scene; read as a whole, and by `status`", data=st.data())
 def test_a_recording_that_is_damaged(data: st.DataObject, first_half: Path, tmp_path: Path) -> None:
     name = data.draw(st.sampled_from(["history.csv", "fields.vtkhdf", "scene.toml"]))
     folder = shutil.copytree(first_half, tmp_path / "copy", dirs_exist_ok=True)

@@ -82,7 +82,7 @@ def test_eq_11_has_no_error_of_the_time_step() -> None:
     """It is a function of the present stress and of absolute time: so is the implicit state."""
     ends = []
     for step in (5.0, 1.25):
-        simulation = short_tube(10.0, step, law="explicit", cells="isotropic", frame="spatial")
+        simulation = short_tube(5.0, step, law="explicit", cells="isotropic", frame="spatial")
         run(simulation)
         ends.append(simulation.cells.structure_tensor())
     assert np.abs(ends[0] - ends[1]).max() < 1e-7 < np.abs(ends[0] - np.eye(3) / 3).max()
@@ -91,12 +91,12 @@ def test_eq_11_has_no_error_of_the_time_step() -> None:
 @pytest.mark.parametrize("law", ["relaxation", pytest.param("rate", marks=pytest.mark.slow)])
 def test_the_other_printed_laws_are_of_first_order(law: str) -> None:
     ends = []
-    for step in (2.5, 1.25, 0.3125):
+    for step in (2.5, 1.25, 0.625):
         simulation = short_tube(5.0, step, law=law, cells="isotropic")
         run(simulation)
         ends.append(simulation.cells.structure_tensor())
     coarse, fine = (np.abs(end - ends[2]).max() for end in ends[:2])
-    assert 0.8 < np.log2(coarse / fine) < 1.4  # (2.5 - 0.3125)/(1.25 - 0.3125) is 2.33
+    assert 1.3 < np.log2(coarse / fine) < 1.9  # (2.5 - 0.625)/(1.25 - 0.625) is 3, of second order it were 5
 
 
 @pytest.mark.parametrize(
