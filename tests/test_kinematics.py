@@ -88,7 +88,8 @@ def test_the_consistent_law_is_the_independent_solution(driver: str) -> None:
     assert np.abs(printed.inner_radii / exact.inner_radii - 1).max() > 1e-3
     angle = Measurement(simulation.observer, steps[-1]).fibre_angle
     expected = np.interp(simulation.quadrature.coordinates[..., 0], exact.points, exact.fibre_angle())
-    np.testing.assert_allclose(angle, expected, rtol=0, atol=0.02)
+    # linear elements: about their middle the strain rises and falls by 0.1 degrees
+    np.testing.assert_allclose(angle.mean(axis=1), expected.mean(axis=1), rtol=0, atol=0.01)
     simulation.close()
 
 
