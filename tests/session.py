@@ -10,7 +10,6 @@ import hashlib
 import os
 import platform
 import signal
-import sysconfig
 import tempfile
 from collections import defaultdict
 from collections.abc import Generator
@@ -181,8 +180,6 @@ def pytest_configure(config: pytest.Config) -> None:
         folder = tempfile.TemporaryDirectory(prefix="remodel-fenicsx-tests-")
         os.environ[COMPILED] = str(Path(folder.name) / "compiled")
         config.add_cleanup(lambda: (os.environ.pop(COMPILED), folder.cleanup()))
-        # Python's own flags for gcc have -g; the same code without that table takes two thirds of the time
-        os.environ["CFLAGS"] = f"{sysconfig.get_config_var('CFLAGS')} -g0"
         os.environ.pop("PYTHONUNBUFFERED", None)  # it writes a line in pieces, and those of two ranks come mixed
         # an mpirun that was killed leaves a folder, in the way of a later one with the same process number
         os.environ["PRTE_MCA_prte_tmpdir_base"] = os.environ["OMPI_MCA_orte_tmpdir_base"] = folder.name

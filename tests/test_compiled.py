@@ -133,6 +133,21 @@ def test_noise_across_the_axes(kernels: PointKernels) -> None:
             np.testing.assert_allclose(kernels.without_noise(steady, given, limit), wanted, rtol=0, atol=1e-14)
 
 
+def test_the_positive_direction(kernels: PointKernels) -> None:
+    rng = np.random.default_rng(9)
+    values = rng.normal(size=(COUNT, 3)) * 10.0 ** rng.integers(-200, 200, (COUNT, 1))
+    values[:5] = [[0.0] * 3, [-1.0, -2.0, -3.0], [1.0, 1e-15, -1.0], [1.0, 1e-13, -1.0], [2.0, 0.5, 0.4]]
+    for limit in (0.0, 0.5, rng.random(COUNT)):
+        wanted, active = spectral.positive_direction(values, limit)
+        found, found_active = kernels.positive_direction(values, limit)
+        np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-15)
+        np.testing.assert_array_equal(found_active, active)
+        assert 0 < active.sum() < COUNT
+    for bad in (np.nan, np.inf):
+        with pytest.raises(FloatingPointError, match=f"set of principal values 7 of {COUNT} is not finite"):
+            kernels.positive_direction(np.where(np.arange(COUNT)[:, None] == 7, bad, values))
+
+
 def test_stretches_and_structure(kernels: PointKernels) -> None:
     rng = np.random.default_rng(7)
     F, cell = np.eye(3) + 0.2 * rng.normal(size=(COUNT, 3, 3)), UnitCell(rng.random((COUNT, 3)), random_axes(rng))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -29,13 +29,15 @@ class PointKernels:
     Attributes
     ----------
     twins
-        Pairings (`spectral.PAIRINGS`) and their compiled twins, for `laws.Drive`.
+        Functions of `spectral` and their compiled twins, for `laws.Drive`.
     """
 
     def __init__(self, comm: MPI.Intracomm):
         module = jit.library(comm, point_kernels.DECLARATIONS, point_kernels.SOURCE, "the pass")
         self._call, self._ffi = module.lib, module.ffi
-        self.twins: Mapping[spectral.Pairing, spectral.Pairing] = {spectral.principal: self.principal}
+        self.twins: Mapping[Callable[..., Any], Callable[..., Any]] = {
+            spectral.principal: self.principal, spectral.positive_direction: self.positive_direction
+        }  # fmt: skip
 
     def principal(
         self, tensors: ArrayLike, previous: ArrayLike, tolerance: float = 1e-8, threshold: ArrayLike = 0.0
@@ -57,6 +59,19 @@ class PointKernels:
                 tensors[at], previous[at], tolerance, limit[at] if len(limit) > 1 else limit
             )
         return values, axes
+
+    def positive_direction(self, values: ArrayLike, threshold: ArrayLike = 0.0) -> tuple[Array, NDArray[np.bool_]]:
+        """`spectral.positive_direction`."""
+        values = np.ascontiguousarray(values, np.float64)
+        limit = np.ascontiguousarray(threshold, np.float64).reshape(-1)
+        direction, active = np.empty(values.shape), np.empty(len(values), np.bool_)
+        not_finite = self._call.positive_direction(
+            len(values), self._in(values), self._in(limit), len(limit) > 1, spectral.ROUNDING, self._out(direction),
+            self._ffi.from_buffer("uint8_t[]", active, require_writable=True),
+        )  # fmt: skip
+        if not_finite:  # for the words that name the first one
+            return spectral.positive_direction(values, threshold)
+        return direction, active
 
     def without_noise(self, tensors: Array, axes: Array, noise: ArrayLike) -> Array:
         """`spectral.without_noise`."""

@@ -135,7 +135,8 @@ class StabilityWatcher(Watcher):
 class Signs:
     """What the factors of Newton's last tangent tell for nothing, or for one substitution, about its eigenvalues.
 
-    - The sign of its determinant (MUMPS, ICNTL(33)): it changes with each eigenvalue that changes sign.
+    - How many pivots are negative: of a symmetric tangent as many as eigenvalues (Sylvester). They are news where the
+      first one comes, the last one goes, or their number turns odd or even; of some factors only the latter is known.
     - The curvature w.K w / w.w of w = K^-1 v. From step to step this is inverse iteration: v turns to the mode of the
       eigenvalue that is nearest to zero, so that it is there when one passes through. It sees pairs as well.
 
@@ -149,20 +150,22 @@ class Signs:
         self.newton, self.equilibrium = stepper.coupling.newton, stepper.coupling.equilibrium
         state = stepper.state
         self._vector = Earlier(state, "stability_vector", state.unknown.copy, 1)
-        self._numbers = Numbers(state, "stability_sign", {"now": 1, "at_look": 1})  # of the determinant
+        self._pivots = Numbers(state, "stability_pivots", {"now": 0, "at_look": 0})  # negative ones
 
     def differ(self, known: int) -> bool:
         """Whether they contradict what is known: a number of negative eigenvalues."""
         factorisation = self.newton.factorisation()
         if factorisation is None:
             return False
-        self._numbers["now"] = determinant_sign(factorisation) or self._numbers["at_look"]
-        differs = self._numbers["now"] != self._numbers["at_look"]
+        before, found = int(self._pivots["at_look"]), negative_pivots(factorisation)
+        now = before if found is None else found
+        self._pivots["now"] = now
+        differs = now % 2 != before % 2 or (now == 0) != (before == 0)
         return differs or (self._curvature(factorisation) < 0 and known == 0)
 
     def settle(self) -> None:
         """The eigenvalues have been counted: from now on what differs from the present signs is news."""
-        self._numbers["at_look"] = self._numbers["now"]
+        self._pivots["at_look"] = self._pivots["now"]
 
     def _curvature(self, factorisation: Any) -> float:
         """Of the remembered vector after one more inverse iteration."""
@@ -191,15 +194,31 @@ class Signs:
         return float(curvature)
 
 
-def determinant_sign(factorisation: Any) -> int:
-    """1 or -1, on all ranks; 0 where the factorisation does not tell. CHOLMOD takes positive definite matrices only."""
-    if factorisation.getFactorSolverType() == "cholmod":
-        return 1
-    if factorisation.getFactorSolverType() != "mumps":
-        return 0
+def negative_pivots(factorisation: Any) -> int | None:
+    """How many there are, on all ranks; 1 or 0, odd or even, where only the determinant is known; None: nothing is."""
+    package = factorisation.getFactorSolverType()
+    if package == "cholmod":
+        return 0  # it takes positive definite matrices only
+    if package == "petsc":
+        return _on_the_diagonal(factorisation.getFactorMatrix())
+    if package != "mumps":
+        return None
     factor = factorisation.getFactorMatrix()
-    sign = int(np.sign(factor.getMumpsRinfog(12))) if factor.getMumpsIcntl(33) else 0
-    return int(factorisation.comm.tompi4py().bcast(sign))  # the first rank knows it
+    found = None
+    if factorisation.getType() == "cholesky":
+        found = factor.getMumpsInfog(12)
+    elif factor.getMumpsIcntl(33):
+        found = int(factor.getMumpsRinfog(12) < 0)
+    return factorisation.comm.tompi4py().bcast(found)  # type: ignore[no-any-return]  # the first rank knows it
+
+
+def _on_the_diagonal(factor: Any) -> int:
+    """Of U in PETSc's own LU, which exchanges no rows: a symmetric matrix is L D L^T, with D its diagonal."""
+    pivots = factor.createVecRight()
+    factor.getDiagonal(pivots)
+    count = int(np.count_nonzero(pivots.array_r < 0))
+    pivots.destroy()
+    return count
 
 
 def eigenvalues(number: int) -> str:

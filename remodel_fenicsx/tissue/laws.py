@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ from remodel_fenicsx.tissue.cells import UnitCell, structure_tensor
 from remodel_fenicsx.tissue.drivers import Driver, Frame, carried_axes
 
 Array = NDArray[np.float64]
+Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 class Drive(NamedTuple):
@@ -47,7 +48,7 @@ class Drive(NamedTuple):
     rotation_time
         Time in which the law `rotation` turns a small angle to 1/e of it.
     twins
-        Compiled functions that stand for pairings.
+        Compiled functions that stand for functions of `spectral`.
     """
 
     deformation_gradient: Array
@@ -60,7 +61,11 @@ class Drive(NamedTuple):
     kappa: float
     pairing: spectral.Pairing = spectral.principal
     rotation_time: float = 40.0
-    twins: Mapping[spectral.Pairing, spectral.Pairing] = MappingProxyType({})
+    twins: Mapping[Callable[..., Any], Callable[..., Any]] = MappingProxyType({})
+
+    def compiled(self, function: Function) -> Function:
+        """The twin of a function, or the function itself."""
+        return cast(Function, self.twins.get(function, function))
 
 
 def relaxed(old: UnitCell, new: UnitCell, factor: float) -> UnitCell:
@@ -136,7 +141,7 @@ def ranked(function: RankedFunction, has_limit: bool = False, of_absolute_time: 
 
     def update(cells: UnitCell, drive: Drive, time_old: float, time_new: float) -> UnitCell:
         values, axes = principal_directions(drive, cells.axes, drive.pairing)
-        direction, active = spectral.positive_direction(values, threshold=drive.threshold)
+        direction, active = drive.compiled(spectral.positive_direction)(values, threshold=drive.threshold)
         target = np.reshape(drive.end_to_end_length, (-1, 1)) * direction
         dimensions = function(cells.dimensions, drive.initial_dimensions, target, drive.kappa, time_old, time_new)
         axes = framed(drive, axes, None if drive.pairing is spectral.principal else dimensions)
@@ -161,7 +166,7 @@ def principal_directions(drive: Drive, previous: Array, pairing: spectral.Pairin
     """Principal values and directions of the drive, in the space in which it lives; `previous`: the cells' axes."""
     if not drive.driver.material and drive.frame.carries_axes:
         previous = carried_axes(drive.deformation_gradient, previous)
-    return drive.twins.get(pairing, pairing)(drive.tensor, previous, threshold=drive.threshold)
+    return drive.compiled(pairing)(drive.tensor, previous, threshold=drive.threshold)
 
 
 def framed(drive: Drive, axes: Array, dimensions: Array | None = None) -> Array:

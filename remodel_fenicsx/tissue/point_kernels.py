@@ -10,6 +10,8 @@ from __future__ import annotations
 DECLARATIONS = """
 int64_t principal(int64_t n, const double *tensors, const double *previous, double tolerance, const double *threshold,
                   int64_t step, double decisive, double *values, double *axes, uint8_t *open);
+int64_t positive_direction(int64_t n, const double *values, const double *threshold, int64_t step, double rounding,
+                           double *direction, uint8_t *active);
 void without_noise(int64_t n, const double *tensors, const double *axes, const double *noise, int64_t step,
                    double *steady);
 void stretches(int64_t n, const double *F, const double *dimensions, const double *axes, double *squared, double *sum);
@@ -170,6 +172,26 @@ int64_t principal(int64_t n, const double *tensors, const double *previous, doub
             open[at] = bad[k];
             count += bad[k] != 0;
         }
+    }
+    return count;
+}
+
+/* spectral.positive_direction; returns how many points have a number that is not finite. */
+int64_t positive_direction(int64_t n, const double *values, const double *threshold, int64_t step, double rounding,
+                           double *direction, uint8_t *active)
+{
+    int64_t count = 0;
+    for (int64_t at = 0; at < n; ++at) {
+        const double *v = values + 3 * at;
+        const double a = fabs(v[0]), b = fabs(v[1]), c = fabs(v[2]), ab = a > b ? a : b, largest = ab > c ? ab : c;
+        const double least = rounding * largest > threshold[step * at] ? rounding * largest : threshold[step * at];
+        const double inverse = largest > 0.0 ? 1.0 / largest : 1.0;
+        const double x = v[0] > least ? v[0] * inverse : 0.0, y = v[1] > least ? v[1] * inverse : 0.0;
+        const double z = v[2] > least ? v[2] * inverse : 0.0, length = sqrt(x * x + y * y + z * z);
+        const double scale = length > 0.0 ? 1.0 / length : 0.0;
+        direction[3 * at] = x * scale, direction[3 * at + 1] = y * scale, direction[3 * at + 2] = z * scale;
+        active[at] = length > 0.0;
+        count += !(a + b + c - (a + b + c) == 0.0);
     }
     return count;
 }
