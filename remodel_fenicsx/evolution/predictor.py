@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.evolution.memory import Earlier, Numbers
 from remodel_fenicsx.evolution.state import State
+from remodel_fenicsx.fem.ranks import over_ranks
 from remodel_fenicsx.tissue import mandel
 
 Array = NDArray[np.float64]
@@ -145,12 +146,17 @@ class Responsive:
         rates = {f"rate_{name}": 0.0 for name in state.loading.values}
         durations = {f"duration_{age}": 0.0 for age in range(ANSWERS)}  # the newest first
         self._numbers = Numbers(state, "predictor", {"time": 0.0} | durations | rates)
+        shares = self.quadrature.owned(self.quadrature.volumes).ravel()
+        self._roots = np.repeat(np.sqrt(shares), *components)  # of the points' volumes
+        self._asked: Array | None = None  # the change of the step under way
 
     def expected(self, step: LoadStep) -> Array | None:
         """The unknowns plus the next increment, with the values that supports and loads prescribe."""
+        self._asked = None
         if not self._increments.known or not _goes_on(step, self._numbers):
             return None
-        weights = self._weights(step)
+        self._asked = self._change()
+        weights = self._weights(step, self._asked)
         values: Array = self.state.unknown.x.array + np.tensordot(weights, np.array(self._increments.values), axes=1)
         for condition in self.state.loading.boundary_conditions:
             condition.set(values)
@@ -158,7 +164,8 @@ class Responsive:
 
     def solved(self, step: LoadStep, before: Array) -> None:
         """Remember the increment and what it answers."""
-        increment, change = self.state.unknown.x.array - before, self._change()
+        increment = self.state.unknown.x.array - before
+        change, self._asked = self._change() if self._asked is None else self._asked, None
         if self._numbers["time"] == step.time:  # solved once more: a coupling that iterates
             self._increments.values[0][:] += increment
             self._changes.values[0][:] += change
@@ -176,11 +183,11 @@ class Responsive:
         change = state.cells.structure_tensor() - state.equilibrium_cells.structure_tensor()
         return mandel.vectors(change.reshape(-1, 3, 3)).ravel()
 
-    def _weights(self, step: LoadStep) -> Array:
+    def _weights(self, step: LoadStep, asked: Array) -> Array:
         """Of the last increments, the newest first."""
-        volumes = np.repeat(np.sqrt(self.quadrature.owned(self.quadrature.volumes)).ravel(), len(mandel.MANDEL))
-        changes = [volumes * change[: len(volumes)] for change in (self._change(), *self._changes.values)]
-        products = self.state.comm.allreduce(np.array(changes) @ np.array(changes).T, MPI.SUM)
+        changes = np.array([change[: len(self._roots)] for change in (asked, *self._changes.values)])
+        changes *= self._roots
+        products = over_ranks(self.state.comm, changes @ changes.T, MPI.SUM)
         durations = [self._numbers[f"duration_{age}"] for age in range(self._changes.known)]
         if any(step.rates.values()):  # loads change with time; the last change counts as much as that of the cells
             lengths = np.array([step.duration, *durations]) / durations[0]
