@@ -156,8 +156,8 @@ class Responsive:
         if not self._increments.known or not _goes_on(step, self._numbers):
             return None
         self._asked = self._change()
-        weights = self._weights(step, self._asked)
-        values: Array = self.state.unknown.x.array + np.tensordot(weights, np.array(self._increments.values), axes=1)
+        increment = self._weights(step, self._asked) @ np.array(self._increments.values)
+        values: Array = self.state.unknown.x.array + increment
         for condition in self.state.loading.boundary_conditions:
             condition.set(values)
         return values
@@ -185,14 +185,19 @@ class Responsive:
 
     def _weights(self, step: LoadStep, asked: Array) -> Array:
         """Of the last increments, the newest first."""
-        changes = np.array([change[: len(self._roots)] for change in (asked, *self._changes.values)])
-        changes *= self._roots
+        changes = np.array([asked, *self._changes.values])[:, : len(self._roots)] * self._roots
         products = over_ranks(self.state.comm, changes @ changes.T, MPI.SUM)
-        durations = [self._numbers[f"duration_{age}"] for age in range(self._changes.known)]
+        known = len(products) - 1
         if any(step.rates.values()):  # loads change with time; the last change counts as much as that of the cells
+            durations = [self._numbers[f"duration_{age}"] for age in range(known)]
             lengths = np.array([step.duration, *durations]) / durations[0]
             products += (products[1, 1] or 1.0) * np.outer(lengths, lengths)
-        return np.asarray(np.linalg.lstsq(products[1:, 1:], products[1:, 0], rcond=INDEPENDENT)[0], dtype=np.float64)
+        matrix, right = products[1:, 1:], products[1:, 0]
+        least = INDEPENDENT * float(matrix.diagonal().sum())
+        if not least:  # nothing has changed
+            return np.zeros(known)
+        matrix.flat[:: known + 1] += least
+        return np.asarray(np.linalg.solve(matrix, right), dtype=np.float64)
 
 
 def _goes_on(step: LoadStep, known: Numbers) -> bool:
