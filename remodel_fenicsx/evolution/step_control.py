@@ -159,8 +159,9 @@ class StepControl:
         return max(same, default=0.0)
 
     def _remember_refused(self, duration: float) -> None:
+        """For the steps to come; the first step, before which there is no stress, has an error of another kind."""
         numbers = self._numbers
-        if self._rejected:
+        if self._rejected and self.state.number:
             longest = self._rejected[0]
             if longest.duration > numbers["refused"] or not _same(longest.error, numbers["refused_error"]):
                 numbers["refused"], numbers["refused_error"] = longest.duration, longest.error
