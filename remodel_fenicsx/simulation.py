@@ -86,7 +86,10 @@ class Simulation:
         tissue = scene.material.tissue(scene.cells.end_to_end_length)
         at_once = scene.time.is_equilibrium
         # a predictor goes by the steps before; on the way to an equilibrium there are none like these
-        solver = scene.solver.model_copy(update={"predictor": "none"}) if at_once else scene.solver
+        predictor: str = "none" if at_once else scene.solver.predictor
+        if scene.time.tolerance is not None and predictor != "none":
+            predictor = "responsive"  # steps have all lengths
+        solver = scene.solver.model_copy(update={"predictor": predictor})
         coupling = Homeostasis if at_once else None
         self.stepper = Stepper(self.state, tissue, scene.remodeling, solver, self.load_values, coupling)
         self.tissue = self.stepper.tissue

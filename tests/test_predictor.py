@@ -11,7 +11,7 @@ import pytest
 
 from remodel_fenicsx import Recording, Simulation
 from remodel_fenicsx.evolution.newton import GuardedNewton, SolveFailure
-from remodel_fenicsx.evolution.predictor import Autoregressive, LoadStep
+from remodel_fenicsx.evolution.predictor import PREDICTORS, Autoregressive, LoadStep, NoPredictor, Responsive
 from remodel_fenicsx.results.checkpoint_file import read_checkpoint
 from remodel_fenicsx.running import resume, run
 from tests.parts import pulled_cube
@@ -71,6 +71,37 @@ def test_steps_of_other_lengths_go_on_at_the_same_speed(simulation: Simulation) 
         before = state.unknown.x.array.copy()
         state.unknown.x.array[:] += 1e-3 * duration * speed
         predictor.solved(LoadStep(time, duration, RATES), before)
+
+
+def test_a_body_that_answers_its_cells_is_expected_whatever_the_steps(simulation: Simulation) -> None:
+    """Cells change by combinations of two fields, and the unknowns answer them linearly."""
+    state, held = simulation.state, {"force": 0.0}
+    predictor, rng, cells = Responsive(state), np.random.default_rng(1), state.cells
+    fields = 1e-3 * rng.uniform(0.0, 1.0, (2, *cells.dimension_values.shape))
+    answers = rng.standard_normal((2, len(state.unknown.x.array)))
+    free, time = np.isnan(simulation.stepper.coupling.equilibrium.prescribed_values()), 0.0
+    for number, shares in enumerate(rng.uniform(0.2, 2.0, (6, 2)), start=1):
+        duration = float(rng.uniform(0.1, 3.0))
+        time += duration
+        cells.set(np.sqrt(cells.dimension_values**2 + np.tensordot(shares, fields, axes=1)), cells.axis_values)
+        found, step = predictor.expected(LoadStep(time, duration, held)), LoadStep(time, duration, held)
+        before = state.unknown.x.array.copy()
+        state.unknown.x.array[:] += shares @ answers
+        if number > 2:
+            assert found is not None
+            np.testing.assert_allclose(found[free], state.unknown.x.array[free], rtol=0, atol=1e-7)
+        predictor.solved(step, before)
+        state.settle_cells()
+    assert predictor.expected(LoadStep(time + 1.0, 1.0, {"force": 2.0})) is None
+
+
+def test_the_presets_predict_where_steps_are_chosen() -> None:
+    equal = pulled_cube(9.0).with_values({"solver.predictor": "with-tolerance"})
+    for scene, kind in ((equal, NoPredictor), (equal.with_values({"time.tolerance": 1.0}), Responsive)):
+        simulation = Simulation(scene, SELF)
+        assert type(simulation.stepper.coupling.predictor) is kind  # type: ignore[attr-defined]
+        simulation.close()
+    assert PREDICTORS["with-tolerance"] is NoPredictor
 
 
 def test_another_rate_is_a_new_beginning(simulation: Simulation) -> None:

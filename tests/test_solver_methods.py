@@ -60,7 +60,7 @@ def test_auto_goes_by_the_size(unknowns: int, ranks: int, method: str) -> None:
 def test_presets_name_their_method() -> None:
     for shape in ("cube", "tendon", "tube"):
         solver = preset_scene("kuhl-holzapfel-2007", shape).solver
-        assert (solver.method, solver.predictor) == ("direct", "none")
+        assert (solver.method, solver.predictor) == ("direct", "with-tolerance")
 
 
 # ---------------------------------------------------------------- same states, other work

@@ -52,7 +52,7 @@ PREDICTED = {"solver.predictor": "autoregressive"}
 PRINTED = "kuhl-holzapfel-2007"
 WAYS = {
     "printed": Way("printed: eq. (11), staggered", PRINTED, {}, "printed", EXACT, (1.0,)),
-    "predicted": Way("the same, with the predictor", PRINTED, PREDICTED, "predicted", EXACT, (1.0,)),
+    "predicted": Way("the same, equal steps with the predictor too", PRINTED, PREDICTED, "predicted", EXACT, (1.0,)),
     "implicit": Way("eq. (11), `implicit`", PRINTED, IMPLICIT, "printed", EXACT, (1.0,)),
     "consistent": Way("`tensor`, `extrapolated`", "consistent", {}, "consistent", RICHARDSON, (-1 / 3, 4 / 3)),
 }

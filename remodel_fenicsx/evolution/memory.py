@@ -28,13 +28,14 @@ class Numbers:
 
     def __init__(self, state: State, name: str, initial: Mapping[str, float]):
         self.state, self.name, self.initial = state, name, dict(initial)
+        self._keys = {key: f"{name}_{key}" for key in self.initial}  # steps ask often
 
     def __getitem__(self, key: str) -> float:
-        return self.state.numbers.get(f"{self.name}_{key}", self.initial[key])
+        return self.state.numbers.get(self._keys[key], self.initial[key])
 
     def __setitem__(self, key: str, value: float) -> None:
         """The same value on all ranks."""
-        self.state.numbers[f"{self.name}_{key}"] = float(value)
+        self.state.numbers[self._keys[key]] = float(value)
 
     def forget(self) -> None:
         """As at the start."""

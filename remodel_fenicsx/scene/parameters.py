@@ -323,7 +323,7 @@ def _printed_method(
             "kappa": 0.025,
         },
         "time": {"end": end, "step": 1.0},
-        "solver": {"method": "direct", "predictor": "none"},
+        "solver": {"method": "direct", "predictor": "with-tolerance"},
     }
 
 

@@ -250,11 +250,12 @@ class Solver(Table):
         + " (docs/speed.md).",
         json_schema_extra={"allowed": "one of " + ", ".join(map(repr, (AUTOMATIC, *METHODS)))},
     )
-    predictor: Literal["none", "autoregressive"] = Field(
+    predictor: Literal["none", "autoregressive", "with-tolerance"] = Field(
         default="autoregressive",
         description="Where Newton's method starts a step: 'none': at the displacement of the step before; "
-        "'autoregressive': where the last increments let expect the solution. The solutions are the same to the "
-        "tolerance.",
+        "'autoregressive': where the last increments let expect the solution; 'with-tolerance', that of the presets: "
+        "the latter where steps are chosen (time.tolerance), 'none' where they are equal. The solutions are the same "
+        "to the tolerance.",
     )
     absolute_tolerance: Annotated[float, FORCE] = Field(
         default=0.0,

@@ -134,8 +134,9 @@ def pitch_angle(dimensions: Array, axes: Array, coordinates: Array) -> Array:
 
     atan sqrt(A_zz / A_tt) with the structure tensor A and t the circumferential direction.
     """
-    direction = circumferential_direction(coordinates)  # without a part along z
-    circumferential = axes[..., 0] * direction[..., None, 0] + axes[..., 1] * direction[..., None, 1]
+    radius = np.sqrt(coordinates[..., 0] ** 2 + coordinates[..., 1] ** 2)
+    cosine, sine = coordinates[..., 0, None] / radius[..., None], coordinates[..., 1, None] / radius[..., None]
+    circumferential = axes[..., 0] * -sine + axes[..., 1] * cosine
     return np.degrees(np.arctan2(_norm(dimensions * axes[..., 2]), _norm(dimensions * circumferential)))
 
 
