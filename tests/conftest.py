@@ -51,15 +51,21 @@ def forks_end_with_the_session() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session")
-def cases(tmp_path_factory: pytest.TempPathFactory) -> Cases:
-    """cases(arguments of `case`, ranks) -> what each of them saved; those that are not there yet start together."""
+def cases(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Cases:
+    """cases(arguments of `case`, ranks) -> what each of them saved; those that are not there yet start together.
+
+    With one that a test file lists as ON_ONE_AND_TWO_RANKS start those of all files of this session: ranks start once.
+    """
+    modules = dict.fromkeys(getattr(item, "module", None) for item in request.session.items)
+    on_both = [arguments for module in modules for arguments in getattr(module, "ON_ONE_AND_TWO_RANKS", ())]
     base = tmp_path_factory.getbasetemp()
     folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "cases"
     folder.mkdir(exist_ok=True)
 
     def run(wanted: Sequence[dict[str, Any]], ranks: int) -> list[dict[str, Any]]:
         requests: dict[Path, str] = {}
-        for arguments in wanted:
+        together = on_both if any(arguments in on_both for arguments in wanted) else []
+        for arguments in (*wanted, *together):
             text = json.dumps({"snapshots": [], "divisions": None} | arguments, sort_keys=True)
             requests[folder / (hashlib.sha256(f"{ranks} {text}".encode()).hexdigest()[:16] + ".npz")] = text
         with ExitStack() as locked:
@@ -76,7 +82,7 @@ def cases(tmp_path_factory: pytest.TempPathFactory) -> Cases:
             for out, part in parts.items():
                 part.rename(out)
         found = []
-        for out in requests:
+        for out in [*requests][: len(wanted)]:
             with np.load(out) as data:
                 found.append(dict(data))
         return found

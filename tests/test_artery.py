@@ -1,4 +1,7 @@
-"""Figs. 7 and 8: the artery with the preset's random cells; the whole one is slow, two of its twelve layers are not."""
+"""Figs. 7 and 8: the artery with the preset's random cells.
+
+The whole one to its end is slow, two of its twelve layers to the middle of the hold are not.
+"""
 
 from __future__ import annotations
 
@@ -17,6 +20,7 @@ ARTERY = {
 
 
 LAYERS = 2  # of elements along the axis, each 8/12 long
+KAPPA = 0.025
 
 
 def slice_of(scene: dict, layers: int = LAYERS) -> dict[str, Any]:
@@ -27,8 +31,10 @@ def slice_of(scene: dict, layers: int = LAYERS) -> dict[str, Any]:
 
 @pytest.fixture(scope="module", params=["slice", pytest.param("whole", marks=pytest.mark.slow)])
 def artery(request: pytest.FixtureRequest, case: Case) -> dict:
-    """150 steps."""
-    return case(**(slice_of(ARTERY) if request.param == "slice" else {"scene": ARTERY}), snapshots=(24.0, 150.0))
+    """150 steps; 75 of the slice, when most of it is done."""
+    if request.param == "slice":
+        return case(**slice_of(ARTERY | {"time": {"end": 75.0}}), snapshots=(24.0,))
+    return case(ARTERY, snapshots=(24.0, 150.0))
 
 
 def is_whole(artery: dict) -> bool:
@@ -39,14 +45,14 @@ def is_whole(artery: dict) -> bool:
 def test_outer_radius_peaks_at_full_load_and_shrinks_as_the_wall_stiffens(artery: dict) -> None:
     peak = artery["time"][np.argmax(artery["outer_radius"])]
     assert 22 <= peak <= 26
-    assert artery["outer_radius"].max() - artery["outer_radius"][-1] >= 0.15
-    assert artery["outer_radius"].max() - artery["outer_radius"][-1] <= 0.20
+    fall = artery["outer_radius"].max() - artery["outer_radius"][-1]
+    assert 0.15 <= fall <= 0.20 if is_whole(artery) else 0.13 <= fall <= 0.15
     # symmetry planes would give 3.228; a slice has a sixth of the whole's random cells
     assert artery["outer_radius"][23] == pytest.approx(3.243, abs=2e-3 if is_whole(artery) else 6e-3)
 
 
 def layer_angles(artery: dict) -> np.ndarray:
-    """Mean reference fibre angle of each of the eight element layers at t = 150, from the inside, degrees."""
+    """Mean reference fibre angle of each of the eight element layers at the end, from the inside, degrees."""
     x, l, n = artery["x"], artery["l"], artery["n"]
     radius = np.hypot(x[..., 0], x[..., 1])
     around = np.stack([-x[..., 1], x[..., 0], 0 * radius], axis=-1) / radius[..., None]
@@ -62,9 +68,9 @@ def layer_angles(artery: dict) -> np.ndarray:
 def test_fibre_angle_rises_from_layer_to_layer(artery: dict) -> None:
     angles = layer_angles(artery)
     assert np.all(np.diff(angles) > 0)
-    np.testing.assert_allclose(
-        angles, [1.1, 4.2, 14.0, 36.9, 60.2, 66.7, 70.3, 72.7], rtol=0, atol=1.5 if is_whole(artery) else 2
-    )
+    whole, half_way = [1.1, 4.2, 14.0, 36.9, 60.2, 66.7, 70.3, 72.7], [5.0, 9.1, 18.4, 31.6, 41.0, 53.4, 57.0, 61.4]
+    expected, tolerance = (whole, 1.5) if is_whole(artery) else (half_way, 2.0)
+    np.testing.assert_allclose(angles, expected, rtol=0, atol=tolerance)
 
 
 def test_history_columns_are_the_means_of_their_layers(artery: dict) -> None:
@@ -78,7 +84,8 @@ def test_third_dimension_dies_out_where_there_is_no_third_tension(artery: dict) 
     never = ~artery["third_in_tension"]
     assert 0.05 < never.mean()
     left = artery["l"][..., 2][never]
-    assert np.all(left <= 0.0235 * artery["l0"][..., 2][never] + 1e-3)
+    share = np.exp(-KAPPA * artery["time"][-1])  # 0.0235 at t = 150
+    assert np.all(left <= share * artery["l0"][..., 2][never] + 1e-3)
 
 
 def test_no_accepted_state_passes_the_contour_length(artery: dict) -> None:

@@ -231,17 +231,20 @@ def test_remodeling_in_a_stiff_bulk_is_that_of_fine_quadratic_elements() -> None
     assert locked[0] - 1 < 0.1 * (quadratic[0] - 1)
 
 
+RANDOM_CUBE = {
+    "preset": "kuhl-holzapfel-2007",
+    "geometry": {"shape": "cube"},
+    "mesh": {"refinement": 2, "formulation": SELECTIVE},
+    "material": {"lame_lambda": 3.103e4, "chain_density": 0.0},
+    "cells": {"initial": "random"},
+    "time": {"end": 6.0},
+    "solver": {"absolute_tolerance": 1e-9, "relative_tolerance": 0.0},
+}
+ON_ONE_AND_TWO_RANKS = [{"scene": RANDOM_CUBE}]
+
+
 def test_one_and_two_ranks_agree(case: Case) -> None:
-    scene = {
-        "preset": "kuhl-holzapfel-2007",
-        "geometry": {"shape": "cube"},
-        "mesh": {"refinement": 2, "formulation": SELECTIVE},
-        "material": {"lame_lambda": 3.103e4, "chain_density": 0.0},
-        "cells": {"initial": "random"},
-        "time": {"end": 6.0},
-        "solver": {"absolute_tolerance": 1e-9, "relative_tolerance": 0.0},
-    }
-    one, two = (case(scene, ranks=ranks) for ranks in (1, 2))
+    one, two = (case(RANDOM_CUBE, ranks=ranks) for ranks in (1, 2))
     assert np.ptp(one["l"] - one["l0"]) > 0.05
     for name, tolerance in (("mean_stretch", 1e-8), ("min_jacobian", 1e-8), ("u", 1e-7), ("l", 1e-6)):
         np.testing.assert_allclose(two[name], one[name], rtol=0, atol=tolerance, err_msg=name)

@@ -127,11 +127,11 @@ def test_runs_at_once_compile_one_after_the_other(tmp_path: Path) -> None:
     def start(_: int) -> subprocess.CompletedProcess[str]:
         return subprocess.run(command, capture_output=True, text=True, timeout=120, env=environment)
 
-    with ThreadPoolExecutor(3) as pool:
-        done = list(pool.map(start, range(3)))
-    assert [run.returncode for run in done] == [0, 0, 0], [run.stderr[-500:] for run in done]
+    with ThreadPoolExecutor(2) as pool:
+        done = list(pool.map(start, range(2)))
+    assert [run.returncode for run in done] == [0, 0], [run.stderr[-500:] for run in done]
     assert not any("removing a compilation" in run.stderr for run in done)  # none takes another's work for cut off
-    assert sorted(run.stdout for run in done) == ["0\n", "0\n", "1\n"]
+    assert sorted(run.stdout for run in done) == ["0\n", "1\n"]
 
 
 def test_a_cache_that_cannot_be_written_is_replaced_with_a_warning(tmp_path: Path) -> None:

@@ -77,14 +77,14 @@ def test_radial_is_the_independent_solution(driver: str, end: float) -> None:
 
 @pytest.mark.parametrize("driver", ["cauchy", *slowly("pk2", "finger")])
 def test_the_consistent_law_is_the_independent_solution(driver: str) -> None:
-    """Its law, typed by hand in the reference too."""
+    """Its law, typed by hand in the reference too; linear elements, which other tests of this law compile anyway."""
     changes = {"driver": driver, "law": "tensor", "frame": "material"}
-    tables: dict[str, Any] = {"mesh": {"degree": 2, "refinement": 8}, "material": {"repulsion": "log"}}
+    tables: dict[str, Any] = {"mesh": {"refinement": 18}, "material": {"repulsion": "log"}}
     simulation = Simulation(scene("tube", "radial", 10.0, remodeling=changes, **tables), SELF)
     steps = list(simulation.steps())
     exact, printed = (solve_radial(driver=driver, law=law, end=10.0, elements=150) for law in ("tensor", "explicit"))
     inner = [step.row["inner_radius"] for step in steps]
-    np.testing.assert_allclose(inner, exact.inner_radii, rtol=1e-5)
+    np.testing.assert_allclose(inner, exact.inner_radii, rtol=2e-5)
     assert np.abs(printed.inner_radii / exact.inner_radii - 1).max() > 1e-3
     angle = Measurement(simulation.observer, steps[-1]).fibre_angle
     expected = np.interp(simulation.quadrature.coordinates[..., 0], exact.points, exact.fibre_angle())
@@ -355,13 +355,14 @@ TWICE = {
     "axisymmetric": values("tube", "axisymmetric", 5.0, supports={"ends": "clamped"}),
     "sector": values("tube", "sector", 5.0),
 }
+ON_ONE_AND_TWO_RANKS = [{"scene": scene | {"solver": {"relative_tolerance": 1e-13}}} for scene in TWICE.values()]
 
 
 @pytest.fixture(scope="module")
 def on_one_and_two_ranks(cases: Cases) -> dict[str, tuple[dict[str, Any], dict[str, Any]]]:
     """What each of them saves."""
-    wanted = [{"scene": scene | {"solver": {"relative_tolerance": 1e-13}}} for scene in TWICE.values()]
-    return dict(zip(TWICE, zip(cases(wanted, 1), cases(wanted, 2), strict=True), strict=True))
+    found = (cases(ON_ONE_AND_TWO_RANKS, ranks) for ranks in (1, 2))
+    return dict(zip(TWICE, zip(*found, strict=True), strict=True))
 
 
 @pytest.mark.parametrize("name", TWICE)

@@ -72,7 +72,7 @@ class StabilityWatcher(Watcher):
         self._numbers["iterations"] = iterations = self._numbers["iterations"] + effort
         suspicious = self.signs.differ(known) if step.work.newton_iterations else False
         overdue = iterations >= ITERATIONS_BETWEEN_LOOKS or (step.is_last and iterations > 0)
-        if overdue and not suspicious and self._is_too_large():
+        if overdue and not suspicious and not self.every_step and self.unknowns > MOST_UNKNOWNS:
             overdue = False
             if step.is_last:
                 self._info(
@@ -91,9 +91,6 @@ class StabilityWatcher(Watcher):
             self._say(step, known, int(count))
 
     # ------------------------------------------------------------ what it means
-    def _is_too_large(self) -> bool:
-        return not self.every_step and self.unknowns > MOST_UNKNOWNS
-
     def _count(self) -> float:
         try:
             return self.inertia.negative_eigenvalues()
