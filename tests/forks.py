@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import gc
 import importlib
+import importlib.metadata
 import json
 import os
 import signal
@@ -177,6 +179,18 @@ def status_of(child: int, seconds: float | None) -> int:
         time.sleep(0.002)
 
 
+def what_is_imported_stays() -> None:
+    """For a process that goes on for long, and its children: work of libraries that finds nothing new is spared.
+
+    No collection of garbage goes through what is there, and setuptools, which cffi asks for its compiler, does not read
+    the entry points of all packages anew, six times for every kernel.
+    """
+    gc.freeze()
+    gc.set_threshold(50_000, *gc.get_threshold()[1:])  # forms make many objects and little garbage
+    known = importlib.metadata.entry_points()
+    importlib.metadata.entry_points = lambda **wanted: known.select(**wanted)
+
+
 def serve() -> None:
     """Until there are no more requests."""
     for line in sys.stdin:
@@ -192,6 +206,7 @@ def serve() -> None:
 if __name__ == "__main__":
     for module in ("gmsh", "h5py", "remodel_fenicsx.body.meshing", "remodel_fenicsx.running", "tests.run_case"):
         importlib.import_module(module)
+    what_is_imported_stays()
     if sys.argv[1:]:
         sys.exit(four_layers(sys.argv[1:]))
     serve()

@@ -20,6 +20,8 @@ from typing import Any
 import pytest
 from xdist.scheduler import LoadFileScheduling
 
+from tests.forks import what_is_imported_stays
+
 PROJECT = Path(__file__).resolve().parents[1]
 SLOW_LIMIT = 3600  # seconds for a test marked slow; pyproject.toml has the limit of all others
 COMPILED = "REMODEL_FENICSX_COMPILED"  # names the file that gets one line for each kernel that is compiled
@@ -183,6 +185,11 @@ def pytest_configure(config: pytest.Config) -> None:
         os.environ.pop("PYTHONUNBUFFERED", None)  # it writes a line in pieces, and those of two ranks come mixed
         # an mpirun that was killed leaves a folder, in the way of a later one with the same process number
         os.environ["PRTE_MCA_prte_tmpdir_base"] = os.environ["OMPI_MCA_orte_tmpdir_base"] = folder.name
+
+
+def pytest_collection_finish() -> None:
+    """From here on nothing is imported but by tests."""
+    what_is_imported_stays()
 
 
 def pytest_terminal_summary(terminalreporter: Any) -> None:
