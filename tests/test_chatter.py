@@ -132,6 +132,20 @@ def test_factor_and_size_of_a_swing_are_found_beside_a_smooth_course(factor: flo
     assert scripted.watcher.warned == (factor == -3.0)
 
 
+def test_passes_around_a_rest_do_not_count() -> None:
+    """Cells that go on after a rest jump: the swing is told from passes that have moved them."""
+    scripted, warned = Scripted(-3.0, 4e-5), []
+    scripted.watcher.started(scripted.step(0))
+    for number in range(1, 9):
+        step = scripted.step(number)
+        if number == 4:
+            scripted.step(3)  # cells as they were
+        scripted.watcher.completed(step)
+        scripted.watcher.committed(step)
+        warned.append(scripted.watcher.warned)
+    assert not any(warned[:6]) and warned[-1]
+
+
 def test_a_step_that_is_undone_leaves_no_trace() -> None:
     """What is remembered is part of the state, which forgets the step."""
     scripted = Scripted(-3.0, 1e-6)
