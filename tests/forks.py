@@ -182,10 +182,9 @@ def status_of(child: int, seconds: float | None) -> int:
 def what_is_imported_stays() -> None:
     """For a process that goes on for long, and its children: work of libraries that finds nothing new is spared.
 
-    No collection of garbage goes through what is there, and setuptools, which cffi asks for its compiler, does not read
-    the entry points of all packages anew, six times for every kernel.
+    Garbage is collected less often, and setuptools, which cffi asks for its compiler, does not read the entry points of
+    all packages anew, six times for every kernel.
     """
-    gc.freeze()
     gc.set_threshold(50_000, *gc.get_threshold()[1:])  # forms make many objects and little garbage
     known = importlib.metadata.entry_points()
     importlib.metadata.entry_points = lambda **wanted: known.select(**wanted)
@@ -207,6 +206,7 @@ if __name__ == "__main__":
     for module in ("gmsh", "h5py", "remodel_fenicsx.body.meshing", "remodel_fenicsx.running", "tests.run_case"):
         importlib.import_module(module)
     what_is_imported_stays()
+    gc.freeze()  # children share what is there: no collection goes through it
     if sys.argv[1:]:
         sys.exit(four_layers(sys.argv[1:]))
     serve()
