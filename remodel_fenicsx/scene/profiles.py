@@ -52,9 +52,9 @@ def _profile(refinement: int, degree: int, tolerance: float, degrees: float, per
 
 
 PROFILES: dict[str, Profile] = {
-    "fast": _profile(1, 1, 1.0, 1.5, 0.8, 0.2),
-    "balanced": _profile(1, 2, 0.5, 0.6, 0.65, 0.3),
-    "reference": _profile(2, 2, 0.1, 0.12, 0.09, 1.2),
+    "fast": _profile(1, 1, 1.0, 1.4, 0.7, 0.2),
+    "balanced": _profile(1, 2, 0.5, 0.5, 0.5, 0.4),
+    "reference": _profile(2, 2, 0.1, 0.13, 0.11, 1.8),
 }
 
 
