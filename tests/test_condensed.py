@@ -186,14 +186,14 @@ def test_held_points_have_the_tangent_of_their_cells() -> None:
 
 
 def test_a_long_step_is_followed_where_newtons_method_does_not_find_its_end() -> None:
-    """kappa dt = 10 from random cells: the branch that the cells at the start lead to, up to the last point."""
+    """kappa dt = 10 from random cells: the branch that the cells at the start lead to, which 391 find of themselves."""
     rng = np.random.default_rng(8)
-    R = Rotation.random(60, random_state=rng).as_matrix()
-    F = np.swapaxes(R, 1, 2) @ ((1 + rng.uniform(-0.2, 0.3, (60, 3)))[:, :, None] * R)
-    some = points("tensor", "log", "cauchy", "material", 60, "random", kappa=2.5)
+    R = Rotation.random(400, random_state=rng).as_matrix()
+    F = np.swapaxes(R, 1, 2) @ ((1 + rng.uniform(-0.2, 0.3, (400, 3)))[:, :, None] * R)
+    some = points("tensor", "log", "cauchy", "material", 400, "random", kappa=2.5)
     start = some.kept(F, some.step.cells, some.step.structure).driving_tensor
     found = some.solve(F, start)
-    assert found.converged.mean() > 0.98
+    assert found.converged.sum() >= 398
     A = found.structure
     np.testing.assert_allclose(np.trace(A, axis1=1, axis2=2)[found.converged], 1.0, atol=1e-12)
     assert (np.linalg.eigvalsh(A) > -1e-12).all()
