@@ -11,14 +11,16 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from remodel_fenicsx.tissue import spectral
+from remodel_fenicsx.tissue import mandel, spectral
 from remodel_fenicsx.tissue.cells import UnitCell, structure_tensor
 from remodel_fenicsx.tissue.condensed import CondensedPoints, Solution
 from remodel_fenicsx.tissue.drivers import DRIVERS, FRAMES
 from remodel_fenicsx.tissue.energy import Tissue
 from remodel_fenicsx.tissue.laws import LAWS, Drive
+from remodel_fenicsx.tissue.network import OrthotropicCells, Strain
 from remodel_fenicsx.tissue.repulsion import REPULSIONS
-from remodel_fenicsx.tissue.responses import StepOfCells
+from remodel_fenicsx.tissue.responses import StepOfCells, response
+from remodel_fenicsx.tissue.tensor_law import ABOVE_NOISE
 
 Array = NDArray[np.float64]
 
@@ -89,6 +91,57 @@ def test_the_tangent_is_the_derivative(law: str, repulsion: str, driver: str, fr
         error = np.einsum("niJkL,nkL->niJ", tangent, H) - expected
         errors.append(np.linalg.norm(error, axis=(1, 2)) / np.linalg.norm(expected, axis=(1, 2)))
     assert np.median(errors) < 1e-7 and np.max(errors) < 1e-5
+
+
+def test_tension_hardly_above_noise_answers_by_the_switch_too() -> None:
+    """There the size of the stress decides how much remodels, not its directions alone."""
+    rng = np.random.default_rng(9)
+    quiet, F = points("tensor", "log", "cauchy", "material", 20), deformations(20, rng)
+    size = float(np.median(np.linalg.norm(solved(quiet, F).driving_tensor, axis=(1, 2))))
+    some = points("tensor", "log", "cauchy", "material", 20, noise=size / ABOVE_NOISE, rounding=1e-13)
+    found = solved(some, F)
+    assert found.converged.all()
+    tangent = some.tangent(found, np.zeros(20, dtype=bool))
+    for _ in range(3):
+        H = rng.standard_normal((20, 3, 3))
+        expected = difference_quotient(some, F, H, 1e-6, found.driving_tensor)
+        error = np.linalg.norm(np.einsum("niJkL,nkL->niJ", tangent, H) - expected, axis=(1, 2))
+        assert np.max(error / np.linalg.norm(expected, axis=(1, 2))) < 1e-6
+
+
+@pytest.mark.parametrize("frame, pairing", [("material", "sorted"), ("spatial", "sorted"), ("material", "continuous")])
+def test_cells_by_rank_answer_to_the_driving_tensor_and_to_the_stretch(frame: str, pairing: str) -> None:
+    """Each alone, with axes that the two do not share: at a solution they mostly do."""
+    rng, h = np.random.default_rng(7), 1e-6
+    some = points("relaxation", "axes", "cauchy", frame, 30, "random")
+    step = replace(some.step, pairing=spectral.PAIRINGS[pairing])
+    R = Rotation.random(30, random_state=rng).as_matrix()
+    X = np.swapaxes(R, 1, 2) @ ((rng.uniform(0.8, 1.2, (30, 3)) * [6.0, 3.0, 1.0])[:, :, None] * R)
+    U, changes = np.tile(np.diag([0.8, 1.1, 1.3]), (30, 1, 1)), rng.standard_normal((30, 3, 3))
+    H, strain = changes + np.swapaxes(changes, 1, 2), Strain.of(U)
+    found = response(step, strain, strain.inside(X), derivatives=True)
+    assert found.by_tensor is not None and (found.by_stretch is not None) == (frame == "material")
+    for derivative, by_stretch in ((found.by_tensor, False), (found.by_stretch, True)):
+        if derivative is None:
+            continue
+        up, down = (outside(step, U + d * H, X) if by_stretch else outside(step, U, X + d * H) for d in (h, -h))
+        expected = numbers_of_the_change(outside(step, U, X), up, down) / (2 * h)
+        answer = np.einsum("nab,nb->na", derivative, mandel.vectors(strain.inside(H)))
+        np.testing.assert_allclose(answer, expected, rtol=1e-5, atol=1e-6)
+
+
+def outside(step: StepOfCells, U: Array, X: Array) -> UnitCell:
+    """The cells that X makes at U, in the global basis."""
+    strain = Strain.of(U)
+    cells = response(step, strain, strain.inside(X), derivatives=False).cells
+    assert isinstance(cells, OrthotropicCells)
+    return UnitCell(cells.cell.dimensions, cells.cell.axes @ np.swapaxes(strain.basis, 1, 2))
+
+
+def numbers_of_the_change(at: UnitCell, up: UnitCell, down: UnitCell) -> Array:
+    """Of lengths, and of the turns n_j . dn_i."""
+    turns = np.einsum("nia,nja->nij", up.axes - down.axes, at.axes)
+    return np.concatenate([up.dimensions - down.dimensions, *(turns[:, i, j, None] for i, j in mandel.PAIRS)], axis=1)
 
 
 @pytest.mark.parametrize("law, repulsion, driver, frame", COMBINATIONS)
