@@ -196,18 +196,19 @@ def _compiler_watched(comm: MPI.Intracomm, what: str, seconds: int) -> Iterator[
 
     FFCx computes a kernel's name and looks for it by `get_cached_module`: nothing else knows without doing that work
     twice whether the compiler is going to run. So this stands before that function. What is in the cache passes at
-    once: no lock, no waiting. Of several ranks the first compiles; the others ask when it is done.
+    once: no lock, no waiting, and no list of the cache's thousands of files, which FFCx makes at every look. Of several
+    ranks the first compiles; the others ask when it is done.
     """
-    if comm.rank != 0:
-        yield
-        return
     look_up: Callable[..., Any] = ffcx.codegeneration.jit.get_cached_module
     with ExitStack() as until_compiled:
 
-        def watched(kernel: str, *arguments: Any, **options: Any) -> Any:
-            if not _is_cached(kernel):
+        def watched(kernel: str, names: list[str], *arguments: Any, **options: Any) -> Any:
+            if _is_cached(kernel):
+                module = _loaded(kernel)
+                return [getattr(module.lib, name) for name in names], module
+            if comm.rank == 0:
                 until_compiled.enter_context(_compiling(kernel, what, seconds))
-            return look_up(kernel, *arguments, **options)
+            return look_up(kernel, names, *arguments, **options)
 
         ffcx.codegeneration.jit.get_cached_module = watched
         try:
