@@ -20,6 +20,7 @@ from mpi4py import MPI
 from scipy.spatial import cKDTree
 
 from remodel_fenicsx.body import SHAPES, Cube, Tendon, Tube, cube, tendon, tube
+from remodel_fenicsx.body.lattice import interval_domain
 from tests import parallel_geometry
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -263,6 +264,19 @@ def test_a_tube_with_divisions_of_its_own(element, degree, refinement):
     assert area(body, "inner") == pytest.approx(
         0.25 * (2 * around * np.sin(np.pi / around) if degree == 1 else 2 * np.pi), rel=1e-3 if degree == 2 else 1e-12
     )
+
+
+@pytest.mark.parametrize("kind", ["drawn", "points"])
+def test_ufls_side_of_a_mesh_is_ufls_own_but_for_the_number_of_its_cells(kind):
+    """The same forms, so that kernels have the same names; one cell, however often it is asked for."""
+    line, faces = ((1.0, 0.0, 0.0), (2.0, 0.0, 0.0), 3, 2), {"inner": lambda x: np.isclose(x[0], 1.0)}
+    domain = domain_of("tube") if kind == "drawn" else interval_domain(*line, faces, "tube", {}, MPI.COMM_SELF)
+    ours = domain.mesh.ufl_domain()
+    theirs = ufl.Mesh(ours.ufl_coordinate_element())
+    assert ours.ufl_cell() == theirs.ufl_cell() and ours.ufl_cell() is ours.ufl_cell()
+    assert ours.ufl_cargo() is domain.mesh._cpp_object and ours.ufl_id() != theirs.ufl_id()
+    signatures = {(ufl.SpatialCoordinate(mesh)[0] * ufl.dx(mesh)).signature() for mesh in (ours, theirs)}
+    assert len(signatures) == 1
 
 
 def test_the_papers_divisions_are_the_default():

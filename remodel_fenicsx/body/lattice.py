@@ -88,11 +88,12 @@ def _domain(
 ) -> Domain:
     import basix.ufl
     import dolfinx.mesh
-    import ufl
+
+    from remodel_fenicsx.fem.symbolic_mesh import SymbolicMesh
 
     comm = comm or MPI.COMM_WORLD
     here = slice(None) if comm.rank == 0 else slice(0)
-    geometry = ufl.Mesh(basix.ufl.element("Lagrange", kind, degree, shape=(3,)))
+    geometry = SymbolicMesh(basix.ufl.element("Lagrange", kind, degree, shape=(3,)))
     mesh: Any = dolfinx.mesh.create_mesh(comm, cells=elements[here], x=points[here], e=geometry)
     dimension = mesh.topology.dim - 1
     found = [dolfinx.mesh.locate_entities_boundary(mesh, dimension, marker) for marker in faces.values()]

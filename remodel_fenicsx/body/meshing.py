@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from typing import Any
 
 from mpi4py import MPI
 
@@ -38,7 +39,7 @@ def build_domain(
         verdict, faces = comm.bcast(None, root=0)
         if verdict:
             raise GeometryError(verdict)
-        return Domain(*compat.mesh_from_gmsh(None, comm), faces, shape, dimensions)
+        return _domain(None, comm, faces, shape, dimensions)
     # the verdict goes out exactly once, whether Gmsh is missing, fails or is interrupted: nobody waits for ever
     told = False
     try:
@@ -47,7 +48,7 @@ def build_domain(
             faces = named_faces()
             told = True
             comm.bcast(("", faces), root=0)
-            return Domain(*compat.mesh_from_gmsh(gmsh.model, comm), faces, shape, dimensions)
+            return _domain(gmsh.model, comm, faces, shape, dimensions)
     except BaseException as error:
         if told:
             raise
@@ -56,3 +57,11 @@ def build_domain(
         if not isinstance(error, Exception):  # Ctrl-C on rank 0 stays what it is there
             raise
         raise GeometryError(verdict) from error
+
+
+def _domain(model: Any, comm: MPI.Intracomm, faces: dict[str, int], shape: str, dimensions: dict[str, float]) -> Domain:
+    from remodel_fenicsx.fem.symbolic_mesh import SymbolicMesh
+
+    mesh, facet_tags = compat.mesh_from_gmsh(model, comm)
+    symbolic = SymbolicMesh(mesh.ufl_domain().ufl_coordinate_element())
+    return Domain(type(mesh)(mesh._cpp_object, symbolic), facet_tags, faces, shape, dimensions)
