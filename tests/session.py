@@ -4,9 +4,11 @@ changed, how many kernels were compiled, and which files start first.
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 import faulthandler
 import hashlib
+import importlib
 import os
 import platform
 import signal
@@ -162,6 +164,23 @@ class LongFilesFirst(LoadFileScheduling):  # type: ignore[misc]
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     """For --dist loadfile, which tests/run asks for."""
     return LongFilesFirst(config, log) if config.getoption("dist") == "loadfile" else None
+
+
+# ---------------------------------------------------------------- what pytest makes of the test files
+def pytest_collection(session: pytest.Session) -> None:
+    """Each of pytest-xdist's workers imports the test files in another order before it collects them.
+
+    pytest rewrites their assertions, in a fresh clone for as long as it imports all else, and leaves the bytecode to
+    whoever comes later: so the workers share this work, where in the same order all would do all of it.
+    """
+    worker = getattr(session.config, "workerinput", None)
+    if worker is None or session.config.args_source is not pytest.Config.ArgsSource.TESTPATHS:
+        return
+    files = sorted(Path(__file__).parent.glob("test_*.py"))
+    first = int(worker["workerid"].removeprefix("gw")) * len(files) // worker["workercount"]
+    for path in files[first:] + files[:first]:
+        with contextlib.suppress(Exception):  # collecting it says what is wrong
+            importlib.import_module(f"tests.{path.stem}")
 
 
 # ---------------------------------------------------------------- the session

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import pkgutil
 import re
 import subprocess
@@ -49,7 +50,8 @@ def modules() -> dict[str, Path]:
     return found
 
 
-def imports_of(name: str, path: Path) -> Iterator[tuple[str, str]]:
+@functools.cache
+def imports_of(path: Path) -> list[tuple[str, str]]:
     """(dotted name of what is imported, when) for every import in a file, whatever is imported."""
 
     def walk(nodes: list[ast.stmt], when: str) -> Iterator[tuple[str, str]]:
@@ -68,14 +70,14 @@ def imports_of(name: str, path: Path) -> Iterator[tuple[str, str]]:
                 bodies += [handler.body for handler in getattr(node, "handlers", [])]
                 yield from walk([statement for body in bodies for statement in body], inside)
 
-    yield from walk(ast.parse(path.read_text(encoding="utf-8")).body, "module")
+    return list(walk(ast.parse(path.read_text(encoding="utf-8")).body, "module"))
 
 
 def arrows() -> list[Import]:
     """All imports of modules of the package in the package."""
     known, found = modules(), []
     for name, path in known.items():
-        for imported, when in imports_of(name, path):
+        for imported, when in imports_of(path):
             parts = imported.split(".")
             if parts[0] != PACKAGE:
                 continue
@@ -97,7 +99,7 @@ def test_the_reader_of_imports_finds_them(tmp_path: Path) -> None:
     text = "import a.b\nif TYPE_CHECKING:\n    from c import d\ntry:\n    import e\nexcept ImportError:\n    import f\n"
     text += "def g():\n    with h:\n        from i import j, k\nclass L:\n    import m\n"
     (tmp_path / "x.py").write_text(text)
-    found = list(imports_of("x", tmp_path / "x.py"))
+    found = imports_of(tmp_path / "x.py")
     assert found == [("a.b", "module"), ("c.d", "types"), ("e", "module"), ("f", "module"), ("i.j", "function"),
                      ("i.k", "function"), ("m", "module")]  # fmt: skip
     assert Import("evolution.stepper", "evolution.state", "module") in arrows()
@@ -172,7 +174,7 @@ def test_a_room_does_without(inside: str, never: set[str]) -> None:
         (name, imported.split(".")[0])
         for name, path in modules().items()
         if room(name) == inside
-        for imported, when in imports_of(name, path)
+        for imported, when in imports_of(path)
         if when != "types" and imported.split(".")[0] in never
     }
     assert not found

@@ -217,8 +217,8 @@ class Measurement:
     @cached_property
     def axial_stretch(self) -> Array:
         """Volume mean of F_zz in each local element, (elements,)."""
-        expression = self.tool("axial stretch", self._compile_axial_stretch)
-        return self.quadrature.element_mean(self.quadrature.evaluate(expression, (1,)))[:, 0]
+        F = self.state.deformation_gradient()
+        return self.quadrature.element_mean(F[:, 2, 2].reshape(self.quadrature.shape))
 
     def face_mean(self, face: str, nodal_values: Array, deformed: bool = False) -> float:
         """Mean of nodal values (nodes,) over a named face, by its reference or its deformed area."""
@@ -256,10 +256,6 @@ class Measurement:
             self._of_step[key] = make()
         return self._of_step[key]
 
-    def _compile_axial_stretch(self) -> Any:
-        F = self.state.kinematics.deformation_gradient(self.state.unknown)
-        return jit.expression(F[2, 2], self.quadrature.points)
-
 
 class _FaceMean:
     """Mean over a face of a nodal field, over the reference or the deformed area."""
@@ -274,12 +270,15 @@ class _FaceMean:
         F = state.kinematics.deformation_gradient(state.unknown)
         stretched = ufl.cofac(F) * normal if deformed else normal
         weight = ufl.sqrt(ufl.inner(stretched, stretched)) * state.kinematics.weight(domain.mesh)
-        measure = state.loading.surface_measure(face)
-        self._weighted, self._area = jit.form(value * weight * measure), jit.form(weight * measure)
+        self._form = jit.form(value * weight * state.loading.measure_alone(face))
         self._comm = domain.comm
 
     def __call__(self, nodal_values: Array) -> float:
-        self.field.x.array.reshape(-1, self._size)[:, 0] = nodal_values
-        both = np.array([np.real(dolfinx.fem.assemble_scalar(form)) for form in (self._weighted, self._area)])
-        weighted, area = self._comm.allreduce(both, MPI.SUM)
+        weighted, area = self._comm.allreduce(
+            np.array([self._integral(values) for values in (nodal_values, 1.0)]), MPI.SUM
+        )
         return float(weighted / area)
+
+    def _integral(self, nodal_values: Array | float) -> float:
+        self.field.x.array.reshape(-1, self._size)[:, 0] = nodal_values
+        return float(np.real(dolfinx.fem.assemble_scalar(self._form)))
