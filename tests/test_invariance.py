@@ -9,18 +9,20 @@ from __future__ import annotations
 
 from typing import Any
 
-import basix.ufl
 import dolfinx.fem
+import dolfinx.mesh
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mpi4py import MPI
 
 from remodel_fenicsx.evolution.coupling import COUPLINGS
 from remodel_fenicsx.scene import parameters
 from remodel_fenicsx.tissue import spectral
 from remodel_fenicsx.tissue.cells import angle_to_axis, structure_tensor
 from remodel_fenicsx.body import cube
+from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.loading import Loading
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
 from remodel_fenicsx.evolution.state import State
@@ -161,11 +163,16 @@ class Points:
     """Every element has a deformation gradient of its own, every point a cell of its own: 64 by 8 states."""
 
     def __init__(self) -> None:
-        self.domain = cube(refinement=4)
-        mesh = self.domain.mesh
-        element = basix.ufl.element("Discontinuous Lagrange", mesh.topology.cell_name(), 1, shape=(3,))
-        self.space = dolfinx.fem.functionspace(mesh, element)
-        self.displacement = dolfinx.fem.Function(self.space, name="displacement")
+        # elements that share no node: what dolfinx asks of a displacement of the kernels that are compiled anyway
+        joined = cube(refinement=4, comm=MPI.COMM_SELF)
+        nodes, cells = joined.gather_mesh()
+        own = np.arange(cells.size).reshape(cells.shape)
+        shape = joined.mesh.ufl_domain().ufl_coordinate_element()
+        mesh = dolfinx.mesh.create_mesh(MPI.COMM_SELF, cells=own, x=nodes[cells].reshape(-1, 3), e=shape)
+        nothing = dolfinx.mesh.meshtags(mesh, 2, np.zeros(0, dtype=np.int32), np.zeros(0, dtype=np.int32))
+        self.domain = Domain(mesh, nothing, {}, "cube", joined.dimensions)
+        self.displacement = FullKinematics().unknown(mesh, 1)
+        self.space = self.displacement.function_space
         self.quadrature = Quadrature(mesh, 1)
         self.cells = UnitCells(
             self.quadrature, self.domain.element_number, self.domain.number_of_elements, Cells(initial="random", seed=2)
