@@ -204,6 +204,7 @@ def test_a_uniform_body_never_locks(element: str, caplog: Any) -> None:
         material={"lame_lambda": 3.103e5, "chain_density": 0.0},
         cells={"initial": "isotropic"},
         loads={"force": {"value": 3.0, "ramp": [[0.0, 0.0], [2.0, 1.0]]}},
+        remodeling={"law": "none"},
         time={"end": 3.0},
     )
     with caplog.at_level(logging.WARNING), simulated(scene):
