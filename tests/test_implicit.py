@@ -104,7 +104,7 @@ def test_the_other_printed_laws_are_of_first_order(law: str) -> None:
 )
 def test_long_steps_run(law: str, cells: str, end: float) -> None:
     """kappa times the step is ten."""
-    divisions = (12, 3, 1) if end == 5.0 else (8, 2, 1)
+    divisions = (12, 3, 1) if end == 5.0 else (4, 3, 1)
     simulation = short_tube(end, law=law, cells=cells, kappa=10.0, divisions=divisions)
     rows = run(simulation)
     assert all(row["held_points"] == 0 for row in rows)
