@@ -41,13 +41,14 @@ def session(folder: Path, *arguments: str, **variables: str) -> subprocess.Compl
 
 def words_of(folder: Path, *arguments: str) -> list[str]:
     """Of pytest's command line."""
-    return ["-p", "tests.session", "-c", str(PROJECT / "pyproject.toml"), "--rootdir", str(folder), *arguments]
+    plugins = ["-p", "xdist", "-p", "timeout", "-p", "tests.session"]
+    return [*plugins, "-c", str(PROJECT / "pyproject.toml"), "--rootdir", str(folder), *arguments]
 
 
 def environment_of(**variables: str) -> dict[str, str]:
-    """This one, but for what belongs to this session."""
+    """This one, but for what belongs to this session, and without plugins that take longer than these tests do."""
     inherited = {name: value for name, value in os.environ.items() if not name.startswith(("PYTEST_", "REMODEL_"))}
-    return {**inherited, "PYTHONPATH": str(PROJECT), **variables}
+    return {**inherited, "PYTHONPATH": str(PROJECT), "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1", **variables}
 
 
 def has_ended(process: int) -> bool:
@@ -92,7 +93,7 @@ MAIN = "import sys, pytest; sys.exit(pytest.main(sys.argv[1:]))"
 def launcher_session(folder: Path, *arguments: str, **variables: str) -> dict[str, str]:
     """What pytest says at its end, with a cache of the test's own; forked, for nothing in it looks at processes."""
     words, environment = words_of(folder, *arguments), environment_of(XDG_CACHE_HOME=str(folder / "cache"), **variables)
-    plugins = ("pytest", "xdist.plugin", "pytest_timeout", "_hypothesis_pytestplugin")
+    plugins = ("pytest", "xdist.plugin", "pytest_timeout")
     done = forked("python", MAIN, *words, cwd=folder, variables=environment, imports=plugins)
     said = done.stdout.splitlines()
     return {"summary": said[-1], "skipped": "\n".join(line for line in said if line.startswith("SKIPPED"))}

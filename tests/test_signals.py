@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -11,8 +12,10 @@ from pathlib import Path
 
 import pytest
 
+from remodel_fenicsx.fem import jit
 from remodel_fenicsx.results.recording import read_history
 from tests.conftest import slowly
+from tests.forks import forked
 from tests.processes import all_end, wait_for_compiler
 
 PROJECT = Path(__file__).parents[1]
@@ -37,11 +40,15 @@ def test_a_reader_that_goes_away_costs_no_step(stream: str, tmp_path: Path) -> N
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="Linux has a disk that is always full")
 def test_a_full_disk_below_stdout_is_exit_code_5(tmp_path: Path) -> None:
-    with open("/dev/full", "w") as full:
-        words = [*COMMAND, "-q", "-o", tmp_path / "out"]
-        done = subprocess.run(words, timeout=200, stdout=full, stderr=subprocess.PIPE)
+    program = """
+import os, sys
+from remodel_fenicsx import cli
+os.dup2(os.open("/dev/full", os.O_WRONLY), 1)
+sys.exit(cli.main(sys.argv[1:]))
+"""
+    done = forked("python", program, *CUBE, "-q", "-o", tmp_path / "out")
     assert done.returncode == 5
-    assert done.stderr.decode() == "remodel-fenicsx: cannot write to the standard output: No space left on device\n"
+    assert done.stderr == "remodel-fenicsx: cannot write to the standard output: No space left on device\n"
     assert read_history(tmp_path / "out")["time"][-1] == 10
 
 
@@ -133,7 +140,7 @@ def meshing(scene, comm):
 running.Simulation = meshing
 sys.exit(cli.main({[*CUBE, "-o", str(tmp_path / "out")]!r}))
 """
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=100)
+    done = forked("python", program)
     assert (done.returncode, done.stdout) == (143, "")
     assert done.stderr == "remodel-fenicsx: stopped by SIGTERM; nothing was computed\n"
     assert list(tmp_path.iterdir()) == []
@@ -172,7 +179,7 @@ def test_a_signal_to_the_group_while_the_compiler_runs(number: signal.Signals, t
 
 def test_a_limit_of_time_while_the_compiler_runs(tmp_path: Path) -> None:
     """timeout sends its signal to the process, then to the group; wherever the run is by then."""
-    process = start_cold(tmp_path, "timeout", "--preserve-status", "3")
+    process = start_cold(tmp_path, "timeout", "--preserve-status", "2")
     errors = process.communicate(timeout=200)[1]
     assert process.returncode == 143, errors
     rest = [line for line in errors.splitlines() if not line.startswith("compiling ")]
@@ -181,29 +188,56 @@ def test_a_limit_of_time_while_the_compiler_runs(tmp_path: Path) -> None:
     assert nothing_is_left(tmp_path)
 
 
+WHAT_IT_LOOKS_FOR = """
+import sys
+from remodel_fenicsx import cli
+from remodel_fenicsx.fem import jit
+is_cached = jit._is_cached
+def looked_for(kernel):
+    jit.log.info("looks for %s", kernel)
+    return is_cached(kernel)
+jit._is_cached = looked_for
+sys.exit(cli.main(sys.argv[1:]))
+"""
+
+
 def test_a_cold_quiet_run_leaves_what_it_compiled_in_the_log_alone(tmp_path: Path) -> None:
-    count, log = tmp_path / "count", tmp_path / "out" / "run.log"
-    environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path / "cache"), "REMODEL_FENICSX_COMPILED": str(count)}
-    settings = ("time.end=1", "model.kinematics=point", "output.fields=false", "material.chain_density=0")
-    words = [*COMMAND, *(f"--set={setting}" for setting in settings), "-q", "-o"]
-    done = subprocess.run([*words, tmp_path / "out"], capture_output=True, text=True, timeout=300, env=environment)
-    assert (done.returncode, done.stderr) == (0, "")
-    kernels = sorted(path.stem for path in (tmp_path / "cache").rglob("*.c"))
-    assert sorted(count.read_text().split()) == kernels and len(kernels) > 5
-    assert log.read_text().count("NOTICE compiling ") == log.read_text().count("INFO compiled ") == len(kernels)
+    """Its cache is the usual one, in which the shortest form and the shortest expression are missing."""
+    count = tmp_path / "count"
+    own = {"XDG_CACHE_HOME": str(tmp_path / "cache"), "REMODEL_FENICSX_COMPILED": str(count)}
+
+    def log_of(name: str, variables: dict[str, str]) -> str:
+        words = [*CUBE, "--set", "time.end=1", "-q", "-o", tmp_path / name]
+        done = forked("python", WHAT_IT_LOOKS_FOR, *words, variables={**os.environ, **variables})
+        assert (done.returncode, done.stderr) == (0, "")
+        return (tmp_path / name / "run.log").read_text()
+
+    usual = log_of("usual", {})
     # all that a run needs is there before its first step
-    assert log.read_text().rindex("compiled ") < log.read_text().index("INFO time ")
-    subprocess.run([*words, tmp_path / "again"], capture_output=True, timeout=300, env=environment)
-    assert "compil" not in (tmp_path / "again" / "run.log").read_text()
-    assert len(count.read_text().split()) == len(kernels)
+    assert usual.rindex("looks for ") < usual.index("INFO time ")
+    kernels = set(re.findall("looks for (.*)", usual))
+    by_length = sorted(kernels, key=lambda kernel: jit._files(kernel)[0].stat().st_size)
+    missing = [next(kernel for kernel in by_length if kind in kernel) for kind in ("forms", "expressions")]
+    assert len(kernels) > 5
+    cache = tmp_path / "cache" / "fenics" / jit.cache_folder().name
+    cache.mkdir(parents=True)
+    for path in (path for kernel in kernels.difference(missing) for path in jit._files(kernel)):
+        (cache / path.name).symlink_to(path)
+
+    log = log_of("cold", own)
+    assert sorted(count.read_text().split()) == sorted(missing)
+    assert log.count("NOTICE compiling ") == log.count("INFO compiled ") == len(missing)
+    assert log.rindex("compiled ") < log.index("INFO time ")
+    assert {path.stem for path in cache.glob("*.c")} == kernels
+    assert "compil" not in log_of("again", own)
+    assert len(count.read_text().split()) == len(missing)
 
 
 def test_a_usage_error_is_said_by_the_first_rank_alone() -> None:
     said = []
     for rank in ("0", "1"):
         environment = {**os.environ, "OMPI_COMM_WORLD_RANK": rank}
-        words = [sys.executable, "-m", "remodel_fenicsx.cli", "run", "--bad"]
-        done = subprocess.run(words, capture_output=True, text=True, timeout=100, env=environment)
+        done = forked("remodel-fenicsx", "run", "--bad", variables=environment)
         assert done.returncode == 2
         said.append(done.stderr + done.stdout)
     assert "one of the arguments SCENE --resume is required" in said[0] and said[1] == ""
@@ -239,8 +273,7 @@ def test_what_was_done_before_a_signal_is_resumed(number: signal.Signals, tmp_pa
     process.send_signal(number)
     assert process.wait(200) == 128 + number
     last = read_history(out)["time"][-1]
-    done = subprocess.run([*COMMAND[:3], "run", "--resume", out, "--set", f"time.end={last + 2}"], text=True,
-                          capture_output=True)  # fmt: skip
+    done = forked("remodel-fenicsx", "run", "--resume", out, "--set", f"time.end={last + 2}")
     assert done.returncode == 0, done.stderr
     assert f"goes on from the checkpoint of time {last:g}, step {last:g}\n" in (out / "run.log").read_text()
     assert read_history(out)["time"].tolist() == [float(time) for time in range(int(last) + 3)]

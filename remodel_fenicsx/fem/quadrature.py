@@ -14,6 +14,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from remodel_fenicsx.fem import jit
+from remodel_fenicsx.fem.compat import geometry_dofmap
 from remodel_fenicsx.fem.ranks import of_all_ranks, over_ranks
 
 # the rule that the element wants; UFL's estimate for this energy is huge
@@ -69,19 +70,24 @@ class Quadrature:
             self.number_of_owned_elements + mesh.topology.index_map(mesh.topology.dim).num_ghosts, dtype=np.int32
         )
         self.shape = len(self.elements), len(self.weights)
-        x, jacobian = ufl.SpatialCoordinate(mesh), ufl.Jacobian(mesh)
-        entries = [jacobian[i, j] for i in range(jacobian.ufl_shape[0]) for j in range(jacobian.ufl_shape[1])]
-        values = ufl.as_vector([*x, ufl.JacobianDeterminant(mesh), *entries])
-        geometry = self.evaluate(jit.expression(values, self.points, "the geometry"), (4 + len(entries),))
-        self.coordinates: NDArray[np.float64] = geometry[..., :3]
-        self.volumes: NDArray[np.float64] = np.abs(geometry[..., 3]) * self.weights
+        self.coordinates, lengths = self._geometry()
+        # the product of an element's extents is |det J|, on lines and surfaces too
+        self.volumes: NDArray[np.float64] = lengths.prod(axis=2) * self.weights
         number = mesh.topology.index_map(mesh.topology.dim).size_global
         self.extent = float((self.integral(np.ones(self.shape)) / number) ** (1 / mesh.topology.dim))
         self.volumes = self.volumes * self._values_of(weight)
-        lengths = np.linalg.svd(geometry[..., 4:].reshape(*self.shape, *jacobian.ufl_shape), compute_uv=False)
         self.smallest_lengths: NDArray[np.float64] = np.asarray(lengths[..., -1], dtype=np.float64)
         self.largest_areas: NDArray[np.float64] = (self.volumes / lengths[..., -1]).sum(axis=1)
         self.smallest_areas: NDArray[np.float64] = (self.volumes / lengths[..., 0]).sum(axis=1)
+
+    def _geometry(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Places of the points, and singular values of the Jacobian there, descending: (elements, points, ...)."""
+        element = self.mesh.ufl_domain().ufl_coordinate_element().basix_element
+        functions = element.tabulate(1, self.points)[..., 0]
+        nodes = self.mesh.geometry.x[geometry_dofmap(self.mesh)[self.elements]]
+        places = np.einsum("pk,nki->npi", functions[0], nodes)
+        jacobians = np.einsum("dpk,nki->npid", functions[1:], nodes)
+        return places, np.linalg.svd(jacobians, compute_uv=False)
 
     def _values_of(self, weight: Any) -> Any:
         """A number, or UFL at the points."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import ufl
-from ufl.algorithms.analysis import extract_coefficients
 from ufl.algorithms.map_integrands import map_integrands
 from ufl.classes import Determinant, Inner, Sqrt, Trace
+from ufl.corealg.traversal import unique_post_traversal
 
 
 def second_derivative(energy: Any, unknown: Any, test: Any, trial: Any) -> Any:
@@ -48,11 +48,15 @@ def invariants(density: Any, unknown: Any) -> list[Any]:
 
     The outermost ones; none at all where it depends on the unknown in another way too.
     """
+    depends: set[Any] = set()
+    for part in unique_post_traversal(density):  # operands come before what is made of them
+        if part == unknown or any(operand in depends for operand in part.ufl_operands):
+            depends.add(part)
     found: dict[Any, None] = {}
     stack, seen = [density], set()
     while stack:
         part = stack.pop()
-        if part in seen or unknown not in extract_coefficients(part):
+        if part in seen or part not in depends:
             continue
         seen.add(part)
         if part.ufl_shape == () and isinstance(part, (Inner, Determinant, Trace)):
