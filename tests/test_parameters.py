@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import basix.ufl
@@ -28,6 +29,12 @@ ELASTIC = Remodeling(law="none")
 def bar() -> parts.Body:
     """Eight elements of isotropic cells, pulled along z."""
     return parts.body(cube(refinement=2, comm=MPI.COMM_SELF), Cells(initial="isotropic")).supported()
+
+
+@cache
+def refusing() -> parts.Body:
+    """Such a bar for what is refused: nobody changes it."""
+    return bar()
 
 
 def tissue() -> Tissue:
@@ -140,7 +147,7 @@ def functions(mesh: Any) -> dict[str, Any]:
     ("nan", "a Function with values that are not finite; every one must be"),
 ])  # fmt: skip
 def test_a_function_of_another_kind_is_refused(name: str, said: str) -> None:
-    made = bar()
+    made = refusing()
     bad = functions(made.domain.mesh)[name]
     with pytest.raises(ValueError) as caught:
         Stepper(made.state(), replace(tissue(), lame_mu=bad), ELASTIC, parts.TIGHT, lambda t: {})
@@ -152,7 +159,7 @@ def test_a_function_of_another_kind_is_refused(name: str, said: str) -> None:
     np.ones(8), np.array(2.0), "3.1", None, True, 1j, ufl.as_ufl(2.0), [1.0], float("nan"), float("inf"),
 ], ids=repr)  # fmt: skip
 def test_whatever_else_is_refused(parameter: str, bad: Any) -> None:
-    made = bar()
+    made = refusing()
     with pytest.raises((TypeError, ValueError), match=f"^{parameter}") as caught:
         Stepper(made.state(), replace(tissue(), **{parameter: bad}), ELASTIC, parts.TIGHT, lambda t: {})
     assert "\n" not in str(caught.value) and "must be" in str(caught.value)
