@@ -36,7 +36,7 @@ def digests(comm):
         "tendon": digest(geometry.tendon(comm=comm)),
         "tendon of tetrahedra": digest(geometry.tendon(element="tetrahedron", comm=comm)),
         "tube": digest(geometry.tube(comm=comm)),
-        "tube of degree 2": digest(geometry.tube(degree=2, comm=comm)),
+        "tube of degree 2": digest(geometry.tube(degree=2, divisions=(16, 3, 2), comm=comm)),
     }
 
 

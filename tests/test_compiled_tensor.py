@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from remodel_fenicsx.evolution import compiled_tensor
 from remodel_fenicsx.evolution.compiled_tensor import CompiledPoints, TensorKernels
-from remodel_fenicsx.tissue import repulsion
+from remodel_fenicsx.tissue import condensed, repulsion
 from remodel_fenicsx.tissue.cells import UnitCell
 from remodel_fenicsx.tissue.chains import CHAINS
 from remodel_fenicsx.tissue.condensed import CondensedPoints
@@ -94,8 +94,9 @@ def test_solution_and_tangent(kernels: TensorKernels, name: str, driver: str) ->
     np.testing.assert_allclose(twin.tangent(found, none), tangent, atol=1e-9 * np.abs(tangent).max())
 
 
-def test_what_the_kernel_does_not_solve_numpy_does(kernels: TensorKernels) -> None:
+def test_what_the_kernel_does_not_solve_numpy_does(kernels: TensorKernels, monkeypatch: pytest.MonkeyPatch) -> None:
     """kappa dt = 10: where Newton's method does not find the end of the step, it is followed; r >= L has none."""
+    monkeypatch.setattr(condensed, "ITERATIONS", 10)  # where there is none all are spent, in every part of the step
     rng = np.random.default_rng(8)
     R = Rotation.random(COUNT, random_state=rng).as_matrix()
     F = np.swapaxes(R, 1, 2) @ ((1 + rng.uniform(-0.2, 0.3, (COUNT, 3)))[:, :, None] * R)
@@ -104,7 +105,7 @@ def test_what_the_kernel_does_not_solve_numpy_does(kernels: TensorKernels) -> No
     twin, start = compiled_twin(kernels, some), some.kept(F, some.step.cells, some.step.structure).driving_tensor
     expected, found = some.solve(F, start), twin.solve(F, start)
     assert found.rest is not None and 0 in found.rest[0]
-    assert not expected.converged[0]
+    assert not expected.converged[0] and expected.converged[1:].all()
     np.testing.assert_array_equal(found.converged, expected.converged)
     solved = found.converged
     np.testing.assert_allclose(found.structure[solved], expected.structure[solved], atol=1e-9)

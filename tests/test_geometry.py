@@ -223,7 +223,11 @@ def test_each_named_face_lies_where_its_name_says(shape, refinement):
 def test_nodes_for_the_supports(element, degree, refinement):
     body = domain_of("tendon", element, degree, refinement)
     assert all(has_node(body.gather_mesh()[0], (0, 0, 0), (body.dimensions["radius"], 0, 0)))
-    body = domain_of("tube", element, degree, refinement)
+    body = (
+        domain_of("tube", element, degree, refinement)
+        if refinement < 3
+        else tube(refinement=refinement, divisions=(16, 8, 1), comm=MPI.COMM_SELF)
+    )
     assert all(has_node(body.gather_mesh()[0], (1, 0, 0), (-1, 0, 0), (0, 1, 0)))
     assert not any(has_node(body.gather_mesh()[0], (0, 0, 0), (1, 1e-3, 0)))
 

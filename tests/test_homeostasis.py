@@ -46,7 +46,7 @@ def coarse(cells: str, comm: Any = SELF, **remodeling: Any) -> Simulation:
     material = {"repulsion": "log" if remodeling.get("law") == "tensor" else "axes"}
     tables = {"cells": {"initial": cells}, "material": material, "remodeling": {"frame": "material"} | remodeling}
     scene = scene_from_dict(values("full", **tables) | {"geometry": {"shape": "tube", "length": 1.0}})
-    return Simulation(scene, comm, tube(1.0, 3.0, 1.0, degree=1, divisions=(12, 3, 1), comm=comm))
+    return Simulation(scene, comm, tube(1.0, 3.0, 1.0, degree=1, divisions=(8, 3, 1), comm=comm))
 
 
 def solved(simulation: Simulation) -> dict[str, float]:

@@ -68,7 +68,7 @@ def test_random_cells_belong_to_their_stress(driver: str) -> None:
 @pytest.mark.parametrize("driver, frame", [("cauchy", "spatial"), *slowly(("pk2", "material"), ("finger", "material"))])
 def test_the_printed_law_from_isotropic_cells(driver: str, frame: str) -> None:
     """At most six iterations a step (the first one, from cells that do not answer, apart), and a symmetric tube."""
-    simulation = short_tube(8.0, law="explicit", cells="isotropic", driver=driver, frame=frame)
+    simulation = short_tube(8.0, law="explicit", cells="isotropic", driver=driver, frame=frame, divisions=(8, 3, 1))
     rows = run(simulation)
     assert max(row["newton_iterations"] for row in rows[1:]) <= 6
     assert all(row["held_points"] == 0 and row["substeps"] == 1 for row in rows)
@@ -82,7 +82,7 @@ def test_eq_11_has_no_error_of_the_time_step() -> None:
     """It is a function of the present stress and of absolute time: so is the implicit state."""
     ends = []
     for step in (5.0, 1.25):
-        simulation = short_tube(5.0, step, law="explicit", cells="isotropic", frame="spatial")
+        simulation = short_tube(5.0, step, law="explicit", cells="isotropic", frame="spatial", divisions=(8, 3, 1))
         run(simulation)
         ends.append(simulation.cells.structure_tensor())
     assert np.abs(ends[0] - ends[1]).max() < 1e-7 < np.abs(ends[0] - np.eye(3) / 3).max()
@@ -92,7 +92,7 @@ def test_eq_11_has_no_error_of_the_time_step() -> None:
 def test_the_other_printed_laws_are_of_first_order(law: str) -> None:
     ends = []
     for step in (2.5, 1.25, 0.625):
-        simulation = short_tube(5.0, step, law=law, cells="isotropic")
+        simulation = short_tube(5.0, step, law=law, cells="isotropic", divisions=(8, 3, 1))
         run(simulation)
         ends.append(simulation.cells.structure_tensor())
     coarse, fine = (np.abs(end - ends[2]).max() for end in ends[:2])

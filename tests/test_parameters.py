@@ -211,7 +211,9 @@ def test_without_chains_nothing_locks(law: str) -> None:
 
 
 def test_a_load_that_a_scene_does_not_name_is_zero() -> None:
-    simulation = Simulation(Scene(geometry={"shape": "cube"}, time={"end": 1.0}), MPI.COMM_SELF)
+    printed: dict[str, Any] = {"material": {"repulsion": "axes"}, "remodeling": {"law": "explicit"}}
+    scene = Scene(geometry={"shape": "cube"}, model={"kinematics": "full"}, **printed, time={"end": 1.0})
+    simulation = Simulation(scene, MPI.COMM_SELF)
     (row,) = [step.row for step in simulation.steps()]
     simulation.close()
     assert row["force"] == 0.0 and row["mean_stretch"] == pytest.approx(1.0, abs=1e-12)
