@@ -31,7 +31,7 @@ from remodel_fenicsx.paper.cases import LOAD_CASES
 from remodel_fenicsx.paper.errors import FigureError
 from remodel_fenicsx.results.recording import Recording, RecordingError
 from remodel_fenicsx.scene.scene import Scene, scene_from_dict
-from tests.conftest import forked_children, mpirun
+from tests.conftest import forked_children
 
 PACKAGE = Path(remodel_fenicsx.__file__).parent
 TINY = {
@@ -73,14 +73,6 @@ def test_every_name_of_the_contract_is_there() -> None:
     assert {run for figure in FIGURES.values() for run in figure.runs} == set(known)
     assert set(CAPTIONS) == set(FIGURES)
     assert all(scene.name == name for name, scene in known.items())
-
-
-def test_ranks_are_refused(tmp_path: Path) -> None:
-    command = mpirun(2, sys.executable, "-m", "remodel_fenicsx.cli", "figures", "fig1", "-o", str(tmp_path / "drawn"))
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 2
-    assert done.stderr.count("figures: uses all cores by itself (--jobs); start it without mpirun") == 1
-    assert not (tmp_path / "drawn").exists()
 
 
 @pytest.mark.parametrize("name", ["fig1.png", "fig1.pdf", "fig1.svg", "fig1.csv", "fig1-mine.csv"])

@@ -45,8 +45,9 @@ cells.initial=aligned | cells.aligned_axis=2 | loads.elongation.value=1.0 | load
 loads.elongation.ramp=[[0.0, 0.0], [5.0, 1.0]] | remodeling.law=none | solver.maximum_halvings=3
 """
 UNSTABLE = "loads.force.value=-30 | mesh.refinement=2 | solver.unstable=stop | output.fields=false"
-# by name: the demo, what is set, and the folder where that is not one of the command's own
+# by name: the demo (none: another command), what is set, and the folder where that is not one of the command's own
 ON_RANKS = {
+    "figures": ("", "", ""),
     "files": ("cube", "time.end=3 | mesh.refinement=3 | cells.initial=random", ""),
     "taken": ("cube", "", ""),
     # axial chains lock at a stretch of L / r0 = 1.594: reached between t = 2 and t = 3
@@ -66,7 +67,8 @@ def words_on_ranks(name: str, parent: Path) -> tuple[list[str], Path]:
         out.mkdir()
         (out / "mine.txt").write_text("dear")
     changes = [f"--set={setting.strip()}" for setting in settings.strip().replace("\n", "|").split("|") if setting]
-    return ["run", str(demo(scene)), *changes, "-o", str(out)], out
+    command = ["run", str(demo(scene))] if scene else ["figures", "fig1"]
+    return [*command, *changes, "-o", str(out)], out
 
 
 @pytest.fixture(scope="module")
@@ -532,6 +534,13 @@ def test_a_bad_scene_is_one_line_exit_code_2_and_nothing_written(
     assert out == "" and err.count("\n") == 1
     assert err.startswith(f"remodel-fenicsx: {beginning}"), err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_figures_on_two_ranks_are_refused(two_ranks: dict[str, Done]) -> None:
+    done, folder = two_ranks["figures"]
+    assert done.returncode == 2
+    assert done.stderr.count("figures: uses all cores by itself (--jobs); start it without mpirun") == 1
+    assert not folder.exists()
 
 
 def test_bad_input_ends_two_ranks_with_one_line(tmp_path: Path) -> None:
