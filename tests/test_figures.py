@@ -312,6 +312,33 @@ def test_runs_do_not_outlive_a_killed_command_and_what_they_leave_is_removed(tmp
     assert os.listdir(tmp_path / "runs") == []
 
 
+def test_a_run_whose_command_is_killed_before_it_begins_does_not_begin(tmp_path: Path) -> None:
+    """setpriv, which asks for the signal of that death, comes too late here."""
+    late, messages = tmp_path / "setpriv", tmp_path / "messages"
+    late.write_text(f"#!/bin/sh\nsleep 0.3\nexec {shutil.which('setpriv')} \"$@\"\n")
+    late.chmod(0o755)
+    code = f"""
+import os, pathlib, signal
+from remodel_fenicsx.system.children import Child
+child = Child(["info"], pathlib.Path({str(messages)!r}))
+print(child.process.pid, flush=True)
+if {{killed}}:
+    os.kill(os.getpid(), signal.SIGKILL)
+child.process.wait()
+"""
+    environment = os.environ | {"PATH": f"{tmp_path}:{os.environ['PATH']}"}
+    for killed in (True, False):
+        command = [sys.executable, "-c", code.replace("{killed}", str(killed))]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=100, env=environment)
+        child = int(done.stdout)
+        for _ in range(1000):
+            if not is_alive(child):
+                break
+            clock.sleep(0.01)
+        assert not is_alive(child)
+        assert (messages.read_text() == "") == killed
+
+
 def test_a_folder_that_cannot_be_written_is_refused_before_any_run(
     tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:

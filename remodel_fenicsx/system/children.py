@@ -31,8 +31,9 @@ class Child:
     def __init__(self, arguments: Sequence[str], messages: Path, keep: Sequence[int] = ()):
         self.messages = messages
         command = [sys.executable, "-m", "remodel_fenicsx.cli", *arguments]
-        if shutil.which("setpriv"):
-            command = ["setpriv", "--pdeathsig", signal.SIGTERM.name, *command]
+        if shutil.which("setpriv"):  # the signal comes from now on; who was killed before is not the parent any more
+            only_with_parent = ["sh", "-c", '[ "$PPID" = "$0" ] && exec "$@"', str(os.getpid())]
+            command = ["setpriv", "--pdeathsig", signal.SIGTERM.name, *only_with_parent, *command]
         # this very package, wherever it was imported from; one thread each, as there are jobs for the cores
         paths = [str(Path(remodel_fenicsx.__file__).parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])]
         environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"}
