@@ -227,7 +227,7 @@ def test_levels_that_have_become_useless_are_made_anew(caplog: pytest.LogCapture
 
 # ---------------------------------------------------------------- quasi-Newton steps
 def test_the_newest_secant_is_met_and_a_linear_problem_is_soon_solved() -> None:
-    """H z = s for the last pair; L-BFGS around the diagonal solves a linear problem many times faster than it alone."""
+    """H z = s for the last pair, and H is symmetric; many times faster on a linear problem than its diagonal alone."""
     rng = np.random.default_rng(2)
     some = rng.standard_normal((40, 40))
     values = np.diag(np.linspace(1.0, 8.0, 40)) + 0.1 * (some + some.T)
@@ -250,6 +250,17 @@ def test_the_newest_secant_is_met_and_a_linear_problem_is_soon_solved() -> None:
             found = pair.image.copy()
             secants.improve(x, pair.change, found)
             np.testing.assert_allclose(found.array, pair.step.array, rtol=0, atol=1e-10 * pair.step.norm())
+            images = []
+            vectors = rng.standard_normal((2, 40))
+            for vector in vectors:
+                residual.array[:] = vector
+                image = residual.copy()
+                image.array[:] /= 8.0
+                secants.interrupt()
+                assert secants.improve(x, residual, image)
+                images.append(image.array.copy())
+            assert vectors[0] @ images[1] == pytest.approx(vectors[1] @ images[0], rel=1e-10)
+            assert all(vector @ image > 0 for vector, image in zip(vectors, images, strict=True))
     assert norms[20] < 5e-3 * norms[0]
 
 
