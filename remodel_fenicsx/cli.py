@@ -17,6 +17,7 @@ import remodel_fenicsx
 from remodel_fenicsx.body.reductions import explained
 from remodel_fenicsx.system import interrupts
 from remodel_fenicsx.system.arguments import positive, wall_time
+from remodel_fenicsx.system.regular_files import ForeignFileError
 from remodel_fenicsx.system.environment import reason_undrawable, reason_unusable, versions
 from remodel_fenicsx.scene.parameters import PRESETS
 from remodel_fenicsx.scene.profiles import PROFILES
@@ -218,6 +219,8 @@ def _run(options: argparse.Namespace, task: Callable[..., Path] | None = None) -
         if options.output and isinstance(error, (FileExistsError, NotADirectoryError)):  # lies in a file, or just taken
             text = f"-o {options.output}: {error.filename}: {error.strerror}; allowed is a new or an empty folder"
             return _end_all(text, BAD_INPUT)
+        if isinstance(error, ForeignFileError):
+            return _end_all(f"{error.filename}: {error.strerror}", BAD_INPUT)
         return _end_all(f"cannot write the results: {error}", BAD_ENVIRONMENT)
     except Exception:
         traceback.print_exc()
@@ -250,6 +253,8 @@ def _study(options: argparse.Namespace, task: Callable[[Scene], tuple[Path, str,
             folder, words, failed = task(scene)
     except interrupts.Interrupted as interruption:
         return _fail("stopped; all that is recorded is kept, the same command goes on", interruption.exit_code)
+    except ForeignFileError as error:
+        return _fail(f"{error.filename}: {error.strerror}", BAD_INPUT)
     except OSError as error:
         return _fail(f"cannot write the results: {error}", BAD_ENVIRONMENT)
     _say(words)

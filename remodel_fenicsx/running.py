@@ -21,7 +21,15 @@ from remodel_fenicsx.results.checkpoint import Checkpoints, restore_state
 from remodel_fenicsx.results.checkpoint_file import Checkpoint, CheckpointError, read_checkpoint
 from remodel_fenicsx.results.fields import Fields, field_names
 from remodel_fenicsx.results.recording import SCENE, RecordingError
-from remodel_fenicsx.results.run_folder import FolderTaken, LastStep, RunFolder, chosen_folder, forget_steps, locked
+from remodel_fenicsx.results.run_folder import (
+    FolderTaken,
+    LastStep,
+    RunFolder,
+    check_kept,
+    chosen_folder,
+    forget_steps,
+    locked,
+)
 from remodel_fenicsx.scene import Scene, SceneError, read_scene, scene_from_dict
 from remodel_fenicsx.scene.continuation import check_continuation
 from remodel_fenicsx.simulation import Simulation
@@ -212,7 +220,10 @@ def _record(simulation: Simulation, place: Path, around: _Circumstances) -> None
     text = scene.to_toml(header)
     columns = [column.name for column in simulation.observer.columns]
     after = LastStep(columns, state.number, state.time) if state.number else None
-    if around.resumes and after is None and comm.rank == 0:
+    if after is not None:
+        wanted = bool(scene.output.fields)
+        _agreed(comm, lambda: check_kept(place, after, wanted) if comm.rank == 0 else None)
+    elif around.resumes and comm.rank == 0:
         forget_steps(place)
     with ExitStack() as stack:
         record = stack.enter_context(_agreed(comm, lambda: RunFolder(place, text, comm.rank, after)))

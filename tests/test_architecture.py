@@ -121,7 +121,7 @@ def test_no_arrow_runs_upwards() -> None:
     assert not upward
 
 
-@pytest.mark.parametrize("pair", [("schema", "system"), ("fem", "tissue"), ("evolution", "scene")])
+@pytest.mark.parametrize("pair", [("fem", "tissue"), ("evolution", "scene")])
 def test_rooms_side_by_side_do_not_know_each_other(pair: tuple[str, str]) -> None:
     assert not [arrow for arrow in arrows() if {room(arrow.importer), room(arrow.imported)} == set(pair)]
 

@@ -22,6 +22,7 @@ from remodel_fenicsx.scene.scene import Scene, SceneError
 from remodel_fenicsx.schema.times import same_time
 from remodel_fenicsx.system.children import Child
 from remodel_fenicsx.system.interrupts import Interrupted, StopRequest
+from remodel_fenicsx.system.regular_files import make_own_folder, write_whole
 from remodel_fenicsx.system.terminal import Line
 
 POLL = 0.1  # seconds
@@ -145,10 +146,11 @@ def run_members(
 
 def _started(member: Member) -> Child:
     """Begin, or go on with what is there."""
-    member.folder.parent.mkdir(parents=True, exist_ok=True)
+    make_own_folder(member.folder.parent)
+    make_own_folder(member.folder)
     messages = member.folder.with_suffix(".txt")
     if (member.folder / SCENE).exists():
         return Child(["run", "--resume", str(member.folder), "-q"], messages)
     scene = member.folder.with_suffix(".toml")
-    scene.write_text(member.scene.to_toml(), encoding="utf-8")
+    write_whole(scene, member.scene.to_toml().encode())
     return Child(["run", str(scene), "-o", str(member.folder), "-q"], messages)

@@ -11,6 +11,7 @@ from remodel_fenicsx.paper.output import COLOURS, STYLE, Page
 from remodel_fenicsx.scene.scene import Scene
 from remodel_fenicsx.studies.estimates import Row, Trade
 from remodel_fenicsx.system.environment import versions
+from remodel_fenicsx.system.regular_files import make_own_folder, write_whole
 
 ROWS = "rows"  # folder of the scenes
 APART = 0.9  # ratio of two errors whose points both have a name
@@ -50,7 +51,7 @@ def write(found: Trade, folder: Path, scene: Scene) -> None:
         "doubt": [row.doubt for row in rows],
     }
     page.save_table(table, [title, *found.notes, made_with])
-    (folder / ROWS).mkdir(exist_ok=True)
+    make_own_folder(folder / ROWS)
     for row in rows:
         setting = row.result.setting
         doubt = f" ({row.doubt})" if row.doubt else ""
@@ -58,7 +59,7 @@ def write(found: Trade, folder: Path, scene: Scene) -> None:
             f"{scene.name}: {row.angle_error:.2g} degrees and {100 * row.length_error:.2g} % off for "
             f"{row.result.seconds:.2g} s, as estimated by remodel-fenicsx trade{doubt}"
         )
-        (folder / ROWS / f"{setting.name}.toml").write_text(setting.scene.to_toml(header), encoding="utf-8")
+        write_whole(folder / ROWS / f"{setting.name}.toml", setting.scene.to_toml(header).encode())
     _draw(page, rows, made_with)
 
 

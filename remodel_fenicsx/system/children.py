@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import remodel_fenicsx
+from remodel_fenicsx.system.regular_files import open_own
 
 PATIENCE = 30.0  # seconds
 
@@ -37,7 +38,8 @@ class Child:
         # this very package, wherever it was imported from; one thread each, as there are jobs for the cores
         paths = [str(Path(remodel_fenicsx.__file__).parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])]
         environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"}
-        with messages.open("w") as output:
+        messages.unlink(missing_ok=True)  # whatever it is, a link too
+        with open(open_own(messages, os.O_WRONLY | os.O_CREAT | os.O_EXCL), "w") as output:
             self.process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=output, stderr=output,
                                             env=environment, pass_fds=tuple(keep))  # fmt: skip
 
