@@ -124,7 +124,7 @@ _PLAIN = re.compile(r"[A-Za-z0-9_.,+-]*")  # names, numbers and lists of them: n
 _VIEWERS = frozenset(
     "adios ascii binary cgns draw exodusii glvis hdf5 mathematica matlab pyvista saws socket string vtk vu".split()
 )
-# of MUMPS: units of its messages (each a file fort.N but for 0 and 6, which it has), matrices written or kept on the disk
+# of MUMPS: units of its messages (each a file fort.N but for 0 and 6, which it has), factors kept on the disk
 _MUMPS_FILES = re.compile(r"mat_mumps_(?:icntl_(?:1|2|3|22)|ooc_\w+)$")
 
 
@@ -141,7 +141,7 @@ def fault_of_option(name: str, value: str | float | bool) -> str | None:
         return "not an option of a solver; allowed are snes_..., ksp_..., pc_... and mat_..."
     if _CODE.search(name) or any(map(_CODE.search, words)):
         return "would run code of its own; allowed are PETSc's compiled solvers"
-    if not isinstance(value, bool) and _MUMPS_FILES.search(name):
+    if _MUMPS_FILES.search(name):
         return "would write files; allowed are options that write none"
     if isinstance(value, str) and (not _PLAIN.fullmatch(value) or _VIEWERS.intersection(words)):
         return "names a file or a viewer; allowed are names, numbers, true (then PETSc prints) and false"

@@ -157,15 +157,19 @@ def read_checkpoint(folder: Path) -> Checkpoint | None:
     OSError
         If one cannot be read.
     """
-    generations = read_pointer(folder)
+    generations, faults = read_pointer(folder), []
     for generation in generations:
         try:
-            return _read(folder / generation.file, generation)
+            found = _read(folder / generation.file, generation)
         except CheckpointError as error:
-            log.warning("%s", error)
+            faults.append(str(error))
+        else:
+            for fault in faults:
+                log.warning("%s", fault)
+            return found
     if generations:
         remedy = "without its files checkpoint* the run starts again at t = 0"
-        raise CheckpointError(f"{folder}: has no checkpoint that is whole; {remedy}")
+        raise CheckpointError(f"{folder}: has no checkpoint that is whole ({'; '.join(faults)}); {remedy}")
     return None
 
 

@@ -39,9 +39,9 @@ def read_regular(path: Path, most: int) -> bytes:
     """
     descriptor = os.open(path, os.O_RDONLY | NEVER_WAITING)
     with open(descriptor, "rb") as file:
-        _check_regular(descriptor, path)
-        data = file.read(most + 1)
-    if len(data) > most:
+        size = _check_regular(descriptor, path).st_size
+        data = file.read(size + 1) if size <= most else b""
+    if max(size, len(data)) > most:
         raise ForeignFileError(errno.EFBIG, f"is larger than {most / 1e6:g} MB", str(path))
     return data
 
@@ -109,7 +109,7 @@ def check_still_there(descriptor: int, path: Path, lost: str) -> None:
         If the file has no name any more.
     """
     if os.fstat(descriptor).st_nlink == 0:
-        raise FileNotFoundError(errno.ENOENT, f"was deleted during the run; lost: {lost}", str(path))
+        raise FileNotFoundError(errno.ENOENT, f"the file was deleted during the run; lost: {lost}", str(path))
 
 
 def write_whole(path: Path, data: bytes) -> None:
