@@ -250,9 +250,13 @@ def _study(options: argparse.Namespace, task: Callable[[Scene], tuple[Path, str,
     scene = read_scene(options.scene, options.set, options.profile)
     if reason := reason_unusable() or reason_undrawable():
         return _fail(f"the environment is not usable: {reason}; run through ./with-fenicsx", BAD_ENVIRONMENT)
+    from remodel_fenicsx.paper.errors import FigureError
+
     try:
         with interrupts.StopRequest(), interrupts.stopping_at_once():
             folder, words, failed = task(scene)
+    except FigureError as refusal:  # a picture or a table of somebody else's stands in its place
+        return _fail(str(refusal), refusal.exit_code)
     except interrupts.Interrupted as interruption:
         return _fail("stopped; all that is recorded is kept, the same command goes on", interruption.exit_code)
     except ForeignFileError as error:

@@ -44,9 +44,9 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise SceneError(f"{path}: line {line}: not UTF-8 text; a scene is a TOML file in UTF-8") from None
     except (OSError, ValueError) as error:
         raise SceneError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
-    for place, line_of_it in enumerate(text.splitlines(), start=1):
-        if not line_of_it.lstrip().startswith("#") and _DECIMAL.sub("", line_of_it).count(".") > MOST_PARTS:
-            raise SceneError(f"{path}: line {place}: a key of more than {MOST_PARTS} parts; a scene has up to 4")
+    for number, words in enumerate(text.splitlines(), start=1):
+        if not words.lstrip().startswith("#") and _DECIMAL.sub("", words).count(".") > MOST_PARTS:
+            raise SceneError(f"{path}: line {number}: a key of more than {MOST_PARTS} parts; a scene has up to 4")
     try:
         values = tomllib.loads(text)
         if _depth_exceeds(values, MOST_PARTS):
