@@ -91,8 +91,17 @@ WRITES = {
     "mat_mumps_icntl_3": "78", "mat_mumps_icntl_22": 1, "mat_mumps_ooc_tmpdir": "here", "mat_mumps_icntl_1": 11,
 }  # fmt: skip
 ELSEWHERE = {
-    "options_file": "victim", "log_view": "ascii:victim", "info": "victim", "malloc_dump": True, "on_error_abort": True,
-    "start_in_debugger": "sh", "help": True, "dm_view": True, "vec_view": True, "tao_type": "python", "ts_type": "python",
+    "options_file": "victim",
+    "log_view": "ascii:victim",
+    "info": "victim",
+    "malloc_dump": True,
+    "on_error_abort": True,
+    "start_in_debugger": "sh",
+    "help": True,
+    "dm_view": True,
+    "vec_view": True,
+    "tao_type": "python",
+    "ts_type": "python",
 }
 
 
@@ -216,26 +225,48 @@ def without(name: str) -> Callable[[dict[str, Any], dict[str, Any]], None]:
 
 ODD = {"text": "x", "none": None, "list": [1], "table": {"a": 1}, "negative": -1, "true": True, "many": 10**400}
 FORGERIES = {
-    **{f"{key} {name}": put(key, value) for key in ("time", "number", "scene", "versions", "loads", "numbers",
-       "functions", "format") for name, value in ODD.items()
-       if not (key == "scene" and name == "text") and not (key == "time" and name in ("true",))},
-    "no time": without("time"), "no header entry": without("numbers"), "no points": without("points"),
-    "no elements": without("elements"), "no function": without("function"), "one entry more": put("more", lambda _: 1),
-    "loads of text": put("loads", {"force": "1"}), "loads NaN": put("loads", {"force": float("nan")}),
-    "numbers of lists": put("numbers", {"a": [1.0]}), "functions twice": put("functions", lambda names: names[:1]),
-    "functions of numbers": put("functions", [1, 2]), "another load": put("loads", {"other": 1.0}),
-    "a later step": put("number", lambda number: number + 7), "another time": put("time", lambda time: time + 0.5),
+    **{
+        f"{key} {name}": put(key, value)
+        for key in ("time", "number", "scene", "versions", "loads", "numbers", "functions", "format")
+        for name, value in ODD.items()
+        if not (key == "scene" and name == "text") and not (key == "time" and name in ("true",))
+    },
+    "no time": without("time"),
+    "no header entry": without("numbers"),
+    "no points": without("points"),
+    "no elements": without("elements"),
+    "no function": without("function"),
+    "one entry more": put("more", lambda _: 1),
+    "loads of text": put("loads", {"force": "1"}),
+    "loads NaN": put("loads", {"force": float("nan")}),
+    "numbers of lists": put("numbers", {"a": [1.0]}),
+    "functions twice": put("functions", lambda names: names[:1]),
+    "functions of numbers": put("functions", [1, 2]),
+    "another load": put("loads", {"other": 1.0}),
+    "a later step": put("number", lambda number: number + 7),
+    "another time": put("time", lambda time: time + 0.5),
     "another scene": put("scene", lambda text: text.replace("kappa = ", "kappa = 9")),
-    "no scene": put("scene", "x = 1"), "no TOML": put("scene", "= ="), "deep": put("numbers", {"a": json.loads("[" * 50 + "]" * 50)}),
-    "a row less": array("function", lambda old: old[:-1]), "a row more": array("function", lambda old: np.vstack([old, old])),
-    "a column less": array("function", lambda old: old[:, :-1]), "no table": array("function", lambda old: old[0]),
-    "deeper": array("function", lambda old: old[..., None]), "empty": array("function", lambda old: old[:0]),
-    "text": array("function", lambda old: old.astype(str)), "complex": array("function", lambda old: old + 1j),
-    "NaN": array("function", lambda old: old * np.nan), "infinite": array("function", lambda old: old + np.inf),
-    "dates": array("function", lambda old: old.astype("datetime64[s]")), "one number": array("function", lambda old: np.float64(1)),
-    "points of text": array("points", lambda old: old.astype(str)), "fewer points": array("points", lambda old: old[:-1]),
-    "moved points": array("points", lambda old: old + 1.0), "points NaN": array("points", lambda old: old * np.nan),
-    "other elements": array("elements", lambda old: old[:, ::-1]), "fewer elements": array("elements", lambda old: old[:-1]),
+    "no scene": put("scene", "x = 1"),
+    "no TOML": put("scene", "= ="),
+    "deep": put("numbers", {"a": json.loads("[" * 50 + "]" * 50)}),
+    "a row less": array("function", lambda old: old[:-1]),
+    "a row more": array("function", lambda old: np.vstack([old, old])),
+    "a column less": array("function", lambda old: old[:, :-1]),
+    "no table": array("function", lambda old: old[0]),
+    "deeper": array("function", lambda old: old[..., None]),
+    "empty": array("function", lambda old: old[:0]),
+    "text": array("function", lambda old: old.astype(str)),
+    "complex": array("function", lambda old: old + 1j),
+    "NaN": array("function", lambda old: old * np.nan),
+    "infinite": array("function", lambda old: old + np.inf),
+    "dates": array("function", lambda old: old.astype("datetime64[s]")),
+    "one number": array("function", lambda old: np.float64(1)),
+    "points of text": array("points", lambda old: old.astype(str)),
+    "fewer points": array("points", lambda old: old[:-1]),
+    "moved points": array("points", lambda old: old + 1.0),
+    "points NaN": array("points", lambda old: old * np.nan),
+    "other elements": array("elements", lambda old: old[:, ::-1]),
+    "fewer elements": array("elements", lambda old: old[:-1]),
     "elements flat": array("elements", lambda old: old.ravel()),
 }
 KEEPS_GOING = {  # what is no forgery: a checkpoint that could have been written, or one whose fault is harmless
