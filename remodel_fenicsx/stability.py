@@ -129,8 +129,8 @@ def verdict(table: Table) -> str:
     if swings.any():
         worst, share = int(np.nanargmin(factors)), np.nanmin(table["stable_share"])
         return (
-            f"Unstable: passes over-correct at {swings.sum()} of {len(times)} times, first at {times[swings][0]:g}; the "
-            f"worst multiplies a small change by {factors[worst]:.3g} at time {times[worst]:g}. The coupling "
+            f"Unstable: passes over-correct at {swings.sum()} of {len(times)} times, first at {times[swings][0]:g}; "
+            f"the worst multiplies a small change by {factors[worst]:.3g} at time {times[worst]:g}. The coupling "
             f"'relaxed' with a relaxation_factor below {share:.2g} does not."
         )
     if grows.any():
