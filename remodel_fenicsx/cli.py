@@ -312,9 +312,11 @@ def _status(options: argparse.Namespace) -> int:
         lines = status(options.folder)
     except (RecordingError, CheckpointError) as error:
         return _fail(str(error), BAD_INPUT)
+    except ForeignFileError as error:
+        return _fail(f"{error.filename}: {error.strerror}", BAD_INPUT)
     except OSError as error:
         return _fail(f"{options.folder}: cannot be read: {error.strerror}", BAD_ENVIRONMENT)
-    _say("\n".join(lines))
+    _say("\n".join(map(printable, lines)))
     return 0
 
 

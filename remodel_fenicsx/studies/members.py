@@ -5,6 +5,7 @@ Each of the processes at work does one run after the other: most of a short run 
 
 from __future__ import annotations
 
+import json
 import math
 import time as clock
 from collections.abc import Callable, Sequence
@@ -15,6 +16,7 @@ from pathlib import Path
 from remodel_fenicsx.results.recording import (
     HISTORY,
     SCENE,
+    STUDY,
     HistoryColumns,
     Recording,
     RecordingError,
@@ -25,7 +27,7 @@ from remodel_fenicsx.scene.scene import Scene, SceneError
 from remodel_fenicsx.schema.times import same_time
 from remodel_fenicsx.system.children import Worker, wait_for_one
 from remodel_fenicsx.system.interrupts import Interrupted, StopRequest
-from remodel_fenicsx.system.regular_files import make_own_folder, write_whole
+from remodel_fenicsx.system.regular_files import check_no_link, make_own_folder, write_whole
 from remodel_fenicsx.system.terminal import Line
 
 POLL = 0.1  # seconds
@@ -86,10 +88,41 @@ class Member:
         return read_history(self.folder)
 
 
+@dataclass(frozen=True)
+class Study:
+    """What several runs are for.
+
+    Attributes
+    ----------
+    name
+        Of the command.
+    scene
+        Name of the user's scene.
+    folder
+        Where all runs are.
+    """
+
+    name: str
+    scene: str
+    folder: Path
+
+    def write(self, runs: Sequence[str]) -> None:
+        """Say in the folder what it is: `remodel-fenicsx status` reads it.
+
+        Raises
+        ------
+        OSError
+            If it cannot be written.
+        """
+        self.folder.mkdir(parents=True, exist_ok=True)
+        text = json.dumps({"study": self.name, "scene": self.scene, "runs": list(runs)}, indent=1)
+        write_whole(self.folder / STUDY, (text + "\n").encode())
+
+
 def run_members(
     members: Sequence[Member],
     jobs: int,
-    title: str,
+    study: Study,
     quiet: bool = False,
     deadline: float = math.inf,
     fits: Callable[[Member], bool] = lambda member: True,
@@ -101,8 +134,8 @@ def run_members(
     ----------
     members
         In the order in which they begin.
-    jobs, title, quiet
-        Runs at a time; what progress begins with; no progress.
+    jobs, study, quiet
+        Runs at a time; what they are runs of; no progress.
     deadline
         `time.monotonic` at which runs are stopped; what they have recorded stays.
     fits
@@ -122,7 +155,9 @@ def run_members(
     waiting = [member for member in reversed(members) if not member.is_complete()]
     running: dict[Worker, Member] = {}
     idle: list[Worker] = []
-    total, failed, line = sum(member.scene.time.number_of_steps for member in members), {}, Line(title)
+    study.write([member.name for member in members])
+    total, failed = sum(member.scene.time.number_of_steps for member in members), {}
+    line = Line(f"{study.scene} {study.name}")
     with StopRequest() as stop:
         try:
             while waiting or running:
@@ -160,7 +195,7 @@ def run_members(
 def _begin(worker: Worker, member: Member) -> None:
     """Begin, or go on with what is there."""
     make_own_folder(member.folder.parent)
-    make_own_folder(member.folder)
+    check_no_link(member.folder)
     messages = member.beside(".txt")
     if (member.folder / SCENE).exists():
         worker.begin(["run", "--resume", str(member.folder), "-q"], messages)

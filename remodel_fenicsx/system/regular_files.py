@@ -89,6 +89,11 @@ def make_own_folder(path: Path) -> None:
         If a link stands in its place.
     """
     path.mkdir(parents=True, exist_ok=True)
+    check_no_link(path)
+
+
+def check_no_link(path: Path) -> None:
+    """Raise ForeignFileError if a link stands in the place of a folder or of nothing yet."""
     if path.is_symlink():
         raise ForeignFileError(errno.ELOOP, LINK, str(path))
 
