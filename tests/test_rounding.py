@@ -135,7 +135,7 @@ def test_thin_walls_are_solved(lame_lambda: float) -> None:
 
 def test_a_refusal_names_a_tolerance_that_works(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where it was too small: made so here by a solver that knows nothing of rounded displacements."""
-    monkeypatch.setattr(newton, "ROUNDED_STRAINS", 0.0)
+    monkeypatch.setattr(newton.GuardedNewton._tolerance, "__defaults__", (0.0,))
     with pytest.raises(StepFailure) as caught:
         list(Simulation(preset_scene(PAPER, "tube").with_values(THIN)).steps())
     assert caught.value.refusal.kind == "solver tolerance"

@@ -345,8 +345,8 @@ class GuardedNewton:
     def _is_small(self, norm: float, last: float) -> bool:
         """Whether a residual may be accepted; `last`: that of the iteration before.
 
-        Near L the rounding of the worst point may be far above that of all others. There what is below it counts as
-        solved only when it goes no further down.
+        Near L the rounding of the worst point may be far above that of all others, and the largest displacement is not
+        that of all elements. What is below such a rounding counts as solved only when it goes no further down.
         """
         if self.on_the_way and norm <= ON_THE_WAY * self._force_scale:
             return True
@@ -354,15 +354,16 @@ class GuardedNewton:
             return False
         relative = self.settings.absolute_tolerance + self.settings.relative_tolerance * self._force_scale
         coarse = self._extension > NEARLY_LOCKED and self._tolerance() > COARSE * self._force_scale
-        return norm <= relative or not coarse or norm > GOES_DOWN * last
+        certain = relative if coarse else self._tolerance(rounded_strains=0.0)
+        return norm <= certain or norm > GOES_DOWN * last
 
-    def _tolerance(self) -> float:
+    def _tolerance(self, rounded_strains: float = ROUNDED_STRAINS) -> float:
         """Relative to the forces at the nodes, not below the rounding of forces that add up to nothing there.
 
         Stresses are rounded, and so are displacements: over a thin element that is a strain of eps |u|/h.
         """
         relative = self.settings.relative_tolerance * self._force_scale
-        area = ROUNDINGS * self._area + ROUNDED_STRAINS * self._displacement * self._area_of_gradients
+        area = ROUNDINGS * self._area + rounded_strains * self._displacement * self._area_of_gradients
         return self.settings.absolute_tolerance + max(relative, self._stress_rounding() * area)
 
     def _stress_rounding(self) -> float:
