@@ -134,6 +134,25 @@ class Quadrature:
         return self.integral(values * chosen) / self.integral(chosen)
 
     @cached_property
+    def gradients(self) -> NDArray[np.float64]:
+        """G with |grad u| <= G max |u_node| in each element, (elements,): the sizes of the slopes of its functions."""
+        element = basix.create_element(
+            basix.ElementFamily.P,
+            basix.CellType[self.element_kind],
+            self.element_degree,
+            basix.LagrangeVariant.gll_warped,
+        )
+        slopes = np.asarray(element.tabulate(1, self.points))[1:, :, :, 0]  # by reference coordinate, point and node
+        sums = np.linalg.norm(slopes, axis=0).sum(axis=-1)
+        largest: NDArray[np.float64] = np.max(sums / self.smallest_lengths, axis=1, initial=0.0)
+        return largest
+
+    @cached_property
+    def largest_gradient(self) -> float:
+        """The largest G over all ranks. Collective, the first time."""
+        return self.maximum(self.gradients)
+
+    @cached_property
     def volume(self) -> float:
         """Of the body, over all ranks. Collective, the first time."""
         return self.integral(np.ones(self.shape))
