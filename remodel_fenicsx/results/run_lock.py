@@ -125,7 +125,9 @@ def is_vacant(folder: Path) -> bool:
     OSError
         If that cannot be found out.
     """
-    return {entry.name for entry in folder.iterdir()} <= {LOCK, part_of(Path(SCENE)).name} and not lock_holder(folder)[1]
+    return {entry.name for entry in folder.iterdir()} <= {LOCK, part_of(Path(SCENE)).name} and not lock_holder(folder)[
+        1
+    ]
 
 
 def _is_at(descriptor: int, path: Path) -> bool:
