@@ -25,6 +25,7 @@ log = logging.getLogger(__name__)
 
 LINE_SEARCH_HALVINGS = 20  # of one Newton step, before the solve is given up
 ROUNDINGS = 8.0  # how many times the rounding of assembled forces a residual may be
+NOTICEABLE = 1e-3  # of the body's size: displacements that may be a jump; 1 % of the radius of a tube of this length
 MET = 1e-13  # of the body's size: prescribed values that are met to rounding
 PRESCRIBED_MET = 1e-10  # of the body's size: how far a prescribed displacement may be missed; no force measures it
 ON_THE_WAY = 1e-3  # of the nodal forces: residual of a part that others follow
@@ -107,6 +108,7 @@ class GuardedNewton:
         self._gap = self._last_norm = np.inf
         bounded = self.method == LAGGED and "snes_linesearch_type" not in self._options.given
         self.limits = Limits(equilibrium, bounded)
+        self._first: float | None = None  # length of the first Newton step of a solve
         self._looked = False  # whether the limits of the start are known
         self._spared = False  # whether the present trial is admissible by the bound alone
         self._options_checked = False
@@ -178,6 +180,7 @@ class GuardedNewton:
         self._largest, self._rounding = self.equilibrium.parameters.largest(), (np.nan, 0.0)
         self._pull(self._x)
         self._lost = self._spared = False
+        self._first = None
         if not self._looked:
             self.limits.forget()
         self._looked = False
@@ -197,7 +200,16 @@ class GuardedNewton:
             raise SolveFailure(text, newton, linear, extension, left, tangents)
         self._linear.ended(newton)
         norm, tangents = float(self._snes.getFunctionNorm()), self._linear.tangents - tangents
-        return Solution(newton, linear, norm, tangents, extension)
+        return Solution(newton, linear, norm, tangents, extension, self._reach(self._values - start))
+
+    def _reach(self, change: Any) -> float:
+        """`Solution.reach` of a solve that has changed the unknowns so."""
+        comm, state = self.equilibrium.comm, self.equilibrium.state
+        largest = over_ranks(comm, float(np.abs(change).max(initial=0.0)), MPI.MAX)
+        if not self._first or largest < NOTICEABLE * state.loading.domain.size:
+            return 0.0
+        owned = change[: state.number_of_owned_unknowns]
+        return float(np.sqrt(over_ranks(comm, owned @ owned, MPI.SUM))) / self._first
 
     def tangent_direction(self, set_fraction: Callable[[float], None], done: float, distance: float) -> Any:
         """Change of the unknowns per fraction of a change of the problem, at a solved state; one linear solve.
@@ -297,6 +309,8 @@ class GuardedNewton:
         method comes back only by a factor of 1.5 an iteration.
         """
         improved = self._linear.improve(x, self._snes.getFunction()[0], step, self._gap <= MET)
+        if self._first is None:
+            self._first = float(step.norm())
         self._spared = self.limits.bounded and self.limits.spare(np.sqrt(3) * step.norm(PETSc.NormType.NORM_INFINITY))
         if self._spared:
             return improved

@@ -69,10 +69,15 @@ SOLVER_TOLERANCE = Refusal(
     "solver tolerance",
     "the residual goes no further down; raise solver.relative_tolerance, or solver.maximum_iterations",
 )
+SEVERAL_SOLUTIONS = Refusal(
+    "several solutions", "this one is not that to which the last one leads; try a slower ramp, or lower loads"
+)
 UNSTABLE = Refusal("lost stability", 'lower the load, or go on beyond it with solver.unstable = "warn"')
 
 
-def diagnosed(newton: GuardedNewton, failure: SolveFailure, direction: NDArray[np.float64] | None = None) -> Refusal:
+def diagnosed(
+    newton: GuardedNewton, failure: SolveFailure | None, direction: NDArray[np.float64] | None = None
+) -> Refusal:
     """The kind of refusal, from the present state: the last one that was solved.
 
     Parameters
@@ -80,7 +85,7 @@ def diagnosed(newton: GuardedNewton, failure: SolveFailure, direction: NDArray[n
     newton
         What could not solve further; loads and cells of its equilibrium are those of the present unknowns.
     failure
-        How the smallest part failed.
+        How the smallest part failed; None if it was solved, but far from here.
     direction
         Change of the unknowns over the last part that was solved, where there was one.
     """
@@ -94,11 +99,14 @@ def diagnosed(newton: GuardedNewton, failure: SolveFailure, direction: NDArray[n
         return replace(CHAIN_LOCKING, finding=f"r/L = {longest:.6g} at ({place}) in the last state that was solved")
     if extension.min_jacobian < CRUSHED:
         return replace(KINEMATIC_LOCKING, finding=f"J = {extension.min_jacobian:.3g} in the last state that was solved")
-    if 1.0 < failure.residual_over_tolerance < NEARLY_SOLVED:
-        return replace(SOLVER_TOLERANCE, finding=f"{failure.residual_over_tolerance:.3g} times the tolerance is left")
     inertia = Inertia(newton.equilibrium)
     try:
-        return _of_the_tangent(inertia, direction)
+        found = _of_the_tangent(inertia, direction)
+        left = failure.residual_over_tolerance if failure is not None else 0.0
+        # beyond a limit point a residual may come near the tolerance too, at a state far away
+        if 1.0 < left < NEARLY_SOLVED and found.kind != LIMIT_POINT.kind:
+            return replace(SOLVER_TOLERANCE, finding=f"{left:.3g} times the tolerance is left")
+        return found
     except FactorisationFailed as reason:
         log.info("the kind of the refusal is not known: %s", reason)
         return TOO_LARGE

@@ -8,6 +8,12 @@ import numpy as np
 
 from remodel_fenicsx.evolution.equilibrium import Extension
 
+FAR = 2.0
+"""`Solution.reach` from which on a way is looked at again in parts. The paper's bodies have at most 1.25, a tube without
+chains that comes near its largest pressure in one step 2.9; a jump over a limit point has 3.9 and more."""
+
+NEAR, MANY = 0.5, 12  # chains that come near their contour length end nearer too, but within 11 iterations
+
 
 @dataclass(frozen=True)
 class Solution:
@@ -21,6 +27,15 @@ class Solution:
     """How many were assembled."""
     extension: Extension | None = None
     """Of the solution."""
+    reach: float = 0.0
+    """Distance of the solution from the start over the length of the first Newton step; 0 where it is too short to
+    matter."""
+
+    @property
+    def is_far(self) -> bool:
+        """Whether it may lie on another branch: much farther than the tangent at the start points, or much nearer after
+        many iterations, as from a start at which the tangent is almost singular."""
+        return self.reach > FAR or (0.0 < self.reach < NEAR and self.newton_iterations > MANY)
 
     def after(self, failure: SolveFailure) -> Solution:
         """With the work of an attempt that had failed before."""
