@@ -20,6 +20,7 @@ CRUSHED = 0.02  # J
 NEARLY_CRITICAL = 0.1  # lowest eigenvalue over its unloaded value
 ALONG_THE_MODE = 0.5  # cosine between the last change of the displacement and the mode
 NEARLY_SOLVED = 1e3  # residual over tolerance
+LOOSEST = 1e-4  # residual over the forces at the nodes that is worth going on with
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,7 @@ KINEMATIC_LOCKING = Refusal(
 )
 SOLVER_TOLERANCE = Refusal(
     "solver tolerance",
-    "the residual goes no further down; raise solver.relative_tolerance, or solver.maximum_iterations",
+    "the residual goes no further down; try a larger solver.maximum_iterations, or a smaller time.step",
 )
 SEVERAL_SOLUTIONS = Refusal(
     "several solutions", "this one is not that to which the last one leads; try a slower ramp, or lower loads"
@@ -102,16 +103,26 @@ def diagnosed(
     inertia = Inertia(newton.equilibrium)
     try:
         found = _of_the_tangent(inertia, direction)
-        left = failure.residual_over_tolerance if failure is not None else 0.0
         # beyond a limit point a residual may come near the tolerance too, at a state far away
-        if 1.0 < left < NEARLY_SOLVED and found.kind != LIMIT_POINT.kind:
-            return replace(SOLVER_TOLERANCE, finding=f"{left:.3g} times the tolerance is left")
-        return found
+        if failure is None or found.kind == LIMIT_POINT.kind:
+            return found
+        return _of_the_tolerance(failure) or found
     except FactorisationFailed as reason:
         log.info("the kind of the refusal is not known: %s", reason)
         return TOO_LARGE
     finally:
         inertia.close()
+
+
+def _of_the_tolerance(failure: SolveFailure) -> Refusal | None:
+    """Where not much is left of the residual."""
+    if not 1.0 < failure.residual_over_tolerance < NEARLY_SOLVED:
+        return None
+    found = replace(SOLVER_TOLERANCE, finding=f"{failure.residual_over_tolerance:.3g} times the tolerance is left")
+    if failure.relative_residual > LOOSEST:
+        return found
+    enough = 10.0 ** np.ceil(np.log10(2 * failure.relative_residual))  # twice: it is not the same in every iteration
+    return replace(found, advice=f"{found.advice}; solver.relative_tolerance = {enough:g} takes it as solved")
 
 
 def _of_the_tangent(inertia: Inertia, direction: NDArray[np.float64] | None) -> Refusal:
