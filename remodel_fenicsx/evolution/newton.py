@@ -11,7 +11,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from remodel_fenicsx.evolution.equilibrium import Equilibrium, Extension, Look
+from remodel_fenicsx.evolution.equilibrium import Equilibrium, Look
 from remodel_fenicsx.evolution.limits import Limits
 from remodel_fenicsx.evolution.linear import BY_METHOD, EveryTangent
 from remodel_fenicsx.evolution.parameters import stress_rounding
@@ -99,8 +99,7 @@ class GuardedNewton:
         self._area_of_gradients = equilibrium.quadrature.norm(areas * gradients)  # per displacement
         self._displacement = 0.0  # largest unknown of an admissible state
         self.on_the_way = False  # whether the solution is only the start of a further one: then it may be coarser
-        self._lost = False
-        self._gap = self._last_norm = np.inf
+        self._lost, self._gap, self._last_norm = False, np.inf, np.inf
         bounded = self.method == LAGGED and "snes_linesearch_type" not in self._options.given
         self.limits = Limits(equilibrium, bounded)
         self._first: float | None = None  # length of the first Newton step of a solve
@@ -157,9 +156,7 @@ class GuardedNewton:
                 try:
                     return self._attempt().after(failure)
                 except SolveFailure as again:
-                    again.newton_iterations += failure.newton_iterations
-                    again.linear_iterations += failure.linear_iterations
-                    again.tangents += failure.tangents
+                    again.count(failure)
                     raise
 
     def may_start(self) -> bool:
@@ -174,8 +171,7 @@ class GuardedNewton:
         # they may be others from solve to solve, not within one
         self._largest, self._rounding = self.equilibrium.parameters.largest(), (np.nan, 0.0)
         self._pull(self._x)
-        self._lost = self._spared = False
-        self._first = None
+        self._lost, self._spared, self._first = False, False, None
         if not self._looked:
             self.limits.forget()
         self._looked = False
@@ -204,7 +200,7 @@ class GuardedNewton:
     def _reach(self, change: Any) -> float:
         """`Solution.reach` of a solve that has changed the unknowns so."""
         comm, state = self.equilibrium.comm, self.equilibrium.state
-        largest = over_ranks(comm, float(np.abs(change).max(initial=0.0)), MPI.MAX)
+        largest = over_ranks(comm, np.abs(change).max(initial=0.0), MPI.MAX)
         if not self._first or largest < NOTICEABLE * state.loading.domain.size:
             return 0.0
         owned = change[: state.number_of_owned_unknowns]
@@ -357,8 +353,7 @@ class GuardedNewton:
         if not after.extension.admissible:
             return False
         near = after.extension.max_chain_extension > NEAR_LOCKING
-        stretches = before.stretches, after.stretches
-        if near and not self.equilibrium.keeps_reserve(*stretches, KEPT_RESERVE, NEAR_LOCKING):
+        if near and not self.equilibrium.keeps_reserve(before.stretches, after.stretches, KEPT_RESERVE, NEAR_LOCKING):
             return False
         return not self.equilibrium.turns_inside_out(before.states, after.states)
 

@@ -68,6 +68,12 @@ class SolveFailure(RuntimeError):
         self.linear_iterations = linear_iterations
         self.extension = extension
 
+    def count(self, earlier: SolveFailure) -> None:
+        """With the work of an attempt that had failed before."""
+        self.newton_iterations += earlier.newton_iterations
+        self.linear_iterations += earlier.linear_iterations
+        self.tangents += earlier.tangents
+
 
 # by PETSc's SNESConvergedReason; numbers, for the names differ between its versions
 FAILURES = {
