@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from remodel_fenicsx.body.buckling import Strut
 from remodel_fenicsx.body.column import Column
 from remodel_fenicsx.body.gmsh_model import length_fault
 from remodel_fenicsx.body.reductions import Reduction, homogeneous, known_loads, same_cells, symmetric_law, unturned
@@ -133,6 +134,10 @@ class Shape(Table):
         """Area of every section across z, for reduced kinematics."""
         raise NotImplementedError(f"a {self.name} has no section across z")
 
+    def strut(self, ends: str) -> Strut | None:
+        """What of the body buckles under thrust, held as `supports.ends` says; None if nothing bends it."""
+        return None
+
     def depth(self, coordinates: Array) -> Array:
         """How far places (..., 3) are through the body, from 0 to 1: here along z."""
         return np.asarray(coordinates[..., 2] / self.axial_length, dtype=np.float64)
@@ -205,8 +210,8 @@ def uniaxial_columns(top: str, length: str) -> tuple[Column, ...]:
 
     return (
         Column("mean_stretch", "", "length over reference length, mean of the top", mean_stretch),
-        Column("min_stretch", "", "smallest element mean of F_zz", lambda m: m.smallest(m.axial_stretch)),
-        Column("max_stretch", "", "largest element mean of F_zz", lambda m: m.largest(m.axial_stretch)),
+        Column("min_stretch", "", "smallest element mean of F_zz", lambda m: m.smallest(m.axial_stretch), extreme=True),
+        Column("max_stretch", "", "largest element mean of F_zz", lambda m: m.largest(m.axial_stretch), extreme=True),
         Column(
             "mean_fibre_angle",
             "degrees",

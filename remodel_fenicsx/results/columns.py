@@ -31,8 +31,9 @@ COLUMNS: dict[str, Column] = {
             "",
             "largest r/L, always below 1 (0 where no chain locks)",
             lambda m: m.step.extension.max_chain_extension,
+            extreme=True,
         ),
-        Column("min_jacobian", "", "smallest J, always above 0", lambda m: m.step.extension.min_jacobian),
+        Column("min_jacobian", "", "smallest J, always above 0", lambda m: m.step.extension.min_jacobian, extreme=True),
         Column("stored_energy", "stress length^3", "integral of W", lambda m: m.equilibrium.stored_energy()),
         Column(
             "remodeling_power",
@@ -72,8 +73,8 @@ COLUMNS_ON_REQUEST: dict[str, Column] = {
         Column(
             "time_error",
             "degrees",
-            "estimated error in time of the fibre angle, root mean square over the body; there without request with "
-            "`time.tolerance`",
+            "estimated error in time: of the direction of the chains, root mean square over the body, or of lengths, "
+            "relative (1 radian is 100 %), the larger; there without request with `time.tolerance`",
             lambda m: m.step.time_error,
             after_pass=True,
         ),
