@@ -100,8 +100,8 @@ class Implicit:
         if self.state.comm.rank == 0:
             log.warning(
                 "time %g: in %.3g %% of the body no cells belong to their stress, not in parts of the step either: "
-                "there they are held, and the row is not the implicit solution. The column held_points counts the points; "
-                "smaller steps have fewer, the law 'tensor' has none",
+                "there they are held, and the row is not the implicit solution. "
+                "The column held_points counts the points; smaller steps have fewer, the law 'tensor' has none",
                 time,
                 100 * share,
             )
