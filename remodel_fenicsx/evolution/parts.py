@@ -240,7 +240,8 @@ class Change:
 
     def _looks(self) -> bool:
         """Whether a part that has ended far away is looked into."""
-        return self.refusal is None and self._jumps["found"] < MOST_JUMPS
+        enough = self.maximum_halvings >= PROOF
+        return enough and self.refusal is None and self._jumps["found"] < MOST_JUMPS
 
     @property
     def _jumps(self) -> Numbers:
