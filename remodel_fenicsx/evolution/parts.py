@@ -22,9 +22,8 @@ SLOPE_SHARE = 1e-3  # of the bounded part: over it the slope of the residual is 
 SAME = 1e-4  # of the way to them: by what two solutions may differ that are one; of other branches it is a good part
 FASTER = 8.0  # than the part before: a way that comes to a limit point is up to 3 times as fast in its last equal part
 WAYS_END = (LIMIT_POINT.kind, BIFURCATION.kind)  # refusals for which no smaller step helps
-MOST_JUMPS = (
-    3  # that are looked into in a run: each costs some 25 solves, and a body that falls apart jumps in each step
-)
+PROOF = 8  # halvings without which a jump is not told from a step that is only too large
+MOST_JUMPS = 3  # that are looked into in a run, each by some 25 solves: a body that falls apart jumps in every step
 log = logging.getLogger(__name__)
 
 
