@@ -305,7 +305,7 @@ def test_every_driver_has_the_formulations_stress() -> None:
 
 
 def test_the_driving_stress_of_quadratic_elements_has_the_pressure_of_their_rule() -> None:
-    """J at the rule's eight points, of shape functions of its own; between them the trilinear polynomial through these."""
+    """J at the rule's eight points, by polynomials of its own; between them the trilinear one through these."""
     domain = cube(refinement=1, degree=2)
     made = parts.body(domain, Cells(initial="isotropic"), degree=2)
     made.formulation = SELECTIVE
