@@ -13,6 +13,7 @@ from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.loading import Loading, LoadValues
 from remodel_fenicsx.body import Shape
 from remodel_fenicsx.body.reductions import AUTO, choice, explained
+from remodel_fenicsx.evolution.buckling import BucklingWarning
 from remodel_fenicsx.evolution.chatter import Chatter
 from remodel_fenicsx.evolution.homeostasis import Homeostasis
 from remodel_fenicsx.evolution.locking import LockingWarning
@@ -106,8 +107,10 @@ class Simulation:
             self.stepper.judge = TimeError(self.stepper, shape.fibre_angle).measure
         wanted = without_free_length(columns_of(shape, columns), shape, scene.loads)
         self.observer = Observer(shape, self.stepper, wanted)
-        locks = formulation.locks(scene.mesh.element, scene.mesh.degree)
-        self.warnings: list[Watcher] = [LockingWarning(self.stepper, locks)]
+        self.warnings: list[Watcher] = [
+            LockingWarning(self.stepper, formulation.locks),
+            BucklingWarning(self.stepper, shape.strut(scene.supports.ends)),
+        ]
         if self.stepper.remodeling.law.remodels and not at_once:
             chatter = Chatter(self.stepper)
             self.warnings.insert(0, chatter)
