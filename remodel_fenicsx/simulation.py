@@ -101,10 +101,10 @@ class Simulation:
         self.control: StepControl | None = None
         if scene.time.tolerance is not None:
             settings = scene.time.tolerance, scene.time.step, scene.stops()
-            self.control = StepControl(self.stepper, shape.fibre_angle, *settings)
+            self.control = StepControl(self.stepper, *settings)
             columns += [TIME_ERROR] if TIME_ERROR not in columns else []
         elif TIME_ERROR in columns:
-            self.stepper.judge = TimeError(self.stepper, shape.fibre_angle).measure
+            self.stepper.judge = TimeError(self.stepper).measure
         wanted = without_free_length(columns_of(shape, columns), shape, scene.loads)
         self.observer = Observer(shape, self.stepper, wanted)
         self.warnings: list[Watcher] = [

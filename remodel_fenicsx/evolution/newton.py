@@ -215,7 +215,7 @@ class GuardedNewton:
             Fraction over which the residual's slope is taken.
         """
         self._pull(self._x)
-        slope, direction = self._x.duplicate(), self._x.duplicate()
+        slope = self._x.duplicate()
         set_fraction(done + distance)
         self.limits.forget()
         self._assemble_residual(self._snes, self._x, slope)
@@ -224,13 +224,37 @@ class GuardedNewton:
         self._assemble_residual(self._snes, self._x, self._residual)
         slope.axpy(-1.0, self._residual)
         self._linear.renew()
-        solver = self._snes.getKSP()
+        values = self._linear_answer(slope) / distance
+        slope.destroy()
+        return values
+
+    def answer(self, equilibrium: Equilibrium, tangents: int) -> Any:
+        """Change of the unknowns of a solved state after a small change of the problem; one linear system.
+
+        Parameters
+        ----------
+        equilibrium
+            Whose residual, at the present unknowns, is to vanish.
+        tangents
+            How many were assembled for the solved state; the last one counts, if the method keeps none from before.
+        """
+        self._pull(self._x)
+        equilibrium.assemble_internal(self._residual)
+        equilibrium.assemble_external(self._external)
+        self._residual.axpy(1.0, self._external)
+        dolfinx.fem.petsc.set_bc(self._residual, equilibrium.state.loading.boundary_conditions, self._x, -1.0)
+        if not (self._linear.tangents if self._linear.keeps else tangents):
+            self._linear.renew()
+        return self._linear_answer(self._residual)
+
+    def _linear_answer(self, residual: Any) -> Any:
+        """Change of the unknowns that the tangent gives for a residual, ghosts included."""
+        solver, direction = self._snes.getKSP(), self._x.duplicate()
         solver.setOperators(self._matrix)
-        solver.solve(slope, direction)
+        solver.solve(residual, direction)
         direction.ghostUpdate(addv=PETSc.InsertMode.INSERT, mode=PETSc.ScatterMode.FORWARD)
         with direction.localForm() as local:
-            values = -local.array_r / distance
-        slope.destroy()
+            values = -local.array_r
         direction.destroy()
         return values
 

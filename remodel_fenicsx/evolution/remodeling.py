@@ -180,10 +180,16 @@ class RemodelingPass:
         squared = self.kernels.squared_length(F, self.state.cells.point_cells) / length**2
         return float(np.sqrt(self.quadrature.maximum(squared.reshape(self.quadrature.shape))))
 
-    def updated_cells(self, time_old: float, time_new: float, residual: float = 0.0) -> tuple[UnitCell, Array]:
-        """New cells of all points in one row, and F (n, 3, 3). Changes nothing."""
+    def updated_cells(
+        self, time_old: float, time_new: float, residual: float = 0.0, cells: UnitCell | None = None
+    ) -> tuple[UnitCell, Array]:
+        """What the present stress makes of the present cells, or of others, in one row, and F (n, 3, 3).
+
+        Changes nothing.
+        """
         drive = self.drive(residual)
-        return self.law.update(self.state.cells.point_cells, drive, time_old, time_new), drive.deformation_gradient
+        cells = self.state.cells.point_cells if cells is None else cells
+        return self.law.update(cells, drive, time_old, time_new), drive.deformation_gradient
 
     def target(self, residual: float = 0.0) -> Target:
         """What the structure tensor tends to in the present state; of laws that have one."""
