@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from remodel_fenicsx import Recording, cli, read_scene
-from remodel_fenicsx.results.profile import PLACES, weights
+from remodel_fenicsx.body.profile import PLACES, weights
 from remodel_fenicsx.scene.scene import Scene, preset_scene
 from remodel_fenicsx.studies import ladder as rungs, trade as study
 from remodel_fenicsx.studies.convergence import limit, pareto, typical

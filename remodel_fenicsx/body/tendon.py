@@ -74,6 +74,11 @@ class Tendon(Shape):
         """The area."""
         return self.area
 
+    @property
+    def proportions(self) -> tuple[tuple[str, str, float, tuple[int, int]], ...]:
+        """Of tendons: neither a plate nor a thread."""
+        return (("length", "length / sqrt(area)", self.length / math.sqrt(self.area), (-2, 3)),)
+
     @model_validator(mode="after")
     def _can_be_meshed(self) -> Tendon:
         check_lengths(self, {"length": self.length, "area": math.sqrt(self.area)})

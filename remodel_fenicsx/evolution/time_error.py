@@ -87,7 +87,7 @@ class TimeError:
         speed = 0.0
         if known:
             last = known[0].reshape(angles.shape)
-            speed = float(np.sqrt(self.quadrature.mean((angles - last) ** 2))) / duration
+            speed = self._typical(angles - last) / duration
         if not self._held(step):
             fading = self.kappa
         elif before > 0 and speed > 0:
@@ -118,4 +118,8 @@ class TimeError:
         dimensions = better.dimensions.reshape(*self.quadrature.shape, 3)
         axes = better.axes.reshape(*self.quadrature.shape, 3, 3)
         apart = self.fibre_angle(dimensions, axes, self.quadrature.coordinates) - angles
-        return float(np.sqrt(self.quadrature.mean(apart**2)))
+        return self._typical(apart)
+
+    def _typical(self, differences: Array) -> float:
+        """Root mean square over the points that have an angle; 0 where there is none."""
+        return float(np.sqrt(np.nan_to_num(self.quadrature.mean_of_known(differences**2))))
