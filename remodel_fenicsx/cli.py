@@ -17,6 +17,7 @@ import remodel_fenicsx
 from remodel_fenicsx.body.reductions import explained
 from remodel_fenicsx.system import interrupts
 from remodel_fenicsx.system.arguments import positive, wall_time
+from remodel_fenicsx.system.children import SERVE, serve
 from remodel_fenicsx.system.environment import reason_undrawable, reason_unusable, versions
 from remodel_fenicsx.scene.parameters import PRESETS
 from remodel_fenicsx.scene.profiles import PROFILES
@@ -122,6 +123,7 @@ def parser() -> argparse.ArgumentParser:
     )
     figures.add_argument("--stamp", action="store_true", help="show in each picture what it was made with")
     figures.add_argument("--jobs", type=int, metavar="N", help="runs at a time (default: as many as there are cores)")
+    commands.add_parser(SERVE)  # of the processes of a study; not listed
     commands.add_parser("info", help="Print versions, solvers and BLAS.", description="Print versions and solvers.")
     return main_parser
 
@@ -388,6 +390,7 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
     "new": _new,
     "figures": _figures,
     "info": _info,
+    SERVE: lambda options: serve(main),
 }
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import os
 import signal
+import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +13,14 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from remodel_fenicsx import Recording, SceneError, cli
+from remodel_fenicsx import Recording, SceneError, cli, read_scene
 from remodel_fenicsx.evolution.coupling import Staggered
 from remodel_fenicsx.running import run
 from remodel_fenicsx.scene.scene import Scene
 from remodel_fenicsx.studies import ensemble as study
 from remodel_fenicsx.studies.members import Member, run_members
-from remodel_fenicsx.system.interrupts import Interrupted, Paused
+from remodel_fenicsx.system.interrupts import Paused
+from tests import forks
 from tests.conftest import forked_children
 from tests.parts import pulled_cube
 
@@ -76,6 +78,33 @@ def test_what_is_there_is_not_run_again(made: tuple[Path, study.Ensemble]) -> No
         study.ensemble(scene(solver={"maximum_halvings": 3}), folder, seeds=3)
 
 
+@pytest.mark.parametrize(
+    ("code", "said"), [(3, "no equilibrium"), (4, "SIGUSR1: all is kept"), (-9, "it said nothing")]
+)
+def test_the_command_says_whose_run_has_failed_or_was_stopped(
+    code: int,
+    said: str,
+    tmp_path: Path,
+    made: tuple[Path, study.Ensemble],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """The others are evaluated; the exit code is 3."""
+
+    def ended(program: str, *words: str) -> subprocess.CompletedProcess[str]:
+        assert program == "remodel-fenicsx" and "seed-2" in " ".join(words)
+        return subprocess.CompletedProcess(words, code, "", f"remodel-fenicsx: {said}\n")
+
+    monkeypatch.setattr(forks, "forked", ended)
+    monkeypatch.setattr(study, "draw", lambda *of: None)
+    path = tmp_path / "scene.toml"
+    path.write_text(scene().to_toml())
+    with forked_children():
+        assert cli.main(["ensemble", str(path), "-o", str(made[0]), "--seeds", "3", "-q"]) == 3
+    written = capsys.readouterr()
+    assert "time 5, 2 seeds" in written.out and f"seed-2 has failed: {said}" in written.err
+
+
 def test_what_was_stopped_goes_on(
     tmp_path: Path, made: tuple[Path, study.Ensemble], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -99,8 +128,11 @@ def test_what_was_stopped_goes_on(
     np.testing.assert_array_equal(member.history()["mean_stretch"], whole["mean_stretch"])
 
 
-def test_a_signal_ends_all_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    members = study.members_of(pulled_cube(5000.0), tmp_path, 2)
+def test_a_signal_ends_all_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, out = tmp_path / "scene.toml", tmp_path / "out"
+    path.write_text(pulled_cube(5000.0).to_toml())
     asked = Member.steps_done.fget
     assert asked is not None
 
@@ -111,10 +143,11 @@ def test_a_signal_ends_all_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         return int(steps)
 
     monkeypatch.setattr(Member, "steps_done", property(then_stop))
-    with pytest.raises(Interrupted) as caught:
-        run_members(members, 1, "test")
-    assert caught.value.exit_code == 128 + signal.SIGTERM
-    assert not any(member.is_complete() for member in members)
+    code = cli.main(["ensemble", str(path), "-o", str(out), "--seeds", "2", "--jobs", "1"])
+    assert code == 128 + signal.SIGTERM
+    assert "stopped; all that is recorded is kept, the same command goes on" in capsys.readouterr().err
+    members = study.members_of(read_scene(path), out, 2)
+    assert any(asked(member) for member in members) and not any(member.is_complete() for member in members)
 
 
 def test_words_say_whether_the_cheap_model_is_enough() -> None:

@@ -533,6 +533,15 @@ def test_a_byte_order_mark_and_windows_line_ends_are_read(tmp_path):
     assert read.name == "from windows 2"
 
 
+@pytest.mark.parametrize(("file", "name"), [
+    ("step-0.5.toml", "step-0.5"), ("step-0.25", "step-0.25"), ("a.b.TOML", "a.b"), (".toml", "scene"),
+])  # fmt: skip
+def test_a_name_is_not_cut_at_a_dot(file, name, tmp_path):
+    path = tmp_path / file
+    path.write_text("geometry = {shape = 'cube'}\ntime = {end = 1}\n")
+    assert read_scene(path).name == name
+
+
 # ---------------------------------------------------------------- overrides
 
 BAD_OVERRIDES = [

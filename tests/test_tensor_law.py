@@ -173,6 +173,22 @@ def test_the_target_is_that_of_eq_9_to_11_in_the_principal_axes() -> None:
     assert found.share[0] == pytest.approx(10 / (10 + 0.01 * 4), rel=1e-12)
 
 
+def test_between_and_beyond_targets_the_direction_has_trace_one_and_the_share_is_one() -> None:
+    """sE is linear; a target that does not count leaves the direction to the other."""
+    ends = structures(2)
+    none, first, second = (
+        Target(direction[None], np.array([share]))
+        for direction, share in ((np.zeros((3, 3)), 0.0), (ends[0], 1.0), (ends[1], 0.6))
+    )
+    middle = first.towards(second, 0.5)
+    np.testing.assert_allclose(middle.direction[0], (ends[0] + 0.6 * ends[1]) / 1.6, atol=1e-14)
+    assert middle.share[0] == pytest.approx(0.8, rel=1e-13)
+    for weight, share in ((1.5, 1.0), (0.5, 0.5), (-0.5, 0.0), (0.0, 0.0)):
+        found = none.towards(first, weight)
+        assert found.share[0] == pytest.approx(share, abs=1e-14)
+        np.testing.assert_allclose(found.share[0] * (found.direction[0] - ends[0]), 0.0, atol=1e-14)
+
+
 def test_the_switch() -> None:
     """One under tension, nothing under compression or noise; no jump between."""
     noise = 1e-14

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from remodel_fenicsx import Recording, cli, read_scene
-from remodel_fenicsx.body.profile import PLACES, weights
+from remodel_fenicsx.body.profile import PLACES, PROFILE, weights
+from remodel_fenicsx.results.recording import HistoryColumns
 from remodel_fenicsx.scene.scene import Scene, preset_scene
 from remodel_fenicsx.studies import ladder as rungs, trade as study
 from remodel_fenicsx.studies.convergence import limit, pareto, typical
@@ -150,6 +152,24 @@ def test_hats_add_up_to_one_and_are_one_at_their_places() -> None:
     np.testing.assert_allclose(weights(np.linspace(0, 1, PLACES)), np.eye(PLACES), atol=1e-15)
 
 
+def test_noise_is_the_standard_error_of_the_mean() -> None:
+    """Of seeds whose angles differ by a known standard deviation; the angles are their mean."""
+    setting = next(s for s in ladder(artery(**{"cells.initial": "random"})) if len(s.seeds) == rungs.SEEDS)
+    spread, times = np.array([-1.0, 0.0, 1.0]), [0.0, 1.0]  # a sample of standard deviation 1
+
+    def history(number: int) -> HistoryColumns:
+        names = dict.fromkeys(PROFILE, np.full(2, 30.0 + spread[number]))
+        return HistoryColumns(names, time=np.array(times), inner_radius=np.ones(2), seconds=np.ones(2),
+                              processor_seconds=np.full(2, 1.0 + number))  # fmt: skip
+
+    members = [SimpleNamespace(history=lambda number=number: history(number)) for number in range(3)]
+    result = study.read(setting, members, times)  # type: ignore[arg-type]
+    assert result.noise == pytest.approx(3**-0.5)
+    np.testing.assert_allclose(result.angles, 30.0)
+    assert result.seconds == pytest.approx(4.0)  # of one run, two rows of 1, 2 and 3
+    assert study.read(setting, members[:1], times).noise == 0.0  # type: ignore[arg-type]
+
+
 # ---------------------------------------------------------------- the command
 def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """On a cube whose stress is the same everywhere: three steps; again: nothing is run; a row is a scene."""
@@ -159,8 +179,13 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     changes = {"model.kinematics": "point", "time.end": 20.0, "remodeling.kappa": 0.1}
     path.write_text(preset_scene(PAPER, "cube").with_values(changes).to_toml())
     monkeypatch.setattr(rungs, "objections", lambda scene, name: ["left out by the test"])
+    out.mkdir()
+    (out / "point-1-degree-1-step-0.5-1").write_text("a file of the user's: this run fails")
     with forked_children():
-        assert cli.main(["trade", str(path), "-o", str(out), "--budget", "10min"]) == 0
+        assert cli.main(["trade", str(path), "-o", str(out), "--jobs", "12", "-q"]) == 3
+        assert "point-1-degree-1-step-0.5-1 has failed: " in capsys.readouterr().err
+        (out / "point-1-degree-1-step-0.5-1").unlink()
+        assert cli.main(["trade", str(path), "-o", str(out), "--jobs", "12", "--budget", "10min"]) == 0
     words = capsys.readouterr().out
     assert (
         "time: order 1.1 (steps 2, 1, 0.5 on refinement 1, degree 1)" in words
@@ -169,6 +194,7 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     names = [f"point-1-degree-1-step-{step}" for step in ("2", "1", "0.5")]
     assert [name in (out / "trade.csv").read_text() for name in names] == [True] * 3
     assert (out / "trade.png").stat().st_size > 10_000
+    assert [read_scene(out / f"{name}-1.toml").time.step for name in names] == [2.0, 1.0, 0.5]
     row = read_scene(out / "rows" / f"{names[2]}.toml")
     assert row.time.step == 0.5 and row.output.fields is True and row.name == "cube"
     # the closed form of the printed scheme: a row of fixed steps has the angle of one step before

@@ -60,7 +60,7 @@ class Scene(Table):
     )
     name: Annotated[str, checked(_name)] = Field(
         default="scene",
-        description="Name of the scene and of its results folder. Default: the file's name without its ending.",
+        description="Name of the scene and of its results folder. Default: the file's name without `.toml`.",
         json_schema_extra={"allowed": "a file name without a path"},
     )
     preset: str | None = Field(
@@ -336,5 +336,6 @@ def read_scene(path: str | os.PathLike[str], overrides: Iterable[str] = (), prof
     for override in overrides:
         key, value = parse_override(override)
         put(values, key, value)
-    values.setdefault("name", re.sub(r"^[^\w]+|[^\w+-]+$|[^\w .+-]", "", Path(path).stem)[:100].rstrip(" .") or "scene")
+    name = re.sub(r"\.toml$", "", Path(path).name, flags=re.IGNORECASE)  # what follows another dot is part of it
+    values.setdefault("name", re.sub(r"^[^\w]+|[^\w+-]+$|[^\w .+-]", "", name)[:100].rstrip(" .") or "scene")
     return scene_from_dict(values)

@@ -1,4 +1,7 @@
-"""The runs of a study: each in a folder of its own, several at a time, gone on with where they have stopped."""
+"""The runs of a study: each in a folder of its own, several at a time, gone on with where they have stopped.
+
+Each of the processes at work does one run after the other: most of a short run would be its start.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +23,7 @@ from remodel_fenicsx.results.recording import (
 )
 from remodel_fenicsx.scene.scene import Scene, SceneError
 from remodel_fenicsx.schema.times import same_time
-from remodel_fenicsx.system.children import Child
+from remodel_fenicsx.system.children import Worker, wait_for_one
 from remodel_fenicsx.system.interrupts import Interrupted, StopRequest
 from remodel_fenicsx.system.terminal import Line
 
@@ -44,6 +47,10 @@ class Member:
     name: str
     scene: Scene
     folder: Path
+
+    def beside(self, ending: str) -> Path:
+        """A file beside its folder, of the same name: names have dots of their own (`step-0.5`)."""
+        return self.folder.with_name(f"{self.folder.name}{ending}")
 
     @property
     def steps_done(self) -> int:
@@ -112,7 +119,8 @@ def run_members(
         If a folder cannot be written.
     """
     waiting = [member for member in reversed(members) if not member.is_complete()]
-    running: dict[str, tuple[Member, Child]] = {}
+    running: dict[Worker, Member] = {}
+    idle: list[Worker] = []
     total, failed, line = sum(member.scene.time.number_of_steps for member in members), {}, Line(title)
     with StopRequest() as stop:
         try:
@@ -124,31 +132,37 @@ def run_members(
                 while waiting and len(running) < jobs:
                     member = waiting.pop()
                     if fits(member):
-                        running[member.name] = (member, _started(member))
-                for member, child in list(running.values()):
-                    code = child.process.poll()
+                        worker = idle.pop() if idle else Worker()
+                        running[worker] = member
+                        _begin(worker, member)
+                wait_for_one(running, POLL)
+                for worker, member in list(running.items()):
+                    code = worker.poll()
                     if code is not None:
-                        del running[member.name]
+                        del running[worker]
                         if code != 0:
-                            failed[member.name] = child.last_words()
+                            failed[member.name] = worker.last_words()
+                        if worker.is_alive:
+                            idle.append(worker)
                         finished()
                 if not quiet:
                     done = sum(member.steps_done for member in members)
-                    line.show(f"{100 * done // total} % of {len(members)} runs: {', '.join(running) or 'done'}")
-                clock.sleep(POLL)
+                    names = ", ".join(member.name for member in running.values())
+                    line.show(f"{100 * done // total} % of {len(members)} runs: {names or 'done'}")
         finally:
-            for _, child in running.values():
-                child.stop()
+            for worker in [*running, *idle]:
+                worker.stop()
             line.end()
     return failed
 
 
-def _started(member: Member) -> Child:
+def _begin(worker: Worker, member: Member) -> None:
     """Begin, or go on with what is there."""
     member.folder.parent.mkdir(parents=True, exist_ok=True)
-    messages = member.folder.with_suffix(".txt")
+    messages = member.beside(".txt")
     if (member.folder / SCENE).exists():
-        return Child(["run", "--resume", str(member.folder), "-q"], messages)
-    scene = member.folder.with_suffix(".toml")
+        worker.begin(["run", "--resume", str(member.folder), "-q"], messages)
+        return
+    scene = member.beside(".toml")
     scene.write_text(member.scene.to_toml(), encoding="utf-8")
-    return Child(["run", str(scene), "-o", str(member.folder), "-q"], messages)
+    worker.begin(["run", str(scene), "-o", str(member.folder), "-q"], messages)

@@ -39,6 +39,25 @@ class Target(NamedTuple):
     direction: Array
     share: Array
 
+    def towards(self, other: Target, weight: Array | float) -> Target:
+        """sE + weight (s'E' - sE), of another target s'E'; weights below 0 or above 1 extrapolate.
+
+        What acts on A is kappa (r0^2 sE - sA): it is sE that changes linearly, and s is its trace. So a target that
+        does not count takes no part, and E has trace one. An s below 0 is 0, one above 1 is 1.
+        """
+        ends = (self.share[:, None, None] * self.direction, other.share[:, None, None] * other.direction)
+        changed = ends[0] + np.reshape(weight, (-1, 1, 1)) * (ends[1] - ends[0])
+        share = np.einsum("nii->n", changed)
+        some = share > 0.0
+        direction = changed / np.where(some, share, 1.0)[:, None, None]
+        return Target(direction, np.where(some, np.minimum(share, 1.0), 0.0))
+
+    def where(self, chosen: NDArray[np.bool_], other: Target) -> Target:
+        """Itself, and at the chosen points another target."""
+        return Target(
+            np.where(chosen[:, None, None], other.direction, self.direction), np.where(chosen, other.share, self.share)
+        )
+
 
 def target(tensor: Array, noise: Array | float) -> Target:
     """E and s of driving tensors in material space.
