@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import tomllib
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar, cast
@@ -22,6 +22,7 @@ from remodel_fenicsx.results.checkpoint_file import Checkpoint, CheckpointError,
 from remodel_fenicsx.results.fields import Fields, field_names
 from remodel_fenicsx.results.recording import SCENE, RecordingError
 from remodel_fenicsx.results.run_folder import FolderTaken, LastStep, RunFolder, chosen_folder, forget_steps, locked
+from remodel_fenicsx.results.status import BEGUN, FAILED, STOPPED
 from remodel_fenicsx.scene import Scene, SceneError, read_scene, scene_from_dict
 from remodel_fenicsx.scene.continuation import check_continuation
 from remodel_fenicsx.simulation import Simulation
@@ -220,7 +221,7 @@ def _record(simulation: Simulation, place: Path, around: _Circumstances) -> None
         steps = scene.time.number_of_steps if simulation.control else state.number + len(simulation.remaining())
         rank, done = -1 if around.quiet else comm.rank, scene.time.progress(state.number, state.time)
         progress = stack.enter_context(Progress(steps, scene.name, rank, done=done))
-        log.info("scene %s on %d ranks, results in %s", scene.name, comm.size, place)
+        log.info(BEGUN + "%s on %d ranks, results in %s", scene.name, comm.size, place)
         log.info("%s", scene.summary())
         for warning in scene.warnings():
             log.warning("%s", warning)
@@ -240,9 +241,16 @@ def _record(simulation: Simulation, place: Path, around: _Circumstances) -> None
             if around.other_starts and isinstance(simulation.stepper.coupling, Homeostasis):
                 check_uniqueness(simulation.stepper.coupling, dict(state.loading.values))
         except (StepFailure, Interrupted, Paused) as reason:
-            log.info("ended: %s", reason)
+            if isinstance(reason, StepFailure):
+                log.info(FAILED + "%s. %s", reason, reason.refusal)
+            else:
+                log.info(STOPPED + "%s", reason)
             if getattr(reason, "on_all_ranks", True):
                 checkpoints.write()
+            raise
+        except Exception as defect:
+            with suppress(OSError):  # the disk may be full
+                log.info(FAILED + "%s: %s", type(defect).__name__, defect)
             raise
         log.info("finished")
 

@@ -25,6 +25,7 @@ from remodel_fenicsx.tissue.laws import LAWS
 log = logging.getLogger(__name__)
 
 NAME = "stability"
+GROWS = 1.001  # factor: changes that no pass touches, where tension is missing, keep their size to what was iterated
 LONG_SCALE = -12.0  # lowest factor that is drawn on a linear scale
 Table = dict[str, list[float]]
 
@@ -116,7 +117,33 @@ def in_words(table: Table) -> str:
     lines = [" ".join(f"{name:>{max(8, len(name))}}" for name in names)]
     for row in range(len(table["time"])):
         lines.append(" ".join(f"{table[name][row]:{max(8, len(name))}.3g}" for name in names))
+    lines.append(verdict(table))
     return "\n".join(lines)
+
+
+def verdict(table: Table) -> str:
+    """The answer in a sentence: whether passes with the scene's coupling make small changes smaller."""
+    times, factors, growing = (np.array(table[name]) for name in ("time", "factor_of_coupling", "growing_factor"))
+    unknown = ~np.isfinite(table["factor"])
+    swings, grows = factors < -1, growing > GROWS
+    if swings.any():
+        worst, share = int(np.nanargmin(factors)), np.nanmin(table["stable_share"])
+        return (
+            f"Unstable: passes over-correct at {swings.sum()} of {len(times)} times, first at {times[swings][0]:g}; "
+            f"the worst multiplies a small change by {factors[worst]:.3g} at time {times[worst]:g}. The coupling "
+            f"'relaxed' with a relaxation_factor below {share:.2g} does not."
+        )
+    if grows.any():
+        worst = int(np.nanargmax(growing))
+        return (
+            f"Unstable: at {grows.sum()} of {len(times)} times a small change of the cells grows from pass to pass "
+            f"without swinging, first at {times[grows][0]:g}; by {growing[worst]:.3g} at time {times[worst]:g}."
+        )
+    if unknown.any():
+        return f"Not known: at {unknown.sum()} of {len(times)} times no mode was found (run.log); stable at all others."
+    return (
+        f"Stable: at all {len(times)} times a pass makes small changes of the cells smaller, or keeps them as they are."
+    )
 
 
 def draw(table: Table, folder: Path, scene: Scene, share: float) -> None:

@@ -6,6 +6,7 @@ import csv
 import os
 import signal
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from mpi4py import MPI
 
 from remodel_fenicsx import Recording, SceneError, cli, read_scene
 from remodel_fenicsx.evolution.coupling import Staggered
+from remodel_fenicsx.results.status import status
 from remodel_fenicsx.running import run
 from remodel_fenicsx.scene.scene import Scene
 from remodel_fenicsx.studies import ensemble as study
@@ -46,6 +48,7 @@ def test_one_that_fails_loses_only_itself(made: tuple[Path, study.Ensemble]) -> 
     folder, found = made
     assert list(found.failed) == ["seed-2"] and "seed-2" in found.failed["seed-2"]
     assert (folder / "seed-2").read_text() == "a file of the user's\n"
+    assert found.extremes == {"max_chain_extension", "min_jacobian", "min_stretch", "max_stretch"}
     assert found.seeds == 2 and found.time.tolist() == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
 
 
@@ -65,6 +68,15 @@ def test_the_table_is_that_of_the_runs(made: tuple[Path, study.Ensemble]) -> Non
     assert isotropic.scene.cells.initial == "isotropic"
     assert float(rows[-1]["mean_stretch_isotropic"]) == pytest.approx(isotropic.history["mean_stretch"][-1], rel=1e-6)
     assert (folder / "ensemble.png").stat().st_size > 10_000
+
+
+def test_status_says_what_the_folder_is(made: tuple[Path, study.Ensemble]) -> None:
+    folder, _ = made
+    said = status(folder)
+    assert said[0] == f"{folder}: ensemble of scene, 4 runs: 3 finished, 1 failed"
+    assert said[1].startswith(f"seed-2 has failed: -o {folder / 'seed-2'}: is a file")
+    assert said[2].startswith(f"its answer: {folder / 'ensemble.csv'}; the same command goes on: ")
+    assert len(said) == 3
 
 
 def test_what_is_there_is_not_run_again(made: tuple[Path, study.Ensemble]) -> None:
@@ -122,7 +134,7 @@ def test_what_was_stopped_goes_on(
         run(member.scene, member.folder, MPI.COMM_SELF)
     assert member.steps_done == 2 and not member.is_complete()
     with forked_children():
-        assert run_members([member], 1, "test", quiet=True) == {}
+        assert run_members([member], 1, study.Study("test", "scene", tmp_path), quiet=True) == {}
     assert member.is_complete()
     whole = Recording(made[0] / "seed-3").history
     np.testing.assert_array_equal(member.history()["mean_stretch"], whole["mean_stretch"])
@@ -150,14 +162,38 @@ def test_a_signal_ends_all_runs(
     assert any(asked(member) for member in members) and not any(member.is_complete() for member in members)
 
 
+def eight_seeds(last: float) -> study.Ensemble:
+    """Stretches of mean 3 and standard deviation 1 at the end, and an extreme; `last` of isotropic cells."""
+    ends = np.array([-1.0, 1.0] * 4) * np.sqrt(7 / 8) + 3.0
+    values = {"stretch": np.stack([np.ones(8), ends], axis=1), "force": np.ones((8, 2))}
+    values["least"] = values["stretch"] / 2
+    isotropic = {name: np.array([1.0, last]) for name in ("stretch", "least")}
+    return study.Ensemble(np.array([0.0, 1.0]), values, isotropic, {}, frozenset({"least"}))
+
+
 def test_words_say_whether_the_cheap_model_is_enough() -> None:
-    times = np.array([0.0, 1.0])
-    values = np.array([[1.0, 2.0], [1.0, 4.0]])
-    found = study.Ensemble(times, {"stretch": values, "force": np.ones((2, 2))}, {"stretch": np.array([1.0, 3.5])}, {})
-    text = study.in_words(found, [1.0])
+    """Extremes are not compared: isotropic cells have none."""
+    text = study.in_words(eight_seeds(3.4), [1.0])
     assert "+0.4 deviations: within the spread" in text and "force" not in text
-    found.isotropic["stretch"][1] = 30.0
-    assert "+19.1 deviations: outside of it" in study.in_words(found, [1.0])
+    assert "3.4  an extreme: not compared" in text
+    assert text.splitlines()[-1] == (
+        "At time 1 isotropic cells lie within 2 deviations of the mean of 8 seeds in all 1 columns: they say what one "
+        "sample of random cells would."
+    )
+    text = study.in_words(eight_seeds(30.0), [1.0])
+    assert "+27.0 deviations: outside of it" in text
+    assert text.splitlines()[-1].endswith("outside of the spread are stretch (+27.0 deviations).")
+
+
+def test_a_deviation_of_few_seeds_is_not_known() -> None:
+    """Five say it to 35 %."""
+    found = eight_seeds(30.0)
+    few = replace(found, columns={name: values[:5] for name, values in found.columns.items()})
+    text = study.in_words(few, [1.0])
+    assert "deviations:" not in text and text.count("not known") == 2
+    assert text.splitlines()[-1].startswith("Not known: 5 seeds are too few")
+    alone = study.in_words(replace(found, isotropic={}), [1.0])
+    assert alone.splitlines()[-1].startswith("Not known: the run with isotropic cells has failed")
 
 
 def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

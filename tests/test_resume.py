@@ -416,6 +416,21 @@ def test_the_status_of_a_run(half: Path) -> None:
     assert status(half)[1].endswith(f"; process {os.getpid()} on {socket.gethostname()} was killed")
 
 
+def test_the_status_of_a_run_that_failed_says_why(tmp_path: Path) -> None:
+    """Until it goes on: then the end of before is none any more."""
+    scene = pulled_cube(6.0).with_values({"loads.force.value": 1e9, "solver.maximum_halvings": 0})
+    with pytest.raises(StepFailure, match="no equilibrium at time 1"):
+        run(scene, tmp_path / "out", MPI.COMM_SELF)
+    said = status(tmp_path / "out")
+    assert said[1].startswith("failed: no equilibrium at time 1: ") and said[2].startswith("not running, ")
+    with (tmp_path / "out" / "run.log").open("a") as log:
+        log.write("2026-01-01 00:00:00,000 INFO scene cube on 1 ranks, results in out\n")
+    assert said[2:] == status(tmp_path / "out")[1:]
+    with (tmp_path / "out" / "run.log").open("a") as log:
+        log.write("2026-01-01 00:00:00,000 INFO ended: SIGTERM\n")
+    assert status(tmp_path / "out")[1].endswith("; stopped by SIGTERM")
+
+
 @pytest.mark.parametrize(
     ("every", "seconds", "cost", "number", "due"),
     [

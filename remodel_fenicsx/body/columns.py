@@ -17,8 +17,9 @@ COLUMNS: dict[str, Column] = {
             "",
             "largest r/L, always below 1 (0 where no chain locks)",
             lambda m: m.step.extension.max_chain_extension,
+            extreme=True,
         ),
-        Column("min_jacobian", "", "smallest J, always above 0", lambda m: m.step.extension.min_jacobian),
+        Column("min_jacobian", "", "smallest J, always above 0", lambda m: m.step.extension.min_jacobian, extreme=True),
         Column("stored_energy", "stress length^3", "integral of W", lambda m: m.equilibrium.stored_energy()),
         Column(
             "remodeling_power",

@@ -228,8 +228,8 @@ def uniaxial_columns(top: str, length: str) -> tuple[Column, ...]:
 
     return (
         Column("mean_stretch", "", "length over reference length, mean of the top", mean_stretch),
-        Column("min_stretch", "", "smallest element mean of F_zz", lambda m: m.smallest(m.axial_stretch)),
-        Column("max_stretch", "", "largest element mean of F_zz", lambda m: m.largest(m.axial_stretch)),
+        Column("min_stretch", "", "smallest element mean of F_zz", lambda m: m.smallest(m.axial_stretch), extreme=True),
+        Column("max_stretch", "", "largest element mean of F_zz", lambda m: m.largest(m.axial_stretch), extreme=True),
         Column(
             "mean_fibre_angle",
             "degrees",

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 HISTORY, FIELDS, CHAINS, SCENE = "history.csv", "fields.vtkhdf", "fields_chains.vtkhdf", "scene.toml"
+LOG, STUDY = "run.log", "study.json"  # of a run; which runs a study has
 
 
 class RecordingError(ValueError):

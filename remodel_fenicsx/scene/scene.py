@@ -21,7 +21,7 @@ from remodel_fenicsx.body.reductions import AUTO, objections
 from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.scene.parameters import FORMAT, PRESETS, RENAMED, Cells, Material, Remodeling, default_method
 from remodel_fenicsx.scene.plausibility import doubts, largest_stress
-from remodel_fenicsx.scene.profiles import PROFILES, known_profile
+from remodel_fenicsx.scene.profiles import EXACT, PROFILES, known_profile
 from remodel_fenicsx.scene.settings import Load, Mesh, Model, Output, Solver, Supports, Time, nearest_multiples
 from remodel_fenicsx.scene.values import in_own_units, in_present_format, known_shape
 from remodel_fenicsx.schema.tables import SceneError, Table, checked, fault, quoted, shown, variant_of
@@ -109,7 +109,10 @@ class Scene(Table):
         profile = plain.get("profile")
         if profile is not None:
             base = merged(base, known_profile(profile).tables())
-        return in_own_units(merged(base, plain), cls, SHAPES[shape], Load)
+        values = in_own_units(merged(base, plain), cls, SHAPES[shape], Load)
+        if profile is not None and PROFILES[profile].takes_exact_coupling and _leaves_coupling_open(plain, values):
+            values = merged(values, {"remodeling": {"coupling": EXACT}})
+        return values
 
     @model_validator(mode="after")
     def _tables_fit_together(self) -> Scene:
@@ -148,13 +151,16 @@ class Scene(Table):
 
     def _missing_for_implicit(self) -> str | None:
         """What the coupling "implicit" would need."""
-        if self.mesh.formulation != "displacement":
-            return "mesh.formulation = 'displacement': with another one the stress at a point belongs to its element"
-        if not self.material.chain_density:
-            return "chains: material.chain_density above 0"
-        remodeling, material = self.remodeling, self.material
-        parts = LAWS[remodeling.law], DRIVERS[remodeling.driver], FRAMES[remodeling.frame]
-        return refused(*parts, MATRICES[material.matrix], REPULSIONS[material.repulsion])
+        return _missing_for_implicit(self.mesh, self.material, self.remodeling)
+
+    @property
+    def has_exact_coupling(self) -> bool:
+        """Whether the coupling "implicit" leaves no error in time: steps of any length lead to the same cells.
+
+        So it is where the cells depend on the time and the tension that they have then alone. From random cells some
+        points have no such state and are held (docs/couplings.md).
+        """
+        return _has_exact_coupling(self.mesh, self.material, self.cells, self.remodeling)
 
     def _missing_for_equilibrium(self) -> str | None:
         """Why time has no end that does not depend on the way there."""
@@ -264,6 +270,32 @@ class Scene(Table):
         return toml_text(self, header)
 
 
+def _missing_for_implicit(mesh: Mesh, material: Material, remodeling: Remodeling) -> str | None:
+    if mesh.formulation != "displacement":
+        return "mesh.formulation = 'displacement': with another one the stress at a point belongs to its element"
+    if not material.chain_density:
+        return "chains: material.chain_density above 0"
+    parts = LAWS[remodeling.law], DRIVERS[remodeling.driver], FRAMES[remodeling.frame]
+    return refused(*parts, MATRICES[material.matrix], REPULSIONS[material.repulsion])
+
+
+def _has_exact_coupling(mesh: Mesh, material: Material, cells: Cells, remodeling: Remodeling) -> bool:
+    if not LAWS[remodeling.law].of_absolute_time or cells.initial == "random":
+        return False
+    return _missing_for_implicit(mesh, material, remodeling) is None
+
+
+def _leaves_coupling_open(own: Mapping[str, Any], values: Mapping[str, Any]) -> bool:
+    """Whether a scene's own keys name no coupling, and all its values, not validated yet, have an exact one."""
+    if "coupling" in own.get("remodeling", {}):
+        return False
+    kinds: dict[str, Any] = {"mesh": Mesh, "material": Material, "cells": Cells, "remodeling": Remodeling}
+    try:
+        return _has_exact_coupling(*(kind(**values.get(name, {})) for name, kind in kinds.items()))
+    except (SceneError, TypeError):  # what is wrong will be said, with its whole key
+        return False
+
+
 def _check_load_names(shape: str, loads: Any) -> None:
     """A load that the shape does not have, before anything is said about what is missing in it."""
     names = SHAPES[shape].loads
@@ -330,7 +362,7 @@ def read_scene(path: str | os.PathLike[str], overrides: Iterable[str] = (), prof
     SceneError
         One line: file and line, or key, value and what is allowed.
     """
-    values = read_toml(Path(path))
+    values, overrides = read_toml(Path(path)), list(overrides)
     if profile is not None:
         values = merged(values, {"profile": profile} | PROFILES[profile].tables())
     for override in overrides:
@@ -338,4 +370,8 @@ def read_scene(path: str | os.PathLike[str], overrides: Iterable[str] = (), prof
         put(values, key, value)
     name = re.sub(r"\.toml$", "", Path(path).name, flags=re.IGNORECASE)  # what follows another dot is part of it
     values.setdefault("name", re.sub(r"^[^\w]+|[^\w+-]+$|[^\w .+-]", "", name)[:100].rstrip(" .") or "scene")
-    return scene_from_dict(values)
+    scene = scene_from_dict(values)
+    if profile is None or not PROFILES[profile].takes_exact_coupling or not scene.has_exact_coupling:
+        return scene
+    asked = any(parse_override(override)[0] == "remodeling.coupling" for override in overrides)
+    return scene if asked else scene.with_values({"remodeling.coupling": EXACT})

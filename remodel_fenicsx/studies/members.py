@@ -5,6 +5,7 @@ Each of the processes at work does one run after the other: most of a short run 
 
 from __future__ import annotations
 
+import json
 import math
 import time as clock
 from collections.abc import Callable, Sequence
@@ -15,6 +16,7 @@ from pathlib import Path
 from remodel_fenicsx.results.recording import (
     HISTORY,
     SCENE,
+    STUDY,
     HistoryColumns,
     Recording,
     RecordingError,
@@ -85,10 +87,41 @@ class Member:
         return read_history(self.folder)
 
 
+@dataclass(frozen=True)
+class Study:
+    """What several runs are for.
+
+    Attributes
+    ----------
+    name
+        Of the command.
+    scene
+        Name of the user's scene.
+    folder
+        Where all runs are.
+    """
+
+    name: str
+    scene: str
+    folder: Path
+
+    def write(self, runs: Sequence[str]) -> None:
+        """Say in the folder what it is: `remodel-fenicsx status` reads it.
+
+        Raises
+        ------
+        OSError
+            If it cannot be written.
+        """
+        self.folder.mkdir(parents=True, exist_ok=True)
+        text = json.dumps({"study": self.name, "scene": self.scene, "runs": list(runs)}, indent=1)
+        (self.folder / STUDY).write_text(text + "\n", encoding="utf-8")
+
+
 def run_members(
     members: Sequence[Member],
     jobs: int,
-    title: str,
+    study: Study,
     quiet: bool = False,
     deadline: float = math.inf,
     fits: Callable[[Member], bool] = lambda member: True,
@@ -100,8 +133,8 @@ def run_members(
     ----------
     members
         In the order in which they begin.
-    jobs, title, quiet
-        Runs at a time; what progress begins with; no progress.
+    jobs, study, quiet
+        Runs at a time; what they are runs of; no progress.
     deadline
         `time.monotonic` at which runs are stopped; what they have recorded stays.
     fits
@@ -121,7 +154,9 @@ def run_members(
     waiting = [member for member in reversed(members) if not member.is_complete()]
     running: dict[Worker, Member] = {}
     idle: list[Worker] = []
-    total, failed, line = sum(member.scene.time.number_of_steps for member in members), {}, Line(title)
+    study.write([member.name for member in members])
+    total, failed = sum(member.scene.time.number_of_steps for member in members), {}
+    line = Line(f"{study.scene} {study.name}")
     with StopRequest() as stop:
         try:
             while waiting or running:
