@@ -235,8 +235,8 @@ def _stability(options: argparse.Namespace) -> int:
     def analyse(scene: Scene, folder: Path | None, quiet: bool) -> Path:
         from remodel_fenicsx.stability import in_words, stability
 
-        place, table = stability(scene, folder, options.times, quiet=quiet)
-        _say(in_words(table))
+        place, table, unseen = stability(scene, folder, options.times, quiet=quiet)
+        _say(in_words(table, unseen))
         return place
 
     return _run(options, analyse)

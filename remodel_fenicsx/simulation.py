@@ -13,6 +13,7 @@ from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.loading import Loading, LoadValues
 from remodel_fenicsx.body.columns import columns_of
 from remodel_fenicsx.body.reductions import AUTO, choice, explained
+from remodel_fenicsx.evolution.buckling import BucklingWarning
 from remodel_fenicsx.evolution.chatter import Chatter
 from remodel_fenicsx.evolution.homeostasis import Homeostasis
 from remodel_fenicsx.evolution.locking import LockingWarning
@@ -101,14 +102,17 @@ class Simulation:
         self.control: StepControl | None = None
         if scene.time.tolerance is not None:
             settings = scene.time.tolerance, scene.time.step, scene.stops()
-            self.control = StepControl(self.stepper, shape.fibre_angle, *settings)
+            self.control = StepControl(self.stepper, *settings)
             columns += [TIME_ERROR] if TIME_ERROR not in columns else []
         elif TIME_ERROR in columns:
-            self.stepper.judge = TimeError(self.stepper, shape.fibre_angle).measure
+            self.stepper.judge = TimeError(self.stepper).measure
         self.observer = Observer(shape, self.stepper, columns_of(shape, columns, scene.loads))
-        locks = formulation.locks(scene.mesh.element, scene.mesh.degree)
-        self.warnings: list[Watcher] = [LockingWarning(self.stepper, locks), VolumeLoss(self.stepper)]
-        self.warnings.append(RadialChains(self.stepper, shape.radial_share))
+        self.warnings: list[Watcher] = [
+            LockingWarning(self.stepper, formulation.locks),
+            BucklingWarning(self.stepper, shape.strut(scene.supports.ends)),
+            VolumeLoss(self.stepper),
+            RadialChains(self.stepper, shape.radial_share),
+        ]
         if self.stepper.remodeling.law.remodels and not at_once:
             chatter = Chatter(self.stepper)
             self.warnings.insert(0, chatter)

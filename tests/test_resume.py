@@ -24,7 +24,7 @@ from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.evolution import chatter, monitor
 from remodel_fenicsx.evolution.chatter import Chatter
 from remodel_fenicsx.evolution.coupling import COUPLINGS, Staggered
-from remodel_fenicsx.evolution.locking import LockingWarning
+from remodel_fenicsx.evolution.locking import LockingWarning, Missing
 from remodel_fenicsx.evolution.monitor import StabilityWatcher
 from remodel_fenicsx.evolution.parts import StepFailure, Work
 from remodel_fenicsx.evolution.state import State
@@ -496,7 +496,7 @@ def test_runs_that_go_on_say_what_one_run_says(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr(chatter, "MOST", 1.0)
     monkeypatch.setattr(Chatter, "_advice", lambda watcher, factor: "nothing")
     monkeypatch.setattr(LockingWarning, "stiffness_ratio", lambda watcher: 1e9)
-    monkeypatch.setattr(LockingWarning, "energy_share", lambda watcher: 1.0)
+    monkeypatch.setattr(LockingWarning, "missing", lambda watcher: Missing(1.0, 0.0))
     monkeypatch.setattr(monitor, "ITERATIONS_BETWEEN_LOOKS", 9)
     counts: list[int] = []
     count = StabilityWatcher._count

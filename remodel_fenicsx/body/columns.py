@@ -59,8 +59,8 @@ COLUMNS_ON_REQUEST: dict[str, Column] = {
         Column(
             "time_error",
             "degrees",
-            "estimated error in time of the fibre angle, root mean square over the body; there without request with "
-            "`time.tolerance`",
+            "estimated error in time: of the direction of the chains, root mean square over the body, or of lengths, "
+            "relative (1 radian is 100 %), the larger; there without request with `time.tolerance`",
             lambda m: m.step.time_error,
             after_pass=True,
         ),

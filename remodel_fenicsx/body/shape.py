@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from remodel_fenicsx.body.buckling import Strut
 from remodel_fenicsx.body.column import Column
 from remodel_fenicsx.body.gmsh_model import length_fault
 from remodel_fenicsx.body.reductions import Reduction, homogeneous, known_loads, same_cells, symmetric_law, unturned
@@ -147,6 +148,10 @@ class Shape(Table):
     def proportions(self) -> tuple[tuple[str, str, float, tuple[int, int]], ...]:
         """Ratios of lengths, which tell numbers in different units: key, words, ratio, decades where bodies have it."""
         return ()
+
+    def strut(self, ends: str) -> Strut | None:
+        """What of the body buckles under thrust, held as `supports.ends` says; None if nothing bends it."""
+        return None
 
     def depth(self, coordinates: Array) -> Array:
         """How far places (..., 3) are through the body, from 0 to 1: here along z."""

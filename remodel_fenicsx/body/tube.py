@@ -10,8 +10,9 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from remodel_fenicsx.body import gmsh_model as model
+from remodel_fenicsx.body.buckling import Strut
 from remodel_fenicsx.body.column import Column
-from remodel_fenicsx.body.reductions import Reduction
+from remodel_fenicsx.body.reductions import Reduction, about_z
 from remodel_fenicsx.body.shape import Array, LoadKind, MeshSettings, Shape, check_lengths
 from remodel_fenicsx.schema.tables import fault, shown
 from remodel_fenicsx.schema.units import FORCE, LENGTH, STRESS
@@ -201,6 +202,15 @@ class Tube(Shape):
             ("inner_radius", "outer_radius / inner_radius", outer / self.inner_radius, (0, 2)),
             ("length", "length / outer_radius", self.length / outer, (-2, 3)),
         )
+
+    def strut(self, ends: str) -> Strut:
+        """Its ends keep their planes; one of them moves sideways unless they are clamped."""
+
+        def squared_distances(places: Array) -> Array:
+            return np.asarray(np.square(places[:, :2]).sum(axis=1) / 2, dtype=np.float64)
+
+        radii, factor = (self.inner_radius, self.outer_radius), 0.5 if ends == "clamped" else 1.0
+        return Strut(self.length, factor, about_z, squared_distances, radii, capped=ends == "closed")
 
     def depth(self, coordinates: Array) -> Array:
         """From the inner (0) to the outer face (1); plane faces of elements lie inside of the cylinders."""

@@ -80,8 +80,8 @@ class AnsweringCells:
     def begin(self, time: float, residual: float) -> None:
         """The present state is the start of a step to this time; it was accepted with these out-of-balance forces."""
         settings, cells = self.remodeling.settings, self.state.cells
-        tissue, F = at_points(self.tissue, self.quadrature), self.state.deformation_gradient()
-        is_stress = self.remodeling.driver.is_stress
+        tissue = at_points(self.tissue, self.quadrature)
+        F, tensor = self.remodeling.driving_tensor()
         old = UnitCell(*(values.copy() for values in cells.point_cells[:2]))
         step = StepOfCells(
             self.remodeling.law,
@@ -95,8 +95,7 @@ class AnsweringCells:
             settings.kappa,
             self.state.time,
             time,
-            self.remodeling.stress_noise(F, residual) if is_stress else spectral.ROUNDING,
-            self.remodeling.stress_noise(F, 0.0) if is_stress else spectral.ROUNDING,
+            *self.remodeling.noise(F, tensor, residual),
         )
         self._points = compiled_tensor.points(self._kernels, tissue, step)
         self._accepted = self._points.kept(F, old, step.structure).driving_tensor

@@ -117,10 +117,10 @@ class Homeostasis(Implicit):
     def remodel(self, time: float) -> float:
         """Nothing is left to do but to say how far the state is from the cells of its own stress."""
         self.remodeling.look_ahead(time, self.state.numbers[RESIDUAL])
-        residual = self.remodeling.residual()
+        residual = self.remodeling.residual() / self._largest_length() ** 2
         if self.state.comm.rank == 0:
-            level = NOTICE if residual <= CONSISTENT * self._largest_length() ** 2 else logging.WARNING
-            log.log(level, "cells and stress agree to |A_pass - A| = %.2g, after %d solves", residual, self.solves)
+            level = NOTICE if residual <= CONSISTENT else logging.WARNING
+            log.log(level, "cells and stress agree to |A_pass - A| = %.2g r0^2, after %d solves", residual, self.solves)
         return self._power
 
     def close(self) -> None:
@@ -213,7 +213,7 @@ class Homeostasis(Implicit):
         if self.state.comm.rank == 0 and not self.only_passes:
             log.log(NOTICE, "the equilibrium of the cells is approached by relaxed passes")
         relaxed, time, done = self._passes(), change.time, math.inf
-        near = NEAR * self._largest_length() ** 2
+        squared, near = self._largest_length() ** 2, NEAR
         for number in range(PASSES):
             slowly = number < len(RAMP)
             relaxed.share = FIRST_SHARE if slowly else SHARE
@@ -228,9 +228,9 @@ class Homeostasis(Implicit):
                 if self._jumped(change):
                     return
             relaxed.remodel(time)
-            done = self.remodeling.residual()
-            log.info("pass %d: changes A by up to %.3g", number + 1, done)
-        text = f"no equilibrium of the cells after {PASSES} relaxed passes: the last one still changes A by {done:.3g}"
+            done = self.remodeling.residual() / squared
+            log.info("pass %d: changes A by up to %.3g r0^2", number + 1, done)
+        text = f"no equilibrium of the cells after {PASSES} relaxed passes: the last one changes A by {done:.3g} r0^2"
         raise StepFailure(time, text, NO_LIMIT)
 
     def _passes(self) -> Relaxed:

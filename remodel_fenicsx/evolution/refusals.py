@@ -20,6 +20,7 @@ CRUSHED = 0.02  # J
 NEARLY_CRITICAL = 0.1  # lowest eigenvalue over its unloaded value
 ALONG_THE_MODE = 0.5  # cosine between the last change of the displacement and the mode
 NEARLY_SOLVED = 1e3  # residual over tolerance
+LOOSEST = 1e-4  # residual over the forces at the nodes that is worth going on with
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,7 @@ KINEMATIC_LOCKING = Refusal(
 )
 SOLVER_TOLERANCE = Refusal(
     "solver tolerance",
-    "the residual goes no further down; raise solver.relative_tolerance, or solver.maximum_iterations",
+    "the residual goes no further down; try a larger solver.maximum_iterations, or a smaller time.step",
 )
 UNSTABLE = Refusal("lost stability", 'lower the load, or go on beyond it with solver.unstable = "warn"')
 
@@ -95,7 +96,13 @@ def diagnosed(newton: GuardedNewton, failure: SolveFailure, direction: NDArray[n
     if extension.min_jacobian < CRUSHED:
         return replace(KINEMATIC_LOCKING, finding=f"J = {extension.min_jacobian:.3g} in the last state that was solved")
     if 1.0 < failure.residual_over_tolerance < NEARLY_SOLVED:
-        return replace(SOLVER_TOLERANCE, finding=f"{failure.residual_over_tolerance:.3g} times the tolerance is left")
+        found = replace(SOLVER_TOLERANCE, finding=f"{failure.residual_over_tolerance:.3g} times the tolerance is left")
+        if failure.relative_residual > LOOSEST:
+            return found
+        enough = 10.0 ** np.ceil(
+            np.log10(2 * failure.relative_residual)
+        )  # twice: it is not the same in every iteration
+        return replace(found, advice=f"{found.advice}; solver.relative_tolerance = {enough:g} takes it as solved")
     inertia = Inertia(newton.equilibrium)
     try:
         return _of_the_tangent(inertia, direction)

@@ -42,8 +42,10 @@ class SolveFailure(RuntimeError):
         extension: Extension,
         residual_over_tolerance: float = np.inf,
         tangents: int = 0,
+        relative_residual: float = np.inf,
     ):
         super().__init__(reason)
+        self.relative_residual = relative_residual
         self.tangents = tangents
         self.residual_over_tolerance = residual_over_tolerance
         self.reason = reason

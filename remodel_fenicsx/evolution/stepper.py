@@ -140,7 +140,7 @@ class Stepper:
         return step
 
     def advance(
-        self, time: float, watchers: Sequence[Watcher] = (), is_last: bool = False, rejected: Sequence[Step] = ()
+        self, time: float, watchers: Sequence[Watcher] = (), is_last: bool = False, rejected: Step | None = None
     ) -> Step:
         """One step: equilibrium with the loads of `time`, and remodeling.
 
@@ -151,7 +151,8 @@ class Stepper:
         watchers, is_last
             Who follows it, and whether it is the last one.
         rejected
-            Attempts at it that were taken back: their work and seconds are its own.
+            The last attempt at it that was taken back: its work and seconds, which have those of the attempts before
+            it, belong to the step.
 
         Raises
         ------
@@ -168,17 +169,19 @@ class Stepper:
         with state.transaction():
             work = self.coupling.solve(time, self.load_values(time))
             extension = work.extension or self.coupling.equilibrium.extension()
-            for attempt in rejected:
-                work.add(attempt.work)
+            if rejected is not None:
+                work.add(rejected.work)
             loads = dict(state.loading.values)  # those that nobody has named too
             step = Step(time, state.number + 1, loads, extension, work, is_last=is_last)
             with undone_by_all(watchers, step):
                 for watcher in watchers:
                     watcher.solved(step)
                 step.remodeling_power = self.coupling.remodel(time)
-                step.seconds = clock.perf_counter() - start + sum(attempt.seconds for attempt in rejected)
+                step.seconds = clock.perf_counter() - start
                 step.processor_seconds = clock.process_time() - processor_start
-                step.processor_seconds += sum(attempt.processor_seconds for attempt in rejected)
+                if rejected is not None:
+                    step.seconds += rejected.seconds
+                    step.processor_seconds += rejected.processor_seconds
                 self.judge(step)
                 state.time, state.number = time, step.number
                 for watcher in watchers:

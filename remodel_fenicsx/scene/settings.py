@@ -167,8 +167,9 @@ class Time(Table):
     tolerance: float | None = Field(
         default=None,
         gt=0,
-        description="Where it is given, steps are as long as the estimated error in time of the fibre angle, in "
-        "degrees, root mean square over the body, stays below it. Times of ramps and output.times are hit.",
+        description="Where it is given, steps are as long as the estimated error in time stays below it, in degrees: "
+        "of the direction of the chains, root mean square over the body, and of lengths, relative, as an angle (1 "
+        "degree is 1.7 %). Times of ramps and output.times are hit.",
         json_schema_extra={"allowed": "a number greater than 0, in degrees"},
     )
 

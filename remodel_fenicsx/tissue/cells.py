@@ -163,6 +163,26 @@ def _wall_components(dimensions: Array, axes: Array, coordinates: Array) -> tupl
     )
 
 
+def angle_between(first: UnitCell, second: UnitCell) -> Array:
+    """Angle in degrees between the directions of the chains of two cells, of n points: (n,) in [0, 90].
+
+    Of chains along one axis it is the angle between the axes; of two cells with the same axes that of the directions
+    sum_I l_I n_I. So it is at least the change of the angle to any axis (`angle_to_axis`), and of the pitch times the
+    cosine of the angle out of the wall, which it counts too. To first order in the change it is Bures' angle between
+    A/tr A of both, ds^2 = sum_IJ dA_IJ^2 / (a_I + a_J) / 2 in the axes of A with the principal values a.
+    """
+    share = first.dimensions / _norm(first.dimensions)[:, None]  # the roots of a_I
+    scaled = second.axes * (second.dimensions / _norm(second.dimensions)[:, None])[:, :, None]
+    root = np.swapaxes(second.axes, 1, 2) @ scaled
+    change = first.axes @ root @ np.swapaxes(first.axes, 1, 2) - share[:, :, None] * np.eye(3)
+    squared = share**2
+    both = squared[:, :, None] + squared[:, None, :]
+    weight = np.divide((share[:, :, None] + share[:, None, :]) ** 2, 2 * both, out=np.ones_like(both), where=both > 0)
+    chord = np.sqrt((weight * change**2).sum(axis=(1, 2)))
+    angle: Array = np.degrees(2 * np.arcsin(np.minimum(0.5 * chord, np.sqrt(0.5))))
+    return angle
+
+
 def _norm(vectors: Array) -> Array:
     """Length of vectors (..., 3); by columns, five times faster than np.linalg.norm."""
     length: Array = np.sqrt(vectors[..., 0] ** 2 + vectors[..., 1] ** 2 + vectors[..., 2] ** 2)
