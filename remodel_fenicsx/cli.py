@@ -19,6 +19,7 @@ from remodel_fenicsx.system import interrupts
 from remodel_fenicsx.system.arguments import positive, wall_time
 from remodel_fenicsx.system.children import SERVE, serve
 from remodel_fenicsx.system.environment import reason_undrawable, reason_unusable, versions
+from remodel_fenicsx.system.regular_files import ForeignFileError
 from remodel_fenicsx.scene.parameters import PRESETS
 from remodel_fenicsx.scene.profiles import PROFILES
 from remodel_fenicsx.scene.scene import Scene, SceneError, preset_scene, read_scene
@@ -220,6 +221,8 @@ def _run(options: argparse.Namespace, task: Callable[..., Path] | None = None) -
         if options.output and isinstance(error, (FileExistsError, NotADirectoryError)):  # lies in a file, or just taken
             text = f"-o {options.output}: {error.filename}: {error.strerror}; allowed is a new or an empty folder"
             return _end_all(text, BAD_INPUT)
+        if isinstance(error, ForeignFileError):
+            return _end_all(f"{error.filename}: {error.strerror}", BAD_INPUT)
         return _end_all(f"cannot write the results: {error}", BAD_ENVIRONMENT)
     except Exception:
         traceback.print_exc()
@@ -247,11 +250,17 @@ def _study(options: argparse.Namespace, task: Callable[[Scene], tuple[Path, str,
     scene = read_scene(options.scene, options.set, options.profile)
     if reason := reason_unusable() or reason_undrawable():
         return _fail(f"the environment is not usable: {reason}; run through ./with-fenicsx", BAD_ENVIRONMENT)
+    from remodel_fenicsx.paper.errors import FigureError
+
     try:
         with interrupts.StopRequest(), interrupts.stopping_at_once():
             folder, words, failed = task(scene)
+    except FigureError as refusal:  # a picture or a table of somebody else's stands in its place
+        return _fail(str(refusal), refusal.exit_code)
     except interrupts.Interrupted as interruption:
         return _fail("stopped; all that is recorded is kept, the same command goes on", interruption.exit_code)
+    except ForeignFileError as error:
+        return _fail(f"{error.filename}: {error.strerror}", BAD_INPUT)
     except OSError as error:
         return _fail(f"cannot write the results: {error}", BAD_ENVIRONMENT)
     _say(words)
@@ -303,9 +312,11 @@ def _status(options: argparse.Namespace) -> int:
         lines = status(options.folder)
     except (RecordingError, CheckpointError) as error:
         return _fail(str(error), BAD_INPUT)
+    except ForeignFileError as error:
+        return _fail(f"{error.filename}: {error.strerror}", BAD_INPUT)
     except OSError as error:
         return _fail(f"{options.folder}: cannot be read: {error.strerror}", BAD_ENVIRONMENT)
-    _say("\n".join(lines))
+    _say("\n".join(map(printable, lines)))
     return 0
 
 

@@ -65,9 +65,15 @@ class Simulation:
     ------
     SceneError
         If `domain` is not a mesh of the scene's body and elements.
+    TypeError
+        If `scene` is none.
     """
 
     def __init__(self, scene: Scene, comm: MPI.Intracomm = MPI.COMM_WORLD, domain: Domain | None = None):
+        if not isinstance(scene, Scene):
+            raise TypeError(
+                f"not a Scene: {scene!r}; read_scene(PATH) makes one of a file, preset_scene one of a preset"
+            )
         take_back_signals()
         if scene.model.kinematics == AUTO and domain is None and comm.rank == 0:
             for line in explained(scene):

@@ -521,7 +521,7 @@ def test_a_missing_file_and_a_folder(tmp_path):
         read_scene(tmp_path / "none.toml")
     with pytest.raises(SceneError, match=re.escape(f"{tmp_path}: is a folder; a scene is a TOML file")):
         read_scene(tmp_path)
-    with pytest.raises(SceneError, match="cannot be read: embedded null byte$"):
+    with pytest.raises(SceneError, match="cannot be read: .*embedded null"):
         read_scene("a\0b")
 
 

@@ -122,6 +122,7 @@ class Stepper:
         name = remodeling.coupling if self.remodeling.law.remodels else "staggered"
         make = coupling or COUPLINGS[name]
         self.coupling: Coupling = make(state, self.tissue, self.remodeling, solver)
+        self._closed = False
         # asked on each rank in every solve: the signal (SIGINT, SIGTERM) that should end it, or 0
         self.stop_signal: Callable[[], int] = lambda: 0
         self.coupling.equilibrium.stop_signal = lambda: self.stop_signal()
@@ -160,10 +161,14 @@ class Stepper:
             If no admissible equilibrium is found.
         ValueError
             If `time` does not come after the state's.
+        RuntimeError
+            After `close`.
         BaseException
             Whatever is raised, by a watcher too: the state is then that of the last committed step.
         """
         state, start, processor_start = self.state, clock.perf_counter(), clock.process_time()
+        if self._closed:
+            raise RuntimeError("this stepper (or its simulation) has been closed; make another one to go on")
         if time <= state.time:
             raise ValueError(f"time {time!r} does not come after {state.time!r}, that of the last step")
         with state.transaction():
@@ -198,7 +203,8 @@ class Stepper:
             yield self.advance(time, watchers, is_last=number == len(remaining))
 
     def close(self) -> None:
-        """Free PETSc's objects and options; the state stays."""
+        """Free PETSc's objects and options; the state stays, and takes no further step."""
+        self._closed = True
         self.coupling.close()
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import os
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -21,6 +20,7 @@ from PIL.PngImagePlugin import PngInfo
 
 import remodel_fenicsx
 from remodel_fenicsx.paper.errors import FigureError
+from remodel_fenicsx.system.regular_files import write_whole
 
 MARK = "remodel_fenicsx figures"  # in every file: what bears it may be drawn anew
 FORMATS = ("png", "pdf", "svg")
@@ -129,12 +129,7 @@ class Page:
         path = self.folder / name
         _check_ours(path)
         self.folder.mkdir(parents=True, exist_ok=True)
-        part = path.with_name(f".{name}.part-{os.getpid()}")
-        try:
-            part.write_bytes(content)
-            part.replace(path)
-        finally:
-            part.unlink(missing_ok=True)
+        write_whole(path, content)
         self.written.append(path)
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from remodel_fenicsx.results.checkpoint_file import read_pointer
 from remodel_fenicsx.results.recording import (
     HISTORY,
+    LARGEST_HISTORY,
     LOG,
     STUDY,
     HistoryColumns,
@@ -23,9 +24,12 @@ from remodel_fenicsx.results.recording import (
     read_history,
 )
 from remodel_fenicsx.results.run_lock import lock_holder
+from remodel_fenicsx.schema.tables import printable
 from remodel_fenicsx.schema.times import same_time
+from remodel_fenicsx.system.regular_files import ForeignFileError, read_regular
 from remodel_fenicsx.system.terminal import duration
 
+LARGEST_STUDY = 10**7  # bytes: ten thousand names of runs
 RECENT = 20  # steps whose mean is the rate
 BEGUN, FAILED, STOPPED = "scene ", "failed: ", "ended: "  # how lines of run.log on a run's beginning and end begin
 LOG_LINE = re.compile(r"[\d-]+ [\d:,]+ [A-Z]+ (.*)")
@@ -87,7 +91,7 @@ def how_it_ended(folder: Path) -> str:
     """What run.log says of a run's end since it last began, beginning with `FAILED` or `STOPPED`; or nothing."""
     words = ""
     with suppress(FileNotFoundError):
-        for line in (folder / LOG).read_text(encoding="utf-8", errors="replace").splitlines():
+        for line in read_regular(folder / LOG, LARGEST_HISTORY).decode(errors="replace").splitlines():
             found = LOG_LINE.fullmatch(line)
             said = found[1] if found else ""
             if said.startswith((BEGUN, FAILED, STOPPED)):
@@ -98,9 +102,9 @@ def how_it_ended(folder: Path) -> str:
 def _of_study(folder: Path) -> list[str]:
     """How many of its runs are where, which have failed and why, and where the answer is."""
     try:
-        study = json.loads((folder / STUDY).read_text(encoding="utf-8"))
-        name, scene, runs = str(study["study"]), str(study["scene"]), [str(run) for run in study["runs"]]
-    except (ValueError, KeyError, TypeError) as error:
+        study = json.loads(read_regular(folder / STUDY, LARGEST_STUDY))
+        name, scene, *runs = (printable(str(text)) for text in (study["study"], study["scene"], *study["runs"]))
+    except (ValueError, KeyError, TypeError, RecursionError, ForeignFileError) as error:
         raise RecordingError(f"{folder / STUDY}: is damaged: {error}") from error
     states = {run: _state(folder / run) for run in runs}
     counted = {state: sum(each == state for each, _ in states.values()) for state, _ in states.values()}
@@ -120,7 +124,8 @@ def _state(folder: Path) -> tuple[str, str]:
     """Of a run of a study in a word; and why it has failed."""
     if not folder.is_dir():
         messages = folder.with_name(f"{folder.name}.txt")
-        said = messages.read_text(encoding="utf-8", errors="replace").split("\n") if messages.is_file() else []
+        data = read_regular(messages, LARGEST_HISTORY) if messages.is_file() else b""
+        said = data.decode(errors="replace").split("\n")
         last = next((line for line in reversed(said) if line), "")
         return ("failed", f"{FAILED}{last.removeprefix('remodel-fenicsx: ')}") if last else ("not begun", "")
     if lock_holder(folder)[1]:

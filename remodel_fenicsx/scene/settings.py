@@ -14,7 +14,7 @@ from remodel_fenicsx.body.reductions import AUTO
 from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.fem.solver_methods import AUTO as AUTOMATIC
-from remodel_fenicsx.fem.solver_methods import LARGE, LARGE_ON_RANKS, MEANINGS, METHODS, SMALL
+from remodel_fenicsx.fem.solver_methods import LARGE, LARGE_ON_RANKS, MEANINGS, METHODS, SMALL, fault_of_option
 from remodel_fenicsx.schema.tables import Table, checked, fault, is_number, one_of, quoted, shown
 from remodel_fenicsx.schema.times import is_multiple, same_time
 from remodel_fenicsx.schema.units import FORCE
@@ -231,6 +231,8 @@ def _petsc_options(value: Any) -> Any:
                 raise fault("has no effect; use solver.relative_tolerance, solver.absolute_tolerance", name, entry)
             if not isinstance(entry, (str, bool)) and not is_number(entry):
                 raise fault("must be a string, a finite number, true or false", name, entry)
+            if refused := fault_of_option(name, entry):
+                raise fault(refused, name, entry)
     return value
 
 
@@ -283,7 +285,8 @@ class Solver(Table):
     )
     petsc_options: Annotated[dict[str, Any], checked(_petsc_options)] = Field(
         default_factory=dict,
-        description="PETSc options that override the method's, without the leading '-': snes_..., ksp_..., pc_....",
+        description="PETSc options that override the method's, without the leading '-': snes_..., ksp_..., pc_... "
+        "and mat_.... None that runs code or writes files; those of PETSC_OPTIONS are the user's own.",
     )
 
     @model_validator(mode="after")

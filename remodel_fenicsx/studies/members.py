@@ -27,6 +27,7 @@ from remodel_fenicsx.scene.scene import Scene, SceneError
 from remodel_fenicsx.schema.times import same_time
 from remodel_fenicsx.system.children import Worker, wait_for_one
 from remodel_fenicsx.system.interrupts import Interrupted, StopRequest
+from remodel_fenicsx.system.regular_files import check_no_link, make_own_folder, write_whole
 from remodel_fenicsx.system.terminal import Line
 
 POLL = 0.1  # seconds
@@ -115,7 +116,7 @@ class Study:
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         text = json.dumps({"study": self.name, "scene": self.scene, "runs": list(runs)}, indent=1)
-        (self.folder / STUDY).write_text(text + "\n", encoding="utf-8")
+        write_whole(self.folder / STUDY, (text + "\n").encode())
 
 
 def run_members(
@@ -193,11 +194,12 @@ def run_members(
 
 def _begin(worker: Worker, member: Member) -> None:
     """Begin, or go on with what is there."""
-    member.folder.parent.mkdir(parents=True, exist_ok=True)
+    make_own_folder(member.folder.parent)
+    check_no_link(member.folder)
     messages = member.beside(".txt")
     if (member.folder / SCENE).exists():
         worker.begin(["run", "--resume", str(member.folder), "-q"], messages)
         return
     scene = member.beside(".toml")
-    scene.write_text(member.scene.to_toml(), encoding="utf-8")
+    write_whole(scene, member.scene.to_toml().encode())
     worker.begin(["run", str(scene), "-o", str(member.folder), "-q"], messages)

@@ -14,6 +14,7 @@ from remodel_fenicsx.scene.scene import Scene
 from remodel_fenicsx.studies.estimates import Row, Trade
 from remodel_fenicsx.studies.ladder import compared_lengths
 from remodel_fenicsx.system.environment import versions
+from remodel_fenicsx.system.regular_files import make_own_folder, write_whole
 
 ROWS = "rows"  # folder of the scenes
 SIZE = 8.0  # of a point with a number in it
@@ -55,14 +56,14 @@ def write(found: Trade, folder: Path, scene: Scene) -> None:
         "noise": [row.result.noise for row in rows],
     }
     page.save_table(table, [title, *found.notes, made_with])
-    (folder / ROWS).mkdir(exist_ok=True)
+    make_own_folder(folder / ROWS)
     for row in rows:
         doubt = f" ({row.doubt})" if row.doubt else ""
         header = (
             f"{scene.name}: {row.angle_error:.2g} degrees and {100 * row.length_error:.2g} % off for "
             f"{row.result.seconds:.2g} s, as estimated by remodel-fenicsx trade{doubt}"
         )
-        (folder / _scene_file(row)).write_text(row.result.setting.scene.to_toml(header), encoding="utf-8")
+        write_whole(folder / _scene_file(row), row.result.setting.scene.to_toml(header).encode())
     with rc_context(STYLE):
         page.save_figure(picture(rows), made_with)
 

@@ -12,9 +12,10 @@ import subprocess
 import sys
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import remodel_fenicsx
+from remodel_fenicsx.system.regular_files import open_own
 
 PATIENCE = 30.0  # seconds
 SERVE = "serve"  # the command of a worker's process
@@ -35,7 +36,7 @@ class Child:
 
     def __init__(self, arguments: Sequence[str], messages: Path, keep: Sequence[int] = ()):
         self.messages = messages
-        with messages.open("w") as output:
+        with _emptied(messages) as output:
             self.process = _process(
                 arguments, stdin=subprocess.DEVNULL, stdout=output, stderr=output, pass_fds=tuple(keep)
             )
@@ -70,7 +71,7 @@ class Worker:
         OSError
             If the file cannot be written.
         """
-        messages.write_text("")
+        _emptied(messages).close()
         self.messages, self.is_at_work = messages, True
         assert self.process.stdin is not None
         if self.is_alive:  # else `poll` will see it; PETSc, where it is loaded, aborts at a closed pipe
@@ -123,7 +124,7 @@ def serve(command: Callable[[Sequence[str]], int]) -> int:
     with os.fdopen(os.dup(1), "w") as answers:
         for line in sys.stdin:
             words, messages = json.loads(line)
-            descriptor = os.open(messages, os.O_WRONLY | os.O_APPEND)
+            descriptor = open_own(Path(messages), os.O_WRONLY | os.O_APPEND)
             for stream in (1, 2):
                 os.dup2(descriptor, stream)
             os.close(descriptor)
@@ -154,6 +155,12 @@ def _process(arguments: Sequence[str], **streams: Any) -> subprocess.Popen[Any]:
     paths = [str(Path(remodel_fenicsx.__file__).parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"}
     return subprocess.Popen(command, env=environment, **streams)
+
+
+def _emptied(messages: Path) -> TextIO:
+    """A new file for what a run says, whatever was in its place: a link too."""
+    messages.unlink(missing_ok=True)
+    return open(open_own(messages, os.O_WRONLY | os.O_CREAT | os.O_EXCL), "w")
 
 
 def _last_words(messages: Path) -> str:

@@ -12,6 +12,7 @@ import shutil
 from pathlib import Path
 
 import remodel_fenicsx
+from remodel_fenicsx.system.interrupts import take_back_signals
 
 OLDEST_DOLFINX = (0, 9)
 NEEDED = ("basix", "dolfinx", "gmsh", "h5py", "mpi4py", "petsc4py", "pint", "rich", "ufl")
@@ -59,6 +60,7 @@ def reason_unusable() -> str | None:
     if not any(shutil.which(name) for name in (os.environ.get("CC", "cc").split()[0], "gcc", "clang")):
         return "there is no C compiler"
     try:
+        take_back_signals()
         import dolfinx
         import numpy
         from petsc4py import PETSc
