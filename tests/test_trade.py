@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from remodel_fenicsx import Recording, cli, read_scene
-from remodel_fenicsx.results.profile import PLACES, PROFILE, weights
+from remodel_fenicsx.body.profile import PLACES, PROFILE, weights
 from remodel_fenicsx.results.recording import HistoryColumns
 from remodel_fenicsx.results.status import status
 from remodel_fenicsx.scene.profiles import PROFILES
