@@ -231,14 +231,9 @@ class GuardedNewton:
         return values
 
     def answer(self, equilibrium: Equilibrium, tangents: int) -> Any:
-        """Change of the unknowns of a solved state after a small change of the problem; one linear system.
+        """Change of a solved state's unknowns with which the residual of `equilibrium` vanishes; one linear system.
 
-        Parameters
-        ----------
-        equilibrium
-            Whose residual, at the present unknowns, is to vanish.
-        tangents
-            How many were assembled for the solved state; the last one counts, if the method keeps none from before.
+        `tangents` were assembled for that state: the last one counts, or where there is none a new one.
         """
         self._pull(self._x)
         equilibrium.assemble_internal(self._residual)
