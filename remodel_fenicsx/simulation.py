@@ -11,25 +11,26 @@ from mpi4py import MPI
 
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.loading import Loading, LoadValues
-from remodel_fenicsx.body import Shape
+from remodel_fenicsx.body.columns import columns_of
 from remodel_fenicsx.body.reductions import AUTO, choice, explained
 from remodel_fenicsx.evolution.buckling import BucklingWarning
 from remodel_fenicsx.evolution.chatter import Chatter
 from remodel_fenicsx.evolution.homeostasis import Homeostasis
 from remodel_fenicsx.evolution.locking import LockingWarning
 from remodel_fenicsx.evolution.monitor import StabilityWatcher
+from remodel_fenicsx.evolution.radial_chains import RadialChains
 from remodel_fenicsx.evolution.resting import Resting
 from remodel_fenicsx.evolution.state import State
 from remodel_fenicsx.evolution.step_control import StepControl
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher, times
 from remodel_fenicsx.evolution.time_error import TimeError
 from remodel_fenicsx.evolution.unit_cells import UnitCells
+from remodel_fenicsx.evolution.volume import VolumeLoss
 from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.fem.free_length import FreeLength
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.fem.quadrature import Quadrature
-from remodel_fenicsx.results.columns import COLUMNS_ON_REQUEST, Observer, columns_of, without_free_length
-from remodel_fenicsx.results.fields import field_names
+from remodel_fenicsx.results.columns import Observer
 from remodel_fenicsx.scene import Scene, SceneError
 from remodel_fenicsx.system.interrupts import take_back_signals
 
@@ -57,7 +58,8 @@ class Simulation:
     control
         Chooses the steps, where the scene has a tolerance.
     stability, warnings
-        Watchers of stability, over-correction and locking; what they remember is part of the state.
+        Watchers of stability, over-correction, locking, volume, and chains that point out of the wall; what they
+        remember is part of the state.
 
     Raises
     ------
@@ -102,8 +104,7 @@ class Simulation:
         self.tissue = self.stepper.tissue
         counted = "negative_eigenvalues" in scene.output.columns
         self.stability = StabilityWatcher(self.stepper, scene.solver.unstable, every_step=counted)
-        field_names(scene.output.fields)
-        columns = list(checked_columns(scene.output.columns, shape))
+        columns = list(scene.output.columns)
         self.control: StepControl | None = None
         if scene.time.tolerance is not None:
             settings = scene.time.tolerance, scene.time.step, scene.stops()
@@ -111,11 +112,12 @@ class Simulation:
             columns += [TIME_ERROR] if TIME_ERROR not in columns else []
         elif TIME_ERROR in columns:
             self.stepper.judge = TimeError(self.stepper).measure
-        wanted = without_free_length(columns_of(shape, columns), shape, scene.loads)
-        self.observer = Observer(shape, self.stepper, wanted)
+        self.observer = Observer(shape, self.stepper, columns_of(shape, columns, scene.loads))
         self.warnings: list[Watcher] = [
             LockingWarning(self.stepper, formulation.locks),
             BucklingWarning(self.stepper, shape.strut(scene.supports.ends)),
+            VolumeLoss(self.stepper),
+            RadialChains(self.stepper, shape.radial_share),
         ]
         if self.stepper.remodeling.law.remodels and not at_once:
             chatter = Chatter(self.stepper)
@@ -159,23 +161,6 @@ class Simulation:
         """Free PETSc's objects and options."""
         self.stability.close()
         self.stepper.close()
-
-
-def checked_columns(names: Sequence[str], shape: Shape) -> Sequence[str]:
-    """The names, if they are columns of the shape that a scene may ask for.
-
-    Raises
-    ------
-    SceneError
-        If one is not; one line that names the key.
-    """
-    for name in names:
-        known = [*COLUMNS_ON_REQUEST, *(column.name for column in columns_of(shape))]
-        if name not in known:
-            raise SceneError(
-                f"output.columns = {name!r}: no such column on request; allowed are {', '.join(map(repr, known))}"
-            )
-    return names
 
 
 def with_kinematics(scene: Scene, domain: Domain | None = None) -> Scene:

@@ -29,7 +29,8 @@ from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.formulations import FORMULATIONS, Selective
 from remodel_fenicsx.fem.kinematics import KINEMATICS, FullKinematics
 from remodel_fenicsx.fem.solver_methods import METHODS
-from remodel_fenicsx.results.columns import COLUMNS, Measurement
+from remodel_fenicsx.body.columns import COLUMNS
+from remodel_fenicsx.results.columns import Measurement
 from remodel_fenicsx.scene import parameters
 from remodel_fenicsx.scene.parameters import Remodeling
 from remodel_fenicsx.schema.tables import markdown_reference

@@ -357,3 +357,36 @@ def test_every_driver_has_the_formulations_stress() -> None:
     for name, driver in DRIVERS.items():
         difference = np.abs(drives["displacement", name] - drives[SELECTIVE, name]).max()
         assert difference > 1.0 if driver.is_stress else difference == 0.0
+
+
+def test_the_driving_stress_of_quadratic_elements_has_the_pressure_of_their_rule() -> None:
+    """J at the rule's eight points, by polynomials of its own; between them the trilinear one through these."""
+    domain = cube(refinement=1, degree=2)
+    made = parts.body(domain, Cells(initial="isotropic"), degree=2)
+    made.formulation = SELECTIVE
+    alone = STIFF.model_copy(update={"chain_density": 0.0})
+    remodeling = made.remodeling(alone, driver="cauchy")
+    made.set_displacement(smooth(made.nodes, 0.1, 5))
+    F, stress = remodeling.driving_tensor()
+    J = np.linalg.det(F)[:, None, None]
+    pressure = J * stress - alone.lame_mu * (F @ np.swapaxes(F, 1, 2) - np.eye(3))
+    places = made.quadrature.coordinates.reshape(-1, 3)
+    low, high = domain.mesh.geometry.x.min(axis=0), domain.mesh.geometry.x.max(axis=0)
+    gauss = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) / np.sqrt(3)
+    at_rule = 0.5 * (low + high) + 0.5 * gauss * (high - low)
+
+    def monomials(points: np.ndarray, degree: int = 2) -> np.ndarray:
+        powers = np.array(list(np.ndindex(*[degree + 1] * 3)))
+        return np.prod(points[:, None, :] ** powers, axis=2)
+
+    weights = np.linalg.solve(monomials(made.nodes), made.displacement.x.array.reshape(-1, 3))
+    slopes = []
+    for axis in range(3):  # differences of a polynomial of degree 2 are exact
+        apart = 0.1 * np.eye(3)[axis]
+        slopes.append((monomials(at_rule + apart) - monomials(at_rule - apart)) @ weights / 0.2)
+    jacobians = np.linalg.det(np.eye(3) + np.stack(slopes, axis=2))
+    between = monomials(places, 1) @ np.linalg.solve(monomials(at_rule, 1), jacobians)
+    expected = alone.lame_lambda * np.log(between)[:, None, None] * np.eye(3)
+    np.testing.assert_allclose(pressure, expected, atol=1e-8 * np.abs(expected).max())
+    assert np.ptp(between) > 0.1  # no constant pressure
+    assert np.abs(between - J[:, 0, 0]).max() > 1e-2  # nor that of the points

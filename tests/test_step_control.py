@@ -267,7 +267,7 @@ def test_where_no_step_is_short_enough_the_run_goes_on_and_says_so(caplog: pytes
     lengths = [0.2, 0.4, float(np.sqrt(0.8))]
     steps, _ = marched(tube("staggered", 10.0, **{"cells.initial": lengths, "time.tolerance": 0.5}))
     errors = [step.time_error for step in steps]
-    assert errors[0] > 10.0 and np.median(errors) < 0.5 and len(steps) < 120
+    assert errors[0] > 10.0 and np.median(errors) < 0.5 and len(steps) < 100
     assert sum("does not fall to time.tolerance" in record.message for record in caplog.records) == 1
 
 
@@ -378,12 +378,13 @@ def test_where_errors_do_not_fall_the_number_of_steps_is_bounded(caplog: pytest.
 
 def test_the_tolerance_counts_again_when_errors_fall() -> None:
     """Nothing helps for a while; what comes then is resolved."""
-    _, times = controlled(
-        lambda start, length: 50.0 + start if 5.0 <= start < 10.0 else length / 0.25, 25.0, **{"time.step": 0.2}
-    )
-    lengths = np.diff(times)
-    starts = np.array(times[:-1])
-    assert lengths[starts > 11.0].max() <= 0.25 * 1.05 and (starts < 5.0).sum() < 30
+
+    def error(start: float, length: float) -> float:
+        return 0.85 * length if start < 5.0 else 50.0 + start if start < 10.0 else length / 0.4
+
+    _, times = controlled(error, 25.0)
+    starts, lengths = np.array(times[:-1]), np.diff(times)
+    assert 0.9 < lengths[starts < 4.0].min() and lengths[starts > 12.0].max() <= 0.4 * 1.05
 
 
 def test_steps_of_an_explicit_rule_are_at_most_half_of_the_cells_own_time() -> None:
@@ -397,6 +398,7 @@ def test_a_printed_pass_that_swings_does_not_crawl(caplog: pytest.LogCaptureFixt
     """By rank the chains of this tube turn over at once, to and fro: thousands of steps in 0.2.0."""
     steps, _ = marched(tube("staggered", 150.0, **{"time.tolerance": 0.5}, **SWINGS))
     assert len(steps) < 600 and steps[-1].time == 150.0
+    assert np.diff([step.time for step in steps]).min() > 0.5 / 360 * 25 / 1.06  # degrees, and the time of the ramp
     assert any("does not fall to time.tolerance" in record.message for record in caplog.records)
 
 

@@ -75,6 +75,11 @@ class Tendon(Shape):
         """The area."""
         return self.area
 
+    @property
+    def proportions(self) -> tuple[tuple[str, str, float, tuple[int, int]], ...]:
+        """Of tendons: neither a plate nor a thread."""
+        return (("length", "length / sqrt(area)", self.length / math.sqrt(self.area), (-2, 3)),)
+
     def strut(self, ends: str) -> Strut:
         """Its bottom stays in its plane, its top is free."""
         moment = self.area / (4 * math.pi)

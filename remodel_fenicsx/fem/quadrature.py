@@ -133,6 +133,21 @@ class Quadrature:
         chosen = np.repeat(elements[:, None], self.shape[1], axis=1).astype(np.float64)
         return self.integral(values * chosen) / self.integral(chosen)
 
+    def mean_of_known(self, values: NDArray[np.float64], weights: NDArray[np.float64] | None = None) -> float:
+        """Volume mean over the points whose value is known, not NaN; NaN where there is none.
+
+        Parameters
+        ----------
+        values
+            (elements, points).
+        weights
+            Of the points beside their volume, of the same shape or one for each element; default: one.
+        """
+        known = ~np.isnan(values)
+        counted = known if weights is None else known * weights.reshape(len(weights), -1)
+        volume = self.integral(counted.astype(np.float64))
+        return self.integral(np.where(known, values, 0.0) * counted) / volume if volume > 0 else np.nan
+
     @cached_property
     def gradients(self) -> NDArray[np.float64]:
         """G with |grad u| <= G max |u_node| in each element, (elements,): the sizes of the slopes of its functions."""
@@ -160,6 +175,12 @@ class Quadrature:
     def element_mean(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Volume mean over each element: (elements, points, ...) to (elements, ...)."""
         return np.einsum("ep,ep...->e...", self._shares, values)
+
+    def element_mean_of_known(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Volume mean over the points of each element whose value is not NaN, (elements, points) to (elements,)."""
+        known = ~np.isnan(values)
+        sums, shares = self.element_mean(np.where(known, values, 0.0)), self.element_mean(known.astype(np.float64))
+        return np.divide(sums, shares, out=np.full_like(sums, np.nan), where=shares > 0)
 
     @cached_property
     def _shares(self) -> NDArray[np.float64]:

@@ -173,7 +173,7 @@ class Recording:
             return np.asarray(root["Connectivity"][:], dtype=np.int64).reshape(count, -1)
 
     def fields(self, time: float) -> dict[str, Array]:
-        """The fields at a recorded time by name: at the nodes, (nodes, ...), and means over the elements, (elements, ...).
+        """The fields at a recorded time by name: at nodes, (nodes, ...), and means over elements, (elements, ...).
 
         `displacement` belongs to the nodes; docs/commands.md lists the others. Values have 7 digits.
 

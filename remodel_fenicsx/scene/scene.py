@@ -16,15 +16,17 @@ from typing import Annotated, Any, ClassVar
 from pydantic import BaseModel, Field, SerializeAsAny, model_validator
 
 from remodel_fenicsx.body import SHAPES, Shape
+from remodel_fenicsx.body.columns import columns_of, columns_on_request
 from remodel_fenicsx.body.reductions import AUTO, objections
 from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.scene.parameters import FORMAT, PRESETS, RENAMED, Cells, Material, Remodeling, default_method
+from remodel_fenicsx.scene.plausibility import doubts, largest_stress
 from remodel_fenicsx.scene.profiles import EXACT, PROFILES, known_profile
 from remodel_fenicsx.scene.settings import Load, Mesh, Model, Output, Solver, Supports, Time, nearest_multiples
-from remodel_fenicsx.scene.values import base_material, in_own_units, in_present_format, known_shape
+from remodel_fenicsx.scene.values import in_own_units, in_present_format, known_shape
 from remodel_fenicsx.schema.tables import SceneError, Table, checked, fault, quoted, shown, variant_of
 from remodel_fenicsx.schema.toml import merged, parse_override, put, read_toml, toml_text
-from remodel_fenicsx.schema.units import FORCE, STRESS
+from remodel_fenicsx.schema.units import FORCE
 from remodel_fenicsx.tissue.chains import CHAINS
 from remodel_fenicsx.tissue.condensed import refused
 from remodel_fenicsx.tissue.drivers import DRIVERS, FRAMES
@@ -141,6 +143,7 @@ class Scene(Table):
         for name, load in self.loads.items():
             self._check_load(name, load)
         self._check_output_times()
+        self._check_columns()
         self._check_length()
         if self.model.kinematics != AUTO and (reasons := objections(self, self.model.kinematics)):
             raise fault("; ".join(reasons), "model.kinematics", self.model.kinematics)
@@ -199,6 +202,13 @@ class Scene(Table):
                 rule = nearest_multiples(time, self.time.step, "time.step")
                 raise fault(rule, f"output.times[{index}]", time)
 
+    def _check_columns(self) -> None:
+        known = dict.fromkeys([*columns_on_request(self.geometry), *(c.name for c in columns_of(self.geometry))])
+        for name in self.output.columns:
+            if name not in known:
+                rule = f"no such column on request; allowed for shape {self.geometry.name!r} are "
+                raise fault(rule + ", ".join(map(repr, known)), "output.columns", name)
+
     def stops(self) -> list[float]:
         """Times at which a step ends, however long steps are: corners of ramps, output.times and the end."""
         times = {time for load in self.loads.values() for time, _ in load.ramp if 0 < time < self.time.end}
@@ -223,17 +233,16 @@ class Scene(Table):
         """Stiffness of network and matrix and the largest loads, in one unit and on one line."""
         loads = {}
         for name, load in self.loads.items():
-            largest, dimension = load.largest(self.last_time), self.geometry.loads[name].dimension
-            if dimension == STRESS:
-                loads[f"largest {name}"] = largest
-            elif dimension == FORCE:
-                loads[f"largest {name} over its area"] = largest / self.geometry.loaded_area
+            stress = largest_stress(name, load.largest(self.last_time), self.geometry)
+            if stress is not None:
+                is_force = self.geometry.loads[name].dimension == FORCE
+                loads[f"largest {name}{' over its area' if is_force else ''}"] = stress
         return self.material.summary(loads)
 
     def warnings(self) -> list[str]:
         """What is allowed but hardly meant, each on one line."""
-        under = {} if self.preset is None else PRESETS[self.preset][self.geometry.name].get("material", {})
-        return self.material.warnings(base_material(under)) + self.remodeling.warnings()
+        parts = self.material, self.geometry, self.loads, self.cells.end_to_end_length, self.last_time
+        return doubts(*parts) + self.remodeling.warnings()
 
     def with_values(self, changes: Mapping[str, Any]) -> Scene:
         """A validated copy with other values by dotted key: ``scene.with_values({"loads.pressure.value": 2.4})``.

@@ -296,11 +296,21 @@ class Solver(Table):
         return self
 
 
+FIELDS_BY_NAME = (
+    "displacement", "deformation_gradient", "cauchy_stress", "cell_dimensions", "axis_1", "axis_2", "axis_3",
+    "fibre_angle", "fibre_angle_deformed", "chain_extension", "chains",
+)  # fmt: skip
+"""What `output.fields` may name (`results.fields`); "chains" are the lines of fields_chains.vtkhdf."""
+
+
 def _fields(value: Any) -> Any:
     if isinstance(value, bool):
         return value
     if not isinstance(value, (list, tuple)) or not all(isinstance(name, str) for name in value):
         raise fault("must be true, false or a list of names of fields")
+    for name in value:
+        if name not in FIELDS_BY_NAME:
+            raise fault(f"no such field; allowed are {', '.join(map(repr, FIELDS_BY_NAME))}", value=name)
     return tuple(value)
 
 

@@ -11,8 +11,8 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from remodel_fenicsx.body.columns import columns_of
 from remodel_fenicsx.paper.output import COLOURS, STYLE, Page
-from remodel_fenicsx.results.columns import columns_of
 from remodel_fenicsx.scene.scene import Scene, SceneError
 from remodel_fenicsx.schema.times import same_time
 from remodel_fenicsx.studies.members import LEAST, Member, Study, TooFewRuns, run_members

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -18,6 +19,7 @@ from remodel_fenicsx.system.regular_files import make_own_folder, write_whole
 
 ROWS = "rows"  # folder of the scenes
 SIZE = 8.0  # of a point with a number in it
+APART = 0.05  # of the axes: such points that are closer would cover each other
 
 
 def in_words(found: Trade) -> str:
@@ -73,7 +75,10 @@ def _scene_file(row: Row) -> str:
 
 
 def picture(rows: list[Row]) -> Figure:
-    """Cost against error; the front has numbers in its points, and beside the axes what they stand for."""
+    """Cost against error; points of the front have numbers, and beside the axes stands what they are.
+
+    Of points that would cover each other the cheapest has one.
+    """
     shown = [row for row in rows if row.angle_error > 0]
     kinds = dict(zip(dict.fromkeys(row.result.setting.way for row in shown), COLOURS, strict=False))
     figure = Figure(figsize=(7.2, 4.2), layout="constrained")
@@ -87,7 +92,9 @@ def picture(rows: list[Row]) -> Figure:
         same = [row for row in shown if row.result.setting.way == way]
         axes.plot(*_places(same), "o", color=colour, markerfacecolor="white", markersize=4, label=", ".join(way))
     names = []
-    for number, row in enumerate(front, start=1):
+    for row in front:
+        axes.plot(row.result.seconds, row.angle_error, "o", color=kinds[row.result.setting.way], markersize=4)
+    for number, row in enumerate(_apart(front, shown), start=1):
         colour, at = kinds[row.result.setting.way], (row.result.seconds, row.angle_error)
         axes.plot(*at, "o", color=colour, markersize=SIZE)
         axes.annotate(str(number), at, ha="center", va="center_baseline", fontsize=6, color="white")
@@ -100,6 +107,17 @@ def picture(rows: list[Row]) -> Figure:
         place: dict[str, Any] = {"loc": "outside right center", "title": "the front", "title_fontsize": 7.5}
         figure.legend(nothing, names, handlelength=0, fontsize=6.5, **place)
     return figure
+
+
+def _apart(front: list[Row], shown: list[Row]) -> list[Row]:
+    """Those of the front whose points do not cover each other."""
+    spread = np.maximum(np.ptp(np.log(_places(shown)), axis=1), 1e-9) if shown else np.ones(2)
+    found: list[Row] = []
+    for row in front:
+        ways = [np.ptp(np.log(_places([row, other])), axis=1) / spread for other in found]
+        if all(np.hypot(*way) > APART for way in ways):
+            found.append(row)
+    return found
 
 
 def _words(row: Row) -> str:

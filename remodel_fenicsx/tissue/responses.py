@@ -22,6 +22,7 @@ Array = NDArray[np.float64]
 
 AGREE = 1e-7
 """Relative difference of two principal values below which nothing is known about a turn in their plane."""
+SAME_LENGTH = 1e-9  # over r0: lengths of isotropic cells, but for rounding
 
 
 @dataclass(frozen=True)
@@ -102,6 +103,21 @@ def response(step: StepOfCells, strain: Strain, tensor: Array, derivatives: bool
     """
     respond = ranked_response if step.law.dimensions is not None else tensor_response
     return respond(step, strain, tensor, derivatives)
+
+
+def jumps_by_rank(step: StepOfCells) -> NDArray[np.bool_]:
+    """Where cells jump when principal values cross, (n,): where equal targets leave the ranks different lengths.
+
+    There the equations of an implicit step may have no solution. Elsewhere cells are continuous in the driving tensor:
+    from isotropic cells eq. (11) never jumps, and the law for A nowhere.
+    """
+    if step.law.dimensions is None:
+        return np.zeros(len(step.structure), dtype=bool)
+    old, r0 = step.cells.dimensions, step.end_to_end_length[:, None]
+    alike = np.repeat(r0 / np.sqrt(3), 3, axis=1)
+    lengths = step.law.dimensions(old, step.initial_dimensions, alike, step.kappa, step.time_old, step.time_new)
+    apart: NDArray[np.bool_] = np.ptp(lengths, axis=1) > SAME_LENGTH * step.end_to_end_length
+    return apart
 
 
 # ---------------------------------------------------------------- the law for A
