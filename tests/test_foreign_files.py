@@ -82,6 +82,7 @@ CODE = {
     "snes_python_type": "mine.Solver", "ksp_monitor_python": "mine.watch", "npc_snes_type": "python",
     "mg_levels_pc_type": "python", "pc_composite_pcs": "jacobi,python", "snes_composite_sneses": "newtonls,python",
     "telescope_pc_type": "shell", "pc_type_": "shell", "sub_pc_type": "PYTHON",
+    "KSP_TYPE": "Python", "mg_levels_1_sub_ksp_type": "python",
 }  # fmt: skip
 WRITES = {
     "snes_monitor": "ascii:victim", "ksp_monitor": "ascii:victim::append", "snes_view": "ascii:victim:ascii_info",
@@ -89,6 +90,10 @@ WRITES = {
     "ksp_converged_reason": "ascii:victim", "snes_converged_reason": "victim/x", "pc_view": "vtk", "mat_view": "draw",
     "ksp_monitor_solution": "saws", "snes_linesearch_monitor": "ascii:victim", "mat_mumps_icntl_2": 77,
     "mat_mumps_icntl_3": "78", "mat_mumps_icntl_22": 1, "mat_mumps_ooc_tmpdir": "here", "mat_mumps_icntl_1": 11,
+    "MAT_MUMPS_ICNTL_3": 9, "pc_asm_print_subdomains": "victim", "pc_gasm_print_subdomains": 5,
+    "snes_mf_noise_file": "victim", "mat_factor_dump_on_error": True, "pc_bddc_save": True,
+    "pc_nn_save_coarse_matrix": True, "pc_mg_dump_binary": True, "ksp_view_diagonal_scale": "xbinary",
+    "ksp_View_mat": "mybinary",
 }  # fmt: skip
 ELSEWHERE = {
     "options_file": "victim",
@@ -440,6 +445,60 @@ def test_a_folder_with_nothing_but_a_dead_lock_is_nobodys(tmp_path: Path) -> Non
     assert choose_folder(tmp_path / "out", "x") == tmp_path / "out"
     done = run("run", demo("cube"), "--set", "time.end=1", "-q", "-o", tmp_path / "out")
     assert done.returncode == 0, done.stderr
+
+
+# ---------------------------------------------------------------- the working folder, and what lies in it
+def test_the_working_folder_runs_nothing_and_sets_nothing(tmp_path: Path) -> None:
+    """Where a scene was unpacked there may be more: modules, and options of PETSc, dolfinx and FFCx."""
+    put_there = {
+        "numpy.py": "open('victim-of-module', 'w')",
+        ".petscrc": "-log_view ascii:victim-of-log\n-remodel_snes_view ascii:victim-of-view\n",
+        "petscrc": "-remodel_ksp_type python\n",
+        "dolfinx_jit_options.json": '{"cffi_libraries": ["mine"], "no JSON',
+        "ffcx_options.json": '{"scalar_type": "float32", "no JSON',
+    }
+    for name, text in put_there.items():
+        (tmp_path / name).write_text(text)
+    (tmp_path / "scene.toml").write_text(pulled_cube(1.0).to_toml())
+    command = [
+        sys.executable,
+        PROJECT / "bin" / "remodel-fenicsx",
+        "ensemble",
+        "scene.toml",
+        "--seeds",
+        "2",
+        "-o",
+        "out",
+    ]
+    own = {"PETSC_OPTIONS": "-remodel_snes_monitor ascii:the-users-own::append"}
+    done = subprocess.run([*command, "-q"], cwd=tmp_path, env=os.environ | own, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, ""), done.stderr
+    assert {path.name for path in tmp_path.iterdir()} == {*put_there, "scene.toml", "out", "the-users-own"}
+
+
+@pytest.mark.parametrize(
+    "study",
+    [
+        {"study": "../../x", "scene": "x", "runs": []},
+        {"study": "ensemble", "scene": "x", "runs": [".."]},
+        {"study": "ensemble", "scene": "x", "runs": ["/proc/self"]},
+        {"study": "ensemble", "scene": "x", "runs": ["a\x1b[31m"]},
+        {"study": "ensemble", "scene": "x", "runs": ["x" * 5000]},
+        {"study": {}, "scene": [], "runs": {"a": 1}},
+        {"study": "ensemble", "scene": "x", "runs": [str(number) for number in range(200_000)]},
+    ],
+    ids=["elsewhere", "above", "at the root", "control", "long", "tables", "many"],
+)
+def test_a_foreign_study_names_runs_of_its_own_folder(study: Any, tmp_path: Path) -> None:
+    """Before, 200,000 runs took the square of that."""
+    (tmp_path / "study.json").write_text(json.dumps(study))
+    assert "study.json: is damaged" in refused("status", tmp_path)
+
+
+def test_a_column_named_often_is_one_column() -> None:
+    """30,000 of them took minutes."""
+    scene = preset_scene("kuhl-holzapfel-2007", "cube").with_values({"output.columns": ["mean_stretch"] * 30_000})
+    assert scene.output.columns == ("mean_stretch",)
 
 
 # ---------------------------------------------------------------- without end
