@@ -33,6 +33,7 @@ from remodel_fenicsx.results.vtkhdf import check_file
 from remodel_fenicsx.running import resume, run as run_scene
 from remodel_fenicsx.scene import preset_scene, read_scene
 from remodel_fenicsx.schema.toml import LARGEST, MOST_PARTS
+from remodel_fenicsx.studies.members import Member
 from tests.parts import pulled_cube
 from tests.test_run import demo, run
 
@@ -341,9 +342,33 @@ def pointing(**entries: Any) -> Callable[[Path], None]:
     return change
 
 
+def marked(flag: int, place: int, central: int) -> Callable[[Path], None]:
+    """Archives with another number in the heads of their files."""
+
+    def change(folder: Path) -> None:
+        data = bytearray((folder / "checkpoint-a.npz").read_bytes())
+        for head, offset in ((b"PK\x03\x04", place), (b"PK\x01\x02", central)):
+            start = data.find(head)
+            while start >= 0:
+                data[start + offset] = flag
+                start = data.find(head, start + 4)
+        other_archive(bytes(data))(folder)
+
+    return change
+
+
+def headed(head: bytes) -> bytes:
+    """An archive with one array that begins so."""
+    whole = io.BytesIO()
+    with zipfile.ZipFile(whole, "w") as archive:
+        archive.writestr("header.npy", b"\x93NUMPY\x02\x00" + len(head).to_bytes(4, "little") + head)
+    return whole.getvalue()
+
+
 @pytest.mark.parametrize(
     "change",
-    [bomb, pickled, other_archive(b"no archive"), other_archive(empty_archive()), other_archive(b""),
+    [marked(1, 6, 8), marked(99, 8, 10), marked(14, 8, 10), other_archive(headed(b"(" * 9000 + b"\n")),
+     bomb, pickled, other_archive(b"no archive"), other_archive(empty_archive()), other_archive(b""),
      pointing(file="../run/checkpoint-a.npz"), pointing(file="/etc/passwd"), pointing(file="scene.toml"),
      pointing(sha256=0), pointing(number="1"), pointing(time=1), pointing(more=1),
      lambda folder: (folder / "checkpoint.json").write_text("[" * 10**5),
@@ -354,6 +379,36 @@ def test_another_archive_or_pointer_is_refused(change: Callable[[Path], None], f
     before = content(folder)
     refused("run", "--resume", folder, "--set", LONGER[0], "-q")
     assert content(folder) == before
+
+
+def test_a_field_without_end_in_a_history_is_refused(folder: Path) -> None:
+    text = (folder / "history.csv").read_text()
+    (folder / "history.csv").write_text(text.replace("\n", '\n"' + "a" * 200_000 + '",', 1))
+    assert "history.csv: field larger than" in refused("status", folder)
+
+
+@pytest.mark.parametrize(
+    "forge",
+    [lambda text: "".join(",".join(line.split(",")[:3]) + "\n" for line in text.splitlines()),
+     lambda text: text.replace("mean_stretch", "mine", 1),
+     lambda text: text.replace(text.splitlines()[2] + "\n", "", 1),
+     lambda text: text.replace("\n", "\n" + text.splitlines()[1] + "\n", 1)],
+    ids=["columns fewer", "columns others", "rows fewer", "rows more"],
+)  # fmt: skip
+def test_a_study_takes_no_history_that_is_not_its_scenes(forge: Callable[[str], str], folder: Path) -> None:
+    member = Member("run", Recording(folder).scene, folder)
+    assert member.is_complete()
+    (folder / "history.csv").write_text(forge((folder / "history.csv").read_text()))
+    with pytest.raises(SceneError, match="its history has other columns or rows than its scene asks for"):
+        member.is_complete()
+
+
+@pytest.mark.parametrize("by", [10**9, -5])
+def test_elements_of_nodes_that_are_not_there_are_refused(by: int, folder: Path) -> None:
+    with h5py.File(folder / "fields.vtkhdf", "r+") as file:
+        file["VTKHDF/Connectivity"][:] += by
+    with pytest.raises(RecordingError, match="nodes that are not there"):
+        _ = Recording(folder).elements
 
 
 # ---------------------------------------------------------------- fields
