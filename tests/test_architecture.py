@@ -17,7 +17,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGE = "remodel_fenicsx"
 # what a room may import: itself, and those before it
-ROOMS = ("system", "schema", "tissue", "fem", "body", "scene", "evolution", "results", "paper", "simulation",
+ROOMS = ("system", "schema", "tissue", "fem", "kernels", "body", "scene", "evolution", "results", "paper", "simulation",
          "running", "stability", "studies", "cli")  # fmt: skip
 # imports that only the type checker follows: of what is there without dolfinx, to what is not
 TYPES_ONLY = {
