@@ -58,7 +58,7 @@ import pytest
 from remodel_fenicsx.fem import jit
 jit.LIBRARY_FLAGS += ["-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
 files = ["tests/test_compiled.py", "tests/test_compiled_tensor.py"]
-sys.exit(pytest.main(["-q", "-p", "no:cacheprovider", "-x", *files, "-k", "not tube"]))
+sys.exit(pytest.main(["-q", "-s", "-p", "no:cacheprovider", "-x", *files, "-k", "not tube"]))
 """
 
 
