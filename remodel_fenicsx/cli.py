@@ -9,7 +9,7 @@ import shlex
 import sys
 import time as clock
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -251,10 +251,14 @@ def _study(options: argparse.Namespace, task: Callable[[Scene], tuple[Path, str,
     if reason := reason_unusable() or reason_undrawable():
         return _fail(f"the environment is not usable: {reason}; run through ./with-fenicsx", BAD_ENVIRONMENT)
     from remodel_fenicsx.paper.errors import FigureError
+    from remodel_fenicsx.studies.members import TooFewRuns
 
     try:
         with interrupts.StopRequest(), interrupts.stopping_at_once():
             folder, words, failed = task(scene)
+    except TooFewRuns as early:
+        _complain_of(early.failed)
+        return _fail(str(early), SOLVE_FAILED if early.failed else STOPPED)
     except FigureError as refusal:  # a picture or a table of somebody else's stands in its place
         return _fail(str(refusal), refusal.exit_code)
     except interrupts.Interrupted as interruption:
@@ -265,9 +269,13 @@ def _study(options: argparse.Namespace, task: Callable[[Scene], tuple[Path, str,
         return _fail(f"cannot write the results: {error}", BAD_ENVIRONMENT)
     _say(words)
     _say(f"results in {folder}")
+    _complain_of(failed)
+    return SOLVE_FAILED if failed else 0
+
+
+def _complain_of(failed: Mapping[str, str]) -> None:
     for name, last_words in failed.items():
         _complain(f"{name} has failed: {last_words}")
-    return SOLVE_FAILED if failed else 0
 
 
 def _ensemble(options: argparse.Namespace) -> int:
