@@ -141,7 +141,7 @@ def with_values(scene: Mapping[str, Any], changes: Mapping[str, Any]) -> Values:
 
 
 Family = Callable[[], Iterator[Case]]
-MODULES = ("homogeneous", "bodies", "prescribed", "consistent", "variants")
+MODULES = ("homogeneous", "bodies", "prescribed", "consistent", "variants", "instant", "ray")
 FAMILIES: dict[str, Family] = {}
 """Generators of cases by name, in the order of the table."""
 
