@@ -128,6 +128,21 @@ def test_rooms_side_by_side_do_not_know_each_other(pair: tuple[str, str]) -> Non
     assert not [arrow for arrow in arrows() if {room(arrow.importer), room(arrow.imported)} == set(pair)]
 
 
+def test_scripts_beside_the_package_import_what_is_there() -> None:
+    """Nothing else runs most of them: what they import may move away unnoticed."""
+    scripts = [path for folder in ("benchmarks", "demos", "docs") for path in sorted((ROOT / folder).rglob("*.py"))]
+    assert len(scripts) > 20
+    for path in scripts:
+        for imported, _ in imports_of(path):
+            if imported.split(".")[0] == PACKAGE:
+                pkgutil.resolve_name(imported)  # raises, if it is not
+
+
+def test_no_benchmark_is_without_an_ending() -> None:
+    """Formatters, linters and searches go by it."""
+    assert [path.name for path in (ROOT / "benchmarks").iterdir() if not path.is_dir() and not path.suffix] == []
+
+
 def test_the_package_itself_only_hands_names_on() -> None:
     """Whoever asks for its version imports nothing else, and no room asks the package itself."""
     assert {arrow.imported for arrow in arrows() if arrow.importer == "__init__" and arrow.when != "types"} == {

@@ -88,7 +88,7 @@ def script(program: list[str], folder: Path) -> str:
 
 def test_the_benchmark_says_where_the_time_goes(tmp_path: Path) -> None:
     mesh = COARSE.replace("(8, 4, 1)", "(24, 6, 4)")  # large enough for times of two digits
-    program = f"{mesh}import runpy; runpy.run_path({str(ROOT / 'benchmarks' / 'artery')!r}, run_name='__main__')"
+    program = f"{mesh}import runpy; runpy.run_path({str(ROOT / 'benchmarks' / 'artery.py')!r}, run_name='__main__')"
     done = forked("python", program, "--steps", "2", cwd=tmp_path)
     assert done.returncode == 0, done.stderr[-2000:]
     printed = done.stdout

@@ -113,7 +113,7 @@ class Case:
     def command(self) -> str:
         """The smallest command that shows it."""
         if self.base is None or self.extended or self.counts:
-            return f"./with-fenicsx benchmarks/stability --only '{self.key}' --again"
+            return f"./with-fenicsx benchmarks/stability.py --only '{self.key}' --again"
         changes = " ".join(f"--set {toml_set(key, value)}" for key, value in self.base[1].items())
         return f"./with-fenicsx remodel-fenicsx run {self.base[0]} {changes}"
 
