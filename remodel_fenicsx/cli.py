@@ -9,11 +9,11 @@ import shlex
 import sys
 import time as clock
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-import remodel_fenicsx
+from remodel_fenicsx._version import __version__
 from remodel_fenicsx.body.reductions import explained
 from remodel_fenicsx.system import interrupts
 from remodel_fenicsx.system.arguments import positive, wall_time
@@ -26,6 +26,16 @@ from remodel_fenicsx.scene.scene import Scene, SceneError, preset_scene, read_sc
 from remodel_fenicsx.schema.tables import printable
 
 BAD_INPUT, SOLVE_FAILED, STOPPED, BAD_ENVIRONMENT = 2, 3, interrupts.PAUSED, 5
+EXIT_CODES = {
+    0: "finished",
+    BAD_INPUT: "bad input",
+    SOLVE_FAILED: "the solve failed",
+    STOPPED: "stopped on purpose",
+    BAD_ENVIRONMENT: "environment not usable",
+    129: "hung up",
+    130: "interrupted",
+    143: "terminated",
+}
 
 
 class _Parser(argparse.ArgumentParser):
@@ -40,10 +50,9 @@ def parser() -> argparse.ArgumentParser:
     main_parser = _Parser(
         prog="remodel-fenicsx",
         description="Predict how collagen in living tissue reorients under load (Kuhl & Holzapfel 2007).",
-        epilog="exit codes: 0 finished, 2 bad input, 3 the solve failed, 4 stopped on purpose, 5 environment not "
-        "usable, 129/130/143 interrupted",
+        epilog="exit codes: " + ", ".join(f"{code} {meaning}" for code, meaning in EXIT_CODES.items()),
     )
-    main_parser.add_argument("--version", action="version", version=remodel_fenicsx.__version__)
+    main_parser.add_argument("--version", action="version", version=__version__)
     commands = main_parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     def scene_command(name: str, text: str, resumes: bool = False) -> argparse.ArgumentParser:
@@ -130,7 +139,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit code of docs/commands.md (0, 2, 3, 4, 5, 129, 130, 143)."""
+    """Run the command line; returns the exit code, one of `EXIT_CODES`."""
     with interrupts.ending_at_once():
         options = _parsed(arguments)
         try:
@@ -255,10 +264,14 @@ def _study(options: argparse.Namespace, task: Callable[[Scene], tuple[Path, str,
     if reason := reason_unusable() or reason_undrawable():
         return _fail(f"the environment is not usable: {reason}; run through ./with-fenicsx", BAD_ENVIRONMENT)
     from remodel_fenicsx.paper.errors import FigureError
+    from remodel_fenicsx.studies.members import TooFewRuns
 
     try:
         with interrupts.StopRequest(), interrupts.stopping_at_once():
             folder, words, failed = task(scene)
+    except TooFewRuns as early:
+        _complain_of(early.failed)
+        return _fail(str(early), SOLVE_FAILED if early.failed else STOPPED)
     except FigureError as refusal:  # a picture or a table of somebody else's stands in its place
         return _fail(str(refusal), refusal.exit_code)
     except interrupts.Interrupted as interruption:
@@ -269,9 +282,13 @@ def _study(options: argparse.Namespace, task: Callable[[Scene], tuple[Path, str,
         return _fail(f"cannot write the results: {error}", BAD_ENVIRONMENT)
     _say(words)
     _say(f"results in {folder}")
+    _complain_of(failed)
+    return SOLVE_FAILED if failed else 0
+
+
+def _complain_of(failed: Mapping[str, str]) -> None:
     for name, last_words in failed.items():
         _complain(f"{name} has failed: {last_words}")
-    return SOLVE_FAILED if failed else 0
 
 
 def _ensemble(options: argparse.Namespace) -> int:

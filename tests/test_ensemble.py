@@ -20,7 +20,7 @@ from remodel_fenicsx.results.status import status
 from remodel_fenicsx.running import run
 from remodel_fenicsx.scene.scene import Scene
 from remodel_fenicsx.studies import ensemble as study
-from remodel_fenicsx.studies.members import Member, run_members
+from remodel_fenicsx.studies.members import Member, TooFewRuns, run_members
 from remodel_fenicsx.system.interrupts import Paused
 from tests import forks
 from tests.conftest import forked_children
@@ -117,6 +117,14 @@ def test_the_command_says_whose_run_has_failed_or_was_stopped(
     assert "time 5, 2 seeds" in written.out and f"seed-2 has failed: {said}" in written.err
 
 
+def test_two_seeds_are_needed(made: tuple[Path, study.Ensemble]) -> None:
+    """Runs that have failed are no bad input."""
+    members = study.members_of(scene(), made[0], 3)
+    with pytest.raises(TooFewRuns, match="1 of 3 seeds reached the end, at least 2 are needed; .* is kept") as too_few:
+        study.gathered(members, {"seed-2": "why", "seed-3": "why not"})
+    assert too_few.value.failed == {"seed-2": "why", "seed-3": "why not"}
+
+
 def test_what_was_stopped_goes_on(
     tmp_path: Path, made: tuple[Path, study.Ensemble], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -138,6 +146,37 @@ def test_what_was_stopped_goes_on(
     assert member.is_complete()
     whole = Recording(made[0] / "seed-3").history
     np.testing.assert_array_equal(member.history()["mean_stretch"], whole["mean_stretch"])
+
+
+DIES = """
+import os, signal, sys
+from pathlib import Path
+from mpi4py import MPI
+from remodel_fenicsx import read_scene
+from remodel_fenicsx.results import run_folder
+from remodel_fenicsx.running import run
+where = {"lock": (run_folder, "write_whole"), "part": (os, "fsync")}[sys.argv[1]]
+setattr(*where, lambda *of: os.kill(os.getpid(), signal.SIGKILL))
+run(read_scene(sys.argv[2]), Path(sys.argv[3]), MPI.COMM_SELF)
+"""
+
+
+@pytest.mark.parametrize(("moment", "left"), [("lock", {"run.lock"}), ("part", {"run.lock", "scene.toml.part"})])
+def test_a_member_killed_before_its_scene_is_run_again(
+    moment: str, left: set[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In the folder that the study takes by itself."""
+    monkeypatch.chdir(tmp_path)
+    short = pulled_cube(1.0)
+    member = study.members_of(short, Path("results", f"{short.name}-ensemble"), 2)[0]
+    Path("scene.toml").write_text(member.scene.to_toml())
+    done = forks.forked("python", DIES, moment, "scene.toml", member.folder.absolute(), cwd=tmp_path)
+    assert done.returncode == -signal.SIGKILL, done.stderr
+    assert {path.name for path in member.folder.iterdir()} == left
+    with forked_children():
+        place, found = study.ensemble(short, seeds=2)
+    assert (place, found.failed, found.seeds) == (member.folder.parent, {}, 2)
+    assert not left & {path.name for path in member.folder.iterdir()}
 
 
 def test_a_signal_ends_all_runs(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -265,8 +266,21 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     assert len(before) == 4  # the three, and 'implicit'
     assert cli.main(["trade", str(path), "-o", str(out), "-q"]) == 0
     assert {file: file.stat().st_mtime_ns for file in out.glob("*/history.csv")} == before
-    assert cli.main(["trade", str(path), "-o", str(tmp_path / "none"), "--budget", "0.001s"]) == 2
-    assert "0 settings reached the end within the budget" in capsys.readouterr().err
+    assert cli.main(["trade", str(path), "-o", str(tmp_path / "none"), "--budget", "0.001s"]) == 4
+    said = capsys.readouterr().err
+    assert said.startswith("remodel-fenicsx: 0 of 4 settings reached the end within the budget of 0.001 s, at least 2")
+    assert re.search(r"is kept, a larger budget goes on; the cheapest 2 need about \S+ s for their steps", said)
+    assert said.count("\n") == 1
+
+    monkeypatch.setattr(study, "ladder", lambda scene: ladder(scene)[:2])
+    lone = tmp_path / "lone"
+    lone.mkdir()
+    (lone / f"{ladder(read_scene(path))[0].name}-1").write_text("a file of the user's")
+    with forked_children():
+        assert cli.main(["trade", str(path), "-o", str(lone), "--jobs", "2", "-q"]) == 3
+    failure, verdict = capsys.readouterr().err.splitlines()
+    assert " has failed: -o " in failure and "1 of 2 settings reached the end" in verdict
+    assert verdict.endswith("is kept, the same command tries again what has failed")
 
 
 def test_words() -> None:

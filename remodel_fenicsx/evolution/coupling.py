@@ -113,6 +113,7 @@ class Staggered:
         else:
             log.info("solving in parts: the remodeled cells have r >= L at the old displacement")
             self._solve_in_parts(time, old_loads, loads, work, failure=None)
+        self._whole(time, old_loads, loads).look_back(before, work)
         self.predictor.solved(step, before)
         self.state.settle_cells()
         self._residual = work.residual
@@ -181,15 +182,34 @@ class Staggered:
             failure = None  # the loads have not been tried from here
 
         def set_load_fraction(fraction: float) -> None:
-            loading.set({k: old_loads[k] + fraction * (new_loads[k] - old_loads[k]) for k in new_loads})
+            loading.set(between(old_loads, new_loads, fraction))
 
         Change(time, "the change of the loads", set_load_fraction, self.newton, halvings).advance(work, failure)
         loading.set(new_loads)
         log.info("time %g solved in %d parts", time, work.substeps)
 
+    def _whole(self, time: float, old_loads: LoadValues, new_loads: LoadValues) -> Change:
+        """The change of the cells and of the loads together."""
+        blend = self.blend if self.blend is not None and self._cells_changed() else None
+
+        def set_fraction(fraction: float) -> None:
+            self.state.loading.set(between(old_loads, new_loads, fraction))
+            if blend is not None:
+                blend.set(fraction)
+
+        halvings = self.settings.maximum_halvings
+        if blend is None:
+            return Change(time, "the step", set_fraction, self.newton, halvings)
+        return Change(time, "the step", set_fraction, blend.newton, halvings, blend.largest_part)
+
     def _cells_changed(self) -> bool:
         same = self.state.equilibrium_cells.equals(self.state.cells)
         return bool(self.state.comm.allreduce(int(not same)) > 0)
+
+
+def between(old: LoadValues, new: LoadValues, fraction: float) -> LoadValues:
+    """Loads after a fraction of their change."""
+    return new if fraction == 1.0 else {name: old[name] + fraction * (new[name] - old[name]) for name in new}
 
 
 class Relaxed(Staggered):

@@ -140,16 +140,19 @@ class Implicit:
             answers.set_time(start + fraction * (time - start))
 
         answers.keeps = not answering
+        before, stage = self.state.unknown.x.array.copy(), "the step" if answering else "the change of the loads"
+        change = Change(time, stage, set_fraction, self.newton, halvings)
         try:
             set_fraction(1.0)
             loading.set(loads)
             work.add(self.newton.solve())
             work.substeps += 1
+            if change.look_back(before, work):
+                work.add(self.newton.solve())  # the cells that answer the unknowns: there is nothing else to do
         except SolveFailure as failure:
             work.add(failure)
             log.info("solving in parts: %s", failure.reason)
-            stage = "the step" if answering else "the change of the loads"
-            Change(time, stage, set_fraction, self.newton, halvings).advance(work, failure)
+            change.advance(work, failure)
             loading.set(loads)
             log.info("time %g solved in %d parts", time, work.substeps)
         finally:

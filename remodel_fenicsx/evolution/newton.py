@@ -11,11 +11,11 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from remodel_fenicsx.evolution.equilibrium import Equilibrium, Extension, Look
+from remodel_fenicsx.evolution.equilibrium import Equilibrium, Look
 from remodel_fenicsx.evolution.limits import Limits
-from remodel_fenicsx.evolution.linear import BY_METHOD, EveryTangent
+from remodel_fenicsx.evolution.linear import LINEAR_METHODS, EveryTangent
 from remodel_fenicsx.evolution.parameters import stress_rounding
-from remodel_fenicsx.evolution.solution import Solution, SolveFailure
+from remodel_fenicsx.evolution.solution import Solution, SolveFailure, failure_text
 from remodel_fenicsx.fem.petsc_options import ProblemOptions
 from remodel_fenicsx.fem.ranks import over_ranks
 from remodel_fenicsx.fem.solver_methods import AUTO, EXACT, LAGGED, SMALL, chosen, method_options
@@ -25,6 +25,7 @@ log = logging.getLogger(__name__)
 
 LINE_SEARCH_HALVINGS = 20  # of one Newton step, before the solve is given up
 ROUNDINGS = 8.0  # how many times the rounding of assembled forces a residual may be
+NOTICEABLE = 1e-3  # of the body's size: displacements that may be a jump; 1 % of the radius of a tube of this length
 ROUNDED_STRAINS = 2.0  # the same of the rounding of displacements; on thin walls 0.05 to 0.8 were measured
 MET = 1e-13  # of the body's size: prescribed values that are met to rounding
 PRESCRIBED_MET = 1e-10  # of the body's size: how far a prescribed displacement may be missed; no force measures it
@@ -56,15 +57,6 @@ class SolverSettings(Protocol):
 
     @property
     def petsc_options(self) -> Mapping[str, Any]: ...
-
-
-# by PETSc's SNESConvergedReason; numbers, for the names differ between its versions
-FAILURES = {
-    -3: "the linear solver failed",
-    -4: "forces or parameters are too large or too small for floating-point numbers",
-    -6: "the line search found no better state",
-    -9: "the residual grew beyond all bounds",
-}
 
 
 class GuardedNewton:
@@ -107,10 +99,10 @@ class GuardedNewton:
         self._area_of_gradients = equilibrium.quadrature.norm(areas * gradients)  # per displacement
         self._displacement = 0.0  # largest unknown of an admissible state
         self.on_the_way = False  # whether the solution is only the start of a further one: then it may be coarser
-        self._lost = False
-        self._gap = self._last_norm = np.inf
+        self._lost, self._gap, self._last_norm = False, np.inf, np.inf
         bounded = self.method == LAGGED and "snes_linesearch_type" not in self._options.given
         self.limits = Limits(equilibrium, bounded)
+        self._first: float | None = None  # length of the first Newton step of a solve
         self._looked = False  # whether the limits of the start are known
         self._spared = False  # whether the present trial is admissible by the bound alone
         self._options_checked = False
@@ -123,7 +115,7 @@ class GuardedNewton:
         self._most_iterations = snes.getTolerances()[3]  # the user's PETSc option may have changed it
         snes.setConvergenceTest(self._converged)
         self._snes: Any = snes
-        self._linear = BY_METHOD.get(self.method, EveryTangent)(equilibrium, snes, self._matrix, self._options)
+        self._linear = LINEAR_METHODS.get(self.method, EveryTangent)(equilibrium, snes, self._matrix, self._options)
 
     def close(self) -> None:
         """Free PETSc's objects and take the options out of its database; calling it again does nothing."""
@@ -164,9 +156,7 @@ class GuardedNewton:
                 try:
                     return self._attempt().after(failure)
                 except SolveFailure as again:
-                    again.newton_iterations += failure.newton_iterations
-                    again.linear_iterations += failure.linear_iterations
-                    again.tangents += failure.tangents
+                    again.count(failure)
                     raise
 
     def may_start(self) -> bool:
@@ -181,7 +171,7 @@ class GuardedNewton:
         # they may be others from solve to solve, not within one
         self._largest, self._rounding = self.equilibrium.parameters.largest(), (np.nan, 0.0)
         self._pull(self._x)
-        self._lost = self._spared = False
+        self._lost, self._spared, self._first = False, False, None
         if not self._looked:
             self.limits.forget()
         self._looked = False
@@ -198,11 +188,23 @@ class GuardedNewton:
                 raise Interrupted(extension.stop_signal)
             norm, tiny = float(self._snes.getFunctionNorm()), float(np.finfo(np.float64).tiny)
             left, relative = norm / max(self._tolerance(), tiny), norm / max(self._force_scale, tiny)
-            text, tangents = self._failure_text(reason, extension), self._linear.tangents - tangents
+            text, tangents = (
+                failure_text(0 if self._lost else reason, newton, extension),
+                self._linear.tangents - tangents,
+            )
             raise SolveFailure(text, newton, linear, extension, left, tangents, relative)
         self._linear.ended(newton)
         norm, tangents = float(self._snes.getFunctionNorm()), self._linear.tangents - tangents
-        return Solution(newton, linear, norm, tangents, extension)
+        return Solution(newton, linear, norm, tangents, extension, self._reach(self._values - start))
+
+    def _reach(self, change: Any) -> float:
+        """`Solution.reach` of a solve that has changed the unknowns so."""
+        comm, state = self.equilibrium.comm, self.equilibrium.state
+        largest = over_ranks(comm, np.abs(change).max(initial=0.0), MPI.MAX)
+        if not self._first or largest < NOTICEABLE * state.loading.domain.size:
+            return 0.0
+        owned = change[: state.number_of_owned_unknowns]
+        return float(np.sqrt(over_ranks(comm, owned @ owned, MPI.SUM))) / self._first
 
     def tangent_direction(self, set_fraction: Callable[[float], None], done: float, distance: float) -> Any:
         """Change of the unknowns per fraction of a change of the problem, at a solved state; one linear solve.
@@ -321,6 +323,8 @@ class GuardedNewton:
         method comes back only by a factor of 1.5 an iteration.
         """
         improved = self._linear.improve(x, self._snes.getFunction()[0], step, self._gap <= MET)
+        if self._first is None:
+            self._first = float(step.norm())
         self._spared = self.limits.bounded and self.limits.spare(np.sqrt(3) * step.norm(PETSc.NormType.NORM_INFINITY))
         if self._spared:
             return improved
@@ -344,8 +348,7 @@ class GuardedNewton:
         if not after.extension.admissible:
             return False
         near = after.extension.max_chain_extension > NEAR_LOCKING
-        stretches = before.stretches, after.stretches
-        if near and not self.equilibrium.keeps_reserve(*stretches, KEPT_RESERVE, NEAR_LOCKING):
+        if near and not self.equilibrium.keeps_reserve(before.stretches, after.stretches, KEPT_RESERVE, NEAR_LOCKING):
             return False
         return not self.equilibrium.turns_inside_out(before.states, after.states)
 
@@ -390,10 +393,3 @@ class GuardedNewton:
         if self._rounding[0] != self._rounds_at:
             self._rounding = self._rounds_at, stress_rounding(self._largest, self._rounds_at)
         return self._rounding[1]
-
-    def _failure_text(self, reason: int, extension: Extension) -> str:
-        if reason >= 0 or self._lost:
-            return f"reached r/L = {extension.max_chain_extension:.4f}, J = {extension.min_jacobian:.4g}"
-        if reason == PETSc.SNES.ConvergedReason.DIVERGED_MAX_IT:
-            return f"no equilibrium within {self._snes.getIterationNumber()} Newton iterations"
-        return FAILURES.get(reason, f"SNES stopped with reason {reason}")

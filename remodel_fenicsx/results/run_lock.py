@@ -10,7 +10,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import TracebackType
 
-from remodel_fenicsx.system.regular_files import open_own
+from remodel_fenicsx.results.recording import SCENE
+from remodel_fenicsx.system.regular_files import open_own, part_of
 
 LOCK = "run.lock"
 
@@ -117,14 +118,16 @@ def lock_holder(folder: Path) -> tuple[Process | None, bool]:
 
 
 def is_vacant(folder: Path) -> bool:
-    """Whether a folder is empty, or holds nothing but the lock of a process that was killed before it wrote anything.
+    """Whether a folder is empty, or holds only what a process leaves that is killed before its scene has its name.
 
     Raises
     ------
     OSError
         If that cannot be found out.
     """
-    return {entry.name for entry in folder.iterdir()} <= {LOCK} and not lock_holder(folder)[1]
+    return {entry.name for entry in folder.iterdir()} <= {LOCK, part_of(Path(SCENE)).name} and not lock_holder(folder)[
+        1
+    ]
 
 
 def _is_at(descriptor: int, path: Path) -> bool:

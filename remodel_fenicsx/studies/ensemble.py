@@ -15,7 +15,7 @@ from remodel_fenicsx.body.columns import columns_of
 from remodel_fenicsx.paper.output import COLOURS, STYLE, Page
 from remodel_fenicsx.scene.scene import Scene, SceneError
 from remodel_fenicsx.schema.times import same_time
-from remodel_fenicsx.studies.members import Member, Study, run_members
+from remodel_fenicsx.studies.members import LEAST, Member, Study, TooFewRuns, run_members
 from remodel_fenicsx.system.children import cores
 from remodel_fenicsx.system.environment import versions
 
@@ -128,7 +128,9 @@ def ensemble(
     Raises
     ------
     SceneError
-        If the scene has no random cells, if a folder holds another one, or if fewer than two runs reach the end.
+        If the scene has no random cells, or if a folder holds another one.
+    TooFewRuns
+        If fewer than two seeds reach the end.
     Interrupted
         If a signal asked for the end; the same call goes on from there.
     OSError
@@ -147,16 +149,13 @@ def gathered(members: list[Member], failed: dict[str, str]) -> Ensemble:
 
     Raises
     ------
-    SceneError
+    TooFewRuns
         If fewer than two seeds have reached the end.
     """
     histories = {member.name: member.history() for member in members if member.name not in failed}
     isotropic = dict(histories.pop(ISOTROPIC, {}))
-    if len(histories) < 2:
-        words = "; ".join(f"{name}: {text}" for name, text in failed.items())
-        raise SceneError(
-            f"{len(histories)} of {len(members) - 1} seeds reached the end, at least 2 are needed ({words})"
-        )
+    if len(histories) < LEAST:
+        raise TooFewRuns(f"{len(histories)} of {len(members) - 1} seeds reached the end", failed)
     first = next(iter(histories.values()))
     columns = {
         name: np.stack([history[name] for history in histories.values()]) for name in first if name not in NOT_COMPARED

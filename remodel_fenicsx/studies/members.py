@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import math
 import time as clock
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,6 +31,21 @@ from remodel_fenicsx.system.regular_files import check_no_link, make_own_folder,
 from remodel_fenicsx.system.terminal import Line
 
 POLL = 0.1  # seconds
+LEAST = 2  # runs, or settings, without which nothing is compared
+
+
+class TooFewRuns(Exception):  # noqa: N818 - what is recorded is whole, and the same call goes on
+    """Fewer than `LEAST` have reached the end, so that there is no answer yet.
+
+    Attributes
+    ----------
+    failed
+        Last words of runs that have failed, by name; empty where the study was only stopped early.
+    """
+
+    def __init__(self, reached: str, failed: Mapping[str, str], advice: str = "the same command goes on"):
+        super().__init__(f"{reached}, at least {LEAST} are needed; all that is recorded is kept, {advice}")
+        self.failed = dict(failed)
 
 
 @dataclass(frozen=True)

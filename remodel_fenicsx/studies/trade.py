@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import time as clock
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from remodel_fenicsx.body.profile import PROFILE
-from remodel_fenicsx.scene.scene import Scene, SceneError
+from remodel_fenicsx.scene.scene import Scene
 from remodel_fenicsx.schema.times import same_time
 from remodel_fenicsx.studies import trade_output
 from remodel_fenicsx.studies.convergence import typical
 from remodel_fenicsx.studies.estimates import Result, Trade, estimated
 from remodel_fenicsx.studies.ladder import Setting, as_run, compared_lengths, compared_times, ladder
-from remodel_fenicsx.studies.members import Member, Study, run_members
+from remodel_fenicsx.studies.members import LEAST, Member, Study, TooFewRuns, run_members
 from remodel_fenicsx.system.children import cores
 
 NAME = "trade"
@@ -53,7 +53,9 @@ def trade(
     Raises
     ------
     SceneError
-        If a folder holds another scene, or if fewer than two settings reach the end.
+        If a folder holds another scene.
+    TooFewRuns
+        If fewer than two settings reach the end; it says what a budget for two would be.
     Interrupted
         If a signal asked for the end: the same call goes on from there.
     OSError
@@ -72,9 +74,9 @@ def trade(
     runner = _Runner(settings, members, times, budget, say)
     failed = runner.run(jobs or cores(), Study(NAME, scene.name, place))
     results = runner.results()
-    if len(results) < 2:
-        words = "; ".join(f"{name}: {text}" for name, text in failed.items())
-        raise SceneError(f"{len(results)} settings reached the end within the budget, at least 2 are needed ({words})")
+    if len(results) < LEAST:
+        reached = f"{len(results)} of {len(settings)} settings reached the end within the budget of {budget:g} s"
+        raise TooFewRuns(reached, failed, runner.advice(LEAST - len(results), jobs or cores(), failed))
     rows, notes = estimated(results)
     done = {row.result.setting.name for row in rows}
     left = [name for name, runs in members.items() if name not in done and not any(run.name in failed for run in runs)]
@@ -109,11 +111,28 @@ class _Runner:
         """Of the settings all of whose runs have reached the end, the cheapest expected first."""
         return [self._results[setting.name] for setting in self.settings if setting.name in self._results]
 
+    def advice(self, number: int, jobs: int, failed: Mapping[str, str]) -> str:
+        """What the cheapest settings that are left would take, if so many are left."""
+        left = [
+            -(-len(self.members[setting.name]) // jobs) * self._expected(setting)
+            for setting in self.settings
+            if setting.name not in self._results and not any(run.name in failed for run in self.members[setting.name])
+        ]
+        if len(left) < number:
+            return "the same command tries again what has failed"
+        return (
+            f"a larger budget goes on; the cheapest {number} need about {sum(sorted(left)[:number]):.2g} s for their "
+            "steps, each process a few seconds for its start, and more where kernels are to be compiled"
+        )
+
+    def _expected(self, setting: Setting) -> float:
+        """Seconds of one of its runs, by what others have taken."""
+        return self._pace.get(setting.way, 1.0) * setting.expected_seconds
+
     def _fits(self, member: Member) -> bool:
         """Whether a run that begins now would end in time."""
         setting = next(setting for setting in self.settings if member in self.members[setting.name])
-        pace = self._pace.get(setting.way, 1.0)
-        return clock.monotonic() + pace * setting.expected_seconds < self.deadline
+        return clock.monotonic() + self._expected(setting) < self.deadline
 
     def _finished(self) -> None:
         """Read, say and learn from what is new."""

@@ -11,7 +11,7 @@ import re
 import shutil
 from pathlib import Path
 
-import remodel_fenicsx
+from remodel_fenicsx._version import __version__
 from remodel_fenicsx.system.interrupts import take_back_signals
 
 OLDEST_DOLFINX = (0, 9)
@@ -27,7 +27,7 @@ def versions() -> dict[str, str]:
     from petsc4py import PETSc
 
     return {
-        "remodel_fenicsx": remodel_fenicsx.__version__,
+        "remodel_fenicsx": __version__,
         "dolfinx": dolfinx.__version__,
         "ufl": importlib.metadata.version("fenics-ufl"),
         "PETSc": ".".join(map(str, PETSc.Sys.getVersion())),

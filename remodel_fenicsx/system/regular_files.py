@@ -117,6 +117,11 @@ def check_still_there(descriptor: int, path: Path, lost: str) -> None:
         raise FileNotFoundError(errno.ENOENT, f"the file was deleted during the run; lost: {lost}", str(path))
 
 
+def part_of(path: Path) -> Path:
+    """Where a file is written before it gets its name."""
+    return path.with_name(f"{path.name}.part")
+
+
 def write_whole(path: Path, data: bytes) -> None:
     """Make or replace a file: written beside it, brought to the disk, then renamed. A link in its place is replaced.
 
@@ -127,7 +132,7 @@ def write_whole(path: Path, data: bytes) -> None:
     OSError
         If it cannot be written (disk full); the old file, if there was one, is still there.
     """
-    part = path.with_name(f"{path.name}.part")
+    part = part_of(path)
     part.unlink(missing_ok=True)  # of a run that was killed
     try:
         with open(open_own(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL), "wb", buffering=0) as file:
