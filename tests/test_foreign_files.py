@@ -666,3 +666,14 @@ def test_no_step_after_the_end() -> None:
     with pytest.raises(RuntimeError, match="has been closed"):
         next(simulation.steps())
     simulation.close()
+
+
+def test_a_flipped_bit_in_the_places_of_values_is_noticed(folder: Path) -> None:
+    """Times and offsets have no check sum of their own: they follow from the numbers of nodes, elements and steps."""
+    for name, wrong in (("Steps/Values", -1.0), ("Steps/PointDataOffsets/displacement", 7)):
+        copy = folder.with_name("copy.vtkhdf")
+        shutil.copy(folder / "fields.vtkhdf", copy)
+        with h5py.File(copy, "r+") as file:
+            file[f"VTKHDF/{name}"][2] = wrong
+        with pytest.raises(ValueError, match="is damaged"):
+            check_file(copy)

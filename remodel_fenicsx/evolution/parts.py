@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from remodel_fenicsx.evolution.blend import KEPT_RESERVE
 from remodel_fenicsx.evolution.equilibrium import Extension
 from remodel_fenicsx.evolution.memory import Numbers
-from remodel_fenicsx.evolution.newton import GuardedNewton, Solution, SolveFailure
+from remodel_fenicsx.evolution.newton import NOTICEABLE, GuardedNewton, Solution, SolveFailure
 from remodel_fenicsx.evolution.refusals import BIFURCATION, LIMIT_POINT, SEVERAL_SOLUTIONS, Refusal, diagnosed
 from remodel_fenicsx.evolution.solution import FAR
 from remodel_fenicsx.fem.ranks import over_ranks
@@ -193,6 +193,16 @@ class Change:
         unknown[:] = before
         return bound
 
+    def look_back(self, before: NDArray[np.float64], work: Work) -> bool:
+        """After a step: whether it has ended far from its tangent, or far from the step before, and was looked into."""
+        unknown, last = self.newton.unknown.x.array, self._jumps["moved"]
+        moved, least = self._size(unknown - before), NOTICEABLE * self.newton.equilibrium.state.loading.domain.size
+        is_far = work.is_far or (last > 0.0 and moved > max(least, FASTER * last))
+        if is_far:
+            self.confirm(before, work)
+        self._jumps["moved"] = self._size(unknown - before)
+        return is_far
+
     def confirm(self, before: NDArray[np.float64], work: Work) -> None:
         """Go the way again in parts, from the unknowns before it, where the whole was solved far from its tangent.
 
@@ -244,7 +254,7 @@ class Change:
 
     @property
     def _jumps(self) -> Numbers:
-        return Numbers(self.newton.equilibrium.state, "jumps", {"found": 0})
+        return Numbers(self.newton.equilibrium.state, "jumps", {"found": 0, "moved": 0})
 
     def _jumped(self, solved: NDArray[np.float64], refusal: Refusal) -> None:
         """Say that there is no way to what was solved; unknowns and loads are those where the way ends."""
