@@ -25,7 +25,6 @@ from remodel_fenicsx.results.recording import (
     read_history,
 )
 from remodel_fenicsx.results.run_lock import lock_holder
-from remodel_fenicsx.schema.tables import printable
 from remodel_fenicsx.schema.times import same_time
 from remodel_fenicsx.system.arguments import MOST
 from remodel_fenicsx.system.regular_files import ForeignFileError, read_regular

@@ -112,7 +112,7 @@ class Member:
         names = [column.name for column in columns_of(scene.geometry, scene.output.columns, scene.loads)]
         is_fixed = scene.time.tolerance is None and not scene.time.is_equilibrium
         rows = scene.time.number_of_steps + 1 if is_fixed else len(times)
-        return list(history) == names and len(times) == rows and bool((np.diff(times) > 0).all())
+        return set(names) <= set(history) and len(times) == rows and bool((np.diff(times) > 0).all())
 
     def history(self) -> HistoryColumns:
         """What it has recorded."""
