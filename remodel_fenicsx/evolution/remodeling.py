@@ -26,6 +26,8 @@ Array = NDArray[np.float64]
 RESIDUAL_SHARE = 20.0  # an eighth of an element's nodes share a face's force; a pulled-back stress is larger still
 ROUNDINGS = 64.0  # how many times the rounding of a stress its principal values may be off
 
+AWAKE = 0.5  # of the speed of remodeling under tension alone
+
 
 class RemodelingSettings(Protocol):
     """How the cells follow the load (`scene.parameters.Remodeling`)."""
@@ -147,6 +149,14 @@ class RemodelingPass:
         drive, target = self.drive(residual), self.law.target
         assert target is not None
         return TensorKernels(self.state.comm).target(drive) if target is tensor_target else target(drive)
+
+    def without_tension(self, residual: float = 0.0) -> NDArray[np.bool_]:
+        """Of all points in one row: those without tension, or with hardly any beside compression. Cells there stay."""
+        drive = self.drive(residual)
+        if self.law.target is not None:
+            return np.asarray(self.target(residual).share < AWAKE)
+        values = np.linalg.eigvalsh(drive.tensor)
+        return ~spectral.positive_direction(values, threshold=drive.threshold)[1]
 
     def followed(self, target: Target, duration: float, cells: UnitCell | None = None) -> UnitCell:
         """Cells of all points in one row, the present or others, after a time with this target. Changes nothing."""
