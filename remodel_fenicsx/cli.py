@@ -9,21 +9,33 @@ import shlex
 import sys
 import time as clock
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-import remodel_fenicsx
+from remodel_fenicsx._version import __version__
 from remodel_fenicsx.body.reductions import explained
 from remodel_fenicsx.system import interrupts
 from remodel_fenicsx.system.arguments import positive, wall_time
+from remodel_fenicsx.system.children import SERVE, serve
 from remodel_fenicsx.system.environment import reason_undrawable, reason_unusable, versions
+from remodel_fenicsx.system.regular_files import ForeignFileError
 from remodel_fenicsx.scene.parameters import PRESETS
 from remodel_fenicsx.scene.profiles import PROFILES
 from remodel_fenicsx.scene.scene import Scene, SceneError, preset_scene, read_scene
 from remodel_fenicsx.schema.tables import printable
 
 BAD_INPUT, SOLVE_FAILED, STOPPED, BAD_ENVIRONMENT = 2, 3, interrupts.PAUSED, 5
+EXIT_CODES = {
+    0: "finished",
+    BAD_INPUT: "bad input",
+    SOLVE_FAILED: "the solve failed",
+    STOPPED: "stopped on purpose",
+    BAD_ENVIRONMENT: "environment not usable",
+    129: "hung up",
+    130: "interrupted",
+    143: "terminated",
+}
 
 
 class _Parser(argparse.ArgumentParser):
@@ -38,10 +50,9 @@ def parser() -> argparse.ArgumentParser:
     main_parser = _Parser(
         prog="remodel-fenicsx",
         description="Predict how collagen in living tissue reorients under load (Kuhl & Holzapfel 2007).",
-        epilog="exit codes: 0 finished, 2 bad input, 3 the solve failed, 4 stopped on purpose, 5 environment not "
-        "usable, 129/130/143 interrupted",
+        epilog="exit codes: " + ", ".join(f"{code} {meaning}" for code, meaning in EXIT_CODES.items()),
     )
-    main_parser.add_argument("--version", action="version", version=remodel_fenicsx.__version__)
+    main_parser.add_argument("--version", action="version", version=__version__)
     commands = main_parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     def scene_command(name: str, text: str, resumes: bool = False) -> argparse.ArgumentParser:
@@ -120,12 +131,13 @@ def parser() -> argparse.ArgumentParser:
     )
     figures.add_argument("--stamp", action="store_true", help="show in each picture what it was made with")
     figures.add_argument("--jobs", type=int, metavar="N", help="runs at a time (default: as many as there are cores)")
+    commands.add_parser(SERVE)  # of the processes of a study; not listed
     commands.add_parser("info", help="Print versions, solvers and BLAS.", description="Print versions and solvers.")
     return main_parser
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit code of docs/commands.md (0, 2, 3, 4, 5, 129, 130, 143)."""
+    """Run the command line; returns the exit code, one of `EXIT_CODES`."""
     with interrupts.ending_at_once():
         options = _parsed(arguments)
         try:
@@ -214,6 +226,8 @@ def _run(options: argparse.Namespace, task: Callable[..., Path] | None = None) -
         if options.output and isinstance(error, (FileExistsError, NotADirectoryError)):  # lies in a file, or just taken
             text = f"-o {options.output}: {error.filename}: {error.strerror}; allowed is a new or an empty folder"
             return _end_all(text, BAD_INPUT)
+        if isinstance(error, ForeignFileError):
+            return _end_all(f"{error.filename}: {error.strerror}", BAD_INPUT)
         return _end_all(f"cannot write the results: {error}", BAD_ENVIRONMENT)
     except Exception:
         traceback.print_exc()
@@ -229,8 +243,8 @@ def _stability(options: argparse.Namespace) -> int:
     def analyse(scene: Scene, folder: Path | None, quiet: bool) -> Path:
         from remodel_fenicsx.stability import in_words, stability
 
-        place, table = stability(scene, folder, options.times, quiet=quiet)
-        _say(in_words(table))
+        place, table, unseen = stability(scene, folder, options.times, quiet=quiet)
+        _say(in_words(table, unseen))
         return place
 
     return _run(options, analyse)
@@ -241,18 +255,32 @@ def _study(options: argparse.Namespace, task: Callable[[Scene], tuple[Path, str,
     scene = read_scene(options.scene, options.set, options.profile)
     if reason := reason_unusable() or reason_undrawable():
         return _fail(f"the environment is not usable: {reason}; run through ./with-fenicsx", BAD_ENVIRONMENT)
+    from remodel_fenicsx.paper.errors import FigureError
+    from remodel_fenicsx.studies.members import TooFewRuns
+
     try:
         with interrupts.StopRequest(), interrupts.stopping_at_once():
             folder, words, failed = task(scene)
+    except TooFewRuns as early:
+        _complain_of(early.failed)
+        return _fail(str(early), SOLVE_FAILED if early.failed else STOPPED)
+    except FigureError as refusal:  # a picture or a table of somebody else's stands in its place
+        return _fail(str(refusal), refusal.exit_code)
     except interrupts.Interrupted as interruption:
         return _fail("stopped; all that is recorded is kept, the same command goes on", interruption.exit_code)
+    except ForeignFileError as error:
+        return _fail(f"{error.filename}: {error.strerror}", BAD_INPUT)
     except OSError as error:
         return _fail(f"cannot write the results: {error}", BAD_ENVIRONMENT)
     _say(words)
     _say(f"results in {folder}")
+    _complain_of(failed)
+    return SOLVE_FAILED if failed else 0
+
+
+def _complain_of(failed: Mapping[str, str]) -> None:
     for name, last_words in failed.items():
         _complain(f"{name} has failed: {last_words}")
-    return SOLVE_FAILED if failed else 0
 
 
 def _ensemble(options: argparse.Namespace) -> int:
@@ -297,9 +325,11 @@ def _status(options: argparse.Namespace) -> int:
         lines = status(options.folder)
     except (RecordingError, CheckpointError) as error:
         return _fail(str(error), BAD_INPUT)
+    except ForeignFileError as error:
+        return _fail(f"{error.filename}: {error.strerror}", BAD_INPUT)
     except OSError as error:
         return _fail(f"{options.folder}: cannot be read: {error.strerror}", BAD_ENVIRONMENT)
-    _say("\n".join(lines))
+    _say("\n".join(map(printable, lines)))
     return 0
 
 
@@ -384,6 +414,7 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
     "new": _new,
     "figures": _figures,
     "info": _info,
+    SERVE: lambda options: serve(main),
 }
 
 

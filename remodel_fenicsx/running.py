@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import tomllib
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar, cast
@@ -18,8 +18,17 @@ from remodel_fenicsx.evolution.stepper import Step, Watcher
 from remodel_fenicsx.results.checkpoint import Checkpoints, restore_state
 from remodel_fenicsx.results.checkpoint_file import Checkpoint, CheckpointError, read_checkpoint
 from remodel_fenicsx.results.fields import Fields, field_names
-from remodel_fenicsx.results.recording import SCENE, RecordingError
-from remodel_fenicsx.results.run_folder import FolderTaken, LastStep, RunFolder, chosen_folder, forget_steps, locked
+from remodel_fenicsx.results.recording import LOG, SCENE, RecordingError
+from remodel_fenicsx.results.run_folder import (
+    FolderTaken,
+    LastStep,
+    RunFolder,
+    check_kept,
+    chosen_folder,
+    forget_steps,
+    locked,
+)
+from remodel_fenicsx.results.status import BEGUN, FAILED, STOPPED
 from remodel_fenicsx.scene import Scene, SceneError, read_scene, scene_from_dict
 from remodel_fenicsx.scene.continuation import check_continuation
 from remodel_fenicsx.simulation import Simulation
@@ -142,7 +151,7 @@ def _kept(place: Path, overrides: Sequence[str], comm: MPI.Intracomm) -> tuple[S
             scene = read_scene(place / SCENE, overrides)
             checkpoint = read_checkpoint(place)
             if checkpoint is not None:
-                check_continuation(scene_from_dict(tomllib.loads(checkpoint.scene)), scene, checkpoint.time)
+                check_continuation(_scene_of(checkpoint), scene, checkpoint.time)
                 _say_where(checkpoint)
             else:
                 log.info("no checkpoint yet: starts again at t = 0")
@@ -152,6 +161,13 @@ def _kept(place: Path, overrides: Sequence[str], comm: MPI.Intracomm) -> tuple[S
     if refusal is not None:
         raise refusal
     return comm.bcast(scene), checkpoint
+
+
+def _scene_of(checkpoint: Checkpoint) -> Scene:
+    try:
+        return scene_from_dict(tomllib.loads(checkpoint.scene))
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raise CheckpointError(f"the checkpoint's scene is not TOML: {error}") from error
 
 
 def _say_where(checkpoint: Checkpoint) -> None:
@@ -205,15 +221,18 @@ def _record(simulation: Simulation, place: Path, around: _Circumstances) -> None
     text = scene.to_toml(header)
     columns = [column.name for column in simulation.observer.columns]
     after = LastStep(columns, state.number, state.time) if state.number else None
-    if around.resumes and after is None and comm.rank == 0:
-        forget_steps(place)
+    if around.resumes:
+        wanted = bool(scene.output.fields)
+        _agreed(comm, lambda: check_kept(place, after, wanted) if comm.rank == 0 else None)
+        if after is None and comm.rank == 0:
+            forget_steps(place)
     with ExitStack() as stack:
         record = stack.enter_context(_agreed(comm, lambda: RunFolder(place, text, comm.rank, after)))
-        stack.enter_context(open_log(place / "run.log", comm.rank, quiet=around.quiet, held=around.held))
+        stack.enter_context(open_log(place / LOG, comm.rank, quiet=around.quiet, held=around.held))
         steps = scene.time.number_of_steps if simulation.control else state.number + len(simulation.remaining())
         rank, done = -1 if around.quiet else comm.rank, scene.time.progress(state.number, state.time)
         progress = stack.enter_context(Progress(steps, scene.name, rank, done=done))
-        log.info("scene %s on %d ranks, results in %s", scene.name, comm.size, place)
+        log.info(BEGUN + "%s on %d ranks, results in %s", scene.name, comm.size, place)
         log.info("%s", scene.summary())
         for warning in scene.warnings():
             log.warning("%s", warning)
@@ -231,9 +250,16 @@ def _record(simulation: Simulation, place: Path, around: _Circumstances) -> None
             for _ in simulation.steps(watchers):
                 pass
         except (StepFailure, Interrupted, Paused) as reason:
-            log.info("ended: %s", reason)
+            if isinstance(reason, StepFailure):
+                log.info(FAILED + "%s. %s", reason, reason.refusal)
+            else:
+                log.info(STOPPED + "%s", reason)
             if getattr(reason, "on_all_ranks", True):
                 checkpoints.write()
+            raise
+        except Exception as defect:
+            with suppress(OSError):  # the disk may be full
+                log.info(FAILED + "%s: %s", type(defect).__name__, defect)
             raise
         log.info("finished")
 

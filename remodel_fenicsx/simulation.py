@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -12,14 +11,16 @@ from mpi4py import MPI
 
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.loading import Loading, LoadValues
-from remodel_fenicsx.body import Shape
+from remodel_fenicsx.body.columns import columns_of
 from remodel_fenicsx.body.reductions import AUTO, choice, explained
+from remodel_fenicsx.evolution.buckling import BucklingWarning
 from remodel_fenicsx.evolution.chatter import Chatter
 from remodel_fenicsx.evolution.coupling import Coupling, Maker
-from remodel_fenicsx.evolution.homeostasis import ITERATIONS, LONGEST, TOLERANCE, Homeostasis, Limit
+from remodel_fenicsx.evolution.homeostasis import COARSE, ITERATIONS, LONGEST, TOLERANCE, Homeostasis, Limit
 from remodel_fenicsx.evolution.locking import LockingWarning
 from remodel_fenicsx.evolution.monitor import StabilityWatcher
 from remodel_fenicsx.evolution.newton import SolverSettings
+from remodel_fenicsx.evolution.radial_chains import RadialChains
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
 from remodel_fenicsx.evolution.resting import Resting
 from remodel_fenicsx.evolution.state import State
@@ -27,12 +28,12 @@ from remodel_fenicsx.evolution.step_control import StepControl
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher, times
 from remodel_fenicsx.evolution.time_error import TimeError
 from remodel_fenicsx.evolution.unit_cells import UnitCells
+from remodel_fenicsx.evolution.volume import VolumeLoss
 from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.fem.free_length import FreeLength
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.fem.quadrature import Quadrature
-from remodel_fenicsx.results.columns import COLUMNS_ON_REQUEST, Observer, columns_of, without_free_length
-from remodel_fenicsx.results.fields import field_names
+from remodel_fenicsx.results.columns import Observer
 from remodel_fenicsx.scene import Scene, SceneError
 from remodel_fenicsx.system.interrupts import take_back_signals
 from remodel_fenicsx.tissue.energy import Tissue
@@ -62,15 +63,22 @@ class Simulation:
     control
         Chooses the steps, where the scene has a tolerance.
     stability, warnings
-        Watchers of stability, over-correction and locking; what they remember is part of the state.
+        Watchers of stability, over-correction, locking, volume, and chains that point out of the wall; what they
+        remember is part of the state.
 
     Raises
     ------
     SceneError
         If `domain` is not a mesh of the scene's body and elements.
+    TypeError
+        If `scene` is none.
     """
 
     def __init__(self, scene: Scene, comm: MPI.Intracomm = MPI.COMM_WORLD, domain: Domain | None = None):
+        if not isinstance(scene, Scene):
+            raise TypeError(
+                f"not a Scene: {scene!r}; read_scene(PATH) makes one of a file, preset_scene one of a preset"
+            )
         take_back_signals()
         if scene.model.kinematics == AUTO and domain is None and comm.rank == 0:
             for line in explained(scene):
@@ -100,19 +108,21 @@ class Simulation:
         self.tissue = self.stepper.tissue
         counted = "negative_eigenvalues" in scene.output.columns
         self.stability = StabilityWatcher(self.stepper, scene.solver.unstable, every_step=counted)
-        field_names(scene.output.fields)
-        columns = list(checked_columns(scene.output.columns, shape))
+        columns = list(scene.output.columns)
         self.control: StepControl | None = None
         if scene.time.tolerance is not None and not at_once:
             settings = scene.time.tolerance, scene.time.step, scene.stops()
-            self.control = StepControl(self.stepper, shape.fibre_angle, *settings)
+            self.control = StepControl(self.stepper, *settings)
             columns += [TIME_ERROR] if TIME_ERROR not in columns else []
         elif TIME_ERROR in columns:
-            self.stepper.judge = TimeError(self.stepper, shape.fibre_angle).measure
-        wanted = without_free_length(columns_of(shape, columns), shape, scene.loads)
-        self.observer = Observer(shape, self.stepper, wanted)
-        locks = formulation.locks(scene.mesh.element, scene.mesh.degree)
-        self.warnings: list[Watcher] = [LockingWarning(self.stepper, locks)]
+            self.stepper.judge = TimeError(self.stepper).measure
+        self.observer = Observer(shape, self.stepper, columns_of(shape, columns, scene.loads))
+        self.warnings: list[Watcher] = [
+            LockingWarning(self.stepper, formulation.locks),
+            BucklingWarning(self.stepper, shape.strut(scene.supports.ends)),
+            VolumeLoss(self.stepper),
+            RadialChains(self.stepper, shape.radial_share),
+        ]
         if self.stepper.remodeling.law.remodels and not at_once:
             chatter = Chatter(self.stepper)
             self.warnings.insert(0, chatter)
@@ -125,10 +135,10 @@ class Simulation:
         settings, tolerance = scene.remodeling, scene.time.tolerance or TOLERANCE
         if scene.cells.initial == "random" and LAWS[settings.law].dimensions is not None:
             # cells that jump from rank to rank: no step is short enough, and passes swing
-            settings, tolerance = settings.model_copy(update={"coupling": "relaxed"}), math.inf
+            settings, tolerance = settings.model_copy(update={"coupling": "relaxed"}), COARSE
         way = Stepper(self.state, tissue, settings, solver, self.load_values)
         way.coupling.longest = min(way.coupling.longest, LONGEST)
-        control = StepControl(way, scene.geometry.fibre_angle, tolerance, scene.time.step, stops)
+        control = StepControl(way, tolerance, scene.time.step, stops)
         until = scene.solver.model_copy(update={"maximum_iterations": ITERATIONS})
 
         def make(state: State, tissue: Tissue, remodeling: RemodelingPass, solver: SolverSettings) -> Coupling:
@@ -173,23 +183,6 @@ class Simulation:
         """Free PETSc's objects and options."""
         self.stability.close()
         self.stepper.close()
-
-
-def checked_columns(names: Sequence[str], shape: Shape) -> Sequence[str]:
-    """The names, if they are columns of the shape that a scene may ask for.
-
-    Raises
-    ------
-    SceneError
-        If one is not; one line that names the key.
-    """
-    for name in names:
-        known = [*COLUMNS_ON_REQUEST, *(column.name for column in columns_of(shape))]
-        if name not in known:
-            raise SceneError(
-                f"output.columns = {name!r}: no such column on request; allowed are {', '.join(map(repr, known))}"
-            )
-    return names
 
 
 def with_kinematics(scene: Scene, domain: Domain | None = None) -> Scene:

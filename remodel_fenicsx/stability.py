@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib import rc_context
@@ -13,18 +14,20 @@ from matplotlib.figure import Figure
 from mpi4py import MPI
 
 from remodel_fenicsx.evolution.amplification import SHARE_NAMES, AmplificationWatcher, Mode
+from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.paper.output import COLOURS, STYLE, Page
 from remodel_fenicsx.results.run_folder import RunFolder, chosen_folder
 from remodel_fenicsx.scene import Scene, SceneError
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.system.environment import versions
 from remodel_fenicsx.system.interrupts import StopRequest, end_all_ranks_on_exception
-from remodel_fenicsx.system.terminal import Progress, open_log
+from remodel_fenicsx.system.terminal import Progress, hold_log, open_log
 from remodel_fenicsx.tissue.laws import LAWS
 
 log = logging.getLogger(__name__)
 
 NAME = "stability"
+GROWS = 1.001  # factor: changes that no pass touches, where tension is missing, keep their size to what was iterated
 LONG_SCALE = -12.0  # lowest factor that is drawn on a linear scale
 Table = dict[str, list[float]]
 
@@ -35,7 +38,7 @@ def stability(
     number: int = 10,
     comm: MPI.Intracomm = MPI.COMM_WORLD,
     quiet: bool = True,
-) -> tuple[Path, Table]:
+) -> tuple[Path, Table, str]:
     """Run a scene and analyse the stability of its passes on the way.
 
     Parameters
@@ -53,7 +56,8 @@ def stability(
 
     Returns
     -------
-    The folder with stability.csv, stability.png, history.csv, scene.toml and run.log; and the columns of stability.csv.
+    The folder with stability.csv, stability.png, history.csv, scene.toml and run.log; the columns of stability.csv; and
+    what the kinematics cannot see, in a sentence, nothing where it sees all.
 
     Raises
     ------
@@ -67,7 +71,8 @@ def stability(
     if scene.time.tolerance is not None and not scene.time.is_equilibrium:
         raise SceneError(f"time.tolerance = {scene.time.tolerance:g}: the analysis is one of equal steps; leave it out")
     end_all_ranks_on_exception()
-    simulation = Simulation(scene, comm)
+    with hold_log(comm.rank, quiet=quiet) as held:
+        simulation = Simulation(scene, comm)
     scene = simulation.scene  # with the kinematics that was chosen
     place = chosen_folder(folder, f"{scene.name}-{NAME}", comm)
     steps, share = scene.time.number_of_steps, simulation.stepper.coupling.share
@@ -77,16 +82,45 @@ def stability(
         stop = stack.enter_context(StopRequest())
         simulation.stepper.stop_signal = lambda: stop.number
         record = stack.enter_context(RunFolder(place, scene.to_toml("as analysed: all values"), comm.rank))
-        stack.enter_context(open_log(place / "run.log", comm.rank, quiet=quiet))
+        stack.enter_context(open_log(place / "run.log", comm.rank, quiet=quiet, held=held))
+        _say(
+            comm,
+            "analysing %s at %d of %d steps, kinematics %r",
+            scene.name,
+            len(chosen),
+            steps,
+            scene.model.kinematics,
+        )
+        if unseen := unseen_by(scene):
+            _say(comm, "%s", unseen)
         progress = stack.enter_context(Progress(steps, f"{scene.name} {NAME}", -1 if quiet else comm.rank))
         try:
             for step in simulation.steps([analysis, record]):
                 progress.step(step.number, step.time, "", step.work.newton_iterations, None)
+                if step.number in chosen:
+                    found = _factor(analysis.found[-1].reversing)
+                    _say(comm, "time %g: a pass multiplies the worst small change by %.3g", step.time, found)
         finally:
             if comm.rank == 0 and analysis.found:  # of a run that ends early too
                 draw(as_table(analysis, share), place, scene, share)
         simulation.close()
-    return place, as_table(analysis, share)
+    return place, as_table(analysis, share), unseen
+
+
+def unseen_by(scene: Scene) -> str:
+    """What an analysis on the scene's kinematics does not see, in a sentence; nothing where it sees all."""
+    name = scene.model.kinematics
+    if not KINEMATICS[name].reduced:
+        return ""
+    return (
+        f"kinematics {name!r} sees changes that keep its symmetry only: passes of the whole body may multiply others "
+        "by more, and the body may buckle; model.kinematics = 'full' sees all"
+    )
+
+
+def _say(comm: MPI.Intracomm, *message: Any) -> None:
+    if comm.rank == 0:
+        log.info(*message)
 
 
 def as_table(analysis: AmplificationWatcher, share: float) -> Table:
@@ -110,13 +144,38 @@ def _factor(mode: Mode | None) -> float:
     return np.nan if mode is None else mode.factor
 
 
-def in_words(table: Table) -> str:
-    """The table for a terminal."""
+def in_words(table: Table, unseen: str = "") -> str:
+    """The table for a terminal, and what the analysis does not see."""
     names = ("time", "factor", "factor_of_coupling", "stable_share", "x", "y", "z", "volume_share", *SHARE_NAMES)
     lines = [" ".join(f"{name:>{max(8, len(name))}}" for name in names)]
     for row in range(len(table["time"])):
         lines.append(" ".join(f"{table[name][row]:{max(8, len(name))}.3g}" for name in names))
-    return "\n".join(lines)
+    return "\n".join([*lines, verdict(table), *([unseen] if unseen else [])])
+
+
+def verdict(table: Table) -> str:
+    """The answer in a sentence: whether passes with the scene's coupling make small changes smaller."""
+    times, factors, growing = (np.array(table[name]) for name in ("time", "factor_of_coupling", "growing_factor"))
+    unknown = ~np.isfinite(table["factor"])
+    swings, grows = factors < -1, growing > GROWS
+    if swings.any():
+        worst, share = int(np.nanargmin(factors)), np.nanmin(table["stable_share"])
+        return (
+            f"Unstable: passes over-correct at {swings.sum()} of {len(times)} times, first at {times[swings][0]:g}; "
+            f"the worst multiplies a small change by {factors[worst]:.3g} at time {times[worst]:g}. The coupling "
+            f"'relaxed' with a relaxation_factor below {share:.2g} does not."
+        )
+    if grows.any():
+        worst = int(np.nanargmax(growing))
+        return (
+            f"Unstable: at {grows.sum()} of {len(times)} times a small change of the cells grows from pass to pass "
+            f"without swinging, first at {times[grows][0]:g}; by {growing[worst]:.3g} at time {times[worst]:g}."
+        )
+    if unknown.any():
+        return f"Not known: at {unknown.sum()} of {len(times)} times no mode was found (run.log); stable at all others."
+    return (
+        f"Stable: at all {len(times)} times a pass makes small changes of the cells smaller, or keeps them as they are."
+    )
 
 
 def draw(table: Table, folder: Path, scene: Scene, share: float) -> None:

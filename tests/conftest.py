@@ -39,7 +39,7 @@ def slowly(*cases: Any) -> list[Any]:
 def forked_children() -> Iterator[None]:
     """Within, the runs that figures, ensembles and trades start are forked, one after the other."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(children, "subprocess", SimpleNamespace(Popen=ForkedChild, DEVNULL=subprocess.DEVNULL))
+        patch.setattr(children, "subprocess", SimpleNamespace(**vars(subprocess) | {"Popen": ForkedChild}))
         yield
 
 

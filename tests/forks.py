@@ -21,7 +21,9 @@ import time
 import traceback
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
+
+from remodel_fenicsx.system.children import SERVE
 
 # before a program: a mesh of few elements for every tube
 COARSE = "import sys, remodel_fenicsx.body; sys.modules['remodel_fenicsx.body.tube'].PAPER = (8, 4, 1)\n"
@@ -102,15 +104,35 @@ def end_forks() -> None:
 class ForkedChild:
     """Stands for subprocess.Popen in `remodel_fenicsx.system.children`, for commands that nobody stops."""
 
-    def __init__(self, command: Sequence[str], stdout: IO[str], **_: Any):
+    def __init__(self, command: Sequence[str], stdout: Any, **_: Any):
         words = command[command.index("remodel_fenicsx.cli") + 1 :]
+        self.returncode: int | None = None
+        if words == [SERVE]:  # a worker, which is asked for one command after the other
+            answers, self._answers = os.pipe()
+            self.stdin, self.stdout = self, os.fdopen(answers)
+            return
         done = forked("remodel-fenicsx", *words)
         stdout.write(done.stdout + done.stderr)
         self.returncode = done.returncode
 
-    def poll(self) -> int:
-        """It has ended."""
+    def write(self, request: str) -> None:
+        """Do what a worker is asked for, and answer."""
+        words, messages = json.loads(request)
+        done = forked("remodel-fenicsx", *words)
+        Path(messages).write_text(done.stdout + done.stderr)
+        os.write(self._answers, f"{done.returncode}\n".encode())
+
+    def close(self) -> None:
+        """Nothing is asked for any more."""
+        os.close(self._answers)
+        self.returncode = 0
+
+    def poll(self) -> int | None:
+        """Whether it has ended."""
         return self.returncode
+
+    def wait(self, timeout: float) -> None:
+        """It has ended."""
 
 
 # ---------------------------------------------------------------- the process itself

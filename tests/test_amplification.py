@@ -17,6 +17,7 @@ from remodel_fenicsx.evolution.amplification import AmplificationWatcher, Linear
 from remodel_fenicsx.evolution.stepper import Step, Watcher
 from remodel_fenicsx.scene import preset_scene
 from remodel_fenicsx.simulation import Simulation
+from remodel_fenicsx.stability import verdict
 from remodel_fenicsx.tissue.cells import structure_tensor
 from tests.conftest import mpirun
 from tests.test_chatter import Tilt
@@ -117,7 +118,8 @@ def test_the_command_writes_table_and_picture(tmp_path: Path, capsys: pytest.Cap
     assert (folder / "stability.png").read_bytes().startswith(b"\x89PNG")
     assert {"history.csv", "scene.toml", "run.log"} <= {path.name for path in folder.iterdir()}
     printed = capsys.readouterr().out.splitlines()
-    assert printed[0].split()[:3] == ["time", "factor", "factor_of_coupling"] and len(printed) == 4
+    assert printed[0].split()[:3] == ["time", "factor", "factor_of_coupling"] and len(printed) == 5
+    assert printed[3].startswith("Unstable: passes over-correct at 1 of 2 times, first at 14; ")
     assert main(["stability", *arguments]) == 2  # the folder is taken
     assert main(["stability", str(scene), "--set", "remodeling.law=none", "-o", str(tmp_path / "none")]) == 2
     assert "nothing remodels" in capsys.readouterr().err and not (tmp_path / "none").exists()
@@ -137,3 +139,26 @@ def test_two_ranks_find_the_same_factor(tmp_path: Path) -> None:
         assert done.returncode == 0, done.stderr[-2000:]
         found.append(read(folder)["factor"][0])
     assert found[1] == pytest.approx(found[0], rel=1e-2) and found[0] < -1.0
+
+
+def table(factors: list[float], growing: float = 0.5, share: float = 1.0) -> dict[str, list[float]]:
+    """Of an analysis at times 1, 2, ..."""
+    return {
+        "time": [float(number + 1) for number in range(len(factors))],
+        "factor": factors,
+        "factor_of_coupling": [1 - share * (1 - factor) for factor in factors],
+        "stable_share": [min(1.0, 2 / (1 - min(factor, 0.0))) for factor in factors],
+        "growing_factor": [growing] * len(factors),
+    }
+
+
+@pytest.mark.parametrize(("found", "words"), [
+    (table([-0.5, 0.2, -0.99]), "Stable: at all 3 times"),
+    (table([-0.5, -1.5, -3.0]), "Unstable: passes over-correct at 2 of 3 times, first at 2; the worst multiplies a "
+     "small change by -3 at time 3. The coupling 'relaxed' with a relaxation_factor below 0.5 does not."),
+    (table([-0.5, -1.5, -2.9], share=0.5), "Stable: at all 3 times"),
+    (table([-0.5, 0.2], growing=1.2), "Unstable: at 2 of 2 times a small change of the cells grows from pass to pass"),
+    (table([-0.5, np.nan]), "Not known: at 1 of 2 times no mode was found"),
+])  # fmt: skip
+def test_the_verdict(found: dict[str, list[float]], words: str) -> None:
+    assert verdict(found).startswith(words)

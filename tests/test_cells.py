@@ -7,6 +7,8 @@ import pytest
 
 from remodel_fenicsx.scene.parameters import Cells
 from remodel_fenicsx.tissue.cells import (
+    UnitCell,
+    angle_between,
     angle_to_axis,
     cylindrical_axes,
     initial_axes,
@@ -90,3 +92,66 @@ def test_angle_to_an_axis_is_that_of_the_chain(angle: float) -> None:
     direction = parts.rotation((1.0, 2.0, -1.0), 40.0)
     cell = R0 * np.array([np.cos(np.radians(angle)), np.sin(np.radians(angle)), 0.0])
     assert angle_to_axis(cell, direction, direction[0]) == pytest.approx(angle, rel=1e-8, abs=1e-14)
+
+
+# ---------------------------------------------------------------- between two cells
+def rotations(angles: np.ndarray) -> np.ndarray:
+    """About random axes by angles in degrees, (n, 3, 3)."""
+    direction = np.random.default_rng(3).normal(size=(len(angles), 3))
+    direction /= np.linalg.norm(direction, axis=1)[:, None]
+    cross = np.cross(direction[:, None], np.eye(3))
+    sine, cosine = np.sin(np.radians(angles))[:, None, None], np.cos(np.radians(angles))[:, None, None]
+    return np.eye(3) + sine * cross + (1 - cosine) * (cross @ cross)
+
+
+def random_cells(count: int) -> UnitCell:
+    """Any dimensions, any axes."""
+    rng = np.random.default_rng(7)
+    return UnitCell(rng.uniform(0.05, 2.0, (count, 3)), np.linalg.qr(rng.normal(size=(count, 3, 3)))[0])
+
+
+def test_between_chains_of_one_direction_it_is_the_angle() -> None:
+    first = random_cells(50)
+    lengths = np.array([0.0, R0, 0.0]) + np.zeros((50, 3))
+    turned = first.axes @ rotations(np.linspace(0.1, 4.0, 50))
+    cosine = np.abs(np.einsum("na,na->n", first.axes[:, 1], turned[:, 1]))
+    found = angle_between(UnitCell(lengths, first.axes), UnitCell(2.0 * lengths, turned))
+    np.testing.assert_allclose(found, np.degrees(np.arccos(cosine)), rtol=5e-3)
+
+
+def test_between_cells_of_the_same_axes_it_is_the_angle_of_the_directions() -> None:
+    """Whatever the order in which the axes stand, and their senses."""
+    first = random_cells(50)
+    second = first.dimensions * np.random.default_rng(8).uniform(0.8, 1.2, (50, 3))
+    unit = [lengths / np.linalg.norm(lengths, axis=1)[:, None] for lengths in (first.dimensions, second)]
+    expected = np.degrees(2 * np.arcsin(0.5 * np.linalg.norm(unit[0] - unit[1], axis=1)))
+    np.testing.assert_allclose(angle_between(first, UnitCell(second, first.axes)), expected, rtol=1e-12)
+    order = [2, 0, 1]
+    other = UnitCell(second[:, order], -first.axes[:, order])
+    np.testing.assert_allclose(angle_between(first, other), expected, rtol=1e-10)
+
+
+def test_it_is_that_of_bures() -> None:
+    """cos = tr sqrt(sqrt(A) B sqrt(A)) for small changes of any kind; no change is no angle."""
+    first = random_cells(50)
+    size = np.linspace(0.1, 3.0, 50)
+    second = UnitCell(first.dimensions * (1 + np.radians(size))[:, None] ** [1, -1, 2], first.axes @ rotations(size))
+    roots = [np.swapaxes(axes, 1, 2) @ (lengths[:, :, None] * axes) for lengths, axes, _ in (first, second)]
+    sizes = [np.linalg.norm(lengths, axis=1) for lengths, _, _ in (first, second)]
+    cosine = np.linalg.svd(roots[0] @ roots[1], compute_uv=False).sum(axis=1) / (sizes[0] * sizes[1])
+    np.testing.assert_allclose(angle_between(first, second), np.degrees(np.arccos(cosine)), rtol=0.03)
+    np.testing.assert_allclose(angle_between(first, first), 0.0, atol=1e-12)
+
+
+def test_no_angle_to_an_axis_changes_by_more() -> None:
+    """Nor does the pitch, times the cosine of the angle out of the wall."""
+    where = places(50)
+    first, direction = random_cells(50), np.array([0.0, 0.0, 1.0])
+    second = UnitCell(first.dimensions, first.axes @ rotations(np.linspace(0.1, 2.0, 50)))
+    apart = angle_between(first, second)
+    change = angle_to_axis(*second[:2], direction) - angle_to_axis(*first[:2], direction)
+    assert np.all(np.abs(change) <= 1.02 * apart) and np.abs(change).max() > 0.3 * apart.max()
+    pitch = np.abs(pitch_angle(*second[:2], where) - pitch_angle(*first[:2], where))
+    radial = np.einsum("na,nia->ni", where * [1, 1, 0] / np.linalg.norm(where[:, :2], axis=1)[:, None], first.axes)
+    out = np.linalg.norm(radial * first.dimensions, axis=1) / np.linalg.norm(first.dimensions, axis=1)
+    assert np.all(pitch * np.sqrt(1 - out**2) <= 1.1 * apart)

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from remodel_fenicsx.body import SHAPES, cube, tube
+from remodel_fenicsx.body import SHAPES, cube, profile, tube
+from remodel_fenicsx.body.columns import columns_of
 from remodel_fenicsx.results.columns import Observer
+from remodel_fenicsx.results.fields import ElementFields
 from remodel_fenicsx.scene.parameters import Cells
 from remodel_fenicsx.tissue.cells import cylindrical_axes, initial_dimensions
 from tests import parts
@@ -64,6 +66,47 @@ def test_layer_angles_are_those_of_the_elements_at_the_radius(wall: tuple[parts.
     assert found["fibre_angle_outer"] == pytest.approx(80.0, abs=1e-9)
     # layers of the same thickness have volumes like their middle radii
     assert found["fibre_angle_middle"] == pytest.approx((1.75 * 30.0 + 2.25 * 60.0) / 4.0, abs=1e-9)
+
+
+def test_chains_out_of_the_wall_have_no_angle(wall: tuple[parts.Body, Any]) -> None:
+    """Layers of pitch 10, none, 60, none and shares of the radial direction: means are over the others, or empty."""
+    made, _ = wall
+    on_request = [*profile.PROFILE, "radial_share"]
+    shape = SHAPES["tube"](shape="tube", inner_radius=INNER, outer_radius=OUTER, length=LENGTH)
+    observer = Observer(shape, made.stepper(lambda t: {}), columns_of(shape, on_request, made.loading.values))
+    radius = np.hypot(*made.quadrature.coordinates[..., :2].mean(axis=1).T)
+    layer = np.argsort(np.argsort(radius)) // 8
+    pitch = np.radians(np.array([10.0, 80.0, 60.0, 30.0]))[layer][:, None]
+    radial = np.array([0.5, 1.0, 0.0, 1.0 - 1e-7])[layer][:, None]  # share of tr A
+    in_plane = np.sqrt(1.0 - radial)
+    cells = np.stack(np.broadcast_arrays(in_plane * np.cos(pitch), in_plane * np.sin(pitch), np.sqrt(radial)), axis=-1)
+    made.set_displacement(np.zeros_like(made.nodes))
+    axes = cylindrical_axes(made.quadrature.coordinates)
+    made.cells.set(np.broadcast_to(cells, made.cells.dimension_values.shape), axes)
+    found = observer.stepper.start([observer]).row
+    assert found["fibre_angle_inner"] == pytest.approx(10.0, abs=1e-9)
+    assert found["fibre_angle_middle"] == pytest.approx(60.0, abs=1e-9)
+    assert np.isnan(found["fibre_angle_outer"])
+    assert found["radial_share"] == pytest.approx((0.5 * 1.25 + 1.75 + (1 - 1e-7) * 2.75) / 8.0, abs=1e-9)
+    places = [found[name] for name in profile.PROFILE]
+    assert places[0] == pytest.approx(10.0) and places[5] == pytest.approx(60.0) and np.isnan(places[8])
+    fields = ElementFields(shape, observer.stepper, ("fibre_angle", "fibre_angle_deformed"))()
+    for angles in fields.values():
+        assert np.isnan(angles[(layer == 1) | (layer == 3)]).all()
+        np.testing.assert_allclose(angles[layer == 2], 60.0, atol=1e-9)
+    made.cells.set(np.broadcast_to([0.6, 0.8, 0.0], cells.shape[:1] + made.cells.dimension_values.shape[1:]), axes)
+    found = observer.stepper.start([observer]).row
+    assert found["radial_share"] == 0.0 and found["fibre_angle_outer"] == pytest.approx(np.degrees(np.arctan(4 / 3)))
+
+
+def test_a_few_radial_chains_among_others_of_an_element(wall: tuple[parts.Body, Any]) -> None:
+    """An element's field is the mean over its points that have an angle."""
+    made, _ = wall
+    values = np.full(made.quadrature.shape, 30.0)
+    values[:, 0] = np.nan
+    np.testing.assert_allclose(made.quadrature.element_mean_of_known(values), 30.0, rtol=1e-14)
+    assert made.quadrature.mean_of_known(values) == pytest.approx(30.0, rel=1e-14)
+    assert np.isnan(made.quadrature.mean_of_known(np.full_like(values, np.nan)))
 
 
 def test_stretches_of_a_cube_that_is_pulled_more_on_one_side() -> None:

@@ -215,3 +215,77 @@ def test_a_pass_of_a_tube(changes: dict[str, str]) -> None:
     assert compare.dimensions < 1e-13
     assert compare.axes < 1e-12
     assert 0.0 < compare.power < 1e-12  # they differ by rounding: both have been made
+
+
+# ---------------------------------------------------------------- at the edges of what they decide
+EDGES = np.array([0.0, 0.5, 0.9, 0.99, 1 - 1e-6, 1 + 1e-6, 1.005, 1.02, 1.1, 1.5, 2.0, 10.0])
+"""Times a threshold."""
+
+
+@pytest.mark.parametrize("limited_by", ["tolerance", "threshold"])
+@pytest.mark.parametrize("pair", [0, 1])
+def test_values_that_just_agree_or_just_do_not(kernels: PointKernels, limited_by: str, pair: int) -> None:
+    """Diagonal tensors, whose values have no rounding, with previous axes a quarter of a turn off in the plane."""
+    limit = 3e-8 if limited_by == "tolerance" else 1e-3  # of a largest value of 3
+    values = np.tile([3.0, 2.0, 1.0], (len(EDGES), 1))
+    values[:, pair + 1] = values[:, pair] - EDGES * limit
+    tensors = values[:, :, None] * np.eye(3)
+    half = np.sqrt(0.5)
+    turned = np.eye(3)
+    turned[pair : pair + 2, pair : pair + 2] = [[half, half], [-half, half]]
+    previous = np.tile(turned, (len(EDGES), 1, 1))
+    threshold = 0.0 if limited_by == "tolerance" else limit
+    expected = spectral.principal(tensors, previous, threshold=threshold)
+    found = kernels.principal(tensors, previous, threshold=threshold)
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_allclose(one, other, rtol=0, atol=1e-12)
+    stays = np.abs(found[1][:, pair, pair] - half) < 1e-12
+    np.testing.assert_array_equal(stays, EDGES <= 1)
+
+
+def test_signs_that_just_decide_or_just_do_not(kernels: PointKernels) -> None:
+    """The first previous axis is almost across its own, on its other side; the next one would choose the other sign."""
+    cosine = EDGES * spectral.DECISIVE
+    previous = np.tile(np.eye(3), (len(EDGES), 1, 1))
+    previous[:, 0] = np.stack([-cosine, np.sqrt(1 - cosine**2), np.zeros_like(cosine)], axis=1)
+    previous[:, 1] = [0.6, 0.8, 0.0]
+    tensors = np.tile(np.diag([3.0, 2.0, 1.0]), (len(EDGES), 1, 1))
+    expected, found = (principal(tensors, previous)[1] for principal in (spectral.principal, kernels.principal))
+    np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(found[:, 0, 0], np.where(EDGES > 1, -1.0, 1.0))
+
+
+@pytest.mark.parametrize("size", [1e-6, 1.0, 1e6])
+def test_tension_that_is_just_more_than_noise(kernels: PointKernels, size: float) -> None:
+    """By the threshold, at equality none; and by rounding of the largest value, here one of compression."""
+    near = np.concatenate([EDGES, [1.0]])
+    for limit, largest in ((0.25 * size, size), (spectral.ROUNDING * size, size)):
+        threshold = limit if limit > 1e-3 * size else 0.0
+        values = np.stack([near * limit, np.full(len(near), -largest), np.full(len(near), -largest)], axis=1)
+        expected, active = spectral.positive_direction(values, threshold)
+        found, found_active = kernels.positive_direction(values, threshold)
+        np.testing.assert_array_equal(found_active, active)
+        np.testing.assert_array_equal(found_active, near > 1)
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize("plane", [(0, 1), (1, 2), (0, 2)])
+def test_what_is_just_across_the_axes(kernels: PointKernels, plane: tuple[int, int]) -> None:
+    """Each plane by itself; at equality it is noise."""
+    near, noise = np.concatenate([EDGES, [1.0]]), 0.125
+    tensors = np.tile(np.diag([3.0, 2.0, 1.0]), (len(near), 1, 1))
+    tensors[:, plane[0], plane[1]] = tensors[:, plane[1], plane[0]] = -near * noise
+    axes = np.tile(np.eye(3), (len(near), 1, 1))
+    found = kernels.without_noise(tensors, axes, noise)
+    np.testing.assert_array_equal(found, spectral.without_noise(tensors, axes, noise))
+    np.testing.assert_array_equal(found[:, plane[0], plane[1]], np.where(near > 1, -near * noise, 0.0))
+
+
+@pytest.mark.parametrize("factor", [1 - 1e-9, 1 + 1e-9])
+def test_a_change_that_may_just_turn_a_point(kernels: PointKernels, factor: float) -> None:
+    """From F = I at |dF| = 2/3; and a state with J = 0 always."""
+    before, change = np.concatenate([[3.0, 1.0], np.eye(3).ravel()])[None], np.zeros(11)
+    change[2:] = factor * 2 / 3 / 3
+    assert kernels.may_turn(before, before + change).size == (factor > 1)
+    before[0, 1] = 0.0
+    assert kernels.may_turn(before, before).size == 1

@@ -154,11 +154,11 @@ def test_energy_of_the_matrix_and_of_the_undeformed_network() -> None:
 
 
 def test_stiffness_of_matrix_and_network() -> None:
-    """lambda + 2 mu + c (r df/dr + g(r0) r0^2), f = r/L + 1/(4 (1-r/L)^2) - 1/4 the chain's force."""
+    """lambda + 2 mu + c (r^2 df/dr + g(r0) r0^2), f = r/L + 1/(4 (1-r/L)^2) - 1/4 the chain's force."""
     big_l, matrix, c = 1.594, 27.293 + 2 * 3.103, 1.381e-23 * 310.0 * 2e21 / (4 * 1.365)
     r = big_l * np.array([0.1, 1 / big_l, 0.9, 1 - 1e-4])
     slope = 1 / big_l + 1 / (2 * big_l * (1 - r / big_l) ** 3)
-    np.testing.assert_allclose(MATERIAL.tissue(R0).stiffness(r), matrix + c * (r * slope + bracket(R0)), rtol=1e-5)
+    np.testing.assert_allclose(MATERIAL.tissue(R0).stiffness(r), matrix + c * (r**2 * slope + bracket(R0)), rtol=1e-5)
     assert Material(chain_density=0.0).tissue(R0).stiffness(1.0) == matrix
 
 

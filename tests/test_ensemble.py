@@ -5,6 +5,8 @@ from __future__ import annotations
 import csv
 import os
 import signal
+import subprocess
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +14,15 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from remodel_fenicsx import Recording, SceneError, cli
+from remodel_fenicsx import Recording, SceneError, cli, read_scene
 from remodel_fenicsx.evolution.coupling import Staggered
+from remodel_fenicsx.results.status import status
 from remodel_fenicsx.running import run
 from remodel_fenicsx.scene.scene import Scene
 from remodel_fenicsx.studies import ensemble as study
-from remodel_fenicsx.studies.members import Member, run_members
-from remodel_fenicsx.system.interrupts import Interrupted, Paused
+from remodel_fenicsx.studies.members import Member, TooFewRuns, run_members
+from remodel_fenicsx.system.interrupts import Paused
+from tests import forks
 from tests.conftest import forked_children
 from tests.parts import pulled_cube
 
@@ -44,6 +48,7 @@ def test_one_that_fails_loses_only_itself(made: tuple[Path, study.Ensemble]) -> 
     folder, found = made
     assert list(found.failed) == ["seed-2"] and "seed-2" in found.failed["seed-2"]
     assert (folder / "seed-2").read_text() == "a file of the user's\n"
+    assert found.extremes == {"max_chain_extension", "min_jacobian", "min_stretch", "max_stretch"}
     assert found.seeds == 2 and found.time.tolist() == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
 
 
@@ -65,6 +70,15 @@ def test_the_table_is_that_of_the_runs(made: tuple[Path, study.Ensemble]) -> Non
     assert (folder / "ensemble.png").stat().st_size > 10_000
 
 
+def test_status_says_what_the_folder_is(made: tuple[Path, study.Ensemble]) -> None:
+    folder, _ = made
+    said = status(folder)
+    assert said[0] == f"{folder}: ensemble of scene, 4 runs: 3 finished, 1 failed"
+    assert said[1].startswith(f"seed-2 has failed: -o {folder / 'seed-2'}: is a file")
+    assert said[2].startswith(f"its answer: {folder / 'ensemble.csv'}; the same command goes on: ")
+    assert len(said) == 3
+
+
 def test_what_is_there_is_not_run_again(made: tuple[Path, study.Ensemble]) -> None:
     folder, found = made
     before = {path: path.stat().st_mtime_ns for path in folder.glob("*/history.csv")}
@@ -74,6 +88,41 @@ def test_what_is_there_is_not_run_again(made: tuple[Path, study.Ensemble]) -> No
     np.testing.assert_array_equal(again.columns["mean_stretch"], found.columns["mean_stretch"])
     with pytest.raises(SceneError, match="holds a run of another scene"):
         study.ensemble(scene(solver={"maximum_halvings": 3}), folder, seeds=3)
+
+
+@pytest.mark.parametrize(
+    ("code", "said"), [(3, "no equilibrium"), (4, "SIGUSR1: all is kept"), (-9, "it said nothing")]
+)
+def test_the_command_says_whose_run_has_failed_or_was_stopped(
+    code: int,
+    said: str,
+    tmp_path: Path,
+    made: tuple[Path, study.Ensemble],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """The others are evaluated; the exit code is 3."""
+
+    def ended(program: str, *words: str) -> subprocess.CompletedProcess[str]:
+        assert program == "remodel-fenicsx" and "seed-2" in " ".join(words)
+        return subprocess.CompletedProcess(words, code, "", f"remodel-fenicsx: {said}\n")
+
+    monkeypatch.setattr(forks, "forked", ended)
+    monkeypatch.setattr(study, "draw", lambda *of: None)
+    path = tmp_path / "scene.toml"
+    path.write_text(scene().to_toml())
+    with forked_children():
+        assert cli.main(["ensemble", str(path), "-o", str(made[0]), "--seeds", "3", "-q"]) == 3
+    written = capsys.readouterr()
+    assert "time 5, 2 seeds" in written.out and f"seed-2 has failed: {said}" in written.err
+
+
+def test_two_seeds_are_needed(made: tuple[Path, study.Ensemble]) -> None:
+    """Runs that have failed are no bad input."""
+    members = study.members_of(scene(), made[0], 3)
+    with pytest.raises(TooFewRuns, match="1 of 3 seeds reached the end, at least 2 are needed; .* is kept") as too_few:
+        study.gathered(members, {"seed-2": "why", "seed-3": "why not"})
+    assert too_few.value.failed == {"seed-2": "why", "seed-3": "why not"}
 
 
 def test_what_was_stopped_goes_on(
@@ -93,14 +142,48 @@ def test_what_was_stopped_goes_on(
         run(member.scene, member.folder, MPI.COMM_SELF)
     assert member.steps_done == 2 and not member.is_complete()
     with forked_children():
-        assert run_members([member], 1, "test", quiet=True) == {}
+        assert run_members([member], 1, study.Study("test", "scene", tmp_path), quiet=True) == {}
     assert member.is_complete()
     whole = Recording(made[0] / "seed-3").history
     np.testing.assert_array_equal(member.history()["mean_stretch"], whole["mean_stretch"])
 
 
-def test_a_signal_ends_all_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    members = study.members_of(pulled_cube(5000.0), tmp_path, 2)
+DIES = """
+import os, signal, sys
+from pathlib import Path
+from mpi4py import MPI
+from remodel_fenicsx import read_scene
+from remodel_fenicsx.results import run_folder
+from remodel_fenicsx.running import run
+where = {"lock": (run_folder, "write_whole"), "part": (os, "fsync")}[sys.argv[1]]
+setattr(*where, lambda *of: os.kill(os.getpid(), signal.SIGKILL))
+run(read_scene(sys.argv[2]), Path(sys.argv[3]), MPI.COMM_SELF)
+"""
+
+
+@pytest.mark.parametrize(("moment", "left"), [("lock", {"run.lock"}), ("part", {"run.lock", "scene.toml.part"})])
+def test_a_member_killed_before_its_scene_is_run_again(
+    moment: str, left: set[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In the folder that the study takes by itself."""
+    monkeypatch.chdir(tmp_path)
+    short = pulled_cube(1.0)
+    member = study.members_of(short, Path("results", f"{short.name}-ensemble"), 2)[0]
+    Path("scene.toml").write_text(member.scene.to_toml())
+    done = forks.forked("python", DIES, moment, "scene.toml", member.folder.absolute(), cwd=tmp_path)
+    assert done.returncode == -signal.SIGKILL, done.stderr
+    assert {path.name for path in member.folder.iterdir()} == left
+    with forked_children():
+        place, found = study.ensemble(short, seeds=2)
+    assert (place, found.failed, found.seeds) == (member.folder.parent, {}, 2)
+    assert not left & {path.name for path in member.folder.iterdir()}
+
+
+def test_a_signal_ends_all_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, out = tmp_path / "scene.toml", tmp_path / "out"
+    path.write_text(pulled_cube(5000.0).to_toml())
     asked = Member.steps_done.fget
     assert asked is not None
 
@@ -111,20 +194,45 @@ def test_a_signal_ends_all_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         return int(steps)
 
     monkeypatch.setattr(Member, "steps_done", property(then_stop))
-    with pytest.raises(Interrupted) as caught:
-        run_members(members, 1, "test")
-    assert caught.value.exit_code == 128 + signal.SIGTERM
-    assert not any(member.is_complete() for member in members)
+    code = cli.main(["ensemble", str(path), "-o", str(out), "--seeds", "2", "--jobs", "1"])
+    assert code == 128 + signal.SIGTERM
+    assert "stopped; all that is recorded is kept, the same command goes on" in capsys.readouterr().err
+    members = study.members_of(read_scene(path), out, 2)
+    assert any(asked(member) for member in members) and not any(member.is_complete() for member in members)
+
+
+def eight_seeds(last: float) -> study.Ensemble:
+    """Stretches of mean 3 and standard deviation 1 at the end, and an extreme; `last` of isotropic cells."""
+    ends = np.array([-1.0, 1.0] * 4) * np.sqrt(7 / 8) + 3.0
+    values = {"stretch": np.stack([np.ones(8), ends], axis=1), "force": np.ones((8, 2))}
+    values["least"] = values["stretch"] / 2
+    isotropic = {name: np.array([1.0, last]) for name in ("stretch", "least")}
+    return study.Ensemble(np.array([0.0, 1.0]), values, isotropic, {}, frozenset({"least"}))
 
 
 def test_words_say_whether_the_cheap_model_is_enough() -> None:
-    times = np.array([0.0, 1.0])
-    values = np.array([[1.0, 2.0], [1.0, 4.0]])
-    found = study.Ensemble(times, {"stretch": values, "force": np.ones((2, 2))}, {"stretch": np.array([1.0, 3.5])}, {})
-    text = study.in_words(found, [1.0])
+    """Extremes are not compared: isotropic cells have none."""
+    text = study.in_words(eight_seeds(3.4), [1.0])
     assert "+0.4 deviations: within the spread" in text and "force" not in text
-    found.isotropic["stretch"][1] = 30.0
-    assert "+19.1 deviations: outside of it" in study.in_words(found, [1.0])
+    assert "3.4  an extreme: not compared" in text
+    assert text.splitlines()[-1] == (
+        "At time 1 isotropic cells lie within 2 deviations of the mean of 8 seeds in all 1 columns: they say what one "
+        "sample of random cells would."
+    )
+    text = study.in_words(eight_seeds(30.0), [1.0])
+    assert "+27.0 deviations: outside of it" in text
+    assert text.splitlines()[-1].endswith("outside of the spread are stretch (+27.0 deviations).")
+
+
+def test_a_deviation_of_few_seeds_is_not_known() -> None:
+    """Five say it to 35 %."""
+    found = eight_seeds(30.0)
+    few = replace(found, columns={name: values[:5] for name, values in found.columns.items()})
+    text = study.in_words(few, [1.0])
+    assert "deviations:" not in text and text.count("not known") == 2
+    assert text.splitlines()[-1].startswith("Not known: 5 seeds are too few")
+    alone = study.in_words(replace(found, isotropic={}), [1.0])
+    assert alone.splitlines()[-1].startswith("Not known: the run with isotropic cells has failed")
 
 
 def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

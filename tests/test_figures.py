@@ -31,6 +31,7 @@ from remodel_fenicsx.paper.cases import LOAD_CASES
 from remodel_fenicsx.paper.errors import FigureError
 from remodel_fenicsx.results.recording import Recording, RecordingError
 from remodel_fenicsx.scene.scene import Scene, scene_from_dict
+from tests import forks
 from tests.conftest import forked_children
 
 PACKAGE = Path(remodel_fenicsx.__file__).parent
@@ -253,6 +254,22 @@ def test_a_failing_run_ends_with_its_own_code_and_leaves_nothing_that_looks_vali
         cache.obtain([scene], jobs=1)
     assert failure.value.exit_code == 3
     assert not cache.is_valid(scene) and not cache.path(scene).exists()
+
+
+@pytest.mark.parametrize(("code", "expected"), [(3, 3), (4, 4), (143, 143), (-9, 137)])
+def test_the_command_ends_as_the_run_that_failed_or_was_stopped(
+    code: int, expected: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    """A process that a signal has killed counts as a shell counts it."""
+
+    def ended(program: str, *words: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.CompletedProcess(words, code, "", "remodel-fenicsx: its last words\n")
+
+    monkeypatch.setattr(forks, "forked", ended)
+    with forked_children():
+        words = ["figures", "fig7", "-o", str(tmp_path / "out"), "--runs", str(tmp_path / "runs"), "--jobs", "1"]
+        assert cli.main(words) == expected
+    assert "its last words" in capsys.readouterr().err and not (tmp_path / "out").exists()
 
 
 def test_a_run_whose_source_changed_meanwhile_is_not_kept(tmp_path: Path) -> None:

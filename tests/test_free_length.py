@@ -103,7 +103,7 @@ def test_the_reaction_of_a_prescribed_length_gives_that_length(kinematics: str, 
     found, _ = rows_of(scene)
     for name in ("axial_elongation", "inner_radius", "stored_energy"):
         np.testing.assert_allclose([row[name] for row in found], [row[name] for row in prescribed], rtol=1e-9)
-    np.testing.assert_allclose([row["axial_force"] for row in found], forces, rtol=1e-14)
+    np.testing.assert_allclose([row["axial_force"] for row in found], forces, rtol=1e-9)
     assert max(row["newton_iterations"] for row in found) <= 6  # one method for field and length
 
 

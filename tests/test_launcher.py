@@ -19,6 +19,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.conftest import slowly
+
 PROJECT = Path(__file__).resolve().parent.parent
 LONG = 200  # seconds, for what takes a few on an idle machine
 SYSTEM_PATH = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
@@ -51,6 +53,7 @@ MOUNT = r"""
 #include <string.h>
 #include <sys/mount.h>
 int main(int number, char **words) {
+    if (!strcmp(words[1], "-t")) return mount("tmpfs", words[6], "tmpfs", 0, words[4]);
     unsigned long flags = !strcmp(words[1], "--bind") ? MS_BIND : MS_BIND | MS_REC;
     if (!strcmp(words[1], "-o")) flags = MS_REMOUNT | MS_BIND | MS_RDONLY;
     if (mount(words[2], words[3], NULL, flags, NULL)) { perror(words[number - 1]); return 1; }
@@ -508,6 +511,50 @@ def test_a_build_that_ends_too_early_takes_its_temporary_folder_along(rooted, tm
     assert sorted(path.suffix for path in (rooted.cache / "remodel-fenicsx").iterdir()) == [".lock", ".log"]
 
 
+@pytest.mark.parametrize("as_user", [False, True])
+@pytest.mark.parametrize("victim", ["leader", "mmdebstrap"])
+@pytest.mark.parametrize("launcher", ["killed", *slowly("alive")])
+def test_a_builder_that_is_killed_leaves_nothing(rooted, tmp_path, launcher, victim, as_user):
+    """At once, or where nobody is left to remove it at the next start, which waits for nobody."""
+    environment = a_user_builds(rooted, tmp_path) if as_user else {}
+    silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    process = rooted.start("true", environment=environment | {"STUB_BUILD": "hang"}, **silent)
+    wait_for((rooted.record / "begun").exists, "the build")
+    builder = int((rooted.record / "pid").read_text())
+    group = os.getpgid(builder)
+    try:
+        if launcher == "killed":
+            process.kill()
+            process.wait()
+        os.kill(group if victim == "leader" else builder, signal.SIGKILL)
+        wait_for(lambda: not group_lives(group), "the end of the whole group")
+        if launcher == "alive":
+            assert process.wait(LONG) == 5
+        else:
+            assert rooted.run("true", environment=environment).returncode == 0
+    finally:
+        if group_lives(group):
+            os.killpg(group, signal.SIGKILL)
+    kept = {path.suffix for path in (rooted.cache / "remodel-fenicsx").iterdir()}
+    assert kept == ({".lock", ".log"} if launcher == "alive" else {".lock", ".log", ""})
+    assert not as_user or list((tmp_path / "temporary").iterdir()) == []
+
+
+@pytest.mark.parametrize("damage", ["empty", "without /etc", "file"])
+def test_an_environment_that_is_not_whole_is_made_anew(rooted, damage):
+    assert rooted.run("true").returncode == 0
+    (root,) = (path for path in (rooted.cache / "remodel-fenicsx").iterdir() if path.is_dir())
+    (root / "etc").unlink()
+    if damage != "without /etc":
+        shutil.rmtree(root)
+        root.mkdir() if damage == "empty" else root.touch()
+    healed = rooted.run("echo", "in")
+    assert (healed.returncode, healed.stdout) == (0, "in\n"), healed.stderr
+    assert healed.stderr.startswith(f"with-fenicsx: {root} is not whole: making it anew\n")
+    assert rooted.run("true").stderr == ""
+    assert rooted.roots() == [root.name]
+
+
 def test_failed_build(rooted):
     result = rooted.run("true", environment={"STUB_BUILD": "fail"})
     assert result.returncode == 5
@@ -569,6 +616,56 @@ def test_one_line_and_exit_5(rooted, environment, words):
     assert result.returncode == 5
     assert result.stderr.startswith(f"with-fenicsx: {words}") and result.stderr.count("\n") == 1
     assert rooted.builds() == []
+
+
+def one_line(result, words: str) -> None:
+    """The launcher's own, exit status 5."""
+    assert (result.returncode, result.stderr.count("\n")) == (5, 1), result.stderr
+    assert result.stderr.startswith("with-fenicsx: ") and words in result.stderr, result.stderr
+
+
+@pytest.mark.parametrize(("inodes", "missing"), [(1, "cache"), (2, "lock"), (3, "log"), (4, "part")])
+def test_a_file_system_without_inodes(rooted, inodes, missing):
+    """One is its own root: the cache, its lock, the log and the unfinished root need one each."""
+    rooted.cache.mkdir()
+    mounted = f'mount -t tmpfs -o nr_inodes={inodes},size=8g tmpfs "$1" && exec "$2" true'
+    namespace = [] if os.getuid() == 0 else ["--user", "--map-root-user"]
+    words = ["unshare", *namespace, "--mount", "sh", "-c", mounted, "sh", rooted.cache, rooted.launcher]
+    done = subprocess.run(words, env=rooted.environment, capture_output=True, text=True)
+    place = {"cache": "remodel-fenicsx: set", "lock": "remodel-fenicsx: set", "log": ".log: ", "part": ".part: "}
+    one_line(done, place[missing])
+    assert "No space left on device" in done.stderr
+    assert rooted.builds() == []
+
+
+def full(clone, *programs: str) -> None:
+    """Stand-ins for programs of a machine whose /tmp is full."""
+    for name in programs:
+        script(clone.stubs / name, f'#!/bin/sh\necho "{name}: cannot create: No space left on device" >&2; exit 1\n')
+
+
+def test_no_folder_for_sessions(ready, tmp_path):
+    clone = Clone(tmp_path, cache=ready.cache)
+    script(
+        clone.stubs / "mkdir", '#!/bin/sh\ncase "$*" in */tmp/*-m*|*-m*/tmp/*) exit 1 ;; esac; exec /bin/mkdir "$@"\n'
+    )
+    full(clone, "mktemp")
+    one_line(clone.run("true", environment={"TMPDIR": None}), "No space left on device: set TMPDIR to a folder")
+
+
+def test_a_file_system_without_locks(ready, tmp_path):
+    clone = Clone(tmp_path, cache=ready.cache)
+    script(clone.stubs / "flock", "#!/bin/sh\necho 'flock: 10: No locks available' >&2; exit 71\n")
+    one_line(clone.run("true"), ".lock: No locks available")
+
+
+def test_what_cannot_be_laid_over_this_machine(ready, tmp_path):
+    clone = Clone(tmp_path, cache=ready.cache)
+    real = shutil.copy(shutil.which("mount", path=clone.environment["PATH"]), tmp_path / "real")
+    refusing = "echo mount: /usr: No space left on device >&2; exit 32"
+    stand_in = f'#!/bin/sh\ncase "$*" in "--rbind "*" /usr") {refusing} ;; esac; exec {real} "$@"\n'
+    script(clone.folder / "bin" / "mount", stand_in)
+    one_line(clone.run("true"), "on /usr: No space left on device")
 
 
 @pytest.mark.parametrize("way", ["root", None])

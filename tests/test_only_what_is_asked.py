@@ -21,7 +21,7 @@ from remodel_fenicsx.evolution.remodeling import RemodelingPass
 from remodel_fenicsx.fem import coefficients, jit
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.results import history
-from remodel_fenicsx.results.fields import FIELDS_BY_NAME
+from remodel_fenicsx.scene.settings import FIELDS_BY_NAME
 from remodel_fenicsx.scene import scene_from_dict
 
 SELF = MPI.COMM_SELF
@@ -124,7 +124,7 @@ def test_columns_that_are_named_are_the_only_ones_measured(monkeypatch: pytest.M
     simulation.close()
     assert {"mean_stretch", "stored_energy", "pass_residual"} < set(rows[0]) and energy.number == 4
     with pytest.raises(SceneError, match="output.columns = 'inner_radius': no such column"):
-        Simulation(scene(output={"columns": ["inner_radius"]}), SELF)
+        scene(output={"columns": ["inner_radius"]})
 
 
 def test_fields_that_are_named_are_the_only_ones_written(tmp_path: Path) -> None:
@@ -143,7 +143,7 @@ def test_fields_that_are_named_are_the_only_ones_written(tmp_path: Path) -> None
     chains = [(folders[name] / "fields_chains.vtkhdf").stat().st_size for name in ("all", "chains")]
     assert chains[0] == chains[1]
     with pytest.raises(SceneError, match="output.fields = 'stress': no such field"):
-        Simulation(scene(output={"fields": ["stress"]}), SELF)
+        scene(output={"fields": ["stress"]})
 
 
 def test_stress_that_nobody_writes_is_not_compiled(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -18,7 +19,7 @@ def test_a_profile_lies_over_the_preset_and_under_the_scene(name: str) -> None:
     scene = scene_from_dict(TUBE | {"profile": name})
     assert scene.model.kinematics == "auto" and scene.time.tolerance == PROFILES[name].values["time.tolerance"]
     assert scene.mesh.degree == PROFILES[name].values["mesh.degree"]
-    assert scene.remodeling == preset_scene(TUBE["preset"], "tube").remodeling  # type: ignore[arg-type]
+    assert scene.remodeling == preset_scene(TUBE["preset"], "tube").remodeling  # type: ignore[arg-type]  # random cells
     own = scene_from_dict(TUBE | {"profile": name, "mesh": {"refinement": 5}, "model": {"kinematics": "full"}})
     assert own.mesh.refinement == 5 and own.model.kinematics == "full"
     assert own.mesh.degree == PROFILES[name].values["mesh.degree"]
@@ -43,6 +44,34 @@ def test_on_the_command_line_it_lies_over_the_scene(tmp_path: Path, capsys: pyte
     assert PROFILES["fast"].in_words("fast") in words
     assert cli.main(["run", "--resume", str(tmp_path), "--profile", "fast"]) == 2
     assert "--profile: a run goes on in its own folder, as it is" in capsys.readouterr().err
+
+
+ISOTROPIC = TUBE | {"cells": {"initial": "isotropic"}}
+
+
+@pytest.mark.parametrize(("changes", "coupling"), [
+    ({}, "implicit"),
+    ({"cells": {"initial": "aligned", "aligned_axis": 1}}, "implicit"),
+    ({"cells": {"initial": "random"}}, "staggered"),  # points without such a state
+    ({"remodeling": {"law": "rate"}}, "staggered"),  # has an error of its steps with any coupling
+    ({"remodeling": {"coupling": "relaxed"}}, "relaxed"),  # the scene's own
+    ({"mesh": {"formulation": "selective-integration"}}, "staggered"),  # not for this coupling
+    ({"material": {"chain_density": 0.0}}, "staggered"),
+    ({"preset": "consistent"}, "extrapolated"),
+    ({"profile": "balanced"}, "staggered"),
+])  # fmt: skip
+def test_the_finest_takes_the_coupling_without_error_in_time(
+    changes: dict[str, Any], coupling: str, tmp_path: Path
+) -> None:
+    """Where it has none, and the scene names no other; on the command line, over what the scene names."""
+    scene = scene_from_dict({**ISOTROPIC, "profile": "reference", **changes})
+    assert scene.remodeling.coupling == coupling
+    path = tmp_path / "whole.toml"
+    path.write_text(scene_from_dict({**ISOTROPIC, **changes, "profile": "fast"}).to_toml())
+    over = read_scene(path, [], "balanced" if coupling == "staggered" and "profile" in changes else "reference")
+    assert over.remodeling.coupling == ("implicit" if coupling == "relaxed" else coupling)
+    asked = ["remodeling.coupling=staggered", "remodeling.law=explicit"]
+    assert read_scene(path, asked, "reference").remodeling.coupling == "staggered"
 
 
 def test_an_unknown_one_is_refused() -> None:

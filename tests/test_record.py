@@ -12,7 +12,7 @@ import pytest
 from remodel_fenicsx.evolution.equilibrium import Extension
 from remodel_fenicsx.evolution.parts import Work
 from remodel_fenicsx.evolution.stepper import Step
-from remodel_fenicsx.results.columns import COLUMNS
+from remodel_fenicsx.body.columns import COLUMNS
 from remodel_fenicsx.results.history import History
 from remodel_fenicsx.results.recording import read_history
 

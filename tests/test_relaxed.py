@@ -91,11 +91,9 @@ def test_the_relaxed_pass_settles_where_the_printed_one_jumps(caplog: pytest.Log
 
 
 def test_an_unknown_column_is_refused_in_one_line() -> None:
-    scene = preset_scene(PAPER, "cube").with_values({"output.columns": ["pass_residuum"]})
-    with pytest.raises(
-        SceneError, match="output.columns = 'pass_residuum': no such column on request; allowed are 'pass_"
-    ):
-        Simulation(scene)
+    words = "output.columns = 'pass_residuum': no such column on request; allowed for shape 'cube' are 'pass_"
+    with pytest.raises(SceneError, match=words):
+        preset_scene(PAPER, "cube").with_values({"output.columns": ["pass_residuum"]})
 
 
 @pytest.mark.slow

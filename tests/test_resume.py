@@ -24,7 +24,7 @@ from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.evolution import chatter, monitor
 from remodel_fenicsx.evolution.chatter import Chatter
 from remodel_fenicsx.evolution.coupling import COUPLINGS, Staggered
-from remodel_fenicsx.evolution.locking import LockingWarning
+from remodel_fenicsx.evolution.locking import LockingWarning, Missing
 from remodel_fenicsx.evolution.monitor import StabilityWatcher
 from remodel_fenicsx.evolution.parts import StepFailure, Work
 from remodel_fenicsx.evolution.state import State
@@ -147,7 +147,7 @@ def test_steps_after_the_checkpoint_are_done_again(half: Path, whole: Path) -> N
 def test_without_a_whole_checkpoint_it_is_refused(half: Path) -> None:
     for generation in read_pointer(half):
         (half / generation.file).write_bytes(b"")
-    with pytest.raises(CheckpointError, match="half: has no checkpoint that is whole; without its files checkpoint"):
+    with pytest.raises(CheckpointError, match="half: has no checkpoint that is whole .*; without its files checkpoint"):
         resume(half, LONGER, SELF)
 
 
@@ -416,6 +416,21 @@ def test_the_status_of_a_run(half: Path) -> None:
     assert status(half)[1].endswith(f"; process {os.getpid()} on {socket.gethostname()} was killed")
 
 
+def test_the_status_of_a_run_that_failed_says_why(tmp_path: Path) -> None:
+    """Until it goes on: then the end of before is none any more."""
+    scene = pulled_cube(6.0).with_values({"loads.force.value": 1e9, "solver.maximum_halvings": 0})
+    with pytest.raises(StepFailure, match="no equilibrium at time 1"):
+        run(scene, tmp_path / "out", MPI.COMM_SELF)
+    said = status(tmp_path / "out")
+    assert said[1].startswith("failed: no equilibrium at time 1: ") and said[2].startswith("not running, ")
+    with (tmp_path / "out" / "run.log").open("a") as log:
+        log.write("2026-01-01 00:00:00,000 INFO scene cube on 1 ranks, results in out\n")
+    assert said[2:] == status(tmp_path / "out")[1:]
+    with (tmp_path / "out" / "run.log").open("a") as log:
+        log.write("2026-01-01 00:00:00,000 INFO ended: SIGTERM\n")
+    assert status(tmp_path / "out")[1].endswith("; stopped by SIGTERM")
+
+
 @pytest.mark.parametrize(
     ("every", "seconds", "cost", "number", "due"),
     [
@@ -481,7 +496,7 @@ def test_runs_that_go_on_say_what_one_run_says(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr(chatter, "MOST", 1.0)
     monkeypatch.setattr(Chatter, "_advice", lambda watcher, factor: "nothing")
     monkeypatch.setattr(LockingWarning, "stiffness_ratio", lambda watcher: 1e9)
-    monkeypatch.setattr(LockingWarning, "energy_share", lambda watcher: 1.0)
+    monkeypatch.setattr(LockingWarning, "missing", lambda watcher: Missing(1.0, 0.0))
     monkeypatch.setattr(monitor, "ITERATIONS_BETWEEN_LOOKS", 9)
     counts: list[int] = []
     count = StabilityWatcher._count

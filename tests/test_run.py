@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from remodel_fenicsx import cli
-from remodel_fenicsx.results.columns import COLUMNS
+from remodel_fenicsx.body.columns import COLUMNS
 from remodel_fenicsx.results.recording import read_history
 from remodel_fenicsx.scene.scene import read_scene
 from tests.conftest import mpirun, slowly
@@ -437,7 +437,7 @@ def test_a_chain_density_of_another_stress_unit_is_said_and_logged(tmp_path: Pat
     settings = ["--set", "material.stress_unit=kPa", "--set", "loads.force.value=1 N", "--set", "time.end=1"]
     done = run("run", demo("cube"), *settings, "--set=geometry.length_unit=cm", "-q", "-o", tmp_path / "out")
     assert done.returncode == 0, done.stderr
-    assert done.stderr.startswith("WARNING: material.chain_density = 7e+21 belongs to a scene in Pa")
+    assert done.stderr.startswith("WARNING: material.chain_density = 7e+21: the network (c g(r0) r0^2 = ")
     assert done.stderr.count("\n") == 1
     assert done.stderr.removeprefix("WARNING: ") in (tmp_path / "out" / "run.log").read_text()
     assert read_scene(tmp_path / "out" / "scene.toml").loads["force"].value == 10.0  # 1 N in kPa cm^2

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,12 +11,15 @@ import pytest
 from mpi4py import MPI
 
 from remodel_fenicsx import Recording, SceneError, Simulation, cli
+from remodel_fenicsx.evolution import time_error
 from remodel_fenicsx.evolution.parts import StepFailure
 from remodel_fenicsx.evolution.refusals import TOO_LARGE
 from remodel_fenicsx.evolution.stepper import Step, Watcher
+from remodel_fenicsx.evolution.time_error import Estimate
 from remodel_fenicsx.running import resume, run
 from remodel_fenicsx.scene.scene import Scene, scene_from_dict
 from remodel_fenicsx.scene.settings import MOST_STEPS, Time
+from remodel_fenicsx.tissue.cells import UnitCell, angle_between
 
 END = 40.0
 COUPLINGS = {
@@ -43,16 +47,18 @@ def tube(coupling: str, end: float = END, **changes: Any) -> Scene:
 
 
 class Angles(Watcher):
-    """Fibre angles of the accepted rows by time."""
+    """Fibre angles and cells of the accepted rows by time."""
 
     def __init__(self, simulation: Simulation):
         self.simulation, self.by_time = simulation, dict[float, np.ndarray]()
+        self.cells = dict[float, UnitCell]()
 
     def committed(self, step: Step) -> None:
         simulation = self.simulation
         cells, places = simulation.state.equilibrium_cells, simulation.quadrature.coordinates
         angles = simulation.scene.geometry.fibre_angle(cells.dimension_values, cells.axis_values, places)
         self.by_time[step.time] = angles.copy()
+        self.cells[step.time] = UnitCell(*(values.copy() for values in cells.point_cells[:2]))
 
 
 def marched(scene: Scene) -> tuple[list[Step], Angles]:
@@ -101,9 +107,52 @@ def test_no_step_is_above_the_tolerance_and_few_are_far_below(
 ) -> None:
     steps, _ = artery[coupling]
     errors = np.array([step.time_error for step in steps])
-    assert errors.max() <= 1.0
+    assert errors.max() <= 1.0 and np.median(errors) > 0.15
     assert [step.row["time_error"] for step in steps] == errors.tolist()
-    assert len(steps) < 50 and np.diff([step.time for step in steps])[-3:].max() > 1.1
+    assert len(steps) < 90
+
+
+def test_no_row_of_the_printed_method_is_off_by_more_than_the_tolerance() -> None:
+    """Chains in space, their pitch, and radii, against eq. (11) without an error in time; the estimate is the error."""
+    tolerance, radii = 2.0, ["inner_radius", "outer_radius"]
+    columns = {"output.columns": radii}
+    steps, rows = marched(tube("staggered", 100.0, **{"time.tolerance": tolerance, **columns}))
+    reference = Simulation(tube("staggered", 100.0, **{"remodeling.coupling": "implicit", **columns}), MPI.COMM_SELF)
+    exact = Angles(reference)
+    same = list(reference.stepper.march([step.time for step in steps], [reference.observer, exact]))
+    estimated, largest = [], []
+    for step, other in zip(steps, same, strict=True):
+        apart = angle_between(rows.cells[step.time], exact.cells[step.time]).reshape(reference.quadrature.shape)
+        angle = float(np.sqrt(reference.quadrature.mean(apart**2)))
+        pitch = distance(reference, rows.by_time[step.time], exact.by_time[step.time])
+        strain = np.degrees(max(abs(step.row[name] / other.row[name] - 1) for name in radii))
+        assert max(angle, pitch, strain) < tolerance, step.time
+        estimated.append(step.time_error)
+        largest.append(max(angle, strain))
+    assert estimated == pytest.approx(largest, rel=0.2)
+
+
+def test_lengths_count_as_angles(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A cube under a large force whose chains are not looked at, against eq. (11) without an error in time."""
+    monkeypatch.setattr(time_error, "angle_between", lambda row, better: np.zeros(len(row.dimensions)))
+    scene = scene_from_dict(
+        {
+            "preset": COUPLINGS["staggered"],
+            "geometry": {"shape": "cube"},
+            "model": {"kinematics": "point"},
+            "cells": {"initial": "isotropic"},
+            "output": {"fields": False, "columns": ["time_error", "mean_stretch"]},
+        }
+    )
+    scene = scene.with_values({"time.end": 5.0, "time.step": 0.25, "loads.force.value": 8 * scene.loads["force"].value})
+    steps, _ = marched(scene)
+    exact, _ = marched(scene.with_values({"remodeling.coupling": "implicit"}))
+    found = [step.time_error for step in steps[4:]]
+    radians = [
+        step.row["mean_stretch"] / other.row["mean_stretch"] - 1 for step, other in zip(steps, exact, strict=True)
+    ]
+    np.testing.assert_allclose(found, np.degrees(np.abs(radians))[4:], rtol=0.2)
+    assert max(found) > 0.1
 
 
 def test_smaller_tolerances_are_smaller_errors(exact: dict[str, dict[float, np.ndarray]]) -> None:
@@ -118,12 +167,11 @@ def test_smaller_tolerances_are_smaller_errors(exact: dict[str, dict[float, np.n
 
 
 @pytest.mark.parametrize("coupling", ["staggered", "extrapolated"])
-def test_a_predictor_spares_iterations_of_steps_of_all_lengths(
-    coupling: str, artery: dict[str, tuple[list[Step], Angles]]
-) -> None:
-    steps, _ = artery[coupling]
-    plain, _ = marched(tube(coupling, **{"time.tolerance": 1.0, "solver.predictor": "none"}))
-    assert [step.time for step in steps] == pytest.approx([step.time for step in plain], rel=1e-6)
+def test_a_predictor_spares_iterations_of_steps_of_all_lengths(coupling: str) -> None:
+    values = {"time.tolerance": 2.0, "time.step": 0.1}
+    steps, _ = marched(tube(coupling, **values))
+    plain, _ = marched(tube(coupling, **values, **{"solver.predictor": "none"}))
+    assert [step.time for step in steps] == pytest.approx([step.time for step in plain], rel=1e-2)
     assert len(set(np.diff([step.time for step in steps]).round(6))) > 4
     spent, before = (sum(step.work.newton_iterations for step in each) for each in (steps, plain))
     assert spent <= 0.8 * before, (spent, before)
@@ -180,8 +228,13 @@ def test_a_rejected_step_leaves_no_trace_but_its_work() -> None:
     np.testing.assert_array_equal(plain.cells.dimension_values, simulation.cells.dimension_values)
 
 
-def test_a_run_that_goes_on_takes_the_same_steps(tmp_path: Path) -> None:
-    scene = tube("extrapolated", 40.0, **{"time.tolerance": 0.3, "output.checkpoint": 5})
+SWINGS: dict[str, Any] = {"cells.initial": [0.8, 0.0, 0.6], "remodeling.frame": "spatial"}
+
+
+@pytest.mark.parametrize(("coupling", "changes"), [("extrapolated", {}), ("staggered", SWINGS)])
+def test_a_run_that_goes_on_takes_the_same_steps(coupling: str, changes: dict[str, Any], tmp_path: Path) -> None:
+    """In steps that were chosen, and among those in vain."""
+    scene = tube(coupling, 40.0, **{"time.tolerance": 0.3, "output.checkpoint": 5, **changes})
     whole = run(scene, tmp_path / "whole", MPI.COMM_SELF)
     stopped = Simulation(scene, MPI.COMM_SELF)
     times = [step.time for step in stopped.steps()]
@@ -214,7 +267,7 @@ def test_where_no_step_is_short_enough_the_run_goes_on_and_says_so(caplog: pytes
     lengths = [0.2, 0.4, float(np.sqrt(0.8))]
     steps, _ = marched(tube("staggered", 10.0, **{"cells.initial": lengths, "time.tolerance": 0.5}))
     errors = [step.time_error for step in steps]
-    assert errors[0] > 10.0 and np.median(errors) < 0.5 and len(steps) < 60
+    assert errors[0] > 10.0 and np.median(errors) < 0.5 and len(steps) < 100
     assert sum("does not fall to time.tolerance" in record.message for record in caplog.records) == 1
 
 
@@ -237,6 +290,118 @@ def test_a_step_that_cannot_be_solved_is_tried_shorter(monkeypatch: pytest.Monke
     assert simulation.state.time == 4.0
 
 
+def test_a_step_that_can_never_be_solved_is_tried_three_times_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each a quarter of the one before; none is shorter than 2^-12 of the first step."""
+    simulation = Simulation(tube("staggered", 4.0, **{"time.tolerance": 5.0, "time.step": 4.0}), MPI.COMM_SELF)
+    tried: list[float] = []
+
+    def fails(time: float, loads: Any) -> Any:
+        tried.append(time)
+        raise StepFailure(time, "never", TOO_LARGE)
+
+    monkeypatch.setattr(simulation.stepper.coupling, "solve", fails)
+    with pytest.raises(StepFailure):
+        next(simulation.steps())
+    assert tried == pytest.approx([4.0, 1.0, 0.25, 0.0625], rel=0.05)  # equal parts of what is left
+    tried.clear()
+    simulation.state.numbers["step_control_wanted"] = shortest = 4.0 * 2.0**-12
+    with pytest.raises(StepFailure):
+        next(simulation.steps())
+    assert tried == pytest.approx([shortest], rel=0.05)
+
+
+def controlled(error: Callable[[float, float], float], end: float, **changes: Any) -> tuple[Simulation, list[float]]:
+    """Times of the steps where the estimated error is this function of their start and length, over the tolerance."""
+    simulation = Simulation(tube("staggered", end, **{"time.tolerance": 1.0, **changes}), MPI.COMM_SELF)
+    control = simulation.control
+    assert control is not None
+
+    def measured(step: Step) -> Estimate:
+        step.time_error = error(simulation.state.time, step.time - simulation.state.time)
+        return Estimate(step.time_error, step.time_error)
+
+    control.error.measure = measured  # type: ignore[method-assign]
+    return simulation, [step.time for step in simulation.steps()]
+
+
+def test_steps_grow_to_twice_their_length_and_shrink_to_a_tenth() -> None:
+    """An error that always allows more, and one that asks for a thousandth at first."""
+    _, times = controlled(lambda start, length: 1e-3 * length, 25.0, **{"time.step": 0.01})
+    ratios = np.diff(times)[1:-4] / np.diff(times)[:-5]
+    assert 1.9 < ratios.min() and ratios.max() < 2.0 * 1.05 + 1e-9
+    tried: list[float] = []
+
+    def steep(start: float, length: float) -> float:
+        if not start:
+            tried.append(length)
+        return 10.0 * length if start < 1.0 else 0.5
+
+    controlled(steep, 25.0, **{"time.step": 25.0})
+    assert tried[0] == 25.0 and 0.1 / 1.05 - 1e-9 <= tried[1] / tried[0] < 0.11
+
+
+def test_a_step_that_was_too_long_is_shortened_by_a_fifth_and_then_by_half() -> None:
+    """However little was missing: what is tried once more must be worth it."""
+    tried: list[float] = []
+
+    def hardly(start: float, length: float) -> float:
+        if not start:
+            tried.append(length)
+        return 1.01 if length > 0.2 else 0.5
+
+    controlled(hardly, 2.0, **{"time.step": 1.0, "loads.pressure.ramp": [[0.0, 1.0]]})
+    ratios = np.array(tried[1:]) / tried[:-1]
+    assert len(ratios) > 1 and ratios[0] <= 0.8 * 1.05 and ratios[1:].max() <= 0.5 * 1.05
+
+
+def test_where_errors_do_not_fall_the_number_of_steps_is_bounded(caplog: pytest.LogCaptureFixture) -> None:
+    """An error that is the same however short the step: twenty in vain, longer ones, and ten after a time 0.7/kappa."""
+    tried = 0
+
+    def stays(start: float, length: float) -> float:
+        nonlocal tried
+        tried += 1
+        return 0.85 if start < 25.0 else 30.0 + start % 7.0
+
+    end = 200.0
+    simulation, times = controlled(stays, end, **{"time.step": 1.0})
+    lengths = np.diff([0.0, *times])
+    settings = simulation.scene.remodeling
+    shortest = 1.0 / 360.0 / settings.kappa
+    assert lengths.min() >= shortest / 1.05
+    in_vain = int((lengths < 0.9).sum())
+    assert 20 <= in_vain <= 20 + 15 * (end - 25.0) * settings.kappa + 8
+    assert len(times) < end + 150 and tried < 2 * len(times)
+    said = [record.message for record in caplog.records if "does not fall to time.tolerance" in record.message]
+    assert len(said) == 2 and "go on" not in said[0] and "steps of 1.04 go on" in said[1]
+
+
+def test_the_tolerance_counts_again_when_errors_fall() -> None:
+    """Nothing helps for a while; what comes then is resolved."""
+
+    def error(start: float, length: float) -> float:
+        return 0.85 * length if start < 5.0 else 50.0 + start if start < 10.0 else length / 0.4
+
+    _, times = controlled(error, 25.0)
+    starts, lengths = np.array(times[:-1]), np.diff(times)
+    assert 0.9 < lengths[starts < 4.0].min() and lengths[starts > 12.0].max() <= 0.4 * 1.05
+
+
+def test_steps_of_an_explicit_rule_are_at_most_half_of_the_cells_own_time() -> None:
+    """Longer ones swing about the equilibrium, however small their error."""
+    simulation = Simulation(tube("extrapolated", 300.0, **{"time.tolerance": 20.0}), MPI.COMM_SELF)
+    lengths = np.diff([step.time for step in simulation.steps()])
+    assert 0.9 * 20.0 < lengths.max() <= 20.0 * 1.05
+
+
+def test_a_printed_pass_that_swings_does_not_crawl(caplog: pytest.LogCaptureFixture) -> None:
+    """By rank the chains of this tube turn over at once, to and fro: thousands of steps in 0.2.0."""
+    steps, _ = marched(tube("staggered", 150.0, **{"time.tolerance": 0.5}, **SWINGS))
+    assert len(steps) < 600 and steps[-1].time == 150.0
+    assert np.diff([step.time for step in steps]).min() > 0.5 / 360 * 25 / 1.06  # degrees, and the time of the ramp
+    assert any("does not fall to time.tolerance" in record.message for record in caplog.records)
+
+
 def test_fixed_steps_tell_their_error_where_it_is_asked_for() -> None:
     scene = tube("staggered", 5.0, **{"output.columns": ["time_error"]})
     steps, _ = marched(scene)
@@ -246,6 +411,14 @@ def test_fixed_steps_tell_their_error_where_it_is_asked_for() -> None:
     assert "time_error" not in plain[0].row
     for step, other in zip(steps, plain, strict=True):
         assert step.row["inner_radius"] == other.row["inner_radius"]
+
+
+def test_after_cells_have_turned_over_the_error_is_that_of_the_steps_again() -> None:
+    """Better cells that stay on the other side of a turn are another state, not an error of short steps."""
+    lengths = [0.2, 0.4, float(np.sqrt(0.8))]
+    values = {"cells.initial": lengths, "time.step": 0.015, "output.columns": ["time_error"]}
+    steps, _ = marched(tube("staggered", 0.15, **values))
+    assert steps[0].time_error > 10.0 and steps[-1].time_error < 0.1
 
 
 def test_nothing_that_remodels_has_no_error() -> None:

@@ -17,7 +17,7 @@ from remodel_fenicsx.tissue.drivers import DRIVERS, FRAMES
 from remodel_fenicsx.tissue.energy import Tissue
 from remodel_fenicsx.tissue.laws import LAWS, Drive
 from remodel_fenicsx.tissue.mandel import MANDEL
-from remodel_fenicsx.tissue.tensor_law import Target, follow, target
+from remodel_fenicsx.tissue.tensor_law import ABOVE_ROUNDING, Target, floor_above, follow, target
 
 Array = NDArray[np.float64]
 RNG = np.random.default_rng(7)
@@ -173,12 +173,35 @@ def test_the_target_is_that_of_eq_9_to_11_in_the_principal_axes() -> None:
     assert found.share[0] == pytest.approx(10 / (10 + 0.01 * 4), rel=1e-12)
 
 
+def test_what_is_out_of_balance_counts_once() -> None:
+    """The rounding is widened for Newton's method; a residual, which may be large, is not: half there, and no more."""
+    tension = np.diag([1e-3, 0.0, 0.0])[None]
+    assert target(tension, floor_above(1e-3, 0.0)).share[0] == pytest.approx(0.5)
+    assert target(tension, floor_above(0.0, 1e-3 / ABOVE_ROUNDING)).share[0] == pytest.approx(0.5)
+
+
+def test_between_and_beyond_targets_the_direction_has_trace_one_and_the_share_is_one() -> None:
+    """sE is linear; a target that does not count leaves the direction to the other."""
+    ends = structures(2)
+    none, first, second = (
+        Target(direction[None], np.array([share]))
+        for direction, share in ((np.zeros((3, 3)), 0.0), (ends[0], 1.0), (ends[1], 0.6))
+    )
+    middle = first.towards(second, 0.5)
+    np.testing.assert_allclose(middle.direction[0], (ends[0] + 0.6 * ends[1]) / 1.6, atol=1e-14)
+    assert middle.share[0] == pytest.approx(0.8, rel=1e-13)
+    for weight, share in ((1.5, 1.0), (0.5, 0.5), (-0.5, 0.0), (0.0, 0.0)):
+        found = none.towards(first, weight)
+        assert found.share[0] == pytest.approx(share, abs=1e-14)
+        np.testing.assert_allclose(found.share[0] * (found.direction[0] - ends[0]), 0.0, atol=1e-14)
+
+
 def test_the_switch() -> None:
     """One under tension, nothing under compression or noise; no jump between."""
-    noise = 1e-14
+    floor = floor_above(0.0, 1e-14)
     tensors = np.array([np.diag(v) for v in ([1, 0, 0], [-1, -1, -1], [1e-14, -1, 0], [1e-15, 0, 0], [0.0, 0, 0])])
-    np.testing.assert_allclose(target(tensors, noise).share, [1, 0, 0, 0, 0], atol=1e-6)
+    np.testing.assert_allclose(target(tensors, floor).share, [1, 0, 0, 0, 0], atol=1e-6)
     sizes = np.logspace(-13, 0, 400)
-    shares = target(np.array([np.diag([size, -1.0, -1.0]) for size in sizes]), noise).share
+    shares = target(np.array([np.diag([size, -1.0, -1.0]) for size in sizes]), floor).share
     assert np.all(np.diff(shares) > 0) and np.diff(shares).max() < 0.04
-    assert np.isfinite(target(np.diag([1e300, -1e300, 0])[None], noise).share).all()
+    assert np.isfinite(target(np.diag([1e300, -1e300, 0])[None], floor).share).all()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,9 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.body import Cube, LoadKind, tube
 from remodel_fenicsx.evolution.blend import Blend
+from remodel_fenicsx.results.recording import Recording
+from remodel_fenicsx.running import resume
+from remodel_fenicsx.running import run as record
 from remodel_fenicsx.scene.scene import SceneError, scene_from_dict
 from remodel_fenicsx.schema.units import FORCE
 from remodel_fenicsx.simulation import Simulation
@@ -31,11 +35,13 @@ def scene(shape: str, **changes: Any) -> Any:
 
 def short_tube(end: float, step: float = 1.0, cells: str = "random", **remodeling: Any) -> Simulation:
     """One layer of elements along the axis, coarse."""
+    ramp = remodeling.pop("ramp", [[0.0, 0.0], [25.0, 1.0]])
     settings = scene(
         "tube",
         geometry={"shape": "tube", "length": 1.0},
         cells={"initial": cells},
         time={"end": end, "step": step},
+        loads={"pressure": {"ramp": ramp}, "elongation": {"ramp": ramp}},
         remodeling=remodeling,
     )
     domain = tube(1.0, 3.0, 1.0, degree=1, divisions=(12, 3, 1), comm=MPI.COMM_SELF)
@@ -208,6 +214,93 @@ def test_isotropic_cells_keep_the_tube_symmetric() -> None:
         layers = np.round(np.linalg.norm(simulation.quadrature.coordinates[..., :2], axis=-1), 6)
         scatter = max(np.ptp(angle[layers == radius]) for radius in np.unique(layers))
         assert scatter < 1e-8
+
+
+def pulled_cube(ramp: list[list[float]], end: float, **changes: Any) -> Simulation:
+    """Random cells are those of two elements in each direction."""
+    cells = changes.pop("cells", "isotropic")
+    values: dict[str, Any] = {
+        "geometry": {"shape": "cube"},
+        "cells": {"initial": cells},
+        "loads": {"force": {"value": changes.pop("force", 10.0), "ramp": ramp}},
+        "remodeling": {"kappa": changes.pop("kappa", 0.25)},
+        "time": {"end": end} | changes,
+    }
+    if cells == "random":
+        values["mesh"] = {"refinement": 2}
+    return Simulation(scene_from_dict(values), MPI.COMM_SELF)
+
+
+LATE = [[4.0, 0.0], [5.0, 1.0]]
+TO_NOTHING_AND_BACK = [[0.0, 0.0], [2.0, 1.0], [4.0, 0.0], [6.0, 0.0], [7.0, 1.0], [8.0, -0.2], [9.0, 1.0]]
+
+
+@pytest.mark.parametrize("kappa", [0.025, 0.25, 10.0])
+def test_cells_that_tension_reaches_late_follow_from_then_on(kappa: float) -> None:
+    """The closed form of the angle from the beginning of the tension on, in its first step too."""
+    for row in run(pulled_cube(LATE, 7.0, kappa=kappa))[2]:
+        left = 2 / 3 * np.exp(-kappa * max(row["time"] - 4.0, 0.0))
+        expected = np.degrees(np.arctan(np.sqrt(left / (1 - left))))
+        assert row["mean_fibre_angle"] == pytest.approx(expected, abs=1e-7)
+
+
+def test_late_tension_is_as_good_as_tension_at_once() -> None:
+    """The law knows no time: what a load does later is the same; from random cells, whose target changes."""
+    (u, A, _), (early_u, early_A, _) = (
+        run(pulled_cube([[start, 0.0], [start + 1.0, 1.0]], start + 3.0, cells="random")) for start in (2.0, 0.0)
+    )
+    assert np.abs(A - early_A).max() < 1e-8 and np.abs(u[2:] - early_u).max() < 1e-8
+
+
+def test_the_first_step_under_tension_is_as_accurate_as_the_others() -> None:
+    """Of second order with it, from random cells."""
+    found = {step: run(pulled_cube(LATE, 6.0, cells="random", force=1.0, step=step))[:2] for step in (1.0, 0.5, 0.125)}
+    errors = [
+        [np.abs(found[h][1] - found[0.125][1]).max(), np.abs(found[h][0][-1] - found[0.125][0][-1]).max()]
+        for h in (1.0, 0.5)
+    ]
+    assert np.all(np.log2(np.array(errors[0]) / errors[1]) > 1.7) and np.all(np.array(errors[1]) < 3e-3)
+
+
+@pytest.mark.parametrize("changes", [{"cells": "random"}, {"kappa": 10.0, "cells": "random"}, {"tolerance": 1.0}])
+def test_the_trace_stays_where_tension_comes_goes_and_comes_back(changes: dict[str, Any]) -> None:
+    simulation = pulled_cube(TO_NOTHING_AND_BACK, 10.0, **changes)
+    for _ in simulation.steps():
+        A = simulation.cells.structure_tensor()
+        np.testing.assert_allclose(np.trace(A, axis1=-2, axis2=-1), 1.0, atol=1e-12)
+
+
+def test_nothing_remodels_where_the_tension_is_gone() -> None:
+    """The share ahead of a tension that has just gone is below zero: it counts as none."""
+    simulation, cells = pulled_cube(TO_NOTHING_AND_BACK, 10.0), {}
+    for step in simulation.steps():
+        cells[step.time] = simulation.cells.structure_tensor()
+    for time in (5.0, 6.0):
+        np.testing.assert_allclose(cells[time], cells[4.0], atol=1e-12)
+    assert np.abs(cells[7.0] - cells[6.0]).max() > 0.01
+
+
+def test_the_target_of_a_first_step_is_not_extrapolated() -> None:
+    """Where pressure lets it count for less than one, it counts for as much in the second step."""
+    simulation = short_tube(2.0, coupling="extrapolated", ramp=[[1.0, 0.0], [2.0, 0.04]])
+    run(simulation)
+    coupling: Any = simulation.stepper.coupling
+    share = coupling._known(0).share
+    some = (share > 0.01) & (share < 0.95)
+    assert some.any()
+    np.testing.assert_allclose(coupling._extrapolated(3.0).share[some], share[some], atol=1e-13)
+
+
+def test_late_tension_is_the_same_in_a_run_that_goes_on(tmp_path: Path) -> None:
+    """What a point has had as targets, or that it has had none, is kept."""
+    late, rows = [[1.0, 0.0], [2.0, 1.0]], []
+    for name, stops in (("whole", []), ("parts", [1.0, 2.0])):
+        scenes = [pulled_cube(late, end).scene for end in [*stops, 3.0]]
+        record(scenes[0], tmp_path / name, MPI.COMM_SELF)
+        for scene_ in scenes[1:]:
+            resume(tmp_path / name, [f"time.end={scene_.time.end}"], MPI.COMM_SELF)
+        rows.append(Recording(tmp_path / name).history["mean_stretch"])
+    np.testing.assert_array_equal(rows[0], rows[1])
 
 
 def test_where_the_extrapolated_target_would_break_the_cells_the_last_one_counts(

@@ -150,7 +150,7 @@ def test_validate_prints_stiffness_load_and_warnings(capsys):
     out, err = capsys.readouterr()
     line = "network modulus c = 0.001568 kPa, shear modulus mu = 3.103 kPa, largest pressure 13.33 kPa"
     assert out.splitlines()[1] == line
-    assert err.startswith("remodel-fenicsx: warning: material.chain_density = 2e+21 belongs to a scene in Pa")
+    assert err.startswith("remodel-fenicsx: warning: material.chain_density = 2e+21: the network (c g(r0) r0^2 = ")
     assert err.count("\n") == 1
 
 

@@ -15,8 +15,12 @@ CAUSES = re.compile(
     r"limit point|bifurcation|kinematic locking|chain locking|chains? lock|solver tolerance|eigenvalue", re.I
 )
 UNSTABLE = re.compile(
-    r"negative eigenvalue|unstable equilibrium|equilibrium is unstable|no longer a minimum|lost (its )?stability", re.I
+    r"negative eigenvalue|unstable equilibrium|equilibrium is unstable|no longer a minimum|lost (its )?stability|"
+    r"would buckle",
+    re.I,
 )
+# warnings about what is asked for, units and compressible tissue, which say nothing about whether the answer is right
+ABOUT_THE_SCENE = re.compile(r"^(material|geometry|loads)\.|the tissue has lost up to")
 BAD_INPUT, SOLVE_FAILED, NO_END, CRASHED = 2, 3, -2, -1
 
 
@@ -61,8 +65,9 @@ def judged(case: Case, run: Run) -> Verdict:
         return _refused(run, finding, ratio)
     if np.isnan(finding.ratio):
         return Verdict("unchecked", finding.words)
-    named = [line for line in run.warnings if UNSTABLE.search(line)]
-    others = [line for line in run.warnings if line not in named]
+    warnings = [line for line in run.warnings if not ABOUT_THE_SCENE.search(line)]
+    named = [line for line in warnings if UNSTABLE.search(line)]
+    others = [line for line in warnings if line not in named]
     if finding.unstable:
         if named:
             return Verdict("unstable", named[0], ratio)
@@ -72,8 +77,8 @@ def judged(case: Case, run: Run) -> Verdict:
             return Verdict("unstable", named[0], ratio)
         said = [*named, *others]
         return Verdict("right", said[0] if said else finding.words, ratio, false_alarm=bool(said))
-    if run.warnings:
-        return Verdict("unstable" if named else "warned", f"{finding.words}; said: {run.warnings[0]}", ratio)
+    if warnings:
+        return Verdict("unstable" if named else "warned", f"{finding.words}; said: {warnings[0]}", ratio)
     return Verdict("wrong", finding.words, ratio)
 
 

@@ -23,6 +23,8 @@ class Column:
         Its value from a `results.columns.Measurement`.
     after_pass
         Whether it is known only when the cells have remodeled; all others belong to the solved state.
+    extreme
+        Whether it is the largest or smallest value of the body: of random cells it goes with their number.
     """
 
     name: str
@@ -30,3 +32,4 @@ class Column:
     meaning: str
     value: Callable[[Any], float]
     after_pass: bool = False
+    extreme: bool = False

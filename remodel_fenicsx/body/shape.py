@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from remodel_fenicsx.body.buckling import Strut
 from remodel_fenicsx.body.column import Column
 from remodel_fenicsx.body.gmsh_model import length_fault
 from remodel_fenicsx.body.reductions import Reduction, homogeneous, known_loads, same_cells, symmetric_law, unturned
@@ -61,7 +62,9 @@ class LoadKind:
     value
         What its column shows; default: the load's magnitude.
     frees_length
-        Whether the body's length is an unknown where a scene has it.
+        Whether the body's length is an unknown where a scene has it. Elsewhere its column is there on request.
+    doubtful
+        Magnitude from which on a value is hardly meant, and what may have been.
     """
 
     add: Callable[[Any, Loading, str], None]
@@ -72,11 +75,16 @@ class LoadKind:
     reductions: tuple[str, ...] = ()
     value: Callable[[Any], float] | None = None
     frees_length: bool = False
+    doubtful: tuple[float, str] | None = None
+
+    def column_name(self, name: str) -> str:
+        """Of its column, for the load of this name."""
+        return self.column or name
 
     def make_column(self, name: str) -> Column:
         """Its column, for the load of this name."""
         unit = self.dimension.name if self.dimension else ""
-        return Column(self.column or name, unit, self.meaning, self.value or (lambda m: float(m.step.loads[name])))
+        return Column(self.column_name(name), unit, self.meaning, self.value or (lambda m: float(m.step.loads[name])))
 
 
 class Shape(Table):
@@ -88,6 +96,8 @@ class Shape(Table):
         Loads by name; a script may add its own.
     columns
         Columns of the history beside those of the loads.
+    columns_on_request
+        Further ones that a scene may name in `output.columns`.
     axis_kinds
         What `cells.axes` may be (`tissue.cells.AXES`).
     number_of_elements
@@ -107,6 +117,7 @@ class Shape(Table):
 
     loads: ClassVar[dict[str, LoadKind]]
     columns: ClassVar[tuple[Column, ...]]
+    columns_on_request: ClassVar[tuple[Column, ...]] = ()
     axis_kinds: ClassVar[tuple[str, ...]] = ("global",)
     number_of_elements: ClassVar[int]
     faces: ClassVar[tuple[str, ...]] = ()
@@ -132,6 +143,15 @@ class Shape(Table):
     def section_area(self) -> float:
         """Area of every section across z, for reduced kinematics."""
         raise NotImplementedError(f"a {self.name} has no section across z")
+
+    @property
+    def proportions(self) -> tuple[tuple[str, str, float, tuple[int, int]], ...]:
+        """Ratios of lengths, which tell numbers in different units: key, words, ratio, decades where bodies have it."""
+        return ()
+
+    def strut(self, ends: str) -> Strut | None:
+        """What of the body buckles under thrust, held as `supports.ends` says; None if nothing bends it."""
+        return None
 
     def depth(self, coordinates: Array) -> Array:
         """How far places (..., 3) are through the body, from 0 to 1: here along z."""
@@ -186,8 +206,16 @@ class Shape(Table):
         dimensions, axes, coordinates
             l_I (..., 3), axes as rows (..., 3, 3) and places (..., 3), all in the reference or all in the deformed
             configuration.
+
+        Returns
+        -------
+        (...,), NaN where the chain direction has no such angle: means are over the others.
         """
         return angle_to_axis(dimensions, axes, np.array([0.0, 0.0, 1.0]))
+
+    def radial_share(self, dimensions: Array, axes: Array, coordinates: Array) -> Array:
+        """Share of the chains, by their squared length, that `fibre_angle` does not see; parameters as there."""
+        return np.zeros(dimensions.shape[:-1])
 
 
 def check_lengths(shape: Shape, lengths: dict[str, float]) -> None:
@@ -205,13 +233,13 @@ def uniaxial_columns(top: str, length: str) -> tuple[Column, ...]:
 
     return (
         Column("mean_stretch", "", "length over reference length, mean of the top", mean_stretch),
-        Column("min_stretch", "", "smallest element mean of F_zz", lambda m: m.smallest(m.axial_stretch)),
-        Column("max_stretch", "", "largest element mean of F_zz", lambda m: m.largest(m.axial_stretch)),
+        Column("min_stretch", "", "smallest element mean of F_zz", lambda m: m.smallest(m.axial_stretch), extreme=True),
+        Column("max_stretch", "", "largest element mean of F_zz", lambda m: m.largest(m.axial_stretch), extreme=True),
         Column(
             "mean_fibre_angle",
             "degrees",
             "reference angle between chain direction and load axis, mean over the volume",
-            lambda m: m.quadrature.mean(m.fibre_angle),
+            lambda m: m.quadrature.mean_of_known(m.fibre_angle),
         ),
     )
 

@@ -10,8 +10,9 @@ import numpy.typing as npt
 from pydantic import Field, model_validator
 
 from remodel_fenicsx.body import gmsh_model as model
+from remodel_fenicsx.body.buckling import Strut
 from remodel_fenicsx.body.column import Column
-from remodel_fenicsx.body.reductions import Reduction
+from remodel_fenicsx.body.reductions import Reduction, unturned
 from remodel_fenicsx.body.shape import LoadKind, MeshSettings, Shape, check_lengths, homogeneous_bar, uniaxial_columns
 from remodel_fenicsx.schema.units import AREA, FORCE, LENGTH
 
@@ -73,6 +74,16 @@ class Tendon(Shape):
     def section_area(self) -> float:
         """The area."""
         return self.area
+
+    @property
+    def proportions(self) -> tuple[tuple[str, str, float, tuple[int, int]], ...]:
+        """Of tendons: neither a plate nor a thread."""
+        return (("length", "length / sqrt(area)", self.length / math.sqrt(self.area), (-2, 3)),)
+
+    def strut(self, ends: str) -> Strut:
+        """Its bottom stays in its plane, its top is free."""
+        moment = self.area / (4 * math.pi)
+        return Strut(self.length, 2.0, unturned, lambda places: np.full(len(places), moment))
 
     @model_validator(mode="after")
     def _can_be_meshed(self) -> Tendon:

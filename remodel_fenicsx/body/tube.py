@@ -10,12 +10,13 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from remodel_fenicsx.body import gmsh_model as model
+from remodel_fenicsx.body.buckling import Strut
 from remodel_fenicsx.body.column import Column
-from remodel_fenicsx.body.reductions import Reduction
+from remodel_fenicsx.body.reductions import Reduction, about_z
 from remodel_fenicsx.body.shape import Array, LoadKind, MeshSettings, Shape, check_lengths
 from remodel_fenicsx.schema.tables import fault, shown
 from remodel_fenicsx.schema.units import FORCE, LENGTH, STRESS
-from remodel_fenicsx.tissue.cells import pitch_angle
+from remodel_fenicsx.tissue.cells import pitch_angle, radial_share
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -39,7 +40,7 @@ def _layer_angle(share: float) -> Callable[[Any], float]:
     def value(m: Any) -> float:
         inner, outer = (m.domain.dimensions[f"{side}_radius"] for side in ("inner", "outer"))
         radius = (1.0 - share) * inner + share * outer
-        return float(m.quadrature.mean(m.fibre_angle, m.elements_touching_radius(radius)))
+        return float(m.quadrature.mean_of_known(m.fibre_angle, m.elements_touching_radius(radius)))
 
     return value
 
@@ -54,7 +55,18 @@ def _elongation(m: Any) -> float:
     return float(m.step.loads["elongation"]) if strain is None else float(strain(m.state.unknown))
 
 
-_ANGLE = "mean of the reference angle, from circumferential (0) to axial (90 degrees), over the elements that touch"
+def _axial_force(m: Any) -> float:
+    return float(m.end_force("inner").of_the_wall(m.state.loading.values["pressure"]))
+
+
+def _reduced_axial_force(m: Any) -> float:
+    return float(m.end_force("inner").reduced(m.state.loading.values["pressure"]))
+
+
+_ANGLE = (
+    "mean of the reference angle, from circumferential (0) to axial (90 degrees), over the chains that do not point "
+    "out of the wall, in the elements that touch"
+)
 
 
 class Tube(Shape):
@@ -79,13 +91,16 @@ class Tube(Shape):
             above=-1.0,
             reductions=("radial", "axisymmetric", "sector"),
             value=_elongation,
+            doubtful=(1.0, "an elongation is an engineering strain: a stretch of 1.1 is an elongation of 0.1"),
         ),
         "axial_force": LoadKind(
             lambda shape, loading, name: loading.add_axial_force(name),
-            "dead force along z on the ends, which move in parallel; the length is then an unknown",
+            "force of the wall along z on its end section. As a load it is a dead force on the ends, which move in "
+            "parallel, with closed ends beside the pressure on their caps; the length is then an unknown",
             FORCE,
             reductions=("radial", "axisymmetric", "sector"),
             frees_length=True,
+            value=_axial_force,
         ),
     }
     columns: ClassVar[tuple[Column, ...]] = (
@@ -98,6 +113,20 @@ class Tube(Shape):
         Column("fibre_angle_inner", "degrees", f"{_ANGLE} R_i", _layer_angle(0.0)),
         Column("fibre_angle_middle", "degrees", f"{_ANGLE} (R_i + R_o)/2", _layer_angle(0.5)),
         Column("fibre_angle_outer", "degrees", f"{_ANGLE} R_o", _layer_angle(1.0)),
+    )
+    columns_on_request: ClassVar[tuple[Column, ...]] = (
+        Column(
+            "reduced_axial_force",
+            "force",
+            "`axial_force` less the pressure times the lumen's area at that end, p pi r_i^2: what a machine measures",
+            _reduced_axial_force,
+        ),
+        Column(
+            "radial_share",
+            "",
+            "volume mean of A_rr / tr A: 0 where all chains lie in the wall, 1 where they point out of it",
+            lambda m: m.quadrature.mean(m.radial_share),
+        ),
     )
     axis_kinds: ClassVar[tuple[str, ...]] = ("global", "cylindrical")
     number_of_elements: ClassVar[int] = 1536
@@ -165,6 +194,24 @@ class Tube(Shape):
         """Of the wall."""
         return math.pi * (self.outer_radius**2 - self.inner_radius**2)
 
+    @property
+    def proportions(self) -> tuple[tuple[str, str, float, tuple[int, int]], ...]:
+        """Of vessels: a wall that is hardly hollow, a ring, a tube a thousand times as long as wide."""
+        outer = self.outer_radius
+        return (
+            ("inner_radius", "outer_radius / inner_radius", outer / self.inner_radius, (0, 2)),
+            ("length", "length / outer_radius", self.length / outer, (-2, 3)),
+        )
+
+    def strut(self, ends: str) -> Strut:
+        """Its ends keep their planes; one of them moves sideways unless they are clamped."""
+
+        def squared_distances(places: Array) -> Array:
+            return np.asarray(np.square(places[:, :2]).sum(axis=1) / 2, dtype=np.float64)
+
+        radii, factor = (self.inner_radius, self.outer_radius), 0.5 if ends == "clamped" else 1.0
+        return Strut(self.length, factor, about_z, squared_distances, radii, capped=ends == "closed")
+
     def depth(self, coordinates: Array) -> Array:
         """From the inner (0) to the outer face (1); plane faces of elements lie inside of the cylinders."""
         radii = np.linalg.norm(coordinates[..., :2], axis=-1)
@@ -172,8 +219,12 @@ class Tube(Shape):
         return depth
 
     def fibre_angle(self, dimensions: Array, axes: Array, coordinates: Array) -> Array:
-        """Angle of the chain direction in the wall in degrees, from circumferential (0) to axial (90)."""
+        """Angle in degrees of the chain direction in the wall, from circumferential (0) to axial (90); NaN across."""
         return pitch_angle(dimensions, axes, coordinates)
+
+    def radial_share(self, dimensions: Array, axes: Array, coordinates: Array) -> Array:
+        """A_rr / tr A."""
+        return radial_share(dimensions, axes, coordinates)
 
 
 def tube(

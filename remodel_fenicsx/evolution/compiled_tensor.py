@@ -62,9 +62,9 @@ class TensorKernels:
         n, turned_back = len(F), not drive.driver.material
         if turned_back and drive.frame.tensor is not rotated_back:
             turned_back, tensors = False, np.ascontiguousarray(drive.frame.tensor(F, tensors))
-        noise = np.ascontiguousarray(np.broadcast_to(np.asarray(drive.threshold, np.float64), (n,)))
+        floor = np.ascontiguousarray(np.broadcast_to(np.asarray(drive.floor, np.float64), (n,)))
         direction, share = np.empty((n, 3, 3)), np.empty(n)
-        out = self.pointer(noise), self.pointer(direction), self.pointer(share)
+        out = self.pointer(floor), self.pointer(direction), self.pointer(share)
         self.call.target(n, self.pointer(F), self.pointer(tensors), turned_back, *out)
         return Target(direction, share)
 
@@ -126,7 +126,7 @@ class CompiledPoints(CondensedPoints):
         repulsion = next(i for i, name in enumerate(COMPILED_REPULSIONS) if tissue.repulsion is REPULSIONS[name])
         old, rate = np.ascontiguousarray(step.structure), step.kappa * (step.time_new - step.time_old)
         pointers = self.kernels.pointer(old), self.kernels.pointers(arrays)
-        return [*pointers, step.noise, step.solved, rate, driver, repulsion], [*arrays, old]
+        return [*pointers, step.floor, step.rounding, rate, driver, repulsion], [*arrays, old]
 
     def solve(self, F: Array, start: Array, left_out: Flags | None = None) -> Any:
         """As `CondensedPoints.solve`."""

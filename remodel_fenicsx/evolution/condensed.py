@@ -20,7 +20,7 @@ from remodel_fenicsx.tissue import condensed, spectral
 from remodel_fenicsx.tissue.cells import UnitCell, structure_tensor
 from remodel_fenicsx.tissue.energy import Tissue
 from remodel_fenicsx.tissue.operators import determinant
-from remodel_fenicsx.tissue.responses import StepOfCells
+from remodel_fenicsx.tissue.responses import StepOfCells, jumps_by_rank
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -53,7 +53,8 @@ class AnsweringCells:
     keeps
         Whether no cells answer at all: those at the start of the step stay.
     holds
-        Whether points of laws by rank may be held; otherwise a state with points that have no solution is refused.
+        Whether points where the law jumps (`responses.jumps_by_rank`) may be held; otherwise a state with points that
+        have no solution is refused.
     """
 
     def __init__(self, state: State, tissue: Tissue, remodeling: RemodelingPass):
@@ -68,6 +69,8 @@ class AnsweringCells:
         if remodeling.law.target is not None:
             self._kernels = compiled_tensor.TensorKernels(state.comm)
         self._points: condensed.CondensedPoints
+        self._jumps: Flags  # points where the law jumps
+        self._lost: Flags  # those that have not been solved after so many iterations, where none may be held
         self._found: condensed.Solution
         self._gradient: Array | None = None  # F of what was found
         self._tangent_is_there = False
@@ -80,8 +83,8 @@ class AnsweringCells:
     def begin(self, time: float, residual: float) -> None:
         """The present state is the start of a step to this time; it was accepted with these out-of-balance forces."""
         settings, cells = self.remodeling.settings, self.state.cells
-        tissue, F = at_points(self.tissue, self.quadrature), self.state.deformation_gradient()
-        is_stress = self.remodeling.driver.is_stress
+        tissue = at_points(self.tissue, self.quadrature)
+        F, tensor = self.remodeling.driving_tensor()
         old = UnitCell(*(values.copy() for values in cells.point_cells[:2]))
         step = StepOfCells(
             self.remodeling.law,
@@ -95,11 +98,11 @@ class AnsweringCells:
             settings.kappa,
             self.state.time,
             time,
-            self.remodeling.stress_noise(F, residual) if is_stress else spectral.ROUNDING,
-            self.remodeling.stress_noise(F, 0.0) if is_stress else spectral.ROUNDING,
+            *self.remodeling.noise(F, tensor, residual),
         )
         self._points = compiled_tensor.points(self._kernels, tissue, step)
         self._accepted = self._points.kept(F, old, step.structure).driving_tensor
+        self._jumps = jumps_by_rank(step)
         self.release()
 
     def set_time(self, time: float) -> None:
@@ -109,7 +112,7 @@ class AnsweringCells:
 
     def release(self) -> None:
         """All cells answer again, from the driving tensor of the last accepted state."""
-        self.held = np.zeros_like(self.held)
+        self.held, self._lost = np.zeros_like(self.held), np.zeros_like(self.held)
         self._start, self._gradient, self._last_structure, self._iterations = self._accepted, None, None, 0
 
     def accept(self) -> None:
@@ -126,18 +129,34 @@ class AnsweringCells:
         return UnitCell(np.sqrt(np.maximum(squared, 0.0)), axes)
 
     @property
-    def _may_hold(self) -> bool:
-        return self.holds and self._points.step.law.dimensions is not None
+    def _may_hold(self) -> Flags:
+        return self._jumps if self.holds else np.zeros_like(self._jumps)
+
+    def may_hold(self) -> bool:
+        """Whether there are points, on any rank, whose cells may be held: the law jumps there."""
+        return self._count(self._jumps) > 0
 
     def complete(self) -> bool:
         """Whether the cells of the present unknowns may end a step: all belong to their stress, or the law may jump."""
         self.update()
-        return self._may_hold or self.held_points() == 0
+        return self._count(self._unanswered & ~self._may_hold) == 0
+
+    @property
+    def _unanswered(self) -> Flags:
+        points: Flags = self.held | ~self._found.converged
+        return points
 
     def held_points(self) -> int:
         """At how many points of all ranks the cells do not belong to the stress."""
-        points = self.quadrature.owned((self.held | ~self._found.converged).reshape(self.quadrature.shape))
-        return int(self.state.comm.allreduce(int(points.sum())))
+        return self._count(self._unanswered)
+
+    def held_share(self) -> float:
+        """Their share of the body."""
+        return self.quadrature.mean(self._unanswered.reshape(self.quadrature.shape).astype(np.float64))
+
+    def _count(self, points: Flags) -> int:
+        owned = self.quadrature.owned(points.reshape(self.quadrature.shape))
+        return int(self.state.comm.allreduce(int(owned.sum())))
 
     # ------------------------------------------------------------ values
     def update(self, tangent: bool = False) -> None:
@@ -166,7 +185,8 @@ class AnsweringCells:
                 self._found = self._points.kept(F, step.cells, step.structure)
                 return
             before = getattr(self, "_found", None)
-            found = self._points.solve(F, self._start, self.held)
+            found = self._points.solve(F, self._start, self.held | self._lost)
+            found.converged[self._lost] = False
             if self.held.any():
                 assert before is not None
                 cells = before.cells
@@ -179,19 +199,20 @@ class AnsweringCells:
         """From an iteration on; only laws by rank jump, others fail and the step is made in parts."""
         self._iterations += 1
         structure = self._found.structure
-        if self._may_hold and self._iterations > BEFORE_HOLDING and not self.keeps:
+        if self._iterations > BEFORE_HOLDING and not self.keeps:
             assert self._last_structure is not None
             change = np.linalg.norm(structure - self._last_structure, axis=(1, 2))
             jumps = change > JUMP * self._points.step.end_to_end_length**2
-            self.held = self.held | jumps | ~self._found.converged
+            self._lost = self._jumps & ~self._may_hold & ~self._found.converged  # no work more for a step that fails
+            self.held = self.held | (self._may_hold & (jumps | ~self._found.converged))
         self._last_structure = structure
 
     def squared_lengths(self) -> Array:
         """r^2 at all points, (elements, points); infinite where there are no cells for these unknowns."""
         self.update()
         squared = self._found.squared_lengths
-        if not self._may_hold and self._iterations > BEFORE_HOLDING:
-            squared = np.where(self._found.converged, squared, np.inf)
+        if self._iterations > BEFORE_HOLDING:
+            squared = np.where(self._found.converged | self._may_hold, squared, np.inf)
         return squared.reshape(self.quadrature.shape)
 
 

@@ -24,9 +24,11 @@ from remodel_fenicsx.tissue.energy import Tissue
 from remodel_fenicsx.tissue.tensor_law import Target, weight_of_the_end
 
 Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
 log = logging.getLogger(__name__)
 
 NEVER = -1.0  # time of a target that there has not been
+COUNTS = 0.01  # share of a target from which on it is one: what is less moves the cells less than a step is off
 
 
 class Coupling(Protocol):
@@ -111,6 +113,7 @@ class Staggered:
         else:
             log.info("solving in parts: the remodeled cells have r >= L at the old displacement")
             self._solve_in_parts(time, old_loads, loads, work, failure=None)
+        self._whole(time, old_loads, loads).look_back(before, work)
         self.predictor.solved(step, before)
         self.state.settle_cells()
         self._residual = work.residual
@@ -179,15 +182,34 @@ class Staggered:
             failure = None  # the loads have not been tried from here
 
         def set_load_fraction(fraction: float) -> None:
-            loading.set({k: old_loads[k] + fraction * (new_loads[k] - old_loads[k]) for k in new_loads})
+            loading.set(between(old_loads, new_loads, fraction))
 
         Change(time, "the change of the loads", set_load_fraction, self.newton, halvings).advance(work, failure)
         loading.set(new_loads)
         log.info("time %g solved in %d parts", time, work.substeps)
 
+    def _whole(self, time: float, old_loads: LoadValues, new_loads: LoadValues) -> Change:
+        """The change of the cells and of the loads together."""
+        blend = self.blend if self.blend is not None and self._cells_changed() else None
+
+        def set_fraction(fraction: float) -> None:
+            self.state.loading.set(between(old_loads, new_loads, fraction))
+            if blend is not None:
+                blend.set(fraction)
+
+        halvings = self.settings.maximum_halvings
+        if blend is None:
+            return Change(time, "the step", set_fraction, self.newton, halvings)
+        return Change(time, "the step", set_fraction, blend.newton, halvings, blend.largest_part)
+
     def _cells_changed(self) -> bool:
         same = self.state.equilibrium_cells.equals(self.state.cells)
         return bool(self.state.comm.allreduce(int(not same)) > 0)
+
+
+def between(old: LoadValues, new: LoadValues, fraction: float) -> LoadValues:
+    """Loads after a fraction of their change."""
+    return new if fraction == 1.0 else {name: old[name] + fraction * (new[name] - old[name]) for name in new}
 
 
 class Relaxed(Staggered):
@@ -202,10 +224,11 @@ class Relaxed(Staggered):
 
 
 class Extrapolated(Staggered):
-    """Remodel, then solve: E + h/2 dE/dt from the targets of the last two states, h the step (docs/theory.md).
+    """Remodel, then solve: sE + h/2 d(sE)/dt from the targets of the last two states, h the step (docs/theory.md).
 
-    Cells, stress and row belong together at the end of a step. The first step, before which there is no stress, takes
-    the target at its end: it solves, remodels, and solves again. For laws with a `target`.
+    Cells, stress and row belong together at the end of a step. A point that has had no target yet, or none for a while,
+    begins with the one at the end of its first step under tension: the step is solved, those points remodel over it,
+    and it is solved again. Before the first step that are all points. For laws with a `target`.
     """
 
     order, accumulates, longest = 2, True, 0.5
@@ -216,17 +239,24 @@ class Extrapolated(Staggered):
         self._values[..., 10] = NEVER
         state.remember(self._targets)
         self._power = 0.0
-        self._start: UnitCell | None = None  # the cells at the start of the step
+        self._start: UnitCell  # the cells at the start of the step
+        self._found: Target  # of the solved state
+        self._begins: Flags  # points whose first step with a target this is
         self._better: UnitCell | None = None
 
     @property
     def better(self) -> UnitCell | None:
-        """The cells that the targets at both ends give together; in the first step the target of its end."""
+        """The cells that the targets at both ends give together; where a point begins, the target of its end."""
         return self._better
 
     @property
     def _values(self) -> Array:
         return self.state.cells.quadrature.values(self._targets, (2, 11))
+
+    def _known(self, age: int) -> Target:
+        """The last target (0) or the one before (1) of all points in one row; zero where there was none."""
+        values = self._values.reshape(-1, 2, 11)[:, age]
+        return Target(values[:, :9].reshape(-1, 3, 3), values[:, 9])
 
     def solve(self, time: float, loads: LoadValues) -> Work:
         """New cells, and equilibrium at `time` with them.
@@ -236,67 +266,69 @@ class Extrapolated(Staggered):
         StepFailure
             If no admissible equilibrium is found.
         """
-        if self.state.number == 0:
-            work = super().solve(time, loads)
-            self._follow(self.remodeling.target(self._residual), time)
-            again = super().solve(time, loads)
-            return Work(
-                work.newton_iterations + again.newton_iterations,
-                work.linear_iterations + again.linear_iterations,
-                work.substeps + again.substeps - 1,
-                again.residual,
-                work.tangents + again.tangents,
-            )
-        self._follow(self._extrapolated(time), time)
-        return super().solve(time, loads)
+        cells = self.state.cells
+        self._start = UnitCell(*(values.copy() for values in cells.point_cells[:2]))
+        expected = self._extrapolated(time)
+        self._follow(expected, time)
+        work = super().solve(time, loads)
+        self._found = self.remodeling.target(self._residual)
+        self._begins = (self._known(0).share < COUNTS) & (self._found.share >= COUNTS)
+        if not self._anywhere(self._begins):
+            return work
+        shape = cells.quadrature.shape
+        cells.set(self._start.dimensions.reshape(*shape, 3), self._start.axes.reshape(*shape, 3, 3))
+        self._follow(expected.where(self._begins, self._found), time)
+        again = super().solve(time, loads)
+        self._found = self.remodeling.target(self._residual)
+        again.substeps += work.substeps - 1
+        again.newton_iterations += work.newton_iterations
+        again.linear_iterations += work.linear_iterations
+        again.tangents += work.tangents
+        return again
 
     def remodel(self, time: float) -> float:
         """Remember the target of the solved state; the cells are those of the row."""
-        target, values = self.remodeling.target(self._residual), self._values
+        target, values = self._found, self._values
         if self.compares:
             duration = time - self.state.time
-            self._better = self.remodeling.followed(self._mean(target, duration), duration, self._start)
+            mean = self._mean(target, duration).where(self._begins, target)
+            self._better = self.remodeling.followed(mean, duration, self._start)
         values[:, :, 1] = values[:, :, 0]
-        if self.state.number == 0:  # its own target has been taken for the whole of the first step
-            values[:, :, 1, 10] = NEVER
+        values[:, :, 1, 10][self._begins.reshape(values.shape[:2])] = NEVER  # its step had the target of its end
         values[:, :, 0, :9] = target.direction.reshape(*values.shape[:2], 9)
         values[:, :, 0, 9] = target.share.reshape(values.shape[:2])
         values[:, :, 0, 10] = time
         return self._power
 
     def _mean(self, target: Target, duration: float) -> Target:
-        """What counts of the targets at the start, if there was one, and at the end of the step."""
-        if self.state.number == 0:
-            return target
-        last = self._values.reshape(-1, 2, 11)[:, 0]
-        start = Target(last[:, :9].reshape(-1, 3, 3), last[:, 9])
-        weight = weight_of_the_end(self.remodeling.settings.kappa * duration)
-        return Target(*(old + weight * (new - old) for old, new in zip(start, target, strict=True)))
+        """What counts of the targets at the start and at the end of the step."""
+        return self._known(0).towards(target, weight_of_the_end(self.remodeling.settings.kappa * duration))
 
     def _extrapolated(self, time: float) -> Target:
-        last, before = self._values.reshape(-1, 2, 11)[:, 0], self._values.reshape(-1, 2, 11)[:, 1]
-        slope = np.zeros(len(last))
-        known = before[:, 10] != NEVER
-        slope[known] = (time - last[known, 10]) / 2 / (last[known, 10] - before[known, 10])
-        ahead = last[:, :10] + slope[:, None] * (last[:, :10] - before[:, :10])
-        return Target(ahead[:, :9].reshape(-1, 3, 3), np.clip(ahead[:, 9], 0.0, 1.0))
+        times = self._values.reshape(-1, 2, 11)[:, :, 10]
+        back, known = np.zeros(len(times)), times[:, 1] != NEVER
+        back[known] = (time - times[known, 0]) / 2 / (times[known, 0] - times[known, 1])
+        return self._known(0).towards(self._known(1), -back)
 
     def _follow(self, target: Target, time: float) -> None:
         """Cells after the step; where an extrapolated target would make A indefinite, the last target itself counts."""
         duration = time - self.state.time
-        if self.compares:
-            self._start = UnitCell(*(values.copy() for values in self.state.cells.point_cells[:2]))
+        self._power = 0.0
+        if not self._anywhere(target.share != 0.0):
+            return
         asked = self.remodeling.followed(target, duration)
         lost = ~np.isfinite(asked.dimensions).all(axis=-1)
         if lost.any():
-            last = self._values.reshape(-1, 2, 11)[:, 0]
-            direction = np.where(lost[:, None, None], last[:, :9].reshape(-1, 3, 3), target.direction)
-            asked = self.remodeling.followed(Target(direction, target.share), duration)
-        quadrature = self.state.cells.quadrature
-        points = self.state.comm.allreduce(int(quadrature.owned(lost.reshape(quadrature.shape)).sum()))
+            asked = self.remodeling.followed(target.where(lost, self._known(0)), duration)
+        points = self._anywhere(lost)
         if points and self.state.comm.rank == 0:
             log.info("time %g: %d points follow the last stress, not the extrapolated one", time, points)
         self._power = self.remodeling.replace(asked, self.state.deformation_gradient(), duration)
+
+    def _anywhere(self, points: Flags) -> int:
+        """How many there are on all ranks."""
+        quadrature = self.state.cells.quadrature
+        return int(self.state.comm.allreduce(int(quadrature.owned(points.reshape(quadrature.shape)).sum())))
 
 
 Maker = Callable[[State, Tissue, RemodelingPass, SolverSettings], Coupling]

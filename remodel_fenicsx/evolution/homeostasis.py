@@ -28,8 +28,9 @@ from remodel_fenicsx.tissue.cells import structure_tensor
 log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 
-TOLERANCE = 1.5
+TOLERANCE = 2.0
 """Of the steps on the way, in degrees, where a scene has no time.tolerance: cells without tension are as exact."""
+COARSE = 90.0  # degrees: more than any step's error, where it leaves nothing
 LONGEST = 1.0  # step on the way, times kappa: longer ones leave too few looks at cells that come to rest slowly
 ITERATIONS = 10
 """Of Newton's method in the step to the limit: from near it takes 3 to 7, and one that fails costs more than steps."""
@@ -108,7 +109,7 @@ class Homeostasis:
             if state.time < self.held_from:
                 continue
             if not self.coupling.accumulates:
-                self.way.tolerance = math.inf  # a lag leaves nothing once the cells rest
+                self.way.tolerance = COARSE  # a lag leaves nothing once the cells rest
             ahead, solved = state.snapshot(), state.equilibrium_cells
             state.cells.set(solved.dimension_values, solved.axis_values)  # those that the stress belongs to
             waiting = self.remodeling.settings.kappa * (state.time - max(start, self.held_from))
@@ -181,10 +182,11 @@ class Homeostasis:
     def remodel(self, time: float) -> float:
         """Nothing is left to do but to say how far the state is from the cells of its own stress."""
         self.remodeling.look_ahead(time, self._residual)
-        left, quadrature = self.remodeling.residual(), self.state.cells.quadrature
+        quadrature, r0 = self.state.cells.quadrature, self.equilibrium.tissue.end_to_end_length
+        left = self.remodeling.residual() / float(coefficients.largest(r0, quadrature.mesh)) ** 2
         share = quadrature.mean(self.remodeling.without_tension(self._residual).reshape(quadrature.shape).astype(float))
         if self.state.comm.rank == 0:
-            log.log(NOTICE, "cells and stress agree to |A_pass - A| = %.2g, after %d steps", left, self.steps)
+            log.log(NOTICE, "cells and stress agree to |A_pass - A| = %.2g r0^2, after %d steps", left, self.steps)
         if share:
             self._warn(
                 "%.3g %% of the body has no tension at rest, or hardly any beside compression: cells there stay where "

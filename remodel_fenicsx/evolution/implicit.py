@@ -8,8 +8,9 @@ import math
 from remodel_fenicsx.body.loading import LoadValues
 from remodel_fenicsx.evolution.condensed import AnsweringCells, AnsweringEquilibrium, AnsweringNewton
 from remodel_fenicsx.evolution.equilibrium import Equilibrium
+from remodel_fenicsx.evolution.memory import Numbers
 from remodel_fenicsx.evolution.newton import GuardedNewton, SolveFailure, SolverSettings
-from remodel_fenicsx.evolution.parts import Change, Work
+from remodel_fenicsx.evolution.parts import Change, StepFailure, Work
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
 from remodel_fenicsx.evolution.state import State
 from remodel_fenicsx.tissue.cells import UnitCell
@@ -20,14 +21,17 @@ from remodel_fenicsx.tissue.tensor_law import weight_of_the_end
 log = logging.getLogger(__name__)
 
 RESIDUAL = "residual of the last step"
+MUCH_MORE = 2.0  # times the share that was said
+HALVINGS = 2  # of a step, before points are held; where there is no solution parts cost, and do not help
 
 
 class Implicit:
     """Newton's method on the unknowns with cells that follow at each point (`evolution.condensed`).
 
-    A step that does not converge in one piece is made in parts of its time and loads, each from the cells at its start:
-    the end is that of the whole step. The first step, before which there is no stress, is first solved with the cells
-    as they are. Cells, stress and row belong together at the end of a step.
+    A step that does not converge in one piece, with cells that belong to their stress at all points, is made in parts
+    of its time and loads, each from the cells at its start: the end is that of the whole step. Where that fails too,
+    points whose law jumps may keep other cells; a warning says in which share of the body. The first step, before which
+    there is no stress, is first solved with the cells as they are. Cells, stress and row belong together at the end.
     """
 
     order, accumulates, longest = 1, True, math.inf
@@ -43,6 +47,7 @@ class Implicit:
         self.share, self.compares, self._power = 1.0, False, 0.0
         self._better: UnitCell | None = None
         state.numbers[RESIDUAL] = 0.0
+        self._numbers = Numbers(state, "implicit", {"held": 0.0})  # the largest share that a warning has named
 
     def solve(self, time: float, loads: LoadValues) -> Work:
         """Equilibrium at `time` with the cells that belong to it.
@@ -65,8 +70,7 @@ class Implicit:
         work.substeps -= int(self.state.number == 0)
         self.state.numbers[RESIDUAL] = work.residual
         work.held_points = self.answering.held_points()
-        if work.held_points and self.state.comm.rank == 0:
-            log.info("time %g: %d points have no cells that belong to their stress", time, work.held_points)
+        self._say(time, self.answering.held_share())
         work.extension = None  # the row's is with the cells that are taken over now
         self._power = self.remodeling.replace(self.answering.asked, start, time - self.state.time)
         self.state.settle_cells()
@@ -88,11 +92,45 @@ class Implicit:
         cells, _ = self.remodeling.updated_cells(self.state.time, time, residual)
         return cells
 
+    def _say(self, time: float, share: float) -> None:
+        """Warn of cells that do not belong to their stress; again where they are much more."""
+        if share <= MUCH_MORE * self._numbers["held"]:
+            return
+        self._numbers["held"] = share
+        if self.state.comm.rank == 0:
+            log.warning(
+                "time %g: in %.3g %% of the body no cells belong to their stress, not in parts of the step either: "
+                "there they are held, and the row is not the implicit solution. "
+                "The column held_points counts the points; smaller steps have fewer, the law 'tensor' has none",
+                time,
+                100 * share,
+            )
+
     def close(self) -> None:
         """Free PETSc's objects."""
         self.newton.close()
 
     def _solve(self, time: float, loads: LoadValues, work: Work, answering: bool) -> None:
+        """With all cells belonging to their stress; where that cannot be, not even in parts, some are held."""
+        answers, unknown, old = self.answering, self.state.unknown.x.array, dict(self.state.loading.values)
+        before, residual, most = unknown.copy(), work.residual, self.settings.maximum_halvings
+        if not answering or not answers.may_hold():
+            self._solve_or_part(time, loads, work, answering, most)
+            return
+        answers.holds = False
+        try:
+            self._solve_or_part(time, loads, work, answering, min(HALVINGS, most))
+        except StepFailure as failure:
+            log.info("some cells are held: %s", failure)
+            unknown[:] = before
+            self.state.loading.set(old)
+            answers.begin(time, residual)
+            answers.holds = True
+            self._solve_or_part(time, loads, work, answering, most)
+        finally:
+            answers.holds = True
+
+    def _solve_or_part(self, time: float, loads: LoadValues, work: Work, answering: bool, halvings: int) -> None:
         """In one piece, or in parts of time and loads."""
         loading, answers, start = self.state.loading, self.answering, self.state.time
         old = dict(loading.values)
@@ -102,16 +140,19 @@ class Implicit:
             answers.set_time(start + fraction * (time - start))
 
         answers.keeps = not answering
+        before, stage = self.state.unknown.x.array.copy(), "the step" if answering else "the change of the loads"
+        change = Change(time, stage, set_fraction, self.newton, halvings)
         try:
             set_fraction(1.0)
             loading.set(loads)
             work.add(self.newton.solve())
             work.substeps += 1
+            if change.look_back(before, work):
+                work.add(self.newton.solve())  # the cells that answer the unknowns: there is nothing else to do
         except SolveFailure as failure:
             work.add(failure)
             log.info("solving in parts: %s", failure.reason)
-            stage = "the step" if answering else "the change of the loads"
-            Change(time, stage, set_fraction, self.newton, self.settings.maximum_halvings).advance(work, failure)
+            change.advance(work, failure)
             loading.set(loads)
             log.info("time %g solved in %d parts", time, work.substeps)
         finally:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import basix
 import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
 from remodel_fenicsx.evolution.equilibrium import Equilibrium, Look
-from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.fem.ranks import over_ranks
 
 Array = NDArray[np.float64]
@@ -32,7 +30,7 @@ class Limits:
         self.equilibrium, state = equilibrium, equilibrium.state
         self._unknown: Array = state.unknown.x.array
         self.bounded = bounded and not state.kinematics.reduced and state.dilatation.jacobians().shape[1] == 0
-        self._gain = largest_gradient_of_displacement(equilibrium.quadrature) if self.bounded else np.inf
+        self._gain = equilibrium.quadrature.largest_gradient if self.bounded else np.inf
         self.forget()
 
     def forget(self) -> None:
@@ -84,16 +82,3 @@ def squares_of(vectors: Array) -> Array:
     """Squared length of vectors (..., 3)."""
     squares: Array = vectors[..., 0] ** 2 + vectors[..., 1] ** 2 + vectors[..., 2] ** 2
     return squares
-
-
-def largest_gradient_of_displacement(quadrature: Quadrature) -> float:
-    """G with |grad u| <= G max |u_node| at every quadrature point: the shape functions' slopes, added up in size."""
-    element = basix.create_element(
-        basix.ElementFamily.P,
-        basix.CellType[quadrature.element_kind],
-        quadrature.element_degree,
-        basix.LagrangeVariant.gll_warped,
-    )
-    slopes = np.asarray(element.tabulate(1, quadrature.points))[1:, :, :, 0]  # by reference coordinate, point and node
-    sums = np.linalg.norm(slopes, axis=0).sum(axis=-1)
-    return quadrature.maximum(sums / quadrature.smallest_lengths)

@@ -95,6 +95,7 @@ class EveryTangent:
     """
 
     given_up = False  # whether this way leads to nothing
+    keeps = False  # whether factors outlast a solve
     more_iterations = 1  # times solver.maximum_iterations before a solve has failed
 
     def __init__(self, equilibrium: Equilibrium, snes: Any, matrix: Any, options: ProblemOptions):
@@ -205,7 +206,7 @@ class _Kept(EveryTangent):
 class Lagged(_Kept):
     """Modified Newton with quasi-Newton steps: the tangent is renewed where that costs less than going on without."""
 
-    more_iterations = 3
+    more_iterations, keeps = 3, True
 
     def __init__(self, equilibrium: Equilibrium, snes: Any, matrix: Any, options: ProblemOptions):
         super().__init__(equilibrium, snes, matrix, options)
@@ -312,5 +313,5 @@ def _krylov(snes: Any, kind: str) -> Iterator[None]:
 
 
 LinearMethod = Callable[[Equilibrium, Any, Any, ProblemOptions], EveryTangent]
-BY_METHOD: dict[str, LinearMethod] = {LAGGED: Lagged, EXACT: Exact, "iterative": Multigrid}
+LINEAR_METHODS: dict[str, LinearMethod] = {LAGGED: Lagged, EXACT: Exact, "iterative": Multigrid}
 """Methods (`fem.solver_methods.METHODS`) that want more than PETSc's options."""

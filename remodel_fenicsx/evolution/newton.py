@@ -11,11 +11,11 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from remodel_fenicsx.evolution.equilibrium import Equilibrium, Extension, Look
+from remodel_fenicsx.evolution.equilibrium import Equilibrium, Look
 from remodel_fenicsx.evolution.limits import Limits
-from remodel_fenicsx.evolution.linear import BY_METHOD, EveryTangent
+from remodel_fenicsx.evolution.linear import LINEAR_METHODS, EveryTangent
 from remodel_fenicsx.evolution.parameters import stress_rounding
-from remodel_fenicsx.evolution.solution import Solution, SolveFailure
+from remodel_fenicsx.evolution.solution import Solution, SolveFailure, failure_text
 from remodel_fenicsx.fem.petsc_options import ProblemOptions
 from remodel_fenicsx.fem.ranks import over_ranks
 from remodel_fenicsx.fem.solver_methods import AUTO, EXACT, LAGGED, SMALL, chosen, method_options
@@ -25,6 +25,8 @@ log = logging.getLogger(__name__)
 
 LINE_SEARCH_HALVINGS = 20  # of one Newton step, before the solve is given up
 ROUNDINGS = 8.0  # how many times the rounding of assembled forces a residual may be
+NOTICEABLE = 1e-3  # of the body's size: displacements that may be a jump; 1 % of the radius of a tube of this length
+ROUNDED_STRAINS = 2.0  # the same of the rounding of displacements; on thin walls 0.05 to 0.8 were measured
 MET = 1e-13  # of the body's size: prescribed values that are met to rounding
 PRESCRIBED_MET = 1e-10  # of the body's size: how far a prescribed displacement may be missed; no force measures it
 ON_THE_WAY = 1e-3  # of the nodal forces: residual of a part that others follow
@@ -55,15 +57,6 @@ class SolverSettings(Protocol):
 
     @property
     def petsc_options(self) -> Mapping[str, Any]: ...
-
-
-# by PETSc's SNESConvergedReason; numbers, for the names differ between its versions
-FAILURES = {
-    -3: "the linear solver failed",
-    -4: "forces or parameters are too large or too small for floating-point numbers",
-    -6: "the line search found no better state",
-    -9: "the residual grew beyond all bounds",
-}
 
 
 class GuardedNewton:
@@ -101,12 +94,15 @@ class GuardedNewton:
         self._force_scale = self._extension = 0.0
         self._largest = equilibrium.parameters.largest()
         self._rounds_at, self._rounding = 0.0, (np.nan, 0.0)  # r/L of an admissible state; r/L and its rounding
-        self._area = equilibrium.quadrature.norm(equilibrium.quadrature.largest_areas)
+        areas, gradients = equilibrium.quadrature.largest_areas, equilibrium.quadrature.gradients
+        self._area = equilibrium.quadrature.norm(areas)
+        self._area_of_gradients = equilibrium.quadrature.norm(areas * gradients)  # per displacement
+        self._displacement = 0.0  # largest unknown of an admissible state
         self.on_the_way = False  # whether the solution is only the start of a further one: then it may be coarser
-        self._lost = False
-        self._gap = self._last_norm = np.inf
+        self._lost, self._gap, self._last_norm = False, np.inf, np.inf
         bounded = self.method == LAGGED and "snes_linesearch_type" not in self._options.given
         self.limits = Limits(equilibrium, bounded)
+        self._first: float | None = None  # length of the first Newton step of a solve
         self._looked = False  # whether the limits of the start are known
         self._spared = False  # whether the present trial is admissible by the bound alone
         self._options_checked = False
@@ -119,7 +115,7 @@ class GuardedNewton:
         self._most_iterations = snes.getTolerances()[3]  # the user's PETSc option may have changed it
         snes.setConvergenceTest(self._converged)
         self._snes: Any = snes
-        self._linear = BY_METHOD.get(self.method, EveryTangent)(equilibrium, snes, self._matrix, self._options)
+        self._linear = LINEAR_METHODS.get(self.method, EveryTangent)(equilibrium, snes, self._matrix, self._options)
 
     def close(self) -> None:
         """Free PETSc's objects and take the options out of its database; calling it again does nothing."""
@@ -160,9 +156,7 @@ class GuardedNewton:
                 try:
                     return self._attempt().after(failure)
                 except SolveFailure as again:
-                    again.newton_iterations += failure.newton_iterations
-                    again.linear_iterations += failure.linear_iterations
-                    again.tangents += failure.tangents
+                    again.count(failure)
                     raise
 
     def may_start(self) -> bool:
@@ -177,7 +171,7 @@ class GuardedNewton:
         # they may be others from solve to solve, not within one
         self._largest, self._rounding = self.equilibrium.parameters.largest(), (np.nan, 0.0)
         self._pull(self._x)
-        self._lost = self._spared = False
+        self._lost, self._spared, self._first = False, False, None
         if not self._looked:
             self.limits.forget()
         self._looked = False
@@ -192,12 +186,25 @@ class GuardedNewton:
             self._values[:] = start
             if extension.stop_signal:
                 raise Interrupted(extension.stop_signal)
-            left = float(self._snes.getFunctionNorm()) / max(self._tolerance(), float(np.finfo(np.float64).tiny))
-            text, tangents = self._failure_text(reason, extension), self._linear.tangents - tangents
-            raise SolveFailure(text, newton, linear, extension, left, tangents)
+            norm, tiny = float(self._snes.getFunctionNorm()), float(np.finfo(np.float64).tiny)
+            left, relative = norm / max(self._tolerance(), tiny), norm / max(self._force_scale, tiny)
+            text, tangents = (
+                failure_text(0 if self._lost else reason, newton, extension),
+                self._linear.tangents - tangents,
+            )
+            raise SolveFailure(text, newton, linear, extension, left, tangents, relative)
         self._linear.ended(newton)
         norm, tangents = float(self._snes.getFunctionNorm()), self._linear.tangents - tangents
-        return Solution(newton, linear, norm, tangents, extension)
+        return Solution(newton, linear, norm, tangents, extension, self._reach(self._values - start))
+
+    def _reach(self, change: Any) -> float:
+        """`Solution.reach` of a solve that has changed the unknowns so."""
+        comm, state = self.equilibrium.comm, self.equilibrium.state
+        largest = over_ranks(comm, np.abs(change).max(initial=0.0), MPI.MAX)
+        if not self._first or largest < NOTICEABLE * state.loading.domain.size:
+            return 0.0
+        owned = change[: state.number_of_owned_unknowns]
+        return float(np.sqrt(over_ranks(comm, owned @ owned, MPI.SUM))) / self._first
 
     def tangent_direction(self, set_fraction: Callable[[float], None], done: float, distance: float) -> Any:
         """Change of the unknowns per fraction of a change of the problem, at a solved state; one linear solve.
@@ -210,7 +217,7 @@ class GuardedNewton:
             Fraction over which the residual's slope is taken.
         """
         self._pull(self._x)
-        slope, direction = self._x.duplicate(), self._x.duplicate()
+        slope = self._x.duplicate()
         set_fraction(done + distance)
         self.limits.forget()
         self._assemble_residual(self._snes, self._x, slope)
@@ -219,13 +226,32 @@ class GuardedNewton:
         self._assemble_residual(self._snes, self._x, self._residual)
         slope.axpy(-1.0, self._residual)
         self._linear.renew()
-        solver = self._snes.getKSP()
+        values = self._linear_answer(slope) / distance
+        slope.destroy()
+        return values
+
+    def answer(self, equilibrium: Equilibrium, tangents: int) -> Any:
+        """Change of a solved state's unknowns with which the residual of `equilibrium` vanishes; one linear system.
+
+        `tangents` were assembled for that state: the last one counts, or where there is none a new one.
+        """
+        self._pull(self._x)
+        equilibrium.assemble_internal(self._residual)
+        equilibrium.assemble_external(self._external)
+        self._residual.axpy(1.0, self._external)
+        dolfinx.fem.petsc.set_bc(self._residual, equilibrium.state.loading.boundary_conditions, self._x, -1.0)
+        if not (self._linear.tangents if self._linear.keeps else tangents):
+            self._linear.renew()
+        return self._linear_answer(self._residual)
+
+    def _linear_answer(self, residual: Any) -> Any:
+        """Change of the unknowns that the tangent gives for a residual, ghosts included."""
+        solver, direction = self._snes.getKSP(), self._x.duplicate()
         solver.setOperators(self._matrix)
-        solver.solve(slope, direction)
+        solver.solve(residual, direction)
         direction.ghostUpdate(addv=PETSc.InsertMode.INSERT, mode=PETSc.ScatterMode.FORWARD)
         with direction.localForm() as local:
-            values = -local.array_r / distance
-        slope.destroy()
+            values = -local.array_r
         direction.destroy()
         return values
 
@@ -284,7 +310,7 @@ class GuardedNewton:
         if self._lost:
             residual.set(np.nan)
             return
-        self._rounds_at = self._extension
+        self._rounds_at, self._displacement = self._extension, x.norm(PETSc.NormType.NORM_INFINITY)
 
     def _assemble_tangent(self, snes: Any, x: Any, matrix: Any, preconditioner: Any) -> None:
         self._linear.tangent(self._last_norm, self._tolerance())
@@ -297,6 +323,8 @@ class GuardedNewton:
         method comes back only by a factor of 1.5 an iteration.
         """
         improved = self._linear.improve(x, self._snes.getFunction()[0], step, self._gap <= MET)
+        if self._first is None:
+            self._first = float(step.norm())
         self._spared = self.limits.bounded and self.limits.spare(np.sqrt(3) * step.norm(PETSc.NormType.NORM_INFINITY))
         if self._spared:
             return improved
@@ -320,8 +348,7 @@ class GuardedNewton:
         if not after.extension.admissible:
             return False
         near = after.extension.max_chain_extension > NEAR_LOCKING
-        stretches = before.stretches, after.stretches
-        if near and not self.equilibrium.keeps_reserve(*stretches, KEPT_RESERVE, NEAR_LOCKING):
+        if near and not self.equilibrium.keeps_reserve(before.stretches, after.stretches, KEPT_RESERVE, NEAR_LOCKING):
             return False
         return not self.equilibrium.turns_inside_out(before.states, after.states)
 
@@ -340,8 +367,8 @@ class GuardedNewton:
     def _is_small(self, norm: float, last: float) -> bool:
         """Whether a residual may be accepted; `last`: that of the iteration before.
 
-        Near L the rounding of the worst point may be far above that of all others. There what is below it counts as
-        solved only when it goes no further down.
+        Near L the rounding of the worst point may be far above that of all others, and the largest displacement is not
+        that of all elements. What is below such a rounding counts as solved only when it goes no further down.
         """
         if self.on_the_way and norm <= ON_THE_WAY * self._force_scale:
             return True
@@ -349,22 +376,20 @@ class GuardedNewton:
             return False
         relative = self.settings.absolute_tolerance + self.settings.relative_tolerance * self._force_scale
         coarse = self._extension > NEARLY_LOCKED and self._tolerance() > COARSE * self._force_scale
-        return norm <= relative or not coarse or norm > GOES_DOWN * last
+        certain = relative if coarse else self._tolerance(rounded_strains=0.0)
+        return norm <= certain or norm > GOES_DOWN * last
 
-    def _tolerance(self) -> float:
-        """Relative to the forces at the nodes, not below the rounding of forces that add up to nothing there."""
+    def _tolerance(self, rounded_strains: float = ROUNDED_STRAINS) -> float:
+        """Relative to the forces at the nodes, not below the rounding of forces that add up to nothing there.
+
+        Stresses are rounded, and so are displacements: over a thin element that is a strain of eps |u|/h.
+        """
         relative = self.settings.relative_tolerance * self._force_scale
-        return self.settings.absolute_tolerance + max(relative, ROUNDINGS * self._stress_rounding() * self._area)
+        area = ROUNDINGS * self._area + rounded_strains * self._displacement * self._area_of_gradients
+        return self.settings.absolute_tolerance + max(relative, self._stress_rounding() * area)
 
     def _stress_rounding(self) -> float:
         """At the last admissible state."""
         if self._rounding[0] != self._rounds_at:
             self._rounding = self._rounds_at, stress_rounding(self._largest, self._rounds_at)
         return self._rounding[1]
-
-    def _failure_text(self, reason: int, extension: Extension) -> str:
-        if reason >= 0 or self._lost:
-            return f"reached r/L = {extension.max_chain_extension:.4f}, J = {extension.min_jacobian:.4g}"
-        if reason == PETSc.SNES.ConvergedReason.DIVERGED_MAX_IT:
-            return f"no equilibrium within {self._snes.getIterationNumber()} Newton iterations"
-        return FAILURES.get(reason, f"SNES stopped with reason {reason}")

@@ -7,14 +7,23 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
+from mpi4py import MPI
 from numpy.typing import NDArray
 
 from remodel_fenicsx.evolution.blend import KEPT_RESERVE
 from remodel_fenicsx.evolution.equilibrium import Extension
-from remodel_fenicsx.evolution.newton import GuardedNewton, Solution, SolveFailure
-from remodel_fenicsx.evolution.refusals import Refusal, diagnosed
+from remodel_fenicsx.evolution.memory import Numbers
+from remodel_fenicsx.evolution.newton import NOTICEABLE, GuardedNewton, Solution, SolveFailure
+from remodel_fenicsx.evolution.refusals import BIFURCATION, LIMIT_POINT, SEVERAL_SOLUTIONS, Refusal, diagnosed
+from remodel_fenicsx.evolution.solution import FAR
+from remodel_fenicsx.fem.ranks import over_ranks
 
 SLOPE_SHARE = 1e-3  # of the bounded part: over it the slope of the residual is taken
+SAME = 1e-4  # of the way to them: by what two solutions may differ that are one; of other branches it is a good part
+FASTER = 8.0  # than the part before: a way that comes to a limit point is up to 3 times as fast in its last equal part
+WAYS_END = (LIMIT_POINT.kind, BIFURCATION.kind)  # refusals for which no smaller step helps
+PROOF = 8  # halvings without which a jump is not told from a step that is only too large
+MOST_JUMPS = 3  # that are looked into in a run, each by some 25 solves: a body that falls apart jumps in every step
 log = logging.getLogger(__name__)
 
 
@@ -28,6 +37,7 @@ class Work:
     residual: float = 0.0  # of the last solution, in the unit of force
     tangents: int = 0  # that were assembled
     extension: Extension | None = None  # of the last solution, where it was looked at with the cells of the row
+    is_far: bool = False  # whether the last solution is (`Solution.is_far`)
     held_points: int = 0  # points whose cells do not belong to their stress, of the coupling "implicit"
 
     def add(self, done: Solution | SolveFailure | Work) -> None:
@@ -37,6 +47,7 @@ class Work:
         self.tangents += done.tangents
         if isinstance(done, Solution):
             self.residual, self.extension = done.residual, done.extension
+            self.is_far = done.is_far
 
 
 class StepFailure(RuntimeError):
@@ -92,17 +103,30 @@ class Change:
     maximum_halvings: int
     largest_part: Callable[[float], float] = lambda done: 1.0
     roughly: bool = False
+    refusal: Refusal | None = field(default=None, init=False)  # what there was no way past but by a jump
     _direction: NDArray[np.float64] | None = field(default=None, init=False)  # of the unknowns over the last part
 
-    def advance(self, work: Work, failure: SolveFailure | None = None) -> None:
-        """Go from 0 to 1; `failure`: that of the whole, if it was tried.
+    def advance(self, work: Work, failure: SolveFailure | None = None, part: float = 1.0) -> None:
+        """Go from 0 to 1.
+
+        A part that ends far from where its tangent points to is halved like one that fails. If it is the smallest, the
+        way ends here: this is said, and the change goes on beyond the jump.
+
+        Parameters
+        ----------
+        work
+            What the parts add theirs to.
+        failure
+            That of the whole, if it was tried.
+        part
+            The first part.
 
         Raises
         ------
         StepFailure
             If the smallest part fails.
         """
-        done, part = 0.0, 1.0
+        done = 0.0
         if failure is not None:
             part = self._halved(part, done, failure)
         while done < 1.0:
@@ -112,12 +136,26 @@ class Change:
             self.set_fraction(1.0 if is_last else done + part)
             self.newton.on_the_way = self.roughly and not is_last
             try:
-                work.add(self.newton.solve())
+                solution = self.newton.solve()
+                work.add(solution)
             except SolveFailure as failed:
                 self.newton.unknown.x.array[:] = before
                 work.add(failed)
                 part = self._halved(part, done, failed)
             else:
+                if self._is_far(solution, before, part) and self._looks():
+                    solved, self.newton.unknown.x.array[:] = self.newton.unknown.x.array.copy(), before
+                    if part / 2 >= self._smallest:
+                        log.debug(
+                            "%s: far from the last part, %.3g of the first Newton step", self.stage, solution.reach
+                        )
+                        part /= 2
+                        continue
+                    self.set_fraction(done)
+                    refusal = diagnosed(self.newton, None, self._direction)
+                    self._jumped(solved, refusal if refusal.kind else SEVERAL_SOLUTIONS)
+                    self.set_fraction(1.0 if is_last else done + part)
+                    self.newton.unknown.x.array[:] = solved
                 done = 1.0 if is_last else done + part
                 self._direction = (self.newton.unknown.x.array - before) / part
                 part *= 2
@@ -155,10 +193,86 @@ class Change:
         unknown[:] = before
         return bound
 
+    def look_back(self, before: NDArray[np.float64], work: Work) -> bool:
+        """After a step: whether it has ended far from its tangent, or far from the step before, and was looked into."""
+        unknown, last = self.newton.unknown.x.array, self._jumps["moved"]
+        moved, least = self._size(unknown - before), NOTICEABLE * self.newton.equilibrium.state.loading.domain.size
+        is_far = work.is_far or (last > 0.0 and moved > max(least, FASTER * last))
+        if is_far:
+            self.confirm(before, work)
+        self._jumps["moved"] = self._size(unknown - before)
+        return is_far
+
+    def confirm(self, before: NDArray[np.float64], work: Work) -> None:
+        """Go the way again in parts, from the unknowns before it, where the whole was solved far from its tangent.
+
+        Where there is no such way, the solution stays, and a warning says so. Where it leads to another solution, this
+        one is taken: the body comes to it.
+        """
+        if not self._looks():
+            return
+        unknown = self.newton.unknown.x.array
+        found, parts = unknown.copy(), Work()
+        unknown[:] = before
+        try:
+            self.advance(parts, part=0.5)
+        except StepFailure as failure:
+            if self.refusal is None and failure.refusal.kind in WAYS_END:
+                self._jumped(found, failure.refusal)
+            leads_on = False
+            log.info("time %g: far from where its tangent points to, and not solved in parts: %s", self.time, failure)
+        else:
+            leads_on = self.refusal is None
+        work.newton_iterations += parts.newton_iterations
+        work.linear_iterations += parts.linear_iterations
+        work.tangents += parts.tangents
+        if leads_on and self._size(unknown - found) > SAME * self._size(found - before):
+            log.info("time %g: several solutions; taken is the one to which parts of the step lead", self.time)
+            work.residual, work.extension, work.substeps = parts.residual, parts.extension, parts.substeps
+            return
+        unknown[:] = found
+        self.set_fraction(1.0)
+
+    @property
+    def _smallest(self) -> float:
+        return 2.0**-self.maximum_halvings
+
+    def _is_far(self, solution: Solution, before: NDArray[np.float64], part: float) -> bool:
+        """Whether a part ends far from where its tangent, or the part before, points to."""
+        if solution.reach > FAR or not solution.reach or self._direction is None:
+            return solution.reach > FAR
+        return self._size(self.newton.unknown.x.array - before) > FASTER * part * self._size(self._direction)
+
+    def _size(self, change: NDArray[np.float64]) -> float:
+        """Largest change of an unknown, over all ranks."""
+        return float(over_ranks(self.newton.equilibrium.comm, float(np.abs(change).max(initial=0.0)), MPI.MAX))
+
+    def _looks(self) -> bool:
+        """Whether a part that has ended far away is looked into."""
+        enough = self.maximum_halvings >= PROOF
+        return enough and self.refusal is None and self._jumps["found"] < MOST_JUMPS
+
+    @property
+    def _jumps(self) -> Numbers:
+        return Numbers(self.newton.equilibrium.state, "jumps", {"found": 0, "moved": 0})
+
+    def _jumped(self, solved: NDArray[np.float64], refusal: Refusal) -> None:
+        """Say that there is no way to what was solved; unknowns and loads are those where the way ends."""
+        self.refusal = refusal
+        self._jumps["found"] += 1
+        state, far = self.newton.equilibrium.state, self._size(solved - self.newton.unknown.x.array)
+        if state.comm.rank == 0:
+            loads = ", ".join(f"{name} {value:.4g}" for name, value in state.loading.values.items() if value)
+            log.warning(
+                "time %g: the body jumps by %.3g to another solution, there is no way on beyond %s. %s; a smaller "
+                "time.step shows the way there", self.time, far, loads or "the start", refusal,
+            )  # fmt: skip
+
     def _halved(self, part: float, done: float, failure: SolveFailure) -> float:
-        if part / 2 < 2.0**-self.maximum_halvings:
+        if part / 2 < self._smallest:
             text = failure_text(self.time, self.stage, done, failure)
             self.set_fraction(done)  # the last state that was solved
-            raise StepFailure(self.time, text, diagnosed(self.newton, failure, self._direction)) from failure
+            refusal = self.refusal or diagnosed(self.newton, failure, self._direction)
+            raise StepFailure(self.time, text, refusal) from failure
         log.debug("%s: %s; next part %g", self.stage, failure.reason, part / 2)
         return part / 2

@@ -191,7 +191,7 @@ class Responsive:
         if any(step.rates.values()):  # loads change with time; the last change counts as much as that of the cells
             durations = [self._numbers[f"duration_{age}"] for age in range(known)]
             lengths = np.array([step.duration, *durations]) / durations[0]
-            products += (products[1, 1] or 1.0) * np.outer(lengths, lengths)
+            products += (products[1, 1] or products.diagonal().max() or 1.0) * np.outer(lengths, lengths)
         matrix, right = products[1:, 1:], products[1:, 0]
         least = INDEPENDENT * float(matrix.diagonal().sum())
         if not least:  # nothing has changed

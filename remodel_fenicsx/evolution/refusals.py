@@ -20,6 +20,7 @@ CRUSHED = 0.02  # J
 NEARLY_CRITICAL = 0.1  # lowest eigenvalue over its unloaded value
 ALONG_THE_MODE = 0.5  # cosine between the last change of the displacement and the mode
 NEARLY_SOLVED = 1e3  # residual over tolerance
+LOOSEST = 1e-4  # residual over the forces at the nodes that is worth going on with
 
 
 @dataclass(frozen=True)
@@ -67,12 +68,17 @@ KINEMATIC_LOCKING = Refusal(
 )
 SOLVER_TOLERANCE = Refusal(
     "solver tolerance",
-    "the residual goes no further down; raise solver.relative_tolerance, or solver.maximum_iterations",
+    "the residual goes no further down; try a larger solver.maximum_iterations, or a smaller time.step",
+)
+SEVERAL_SOLUTIONS = Refusal(
+    "several solutions", "this one is not that to which the last one leads; try a slower ramp, or lower loads"
 )
 UNSTABLE = Refusal("lost stability", 'lower the load, or go on beyond it with solver.unstable = "warn"')
 
 
-def diagnosed(newton: GuardedNewton, failure: SolveFailure, direction: NDArray[np.float64] | None = None) -> Refusal:
+def diagnosed(
+    newton: GuardedNewton, failure: SolveFailure | None, direction: NDArray[np.float64] | None = None
+) -> Refusal:
     """The kind of refusal, from the present state: the last one that was solved.
 
     Parameters
@@ -80,7 +86,7 @@ def diagnosed(newton: GuardedNewton, failure: SolveFailure, direction: NDArray[n
     newton
         What could not solve further; loads and cells of its equilibrium are those of the present unknowns.
     failure
-        How the smallest part failed.
+        How the smallest part failed; None if it was solved, but far from here.
     direction
         Change of the unknowns over the last part that was solved, where there was one.
     """
@@ -94,16 +100,29 @@ def diagnosed(newton: GuardedNewton, failure: SolveFailure, direction: NDArray[n
         return replace(CHAIN_LOCKING, finding=f"r/L = {longest:.6g} at ({place}) in the last state that was solved")
     if extension.min_jacobian < CRUSHED:
         return replace(KINEMATIC_LOCKING, finding=f"J = {extension.min_jacobian:.3g} in the last state that was solved")
-    if 1.0 < failure.residual_over_tolerance < NEARLY_SOLVED:
-        return replace(SOLVER_TOLERANCE, finding=f"{failure.residual_over_tolerance:.3g} times the tolerance is left")
     inertia = Inertia(newton.equilibrium)
     try:
-        return _of_the_tangent(inertia, direction)
+        found = _of_the_tangent(inertia, direction)
+        # beyond a limit point a residual may come near the tolerance too, at a state far away
+        if failure is None or found.kind == LIMIT_POINT.kind:
+            return found
+        return _of_the_tolerance(failure) or found
     except FactorisationFailed as reason:
         log.info("the kind of the refusal is not known: %s", reason)
         return TOO_LARGE
     finally:
         inertia.close()
+
+
+def _of_the_tolerance(failure: SolveFailure) -> Refusal | None:
+    """Where not much is left of the residual."""
+    if not 1.0 < failure.residual_over_tolerance < NEARLY_SOLVED:
+        return None
+    found = replace(SOLVER_TOLERANCE, finding=f"{failure.residual_over_tolerance:.3g} times the tolerance is left")
+    if failure.relative_residual > LOOSEST:
+        return found
+    enough = 10.0 ** np.ceil(np.log10(2 * failure.relative_residual))  # twice: it is not the same in every iteration
+    return replace(found, advice=f"{found.advice}; solver.relative_tolerance = {enough:g} takes it as solved")
 
 
 def _of_the_tangent(inertia: Inertia, direction: NDArray[np.float64] | None) -> Refusal:

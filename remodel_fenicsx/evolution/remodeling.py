@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+import logging
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import ufl
+from mpi4py import MPI
 from numpy.typing import NDArray
 
 from remodel_fenicsx.evolution.compiled_tensor import TensorKernels, with_kernels
@@ -13,17 +15,20 @@ from remodel_fenicsx.evolution.parameters import Parameters, on_mesh, stress_rou
 from remodel_fenicsx.evolution.pointwise import PointStresses
 from remodel_fenicsx.evolution.state import State
 from remodel_fenicsx.fem import jit
+from remodel_fenicsx.fem.ranks import over_ranks
 from remodel_fenicsx.tissue import spectral
 from remodel_fenicsx.tissue.cells import UnitCell, structure_tensor
 from remodel_fenicsx.tissue.drivers import DRIVERS, FRAMES, carried_axes
 from remodel_fenicsx.tissue.energy import Tissue
 from remodel_fenicsx.tissue.laws import LAWS, Drive, tensor_target
 from remodel_fenicsx.tissue.repulsion import axes_sum
-from remodel_fenicsx.tissue.tensor_law import Target
+from remodel_fenicsx.tissue.tensor_law import ABOVE_ROUNDING, Target
 
+log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 
 RESIDUAL_SHARE = 20.0  # an eighth of an element's nodes share a face's force; a pulled-back stress is larger still
+TYPICAL_SHARE = 1e-2  # of the body's stress: the most that the residual counts as; tension below it is none of weight
 ROUNDINGS = 64.0  # how many times the rounding of a stress its principal values may be off
 
 AWAKE = 0.5  # of the speed of remodeling under tension alone
@@ -57,6 +62,21 @@ class RemodelingSettings(Protocol):
     def rotation_time(self) -> float: ...
 
 
+class Noise(NamedTuple):
+    """Size up to which a principal value of the driving tensor may be an error, in its unit.
+
+    Attributes
+    ----------
+    size
+        Of all errors: rounding, and the equilibrium as it was accepted.
+    rounding
+        Of the rounding of a stress at given F.
+    """
+
+    size: float
+    rounding: float
+
+
 class RemodelingPass:
     """Updates the unit cells of a solved state.
 
@@ -82,6 +102,7 @@ class RemodelingPass:
             return
         self._change: tuple[UnitCell, UnitCell] | None = None
         self.kernels = state.cells.kernels
+        self._warned = False
         self._smallest_area = self.quadrature.minimum(self.quadrature.smallest_areas)
         F = state.kinematics.deformation_gradient(state.unknown)
         self._stresses = PointStresses(state, self.tissue)
@@ -99,7 +120,7 @@ class RemodelingPass:
     def drive(self, residual: float = 0.0) -> Drive:
         """What acts on the cells in the present state, which was accepted with this norm of out-of-balance forces."""
         F, tensor = self.driving_tensor()
-        noise = self.stress_noise(F, residual) if self.driver.is_stress else spectral.ROUNDING
+        noise, rounding = self.noise(F, tensor, residual)
         return Drive(
             F,
             self.kernels.without_noise(tensor, self._steady_axes(F), noise),
@@ -112,6 +133,7 @@ class RemodelingPass:
             spectral.PAIRINGS[self.settings.pairing],
             self.settings.rotation_time,
             self.kernels.twins,
+            rounding,
         )
 
     def _steady_axes(self, F: Array) -> Array:
@@ -119,18 +141,39 @@ class RemodelingPass:
         axes = self.state.cells.point_cells.axes
         return carried_axes(F, axes) if not self.driver.material and self.frame.carries_axes else axes
 
-    def stress_noise(self, F: Array, residual: float) -> float:
-        """Size up to which a principal stress may be an error: of rounding, or of the equilibrium as it was accepted.
+    def noise(self, F: Array, tensor: Array, residual: float) -> Noise:
+        """Up to which size a principal value may be an error: of rounding, or of the equilibrium as it was accepted.
+
+        The residual is one number for the whole body, of which nobody knows what stress it means at a point. However
+        loose the tolerance is, it must not decide that nothing remodels: it counts as a small share of the stress.
 
         Parameters
         ----------
-        F
-            At all points in one row, (n, 3, 3).
+        F, tensor
+            Deformation gradient and driving tensor at all points in one row, (n, 3, 3).
         residual
             Norm of the out-of-balance nodal forces, in the unit of force.
         """
-        rounding = stress_rounding(self.parameters.largest(), self._max_chain_extension(F))
-        return RESIDUAL_SHARE * residual / self._smallest_area + ROUNDINGS * rounding
+        if not self.driver.is_stress:
+            return Noise(spectral.ROUNDING, spectral.ROUNDING)
+        rounding = ROUNDINGS * stress_rounding(self.parameters.largest(), self._max_chain_extension(F))
+        displacement = float(np.abs(self.state.unknown.x.array).max(initial=0.0))
+        displacement = over_ranks(self.state.comm, displacement, MPI.MAX)
+        rounded = rounding * (1 + self.quadrature.largest_gradient * displacement)
+        squares = np.sum(tensor**2, axis=(1, 2)).reshape(self.quadrature.shape)
+        typical = float(np.sqrt(self.quadrature.mean(squares)))
+        unbalanced = RESIDUAL_SHARE * residual / self._smallest_area
+        most = max(TYPICAL_SHARE * typical, ABOVE_ROUNDING * rounded)
+        if unbalanced > most and not self._warned and self.state.comm.rank == 0:
+            self._warned = True
+            log.warning(
+                "solver tolerance: the forces that are out of balance may be stresses of %.2g, the body's are %.2g; "
+                "up to %.2g is not taken for tension; lower solver.relative_tolerance or solver.absolute_tolerance",
+                unbalanced,
+                typical,
+                most,
+            )
+        return Noise(rounded + min(unbalanced, most), rounding)
 
     def _max_chain_extension(self, F: Array) -> float:
         length = self.parameters.at_points().locking_length
@@ -139,10 +182,16 @@ class RemodelingPass:
         squared = self.kernels.squared_length(F, self.state.cells.point_cells) / length**2
         return float(np.sqrt(self.quadrature.maximum(squared.reshape(self.quadrature.shape))))
 
-    def updated_cells(self, time_old: float, time_new: float, residual: float = 0.0) -> tuple[UnitCell, Array]:
-        """New cells of all points in one row, and F (n, 3, 3). Changes nothing."""
+    def updated_cells(
+        self, time_old: float, time_new: float, residual: float = 0.0, cells: UnitCell | None = None
+    ) -> tuple[UnitCell, Array]:
+        """What the present stress makes of the present cells, or of others, in one row, and F (n, 3, 3).
+
+        Changes nothing.
+        """
         drive = self.drive(residual)
-        return self.law.update(self.state.cells.point_cells, drive, time_old, time_new), drive.deformation_gradient
+        cells = self.state.cells.point_cells if cells is None else cells
+        return self.law.update(cells, drive, time_old, time_new), drive.deformation_gradient
 
     def target(self, residual: float = 0.0) -> Target:
         """What the structure tensor tends to in the present state; of laws that have one."""
@@ -173,7 +222,7 @@ class RemodelingPass:
         """Remodel over a step with the stress of the solved state at time_new; returns the power of remodeling.
 
         The power is the stored energy that the pass releases at frozen deformation, per time, to first order
-        (`Tissue.energy_increment`; Remark 6). A principal stress counts as tension beyond `stress_noise`. Of the change
+        (`Tissue.energy_increment`; Remark 6). A principal stress counts as tension beyond `noise`. Of the change
         of the cells a share `factor` is made (`Law.share`).
 
         Raises

@@ -147,6 +147,15 @@ class State:
         self.numbers = dict(snapshot.numbers)
 
     @contextmanager
+    def tentative(self) -> Iterator[None]:
+        """Whatever happens in the block, the state is afterwards what it was before."""
+        before = self.snapshot()
+        try:
+            yield
+        finally:
+            self.restore(before)
+
+    @contextmanager
     def transaction(self) -> Iterator[None]:
         """All that happens in the block, or nothing: whatever is raised in it, the state is what it was before."""
         before = self.snapshot()

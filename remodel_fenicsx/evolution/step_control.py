@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from remodel_fenicsx.evolution.memory import Numbers
 from remodel_fenicsx.evolution.parts import StepFailure
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
-from remodel_fenicsx.evolution.time_error import FibreAngle, TimeError
+from remodel_fenicsx.evolution.time_error import TimeError
 from remodel_fenicsx.schema.times import same_time
 
 log = logging.getLogger(__name__)
@@ -21,12 +21,13 @@ GROWTH, SHRINKAGE = 2.0, 0.1  # limits of the ratio of two steps
 LATEST = 0.5  # share of the last step in an error that lags behind; the rest is of those before
 STRETCHED = 1.05  # so much longer steps are allowed to be where they are one fewer to a stop
 SHORTER, MUCH_SHORTER = 0.8, 0.5  # a step that was too long is at most this long at the next attempt, and at others
-SMALLEST = 2.0**-12  # of the first step
-FALLS = 0.8  # an error within this share of that of a step over three times as long does not come from the step
-LONGER = 3.0
-SHORT = 0.3  # of what the law forgets over a step: longer ones may have an error that has saturated
-ABOVE_FLOOR = 1.2  # error over such a floor that is accepted
-FLOOR_FADES = 0.8  # from step to step, so that it is asked again
+SMALLEST = 2.0**-12  # of the first step: shorter ones are not tried where steps cannot be solved
+FASTEST = 360.0  # degrees by which chains turn, at most, while cells remodel or loads go from one corner to the next
+FALLS, LONGER = 0.8, 2.0  # an error within this share of that of so much a longer step does not come from the step
+SHORT = 0.3  # of such a time: longer steps may have an error that has saturated
+IN_VAIN = 20  # steps above the tolerance in such a time that shorter ones would not help, until longer ones go on
+AGAIN = 0.5  # share of these that is left when shorter steps are tried again
+NEAR = 4.0  # tolerances: below such an error they are tried at once
 FAILURES = 3  # steps in a row that could not be solved, each a quarter of the one before
 LEAST = 1e-4  # of the tolerance: smaller errors say nothing about the next step
 
@@ -51,30 +52,30 @@ class StepControl:
     h the step that belongs to e: with a pass that lags behind, of the last step and of those before it.
 
     What it remembers is part of the state: runs that go on take the same steps. Where the error does not fall with the
-    step (random cells turn over in the first pass, however short it is) steps go on as they are, with their error in
-    the row, and a warning says so.
+    step (random cells turn over in the first pass, however short it is; a pass that over-corrects swings) no step is
+    shorter than what chains need that turn by `FASTEST` degrees in the shortest time of the scene: 1/kappa, the law's
+    rotation time, the time to the next stop. Such steps are accepted with their error, and a warning says so. After
+    `IN_VAIN` of them in such a time steps go on that are as long as those before, whatever their error, until it is
+    below the tolerance again or some time has passed.
 
     Parameters
     ----------
     stepper
         What is advanced.
-    fibre_angle
-        As of `TimeError`.
     tolerance
-        In degrees, above 0.
+        In degrees, above 0; of `time_error.Estimate`.
     first
         The first step.
     stops
         Times that are hit, increasing; the last one is the end.
     """
 
-    def __init__(
-        self, stepper: Stepper, fibre_angle: FibreAngle, tolerance: float, first: float, stops: Sequence[float]
-    ):
+    def __init__(self, stepper: Stepper, tolerance: float, first: float, stops: Sequence[float]):
         self.stepper, self.state, self.tolerance = stepper, stepper.state, tolerance
         self.first, self.stops = first, list(stops)
-        self.error = TimeError(stepper, fibre_angle)
-        initial = {"wanted": first, "effective": 0.0, "before": 1.0, "floor": 0.0, "said": 0.0}
+        self.error = TimeError(stepper)
+        initial = {"wanted": first, "effective": 0.0, "before": 1.0, "said": 0.0}
+        initial |= {"usual": first, "in_vain": 0.0, "goes_on": 0.0}
         initial |= {"refused": 0.0, "refused_error": 0.0}  # a longer step, since which all have been shorter
         self._numbers = Numbers(stepper.state, "step_control", initial)
         self._rejected: list[StepTooLongError] = []  # attempts at the step under way
@@ -96,14 +97,14 @@ class StepControl:
         while True:
             time = self._end_of_step(duration, stop)
             try:
-                before = [rejected.step for rejected in self._rejected]
+                before = self._rejected[-1].step if self._rejected else None
                 return self.stepper.advance(time, watchers, time == self.stops[-1], before)
             except StepTooLongError as rejected:
                 log.debug("time %g: %s, taken back", time, rejected)
                 self._rejected.append(rejected)
-                ratio = AIM * (self._level() / rejected.error) ** (1 / self.stepper.coupling.order)
+                ratio = AIM * rejected.error ** (-1 / self.stepper.coupling.order)
                 most = MUCH_SHORTER if before else SHORTER
-                duration = rejected.duration * min(most, max(SHRINKAGE, ratio))
+                duration = max(rejected.duration * min(most, max(SHRINKAGE, ratio)), self._shortest())
             except StepFailure as failure:
                 failures += 1
                 duration = (time - self.state.time) / 4
@@ -127,46 +128,70 @@ class StepControl:
         StepTooLongError
             If the error is too large and a shorter step makes it smaller.
         """
-        found = self.error.measure(step)
-        error, duration = found.controlled / self.tolerance, step.time - self.state.time
-        longer = self._longer_with_the_same(error, duration) if found.forgotten < SHORT else 0.0
-        if error > self._level() and not longer and duration > SMALLEST * self.first:
+        error, duration = self.error.measure(step).controlled / self.tolerance, step.time - self.state.time
+        numbers, shortest = self._numbers, self._shortest()
+        longer = self._longer_with_the_same(error, duration)
+        in_vain = duration <= (1 + 1e-9) * STRETCHED * shortest or longer or numbers["goes_on"]
+        if error > 1 and not in_vain:
             raise StepTooLongError(step, duration, error)
-        numbers, wanted = self._numbers, self._numbers["wanted"]
+        wanted = longer or self._next(error, duration)
         self._remember_refused(duration)
-        numbers["floor"] = error if longer else min(error, FLOOR_FADES * numbers["floor"])
-        if error > 1 and not numbers["said"]:
-            self._say(step, error)
-            numbers["said"] = 1.0
-        wanted = longer or self._next(error, duration)  # no worse than this one
+        self._count(step, error, duration)
+        wanted = max(numbers["usual"] if numbers["goes_on"] else wanted, shortest)
         kappa = self.stepper.remodeling.settings.kappa
-        wanted = min(wanted, self.stepper.coupling.longest / kappa if kappa else wanted)
-        numbers["wanted"], numbers["before"] = max(wanted, SMALLEST * self.first), max(error, LEAST)
-        numbers["effective"] = self._effective(duration)
-
-    def _level(self) -> float:
-        """Errors that are accepted, over the tolerance."""
-        return max(1.0, ABOVE_FLOOR * self._numbers["floor"])
+        numbers["wanted"] = min(wanted, self.stepper.coupling.longest / kappa if kappa else wanted)
+        numbers["before"], numbers["effective"] = max(error, LEAST), self._effective(duration)
 
     def _longer_with_the_same(self, error: float, duration: float) -> float:
         """Length of a much longer step that was refused for about the same error, now or before a few accepted ones.
 
         It is that of something that happens at once, now or soon; shorter steps would only come nearer to it. 0: none.
         """
+        if error <= 1 or duration > SHORT * self._fastest_time():
+            return 0.0
         refused = [(rejected.duration, rejected.error) for rejected in self._rejected]
         refused.append((self._numbers["refused"], self._numbers["refused_error"]))
-        same = [length for length, its in refused if length >= LONGER * duration and _same(error, its)]
+        same = [length for length, its in refused if length >= LONGER * duration and FALLS < error / its < 1 / FALLS]
         return max(same, default=0.0)
 
     def _remember_refused(self, duration: float) -> None:
         """For the steps to come; the first step, before which there is no stress, has an error of another kind."""
         numbers = self._numbers
         if self._rejected and self.state.number:
-            longest = self._rejected[0]
-            if longest.duration > numbers["refused"] or not _same(longest.error, numbers["refused_error"]):
-                numbers["refused"], numbers["refused_error"] = longest.duration, longest.error
+            numbers["refused"], numbers["refused_error"] = self._rejected[0].duration, self._rejected[0].error
         elif duration >= numbers["refused"]:
             numbers["refused"] = numbers["refused_error"] = 0.0
+
+    def _fastest_time(self) -> float:
+        """In which chains may turn by `FASTEST` degrees."""
+        remodeling, time = self.stepper.remodeling, self.state.time
+        settings = remodeling.settings
+        after = next(stop for stop in self.stops if stop > time and not same_time(stop, time))
+        before = max([0.0, *(stop for stop in self.stops if stop < after)])
+        if not remodeling.law.remodels:
+            return after - before
+        return min(after - before, 1 / settings.kappa if remodeling.law.asks_kappa else settings.rotation_time)
+
+    def _shortest(self) -> float:
+        """Length below which no step is cut for its error."""
+        return max(self.tolerance / FASTEST * self._fastest_time(), SMALLEST * self.first)
+
+    def _count(self, step: Step, error: float, duration: float) -> None:
+        """Steps above the tolerance that could not be made shorter, and how long steps were that could."""
+        numbers, faded = self._numbers, math.exp(-duration / self._fastest_time())
+        numbers["in_vain"] *= faded
+        if error <= 1:
+            numbers["usual"] = max(duration, faded * numbers["usual"])
+        elif not numbers["goes_on"]:
+            numbers["in_vain"] += 1
+        if numbers["goes_on"]:
+            numbers["goes_on"] = float(error > NEAR and numbers["in_vain"] > AGAIN * IN_VAIN)
+        elif numbers["in_vain"] > IN_VAIN:
+            numbers["goes_on"] = 1.0
+        said = 2.0 * numbers["goes_on"] or float(error > 1 and step.time_error > self.tolerance)
+        if said > numbers["said"]:
+            self._say(step)
+            numbers["said"] = said
 
     def _effective(self, duration: float) -> float:
         """Length of steps that would, one after another, have this step's error."""
@@ -177,26 +202,26 @@ class StepControl:
 
     def _next(self, error: float, duration: float) -> float:
         """Length of the next steps: as they are, or another one where it is worth it."""
-        numbers, level, order = self._numbers, self._level(), self.stepper.coupling.order
+        numbers, order = self._numbers, self.stepper.coupling.order
         wanted = duration if self._rejected else numbers["wanted"]
-        settled = max(error, LEAST) * (wanted / self._effective(duration)) ** order / level  # of steps as they are
-        rising = max(0.0, error - numbers["before"]) / level if numbers["effective"] else 0.0
+        settled = max(error, LEAST) * (wanted / self._effective(duration)) ** order  # of steps as they are
+        rising = max(0.0, error - numbers["before"]) if numbers["effective"] else 0.0
         ratio = (AIM / settled) ** (1 / order)
         if settled + rising > MOST:
             return wanted * min(1.0, max(SHRINKAGE, ratio))
         return wanted * min(GROWTH, ratio) if ratio >= WORTHWHILE and not self._rejected else wanted
 
-    def _say(self, step: Step, error: float) -> None:
-        if self.state.comm.rank == 0:
-            log.warning(
-                "time %g: the estimated error in time, %.3g degrees, does not fall to time.tolerance = %g with shorter "
-                "steps: cells turn over at once there. The column time_error has what was reached",
-                step.time,
-                error * self.tolerance,
-                self.tolerance,
-            )
-
-
-def _same(error: float, other: float) -> bool:
-    """Whether two errors are about the same."""
-    return FALLS * other < error < other / FALLS
+    def _say(self, step: Step) -> None:
+        if self.state.comm.rank:
+            return
+        goes_on = f"; steps of {self._numbers['usual']:.3g} go on" if self._numbers["goes_on"] else ""
+        log.warning(
+            "time %g: the estimated error in time, %.3g degrees, does not fall to time.tolerance = %g with steps of "
+            "%.3g: cells turn over at once there, or the pass over-corrects%s. The column time_error has what was "
+            "reached",
+            step.time,
+            step.time_error,
+            self.tolerance,
+            step.time - self.state.time,
+            goes_on,
+        )

@@ -122,6 +122,7 @@ class Stepper:
         name = remodeling.coupling if self.remodeling.law.remodels else "staggered"
         make = coupling or COUPLINGS[name]
         self.coupling: Coupling = make(state, self.tissue, self.remodeling, solver)
+        self._closed = False
         # asked on each rank in every solve: the signal (SIGINT, SIGTERM) that should end it, or 0
         self.stop_signal: Callable[[], int] = lambda: 0
         self.coupling.equilibrium.stop_signal = lambda: self.stop_signal()
@@ -140,7 +141,7 @@ class Stepper:
         return step
 
     def advance(
-        self, time: float, watchers: Sequence[Watcher] = (), is_last: bool = False, rejected: Sequence[Step] = ()
+        self, time: float, watchers: Sequence[Watcher] = (), is_last: bool = False, rejected: Step | None = None
     ) -> Step:
         """One step: equilibrium with the loads of `time`, and remodeling.
 
@@ -151,7 +152,8 @@ class Stepper:
         watchers, is_last
             Who follows it, and whether it is the last one.
         rejected
-            Attempts at it that were taken back: their work and seconds are its own.
+            The last attempt at it that was taken back: its work and seconds, which have those of the attempts before
+            it, belong to the step.
 
         Raises
         ------
@@ -159,26 +161,32 @@ class Stepper:
             If no admissible equilibrium is found.
         ValueError
             If `time` does not come after the state's.
+        RuntimeError
+            After `close`.
         BaseException
             Whatever is raised, by a watcher too: the state is then that of the last committed step.
         """
         state, start, processor_start = self.state, clock.perf_counter(), clock.process_time()
+        if self._closed:
+            raise RuntimeError("this stepper (or its simulation) has been closed; make another one to go on")
         if time <= state.time:
             raise ValueError(f"time {time!r} does not come after {state.time!r}, that of the last step")
         with state.transaction():
             work = self.coupling.solve(time, self.load_values(time))
             extension = work.extension or self.coupling.equilibrium.extension()
-            for attempt in rejected:
-                work.add(attempt.work)
+            if rejected is not None:
+                work.add(rejected.work)
             loads = dict(state.loading.values)  # those that nobody has named too
             step = Step(time, state.number + 1, loads, extension, work, is_last=is_last)
             with undone_by_all(watchers, step):
                 for watcher in watchers:
                     watcher.solved(step)
                 step.remodeling_power = self.coupling.remodel(time)
-                step.seconds = clock.perf_counter() - start + sum(attempt.seconds for attempt in rejected)
+                step.seconds = clock.perf_counter() - start
                 step.processor_seconds = clock.process_time() - processor_start
-                step.processor_seconds += sum(attempt.processor_seconds for attempt in rejected)
+                if rejected is not None:
+                    step.seconds += rejected.seconds
+                    step.processor_seconds += rejected.processor_seconds
                 self.judge(step)
                 state.time, state.number = time, step.number
                 for watcher in watchers:
@@ -195,7 +203,8 @@ class Stepper:
             yield self.advance(time, watchers, is_last=number == len(remaining))
 
     def close(self) -> None:
-        """Free PETSc's objects and options; the state stays."""
+        """Free PETSc's objects and options; the state stays, and takes no further step."""
+        self._closed = True
         self.coupling.close()
 
 

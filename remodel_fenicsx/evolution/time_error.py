@@ -1,8 +1,7 @@
-"""How far a row's cells are from those that smaller steps would give: an estimate from the step itself."""
+"""How far a row is from what smaller steps would give: an estimate from the step itself."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,16 +9,24 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.evolution.memory import Earlier, Numbers
 from remodel_fenicsx.evolution.stepper import Step, Stepper
+from remodel_fenicsx.tissue import mandel, spectral
+from remodel_fenicsx.tissue.cells import UnitCell, angle_between, structure_tensor
+from remodel_fenicsx.tissue.operators import largest_change_of_length
 
 Array = NDArray[np.float64]
-FibreAngle = Callable[[Array, Array, Array], Array]
 
 SLOWEST = 20.0  # times as slowly as the cells alone body and cells may forget
+MOST = 1.0  # change of a length: a linear answer says no more
+COMPONENTS = (len(mandel.MANDEL),)
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Of one step, in degrees of the fibre angle, root mean square over the body.
+    """Of one step, in degrees.
+
+    The larger of two errors: that of the direction of the chains in space (`angle_between`), root mean square over the
+    body, and the largest error of a length in the body, relative to this length, as an angle in radians. A strain of
+    this size turns lines of the body by up to this angle.
 
     Attributes
     ----------
@@ -27,74 +34,105 @@ class Estimate:
         What a tolerance holds down: the error that the row would end with if all steps were like this one.
     row
         The row's own: where the errors of steps add up, with what is left of those before.
-    forgotten
-        Share of an earlier error that the cells forget over the step, 1 - exp(-kappa dt).
     """
 
     controlled: float
     row: float
-    forgotten: float
 
 
 class TimeError:
-    """Compares the cells of each row with better ones, which the coupling has from the same step (docs/theory.md).
+    """Compares each row with a better one, which the coupling has from the same step (docs/theory.md).
 
-    A staggered row is solved with cells that lag a step behind: the cells that its own pass makes are better. Rows of
-    the other couplings lag nothing, but their cells follow a target that changes within the step: better is one that
+    Rows of some couplings lag nothing, but their cells follow a target that changes within the step: better is one that
     goes from that of its start to that of its end. Each step then adds an error, and kappa forgets it: it ends at the
-    error of a step over 1 - exp(-kappa dt), if all steps are alike.
+    error of a step over 1 - exp(-kappa dt), if all steps are alike. Cells forget with kappa, but the stress follows the
+    cells, so that body and cells together forget more slowly: with the rate at which they slow down under loads that
+    are held, which is measured. With time an error grows by kappa over it.
 
-    Cells forget with kappa, but the stress follows the cells, so that body and cells together forget more slowly: with
-    the rate at which they slow down under loads that are held, which is measured. With time an error grows by kappa
-    over it.
+    A staggered row is solved with cells that lag a step behind: those that its own pass makes are better. But the
+    stress, to which the pass answers, lags too: the better cells are those that a pass makes with the stress of a body
+    that has the better cells. They are found by one such pass at each step, from what the error was at the last one.
+
+    How the body answers other cells is one solution with the tangent of its last Newton iteration.
 
     Parameters
     ----------
     stepper
         Whose steps are estimated; what is remembered of them is part of its state.
-    fibre_angle
-        Of dimensions, axes and places, as `Shape.fibre_angle`.
     """
 
-    def __init__(self, stepper: Stepper, fibre_angle: FibreAngle):
-        self.stepper, self.state, self.fibre_angle = stepper, stepper.state, fibre_angle
+    def __init__(self, stepper: Stepper):
+        self.stepper, self.state = stepper, stepper.state
         self.quadrature, self.kappa = stepper.state.cells.quadrature, stepper.remodeling.settings.kappa
         stepper.coupling.compares = True
         initial = {"row": 0.0, "speed": 0.0, "duration": 0.0, "fading": self.kappa, "answer": 1.0}
         self._numbers = Numbers(stepper.state, "time_error", initial)
-        self._angles = Earlier(stepper.state, "time_error_angles", lambda: self.quadrature.function("", ()), 1)
+        # of structure tensors: with rows that lag the last error, with others the last row
+        self._last = Earlier(stepper.state, "time_error_cells", lambda: self.quadrature.function("", COMPONENTS), 1)
 
     def measure(self, step: Step) -> Estimate:
         """The estimate of a step whose pass is done, within its transaction."""
-        coupling, duration = self.stepper.coupling, step.time - self.state.time
-        solved = self.state.equilibrium_cells
-        angles = self.fibre_angle(solved.dimension_values, solved.axis_values, self.quadrature.coordinates)
-        fading = self._fading(step, angles, duration)
-        difference, answer = self._difference(angles), self._answer(fading, duration)
-        forgotten = float(-np.expm1(-self.kappa * duration))
-        if not coupling.accumulates or not forgotten:
-            found = Estimate(answer * difference, answer * difference, forgotten)
+        duration = step.time - self.state.time
+        solved, better = self.state.equilibrium_cells, self.stepper.coupling.better
+        row = UnitCell(solved.dimension_values.reshape(-1, 3), solved.axis_values.reshape(-1, 3, 3))
+        if self.stepper.coupling.accumulates:
+            found = self._added_up(step, row, better, duration)
+        elif better is None:
+            found = Estimate(0.0, 0.0)
         else:
-            left = float(np.exp(-fading * duration)) * self._numbers["row"] + difference
-            found = Estimate(answer * difference / forgotten, left, forgotten)
-        self._numbers["row"] = step.time_error = found.row
+            lag = self._lag(step, row, better, duration)
+            found = Estimate(lag, lag)
+        self._numbers["row"], self._numbers["duration"] = found.row, duration
+        step.time_error = found.row
         return found
 
-    def _fading(self, step: Step, angles: Array, duration: float) -> float:
-        """Rate at which errors fade: that at which the angles slow down while loads are held."""
-        numbers, known = self._numbers, self._angles.values
-        before, fading = numbers["speed"], numbers["fading"]
-        speed = 0.0
+    # ------------------------------------------------------------ rows that lag behind
+    def _lag(self, step: Step, row: UnitCell, better: UnitCell, duration: float) -> float:
+        """Distance to the cells of a pass with the stress that belongs to such cells."""
+        before, expected = structure_tensor(*row[:2]), better
+        if self._last.known:
+            last = mandel.tensors(self._last.values[0].reshape(-1, *COMPONENTS))
+            squared, axes = spectral.continued(before + duration / self._numbers["duration"] * last, row.axes)
+            expected = UnitCell(np.sqrt(np.maximum(squared, 0.0)), axes)
+        known, angle = better, self._angle(row, better)
+        with self.state.tentative():
+            strain, admissible = self._strain(step, expected)
+            if admissible:
+                remodeling = self.stepper.remodeling
+                better, _ = remodeling.updated_cells(self.state.time, step.time, step.work.residual, row)
+        most, angle = SLOWEST * angle, self._angle(row, better)
+        if angle > most:  # another state, to which this one does not tend
+            better, angle = known, most
+        self._last.push(mandel.vectors(structure_tensor(*better[:2]) - before).ravel())
+        return max(angle, strain)
+
+    # ------------------------------------------------------------ errors that add up
+    def _added_up(self, step: Step, row: UnitCell, better: UnitCell | None, duration: float) -> Estimate:
+        fading = self._fading(step, row, duration)
+        answer, difference = self._answer(fading, duration), 0.0
+        if better is not None:
+            with self.state.tentative():
+                strain, _ = self._strain(step, better)
+            difference = max(self._angle(row, better), strain)
+        forgotten = float(-np.expm1(-self.kappa * duration))
+        left = float(np.exp(-fading * duration)) * self._numbers["row"] + difference
+        return Estimate(answer * difference / forgotten if forgotten else difference, left)
+
+    def _fading(self, step: Step, row: UnitCell, duration: float) -> float:
+        """Rate at which errors fade: that at which the cells slow down while loads are held."""
+        numbers, known = self._numbers, self._last.values
+        before, fading, speed = numbers["speed"], numbers["fading"], 0.0
+        present = mandel.vectors(structure_tensor(*row[:2])).ravel()
         if known:
-            last = known[0].reshape(angles.shape)
-            speed = float(np.sqrt(self.quadrature.mean((angles - last) ** 2))) / duration
+            change = ((present - known[0]) ** 2).reshape(*self.quadrature.shape, -1).sum(axis=-1)
+            speed = float(np.sqrt(self.quadrature.mean(change))) / duration
         if not self._held(step):
             fading = self.kappa
         elif before > 0 and speed > 0:
             rate = np.log(before / speed) / (0.5 * (duration + numbers["duration"]))
             fading = float(np.sqrt(fading * np.clip(rate, self.kappa / SLOWEST, self.kappa)))
-        self._angles.push(angles.ravel())
-        numbers["speed"], numbers["duration"], numbers["fading"] = speed, duration, fading
+        self._last.push(present)
+        numbers["speed"], numbers["fading"] = speed, fading
         return fading
 
     def _answer(self, fading: float, duration: float) -> float:
@@ -110,12 +148,19 @@ class TimeError:
         before = self.stepper.load_values(self.state.time)
         return all(step.loads.get(name) == value for name, value in before.items())
 
-    def _difference(self, angles: Array) -> float:
-        """Root mean square of the difference to the angles of the better cells."""
-        better = self.stepper.coupling.better
-        if better is None:
-            return 0.0
-        dimensions = better.dimensions.reshape(*self.quadrature.shape, 3)
-        axes = better.axes.reshape(*self.quadrature.shape, 3, 3)
-        apart = self.fibre_angle(dimensions, axes, self.quadrature.coordinates) - angles
+    # ------------------------------------------------------------ distances
+    def _angle(self, row: UnitCell, better: UnitCell) -> float:
+        """Between the directions of the chains, root mean square over the body."""
+        apart = angle_between(row, better).reshape(self.quadrature.shape)
         return float(np.sqrt(self.quadrature.mean(apart**2)))
+
+    def _strain(self, step: Step, cells: UnitCell) -> tuple[float, bool]:
+        """Give the body other cells, and let it answer: the largest change of a length, and whether that is a state."""
+        state, shape = self.state, self.quadrature.shape
+        before = state.deformation_gradient()
+        state.cells.set(cells.dimensions.reshape(*shape, 3), cells.axes.reshape(*shape, 3, 3))
+        equilibrium, newton = self.stepper.coupling.equilibrium, self.stepper.coupling.newton
+        state.unknown.x.array[:] += newton.answer(equilibrium, step.work.tangents)
+        after, admissible = state.deformation_gradient(), equilibrium.extension().admissible
+        changes = np.minimum(largest_change_of_length(before, after), MOST).reshape(shape)
+        return float(np.degrees(self.quadrature.maximum(changes))), admissible

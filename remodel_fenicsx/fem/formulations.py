@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,21 +55,6 @@ class Dilatation(Protocol):
         """J of the present unknowns where the formulation takes it beside the quadrature points, (elements, any)."""
 
 
-class Locking(NamedTuple):
-    """From where on elements lock: both must be exceeded (`evolution.locking`).
-
-    Attributes
-    ----------
-    stiffness_ratio
-        lambda/mu up to which they never do.
-    energy_share
-        Share of the work that changes of volume inside single elements may take.
-    """
-
-    stiffness_ratio: float
-    energy_share: float
-
-
 class Formulation(Protocol):
     """What scenes, states and warnings ask of a formulation.
 
@@ -79,6 +64,8 @@ class Formulation(Protocol):
         What it does, for docs/scene.md.
     takes_parts
         Whether it needs a matrix energy whose volumetric part is told apart (`tissue.energy.Matrix`).
+    locks
+        Whether differences of J inside an element cost energy: elements lock where the bulk is stiff.
     """
 
     @property
@@ -87,8 +74,8 @@ class Formulation(Protocol):
     @property
     def takes_parts(self) -> bool: ...
 
-    def locks(self, element: str, degree: int) -> Locking | None:
-        """From where on elements of this kind and degree lock; None if they never do."""
+    @property
+    def locks(self) -> bool: ...
 
     def has(self, element: str, degree: int) -> bool:
         """Whether it changes anything for such an element."""
@@ -105,12 +92,8 @@ class AtAllPoints:
     """W as it stands, at all quadrature points."""
 
     meaning: str
-    limits: Mapping[int, Locking]  # by degree
     takes_parts: bool = False
-
-    def locks(self, element: str, degree: int) -> Locking | None:
-        """By degree."""
-        return self.limits.get(degree)
+    locks: bool = True
 
     def has(self, element: str, degree: int) -> bool:
         """Always."""
@@ -154,10 +137,7 @@ class Selective:
     meaning: str
     degrees: Mapping[tuple[str, int], int]
     takes_parts: bool = True
-
-    def locks(self, element: str, degree: int) -> Locking | None:
-        """Never."""
-        return None
+    locks: bool = False
 
     def has(self, element: str, degree: int) -> bool:
         """Where there is a rule."""
@@ -210,8 +190,7 @@ class _PartsApart:
 FORMULATIONS: dict[str, Formulation] = {
     # docs/theory.md, Volumetric locking, has the measurements behind these numbers
     "displacement": AtAllPoints(
-        "at all quadrature points, right while lambda/mu is below about 100",
-        {1: Locking(50.0, 0.03), 2: Locking(500.0, 0.15)},
+        "at all quadrature points, right where the bulk is soft or elements are small; a run whose elements lock warns"
     ),
     "selective-integration": Selective(
         "the volumetric part of the matrix at fewer points, in linear hexahedra at the centroid; hexahedra do not lock "

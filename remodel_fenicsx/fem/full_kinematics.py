@@ -37,6 +37,8 @@ class Kinematics(Protocol):
         Whether the body can move as a whole across z, or turn about it: then supports at single nodes hold it.
     symmetry_planes
         Faces of the mesh that are planes of symmetry, and the component of the displacement that is zero there.
+    homogeneous
+        Whether the strain is the same everywhere: then no mesh changes what is found.
     cost
         Of a step for each quadrature point, in that of one of a hexahedron, as measured on the artery.
     """
@@ -55,6 +57,9 @@ class Kinematics(Protocol):
 
     @property
     def symmetry_planes(self) -> Mapping[str, int]: ...
+
+    @property
+    def homogeneous(self) -> bool: ...
 
     @property
     def cost(self) -> float: ...
@@ -98,6 +103,7 @@ class FullKinematics:
     reduced: ClassVar[bool] = False
     moves_rigidly: ClassVar[bool] = True
     symmetry_planes: ClassVar[Mapping[str, int]] = {}
+    homogeneous: ClassVar[bool] = False
     cost: ClassVar[float] = 1.0
 
     def element(self, kind: str) -> str:

@@ -8,6 +8,7 @@ from typing import Any
 import basix
 import basix.ufl
 import dolfinx.fem
+import dolfinx.la
 import numpy as np
 import ufl
 from mpi4py import MPI
@@ -60,6 +61,7 @@ class Quadrature:
     def __init__(self, mesh: Any, element_degree: int, weight: Any = 1):
         self.mesh, self.element_degree = mesh, element_degree
         self._spaces: dict[tuple[int, ...], Any] = {}
+        self._complements: dict[int, NDArray[np.float64]] = {}
         self.element_kind = mesh.topology.cell_name()
         self.degree = DEGREES[self.element_kind, element_degree]
         points, weights = basix.make_quadrature(basix.CellType[self.element_kind], self.degree)
@@ -131,6 +133,40 @@ class Quadrature:
         chosen = np.repeat(elements[:, None], self.shape[1], axis=1).astype(np.float64)
         return self.integral(values * chosen) / self.integral(chosen)
 
+    def mean_of_known(self, values: NDArray[np.float64], weights: NDArray[np.float64] | None = None) -> float:
+        """Volume mean over the points whose value is known, not NaN; NaN where there is none.
+
+        Parameters
+        ----------
+        values
+            (elements, points).
+        weights
+            Of the points beside their volume, of the same shape or one for each element; default: one.
+        """
+        known = ~np.isnan(values)
+        counted = known if weights is None else known * weights.reshape(len(weights), -1)
+        volume = self.integral(counted.astype(np.float64))
+        return self.integral(np.where(known, values, 0.0) * counted) / volume if volume > 0 else np.nan
+
+    @cached_property
+    def gradients(self) -> NDArray[np.float64]:
+        """G with |grad u| <= G max |u_node| in each element, (elements,): the sizes of the slopes of its functions."""
+        element = basix.create_element(
+            basix.ElementFamily.P,
+            basix.CellType[self.element_kind],
+            self.element_degree,
+            basix.LagrangeVariant.gll_warped,
+        )
+        slopes = np.asarray(element.tabulate(1, self.points))[1:, :, :, 0]  # by reference coordinate, point and node
+        sums = np.linalg.norm(slopes, axis=0).sum(axis=-1)
+        largest: NDArray[np.float64] = np.max(sums / self.smallest_lengths, axis=1, initial=0.0)
+        return largest
+
+    @cached_property
+    def largest_gradient(self) -> float:
+        """The largest G over all ranks. Collective, the first time."""
+        return self.maximum(self.gradients)
+
     @cached_property
     def volume(self) -> float:
         """Of the body, over all ranks. Collective, the first time."""
@@ -140,11 +176,47 @@ class Quadrature:
         """Volume mean over each element: (elements, points, ...) to (elements, ...)."""
         return np.einsum("ep,ep...->e...", self._shares, values)
 
+    def element_mean_of_known(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Volume mean over the points of each element whose value is not NaN, (elements, points) to (elements,)."""
+        known = ~np.isnan(values)
+        sums, shares = self.element_mean(np.where(known, values, 0.0)), self.element_mean(known.astype(np.float64))
+        return np.divide(sums, shares, out=np.full_like(sums, np.nan), where=shares > 0)
+
     @cached_property
     def _shares(self) -> NDArray[np.float64]:
         """Of the points in the volume of their element, (elements, points)."""
         shares: NDArray[np.float64] = self.volumes / self.volumes.sum(axis=1, keepdims=True)
         return shares
+
+    def beyond(self, degree: int, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """What of values (owned elements, points, n) no polynomial of a degree has in an element, by least squares.
+
+        Elements of a single point have nothing inside: theirs is the distance from the mean over their neighbours.
+        """
+        if self.shape[1] == 1:
+            return values - self._mean_of_neighbours(values[:, 0])[:, None]
+        if degree not in self._complements:
+            kind = basix.CellType[self.element_kind]
+            element = basix.create_element(basix.ElementFamily.P, kind, degree, discontinuous=True)
+            polynomials = np.asarray(element.tabulate(0, self.points))[0, :, :, 0]
+            roots = np.sqrt(self.weights)[:, None]
+            fit = polynomials @ (np.linalg.pinv(roots * polynomials) * roots.T)
+            self._complements[degree] = np.eye(self.shape[1]) - fit
+        complement: NDArray[np.float64] = self._complements[degree] @ values
+        return complement
+
+    def _mean_of_neighbours(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Of values (owned elements, n): means over all elements at each node, averaged over an element's nodes."""
+        nodes, number = geometry_dofmap(self.mesh)[: self.number_of_owned_elements], values.shape[1] + 1
+        sums = dolfinx.la.vector(self.mesh.geometry.index_map(), number, dtype=np.float64)
+        volumes = self.owned(self.volumes).sum(axis=1, keepdims=True)
+        weighted = np.hstack([values * volumes, volumes])
+        at_nodes = sums.array.reshape(-1, number)
+        np.add.at(at_nodes, nodes, weighted[:, None])
+        sums.scatter_reverse(dolfinx.la.InsertMode.add)
+        sums.scatter_forward()
+        means: NDArray[np.float64] = (at_nodes[nodes, :-1] / at_nodes[nodes, -1:]).mean(axis=1)
+        return means
 
     def maximum(self, values: NDArray[np.float64]) -> float:
         """Largest of values (elements, ...) over all ranks."""

@@ -24,6 +24,7 @@ class SectorKinematics(FullKinematics):
     name = "sector"
     meaning = "the same on a quarter of a tube, with planes of symmetry"
     reduced = True
+    homogeneous = False
     moves_rigidly = False
     symmetry_planes: ClassVar[Mapping[str, int]] = {"plane_x": 0, "plane_y": 1}
 
@@ -36,6 +37,7 @@ class _Reduced:
     """What the kinematics with fewer dimensions have in common."""
 
     reduced: ClassVar[bool] = True
+    homogeneous: ClassVar[bool] = False
     moves_rigidly: ClassVar[bool] = False
     symmetry_planes: ClassVar[Mapping[str, int]] = {}
     element_kind: ClassVar[str]
@@ -167,6 +169,7 @@ class PointKinematics(_Reduced):
     meaning = "a cube or tendon with the same strain everywhere: three numbers"
     element_kind = "interval"
     components = (None, None, None)
+    homogeneous = True
     cost = 0.2
 
     def unknown(self, mesh: Any, degree: int) -> Any:

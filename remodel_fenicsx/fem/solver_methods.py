@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 AUTO = "auto"
@@ -110,3 +111,38 @@ def _on_ranks(options: dict[str, Any], method: str, ranks: int) -> dict[str, Any
         if options.get("pc_type") == "telescope":
             options["pc_telescope_reduction_factor"] = ranks
     return options
+
+
+# ---------------------------------------------------------------- options that a scene may give
+# A scene is passed around: it may choose how systems are solved, never run code nor write files.
+_SOLVERS = re.compile(
+    r"(?:\w+_)??(?:snes|ksp|pc|mat)_\w+"
+)  # also those of a solver's inner solvers: mg_levels_ksp_type
+_CODE = re.compile(r"python|shell", re.IGNORECASE)
+_PLAIN = re.compile(r"[A-Za-z0-9_.,+-]*")  # names, numbers and lists of them: no path, no "ascii:FILE"
+# PETSc's PetscViewerType: as a value of any monitor or view each of them opens a file, a socket or a window
+_VIEWERS = frozenset(
+    "adios ascii binary cgns draw exodusii glvis hdf5 mathematica matlab pyvista saws socket string vtk vu".split()
+)
+# of MUMPS: units of its messages (each a file fort.N but for 0 and 6, which it has), factors kept on the disk
+_MUMPS_FILES = re.compile(r"mat_mumps_(?:icntl_(?:1|2|3|22)|ooc_\w+)$")
+
+
+def fault_of_option(name: str, value: str | float | bool) -> str | None:
+    """Why a scene may not give this PETSc option; None where it may.
+
+    Parameters
+    ----------
+    name, value
+        As in `solver.petsc_options`, the name without the leading '-'.
+    """
+    words = re.split(r"[,.]", value.lower()) if isinstance(value, str) else []
+    if not _SOLVERS.fullmatch(name):
+        return "not an option of a solver; allowed are snes_..., ksp_..., pc_... and mat_..."
+    if _CODE.search(name) or any(map(_CODE.search, words)):
+        return "would run code of its own; allowed are PETSc's compiled solvers"
+    if _MUMPS_FILES.search(name):
+        return "would write files; allowed are options that write none"
+    if isinstance(value, str) and (not _PLAIN.fullmatch(value) or _VIEWERS.intersection(words)):
+        return "names a file or a viewer; allowed are names, numbers, true (then PETSc prints) and false"
+    return None

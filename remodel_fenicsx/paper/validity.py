@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-import remodel_fenicsx
 from remodel_fenicsx.results.recording import Recording, RecordingError
 from remodel_fenicsx.scene.scene import Scene, SceneError
 
@@ -59,7 +58,7 @@ def library_versions() -> dict[str, str]:
 # ---------------------------------------------------------------- the source
 
 
-def source_fingerprint(package: Path = Path(remodel_fenicsx.__file__).parent) -> str:
+def source_fingerprint(package: Path = Path(__file__).parents[1]) -> str:
     """Hash of all source that a run imports, whatever its files are called and wherever they lie.
 
     Comments, docstrings, layout and the order of imports do not change it, nor does moving a module. What a module

@@ -160,7 +160,7 @@ def restore_state(state: State, checkpoint: Checkpoint | None) -> None:
     told = None if checkpoint is None or comm.rank else (checkpoint.loads, checkpoint.time, checkpoint.number)
     numbers = None if checkpoint is None or comm.rank else checkpoint.numbers
     loads, state.time, state.number = comm.bcast(told, root=0)
-    state.numbers = comm.bcast(numbers, root=0) | {state.counts[name]: 0.0 for name in missing}
+    state.numbers |= comm.bcast(numbers, root=0) | {state.counts[name]: 0.0 for name in missing}
     if missing and comm.rank == 0:
         log.info("what the checkpoint does not hold begins anew: %s", ", ".join(missing))
     state.loading.set(loads)
@@ -173,6 +173,11 @@ def _fault(state: State, domain: Domain, checkpoint: Checkpoint, mesh: dict[str,
         return f"the checkpoint has the functions {', '.join(there)}, this run has {', '.join(here)}"
     if set(checkpoint.loads) != set(state.loading.values):
         return f"the checkpoint has the loads {sorted(checkpoint.loads)}, this run has {sorted(state.loading.values)}"
+    for name, function in here.items():
+        wanted = domain.number_of_elements, _places(function).shape[1]
+        shape = checkpoint.arrays[f"function/{name}"].shape if name in there else wanted
+        if shape != wanted:
+            return f"the checkpoint's function {name} has the shape {shape}, that of this run has {wanted}"
     points, elements = checkpoint.arrays["points"], checkpoint.arrays["elements"]
     same = points.shape == mesh["points"].shape and np.array_equal(elements, mesh["elements"])
     if not same or not np.allclose(points, mesh["points"], rtol=0.0, atol=1e-9 * domain.size):

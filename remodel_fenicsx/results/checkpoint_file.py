@@ -1,7 +1,8 @@
 """Checkpoints as files: numpy's .npz with a JSON header, in two generations, and the pointer that names them.
 
 The pointer, checkpoint.json, is written last: what it names is whole. It holds the check sum of each generation, the
-newest first; a file that does not fit is damaged, and the one before counts. This needs numpy alone.
+newest first; a file that does not fit is damaged, and the one before counts. The sums tell of accidents, not of intent:
+types and shapes are looked at too. This needs no dolfinx.
 """
 
 from __future__ import annotations
@@ -11,15 +12,16 @@ import io
 import json
 import logging
 import math
-from collections.abc import Mapping
+import zipfile
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
 
-from remodel_fenicsx.results.whole_file import write_whole
+from remodel_fenicsx.system.regular_files import ForeignFileError, read_regular, write_whole
 
 log = logging.getLogger(__name__)
 Array = NDArray[Any]
@@ -27,6 +29,7 @@ Array = NDArray[Any]
 POINTER, FORMAT = "checkpoint.json", 1
 GENERATIONS = ("checkpoint-a.npz", "checkpoint-b.npz")
 _HEADER = "header"  # name of the array that holds the JSON
+LARGEST, LARGEST_POINTER = 10**11, 10**6  # bytes
 
 
 class CheckpointError(ValueError):
@@ -73,6 +76,21 @@ class Checkpoint:
     arrays: dict[str, Array]
 
 
+class _Header(BaseModel):
+    """What a checkpoint's JSON must be: `Checkpoint` without the arrays."""
+
+    model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
+
+    format: int = Field(ge=1, le=FORMAT)
+    time: float = Field(ge=0)
+    number: int = Field(ge=0)
+    scene: str
+    versions: dict[str, str]
+    loads: dict[str, float]
+    numbers: dict[str, float]
+    functions: list[str]
+
+
 def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
     """Write a checkpoint over the older generation, then the pointer.
 
@@ -109,7 +127,7 @@ def read_pointer(folder: Path) -> list[Generation]:
     """
     path = folder / POINTER
     try:
-        pointer = json.loads(path.read_bytes())
+        pointer = json.loads(read_regular(path, LARGEST_POINTER))
         if pointer["format"] > FORMAT:
             raise CheckpointError(f"{path}: was written by a newer version")
         generations = [Generation(**one) for one in pointer["generations"]]
@@ -122,7 +140,7 @@ def read_pointer(folder: Path) -> list[Generation]:
         return []
     except CheckpointError:
         raise
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
+    except (ValueError, KeyError, TypeError, RecursionError, ForeignFileError) as error:
         raise CheckpointError(f"{path}: is damaged or of another kind") from error
     if not good or not generations:
         raise CheckpointError(f"{path}: is damaged or of another kind")
@@ -139,26 +157,56 @@ def read_checkpoint(folder: Path) -> Checkpoint | None:
     OSError
         If one cannot be read.
     """
-    generations = read_pointer(folder)
+    generations, faults = read_pointer(folder), []
     for generation in generations:
         try:
-            return _read(folder / generation.file, generation)
+            found = _read(folder / generation.file, generation)
         except CheckpointError as error:
-            log.warning("%s", error)
+            faults.append(str(error))
+        else:
+            for fault in faults:
+                log.warning("%s", fault)
+            return found
     if generations:
         remedy = "without its files checkpoint* the run starts again at t = 0"
-        raise CheckpointError(f"{folder}: has no checkpoint that is whole; {remedy}")
+        raise CheckpointError(f"{folder}: has no checkpoint that is whole ({'; '.join(faults)}); {remedy}")
     return None
 
 
 def _read(path: Path, generation: Generation) -> Checkpoint:
     try:
-        data = path.read_bytes()
+        data = read_regular(path, LARGEST)
     except FileNotFoundError:
         raise CheckpointError(f"{path}: is missing") from None
     if hashlib.sha256(data).hexdigest() != generation.sha256:
         raise CheckpointError(f"{path}: is damaged: it is not the file that {POINTER} names")
-    with np.load(io.BytesIO(data), allow_pickle=False) as file:
-        arrays = {name: file[name] for name in file.files if name != _HEADER}
-        header: Mapping[str, Any] = json.loads(file[_HEADER].tobytes())
-    return Checkpoint(**{name: value for name, value in header.items() if name != "format"}, arrays=arrays)
+    try:
+        # what is compressed may be of any size: a checkpoint is not
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            if any(entry.compress_type != zipfile.ZIP_STORED for entry in archive.infolist()):
+                raise ValueError("compressed")
+        with np.load(io.BytesIO(data), allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files if name != _HEADER}
+            header = _Header.model_validate_json(file[_HEADER].tobytes())
+        for name in ("points", "elements", *(f"function/{function}" for function in header.functions)):
+            _check_table(arrays[name])
+    except (
+        ValueError,
+        KeyError,
+        TypeError,
+        EOFError,
+        OSError,
+        MemoryError,
+        RecursionError,
+        NotImplementedError,
+    ) as error:
+        raise CheckpointError(f"{path}: is of another kind than the checkpoints of this version") from error
+    except zipfile.BadZipFile as error:
+        raise CheckpointError(f"{path}: is no archive of numpy's") from error
+    return Checkpoint(**header.model_dump(exclude={"format"}), arrays=arrays)
+
+
+def _check_table(array: Array) -> None:
+    """Raise ValueError unless it is a table of finite numbers."""
+    if array.ndim != 2 or array.dtype.kind not in "fiu" or not np.isfinite(array).all():
+        raise ValueError("no table of finite numbers")

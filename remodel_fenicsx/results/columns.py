@@ -1,8 +1,8 @@
-"""The columns of a run's history, and how they are measured on a solved state."""
+"""The rows of a run's history: every column measured on a solved state."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -13,117 +13,15 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from remodel_fenicsx.body.column import Column
+from remodel_fenicsx.body.columns import columns_of
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.shape import Shape
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
 from remodel_fenicsx.fem import compat, jit
 from remodel_fenicsx.fem.quadrature import Quadrature
-from remodel_fenicsx.results import profile
+from remodel_fenicsx.results.end_force import EndForce, EndForceMeasure
 
 Array = NDArray[np.float64]
-
-FIRST_COLUMN = Column("time", "time", "time of the scene", lambda m: m.step.time)
-COLUMNS: dict[str, Column] = {
-    column.name: column
-    for column in (
-        Column(
-            "max_chain_extension",
-            "",
-            "largest r/L, always below 1 (0 where no chain locks)",
-            lambda m: m.step.extension.max_chain_extension,
-        ),
-        Column("min_jacobian", "", "smallest J, always above 0", lambda m: m.step.extension.min_jacobian),
-        Column("stored_energy", "stress length^3", "integral of W", lambda m: m.equilibrium.stored_energy()),
-        Column(
-            "remodeling_power",
-            "stress length^3 / time",
-            "power released by the remodeling pass that follows (docs/theory.md)",
-            lambda m: m.step.remodeling_power,
-            after_pass=True,
-        ),
-        Column(
-            "newton_iterations",
-            "",
-            "Newton iterations of the step, failed attempts included",
-            lambda m: m.step.work.newton_iterations,
-        ),
-        Column("linear_iterations", "", "linear iterations of the same", lambda m: m.step.work.linear_iterations),
-        Column(
-            "substeps",
-            "",
-            "solves that made up the step; 1: the paper's step in one piece",
-            lambda m: m.step.work.substeps,
-        ),
-        Column("seconds", "s", "wall time of the step", lambda m: m.step.seconds, after_pass=True),
-    )
-}
-"""Columns of every shape by name, after `time` and those of the shape; a script adds its own."""
-
-COLUMNS_ON_REQUEST: dict[str, Column] = {
-    column.name: column
-    for column in (
-        Column(
-            "pass_residual",
-            "squared link length",
-            "largest norm of A_pass - A over all points: how far the row is from cells that belong to its own stress",
-            lambda m: m.observer.stepper.remodeling.residual(),
-            after_pass=True,
-        ),
-        Column(
-            "time_error",
-            "degrees",
-            "estimated error in time of the fibre angle, root mean square over the body; there without request with "
-            "`time.tolerance`",
-            lambda m: m.step.time_error,
-            after_pass=True,
-        ),
-        Column(
-            "negative_eigenvalues",
-            "",
-            "negative eigenvalues of the tangent's symmetric part: 0 where the equilibrium is stable",
-            lambda m: m.step.negative_eigenvalues,
-        ),
-        Column(
-            "held_points",
-            "",
-            "points at which the coupling 'implicit' found no cells that belong to their stress",
-            lambda m: m.step.work.held_points,
-        ),
-        Column(
-            "processor_seconds",
-            "s",
-            "time of the first rank's processor in the step: on a machine that others use it says more than `seconds`",
-            lambda m: m.step.processor_seconds,
-            after_pass=True,
-        ),
-        *profile.COLUMNS,
-    )
-}
-"""Columns that a scene may name in `output.columns`; a script adds its own."""
-
-
-def columns_of(shape: Shape | type[Shape], requested: Sequence[str] = ()) -> tuple[Column, ...]:
-    """The columns of a shape's history, in the order of the file, those on request last.
-
-    Where some of the others are requested too, only they are there, with time and loads.
-
-    Raises
-    ------
-    KeyError
-        If a column that is requested does not exist.
-    """
-    always = (FIRST_COLUMN, *(kind.make_column(name) for name, kind in shape.loads.items()))
-    others = (*shape.columns, *COLUMNS.values())
-    chosen = [column for column in others if column.name in requested]
-    known = {column.name for column in (*always, *others)}
-    extra = (COLUMNS_ON_REQUEST[name] for name in requested if name not in known)
-    return (*always, *(chosen or others), *extra)
-
-
-def without_free_length(columns: Sequence[Column], shape: Shape, loads: Container[str]) -> tuple[Column, ...]:
-    """The columns but those of loads that free the length of the body, where these are not among the loads."""
-    free = {name for name, kind in shape.loads.items() if kind.frees_length and name not in loads}
-    return tuple(column for column in columns if column.name not in free)
 
 
 class Observer(Watcher):
@@ -136,13 +34,13 @@ class Observer(Watcher):
     stepper
         What is measured; nothing here changes it.
     columns
-        Other columns than `columns_of(shape)`.
+        Other columns than `columns_of(shape)` of the loads that there are.
     """
 
     def __init__(self, shape: Shape, stepper: Stepper, columns: Sequence[Column] | None = None):
         self.shape, self.stepper, self.state = shape, stepper, stepper.state
         if columns is None:
-            columns = without_free_length(columns_of(shape), shape, self.state.loading.values)
+            columns = columns_of(shape, loads=self.state.loading.values)
         self.columns = tuple(columns)
         self.quadrature: Quadrature = self.state.cells.quadrature
         self.domain: Domain = self.state.loading.domain
@@ -210,9 +108,15 @@ class Measurement:
 
     @cached_property
     def fibre_angle(self) -> Array:
-        """Reference fibre angle at all points (elements, points), degrees."""
+        """Reference fibre angle at all points (elements, points), degrees; NaN where there is none."""
         cells = self.state.cells
         return self.observer.shape.fibre_angle(cells.dimension_values, cells.axis_values, self.quadrature.coordinates)
+
+    @cached_property
+    def radial_share(self) -> Array:
+        """Of the chains at all points (elements, points)."""
+        cells = self.state.cells
+        return self.observer.shape.radial_share(cells.dimension_values, cells.axis_values, self.quadrature.coordinates)
 
     @cached_property
     def axial_stretch(self) -> Array:
@@ -224,6 +128,13 @@ class Measurement:
         """Mean of nodal values (nodes,) over a named face, by its reference or its deformed area."""
         mean = self.tool((face, deformed), lambda: _FaceMean(self.observer, face, deformed))
         return float(mean(nodal_values))
+
+    def end_force(self, face: str) -> EndForce:
+        """Of a tube whose inner face has this name, at the end z = length."""
+        length = self.domain.dimensions["length"]
+        measure = self.tool(("end force", face), lambda: EndForceMeasure(self.equilibrium, face, length))
+        found: EndForce = self.tool_of_step(("end force", face), measure)
+        return found
 
     def largest(self, values: Array) -> float:
         """Largest of one value per local element, over all ranks."""

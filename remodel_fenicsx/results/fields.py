@@ -6,7 +6,6 @@ import logging
 from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any
 
 import numpy as np
 import ufl
@@ -21,37 +20,22 @@ from remodel_fenicsx.fem import compat, jit
 from remodel_fenicsx.results.chain_lines import chain_displacement, chain_lines
 from remodel_fenicsx.results.recording import CHAINS, FIELDS, RecordingError
 from remodel_fenicsx.results.vtkhdf import LINE, TransientGrid, cell_type_and_permutation
-from remodel_fenicsx.schema.tables import SceneError
+from remodel_fenicsx.scene.settings import FIELDS_BY_NAME
 from remodel_fenicsx.schema.times import SAME_TIME, same_time
 
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
 
-AXES = ("axis_1", "axis_2", "axis_3")
-OF_ELEMENTS = (
-    "deformation_gradient", "cauchy_stress", "cell_dimensions", *AXES, "fibre_angle", "fibre_angle_deformed",
-    "chain_extension",
-)  # fmt: skip
-FIELDS_BY_NAME = ("displacement", *OF_ELEMENTS, "chains")
-"""What a scene may name in `output.fields`; "chains" are the lines of fields_chains.vtkhdf."""
+AXES = tuple(name for name in FIELDS_BY_NAME if name.startswith("axis_"))
+OF_ELEMENTS = tuple(name for name in FIELDS_BY_NAME if name not in ("displacement", "chains"))
 OF_CHAINS = ("cell_dimensions", *AXES, "deformation_gradient", "fibre_angle")  # what the lines are made of
 
 
 def field_names(asked: bool | Sequence[str]) -> tuple[str, ...]:
-    """The fields that a scene's `output.fields` asks for.
-
-    Raises
-    ------
-    SceneError
-        If there is no such field; one line.
-    """
+    """The fields that a scene's `output.fields` asks for."""
     if isinstance(asked, bool):
         return FIELDS_BY_NAME if asked else ()
-    for name in asked:
-        if name not in FIELDS_BY_NAME:
-            known = ", ".join(map(repr, FIELDS_BY_NAME))
-            raise SceneError(f"output.fields = {name!r}: no such field; allowed are {known}")
     return tuple(asked)
 
 
@@ -88,8 +72,8 @@ class ElementFields:
 
         `deformation_gradient` and `cauchy_stress` (9, row by row); `cell_dimensions` (3) and `axis_1..3`: the cell
         whose structure tensor is the element's mean, longest first; `fibre_angle` and `fibre_angle_deformed` (degrees,
-        to the load axis, or in a tube from circumferential to axial); `chain_extension` (largest r/L in the element; 0
-        where no chain locks).
+        to the load axis, or in a tube from circumferential to axial; NaN where no chain has one); `chain_extension`
+        (largest r/L in the element; 0 where no chain locks).
         """
         if self._stresses is not None:
             self._stresses.refresh()
@@ -97,6 +81,7 @@ class ElementFields:
         F = values[..., :9].reshape(*values.shape[:2], 3, 3)
         dimensions, axes = self.state.cells.dimension_values, self.state.cells.axis_values
         mean, fibre_angle, wanted = self.quadrature.element_mean, self.shape.fibre_angle, set(self.names)
+        mean_of_known = self.quadrature.element_mean_of_known
         found: dict[str, Array] = {}
         if "deformation_gradient" in wanted:
             found["deformation_gradient"] = mean(values[..., :9])
@@ -106,10 +91,10 @@ class ElementFields:
             found["cell_dimensions"], mean_axes = self.mean_cells()
             found |= {name: mean_axes[:, i] for i, name in enumerate(AXES)}
         if "fibre_angle" in wanted:
-            found["fibre_angle"] = mean(fibre_angle(dimensions, axes, self.quadrature.coordinates))
+            found["fibre_angle"] = mean_of_known(fibre_angle(dimensions, axes, self.quadrature.coordinates))
         if "fibre_angle_deformed" in wanted:
             position, deformed_axes = self.quadrature.coordinates + values[..., -3:], axes @ np.swapaxes(F, -1, -2)
-            found["fibre_angle_deformed"] = mean(fibre_angle(dimensions, deformed_axes, position))
+            found["fibre_angle_deformed"] = mean_of_known(fibre_angle(dimensions, deformed_axes, position))
         if "chain_extension" in wanted:
             cells = self.state.cells
             squared = cells.kernels.squared_length(F.reshape(-1, 3, 3), cells.point_cells).reshape(F.shape[:2])
@@ -145,7 +130,7 @@ class Fields(Watcher):
     after
         Where a run goes on: time of the last step that was done. Fields of later ones are dropped.
     names
-        Of FIELDS_BY_NAME, what is written; the lines only with "chains".
+        Of `scene.settings.FIELDS_BY_NAME`, what is written; the lines only with "chains".
     times
         Further times that are written.
 

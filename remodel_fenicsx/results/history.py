@@ -10,8 +10,9 @@ import time as clock
 from collections.abc import Sequence
 from pathlib import Path
 
-from remodel_fenicsx.results.recording import RecordingError
+from remodel_fenicsx.results.recording import LARGEST_HISTORY, RecordingError
 from remodel_fenicsx.schema.times import same_time
+from remodel_fenicsx.system.regular_files import check_still_there, open_own, read_regular
 
 
 FLUSHED_AFTER = 0.5  # seconds: rows that come faster are brought to the disk together
@@ -36,7 +37,7 @@ class History:
     """
 
     def __init__(self, path: Path):
-        self._file = path.open("xb", buffering=0)
+        self._path, self._file = path, open(open_own(path, os.O_RDWR | os.O_CREAT | os.O_EXCL), "r+b", buffering=0)
         self._columns: list[str] | None = None
         self._sizes = [0]  # bytes up to the end of each whole row
         self._flushed_at, self._is_flushed = -math.inf, True
@@ -54,7 +55,26 @@ class History:
         OSError
             If it cannot be opened or written.
         """
-        lines = path.read_bytes().splitlines(keepends=True)[: rows + 1]
+        history = cls.__new__(cls)
+        history._path, history._columns = path, list(columns)
+        history._sizes = [cls.size_of(path, columns, rows, time)]
+        history._file = open(open_own(path, os.O_RDWR), "r+b", buffering=0)
+        history._flushed_at, history._is_flushed = -math.inf, True
+        history._cut()
+        return history
+
+    @staticmethod
+    def size_of(path: Path, columns: Sequence[str], rows: int, time: float) -> int:
+        """Bytes of the head and the first `rows` rows of a history, the last of which is that of `time`.
+
+        Raises
+        ------
+        RecordingError
+            If it has not these columns and rows.
+        OSError
+            If it cannot be read.
+        """
+        lines = read_regular(path, LARGEST_HISTORY).splitlines(keepends=True)[: rows + 1]
         try:
             texts = [line.decode("utf-8") for line in lines]
             found, *read = csv.reader(texts)
@@ -66,12 +86,7 @@ class History:
             raise RecordingError(f"{path}: has not the {rows} rows up to time {time:g} that belong to the checkpoint")
         if found != list(columns):
             raise RecordingError(f"{path}: has other columns than this run; output.columns must stay what it was")
-        history = cls.__new__(cls)
-        history._file, history._columns = path.open("r+b", buffering=0), found
-        history._sizes = [sum(map(len, lines))]
-        history._flushed_at, history._is_flushed = -math.inf, True
-        history._cut()
-        return history
+        return sum(map(len, lines))
 
     def append(self, row: dict[str, float]) -> None:
         """Write one row; the first one decides the columns.
@@ -111,10 +126,11 @@ class History:
         Raises
         ------
         OSError
-            If that fails (disk full).
+            If that fails (disk full), or somebody has deleted the file.
         """
         if not self._is_flushed:
             os.fsync(self._file.fileno())
+            check_still_there(self._file.fileno(), self._path, "the rows of this run, and what else was in its folder")
             self._flushed_at, self._is_flushed = clock.monotonic(), True
 
     def drop_last(self) -> None:

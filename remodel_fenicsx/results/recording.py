@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from remodel_fenicsx.schema.times import same_time
+from remodel_fenicsx.system.regular_files import read_regular
 
 if TYPE_CHECKING:
     import h5py
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 HISTORY, FIELDS, CHAINS, SCENE = "history.csv", "fields.vtkhdf", "fields_chains.vtkhdf", "scene.toml"
+LOG, STUDY = "run.log", "study.json"  # of a run; which runs a study has
+LARGEST_HISTORY = 10**9  # bytes: the million steps that a scene may have, of a thousand characters each
 
 
 class RecordingError(ValueError):
@@ -170,7 +173,7 @@ class Recording:
             return np.asarray(root["Connectivity"][:], dtype=np.int64).reshape(count, -1)
 
     def fields(self, time: float) -> dict[str, Array]:
-        """The fields at a recorded time by name: at the nodes, (nodes, ...), and means over the elements, (elements, ...).
+        """The fields at a recorded time by name: at nodes, (nodes, ...), and means over elements, (elements, ...).
 
         `displacement` belongs to the nodes; docs/commands.md lists the others. Values have 7 digits.
 
@@ -213,7 +216,7 @@ class Recording:
 def steps_recorded(folder: str | os.PathLike[str]) -> int:
     """How many steps a run has recorded so far, without reading them; 0 before it has begun."""
     try:
-        rows = (Path(folder) / HISTORY).read_bytes().count(b"\n")
+        rows = read_regular(Path(folder) / HISTORY, LARGEST_HISTORY).count(b"\n")
     except FileNotFoundError:
         return 0
     return max(0, rows - 2)  # the head, and t = 0
@@ -229,7 +232,7 @@ def read_history(folder: str | os.PathLike[str]) -> HistoryColumns:
     """
     path = Path(folder) / HISTORY
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_regular(path, LARGEST_HISTORY).decode()
     except (OSError, UnicodeDecodeError) as error:
         raise RecordingError(f"{path}: cannot be read: {error}") from error
     if not text:

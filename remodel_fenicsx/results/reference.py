@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from remodel_fenicsx.body import SHAPES
 from remodel_fenicsx.body.column import Column
-from remodel_fenicsx.results.columns import COLUMNS_ON_REQUEST, columns_of
+from remodel_fenicsx.body.columns import COLUMNS_ON_REQUEST, columns_of
 
 
 def column_reference() -> str:
@@ -18,11 +18,15 @@ def _rows() -> Iterator[str]:
     """Columns of all shapes before those of some; the same one of several shapes on one row."""
     shapes: dict[tuple[str, str, str], list[str]] = {}
     for shape, kind in SHAPES.items():
-        for column in columns_of(kind):
+        for column in columns_of(kind, loads=()):
             shapes.setdefault(_key(column), []).append(shape)
     for (name, unit, meaning), having in sorted(shapes.items(), key=lambda item: len(item[1]) != len(SHAPES)):
         of = "all" if len(having) == len(SHAPES) else ", ".join(having)
         yield f"| `{name}` | {of} | {unit} | {meaning} |"
+    for shape, kind in SHAPES.items():
+        of_loads = (load.make_column(name) for name, load in kind.loads.items() if load.frees_length)
+        for column in (*of_loads, *kind.columns_on_request):
+            yield f"| `{column.name}` | {shape}, on request | {column.unit} | {column.meaning} |"
     for column in COLUMNS_ON_REQUEST.values():
         yield f"| `{column.name}` | on request | {column.unit} | {column.meaning} |"
 

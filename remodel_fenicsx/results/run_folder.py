@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import NamedTuple
@@ -12,9 +13,10 @@ from mpi4py import MPI
 
 from remodel_fenicsx.evolution.stepper import Step, Watcher
 from remodel_fenicsx.results.history import History
-from remodel_fenicsx.results.recording import CHAINS, FIELDS, HISTORY, SCENE
-from remodel_fenicsx.results.run_lock import FolderTaken, RunLock
-from remodel_fenicsx.results.whole_file import write_whole
+from remodel_fenicsx.results.recording import CHAINS, FIELDS, HISTORY, LOG, SCENE, RecordingError
+from remodel_fenicsx.results.run_lock import FolderTaken, RunLock, is_vacant
+from remodel_fenicsx.results.vtkhdf import check_file
+from remodel_fenicsx.system.regular_files import open_own, write_whole
 
 
 class LastStep(NamedTuple):
@@ -40,7 +42,7 @@ def choose_folder(requested: Path | None, name: str) -> Path:
     if requested is not None:
         if requested.exists() and not requested.is_dir():
             raise FolderTaken(f"-o {requested}: is a file; allowed is a new or an empty folder")
-        if requested.is_dir() and any(requested.iterdir()):
+        if requested.is_dir() and not is_vacant(requested):
             raise FolderTaken(f"-o {requested}: is not empty; allowed is a new or an empty folder")
         return requested
     Path("results").mkdir(exist_ok=True)
@@ -116,6 +118,41 @@ def locked(folder: Path, comm: MPI.Intracomm, new: bool) -> Iterator[None]:
     finally:
         if lock is not None:
             lock.close()
+
+
+def check_kept(folder: Path, after: LastStep | None, fields: bool) -> None:
+    """Look at all that a run goes on with, before anything is changed.
+
+    Parameters
+    ----------
+    folder
+        The run's.
+    after
+        Where it goes on; None: at the start, with nothing but its log.
+    fields
+        Whether it goes on with its fields too.
+
+    Raises
+    ------
+    RecordingError
+        If the history does not hold the steps that were done, or a file of fields is damaged or foreign.
+    OSError
+        If one cannot be read.
+    ForeignFileError
+        If one is a link or no regular file.
+    """
+    for name in (LOG, HISTORY):
+        with suppress(FileNotFoundError):
+            os.close(open_own(folder / name, os.O_RDONLY))
+    if after is None:
+        return
+    History.size_of(folder / HISTORY, after.columns, after.number + 1, after.time)
+    for name in (FIELDS, CHAINS) if fields else ():
+        try:
+            if (folder / name).exists():
+                check_file(folder / name)
+        except ValueError as error:
+            raise RecordingError(f"{error}; the run goes on without this file") from error
 
 
 def forget_steps(folder: Path) -> None:

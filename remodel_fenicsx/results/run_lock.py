@@ -10,6 +10,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import TracebackType
 
+from remodel_fenicsx.results.recording import SCENE
+from remodel_fenicsx.system.regular_files import open_own, part_of
+
 LOCK = "run.lock"
 
 
@@ -45,7 +48,7 @@ class RunLock:
     FolderTaken
         If a process holds the folder; it is named.
     OSError
-        If the folder cannot be made or written.
+        If the folder cannot be made or written, or the lock is a link or no regular file.
     """
 
     def __init__(self, folder: Path, ranks: int = 1):
@@ -53,7 +56,7 @@ class RunLock:
         folder.mkdir(parents=True, exist_ok=True)
         self._descriptor = -1
         while self._descriptor < 0:
-            descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT, 0o666)
+            descriptor = open_own(self._path, os.O_RDWR | os.O_CREAT)
             try:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
@@ -96,7 +99,7 @@ def lock_holder(folder: Path) -> tuple[Process | None, bool]:
         If that cannot be found out.
     """
     try:
-        descriptor = os.open(folder / LOCK, os.O_RDONLY)
+        descriptor = open_own(folder / LOCK, os.O_RDONLY)
     except FileNotFoundError:
         return None, False
     try:
@@ -112,6 +115,19 @@ def lock_holder(folder: Path) -> tuple[Process | None, bool]:
         return process, lives
     finally:
         os.close(descriptor)
+
+
+def is_vacant(folder: Path) -> bool:
+    """Whether a folder is empty, or holds only what a process leaves that is killed before its scene has its name.
+
+    Raises
+    ------
+    OSError
+        If that cannot be found out.
+    """
+    return {entry.name for entry in folder.iterdir()} <= {LOCK, part_of(Path(SCENE)).name} and not lock_holder(folder)[
+        1
+    ]
 
 
 def _is_at(descriptor: int, path: Path) -> bool:

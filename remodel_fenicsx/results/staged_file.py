@@ -13,6 +13,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from remodel_fenicsx.system.regular_files import open_own
+
 _CHANGE = struct.Struct("<QQ")  # offset and length, before the bytes
 _END = struct.Struct("<QI8s")  # length and check sum of the changes before it
 _MARK = b"remodel1"
@@ -67,7 +69,7 @@ class StagedFile(io.RawIOBase):
         self._descriptor = -1
         super().__init__()
         self._path = path
-        self._descriptor = os.open(path, os.O_RDWR | (0 if existing else os.O_CREAT | os.O_EXCL), 0o666)
+        self._descriptor = open_own(path, os.O_RDWR | (0 if existing else os.O_CREAT | os.O_EXCL))
         if existing:
             self._finish_changes()
         self._committed = os.fstat(self._descriptor).st_size  # bytes on the disk

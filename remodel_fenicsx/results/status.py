@@ -2,32 +2,52 @@
 
 from __future__ import annotations
 
+import json
 import os
+import re
 import time as clock
+from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
 
 import numpy as np
 
 from remodel_fenicsx.results.checkpoint_file import read_pointer
-from remodel_fenicsx.results.recording import HISTORY, HistoryColumns, Recording, RecordingError, read_history
+from remodel_fenicsx.results.recording import (
+    HISTORY,
+    LARGEST_HISTORY,
+    LOG,
+    STUDY,
+    HistoryColumns,
+    Recording,
+    RecordingError,
+    read_history,
+)
 from remodel_fenicsx.results.run_lock import lock_holder
+from remodel_fenicsx.schema.tables import printable
 from remodel_fenicsx.schema.times import same_time
+from remodel_fenicsx.system.regular_files import ForeignFileError, read_regular
 from remodel_fenicsx.system.terminal import duration
 
+LARGEST_STUDY = 10**7  # bytes: ten thousand names of runs
 RECENT = 20  # steps whose mean is the rate
+BEGUN, FAILED, STOPPED = "scene ", "failed: ", "ended: "  # how lines of run.log on a run's beginning and end begin
+LOG_LINE = re.compile(r"[\d-]+ [\d:,]+ [A-Z]+ (.*)")
+SHOWN = 5  # runs of a study that have failed and are named
 
 
 def status(folder: Path) -> list[str]:
-    """Lines for people: where the run is, whether it is alive, its rate, its checkpoint.
+    """Lines for people: where the run is, whether it is alive, its rate, its checkpoint; or what a study's runs do.
 
     Raises
     ------
     RecordingError, SceneError, CheckpointError
-        If it is no folder of a run, or damaged.
+        If it is no folder of a run or of a study, or damaged.
     OSError
         If it cannot be read.
     """
+    if (folder / STUDY).is_file():
+        return _of_study(folder)
     holder, lives = lock_holder(folder)
     if not lives or (folder / HISTORY).exists():
         recording = Recording(folder)  # what is no run's folder is refused
@@ -53,13 +73,70 @@ def status(folder: Path) -> list[str]:
     else:
         when = f"{datetime.fromtimestamp(os.stat(folder / HISTORY).st_mtime):%Y-%m-%d %H:%M:%S}"
         killed = f"; {holder} was killed" if holder else ""
+        words = how_it_ended(folder)
+        if words.startswith(FAILED):
+            lines.append(words)
         lines.append(f"not running, the last step was done at {when}{killed}")
+        if words.startswith(STOPPED):
+            lines[-1] += f"; stopped by {words.removeprefix(STOPPED)}"
     if rate:
         lines.append(f"{rate:.3g} s a step (mean of the last {len(seconds)})")
     generations = read_pointer(folder)
     kept = f"checkpoint at time {generations[0].time:g}" if generations else "no checkpoint yet"
     lines.append(kept if lives or done else f"{kept}; it goes on with: remodel-fenicsx run --resume {folder}")
     return lines
+
+
+def how_it_ended(folder: Path) -> str:
+    """What run.log says of a run's end since it last began, beginning with `FAILED` or `STOPPED`; or nothing."""
+    words = ""
+    with suppress(FileNotFoundError):
+        for line in read_regular(folder / LOG, LARGEST_HISTORY).decode(errors="replace").splitlines():
+            found = LOG_LINE.fullmatch(line)
+            said = found[1] if found else ""
+            if said.startswith((BEGUN, FAILED, STOPPED)):
+                words = "" if said.startswith(BEGUN) else said
+    return words
+
+
+def _of_study(folder: Path) -> list[str]:
+    """How many of its runs are where, which have failed and why, and where the answer is."""
+    try:
+        study = json.loads(read_regular(folder / STUDY, LARGEST_STUDY))
+        name, scene, *runs = (printable(str(text)) for text in (study["study"], study["scene"], *study["runs"]))
+    except (ValueError, KeyError, TypeError, RecursionError, ForeignFileError) as error:
+        raise RecordingError(f"{folder / STUDY}: is damaged: {error}") from error
+    states = {run: _state(folder / run) for run in runs}
+    counted = {state: sum(each == state for each, _ in states.values()) for state, _ in states.values()}
+    lines = [
+        f"{folder}: {name} of {scene}, {len(runs)} runs: {', '.join(f'{n} {state}' for state, n in counted.items())}"
+    ]
+    failed = [f"{run} has {words}" for run, (state, words) in states.items() if state == "failed"]
+    lines += failed[:SHOWN] + ([f"and {len(failed) - SHOWN} more"] if len(failed) > SHOWN else [])
+    answer = folder / f"{name}.csv"
+    lines.append(f"its answer: {answer}" if answer.exists() else "no answer yet")
+    if set(counted) - {"finished", "running"}:
+        lines[-1] += f"; the same command goes on: remodel-fenicsx {name} SCENE -o {folder}"
+    return lines
+
+
+def _state(folder: Path) -> tuple[str, str]:
+    """Of a run of a study in a word; and why it has failed."""
+    if not folder.is_dir():
+        messages = folder.with_name(f"{folder.name}.txt")
+        data = read_regular(messages, LARGEST_HISTORY) if messages.is_file() else b""
+        said = data.decode(errors="replace").split("\n")
+        last = next((line for line in reversed(said) if line), "")
+        return ("failed", f"{FAILED}{last.removeprefix('remodel-fenicsx: ')}") if last else ("not begun", "")
+    if lock_holder(folder)[1]:
+        return "running", ""
+    with suppress(RecordingError):
+        recording = Recording(folder)
+        times = recording.history["time"]
+        if len(times) and same_time(float(times[-1]), recording.scene.last_time):
+            return "finished", ""
+    words = how_it_ended(folder)
+    return ("failed", words) if words.startswith(FAILED) else ("stopped", "")
 
 
 def _rows(recording: Recording, lives: bool) -> HistoryColumns:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from remodel_fenicsx.results.staged_file import StagedFile, signals_held_back
+from remodel_fenicsx.system.regular_files import open_own
 
 if TYPE_CHECKING:
     import h5py  # late everywhere: a run without fields needs none
@@ -36,11 +37,13 @@ CELL_TYPES = {
 LINE = 3
 _NODES = {3: 2, 5: 3, 9: 4, 10: 4, 12: 8}
 _STEPS_PER_CHUNK = 256
+_LARGEST_RATIO = 1100  # deflate makes nothing smaller than a 1032nd: a block that claims more is not there
+_ROWS_AT_ONCE = 10**6  # values that are read together where a whole file is checked
 # with these bounds HDF5 sets no "open for writing" mark, which a killed process would leave for ever
 _VERSIONS = ("earliest", "v110")
 # of the mesh, which is written once; shuffle and deflate are built into every HDF5. Fields are not compressed: noisy
 # floats become smaller by a fifth only, and a step would take twice as long
-_COMPRESSION: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
+_COMPRESSION: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True, "fletcher32": True}
 
 
 class TransientGrid:
@@ -360,11 +363,74 @@ def _checked_cells(cells: Array, cell_type: int, number_of_points: int) -> NDArr
 def _create(group: h5py.Group, name: str, block: Array) -> h5py.Dataset:
     """A dataset to which blocks like this one are added: a chunk is a step, which readers take as a whole."""
     trailing = block.shape[1:]
-    return group.create_dataset(name, (0, *trailing), block.dtype, maxshape=(None, *trailing), chunks=block.shape)
+    return group.create_dataset(
+        name, (0, *trailing), block.dtype, maxshape=(None, *trailing), chunks=block.shape, fletcher32=True
+    )
 
 
 def _create_row_dataset(group: h5py.Group, name: str, dtype: DTypeLike, trailing: tuple[int, ...] = ()) -> None:
+    # no check sum: these chunks are written over, and a reader must find the file whole between two writes
     group.create_dataset(name, (0, *trailing), dtype, maxshape=(None, *trailing), chunks=(_STEPS_PER_CHUNK, *trailing))
+
+
+def check_file(path: Path) -> None:
+    """Read a file of `TransientGrid` as a whole, so that damage and what is foreign are noticed. Nothing is changed.
+
+    HDF5 keeps a check sum of every block of values (since version 0.3.0), and compares it whenever the block is read.
+    Times and places of the blocks have none, but can be told from the numbers of nodes and elements.
+
+    Raises
+    ------
+    OSError
+        If it cannot be read.
+    ForeignFileError
+        If it is no regular file, is a link, or has other names.
+    ValueError
+        If it is damaged or of another kind, or refers to other files; one line.
+    """
+    import h5py
+
+    os.close(open_own(path, os.O_RDONLY))
+    try:
+        with h5py.File(path, "r") as file:
+            root = file["VTKHDF"]
+            _check_group(root, _LARGEST_RATIO * path.stat().st_size)
+            _check_steps(root)
+    except (KeyError, ValueError, TypeError, IndexError, RuntimeError, OSError) as error:
+        if isinstance(error, OSError) and error.errno is not None:
+            raise
+        raise ValueError(f"{path}: is damaged or of another kind: {' '.join(str(error).split())}") from error
+
+
+def _check_group(group: h5py.Group, most: int) -> None:
+    import h5py
+
+    for name in group:
+        if not isinstance(group.get(name, getlink=True), h5py.HardLink):
+            raise ValueError(f"{group.name}/{name} is a link to elsewhere")
+        entry = group[name]
+        if isinstance(entry, h5py.Group):
+            _check_group(entry, most)
+        elif entry.nbytes > most:
+            raise ValueError(f"{entry.name} claims {entry.nbytes} bytes")
+        elif entry.is_virtual or entry.external:
+            raise ValueError(f"{entry.name} is kept in another file")
+        else:
+            rows = max(1, _ROWS_AT_ONCE // max(1, int(np.prod(entry.shape[1:])))) if entry.shape else 1
+            for start in range(0, entry.shape[0] if entry.shape else 0, rows):
+                entry[start : start + rows]
+
+
+def _check_steps(root: h5py.Group) -> None:
+    steps, number = root["Steps"], int(root["Steps"].attrs["NSteps"])
+    times = steps["Values"][:number]
+    if len(times) != number or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
+        raise ValueError("the times of its steps do not increase")
+    for kind, unit in (("PointData", "NumberOfPoints"), ("CellData", "NumberOfCells")):
+        size = int(root[unit][0])
+        for name, offsets in steps[f"{kind}Offsets"].items():
+            if (offsets[:number] != size * np.arange(number)).any() or len(root[kind][name]) < size * number:
+                raise ValueError(f"the values of {name} are not where they belong")
 
 
 class _Rows:
@@ -372,22 +438,16 @@ class _Rows:
 
     def __init__(self, dataset: h5py.Dataset):
         self._id, self.dtype = dataset.id, dataset.dtype
-        self.trailing, self._chunks = tuple(dataset.shape[1:]), dataset.chunks
-        # of 0.1.0's files, which new chunks pass over
-        self._no_filters = (1 << dataset.id.get_create_plist().get_nfilters()) - 1
+        self.trailing = tuple(dataset.shape[1:])
 
     def write(self, number: int, block: Array) -> None:
         """Write block `number` of a dataset whose blocks have this one's length.
 
-        By HDF5's own functions: for a few numbers h5py's selections cost ten times as much. A block that is a chunk
-        goes to the file as it is.
+        By HDF5's own functions: for a few numbers h5py's selections cost ten times as much.
         """
         start, rest = number * len(block), (0,) * (block.ndim - 1)
         block = np.ascontiguousarray(block, self.dtype)
         self._id.set_extent((start + len(block), *block.shape[1:]))
-        if self._chunks == block.shape:
-            self._id.write_direct_chunk((start, *rest), block, filter_mask=self._no_filters)
-            return
         import h5py
 
         place = self._id.get_space()

@@ -22,7 +22,7 @@ from remodel_fenicsx.tissue.repulsion import REPULSIONS
 from remodel_fenicsx.tissue.spectral import PAIRINGS
 from remodel_fenicsx.schema.units import NUMBER_DENSITY, STRESS, TEMPERATURE
 
-COUPLINGS = {
+COUPLING_MEANINGS = {
     "staggered": "solve with the cells of the step before, then remodel once",
     "relaxed": "the same with a share, relaxation_factor, of what the pass changes: half of it is stable for every "
     "driver and frame but under weak loads, where 'staggered' over-corrects with 'pk2' and 'finger'",
@@ -120,31 +120,6 @@ class Material(Table):
         stresses = {"network modulus c =": self.network_modulus, "shear modulus mu =": self.lame_mu, **loads}
         return ", ".join(f"{words} {value:.4g} {self.stress_unit}" for words, value in stresses.items())
 
-    def warnings(self, base: Material) -> list[str]:
-        """Lines on a network that a change of stress_unit alone has made too soft or too stiff for its matrix.
-
-        The Lame constants of a scene are numbers in stress_unit, the chain density is always in 1/m^3: whoever changes
-        the unit changes the one and not the other.
-
-        Parameters
-        ----------
-        base
-            What lies under the scene's own keys: the preset's material, or the defaults.
-        """
-        unit, factor = self.stress_unit, STRESS_UNITS[self.stress_unit] / STRESS_UNITS[base.stress_unit]
-        if factor == 1 or self.chain_density != base.chain_density or not self.chain_density:
-            return []
-        ratio = self.network_modulus / self.lame_mu / (base.network_modulus / base.lame_mu)
-        if 1 / 30 < ratio < 30:  # other chains or a tenfold stiffer matrix are a choice; units differ by a thousand
-            return []
-        return [
-            f"material.chain_density = {self.chain_density:g} belongs to a scene in {base.stress_unit}, but "
-            f"material.stress_unit is {unit}: the network (c = {self.network_modulus:.4g} {unit}) is "
-            f"{max(ratio, 1 / ratio):.4g} times too {'soft' if ratio < 1 else 'stiff'} beside the matrix "
-            f"(mu = {self.lame_mu:.4g} {unit}); {self.chain_density * factor:g} makes c the same number as in "
-            f"{base.stress_unit}"
-        ]
-
 
 def _initial_cells(value: Any) -> Any:
     """A list of three lengths becomes a tuple of floats; names pass."""
@@ -231,9 +206,9 @@ class Remodeling(Table):
         "cross, the cell turns by 90 degrees at once), 'continuous' by axis (each principal direction goes on from the "
         "axis that it overlaps most). The law 'rotation' does not ask.",
     )
-    coupling: Annotated[str, one_of(COUPLINGS)] = Field(
+    coupling: Annotated[str, one_of(COUPLING_MEANINGS)] = Field(
         default="staggered",
-        description="; ".join(f"{name!r}: {text}" for name, text in COUPLINGS.items())
+        description="; ".join(f"{name!r}: {text}" for name, text in COUPLING_MEANINGS.items())
         + ". Where neither scene nor preset says it: 'extrapolated' with the law 'tensor'.",
     )
     relaxation_factor: float = Field(

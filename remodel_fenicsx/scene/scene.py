@@ -16,15 +16,17 @@ from typing import Annotated, Any, ClassVar
 from pydantic import BaseModel, Field, SerializeAsAny, model_validator
 
 from remodel_fenicsx.body import SHAPES, Shape
+from remodel_fenicsx.body.columns import columns_of, columns_on_request
 from remodel_fenicsx.body.reductions import AUTO, objections
 from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.scene.parameters import FORMAT, PRESETS, RENAMED, Cells, Material, Remodeling, default_method
-from remodel_fenicsx.scene.profiles import PROFILES, known_profile
+from remodel_fenicsx.scene.plausibility import doubts, largest_stress
+from remodel_fenicsx.scene.profiles import EXACT, PROFILES, known_profile
 from remodel_fenicsx.scene.settings import Load, Mesh, Model, Output, Solver, Supports, Time, nearest_multiples
-from remodel_fenicsx.scene.values import base_material, in_own_units, in_present_format, known_shape
+from remodel_fenicsx.scene.values import in_own_units, in_present_format, known_shape
 from remodel_fenicsx.schema.tables import SceneError, Table, checked, fault, quoted, shown, variant_of
 from remodel_fenicsx.schema.toml import merged, parse_override, put, read_toml, toml_text
-from remodel_fenicsx.schema.units import FORCE, STRESS
+from remodel_fenicsx.schema.units import FORCE
 from remodel_fenicsx.tissue.chains import CHAINS
 from remodel_fenicsx.tissue.condensed import refused
 from remodel_fenicsx.tissue.drivers import DRIVERS, FRAMES
@@ -58,7 +60,7 @@ class Scene(Table):
     )
     name: Annotated[str, checked(_name)] = Field(
         default="scene",
-        description="Name of the scene and of its results folder. Default: the file's name without its ending.",
+        description="Name of the scene and of its results folder. Default: the file's name without `.toml`.",
         json_schema_extra={"allowed": "a file name without a path"},
     )
     preset: str | None = Field(
@@ -107,7 +109,10 @@ class Scene(Table):
         profile = plain.get("profile")
         if profile is not None:
             base = merged(base, known_profile(profile).tables())
-        return in_own_units(merged(base, plain), cls, SHAPES[shape], Load)
+        values = in_own_units(merged(base, plain), cls, SHAPES[shape], Load)
+        if profile is not None and PROFILES[profile].takes_exact_coupling and _leaves_coupling_open(plain, values):
+            values = merged(values, {"remodeling": {"coupling": EXACT}})
+        return values
 
     @model_validator(mode="after")
     def _tables_fit_together(self) -> Scene:
@@ -138,6 +143,7 @@ class Scene(Table):
         for name, load in self.loads.items():
             self._check_load(name, load)
         self._check_output_times()
+        self._check_columns()
         self._check_length()
         if self.model.kinematics != AUTO and (reasons := objections(self, self.model.kinematics)):
             raise fault("; ".join(reasons), "model.kinematics", self.model.kinematics)
@@ -145,13 +151,16 @@ class Scene(Table):
 
     def missing_for_implicit(self) -> str | None:
         """What the coupling "implicit" would need."""
-        if self.mesh.formulation != "displacement":
-            return "mesh.formulation = 'displacement': with another one the stress at a point belongs to its element"
-        if not self.material.chain_density:
-            return "chains: material.chain_density above 0"
-        remodeling, material = self.remodeling, self.material
-        parts = LAWS[remodeling.law], DRIVERS[remodeling.driver], FRAMES[remodeling.frame]
-        return refused(*parts, MATRICES[material.matrix], REPULSIONS[material.repulsion])
+        return _missing_for_implicit(self.mesh, self.material, self.remodeling)
+
+    @property
+    def has_exact_coupling(self) -> bool:
+        """Whether the coupling "implicit" leaves no error in time: steps of any length lead to the same cells.
+
+        So it is where the cells depend on the time and the tension that they have then alone. From random cells some
+        points have no such state and are held (docs/couplings.md).
+        """
+        return _has_exact_coupling(self.mesh, self.material, self.cells, self.remodeling)
 
     def _missing_for_equilibrium(self) -> str | None:
         """Why time has no end that does not depend on the way there."""
@@ -192,6 +201,13 @@ class Scene(Table):
                 rule = nearest_multiples(time, self.time.step, "time.step")
                 raise fault(rule, f"output.times[{index}]", time)
 
+    def _check_columns(self) -> None:
+        known = dict.fromkeys([*columns_on_request(self.geometry), *(c.name for c in columns_of(self.geometry))])
+        for name in self.output.columns:
+            if name not in known:
+                rule = f"no such column on request; allowed for shape {self.geometry.name!r} are "
+                raise fault(rule + ", ".join(map(repr, known)), "output.columns", name)
+
     def stops(self) -> list[float]:
         """Times at which a step ends, however long steps are: corners of ramps, output.times and the end."""
         end = self.last_time
@@ -217,17 +233,16 @@ class Scene(Table):
         """Stiffness of network and matrix and the largest loads, in one unit and on one line."""
         loads = {}
         for name, load in self.loads.items():
-            largest, dimension = load.largest(self.last_time), self.geometry.loads[name].dimension
-            if dimension == STRESS:
-                loads[f"largest {name}"] = largest
-            elif dimension == FORCE:
-                loads[f"largest {name} over its area"] = largest / self.geometry.loaded_area
+            stress = largest_stress(name, load.largest(self.last_time), self.geometry)
+            if stress is not None:
+                is_force = self.geometry.loads[name].dimension == FORCE
+                loads[f"largest {name}{' over its area' if is_force else ''}"] = stress
         return self.material.summary(loads)
 
     def warnings(self) -> list[str]:
         """What is allowed but hardly meant, each on one line."""
-        under = {} if self.preset is None else PRESETS[self.preset][self.geometry.name].get("material", {})
-        return self.material.warnings(base_material(under)) + self.remodeling.warnings()
+        parts = self.material, self.geometry, self.loads, self.cells.end_to_end_length, self.last_time
+        return doubts(*parts) + self.remodeling.warnings()
 
     def with_values(self, changes: Mapping[str, Any]) -> Scene:
         """A validated copy with other values by dotted key: ``scene.with_values({"loads.pressure.value": 2.4})``.
@@ -253,6 +268,32 @@ class Scene(Table):
             Lines for the top, each becomes a comment.
         """
         return toml_text(self, header)
+
+
+def _missing_for_implicit(mesh: Mesh, material: Material, remodeling: Remodeling) -> str | None:
+    if mesh.formulation != "displacement":
+        return "mesh.formulation = 'displacement': with another one the stress at a point belongs to its element"
+    if not material.chain_density:
+        return "chains: material.chain_density above 0"
+    parts = LAWS[remodeling.law], DRIVERS[remodeling.driver], FRAMES[remodeling.frame]
+    return refused(*parts, MATRICES[material.matrix], REPULSIONS[material.repulsion])
+
+
+def _has_exact_coupling(mesh: Mesh, material: Material, cells: Cells, remodeling: Remodeling) -> bool:
+    if not LAWS[remodeling.law].of_absolute_time or cells.initial == "random":
+        return False
+    return _missing_for_implicit(mesh, material, remodeling) is None
+
+
+def _leaves_coupling_open(own: Mapping[str, Any], values: Mapping[str, Any]) -> bool:
+    """Whether a scene's own keys name no coupling, and all its values, not validated yet, have an exact one."""
+    if "coupling" in own.get("remodeling", {}):
+        return False
+    kinds: dict[str, Any] = {"mesh": Mesh, "material": Material, "cells": Cells, "remodeling": Remodeling}
+    try:
+        return _has_exact_coupling(*(kind(**values.get(name, {})) for name, kind in kinds.items()))
+    except (SceneError, TypeError):  # what is wrong will be said, with its whole key
+        return False
 
 
 def _check_load_names(shape: str, loads: Any) -> None:
@@ -321,11 +362,16 @@ def read_scene(path: str | os.PathLike[str], overrides: Iterable[str] = (), prof
     SceneError
         One line: file and line, or key, value and what is allowed.
     """
-    values = read_toml(Path(path))
+    values, overrides = read_toml(Path(path)), list(overrides)
     if profile is not None:
         values = merged(values, {"profile": profile} | PROFILES[profile].tables())
     for override in overrides:
         key, value = parse_override(override)
         put(values, key, value)
-    values.setdefault("name", re.sub(r"^[^\w]+|[^\w+-]+$|[^\w .+-]", "", Path(path).stem)[:100].rstrip(" .") or "scene")
-    return scene_from_dict(values)
+    name = re.sub(r"\.toml$", "", Path(path).name, flags=re.IGNORECASE)  # what follows another dot is part of it
+    values.setdefault("name", re.sub(r"^[^\w]+|[^\w+-]+$|[^\w .+-]", "", name)[:100].rstrip(" .") or "scene")
+    scene = scene_from_dict(values)
+    if profile is None or not PROFILES[profile].takes_exact_coupling or not scene.has_exact_coupling:
+        return scene
+    asked = any(parse_override(override)[0] == "remodeling.coupling" for override in overrides)
+    return scene if asked else scene.with_values({"remodeling.coupling": EXACT})

@@ -14,7 +14,7 @@ from remodel_fenicsx.body.reductions import AUTO
 from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.fem.solver_methods import AUTO as AUTOMATIC
-from remodel_fenicsx.fem.solver_methods import LARGE, LARGE_ON_RANKS, MEANINGS, METHODS, SMALL
+from remodel_fenicsx.fem.solver_methods import LARGE, LARGE_ON_RANKS, MEANINGS, METHODS, SMALL, fault_of_option
 from remodel_fenicsx.schema.tables import Table, checked, fault, is_number, one_of, quoted, shown
 from remodel_fenicsx.schema.times import is_multiple, same_time
 from remodel_fenicsx.schema.units import FORCE
@@ -167,9 +167,10 @@ class Time(Table):
     tolerance: float | None = Field(
         default=None,
         gt=0,
-        description="Where it is given, steps are as long as the estimated error in time of the fibre angle, in "
-        "degrees, root mean square over the body, stays below it. Times of ramps and output.times are hit. On the "
-        "way to an equilibrium steps are always chosen so; default there: 1.5 degrees.",
+        description="Where it is given, steps are as long as the estimated error in time stays below it, in degrees: "
+        "of the direction of the chains, root mean square over the body, and of lengths, relative, as an angle (1 "
+        "degree is 1.7 %). Times of ramps and output.times are hit. On the way to an equilibrium steps are always "
+        "chosen so; default there: 2 degrees.",
         json_schema_extra={"allowed": "a number greater than 0, in degrees"},
     )
 
@@ -229,6 +230,8 @@ def _petsc_options(value: Any) -> Any:
                 raise fault("has no effect; use solver.relative_tolerance, solver.absolute_tolerance", name, entry)
             if not isinstance(entry, (str, bool)) and not is_number(entry):
                 raise fault("must be a string, a finite number, true or false", name, entry)
+            if refused := fault_of_option(name, entry):
+                raise fault(refused, name, entry)
     return value
 
 
@@ -281,7 +284,8 @@ class Solver(Table):
     )
     petsc_options: Annotated[dict[str, Any], checked(_petsc_options)] = Field(
         default_factory=dict,
-        description="PETSc options that override the method's, without the leading '-': snes_..., ksp_..., pc_....",
+        description="PETSc options that override the method's, without the leading '-': snes_..., ksp_..., pc_... "
+        "and mat_.... None that runs code or writes files; those of PETSC_OPTIONS are the user's own.",
     )
 
     @model_validator(mode="after")
@@ -291,11 +295,21 @@ class Solver(Table):
         return self
 
 
+FIELDS_BY_NAME = (
+    "displacement", "deformation_gradient", "cauchy_stress", "cell_dimensions", "axis_1", "axis_2", "axis_3",
+    "fibre_angle", "fibre_angle_deformed", "chain_extension", "chains",
+)  # fmt: skip
+"""What `output.fields` may name (`results.fields`); "chains" are the lines of fields_chains.vtkhdf."""
+
+
 def _fields(value: Any) -> Any:
     if isinstance(value, bool):
         return value
     if not isinstance(value, (list, tuple)) or not all(isinstance(name, str) for name in value):
         raise fault("must be true, false or a list of names of fields")
+    for name in value:
+        if name not in FIELDS_BY_NAME:
+            raise fault(f"no such field; allowed are {', '.join(map(repr, FIELDS_BY_NAME))}", value=name)
     return tuple(value)
 
 

@@ -76,11 +76,6 @@ def in_own_units(
     return result
 
 
-def base_material(values: Mapping[str, Any]) -> Material:
-    """The material of a preset, or the default one."""
-    return Material(**in_units(values, Material, _units({"material": values}), "material"))
-
-
 def _units(values: Mapping[str, Any], shape: type[Table] | None = None) -> dict[str, str | None]:
     """The scene's own units by the keys that choose them."""
     units: dict[str, str | None] = {LENGTH_UNIT: None}

@@ -44,12 +44,21 @@ class Table(BaseModel):
 
         def __init__(self, /, **values):
             try:
-                super().__init__(**values)
+                super().__init__(**{name: _of_python(value) for name, value in values.items()})
             except ValidationError as error:
                 raise SceneError(one_line(error, type(self))) from None
 
         # A table inside a table is then validated by pydantic directly, so that an error keeps its whole dotted key.
         __init__.__pydantic_base_init__ = True
+
+
+def _of_python(value: Any) -> Any:
+    """A value with numpy's numbers and arrays, at any depth, as Python's own."""
+    if hasattr(value, "dtype") and hasattr(value, "tolist"):
+        return value.tolist()
+    if isinstance(value, dict):
+        return {name: _of_python(entry) for name, entry in value.items()}
+    return type(value)(map(_of_python, value)) if type(value) in (list, tuple) else value
 
 
 class OneOf:

@@ -17,8 +17,12 @@ from pydantic import BaseModel
 
 from remodel_fenicsx.schema.tables import SceneError, printable, shown
 from remodel_fenicsx.schema.units import is_quantity
+from remodel_fenicsx.system.regular_files import read_regular
 
 COMMENT_WIDTH = 100  # characters of a line of comment
+LARGEST = 10**6  # bytes: thirty times a scene with all keys and their comments
+MOST_PARTS = 100  # of a dotted key: TOML's reader takes the square of them in time
+_DECIMAL = re.compile(r"(?<![\w.])[+-]?\d[\d_]*\.\d[\d_]*(?:[eE][+-]?\d+)?(?![\w.])")
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -30,7 +34,7 @@ def read_toml(path: Path) -> dict[str, Any]:
         If it cannot be read; one line with the file and, where it is not TOML, the line in it.
     """
     try:
-        text = path.read_bytes().decode("utf-8-sig")
+        text = read_regular(path, LARGEST).decode("utf-8-sig")
     except IsADirectoryError:
         raise SceneError(f"{path}: is a folder; a scene is a TOML file") from None
     except FileNotFoundError:
@@ -40,12 +44,35 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise SceneError(f"{path}: line {line}: not UTF-8 text; a scene is a TOML file in UTF-8") from None
     except (OSError, ValueError) as error:
         raise SceneError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
+    for number, words in enumerate(text.splitlines(), start=1):
+        if not words.lstrip().startswith("#") and _DECIMAL.sub("", words).count(".") > MOST_PARTS:
+            raise SceneError(f"{path}: line {number}: a key of more than {MOST_PARTS} parts; a scene has up to 4")
     try:
-        return tomllib.loads(text)
+        values = tomllib.loads(text)
+        if _depth_exceeds(values, MOST_PARTS):
+            raise SceneError(f"{path}: tables or lists in more than {MOST_PARTS} others; a scene has up to 4")
+        return values
+    except SceneError:
+        raise
     except (ValueError, RecursionError) as error:
         place = re.search(r"^(.*) \(at (?:line (\d+), column \d+|(end of document))\)$", str(error), re.DOTALL)
         where = f"line {place[2] or len(text.splitlines())}: " if place else ""
         raise SceneError(f"{path}: {where}not TOML: {place[1] if place else error}") from None
+
+
+def _depth_exceeds(value: Any, most: int) -> bool:
+    """Whether tables and lists lie in more than so many others."""
+    level = [value]
+    for _ in range(most):
+        level = [
+            entry
+            for outer in level
+            for entry in (outer.values() if isinstance(outer, dict) else outer)
+            if isinstance(entry, (dict, list))
+        ]
+        if not level:
+            return False
+    return True
 
 
 def parse_override(text: str) -> tuple[str, Any]:
@@ -59,6 +86,8 @@ def parse_override(text: str) -> tuple[str, Any]:
     key, equals, value = (part.strip() for part in text.partition("="))
     if not equals:
         raise SceneError(f"--set {shown(text)}: must be KEY=VALUE, as in cells.seed=2")
+    if len(key.split(".")) > MOST_PARTS:
+        raise SceneError(f"--set {shown(text)}: a key of more than {MOST_PARTS} parts; a scene has up to 4")
     if not all(key.split(".")):
         raise SceneError(f"--set {shown(text)}: the key must be a dotted path, as in cells.seed=2")
     try:

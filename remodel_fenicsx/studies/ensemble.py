@@ -11,10 +11,11 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from remodel_fenicsx.body.columns import columns_of
 from remodel_fenicsx.paper.output import COLOURS, STYLE, Page
 from remodel_fenicsx.scene.scene import Scene, SceneError
 from remodel_fenicsx.schema.times import same_time
-from remodel_fenicsx.studies.members import Member, run_members
+from remodel_fenicsx.studies.members import LEAST, Member, Study, TooFewRuns, run_members
 from remodel_fenicsx.system.children import cores
 from remodel_fenicsx.system.environment import versions
 
@@ -23,6 +24,7 @@ Array = NDArray[np.float64]
 NAME, ISOTROPIC = "ensemble", "isotropic"
 NOT_COMPARED = ("time", "seconds", "newton_iterations", "linear_iterations", "substeps")
 WITHIN = 2.0  # standard deviations
+KNOWN = 6  # seeds from which on a deviation is known to a third: its relative error is 1 / sqrt(2 (seeds - 1))
 PANELS = 6
 
 
@@ -40,17 +42,33 @@ class Ensemble:
         The same of the model with isotropic cells, (rows,); empty if it has failed.
     failed
         Last words of runs that have failed, by name.
+    extremes
+        Columns of a largest or smallest value: isotropic cells, the same everywhere, have no such values to compare.
     """
 
     time: Array
     columns: dict[str, Array]
     isotropic: dict[str, Array]
     failed: dict[str, str]
+    extremes: frozenset[str] = frozenset()
 
     @property
     def seeds(self) -> int:
         """How many there are."""
         return len(next(iter(self.columns.values())))
+
+    @property
+    def knows_deviations(self) -> bool:
+        """Whether the seeds are enough for them."""
+        return self.seeds >= KNOWN
+
+    def away(self, name: str, row: int) -> float:
+        """By how many standard deviations isotropic cells miss the mean; NaN where that is not to be compared."""
+        values = self.columns[name][:, row]
+        deviation = float(values.std(ddof=1))
+        if name not in self.isotropic or name in self.extremes or not self.knows_deviations or deviation == 0:
+            return np.nan
+        return (float(self.isotropic[name][row]) - float(values.mean())) / deviation
 
     def table(self) -> dict[str, Array]:
         """Columns of ensemble.csv: of each column mean, standard deviation, least, most, and isotropic cells."""
@@ -110,7 +128,9 @@ def ensemble(
     Raises
     ------
     SceneError
-        If the scene has no random cells, if a folder holds another one, or if fewer than two runs reach the end.
+        If the scene has no random cells, or if a folder holds another one.
+    TooFewRuns
+        If fewer than two seeds reach the end.
     Interrupted
         If a signal asked for the end; the same call goes on from there.
     OSError
@@ -118,7 +138,7 @@ def ensemble(
     """
     place = Path(folder or Path("results") / f"{scene.name}-{NAME}")
     members = members_of(scene, place, seeds)
-    failed = run_members(members, jobs or cores(), f"{scene.name} {NAME}", quiet)
+    failed = run_members(members, jobs or cores(), Study(NAME, scene.name, place), quiet)
     found = gathered(members, failed)
     draw(found, place, scene)
     return place, found
@@ -129,51 +149,85 @@ def gathered(members: list[Member], failed: dict[str, str]) -> Ensemble:
 
     Raises
     ------
-    SceneError
+    TooFewRuns
         If fewer than two seeds have reached the end.
     """
     histories = {member.name: member.history() for member in members if member.name not in failed}
     isotropic = dict(histories.pop(ISOTROPIC, {}))
-    if len(histories) < 2:
-        words = "; ".join(f"{name}: {text}" for name, text in failed.items())
-        raise SceneError(
-            f"{len(histories)} of {len(members) - 1} seeds reached the end, at least 2 are needed ({words})"
-        )
+    if len(histories) < LEAST:
+        raise TooFewRuns(f"{len(histories)} of {len(members) - 1} seeds reached the end", failed)
     first = next(iter(histories.values()))
     columns = {
         name: np.stack([history[name] for history in histories.values()]) for name in first if name not in NOT_COMPARED
     }
-    return Ensemble(first["time"], columns, {name: isotropic[name] for name in columns if name in isotropic}, failed)
+    scene = members[0].scene
+    extremes = frozenset(column.name for column in columns_of(scene.geometry, scene.output.columns) if column.extreme)
+    same = {name: isotropic[name] for name in columns if name in isotropic}
+    return Ensemble(first["time"], columns, same, failed, extremes)
 
 
 # ---------------------------------------------------------------- in words
 def in_words(found: Ensemble, times: list[float]) -> str:
-    """A table for a terminal: the columns that differ between seeds, at some times."""
+    """A table for a terminal: the columns that differ between seeds, at some times; then the answer in a sentence."""
     table, lines = found.table(), []
     width = max(len(name) for name in found.columns)
     head = f"{'':{width}} {'mean':>11} {'deviation':>11} {'least':>11} {'most':>11} {'isotropic':>11}"
     for time in times:
-        row = next(row for row, recorded in enumerate(found.time) if same_time(float(recorded), time))
+        row = _row_of(found, time)
         lines += [f"time {time:g}, {found.seeds} seeds", head]
-        for name, values in found.columns.items():
-            if np.ptp(values[:, row]) == 0:
-                continue  # a load
-            numbers = [float(table[f"{name}_{kind}"][row]) for kind in ("mean", "deviation", "least", "most")]
-            shown = " ".join(f"{number:11.5g}" for number in numbers)
-            lines.append(f"{name:{width}} {shown} {_beside(found, name, row, *numbers[:2])}")
-    return "\n".join(lines)
+        for name in _varying(found, row):
+            numbers = {kind: float(table[f"{name}_{kind}"][row]) for kind in ("mean", "deviation", "least", "most")}
+            words = {kind: f"{number:11.5g}" for kind, number in numbers.items()}
+            if not found.knows_deviations:
+                words["deviation"] = f"{'not known':>11}"
+            lines.append(f"{name:{width}} {' '.join(words.values())} {_beside(found, name, row)}")
+    return "\n".join([*lines, verdict(found, times[-1])])
 
 
-def _beside(found: Ensemble, name: str, row: int, mean: float, deviation: float) -> str:
+def _row_of(found: Ensemble, time: float) -> int:
+    return next(row for row, recorded in enumerate(found.time) if same_time(float(recorded), time))
+
+
+def _varying(found: Ensemble, row: int) -> list[str]:
+    """Columns that are no load."""
+    return [name for name, values in found.columns.items() if np.ptp(values[:, row]) != 0]
+
+
+def _beside(found: Ensemble, name: str, row: int) -> str:
     """Isotropic cells, and by how many standard deviations they miss the mean."""
     if name not in found.isotropic:
         return f"{'failed':>11}"
-    value = float(found.isotropic[name][row])
-    if not np.isfinite(value) or deviation == 0:
+    value, away = float(found.isotropic[name][row]), found.away(name, row)
+    if name in found.extremes:
+        return f"{value:11.5g}  an extreme: not compared"
+    if not np.isfinite(away):
         return f"{value:11.5g}"
-    away = (value - mean) / deviation
     words = "within the spread" if abs(away) <= WITHIN else "outside of it"
     return f"{value:11.5g}  {away:+.1f} deviations: {words}"
+
+
+def verdict(found: Ensemble, time: float) -> str:
+    """Whether isotropic cells say what random ones do, in a sentence."""
+    row = _row_of(found, time)
+    if not found.isotropic:
+        return "Not known: the run with isotropic cells has failed, so there is nothing to compare."
+    if not found.knows_deviations:
+        return (
+            f"Not known: {found.seeds} seeds are too few for a standard deviation; {KNOWN} tell it to a third. The "
+            f"same command with --seeds {KNOWN} or more goes on from these."
+        )
+    away = {name: found.away(name, row) for name in _varying(found, row)}
+    compared = {name: number for name, number in away.items() if np.isfinite(number)}
+    outside = [f"{name} ({number:+.1f} deviations)" for name, number in compared.items() if abs(number) > WITHIN]
+    if not compared:
+        return f"At time {time:g} no column differs between the seeds: there is nothing to compare."
+    if outside:
+        names = ", ".join(outside)
+        return f"At time {time:g} isotropic cells do not stand for random ones: outside of the spread are {names}."
+    return (
+        f"At time {time:g} isotropic cells lie within {WITHIN:g} deviations of the mean of {found.seeds} seeds in all "
+        f"{len(compared)} columns: they say what one sample of random cells would."
+    )
 
 
 def chosen_times(scene: Scene) -> list[float]:
@@ -204,9 +258,10 @@ def draw(found: Ensemble, folder: Path, scene: Scene) -> None:
         for axes, name in zip(grid, shown, strict=False):
             mean, deviation = table[f"{name}_mean"], table[f"{name}_deviation"]
             axes.fill_between(found.time, table[f"{name}_least"], table[f"{name}_most"], color=COLOURS[0], alpha=0.15)
-            axes.fill_between(found.time, mean - deviation, mean + deviation, color=COLOURS[0], alpha=0.35)
+            if found.knows_deviations:
+                axes.fill_between(found.time, mean - deviation, mean + deviation, color=COLOURS[0], alpha=0.35)
             axes.plot(found.time, mean, color=COLOURS[0], label="random cells, mean over the seeds")
-            if name in found.isotropic:
+            if name in found.isotropic and name not in found.extremes:
                 axes.plot(found.time, found.isotropic[name], "--", color=COLOURS[1], label="isotropic cells")
             axes.set(xlabel="time", ylabel=name, xlim=(0, found.time[-1]))
         for axes in grid[len(shown) :]:

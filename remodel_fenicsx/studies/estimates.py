@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.schema.times import same_time
 from remodel_fenicsx.studies.convergence import Limit, limit, pareto, typical
 from remodel_fenicsx.studies.ladder import KINEMATIC, Setting, is_reduced
@@ -15,6 +16,7 @@ from remodel_fenicsx.studies.ladder import KINEMATIC, Setting, is_reduced
 Array = NDArray[np.float64]
 
 CLOSE = 0.5  # of an error: what is left unknown may be so much of it
+NO_ERROR = 1e-6  # degrees: what solves leave is less, what elements and steps leave more
 SPREAD = 2.0  # noise of the mean over the seeds that an error must be above
 
 
@@ -61,7 +63,7 @@ class Row:
         Estimated error of the fibre angle, degrees, root mean square over places and times.
     length_error
         The same of radii or stretch: the largest relative one.
-    best
+    on_front
         Whether no other row is as good for less.
     doubt
         Why the estimate is not to be trusted; empty where it is.
@@ -70,7 +72,7 @@ class Row:
     result: Result
     angle_error: float
     length_error: float
-    best: bool = False
+    on_front: bool = False
     doubt: str = ""
 
 
@@ -96,19 +98,66 @@ class Trade:
     failed: dict[str, str]
 
 
+@dataclass(frozen=True)
+class _Guess:
+    """Of the exact result: what settings of one coupling tend to.
+
+    Attributes
+    ----------
+    angles, lengths
+        As in `Result`.
+    unknown
+        Degrees that stay unknown where a sweep shows no order; infinite where a factor was not varied.
+    beyond
+        Degrees from the finest setting to it.
+    notes
+        What it rests on.
+    """
+
+    angles: Array
+    lengths: Array
+    unknown: float
+    beyond: float
+    notes: list[str]
+
+
 def estimated(results: Sequence[Result]) -> tuple[list[Row], list[str]]:
     """Rows with errors against the best guess of the exact result, and what it rests on.
 
-    What is not known of that guess, where a sweep shows no order, counts as an error too.
+    Settings of each coupling make a guess; the best one has the least before it, and the least unknown. What is not
+    known of it, where a sweep shows no order, counts as an error too.
     """
     notes = _about_steps_on_the_same_cells(results)
     results = _on_the_mean(results)
     fixed = [result for result in results if result.setting.step is not None]
-    if not fixed:
+    by_coupling = {
+        name: [result for result in fixed if result.setting.way[1] == name]
+        for name in dict.fromkeys(result.setting.way[1] for result in fixed)
+    }
+    guesses = {name: _guess(same) for name, same in by_coupling.items()}
+    if not guesses:
         return [Row(result, np.nan, np.nan, doubt="nothing to compare with") for result in results], notes
+    name, best = min(guesses.items(), key=lambda item: float(np.hypot(item[1].unknown, item[1].beyond)))
+    notes += best.notes
+    for other, guess in guesses.items():
+        if other != name and np.isfinite(guess.unknown):
+            apart = typical(guess.angles - best.angles)
+            notes.append(f"couplings: what {other!r} tends to is {apart:.2g} degrees from what {name!r} does")
+    rows = [_row(result, best) for result in results]
+    rows.sort(key=lambda row: row.result.seconds)
+    on_front = pareto([row.result.seconds for row in rows], [row.angle_error for row in rows])
+    notes += _about_kinematics(results)
+    return [replace(row, on_front=is_best) for row, is_best in zip(rows, on_front, strict=True)], notes
+
+
+def _guess(fixed: Sequence[Result]) -> _Guess:
+    """What settings with fixed steps, and one coupling, tend to."""
     finest = min(fixed, key=_fineness)
-    angles, lengths, unknown = finest.angles, finest.lengths, 0.0
-    for factor, (sweep, words) in {"time": _time_sweep(results), "mesh": _mesh_sweep(results)}.items():
+    angles, lengths, unknown, notes = finest.angles, finest.lengths, 0.0, []
+    sweeps = {"time": _time_sweep(fixed)}
+    if not KINEMATICS[finest.setting.mesh[0]].homogeneous:
+        sweeps["mesh"] = _mesh_sweep(fixed)
+    for factor, (sweep, words) in sweeps.items():
         if not sweep:
             notes.append(f"{factor}: fewer than two settings of it: its error is in no estimate")
             unknown = np.inf
@@ -121,18 +170,14 @@ def estimated(results: Sequence[Result]) -> tuple[list[Row], list[str]]:
         notes.append(_words(factor, words, found))
         if not found.trusted:
             unknown = max(unknown, typical(found.last)) if np.isfinite(found.last).any() else np.inf
-    rows = [_row(result, angles, lengths, unknown) for result in results]
-    rows.sort(key=lambda row: row.result.seconds)
-    best = pareto([row.result.seconds for row in rows], [row.angle_error for row in rows])
-    notes += _about_kinematics(results)
-    return [replace(row, best=on_front) for row, on_front in zip(rows, best, strict=True)], notes
+    return _Guess(angles, lengths, unknown, typical(angles - finest.angles), notes)
 
 
-def _row(result: Result, angles: Array, lengths: Array, unknown: float) -> Row:
-    error = typical(result.angles - angles)
+def _row(result: Result, guess: _Guess) -> Row:
+    error, unknown = typical(result.angles - guess.angles), guess.unknown
     if np.isfinite(unknown):
         error = float(np.hypot(error, unknown))
-    length = float(np.nanmax(np.abs(result.lengths / lengths - 1)))
+    length = float(np.nanmax(np.abs(result.lengths / guess.lengths - 1)))
     doubt = ""
     if unknown > CLOSE * error:
         doubt = "no order seen" if np.isfinite(unknown) else "a factor was not varied"
@@ -215,6 +260,8 @@ def _same_level(result: Result, finest: Result, factor: str) -> bool:
 
 
 def _words(factor: str, words: str, found: Limit) -> str:
+    if typical(found.last) < NO_ERROR:
+        return f"{factor}: no error ({words}): the last two differ by {typical(found.last):.2g} degrees"
     if found.trusted:
         return f"{factor}: order {found.order:.2g} ({words}); the finest is {typical(found.beyond):.2g} degrees off"
     return (
@@ -249,12 +296,14 @@ def _about_kinematics(results: Sequence[Result]) -> list[str]:
     for result in results:
         if result.setting.factor != KINEMATIC or is_reduced(result.setting):
             continue
-        part = next((r for r in results if is_reduced(r.setting) and r.setting.mesh[1:] == result.setting.mesh[1:]
-                     and r.setting.step == result.setting.step), None)  # fmt: skip
+        alike = [r for r in results if is_reduced(r.setting) and r.setting.mesh[1:] == result.setting.mesh[1:]]
+        part = next((r for r in alike if (r.setting.step, r.setting.way[1])
+                     == (result.setting.step, result.setting.way[1])), None)  # fmt: skip
         if part is not None:
             apart = typical(result.angles - part.angles)
+            several = "; where finer meshes do not bring them together the body has several solutions"
             notes.append(
                 f"kinematics: {result.setting.mesh[0]} and {part.setting.mesh[0]} on alike elements are {apart:.2g} "
-                "degrees apart; where finer meshes do not bring them together the body has several solutions"
+                f"degrees apart{several if apart > NO_ERROR else ''}"
             )
     return notes

@@ -7,15 +7,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from remodel_fenicsx.body.profile import PROFILE
 from remodel_fenicsx.body.reductions import AUTO, choice, objections, step_cost
 from remodel_fenicsx.fem.kinematics import KINEMATICS
-from remodel_fenicsx.results.profile import PROFILE
+from remodel_fenicsx.scene.profiles import EXACT, PROFILES
 from remodel_fenicsx.scene.scene import Scene, SceneError
 from remodel_fenicsx.tissue.laws import LAWS
 
 log = logging.getLogger(__name__)
 
 SECONDS_PER_POINT = 3e-5  # of a step: a first guess, corrected by the runs
+COST_OF_EXACT = 20.0  # of a step with the coupling that has no error in time, in others, as measured on the artery
 DEGREES_PER_RUN = 60.0  # what angles turn by: steps of a tolerance are about so many tolerances
 STEPS = (8.0, 5.0, 4.0, 2.5, 2.0)  # longer ones than the scene's, in its own
 HALVINGS = 3  # of the scene's own step
@@ -24,6 +26,7 @@ MESHES = ((1, 1), (2, 1), (4, 1), (8, 1), (1, 2), (2, 2), (4, 2))  # refinement,
 TOGETHER = ((2, 1, 0.5), (2, 2, 0.5), (2, 2, 0.25), (4, 2, 0.25))  # both finer: refinement, degree, step in the scene's
 SEEDS = 3  # where another mesh draws other cells
 COMPARED = 8  # times at which rows are compared, beside corners of ramps and the end
+STRETCH, COUPLING = "mean_stretch", "remodeling.coupling"
 TIME, MESH, BOTH, KINEMATIC = "time", "mesh", "both", "kinematics"
 
 
@@ -43,6 +46,8 @@ class Setting:
         The user's scene with them.
     seeds
         Of its runs; one where cells are not random or are the same.
+    profile
+        Name of the profile that it is.
     """
 
     name: str
@@ -50,6 +55,7 @@ class Setting:
     changes: Mapping[str, Any] = field(hash=False)
     scene: Scene = field(hash=False)
     seeds: tuple[int, ...]
+    profile: str = ""
 
     @property
     def step(self) -> float | None:
@@ -62,11 +68,19 @@ class Setting:
         return self.scene.model.kinematics, self.scene.mesh.refinement, self.scene.mesh.degree
 
     @property
+    def way(self) -> tuple[str, str]:
+        """Kinematics and coupling: what a step costs goes by them."""
+        return self.scene.model.kinematics, self.scene.remodeling.coupling
+
+    @property
     def expected_seconds(self) -> float:
         """Of one of its runs, roughly."""
-        time = self.scene.time
-        steps = time.number_of_steps if time.tolerance is None else DEGREES_PER_RUN / time.tolerance
-        return SECONDS_PER_POINT * step_cost(self.scene, self.scene.model.kinematics) * steps
+        time, is_exact = self.scene.time, self.scene.remodeling.coupling == EXACT
+        steps: float = time.number_of_steps
+        if time.tolerance is not None:  # where steps have no error they are as long as they may be
+            steps = COMPARED if is_exact else DEGREES_PER_RUN / time.tolerance
+        cost = step_cost(self.scene, self.scene.model.kinematics) * (COST_OF_EXACT if is_exact else 1.0)
+        return SECONDS_PER_POINT * cost * steps
 
     @property
     def steps_in_words(self) -> str:
@@ -74,9 +88,12 @@ class Setting:
         return f"step {self.step:g}" if self.step is not None else f"tolerance {self.scene.time.tolerance:g}"
 
     def in_words(self) -> str:
-        """Kinematics, mesh and steps on a line."""
+        """Kinematics, mesh, steps and coupling on a line."""
         kinematics, refinement, degree = self.mesh
-        return f"{kinematics:12} refinement {refinement} degree {degree} {self.steps_in_words}"
+        mesh = "" if KINEMATICS[kinematics].homogeneous else f" refinement {refinement} degree {degree}"
+        profile = f" (profile {self.profile})" if self.profile else ""
+        coupling = f" {self.way[1]}" if COUPLING in self.changes else ""
+        return f"{kinematics:12}{mesh} {self.steps_in_words}{coupling}{profile}"
 
 
 def ladder(scene: Scene) -> list[Setting]:
@@ -94,31 +111,47 @@ def ladder(scene: Scene) -> list[Setting]:
     several = tuple(range(seed, seed + SEEDS)) if random else (seed,)
     found: dict[str, Setting] = {}
 
-    def add(factor: str, seeds: tuple[int, ...] = (seed,), **changes: Any) -> None:
-        values = {key.replace("__", "."): value for key, value in changes.items()}
+    def add(factor: str, seeds: tuple[int, ...], values: Mapping[str, Any], profile: str = "") -> Setting | None:
+        if KINEMATICS[values.get("model.kinematics", base.model.kinematics)].homogeneous:
+            values = {key: value for key, value in values.items() if not key.startswith("mesh.")}
         try:
             changed = base.with_values(values)
         except SceneError as error:  # a step of which a corner is no multiple, an element that a formulation has not
             log.debug("left out: %s", error)
-            return
-        setting = Setting(_name(changed), factor, values, changed, seeds)
-        found.setdefault(setting.name, setting)
+            return None
+        name = _name(changed) + (f"-{values[COUPLING]}" if COUPLING in values else "")
+        setting = Setting(f"profile-{profile}" if profile else name, factor, values, changed, seeds, profile)
+        return found.setdefault(name, setting)
 
-    add(MESH, several)
+    def meshes(refinement: int, degree: int) -> dict[str, int]:
+        return {"mesh.refinement": refinement * mesh[0], "mesh.degree": degree}
+
+    add(MESH, several, {})
+    remodels = LAWS[scene.remodeling.law].remodels
+    for name, profile in PROFILES.items() if remodels else ():
+        values = profile.values | {"model.kinematics": base.model.kinematics}
+        exact = base.with_values(values).has_exact_coupling and profile.takes_exact_coupling
+        add(BOTH, several, values | ({COUPLING: EXACT} if exact else {}), name)
     for factor in [*STEPS, *(0.5**k for k in range(1, HALVINGS + 1))]:
-        add(TIME, time__step=factor * step)
+        add(TIME, (seed,), {"time.step": factor * step})
     for refinement, degree in MESHES:
-        add(MESH, several, mesh__refinement=refinement * mesh[0], mesh__degree=degree)
+        add(MESH, several, meshes(refinement, degree))
     for refinement, degree, factor in TOGETHER:
-        finer = {"mesh__refinement": refinement * mesh[0], "mesh__degree": degree}
-        add(BOTH, several, **finer, time__step=factor * step)
-    if LAWS[scene.remodeling.law].remodels:
-        for tolerance in TOLERANCES:
-            add(BOTH, several, mesh__refinement=2 * mesh[0], mesh__degree=2, time__tolerance=tolerance)
-            add(TIME, time__tolerance=tolerance)
+        add(BOTH, several, meshes(refinement, degree) | {"time.step": factor * step})
+    for tolerance in TOLERANCES if remodels else ():
+        add(BOTH, several, meshes(2, 2) | {"time.tolerance": tolerance})
+        add(TIME, (seed,), {"time.tolerance": tolerance})
+    if base.has_exact_coupling and base.remodeling.coupling != EXACT:  # long steps are as good as short ones, and pay
+        values = {COUPLING: EXACT}
+        longer = [add(TIME, several, values | {"time.step": factor * step}) for factor in STEPS]
+        longest = max((setting.scene.time.step for setting in longer if setting is not None), default=step)
+        for refinement, degree in MESHES:
+            add(MESH, several, values | meshes(refinement, degree) | {"time.step": longest})
+        for tolerance in TOLERANCES[:1]:
+            add(BOTH, several, values | meshes(2, 2) | {"time.tolerance": tolerance})
     for name in dict.fromkeys((own, "sector", "full")):
         if name == own or not objections(scene, name):
-            add(KINEMATIC, model__kinematics=name)
+            add(KINEMATIC, (seed,), {"model.kinematics": name})
     return sorted(found.values(), key=lambda setting: setting.expected_seconds)
 
 
@@ -142,11 +175,16 @@ def compared_times(scene: Scene, settings: Sequence[Setting]) -> list[float]:
     return sorted({*scene.stops(), *hit[:: -(-len(hit) // COMPARED) or 1]})
 
 
+def compared_lengths(scene: Scene) -> tuple[str, list[str]]:
+    """What the lengths of a body are called, and its columns of them: radii, or the stretch of what has none."""
+    columns = scene.geometry.columns
+    radii = [column.name for column in columns if column.unit == "length"]
+    return ("radii", radii) if radii else ("stretch", [column.name for column in columns if column.name == STRETCH])
+
+
 def as_run(setting: Setting, seed: int, times: list[float]) -> Scene:
     """The scene of a run of the study: only what is compared is measured."""
-    shape = setting.scene.geometry
-    lengths = [column.name for column in shape.columns if column.unit == "length" or column.name == "mean_stretch"]
-    columns = [*lengths, "substeps", "seconds", "processor_seconds", *PROFILE]
+    columns = [*compared_lengths(setting.scene)[1], "substeps", "seconds", "processor_seconds", *PROFILE]
     values = {"output.fields": False, "output.columns": columns, "output.times": times, "output.every": 1}
     return setting.scene.with_values({**values, "cells.seed": seed, "name": f"{setting.name}-{seed}"})
 

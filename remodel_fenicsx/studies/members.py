@@ -1,10 +1,14 @@
-"""The runs of a study: each in a folder of its own, several at a time, gone on with where they have stopped."""
+"""The runs of a study: each in a folder of its own, several at a time, gone on with where they have stopped.
+
+Each of the processes at work does one run after the other: most of a short run would be its start.
+"""
 
 from __future__ import annotations
 
+import json
 import math
 import time as clock
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +16,7 @@ from pathlib import Path
 from remodel_fenicsx.results.recording import (
     HISTORY,
     SCENE,
+    STUDY,
     HistoryColumns,
     Recording,
     RecordingError,
@@ -20,11 +25,27 @@ from remodel_fenicsx.results.recording import (
 )
 from remodel_fenicsx.scene.scene import Scene, SceneError
 from remodel_fenicsx.schema.times import same_time
-from remodel_fenicsx.system.children import Child
+from remodel_fenicsx.system.children import Worker, wait_for_one
 from remodel_fenicsx.system.interrupts import Interrupted, StopRequest
+from remodel_fenicsx.system.regular_files import check_no_link, make_own_folder, write_whole
 from remodel_fenicsx.system.terminal import Line
 
 POLL = 0.1  # seconds
+LEAST = 2  # runs, or settings, without which nothing is compared
+
+
+class TooFewRuns(Exception):  # noqa: N818 - what is recorded is whole, and the same call goes on
+    """Fewer than `LEAST` have reached the end, so that there is no answer yet.
+
+    Attributes
+    ----------
+    failed
+        Last words of runs that have failed, by name; empty where the study was only stopped early.
+    """
+
+    def __init__(self, reached: str, failed: Mapping[str, str], advice: str = "the same command goes on"):
+        super().__init__(f"{reached}, at least {LEAST} are needed; all that is recorded is kept, {advice}")
+        self.failed = dict(failed)
 
 
 @dataclass(frozen=True)
@@ -44,6 +65,10 @@ class Member:
     name: str
     scene: Scene
     folder: Path
+
+    def beside(self, ending: str) -> Path:
+        """A file beside its folder, of the same name: names have dots of their own (`step-0.5`)."""
+        return self.folder.with_name(f"{self.folder.name}{ending}")
 
     @property
     def steps_done(self) -> int:
@@ -78,10 +103,41 @@ class Member:
         return read_history(self.folder)
 
 
+@dataclass(frozen=True)
+class Study:
+    """What several runs are for.
+
+    Attributes
+    ----------
+    name
+        Of the command.
+    scene
+        Name of the user's scene.
+    folder
+        Where all runs are.
+    """
+
+    name: str
+    scene: str
+    folder: Path
+
+    def write(self, runs: Sequence[str]) -> None:
+        """Say in the folder what it is: `remodel-fenicsx status` reads it.
+
+        Raises
+        ------
+        OSError
+            If it cannot be written.
+        """
+        self.folder.mkdir(parents=True, exist_ok=True)
+        text = json.dumps({"study": self.name, "scene": self.scene, "runs": list(runs)}, indent=1)
+        write_whole(self.folder / STUDY, (text + "\n").encode())
+
+
 def run_members(
     members: Sequence[Member],
     jobs: int,
-    title: str,
+    study: Study,
     quiet: bool = False,
     deadline: float = math.inf,
     fits: Callable[[Member], bool] = lambda member: True,
@@ -93,8 +149,8 @@ def run_members(
     ----------
     members
         In the order in which they begin.
-    jobs, title, quiet
-        Runs at a time; what progress begins with; no progress.
+    jobs, study, quiet
+        Runs at a time; what they are runs of; no progress.
     deadline
         `time.monotonic` at which runs are stopped; what they have recorded stays.
     fits
@@ -112,8 +168,11 @@ def run_members(
         If a folder cannot be written.
     """
     waiting = [member for member in reversed(members) if not member.is_complete()]
-    running: dict[str, tuple[Member, Child]] = {}
-    total, failed, line = sum(member.scene.time.number_of_steps for member in members), {}, Line(title)
+    running: dict[Worker, Member] = {}
+    idle: list[Worker] = []
+    study.write([member.name for member in members])
+    total, failed = sum(member.scene.time.number_of_steps for member in members), {}
+    line = Line(f"{study.scene} {study.name}")
     with StopRequest() as stop:
         try:
             while waiting or running:
@@ -124,31 +183,38 @@ def run_members(
                 while waiting and len(running) < jobs:
                     member = waiting.pop()
                     if fits(member):
-                        running[member.name] = (member, _started(member))
-                for member, child in list(running.values()):
-                    code = child.process.poll()
+                        worker = idle.pop() if idle else Worker()
+                        running[worker] = member
+                        _begin(worker, member)
+                wait_for_one(running, POLL)
+                for worker, member in list(running.items()):
+                    code = worker.poll()
                     if code is not None:
-                        del running[member.name]
+                        del running[worker]
                         if code != 0:
-                            failed[member.name] = child.last_words()
+                            failed[member.name] = worker.last_words()
+                        if worker.is_alive:
+                            idle.append(worker)
                         finished()
                 if not quiet:
                     done = sum(member.steps_done for member in members)
-                    line.show(f"{100 * done // total} % of {len(members)} runs: {', '.join(running) or 'done'}")
-                clock.sleep(POLL)
+                    names = ", ".join(member.name for member in running.values())
+                    line.show(f"{100 * done // total} % of {len(members)} runs: {names or 'done'}")
         finally:
-            for _, child in running.values():
-                child.stop()
+            for worker in [*running, *idle]:
+                worker.stop()
             line.end()
     return failed
 
 
-def _started(member: Member) -> Child:
+def _begin(worker: Worker, member: Member) -> None:
     """Begin, or go on with what is there."""
-    member.folder.parent.mkdir(parents=True, exist_ok=True)
-    messages = member.folder.with_suffix(".txt")
+    make_own_folder(member.folder.parent)
+    check_no_link(member.folder)
+    messages = member.beside(".txt")
     if (member.folder / SCENE).exists():
-        return Child(["run", "--resume", str(member.folder), "-q"], messages)
-    scene = member.folder.with_suffix(".toml")
-    scene.write_text(member.scene.to_toml(), encoding="utf-8")
-    return Child(["run", str(scene), "-o", str(member.folder), "-q"], messages)
+        worker.begin(["run", "--resume", str(member.folder), "-q"], messages)
+        return
+    scene = member.beside(".toml")
+    write_whole(scene, member.scene.to_toml().encode())
+    worker.begin(["run", str(scene), "-o", str(member.folder), "-q"], messages)

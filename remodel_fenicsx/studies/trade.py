@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import time as clock
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from remodel_fenicsx.results.profile import PROFILE
-from remodel_fenicsx.scene.scene import Scene, SceneError
+from remodel_fenicsx.body.profile import PROFILE
+from remodel_fenicsx.scene.scene import Scene
 from remodel_fenicsx.schema.times import same_time
 from remodel_fenicsx.studies import trade_output
 from remodel_fenicsx.studies.convergence import typical
 from remodel_fenicsx.studies.estimates import Result, Trade, estimated
-from remodel_fenicsx.studies.ladder import Setting, as_run, compared_times, ladder
-from remodel_fenicsx.studies.members import Member, run_members
+from remodel_fenicsx.studies.ladder import Setting, as_run, compared_lengths, compared_times, ladder
+from remodel_fenicsx.studies.members import LEAST, Member, Study, TooFewRuns, run_members
 from remodel_fenicsx.system.children import cores
 
 NAME = "trade"
@@ -53,7 +53,9 @@ def trade(
     Raises
     ------
     SceneError
-        If a folder holds another scene, or if fewer than two settings reach the end.
+        If a folder holds another scene.
+    TooFewRuns
+        If fewer than two settings reach the end; it says what a budget for two would be.
     Interrupted
         If a signal asked for the end: the same call goes on from there.
     OSError
@@ -70,14 +72,15 @@ def trade(
         for setting in settings
     }
     runner = _Runner(settings, members, times, budget, say)
-    failed = runner.run(jobs or cores(), f"{scene.name} {NAME}")
+    failed = runner.run(jobs or cores(), Study(NAME, scene.name, place))
     results = runner.results()
-    if len(results) < 2:
-        words = "; ".join(f"{name}: {text}" for name, text in failed.items())
-        raise SceneError(f"{len(results)} settings reached the end within the budget, at least 2 are needed ({words})")
+    if len(results) < LEAST:
+        reached = f"{len(results)} of {len(settings)} settings reached the end within the budget of {budget:g} s"
+        raise TooFewRuns(reached, failed, runner.advice(LEAST - len(results), jobs or cores(), failed))
     rows, notes = estimated(results)
-    left = [setting.name for setting in settings if setting.name not in {row.result.setting.name for row in rows}]
-    found = Trade(rows, notes, [name for name in left if not any(key.startswith(name) for key in failed)], failed)
+    done = {row.result.setting.name for row in rows}
+    left = [name for name, runs in members.items() if name not in done and not any(run.name in failed for run in runs)]
+    found = Trade(rows, notes, left, failed)
     trade_output.write(found, place, scene)
     return place, found
 
@@ -96,23 +99,40 @@ class _Runner:
         self.settings, self.members, self.times, self.say = settings, members, times, say
         self.deadline = clock.monotonic() + budget
         self._results: dict[str, Result] = {}
-        self._pace: dict[str, float] = {}  # seconds over those expected, by kinematics
+        self._pace: dict[tuple[str, str], float] = {}  # seconds over those expected, by kinematics and coupling
 
-    def run(self, jobs: int, title: str) -> dict[str, str]:
+    def run(self, jobs: int, study: Study) -> dict[str, str]:
         """All that fits; returns the last words of those that failed."""
         self._finished()
         every = [member for setting in self.settings for member in self.members[setting.name]]
-        return run_members(every, jobs, title, self.say is None, self.deadline, self._fits, self._finished)
+        return run_members(every, jobs, study, self.say is None, self.deadline, self._fits, self._finished)
 
     def results(self) -> list[Result]:
         """Of the settings all of whose runs have reached the end, the cheapest expected first."""
         return [self._results[setting.name] for setting in self.settings if setting.name in self._results]
 
+    def advice(self, number: int, jobs: int, failed: Mapping[str, str]) -> str:
+        """What the cheapest settings that are left would take, if so many are left."""
+        left = [
+            -(-len(self.members[setting.name]) // jobs) * self._expected(setting)
+            for setting in self.settings
+            if setting.name not in self._results and not any(run.name in failed for run in self.members[setting.name])
+        ]
+        if len(left) < number:
+            return "the same command tries again what has failed"
+        return (
+            f"a larger budget goes on; the cheapest {number} need about {sum(sorted(left)[:number]):.2g} s for their "
+            "steps, each process a few seconds for its start, and more where kernels are to be compiled"
+        )
+
+    def _expected(self, setting: Setting) -> float:
+        """Seconds of one of its runs, by what others have taken."""
+        return self._pace.get(setting.way, 1.0) * setting.expected_seconds
+
     def _fits(self, member: Member) -> bool:
         """Whether a run that begins now would end in time."""
         setting = next(setting for setting in self.settings if member in self.members[setting.name])
-        pace = self._pace.get(setting.scene.model.kinematics, 1.0)
-        return clock.monotonic() + pace * setting.expected_seconds < self.deadline
+        return clock.monotonic() + self._expected(setting) < self.deadline
 
     def _finished(self) -> None:
         """Read, say and learn from what is new."""
@@ -121,7 +141,7 @@ class _Runner:
             if setting.name in self._results or not all(member.is_complete() for member in members):
                 continue
             result = self._results[setting.name] = read(setting, members, self.times)
-            self._pace[setting.scene.model.kinematics] = max(result.wall_seconds / setting.expected_seconds, 0.1)
+            self._pace[setting.way] = max(result.wall_seconds / setting.expected_seconds, 0.1)
             if self.say is not None:
                 rows, _ = estimated(self.results()) if len(self._results) > 1 else ([], [])
                 error = next((row.angle_error for row in rows if row.result.setting == setting), np.nan)
@@ -136,7 +156,7 @@ def read(setting: Setting, members: Sequence[Member], times: Sequence[float]) ->
         history = member.history()
         rows = [next(r for r, time in enumerate(history["time"]) if same_time(float(time), t)) for t in times]
         angles.append(np.array([history[name] for name in PROFILE]).T[rows])
-        known = [column.name for column in setting.scene.geometry.columns if column.name in history]
+        known = compared_lengths(setting.scene)[1]
         lengths.append(np.array([history[name] for name in known]).T[rows])
         seconds.append(float(np.nansum(history["processor_seconds"])))
         wall.append(float(np.nansum(history["seconds"])))

@@ -21,8 +21,11 @@ def wall_time(text: str) -> float:
     return seconds
 
 
+MOST = 10_000  # of runs of a study, or of times that are analysed: each is a folder or a row that a person looks at
+
+
 def positive(text: str) -> int:
-    """A whole number from 1 on.
+    """A whole number from 1 to `MOST`.
 
     Raises
     ------
@@ -30,6 +33,6 @@ def positive(text: str) -> int:
         If it is none.
     """
     number = int(text)
-    if number < 1:
-        raise argparse.ArgumentTypeError(f"{text}: allowed is a whole number at least 1")
+    if not 1 <= number <= MOST:
+        raise argparse.ArgumentTypeError(f"{text}: allowed is a whole number from 1 to {MOST}")
     return number

@@ -11,7 +11,8 @@ import re
 import shutil
 from pathlib import Path
 
-import remodel_fenicsx
+from remodel_fenicsx._version import __version__
+from remodel_fenicsx.system.interrupts import take_back_signals
 
 OLDEST_DOLFINX = (0, 9)
 NEEDED = ("basix", "dolfinx", "gmsh", "h5py", "mpi4py", "petsc4py", "pint", "rich", "ufl")
@@ -25,7 +26,7 @@ def versions() -> dict[str, str]:
     from petsc4py import PETSc
 
     return {
-        "remodel_fenicsx": remodel_fenicsx.__version__,
+        "remodel_fenicsx": __version__,
         "dolfinx": dolfinx.__version__,
         "ufl": importlib.metadata.version("fenics-ufl"),
         "PETSc": ".".join(map(str, PETSc.Sys.getVersion())),
@@ -59,6 +60,7 @@ def reason_unusable() -> str | None:
     if not any(shutil.which(name) for name in (os.environ.get("CC", "cc").split()[0], "gcc", "clang")):
         return "there is no C compiler"
     try:
+        take_back_signals()
         import dolfinx
         import numpy
         from petsc4py import PETSc

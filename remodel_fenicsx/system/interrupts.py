@@ -66,15 +66,23 @@ class Paused(Exception):  # noqa: N818 - no error: somebody asked for it
 
 
 def take_back_signals() -> None:
-    """What Python had set before PETSc was loaded: a closed pipe is a BrokenPipeError, an ignored signal is ignored."""
-    import petsc4py.PETSc  # noqa: F401 - before its signals can be taken back
+    """Load MPI and PETSc, where nobody has yet, so that signals stay what Python has set.
 
-    if not _is_main_thread():
-        return
-    for number in _NOT_PETSCS:
-        handler = signal.getsignal(number)  # what Python remembers: it does not see that PETSc has replaced it
-        if handler is not None:
-            signal.signal(number, handler)
+    A closed pipe is then a BrokenPipeError, and an ignored signal is ignored. While the libraries are loaded signals
+    wait: PETSc's handlers would abort the process, and UCX, below MPI, has one for SIGHUP that swallows it.
+    """
+    asked = {*SIGNALS, PAUSE}
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, asked)  # the libraries' threads inherit it, and never take one
+    try:
+        import mpi4py.MPI  # noqa: F401
+        import petsc4py.PETSc  # noqa: F401
+
+        for number in _NOT_PETSCS if _is_main_thread() else ():
+            handler = signal.getsignal(number)  # what Python remembers: it does not see what libraries put below
+            if handler is not None:
+                signal.signal(number, handler)
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _is_main_thread() -> bool:

@@ -9,8 +9,12 @@ import sys
 import time as clock
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from io import TextIOWrapper
+from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, cast
+
+from remodel_fenicsx.system.regular_files import open_own
 
 LOGGER = "remodel_fenicsx"
 LOG_FORMAT = "%(asctime)s %(levelname)s %(message)s"
@@ -246,7 +250,11 @@ class _ForPeople(_OneBlock):
 
 
 class _LogFile(logging.FileHandler):
-    """A log whose write errors are errors."""
+    """A log whose write errors are errors, and which follows no link."""
+
+    def _open(self) -> TextIOWrapper:
+        descriptor = open_own(Path(self.baseFilename), os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+        return cast(TextIOWrapper, open(descriptor, "a", encoding=self.encoding))
 
     def handleError(self, record: logging.LogRecord) -> None:
         # called inside logging's own `except`: logging would print a traceback for every line and go on

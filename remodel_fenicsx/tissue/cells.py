@@ -129,15 +129,58 @@ def angle_to_axis(dimensions: Array, axes: Array, direction: Array) -> Array:
     return np.degrees(np.arctan2(_norm(dimensions * across), _norm(dimensions * along)))
 
 
+IN_THE_WALL = 1e-6  # of tr A: of less a rounded A has no direction, and a chain there has none that a picture shows
+
+
 def pitch_angle(dimensions: Array, axes: Array, coordinates: Array) -> Array:
     """Angle in degrees of the chain direction in the wall of a tube about z, from circumferential (0) to axial (90).
 
-    atan sqrt(A_zz / A_tt) with the structure tensor A and t the circumferential direction.
+    atan sqrt(A_zz / A_tt) with the structure tensor A and t the circumferential direction; NaN where chains point out
+    of the wall, A_zz + A_tt < IN_THE_WALL tr A.
     """
+    circumferential, axial, radial = _wall_components(dimensions, axes, coordinates)
+    inside = circumferential**2 + axial**2
+    angle: Array = np.degrees(np.arctan2(axial, circumferential))
+    return np.where(inside < IN_THE_WALL * (inside + radial**2), np.nan, angle)
+
+
+def radial_share(dimensions: Array, axes: Array, coordinates: Array) -> Array:
+    """A_rr / tr A about the z axis, from 0 (chains in the wall) to 1 (chains across it); 0 where there are none."""
+    circumferential, axial, radial = _wall_components(dimensions, axes, coordinates)
+    trace = circumferential**2 + axial**2 + radial**2
+    return np.divide(radial**2, trace, out=np.zeros_like(trace), where=trace > 0)
+
+
+def _wall_components(dimensions: Array, axes: Array, coordinates: Array) -> tuple[Array, Array, Array]:
+    """Roots of A_tt, A_zz and A_rr."""
     radius = np.sqrt(coordinates[..., 0] ** 2 + coordinates[..., 1] ** 2)
     cosine, sine = coordinates[..., 0, None] / radius[..., None], coordinates[..., 1, None] / radius[..., None]
-    circumferential = axes[..., 0] * -sine + axes[..., 1] * cosine
-    return np.degrees(np.arctan2(_norm(dimensions * axes[..., 2]), _norm(dimensions * circumferential)))
+    x, y, z = (axes[..., i] for i in range(3))
+    return (
+        _norm(dimensions * (y * cosine - x * sine)),
+        _norm(dimensions * z),
+        _norm(dimensions * (x * cosine + y * sine)),
+    )
+
+
+def angle_between(first: UnitCell, second: UnitCell) -> Array:
+    """Angle in degrees between the directions of the chains of two cells, of n points: (n,) in [0, 90].
+
+    Of chains along one axis it is the angle between the axes; of two cells with the same axes that of the directions
+    sum_I l_I n_I. So it is at least the change of the angle to any axis (`angle_to_axis`), and of the pitch times the
+    cosine of the angle out of the wall, which it counts too. To first order in the change it is Bures' angle between
+    A/tr A of both, ds^2 = sum_IJ dA_IJ^2 / (a_I + a_J) / 2 in the axes of A with the principal values a.
+    """
+    share = first.dimensions / _norm(first.dimensions)[:, None]  # the roots of a_I
+    scaled = second.axes * (second.dimensions / _norm(second.dimensions)[:, None])[:, :, None]
+    root = np.swapaxes(second.axes, 1, 2) @ scaled
+    change = first.axes @ root @ np.swapaxes(first.axes, 1, 2) - share[:, :, None] * np.eye(3)
+    squared = share**2
+    both = squared[:, :, None] + squared[:, None, :]
+    weight = np.divide((share[:, :, None] + share[:, None, :]) ** 2, 2 * both, out=np.ones_like(both), where=both > 0)
+    chord = np.sqrt((weight * change**2).sum(axis=(1, 2)))
+    angle: Array = np.degrees(2 * np.arcsin(np.minimum(0.5 * chord, np.sqrt(0.5))))
+    return angle
 
 
 def _norm(vectors: Array) -> Array:

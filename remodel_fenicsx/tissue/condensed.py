@@ -267,7 +267,7 @@ class CondensedPoints:
         stress = self.stress(strain, answer.cells)
         missing = self._tensor(strain, stress, False)[0] - tensor
         size = np.linalg.norm(tensor, axis=(1, 2))
-        converged = np.linalg.norm(missing, axis=(1, 2)) <= TOLERANCE * size + self.step.solved
+        converged = np.linalg.norm(missing, axis=(1, 2)) <= TOLERANCE * size + self.step.rounding
         return Solution(strain, tensor, answer, stress, converged & (stress.extension < 1.0))
 
     def _iterated(self, found: Solution) -> Solution:

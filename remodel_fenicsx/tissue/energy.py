@@ -149,7 +149,7 @@ class Tissue:
     def stiffness(self, end_to_end_length: Any) -> Any:
         """A stress per strain of matrix and network, where chains have a length r; times eps the rounding of a stress.
 
-        lambda + 2 mu + c (r d(g r)/dr + g(r0) r0^2): near the contour length the chains' force changes by much more
+        lambda + 2 mu + c (r^2 d(g r)/dr + g(r0) r0^2): near the contour length the chains' force changes by much more
         than itself when r changes by a little.
         """
         matrix = self.lame_lambda + 2 * self.lame_mu
@@ -158,7 +158,7 @@ class Tissue:
         r, r0, L, g = end_to_end_length, self.end_to_end_length, self.contour_length, self.chain.stiffness
         h = 1e-6 * r * (1 - r / L if self.chain.locks else 1)
         slope = ((r + h) * g(r + h, L) - (r - h) * g(r - h, L)) / (2 * h)
-        return matrix + self.network_modulus * (r * slope + g(r0, L) * r0**2)
+        return matrix + self.network_modulus * (r**2 * slope + g(r0, L) * r0**2)
 
     def map(self, function: Callable[[str, Any], Any]) -> Tissue:
         """The same tissue with function(name, value) for every parameter."""

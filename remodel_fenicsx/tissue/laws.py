@@ -49,6 +49,8 @@ class Drive(NamedTuple):
         Time in which the law `rotation` turns a small angle to 1/e of it.
     twins
         Compiled functions that stand for functions of `spectral`.
+    rounding
+        The part of the threshold that is the rounding of a stress.
     """
 
     deformation_gradient: Array
@@ -62,6 +64,13 @@ class Drive(NamedTuple):
     pairing: spectral.Pairing = spectral.principal
     rotation_time: float = 40.0
     twins: Mapping[Callable[..., Any], Callable[..., Any]] = MappingProxyType({})
+    rounding: Array | float = 0.0
+
+    @property
+    def floor(self) -> Array | float:
+        """Of `tensor_law.target`."""
+        floor: Array | float = tensor_law.floor_above(self.threshold, self.rounding)
+        return floor
 
     def compiled(self, function: Function) -> Function:
         """The twin of a function, or the function itself."""
@@ -279,7 +288,7 @@ def tensor_target(drive: Drive) -> tensor_law.Target:
     tensor = drive.tensor
     if not drive.driver.material:
         tensor = drive.frame.tensor(drive.deformation_gradient, tensor)
-    return tensor_law.target(tensor, drive.threshold)
+    return tensor_law.target(tensor, drive.floor)
 
 
 def follow_tensor(

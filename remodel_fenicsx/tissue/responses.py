@@ -22,6 +22,7 @@ Array = NDArray[np.float64]
 
 AGREE = 1e-7
 """Relative difference of two principal values below which nothing is known about a turn in their plane."""
+SAME_LENGTH = 1e-9  # over r0: lengths of isotropic cells, but for rounding
 
 
 @dataclass(frozen=True)
@@ -40,11 +41,9 @@ class StepOfCells:
         r0, (n,).
     kappa, time_old, time_new
         Of the step.
-    noise
-        Size up to which a principal value of the driving tensor may be an error.
-    rounding
-        Size down to which the driving tensor can be solved for; `noise` where it is not given. It is the smaller one:
-        what is missing here is missing in the balance of forces.
+    noise, rounding
+        Size up to which a principal value of the driving tensor may be an error, and that of its rounding alone. Down
+        to the latter it is solved for: what is missing here is missing in the balance of forces.
     """
 
     law: Law
@@ -59,12 +58,12 @@ class StepOfCells:
     time_old: float
     time_new: float
     noise: float
-    rounding: float | None = None
+    rounding: float
 
     @property
-    def solved(self) -> float:
-        """What of the driving tensor may be missing at a solved point."""
-        return self.noise if self.rounding is None else self.rounding
+    def floor(self) -> float:
+        """Of `tensor_law.target`."""
+        return float(tensor_law.floor_above(self.noise, self.rounding))
 
     def at(self, chosen: Any) -> StepOfCells:
         """Of some of the points."""
@@ -106,18 +105,33 @@ def response(step: StepOfCells, strain: Strain, tensor: Array, derivatives: bool
     return respond(step, strain, tensor, derivatives)
 
 
+def jumps_by_rank(step: StepOfCells) -> NDArray[np.bool_]:
+    """Where cells jump when principal values cross, (n,): where equal targets leave the ranks different lengths.
+
+    There the equations of an implicit step may have no solution. Elsewhere cells are continuous in the driving tensor:
+    from isotropic cells eq. (11) never jumps, and the law for A nowhere.
+    """
+    if step.law.dimensions is None:
+        return np.zeros(len(step.structure), dtype=bool)
+    old, r0 = step.cells.dimensions, step.end_to_end_length[:, None]
+    alike = np.repeat(r0 / np.sqrt(3), 3, axis=1)
+    lengths = step.law.dimensions(old, step.initial_dimensions, alike, step.kappa, step.time_old, step.time_new)
+    apart: NDArray[np.bool_] = np.ptp(lengths, axis=1) > SAME_LENGTH * step.end_to_end_length
+    return apart
+
+
 # ---------------------------------------------------------------- the law for A
 
 
 def tensor_response(step: StepOfCells, strain: Strain, tensor: Array, derivatives: bool) -> Response:
     """A = A_old + w (r0^2 E - A_old), w = 1 - exp(-kappa s dt): `tensor_law` and its derivative."""
     rate = step.kappa * (step.time_new - step.time_old)
-    towards = tensor_law.target(tensor, step.noise)
+    towards = tensor_law.target(tensor, step.floor)
     old = strain.inside(step.structure)
     cells = StructureCells(tensor_law.follow(old, towards, step.end_to_end_length, rate))
     if not derivatives:
         return Response(cells)
-    direction, share = tensor_law.target_derivatives(tensor, step.noise)
+    direction, share = tensor_law.target_derivatives(tensor, step.floor)
     left = np.exp(-rate * towards.share)
     squared = step.end_to_end_length**2
     way = mandel.vectors(squared[:, None, None] * towards.direction - old)

@@ -10,14 +10,14 @@ from remodel_fenicsx.tissue.tensor_algebra import ALGEBRA, LOGARITHM
 
 DECLARATIONS = """
 void log_sum(int64_t n, const double *F, const double *A, double *result);
-void target(int64_t n, const double *F, const double *tensors, int turned_back, const double *noise, double *direction,
+void target(int64_t n, const double *F, const double *tensors, int turned_back, const double *floor, double *direction,
             double *share);
 void log_derivatives(int64_t n, const double *C, const double *A, double *first, double *second);
 void solve(int64_t n, const double *F, const double *start, const double *old, const double *const *parameters,
-           double noise, double solved, double rate, int driver, int repulsion, double *tensor, double *structure,
+           double floor, double solved, double rate, int driver, int repulsion, double *tensor, double *structure,
            double *stress, double *squared, uint8_t *converged);
 void tangent(int64_t n, const double *F, const double *tensor, const double *old, const double *const *parameters,
-             double noise, double solved, double rate, int driver, int repulsion, double *result);
+             double floor, double solved, double rate, int driver, int repulsion, double *result);
 """
 
 POINT = r"""
@@ -27,7 +27,7 @@ enum { LAMBDA, MU, MODULUS, CONTOUR_LENGTH, END_TO_END_LENGTH, PARAMETERS };
 
 typedef struct {               /* in the eigenbasis of C */
     tensor F, basis, old;      /* F and the basis in the global one; A at the start of the step */
-    double c[3], u[3], J, parameter[PARAMETERS], noise, solved, rate;
+    double c[3], u[3], J, parameter[PARAMETERS], floor, solved, rate;
     int driver, repulsion;
 } point;
 
@@ -39,7 +39,7 @@ typedef struct {
 } state;
 
 static void prepare(point *p, int64_t at, const double *F, const double *old, const double *const *parameters,
-                    double noise, double solved, double rate, int driver, int repulsion)
+                    double floor, double solved, double rate, int driver, int repulsion)
 {
     tensor C, global;
     memcpy(p->F, F + 9 * at, sizeof(tensor)), memcpy(global, old + 9 * at, sizeof(tensor));
@@ -49,7 +49,7 @@ static void prepare(point *p, int64_t at, const double *F, const double *old, co
     ALL(i) p->u[i] = sqrt(p->c[i]);
     p->J = p->u[0] * p->u[1] * p->u[2];
     for (int k = 0; k < PARAMETERS; ++k) p->parameter[k] = parameters[k][at];
-    p->noise = noise, p->solved = solved, p->rate = rate, p->driver = driver, p->repulsion = repulsion;
+    p->floor = floor, p->solved = solved, p->rate = rate, p->driver = driver, p->repulsion = repulsion;
 }
 
 /* chains.wormlike_stiffness, and its slope by r. */
@@ -93,23 +93,23 @@ static void stress(point *p, state *s, matrix *by_cells, matrix *by_strain)
 }
 
 /* tensor_law.target: the principal values of E, and s, from those of D. */
-static double weights(const double *values, double noise, double *direction)
+static double weights(const double *values, double floor, double *direction)
 {
     double largest = 0, tension = 0, compression = 0;
     ALL(i) largest = fmax(largest, fabs(values[i]));
-    const double unit = largest > 0 ? largest : 1, floor = 7000 * noise / unit;
+    const double unit = largest > 0 ? largest : 1, least = floor / unit;
     ALL(i) {
         const double value = values[i] / unit;
         direction[i] = value > 0 ? value * value : 0;
         tension += direction[i], compression += value < 0 ? value * value : 0;
     }
-    const double total = tension + 0.01 * compression + floor * floor;
+    const double total = tension + 0.01 * compression + least * least;
     ALL(i) direction[i] /= tension > 0 ? tension : 1;
     return tension / (total > 0 ? total : 1);
 }
 
 /* The same from F and tensors, of a spatial driver turned back by drivers.rotated_back. */
-void target(int64_t n, const double *F, const double *tensors, int turned_back, const double *noise, double *direction,
+void target(int64_t n, const double *F, const double *tensors, int turned_back, const double *floor, double *direction,
             double *share)
 {
     for (int64_t at = 0; at < n; ++at) {
@@ -129,7 +129,7 @@ void target(int64_t n, const double *F, const double *tensors, int turned_back, 
             rotated(in_basis, basis, 1, D);
         }
         eigen(D, values, vectors);
-        share[at] = weights(values, noise[at], weight);
+        share[at] = weights(values, floor[at], weight);
         ALL(i) ALL(j) {
             double sum = 0;
             ALL(k) sum += vectors[i][k] * weight[k] * vectors[j][k];
@@ -143,7 +143,7 @@ static void cells(point *p, state *s)
 {
     const double squared = p->parameter[END_TO_END_LENGTH] * p->parameter[END_TO_END_LENGTH];
     eigen(s->D, s->values, s->vectors);
-    s->share = weights(s->values, p->noise, s->direction);
+    s->share = weights(s->values, p->floor, s->direction);
     const double weight = -expm1(-p->rate * s->share);
     ALL(i) ALL(j) {
         double direction = 0;
@@ -163,7 +163,7 @@ static void cells_by_tensor(point *p, state *s, matrix result)
         v[i] = s->values[i] / unit, tension[i] = fmax(v[i], 0);
         positive += tension[i] * tension[i], negative += fmin(v[i], 0) * fmin(v[i], 0);
     }
-    const double some = positive > 0 ? positive : 1, noise = 7000 * p->noise / unit;
+    const double some = positive > 0 ? positive : 1, least = p->floor / unit;
     matrix by_values, turn;
     memset(by_values, 0, sizeof(matrix));
     ALL(i) ALL(j) by_values[i][j] = 2 * tension[j] / some * ((i == j) - tension[i] * tension[i] / some) / unit;
@@ -174,8 +174,8 @@ static void cells_by_tensor(point *p, state *s, matrix result)
     }
     congruence(s->vectors, turn);
     turned(turn, by_values, result);
-    const double floor = 0.01 * negative + noise * noise, total = positive + floor > 0 ? positive + floor : 1;
-    ALL(i) slope[i] = 2 * (tension[i] * floor - 0.01 * positive * fmin(v[i], 0)) / (total * total * unit);
+    const double against = 0.01 * negative + least * least, sum = positive + against, total = sum > 0 ? sum : 1;
+    ALL(i) slope[i] = 2 * (tension[i] * against - 0.01 * positive * fmin(v[i], 0)) / (total * total * unit);
     const double left = exp(-p->rate * s->share), weight = squared * -expm1(-p->rate * s->share);
     MANDEL(a) {
         double way = 0;
@@ -272,14 +272,14 @@ static void iterate(point *p, state *s)
 
 /* condensed.CondensedPoints.solve, from start; all results in the global basis. */
 void solve(int64_t n, const double *F, const double *start, const double *old, const double *const *parameters,
-           double noise, double solved, double rate, int driver, int repulsion, double *tensors, double *structure,
+           double floor, double solved, double rate, int driver, int repulsion, double *tensors, double *structure,
            double *stresses, double *squared, uint8_t *converged)
 {
     for (int64_t at = 0; at < n; ++at) {
         point p;
         state s;
         tensor global, P;
-        prepare(&p, at, F, old, parameters, noise, solved, rate, driver, repulsion);
+        prepare(&p, at, F, old, parameters, floor, solved, rate, driver, repulsion);
         memcpy(global, start + 9 * at, sizeof(tensor));
         rotated(global, p.basis, 0, s.D);
         evaluate(&p, &s);
@@ -334,14 +334,14 @@ static void by_gradient(point *p, tensor S, matrix by_strain, double *result)
 
 /* condensed.CondensedPoints.tangent at solved points. */
 void tangent(int64_t n, const double *F, const double *tensors, const double *old, const double *const *parameters,
-             double noise, double solved, double rate, int driver, int repulsion, double *result)
+             double floor, double solved, double rate, int driver, int repulsion, double *result)
 {
     for (int64_t at = 0; at < n; ++at) {
         point p;
         state s;
         tensor global;
         matrix left, answers, direct, right, change;
-        prepare(&p, at, F, old, parameters, noise, solved, rate, driver, repulsion);
+        prepare(&p, at, F, old, parameters, floor, solved, rate, driver, repulsion);
         memcpy(global, tensors + 9 * at, sizeof(tensor));
         rotated(global, p.basis, 0, s.D);
         evaluate(&p, &s);

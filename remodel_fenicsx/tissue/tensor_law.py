@@ -8,7 +8,7 @@ it. For the driver `finger` D is C. E has trace one, so tr A stays r0^2. Pure fu
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,9 +20,24 @@ Array = NDArray[np.float64]
 COMPRESSION = 0.1
 """How large a tension beside a compression must be to remodel: the switch is one half where n+ = COMPRESSION^2 n-."""
 
-ABOVE_NOISE = 7000.0
-"""Where the switch sets in, over the size up to which a principal value may be an error (1e-10 of the stiffness): wide
-enough that Newton's method sees a smooth function."""
+ABOVE_ROUNDING = 7000.0
+"""Where the switch sets in, over the rounding of a principal value (1e-10 of the stiffness): wide enough that Newton's
+method sees a smooth function."""
+
+
+def floor_above(noise: Any, rounding: Any) -> Any:
+    """Tension at which the switch is one half, where there is no compression.
+
+    What the solver's tolerance leaves out of balance counts as it is: multiplied like the rounding, it would be stress.
+
+    Parameters
+    ----------
+    noise
+        Size up to which a principal value may be an error: of rounding, or of the equilibrium as it was accepted.
+    rounding
+        The part of it that the rounding of a stress at given F is.
+    """
+    return ABOVE_ROUNDING * rounding + noise
 
 
 class Target(NamedTuple):
@@ -39,16 +54,35 @@ class Target(NamedTuple):
     direction: Array
     share: Array
 
+    def towards(self, other: Target, weight: Array | float) -> Target:
+        """sE + weight (s'E' - sE), of another target s'E'; weights below 0 or above 1 extrapolate.
 
-def target(tensor: Array, noise: Array | float) -> Target:
+        What acts on A is kappa (r0^2 sE - sA): it is sE that changes linearly, and s is its trace. So a target that
+        does not count takes no part, and E has trace one. An s below 0 is 0, one above 1 is 1.
+        """
+        ends = (self.share[:, None, None] * self.direction, other.share[:, None, None] * other.direction)
+        changed = ends[0] + np.reshape(weight, (-1, 1, 1)) * (ends[1] - ends[0])
+        share = np.einsum("nii->n", changed)
+        some = share > 0.0
+        direction = changed / np.where(some, share, 1.0)[:, None, None]
+        return Target(direction, np.where(some, np.minimum(share, 1.0), 0.0))
+
+    def where(self, chosen: NDArray[np.bool_], other: Target) -> Target:
+        """Itself, and at the chosen points another target."""
+        return Target(
+            np.where(chosen[:, None, None], other.direction, self.direction), np.where(chosen, other.share, self.share)
+        )
+
+
+def target(tensor: Array, floor: Array | float) -> Target:
     """E and s of driving tensors in material space.
 
     Parameters
     ----------
     tensor
         D, symmetric, (n, 3, 3), any unit.
-    noise
-        Size up to which a principal value may be an error, in the same unit; (n,) or a number.
+    floor
+        Tension below which next to nothing remodels (`floor_above`), in the same unit; (n,) or a number.
     """
     values, vectors = np.linalg.eigh(tensor)
     largest = np.abs(values).max(axis=1)
@@ -58,8 +92,7 @@ def target(tensor: Array, noise: Array | float) -> Target:
     tension, compression = positive.sum(axis=1), (np.minimum(values, 0.0) ** 2).sum(axis=1)
     weights = positive / np.where(tension > 0, tension, 1.0)[:, None]
     direction = (vectors * weights[:, None, :]) @ np.swapaxes(vectors, 1, 2)
-    floor = (ABOVE_NOISE * np.asarray(noise) / unit) ** 2
-    total = tension + COMPRESSION**2 * compression + floor
+    total = tension + COMPRESSION**2 * compression + (np.asarray(floor) / unit) ** 2
     return Target(direction, tension / np.where(total > 0, total, 1.0))
 
 
@@ -74,7 +107,7 @@ def weight_of_the_end(rate: float) -> float:
     return float(-1.0 / np.expm1(-rate) - 1.0 / rate)
 
 
-def target_derivatives(tensor: Array, noise: Array | float) -> tuple[Array, Array]:
+def target_derivatives(tensor: Array, floor: Array | float) -> tuple[Array, Array]:
     """dE/dD as Mandel matrices (n, 6, 6) and ds/dD as Mandel vectors (n, 6); arguments as for `target`.
 
     With v the principal values of D, N = (D+)^2 changes across two of its axes by v_i + v_j, where both are positive,
@@ -98,9 +131,9 @@ def target_derivatives(tensor: Array, noise: Array | float) -> tuple[Array, Arra
         by_values[:, row, row] = np.where(both, v[:, i] + v[:, j], one) / some
     to_axes = mandel.congruence(vectors)
     direction = to_axes @ (by_values / unit[:, None, None]) @ np.swapaxes(to_axes, 1, 2)
-    floor = COMPRESSION**2 * negative + (ABOVE_NOISE * np.asarray(noise) / unit) ** 2
-    total = positive + floor
-    slope = 2 * (tension * floor[:, None] - COMPRESSION**2 * positive[:, None] * compression)
+    against = COMPRESSION**2 * negative + (np.asarray(floor) / unit) ** 2
+    total = positive + against
+    slope = 2 * (tension * against[:, None] - COMPRESSION**2 * positive[:, None] * compression)
     slope /= (np.where(total > 0, total, 1.0) ** 2 * unit)[:, None]
     share: Array = np.einsum("nab,nb->na", to_axes, mandel.on_diagonal(slope))
     return direction, share

@@ -28,21 +28,15 @@ def _value(number: int, measurement: Any) -> float:
 def _profile(measurement: Any) -> Array:
     quadrature, shape = measurement.quadrature, measurement.observer.shape
     hats = measurement.tool("hats", lambda: weights(shape.depth(quadrature.coordinates)))
-    angle = measurement.fibre_angle
-    found = np.full(PLACES, np.nan)
-    for number in range(PLACES):
-        volume = quadrature.integral(hats[..., number])
-        if volume > 0:
-            found[number] = quadrature.integral(hats[..., number] * angle) / volume
-    return found
+    return np.array([quadrature.mean_of_known(measurement.fibre_angle, hats[..., k]) for k in range(PLACES)])
 
 
 COLUMNS = tuple(
     Column(
         name,
         "degrees",
-        f"mean of the reference fibre angle about {number}/{PLACES - 1} of the way through the wall of a tube, or along "
-        "z, weighted with a hat function as wide as a quarter of the way",
+        f"mean of the reference fibre angle about {number}/{PLACES - 1} of the way through the wall of a tube, or "
+        "along z, weighted with a hat function as wide as a quarter of the way",
         partial(_value, number),
     )
     for number, name in enumerate(PROFILE)

@@ -1,0 +1,160 @@
+"""Files that somebody else may have put there: only regular files are read, no link is written through.
+
+Scenes and folders of runs are passed around. A pipe would make whoever opens it wait, a device has no end, and a link
+(symbolic, or a second name of one file) would lead what is written out of the folder.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import stat
+from pathlib import Path
+
+NEVER_WAITING = os.O_NONBLOCK | os.O_CLOEXEC  # opening a pipe without a writer would wait
+
+LINK = "is a link; nothing is written through one"
+
+
+class ForeignFileError(OSError):
+    """Under a name that a run uses there is something that no run has made: a link, a pipe, a file without end."""
+
+
+def read_regular(path: Path, most: int) -> bytes:
+    """All of a regular file; links to one are followed.
+
+    Parameters
+    ----------
+    path
+        The file.
+    most
+        Bytes that it may have.
+
+    Raises
+    ------
+    OSError
+        If it cannot be read.
+    ForeignFileError
+        If it is no regular file, or larger.
+    """
+    descriptor = os.open(path, os.O_RDONLY | NEVER_WAITING)
+    with open(descriptor, "rb") as file:
+        size = _check_regular(descriptor, path).st_size
+        data = file.read(size + 1) if size <= most else b""
+    if max(size, len(data)) > most:
+        raise ForeignFileError(errno.EFBIG, f"is larger than {most / 1e6:g} MB", str(path))
+    return data
+
+
+def open_own(path: Path, flags: int) -> int:
+    """Descriptor of a file that is written in place: a regular one of this name alone.
+
+    Parameters
+    ----------
+    path
+        The file.
+    flags
+        As of `os.open`; what is made is readable by all that the user's mask allows.
+
+    Raises
+    ------
+    OSError
+        If it cannot be opened.
+    ForeignFileError
+        If it is no regular file, is a link, or has other names.
+    """
+    try:
+        descriptor = os.open(path, flags | os.O_NOFOLLOW | NEVER_WAITING, 0o666)
+    except OSError as error:
+        if error.errno == errno.ELOOP:
+            raise ForeignFileError(errno.ELOOP, LINK, str(path)) from None
+        raise
+    try:
+        if _check_regular(descriptor, path).st_nlink > 1:
+            raise ForeignFileError(errno.EMLINK, "has a second name (a hard link); nothing is written to it", str(path))
+    except OSError:
+        os.close(descriptor)
+        raise
+    return descriptor
+
+
+def make_own_folder(path: Path) -> None:
+    """Make a folder inside of another one, if it is not there.
+
+    Raises
+    ------
+    OSError
+        If it cannot be made.
+    ForeignFileError
+        If a link stands in its place.
+    """
+    path.mkdir(parents=True, exist_ok=True)
+    check_no_link(path)
+
+
+def check_no_link(path: Path) -> None:
+    """Raise ForeignFileError if a link stands in the place of a folder or of nothing yet."""
+    if path.is_symlink():
+        raise ForeignFileError(errno.ELOOP, LINK, str(path))
+
+
+def check_still_there(descriptor: int, path: Path, lost: str) -> None:
+    """Raise where an open file has been deleted: what is written to it is gone.
+
+    Parameters
+    ----------
+    descriptor, path
+        Of the open file, and the name under which it was opened.
+    lost
+        What is lost with it, in words.
+
+    Raises
+    ------
+    FileNotFoundError
+        If the file has no name any more.
+    """
+    if os.fstat(descriptor).st_nlink == 0:
+        raise FileNotFoundError(errno.ENOENT, f"the file was deleted during the run; lost: {lost}", str(path))
+
+
+def part_of(path: Path) -> Path:
+    """Where a file is written before it gets its name."""
+    return path.with_name(f"{path.name}.part")
+
+
+def write_whole(path: Path, data: bytes) -> None:
+    """Make or replace a file: written beside it, brought to the disk, then renamed. A link in its place is replaced.
+
+    The file is there whole or not at all, whenever the process is killed or the disk fills up.
+
+    Raises
+    ------
+    OSError
+        If it cannot be written (disk full); the old file, if there was one, is still there.
+    """
+    part = part_of(path)
+    part.unlink(missing_ok=True)  # of a run that was killed
+    try:
+        with open(open_own(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL), "wb", buffering=0) as file:
+            view = memoryview(data)
+            while view:
+                view = view[file.write(view) :]
+            os.fsync(file.fileno())
+        part.replace(path)
+    except OSError:
+        part.unlink(missing_ok=True)  # the room it takes may be all there is
+        raise
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)  # the name too
+    finally:
+        os.close(folder)
+
+
+def _check_regular(descriptor: int, path: Path) -> os.stat_result:
+    found = os.fstat(descriptor)
+    if stat.S_ISDIR(found.st_mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    if not stat.S_ISREG(found.st_mode):
+        raise ForeignFileError(errno.EINVAL, "is a pipe or a device, not a file", str(path))
+    return found

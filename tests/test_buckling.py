@@ -1,0 +1,179 @@
+"""Whether a body would buckle that a reduction keeps straight: thrust and suction, before a run and in it."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from remodel_fenicsx import Scene, Simulation
+from remodel_fenicsx.body import tube
+from remodel_fenicsx.body.reductions import choice, explained
+from remodel_fenicsx.evolution.buckling import BucklingWarning
+from remodel_fenicsx.stability import in_words, stability
+
+MU, LAME = 3.103, 27.293
+YOUNG, POISSON = MU * (3 * LAME + 2 * MU) / (LAME + MU), LAME / (2 * (LAME + MU))
+SECOND_MOMENT = np.pi / 4 * (1.5**4 - 1)
+
+
+def ramped(value: float) -> dict[str, Any]:
+    """A load that is all there from t = 1."""
+    return {"value": value, "ramp": [[0.0, 0.0], [1.0, 1.0]]}
+
+
+def slender(kinematics: str, pressure: float, **changes: Any) -> Scene:
+    """A tube without chains, 40 long, its wall from 1 to 1.5."""
+    scene = Scene(
+        geometry={"shape": "tube", "inner_radius": 1.0, "outer_radius": 1.5, "length": 40.0},
+        material={"lame_mu": MU, "lame_lambda": LAME, "chain_density": 0.0},
+        cells={"initial": "isotropic"},
+        model={"kinematics": kinematics},
+        loads={"pressure": ramped(pressure)},
+        remodeling={"law": "none", "coupling": "staggered"},
+        time={"end": 1.0},
+    )
+    return scene.with_values(changes)
+
+
+@contextmanager
+def watched(scene: Scene) -> Iterator[BucklingWarning]:
+    """The watcher at the end of a run."""
+    simulation = Simulation(scene, MPI.COMM_SELF)
+    try:
+        for _ in simulation.steps():
+            pass
+        yield BucklingWarning(simulation.stepper, scene.geometry.strut(scene.supports.ends))
+    finally:
+        simulation.close()
+
+
+# ---------------------------------------------------------------- in closed form
+@pytest.mark.parametrize(("ends", "force"), [("closed", None), ("closed", 0.3), ("free", 0.1)])
+def test_thrust_is_what_is_not_given(ends: str, force: float | None) -> None:
+    """Caps take the pressure on the lumen, a force that is given is the wall's."""
+    changes: dict[str, Any] = {"supports.ends": ends}
+    if force is not None:
+        changes["loads.axial_force"] = ramped(force)
+    with watched(slender("radial", 0.3, **changes)) as watcher:
+        lumen = 0.3 * np.pi * watcher._radii()[0] ** 2 if ends == "free" else 0.0
+        assert watcher.thrust() == pytest.approx(lumen - (force or 0.0), abs=2e-6)
+
+
+@pytest.mark.parametrize(("kinematics", "ends", "factor"), [
+    ("radial", "free", 1.0), ("axisymmetric", "clamped", 0.5), ("sector", "free", 1.0),
+])  # fmt: skip
+def test_eulers_load_of_an_unloaded_tube(kinematics: str, ends: str, factor: float) -> None:
+    """pi^2 EI / (k L)^2; the pressure's thrust on a held length is (1 - 2 nu) p pi r_i^2 at first."""
+    with watched(slender(kinematics, 1e-4, **{"supports.ends": ends, "mesh.degree": 2})) as watcher:
+        exact = np.pi**2 * YOUNG * SECOND_MOMENT / (factor * 40) ** 2
+        assert watcher.euler_load() == pytest.approx(exact, rel=0.01)
+        assert watcher.thrust() == pytest.approx(
+            (1 - 2 * POISSON) * 1e-4 * np.pi, rel=0.01 if kinematics == "radial" else 0.2
+        )
+
+
+def column(force: float, kinematics: str = "point") -> Scene:
+    """A slender tendon under a dead force."""
+    return Scene(
+        geometry={"shape": "tendon", "length": 10.0, "area": 0.1},
+        material={"lame_mu": MU, "lame_lambda": LAME, "chain_density": 0.0},
+        cells={"initial": "isotropic"},
+        model={"kinematics": kinematics},
+        loads={"force": ramped(force)},
+        remodeling={"law": "none", "coupling": "staggered"},
+        time={"end": 1.0},
+    )
+
+
+def test_a_tendon_is_a_column_with_a_free_end() -> None:
+    exact = np.pi**2 * YOUNG * 0.1**2 / (4 * np.pi) / (2 * 10.0) ** 2
+    with watched(column(-0.5 * exact)) as watcher:
+        assert watcher.thrust_share() == pytest.approx(0.5, rel=0.01)
+
+
+def test_suction_makes_a_ring_oval() -> None:
+    """3 EI'/R^3 on the middle of a thin wall in plane strain."""
+    thin = {"geometry.inner_radius": 0.98, "geometry.outer_radius": 1.02, "geometry.length": 1.0}
+    bears = 3 * YOUNG / (1 - POISSON**2) * 0.04**3 / 12
+    with watched(slender("radial", -0.5 * bears, **thin)) as watcher:
+        assert watcher.suction_share() == pytest.approx(0.5, rel=0.03)
+        assert watcher.in_words() == ""
+    with watched(slender("radial", -1.1 * bears, **thin)) as watcher:
+        assert "its suction is about 1." in watcher.in_words()
+
+
+# ---------------------------------------------------------------- against the whole body
+def test_the_whole_tube_loses_its_stability_where_the_ray_says_so(caplog: Any) -> None:
+    """Two modes, x and y, between pressures at which the estimate is 0.8 and 1.1."""
+    counts, shares = [], []
+    for pressure in (0.26, 0.32):
+        with watched(slender("radial", pressure)) as watcher:
+            shares.append(watcher.thrust_share())
+        changes = {"mesh.degree": 2, "output.columns": ["negative_eigenvalues"]}
+        whole = slender("full", pressure, **changes)
+        simulation = Simulation(
+            whole, MPI.COMM_SELF, tube(1.0, 1.5, 40.0, 1, "hexahedron", 2, MPI.COMM_SELF, (8, 1, 8))
+        )
+        counts.append([step.row["negative_eigenvalues"] for step in simulation.steps()][-1])
+        simulation.close()
+    assert counts == [0, 2]
+    assert shares[0] < 0.9 < shares[1]
+
+
+@pytest.mark.parametrize(("scene", "told"), [
+    (slender("radial", 0.2), ""), (slender("radial", 0.4), "thrust"), (slender("sector", 0.4), "thrust"),
+    (slender("axisymmetric", 0.4, **{"supports.ends": "clamped"}), ""),
+    (slender("radial", 0.4, **{"supports.ends": "closed"}), ""),
+    (slender("radial", 0.4, **{"loads.elongation": ramped(0.02)}), ""),
+    (slender("radial", 0.01, **{"loads.elongation": ramped(-0.02)}), "thrust"),
+    (slender("radial", 0.01, **{"loads.axial_force": ramped(-0.3)}), "thrust"),
+    (slender("radial", 0.4, **{"geometry.length": 8.0}), ""), (column(-1e-4), ""), (column(-2e-4), "thrust"),
+    (column(0.1), ""),
+])  # fmt: skip
+def test_who_is_told(scene: Scene, told: str, caplog: Any) -> None:
+    """Once, with what to set."""
+    longer = scene.with_values({"time.end": 2.0})
+    with caplog.at_level(logging.WARNING), watched(longer):
+        pass
+    lines = [record.getMessage() for record in caplog.records if "would buckle" in record.getMessage()]
+    assert len(lines) == bool(told), lines
+    for line in lines:
+        assert f"its {told} along z is about " in line and "set model.kinematics = 'full'" in line
+
+
+# ---------------------------------------------------------------- before
+@pytest.mark.parametrize(("changes", "name"), [
+    ({}, "full"), ({"loads.pressure.value": 0.15}, "radial"), ({"geometry.length": 8.0}, "radial"),
+    ({"supports.ends": "closed"}, "radial"), ({"supports.ends": "clamped"}, "axisymmetric"),
+    ({"loads.elongation": ramped(0.05)}, "radial"), ({"loads.axial_force": ramped(0.0)}, "full"),
+    ({"loads.axial_force": ramped(2.0)}, "radial"), ({"supports.ends": "clamped", "loads.pressure.value": 0.9}, "full"),
+    ({"geometry.outer_radius": 3.0, "geometry.length": 8.0, "loads.pressure.value": 2.4}, "radial"),
+])  # fmt: skip
+def test_auto_is_full_where_thrust_comes_near_eulers_load(changes: dict[str, Any], name: str) -> None:
+    """And says why."""
+    scene = slender("auto", 0.35, **changes)
+    assert choice(scene).name == name
+    assert any("Euler's load" in line for line in explained(scene)) == (name == "full")
+
+
+# ---------------------------------------------------------------- the analysis of passes
+def test_the_analysis_of_a_reduction_says_what_it_does_not_see(tmp_path: Path) -> None:
+    changes = {
+        "material.chain_density": 2e21,
+        "remodeling.law": "explicit",
+        "remodeling.coupling": "staggered",
+        "geometry.length": 8.0,
+    }
+    scene = slender("radial", 0.5, **changes).with_values({"time.end": 2.0})
+    place, table, unseen = stability(scene, tmp_path / "radial", 1, MPI.COMM_SELF)
+    log = (place / "run.log").read_text()
+    assert "kinematics 'radial' sees changes that keep its symmetry only" in unseen
+    assert unseen in log and unseen in in_words(table, unseen)
+    assert f"time 2: a pass multiplies the worst small change by {table['factor'][0]:.3g}" in log

@@ -1,0 +1,59 @@
+"""Commands in processes of their own: a worker does one after the other, and says how each has ended."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from remodel_fenicsx.system.children import Worker, wait_for_one
+from tests.parts import pulled_cube
+
+
+@pytest.fixture
+def worker() -> Iterator[Worker]:
+    """A process; it ends with the test."""
+    made = Worker()
+    yield made
+    made.stop()
+    assert not made.is_alive
+
+
+def end_of(worker: Worker, words: list[str], messages: Path) -> int | None:
+    """Exit code of a command."""
+    worker.begin(words, messages)
+    assert worker.is_at_work
+    wait_for_one([worker], 300.0)
+    return worker.poll()
+
+
+def test_one_process_does_many_commands(worker: Worker, tmp_path: Path) -> None:
+    """Each with words of its own; then it is killed in one of them."""
+    scene, number = tmp_path / "step-0.5.toml", worker.process.pid
+    scene.write_text(pulled_cube(5000.0).to_toml())
+    said = [tmp_path / f"{name}.txt" for name in ("one", "two", "three", "four")]
+    assert end_of(worker, ["validate", str(tmp_path / "nothing.toml")], said[0]) == 2
+    assert worker.last_words().endswith("nothing.toml: no such file; a scene is a TOML file")
+    assert end_of(worker, ["no-such-command"], said[1]) == 2  # argparse ends in a way of its own
+    assert end_of(worker, ["validate", str(scene)], said[2]) == 0
+    assert "not allowed: cells.initial" in worker.last_words()
+    assert [file.read_text().count("no such file") for file in said[:3]] == [1, 0, 0]
+    assert "a valid scene (cube" in said[2].read_text() and worker.is_alive and worker.process.pid == number
+    worker.begin(["run", str(scene), "-o", str(tmp_path / "run"), "-q"], said[3])
+    assert worker.poll() is None and worker.is_at_work
+    os.kill(number, signal.SIGKILL)
+    wait_for_one([worker], 300.0)
+    assert worker.poll() == -signal.SIGKILL and worker.last_words() == "killed by SIGKILL"
+    assert end_of(worker, ["info"], said[3]) == -signal.SIGKILL  # who is not there does nothing
+
+
+def test_what_is_at_work_is_stopped(tmp_path: Path) -> None:
+    """As by a signal: what is recorded stays."""
+    scene, worker = tmp_path / "scene.toml", Worker()
+    scene.write_text(pulled_cube(5000.0).to_toml())
+    worker.begin(["run", str(scene), "-o", str(tmp_path / "run"), "-q"], tmp_path / "said.txt")
+    worker.stop()
+    assert worker.process.returncode in (128 + signal.SIGTERM, -signal.SIGTERM)

@@ -1,0 +1,123 @@
+"""A step that ends far from where its tangent points to: what is beyond a limit point is not taken without a word."""
+
+from __future__ import annotations
+
+import logging
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from remodel_fenicsx import Scene, Simulation
+from remodel_fenicsx.evolution.equilibrium import Extension
+from remodel_fenicsx.evolution.newton import GuardedNewton, SolveFailure
+from remodel_fenicsx.evolution.parts import Change
+from remodel_fenicsx.evolution.refusals import diagnosed
+from remodel_fenicsx.scene import scene_from_dict
+
+LARGEST = 0.3018  # pressure of this tube: benchmarks/stability_map/tube_march.py, with the inner radius prescribed
+
+
+def thin_tube(pressure: float = 0.5, end: float = 1.0, **values: Any) -> Scene:
+    """Few of its chains run around it: with closed ends its pressure has a largest value."""
+    return scene_from_dict({
+        "geometry": {"shape": "tube", "inner_radius": 1.0, "outer_radius": 1.1, "length": 8.0},
+        "model": {"kinematics": "radial"},
+        "cells": {"initial": [0.4, 0.2, 0.8944271909999159]},
+        "supports": {"ends": "closed"},
+        "remodeling": {"law": "none"},
+        "loads": {"pressure": {"value": pressure, "ramp": [[0.0, 0.0], [1.0, 1.0]]}},
+        "time": {"end": end, "step": 1.0},
+        "output": {"columns": ["inner_radius"]},
+    }).with_values(values)  # fmt: skip
+
+
+def radii(scene: Scene) -> tuple[list[float], int]:
+    """Inner radius of the steps, and their Newton iterations."""
+    simulation = Simulation(scene, MPI.COMM_SELF)
+    try:
+        steps = list(simulation.steps())
+    finally:
+        simulation.close()
+    return [step.row["inner_radius"] for step in steps], sum(step.work.newton_iterations for step in steps)
+
+
+def warnings(caplog: pytest.LogCaptureFixture) -> list[str]:
+    return [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING]
+
+
+@pytest.mark.parametrize(("pressure", "step"), [(0.5, 0.25), (0.5, 0.05), (0.3624, 0.2)])
+def test_a_limit_point_that_is_jumped_over_is_named(
+    pressure: float, step: float, caplog: pytest.LogCaptureFixture
+) -> None:
+    """From r = 1.6 to 3.4: where the way ends is the largest pressure, whatever the step."""
+    found, _ = radii(thin_tube(pressure, **{"mesh.degree": 2, "time.step": step, "solver.relative_tolerance": 1e-9}))
+    assert max(np.diff(found)) > 1.5
+    (said,) = warnings(caplog)
+    assert "limit point" in said and "a smaller time.step" in said
+    place = re.search(r"no way on beyond pressure ([0-9.]+)\.", said)
+    assert place is not None and float(place[1]) == pytest.approx(LARGEST, rel=5e-3)
+
+
+def test_a_refusal_beyond_it_is_no_matter_of_the_tolerance() -> None:
+    """The far state that Newton's method ends near may miss the tolerance by a little; the tangent knows better."""
+    simulation = Simulation(thin_tube(LARGEST - 1e-4, **{"time.step": 0.125}), MPI.COMM_SELF)
+    before = [simulation.unknown.x.array.copy() for _ in simulation.steps()][-2]
+    last = simulation.unknown.x.array - before
+    failure = SolveFailure("refused", 25, 25, Extension(0.7, 1.0, (0.0, 0.0, 0.0)), residual_over_tolerance=50.0)
+    refusal = diagnosed(simulation.stepper.coupling.newton, failure, last)
+    simulation.close()
+    assert refusal.kind == "limit point"
+
+
+def test_a_far_step_with_a_way_to_it_says_nothing(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Near its largest pressure a tube without chains goes more than twice as far as its first tangent points."""
+    changes: dict[str, Any] = {"material.chain_density": 0.0, "geometry.outer_radius": 3.0, "supports.ends": "free"}
+    changes |= {"loads.elongation": {"value": 0.0, "ramp": [[0.0, 0.0], [1.0, 1.0]]}}
+    looked, confirm = [], Change.confirm
+    monkeypatch.setattr(Change, "confirm", lambda *arguments: looked.append(1) or confirm(*arguments))
+    (whole,), _ = radii(thin_tube(3.15, **changes))
+    assert looked and not warnings(caplog)
+    small, _ = radii(thin_tube(3.15, **changes, **{"time.step": 0.1}))
+    assert whole == pytest.approx(small[-1], rel=1e-8)
+
+
+def test_of_several_solutions_the_one_that_parts_lead_to_is_taken(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Newton's method starts at the wide tube, whose branch reaches down below the limit point."""
+    caplog.set_level(logging.INFO)
+    narrow, _ = radii(thin_tube(0.29))
+    wide = Simulation(thin_tube(0.5, **{"time.step": 0.25, "solver.relative_tolerance": 1e-9}), MPI.COMM_SELF)
+    list(wide.steps())
+    far = wide.unknown.x.array.copy()
+    wide.close()
+    solve, starts = GuardedNewton.solve, [far]
+
+    def misled(newton: GuardedNewton) -> Any:
+        if starts:
+            first = newton.unknown.x.array.copy()
+            newton.unknown.x.array[:] = starts.pop()
+            solution = solve(newton)
+            assert np.abs(newton.unknown.x.array - first).max() > 1.0
+            object.__setattr__(solution, "reach", 10.0)
+            return solution
+        return solve(newton)
+
+    monkeypatch.setattr(GuardedNewton, "solve", misled)
+    found, _ = radii(thin_tube(0.29, **{"solver.relative_tolerance": 1e-9}))
+    assert found == pytest.approx(narrow, rel=1e-7)
+    assert "several solutions; taken is the one to which parts of the step lead" in caplog.text
+
+
+def test_a_body_that_jumps_again_and_again_is_looked_into_three_times(caplog: pytest.LogCaptureFixture) -> None:
+    """Loaded, unloaded, loaded: each way over a limit point is a warning, up to a number."""
+    cycle = [[0.0, 0.0], *([float(t), float(t % 2)] for t in range(1, 9))]
+    scene = thin_tube(end=8.0, **{"loads.pressure.ramp": cycle, "time.step": 0.25, "solver.relative_tolerance": 1e-9})
+    found, _ = radii(scene)
+    assert sum(np.abs(np.diff(found)) > 1.0) >= 4
+    assert len(warnings(caplog)) == 3

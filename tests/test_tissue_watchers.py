@@ -1,0 +1,122 @@
+"""What a run says of its tissue: volume that is lost, and chains that point out of the wall."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from remodel_fenicsx import Simulation
+from remodel_fenicsx.body import SHAPES
+from remodel_fenicsx.evolution.volume import VolumeLoss
+from remodel_fenicsx.scene import Scene, scene_from_dict
+from remodel_fenicsx.system.terminal import NOTICE
+from tests.conftest import Case
+
+SELF = MPI.COMM_SELF
+
+
+def tube_scene(**tables: Any) -> Scene:
+    base: dict[str, Any] = {
+        "preset": "kuhl-holzapfel-2007",
+        "geometry": {"shape": "tube"},
+        "model": {"kinematics": "radial"},
+        "cells": {"initial": "isotropic"},
+        "loads": {"pressure": {"value": 0.0, "ramp": [[0, 0], [1, 1]]}, "elongation": {"value": 0.0, "ramp": [[0, 1]]}},
+        "remodeling": {"law": "none"},
+        "time": {"end": 3.0},
+    }
+    return scene_from_dict(base | tables)
+
+
+def squeezed(elongation: float, ratio: float, **tables: Any) -> Scene:
+    """A tube of a matrix alone that is made shorter; ratio is lambda/mu."""
+    loads = {
+        "pressure": {"value": 0.0, "ramp": [[0, 0], [1, 1]]},
+        "elongation": {"value": elongation, "ramp": [[0, 0], [2, 1]]},
+    }
+    return tube_scene(material={"chain_density": 0.0, "lame_lambda": ratio, "lame_mu": 1.0}, loads=loads, **tables)
+
+
+def said(scene: Scene, caplog: pytest.LogCaptureFixture, word: str) -> list[tuple[int, str]]:
+    """Lines of a run with a word: level and text."""
+    caplog.clear()
+    with caplog.at_level(logging.INFO):
+        simulation = Simulation(scene, SELF)
+        for _ in simulation.steps():
+            pass
+        simulation.close()
+    return [(record.levelno, record.getMessage()) for record in caplog.records if word in record.getMessage()]
+
+
+def volume_of(elongation: float, ratio: float) -> float:
+    """J of uniaxial stress in the neo-Hookean matrix: mu (a^2 - 1) + lambda ln J = 0 with J = a^2 (1 + elongation)."""
+    low, high = 0.01, 10.0
+    for _ in range(200):
+        squared = (low + high) / 2
+        low, high = (squared, high) if squared - 1 + ratio * np.log(squared * (1 + elongation)) < 0 else (low, squared)
+    return float(low * (1 + elongation))
+
+
+@pytest.mark.parametrize(
+    ("elongation", "ratio", "level"),
+    [(-0.3, 8.8, None), (-0.3, 1.0, logging.INFO), (-0.3, 0.0, logging.WARNING), (-0.6, 1.0, logging.WARNING)],
+)
+def test_tissue_that_loses_volume(
+    elongation: float, ratio: float, level: int | None, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The mean and the worst point are those of the closed form, here the same; said once, in words of its level."""
+    J = volume_of(elongation, ratio)
+    lines = said(squeezed(elongation, ratio), caplog, "of its volume")
+    assert (level is None) == (J > 0.95) and (level == logging.WARNING) == (J <= 0.8)
+    warned = [logging.WARNING] if level == logging.WARNING else []
+    assert [found for found, _ in lines] == ([] if level is None else [*warned, logging.INFO])
+    for _, text in lines:  # a warning when it happens, and at the end how much it was
+        assert (
+            f"has lost up to {100 * (1 - J):.2g} % of its volume (mean J {J:.3g} at time 2; least J {J:.3g} at" in text
+        )
+
+
+def test_the_worst_point_alone_is_enough_for_a_warning(caplog: pytest.LogCaptureFixture) -> None:
+    """Suction on a soft thick wall: the inner face is squeezed, the rest is not."""
+    loads = {"pressure": {"value": -14.0, "ramp": [[0, 0], [2, 1]]}, "elongation": {"value": 0.0, "ramp": [[0, 1]]}}
+    material = {"chain_density": 0.0, "lame_lambda": 0.0, "lame_mu": 1.0}
+    scene = tube_scene(material=material, loads=loads, geometry={"shape": "tube", "outer_radius": 10.0})
+    lines = said(scene, caplog, "of its volume")
+    assert [level for level, _ in lines] == [logging.WARNING]
+    simulation = Simulation(scene, SELF)
+    rows = [step.row for step in simulation.steps()]
+    watcher = next(watcher for watcher in simulation.warnings if isinstance(watcher, VolumeLoss))
+    assert min(row["min_jacobian"] for row in rows) == watcher._numbers["least"] < 0.6
+    assert watcher._numbers["mean"] > 0.9 and 1.2 < watcher._numbers["x"] < 1.3
+    simulation.close()
+
+
+def test_chains_that_point_out_of_the_wall_are_said(caplog: pytest.LogCaptureFixture) -> None:
+    """One notice where most of them do; none of the others, and none of bodies without a wall."""
+    for cells, lines in (([0.6, 0.0, 0.8], 1), ([0.8, 0.0, 0.6], 0), ("isotropic", 0)):
+        found = said(tube_scene(cells={"initial": cells}), caplog, "out of the wall")
+        assert [level for level, _ in found] == [NOTICE] * lines
+        assert all(text.startswith("time 1: ") and "radial_share 0.64" in text for _, text in found)
+    dimensions, axes, places = np.ones((4, 3)), np.broadcast_to(np.eye(3), (4, 3, 3)), np.ones((4, 3))
+    assert not SHAPES["cube"](shape="cube", side=1.0).radial_share(dimensions, axes, places).any()
+
+
+@pytest.mark.slow
+def test_one_and_two_ranks_agree(case: Case) -> None:
+    """Of random cells on the whole tube: forces, shares and angles."""
+    columns = ["axial_force", "reduced_axial_force", "radial_share", "fibre_angle_inner", "angle_profile_4"]
+    loads = {
+        "pressure": {"value": 2.4, "ramp": [[0, 0], [2, 1]]},
+        "elongation": {"value": -0.2, "ramp": [[0, 0], [2, 1]]},
+    }
+    scene = {
+        "preset": "kuhl-holzapfel-2007", "geometry": {"shape": "tube", "length": 2.0}, "time": {"end": 2.0},
+        "loads": loads, "output": {"columns": columns}, "material": {"lame_lambda": 2.0},
+    }  # fmt: skip
+    one, two = (case(scene, ranks=ranks) for ranks in (1, 2))
+    for name in columns:
+        np.testing.assert_allclose(two[name], one[name], rtol=1e-10)
