@@ -18,7 +18,7 @@ from remodel_fenicsx.body.reductions import explained
 from remodel_fenicsx.system import interrupts
 from remodel_fenicsx.system.arguments import positive, wall_time
 from remodel_fenicsx.system.children import SERVE, serve
-from remodel_fenicsx.system.environment import reason_undrawable, reason_unusable, versions
+from remodel_fenicsx.system.environment import kernels, reason_undrawable, reason_unusable, versions
 from remodel_fenicsx.system.regular_files import ForeignFileError
 from remodel_fenicsx.scene.parameters import PRESETS
 from remodel_fenicsx.scene.profiles import PROFILES
@@ -140,6 +140,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code, one of `EXIT_CODES`."""
     with interrupts.ending_at_once():
         options = _parsed(arguments)
+        try:
+            kernels()  # not after minutes, when they are asked for
+        except ValueError as error:
+            return _fail(str(error), BAD_INPUT)
         try:
             code = COMMANDS[options.command](options)
             sys.stdout.flush()

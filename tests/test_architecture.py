@@ -19,8 +19,8 @@ import remodel_fenicsx
 ROOT = Path(__file__).parents[1]
 PACKAGE = "remodel_fenicsx"
 # what a room may import: itself, and those before it
-ROOMS = ("_version", "system", "schema", "tissue", "fem", "body", "scene", "evolution", "results", "paper",
-         "simulation", "running", "stability", "studies", "cli", "parts", "extend")  # fmt: skip
+ROOMS = ("_version", "system", "schema", "tissue", "fem", "kernels", "body", "scene", "evolution", "results",
+         "paper", "simulation", "running", "stability", "studies", "cli", "parts", "extend")  # fmt: skip
 # imports that only the type checker follows: of what is there without dolfinx, to what is not
 TYPES_ONLY = {
     "__init__": {"results.recording", "running", "scene", "simulation"},

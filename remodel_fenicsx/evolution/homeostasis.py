@@ -28,13 +28,13 @@ from remodel_fenicsx.tissue.cells import structure_tensor
 log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 
-TOLERANCE = 2.0
+TOLERANCE = 3.0
 """Of the steps on the way, in degrees, where a scene has no time.tolerance: cells without tension are as exact."""
 COARSE = 90.0  # degrees: more than any step's error, where it leaves nothing
 LONGEST = 1.0  # step on the way, times kappa: longer ones leave too few looks at cells that come to rest slowly
 ITERATIONS = 10
 """Of Newton's method in the step to the limit: from near it takes 3 to 7, and one that fails costs more than steps."""
-NEAR, AGAIN = 0.1, 0.8
+NEAR, AGAIN = 0.05, 0.8
 """Change of A over r0^2 by a pass to the limit from which on the rest is tried in one step, and again at each fifth
 less."""
 SAME_WAY, NO_CHANGE = 0.5, 0.03
@@ -139,29 +139,30 @@ class Homeostasis:
 
     def _arrived(self, limit: Limit, time: float, loads: LoadValues, towards: Array, work: Work) -> bool:
         """Make the rest of the way in one step; if it is not solved or leads elsewhere, all is as before."""
-        state, before, structure = self.state, self.state.snapshot(), self.state.cells.structure_tensor()
-        state.numbers[RESIDUAL] = work.residual
+        state, before, residual = self.state, self.state.snapshot(), work.residual
+        structure = state.cells.structure_tensor()
+        state.numbers[RESIDUAL] = residual
         try:
             found = limit.solve(time, loads)
         except SolveFailure as failure:
-            state.restore(before)
             work.add(failure)
             log.info("the rest of the way is not solved in one step: %s", failure.reason)
+            state.restore(before)
             return False
-        work.newton_iterations += found.newton_iterations
-        work.linear_iterations += found.linear_iterations
-        work.tangents += found.tangents
-        change = state.cells.structure_tensor() - structure
+        work.add(found)
+        if not self._is_along(state.cells.structure_tensor() - structure, towards):
+            work.residual = residual
+            log.info("the rest of the way in one step leads elsewhere")
+            state.restore(before)
+            return False
+        self.steps, work.substeps, work.residual = self.steps + 1, work.substeps + 1, found.residual
+        return True
+
+    def _is_along(self, change: Array, towards: Array) -> bool:
+        """Whether a change of A goes where a pass does, at all points where it counts."""
         size, pass_size = (np.linalg.norm(tensors, axis=(-1, -2)) for tensors in (change, towards))
         aside = (change * towards).sum(axis=(-1, -2)) < SAME_WAY * size * pass_size
-        if self._largest(np.where((aside | (pass_size == 0.0))[..., None, None], change, 0.0)) > NO_CHANGE:
-            state.restore(before)
-            log.info("the rest of the way in one step leads elsewhere")
-            return False
-        self.steps += 1
-        work.substeps += found.substeps
-        work.residual = found.residual
-        return True
+        return self._largest(np.where((aside | (pass_size == 0.0))[..., None, None], change, 0.0)) <= NO_CHANGE
 
     def _change_by_a_pass(self, time: float, residual: float) -> Array:
         """Of A up to a time, at all points."""

@@ -46,7 +46,7 @@ COMPILER_FLAGS = [
 ]  # fmt: skip
 
 # of our own C functions: no sum is taken in another order than it is written in
-LIBRARY_FLAGS = ["-std=c17", "-O3", "-g0", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-w"]
+LIBRARY_FLAGS = ["-std=c17", "-O3", "-g0", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-Wall", "-Wextra"]
 
 # By number of arguments: what a form is, and the seconds that it takes (the energy here, hexahedra, one core)
 _KINDS = {0: ("an integral", 1), 1: ("the residual", 1), 2: ("the tangent", 5)}

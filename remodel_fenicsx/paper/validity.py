@@ -59,10 +59,10 @@ def library_versions() -> dict[str, str]:
 
 
 def source_fingerprint(package: Path = Path(__file__).parents[1]) -> str:
-    """Hash of all source that a run imports, whatever its files are called and wherever they lie.
+    """Hash of all source that a run imports, whatever its files are called and wherever they lie, and of all C.
 
-    Comments, docstrings, layout and the order of imports do not change it, nor does moving a module. What a module
-    imports from the package counts by the source that it comes from, not by its path.
+    Comments, docstrings, layout and the order of imports of Python do not change it, nor does moving a module. What a
+    module imports from the package counts by the source that it comes from, not by its path.
     """
     read = _imported(package)
     bodies = {name: body for name, (_, body) in read.items()}
@@ -75,6 +75,7 @@ def source_fingerprint(package: Path = Path(__file__).parents[1]) -> str:
             else:  # what stands in one, or a library
                 taken.add((bodies.get(source, source), part, alias))
         whole.append(_hash(repr((body, sorted(taken)))))
+    whole += [_hash(path.read_text(encoding="utf-8")) for path in package.rglob("*.[ch]")]
     return _hash(repr(sorted(set(whole))))
 
 

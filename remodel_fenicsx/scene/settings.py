@@ -170,7 +170,7 @@ class Time(Table):
         description="Where it is given, steps are as long as the estimated error in time stays below it, in degrees: "
         "of the direction of the chains, root mean square over the body, and of lengths, relative, as an angle (1 "
         "degree is 1.7 %). Times of ramps and output.times are hit. On the way to an equilibrium steps are always "
-        "chosen so; default there: 2 degrees.",
+        "chosen so; default there: 3 degrees.",
         json_schema_extra={"allowed": "a number greater than 0, in degrees"},
     )
 
