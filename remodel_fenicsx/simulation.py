@@ -16,7 +16,7 @@ from remodel_fenicsx.body.reductions import AUTO, choice, explained
 from remodel_fenicsx.evolution.buckling import BucklingWarning
 from remodel_fenicsx.evolution.chatter import Chatter
 from remodel_fenicsx.evolution.coupling import Coupling, Maker
-from remodel_fenicsx.evolution.homeostasis import COARSE, ITERATIONS, LONGEST, TOLERANCE, Homeostasis, Limit
+from remodel_fenicsx.evolution.homeostasis import COARSE, ITERATIONS, LONGEST, TOLERANCE, UNLOADING, Homeostasis, Limit
 from remodel_fenicsx.evolution.locking import LockingWarning
 from remodel_fenicsx.evolution.monitor import StabilityWatcher
 from remodel_fenicsx.evolution.newton import SolverSettings
@@ -132,7 +132,9 @@ class Simulation:
     def _at_once(self, tissue: Tissue, solver: SolverSettings) -> Maker:
         """The coupling that goes to the equilibrium, with the steps of a stepper of its own on the same state."""
         scene, stops = self.scene, self.scene.stops()
-        settings, tolerance = scene.remodeling, scene.time.tolerance or TOLERANCE
+        settings, tolerance = scene.remodeling, scene.time.tolerance
+        if tolerance is None:
+            tolerance = UNLOADING if any(load.falls for load in scene.loads.values()) else TOLERANCE
         if scene.cells.initial == "random" and LAWS[settings.law].dimensions is not None:
             # cells that jump from rank to rank: no step is short enough, and passes swing
             settings, tolerance = settings.model_copy(update={"coupling": "relaxed"}), COARSE

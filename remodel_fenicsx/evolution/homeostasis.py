@@ -28,8 +28,9 @@ from remodel_fenicsx.tissue.cells import structure_tensor
 log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 
-TOLERANCE = 3.0
-"""Of the steps on the way, in degrees, where a scene has no time.tolerance: cells without tension are as exact."""
+TOLERANCE, UNLOADING = 3.0, 0.5
+"""Of the steps on the way, in degrees, where a scene has no time.tolerance: in all, and where loads fall or reverse.
+There points lose their tension, and their cells stay as exact as the way. The paper's artery takes 25 solves."""
 COARSE = 90.0  # degrees: more than any step's error, where it leaves nothing
 LONGEST = 1.0  # step on the way, times kappa: longer ones leave too few looks at cells that come to rest slowly
 ITERATIONS = 10
