@@ -145,8 +145,8 @@ def cores() -> int:
 
 
 def _process(arguments: Sequence[str], **streams: Any) -> subprocess.Popen[Any]:
-    """remodel-fenicsx ARGUMENTS."""
-    command = [sys.executable, "-m", "remodel_fenicsx.cli", *arguments]
+    """remodel-fenicsx ARGUMENTS; -P: no module is taken from the working folder, which may be somebody else's."""
+    command = [sys.executable, "-P", "-m", "remodel_fenicsx.cli", *arguments]
     if shutil.which("setpriv"):  # the signal comes from now on; who was killed before is not the parent any more
         only_with_parent = ["sh", "-c", '[ "$PPID" = "$0" ] && exec "$@"', str(os.getpid())]
         command = ["setpriv", "--pdeathsig", signal.SIGTERM.name, *only_with_parent, *command]
