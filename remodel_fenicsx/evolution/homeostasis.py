@@ -35,9 +35,9 @@ COARSE = 90.0  # degrees: more than any step's error, where it leaves nothing
 LONGEST = 1.0  # step on the way, times kappa: longer ones leave too few looks at cells that come to rest slowly
 ITERATIONS = 10
 """Of Newton's method in the step to the limit: from near it takes 3 to 7, and one that fails costs more than steps."""
-NEAR, AGAIN = 0.05, 0.8
-"""Change of A over r0^2 by a pass to the limit from which on the rest is tried in one step, and again at each fifth
-less."""
+NEAR, AGAIN, TRIES = 0.05, 0.7, 6
+"""Change of A over r0^2 by a pass to the limit from which on the rest is tried in one step, how much nearer the cells
+are at the next try, and how often. Where there are points that gain and lose their tension, none is solved."""
 SAME_WAY, NO_CHANGE = 0.5, 0.03
 """The step leads where time does if it changes A at each point in the direction of that pass: cosine, and change over
 r0^2 that needs none. Measured on tubes: steps to another state had points with a cosine of -0.7 and below. Right ones
@@ -88,7 +88,8 @@ class Homeostasis:
         self.newton: GuardedNewton = self.coupling.newton
         if limit is not None:
             limit.equilibrium.stop_signal = lambda: self.equilibrium.stop_signal()
-        self.compares, self.steps, self.near, self._residual = False, 0, NEAR, 0.0
+        self.compares, self.steps, self._residual = False, 0, 0.0
+        self.near, self.tries = NEAR, TRIES
 
     def solve(self, time: float, loads: LoadValues) -> Work:
         """Equilibrium of forces and of cells.
@@ -99,7 +100,7 @@ class Homeostasis:
             If a step on the way is not solved.
         """
         state, work = self.state, Work()
-        start, number, self.near, self.steps = state.time, state.number, NEAR, 0
+        start, number, self.near, self.tries, self.steps = state.time, state.number, NEAR, TRIES, 0
         self.way.tolerance = self.tolerance
         for step in self.way.march():
             self.steps += 1
@@ -127,8 +128,8 @@ class Homeostasis:
         towards, quadrature = self._change_by_a_pass(time, work.residual), self.state.cells.quadrature
         towards[self.remodeling.without_tension(work.residual).reshape(quadrature.shape)] = 0.0
         rest = self._largest(towards)
-        if self.limit is not None and rest <= self.near:
-            self.near = AGAIN * rest
+        if self.limit is not None and self.tries and rest <= self.near:
+            self.near, self.tries = AGAIN * rest, self.tries - 1
             if self._arrived(self.limit, time, loads, towards, work):
                 return True
         soon = self.state.time + 1 / self.remodeling.settings.kappa
