@@ -10,6 +10,7 @@ import ufl
 from mpi4py import MPI
 from numpy.typing import NDArray
 
+from remodel_fenicsx.evolution.memory import Numbers
 from remodel_fenicsx.evolution.parameters import Parameters, on_mesh, stress_rounding
 from remodel_fenicsx.evolution.pointwise import PointStresses
 from remodel_fenicsx.evolution.state import State
@@ -29,6 +30,9 @@ Array = NDArray[np.float64]
 
 RESIDUAL_SHARE = 20.0  # an eighth of an element's nodes share a face's force; a pulled-back stress is larger still
 TYPICAL_SHARE = 1e-2  # of the body's stress: the most that the residual counts as; tension below it is none of weight
+# Of the body's stress, from which on the residual is said. The artery on one radius, law "tensor": at 0.02 to 0.05
+# radii are within 0.1 %, at 0.4 they are 2 % off
+WORTH_A_WORD = 0.1
 ROUNDINGS = 64.0  # how many times the rounding of a stress its principal values may be off
 
 AWAKE = 0.5  # of the speed of remodeling under tension alone
@@ -102,7 +106,7 @@ class RemodelingPass:
             return
         self._change: tuple[UnitCell, UnitCell] | None = None
         self.kernels = state.cells.kernels
-        self._warned = False
+        self._numbers = Numbers(state, "noise", {"said": 0})
         self._smallest_area = self.quadrature.minimum(self.quadrature.smallest_areas)
         F = state.kinematics.deformation_gradient(state.unknown)
         self._stresses = PointStresses(state, self.tissue)
@@ -164,15 +168,17 @@ class RemodelingPass:
         typical = float(np.sqrt(self.quadrature.mean(squares)))
         unbalanced = RESIDUAL_SHARE * residual / self._smallest_area
         most = max(TYPICAL_SHARE * typical, ABOVE_ROUNDING * rounded)
-        if unbalanced > most and not self._warned and self.state.comm.rank == 0:
-            self._warned = True
-            log.warning(
-                "solver tolerance: the forces that are out of balance may be stresses of %.2g, the body's are %.2g; "
-                "up to %.2g is not taken for tension; lower solver.relative_tolerance or solver.absolute_tolerance",
-                unbalanced,
-                typical,
-                most,
-            )
+        if unbalanced > max(WORTH_A_WORD * typical, most) and not self._numbers["said"]:
+            self._numbers["said"] = 1
+            if self.state.comm.rank == 0:
+                log.warning(
+                    "solver tolerance: the forces that are out of balance may be stresses of %.2g, the body's are "
+                    "%.2g; up to %.2g is not taken for tension; lower solver.relative_tolerance or "
+                    "solver.absolute_tolerance",
+                    unbalanced,
+                    typical,
+                    most,
+                )
         return Noise(rounded + min(unbalanced, most), rounding)
 
     def _max_chain_extension(self, F: Array) -> float:
