@@ -35,6 +35,8 @@ TYPICAL_SHARE = 1e-2  # of the body's stress: the most that the residual counts 
 WORTH_A_WORD = 0.1
 ROUNDINGS = 64.0  # how many times the rounding of a stress its principal values may be off
 
+AWAKE = 0.5  # of the speed of remodeling under tension alone
+
 
 class RemodelingSettings(Protocol):
     """How the cells follow the load (`scene.parameters.Remodeling`)."""
@@ -203,6 +205,14 @@ class RemodelingPass:
         assert target is not None
         kernels = tensor_kernels(self.state.comm) if target is tensor_target else None
         return target(drive) if kernels is None else kernels.target(drive)
+
+    def without_tension(self, residual: float = 0.0) -> NDArray[np.bool_]:
+        """Of all points in one row: those without tension, or with hardly any beside compression. Cells there stay."""
+        drive = self.drive(residual)
+        if self.law.target is not None:
+            return np.asarray(self.target(residual).share < AWAKE)
+        values = np.linalg.eigvalsh(drive.tensor)
+        return ~spectral.positive_direction(values, threshold=drive.threshold)[1]
 
     def followed(self, target: Target, duration: float, cells: UnitCell | None = None) -> UnitCell:
         """Cells of all points in one row, the present or others, after a time with this target. Changes nothing."""
