@@ -1,4 +1,4 @@
-"""The artery of `benchmarks/peers` in FElupe, as one of its users would write it: run by that command, not by hand.
+"""The artery of `benchmarks/peers.py` in FElupe, as one of its users would write it: run by that command, not by hand.
 
     python3 peer_felupe.py PROBLEM.npz STEPS TOLERANCE RESULT.npz
 

@@ -15,55 +15,34 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from remodel_fenicsx.body import Cube
-from remodel_fenicsx.body.loading import Loading
-from remodel_fenicsx.evolution.state import State
-from remodel_fenicsx.evolution.stepper import Stepper, times
-from remodel_fenicsx.evolution.unit_cells import UnitCells
-from remodel_fenicsx.fem.kinematics import FullKinematics
-from remodel_fenicsx.fem.quadrature import Quadrature
-from remodel_fenicsx.results.columns import Observer
-from remodel_fenicsx.results.run_folder import RunFolder, chosen_folder
-from remodel_fenicsx.scene.parameters import Cells, Material, Remodeling
-from remodel_fenicsx.scene.scene import Mesh, Solver
-from remodel_fenicsx.system.interrupts import end_all_ranks_on_exception
+from remodel_fenicsx import parts
 
 end = float(sys.argv[1]) if len(sys.argv) > 1 else 100.0
 comm = MPI.COMM_WORLD
-folder = chosen_folder(sys.argv[2] if len(sys.argv) > 2 else None, "cube-script", comm)
-end_all_ranks_on_exception()
+folder = parts.chosen_folder(sys.argv[2] if len(sys.argv) > 2 else None, "cube-script", comm)
+parts.end_all_ranks_on_exception()
 
 # %% [markdown]
 # ## Geometry and tissue
 # One element. Isotropic cells: $l_1 = l_2 = l_3 = r_0 / \sqrt3$.
 
 # %%
-body = Cube(side=1.0)
-domain = body.build(Mesh(refinement=1, element="hexahedron", degree=1), comm)
-kinematics = FullKinematics()
+body = parts.Cube(side=1.0)
+domain = body.build(parts.Mesh(refinement=1, element="hexahedron", degree=1), comm)
+kinematics = parts.FullKinematics()
 displacement = kinematics.unknown(domain.mesh, degree=1)
-tissue = Material(
-    lame_lambda=27.293,
-    lame_mu=3.103,
-    chain_density=7.0e21,
-    contour_length=2.125,
-    persistence_length=1.82,
-    temperature=310.0,
-).tissue(end_to_end_length=1.0)
-quadrature = Quadrature(domain.mesh, element_degree=1)
-cells = UnitCells(
-    quadrature,
-    domain.element_number,
-    domain.number_of_elements,
-    Cells(initial="isotropic", axes="global", end_to_end_length=1.0),
-)
+tissue = parts.Material(lame_lambda=27.293, lame_mu=3.103, chain_density=7.0e21, contour_length=2.125,
+                        persistence_length=1.82, temperature=310.0).tissue(end_to_end_length=1.0)  # fmt: skip
+quadrature = parts.Quadrature(domain.mesh, element_degree=1)
+start = parts.Cells(initial="isotropic", axes="global", end_to_end_length=1.0)
+cells = parts.UnitCells(quadrature, domain.element_number, domain.number_of_elements, start)
 
 # %% [markdown]
 # ## Supports and loads
 # Three symmetry planes, a dead force along z on the face z = 1.
 
 # %%
-loading = Loading(domain, displacement, kinematics)
+loading = parts.Loading(domain, displacement, kinematics)
 loading.hold_face("x0", component=0)
 loading.hold_face("y0", component=1)
 loading.hold_face("z0", component=2)
@@ -81,9 +60,9 @@ def load_values(time: float) -> dict[str, float]:
 
 # %%
 kappa = 0.025
-remodeling = Remodeling(driver="cauchy", law="explicit", frame="spatial", kappa=kappa)
-state = State(displacement, kinematics, cells, loading)
-stepper = Stepper(state, tissue, remodeling, Solver(method="direct", predictor="none"), load_values)
+remodeling = parts.Remodeling(driver="cauchy", law="explicit", frame="spatial", kappa=kappa)
+state = parts.State(displacement, kinematics, cells, loading)
+stepper = parts.Stepper(state, tissue, remodeling, parts.Solver(method="direct", predictor="none"), load_values)
 
 
 def closed_form(time: float) -> float:
@@ -93,6 +72,6 @@ def closed_form(time: float) -> float:
 
 
 line = "t = {time:5.1f}  stretch {mean_stretch:.4f}  angle {mean_fibre_angle:8.5f}, in closed form {exact:8.5f}"
-with RunFolder(folder, "# made by demos/cube.py\n", comm.rank) as record:
-    for step in stepper.march(times(end, step=1.0), [Observer(body, stepper), record]):
+with parts.RunFolder(folder, "# made by demos/cube.py\n", comm.rank) as record:
+    for step in stepper.march(parts.times(end, step=1.0), [parts.Observer(body, stepper), record]):
         PETSc.Sys.Print(line.format(**step.row, exact=closed_form(step.time)))

@@ -14,32 +14,21 @@ import sys
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from remodel_fenicsx.body import Tendon
-from remodel_fenicsx.body.loading import Loading
-from remodel_fenicsx.evolution.state import State
-from remodel_fenicsx.evolution.stepper import Stepper, times
-from remodel_fenicsx.evolution.unit_cells import UnitCells
-from remodel_fenicsx.fem.kinematics import FullKinematics
-from remodel_fenicsx.fem.quadrature import Quadrature
-from remodel_fenicsx.results.columns import Observer
-from remodel_fenicsx.results.run_folder import RunFolder, chosen_folder
-from remodel_fenicsx.scene.parameters import Cells, Material, Remodeling
-from remodel_fenicsx.scene.scene import Mesh, Solver
-from remodel_fenicsx.system.interrupts import end_all_ranks_on_exception
+from remodel_fenicsx import parts
 
 end = float(sys.argv[1]) if len(sys.argv) > 1 else 150.0
 comm = MPI.COMM_WORLD
-folder = chosen_folder(sys.argv[2] if len(sys.argv) > 2 else None, "tendon-script", comm)
-end_all_ranks_on_exception()
+folder = parts.chosen_folder(sys.argv[2] if len(sys.argv) > 2 else None, "tendon-script", comm)
+parts.end_all_ranks_on_exception()
 
 # %% [markdown]
 # ## Geometry
 # 48 trilinear elements in the cross-section, 10 along the axis z.
 
 # %%
-body = Tendon(length=10.0, area=10.0)
-domain = body.build(Mesh(refinement=1, element="hexahedron", degree=1), comm)
-kinematics = FullKinematics()
+body = parts.Tendon(length=10.0, area=10.0)
+domain = body.build(parts.Mesh(refinement=1, element="hexahedron", degree=1), comm)
+kinematics = parts.FullKinematics()
 displacement = kinematics.unknown(domain.mesh, degree=1)
 
 # %% [markdown]
@@ -48,21 +37,11 @@ displacement = kinematics.unknown(domain.mesh, degree=1)
 # $|l| = r_0$. A cell whose long side lies along z is stiff, one that lies across is soft: the body is not homogeneous.
 
 # %%
-tissue = Material(
-    lame_lambda=27.293,
-    lame_mu=3.103,
-    chain_density=2.0e21,
-    contour_length=1.594,
-    persistence_length=1.365,
-    temperature=310.0,
-).tissue(end_to_end_length=1.0)
-quadrature = Quadrature(domain.mesh, element_degree=1)
-cells = UnitCells(
-    quadrature,
-    domain.element_number,
-    domain.number_of_elements,
-    Cells(initial="random", axes="global", seed=1, end_to_end_length=1.0),
-)
+tissue = parts.Material(lame_lambda=27.293, lame_mu=3.103, chain_density=2.0e21, contour_length=1.594,
+                        persistence_length=1.365, temperature=310.0).tissue(end_to_end_length=1.0)  # fmt: skip
+quadrature = parts.Quadrature(domain.mesh, element_degree=1)
+start = parts.Cells(initial="random", axes="global", seed=1, end_to_end_length=1.0)
+cells = parts.UnitCells(quadrature, domain.element_number, domain.number_of_elements, start)
 
 # %% [markdown]
 # ## Supports and loads
@@ -70,7 +49,7 @@ cells = UnitCells(
 # $T = F / A_0$ along z; the top is free to deform.
 
 # %%
-loading = Loading(domain, displacement, kinematics)
+loading = parts.Loading(domain, displacement, kinematics)
 loading.hold_face("bottom", component=2)
 loading.hold_node((0.0, 0.0, 0.0), component=0)
 loading.hold_node((0.0, 0.0, 0.0), component=1)
@@ -84,21 +63,16 @@ def load_values(time: float) -> dict[str, float]:
 
 
 # %% [markdown]
-# ## Remodeling
+# ## Remodeling, step by step
+# Each step sets the loads of its time, finds $u$ in equilibrium with the cells as they are, and then lets them remodel.
 # Under uniaxial tension only the first eigenvalue of the Cauchy stress is positive, so $e \to (1, 0, 0)$ and eq. (11)
 # lets $l_1 \to r_0$, $l_2, l_3 \to 0$ with $n_1$ along the load.
 
 # %%
-remodeling = Remodeling(driver="cauchy", law="explicit", frame="spatial", kappa=0.025)
-
-# %% [markdown]
-# ## Through time
-# Each step sets the loads of its time, finds $u$ in equilibrium with the cells as they are, and then lets them remodel.
-
-# %%
-state = State(displacement, kinematics, cells, loading)
-stepper = Stepper(state, tissue, remodeling, Solver(method="direct", predictor="none"), load_values)
+remodeling = parts.Remodeling(driver="cauchy", law="explicit", frame="spatial", kappa=0.025)
+state = parts.State(displacement, kinematics, cells, loading)
+stepper = parts.Stepper(state, tissue, remodeling, parts.Solver(method="direct", predictor="none"), load_values)
 line = "t = {time:5.1f}  stretch {mean_stretch:.4f}  angle {mean_fibre_angle:5.1f}"
-with RunFolder(folder, "# made by demos/tendon.py\n", comm.rank) as record:
-    for step in stepper.march(times(end, step=1.0), [Observer(body, stepper), record]):
+with parts.RunFolder(folder, "# made by demos/tendon.py\n", comm.rank) as record:
+    for step in stepper.march(parts.times(end, step=1.0), [parts.Observer(body, stepper), record]):
         PETSc.Sys.Print(line.format(**step.row))

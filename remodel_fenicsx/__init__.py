@@ -5,17 +5,28 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-__version__ = "0.2.0"
-__all__ = ["Recording", "Scene", "SceneError", "Simulation", "preset_scene", "read_scene", "run"]
+from remodel_fenicsx._version import __version__
+
+__all__ = [
+    "Recording",
+    "RecordingError",
+    "Scene",
+    "SceneError",
+    "Simulation",
+    "__version__",
+    "preset_scene",
+    "read_scene",
+    "run",
+]
 
 if TYPE_CHECKING:
-    from remodel_fenicsx.results.recording import Recording
+    from remodel_fenicsx.results.recording import Recording, RecordingError
     from remodel_fenicsx.running import run
     from remodel_fenicsx.scene import Scene, SceneError, preset_scene, read_scene
     from remodel_fenicsx.simulation import Simulation
 
 _PLACES = {
-    "Recording": "results.recording",
+    **dict.fromkeys(("Recording", "RecordingError"), "results.recording"),
     "run": "running",
     **dict.fromkeys(("Scene", "SceneError", "preset_scene", "read_scene"), "scene"),
     "Simulation": "simulation",

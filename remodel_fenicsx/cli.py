@@ -13,12 +13,12 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-import remodel_fenicsx
+from remodel_fenicsx._version import __version__
 from remodel_fenicsx.body.reductions import explained
 from remodel_fenicsx.system import interrupts
 from remodel_fenicsx.system.arguments import positive, wall_time
 from remodel_fenicsx.system.children import SERVE, serve
-from remodel_fenicsx.system.environment import reason_undrawable, reason_unusable, versions
+from remodel_fenicsx.system.environment import kernels, reason_undrawable, reason_unusable, versions
 from remodel_fenicsx.system.regular_files import ForeignFileError
 from remodel_fenicsx.scene.parameters import PRESETS
 from remodel_fenicsx.scene.profiles import PROFILES
@@ -26,6 +26,16 @@ from remodel_fenicsx.scene.scene import Scene, SceneError, preset_scene, read_sc
 from remodel_fenicsx.schema.tables import printable
 
 BAD_INPUT, SOLVE_FAILED, STOPPED, BAD_ENVIRONMENT = 2, 3, interrupts.PAUSED, 5
+EXIT_CODES = {
+    0: "finished",
+    BAD_INPUT: "bad input",
+    SOLVE_FAILED: "the solve failed",
+    STOPPED: "stopped on purpose",
+    BAD_ENVIRONMENT: "environment not usable",
+    129: "hung up",
+    130: "interrupted",
+    143: "terminated",
+}
 
 
 class _Parser(argparse.ArgumentParser):
@@ -40,10 +50,9 @@ def parser() -> argparse.ArgumentParser:
     main_parser = _Parser(
         prog="remodel-fenicsx",
         description="Predict how collagen in living tissue reorients under load (Kuhl & Holzapfel 2007).",
-        epilog="exit codes: 0 finished, 2 bad input, 3 the solve failed, 4 stopped on purpose, 5 environment not "
-        "usable, 129/130/143 interrupted",
+        epilog="exit codes: " + ", ".join(f"{code} {meaning}" for code, meaning in EXIT_CODES.items()),
     )
-    main_parser.add_argument("--version", action="version", version=remodel_fenicsx.__version__)
+    main_parser.add_argument("--version", action="version", version=__version__)
     commands = main_parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     def scene_command(name: str, text: str, resumes: bool = False) -> argparse.ArgumentParser:
@@ -130,9 +139,13 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit code of docs/commands.md (0, 2, 3, 4, 5, 129, 130, 143)."""
+    """Run the command line; returns the exit code, one of `EXIT_CODES`."""
     with interrupts.ending_at_once():
         options = _parsed(arguments)
+        try:
+            kernels()  # not after minutes, when they are asked for
+        except ValueError as error:
+            return _fail(str(error), BAD_INPUT)
         try:
             code = COMMANDS[options.command](options)
             sys.stdout.flush()

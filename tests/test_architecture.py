@@ -14,11 +14,13 @@ from pathlib import Path
 
 import pytest
 
+import remodel_fenicsx
+
 ROOT = Path(__file__).parents[1]
 PACKAGE = "remodel_fenicsx"
 # what a room may import: itself, and those before it
-ROOMS = ("system", "schema", "tissue", "fem", "body", "scene", "evolution", "results", "paper", "simulation",
-         "running", "stability", "studies", "cli")  # fmt: skip
+ROOMS = ("_version", "system", "schema", "tissue", "fem", "kernels", "body", "scene", "evolution", "results",
+         "paper", "simulation", "running", "stability", "studies", "cli", "parts", "extend")  # fmt: skip
 # imports that only the type checker follows: of what is there without dolfinx, to what is not
 TYPES_ONLY = {
     "__init__": {"results.recording", "running", "scene", "simulation"},
@@ -27,6 +29,7 @@ TYPES_ONLY = {
     "body.tendon": {"body.domain", "body.loading"},
     "body.tube_reductions": {"body.domain"},
     "body.tube": {"body.domain", "body.loading"},
+    "extend": {"evolution.coupling", "evolution.linear", "fem.jit", "results.columns"},
     "results.recording": {"scene.scene"},
 }
 
@@ -125,9 +128,27 @@ def test_rooms_side_by_side_do_not_know_each_other(pair: tuple[str, str]) -> Non
     assert not [arrow for arrow in arrows() if {room(arrow.importer), room(arrow.imported)} == set(pair)]
 
 
+def test_scripts_beside_the_package_import_what_is_there() -> None:
+    """Nothing else runs most of them: what they import may move away unnoticed."""
+    scripts = [path for folder in ("benchmarks", "demos", "docs") for path in sorted((ROOT / folder).rglob("*.py"))]
+    assert len(scripts) > 20
+    for path in scripts:
+        for imported, _ in imports_of(path):
+            if imported.split(".")[0] == PACKAGE:
+                pkgutil.resolve_name(imported)  # raises, if it is not
+
+
+def test_no_benchmark_is_without_an_ending() -> None:
+    """Formatters, linters and searches go by it."""
+    assert [path.name for path in (ROOT / "benchmarks").iterdir() if not path.is_dir() and not path.suffix] == []
+
+
 def test_the_package_itself_only_hands_names_on() -> None:
-    """Whoever asks for its version or its folder imports nothing else."""
-    assert not [arrow for arrow in arrows() if arrow.importer == "__init__" and arrow.when != "types"]
+    """Whoever asks for its version imports nothing else, and no room asks the package itself."""
+    assert {arrow.imported for arrow in arrows() if arrow.importer == "__init__" and arrow.when != "types"} == {
+        "_version"
+    }
+    assert not [arrow for arrow in arrows() if arrow.imported == "__init__"]
     assert {room(arrow.imported) for arrow in arrows() if arrow.importer == "__main__"} == {"cli"}
 
 
@@ -182,6 +203,7 @@ def test_a_room_does_without(inside: str, never: set[str]) -> None:
 @pytest.mark.parametrize(("module", "never"), [
     (PACKAGE, "numpy dolfinx basix mpi4py petsc4py gmsh ufl pint h5py pydantic"),
     (f"{PACKAGE}.scene", "dolfinx basix mpi4py petsc4py gmsh ufl pint h5py"),
+    (f"{PACKAGE}.extend", "dolfinx basix mpi4py petsc4py gmsh ufl pint h5py"),
     (f"{PACKAGE}.tissue.laws", "dolfinx basix mpi4py petsc4py gmsh ufl pydantic"),
     (f"{PACKAGE}.results.recording", "dolfinx basix mpi4py petsc4py gmsh ufl pint pydantic"),
 ])  # fmt: skip
@@ -227,8 +249,9 @@ def test_what_the_newcomers_table_names_is_there(thing: str) -> None:
     source = ast.parse((ROOT / "tests" / "test_extensions.py").read_text(encoding="utf-8"))
     functions = {node.name: ast.unparse(node) for node in source.body if isinstance(node, ast.FunctionDef)}
     for registry in registries:
-        found = pkgutil.resolve_name(f"{PACKAGE}.{registry}")
+        found = pkgutil.resolve_name(registry := f"{PACKAGE}.{registry}")
         assert isinstance(found, (dict, tuple, type)), registry
+        assert registry.split(".")[1] in ("extend", "parts", *remodel_fenicsx.__all__), registry
         *_, owner, name = registry.split(".")
         adding = (f"setitem({name}", f"setitem({owner}.{name}", f"setattr({owner}, '{name}'", f"Healing{name}(")
         for test in tests:

@@ -14,8 +14,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from remodel_fenicsx.evolution.compiled_tensor import TensorKernels
-from remodel_fenicsx.evolution.compiled_tensor import points as compiled_points
+from remodel_fenicsx.kernels.tensor import TensorKernels, condensed_points
 from remodel_fenicsx.evolution.homeostasis import Homeostasis
 from remodel_fenicsx.evolution.uniqueness import check_uniqueness
 from remodel_fenicsx.scene import preset_scene
@@ -179,7 +178,7 @@ def test_cells_that_answer(law: str, repulsion: str, compiled: bool) -> None:
     kernels, answers = TensorKernels(MPI.COMM_SELF) if compiled else None, []
     for unit in (1.0, METRES, 1e6):
         scaled = in_unit(some, unit)
-        twin = compiled_points(kernels, scaled.tissue, scaled.step)
+        twin = condensed_points(kernels, scaled.tissue, scaled.step)
         found = solved(twin, F)
         tangent, there = twin.tangent(found, np.zeros(12, dtype=bool)).reshape(12, 81), found.converged
         values = (found.first_piola_kirchhoff, tangent, found.structure / unit**2)

@@ -7,8 +7,8 @@ import pytest
 from mpi4py import MPI
 
 from remodel_fenicsx.body.tube import tube
-from remodel_fenicsx.evolution.compiled import PointKernels
 from remodel_fenicsx.evolution.stepper import Step, Watcher
+from remodel_fenicsx.kernels.points import CompiledPointKernels, PointKernels
 from remodel_fenicsx.scene import preset_scene
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.tissue import repulsion, spectral
@@ -20,7 +20,12 @@ COUNT = 203  # no multiple of the eight that are done at once
 
 @pytest.fixture(scope="module")
 def kernels() -> PointKernels:
-    return PointKernels(MPI.COMM_SELF)
+    return CompiledPointKernels(MPI.COMM_SELF)
+
+
+@pytest.fixture(params=["C", "numpy"])
+def either(request: pytest.FixtureRequest, kernels: PointKernels) -> PointKernels:
+    return kernels if request.param == "C" else PointKernels()
 
 
 def random_axes(rng: np.random.Generator) -> spectral.Array:
@@ -81,44 +86,44 @@ def states_of_every_kind(rng: np.random.Generator) -> spectral.Array:
     return states[states[:, 1] > 0]
 
 
-def test_how_far_points_are_from_their_limits(kernels: PointKernels) -> None:
+def test_how_far_points_are_from_their_limits(either: PointKernels) -> None:
     rng = np.random.default_rng(16)
     states = states_of_every_kind(rng)
     lengths = 5 + 5 * rng.random(len(states))
-    stretch, worst, smallest = kernels.extension(states, lengths)
+    stretch, worst, smallest = either.extension(states, lengths)
     np.testing.assert_allclose(stretch, np.sqrt(states[:, 0]) / lengths, rtol=1e-15)
     assert worst == np.argmax(stretch) and smallest == states[:, 1].min()
-    assert kernels.extension(states, np.full(len(states), np.inf))[0].max() == 0.0
+    assert either.extension(states, np.full(len(states), np.inf))[0].max() == 0.0
     for number in (np.nan, np.inf, -np.inf):
         states[[5, 9], [0, 1]] = number
-        stretch, worst, smallest = kernels.extension(states, lengths)
+        stretch, worst, smallest = either.extension(states, lengths)
         assert stretch[5] == np.inf and worst == 5 and np.isfinite(np.delete(stretch, 5)).all()
         assert smallest == -np.inf
-    assert kernels.extension(states[:0], lengths[:0])[2] == np.inf
+    assert either.extension(states[:0], lengths[:0])[2] == np.inf
 
 
-def test_no_point_that_turns_is_left_out(kernels: PointKernels) -> None:
+def test_no_point_that_turns_is_left_out(either: PointKernels) -> None:
     """Of small changes no point need be asked for, of large ones every point that turns is among those that are."""
     rng = np.random.default_rng(17)
     before = states_of_every_kind(rng)
     for size in (1e-3, 0.1, 0.3, 1.0):
         after = before + size * rng.normal(size=before.shape)
-        at = kernels.may_turn(before, after)
+        at = either.may_turn(before, after)
         F, G = (ends[:, 2:].reshape(-1, 3, 3) for ends in (before, after))
         assert set(np.flatnonzero(passes_through_zero(F, G))) <= set(at)
         assert 0 < len(at) < len(before) or size in (1e-3, 1.0), size
-    assert kernels.may_turn(before, before).size == 0
+    assert either.may_turn(before, before).size == 0
 
 
-def test_within_the_room_around_a_state_there_is_no_limit(kernels: PointKernels) -> None:
+def test_within_the_room_around_a_state_there_is_no_limit(either: PointKernels) -> None:
     rng = np.random.default_rng(18)
     states, far = states_of_every_kind(rng), 0.95
     stretch, chain = 0.9 * rng.random(len(states)), 0.5 + rng.random(len(states))
     for some in (slice(None), slice(0, 1), slice(3, 4)):
         sizes = (states[some, 2:] ** 2).sum(axis=1)
         expected = np.minimum(2 * states[some, 1] / sizes, (far - stretch[some]) / chain[some]).min()
-        assert kernels.room(states[some], stretch[some], chain[some], far) == pytest.approx(expected, rel=1e-14)
-    assert kernels.room(states[:0], stretch[:0], chain[:0], far) == np.inf
+        assert either.room(states[some], stretch[some], chain[some], far) == pytest.approx(expected, rel=1e-14)
+    assert either.room(states[:0], stretch[:0], chain[:0], far) == np.inf
 
 
 def test_noise_across_the_axes(kernels: PointKernels) -> None:
@@ -160,25 +165,6 @@ def test_stretches_and_structure(kernels: PointKernels) -> None:
 
 
 # ---------------------------------------------------------------- a whole pass
-class InNumpy:
-    """In place of the kernels: what they are twins of."""
-
-    twins: dict[spectral.Pairing, spectral.Pairing] = {}
-    without_noise = staticmethod(spectral.without_noise)
-
-    @staticmethod
-    def squared_length(F: spectral.Array, cell: UnitCell) -> spectral.Array:
-        return np.asarray(repulsion.squared_end_to_end_length(F, [cell]))
-
-    @staticmethod
-    def squared_length_and_sum(F: spectral.Array, cell: UnitCell) -> tuple[spectral.Array, spectral.Array]:
-        return InNumpy.squared_length(F, cell), np.asarray(repulsion.axes_sum(F, [cell], 1.0))
-
-    @staticmethod
-    def gradient_and_driver(both: spectral.Array) -> tuple[spectral.Array, spectral.Array]:
-        return both[:, 0], (both[:, 1] + np.swapaxes(both[:, 1], 1, 2)) / 2
-
-
 class Compare(Watcher):
     """Makes the pass of every solved state twice, from the same cells, and keeps how far apart they are."""
 
@@ -190,7 +176,7 @@ class Compare(Watcher):
         stepper, cells = self.simulation.stepper, self.simulation.cells
         state, compiled, found = self.simulation.state, cells.kernels, []
         before = state.snapshot()
-        for kernels in (compiled, InNumpy):
+        for kernels in (compiled, PointKernels()):
             stepper.remodeling.kernels = kernels
             power = stepper.remodeling.apply(state.time, step.time, step.work.residual)
             found.append((cells.dimension_values.copy(), cells.axis_values.copy(), power))
@@ -282,10 +268,10 @@ def test_what_is_just_across_the_axes(kernels: PointKernels, plane: tuple[int, i
 
 
 @pytest.mark.parametrize("factor", [1 - 1e-9, 1 + 1e-9])
-def test_a_change_that_may_just_turn_a_point(kernels: PointKernels, factor: float) -> None:
+def test_a_change_that_may_just_turn_a_point(either: PointKernels, factor: float) -> None:
     """From F = I at |dF| = 2/3; and a state with J = 0 always."""
     before, change = np.concatenate([[3.0, 1.0], np.eye(3).ravel()])[None], np.zeros(11)
     change[2:] = factor * 2 / 3 / 3
-    assert kernels.may_turn(before, before + change).size == (factor > 1)
+    assert either.may_turn(before, before + change).size == (factor > 1)
     before[0, 1] = 0.0
-    assert kernels.may_turn(before, before).size == 1
+    assert either.may_turn(before, before).size == 1

@@ -9,8 +9,7 @@ import pytest
 from mpi4py import MPI
 from scipy.spatial.transform import Rotation
 
-from remodel_fenicsx.evolution import compiled_tensor
-from remodel_fenicsx.evolution.compiled_tensor import CompiledPoints, TensorKernels
+from remodel_fenicsx.kernels.tensor import CompiledPoints, TensorKernels, condensed_points
 from remodel_fenicsx.tissue import condensed, repulsion
 from remodel_fenicsx.tissue.cells import UnitCell
 from remodel_fenicsx.tissue.chains import CHAINS
@@ -69,7 +68,7 @@ def test_the_target(kernels: TensorKernels, driver: str, frame: str) -> None:
 
 
 def compiled_twin(kernels: TensorKernels, some: CondensedPoints) -> CompiledPoints:
-    twin = compiled_tensor.points(kernels, some.tissue, some.step)
+    twin = condensed_points(kernels, some.tissue, some.step)
     assert isinstance(twin, CompiledPoints)
     return twin
 
@@ -123,5 +122,5 @@ def test_parts_that_the_kernel_does_not_know_are_numpys(kernels: TensorKernels) 
         (some.tissue, points("tensor", "log", "cauchy", "spatial", 2).step),
         (replace(some.tissue, chain=chain), some.step),
     ):
-        assert type(compiled_tensor.points(kernels, tissue, step)) is CondensedPoints
-    assert type(compiled_tensor.points(None, some.tissue, some.step)) is CondensedPoints
+        assert type(condensed_points(kernels, tissue, step)) is CondensedPoints
+    assert type(condensed_points(None, some.tissue, some.step)) is CondensedPoints

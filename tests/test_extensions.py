@@ -20,28 +20,52 @@ from mpi4py import MPI
 from pydantic import Field
 
 from remodel_fenicsx import Recording, Scene, SceneError, Simulation, run
-from remodel_fenicsx.body import SHAPES, Cube, LoadKind, Shape
-from remodel_fenicsx.body.column import Column
-from remodel_fenicsx.body.domain import Domain
-from remodel_fenicsx.body.shape import uniaxial_columns
-from remodel_fenicsx.evolution import coupling
-from remodel_fenicsx.fem import jit
-from remodel_fenicsx.fem.formulations import FORMULATIONS, Selective
-from remodel_fenicsx.fem.kinematics import KINEMATICS, FullKinematics
-from remodel_fenicsx.fem.solver_methods import METHODS
-from remodel_fenicsx.body.columns import COLUMNS
-from remodel_fenicsx.results.columns import Measurement
-from remodel_fenicsx.scene import parameters
-from remodel_fenicsx.scene.parameters import Remodeling
-from remodel_fenicsx.schema.tables import markdown_reference
-from remodel_fenicsx.schema.units import FORCE, LENGTH, LENGTH_UNIT, STRESS_UNIT, Dimension
-from remodel_fenicsx.tissue.cells import AXES, UnitCell, angle_to_axis
-from remodel_fenicsx.tissue.chains import CHAINS, Chain
-from remodel_fenicsx.tissue.drivers import DRIVERS, FRAMES, Driver, Frame
-from remodel_fenicsx.tissue.energy import MATRICES, neo_hookean
-from remodel_fenicsx.tissue.laws import LAWS, Drive, Law, ranked
-from remodel_fenicsx.tissue.repulsion import REPULSIONS, Repulsion, axes_sum, squared_end_to_end_length
-from remodel_fenicsx.tissue.spectral import PAIRINGS, principal
+from remodel_fenicsx.extend import (
+    AXES,
+    CHAINS,
+    COLUMNS,
+    COUPLING_MEANINGS,
+    COUPLINGS,
+    DRIVERS,
+    FORCE,
+    FORMULATIONS,
+    FRAMES,
+    KINEMATICS,
+    LAWS,
+    LENGTH,
+    LENGTH_UNIT,
+    MATRICES,
+    METHODS,
+    PAIRINGS,
+    REPULSIONS,
+    SHAPES,
+    STRESS_UNIT,
+    Chain,
+    Column,
+    Dimension,
+    Drive,
+    Driver,
+    Frame,
+    FullKinematics,
+    Law,
+    LoadKind,
+    Measurement,
+    Repulsion,
+    Selective,
+    Shape,
+    Staggered,
+    UnitCell,
+    angle_to_axis,
+    axes_sum,
+    form,
+    markdown_reference,
+    neo_hookean,
+    principal,
+    ranked,
+    squared_end_to_end_length,
+    uniaxial_columns,
+)
+from remodel_fenicsx.parts import Cube, Domain, Remodeling
 
 KAPPA = 0.1
 SCENE: dict[str, Any] = {
@@ -286,7 +310,7 @@ def test_a_column(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     def volume(m: Measurement) -> float:
         def compiled() -> Any:
             F = m.state.kinematics.deformation_gradient(m.state.unknown)
-            return jit.form(ufl.det(F) * m.quadrature.dx)
+            return form(ufl.det(F) * m.quadrature.dx)
 
         return float(dolfinx.fem.assemble_scalar(m.tool("volume", compiled)))
 
@@ -391,17 +415,17 @@ def test_a_shape_that_does_not_mesh_what_the_scene_asks_for_is_refused(monkeypat
 def test_a_coupling(monkeypatch: pytest.MonkeyPatch) -> None:
     """One that lets the cells alone until t = 2."""
 
-    class Late(coupling.Staggered):
+    class Late(Staggered):
         def remodel(self, time: float) -> float:
             return super().remodel(time) if time > 2.0 else 0.0
 
-    monkeypatch.setitem(coupling.COUPLINGS, "late", Late)
+    monkeypatch.setitem(COUPLINGS, "late", Late)
     with pytest.raises(
         SceneError,
         match="^remodeling.coupling = 'late': allowed are 'staggered', 'relaxed', 'extrapolated', 'implicit'$",
     ):
         scene(remodeling={"coupling": "late"})
-    monkeypatch.setitem(parameters.COUPLINGS, "late", "as staggered, but the cells stay as they are up to t = 2")
+    monkeypatch.setitem(COUPLING_MEANINGS, "late", "as staggered, but the cells stay as they are up to t = 2")
     angles = column(rows_of(scene(remodeling={"coupling": "late"})), "mean_fibre_angle")
     isotropic = np.degrees(np.arccos(3**-0.5))
     np.testing.assert_allclose(angles[:3], isotropic, rtol=1e-12)
@@ -409,7 +433,7 @@ def test_a_coupling(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_every_coupling_is_told_to_scenes() -> None:
-    assert set(parameters.COUPLINGS) == set(coupling.COUPLINGS)
+    assert set(COUPLING_MEANINGS) == set(COUPLINGS)
 
 
 def test_a_kinematics(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -204,6 +204,10 @@ def test_only_source_that_decides_numbers_makes_runs_stale(copy: Path) -> None:
     (copy / "cli.py").write_text("Y = 2\n")
     (copy / "body" / "more.py").write_text("Z = 3\n")  # nothing imports it
     assert validity.source_fingerprint(copy) == before
+    in_c = copy / "kernels" / "tensor.c"
+    in_c.write_text(in_c.read_text().replace("1 / ", "2 / "))
+    assert validity.source_fingerprint(copy) != before
+    shutil.copy(PACKAGE / "kernels" / "tensor.c", in_c)
     laws.write_text(text + "\nLAWS.pop('rate')\n")
     assert validity.source_fingerprint(copy) != before
     laws.write_text(text + "\nimport remodel_fenicsx.body.more\n")

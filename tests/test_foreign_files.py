@@ -33,6 +33,7 @@ from remodel_fenicsx.results.vtkhdf import check_file
 from remodel_fenicsx.running import resume, run as run_scene
 from remodel_fenicsx.scene import preset_scene, read_scene
 from remodel_fenicsx.schema.toml import LARGEST, MOST_PARTS
+from remodel_fenicsx.studies.members import Member
 from tests.parts import pulled_cube
 from tests.test_run import demo, run
 
@@ -82,6 +83,7 @@ CODE = {
     "snes_python_type": "mine.Solver", "ksp_monitor_python": "mine.watch", "npc_snes_type": "python",
     "mg_levels_pc_type": "python", "pc_composite_pcs": "jacobi,python", "snes_composite_sneses": "newtonls,python",
     "telescope_pc_type": "shell", "pc_type_": "shell", "sub_pc_type": "PYTHON",
+    "KSP_TYPE": "Python", "mg_levels_1_sub_ksp_type": "python",
 }  # fmt: skip
 WRITES = {
     "snes_monitor": "ascii:victim", "ksp_monitor": "ascii:victim::append", "snes_view": "ascii:victim:ascii_info",
@@ -89,6 +91,10 @@ WRITES = {
     "ksp_converged_reason": "ascii:victim", "snes_converged_reason": "victim/x", "pc_view": "vtk", "mat_view": "draw",
     "ksp_monitor_solution": "saws", "snes_linesearch_monitor": "ascii:victim", "mat_mumps_icntl_2": 77,
     "mat_mumps_icntl_3": "78", "mat_mumps_icntl_22": 1, "mat_mumps_ooc_tmpdir": "here", "mat_mumps_icntl_1": 11,
+    "MAT_MUMPS_ICNTL_3": 9, "pc_asm_print_subdomains": "victim", "pc_gasm_print_subdomains": 5,
+    "snes_mf_noise_file": "victim", "mat_factor_dump_on_error": True, "pc_bddc_save": True,
+    "pc_nn_save_coarse_matrix": True, "pc_mg_dump_binary": True, "ksp_view_diagonal_scale": "xbinary",
+    "ksp_View_mat": "mybinary",
 }  # fmt: skip
 ELSEWHERE = {
     "options_file": "victim",
@@ -336,9 +342,33 @@ def pointing(**entries: Any) -> Callable[[Path], None]:
     return change
 
 
+def marked(flag: int, place: int, central: int) -> Callable[[Path], None]:
+    """Archives with another number in the heads of their files."""
+
+    def change(folder: Path) -> None:
+        data = bytearray((folder / "checkpoint-a.npz").read_bytes())
+        for head, offset in ((b"PK\x03\x04", place), (b"PK\x01\x02", central)):
+            start = data.find(head)
+            while start >= 0:
+                data[start + offset] = flag
+                start = data.find(head, start + 4)
+        other_archive(bytes(data))(folder)
+
+    return change
+
+
+def headed(head: bytes) -> bytes:
+    """An archive with one array that begins so."""
+    whole = io.BytesIO()
+    with zipfile.ZipFile(whole, "w") as archive:
+        archive.writestr("header.npy", b"\x93NUMPY\x02\x00" + len(head).to_bytes(4, "little") + head)
+    return whole.getvalue()
+
+
 @pytest.mark.parametrize(
     "change",
-    [bomb, pickled, other_archive(b"no archive"), other_archive(empty_archive()), other_archive(b""),
+    [marked(1, 6, 8), marked(99, 8, 10), marked(14, 8, 10), other_archive(headed(b"(" * 9000 + b"\n")),
+     bomb, pickled, other_archive(b"no archive"), other_archive(empty_archive()), other_archive(b""),
      pointing(file="../run/checkpoint-a.npz"), pointing(file="/etc/passwd"), pointing(file="scene.toml"),
      pointing(sha256=0), pointing(number="1"), pointing(time=1), pointing(more=1),
      lambda folder: (folder / "checkpoint.json").write_text("[" * 10**5),
@@ -349,6 +379,36 @@ def test_another_archive_or_pointer_is_refused(change: Callable[[Path], None], f
     before = content(folder)
     refused("run", "--resume", folder, "--set", LONGER[0], "-q")
     assert content(folder) == before
+
+
+def test_a_field_without_end_in_a_history_is_refused(folder: Path) -> None:
+    text = (folder / "history.csv").read_text()
+    (folder / "history.csv").write_text(text.replace("\n", '\n"' + "a" * 200_000 + '",', 1))
+    assert "history.csv: field larger than" in refused("status", folder)
+
+
+@pytest.mark.parametrize(
+    "forge",
+    [lambda text: "".join(",".join(line.split(",")[:3]) + "\n" for line in text.splitlines()),
+     lambda text: text.replace("mean_stretch", "mine", 1),
+     lambda text: text.replace(text.splitlines()[2] + "\n", "", 1),
+     lambda text: text.replace("\n", "\n" + text.splitlines()[1] + "\n", 1)],
+    ids=["columns fewer", "columns others", "rows fewer", "rows more"],
+)  # fmt: skip
+def test_a_study_takes_no_history_that_is_not_its_scenes(forge: Callable[[str], str], folder: Path) -> None:
+    member = Member("run", Recording(folder).scene, folder)
+    assert member.is_complete()
+    (folder / "history.csv").write_text(forge((folder / "history.csv").read_text()))
+    with pytest.raises(SceneError, match="its history has other columns or rows than its scene asks for"):
+        member.is_complete()
+
+
+@pytest.mark.parametrize("by", [10**9, -5])
+def test_elements_of_nodes_that_are_not_there_are_refused(by: int, folder: Path) -> None:
+    with h5py.File(folder / "fields.vtkhdf", "r+") as file:
+        file["VTKHDF/Connectivity"][:] += by
+    with pytest.raises(RecordingError, match="nodes that are not there"):
+        _ = Recording(folder).elements
 
 
 # ---------------------------------------------------------------- fields
@@ -440,6 +500,60 @@ def test_a_folder_with_nothing_but_a_dead_lock_is_nobodys(tmp_path: Path) -> Non
     assert choose_folder(tmp_path / "out", "x") == tmp_path / "out"
     done = run("run", demo("cube"), "--set", "time.end=1", "-q", "-o", tmp_path / "out")
     assert done.returncode == 0, done.stderr
+
+
+# ---------------------------------------------------------------- the working folder, and what lies in it
+def test_the_working_folder_runs_nothing_and_sets_nothing(tmp_path: Path) -> None:
+    """Where a scene was unpacked there may be more: modules, and options of PETSc, dolfinx and FFCx."""
+    put_there = {
+        "numpy.py": "open('victim-of-module', 'w')",
+        ".petscrc": "-log_view ascii:victim-of-log\n-remodel_snes_view ascii:victim-of-view\n",
+        "petscrc": "-remodel_ksp_type python\n",
+        "dolfinx_jit_options.json": '{"cffi_libraries": ["mine"], "no JSON',
+        "ffcx_options.json": '{"scalar_type": "float32", "no JSON',
+    }
+    for name, text in put_there.items():
+        (tmp_path / name).write_text(text)
+    (tmp_path / "scene.toml").write_text(pulled_cube(1.0).to_toml())
+    command = [
+        sys.executable,
+        PROJECT / "bin" / "remodel-fenicsx",
+        "ensemble",
+        "scene.toml",
+        "--seeds",
+        "2",
+        "-o",
+        "out",
+    ]
+    own = {"PETSC_OPTIONS": "-remodel_snes_monitor ascii:the-users-own::append"}
+    done = subprocess.run([*command, "-q"], cwd=tmp_path, env=os.environ | own, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, ""), done.stderr
+    assert {path.name for path in tmp_path.iterdir()} == {*put_there, "scene.toml", "out", "the-users-own"}
+
+
+@pytest.mark.parametrize(
+    "study",
+    [
+        {"study": "../../x", "scene": "x", "runs": []},
+        {"study": "ensemble", "scene": "x", "runs": [".."]},
+        {"study": "ensemble", "scene": "x", "runs": ["/proc/self"]},
+        {"study": "ensemble", "scene": "x", "runs": ["a\x1b[31m"]},
+        {"study": "ensemble", "scene": "x", "runs": ["x" * 5000]},
+        {"study": {}, "scene": [], "runs": {"a": 1}},
+        {"study": "ensemble", "scene": "x", "runs": [str(number) for number in range(200_000)]},
+    ],
+    ids=["elsewhere", "above", "at the root", "control", "long", "tables", "many"],
+)
+def test_a_foreign_study_names_runs_of_its_own_folder(study: Any, tmp_path: Path) -> None:
+    """Before, 200,000 runs took the square of that."""
+    (tmp_path / "study.json").write_text(json.dumps(study))
+    assert "study.json: is damaged" in refused("status", tmp_path)
+
+
+def test_a_column_named_often_is_one_column() -> None:
+    """30,000 of them took minutes."""
+    scene = preset_scene("kuhl-holzapfel-2007", "cube").with_values({"output.columns": ["mean_stretch"] * 30_000})
+    assert scene.output.columns == ("mean_stretch",)
 
 
 # ---------------------------------------------------------------- without end
@@ -552,3 +666,14 @@ def test_no_step_after_the_end() -> None:
     with pytest.raises(RuntimeError, match="has been closed"):
         next(simulation.steps())
     simulation.close()
+
+
+def test_a_flipped_bit_in_the_places_of_values_is_noticed(folder: Path) -> None:
+    """Times and offsets have no check sum of their own: they follow from the numbers of nodes, elements and steps."""
+    for name, wrong in (("Steps/Values", -1.0), ("Steps/PointDataOffsets/displacement", 7)):
+        copy = folder.with_name("copy.vtkhdf")
+        shutil.copy(folder / "fields.vtkhdf", copy)
+        with h5py.File(copy, "r+") as file:
+            file[f"VTKHDF/{name}"][2] = wrong
+        with pytest.raises(ValueError, match="is damaged"):
+            check_file(copy)

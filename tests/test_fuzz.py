@@ -33,7 +33,7 @@ def runner() -> Iterator[Runner]:
 def hold(seed: int, runner: Runner) -> None:
     """Nothing that a reference or another run contradicts without a word."""
     record = evaluated(seed, runner)
-    assert record["outcome"] in HELD, f"./with-fenicsx benchmarks/fuzz --only {seed}: {said(record)}"
+    assert record["outcome"] in HELD, f"./with-fenicsx benchmarks/fuzz.py --only {seed}: {said(record)}"
 
 
 @pytest.mark.parametrize("seed", QUICK)

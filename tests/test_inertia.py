@@ -106,7 +106,7 @@ def test_a_compressed_cube_in_every_row(force: float, expected: list[int], caplo
     scene = pushed_cube(force, **COLUMN, **{"remodeling.law": "none"})
     rows = [step.row["negative_eigenvalues"] for step in run(scene)]
     assert rows == expected[1:]
-    said = warnings(caplog)
+    said = [line for line in warnings(caplog) if "unstable" in line]
     assert len(said) == len(set(expected)) - 1  # each change once
     if said:
         assert "time 2: the equilibrium is unstable" in said[0] and "1 negative eigenvalue of the tangent (0" in said[0]

@@ -432,7 +432,7 @@ def test_a_driver_that_is_not_finite_is_refused(points: Points) -> None:
 
 # ---------------------------------------------------------------- registries
 def test_registries_are_what_the_scene_offers() -> None:
-    assert set(COUPLINGS) == set(parameters.COUPLINGS)
+    assert set(COUPLINGS) == set(parameters.COUPLING_MEANINGS)
     assert FRAMES["material"].axes is material_frame and FRAMES["spatial"].axes is spatial_frame
     assert Remodeling().frame == "material"
 

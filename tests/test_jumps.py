@@ -13,7 +13,7 @@ from mpi4py import MPI
 from remodel_fenicsx import Scene, Simulation
 from remodel_fenicsx.evolution.equilibrium import Extension
 from remodel_fenicsx.evolution.newton import GuardedNewton, SolveFailure
-from remodel_fenicsx.evolution.parts import Change
+from remodel_fenicsx.evolution.parts import Change, StepFailure
 from remodel_fenicsx.evolution.refusals import diagnosed
 from remodel_fenicsx.scene import scene_from_dict
 
@@ -48,15 +48,32 @@ def warnings(caplog: pytest.LogCaptureFixture) -> list[str]:
     return [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING]
 
 
-@pytest.mark.parametrize("step", [0.25, 0.05])
-def test_a_limit_point_that_is_jumped_over_is_named(step: float, caplog: pytest.LogCaptureFixture) -> None:
+@pytest.mark.parametrize(("pressure", "step"), [(0.5, 0.25), (0.5, 0.05), (0.3624, 0.2)])
+def test_a_limit_point_that_is_jumped_over_is_named(
+    pressure: float, step: float, caplog: pytest.LogCaptureFixture
+) -> None:
     """From r = 1.6 to 3.4: where the way ends is the largest pressure, whatever the step."""
-    found, _ = radii(thin_tube(**{"time.step": step, "solver.relative_tolerance": 1e-9}))
+    found, _ = radii(thin_tube(pressure, **{"mesh.degree": 2, "time.step": step, "solver.relative_tolerance": 1e-9}))
     assert max(np.diff(found)) > 1.5
     (said,) = warnings(caplog)
     assert "limit point" in said and "a smaller time.step" in said
-    pressure = re.search(r"no way on beyond pressure ([0-9.]+)\.", said)
-    assert pressure is not None and float(pressure[1]) == pytest.approx(LARGEST, rel=5e-3)
+    place = re.search(r"no way on beyond pressure ([0-9.]+)\.", said)
+    assert place is not None and float(place[1]) == pytest.approx(LARGEST, rel=5e-3)
+
+
+def test_a_part_that_starts_where_the_tangent_is_singular_is_no_way_on(caplog: pytest.LogCaptureFixture) -> None:
+    """A part ends 0.2 % below the largest pressure, 0.2745: from there the first Newton step goes beyond the jump."""
+    cells = {"cells.initial": [0.2, 0.6, 0.7745966692414834], "mesh.degree": 2}
+    material = {"chain_density": 2.0e21, "contour_length": 1.594, "persistence_length": 1.365}
+    values = cells | {f"material.{name}": value for name, value in material.items()}
+    scene = thin_tube(0.4384, **values, **{"time.step": 0.2, "solver.relative_tolerance": 1e-9})
+    try:
+        radii(scene)
+    except StepFailure as failure:  # whether Newton's method finds something beyond is a matter of luck
+        assert failure.refusal.kind == "limit point"
+    else:
+        (said,) = warnings(caplog)
+        assert "limit point" in said and "beyond pressure 0.274" in said
 
 
 def test_a_refusal_beyond_it_is_no_matter_of_the_tolerance() -> None:

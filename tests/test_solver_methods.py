@@ -309,4 +309,4 @@ def test_what_the_bound_spares_is_admissible(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_the_registry_names_no_method_without_options() -> None:
-    assert set(linear.BY_METHOD) < set(METHODS)
+    assert set(linear.LINEAR_METHODS) < set(METHODS)

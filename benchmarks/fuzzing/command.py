@@ -1,4 +1,4 @@
-"""The command `benchmarks/fuzz`: which seeds are to run, on which cores, and what becomes of the results."""
+"""The command `benchmarks/fuzz.py`: which seeds are to run, on which cores, and what becomes of the results."""
 
 from __future__ import annotations
 

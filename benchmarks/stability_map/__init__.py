@@ -1,1 +1,1 @@
-"""The cases of `benchmarks/stability`, their references, and how they are run, judged and reported."""
+"""The cases of `benchmarks/stability.py`, their references, and how they are run, judged and reported."""

@@ -113,7 +113,7 @@ class Case:
     def command(self) -> str:
         """The smallest command that shows it."""
         if self.base is None or self.extended or self.counts:
-            return f"./with-fenicsx benchmarks/stability --only '{self.key}' --again"
+            return f"./with-fenicsx benchmarks/stability.py --only '{self.key}' --again"
         changes = " ".join(f"--set {toml_set(key, value)}" for key, value in self.base[1].items())
         return f"./with-fenicsx remodel-fenicsx run {self.base[0]} {changes}"
 
@@ -141,7 +141,7 @@ def with_values(scene: Mapping[str, Any], changes: Mapping[str, Any]) -> Values:
 
 
 Family = Callable[[], Iterator[Case]]
-MODULES = ("homogeneous", "bodies", "prescribed", "consistent", "variants")
+MODULES = ("homogeneous", "bodies", "prescribed", "consistent", "variants", "instant", "ray")
 FAMILIES: dict[str, Family] = {}
 """Generators of cases by name, in the order of the table."""
 

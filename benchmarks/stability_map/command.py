@@ -1,4 +1,4 @@
-"""The command `benchmarks/stability`: which cases are to run, on which cores, and what becomes of the results."""
+"""The command `benchmarks/stability.py`: which cases are to run, on which cores, and what becomes of the results."""
 
 from __future__ import annotations
 

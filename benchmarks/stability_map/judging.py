@@ -15,7 +15,9 @@ CAUSES = re.compile(
     r"limit point|bifurcation|kinematic locking|chain locking|chains? lock|solver tolerance|eigenvalue", re.I
 )
 UNSTABLE = re.compile(
-    r"negative eigenvalue|unstable equilibrium|equilibrium is unstable|no longer a minimum|lost (its )?stability", re.I
+    r"negative eigenvalue|unstable equilibrium|equilibrium is unstable|no longer a minimum|lost (its )?stability|"
+    r"would buckle",
+    re.I,
 )
 # warnings about what is asked for, units and compressible tissue, which say nothing about whether the answer is right
 ABOUT_THE_SCENE = re.compile(r"^(material|geometry|loads)\.|the tissue has lost up to")

@@ -153,7 +153,7 @@ def write(results: Path, cases: Mapping[str, Case], source: str, digest: Any) ->
     after = latest(read_records(results / f"{version}.jsonl"), cases, digest, source)
     before = latest([*read_records(BEFORE), *read_records(results / "0.1.0.jsonl")], cases)
     if not after:
-        print(f"nothing has been measured with {source}: run benchmarks/stability first")
+        print(f"nothing has been measured with {source}: run benchmarks/stability.py first")
         return 1
     draw(PROJECT / "docs" / "figures" / "stability.png", cases, {"0.1.0": before, f"{version}, now": after})
     words = {

@@ -147,7 +147,8 @@ def source_of(checkout: Path) -> str:
     package, key = checkout / "remodel_fenicsx", hashlib.sha256()
     for path in sorted(package.rglob("*.py")):
         key.update(f"{path.relative_to(package)}\n".encode() + path.read_bytes())
-    text = (package / "__init__.py").read_text(encoding="utf-8")
+    places = (package / "_version.py", package / "__init__.py")  # the latter in earlier versions
+    text = next(place for place in places if place.exists()).read_text(encoding="utf-8")
     version = text.partition('__version__ = "')[2].partition('"')[0]
     return f"{version}+{key.hexdigest()[:10]}"
 

@@ -9,13 +9,13 @@ import numpy as np
 import ufl
 from numpy.typing import NDArray
 
-from remodel_fenicsx.evolution import compiled_tensor
 from remodel_fenicsx.evolution.equilibrium import Equilibrium, Look
 from remodel_fenicsx.evolution.newton import GuardedNewton, Solution, SolveFailure, SolverSettings
 from remodel_fenicsx.evolution.parameters import at_points
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
 from remodel_fenicsx.evolution.state import State
 from remodel_fenicsx.fem.solver_methods import AUTO
+from remodel_fenicsx.kernels.tensor import condensed_points, tensor_kernels
 from remodel_fenicsx.tissue import condensed, spectral
 from remodel_fenicsx.tissue.cells import UnitCell, structure_tensor
 from remodel_fenicsx.tissue.energy import Tissue
@@ -67,7 +67,7 @@ class AnsweringCells:
         self.held: Flags = np.zeros(int(np.prod(self.quadrature.shape)), dtype=bool)
         self._kernels = None
         if remodeling.law.target is not None:
-            self._kernels = compiled_tensor.TensorKernels(state.comm)
+            self._kernels = tensor_kernels(state.comm)
         self._points: condensed.CondensedPoints
         self._jumps: Flags  # points where the law jumps
         self._lost: Flags  # those that have not been solved after so many iterations, where none may be held
@@ -100,7 +100,7 @@ class AnsweringCells:
             time,
             *self.remodeling.noise(F, tensor, residual),
         )
-        self._points = compiled_tensor.points(self._kernels, tissue, step)
+        self._points = condensed_points(self._kernels, tissue, step)
         self._accepted = self._points.kept(F, old, step.structure).driving_tensor
         self._jumps = jumps_by_rank(step)
         self.release()

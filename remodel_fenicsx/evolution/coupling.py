@@ -113,8 +113,7 @@ class Staggered:
         else:
             log.info("solving in parts: the remodeled cells have r >= L at the old displacement")
             self._solve_in_parts(time, old_loads, loads, work, failure=None)
-        if work.is_far:
-            self._whole(time, old_loads, loads).confirm(before, work)
+        self._whole(time, old_loads, loads).look_back(before, work)
         self.predictor.solved(step, before)
         self.state.settle_cells()
         self._residual = work.residual

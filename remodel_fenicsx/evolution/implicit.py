@@ -147,8 +147,7 @@ class Implicit:
             loading.set(loads)
             work.add(self.newton.solve())
             work.substeps += 1
-            if work.is_far:
-                change.confirm(before, work)
+            if change.look_back(before, work):
                 work.add(self.newton.solve())  # the cells that answer the unknowns: there is nothing else to do
         except SolveFailure as failure:
             work.add(failure)

@@ -313,5 +313,5 @@ def _krylov(snes: Any, kind: str) -> Iterator[None]:
 
 
 LinearMethod = Callable[[Equilibrium, Any, Any, ProblemOptions], EveryTangent]
-BY_METHOD: dict[str, LinearMethod] = {LAGGED: Lagged, EXACT: Exact, "iterative": Multigrid}
+LINEAR_METHODS: dict[str, LinearMethod] = {LAGGED: Lagged, EXACT: Exact, "iterative": Multigrid}
 """Methods (`fem.solver_methods.METHODS`) that want more than PETSc's options."""

@@ -13,7 +13,7 @@ from petsc4py import PETSc
 
 from remodel_fenicsx.evolution.equilibrium import Equilibrium, Look
 from remodel_fenicsx.evolution.limits import Limits
-from remodel_fenicsx.evolution.linear import BY_METHOD, EveryTangent
+from remodel_fenicsx.evolution.linear import LINEAR_METHODS, EveryTangent
 from remodel_fenicsx.evolution.parameters import stress_rounding
 from remodel_fenicsx.evolution.solution import Solution, SolveFailure, failure_text
 from remodel_fenicsx.fem.petsc_options import ProblemOptions
@@ -115,7 +115,7 @@ class GuardedNewton:
         self._most_iterations = snes.getTolerances()[3]  # the user's PETSc option may have changed it
         snes.setConvergenceTest(self._converged)
         self._snes: Any = snes
-        self._linear = BY_METHOD.get(self.method, EveryTangent)(equilibrium, snes, self._matrix, self._options)
+        self._linear = LINEAR_METHODS.get(self.method, EveryTangent)(equilibrium, snes, self._matrix, self._options)
 
     def close(self) -> None:
         """Free PETSc's objects and take the options out of its database; calling it again does nothing."""

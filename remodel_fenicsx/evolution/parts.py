@@ -13,14 +13,13 @@ from numpy.typing import NDArray
 from remodel_fenicsx.evolution.blend import KEPT_RESERVE
 from remodel_fenicsx.evolution.equilibrium import Extension
 from remodel_fenicsx.evolution.memory import Numbers
-from remodel_fenicsx.evolution.newton import GuardedNewton, Solution, SolveFailure
+from remodel_fenicsx.evolution.newton import NOTICEABLE, GuardedNewton, Solution, SolveFailure
 from remodel_fenicsx.evolution.refusals import BIFURCATION, LIMIT_POINT, SEVERAL_SOLUTIONS, Refusal, diagnosed
-from remodel_fenicsx.evolution.solution import FAR
 from remodel_fenicsx.fem.ranks import over_ranks
 
 SLOPE_SHARE = 1e-3  # of the bounded part: over it the slope of the residual is taken
 SAME = 1e-4  # of the way to them: by what two solutions may differ that are one; of other branches it is a good part
-FASTER = 8.0  # than the part before: a way that comes to a limit point is up to 3 times as fast in its last equal part
+FASTER = 4.0  # than the part before: a way that comes to a limit point is up to 3 times as fast in its last equal part
 WAYS_END = (LIMIT_POINT.kind, BIFURCATION.kind)  # refusals for which no smaller step helps
 PROOF = 8  # halvings without which a jump is not told from a step that is only too large
 MOST_JUMPS = 3  # that are looked into in a run, each by some 25 solves: a body that falls apart jumps in every step
@@ -193,6 +192,16 @@ class Change:
         unknown[:] = before
         return bound
 
+    def look_back(self, before: NDArray[np.float64], work: Work) -> bool:
+        """After a step: whether it has ended far from its tangent, or far from the step before, and was looked into."""
+        unknown, last = self.newton.unknown.x.array, self._jumps["moved"]
+        moved, least = self._size(unknown - before), NOTICEABLE * self.newton.equilibrium.state.loading.domain.size
+        is_far = work.is_far or (last > 0.0 and moved > max(least, FASTER * last))
+        if is_far:
+            self.confirm(before, work)
+        self._jumps["moved"] = self._size(unknown - before)
+        return is_far
+
     def confirm(self, before: NDArray[np.float64], work: Work) -> None:
         """Go the way again in parts, from the unknowns before it, where the whole was solved far from its tangent.
 
@@ -229,8 +238,8 @@ class Change:
 
     def _is_far(self, solution: Solution, before: NDArray[np.float64], part: float) -> bool:
         """Whether a part ends far from where its tangent, or the part before, points to."""
-        if solution.reach > FAR or not solution.reach or self._direction is None:
-            return solution.reach > FAR
+        if solution.is_far or not solution.reach or self._direction is None:
+            return solution.is_far
         return self._size(self.newton.unknown.x.array - before) > FASTER * part * self._size(self._direction)
 
     def _size(self, change: NDArray[np.float64]) -> float:
@@ -244,7 +253,7 @@ class Change:
 
     @property
     def _jumps(self) -> Numbers:
-        return Numbers(self.newton.equilibrium.state, "jumps", {"found": 0})
+        return Numbers(self.newton.equilibrium.state, "jumps", {"found": 0, "moved": 0})
 
     def _jumped(self, solved: NDArray[np.float64], refusal: Refusal) -> None:
         """Say that there is no way to what was solved; unknowns and loads are those where the way ends."""
@@ -262,7 +271,8 @@ class Change:
         if part / 2 < self._smallest:
             text = failure_text(self.time, self.stage, done, failure)
             self.set_fraction(done)  # the last state that was solved
-            refusal = self.refusal or diagnosed(self.newton, failure, self._direction)
+            found = diagnosed(self.newton, failure, self._direction)
+            refusal = found if found.kind or self.refusal is None else self.refusal
             raise StepFailure(self.time, text, refusal) from failure
         log.debug("%s: %s; next part %g", self.stage, failure.reason, part / 2)
         return part / 2

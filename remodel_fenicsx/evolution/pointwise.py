@@ -9,9 +9,9 @@ import numpy as np
 import ufl
 from numpy.typing import NDArray
 
-from remodel_fenicsx.evolution.compiled_tensor import with_kernels
 from remodel_fenicsx.evolution.state import State
 from remodel_fenicsx.fem import coefficients
+from remodel_fenicsx.kernels.tensor import with_kernels
 from remodel_fenicsx.tissue.cells import UnitCell
 from remodel_fenicsx.tissue.energy import Stresses, Tissue
 from remodel_fenicsx.tissue.mandel import MANDEL

@@ -10,12 +10,12 @@ import ufl
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from remodel_fenicsx.evolution.compiled_tensor import TensorKernels, with_kernels
 from remodel_fenicsx.evolution.parameters import Parameters, on_mesh, stress_rounding
 from remodel_fenicsx.evolution.pointwise import PointStresses
 from remodel_fenicsx.evolution.state import State
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.ranks import over_ranks
+from remodel_fenicsx.kernels.tensor import tensor_kernels, with_kernels
 from remodel_fenicsx.tissue import spectral
 from remodel_fenicsx.tissue.cells import UnitCell, structure_tensor
 from remodel_fenicsx.tissue.drivers import DRIVERS, FRAMES, carried_axes
@@ -130,7 +130,7 @@ class RemodelingPass:
             self.settings.kappa,
             spectral.PAIRINGS[self.settings.pairing],
             self.settings.rotation_time,
-            self.kernels.twins,
+            self.kernels,
             rounding,
         )
 
@@ -195,7 +195,8 @@ class RemodelingPass:
         """What the structure tensor tends to in the present state; of laws that have one."""
         drive, target = self.drive(residual), self.law.target
         assert target is not None
-        return TensorKernels(self.state.comm).target(drive) if target is tensor_target else target(drive)
+        kernels = tensor_kernels(self.state.comm) if target is tensor_target else None
+        return target(drive) if kernels is None else kernels.target(drive)
 
     def followed(self, target: Target, duration: float, cells: UnitCell | None = None) -> UnitCell:
         """Cells of all points in one row, the present or others, after a time with this target. Changes nothing."""

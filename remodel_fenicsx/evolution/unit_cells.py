@@ -7,8 +7,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from remodel_fenicsx.evolution.compiled import PointKernels
 from remodel_fenicsx.fem.quadrature import Quadrature
+from remodel_fenicsx.kernels.points import PointKernels, point_kernels
 from remodel_fenicsx.tissue.cells import CellSettings, UnitCell, initial_axes, initial_dimensions
 
 Array = NDArray[np.float64]
@@ -52,8 +52,8 @@ class CellField:
 
     @cached_property
     def kernels(self) -> PointKernels:
-        """The compiled functions of a pass. Collective, the first time."""
-        return PointKernels(self.quadrature.mesh.comm)
+        """What a pass computes at points. Collective, the first time."""
+        return point_kernels(self.quadrature.mesh.comm)
 
     def structure_tensor(self) -> Array:
         """A = sum_I l_I^2 n_I (x) n_I, shape (cells, points, 3, 3), in squared link lengths. Collective at first."""

@@ -23,7 +23,9 @@ from typing import IO, Any
 
 import cffi
 import dolfinx.fem
+import dolfinx.jit
 import ffcx.codegeneration.jit
+import ffcx.options
 from mpi4py import MPI
 from ufl.classes import Label
 from ufl.corealg.map_dag import map_expr_dag
@@ -46,7 +48,7 @@ COMPILER_FLAGS = [
 ]  # fmt: skip
 
 # of our own C functions: no sum is taken in another order than it is written in
-LIBRARY_FLAGS = ["-std=c17", "-O3", "-g0", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-w"]
+LIBRARY_FLAGS = ["-std=c17", "-O3", "-g0", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-Wall", "-Wextra"]
 
 # By number of arguments: what a form is, and the seconds that it takes (the energy here, hexahedra, one core)
 _KINDS = {0: ("an integral", 1), 1: ("the residual", 1), 2: ("the tangent", 5)}
@@ -85,6 +87,24 @@ def cache_folder() -> Path:
         raise PermissionError(f"{other}: of another user; set TMPDIR to a folder of your own")
     log.warning("cannot write to %s: forms are compiled into %s", folder, other)
     return other / name
+
+
+def _read_users_options() -> None:
+    """Let dolfinx and FFCx read the options of the user's own folder, once, and none of the working folder.
+
+    That may be somebody else's; its files would choose libraries to load and change numbers.
+    """
+    here = os.open(".", os.O_RDONLY)
+    os.chdir("/")
+    try:
+        dolfinx.jit.get_options()
+        ffcx.options.get_options()
+    finally:
+        os.fchdir(here)
+        os.close(here)
+
+
+_read_users_options()
 
 
 def jit_options() -> dict[str, Any]:

@@ -120,12 +120,14 @@ _SOLVERS = re.compile(
 )  # also those of a solver's inner solvers: mg_levels_ksp_type
 _CODE = re.compile(r"python|shell", re.IGNORECASE)
 _PLAIN = re.compile(r"[A-Za-z0-9_.,+-]*")  # names, numbers and lists of them: no path, no "ascii:FILE"
-# PETSc's PetscViewerType: as a value of any monitor or view each of them opens a file, a socket or a window
-_VIEWERS = frozenset(
+# PETSc's PetscViewerType: as the end of a value of any monitor or view each opens a file, a socket or a window
+_VIEWERS = tuple(
     "adios ascii binary cgns draw exodusii glvis hdf5 mathematica matlab pyvista saws socket string vtk vu".split()
 )
 # of MUMPS: units of its messages (each a file fort.N but for 0 and 6, which it has), factors kept on the disk
-_MUMPS_FILES = re.compile(r"mat_mumps_(?:icntl_(?:1|2|3|22)|ooc_\w+)$")
+_MUMPS_FILES = re.compile(r"mat_mumps_(?:icntl_(?:1|2|3|22)|ooc_\w+)$", re.IGNORECASE)
+_FILES = re.compile(r"_(?:dump|save|file)(?:_|$)", re.IGNORECASE)
+_FILE_OR_TERMINAL = re.compile(r"_print_subdomains$", re.IGNORECASE)  # a value is the name of a file
 
 
 def fault_of_option(name: str, value: str | float | bool) -> str | None:
@@ -141,8 +143,8 @@ def fault_of_option(name: str, value: str | float | bool) -> str | None:
         return "not an option of a solver; allowed are snes_..., ksp_..., pc_... and mat_..."
     if _CODE.search(name) or any(map(_CODE.search, words)):
         return "would run code of its own; allowed are PETSc's compiled solvers"
-    if _MUMPS_FILES.search(name):
+    if _MUMPS_FILES.search(name) or _FILES.search(name) or (_FILE_OR_TERMINAL.search(name) and value is not True):
         return "would write files; allowed are options that write none"
-    if isinstance(value, str) and (not _PLAIN.fullmatch(value) or _VIEWERS.intersection(words)):
+    if isinstance(value, str) and (not _PLAIN.fullmatch(value) or any(word.endswith(_VIEWERS) for word in words)):
         return "names a file or a viewer; allowed are names, numbers, true (then PETSc prints) and false"
     return None

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
-import remodel_fenicsx
+from remodel_fenicsx._version import __version__
 from remodel_fenicsx.paper.errors import FigureError
 from remodel_fenicsx.system.regular_files import write_whole
 
@@ -85,7 +85,7 @@ class Page:
         made_with = f"{made_with}; matplotlib {matplotlib.__version__}"
         if self.stamp:
             figure.text(0.004, 0.004, made_with, fontsize=4.5, color="0.55", ha="left", va="bottom")
-        made_by = f"{MARK} {remodel_fenicsx.__version__}"
+        made_by = f"{MARK} {__version__}"
         common = {"Title": self.title, "Creator": made_by}
         notes: dict[str, dict[str, Any]] = {
             "png": {"Software": made_by, "Title": self.title, "Description": self.caption, "Source": made_with,
@@ -117,7 +117,7 @@ class Page:
         """Write NAME.csv or NAME-PART.csv: notes as comments, then the columns, all of one length."""
         names, values = list(columns), [np.asarray(column) for column in columns.values()]
         text = io.StringIO()
-        for note in (f"{MARK} {remodel_fenicsx.__version__}: {self.name}", *notes):
+        for note in (f"{MARK} {__version__}: {self.name}", *notes):
             text.write(f"# {note}\n")
         writer = csv.writer(text, lineterminator="\n")
         writer.writerow(names)

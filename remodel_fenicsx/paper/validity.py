@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-import remodel_fenicsx
 from remodel_fenicsx.results.recording import Recording, RecordingError
 from remodel_fenicsx.scene.scene import Scene, SceneError
 
@@ -59,11 +58,11 @@ def library_versions() -> dict[str, str]:
 # ---------------------------------------------------------------- the source
 
 
-def source_fingerprint(package: Path = Path(remodel_fenicsx.__file__).parent) -> str:
-    """Hash of all source that a run imports, whatever its files are called and wherever they lie.
+def source_fingerprint(package: Path = Path(__file__).parents[1]) -> str:
+    """Hash of all source that a run imports, whatever its files are called and wherever they lie, and of all C.
 
-    Comments, docstrings, layout and the order of imports do not change it, nor does moving a module. What a module
-    imports from the package counts by the source that it comes from, not by its path.
+    Comments, docstrings, layout and the order of imports of Python do not change it, nor does moving a module. What a
+    module imports from the package counts by the source that it comes from, not by its path.
     """
     read = _imported(package)
     bodies = {name: body for name, (_, body) in read.items()}
@@ -76,6 +75,7 @@ def source_fingerprint(package: Path = Path(remodel_fenicsx.__file__).parent) ->
             else:  # what stands in one, or a library
                 taken.add((bodies.get(source, source), part, alias))
         whole.append(_hash(repr((body, sorted(taken)))))
+    whole += [_hash(path.read_text(encoding="utf-8")) for path in package.rglob("*.[ch]")]
     return _hash(repr(sorted(set(whole))))
 
 

@@ -12,6 +12,7 @@ import io
 import json
 import logging
 import math
+import tokenize
 import zipfile
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -197,8 +198,9 @@ def _read(path: Path, generation: Generation) -> Checkpoint:
         EOFError,
         OSError,
         MemoryError,
-        RecursionError,
-        NotImplementedError,
+        RuntimeError,  # encrypted, of an unknown method, too deep
+        SyntaxError,  # a header that is no literal
+        tokenize.TokenError,
     ) as error:
         raise CheckpointError(f"{path}: is of another kind than the checkpoints of this version") from error
     except zipfile.BadZipFile as error:

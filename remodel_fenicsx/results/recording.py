@@ -170,7 +170,10 @@ class Recording:
         """
         with self._fields_file() as root:
             count = int(root["NumberOfCells"][0])
-            return np.asarray(root["Connectivity"][:], dtype=np.int64).reshape(count, -1)
+            numbers = np.asarray(root["Connectivity"][:], dtype=np.int64).reshape(count, -1)
+            if not np.isin(numbers, np.arange(len(root["Points"]))).all():
+                raise ValueError("elements have nodes that are not there")
+            return numbers
 
     def fields(self, time: float) -> dict[str, Array]:
         """The fields at a recorded time by name: at nodes, (nodes, ...), and means over elements, (elements, ...).
@@ -239,7 +242,10 @@ def read_history(folder: str | os.PathLike[str]) -> HistoryColumns:
         return HistoryColumns(time=np.zeros(0))
     if not text.endswith("\n"):
         raise RecordingError(f"{path}: ends in the middle of a row")
-    names, *rows = csv.reader(text.splitlines())
+    try:
+        names, *rows = csv.reader(text.splitlines())
+    except csv.Error as error:
+        raise RecordingError(f"{path}: {error}") from error
     if "time" not in names:
         raise RecordingError(f"{path}: is not the history of a run, it has no column 'time'")
     for number, row in enumerate(rows, start=2):

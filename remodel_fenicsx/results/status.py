@@ -6,6 +6,7 @@ import json
 import os
 import re
 import time as clock
+from collections import Counter
 from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
@@ -24,11 +25,12 @@ from remodel_fenicsx.results.recording import (
     read_history,
 )
 from remodel_fenicsx.results.run_lock import lock_holder
-from remodel_fenicsx.schema.tables import printable
 from remodel_fenicsx.schema.times import same_time
+from remodel_fenicsx.system.arguments import MOST
 from remodel_fenicsx.system.regular_files import ForeignFileError, read_regular
 from remodel_fenicsx.system.terminal import duration
 
+_NAME = re.compile(r"\w[\w.+ -]{0,199}")  # as scenes have: of one file, in no folder elsewhere
 LARGEST_STUDY = 10**7  # bytes: ten thousand names of runs
 RECENT = 20  # steps whose mean is the rate
 BEGUN, FAILED, STOPPED = "scene ", "failed: ", "ended: "  # how lines of run.log on a run's beginning and end begin
@@ -103,11 +105,15 @@ def _of_study(folder: Path) -> list[str]:
     """How many of its runs are where, which have failed and why, and where the answer is."""
     try:
         study = json.loads(read_regular(folder / STUDY, LARGEST_STUDY))
-        name, scene, *runs = (printable(str(text)) for text in (study["study"], study["scene"], *study["runs"]))
+        name, scene, runs = study["study"], study["scene"], study["runs"]
+        if not all(isinstance(text, str) and _NAME.fullmatch(text) for text in (name, scene, *runs)):
+            raise ValueError("names are not those of files")
+        if len(runs) > MOST:
+            raise ValueError(f"more than {MOST} runs")
     except (ValueError, KeyError, TypeError, RecursionError, ForeignFileError) as error:
         raise RecordingError(f"{folder / STUDY}: is damaged: {error}") from error
     states = {run: _state(folder / run) for run in runs}
-    counted = {state: sum(each == state for each, _ in states.values()) for state, _ in states.values()}
+    counted = Counter(state for state, _ in states.values())
     lines = [
         f"{folder}: {name} of {scene}, {len(runs)} runs: {', '.join(f'{n} {state}' for state, n in counted.items())}"
     ]

@@ -22,7 +22,7 @@ from remodel_fenicsx.tissue.repulsion import REPULSIONS
 from remodel_fenicsx.tissue.spectral import PAIRINGS
 from remodel_fenicsx.schema.units import NUMBER_DENSITY, STRESS, TEMPERATURE
 
-COUPLINGS = {
+COUPLING_MEANINGS = {
     "staggered": "solve with the cells of the step before, then remodel once",
     "relaxed": "the same with a share, relaxation_factor, of what the pass changes: half of it is stable for every "
     "driver and frame but under weak loads, where 'staggered' over-corrects with 'pk2' and 'finger'",
@@ -206,9 +206,9 @@ class Remodeling(Table):
         "cross, the cell turns by 90 degrees at once), 'continuous' by axis (each principal direction goes on from the "
         "axis that it overlaps most). The law 'rotation' does not ask.",
     )
-    coupling: Annotated[str, one_of(COUPLINGS)] = Field(
+    coupling: Annotated[str, one_of(COUPLING_MEANINGS)] = Field(
         default="staggered",
-        description="; ".join(f"{name!r}: {text}" for name, text in COUPLINGS.items())
+        description="; ".join(f"{name!r}: {text}" for name, text in COUPLING_MEANINGS.items())
         + ". Where neither scene nor preset says it: 'extrapolated' with the law 'tensor'.",
     )
     relaxation_factor: float = Field(

@@ -317,7 +317,7 @@ def _fields(value: Any) -> Any:
 def _columns(value: Any) -> Any:
     if not isinstance(value, (list, tuple)) or not all(isinstance(name, str) for name in value):
         raise fault("must be a list of names of columns")
-    return tuple(value)
+    return tuple(dict.fromkeys(value))
 
 
 def _times(value: Any) -> Any:

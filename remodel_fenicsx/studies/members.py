@@ -13,6 +13,9 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
+from remodel_fenicsx.body.columns import columns_of
 from remodel_fenicsx.results.recording import (
     HISTORY,
     SCENE,
@@ -86,7 +89,7 @@ class Member:
         Raises
         ------
         SceneError
-            If the folder holds another scene.
+            If the folder holds another scene, or a history that is not the scene's.
         """
         if not (self.folder / SCENE).exists() or not (self.folder / HISTORY).exists():
             return False
@@ -94,9 +97,22 @@ class Member:
         if recording.scene != self.scene:
             raise SceneError(f"{self.folder}: holds a run of another scene; choose another folder with -o")
         with suppress(RecordingError):  # a last row that is not whole is done again
-            times = recording.history["time"]
-            return bool(len(times)) and same_time(float(times[-1]), self.scene.last_time)
+            history = recording.history
+            times = history["time"]
+            if not len(times) or not same_time(float(times[-1]), self.scene.last_time):
+                return False
+            if not self._is_of_the_scene(history):
+                raise SceneError(f"{self.folder}: its history has other columns or rows than its scene asks for")
+            return True
         return False
+
+    def _is_of_the_scene(self, history: HistoryColumns) -> bool:
+        """Whether somebody else's history has the columns and the rows of a run that has reached its end."""
+        scene, times = self.scene, history["time"]
+        names = [column.name for column in columns_of(scene.geometry, scene.output.columns, scene.loads)]
+        is_fixed = scene.time.tolerance is None and not scene.time.is_equilibrium
+        rows = scene.time.number_of_steps + 1 if is_fixed else len(times)
+        return set(names) <= set(history) and len(times) == rows and bool((np.diff(times) > 0).all())
 
     def history(self) -> HistoryColumns:
         """What it has recorded."""

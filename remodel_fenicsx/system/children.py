@@ -14,7 +14,6 @@ from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
-import remodel_fenicsx
 from remodel_fenicsx.system.regular_files import open_own
 
 PATIENCE = 30.0  # seconds
@@ -146,13 +145,13 @@ def cores() -> int:
 
 
 def _process(arguments: Sequence[str], **streams: Any) -> subprocess.Popen[Any]:
-    """remodel-fenicsx ARGUMENTS."""
-    command = [sys.executable, "-m", "remodel_fenicsx.cli", *arguments]
+    """remodel-fenicsx ARGUMENTS; -P: no module is taken from the working folder, which may be somebody else's."""
+    command = [sys.executable, "-P", "-m", "remodel_fenicsx.cli", *arguments]
     if shutil.which("setpriv"):  # the signal comes from now on; who was killed before is not the parent any more
         only_with_parent = ["sh", "-c", '[ "$PPID" = "$0" ] && exec "$@"', str(os.getpid())]
         command = ["setpriv", "--pdeathsig", signal.SIGTERM.name, *only_with_parent, *command]
     # this very package, wherever it was imported from; one thread each, as there are jobs for the cores
-    paths = [str(Path(remodel_fenicsx.__file__).parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])]
+    paths = [str(Path(__file__).parents[2]), *filter(None, [os.environ.get("PYTHONPATH")])]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"}
     return subprocess.Popen(command, env=environment, **streams)
 

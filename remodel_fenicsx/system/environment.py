@@ -11,10 +11,11 @@ import re
 import shutil
 from pathlib import Path
 
-import remodel_fenicsx
+from remodel_fenicsx._version import __version__
 from remodel_fenicsx.system.interrupts import take_back_signals
 
 OLDEST_DOLFINX = (0, 9)
+KERNELS = "REMODEL_FENICSX_KERNELS"  # what computes at points: C, or numpy for a debugger
 NEEDED = ("basix", "dolfinx", "gmsh", "h5py", "mpi4py", "petsc4py", "pint", "rich", "ufl")
 
 
@@ -26,17 +27,32 @@ def versions() -> dict[str, str]:
     from petsc4py import PETSc
 
     return {
-        "remodel_fenicsx": remodel_fenicsx.__version__,
+        "remodel_fenicsx": __version__,
         "dolfinx": dolfinx.__version__,
         "ufl": importlib.metadata.version("fenics-ufl"),
         "PETSc": ".".join(map(str, PETSc.Sys.getVersion())),
         "gmsh": gmsh_version(),
         "numpy": numpy.__version__,
+        "kernels": kernels(),
         "Python": platform.python_version(),
         "MPI": MPI.Get_library_version().split(",")[0].strip(),
         "BLAS": blas_library(),
         "system": platform.platform(),
     }
+
+
+def kernels() -> str:
+    """What computes at the points: "C", or "numpy" where REMODEL_FENICSX_KERNELS says so.
+
+    Raises
+    ------
+    ValueError
+        If it says anything else.
+    """
+    name = os.environ.get(KERNELS, "C")
+    if name not in ("C", "numpy"):
+        raise ValueError(f"{KERNELS} = {name!r}: allowed are 'C' and 'numpy'")
+    return name
 
 
 @functools.cache

@@ -68,14 +68,19 @@ class Paused(Exception):  # noqa: N818 - no error: somebody asked for it
 def take_back_signals() -> None:
     """Load MPI and PETSc, where nobody has yet, so that signals stay what Python has set.
 
-    A closed pipe is then a BrokenPipeError, and an ignored signal is ignored. While the libraries are loaded signals
+    A closed pipe is then a BrokenPipeError, and an ignored signal is ignored. PETSc reads no `.petscrc` of the
+    working folder. While the libraries are loaded signals
     wait: PETSc's handlers would abort the process, and UCX, below MPI, has one for SIGHUP that swallows it.
     """
     asked = {*SIGNALS, PAUSE}
     before = signal.pthread_sigmask(signal.SIG_BLOCK, asked)  # the libraries' threads inherit it, and never take one
     try:
         import mpi4py.MPI  # noqa: F401
-        import petsc4py.PETSc  # noqa: F401
+        import petsc4py
+
+        if _has_foreign_options():
+            petsc4py.init([sys.argv[0], "-skip_petscrc"])
+        import petsc4py.PETSc
 
         for number in _NOT_PETSCS if _is_main_thread() else ():
             handler = signal.getsignal(number)  # what Python remembers: it does not see what libraries put below
@@ -83,6 +88,12 @@ def take_back_signals() -> None:
                 signal.signal(number, handler)
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _has_foreign_options() -> bool:
+    """Whether PETSc would read options from a file of the working folder, which is not the user's home."""
+    home = Path.home()
+    return any(map(os.path.lexists, (".petscrc", "petscrc"))) and not (home.exists() and home.samefile("."))
 
 
 def _is_main_thread() -> bool:

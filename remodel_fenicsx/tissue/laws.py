@@ -8,10 +8,9 @@ the dimensions stay.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from types import MappingProxyType
-from typing import Any, NamedTuple, TypeVar, cast
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +20,6 @@ from remodel_fenicsx.tissue.cells import UnitCell, structure_tensor
 from remodel_fenicsx.tissue.drivers import Driver, Frame, carried_axes
 
 Array = NDArray[np.float64]
-Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 class Drive(NamedTuple):
@@ -47,8 +45,8 @@ class Drive(NamedTuple):
         Of `spectral.PAIRINGS`: principal values and axes, in the order in which they belong to the cell's dimensions.
     rotation_time
         Time in which the law `rotation` turns a small angle to 1/e of it.
-    twins
-        Compiled functions that stand for functions of `spectral`.
+    kernels
+        Whose `principal` and `positive_direction` are called: those of `spectral`, or of C (`kernels.points`).
     rounding
         The part of the threshold that is the rounding of a stress.
     """
@@ -63,7 +61,7 @@ class Drive(NamedTuple):
     kappa: float
     pairing: spectral.Pairing = spectral.principal
     rotation_time: float = 40.0
-    twins: Mapping[Callable[..., Any], Callable[..., Any]] = MappingProxyType({})
+    kernels: Any = spectral
     rounding: Array | float = 0.0
 
     @property
@@ -71,10 +69,6 @@ class Drive(NamedTuple):
         """Of `tensor_law.target`."""
         floor: Array | float = tensor_law.floor_above(self.threshold, self.rounding)
         return floor
-
-    def compiled(self, function: Function) -> Function:
-        """The twin of a function, or the function itself."""
-        return cast(Function, self.twins.get(function, function))
 
 
 def relaxed(old: UnitCell, new: UnitCell, factor: float) -> UnitCell:
@@ -150,7 +144,7 @@ def ranked(function: RankedFunction, has_limit: bool = False, of_absolute_time: 
 
     def update(cells: UnitCell, drive: Drive, time_old: float, time_new: float) -> UnitCell:
         values, axes = principal_directions(drive, cells.axes, drive.pairing)
-        direction, active = drive.compiled(spectral.positive_direction)(values, threshold=drive.threshold)
+        direction, active = drive.kernels.positive_direction(values, threshold=drive.threshold)
         target = np.reshape(drive.end_to_end_length, (-1, 1)) * direction
         dimensions = function(cells.dimensions, drive.initial_dimensions, target, drive.kappa, time_old, time_new)
         axes = framed(drive, axes, None if drive.pairing is spectral.principal else dimensions)
@@ -175,7 +169,8 @@ def principal_directions(drive: Drive, previous: Array, pairing: spectral.Pairin
     """Principal values and directions of the drive, in the space in which it lives; `previous`: the cells' axes."""
     if not drive.driver.material and drive.frame.carries_axes:
         previous = carried_axes(drive.deformation_gradient, previous)
-    return drive.compiled(pairing)(drive.tensor, previous, threshold=drive.threshold)
+    function: spectral.Pairing = drive.kernels.principal if pairing is spectral.principal else pairing
+    return function(drive.tensor, previous, threshold=drive.threshold)
 
 
 def framed(drive: Drive, axes: Array, dimensions: Array | None = None) -> Array:

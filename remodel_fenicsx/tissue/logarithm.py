@@ -21,14 +21,14 @@ from remodel_fenicsx.tissue.mandel import MANDEL
 Array = NDArray[np.float64]
 
 CLOSE = 1e-3
-"""Relative distance of three eigenvalues below which a series stands for a quotient of differences: the quotient loses
-eps / CLOSE, the series CLOSE^5."""
+"""Relative distance of two or three eigenvalues below which a series stands for a quotient of differences: the quotient
+loses eps / CLOSE, the series CLOSE^5."""
 
 
 def first_divided_difference(a: Array, b: Array) -> Array:
     """f[a, b] = (ln a - ln b)/(a - b) of positive numbers, 1/a where they agree: atanh(x)/x at x = (a - b)/(a + b)."""
     x = (a - b) / (a + b)
-    small = np.abs(x) < 1e-3
+    small = np.abs(x) < CLOSE
     series = 1 + x**2 / 3 + x**4 / 5
     quotient = np.arctanh(np.where(small, 0.5, x)) / np.where(small, 0.5, x)
     return 2 / (a + b) * np.where(small, series, quotient)

@@ -22,8 +22,13 @@ DECISIVE = 1e-3
 zero, up to rounding; any threshold far above rounding gives the same choice on every machine."""
 
 
+AGREEMENT = 1e-8
+"""Difference of two principal values, over the largest, up to which they are equal: about the root of eps. Their axes
+are then rounding to eps / AGREEMENT."""
+
+
 def principal(
-    tensors: npt.ArrayLike, previous: npt.ArrayLike, tolerance: float = 1e-8, threshold: npt.ArrayLike = 0.0
+    tensors: npt.ArrayLike, previous: npt.ArrayLike, tolerance: float = AGREEMENT, threshold: npt.ArrayLike = 0.0
 ) -> tuple[Array, Array]:
     """Return the principal values, descending, and the principal axes of symmetric tensors.
 
@@ -66,7 +71,7 @@ def principal(
 
 
 def continued(
-    tensors: npt.ArrayLike, previous: npt.ArrayLike, tolerance: float = 1e-8, threshold: npt.ArrayLike = 0.0
+    tensors: npt.ArrayLike, previous: npt.ArrayLike, tolerance: float = AGREEMENT, threshold: npt.ArrayLike = 0.0
 ) -> tuple[Array, Array]:
     """Return the principal values and axes of symmetric tensors in the order of the previous axes.
 

@@ -17,8 +17,9 @@ from remodel_fenicsx.tissue import mandel
 
 Array = NDArray[np.float64]
 
-COMPRESSION = 0.1
-"""How large a tension beside a compression must be to remodel: the switch is one half where n+ = COMPRESSION^2 n-."""
+COMPRESSION = 0.01
+"""Share of the squared compression that counts against the tension: the switch is one half where n+ = COMPRESSION n-,
+a tension of a tenth of the compression."""
 
 ABOVE_ROUNDING = 7000.0
 """Where the switch sets in, over the rounding of a principal value (1e-10 of the stiffness): wide enough that Newton's
@@ -92,7 +93,7 @@ def target(tensor: Array, floor: Array | float) -> Target:
     tension, compression = positive.sum(axis=1), (np.minimum(values, 0.0) ** 2).sum(axis=1)
     weights = positive / np.where(tension > 0, tension, 1.0)[:, None]
     direction = (vectors * weights[:, None, :]) @ np.swapaxes(vectors, 1, 2)
-    total = tension + COMPRESSION**2 * compression + (np.asarray(floor) / unit) ** 2
+    total = tension + COMPRESSION * compression + (np.asarray(floor) / unit) ** 2
     return Target(direction, tension / np.where(total > 0, total, 1.0))
 
 
@@ -131,9 +132,9 @@ def target_derivatives(tensor: Array, floor: Array | float) -> tuple[Array, Arra
         by_values[:, row, row] = np.where(both, v[:, i] + v[:, j], one) / some
     to_axes = mandel.congruence(vectors)
     direction = to_axes @ (by_values / unit[:, None, None]) @ np.swapaxes(to_axes, 1, 2)
-    against = COMPRESSION**2 * negative + (np.asarray(floor) / unit) ** 2
+    against = COMPRESSION * negative + (np.asarray(floor) / unit) ** 2
     total = positive + against
-    slope = 2 * (tension * against[:, None] - COMPRESSION**2 * positive[:, None] * compression)
+    slope = 2 * (tension * against[:, None] - COMPRESSION * positive[:, None] * compression)
     slope /= (np.where(total > 0, total, 1.0) ** 2 * unit)[:, None]
     share: Array = np.einsum("nab,nb->na", to_axes, mandel.on_diagonal(slope))
     return direction, share

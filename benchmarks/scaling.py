@@ -1,13 +1,13 @@
 #!/usr/bin/env python3
 """How time and memory grow with the body: the artery on finer meshes, on one rank and on two.
 
-    ./with-fenicsx benchmarks/scaling [--unknowns N]... [--ranks N]... [--steps 3] [--method auto]    # measures
-    ./with-fenicsx benchmarks/scaling --report       # docs/speed.md's table and cost model from what was measured
+    ./with-fenicsx benchmarks/scaling.py [--unknowns N]... [--ranks N]... [--steps 3] [--method auto]    # measures
+    ./with-fenicsx benchmarks/scaling.py --report       # docs/speed.md's table and cost model from what was measured
 
 Each case is a run of its own (the paper's tube, random cells, no fields, predictor on) with the mesh whose number of
-unknowns is nearest to N; its first load steps are solved. Results are lines of results/scaling.jsonl: wall and processor
-seconds of a step after the first, Newton and linear iterations, peak memory of all ranks, and what parts took. Cases that are
-there are measured again and replaced. Wall time says something on an idle machine only.
+unknowns is nearest to N; its first load steps are solved. Results are lines of results/scaling.jsonl: wall and
+processor seconds of a step after the first, Newton and linear iterations, peak memory of all ranks, and what parts
+took. Cases that are there are measured again and replaced. Wall time says something on an idle machine only.
 """
 
 from __future__ import annotations
@@ -122,7 +122,8 @@ def row(record: dict) -> str:
     )
 
 
-HEAD = """| unknowns | ranks | method | wall s a step | processor s | Newton its | linear its each | us per unknown and it | GB | kB per unknown |
+HEAD = """| unknowns | ranks | method | wall s a step | processor s | Newton its | linear its each | \
+us per unknown and it | GB | kB per unknown |
 |---|---|---|---|---|---|---|---|---|---|"""
 
 

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Where the time of the paper's artery goes: 150 steps, preset, random cells, recorded, on one core with a warm cache.
 
-    ./with-fenicsx benchmarks/artery [--steps N] [--set KEY=VALUE]...
+    ./with-fenicsx benchmarks/artery.py [--steps N] [--set KEY=VALUE]...
 
 Prints seconds and shares of tangent, residual, linear solve, guards, remodeling and record. PETSc's own event log times
 what happens inside SNES; the rest is timed by watchers between the others. A first run of one step warms the cache of

@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
 """What checkpoints cost: the paper's artery with them and without, in pairs in one process.
 
-    ./with-fenicsx benchmarks/checkpoints [--steps N] [--pairs N] [--every N] [--set KEY=VALUE]...
+    ./with-fenicsx benchmarks/checkpoints.py [--steps N] [--pairs N] [--every N] [--set KEY=VALUE]...
 
-Prints the ratio of processor times pair by pair, and what the checkpoints themselves took: share of the run, milliseconds
-and bytes of one. --every: steps between two; without it they are chosen by time, as in every run.
+Prints the ratio of processor times pair by pair, and what the checkpoints themselves took: share of the run,
+milliseconds and bytes of one. --every: steps between two; without it they are chosen by time, as in every run.
 """
 
 from __future__ import annotations

@@ -2,12 +2,13 @@
 """The paper's artery here and in FElupe: the same mesh, cells, loads, steps and tolerance, on one core in turns.
 
     pip install --no-deps --target peers felupe==11.3.0 tensortrax==0.29.0     # once, with any pip: pure Python
-    ./with-fenicsx benchmarks/peers peers [--steps 40] [--pairs 1] [--core 0] [--tolerance 1e-10] [--set KEY=VALUE]...
+    ./with-fenicsx benchmarks/peers.py peers [--steps 40] [--pairs 1] [--core 0] [--tolerance 1e-10]
+        [--set KEY=VALUE]...
 
-FElupe is a finite element library of Python for hyperelastic bodies; numpy and SciPy are the environment's for both. Ours
-is run as a user runs it (solver.method auto, predictor autoregressive, all fields recorded) and its record gives the other
-one mesh and cells: benchmarks/peer_felupe.py. What a run of one step costs is taken off both: imports, mesh, forms from the
-cache. Radii have to agree to 1e-3. `--set` changes ours.
+FElupe is a finite element library of Python for hyperelastic bodies; numpy and SciPy are the environment's for both.
+Ours is run as a user runs it (solver.method auto, predictor autoregressive, all fields recorded) and its record gives
+the other one mesh and cells: benchmarks/peer_felupe.py. What a run of one step costs is taken off both: imports,
+mesh, forms from the cache. Radii have to agree to 1e-3. `--set` changes ours.
 """
 
 from __future__ import annotations
@@ -106,8 +107,9 @@ def main() -> None:
             iterations = int(np.sum(recording.history["newton_iterations"]))
             difference = np.abs(ours - theirs).max()
             print(
-                f"{options.steps} steps: here {seconds:.1f} s, {iterations} iterations; FElupe {seconds_of_other:.1f} s, "
-                f"{int(found['iterations'])} iterations; ratio {seconds_of_other / seconds:.1f}; radii here {ours}, "
+                f"{options.steps} steps: here {seconds:.1f} s, {iterations} iterations; FElupe "
+                f"{seconds_of_other:.1f} s, {int(found['iterations'])} iterations; ratio "
+                f"{seconds_of_other / seconds:.1f}; radii here {ours}, "
                 f"there {theirs}; u differs by up to {np.abs(displacement - found['displacement']).max():.1e}",
                 flush=True,
             )

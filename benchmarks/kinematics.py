@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """What reduced kinematics save: processor time of the artery's steps for each of them, in one paired run.
 
-    ./with-fenicsx benchmarks/kinematics [--steps N] [--rounds N] [--without-full]
+    ./with-fenicsx benchmarks/kinematics.py [--steps N] [--rounds N] [--without-full]
 
 The preset's tube with isotropic cells, its ramp and a part of the hold. Only solving and remodeling count: no columns,
 no fields, no record; kernels are warm. The kinematics take turns, and the least time of each counts, so that what else

@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
 """Which law and coupling gives most for its processor time: error against time, and cost on the paper's artery.
 
-    ./with-fenicsx benchmarks/couplings [--steps N]     # docs/couplings.md and its picture; 15 minutes on an idle core
-    ./with-fenicsx benchmarks/couplings --page          # only the page, from what has been measured
+    ./with-fenicsx benchmarks/couplings.py [--steps N]  # docs/couplings.md and its picture; 15 minutes on an idle core
+    ./with-fenicsx benchmarks/couplings.py --page       # only the page, from what has been measured
 
 Error: one layer of the artery's elements along z to t = 40, with steps from 5 to 5/8; each law against its own limit.
 Cost: the whole artery, N steps (40) of all schemes in turn, so that a noisy machine is noisy for all of them.
@@ -21,7 +21,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from mpi4py import MPI
 
-from remodel_fenicsx import Scene, Simulation, read_scene
+from remodel_fenicsx import Simulation, read_scene
 from remodel_fenicsx.body import tube
 from remodel_fenicsx.paper.output import COLOURS, STYLE, Page, panel_letters, read_table
 
@@ -223,7 +223,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=40, help="of the cost on the whole artery")
     parser.add_argument("--page", action="store_true", help="measure nothing")
     options = parser.parse_args()
-    source = ["benchmarks/couplings"]
+    source = ["benchmarks/couplings.py"]
     if not options.page:
         for name, measured in (("couplings", errors()), ("couplings-cost", cost(options.steps))):
             rows = list(measured)

@@ -1,15 +1,15 @@
 #!/usr/bin/env python3
 """Error against time of the processor for every setting of the artery, one factor at a time, and the front of all.
 
-    ./with-fenicsx benchmarks/work_precision [--folder DIR] [--budget SECONDS] [--only PART...] [--jobs N] [--report]
+    ./with-fenicsx benchmarks/work_precision.py [--folder DIR] [--budget SECONDS] [--only PART...] [--jobs N] [--report]
 
-Parts: `artery`, the settings of `remodel-fenicsx trade` and the profiles on the paper's artery with isotropic cells, for
-the printed coupling, the implicit one and the consistent variant, against the one-dimensional solver of tests/reference
-with steps of 1/8 and 1/16 (1/2 and 1/4 for the law tensor), extrapolated; `end`, chosen steps against equal ones there,
-in turns; `paper`, the paper's own mesh there, at its points too; `whole`, the whole tube in three dimensions, up to 20
-minutes a run; `hold`, chosen steps against equal ones to t = 1000; `tendon`, the paper's with random cells; `seeds`, 32
-of it. Two hours of one core, most of it the whole tube and the seeds. Then makes docs/speed_and_accuracy.md and its
-pictures; --report makes them from what is there. What is recorded is used again.
+Parts: `artery`, the settings of `remodel-fenicsx trade` and the profiles on the paper's artery with isotropic cells,
+for the printed coupling, the implicit one and the consistent variant, against the one-dimensional solver of
+tests/reference with steps of 1/8 and 1/16 (1/2 and 1/4 for the law tensor), extrapolated; `end`, chosen steps against
+equal ones there, in turns; `paper`, the paper's own mesh there, at its points too; `whole`, the whole tube in three
+dimensions, up to 20 minutes a run; `hold`, chosen steps against equal ones to t = 1000; `tendon`, the paper's with
+random cells; `seeds`, 32 of it. Two hours of one core, most of it the whole tube and the seeds. Then makes
+docs/speed_and_accuracy.md and its pictures; --report makes them from what is there. What is recorded is used again.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from benchmarks.precision import end, hold, places, spread, tendon, whole
 from remodel_fenicsx.paper.output import COLOURS, STYLE, Page
-from remodel_fenicsx.results.profile import PROFILE, weights
+from remodel_fenicsx.body.profile import PROFILE, weights
 from remodel_fenicsx.scene.profiles import PROFILES
 from remodel_fenicsx.scene.scene import Scene, preset_scene, read_scene
 from remodel_fenicsx.schema.times import same_time
@@ -228,8 +228,9 @@ def report(folder: Path) -> None:
     made = ", ".join(f"{name} {version}" for name, version in versions().items() if name != "BLAS")
     text = (Path(__file__).with_name("work_precision.template.md")).read_text(encoding="utf-8")
     found_seeds = spread.recorded(read_scene(TENDON), folder / SEEDS)
-    parts = {"rows": "\n".join(rows), "whole": whole_rows(found), "hold": hold.rows(folder), "end": end.rows(folder), "tendon": tendon.rows(folder), "made": made,
-             "paper": paper_words(found), "places": places.words(folder), "seeds": spread.rows(found_seeds), "number": str(found_seeds.seeds)}  # fmt: skip
+    parts = {"rows": "\n".join(rows), "whole": whole_rows(found), "hold": hold.rows(folder), "end": end.rows(folder),
+             "tendon": tendon.rows(folder), "made": made, "paper": paper_words(found), "places": places.words(folder),
+             "seeds": spread.rows(found_seeds), "number": str(found_seeds.seeds)}  # fmt: skip
     for name, words in parts.items():
         text = text.replace(f"{{{name}}}", words)
     PAGE.write_text(text, encoding="utf-8")

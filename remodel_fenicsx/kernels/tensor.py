@@ -1,4 +1,4 @@
-"""The compiled twins of the law `tensor` and the repulsion `log`; what they leave open numpy solves (`tissue`)."""
+"""The law `tensor` and the repulsion `log` in C (tensor.c); what C leaves open numpy solves (`tissue`)."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from remodel_fenicsx.fem import jit
-from remodel_fenicsx.tissue import condensed, tensor_kernels
+from remodel_fenicsx.kernels.library import Library, in_numpy
+from remodel_fenicsx.tissue import condensed, logarithm, tensor_law
 from remodel_fenicsx.tissue.cells import UnitCell
 from remodel_fenicsx.tissue.chains import CHAINS
 from remodel_fenicsx.tissue.condensed import CondensedPoints
@@ -25,8 +25,22 @@ from remodel_fenicsx.tissue.tensor_law import Target
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-COMPILED_REPULSIONS = ("log", "length")  # in the order of the kernels, as the drivers in condensed.TENSORS
+COMPILED_REPULSIONS = ("log", "length")
 PARAMETERS = ("lame_lambda", "lame_mu", "network_modulus", "contour_length", "end_to_end_length")
+NUMBERS = {
+    **{
+        name.upper(): i
+        for names in (condensed.TENSORS, COMPILED_REPULSIONS, PARAMETERS)
+        for i, name in enumerate(names)
+    },
+    "PARAMETERS": len(PARAMETERS),
+    "ITERATIONS": condensed.ITERATIONS,
+    "HALVINGS": condensed.HALVINGS,
+    "TOLERANCE": condensed.TOLERANCE,
+    "CLOSE": logarithm.CLOSE,
+    "COMPRESSION": tensor_law.COMPRESSION,
+}
+"""What tensor.c takes from Python: the numbers of drivers, repulsions and parameters, and those that tune."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +57,7 @@ class CompiledSolution:
 
 
 class TensorKernels:
-    """Compiled functions on arrays of n points.
+    """Functions in C on arrays of n points.
 
     Parameters
     ----------
@@ -52,55 +66,46 @@ class TensorKernels:
     """
 
     def __init__(self, comm: MPI.Intracomm):
-        declarations, source = tensor_kernels.DECLARATIONS, tensor_kernels.SOURCE
-        module = jit.library(comm, declarations, source, "the law for the structure tensor", 5)
-        self.call, self._ffi = module.lib, module.ffi
+        self.call = Library(comm, "tensor.c", "the law for the structure tensor", 5, NUMBERS)
 
     def target(self, drive: Drive) -> Target:
         """`laws.tensor_target`."""
-        F, tensors = np.ascontiguousarray(drive.deformation_gradient), np.ascontiguousarray(drive.tensor)
+        F, tensors = drive.deformation_gradient, drive.tensor
         n, turned_back = len(F), not drive.driver.material
         if turned_back and drive.frame.tensor is not rotated_back:
-            turned_back, tensors = False, np.ascontiguousarray(drive.frame.tensor(F, tensors))
-        floor = np.ascontiguousarray(np.broadcast_to(np.asarray(drive.floor, np.float64), (n,)))
+            turned_back, tensors = False, drive.frame.tensor(F, tensors)
         direction, share = np.empty((n, 3, 3)), np.empty(n)
-        out = self.pointer(floor), self.pointer(direction), self.pointer(share)
-        self.call.target(n, self.pointer(F), self.pointer(tensors), turned_back, *out)
+        self.call("target", n, F, tensors, turned_back, np.broadcast_to(drive.floor, n), direction, share)
         return Target(direction, share)
 
     def log_sum(self, F: Array, cells: Sequence[UnitCell], end_to_end_length: Any) -> Array:
         """`repulsion.log_sum`."""
-        F, A, result = np.ascontiguousarray(F), np.ascontiguousarray(whole_structure_tensor(cells)), np.empty(len(F))
-        self.call.log_sum(len(F), self.pointer(F), self.pointer(A), self.pointer(result))
+        result = np.empty(len(F))
+        self.call("log_sum", len(F), F, whole_structure_tensor(cells), result)
         return result
 
     def log_derivatives(self, C: Array, A: Array, second: bool = True) -> tuple[Array, Array | None]:
         """`repulsion.log_derivatives`."""
         first, matrices = np.empty(C.shape), np.empty((len(C), 6, 6)) if second else None
-        out = self._ffi.NULL if matrices is None else self.pointer(matrices)
-        self.call.log_derivatives(len(C), self.pointer(C), self.pointer(A), self.pointer(first), out)
+        self.call("log_derivatives", len(C), C, A, first, matrices)
         return first, matrices
 
-    def pointer(self, values: NDArray[Any]) -> Any:
-        """To the numbers of an array."""
-        kind = "uint8_t[]" if values.dtype == np.uint8 else "double[]"
-        return self._ffi.from_buffer(kind, np.ascontiguousarray(values))
 
-    def pointers(self, arrays: list[Array]) -> Any:
-        """To several."""
-        return self._ffi.new("double *[]", [self.pointer(array) for array in arrays])
+def tensor_kernels(comm: MPI.Intracomm) -> TensorKernels | None:
+    """None where numpy is asked for. Collective."""
+    return None if in_numpy() else TensorKernels(comm)
 
 
 def with_kernels(tissue: Tissue, comm: MPI.Intracomm) -> Tissue:
-    """The tissue with its repulsion compiled, where it is `log`."""
-    if tissue.chain is None or tissue.repulsion is not REPULSIONS["log"]:
+    """The tissue with its repulsion in C, where it is `log`."""
+    if tissue.chain is None or tissue.repulsion is not REPULSIONS["log"] or in_numpy():
         return tissue
     kernels = TensorKernels(comm)
     return replace(tissue, repulsion=Repulsion(kernels.log_sum, kernels.log_derivatives))
 
 
-def points(kernels: TensorKernels | None, tissue: Tissue, step: StepOfCells) -> CondensedPoints:
-    """Tissue and step of n points: compiled, where the kernels know all of its parts."""
+def condensed_points(kernels: TensorKernels | None, tissue: Tissue, step: StepOfCells) -> CondensedPoints:
+    """Tissue and step of n points: in C, where that knows all of its parts."""
     known = (
         step.law is LAWS["tensor"]
         and step.driver in (DRIVERS[name] for name in condensed.TENSORS)
@@ -118,28 +123,25 @@ class CompiledPoints(CondensedPoints):
 
     kernels: TensorKernels
 
-    def _arguments(self) -> tuple[list[Any], list[Array]]:
-        """Cells at the start, parameters, and what else a kernel takes; the arrays that must live as long."""
+    @property
+    def _given(self) -> tuple[Any, ...]:
+        """Cells at the start, parameters, and what else C takes of tissue and step."""
         step, tissue = self.step, self.tissue
-        arrays = [np.ascontiguousarray(getattr(tissue, name), np.float64) for name in PARAMETERS]
         driver = next(i for i, name in enumerate(condensed.TENSORS) if step.driver is DRIVERS[name])
         repulsion = next(i for i, name in enumerate(COMPILED_REPULSIONS) if tissue.repulsion is REPULSIONS[name])
-        old, rate = np.ascontiguousarray(step.structure), step.kappa * (step.time_new - step.time_old)
-        pointers = self.kernels.pointer(old), self.kernels.pointers(arrays)
-        return [*pointers, step.floor, step.rounding, rate, driver, repulsion], [*arrays, old]
+        parameters = np.stack([getattr(tissue, name) for name in PARAMETERS])
+        rate = step.kappa * (step.time_new - step.time_old)
+        return step.structure, parameters, step.floor, step.rounding, rate, driver, repulsion
 
     def solve(self, F: Array, start: Array, left_out: Flags | None = None) -> Any:
         """As `CondensedPoints.solve`."""
         if left_out is not None and left_out.any():
             return super().solve(F, start, left_out)
-        n, pointer = len(F), self.kernels.pointer
-        F, start = np.ascontiguousarray(F), np.ascontiguousarray(start)
-        tensor, structure, stress = (np.empty((n, 3, 3)) for _ in range(3))
-        squared, flags = np.empty(n), np.empty(n, np.uint8)
-        arguments, _alive = self._arguments()
-        out = (pointer(values) for values in (tensor, structure, stress, squared, flags))
-        self.kernels.call.solve(n, pointer(F), pointer(start), *arguments, *out)
-        found = CompiledSolution(F, tensor, structure, stress, squared, flags.astype(bool))
+        n = len(F)
+        tensor, structure, stress = np.empty((3, n, 3, 3))
+        squared, converged = np.empty(n), np.empty(n, np.bool_)
+        self.kernels.call("solve", n, F, start, *self._given, tensor, structure, stress, squared, converged)
+        found = CompiledSolution(F, tensor, structure, stress, squared, converged)
         lost = np.flatnonzero(~found.converged)
         return self._completed(found, lost, start[lost]) if lost.size else found
 
@@ -153,10 +155,8 @@ class CompiledPoints(CondensedPoints):
         """As `CondensedPoints.tangent`."""
         if not isinstance(found, CompiledSolution):
             return super().tangent(found, held)
-        n, pointer, result = len(found.gradient), self.kernels.pointer, np.empty((len(found.gradient), 3, 3, 3, 3))
-        arguments, _alive = self._arguments()
-        gradient, tensor = pointer(found.gradient), pointer(found.driving_tensor)
-        self.kernels.call.tangent(n, gradient, tensor, *arguments, pointer(result))
+        n, result = len(found.gradient), np.empty((len(found.gradient), 3, 3, 3, 3))
+        self.kernels.call("tangent", n, found.gradient, found.driving_tensor, *self._given, result)
         if found.rest is not None:
             lost, rest = found.rest
             result[lost] = self.at(lost).tangent(rest, held[lost])

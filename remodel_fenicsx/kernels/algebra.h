@@ -1,11 +1,6 @@
-"""Tensors of one point in C: eigenvalues, Mandel matrices, ln C. For the kernels of `tensor_kernels`.
-
-The numpy functions that these stand for are named beside each.
-"""
-
-from __future__ import annotations
-
-ALGEBRA = r"""
+/* Tensors of one point: eigenvalues, Mandel matrices. */
+#ifndef ALGEBRA_H
+#define ALGEBRA_H
 #include <math.h>
 #include <stdint.h>
 #include <string.h>
@@ -161,92 +156,4 @@ static void eigen(tensor t, double *values, tensor vectors)
         }
     }
 }
-"""
-
-LOGARITHM = r"""
-/* logarithm.first_divided_difference. */
-static inline double first_difference(double a, double b)
-{
-    const double x = (a - b) / (a + b), square = x * x;
-    return 2 / (a + b) * (fabs(x) < 1e-3 ? 1 + square / 3 + square * square / 5 : atanh(x) / x);
-}
-
-/* logarithm.second_divided_difference of ascending numbers, from f[a, b] and f[b, c]. */
-static inline double second_difference(double a, double b, double c, double first, double last)
-{
-    if (!(c - a < 1e-3 * c)) return (last - first) / (c - a);
-    const double mean = (a + b + c) / 3, three[3] = {a / mean - 1, b / mean - 1, c / mean - 1};
-    double p2 = 0, p3 = 0, p4 = 0;
-    ALL(i) {
-        const double square = three[i] * three[i];
-        p2 += square, p3 += square * three[i], p4 += square * square;
-    }
-    return -(0.5 + p2 / 8 - p3 / 15 + p2 * p2 / 48 + p4 / 24) / (mean * mean);
-}
-
-/* logarithm.first_divided_differences. */
-static void first_differences(const double *c, tensor result)
-{
-    ALL(i) ALL(j) if (i <= j) result[i][j] = result[j][i] = i == j ? 1 / c[i] : first_difference(c[j], c[i]);
-}
-
-/* logarithm.second_derivative. */
-static void second_derivative(const double *c, tensor first, tensor A, matrix result)
-{
-    double f[3][3][3];
-    ALL(i) ALL(j) ALL(k) if (i <= j && j <= k) {
-        const double value = second_difference(c[i], c[j], c[k], first[i][j], first[j][k]);
-        f[i][j][k] = f[i][k][j] = f[j][i][k] = f[j][k][i] = f[k][i][j] = f[k][j][i] = value;
-    }
-    MANDEL(r) for (int s = r; s < 6; ++s) {
-        const int i = ROW[r], j = COLUMN[r];
-        double sum = 0;
-        for (int side = 0; side < 2; ++side) {
-            const int p = side ? COLUMN[s] : ROW[s], q = side ? ROW[s] : COLUMN[s];
-            if (q == j) sum += f[i][p][j] * A[i][p];
-            if (p == i) sum += f[i][q][j] * A[q][j];
-        }
-        result[r][s] = result[s][r] = FACTOR[r] * FACTOR[s] / 2 * sum;
-    }
-}
-
-/* repulsion.log_sum: A : ln C. */
-void log_sum(int64_t n, const double *F, const double *A, double *result)
-{
-    for (int64_t at = 0; at < n; ++at) {
-        tensor gradient, strain, basis;
-        double c[3];
-        memcpy(gradient, F + 9 * at, sizeof(tensor));
-        strain_of(gradient, strain);
-        eigen(strain, c, basis);
-        result[at] = 0;
-        ALL(k) {
-            double along = 0;
-            ALL(i) ALL(j) along += basis[i][k] * A[9 * at + 3 * i + j] * basis[j][k];
-            result[at] += log(c[k]) * along;
-        }
-    }
-}
-
-/* repulsion.log_derivatives; second may be null. */
-void log_derivatives(int64_t n, const double *C, const double *A, double *first, double *second)
-{
-    for (int64_t at = 0; at < n; ++at) {
-        tensor strain, cells, basis, inside, quotients, value;
-        double c[3];
-        memcpy(strain, C + 9 * at, sizeof(tensor)), memcpy(cells, A + 9 * at, sizeof(tensor));
-        eigen(strain, c, basis);
-        rotated(cells, basis, 0, inside);
-        first_differences(c, quotients);
-        ALL(i) ALL(j) value[i][j] = quotients[i][j] * inside[i][j];
-        rotated(value, basis, 1, strain);
-        memcpy(first + 9 * at, strain, sizeof(tensor));
-        if (!second) continue;
-        matrix derivative, turn, outside;
-        second_derivative(c, quotients, inside, derivative);
-        congruence(basis, turn);
-        turned(turn, derivative, outside);
-        memcpy(second + 36 * at, outside, sizeof(matrix));
-    }
-}
-"""
+#endif

@@ -1,28 +1,7 @@
-"""What a pass does at every point, in C: compiled like the forms (`fem.jit.library`), held against numpy by tests.
-
-Plain arrays in, plain arrays out; the functions of this package that they stand for are named beside each. Where a
-tensor does not decide (values that agree, signs that are weak) the kernels decide nothing: they mark the point, and
-`spectral` does it. Eight points go side by side, so that the compiler takes vector instructions.
-"""
-
-from __future__ import annotations
-
-DECLARATIONS = """
-int64_t principal(int64_t n, const double *tensors, const double *previous, double tolerance, const double *threshold,
-                  int64_t step, double decisive, double *values, double *axes, uint8_t *open);
-int64_t positive_direction(int64_t n, const double *values, const double *threshold, int64_t step, double rounding,
-                           double *direction, uint8_t *active);
-void without_noise(int64_t n, const double *tensors, const double *axes, const double *noise, int64_t step,
-                   double *steady);
-void stretches(int64_t n, const double *F, const double *dimensions, const double *axes, double *squared, double *sum);
-void parts(int64_t n, const double *both, double *F, double *driver);
-void structure(int64_t n, const double *dimensions, const double *axes, double *tensor);
-int64_t extension(int64_t n, const double *states, const double *length, double *stretch, double *smallest);
-int64_t may_turn(int64_t n, const double *before, const double *after, uint8_t *found);
-double room(int64_t n, const double *states, const double *stretch, const double *chain, double far);
-"""
-
-SOURCE = r"""
+/* What a pass and its limits compute at every point. Plain arrays in, plain arrays out; the Python functions that these
+   stand for are listed in kernels/__init__.py and named below. Where a tensor does not decide (values that agree, signs
+   that are weak) nothing is decided here: the point is marked, and spectral.py does it. Eight points go side by side, so
+   that the compiler takes vector instructions. */
 #include <math.h>
 #include <stdint.h>
 
@@ -105,7 +84,7 @@ static inline void cosine_of(lanes *unit, lanes *other, double *cosine)
 
 /* spectral.principal. open: 1 where it is left open, 2 where a number is not finite; returns how many there are. */
 int64_t principal(int64_t n, const double *tensors, const double *previous, double tolerance, const double *threshold,
-                  int64_t step, double decisive, double *values, double *axes, uint8_t *open)
+                  double decisive, double *values, double *axes, uint8_t *open)
 {
     int64_t count = 0;
     for (int64_t first = 0; first < n; first += W) {
@@ -160,7 +139,7 @@ int64_t principal(int64_t n, const double *tensors, const double *previous, doub
         for (int k = 0; k < W && first + k < n; ++k) {
             const int64_t at = first + k;
             const double size = scale[k], largest = fabs(a00[k]) > fabs(a22[k]) ? fabs(a00[k]) : fabs(a22[k]);
-            const double relative = tolerance * largest * size, equal = threshold[step * at];
+            const double relative = tolerance * largest * size, equal = threshold[at];
             /* what is within 1 % of a limit is left to the code that knows the limit */
             if (!bad[k] && !(size * gap[k] > 1.01 * (relative > equal ? relative : equal)
                              && weakest[k] > 1.01 * decisive && left <= DIAGONAL)) bad[k] = 1;
@@ -177,14 +156,14 @@ int64_t principal(int64_t n, const double *tensors, const double *previous, doub
 }
 
 /* spectral.positive_direction; returns how many points have a number that is not finite. */
-int64_t positive_direction(int64_t n, const double *values, const double *threshold, int64_t step, double rounding,
+int64_t positive_direction(int64_t n, const double *values, const double *threshold, double rounding,
                            double *direction, uint8_t *active)
 {
     int64_t count = 0;
     for (int64_t at = 0; at < n; ++at) {
         const double *v = values + 3 * at;
         const double a = fabs(v[0]), b = fabs(v[1]), c = fabs(v[2]), ab = a > b ? a : b, largest = ab > c ? ab : c;
-        const double least = rounding * largest > threshold[step * at] ? rounding * largest : threshold[step * at];
+        const double least = rounding * largest > threshold[at] ? rounding * largest : threshold[at];
         const double inverse = largest > 0.0 ? 1.0 / largest : 1.0;
         const double x = v[0] > least ? v[0] * inverse : 0.0, y = v[1] > least ? v[1] * inverse : 0.0;
         const double z = v[2] > least ? v[2] * inverse : 0.0, length = sqrt(x * x + y * y + z * z);
@@ -197,8 +176,7 @@ int64_t positive_direction(int64_t n, const double *values, const double *thresh
 }
 
 /* spectral.without_noise. */
-void without_noise(int64_t n, const double *tensors, const double *axes, const double *noise, int64_t step,
-                   double *steady)
+void without_noise(int64_t n, const double *tensors, const double *axes, const double *noise, double *steady)
 {
     for (int64_t at = 0; at < n; ++at) {
         const double *t = tensors + 9 * at;
@@ -219,7 +197,7 @@ void without_noise(int64_t n, const double *tensors, const double *axes, const d
             value[i] = f[i][0] * tf[i][0] + f[i][1] * tf[i][1] + f[i][2] * tf[i][2];
             across[i] = fabs(f[i][0] * tf[j][0] + f[i][1] * tf[j][1] + f[i][2] * tf[j][2]);
         }
-        const double limit = noise[step * at];
+        const double limit = noise[at];
         const int keep = across[0] <= limit && across[1] <= limit && across[2] <= limit;
         for (int i = 0; i < 3; ++i)
             for (int j = 0; j < 3; ++j)
@@ -321,4 +299,3 @@ double room(int64_t n, const double *states, const double *stretch, const double
     }
     return least;
 }
-"""

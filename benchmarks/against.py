@@ -1,13 +1,13 @@
 #!/usr/bin/env python3
 """Two states of this project on one scene, in pairs: processor time, and how far their results are apart.
 
-    ./with-fenicsx benchmarks/against COMMIT [--scene demos/artery.toml] [--steps N] [--pairs 3] [--core 0]
+    ./with-fenicsx benchmarks/against.py COMMIT [--scene demos/artery.toml] [--steps N] [--pairs 3] [--core 0]
         [--set KEY=VALUE]... [--set-here KEY=VALUE]... [--set-there KEY=VALUE]...
 
-COMMIT is a commit of this project, or a folder with a checkout of it. Each state takes its own file SCENE, all --set, and
-its own --set-here or --set-there (keys that were not there, or had other names then). Both run as a user runs them, recorded, on one core;
-they take turns, and what a run of one step costs is taken off: imports, the mesh, the forms from the cache. The ratio is
-what counts: it hardly depends on the machine, nor on what else runs there.
+COMMIT is a commit of this project, or a folder with a checkout of it. Each state takes its own file SCENE, all --set,
+and its own --set-here or --set-there (keys that were not there, or had other names then). Both run as a user runs
+them, recorded, on one core; they take turns, and what a run of one step costs is taken off: imports, the mesh, the
+forms from the cache. The ratio is what counts: it hardly depends on the machine, nor on what else runs there.
 """
 
 from __future__ import annotations
@@ -99,12 +99,11 @@ def main() -> None:
                 seconds[name].append(total - start)
                 rows[name] = history(whole)
     ratios = [here / there for here, there in zip(seconds["here"], seconds["there"], strict=True)]
-    print(
-        f"{options.scene}, {options.steps:g} units of time, against {options.commit}: processor seconds without the start"
-    )
+    print(f"{options.scene} to t = {options.steps:g}, against {options.commit}: processor seconds without the start")
     for name in ("there", "here"):
         print(
-            f"{name:6} {statistics.median(seconds[name]):8.2f} s ({min(seconds[name]):.2f} to {max(seconds[name]):.2f}), "
+            f"{name:6} {statistics.median(seconds[name]):8.2f} s "
+            f"({min(seconds[name]):.2f} to {max(seconds[name]):.2f}), "
             f"start {statistics.median(starts[name]):.2f} s, {iterations(rows[name])} Newton iterations"
         )
     print(f"ratio  {statistics.median(ratios):8.3f}   ({min(ratios):.3f} to {max(ratios):.3f})")

@@ -1,29 +1,94 @@
-"""The law `tensor` and the repulsion `log` at every point, in C: compiled like the forms, held against numpy by tests.
+/* The law `tensor` and the repulsion `log` at every point. Plain arrays in, plain arrays out; the Python functions that
+   these stand for are listed in kernels/__init__.py and named below. What is not solved here is marked, and numpy solves
+   it. Names in capitals that are not defined here are Python's: kernels/tensor.py writes them before the first line. */
+#include <float.h>
+#include "algebra.h"
 
-Plain arrays in, plain arrays out. The numpy functions that these stand for are named beside each: `network.stress`,
-`tensor_law.target`, `condensed.CondensedPoints`. What is not solved here is marked, and numpy solves it.
-"""
+/* logarithm.first_divided_difference. */
+static inline double first_difference(double a, double b)
+{
+    const double x = (a - b) / (a + b), square = x * x;
+    return 2 / (a + b) * (fabs(x) < CLOSE ? 1 + square / 3 + square * square / 5 : atanh(x) / x);
+}
 
-from __future__ import annotations
+/* logarithm.second_divided_difference of ascending numbers, from f[a, b] and f[b, c]. */
+static inline double second_difference(double a, double b, double c, double first, double last)
+{
+    if (!(c - a < CLOSE * c)) return (last - first) / (c - a);
+    const double mean = (a + b + c) / 3, three[3] = {a / mean - 1, b / mean - 1, c / mean - 1};
+    double p2 = 0, p3 = 0, p4 = 0;
+    ALL(i) {
+        const double square = three[i] * three[i];
+        p2 += square, p3 += square * three[i], p4 += square * square;
+    }
+    return -(0.5 + p2 / 8 - p3 / 15 + p2 * p2 / 48 + p4 / 24) / (mean * mean);
+}
 
-from remodel_fenicsx.tissue.tensor_algebra import ALGEBRA, LOGARITHM
+/* logarithm.first_divided_differences. */
+static void first_differences(const double *c, tensor result)
+{
+    ALL(i) ALL(j) if (i <= j) result[i][j] = result[j][i] = i == j ? 1 / c[i] : first_difference(c[j], c[i]);
+}
 
-DECLARATIONS = """
-void log_sum(int64_t n, const double *F, const double *A, double *result);
-void target(int64_t n, const double *F, const double *tensors, int turned_back, const double *floor, double *direction,
-            double *share);
-void log_derivatives(int64_t n, const double *C, const double *A, double *first, double *second);
-void solve(int64_t n, const double *F, const double *start, const double *old, const double *const *parameters,
-           double floor, double solved, double rate, int driver, int repulsion, double *tensor, double *structure,
-           double *stress, double *squared, uint8_t *converged);
-void tangent(int64_t n, const double *F, const double *tensor, const double *old, const double *const *parameters,
-             double floor, double solved, double rate, int driver, int repulsion, double *result);
-"""
+/* logarithm.second_derivative. */
+static void second_derivative(const double *c, tensor first, tensor A, matrix result)
+{
+    double f[3][3][3];
+    ALL(i) ALL(j) ALL(k) if (i <= j && j <= k) {
+        const double value = second_difference(c[i], c[j], c[k], first[i][j], first[j][k]);
+        f[i][j][k] = f[i][k][j] = f[j][i][k] = f[j][k][i] = f[k][i][j] = f[k][j][i] = value;
+    }
+    MANDEL(r) for (int s = r; s < 6; ++s) {
+        const int i = ROW[r], j = COLUMN[r];
+        double sum = 0;
+        for (int side = 0; side < 2; ++side) {
+            const int p = side ? COLUMN[s] : ROW[s], q = side ? ROW[s] : COLUMN[s];
+            if (q == j) sum += f[i][p][j] * A[i][p];
+            if (p == i) sum += f[i][q][j] * A[q][j];
+        }
+        result[r][s] = result[s][r] = FACTOR[r] * FACTOR[s] / 2 * sum;
+    }
+}
 
-POINT = r"""
-enum { CAUCHY, SECOND_PIOLA_KIRCHHOFF, RIGHT_CAUCHY_GREEN };
-enum { LOG, LENGTH };
-enum { LAMBDA, MU, MODULUS, CONTOUR_LENGTH, END_TO_END_LENGTH, PARAMETERS };
+/* repulsion.log_sum: A : ln C. */
+void log_sum(int64_t n, const double *F, const double *A, double *result)
+{
+    for (int64_t at = 0; at < n; ++at) {
+        tensor gradient, strain, basis;
+        double c[3];
+        memcpy(gradient, F + 9 * at, sizeof(tensor));
+        strain_of(gradient, strain);
+        eigen(strain, c, basis);
+        result[at] = 0;
+        ALL(k) {
+            double along = 0;
+            ALL(i) ALL(j) along += basis[i][k] * A[9 * at + 3 * i + j] * basis[j][k];
+            result[at] += log(c[k]) * along;
+        }
+    }
+}
+
+/* repulsion.log_derivatives; second may be null. */
+void log_derivatives(int64_t n, const double *C, const double *A, double *first, double *second)
+{
+    for (int64_t at = 0; at < n; ++at) {
+        tensor strain, cells, basis, inside, quotients, value;
+        double c[3];
+        memcpy(strain, C + 9 * at, sizeof(tensor)), memcpy(cells, A + 9 * at, sizeof(tensor));
+        eigen(strain, c, basis);
+        rotated(cells, basis, 0, inside);
+        first_differences(c, quotients);
+        ALL(i) ALL(j) value[i][j] = quotients[i][j] * inside[i][j];
+        rotated(value, basis, 1, strain);
+        memcpy(first + 9 * at, strain, sizeof(tensor));
+        if (!second) continue;
+        matrix derivative, turn, outside;
+        second_derivative(c, quotients, inside, derivative);
+        congruence(basis, turn);
+        turned(turn, derivative, outside);
+        memcpy(second + 36 * at, outside, sizeof(matrix));
+    }
+}
 
 typedef struct {               /* in the eigenbasis of C */
     tensor F, basis, old;      /* F and the basis in the global one; A at the start of the step */
@@ -38,7 +103,7 @@ typedef struct {
     int converged;
 } state;
 
-static void prepare(point *p, int64_t at, const double *F, const double *old, const double *const *parameters,
+static void prepare(point *p, int64_t n, int64_t at, const double *F, const double *old, const double *parameters,
                     double floor, double solved, double rate, int driver, int repulsion)
 {
     tensor C, global;
@@ -48,7 +113,7 @@ static void prepare(point *p, int64_t at, const double *F, const double *old, co
     rotated(global, p->basis, 0, p->old);
     ALL(i) p->u[i] = sqrt(p->c[i]);
     p->J = p->u[0] * p->u[1] * p->u[2];
-    for (int k = 0; k < PARAMETERS; ++k) p->parameter[k] = parameters[k][at];
+    for (int k = 0; k < PARAMETERS; ++k) p->parameter[k] = parameters[k * n + at];
     p->floor = floor, p->solved = solved, p->rate = rate, p->driver = driver, p->repulsion = repulsion;
 }
 
@@ -64,17 +129,18 @@ static inline double stiffness(double r, double L, double *slope)
 static void stress(point *p, state *s, matrix *by_cells, matrix *by_strain)
 {
     const double *q = p->parameter, L = q[CONTOUR_LENGTH], r0 = q[END_TO_END_LENGTH];
-    const double volumetric = q[LAMBDA] * log(p->J) - q[MU];
+    const double volumetric = q[LAME_LAMBDA] * log(p->J) - q[LAME_MU];
     double slope, ignored, squared = 0;
     ALL(i) squared += s->A[i][i] * p->c[i];
-    const double r = sqrt(squared), along = q[MODULUS] * stiffness(r, L, &slope);
-    const double against = q[MODULUS] * stiffness(r0, L, &ignored), steep = q[MODULUS] * slope / (2 * r);
+    const double r = sqrt(squared), along = q[NETWORK_MODULUS] * stiffness(r, L, &slope);
+    const double against = q[NETWORK_MODULUS] * stiffness(r0, L, &ignored);
+    const double steep = q[NETWORK_MODULUS] * slope / (2 * r);
     tensor quotients;
     if (p->repulsion == LOG) first_differences(p->c, quotients);
     else ALL(i) ALL(j) quotients[i][j] = r0 * r0 / squared;
     s->squared = squared;
     ALL(i) ALL(j) s->S[i][j] = (along - against * quotients[i][j]) * s->A[i][j];
-    ALL(i) s->S[i][i] += volumetric / p->c[i] + q[MU];
+    ALL(i) s->S[i][i] += volumetric / p->c[i] + q[LAME_MU];
     if (!by_cells) return;
     vector a;
     to_vector(s->A, a);
@@ -82,7 +148,7 @@ static void stress(point *p, state *s, matrix *by_cells, matrix *by_strain)
     MANDEL(i) MANDEL(j) {
         const double across = p->repulsion == LOG ? 0 : against * r0 * r0 / (squared * squared);
         const double second = p->repulsion == LOG ? -against * (*by_strain)[i][j] : across * a[i] * a[j];
-        const double matrix_part = i < 3 && j < 3 ? q[LAMBDA] / 2 / (p->c[i] * p->c[j]) : 0;
+        const double matrix_part = i < 3 && j < 3 ? q[LAME_LAMBDA] / 2 / (p->c[i] * p->c[j]) : 0;
         (*by_strain)[i][j] = matrix_part + steep * a[i] * a[j] + second;
         (*by_cells)[i][j] = j < 3 ? (steep + across) * a[i] * p->c[j] : 0;
     }
@@ -103,7 +169,7 @@ static double weights(const double *values, double floor, double *direction)
         direction[i] = value > 0 ? value * value : 0;
         tension += direction[i], compression += value < 0 ? value * value : 0;
     }
-    const double total = tension + 0.01 * compression + least * least;
+    const double total = tension + COMPRESSION * compression + least * least;
     ALL(i) direction[i] /= tension > 0 ? tension : 1;
     return tension / (total > 0 ? total : 1);
 }
@@ -169,13 +235,13 @@ static void cells_by_tensor(point *p, state *s, matrix result)
     ALL(i) ALL(j) by_values[i][j] = 2 * tension[j] / some * ((i == j) - tension[i] * tension[i] / some) / unit;
     for (int row = 3; row < 6; ++row) {
         const int i = ROW[row], j = COLUMN[row];
-        const double more = fmax(tension[i], tension[j]), apart = fmax(fabs(v[i] - v[j]), 1e-300);
+        const double more = fmax(tension[i], tension[j]), apart = fmax(fabs(v[i] - v[j]), DBL_MIN);
         by_values[row][row] = (v[i] > 0 && v[j] > 0 ? v[i] + v[j] : more * more / apart) / some / unit;
     }
     congruence(s->vectors, turn);
     turned(turn, by_values, result);
-    const double against = 0.01 * negative + least * least, sum = positive + against, total = sum > 0 ? sum : 1;
-    ALL(i) slope[i] = 2 * (tension[i] * against - 0.01 * positive * fmin(v[i], 0)) / (total * total * unit);
+    const double against = COMPRESSION * negative + least * least, sum = positive + against, total = sum > 0 ? sum : 1;
+    ALL(i) slope[i] = 2 * (tension[i] * against - COMPRESSION * positive * fmin(v[i], 0)) / (total * total * unit);
     const double left = exp(-p->rate * s->share), weight = squared * -expm1(-p->rate * s->share);
     MANDEL(a) {
         double way = 0;
@@ -192,19 +258,19 @@ static void cells_by_tensor(point *p, state *s, matrix result)
 /* condensed.TENSORS: what a stress makes of D, and the factors of its derivative by the stress. */
 static inline double by_stress(point *p, int i, int j)
 {
-    return p->driver == CAUCHY ? p->u[i] * p->u[j] / p->J : p->driver == SECOND_PIOLA_KIRCHHOFF;
+    return p->driver == CAUCHY ? p->u[i] * p->u[j] / p->J : p->driver == PK2;
 }
 
 static void drive(point *p, tensor S, tensor D)
 {
-    ALL(i) ALL(j) D[i][j] = p->driver == RIGHT_CAUCHY_GREEN ? (i == j) * p->c[i] : by_stress(p, i, j) * S[i][j];
+    ALL(i) ALL(j) D[i][j] = p->driver == FINGER ? (i == j) * p->c[i] : by_stress(p, i, j) * S[i][j];
 }
 
 /* Its derivative by C at fixed stress. */
 static void drive_by_strain(point *p, tensor S, matrix result)
 {
     memset(result, 0, sizeof(matrix));
-    if (p->driver == RIGHT_CAUCHY_GREEN) MANDEL(a) result[a][a] = 1;
+    if (p->driver == FINGER) MANDEL(a) result[a][a] = 1;
     if (p->driver != CAUCHY) return;
     tensor D;
     drive(p, S, D);
@@ -221,21 +287,19 @@ static void drive_by_strain(point *p, tensor S, matrix result)
         MANDEL(a) result[a][b] = FACTOR[a] * change[ROW[a]][COLUMN[a]];
     }
 }
-"""
 
-LOCAL = r"""
 /* condensed.CondensedPoints._at_tensor: all that D says. */
 static void evaluate(point *p, state *s)
 {
     tensor D;
-    if (p->driver == RIGHT_CAUCHY_GREEN) drive(p, s->S, s->D);
+    if (p->driver == FINGER) drive(p, s->S, s->D);
     cells(p, s);
     stress(p, s, 0, 0);
     drive(p, s->S, D);
     ALL(i) ALL(j) s->missing[i][j] = D[i][j] - s->D[i][j];
     const double extension = sqrt(s->squared) / p->parameter[CONTOUR_LENGTH];
-    s->converged = norm(s->missing) <= 1e-12 * norm(s->D) + p->solved && extension < 1;
-    if (p->driver == RIGHT_CAUCHY_GREEN) s->converged = isfinite(norm(s->S));
+    s->converged = norm(s->missing) <= TOLERANCE * norm(s->D) + p->solved && extension < 1;
+    if (p->driver == FINGER) s->converged = isfinite(norm(s->S));
 }
 
 /* 1 - dD/dS dS/dA dA/dD, and dS/dA dA/dD and dS/dC with it. */
@@ -262,7 +326,7 @@ static void iterate(point *p, state *s)
     const double length = norm(step), size = fmax(norm(s->D), norm(s->missing));
     double share = length > 0 ? fmin(1, size / length) : 1;
     const int finite = isfinite(length);
-    for (int halving = 0; halving <= 12; ++halving, share /= 2) {
+    for (int halving = 0; halving <= HALVINGS; ++halving, share /= 2) {
         ALL(i) ALL(j) next.D[i][j] = s->D[i][j] + (finite ? share * step[i][j] : 0);
         evaluate(p, &next);
         if (sqrt(next.squared) < p->parameter[CONTOUR_LENGTH]) break;
@@ -271,7 +335,7 @@ static void iterate(point *p, state *s)
 }
 
 /* condensed.CondensedPoints.solve, from start; all results in the global basis. */
-void solve(int64_t n, const double *F, const double *start, const double *old, const double *const *parameters,
+void solve(int64_t n, const double *F, const double *start, const double *old, const double *parameters,
            double floor, double solved, double rate, int driver, int repulsion, double *tensors, double *structure,
            double *stresses, double *squared, uint8_t *converged)
 {
@@ -279,11 +343,11 @@ void solve(int64_t n, const double *F, const double *start, const double *old, c
         point p;
         state s;
         tensor global, P;
-        prepare(&p, at, F, old, parameters, floor, solved, rate, driver, repulsion);
+        prepare(&p, n, at, F, old, parameters, floor, solved, rate, driver, repulsion);
         memcpy(global, start + 9 * at, sizeof(tensor));
         rotated(global, p.basis, 0, s.D);
         evaluate(&p, &s);
-        for (int iteration = 0; iteration < 25 && !s.converged && p.driver != RIGHT_CAUCHY_GREEN; ++iteration)
+        for (int iteration = 0; iteration < ITERATIONS && !s.converged && p.driver != FINGER; ++iteration)
             iterate(&p, &s);
         rotated(s.D, p.basis, 1, global);
         memcpy(tensors + 9 * at, global, sizeof(tensor));
@@ -333,7 +397,7 @@ static void by_gradient(point *p, tensor S, matrix by_strain, double *result)
 }
 
 /* condensed.CondensedPoints.tangent at solved points. */
-void tangent(int64_t n, const double *F, const double *tensors, const double *old, const double *const *parameters,
+void tangent(int64_t n, const double *F, const double *tensors, const double *old, const double *parameters,
              double floor, double solved, double rate, int driver, int repulsion, double *result)
 {
     for (int64_t at = 0; at < n; ++at) {
@@ -341,7 +405,7 @@ void tangent(int64_t n, const double *F, const double *tensors, const double *ol
         state s;
         tensor global;
         matrix left, answers, direct, right, change;
-        prepare(&p, at, F, old, parameters, floor, solved, rate, driver, repulsion);
+        prepare(&p, n, at, F, old, parameters, floor, solved, rate, driver, repulsion);
         memcpy(global, tensors + 9 * at, sizeof(tensor));
         rotated(global, p.basis, 0, s.D);
         evaluate(&p, &s);
@@ -354,6 +418,3 @@ void tangent(int64_t n, const double *F, const double *tensors, const double *ol
         by_gradient(&p, s.S, direct, result + 81 * at);
     }
 }
-"""
-
-SOURCE = ALGEBRA + LOGARITHM + POINT + LOCAL

@@ -1,9 +1,9 @@
 #!/usr/bin/env python3
 """Where the method holds: several hundred cases at the extremes, each held against a reference that shares no code.
 
-    ./with-fenicsx benchmarks/stability [--family NAME]... [--only TEXT]... [--again] [--jobs N] [--limit SECONDS]
-    ./with-fenicsx benchmarks/stability --checkout PATH        # the same for another version, with its own command line
-    ./with-fenicsx benchmarks/stability --report               # docs/stability.md from what has been measured
+    ./with-fenicsx benchmarks/stability.py [--family NAME]... [--only TEXT]... [--again] [--jobs N] [--limit SECONDS]
+    ./with-fenicsx benchmarks/stability.py --checkout PATH  # the same for another version, with its own command line
+    ./with-fenicsx benchmarks/stability.py --report         # docs/stability.md from what has been measured
 
 A case ends as right, refused, unstable, warned, wrong or unchecked (docs/stability.md says what each means), or as "not
 there" where the version cannot express it. Each result is one line of results/stability/VERSION.jsonl. What is there is

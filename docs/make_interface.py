@@ -1,0 +1,189 @@
+#!/usr/bin/env python3
+"""Writes docs/interface.md, the list of everything that is public:
+
+    ./with-fenicsx python3 docs/make_interface.py
+
+tests/test_interface.py compares the page with the code: a change of the interface is a change of this page.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import inspect
+import re
+import textwrap
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from mpi4py import MPI
+
+import remodel_fenicsx
+from remodel_fenicsx import Scene, cli, extend, parts
+from remodel_fenicsx.body.columns import columns_of, columns_on_request
+from remodel_fenicsx.scene.parameters import PRESETS
+from remodel_fenicsx.scene.profiles import PROFILES
+from remodel_fenicsx.schema.tables import Table, sections
+
+PAGE = Path(__file__).with_name("interface.md")
+HEAD = """# The public interface
+
+This page is made from the code: `./with-fenicsx python3 docs/make_interface.py`. A test compares
+the two, so that nothing here changes unnoticed.
+
+What stands here is public: the names of three modules with their parameters, the keys of scenes,
+the columns of histories, the commands with their options, and the exit codes. Scripts, scenes and
+notebooks may rely on it; [CHANGELOG.md](../CHANGELOG.md) says when some of it changes. Everything
+else is private and changes without notice: all other modules, names with a leading underscore, and
+whatever a public object hands out that is not listed.
+
+Docstrings say what a name means, [scene.md](scene.md) what a key, [commands.md](commands.md) what a
+command, a column and an exit code.
+"""
+MODULES = {
+    remodel_fenicsx: "run a scene, read what it left",
+    parts: "assemble a simulation in a script",
+    extend: "add to what scenes may name",
+}
+
+
+def page() -> str:
+    """The whole page."""
+    text, seen = HEAD, dict[int, str]()
+    for module, use in MODULES.items():
+        text += f"\n## `{module.__name__}`: {use}\n\n```python\n{_wrapped(_module(module, seen), '        ')}\n```\n"
+    text += f"\n## Keys of a scene\n\n{_wrapped(_keys())}\n\n## Columns of a history\n\n{_wrapped(_columns())}\n"
+    text += f"\n## Commands\n\n```text\n{_wrapped(_commands(cli.parser()), '    ')}\n```\n\n## Exit codes\n\n"
+    return text + "\n".join(f"- {code}: {meaning}" for code, meaning in cli.EXIT_CODES.items()) + "\n"
+
+
+def _wrapped(lines: Iterable[str], indent: str = "  ") -> str:
+    return "\n".join(textwrap.fill(line, 100, subsequent_indent=indent, break_on_hyphens=False) for line in lines)
+
+
+# ---------------------------------------------------------------- names
+def _module(module: ModuleType, seen: dict[int, str]) -> Iterator[str]:
+    """The names of a module; what an earlier one has too is described there."""
+    for name in sorted(module.__all__):
+        value = getattr(module, name)
+        where = seen.setdefault(id(value), module.__name__)
+        if where != module.__name__:
+            yield f"{name}  # that of {where}"
+        elif inspect.isclass(value):
+            yield from _class(value)
+        elif callable(value):
+            yield name + _parameters(value if inspect.isfunction(value) else type(value).__call__)
+        elif isinstance(value, Mapping):
+            yield f"{name} = {{{', '.join(map(repr, value))}}}"
+        else:
+            yield f"{name}: {type(value).__name__}"
+
+
+def _class(kind: type) -> Iterator[str]:
+    """How it is made, its attributes and methods without those of a public base."""
+    public = {value for module in MODULES for name in module.__all__ if inspect.isclass(value := getattr(module, name))}
+    lineage = [base for base in kind.__mro__ if base.__module__.startswith("remodel_fenicsx.") and base is not Table]
+    bases = [base for base in lineage[1:] if base in public]
+    own = [owner for owner in lineage if not any(issubclass(base, owner) for base in bases)]
+    fields = {field.name for field in dataclasses.fields(kind)} if dataclasses.is_dataclass(kind) else set[str]()
+    fields |= {*getattr(kind, "_fields", ()), *getattr(kind, "model_fields", ())}  # of a tuple, of a table
+    members: dict[str, str] = {}
+    for owner in reversed(own):
+        members |= {name: name for name in _documented(owner)}
+        members |= {name: name + _parameters(member) for name, member in vars(owner).items()}
+    made = ""
+    if issubclass(kind, Table):
+        made = "(**keys)"
+    elif fields or "__init__" in members and not getattr(kind, "_is_protocol", False):
+        made = _parameters(kind)
+    yield f"class {kind.__name__}{made}" + (f"  # a {bases[0].__name__}" if bases else "")
+    hidden = {"model_config", *fields}
+    yield from (f"    {members[name]}" for name in sorted(members) if name not in hidden and not name.startswith("_"))
+
+
+def _documented(kind: type) -> list[str]:
+    """Names in the section "Attributes" of a docstring."""
+    text = inspect.cleandoc(vars(kind).get("__doc__") or "")
+    section = re.search(r"^Attributes\n-+\n(.*?)(?=\n\w[\w ]*\n-+\n|\Z)", text, re.DOTALL | re.MULTILINE)
+    heads = re.findall(r"^(\w[^:\n]*)", section[1], re.MULTILINE) if section else []
+    return [name.strip() for head in heads for name in head.split(",")]
+
+
+def _parameters(function: Any) -> str:
+    """Parameters in brackets with their defaults; nothing for what is no function."""
+    function = inspect.unwrap(getattr(function, "__func__", function))  # of a class method
+    if not inspect.isfunction(function) and not inspect.isclass(function):
+        return ""
+    signature = inspect.signature(function)
+    parameters = [
+        parameter.replace(
+            annotation=parameter.empty,
+            default=parameter.empty if parameter.default is parameter.empty else _Default(parameter.default),
+        )
+        for name, parameter in signature.parameters.items()
+        if name not in ("self", "cls")
+    ]
+    return str(signature.replace(parameters=parameters, return_annotation=signature.empty))
+
+
+class _Default:
+    """A default as a reader knows it."""
+
+    def __init__(self, value: Any):
+        plain = repr(value) if value is None or isinstance(value, (bool, int, float, str, tuple)) else "..."
+        self.text = "MPI.COMM_WORLD" if isinstance(value, MPI.Comm) else getattr(value, "__name__", plain)
+
+    def __repr__(self) -> str:
+        return self.text
+
+
+# ---------------------------------------------------------------- the rest
+def _listed(what: str, names: Iterable[str]) -> str:
+    return f"- {what}: " + ", ".join(f"`{name}`" for name in names)
+
+
+def _keys() -> Iterator[str]:
+    for key, variant, table in sections(Scene):
+        what = (f"`[{key}]`" if key else "top of the file") + (f" of shape `{variant}`" if variant else "")
+        yield _listed(what, (name for name, field in table.model_fields.items() if field.description))
+    for shape, kind in extend.SHAPES.items():
+        yield _listed(f"`[loads]` of shape `{shape}`", kind.loads)
+    yield _listed("presets", PRESETS)
+    yield _listed("profiles", PROFILES)
+
+
+def _columns() -> Iterator[str]:
+    by_shape: dict[str, dict[str, list[str]]] = {"": {}, " on request": {}}
+    for shape, kind in extend.SHAPES.items():
+        freed = [load.column_name(name) for name, load in kind.loads.items() if load.frees_length]
+        by_shape[""][shape] = [column.name for column in columns_of(kind, loads=())]
+        by_shape[" on request"][shape] = [*freed, *columns_on_request(kind)]
+    for when, columns in by_shape.items():
+        common = [name for name in columns["cube"] if all(name in names for names in columns.values())]
+        yield _listed("every shape" + when, common)
+        for shape, names in columns.items():
+            if own := [name for name in dict.fromkeys(names) if name not in common]:
+                yield _listed(f"shape `{shape}`{when}", own)
+
+
+def _commands(parser: argparse.ArgumentParser) -> Iterator[str]:
+    (commands,) = (action for action in parser._actions if isinstance(action, argparse._SubParsersAction))
+    yield " ".join([parser.prog, *_arguments(parser)])
+    for listed in commands._choices_actions:  # those with a help text
+        yield " ".join([parser.prog, listed.dest, *_arguments(commands.choices[listed.dest])])
+
+
+def _arguments(parser: argparse.ArgumentParser) -> Iterator[str]:
+    for action in parser._actions:
+        if isinstance(action, (argparse._HelpAction, argparse._SubParsersAction)):
+            continue
+        choices = f"{{{','.join(map(str, action.choices))}}}" if action.choices else ""
+        value = (action.metavar or choices or action.dest.upper()) if action.nargs != 0 else ""
+        text = " ".join(filter(None, ["|".join(action.option_strings), str(value)]))
+        yield text if action.required and action.nargs != "*" else f"[{text}]"
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(), encoding="utf-8")

@@ -1,0 +1,121 @@
+"""Registries, and what is put into them: a scene then knows the name. CONTRIBUTING.md says which to use for what.
+
+    from remodel_fenicsx.extend import DRIVERS, Driver
+
+    DRIVERS["mine"] = Driver(lambda F, stresses: stresses.cauchy, material=False)
+
+Importing this needs no dolfinx; asking for couplings, measurements, linear solvers or `form` does.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+from remodel_fenicsx.body import SHAPES, LoadKind, Shape
+from remodel_fenicsx.body.column import Column
+from remodel_fenicsx.body.columns import COLUMNS, COLUMNS_ON_REQUEST
+from remodel_fenicsx.body.reductions import Reduction
+from remodel_fenicsx.body.shape import uniaxial_columns
+from remodel_fenicsx.fem.formulations import FORMULATIONS, Formulation, Selective
+from remodel_fenicsx.fem.kinematics import KINEMATICS, FullKinematics, Kinematics
+from remodel_fenicsx.fem.solver_methods import METHODS
+from remodel_fenicsx.scene.parameters import COUPLING_MEANINGS
+from remodel_fenicsx.schema.tables import markdown_reference
+from remodel_fenicsx.schema.units import (
+    AREA,
+    FORCE,
+    LENGTH,
+    LENGTH_UNIT,
+    NUMBER_DENSITY,
+    STRESS,
+    STRESS_UNIT,
+    TEMPERATURE,
+    Dimension,
+)
+from remodel_fenicsx.tissue.cells import AXES, UnitCell, angle_to_axis
+from remodel_fenicsx.tissue.chains import CHAINS, Chain
+from remodel_fenicsx.tissue.drivers import DRIVERS, FRAMES, Driver, Frame
+from remodel_fenicsx.tissue.energy import MATRICES, Matrix, Stresses, neo_hookean
+from remodel_fenicsx.tissue.laws import LAWS, Drive, Law, ranked
+from remodel_fenicsx.tissue.repulsion import REPULSIONS, Repulsion, axes_sum, squared_end_to_end_length
+from remodel_fenicsx.tissue.spectral import PAIRINGS, principal
+
+if TYPE_CHECKING:
+    from remodel_fenicsx.evolution.coupling import COUPLINGS, Coupling, Staggered
+    from remodel_fenicsx.evolution.linear import LINEAR_METHODS, EveryTangent
+    from remodel_fenicsx.fem.jit import form
+    from remodel_fenicsx.results.columns import Measurement
+
+__all__ = [
+    "AREA",
+    "AXES",
+    "CHAINS",
+    "COLUMNS",
+    "COLUMNS_ON_REQUEST",
+    "COUPLINGS",
+    "COUPLING_MEANINGS",
+    "Chain",
+    "Column",
+    "Coupling",
+    "DRIVERS",
+    "Dimension",
+    "Drive",
+    "Driver",
+    "EveryTangent",
+    "FORCE",
+    "FORMULATIONS",
+    "FRAMES",
+    "Formulation",
+    "Frame",
+    "FullKinematics",
+    "KINEMATICS",
+    "Kinematics",
+    "LAWS",
+    "LENGTH",
+    "LENGTH_UNIT",
+    "LINEAR_METHODS",
+    "Law",
+    "LoadKind",
+    "MATRICES",
+    "METHODS",
+    "Matrix",
+    "Measurement",
+    "NUMBER_DENSITY",
+    "PAIRINGS",
+    "REPULSIONS",
+    "Reduction",
+    "Repulsion",
+    "SHAPES",
+    "STRESS",
+    "STRESS_UNIT",
+    "Selective",
+    "Shape",
+    "Staggered",
+    "Stresses",
+    "TEMPERATURE",
+    "UnitCell",
+    "angle_to_axis",
+    "axes_sum",
+    "form",
+    "markdown_reference",
+    "neo_hookean",
+    "principal",
+    "ranked",
+    "squared_end_to_end_length",
+    "uniaxial_columns",
+]
+
+_WITH_DOLFINX = {
+    **dict.fromkeys(("COUPLINGS", "Coupling", "Staggered"), "evolution.coupling"),
+    **dict.fromkeys(("EveryTangent", "LINEAR_METHODS"), "evolution.linear"),
+    "Measurement": "results.columns",
+    "form": "fem.jit",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Names that need dolfinx, when they are first asked for."""
+    if name not in _WITH_DOLFINX:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"remodel_fenicsx.{_WITH_DOLFINX[name]}"), name)

@@ -1,0 +1,154 @@
+"""What a pass and its limits compute at every point: in numpy, and in C (spectral.c)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import ArrayLike, NDArray
+
+from remodel_fenicsx.kernels.library import Library, in_numpy
+from remodel_fenicsx.tissue import cells, repulsion, spectral
+from remodel_fenicsx.tissue.cells import UnitCell
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+NOT_FINITE = 2  # mark of a point with NaN or infinity
+
+
+class PointKernels:
+    """Functions on arrays of n points, in numpy: what they are in C stands for these."""
+
+    principal: spectral.Pairing = staticmethod(spectral.principal)
+    positive_direction: Callable[..., tuple[Array, Flags]] = staticmethod(spectral.positive_direction)
+    without_noise: Callable[..., Array] = staticmethod(spectral.without_noise)
+    structure_tensor: Callable[..., Array] = staticmethod(cells.structure_tensor)
+
+    def squared_length(self, F: Array, cell: UnitCell) -> Array:
+        """`repulsion.squared_end_to_end_length` of one whole cell."""
+        return np.asarray(repulsion.squared_end_to_end_length(F, [cell]))
+
+    def squared_length_and_sum(self, F: Array, cell: UnitCell) -> tuple[Array, Array]:
+        """The same, and `repulsion.axes_sum`."""
+        return self.squared_length(F, cell), np.asarray(repulsion.axes_sum(F, [cell], 1.0))
+
+    def gradient_and_driver(self, both: Array) -> tuple[Array, Array]:
+        """F and the symmetric part of the driving tensor, (n, 3, 3) each, from both (n, 2, 3, 3)."""
+        return both[:, 0], (both[:, 1] + np.swapaxes(both[:, 1], 1, 2)) / 2
+
+    def extension(self, states: Array, length: Array) -> tuple[Array, int, float]:
+        """How far points are from their limits: r/L (n,), the number of the largest, and the smallest J.
+
+        Parameters
+        ----------
+        states
+            r^2, J and F of n points (n, 11), as `Equilibrium.states` has them.
+        length
+            L (n,).
+
+        Returns
+        -------
+        r/L is infinite where it is no finite number; J is minus infinity if one is none, and infinity without points.
+        """
+        with np.errstate(invalid="ignore"):
+            stretch = np.sqrt(states[:, 0]) / length
+        stretch[~np.isfinite(stretch)] = np.inf
+        smallest = states[:, 1].min(initial=np.inf) if np.isfinite(states[:, 1]).all() else -np.inf
+        return stretch, int(np.argmax(stretch)) if stretch.size else 0, float(smallest)
+
+    def may_turn(self, before: Array, after: Array) -> NDArray[np.intp]:
+        """Which points `operators.passes_through_zero` has to be asked for, by number; states (n, 11) of both ends.
+
+        |F^-1| <= F:F / (2 det F), and nearer than its inverse nothing is singular.
+        """
+        F, J, change = before[:, 2:], before[:, 1], after[:, 2:] - before[:, 2:]
+        reach = np.sqrt((change**2).sum(axis=1)) * (F**2).sum(axis=1)
+        return np.flatnonzero((J <= 0.0) | (reach >= 2.0 * J))
+
+    def room(self, states: Array, stretch: Array, chain: Array, far: float) -> float:
+        """Largest |dF| at which J > 0 and r/L < far at all points; chain: |l|/L (n,)."""
+        volume = 2.0 * states[:, 1] / (states[:, 2:] ** 2).sum(axis=1)
+        return float(np.minimum(volume, (far - stretch) / chain).min(initial=np.inf))
+
+
+class CompiledPointKernels(PointKernels):
+    """The same in C. `PointKernels` says what goes in and comes out, and does what C leaves open.
+
+    Parameters
+    ----------
+    comm
+        Its ranks compile, or load, together.
+    """
+
+    def __init__(self, comm: MPI.Intracomm):
+        self._call = Library(comm, "spectral.c", "the pass")
+
+    def principal(
+        self, tensors: ArrayLike, previous: ArrayLike, tolerance: float = spectral.AGREEMENT, threshold: ArrayLike = 0.0
+    ) -> tuple[Array, Array]:
+        """By Jacobi's method where the tensor decides."""
+        tensors, previous = np.asarray(tensors), np.asarray(previous)
+        n, limit = len(tensors), np.broadcast_to(threshold, len(tensors))
+        values, axes, left_open = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty(n, np.uint8)
+        given = tensors, previous, tolerance, limit, spectral.DECISIVE
+        if self._call("principal", n, *given, values, axes, left_open):
+            if np.any(left_open == NOT_FINITE):  # for the words that name the first one
+                return super().principal(tensors, previous, tolerance, threshold)
+            at = np.flatnonzero(left_open)
+            values[at], axes[at] = super().principal(tensors[at], previous[at], tolerance, limit[at])
+        return values, axes
+
+    def positive_direction(self, values: ArrayLike, threshold: ArrayLike = 0.0) -> tuple[Array, Flags]:
+        values = np.asarray(values)
+        n, limit = len(values), np.broadcast_to(threshold, len(values))
+        direction, active = np.empty((n, 3)), np.empty(n, np.bool_)
+        if self._call("positive_direction", n, values, limit, spectral.ROUNDING, direction, active):
+            return super().positive_direction(values, threshold)  # for the words that name the first one
+        return direction, active
+
+    def without_noise(self, tensors: Array, axes: Array, noise: ArrayLike) -> Array:
+        n, steady = len(tensors), np.empty(tensors.shape)
+        self._call("without_noise", n, tensors, axes, np.broadcast_to(noise, n), steady)
+        return steady
+
+    def structure_tensor(self, dimensions: Array, axes: Array) -> Array:
+        tensor = np.empty(axes.shape)
+        self._call("structure", axes.size // 9, dimensions, axes, tensor)
+        return tensor
+
+    def squared_length(self, F: Array, cell: UnitCell) -> Array:
+        return self._stretches(F, cell, None)
+
+    def squared_length_and_sum(self, F: Array, cell: UnitCell) -> tuple[Array, Array]:
+        logarithms = np.empty(len(F))
+        return self._stretches(F, cell, logarithms), logarithms
+
+    def _stretches(self, F: Array, cell: UnitCell, logarithms: Array | None) -> Array:
+        squared = np.empty(len(F))
+        self._call("stretches", len(F), F, cell.dimensions, cell.axes, squared, logarithms)
+        return squared
+
+    def gradient_and_driver(self, both: Array) -> tuple[Array, Array]:
+        F, driver = np.empty((2, len(both), 3, 3))
+        self._call("parts", len(both), both, F, driver)
+        return F, driver
+
+    def extension(self, states: Array, length: Array) -> tuple[Array, int, float]:
+        stretch, smallest = np.empty(len(length)), np.empty(1)
+        worst = self._call("extension", len(length), states, length, stretch, smallest)
+        return stretch, worst, smallest.item()
+
+    def may_turn(self, before: Array, after: Array) -> NDArray[np.intp]:
+        found = np.empty(len(before), np.bool_)
+        count = self._call("may_turn", len(before), before, after, found)
+        return np.flatnonzero(found) if count else np.empty(0, np.intp)
+
+    def room(self, states: Array, stretch: Array, chain: Array, far: float) -> float:
+        return float(self._call("room", len(stretch), states, stretch, chain, far))
+
+
+def point_kernels(comm: MPI.Intracomm) -> PointKernels:
+    """In C, or in numpy where that is asked for. Collective."""
+    return PointKernels() if in_numpy() else CompiledPointKernels(comm)
