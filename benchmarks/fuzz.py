@@ -2,7 +2,7 @@
 """Random scenes over all keys, each held against a reference of its own: what nobody has thought of.
 
     ./with-fenicsx benchmarks/fuzz.py [--seed FIRST] [--count N] [--jobs N] [--limit SECONDS] [--again]
-    ./with-fenicsx benchmarks/fuzz.py --only SEED      # prints the scene and what it is held against, runs and judges it
+    ./with-fenicsx benchmarks/fuzz.py --only SEED      # prints the scene, runs and judges it
 
 A seed makes a scene (`fuzzing/scenes.py`), which is run through the command line. What it leaves is held against what
 must hold in every row, against a one-dimensional reference of its own where there is one (`fuzzing/references.py`), and

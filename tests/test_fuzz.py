@@ -18,7 +18,10 @@ from benchmarks.stability_map.running import PROJECT, Runner
 from remodel_fenicsx.scene import scene_from_dict
 
 ALL = range(1, 301)
-QUICK: tuple[int, ...] = ()  # a second or less with what they are held against
+QUICK = (  # half a second or less with what they are held against
+    18, 39, 45, 60, 87, 117, 119, 123, 127, 128, 137, 138, 139, 140, 141, 147, 149, 150, 159, 162, 164, 173, 191, 194,
+    212, 220, 227, 238, 242, 294,
+)  # fmt: skip
 HELD = ("right", "refused", "unstable", "warned")
 
 
@@ -66,7 +69,9 @@ def test_scenes_are_valid_and_draw_every_key() -> None:
 
 # ---------------------------------------------------------------- right and wrong
 CUBE = next(seed for seed in ALL if references.known(made(seed)[0]) and made(seed)[0]["model"]["kinematics"] == "point")
-TUBE = next(seed for seed in ALL if references.known(made(seed)[0]) and made(seed)[0]["model"]["kinematics"] == "radial")
+TUBE = next(
+    seed for seed in ALL if references.known(made(seed)[0]) and made(seed)[0]["model"]["kinematics"] == "radial"
+)
 
 
 @pytest.mark.parametrize("seed, column", [(CUBE, "mean_stretch"), (CUBE, "mean_fibre_angle"), (TUBE, "inner_radius")])
@@ -104,7 +109,9 @@ def test_no_row_may_do_this(fault: str) -> None:
         "max_chain_extension": np.full(5, 0.5), "stored_energy": np.zeros(5),
     }  # fmt: skip
     r0 = scene["cells"]["end_to_end_length"]
-    run = Run(0, history={name: list(values) for name, values in rows.items()}, fields={"cell_dimensions": [[r0, 0, 0]]})
+    run = Run(
+        0, history={name: list(values) for name, values in rows.items()}, fields={"cell_dimensions": [[r0, 0, 0]]}
+    )
     assert not references.broken(scene, run)
     for key, value in FAULTS[fault].items():
         if key in rows:

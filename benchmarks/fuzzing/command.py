@@ -5,15 +5,14 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
-import multiprocessing
 import os
 import sys
+import threading
 from collections import Counter
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import asdict, replace
 from pathlib import Path
 from random import Random
-from typing import Any
 
 import numpy as np
 import tomlkit
@@ -51,9 +50,15 @@ def main(description: str | None, arguments: list[str] | None = None) -> int:
     print(f"{source}: {len(seeds)} scenes, {len(missing)} to run; {file}", file=sys.stderr)
     file.parent.mkdir(parents=True, exist_ok=True)
     kept = options.results / "runs" / source.partition(" ")[0]  # a run is judged again without being run again
-    context = multiprocessing.get_context("spawn")
-    with file.open("a") as out, ProcessPoolExecutor(options.jobs, context, _set_up, (options.limit, kept)) as pool:
-        for future in as_completed([pool.submit(_evaluate, seed) for seed in missing]):
+    mine = threading.local()  # a thread waits for a process of its own, that runs the scenes
+
+    def evaluate(seed: int) -> Record:
+        if not hasattr(mine, "runner"):
+            mine.runner = Runner(PROJECT, options.limit, kept)
+        return evaluated(seed, mine.runner)
+
+    with file.open("a", encoding="utf-8") as out, ThreadPoolExecutor(options.jobs) as pool:
+        for future in as_completed([pool.submit(evaluate, seed) for seed in missing]):
             record = future.result() | {"source": source}
             done[record["seed"]] = record
             out.write(json.dumps(record) + "\n")
@@ -88,7 +93,7 @@ def verdict_on(scene: Values, other: Other, run: Run, again: Run) -> Verdict:
     """What all references say together; what no row may do is wrong whatever was said beside it."""
     faults = [] if run.code == NO_END else references.broken(scene, run)
     if again.code != NO_END:
-        faults += [f"{other.name}: {fault}" for fault in references.broken(other.scene, again)]
+        faults += [f"{other.name}: {fault}" for fault in references.broken(other.in_numbers or other.scene, again)]
     ends = {run.code, again.code}
     if other.tolerance == relations.EXACT and len(ends) == 2 and NO_END not in ends:
         faults.append(f"{other.name}: exit {again.code} for {run.code}: {(again.said or run.said)[-300:].strip()}")
@@ -98,8 +103,10 @@ def verdict_on(scene: Values, other: Other, run: Run, again: Run) -> Verdict:
     if references.known(scene) and run.code in (0, SOLVE_FAILED):
         findings.append(references.compared(scene, run))
     if ends == {0}:
-        findings.append(relations.compared(other, run, again))
-        run = replace(run, warnings=[*run.warnings, *(f"({other.name}) {line}" for line in again.warnings)])
+        finding = relations.compared(other, run, again)
+        if finding.ratio > 1 and again.warnings and not run.warnings:  # nobody knows which of them is off
+            finding = replace(finding, ratio=np.nan, words=f"{finding.words}, which says: {again.warnings[0]}")
+        findings.append(finding)
     known = [finding for finding in findings if not np.isnan(finding.ratio)]
     words = "; ".join(finding.words for finding in findings) or f"{other.name}: {again.said.strip()[-200:]}"
     ratio = max((finding.ratio for finding in known), default=np.nan if run.code == 0 else 0.0)
@@ -110,7 +117,9 @@ def verdict_on(scene: Values, other: Other, run: Run, again: Run) -> Verdict:
 def said(record: Record) -> str:
     """A line on a seed."""
     alarm = " (false alarm)" if record["false_alarm"] else ""
-    return f"{record['outcome']:9}{alarm} {record['seed']}: {record['body']}, {record['seconds']:g} s: {record['words']}"
+    return (
+        f"{record['outcome']:9}{alarm} {record['seed']}: {record['body']}, {record['seconds']:g} s: {record['words']}"
+    )
 
 
 def summary(records: list[Record]) -> str:
@@ -140,16 +149,3 @@ def _one(seed: int, limit: float) -> int:
         runner.close()
     print(said(record))
     return int(record["outcome"] == "wrong")
-
-
-# ---------------------------------------------------------------- in a pool
-_mine: dict[str, Any] = {}
-
-
-def _set_up(limit: float, kept: Path) -> None:
-    os.environ["OMP_NUM_THREADS"] = "1"
-    _mine["runner"] = Runner(PROJECT, limit, kept)
-
-
-def _evaluate(seed: int) -> Record:
-    return evaluated(seed, _mine["runner"])

@@ -1,7 +1,7 @@
 """What must hold in every row of a run, and what a reference of one dimension makes of a scene, where it can.
 
-The reference is typed from docs/theory.md on top of tests/reference/radial.py and `stability_map.point`: a cube or bar is
-one point, a tube is divided along its radius; axes stay where they are, so that cells are three squares by direction.
+The reference is typed from docs/theory.md on top of tests/reference/radial.py and `stability_map.point`: a cube or bar
+is one point, a tube is divided along its radius; axes stay, so that cells are three squares by direction.
 """
 
 from __future__ import annotations
@@ -20,7 +20,10 @@ from tests.reference.radial import RadialMaterial, Tube, cauchy_stress, driving_
 COUNTS = 0.01  # a target with a smaller share is none to go on from
 COMPRESSION = 0.1
 SETTLED, PASSES = 1e-10, 300  # of an implicit step by repeated passes: change of the squares over r0^2; how many
-POINT_TOLERANCE, WALL_TOLERANCE, WALL_ANGLE = 1e-5, 0.02, 5.0  # of stretches; of radii; degrees
+POINT_TOLERANCE, ROUNDING = 1e-5, 1e-9  # of stretches; of radii
+WALL_TOLERANCE = (
+    0.08  # of the largest displacement: that elements lack more than 5 % of it is warned of, by an estimate
+)
 
 
 # ---------------------------------------------------------------- bodies of one dimension
@@ -72,10 +75,13 @@ def known(scene: Values) -> bool:
     """Whether the reference can do it: axes that stay, the repulsions that agree then, equal steps, paired by rank."""
     r, g, time = scene["remodeling"], scene["geometry"]["shape"], scene["time"]
     lags = r["coupling"] == "relaxed" and r["law"] in ("rate", "relaxation")  # slower than its law says
+    # across a bar two values agree: which of them has which rank matters where the old cells tell x from y, and stay
+    lags |= r["coupling"] == "relaxed" and g != "tube" and scene["cells"]["initial"] != "isotropic"
     return (
         r["law"] != "rotation" and not lags and (r["pairing"] == "sorted" or r["law"] in ("tensor", "none"))
         and "tolerance" not in time and time["end"] != "equilibrium" and scene["material"]["repulsion"] != "length"
-        and scene["cells"]["initial"] != "random" and scene["cells"]["axes"] == ("cylindrical" if g == "tube" else "global")
+        and scene["cells"]["initial"] != "random"
+        and scene["cells"]["axes"] == ("cylindrical" if g == "tube" else "global")
         and (g != "tube" or scene["supports"]["ends"] == "free" and "axial_force" not in scene["loads"])
     )  # fmt: skip
 
@@ -111,7 +117,7 @@ class Pass:
         """sE of the law `tensor`."""
         values, noise = self.values(stretches, squares)
         tension, compression = np.maximum(values, 0) ** 2, np.minimum(values, 0) ** 2
-        total = tension.sum(axis=1) + COMPRESSION**2 * compression.sum(axis=1) + (7e4 * noise) ** 2
+        total = tension.sum(axis=1) + COMPRESSION**2 * compression.sum(axis=1) + (100 * noise) ** 2
         return np.asarray(tension / total[:, None])
 
     def followed(self, squares: Array, target: Array, rate: float) -> Array:
@@ -209,11 +215,10 @@ def compared(scene: Values, run: Run) -> Finding:
     off = {}
     if tube:
         radii = np.array([row.unknown[[0, -1]] for row in rows[:number]])
-        size = scene["geometry"]["outer_radius"] - scene["geometry"]["inner_radius"]
+        start = np.array([scene["geometry"]["inner_radius"], scene["geometry"]["outer_radius"]])
+        moved = np.abs(radii - start).max() + ROUNDING * start[1]
         for i, name in enumerate(("inner_radius", "outer_radius")):
-            moved = np.abs(radii[:, i] - radii[0, i]).max() + np.abs(radii[:, i] - [scene["geometry"][name]]).max()
-            scale = max(size, moved)
-            off[name] = np.abs(run.column(name)[:number] - radii[:, i]).max() / scale / WALL_TOLERANCE
+            off[name] = np.abs(run.column(name)[:number] - radii[:, i]).max() / moved / WALL_TOLERANCE
     else:
         stretch, squares = (np.array([row[i] for row in rows[:number]]) for i in (1, 2))
         off["mean_stretch"] = np.abs(run.column("mean_stretch")[:number] / stretch[:, 2] - 1).max() / POINT_TOLERANCE
@@ -254,12 +259,16 @@ def broken(scene: Values, run: Run) -> list[str]:
     if run.fields.get("cell_dimensions"):
         trace = np.sum(np.array(run.fields["cell_dimensions"]) ** 2, axis=1) / r0**2
         exact = scene["remodeling"]["law"] in ("tensor", "none", "rotation")
-        if trace.max() > 1 + 1e-5 or exact and trace.min() < 1 - 1e-5:
+        bounded = scene["remodeling"]["law"] != "rate"  # eq. (10) adds up whatever its targets were
+        if bounded and trace.max() > 1 + 1e-5 or exact and trace.min() < 1 - 1e-5:
             found.append(f"tr A between {trace.min():.7g} and {trace.max():.7g} r0^2")
     if scene["remodeling"]["law"] == "none" and end != "equilibrium":
         loads = [history[name] for name in ("force", "pressure", "axial_elongation") if name in history]
         held = np.all(np.diff(loads, axis=1) == 0, axis=0)
         change = np.abs(np.diff(history["stored_energy"]))[held]
-        if "axial_force" not in scene["loads"] and change.max(initial=0.0) > 1e-5 * np.abs(history["stored_energy"]).max():
+        if (
+            "axial_force" not in scene["loads"]
+            and change.max(initial=0.0) > 1e-5 * np.abs(history["stored_energy"]).max()
+        ):
             found.append("energy changes under held loads without remodeling")
     return found

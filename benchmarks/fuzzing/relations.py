@@ -36,6 +36,7 @@ class Other:
     tolerance: float = EXACT
     degrees: float | None = None  # allowed of angles, where it is no rounding
     last_only: bool = False
+    in_numbers: Values | None = None  # the other scene, where that one has words
 
 
 def in_units(scene: Values, stress: float = 1.0, length: float = 1.0, time: float = 1.0, chain: float = 1.0) -> Values:
@@ -101,7 +102,7 @@ def _said(scene: Values, random: Random) -> Other | None:
             load["value"] = f"{load['value'] * by!r} {other}"
         elif name in LOADS:
             load["value"] = f"{load['value'] * by!r} {other}*{unit}^2"
-    return Other("with units in words", s)
+    return Other("with units in words", s, in_numbers=scene)
 
 
 def _ramp(scene: Values, random: Random) -> Other:
@@ -146,7 +147,9 @@ def _kinematics(scene: Values, random: Random) -> Other | None:
     other = {"point": "full", "radial": "axisymmetric", "sector": "full"}
     other |= {value: key for key, value in other.items()} | {"full": "point" if shape != "tube" else "sector"}
     s["model"]["kinematics"] = other[chosen]
-    if other[chosen] in ("radial", "sector") and (scene["supports"]["ends"] == "clamped" or "axial_force" in s["loads"]):
+    if other[chosen] in ("radial", "sector") and (
+        scene["supports"]["ends"] == "clamped" or "axial_force" in s["loads"]
+    ):
         return None
     if other[chosen] == "sector" and scene["cells"]["axes"] == "global":
         return None
@@ -168,9 +171,7 @@ def _tolerance(scene: Values, random: Random) -> Other | None:
     if asked is None or scene["time"]["end"] == "equilibrium":
         return None
     s["time"]["tolerance"] = asked / 4
-    return Other(
-        f"a quarter of time.tolerance {asked:g}", s, tolerance=1.3 * np.radians(asked), degrees=1.3 * asked
-    )
+    return Other(f"a quarter of time.tolerance {asked:g}", s, tolerance=1.3 * np.radians(asked), degrees=1.3 * asked)
 
 
 def _half(scene: Values, random: Random) -> Other | None:
@@ -228,7 +229,11 @@ def compared(other: Other, run: Run, again: Run) -> Finding:
         a, b = np.array(run.history[name])[rows], np.array(again.history[name])[others] / sizes.get(name, 1.0)
         if np.any(np.isnan(a) != np.isnan(b)):
             off[f"emptiness of {name}"] = np.inf
-        scale = 1.0 if "angle" in name or name in ("axial_elongation", "max_chain_extension") else np.nanmax(np.abs(a), initial=0.0)
+        scale = (
+            1.0
+            if "angle" in name or name in ("axial_elongation", "max_chain_extension")
+            else np.nanmax(np.abs(a), initial=0.0)
+        )
         off[name] = np.nanmax(np.abs(a - b), initial=0.0) / (scale or 1.0) / allowed
     name = max(off, key=lambda key: off[key])
     return Finding(float(off[name]), f"{other.name}: {name} off by {off[name]:.3g} tolerances")

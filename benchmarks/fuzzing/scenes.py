@@ -37,7 +37,9 @@ def made(seed: int) -> tuple[Values, Values]:
     scene["material"], r0, stiffness = _material(random)
     scene["remodeling"] = _remodeling(random, scene["material"]["chain_density"] > 0)
     scene["cells"] = _cells(random, shape, r0)
-    scene["supports"] = {"ends": random.choices(("free", "clamped", "closed"), (12, 1, 2))[0] if shape == "tube" else "free"}
+    scene["supports"] = {
+        "ends": random.choices(("free", "clamped", "closed"), (12, 1, 2))[0] if shape == "tube" else "free"
+    }
     scene["mesh"], scene["model"] = _mesh(random, scene)
     scene["time"] = _time(random, scene)
     scene["loads"] = _loads(random, scene, stiffness)
@@ -59,7 +61,8 @@ def cheap(scene: Values) -> bool:
 
 def cost(scene: Values) -> tuple[bool, bool]:
     """To sort by: whether a step costs much, whether there may be many."""
-    return not cheap(scene), "tolerance" in scene["time"] or scene["time"]["end"] == "equilibrium"
+    long = "tolerance" in scene["time"] or scene["time"]["end"] == "equilibrium"
+    return not cheap(scene), long or scene["remodeling"]["coupling"] == "implicit"
 
 
 def _geometry(random: Random, shape: str) -> Values:
@@ -167,10 +170,11 @@ def _time(random: Random, scene: Values) -> Values:
 def _ramp(random: Random, step: float, steps: int) -> list[list[float]]:
     """At once, at the start, late, falling, reversed or in cycles; corners at steps."""
     at = sorted(random.sample(range(1, steps + 1), min(3, steps)))
-    a, b, c = ((at + [steps + 1, steps + 2])[:3])
+    a, b, c = (at + [steps + 1, steps + 2])[:3]
     kind = random.choice(("start", "start", "start", "late", "falling", "reversed", "cycles", "at once", "beyond"))
     corners = {
-        "start": [(0, 0.0), (a, 1.0)], "late": [(a, 0.0), (b, 1.0)], "falling": [(0, 0.0), (a, 1.0), (b, 1.0), (c, 0.0)],
+        "start": [(0, 0.0), (a, 1.0)], "late": [(a, 0.0), (b, 1.0)],
+        "falling": [(0, 0.0), (a, 1.0), (b, 1.0), (c, 0.0)],
         "reversed": [(0, 0.0), (a, 1.0), (c, -0.3)], "cycles": [(0, 0.0), (a, 1.0), (b, 0.2), (c, 1.0)],
         "at once": [(0, 1.0)], "beyond": [(0, 0.0), (2 * steps, 1.0)],
     }[kind]  # fmt: skip

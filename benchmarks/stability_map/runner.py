@@ -109,10 +109,20 @@ def commanded(command: list[str], said: io.StringIO) -> Any:
 def on_ranks(request: dict[str, Any], command: list[str], said: io.StringIO) -> int:
     """The exit code of a command line in processes of its own, each with the request's numbers of elements."""
     program = (
-        "import json, sys; from benchmarks.stability_map.runner import element_counts; from remodel_fenicsx.cli import main\n"
+        "import json, sys\n"
+        "from benchmarks.stability_map.runner import element_counts\nfrom remodel_fenicsx.cli import main\n"
         "with element_counts(json.loads(sys.argv[1])): code = main(sys.argv[2:])\nsys.exit(code)"
     )
-    words = ["mpirun", "--allow-run-as-root", "--oversubscribe", "-n", str(request["ranks"]), sys.executable, "-c", program]
+    words = [
+        "mpirun",
+        "--allow-run-as-root",
+        "--oversubscribe",
+        "-n",
+        str(request["ranks"]),
+        sys.executable,
+        "-c",
+        program,
+    ]
     words += [json.dumps(request.get("counts", {})), *command]
     done = subprocess.run(words, capture_output=True, text=True, timeout=300, cwd=tempfile.gettempdir())
     said.write(done.stderr)
