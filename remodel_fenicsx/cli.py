@@ -86,8 +86,6 @@ def parser() -> argparse.ArgumentParser:
         metavar="TIME",
         help="stop before this time is over, after a whole step, with exit code 4: 90s, 30min, 2h, 1.5d",
     )
-    text = "with time.end = 'equilibrium': go there from other cells too, and say whether they lead elsewhere"
-    run_command.add_argument("--check-uniqueness", action="store_true", help=text)
     run_command.add_argument("-q", "--quiet", action="store_true", help="no progress")
     stability = scene_command(
         "stability", "Run a scene and say by what its passes multiply a small change of the cells."
@@ -97,7 +95,7 @@ def parser() -> argparse.ArgumentParser:
     )
     stability.add_argument("--times", type=positive, default=10, metavar="N", help="times to analyse (default: 10)")
     stability.add_argument("-q", "--quiet", action="store_true", help="no progress")
-    stability.set_defaults(resume=None, max_wall_time=None, check_uniqueness=False)
+    stability.set_defaults(resume=None, max_wall_time=None)
     ensemble = scene_command("ensemble", "Run a scene of random cells with many seeds, and with isotropic cells.")
     ensemble.add_argument("--seeds", type=positive, default=32, metavar="N", help="how many (default: 32; at least 2)")
     trade = scene_command("trade", "Run a scene with a ladder of settings: what each costs, and how far off it is.")
@@ -196,9 +194,7 @@ def _fail(message: str, code: int) -> int:
 def _run(options: argparse.Namespace, task: Callable[..., Path] | None = None) -> int:
     deadline = None if options.max_wall_time is None else clock.monotonic() + options.max_wall_time
     scene = None if options.resume else read_scene(options.scene, options.set, options.profile)
-    wishes: Any = {"quiet": options.quiet, "deadline": deadline, "other_starts": options.check_uniqueness}
-    if options.check_uniqueness and scene is not None and not scene.time.is_equilibrium:
-        return _fail("--check-uniqueness: only with time.end = 'equilibrium'", BAD_INPUT)
+    wishes: Any = {"quiet": options.quiet, "deadline": deadline}
     if options.resume and (options.output or options.profile):
         return _fail(f"{'-o' if options.output else '--profile'}: a run goes on in its own folder, as it is", BAD_INPUT)
     reason = reason_unusable()

@@ -12,11 +12,9 @@ from typing import TypeVar, cast
 
 from mpi4py import MPI
 
-from remodel_fenicsx.evolution.homeostasis import Homeostasis
 from remodel_fenicsx.evolution.parts import StepFailure
 from remodel_fenicsx.evolution.pause import Pause
 from remodel_fenicsx.evolution.stepper import Step, Watcher
-from remodel_fenicsx.evolution.uniqueness import check_uniqueness
 from remodel_fenicsx.results.checkpoint import Checkpoints, restore_state
 from remodel_fenicsx.results.checkpoint_file import Checkpoint, CheckpointError, read_checkpoint
 from remodel_fenicsx.results.fields import Fields, field_names
@@ -53,7 +51,6 @@ def run(
     comm: MPI.Intracomm = MPI.COMM_WORLD,
     quiet: bool = True,
     deadline: float | None = None,
-    other_starts: bool = False,
 ) -> Path:
     """Run a scene and record it.
 
@@ -69,8 +66,6 @@ def run(
         No progress on the terminal.
     deadline
         `time.monotonic` before which it shall stop, between two steps; None: never.
-    other_starts
-        Whether other starts are tried at the end of a run to the equilibrium (`evolution.uniqueness`).
 
     Returns
     -------
@@ -97,7 +92,7 @@ def run(
             simulation = _built(scene, comm)
             place = place or chosen_folder(None, scene.name, comm)
         with _closing(simulation), locked(place, comm, new=True):
-            _record(simulation, place, _Circumstances(stop, quiet, held, deadline, other_starts=other_starts))
+            _record(simulation, place, _Circumstances(stop, quiet, held, deadline))
     return place
 
 
@@ -107,7 +102,6 @@ def resume(
     comm: MPI.Intracomm = MPI.COMM_WORLD,
     quiet: bool = True,
     deadline: float | None = None,
-    other_starts: bool = False,
 ) -> Path:
     """Go on with a recorded run from its last checkpoint, or from t = 0 where it has none yet.
 
@@ -117,7 +111,7 @@ def resume(
         The run's.
     overrides
         "KEY=VALUE": keys that may change are time.end, output, solver, and loads after the checkpoint.
-    comm, quiet, deadline, other_starts
+    comm, quiet, deadline
         As for `run`; the number of ranks may be another one.
 
     Returns
@@ -144,7 +138,7 @@ def resume(
                 with hold_log(comm.rank, quiet=quiet) as more:
                     restore_state(simulation.state, checkpoint)
                 held += more
-            around = _Circumstances(stop, quiet, held, deadline, resumes=True, other_starts=other_starts)
+            around = _Circumstances(stop, quiet, held, deadline, resumes=True)
             _record(simulation, place, around)
     return place
 
@@ -210,14 +204,13 @@ def _closing(simulation: Simulation) -> Iterator[None]:
 
 @dataclass
 class _Circumstances:
-    """Of a run: who may stop it, what was logged before it had a folder, whether it goes on, what else is asked."""
+    """Of a run: who may stop it, what was logged before it had a folder, whether it goes on."""
 
     stop: StopRequest
     quiet: bool
     held: list[logging.LogRecord] = field(default_factory=list)
     deadline: float | None = None
     resumes: bool = False
-    other_starts: bool = False
 
 
 def _record(simulation: Simulation, place: Path, around: _Circumstances) -> None:
@@ -256,8 +249,6 @@ def _record(simulation: Simulation, place: Path, around: _Circumstances) -> None
         try:
             for _ in simulation.steps(watchers):
                 pass
-            if around.other_starts and isinstance(simulation.stepper.coupling, Homeostasis):
-                check_uniqueness(simulation.stepper.coupling, dict(state.loading.values))
         except (StepFailure, Interrupted, Paused) as reason:
             if isinstance(reason, StepFailure):
                 log.info(FAILED + "%s. %s", reason, reason.refusal)

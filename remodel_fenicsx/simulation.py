@@ -15,10 +15,13 @@ from remodel_fenicsx.body.columns import columns_of
 from remodel_fenicsx.body.reductions import AUTO, choice, explained
 from remodel_fenicsx.evolution.buckling import BucklingWarning
 from remodel_fenicsx.evolution.chatter import Chatter
-from remodel_fenicsx.evolution.homeostasis import Homeostasis
+from remodel_fenicsx.evolution.coupling import Coupling, Maker
+from remodel_fenicsx.evolution.homeostasis import COARSE, ITERATIONS, LONGEST, TOLERANCE, UNLOADING, Homeostasis, Limit
 from remodel_fenicsx.evolution.locking import LockingWarning
 from remodel_fenicsx.evolution.monitor import StabilityWatcher
+from remodel_fenicsx.evolution.newton import SolverSettings
 from remodel_fenicsx.evolution.radial_chains import RadialChains
+from remodel_fenicsx.evolution.remodeling import RemodelingPass
 from remodel_fenicsx.evolution.resting import Resting
 from remodel_fenicsx.evolution.state import State
 from remodel_fenicsx.evolution.step_control import StepControl
@@ -33,6 +36,8 @@ from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.results.columns import Observer
 from remodel_fenicsx.scene import Scene, SceneError
 from remodel_fenicsx.system.interrupts import take_back_signals
+from remodel_fenicsx.tissue.energy import Tissue
+from remodel_fenicsx.tissue.laws import LAWS
 
 log = logging.getLogger(__name__)
 
@@ -94,19 +99,18 @@ class Simulation:
         self.state = State(self.unknown, kinematics, self.cells, self.loading, formulation)
         tissue = scene.material.tissue(scene.cells.end_to_end_length)
         at_once = scene.time.is_equilibrium
-        # a predictor goes by the steps before; on the way to an equilibrium there are none like these
-        predictor: str = "none" if at_once else scene.solver.predictor
-        if scene.time.tolerance is not None and predictor != "none":
+        predictor: str = scene.solver.predictor
+        if (at_once or scene.time.tolerance is not None) and predictor != "none":
             predictor = "responsive"  # steps have all lengths
         solver = scene.solver.model_copy(update={"predictor": predictor})
-        coupling = Homeostasis if at_once else None
-        self.stepper = Stepper(self.state, tissue, scene.remodeling, solver, self.load_values, coupling)
+        parts = self.state, tissue, scene.remodeling, solver, self.load_values
+        self.stepper = Stepper(*parts, self._at_once(tissue, solver) if at_once else None)
         self.tissue = self.stepper.tissue
         counted = "negative_eigenvalues" in scene.output.columns
         self.stability = StabilityWatcher(self.stepper, scene.solver.unstable, every_step=counted)
         columns = list(scene.output.columns)
         self.control: StepControl | None = None
-        if scene.time.tolerance is not None:
+        if scene.time.tolerance is not None and not at_once:
             settings = scene.time.tolerance, scene.time.step, scene.stops()
             self.control = StepControl(self.stepper, *settings)
             columns += [TIME_ERROR] if TIME_ERROR not in columns else []
@@ -124,6 +128,26 @@ class Simulation:
             self.warnings.insert(0, chatter)
             if self.stepper.remodeling.law.of_absolute_time:
                 self.warnings.append(Resting(self.stepper, chatter))
+
+    def _at_once(self, tissue: Tissue, solver: SolverSettings) -> Maker:
+        """The coupling that goes to the equilibrium, with the steps of a stepper of its own on the same state."""
+        scene, stops = self.scene, self.scene.stops()
+        settings, tolerance = scene.remodeling, scene.time.tolerance
+        if tolerance is None:
+            tolerance = UNLOADING if any(load.falls for load in scene.loads.values()) else TOLERANCE
+        if scene.cells.initial == "random" and LAWS[settings.law].dimensions is not None:
+            # cells that jump from rank to rank: no step is short enough, and passes swing
+            settings, tolerance = settings.model_copy(update={"coupling": "relaxed"}), COARSE
+        way = Stepper(self.state, tissue, settings, solver, self.load_values)
+        way.coupling.longest = min(way.coupling.longest, LONGEST)
+        control = StepControl(way, tolerance, scene.time.step, stops)
+        until = scene.solver.model_copy(update={"maximum_iterations": ITERATIONS})
+
+        def make(state: State, tissue: Tissue, remodeling: RemodelingPass, solver: SolverSettings) -> Coupling:
+            limit = Limit(state, tissue, remodeling, until) if scene.missing_for_implicit() is None else None
+            return Homeostasis(control, remodeling, max(stops[:-1], default=0.0), limit)
+
+        return make
 
     def load_values(self, time: float) -> LoadValues:
         """Magnitude of every load at a time."""

@@ -15,8 +15,6 @@ import pytest
 from mpi4py import MPI
 
 from remodel_fenicsx.kernels.tensor import TensorKernels, condensed_points
-from remodel_fenicsx.evolution.homeostasis import Homeostasis
-from remodel_fenicsx.evolution.uniqueness import check_uniqueness
 from remodel_fenicsx.scene import preset_scene
 from remodel_fenicsx.scene.scene import Scene
 from remodel_fenicsx.simulation import Simulation
@@ -187,14 +185,3 @@ def test_cells_that_answer(law: str, repulsion: str, compiled: bool) -> None:
     for other in answers[1:]:
         for values, expected in zip(other, answers[0], strict=True):
             np.testing.assert_allclose(values, expected, rtol=0, atol=1e-10 * np.abs(expected).max())
-
-
-def test_other_equilibria_are_as_far() -> None:
-    found = []
-    for unit in (1.0, POWER):
-        simulation = Simulation(scene_in(unit, *CASES["equilibrium"]), MPI.COMM_SELF)
-        (step,) = simulation.steps()
-        coupling = simulation.stepper.coupling
-        assert isinstance(coupling, Homeostasis)
-        found.append([other.distance for other in check_uniqueness(coupling, step.loads)])
-    assert found[0] == found[1] and len(found[0]) > 1

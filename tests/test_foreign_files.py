@@ -14,6 +14,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 import tomllib
 import zipfile
 from collections.abc import Callable
@@ -26,7 +27,7 @@ import pytest
 from mpi4py import MPI
 
 from remodel_fenicsx import Recording, SceneError, Simulation
-from remodel_fenicsx.results.checkpoint_file import CheckpointError
+from remodel_fenicsx.results.checkpoint_file import CheckpointError, read_checkpoint
 from remodel_fenicsx.results.recording import RecordingError
 from remodel_fenicsx.results.run_folder import choose_folder
 from remodel_fenicsx.results.vtkhdf import check_file
@@ -34,6 +35,7 @@ from remodel_fenicsx.running import resume, run as run_scene
 from remodel_fenicsx.scene import preset_scene, read_scene
 from remodel_fenicsx.schema.toml import LARGEST, MOST_PARTS
 from remodel_fenicsx.studies.members import Member
+from tests.conftest import slowly
 from tests.parts import pulled_cube
 from tests.test_run import demo, run
 
@@ -463,8 +465,8 @@ def test_a_flipped_bit_in_fields_is_noticed_before_anything_changes(name: str, f
     assert content(folder) == before
     if name == "fields.vtkhdf":
         with pytest.raises(RecordingError, match="is damaged"):
-            for time in Recording(folder).times:
-                Recording(folder).fields(time)
+            for recorded in Recording(folder).times:
+                Recording(folder).fields(recorded)
 
 
 def test_a_file_that_is_whole_is_taken(finished: Path) -> None:
@@ -592,7 +594,7 @@ def test_a_scene_has_bounds(tmp_path: Path) -> None:
         path.write_text(text[: LARGEST - 1] if "larger" not in words else text)
         with pytest.raises(SceneError, match=words):
             read_scene(path)
-    times = ", ".join(f"{time}.5" for time in range(20_000))  # decimals are no keys
+    times = ", ".join(f"{whole}.5" for whole in range(20_000))  # decimals are no keys
     path.write_text(f"{demo('cube').read_text()}\n[output]\ntimes = [{times}]\n")
     with pytest.raises(SceneError, match="output.times"):
         read_scene(path)
@@ -635,6 +637,47 @@ assert before >= 1 and len(taken) == before + 1, taken
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=100)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+AT_ANY_MOMENT = """
+import os, runpy, sys
+class Ready:
+    def find_spec(name, path=None, target=None):
+        if name == "remodel_fenicsx":  # the command's handlers are there
+            sys.meta_path.remove(Ready)
+            os.write({writing}, b"x")
+sys.meta_path.insert(0, Ready)
+sys.argv = {words}
+runpy.run_path({program!r}, run_name="__main__")
+"""
+
+
+@pytest.mark.parametrize("moments", [3, *slowly(20)])
+@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGTERM, signal.SIGINT, signal.SIGUSR1])
+def test_a_signal_at_any_moment_of_the_start(number: signal.Signals, moments: int, tmp_path: Path) -> None:
+    """From the command's first line to its first steps: its exit code, one line, and a run that goes on."""
+    long = ["--set", "time.end=400", "--set", "time.step=0.1", "--set", "output.checkpoint=1"]
+    for moment in range(moments):
+        out = tmp_path / f"out-{moment}"
+        reading, writing = os.pipe()
+        words = ["remodel-fenicsx", "run", str(demo("cube")), *long, "-q", "-o", str(out)]
+        program = AT_ANY_MOMENT.format(
+            writing=writing, words=words, program=str(PROJECT / "bin" / "remodel-fenicsx")
+        )  # fmt: skip
+        command = [sys.executable, "-c", program]
+        with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, pass_fds=[writing]) as process:
+            os.close(writing)
+            assert os.read(reading, 1) == b"x"
+            os.close(reading)
+            time.sleep(1.5 * (moment + 0.5) / moments)
+            process.send_signal(number)
+            errors = process.communicate(timeout=100)[1]
+        assert process.returncode == (4 if number == signal.SIGUSR1 else 128 + number), (moment, errors)
+        assert errors.count("\n") == 1 and errors.startswith("remodel-fenicsx: "), (moment, errors)
+        kept = read_checkpoint(out) if (out / "scene.toml").exists() else None
+        if kept is not None:
+            resume(out, [f"time.end={kept.time + 0.1:.1f}"], SELF)
+            assert Recording(out).history["time"][-1] == pytest.approx(kept.time + 0.1)
 
 
 # ---------------------------------------------------------------- Python

@@ -165,7 +165,9 @@ def simulated(scene: Scene, divisions: tuple[int, int, int] | None = None) -> It
 @pytest.mark.parametrize(("around", "through", "tolerance"), [(16, 8, 0.035), *slowly((32, 16, 0.01))])
 def test_a_thick_tube_does_not_lock(around: int, through: int, tolerance: float, caplog: Any) -> None:
     """Incompressible, closed form."""
-    with caplog.at_level(logging.WARNING), simulated(thick_tube(1e4, SELECTIVE), (around, through, 1)) as (_, rows):
+    # few halvings: the three steps that go three times as far as their first Newton step are not looked into again
+    scene = thick_tube(1e4, SELECTIVE).with_values({"solver.maximum_halvings": 4})
+    with caplog.at_level(logging.WARNING), simulated(scene, (around, through, 1)) as (_, rows):
         assert rows[-1]["inner_radius"] - 1 == pytest.approx(EXACT_TUBE, rel=tolerance)
         assert max(row["newton_iterations"] for row in rows) <= 9
         assert {row["substeps"] for row in rows[1:]} == {1.0}

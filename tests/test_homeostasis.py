@@ -11,10 +11,9 @@ import pytest
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from remodel_fenicsx import Recording, Scene, SceneError, Simulation, cli
+from remodel_fenicsx import Recording, Scene, SceneError, Simulation
 from remodel_fenicsx.body import tube
 from remodel_fenicsx.evolution.homeostasis import Homeostasis
-from remodel_fenicsx.evolution.uniqueness import STARTS, check_uniqueness
 from remodel_fenicsx.results.columns import Measurement
 from remodel_fenicsx.running import resume, run
 from remodel_fenicsx.scene import scene_from_dict
@@ -62,7 +61,7 @@ def test_it_is_where_time_leads(driver: str) -> None:
     at_once = Simulation(artery(remodeling={"driver": driver}), SELF)
     row = solved(at_once)
     coupling = at_once.stepper.coupling
-    assert isinstance(coupling, Homeostasis) and coupling.solves <= 15 and row["newton_iterations"] <= 60
+    assert isinstance(coupling, Homeostasis) and row["substeps"] == coupling.steps
     assert row["pass_residual"] < 1e-8
     changes = {"driver": driver, "coupling": "relaxed" if driver != "cauchy" else "staggered"}
     in_time = Simulation(artery(remodeling=changes, time={"end": 900.0, "step": 12.5}), SELF)
@@ -86,15 +85,11 @@ def test_relaxation_and_tensor_have_the_same_limit_as_eq_11() -> None:
 
 
 @pytest.mark.parametrize("law", ["explicit", *slowly("tensor")])
-def test_random_cells_come_to_the_same_state(law: str, caplog: pytest.LogCaptureFixture) -> None:
-    """By passes; isotropic ones go along the path."""
+def test_random_cells_come_to_the_same_state(law: str) -> None:
     found = []
     for cells in ("isotropic", "random"):
-        with caplog.at_level(logging.INFO):
-            caplog.clear()
-            simulation = coarse(cells, law=law)
-            assert solved(simulation)["pass_residual"] < 1e-8
-        assert ("relaxed passes" in caplog.text) == (cells == "random")
+        simulation = coarse(cells, law=law)
+        assert solved(simulation)["pass_residual"] < 1e-8
         found.append(simulation.cells.structure_tensor())
     np.testing.assert_allclose(found[0], found[1], atol=1e-6)
     assert np.abs(found[0] - np.eye(3) / 3).max() > 0.3
@@ -121,12 +116,10 @@ TABLE = [
 @pytest.mark.slow
 @pytest.mark.parametrize(("driver", "frame", "inner", "outer", "angles"), TABLE)
 def test_the_full_artery(driver: str, frame: str, inner: float, outer: float, angles: list[float]) -> None:
-    """At most 15 solves and 60 iterations; means over the points of each layer of elements."""
+    """Means over the points of each layer of elements."""
     simulation = Simulation(artery("full", remodeling={"driver": driver, "frame": frame}), SELF)
     (step,) = simulation.steps()
-    coupling = simulation.stepper.coupling
-    assert isinstance(coupling, Homeostasis) and coupling.solves <= 15
-    assert step.row["newton_iterations"] <= 60 and step.row["pass_residual"] < 1e-8
+    assert step.row["pass_residual"] < 1e-8
     assert (step.row["inner_radius"], step.row["outer_radius"]) == pytest.approx((inner, outer), abs=1e-3)
     angle = Measurement(simulation.observer, step).fibre_angle
     radius = np.linalg.norm(simulation.quadrature.coordinates[..., :2], axis=-1).mean(axis=1)
@@ -135,37 +128,93 @@ def test_the_full_artery(driver: str, frame: str, inner: float, outer: float, an
     np.testing.assert_allclose(means, angles, rtol=0, atol=0.1)
 
 
-# ---------------------------------------------------------------- other starts
-def test_other_starts_lead_to_the_same_state(caplog: pytest.LogCaptureFixture) -> None:
-    simulation = Simulation(artery(), SELF)
-    solved(simulation)
-    coupling, before = simulation.stepper.coupling, simulation.state.snapshot()
-    assert isinstance(coupling, Homeostasis)
-    others = check_uniqueness(coupling, before.loads)
-    assert [other.start for other in others] == list(STARTS) and all(other.distance < 1e-6 for other in others)
-    after = simulation.state.snapshot()
-    for name, array in before.arrays.items():
-        np.testing.assert_array_equal(after.arrays[name], array)
-    assert (after.time, after.number, after.loads) == (before.time, before.number, before.loads)
+# ---------------------------------------------------------------- the way decides
+def tube_in_time(pressure: float, elongation: float, factors: list[tuple[float, float]], **tables: Any) -> Any:
+    """Of a tube on a ray, at once and in time to kappa t = 37: row, A at all points, simulation."""
+    ramp = [list(pair) for pair in factors]
+    base: dict[str, Any] = {
+        "geometry": {"shape": "tube", "inner_radius": 1.0, "outer_radius": 3.0, "length": 8.0},
+        "model": {"kinematics": "radial"},
+        "mesh": {"degree": 2},
+        "cells": {"initial": "isotropic"},
+        "loads": {name: {"value": v, "ramp": ramp} for name, v in (("pressure", pressure), ("elongation", elongation))},
+        "output": {"fields": False},
+    }
+    found = []
+    for time in ({"end": "equilibrium"}, {"end": 1500.0, "tolerance": 0.5}):
+        simulation = Simulation(scene_from_dict(base | tables | {"time": time}), SELF)
+        row = list(simulation.steps())[-1].row
+        found.append((row, simulation.state.equilibrium_cells.structure_tensor(), simulation))
+    return found
+
+
+HALF_WAY_BACK = [(0.0, 0.0), (25.0, 1.0), (50.0, -0.3)]
+CAROTID: dict[str, Any] = {
+    "geometry": {"shape": "tube", "inner_radius": 3.2, "outer_radius": 4.3, "length": 20.0},
+    "material": {
+        "lame_lambda": 600.0,
+        "lame_mu": 3.0,
+        "chain_density": 2e25,
+        "temperature": 310.15,
+        "stress_unit": "kPa",
+    },
+}
+
+
+@pytest.mark.parametrize("formulation", ["displacement", "selective-integration"])
+def test_of_several_states_it_is_the_one_that_time_comes_to(formulation: str) -> None:
+    """A tube that is stretched by 0.3 while it dilates: other ways end up to 80 degrees away at the outer wall."""
+    mesh = {"degree": 2, "refinement": 2, "formulation": formulation}
+    (at_once, cells, _), (in_time, others, _) = tube_in_time(
+        13.332, 0.3, [(0.0, 0.0), (25.0, 1.0)], mesh=mesh, **CAROTID
+    )
+    for name in ("fibre_angle_inner", "fibre_angle_middle", "fibre_angle_outer"):
+        assert at_once[name] == pytest.approx(in_time[name], abs=0.5)
+    assert in_time["fibre_angle_outer"] < 10
+    assert at_once["inner_radius"] == pytest.approx(in_time["inner_radius"], rel=1e-3)
+    np.testing.assert_allclose(cells, others, atol=0.01)
+
+
+def test_a_step_that_leads_elsewhere_does_not_count() -> None:
+    """From near the state at rest of a thick tube Newton's method finds another one, 10 degrees away."""
+    thick = {"geometry": {"shape": "tube", "inner_radius": 1.0, "outer_radius": 6.0, "length": 8.0}}
+    mesh = {"degree": 2, "refinement": 2}
+    (at_once, cells, _), (in_time, others, _) = tube_in_time(2.0, 0.2, [(0.0, 0.0), (25.0, 1.0)], mesh=mesh, **thick)
+    assert at_once["fibre_angle_inner"] == pytest.approx(in_time["fibre_angle_inner"], abs=0.5)
+    np.testing.assert_allclose(cells, others, atol=0.01)
+
+
+def test_cells_without_tension_stay_where_the_way_has_left_them(caplog: pytest.LogCaptureFixture) -> None:
+    """After a reversal of the loads, and the share of the body where it matters is said."""
+    (_, cells, _), (_, others, simulation) = tube_in_time(3.0, 0.1, HALF_WAY_BACK)
+    np.testing.assert_allclose(cells, others, atol=0.03)
+    (said,) = [record.getMessage() for record in caplog.records if "no tension at rest" in record.getMessage()]
+    values = np.linalg.eigvalsh(simulation.stepper.remodeling.driving_tensor()[1])
+    squares = np.sign(values) * values**2
+    tension, compression = np.maximum(squares, 0).sum(axis=1), -np.minimum(squares, 0).sum(axis=1)
+    quadrature = simulation.quadrature
+    share = quadrature.mean((tension < 0.01 * compression).astype(float).reshape(quadrature.shape))
+    assert float(said.split(" %")[0]) == pytest.approx(100 * share, abs=3) and share > 0.1
+
+
+def test_an_unloaded_body_keeps_its_cells_and_says_so(caplog: pytest.LogCaptureFixture) -> None:
+    """Cells have turned before the load went; nothing asks them to turn back."""
+    loads = {"force": {"value": 10.0, "ramp": [[0.0, 0.0], [10.0, 1.0], [30.0, 0.0]]}}
+    cube = {"geometry": {"shape": "cube"}, "loads": loads, "output": {"fields": False}}
+    found = []
+    for time in ({"end": "equilibrium", "tolerance": 0.5}, {"end": 100.0, "tolerance": 0.5}):
+        tables = cube | {"model": {"kinematics": "point"}, "time": time}
+        simulation = Simulation(scene_from_dict(values("point") | tables), SELF)
+        found.append(list(simulation.steps())[-1].row["mean_fibre_angle"])
+    assert found[0] == pytest.approx(found[1], abs=0.5) and 20 < found[1] < 45
+    assert "100 % of the body has no tension at rest" in caplog.text
+
+
+def test_the_artery_says_nothing(caplog: pytest.LogCaptureFixture) -> None:
+    """And takes about as many solves as it has steps, not one for each unit of time."""
+    row = solved(Simulation(artery(), SELF))
+    assert row["substeps"] <= 25
     assert not [record for record in caplog.records if record.levelno >= logging.WARNING]
-
-
-def test_a_body_that_forgets_nothing_has_many_equilibria(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Without tension no cell changes: every start is its own end, and that is said."""
-    scene = scene_from_dict(values("point") | {"geometry": {"shape": "cube"}, "loads": {"force": {"value": 0.0}}})
-    path = tmp_path / "cube.toml"
-    path.write_text(scene.to_toml())
-    assert cli.main(["run", str(path), "-o", str(tmp_path / "out"), "--check-uniqueness"]) == 0
-    said = capsys.readouterr().err
-    assert "uniqueness: from random cells to another equilibrium" in said
-    assert "uniqueness: from isotropic cells to the same equilibrium" in said
-
-
-def test_only_an_equilibrium_has_other_starts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = tmp_path / "cube.toml"
-    path.write_text(artery(time={"end": 2.0}).to_toml())
-    assert cli.main(["run", str(path), "-o", str(tmp_path / "out"), "--check-uniqueness"]) == 2
-    assert "--check-uniqueness: only with time.end = 'equilibrium'" in capsys.readouterr().err
 
 
 # ---------------------------------------------------------------- scenes and records

@@ -58,11 +58,11 @@ def test_a_loose_tolerance_remodels_as_a_tight_one(coupling: str) -> None:
 
 
 def test_a_residual_that_may_be_much_of_the_stress_is_said(caplog: pytest.LogCaptureFixture) -> None:
-    for tolerance in (1e-6, 1e-2):
+    for tolerance in (1e-6, 1e-1):
         changes = {**LOOSE, "time.end": 5.0, "solver.relative_tolerance": tolerance}
         list(Simulation(preset_scene("consistent", "tube").with_values(changes)).steps())
         said = [record.getMessage() for record in caplog.records if "out of balance" in record.getMessage()]
-        assert len(said) == (tolerance == 1e-2), tolerance
+        assert len(said) == (tolerance == 1e-1), tolerance
     assert "lower solver.relative_tolerance" in said[0]
 
 

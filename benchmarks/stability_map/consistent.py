@@ -46,7 +46,8 @@ class Target:
         positive, negative = np.maximum(values, 0.0) ** 2, np.minimum(values, 0.0) ** 2
         tension = positive.sum()
         # what is below rounding of the stress remodels nothing
-        floor = 0.0 if driver == "finger" else (1e-7 * (m.lame_lambda + 2 * m.lame_mu + m.network_modulus)) ** 2
+        network = m.network_modulus * secant_stiffness(np.array(r0 := m.end_to_end_length), m.contour_length) * r0**2
+        floor = 0.0 if driver == "finger" else (1e-7 * (m.lame_lambda + 2 * m.lame_mu + float(network))) ** 2
         share = tension / (tension + COMPRESSION**2 * negative.sum() + floor)
         return cls(positive / (tension or 1.0), float(share), time)
 

@@ -59,6 +59,7 @@ class LockingWarning(Watcher):
         shape = self.quadrature.shape
         self.stiffnesses = [self.quadrature.owned(v.reshape(shape)) for v in (tissue.lame_lambda, tissue.lame_mu)]
         self.locks = locks
+        self.homogeneous = stepper.state.kinematics.homogeneous  # then there are no elements that could hold it back
         self._occasions = Occasions(stepper.state, "locking")
         self._numbers = Numbers(stepper.state, "locking", {"said": 0, "energy": 0, "vain": 0})
 
@@ -95,7 +96,7 @@ class LockingWarning(Watcher):
 
     def solved(self, step: Step) -> None:
         """Look, until it was said."""
-        if self._numbers["said"] or not self._occasions.due() or not self._is_news():
+        if self.homogeneous or self._numbers["said"] or not self._occasions.due() or not self._is_news():
             return
         missing = self.missing()
         if sum(missing) <= LIMIT:

@@ -19,6 +19,9 @@ from remodel_fenicsx.results.vtkhdf import check_file
 from remodel_fenicsx.system.regular_files import open_own, write_whole
 
 
+DEEPEST = 100  # folders in folders: Python makes them by a function that calls itself
+
+
 class LastStep(NamedTuple):
     """Where a run goes on."""
 
@@ -40,6 +43,8 @@ def choose_folder(requested: Path | None, name: str) -> Path:
         If the default folder cannot be made.
     """
     if requested is not None:
+        if len(requested.parts) > DEEPEST:
+            raise FolderTaken(f"-o {requested}: lies in more than {DEEPEST} folders")
         if requested.exists() and not requested.is_dir():
             raise FolderTaken(f"-o {requested}: is a file; allowed is a new or an empty folder")
         if requested.is_dir() and not is_vacant(requested):

@@ -127,7 +127,7 @@ class Scene(Table):
         if FORMULATIONS[formulation].takes_parts and not isinstance(MATRICES[material.matrix], Matrix):
             rule = f"needs the volumetric part of material.matrix = {material.matrix!r}: an energy made as a Matrix"
             raise fault(rule, "mesh.formulation", formulation)
-        missing = self._missing_for_implicit() if self.remodeling.coupling == "implicit" else None
+        missing = self.missing_for_implicit() if self.remodeling.coupling == "implicit" else None
         if missing is not None:
             raise fault(f"needs {missing}", "remodeling.coupling", "implicit")
         if self.time.is_equilibrium and (missing := self._missing_for_equilibrium()) is not None:
@@ -149,7 +149,7 @@ class Scene(Table):
             raise fault("; ".join(reasons), "model.kinematics", self.model.kinematics)
         return self
 
-    def _missing_for_implicit(self) -> str | None:
+    def missing_for_implicit(self) -> str | None:
         """What the coupling "implicit" would need."""
         return _missing_for_implicit(self.mesh, self.material, self.remodeling)
 
@@ -169,8 +169,7 @@ class Scene(Table):
             return f"remodeling.law = {law!r} has no limit that the way there does not decide; those with one: {laws}"
         if self.remodeling.kappa == 0:
             return "remodeling.kappa = 0: the cells never change"
-        missing = self._missing_for_implicit()
-        return None if missing is None else f"needs {missing}"
+        return None if self.material.chain_density else "needs chains: material.chain_density above 0"
 
     @property
     def last_time(self) -> float:
@@ -211,8 +210,9 @@ class Scene(Table):
 
     def stops(self) -> list[float]:
         """Times at which a step ends, however long steps are: corners of ramps, output.times and the end."""
-        times = {time for load in self.loads.values() for time, _ in load.ramp if 0 < time < self.time.end}
-        return sorted({*times, *self.output.times, self.time.end})
+        end = self.last_time
+        times = {time for load in self.loads.values() for time, _ in load.ramp if 0 < time < end}
+        return sorted({*times, *self.output.times, end})
 
     @property
     def has_free_length(self) -> bool:

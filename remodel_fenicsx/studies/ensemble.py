@@ -91,7 +91,7 @@ def members_of(scene: Scene, folder: Path, seeds: int) -> list[Member]:
     """
     if scene.cells.initial != "random":
         raise SceneError(f"cells.initial = {scene.cells.initial!r}: an ensemble is one of 'random' cells")
-    if scene.time.tolerance is not None:
+    if scene.time.tolerance is not None and not scene.time.is_equilibrium:
         raise SceneError(f"time.tolerance = {scene.time.tolerance:g}: each seed would have other steps; leave it out")
     numbers = range(scene.cells.seed, scene.cells.seed + seeds)
     every: dict[str, dict[str, Any]] = {f"seed-{number}": {"cells.seed": number} for number in numbers}
