@@ -392,3 +392,23 @@ def test_the_driving_stress_of_quadratic_elements_has_the_pressure_of_their_rule
     np.testing.assert_allclose(pressure, expected, atol=1e-8 * np.abs(expected).max())
     assert np.ptp(between) > 0.1  # no constant pressure
     assert np.abs(between - J[:, 0, 0]).max() > 1e-2  # nor that of the points
+
+
+def test_a_twisted_bar_is_not_said_to_be_too_coarse() -> None:
+    """Trilinear elements have u = twist z (-y, x, 0) exactly: strain varies inside them and has no jumps between them.
+
+    A bent bar, u = bend (x z, 0, -x^2 / 2), has a shear strain that they cannot follow: that counts.
+    """
+    scene = preset_scene("kuhl-holzapfel-2007", "cube").with_values({"mesh.refinement": 2, "material.chain_density": 0})
+    simulation = Simulation(scene, MPI.COMM_SELF)
+    warning = next(watcher for watcher in simulation.warnings if isinstance(watcher, LockingWarning))
+    x, unknown = simulation.domain.mesh.geometry.x, simulation.unknown
+
+    def shape_energy(displacement: Any) -> float:
+        unknown.interpolate(displacement)
+        return warning.energies()[2]
+
+    twisted = shape_energy(lambda x: 0.01 * x[2] * np.array([-x[1], x[0], 0 * x[0]]))
+    bent = shape_energy(lambda x: 0.01 * np.array([x[0] * x[2], 0 * x[0], -(x[0] ** 2) / 2]))
+    assert len(x) == 27 and bent > 0 and twisted < 1e-9 * bent
+    simulation.close()

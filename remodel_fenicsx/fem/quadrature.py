@@ -205,18 +205,35 @@ class Quadrature:
         complement: NDArray[np.float64] = self._complements[degree] @ values
         return complement
 
+    def jumps(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """How far values (owned elements, points, n) lie from their neighbours': a mean square, (owned elements,).
+
+        They are continued to the element's nodes, and compared with the mean over all elements there.
+        """
+        kind = basix.CellType[self.element_kind]
+        element = basix.create_element(
+            basix.ElementFamily.P, kind, self.mesh.geometry.cmap.degree, basix.LagrangeVariant.gll_warped
+        )
+        continued = np.linalg.pinv(np.asarray(element.tabulate(0, self.points))[0, :, :, 0]) @ values
+        squares: NDArray[np.float64] = np.square(continued - self._means_at_nodes(continued)).sum(axis=-1).mean(axis=-1)
+        return squares
+
     def _mean_of_neighbours(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Of values (owned elements, n): means over all elements at each node, averaged over an element's nodes."""
-        nodes, number = geometry_dofmap(self.mesh)[: self.number_of_owned_elements], values.shape[1] + 1
+        return np.asarray(self._means_at_nodes(values[:, None]).mean(axis=1))
+
+    def _means_at_nodes(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Of values at an element's nodes, or the same at all, (owned elements, nodes or 1, n): means by volume."""
+        nodes, number = geometry_dofmap(self.mesh)[: self.number_of_owned_elements], values.shape[-1] + 1
         sums = dolfinx.la.vector(self.mesh.geometry.index_map(), number, dtype=np.float64)
-        volumes = self.owned(self.volumes).sum(axis=1, keepdims=True)
-        weighted = np.hstack([values * volumes, volumes])
+        volumes = np.broadcast_to(
+            self.owned(self.volumes).sum(axis=1)[:, None, None], (*nodes.shape, 1)
+        )  # fmt: skip
         at_nodes = sums.array.reshape(-1, number)
-        np.add.at(at_nodes, nodes, weighted[:, None])
+        np.add.at(at_nodes, nodes, np.concatenate([values * volumes, volumes], axis=-1))
         sums.scatter_reverse(dolfinx.la.InsertMode.add)
         sums.scatter_forward()
-        means: NDArray[np.float64] = (at_nodes[nodes, :-1] / at_nodes[nodes, -1:]).mean(axis=1)
-        return means
+        return np.asarray(at_nodes[nodes, :-1] / at_nodes[nodes, -1:])
 
     def maximum(self, values: NDArray[np.float64]) -> float:
         """Largest of values (elements, ...) over all ranks."""
