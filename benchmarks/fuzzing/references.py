@@ -21,10 +21,9 @@ COUNTS = 0.01  # a target with a smaller share is none to go on from
 COMPRESSION = 0.1
 SETTLED, PASSES = 1e-10, 300  # of an implicit step by repeated passes: change of the squares over r0^2; how many
 POINT_TOLERANCE, ROUNDING = 1e-5, 1e-9  # of stretches; of radii
-WALL_TOLERANCE = (
-    0.08  # of the largest displacement: that elements lack more than 5 % of it is warned of, by an estimate
-POLYGON_TOLERANCE = 0.2  # eight linear elements around, half of what scenes have, are off by 10 % where nothing locks
-)
+# Of the largest displacement. That elements lack more than 5 % of it is warned of, by an estimate; eight linear ones
+# around, half of what scenes have, are off by 10 % where nothing locks
+WALL_TOLERANCE, POLYGON_TOLERANCE = 0.08, 0.2
 
 
 # ---------------------------------------------------------------- bodies of one dimension
