@@ -93,6 +93,18 @@ def test_the_tangent_is_the_derivative(law: str, repulsion: str, driver: str, fr
     assert np.median(errors) < 1e-7 and np.max(errors) < 1e-5
 
 
+def test_points_without_tension_answer_nothing() -> None:
+    """Their axes stay, and are none of the driver's: nothing is divided by what one has along the other."""
+    some = points("relaxation", "axes", "cauchy", "material", 1)
+    some = replace(
+        some, step=replace(some.step, cells=UnitCell(some.step.cells.dimensions, np.eye(3)[None, [1, 2, 0]]))
+    )
+    strain = Strain.of(np.diag([1.2, 1.1, 1.0])[None])
+    with np.errstate(all="raise"):
+        found = response(some.step, strain, strain.inside(np.diag([-3.0, -2.0, -1.0])[None]), derivatives=True)
+    assert not np.any(found.by_tensor) and not np.any(found.by_stretch)
+
+
 def test_tension_hardly_above_noise_answers_by_the_switch_too() -> None:
     """There the size of the stress decides how much remodels, not its directions alone."""
     rng = np.random.default_rng(9)

@@ -11,8 +11,10 @@ import contextlib
 import importlib
 import io
 import json
+import math
 import os
 import re
+import subprocess
 import sys
 import tempfile
 import time as clock
@@ -52,6 +54,8 @@ def run_request(request: dict[str, Any]) -> dict[str, Any]:
     request
         `scene`: nested tables; `counts`: {module: {constant: value}}, numbers of elements that scenes cannot ask for;
         `extended`: whether it needs the loads and bodies of `extensions`; `other`: whether this is another checkout.
+        Ways to run it that must change nothing: `ranks`; `stop`, a time at which it ends and is resumed; `recorded`:
+        the scene.toml that it leaves is what is run.
 
     Returns
     -------
@@ -70,22 +74,64 @@ def run_request(request: dict[str, Any]) -> dict[str, Any]:
         if not request.get("other"):  # without it scenes without a preset take the cheapest kinematics
             tables = {"model": {"kinematics": "full"}, **tables}
         scene.write_text(tomlkit.dumps(tables), encoding="utf-8")
-        said = io.StringIO()
+        said, command = io.StringIO(), ["run", str(scene), "-o", str(results), "-q"]
         with element_counts(request.get("counts", {})), contextlib.redirect_stderr(said):
             with contextlib.redirect_stdout(io.StringIO()):
-                try:
-                    code = importlib.import_module("remodel_fenicsx.cli").main(
-                        ["run", str(scene), "-o", str(results), "-q"]
-                    )
-                except SystemExit as error:  # the command line's own words for its arguments
-                    code = error.code
-                except Exception:  # a defect of the program is an outcome of the map, with its traceback
-                    code, trace = 1, traceback.format_exc()
-                    said.write(trace)
+                if "ranks" in request:
+                    code = on_ranks(request, command, said)
+                elif "stop" in request:
+                    code = commanded([*command, "--set", f"time.end={request['stop']!r}"], said)
+                    if code == 0:
+                        more = ["run", "--resume", str(results), "--set", f"time.end={tables['time']['end']!r}", "-q"]
+                        code = commanded(more, said)
+                else:
+                    code = commanded(command, said)
+                if code == 0 and request.get("recorded"):
+                    again = Path(folder) / "again"
+                    code, results = commanded(["run", str(results / "scene.toml"), "-o", str(again), "-q"], said), again
         if code == 2 and UNKNOWN.search(said.getvalue()) and request.get("other"):
             code = None
         found = {"code": code, "said": said.getvalue()[-2000:], "seconds": clock.perf_counter() - start}
         return {**found, **read_results(results)}
+
+
+def commanded(command: list[str], said: io.StringIO) -> Any:
+    """The exit code of a command line in this process."""
+    try:
+        return importlib.import_module("remodel_fenicsx.cli").main(command)
+    except SystemExit as error:  # the command line's own words for its arguments
+        return error.code
+    except Exception:  # a defect of the program is an outcome of the map, with its traceback
+        said.write(traceback.format_exc())
+        return 1
+
+
+def on_ranks(request: dict[str, Any], command: list[str], said: io.StringIO) -> int:
+    """The exit code of a command line in processes of its own, each with the request's numbers of elements."""
+    program = (
+        "import json, sys\n"
+        "from benchmarks.stability_map.runner import element_counts\nfrom remodel_fenicsx.cli import main\n"
+        "with element_counts(json.loads(sys.argv[1])): code = main(sys.argv[2:])\nsys.exit(code)"
+    )
+    words = [
+        "mpirun",
+        "--allow-run-as-root",
+        "--oversubscribe",
+        "-n",
+        str(request["ranks"]),
+        sys.executable,
+        "-c",
+        program,
+    ]
+    words += [json.dumps(request.get("counts", {})), *command]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=300, cwd=tempfile.gettempdir())
+    said.write(done.stderr)
+    return done.returncode
+
+
+def value_of(entry: str) -> float:
+    """An entry of history.csv: empty is nan, and what says nan is none that a row may have."""
+    return float("nan") if not entry else float("inf") if math.isnan(float(entry)) else float(entry)
 
 
 @contextlib.contextmanager
@@ -114,7 +160,7 @@ def read_results(folder: Path) -> dict[str, Any]:
         found["warnings"] = [re.sub(r"^.*? WARNING ", "", line) for line in lines if " WARNING " in line]
     if (folder / "history.csv").exists():
         names, *rows = (folder / "history.csv").read_text(encoding="utf-8").splitlines() or [""]
-        values = [[float(entry or "nan") for entry in row.split(",")] for row in rows]
+        values = [[value_of(entry) for entry in row.split(",")] for row in rows]
         found["history"] = {name: [row[i] for row in values] for i, name in enumerate(names.split(","))}
     if (folder / "fields.vtkhdf").exists():
         with h5py.File(folder / "fields.vtkhdf", "r") as file:

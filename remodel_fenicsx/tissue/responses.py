@@ -227,6 +227,7 @@ def _pulled_back(found: _Principal, strain: Strain, turns: Array) -> tuple[Array
     """
     m, n, inverse = found.axes, found.cell.axes, 1 / strain.stretches[:, None, :]
     w = (n * inverse) @ np.swapaxes(m, 1, 2)  # n_a . U^-1 m_b
+    w = np.where(found.active[:, None, None], w, np.eye(3))  # axes that stay follow none of X
     (r12, r02, r01), turned = (turns[:, 3], turns[:, 4], turns[:, 5]), turns.copy()
     first, second, third = (w[:, i, i, None] for i in range(3))
     turned[:, 5] = (w[:, 1, 1, None] * r01 + w[:, 1, 2, None] * r02) / first

@@ -1,0 +1,1 @@
+"""Random scenes, what must be true of them, and the command `benchmarks/fuzz.py`."""

@@ -1,0 +1,151 @@
+"""The command `benchmarks/fuzz.py`: which seeds are to run, on which cores, and what becomes of the results."""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import sys
+import threading
+from collections import Counter
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import asdict, replace
+from pathlib import Path
+from random import Random
+
+import numpy as np
+import tomlkit
+
+from benchmarks.fuzzing import references, relations
+from benchmarks.fuzzing.relations import Other
+from benchmarks.fuzzing.scenes import Values, cost, made
+from benchmarks.stability_map.cases import Case, Finding, Run
+from benchmarks.stability_map.judging import BAD_INPUT, NO_END, SOLVE_FAILED, Verdict, judged
+from benchmarks.stability_map.report import read_records
+from benchmarks.stability_map.running import PROJECT, Record, Runner, source_of
+
+RESULTS = PROJECT / "results" / "fuzz"
+
+
+def main(description: str | None, arguments: list[str] | None = None) -> int:
+    """Run what is missing, print what has come of it; 1 if a scene is wrong."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seed", type=int, default=1, metavar="FIRST", help="the first seed (1)")
+    parser.add_argument("--count", type=int, default=300, metavar="N", help="how many seeds (300)")
+    parser.add_argument("--only", type=int, metavar="SEED", help="this one, with its scene, whatever is there of it")
+    parser.add_argument("--again", action="store_true", help="run also what is there")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, metavar="N", help="at a time (all cores)")
+    parser.add_argument("--limit", type=float, default=15, metavar="SECONDS", help="of processor time for a run (15)")
+    parser.add_argument("--results", type=Path, default=RESULTS, metavar="DIR", help="folder of the results")
+    options = parser.parse_args(arguments)
+    if options.only is not None:
+        return _one(options.only, options.limit)
+    source, seeds = f"{source_of(PROJECT)} by {judges()}", range(options.seed, options.seed + options.count)
+    file = options.results / f"{source.partition('+')[0]}.jsonl"
+    there = {} if options.again else {r["seed"]: r for r in read_records(file) if r["source"] == source}
+    done = {seed: there[seed] for seed in seeds if seed in there}
+    # the cheap ones first: what is stopped has seen as many as it could
+    missing = sorted((seed for seed in seeds if seed not in done), key=lambda seed: cost(made(seed)[0]))
+    print(f"{source}: {len(seeds)} scenes, {len(missing)} to run; {file}", file=sys.stderr)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    kept = options.results / "runs" / source.partition(" ")[0]  # a run is judged again without being run again
+    mine = threading.local()  # a thread waits for a process of its own, that runs the scenes
+
+    def evaluate(seed: int) -> Record:
+        if not hasattr(mine, "runner"):
+            mine.runner = Runner(PROJECT, options.limit, kept)
+        return evaluated(seed, mine.runner)
+
+    with file.open("a", encoding="utf-8") as out, ThreadPoolExecutor(options.jobs) as pool:
+        for future in as_completed([pool.submit(evaluate, seed) for seed in missing]):
+            record = future.result() | {"source": source}
+            done[record["seed"]] = record
+            out.write(json.dumps(record) + "\n")
+            out.flush()
+            print(said(record), file=sys.stderr, flush=True)
+    print(summary([done[seed] for seed in seeds]))
+    return int(any(record["outcome"] == "wrong" for record in done.values()))
+
+
+def judges() -> str:
+    """Hash of what makes the scenes and judges them: with other scenes a seed is another one."""
+    files = [*sorted(Path(__file__).parent.glob("*.py")), PROJECT / "tests" / "reference" / "radial.py"]
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:10]
+
+
+def evaluated(seed: int, runner: Runner) -> Record:
+    """The scene of a seed, run twice and judged."""
+    scene, counts = made(seed)
+    other = relations.chosen(scene, Random(seed))
+    run = runner.run({"scene": scene, "counts": counts})
+    asked = {"scene": other.scene, "counts": counts, **other.asked}
+    again = Run(NO_END, run.said) if run.code in (NO_END, BAD_INPUT) else runner.run(asked)
+    verdict = verdict_on(scene, other, run, again)
+    return {
+        "seed": seed, **asdict(verdict), "other": other.name, "reference": references.known(scene),
+        "body": f"{scene['geometry']['shape']} {scene['model']['kinematics']}", "warnings": len(run.warnings),
+        "seconds": round(run.seconds + again.seconds, 2),
+    }  # fmt: skip
+
+
+def verdict_on(scene: Values, other: Other, run: Run, again: Run) -> Verdict:
+    """What all references say together; what no row may do is wrong whatever was said beside it."""
+    faults = [] if run.code == NO_END else references.broken(scene, run)
+    if again.code != NO_END:
+        faults += [f"{other.name}: {fault}" for fault in references.broken(other.in_numbers or other.scene, again)]
+    ends = {run.code, again.code}
+    if other.tolerance == relations.EXACT and len(ends) == 2 and NO_END not in ends:
+        faults.append(f"{other.name}: exit {again.code} for {run.code}: {(again.said or run.said)[-300:].strip()}")
+    if faults:
+        return Verdict("wrong", "; ".join(faults))
+    findings = []
+    if references.known(scene) and run.code in (0, SOLVE_FAILED):
+        findings.append(references.compared(scene, run))
+    if ends == {0}:
+        finding = relations.compared(other, run, again)
+        if finding.ratio > 1 and again.warnings and not run.warnings:  # nobody knows which of them is off
+            finding = replace(finding, ratio=np.nan, words=f"{finding.words}, which says: {again.warnings[0]}")
+        findings.append(finding)
+    known = [finding for finding in findings if not np.isnan(finding.ratio)]
+    words = "; ".join(finding.words for finding in findings) or f"{other.name}: {again.said.strip()[-200:]}"
+    ratio = max((finding.ratio for finding in known), default=np.nan if run.code == 0 else 0.0)
+    worst = Finding(ratio, words, None, all(finding.solvable for finding in findings))
+    return judged(Case("fuzz", "", scene, lambda case, run: worst, ""), run)
+
+
+def said(record: Record) -> str:
+    """A line on a seed."""
+    alarm = " (false alarm)" if record["false_alarm"] else ""
+    return (
+        f"{record['outcome']:9}{alarm} {record['seed']}: {record['body']}, {record['seconds']:g} s: {record['words']}"
+    )
+
+
+def summary(records: list[Record]) -> str:
+    """How many ended how, and those that are not right."""
+    counts = Counter(record["outcome"] for record in records)
+    lines = [said(record) for record in records if record["outcome"] in ("wrong", "unchecked")]
+    lines += [f"{len(records)} scenes: " + ", ".join(f"{number} {outcome}" for outcome, number in counts.most_common())]
+    named = sum(bool(record["cause_named"]) for record in records)
+    alarms, own = (sum(bool(record[key]) for record in records) for key in ("false_alarm", "reference"))
+    return "\n".join([*lines, f"refused with a cause {named}; false alarms {alarms}; own reference for {own}"])
+
+
+def _one(seed: int, limit: float) -> int:
+    scene, counts = made(seed)
+    other = relations.chosen(scene, Random(seed))
+    print(tomlkit.dumps(scene), f"# elements: {counts}\n# held against: {other.name} {other.asked}", sep="")
+    changed = {
+        f"{table}.{key}": value
+        for table, values in other.scene.items() if isinstance(values, dict)
+        for key, value in values.items() if scene.get(table, {}).get(key) != value
+    }  # fmt: skip
+    print("\n".join(f"#     {key} = {value}" for key, value in changed.items()))
+    runner = Runner(PROJECT, limit)
+    try:
+        record = evaluated(seed, runner)
+    finally:
+        runner.close()
+    print(said(record))
+    return int(record["outcome"] == "wrong")
