@@ -193,14 +193,15 @@ class Change:
         return bound
 
     def look_back(self, before: NDArray[np.float64], work: Work) -> bool:
-        """After a step: whether it has ended far from its tangent, or far from the step before, and was looked into."""
+        """After a step: look into one that has ended far from its tangent or from the step before; whether it did."""
         unknown, last = self.newton.unknown.x.array, self._jumps["moved"]
         moved, least = self._size(unknown - before), NOTICEABLE * self.newton.equilibrium.state.loading.domain.size
         is_far = work.is_far or (last > 0.0 and moved > max(least, FASTER * last))
-        if is_far:
+        looked = is_far and self._looks()
+        if looked:
             self.confirm(before, work)
         self._jumps["moved"] = self._size(unknown - before)
-        return is_far
+        return looked
 
     def confirm(self, before: NDArray[np.float64], work: Work) -> None:
         """Go the way again in parts, from the unknowns before it, where the whole was solved far from its tangent.
@@ -208,8 +209,6 @@ class Change:
         Where there is no such way, the solution stays, and a warning says so. Where it leads to another solution, this
         one is taken: the body comes to it.
         """
-        if not self._looks():
-            return
         unknown = self.newton.unknown.x.array
         found, parts = unknown.copy(), Work()
         unknown[:] = before
