@@ -210,13 +210,18 @@ class Quadrature:
 
         They are continued to the element's nodes, and compared with the mean over all elements there.
         """
+        continued = self._continuation @ values
+        squares: NDArray[np.float64] = np.square(continued - self._means_at_nodes(continued)).sum(axis=-1).mean(axis=-1)
+        return squares
+
+    @cached_property
+    def _continuation(self) -> NDArray[np.float64]:
+        """From values at an element's points to those at its nodes, (nodes, points)."""
         kind = basix.CellType[self.element_kind]
         element = basix.create_element(
             basix.ElementFamily.P, kind, self.mesh.geometry.cmap.degree, basix.LagrangeVariant.gll_warped
         )
-        continued = np.linalg.pinv(np.asarray(element.tabulate(0, self.points))[0, :, :, 0]) @ values
-        squares: NDArray[np.float64] = np.square(continued - self._means_at_nodes(continued)).sum(axis=-1).mean(axis=-1)
-        return squares
+        return np.asarray(np.linalg.pinv(np.asarray(element.tabulate(0, self.points))[0, :, :, 0]))
 
     def _mean_of_neighbours(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Of values (owned elements, n): means over all elements at each node, averaged over an element's nodes."""
