@@ -19,10 +19,10 @@ from mpi4py import MPI
 
 from remodel_fenicsx import Scene, Simulation
 from remodel_fenicsx.body import tube
-from remodel_fenicsx.evolution.locking import LockingWarning
-from remodel_fenicsx.evolution.parts import StepFailure
 from remodel_fenicsx.fem.formulations import FORMULATIONS
+from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.system.environment import versions
+from remodel_fenicsx.watch.locking import LockingWarning
 from tests.locking_bodies import EXACT_TUBE, bar_scene, membrane_scene, registered, thick_tube
 from tests.reference.radial import RadialMaterial, solve_radial
 

@@ -28,7 +28,7 @@ parts.end_all_ranks_on_exception()
 # $$W = \frac{\lambda}{2}\ln^2 J + \frac{\mu}{2}(\operatorname{tr} C - 3) - \mu \ln J
 #     + c\,\frac{L}{4}\Big(2\frac{r^2}{L^2} + \frac{1}{1-r/L} - \frac{r}{L}\Big)
 #     - \frac{c}{2}\,g(r_0) \sum_I l_I^2 \ln(n_I \cdot C n_I)$$
-# with the end-to-end length $r^2 = \sum_I l_I^2\, n_I \cdot C n_I$ and $c = k\theta n / (4 A_p)$; `tissue/energy.py`
+# with the end-to-end length $r^2 = \sum_I l_I^2\, n_I \cdot C n_I$ and $c = k\theta n / (4 A_p)$; `model/energy.py`
 # says it in UFL. The cells live at the quadrature points; each element starts with random dimensions, $|l| = r_0$.
 
 # %%

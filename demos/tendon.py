@@ -33,7 +33,7 @@ displacement = kinematics.unknown(domain.mesh, degree=1)
 
 # %% [markdown]
 # ## Tissue
-# The energy of `tissue/energy.py`; a unit cell at every quadrature point with one random draw of $l_I$ per element,
+# The energy of `model/energy.py`; a unit cell at every quadrature point with one random draw of $l_I$ per element,
 # $|l| = r_0$. A cell whose long side lies along z is stiff, one that lies across is soft: the body is not homogeneous.
 
 # %%

@@ -26,9 +26,9 @@ from remodel_fenicsx import Scene, Simulation  # noqa: E402
 from remodel_fenicsx.body import Cube, LoadKind  # noqa: E402
 from remodel_fenicsx.body.domain import Domain  # noqa: E402
 from remodel_fenicsx.body.tube import tube  # noqa: E402
-from remodel_fenicsx.evolution.parts import StepFailure  # noqa: E402
 from remodel_fenicsx.paper.output import COLOURS, STYLE, Page, panel_letters, read_table  # noqa: E402
 from remodel_fenicsx.schema.units import FORCE  # noqa: E402
+from remodel_fenicsx.solver.continuation import StepFailure  # noqa: E402
 
 KEPT, PAGE = DOCS / "figures", DOCS / "laws.md"
 LATE = 10  # steps at the end of a run in which the cells should have come to rest

@@ -21,13 +21,14 @@ from matplotlib.figure import Figure
 DOCS = Path(__file__).resolve().parent
 sys.path[:0] = [str(DOCS), str(DOCS.parent)]
 
+from compare_consistent import page_values  # noqa: E402
+from verification_studies import study  # noqa: E402
+
 from remodel_fenicsx import paper as figures  # noqa: E402
 from remodel_fenicsx.paper.captions import CAPTIONS  # noqa: E402
 from remodel_fenicsx.paper.cases import LOAD_CASES  # noqa: E402
 from remodel_fenicsx.paper.output import COLOURS, STYLE, Page, read_table  # noqa: E402
-from compare_consistent import page_values  # noqa: E402
 from tests.reference.radial import RadialHistory, solve_radial  # noqa: E402
-from verification_studies import study  # noqa: E402
 
 KEPT = DOCS / "figures"
 MORE_TABLES = ("fig6-snapshots", "fig7-history", "fig10-history", "fig11-history", "radial-reference-radii")

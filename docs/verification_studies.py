@@ -22,13 +22,13 @@ sys.path.insert(0, str(ROOT))
 
 from remodel_fenicsx.evolution.remodeling import RemodelingPass  # noqa: E402
 from remodel_fenicsx.evolution.stepper import Step, Watcher  # noqa: E402
-from remodel_fenicsx.paper.output import Page, read_table  # noqa: E402
+from remodel_fenicsx.model.spectral import positive_direction  # noqa: E402
 from remodel_fenicsx.paper.cases import scenes  # noqa: E402
-from remodel_fenicsx.system.children import cores  # noqa: E402
+from remodel_fenicsx.paper.output import Page, read_table  # noqa: E402
 from remodel_fenicsx.paper.validity import library_versions, source_fingerprint  # noqa: E402
 from remodel_fenicsx.results.columns import Measurement  # noqa: E402
 from remodel_fenicsx.simulation import Simulation  # noqa: E402
-from remodel_fenicsx.tissue.spectral import positive_direction  # noqa: E402
+from remodel_fenicsx.system.children import cores  # noqa: E402
 
 Row = dict[str, Any]
 USED_BY_STUDIES = (
@@ -101,7 +101,7 @@ def comparison_jobs() -> dict[str, list[tuple[Callable[[Any], Row], Any]]]:
 
 def invariance(case: tuple[str, str, str]) -> Row:
     """The bar of tests/test_invariance.py twice, once turned: what differs, measured by r0, the side and the energy."""
-    from remodel_fenicsx.tissue.cells import angle_to_axis
+    from remodel_fenicsx.model.cells import angle_to_axis
     from tests import test_invariance as bars
 
     driver, frame, turned = case

@@ -15,15 +15,15 @@ from typing import Any, NoReturn
 
 from remodel_fenicsx._version import __version__
 from remodel_fenicsx.body.reductions import explained
+from remodel_fenicsx.scene.parameters import PRESETS
+from remodel_fenicsx.scene.profiles import PROFILES
+from remodel_fenicsx.scene.scene import Scene, SceneError, preset_scene, read_scene
+from remodel_fenicsx.schema.tables import printable
 from remodel_fenicsx.system import interrupts
 from remodel_fenicsx.system.arguments import positive, wall_time
 from remodel_fenicsx.system.children import SERVE, serve
 from remodel_fenicsx.system.environment import kernels, reason_undrawable, reason_unusable, versions
 from remodel_fenicsx.system.regular_files import ForeignFileError
-from remodel_fenicsx.scene.parameters import PRESETS
-from remodel_fenicsx.scene.profiles import PROFILES
-from remodel_fenicsx.scene.scene import Scene, SceneError, preset_scene, read_scene
-from remodel_fenicsx.schema.tables import printable
 
 BAD_INPUT, SOLVE_FAILED, STOPPED, BAD_ENVIRONMENT = 2, 3, interrupts.PAUSED, 5
 EXIT_CODES = {
@@ -202,11 +202,11 @@ def _run(options: argparse.Namespace, task: Callable[..., Path] | None = None) -
         return _fail(f"the environment is not usable: {reason}; run through ./with-fenicsx", BAD_ENVIRONMENT)
     interrupts.take_back_signals()
     from remodel_fenicsx.body import GeometryError
-    from remodel_fenicsx.evolution.parts import StepFailure
     from remodel_fenicsx.results.checkpoint_file import CheckpointError
     from remodel_fenicsx.results.recording import RecordingError
     from remodel_fenicsx.results.run_folder import FolderTaken
     from remodel_fenicsx.running import resume, run
+    from remodel_fenicsx.solver.continuation import StepFailure
 
     try:
         if scene is None:
@@ -301,7 +301,8 @@ def _ensemble(options: argparse.Namespace) -> int:
 
 def _trade(options: argparse.Namespace) -> int:
     def task(scene: Scene) -> tuple[Path, str, dict[str, str]]:
-        from remodel_fenicsx.studies import trade as study, trade_output
+        from remodel_fenicsx.studies import trade as study
+        from remodel_fenicsx.studies import trade_output
 
         say = None if options.quiet else _say
         folder, found = study.trade(scene, options.output, options.budget, options.jobs, say)

@@ -20,6 +20,13 @@ from remodel_fenicsx.body.shape import uniaxial_columns
 from remodel_fenicsx.fem.formulations import FORMULATIONS, Formulation, Selective
 from remodel_fenicsx.fem.kinematics import KINEMATICS, FullKinematics, Kinematics
 from remodel_fenicsx.fem.solver_methods import METHODS
+from remodel_fenicsx.model.cells import AXES, UnitCell, angle_to_axis
+from remodel_fenicsx.model.chains import CHAINS, Chain
+from remodel_fenicsx.model.drivers import DRIVERS, FRAMES, Driver, Frame
+from remodel_fenicsx.model.energy import MATRICES, Matrix, Stresses, neo_hookean
+from remodel_fenicsx.model.laws import LAWS, Drive, Law, ranked
+from remodel_fenicsx.model.repulsion import REPULSIONS, Repulsion, axes_sum, squared_end_to_end_length
+from remodel_fenicsx.model.spectral import PAIRINGS, principal
 from remodel_fenicsx.scene.parameters import COUPLING_MEANINGS
 from remodel_fenicsx.schema.tables import markdown_reference
 from remodel_fenicsx.schema.units import (
@@ -33,19 +40,12 @@ from remodel_fenicsx.schema.units import (
     TEMPERATURE,
     Dimension,
 )
-from remodel_fenicsx.tissue.cells import AXES, UnitCell, angle_to_axis
-from remodel_fenicsx.tissue.chains import CHAINS, Chain
-from remodel_fenicsx.tissue.drivers import DRIVERS, FRAMES, Driver, Frame
-from remodel_fenicsx.tissue.energy import MATRICES, Matrix, Stresses, neo_hookean
-from remodel_fenicsx.tissue.laws import LAWS, Drive, Law, ranked
-from remodel_fenicsx.tissue.repulsion import REPULSIONS, Repulsion, axes_sum, squared_end_to_end_length
-from remodel_fenicsx.tissue.spectral import PAIRINGS, principal
 
 if TYPE_CHECKING:
     from remodel_fenicsx.evolution.coupling import COUPLINGS, Coupling, Staggered
-    from remodel_fenicsx.evolution.linear import LINEAR_METHODS, EveryTangent
     from remodel_fenicsx.fem.jit import form
     from remodel_fenicsx.results.columns import Measurement
+    from remodel_fenicsx.solver.linear import LINEAR_METHODS, EveryTangent
 
 __all__ = [
     "AREA",
@@ -108,7 +108,7 @@ __all__ = [
 
 _WITH_DOLFINX = {
     **dict.fromkeys(("COUPLINGS", "Coupling", "Staggered"), "evolution.coupling"),
-    **dict.fromkeys(("EveryTangent", "LINEAR_METHODS"), "evolution.linear"),
+    **dict.fromkeys(("EveryTangent", "LINEAR_METHODS"), "solver.linear"),
     "Measurement": "results.columns",
     "form": "fem.jit",
 }

@@ -9,19 +9,19 @@ from remodel_fenicsx.body import Cube, GeometryError, Tendon, Tube
 from remodel_fenicsx.body.columns import columns_of
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.loading import Loading
-from remodel_fenicsx.evolution.parts import StepFailure
-from remodel_fenicsx.evolution.state import State
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher, times
-from remodel_fenicsx.evolution.unit_cells import UnitCells
 from remodel_fenicsx.fem.kinematics import FullKinematics
 from remodel_fenicsx.fem.quadrature import Quadrature
+from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.results.columns import Observer
 from remodel_fenicsx.results.fields import Fields
 from remodel_fenicsx.results.run_folder import FolderTaken, RunFolder, chosen_folder
 from remodel_fenicsx.scene.parameters import Cells, Material, Remodeling
 from remodel_fenicsx.scene.scene import Mesh, Solver
+from remodel_fenicsx.solver.continuation import StepFailure
+from remodel_fenicsx.state.state import State
+from remodel_fenicsx.state.unit_cells import UnitCells
 from remodel_fenicsx.system.interrupts import end_all_ranks_on_exception
-from remodel_fenicsx.tissue.energy import Tissue
 
 __all__ = [
     "Cells",

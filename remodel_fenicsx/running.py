@@ -12,7 +12,6 @@ from typing import TypeVar, cast
 
 from mpi4py import MPI
 
-from remodel_fenicsx.evolution.parts import StepFailure
 from remodel_fenicsx.evolution.pause import Pause
 from remodel_fenicsx.evolution.stepper import Step, Watcher
 from remodel_fenicsx.results.checkpoint import Checkpoints, restore_state
@@ -30,8 +29,9 @@ from remodel_fenicsx.results.run_folder import (
 )
 from remodel_fenicsx.results.status import BEGUN, FAILED, STOPPED
 from remodel_fenicsx.scene import Scene, SceneError, read_scene, scene_from_dict
-from remodel_fenicsx.scene.continuation import check_continuation
+from remodel_fenicsx.scene.resuming import check_continuation
 from remodel_fenicsx.simulation import Simulation
+from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.system.environment import versions
 from remodel_fenicsx.system.interrupts import (
     Interrupted,

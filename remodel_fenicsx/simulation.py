@@ -9,35 +9,35 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
+from remodel_fenicsx.body.columns import columns_of
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.loading import Loading, LoadValues
-from remodel_fenicsx.body.columns import columns_of
 from remodel_fenicsx.body.reductions import AUTO, choice, explained
-from remodel_fenicsx.evolution.buckling import BucklingWarning
-from remodel_fenicsx.evolution.chatter import Chatter
 from remodel_fenicsx.evolution.coupling import Coupling, Maker
 from remodel_fenicsx.evolution.homeostasis import COARSE, ITERATIONS, LONGEST, TOLERANCE, UNLOADING, Homeostasis, Limit
-from remodel_fenicsx.evolution.locking import LockingWarning
-from remodel_fenicsx.evolution.monitor import StabilityWatcher
-from remodel_fenicsx.evolution.newton import SolverSettings
-from remodel_fenicsx.evolution.radial_chains import RadialChains
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
-from remodel_fenicsx.evolution.resting import Resting
-from remodel_fenicsx.evolution.state import State
 from remodel_fenicsx.evolution.step_control import StepControl
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher, times
 from remodel_fenicsx.evolution.time_error import TimeError
-from remodel_fenicsx.evolution.unit_cells import UnitCells
-from remodel_fenicsx.evolution.volume import VolumeLoss
 from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.fem.free_length import FreeLength
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.fem.quadrature import Quadrature
+from remodel_fenicsx.model.energy import Tissue
+from remodel_fenicsx.model.laws import LAWS
 from remodel_fenicsx.results.columns import Observer
 from remodel_fenicsx.scene import Scene, SceneError
+from remodel_fenicsx.solver.newton import SolverSettings
+from remodel_fenicsx.state.state import State
+from remodel_fenicsx.state.unit_cells import UnitCells
 from remodel_fenicsx.system.interrupts import take_back_signals
-from remodel_fenicsx.tissue.energy import Tissue
-from remodel_fenicsx.tissue.laws import LAWS
+from remodel_fenicsx.watch.buckling import BucklingWarning
+from remodel_fenicsx.watch.chatter import Chatter
+from remodel_fenicsx.watch.locking import LockingWarning
+from remodel_fenicsx.watch.monitor import StabilityWatcher
+from remodel_fenicsx.watch.radial_chains import RadialChains
+from remodel_fenicsx.watch.resting import Resting
+from remodel_fenicsx.watch.volume import VolumeLoss
 
 log = logging.getLogger(__name__)
 

@@ -13,8 +13,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from mpi4py import MPI
 
-from remodel_fenicsx.evolution.amplification import SHARE_NAMES, AmplificationWatcher, Mode
 from remodel_fenicsx.fem.kinematics import KINEMATICS
+from remodel_fenicsx.model.laws import LAWS
 from remodel_fenicsx.paper.output import COLOURS, STYLE, Page
 from remodel_fenicsx.results.run_folder import RunFolder, chosen_folder
 from remodel_fenicsx.scene import Scene, SceneError
@@ -22,7 +22,7 @@ from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.system.environment import versions
 from remodel_fenicsx.system.interrupts import StopRequest, end_all_ranks_on_exception
 from remodel_fenicsx.system.terminal import Progress, hold_log, open_log
-from remodel_fenicsx.tissue.laws import LAWS
+from remodel_fenicsx.watch.amplification import SHARE_NAMES, AmplificationWatcher, Mode
 
 log = logging.getLogger(__name__)
 

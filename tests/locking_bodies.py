@@ -22,9 +22,8 @@ from remodel_fenicsx.body import gmsh_model as model
 from remodel_fenicsx.body.column import Column
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.meshing import build_domain
+from remodel_fenicsx.model.energy import MATRICES, Matrix, logarithmic_dilatation
 from remodel_fenicsx.schema.units import FORCE, STRESS
-from remodel_fenicsx.tissue.energy import MATRICES, Matrix, logarithmic_dilatation
-
 
 EXACT_TUBE = 0.64144  # displacement of the inner face of the tube with J = 1, pressure 2, mu = 3.103, in plane strain
 

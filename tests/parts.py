@@ -12,17 +12,17 @@ from remodel_fenicsx.body import SHAPES
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.loading import Loading, LoadValues
 from remodel_fenicsx.body.shape import Shape
-from remodel_fenicsx.evolution.equilibrium import Equilibrium
-from remodel_fenicsx.evolution.newton import GuardedNewton, Solution
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
-from remodel_fenicsx.evolution.state import State
 from remodel_fenicsx.evolution.stepper import Stepper
-from remodel_fenicsx.evolution.unit_cells import UnitCells
 from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.fem.kinematics import FullKinematics
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.scene.parameters import Cells, Material, Remodeling
 from remodel_fenicsx.scene.scene import Scene, Solver
+from remodel_fenicsx.solver.equilibrium import Equilibrium
+from remodel_fenicsx.solver.newton import GuardedNewton, Solution
+from remodel_fenicsx.state.state import State
+from remodel_fenicsx.state.unit_cells import UnitCells
 
 MATERIAL = Material()
 TIGHT = Solver(absolute_tolerance=1e-11, relative_tolerance=1e-13)

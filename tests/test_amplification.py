@@ -13,12 +13,12 @@ import pytest
 from mpi4py import MPI
 
 from remodel_fenicsx.cli import main
-from remodel_fenicsx.evolution.amplification import AmplificationWatcher, LinearPass
 from remodel_fenicsx.evolution.stepper import Step, Watcher
+from remodel_fenicsx.model.cells import structure_tensor
 from remodel_fenicsx.scene import preset_scene
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.stability import verdict
-from remodel_fenicsx.tissue.cells import structure_tensor
+from remodel_fenicsx.watch.amplification import AmplificationWatcher, LinearPass
 from tests.conftest import mpirun
 from tests.test_chatter import Tilt
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from remodel_fenicsx.scene.parameters import Cells
-from remodel_fenicsx.tissue.cells import (
+from remodel_fenicsx.model.cells import (
     UnitCell,
     angle_between,
     angle_to_axis,
@@ -16,6 +15,7 @@ from remodel_fenicsx.tissue.cells import (
     pitch_angle,
     structure_tensor,
 )
+from remodel_fenicsx.scene.parameters import Cells
 from tests import parts
 
 R0 = 1.3

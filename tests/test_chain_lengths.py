@@ -15,13 +15,13 @@ import pytest
 from mpi4py import MPI
 
 from remodel_fenicsx.kernels.tensor import TensorKernels, condensed_points
+from remodel_fenicsx.model.cells import UnitCell
+from remodel_fenicsx.model.energy import Tissue
+from remodel_fenicsx.model.implicit.condensed import CondensedPoints
+from remodel_fenicsx.model.repulsion import REPULSIONS
 from remodel_fenicsx.scene import preset_scene
 from remodel_fenicsx.scene.scene import Scene
 from remodel_fenicsx.simulation import Simulation
-from remodel_fenicsx.tissue.cells import UnitCell
-from remodel_fenicsx.tissue.condensed import CondensedPoints
-from remodel_fenicsx.tissue.energy import Tissue
-from remodel_fenicsx.tissue.repulsion import REPULSIONS
 from tests.test_chatter import Tilt
 from tests.test_condensed import deformations, points, solved
 

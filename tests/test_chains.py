@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from remodel_fenicsx.tissue.chains import BOLTZMANN_CONSTANT, CHAINS
+from remodel_fenicsx.model.chains import BOLTZMANN_CONSTANT, CHAINS
 
 CONTOUR_LENGTHS = [1.594, 2.125]
 WORMLIKE = CHAINS["wormlike"]

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from remodel_fenicsx.evolution.chatter import Chatter
-from remodel_fenicsx.evolution.parts import Work
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
+from remodel_fenicsx.model import spectral
+from remodel_fenicsx.model.cells import angle_to_axis
 from remodel_fenicsx.scene import preset_scene
 from remodel_fenicsx.simulation import Simulation
-from remodel_fenicsx.tissue import spectral
-from remodel_fenicsx.tissue.cells import angle_to_axis
+from remodel_fenicsx.solver.continuation import Work
+from remodel_fenicsx.watch.chatter import Chatter
 from tests import parts
 from tests.conftest import slowly
 from tests.test_cube import closed_form_angle, uniaxial_stretches

@@ -10,10 +10,10 @@ from mpi4py import MPI
 
 from remodel_fenicsx.body import SHAPES, cube, profile, tube
 from remodel_fenicsx.body.columns import columns_of
+from remodel_fenicsx.model.cells import cylindrical_axes, initial_dimensions
 from remodel_fenicsx.results.columns import Observer
 from remodel_fenicsx.results.fields import ElementFields
 from remodel_fenicsx.scene.parameters import Cells
-from remodel_fenicsx.tissue.cells import cylindrical_axes, initial_dimensions
 from tests import parts
 
 INNER, OUTER, LENGTH = 1.0, 3.0, 1.0

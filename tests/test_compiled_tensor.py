@@ -10,12 +10,13 @@ from mpi4py import MPI
 from scipy.spatial.transform import Rotation
 
 from remodel_fenicsx.kernels.tensor import CompiledPoints, TensorKernels, condensed_points
-from remodel_fenicsx.tissue import condensed, repulsion
-from remodel_fenicsx.tissue.cells import UnitCell
-from remodel_fenicsx.tissue.chains import CHAINS
-from remodel_fenicsx.tissue.condensed import CondensedPoints
-from remodel_fenicsx.tissue.drivers import DRIVERS, FRAMES
-from remodel_fenicsx.tissue.laws import Drive, tensor_target
+from remodel_fenicsx.model import repulsion
+from remodel_fenicsx.model.cells import UnitCell
+from remodel_fenicsx.model.chains import CHAINS
+from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
+from remodel_fenicsx.model.implicit import condensed
+from remodel_fenicsx.model.implicit.condensed import CondensedPoints
+from remodel_fenicsx.model.laws import Drive, tensor_target
 from tests.test_condensed import deformations, points
 from tests.test_tensor_law import cells_of, right_cauchy_green, structures
 

@@ -11,15 +11,15 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from remodel_fenicsx.tissue import mandel, spectral
-from remodel_fenicsx.tissue.cells import UnitCell, structure_tensor
-from remodel_fenicsx.tissue.condensed import CondensedPoints, Solution
-from remodel_fenicsx.tissue.drivers import DRIVERS, FRAMES
-from remodel_fenicsx.tissue.energy import Tissue
-from remodel_fenicsx.tissue.laws import LAWS, Drive
-from remodel_fenicsx.tissue.network import OrthotropicCells, Strain
-from remodel_fenicsx.tissue.repulsion import REPULSIONS
-from remodel_fenicsx.tissue.responses import StepOfCells, jumps_by_rank, response
+from remodel_fenicsx.model import mandel, spectral
+from remodel_fenicsx.model.cells import UnitCell, structure_tensor
+from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
+from remodel_fenicsx.model.energy import Tissue
+from remodel_fenicsx.model.implicit.condensed import CondensedPoints, Solution
+from remodel_fenicsx.model.implicit.network import OrthotropicCells, Strain
+from remodel_fenicsx.model.implicit.responses import StepOfCells, jumps_by_rank, response
+from remodel_fenicsx.model.laws import LAWS, Drive
+from remodel_fenicsx.model.repulsion import REPULSIONS
 
 Array = NDArray[np.float64]
 

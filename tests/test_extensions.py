@@ -277,7 +277,7 @@ def test_initial_axes(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(SceneError, match="^cells.axes = 'leaning': allowed for shape 'cube' is 'global'$"):
         whole(cells={"axes": "leaning", "initial": "aligned"})
     monkeypatch.setattr(Cube, "axis_kinds", (*Cube.axis_kinds, "leaning"))
-    (first, *_) = rows_of(whole(cells={"axes": "leaning", "initial": "aligned"}))
+    first, *_ = rows_of(whole(cells={"axes": "leaning", "initial": "aligned"}))
     assert first["mean_fibre_angle"] == pytest.approx(30.0)
 
 

@@ -12,11 +12,11 @@ from mpi4py import MPI
 from remodel_fenicsx.body import SHAPES, tube
 from remodel_fenicsx.body.shape import Shape
 from remodel_fenicsx.evolution.stepper import Step
+from remodel_fenicsx.model.cells import cylindrical_axes, structure_tensor
 from remodel_fenicsx.results.fields import ElementFields, Fields
 from remodel_fenicsx.scene.parameters import Cells
 from remodel_fenicsx.scene.scene import scene_from_dict
 from remodel_fenicsx.simulation import Simulation
-from remodel_fenicsx.tissue.cells import cylindrical_axes, structure_tensor
 from tests import parts
 
 SIZE = {"inner_radius": 1.0, "outer_radius": 3.0, "length": 1.0}

@@ -24,11 +24,11 @@ from PIL import Image
 
 import remodel_fenicsx
 from remodel_fenicsx import cli
-from remodel_fenicsx.results import vtkhdf
 from remodel_fenicsx.paper import FIGURES, bodies, cases, curves, output, rendering, runs, snapshots, validity
 from remodel_fenicsx.paper.captions import CAPTIONS
 from remodel_fenicsx.paper.cases import LOAD_CASES
 from remodel_fenicsx.paper.errors import FigureError
+from remodel_fenicsx.results import vtkhdf
 from remodel_fenicsx.results.recording import Recording, RecordingError
 from remodel_fenicsx.scene.scene import Scene, scene_from_dict
 from tests import forks

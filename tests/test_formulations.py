@@ -14,11 +14,11 @@ from mpi4py import MPI
 
 from remodel_fenicsx import Scene, SceneError, Simulation
 from remodel_fenicsx.body import cube, tube
-from remodel_fenicsx.evolution.locking import LockingWarning
+from remodel_fenicsx.model.drivers import DRIVERS
+from remodel_fenicsx.model.energy import MATRICES, neo_hookean
 from remodel_fenicsx.scene import preset_scene
 from remodel_fenicsx.scene.parameters import Cells, Material
-from remodel_fenicsx.tissue.drivers import DRIVERS
-from remodel_fenicsx.tissue.energy import MATRICES, neo_hookean
+from remodel_fenicsx.watch.locking import LockingWarning
 from tests import parts
 from tests.conftest import Case, slowly
 from tests.locking_bodies import EXACT_TUBE, bar_scene, membrane_scene, registered, thick_tube

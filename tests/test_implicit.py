@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.body import tube
 from remodel_fenicsx.evolution.implicit import Implicit
-from remodel_fenicsx.evolution.parts import PROOF
-from remodel_fenicsx.scene.scene import scene_from_dict
+from remodel_fenicsx.model.cells import structure_tensor
 from remodel_fenicsx.results.recording import Recording
 from remodel_fenicsx.running import resume
 from remodel_fenicsx.running import run as record
+from remodel_fenicsx.scene.scene import scene_from_dict
 from remodel_fenicsx.simulation import Simulation
-from remodel_fenicsx.tissue.cells import structure_tensor
+from remodel_fenicsx.solver.continuation import PROOF
 from tests.conftest import Case, slowly
 
 Array = NDArray[np.float64]

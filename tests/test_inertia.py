@@ -13,19 +13,19 @@ from petsc4py import PETSc
 
 from remodel_fenicsx import Scene, Simulation, read_scene
 from remodel_fenicsx.body import cube, tube
-from remodel_fenicsx.evolution import monitor
-from remodel_fenicsx.evolution.equilibrium import Extension
-from remodel_fenicsx.evolution.inertia import Inertia
-from remodel_fenicsx.evolution.monitor import StabilityWatcher
-from remodel_fenicsx.evolution.newton import SolveFailure
-from remodel_fenicsx.evolution.parts import StepFailure
-from remodel_fenicsx.evolution.refusals import diagnosed
 from remodel_fenicsx.evolution.stepper import Step
 from remodel_fenicsx.fem.petsc_options import ProblemOptions
 from remodel_fenicsx.fem.solver_methods import SYMMETRIC, factor_options, method_options
 from remodel_fenicsx.results.history import History
 from remodel_fenicsx.results.recording import read_history
 from remodel_fenicsx.scene.parameters import Cells
+from remodel_fenicsx.solver.continuation import StepFailure
+from remodel_fenicsx.solver.equilibrium import Extension
+from remodel_fenicsx.solver.inertia import Inertia
+from remodel_fenicsx.solver.newton import SolveFailure
+from remodel_fenicsx.solver.refusals import diagnosed
+from remodel_fenicsx.watch import monitor
+from remodel_fenicsx.watch.monitor import StabilityWatcher
 from tests import parts
 
 DEMOS = Path(__file__).parents[1] / "demos"

@@ -17,20 +17,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mpi4py import MPI
 
-from remodel_fenicsx.evolution.coupling import COUPLINGS
-from remodel_fenicsx.scene import parameters
-from remodel_fenicsx.tissue import spectral
-from remodel_fenicsx.tissue.cells import angle_to_axis, structure_tensor
 from remodel_fenicsx.body import cube
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.loading import Loading
+from remodel_fenicsx.evolution.coupling import COUPLINGS
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
-from remodel_fenicsx.evolution.state import State
-from remodel_fenicsx.evolution.unit_cells import UnitCells
 from remodel_fenicsx.fem.kinematics import FullKinematics
 from remodel_fenicsx.fem.quadrature import Quadrature
+from remodel_fenicsx.model import spectral
+from remodel_fenicsx.model.cells import angle_to_axis, structure_tensor
+from remodel_fenicsx.model.drivers import DRIVERS, FRAMES, material_frame, spatial_frame
+from remodel_fenicsx.scene import parameters
 from remodel_fenicsx.scene.parameters import Cells, Remodeling
-from remodel_fenicsx.tissue.drivers import DRIVERS, FRAMES, material_frame, spatial_frame
+from remodel_fenicsx.state.state import State
+from remodel_fenicsx.state.unit_cells import UnitCells
 from tests import parts
 
 QUARTER = parts.rotation((1.0, 0.0, 0.0), 90.0)  # carries the load axis z to -y

@@ -11,11 +11,11 @@ import pytest
 from mpi4py import MPI
 
 from remodel_fenicsx import Scene, Simulation
-from remodel_fenicsx.evolution.equilibrium import Extension
-from remodel_fenicsx.evolution.newton import GuardedNewton, SolveFailure
-from remodel_fenicsx.evolution.parts import Change, StepFailure
-from remodel_fenicsx.evolution.refusals import diagnosed
 from remodel_fenicsx.scene import scene_from_dict
+from remodel_fenicsx.solver.continuation import Change, StepFailure
+from remodel_fenicsx.solver.equilibrium import Extension
+from remodel_fenicsx.solver.newton import GuardedNewton, SolveFailure
+from remodel_fenicsx.solver.refusals import diagnosed
 
 LARGEST = 0.3018  # pressure of this tube: benchmarks/stability_map/tube_march.py, with the inner radius prescribed
 

@@ -22,10 +22,10 @@ import remodel_fenicsx.kernels
 from remodel_fenicsx import cli
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.kernels import library, points, tensor
+from remodel_fenicsx.model.cells import structure_tensor
 from remodel_fenicsx.scene import preset_scene
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.system.environment import KERNELS, versions
-from remodel_fenicsx.tissue.cells import structure_tensor
 
 ROOT = Path(__file__).parents[1]
 NUMBERS = {"spectral.c": library.NO_NUMBERS, "tensor.c": tensor.NUMBERS}

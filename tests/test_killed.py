@@ -30,7 +30,7 @@ from remodel_fenicsx.running import resume, run
 from tests.conftest import mpirun
 from tests.forks import forked
 from tests.processes import session_members
-from tests.test_resume import COUNTED, LONGER, SELF, assert_close, assert_same, half, first_half, rows, scene, whole
+from tests.test_resume import COUNTED, LONGER, SELF, assert_close, assert_same, first_half, half, rows, scene, whole
 
 __all__ = ["first_half", "half", "whole"]  # fixtures
 

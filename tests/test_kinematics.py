@@ -14,11 +14,11 @@ import pytest
 from mpi4py import MPI
 
 from remodel_fenicsx import Recording, Scene, SceneError, Simulation, cli, run
-from remodel_fenicsx.scene import scene_from_dict
 from remodel_fenicsx.body.reductions import AUTO, choice, explained, objections
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.results.columns import Measurement
+from remodel_fenicsx.scene import scene_from_dict
 from tests.conftest import Cases, slowly
 from tests.reference.radial import solve_radial
 
@@ -242,7 +242,7 @@ def test_a_load_is_for_the_reductions_that_have_it(monkeypatch: pytest.MonkeyPat
 
 def test_axes_of_ones_own_may_have_no_symmetry(monkeypatch: pytest.MonkeyPatch) -> None:
     from remodel_fenicsx.body import Cube, Tube
-    from remodel_fenicsx.tissue.cells import AXES, global_axes
+    from remodel_fenicsx.model.cells import AXES, global_axes
 
     monkeypatch.setitem(AXES, "tilted", lambda places: np.roll(global_axes(places), 1, axis=-1))
     for shape in (Cube, Tube):

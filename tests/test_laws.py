@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from remodel_fenicsx.tissue.cells import UnitCell
-from remodel_fenicsx.tissue.drivers import DRIVERS, FRAMES
-from remodel_fenicsx.tissue.laws import LAWS, Array, Drive, explicit, rate, relaxation
+from remodel_fenicsx.model.cells import UnitCell
+from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
+from remodel_fenicsx.model.laws import LAWS, Array, Drive, explicit, rate, relaxation
 from tests import parts
 
 FUNCTIONS = {"explicit": explicit, "rate": rate, "relaxation": relaxation}

@@ -14,15 +14,15 @@ import pytest
 from mpi4py import MPI
 
 from remodel_fenicsx import Recording, Scene, SceneError, Simulation, run
-from remodel_fenicsx.evolution.blend import Blend
-from remodel_fenicsx.evolution.equilibrium import Equilibrium
-from remodel_fenicsx.evolution.parts import Work
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
 from remodel_fenicsx.fem import coefficients, jit
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.results import history
-from remodel_fenicsx.scene.settings import FIELDS_BY_NAME
 from remodel_fenicsx.scene import scene_from_dict
+from remodel_fenicsx.scene.settings import FIELDS_BY_NAME
+from remodel_fenicsx.solver.blend import Blend
+from remodel_fenicsx.solver.continuation import Work
+from remodel_fenicsx.solver.equilibrium import Equilibrium
 
 SELF = MPI.COMM_SELF
 

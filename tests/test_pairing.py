@@ -6,11 +6,11 @@ from mpi4py import MPI
 
 from remodel_fenicsx import Scene, Simulation
 from remodel_fenicsx.body import Cube, LoadKind
+from remodel_fenicsx.model.cells import UnitCell, structure_tensor
+from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
+from remodel_fenicsx.model.laws import LAWS, Array, Drive, relaxed
+from remodel_fenicsx.model.spectral import PAIRINGS, continued, principal
 from remodel_fenicsx.schema.units import FORCE
-from remodel_fenicsx.tissue.cells import UnitCell, structure_tensor
-from remodel_fenicsx.tissue.drivers import DRIVERS, FRAMES
-from remodel_fenicsx.tissue.laws import LAWS, Array, Drive, relaxed
-from remodel_fenicsx.tissue.spectral import PAIRINGS, continued, principal
 from tests import parts
 
 COUNT, KAPPA = 50, 0.05

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from remodel_fenicsx import Recording, Simulation
-from remodel_fenicsx.evolution.newton import GuardedNewton, SolveFailure
 from remodel_fenicsx.evolution.predictor import PREDICTORS, Autoregressive, LoadStep, NoPredictor, Responsive
 from remodel_fenicsx.results.checkpoint_file import read_checkpoint
 from remodel_fenicsx.running import resume, run
+from remodel_fenicsx.solver.newton import GuardedNewton, SolveFailure
 from tests.parts import pulled_cube
 from tests.test_resume import SELF, rows
 

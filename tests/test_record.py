@@ -9,12 +9,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from remodel_fenicsx.evolution.equilibrium import Extension
-from remodel_fenicsx.evolution.parts import Work
-from remodel_fenicsx.evolution.stepper import Step
 from remodel_fenicsx.body.columns import COLUMNS
+from remodel_fenicsx.evolution.stepper import Step
 from remodel_fenicsx.results.history import History
 from remodel_fenicsx.results.recording import read_history
+from remodel_fenicsx.solver.continuation import Work
+from remodel_fenicsx.solver.equilibrium import Extension
 
 
 def test_rows_read_back_as_the_same_numbers(tmp_path: Path) -> None:

@@ -21,13 +21,8 @@ from mpi4py import MPI
 
 from remodel_fenicsx import Recording, Scene, SceneError, Simulation
 from remodel_fenicsx.body.domain import Domain
-from remodel_fenicsx.evolution import chatter, monitor
-from remodel_fenicsx.evolution.chatter import Chatter
 from remodel_fenicsx.evolution.coupling import COUPLINGS, Staggered
-from remodel_fenicsx.evolution.locking import LockingWarning, Missing
-from remodel_fenicsx.evolution.monitor import StabilityWatcher
-from remodel_fenicsx.evolution.parts import StepFailure, Work
-from remodel_fenicsx.evolution.state import State
+from remodel_fenicsx.model.cells import structure_tensor
 from remodel_fenicsx.results.checkpoint import Checkpoints, gather_state, restore_state
 from remodel_fenicsx.results.checkpoint_file import Checkpoint, CheckpointError, _read, read_checkpoint, read_pointer
 from remodel_fenicsx.results.recording import RecordingError
@@ -35,8 +30,13 @@ from remodel_fenicsx.results.run_lock import FolderTaken, RunLock, lock_holder
 from remodel_fenicsx.results.status import status
 from remodel_fenicsx.running import resume, run
 from remodel_fenicsx.scene import preset_scene
+from remodel_fenicsx.solver.continuation import StepFailure, Work
+from remodel_fenicsx.state.state import State
 from remodel_fenicsx.system.interrupts import Paused
-from remodel_fenicsx.tissue.cells import structure_tensor
+from remodel_fenicsx.watch import chatter, monitor
+from remodel_fenicsx.watch.chatter import Chatter
+from remodel_fenicsx.watch.locking import LockingWarning, Missing
+from remodel_fenicsx.watch.monitor import StabilityWatcher
 from tests.conftest import mpirun
 from tests.forks import forked
 from tests.parts import pulled_cube

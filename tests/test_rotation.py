@@ -7,9 +7,9 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from remodel_fenicsx import Scene, Simulation
-from remodel_fenicsx.tissue.cells import UnitCell, structure_tensor
-from remodel_fenicsx.tissue.drivers import DRIVERS, FRAMES
-from remodel_fenicsx.tissue.laws import LAWS, Array, Drive, angle_left, turned
+from remodel_fenicsx.model.cells import UnitCell, structure_tensor
+from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
+from remodel_fenicsx.model.laws import LAWS, Array, Drive, angle_left, turned
 from tests import parts
 
 TAU = 3.0

@@ -7,11 +7,11 @@ import pytest
 from mpi4py import MPI
 
 from remodel_fenicsx.body import cube
-from remodel_fenicsx.evolution import newton
-from remodel_fenicsx.evolution.parts import StepFailure
-from remodel_fenicsx.scene.parameters import Cells
 from remodel_fenicsx.scene import preset_scene
+from remodel_fenicsx.scene.parameters import Cells
 from remodel_fenicsx.simulation import Simulation
+from remodel_fenicsx.solver import newton
+from remodel_fenicsx.solver.continuation import StepFailure
 from tests import parts
 from tests.reference.radial import RadialMaterial, Tube
 

@@ -12,14 +12,14 @@ from typing import Any
 
 import pytest
 
-from remodel_fenicsx.scene import parameters
-from remodel_fenicsx.tissue.chains import wormlike_stiffness
-from remodel_fenicsx.tissue.laws import LAWS
-from remodel_fenicsx.scene.parameters import PRESET_NOTES, PRESETS, Cells, Material, Remodeling
 from remodel_fenicsx.body import Cube, Tendon, Tube
+from remodel_fenicsx.model.chains import wormlike_stiffness
+from remodel_fenicsx.model.laws import LAWS
+from remodel_fenicsx.scene import parameters
+from remodel_fenicsx.scene.parameters import PRESET_NOTES, PRESETS, Cells, Material, Remodeling
+from remodel_fenicsx.scene.reference import scene_reference
 from remodel_fenicsx.scene.scene import Scene, preset_scene, read_scene, scene_from_dict
 from remodel_fenicsx.scene.settings import Load, Solver, Time
-from remodel_fenicsx.scene.reference import scene_reference
 from remodel_fenicsx.schema.tables import SceneError, sections
 
 ROOT = Path(__file__).resolve().parent.parent

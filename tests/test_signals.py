@@ -97,7 +97,7 @@ runpy.run_path({str(PROJECT / "bin" / "remodel-fenicsx")!r}, run_name="__main__"
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("module", ["running", "cli", *slowly("evolution.equilibrium", "system.interrupts")])
+@pytest.mark.parametrize("module", ["running", "cli", *slowly("solver.equilibrium", "system.interrupts")])
 def test_an_import_changes_no_handler(module: str) -> None:
     """What Python knows of; PETSc puts some of its own below (take_back_signals)."""
     program = f"""

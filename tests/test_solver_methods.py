@@ -12,12 +12,12 @@ from petsc4py import PETSc
 
 from remodel_fenicsx import Simulation
 from remodel_fenicsx.body.tube import tube
-from remodel_fenicsx.evolution import linear
-from remodel_fenicsx.evolution.limits import Limits
-from remodel_fenicsx.evolution.linear import Exact, KeptFactor, Lagged, useful_accuracy
-from remodel_fenicsx.evolution.quasi_newton import Secants
 from remodel_fenicsx.fem.solver_methods import LARGE, LARGE_ON_RANKS, METHODS, SMALL, chosen
 from remodel_fenicsx.scene import preset_scene
+from remodel_fenicsx.solver import linear
+from remodel_fenicsx.solver.limits import Limits
+from remodel_fenicsx.solver.linear import Exact, KeptFactor, Lagged, useful_accuracy
+from remodel_fenicsx.solver.quasi_newton import Secants
 from tests import parts
 
 SELF = MPI.COMM_SELF

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from remodel_fenicsx.tissue.spectral import ROUNDING, Array, positive_direction, principal
+from remodel_fenicsx.model.spectral import ROUNDING, Array, positive_direction, principal
 
 COUNT = 50
 

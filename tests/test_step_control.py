@@ -12,14 +12,14 @@ from mpi4py import MPI
 
 from remodel_fenicsx import Recording, SceneError, Simulation, cli
 from remodel_fenicsx.evolution import time_error
-from remodel_fenicsx.evolution.parts import StepFailure
-from remodel_fenicsx.evolution.refusals import TOO_LARGE
 from remodel_fenicsx.evolution.stepper import Step, Watcher
 from remodel_fenicsx.evolution.time_error import Estimate
+from remodel_fenicsx.model.cells import UnitCell, angle_between
 from remodel_fenicsx.running import resume, run
 from remodel_fenicsx.scene.scene import Scene, scene_from_dict
 from remodel_fenicsx.scene.settings import MOST_STEPS, Time
-from remodel_fenicsx.tissue.cells import UnitCell, angle_between
+from remodel_fenicsx.solver.continuation import StepFailure
+from remodel_fenicsx.solver.refusals import TOO_LARGE
 
 END = 40.0
 COUPLINGS = {

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from remodel_fenicsx.body import cube, tube
-from remodel_fenicsx.evolution.blend import KEPT_RESERVE, Blend
-from remodel_fenicsx.evolution.equilibrium import Extension
-from remodel_fenicsx.evolution.newton import GuardedNewton, Solution, SolveFailure
-from remodel_fenicsx.evolution.parts import Change, StepFailure, Work
 from remodel_fenicsx.evolution.stepper import Stepper, times
 from remodel_fenicsx.scene.parameters import Cells
 from remodel_fenicsx.scene.scene import Load, preset_scene
 from remodel_fenicsx.simulation import Simulation
+from remodel_fenicsx.solver.blend import KEPT_RESERVE, Blend
+from remodel_fenicsx.solver.continuation import Change, StepFailure, Work
+from remodel_fenicsx.solver.equilibrium import Extension
+from remodel_fenicsx.solver.newton import GuardedNewton, Solution, SolveFailure
 from tests import parts
 from tests.conftest import slowly
 

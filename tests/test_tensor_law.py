@@ -11,13 +11,13 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import logm
 from scipy.spatial.transform import Rotation
 
-from remodel_fenicsx.tissue import logarithm, repulsion
-from remodel_fenicsx.tissue.cells import UnitCell, structure_tensor
-from remodel_fenicsx.tissue.drivers import DRIVERS, FRAMES
-from remodel_fenicsx.tissue.energy import Tissue
-from remodel_fenicsx.tissue.laws import LAWS, Drive
-from remodel_fenicsx.tissue.mandel import MANDEL
-from remodel_fenicsx.tissue.tensor_law import ABOVE_ROUNDING, Target, floor_above, follow, target
+from remodel_fenicsx.model import logarithm, repulsion
+from remodel_fenicsx.model.cells import UnitCell, structure_tensor
+from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
+from remodel_fenicsx.model.energy import Tissue
+from remodel_fenicsx.model.laws import LAWS, Drive
+from remodel_fenicsx.model.mandel import MANDEL
+from remodel_fenicsx.model.tensor_law import ABOVE_ROUNDING, Target, floor_above, follow, target
 
 Array = NDArray[np.float64]
 RNG = np.random.default_rng(7)

@@ -11,13 +11,13 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from remodel_fenicsx.body import Cube, LoadKind, tube
-from remodel_fenicsx.evolution.blend import Blend
 from remodel_fenicsx.results.recording import Recording
 from remodel_fenicsx.running import resume
 from remodel_fenicsx.running import run as record
 from remodel_fenicsx.scene.scene import SceneError, scene_from_dict
 from remodel_fenicsx.schema.units import FORCE
 from remodel_fenicsx.simulation import Simulation
+from remodel_fenicsx.solver.blend import Blend
 
 Array = NDArray[np.float64]
 KAPPA = 0.025

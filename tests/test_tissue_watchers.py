@@ -11,9 +11,9 @@ from mpi4py import MPI
 
 from remodel_fenicsx import Simulation
 from remodel_fenicsx.body import SHAPES
-from remodel_fenicsx.evolution.volume import VolumeLoss
 from remodel_fenicsx.scene import Scene, scene_from_dict
 from remodel_fenicsx.system.terminal import NOTICE
+from remodel_fenicsx.watch.volume import VolumeLoss
 from tests.conftest import Case
 
 SELF = MPI.COMM_SELF

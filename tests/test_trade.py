@@ -18,7 +18,8 @@ from remodel_fenicsx.results.recording import HistoryColumns
 from remodel_fenicsx.results.status import status
 from remodel_fenicsx.scene.profiles import PROFILES
 from remodel_fenicsx.scene.scene import Scene, preset_scene
-from remodel_fenicsx.studies import ladder as rungs, trade as study
+from remodel_fenicsx.studies import ladder as rungs
+from remodel_fenicsx.studies import trade as study
 from remodel_fenicsx.studies.convergence import limit, pareto, typical
 from remodel_fenicsx.studies.estimates import Result, Trade, estimated
 from remodel_fenicsx.studies.ladder import Setting, compared_times, ladder

@@ -36,7 +36,7 @@ class Bar:
 
     def solve(self, unknown: Array, old: tuple[Array, Values], new: tuple[Array, Values]) -> Array:
         """Equilibrium with other squares and loads."""
-        (before, after) = (np.array([0.0, 0.0, loads["force"] / self.area]) for _, loads in (old, new))
+        before, after = (np.array([0.0, 0.0, loads["force"] / self.area]) for _, loads in (old, new))
         return advance(unknown, (old[0], before), (new[0], after), self.material)
 
     def stretches(self, unknown: Array, loads: Values) -> Array:

@@ -11,8 +11,8 @@ import ufl
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from remodel_fenicsx.fem import jit
 from remodel_fenicsx.body.domain import Domain
+from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.free_length import field_degree
 from remodel_fenicsx.fem.kinematics import FullKinematics, Kinematics
 

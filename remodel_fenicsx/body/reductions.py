@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.body.buckling import expected_thrust
 from remodel_fenicsx.fem.kinematics import KINEMATICS
-from remodel_fenicsx.tissue.cells import cylindrical_axes, global_axes, initial_dimensions
-from remodel_fenicsx.tissue.laws import LAWS
+from remodel_fenicsx.model.cells import cylindrical_axes, global_axes, initial_dimensions
+from remodel_fenicsx.model.laws import LAWS
 
 Rule = Callable[[Any], str | None]
 Turn = Callable[[NDArray[np.float64]], NDArray[np.float64]]

@@ -15,9 +15,9 @@ from remodel_fenicsx.body.buckling import Strut
 from remodel_fenicsx.body.column import Column
 from remodel_fenicsx.body.gmsh_model import length_fault
 from remodel_fenicsx.body.reductions import Reduction, homogeneous, known_loads, same_cells, symmetric_law, unturned
+from remodel_fenicsx.model.cells import angle_to_axis
 from remodel_fenicsx.schema.tables import Table, fault
 from remodel_fenicsx.schema.units import Dimension, LengthUnit
-from remodel_fenicsx.tissue.cells import angle_to_axis
 
 if TYPE_CHECKING:  # shapes are part of every scene: they are read without dolfinx
     from mpi4py import MPI
@@ -99,7 +99,7 @@ class Shape(Table):
     columns_on_request
         Further ones that a scene may name in `output.columns`.
     axis_kinds
-        What `cells.axes` may be (`tissue.cells.AXES`).
+        What `cells.axes` may be (`model.cells.AXES`).
     number_of_elements
         Hexahedra of the mesh with refinement 1.
     faces

@@ -14,9 +14,9 @@ from remodel_fenicsx.body.buckling import Strut
 from remodel_fenicsx.body.column import Column
 from remodel_fenicsx.body.reductions import Reduction, about_z
 from remodel_fenicsx.body.shape import Array, LoadKind, MeshSettings, Shape, check_lengths
+from remodel_fenicsx.model.cells import pitch_angle, radial_share
 from remodel_fenicsx.schema.tables import fault, shown
 from remodel_fenicsx.schema.units import FORCE, LENGTH, STRESS
-from remodel_fenicsx.tissue.cells import pitch_angle, radial_share
 
 if TYPE_CHECKING:
     from mpi4py import MPI

@@ -1,1 +1,1 @@
-"""The way through time: equilibrium, remodeling pass, steps."""
+"""The way through time: steps, remodeling passes, and how equilibrium and cells are coupled."""

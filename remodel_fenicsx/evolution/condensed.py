@@ -9,18 +9,19 @@ import numpy as np
 import ufl
 from numpy.typing import NDArray
 
-from remodel_fenicsx.evolution.equilibrium import Equilibrium, Look
-from remodel_fenicsx.evolution.newton import GuardedNewton, Solution, SolveFailure, SolverSettings
-from remodel_fenicsx.evolution.parameters import at_points
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
-from remodel_fenicsx.evolution.state import State
 from remodel_fenicsx.fem.solver_methods import AUTO
 from remodel_fenicsx.kernels.tensor import condensed_points, tensor_kernels
-from remodel_fenicsx.tissue import condensed, spectral
-from remodel_fenicsx.tissue.cells import UnitCell, structure_tensor
-from remodel_fenicsx.tissue.energy import Tissue
-from remodel_fenicsx.tissue.operators import determinant
-from remodel_fenicsx.tissue.responses import StepOfCells, jumps_by_rank
+from remodel_fenicsx.model import spectral
+from remodel_fenicsx.model.cells import UnitCell, structure_tensor
+from remodel_fenicsx.model.energy import Tissue
+from remodel_fenicsx.model.implicit import condensed
+from remodel_fenicsx.model.implicit.responses import StepOfCells, jumps_by_rank
+from remodel_fenicsx.model.operators import determinant
+from remodel_fenicsx.solver.equilibrium import Equilibrium, Look
+from remodel_fenicsx.solver.newton import GuardedNewton, Solution, SolveFailure, SolverSettings
+from remodel_fenicsx.state.parameters import at_points
+from remodel_fenicsx.state.state import State
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]

@@ -11,17 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from remodel_fenicsx.body.loading import LoadValues
-from remodel_fenicsx.evolution.blend import Blend
-from remodel_fenicsx.evolution.equilibrium import Equilibrium
 from remodel_fenicsx.evolution.implicit import Implicit
-from remodel_fenicsx.evolution.newton import GuardedNewton, SolveFailure, SolverSettings
-from remodel_fenicsx.evolution.parts import Change, Work
 from remodel_fenicsx.evolution.predictor import PREDICTORS, LoadStep
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
-from remodel_fenicsx.evolution.state import State
-from remodel_fenicsx.tissue.cells import UnitCell
-from remodel_fenicsx.tissue.energy import Tissue
-from remodel_fenicsx.tissue.tensor_law import Target, weight_of_the_end
+from remodel_fenicsx.model.cells import UnitCell
+from remodel_fenicsx.model.energy import Tissue
+from remodel_fenicsx.model.tensor_law import Target, weight_of_the_end
+from remodel_fenicsx.solver.blend import Blend
+from remodel_fenicsx.solver.continuation import Change, Work
+from remodel_fenicsx.solver.equilibrium import Equilibrium
+from remodel_fenicsx.solver.newton import GuardedNewton, SolveFailure, SolverSettings
+from remodel_fenicsx.state.state import State
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]

@@ -15,15 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from remodel_fenicsx.body.loading import LoadValues
-from remodel_fenicsx.evolution.equilibrium import Equilibrium
 from remodel_fenicsx.evolution.implicit import RESIDUAL, Implicit
-from remodel_fenicsx.evolution.newton import GuardedNewton, SolveFailure
-from remodel_fenicsx.evolution.parts import Work
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
 from remodel_fenicsx.evolution.step_control import StepControl
 from remodel_fenicsx.fem import coefficients
+from remodel_fenicsx.model.cells import structure_tensor
+from remodel_fenicsx.solver.continuation import Work
+from remodel_fenicsx.solver.equilibrium import Equilibrium
+from remodel_fenicsx.solver.newton import GuardedNewton, SolveFailure
 from remodel_fenicsx.system.terminal import NOTICE
-from remodel_fenicsx.tissue.cells import structure_tensor
 
 log = logging.getLogger(__name__)
 Array = NDArray[np.float64]

@@ -7,16 +7,16 @@ import math
 
 from remodel_fenicsx.body.loading import LoadValues
 from remodel_fenicsx.evolution.condensed import AnsweringCells, AnsweringEquilibrium, AnsweringNewton
-from remodel_fenicsx.evolution.equilibrium import Equilibrium
-from remodel_fenicsx.evolution.memory import Numbers
-from remodel_fenicsx.evolution.newton import GuardedNewton, SolveFailure, SolverSettings
-from remodel_fenicsx.evolution.parts import Change, StepFailure, Work
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
-from remodel_fenicsx.evolution.state import State
-from remodel_fenicsx.tissue.cells import UnitCell
-from remodel_fenicsx.tissue.energy import Tissue
-from remodel_fenicsx.tissue.laws import relaxed
-from remodel_fenicsx.tissue.tensor_law import weight_of_the_end
+from remodel_fenicsx.model.cells import UnitCell
+from remodel_fenicsx.model.energy import Tissue
+from remodel_fenicsx.model.laws import relaxed
+from remodel_fenicsx.model.tensor_law import weight_of_the_end
+from remodel_fenicsx.solver.continuation import Change, StepFailure, Work
+from remodel_fenicsx.solver.equilibrium import Equilibrium
+from remodel_fenicsx.solver.newton import GuardedNewton, SolveFailure, SolverSettings
+from remodel_fenicsx.state.memory import Numbers
+from remodel_fenicsx.state.state import State
 
 log = logging.getLogger(__name__)
 

@@ -9,10 +9,10 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from remodel_fenicsx.evolution.memory import Earlier, Numbers
-from remodel_fenicsx.evolution.state import State
 from remodel_fenicsx.fem.ranks import over_ranks
-from remodel_fenicsx.tissue import mandel
+from remodel_fenicsx.model import mandel
+from remodel_fenicsx.state.memory import Earlier, Numbers
+from remodel_fenicsx.state.state import State
 
 Array = NDArray[np.float64]
 

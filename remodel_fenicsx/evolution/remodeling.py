@@ -10,20 +10,20 @@ import ufl
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from remodel_fenicsx.evolution.memory import Numbers
-from remodel_fenicsx.evolution.parameters import Parameters, on_mesh, stress_rounding
-from remodel_fenicsx.evolution.pointwise import PointStresses
-from remodel_fenicsx.evolution.state import State
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.ranks import over_ranks
 from remodel_fenicsx.kernels.tensor import tensor_kernels, with_kernels
-from remodel_fenicsx.tissue import spectral
-from remodel_fenicsx.tissue.cells import UnitCell, structure_tensor
-from remodel_fenicsx.tissue.drivers import DRIVERS, FRAMES, carried_axes
-from remodel_fenicsx.tissue.energy import Tissue
-from remodel_fenicsx.tissue.laws import LAWS, Drive, tensor_target
-from remodel_fenicsx.tissue.repulsion import axes_sum
-from remodel_fenicsx.tissue.tensor_law import ABOVE_ROUNDING, Target
+from remodel_fenicsx.model import spectral
+from remodel_fenicsx.model.cells import UnitCell, structure_tensor
+from remodel_fenicsx.model.drivers import DRIVERS, FRAMES, carried_axes
+from remodel_fenicsx.model.energy import Tissue
+from remodel_fenicsx.model.laws import LAWS, Drive, tensor_target
+from remodel_fenicsx.model.repulsion import axes_sum
+from remodel_fenicsx.model.tensor_law import ABOVE_ROUNDING, Target
+from remodel_fenicsx.solver.pointwise import PointStresses
+from remodel_fenicsx.state.memory import Numbers
+from remodel_fenicsx.state.parameters import Parameters, on_mesh, stress_rounding
+from remodel_fenicsx.state.state import State
 
 log = logging.getLogger(__name__)
 Array = NDArray[np.float64]

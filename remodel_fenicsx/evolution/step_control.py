@@ -6,11 +6,11 @@ import logging
 import math
 from collections.abc import Iterator, Sequence
 
-from remodel_fenicsx.evolution.memory import Numbers
-from remodel_fenicsx.evolution.parts import StepFailure
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
 from remodel_fenicsx.evolution.time_error import TimeError
 from remodel_fenicsx.schema.times import same_time
+from remodel_fenicsx.solver.continuation import StepFailure
+from remodel_fenicsx.state.memory import Numbers
 
 log = logging.getLogger(__name__)
 

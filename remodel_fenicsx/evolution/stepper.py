@@ -11,13 +11,13 @@ from decimal import Decimal
 
 from remodel_fenicsx.body.loading import LoadValues
 from remodel_fenicsx.evolution.coupling import COUPLINGS, Coupling, Maker
-from remodel_fenicsx.evolution.equilibrium import Extension
-from remodel_fenicsx.evolution.newton import SolverSettings
-from remodel_fenicsx.evolution.parameters import on_mesh
-from remodel_fenicsx.evolution.parts import Work
 from remodel_fenicsx.evolution.remodeling import RemodelingPass, RemodelingSettings
-from remodel_fenicsx.evolution.state import State
-from remodel_fenicsx.tissue.energy import Tissue
+from remodel_fenicsx.model.energy import Tissue
+from remodel_fenicsx.solver.continuation import Work
+from remodel_fenicsx.solver.equilibrium import Extension
+from remodel_fenicsx.solver.newton import SolverSettings
+from remodel_fenicsx.state.parameters import on_mesh
+from remodel_fenicsx.state.state import State
 
 
 @dataclass

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from remodel_fenicsx.evolution.memory import Earlier, Numbers
 from remodel_fenicsx.evolution.stepper import Step, Stepper
-from remodel_fenicsx.tissue import mandel, spectral
-from remodel_fenicsx.tissue.cells import UnitCell, angle_between, structure_tensor
-from remodel_fenicsx.tissue.operators import largest_change_of_length
+from remodel_fenicsx.model import mandel, spectral
+from remodel_fenicsx.model.cells import UnitCell, angle_between, structure_tensor
+from remodel_fenicsx.model.operators import largest_change_of_length
+from remodel_fenicsx.state.memory import Earlier, Numbers
 
 Array = NDArray[np.float64]
 

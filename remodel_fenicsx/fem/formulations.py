@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 
 
 class TwoParts(Protocol):
-    """What a formulation needs of a material (`tissue.energy.Tissue`), cells as it takes them."""
+    """What a formulation needs of a material (`model.energy.Tissue`), cells as it takes them."""
 
     def strain_energy(self, deformation_gradient: Any, cells: Any) -> Any:
         """All of W."""
@@ -63,7 +63,7 @@ class Formulation(Protocol):
     meaning
         What it does, for docs/scene.md.
     takes_parts
-        Whether it needs a matrix energy whose volumetric part is told apart (`tissue.energy.Matrix`).
+        Whether it needs a matrix energy whose volumetric part is told apart (`model.energy.Matrix`).
     locks
         Whether differences of J inside an element cost energy: elements lock where the bulk is stiff.
     """

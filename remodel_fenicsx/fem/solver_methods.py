@@ -6,7 +6,7 @@ import re
 from typing import Any
 
 AUTO = "auto"
-LAGGED, EXACT = "lagged", "exact"  # those whose factors may be of an earlier tangent (`evolution.linear`)
+LAGGED, EXACT = "lagged", "exact"  # those whose factors may be of an earlier tangent (`solver.linear`)
 
 # MUMPS: robust for indefinite tangents too, one factorisation pattern for all steps
 METHODS: dict[str, dict[str, Any]] = {

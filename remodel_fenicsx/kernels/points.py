@@ -9,8 +9,8 @@ from mpi4py import MPI
 from numpy.typing import ArrayLike, NDArray
 
 from remodel_fenicsx.kernels.library import Library, in_numpy
-from remodel_fenicsx.tissue import cells, repulsion, spectral
-from remodel_fenicsx.tissue.cells import UnitCell
+from remodel_fenicsx.model import cells, repulsion, spectral
+from remodel_fenicsx.model.cells import UnitCell
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]

@@ -11,16 +11,17 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from remodel_fenicsx.kernels.library import Library, in_numpy
-from remodel_fenicsx.tissue import condensed, logarithm, tensor_law
-from remodel_fenicsx.tissue.cells import UnitCell
-from remodel_fenicsx.tissue.chains import CHAINS
-from remodel_fenicsx.tissue.condensed import CondensedPoints
-from remodel_fenicsx.tissue.drivers import DRIVERS, rotated_back
-from remodel_fenicsx.tissue.energy import MATRICES, Tissue
-from remodel_fenicsx.tissue.laws import LAWS, Drive
-from remodel_fenicsx.tissue.repulsion import REPULSIONS, Repulsion, whole_structure_tensor
-from remodel_fenicsx.tissue.responses import StepOfCells
-from remodel_fenicsx.tissue.tensor_law import Target
+from remodel_fenicsx.model import logarithm, tensor_law
+from remodel_fenicsx.model.cells import UnitCell
+from remodel_fenicsx.model.chains import CHAINS
+from remodel_fenicsx.model.drivers import DRIVERS, rotated_back
+from remodel_fenicsx.model.energy import MATRICES, Tissue
+from remodel_fenicsx.model.implicit import condensed
+from remodel_fenicsx.model.implicit.condensed import CondensedPoints
+from remodel_fenicsx.model.implicit.responses import StepOfCells
+from remodel_fenicsx.model.laws import LAWS, Drive
+from remodel_fenicsx.model.repulsion import REPULSIONS, Repulsion, whole_structure_tensor
+from remodel_fenicsx.model.tensor_law import Target
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]

@@ -19,9 +19,9 @@ from remodel_fenicsx.paper.cases import KAPPAS, LOAD_CASES, load_case_name, scen
 from remodel_fenicsx.paper.errors import FigureError
 from remodel_fenicsx.paper.output import FORMATS, STYLE, Page, check_folder
 from remodel_fenicsx.paper.runs import RunCache
+from remodel_fenicsx.results.recording import Recording
 from remodel_fenicsx.system.children import cores
 from remodel_fenicsx.system.terminal import Line
-from remodel_fenicsx.results.recording import Recording
 
 __all__ = ["DEFAULT_FOLDER", "DEFAULT_RUNS", "FIGURES", "FigureError", "draw"]
 

@@ -12,8 +12,8 @@ from matplotlib.colors import BoundaryNorm, Colormap
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from remodel_fenicsx.paper.snapshots import Snapshot
 from remodel_fenicsx.paper.rendering import AMBIENT, Patch, Pixels
+from remodel_fenicsx.paper.snapshots import Snapshot
 from remodel_fenicsx.results.chain_lines import chain_lines
 
 Array = NDArray[np.float64]

@@ -6,14 +6,14 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from remodel_fenicsx.tissue.chains import CHAINS
+from remodel_fenicsx.model.chains import CHAINS
 from remodel_fenicsx.paper.bodies import angle_scale, place
 from remodel_fenicsx.paper.cases import KAPPAS
 from remodel_fenicsx.paper.output import COLOURS, Page, panel_letters
 from remodel_fenicsx.paper.rendering import render
 from remodel_fenicsx.paper.snapshots import Array, Snapshot, Table, first_cells, made_with
-from remodel_fenicsx.results.recording import Recording
 from remodel_fenicsx.paper.structures import SOLVED, at, joined, layer_table, peeled, tube_picture, wall_table
+from remodel_fenicsx.results.recording import Recording
 
 PERSISTENCE_LENGTHS = (0.1, 0.4, 0.8)  # Remark 1
 ANGLE_LABEL = "reference fibre angle{} (degrees)"

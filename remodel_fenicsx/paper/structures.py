@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from remodel_fenicsx.tissue.cells import initial_axes, radial_direction
+from remodel_fenicsx.model.cells import initial_axes, radial_direction
 from remodel_fenicsx.paper.bodies import angle_scale, body, place
 from remodel_fenicsx.paper.cases import ELONGATION_COLUMN, LOAD_CASES, load_case_name
 from remodel_fenicsx.paper.output import COLOURS, Page, panel_letters

@@ -92,7 +92,7 @@ class Measurement:
 
     @property
     def equilibrium(self) -> Any:
-        """The forms of the solved state (`evolution.equilibrium.Equilibrium`)."""
+        """The forms of the solved state (`solver.equilibrium.Equilibrium`)."""
         return self.observer.stepper.coupling.equilibrium
 
     @cached_property

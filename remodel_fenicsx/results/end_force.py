@@ -10,8 +10,8 @@ import numpy as np
 import ufl
 from mpi4py import MPI
 
-from remodel_fenicsx.evolution.equilibrium import Equilibrium
 from remodel_fenicsx.fem import jit
+from remodel_fenicsx.solver.equilibrium import Equilibrium
 
 
 class EndForce(NamedTuple):

@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.shape import Shape
-from remodel_fenicsx.evolution.pointwise import PointStresses
-from remodel_fenicsx.evolution.state import State
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
 from remodel_fenicsx.fem import compat, jit
 from remodel_fenicsx.results.chain_lines import chain_displacement, chain_lines
@@ -22,6 +20,8 @@ from remodel_fenicsx.results.recording import CHAINS, FIELDS, RecordingError
 from remodel_fenicsx.results.vtkhdf import LINE, TransientGrid, cell_type_and_permutation
 from remodel_fenicsx.scene.settings import FIELDS_BY_NAME
 from remodel_fenicsx.schema.times import SAME_TIME, same_time
+from remodel_fenicsx.solver.pointwise import PointStresses
+from remodel_fenicsx.state.state import State
 
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)

@@ -14,7 +14,6 @@ from remodel_fenicsx.results.recording import LARGEST_HISTORY, RecordingError
 from remodel_fenicsx.schema.times import same_time
 from remodel_fenicsx.system.regular_files import check_still_there, open_own, read_regular
 
-
 FLUSHED_AFTER = 0.5  # seconds: rows that come faster are brought to the disk together
 
 

@@ -18,7 +18,6 @@ from remodel_fenicsx.results.run_lock import FolderTaken, RunLock, is_vacant
 from remodel_fenicsx.results.vtkhdf import check_file
 from remodel_fenicsx.system.regular_files import open_own, write_whole
 
-
 DEEPEST = 100  # folders in folders: Python makes them by a function that calls itself
 
 

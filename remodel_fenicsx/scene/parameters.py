@@ -6,20 +6,19 @@ Source: E. Kuhl, G. A. Holzapfel, J. Mater. Sci. 42 (2007) 8811-8823; docs/theor
 from __future__ import annotations
 
 import math
-
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
+from remodel_fenicsx.model.cells import AXES
+from remodel_fenicsx.model.chains import BOLTZMANN_CONSTANT, CHAINS
+from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
+from remodel_fenicsx.model.energy import MATRICES, Tissue
+from remodel_fenicsx.model.laws import LAWS
+from remodel_fenicsx.model.repulsion import REPULSIONS
+from remodel_fenicsx.model.spectral import PAIRINGS
 from remodel_fenicsx.schema.tables import Table, checked, fault, is_number, one_of, shown
-from remodel_fenicsx.tissue.cells import AXES
-from remodel_fenicsx.tissue.chains import BOLTZMANN_CONSTANT, CHAINS
-from remodel_fenicsx.tissue.drivers import DRIVERS, FRAMES
-from remodel_fenicsx.tissue.energy import MATRICES, Tissue
-from remodel_fenicsx.tissue.laws import LAWS
-from remodel_fenicsx.tissue.repulsion import REPULSIONS
-from remodel_fenicsx.tissue.spectral import PAIRINGS
 from remodel_fenicsx.schema.units import NUMBER_DENSITY, STRESS, TEMPERATURE
 
 COUPLING_MEANINGS = {

@@ -19,6 +19,12 @@ from remodel_fenicsx.body import SHAPES, Shape
 from remodel_fenicsx.body.columns import columns_of, columns_on_request
 from remodel_fenicsx.body.reductions import AUTO, objections
 from remodel_fenicsx.fem.formulations import FORMULATIONS
+from remodel_fenicsx.model.chains import CHAINS
+from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
+from remodel_fenicsx.model.energy import MATRICES, Matrix
+from remodel_fenicsx.model.implicit.condensed import refused
+from remodel_fenicsx.model.laws import LAWS
+from remodel_fenicsx.model.repulsion import REPULSIONS
 from remodel_fenicsx.scene.parameters import FORMAT, PRESETS, RENAMED, Cells, Material, Remodeling, default_method
 from remodel_fenicsx.scene.plausibility import doubts, largest_stress
 from remodel_fenicsx.scene.profiles import EXACT, PROFILES, known_profile
@@ -27,12 +33,6 @@ from remodel_fenicsx.scene.values import in_own_units, in_present_format, known_
 from remodel_fenicsx.schema.tables import SceneError, Table, checked, fault, quoted, shown, variant_of
 from remodel_fenicsx.schema.toml import merged, parse_override, put, read_toml, toml_text
 from remodel_fenicsx.schema.units import FORCE
-from remodel_fenicsx.tissue.chains import CHAINS
-from remodel_fenicsx.tissue.condensed import refused
-from remodel_fenicsx.tissue.drivers import DRIVERS, FRAMES
-from remodel_fenicsx.tissue.energy import MATRICES, Matrix
-from remodel_fenicsx.tissue.laws import LAWS
-from remodel_fenicsx.tissue.repulsion import REPULSIONS
 
 LIMIT = 1000.0  # times 1/kappa after which nothing is left of a start, of cells under a hundredth of a tension too
 LARGEST_MESH = 10_000_000  # hexahedra; Gmsh, which is serial, needs about 10 GB for them

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from typing import Any
 
-from remodel_fenicsx.schema.tables import Table, allowed, fault
-from remodel_fenicsx.schema.units import LENGTH_UNIT, LENGTH_UNITS, STRESS_UNIT, in_units
 from remodel_fenicsx.body import Shape
 from remodel_fenicsx.scene.parameters import FORMAT, STRESS_UNITS, Material
+from remodel_fenicsx.schema.tables import Table, allowed, fault
+from remodel_fenicsx.schema.units import LENGTH_UNIT, LENGTH_UNITS, STRESS_UNIT, in_units
 
 
 def in_present_format(values: Mapping[str, Any]) -> dict[str, Any]:

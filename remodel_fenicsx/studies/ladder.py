@@ -10,9 +10,9 @@ from typing import Any
 from remodel_fenicsx.body.profile import PROFILE
 from remodel_fenicsx.body.reductions import AUTO, choice, objections, step_cost
 from remodel_fenicsx.fem.kinematics import KINEMATICS
+from remodel_fenicsx.model.laws import LAWS
 from remodel_fenicsx.scene.profiles import EXACT, PROFILES
 from remodel_fenicsx.scene.scene import Scene, SceneError
-from remodel_fenicsx.tissue.laws import LAWS
 
 log = logging.getLogger(__name__)
 

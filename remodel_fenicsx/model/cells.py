@@ -1,0 +1,189 @@
+"""Orthotropic unit cells of the collagen network: dimensions l_I along axes n_I, plain arrays or UFL."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from remodel_fenicsx.model.operators import squared_stretch
+
+Array = NDArray[np.float64]
+
+
+class UnitCell(NamedTuple):
+    """An orthotropic eight-chain unit cell, or a share of one (paper, Fig. 2).
+
+    Attributes
+    ----------
+    dimensions
+        l_I in link lengths: UFL vector of length 3, or array (..., 3).
+    axes
+        n_I: UFL tensor (3, 3) or array (..., 3, 3); row I is the unit vector n_I in the reference configuration.
+    weight
+        Share of this cell in r^2 and in W_rep. One for a whole cell; a blend of an old and a new cell (weights that add
+        up to one) is how a remodeling increment is applied in parts.
+    """
+
+    dimensions: Any
+    axes: Any
+    weight: Any = 1.0
+
+    def squared_stretches(self, deformation_gradient: Any) -> list[Any]:
+        """I_I = n_I . C n_I, the squared stretches along the three axes (eq. 5)."""
+        return [squared_stretch(deformation_gradient, self.axes, i) for i in range(3)]
+
+
+class CellSettings(Protocol):
+    """What decides the cells at t = 0 (`scene.parameters.Cells`)."""
+
+    @property
+    def initial(self) -> str | tuple[float, float, float]: ...
+
+    @property
+    def axes(self) -> str: ...
+
+    @property
+    def aligned_axis(self) -> int: ...
+
+    @property
+    def seed(self) -> int: ...
+
+    @property
+    def end_to_end_length(self) -> float: ...
+
+
+def structure_tensor(dimensions: Array, axes: Array) -> Array:
+    """A = sum_I l_I^2 n_I (x) n_I from l (..., 3) and axes as rows (..., 3, 3)."""
+    scaled = dimensions[..., :, None] * axes
+    return np.swapaxes(scaled, -1, -2) @ scaled
+
+
+def initial_dimensions(settings: CellSettings, number_of_elements: int) -> Array:
+    """l_I at t = 0 of every element of the mesh file, shape (number_of_elements, 3), in link lengths.
+
+    `random`: |l| = r0 and l uniform on the positive octant of the sphere, one draw per element. The whole list is drawn
+    on every rank, in the mesh file's order: the same element gets the same draw for any number of ranks.
+    """
+    r0 = settings.end_to_end_length
+    if settings.initial == "random":
+        draws = np.abs(np.random.default_rng(settings.seed).standard_normal((number_of_elements, 3)))
+        return r0 * draws / np.linalg.norm(draws, axis=1, keepdims=True)
+    if settings.initial == "isotropic":
+        lengths = [r0 / np.sqrt(3)] * 3
+    elif settings.initial == "aligned":
+        lengths = [r0 if axis == settings.aligned_axis else 0.0 for axis in (1, 2, 3)]
+    else:
+        lengths = [float(length) for length in settings.initial]
+    return np.tile(lengths, (number_of_elements, 1))
+
+
+def global_axes(coordinates: Array) -> Array:
+    """x, y, z at all points: rows, (..., 3, 3), at reference coordinates (..., 3)."""
+    axes = np.zeros((*coordinates.shape[:-1], 3, 3))
+    axes[...] = np.eye(3)
+    return axes
+
+
+def cylindrical_axes(coordinates: Array) -> Array:
+    """Circumferential, axial and radial direction about the z axis: rows, (..., 3, 3), at coordinates (..., 3)."""
+    axes = np.zeros((*coordinates.shape[:-1], 3, 3))
+    axes[..., 0, :] = circumferential_direction(coordinates)
+    axes[..., 1, 2] = 1.0
+    axes[..., 2, :] = radial_direction(coordinates)
+    return axes
+
+
+AXES: dict[str, Callable[[Array], Array]] = {"global": global_axes, "cylindrical": cylindrical_axes}
+"""Axes of the cells before the first pass by name: functions of the reference coordinates."""
+
+
+def initial_axes(kind: str, coordinates: Array) -> Array:
+    """n_I before the first pass (`AXES`), rows, shape (..., 3, 3), at reference coordinates (..., 3)."""
+    return AXES[kind](coordinates)
+
+
+def radial_direction(coordinates: Array) -> Array:
+    """Unit vector away from the z axis at coordinates (..., 3)."""
+    radius = np.sqrt(coordinates[..., 0] ** 2 + coordinates[..., 1] ** 2)[..., None]
+    return np.concatenate([coordinates[..., :2] / radius, np.zeros_like(radius)], axis=-1)
+
+
+def circumferential_direction(coordinates: Array) -> Array:
+    """Unit vector about the z axis, counter-clockwise, at coordinates (..., 3)."""
+    radial = radial_direction(coordinates)
+    return np.stack([-radial[..., 1], radial[..., 0], np.zeros_like(radial[..., 0])], axis=-1)
+
+
+def angle_to_axis(dimensions: Array, axes: Array, direction: Array) -> Array:
+    """Angle in degrees between the chain direction and a unit vector, from the structure tensor: (..., ) in [0, 90].
+
+    cos^2 = d . A d / tr A, which is the angle of sum_I l_I n_I when d is one of the axes (docs/theory.md). The part
+    across d is summed by itself, so that small angles keep their digits.
+    """
+    along = np.einsum("...ij,...j->...i", axes, np.broadcast_to(direction, dimensions.shape))
+    parallel = along[..., None] * np.broadcast_to(direction, dimensions.shape)[..., None, :]
+    across = _norm(axes - parallel)
+    return np.degrees(np.arctan2(_norm(dimensions * across), _norm(dimensions * along)))
+
+
+IN_THE_WALL = 1e-6  # of tr A: of less a rounded A has no direction, and a chain there has none that a picture shows
+
+
+def pitch_angle(dimensions: Array, axes: Array, coordinates: Array) -> Array:
+    """Angle in degrees of the chain direction in the wall of a tube about z, from circumferential (0) to axial (90).
+
+    atan sqrt(A_zz / A_tt) with the structure tensor A and t the circumferential direction; NaN where chains point out
+    of the wall, A_zz + A_tt < IN_THE_WALL tr A.
+    """
+    circumferential, axial, radial = _wall_components(dimensions, axes, coordinates)
+    inside = circumferential**2 + axial**2
+    angle: Array = np.degrees(np.arctan2(axial, circumferential))
+    return np.where(inside < IN_THE_WALL * (inside + radial**2), np.nan, angle)
+
+
+def radial_share(dimensions: Array, axes: Array, coordinates: Array) -> Array:
+    """A_rr / tr A about the z axis, from 0 (chains in the wall) to 1 (chains across it); 0 where there are none."""
+    circumferential, axial, radial = _wall_components(dimensions, axes, coordinates)
+    trace = circumferential**2 + axial**2 + radial**2
+    return np.divide(radial**2, trace, out=np.zeros_like(trace), where=trace > 0)
+
+
+def _wall_components(dimensions: Array, axes: Array, coordinates: Array) -> tuple[Array, Array, Array]:
+    """Roots of A_tt, A_zz and A_rr."""
+    radius = np.sqrt(coordinates[..., 0] ** 2 + coordinates[..., 1] ** 2)
+    cosine, sine = coordinates[..., 0, None] / radius[..., None], coordinates[..., 1, None] / radius[..., None]
+    x, y, z = (axes[..., i] for i in range(3))
+    return (
+        _norm(dimensions * (y * cosine - x * sine)),
+        _norm(dimensions * z),
+        _norm(dimensions * (x * cosine + y * sine)),
+    )
+
+
+def angle_between(first: UnitCell, second: UnitCell) -> Array:
+    """Angle in degrees between the directions of the chains of two cells, of n points: (n,) in [0, 90].
+
+    Of chains along one axis it is the angle between the axes; of two cells with the same axes that of the directions
+    sum_I l_I n_I. So it is at least the change of the angle to any axis (`angle_to_axis`), and of the pitch times the
+    cosine of the angle out of the wall, which it counts too. To first order in the change it is Bures' angle between
+    A/tr A of both, ds^2 = sum_IJ dA_IJ^2 / (a_I + a_J) / 2 in the axes of A with the principal values a.
+    """
+    share = first.dimensions / _norm(first.dimensions)[:, None]  # the roots of a_I
+    scaled = second.axes * (second.dimensions / _norm(second.dimensions)[:, None])[:, :, None]
+    root = np.swapaxes(second.axes, 1, 2) @ scaled
+    change = first.axes @ root @ np.swapaxes(first.axes, 1, 2) - share[:, :, None] * np.eye(3)
+    squared = share**2
+    both = squared[:, :, None] + squared[:, None, :]
+    weight = np.divide((share[:, :, None] + share[:, None, :]) ** 2, 2 * both, out=np.ones_like(both), where=both > 0)
+    chord = np.sqrt((weight * change**2).sum(axis=(1, 2)))
+    angle: Array = np.degrees(2 * np.arcsin(np.minimum(0.5 * chord, np.sqrt(0.5))))
+    return angle
+
+
+def _norm(vectors: Array) -> Array:
+    """Length of vectors (..., 3); by columns, five times faster than np.linalg.norm."""
+    length: Array = np.sqrt(vectors[..., 0] ** 2 + vectors[..., 1] ** 2 + vectors[..., 2] ** 2)
+    return length

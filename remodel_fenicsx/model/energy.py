@@ -1,0 +1,261 @@
+"""The strain energy of tissue with remodeling collagen, in UFL or on arrays: the only place where it is written.
+
+Stresses, drivers, residual and tangent follow by differentiation. Per reference volume (docs/theory.md):
+
+    W      = W_iso + W_chn + W_rep
+    W_iso  = lambda/2 ln^2 J + mu/2 (tr C - 3) - mu ln J
+    W_chn  = c psi(r),  r^2 = sum_I l_I^2 I_I,  I_I = n_I . C n_I = f_I . f_I,  f_I = F n_I
+    W_rep  = -c/2 g(r0) sum_I l_I^2 ln I_I
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from remodel_fenicsx.model.cells import UnitCell, structure_tensor
+from remodel_fenicsx.model.chains import CHAINS, Chain
+from remodel_fenicsx.model.mandel import MANDEL
+from remodel_fenicsx.model.operators import det, is_array, ln, sqrt, squared_norm
+from remodel_fenicsx.model.repulsion import REPULSIONS, Repulsion, squared_end_to_end_length
+
+Term = Callable[[Any, Any, Any], Any]
+
+
+class Matrix:
+    """An energy of the matrix whose volumetric part is told apart, as `fem.formulations` need it.
+
+    Called with F, lambda and mu it is the whole energy. Its terms are added one after the other: grouped otherwise, the
+    last digits would be others.
+
+    Parameters
+    ----------
+    volumetric
+        What resists a change of volume, a function of J, lambda and mu: zero and without slope at J = 1.
+    others
+        All other terms, functions of F, lambda and mu; together zero and stress-free at F = I.
+    derivatives
+        S and dS/dC of the whole energy at points, from (eigenvalues of C (n, 3), lambda, mu, whether dS/dC is asked
+        for), in the eigenbasis of C: tensors (n, 3, 3) and Mandel matrices (n, 6, 6). The coupling "implicit" needs it.
+    """
+
+    def __init__(self, volumetric: Term, *others: Term, derivatives: Callable[..., tuple[Any, Any]] | None = None):
+        self.volumetric, self.others, self.derivatives = volumetric, others, derivatives
+
+    def __call__(self, deformation_gradient: Any, lame_lambda: Any, lame_mu: Any) -> Any:
+        """The whole energy."""
+        volumetric = self.volumetric(det(deformation_gradient), lame_lambda, lame_mu)
+        return sum((term(deformation_gradient, lame_lambda, lame_mu) for term in self.others), volumetric)
+
+    def distortional(self, deformation_gradient: Any, lame_lambda: Any, lame_mu: Any) -> Any:
+        """All but the volumetric part."""
+        first, *rest = (term(deformation_gradient, lame_lambda, lame_mu) for term in self.others)
+        return sum(rest, first)
+
+
+def logarithmic_dilatation(jacobian: Any, lame_lambda: Any, lame_mu: Any) -> Any:
+    """U = lambda/2 ln^2 J, the volumetric part of eq. (4a): its Kirchhoff pressure is lambda ln J."""
+    return lame_lambda / 2 * ln(jacobian) ** 2
+
+
+def neo_hookean_derivatives(squared: Any, lame_lambda: Any, lame_mu: Any, second: bool) -> tuple[Any, Any]:
+    """S = (lambda ln J - mu) C^-1 + mu I and dS/dC in the eigenbasis of C; arrays of n points."""
+    inverse = 1 / squared
+    volumetric = lame_lambda * np.log(squared).sum(axis=1) / 2 - lame_mu
+    value = np.zeros((len(squared), 3, 3))
+    value[:, range(3), range(3)] = volumetric[:, None] * inverse + np.reshape(lame_mu, (-1, 1))
+    if not second:
+        return value, None
+    entries = np.concatenate([inverse, np.zeros_like(inverse)], axis=1)
+    dyad = np.reshape(lame_lambda, (-1, 1, 1)) / 2 * entries[:, :, None] * entries[:, None, :]
+    rows, columns = np.array(MANDEL).T
+    dyad[:, range(6), range(6)] -= volumetric[:, None] * inverse[:, rows] * inverse[:, columns]
+    return value, dyad
+
+
+neo_hookean = Matrix(
+    logarithmic_dilatation,
+    lambda F, lame_lambda, lame_mu: lame_mu / 2 * (squared_norm(F) - 3),
+    lambda F, lame_lambda, lame_mu: -(lame_mu * ln(det(F))),
+    derivatives=neo_hookean_derivatives,
+)
+"""W_iso = lambda/2 ln^2 J + mu/2 (tr C - 3) - mu ln J (eq. 4a)."""
+
+MATRICES: dict[str, Term] = {"neo-hookean": neo_hookean}
+"""Energies of the matrix by name: functions of F, lambda and mu (UFL or arrays), zero and stress-free at F = I; those
+that formulations other than "displacement" can take are a `Matrix`."""
+
+
+class Stresses(NamedTuple):
+    """Stress tensors of one state, UFL, shape (3, 3)."""
+
+    first_piola_kirchhoff: Any
+    second_piola_kirchhoff: Any
+    cauchy: Any
+
+    def plus(self, deformation_gradient: Any, second_piola_kirchhoff: Any) -> Stresses:
+        """With what `Tissue.strain_energy` leaves out of UFL, a second Piola-Kirchhoff stress."""
+        import ufl
+
+        F, S = deformation_gradient, second_piola_kirchhoff
+        P = ufl.dot(F, S)
+        first, second, cauchy = self
+        return Stresses(first + P, second + S, cauchy + ufl.dot(P, F.T) / ufl.det(F))
+
+
+@dataclass(frozen=True)
+class Tissue:
+    """Matrix and collagen network: the constitutive parameters and what follows from them.
+
+    Every parameter is a number, a dolfinx Constant, a DG0 function (regions) or an array over points: the same
+    functions serve forms and arrays. `fem.coefficients` makes one kind of the other.
+
+    Attributes
+    ----------
+    lame_lambda, lame_mu
+        Lame constants of the matrix, in a unit of stress.
+    network_modulus
+        c = omega k theta n_chn / (4 A_p), in the same unit.
+    contour_length
+        L, in link lengths. A chain law that does not lock may mean something else by it, or nothing.
+    end_to_end_length
+        r0, the initial length of a chain (erratum 3), in link lengths.
+    chain
+        Law of a single chain; None for a matrix without chains, which does not lock.
+    matrix
+        Energy of the matrix (`MATRICES`).
+    repulsion
+        Form of the repulsive energy (`REPULSIONS`).
+    """
+
+    lame_lambda: Any
+    lame_mu: Any
+    network_modulus: Any
+    contour_length: Any
+    end_to_end_length: Any
+    chain: Chain | None = CHAINS["wormlike"]
+    matrix: Term = neo_hookean
+    repulsion: Repulsion = REPULSIONS["axes"]
+
+    @property
+    def locking_length(self) -> Any:
+        """Length at which a chain locks, in link lengths; None where nothing locks."""
+        return self.contour_length if self.chain is not None and self.chain.locks else None
+
+    def stiffness(self, end_to_end_length: Any) -> Any:
+        """A stress per strain of matrix and network, where chains have a length r; times eps the rounding of a stress.
+
+        lambda + 2 mu + c (r^2 d(g r)/dr + g(r0) r0^2): near the contour length the chains' force changes by much more
+        than itself when r changes by a little.
+        """
+        matrix = self.lame_lambda + 2 * self.lame_mu
+        if self.chain is None:
+            return matrix
+        r, r0, L, g = end_to_end_length, self.end_to_end_length, self.contour_length, self.chain.stiffness
+        h = 1e-6 * r * (1 - r / L if self.chain.locks else 1)
+        slope = ((r + h) * g(r + h, L) - (r - h) * g(r - h, L)) / (2 * h)
+        return matrix + self.network_modulus * (r**2 * slope + g(r0, L) * r0**2)
+
+    def map(self, function: Callable[[str, Any], Any]) -> Tissue:
+        """The same tissue with function(name, value) for every parameter."""
+        names = ("lame_lambda", "lame_mu", "network_modulus", "contour_length", "end_to_end_length")
+        return replace(self, **{name: function(name, getattr(self, name)) for name in names})
+
+    def strain_energy(self, deformation_gradient: Any, cells: Sequence[UnitCell]) -> Any:
+        """W per reference volume (eqs. 3 and 4 with errata 1 and 2), in the unit of the Lame constants.
+
+        Parameters
+        ----------
+        deformation_gradient
+            F, UFL of shape (3, 3) or array (..., 3, 3).
+        cells
+            The unit cell: one whole cell, or shares whose weights add up to one.
+
+        In UFL a repulsion that has derivatives of its own (`Repulsion.derivatives`) is left out: these enter forms as
+        values at the quadrature points (`solver.pointwise`).
+        """
+        energy = self.matrix(deformation_gradient, self.lame_lambda, self.lame_mu)
+        return self._with_network(energy, deformation_gradient, cells)
+
+    def distortional_energy(self, deformation_gradient: Any, cells: Sequence[UnitCell]) -> Any:
+        """W without the volumetric part of the matrix; as `strain_energy`, which it makes together with that part."""
+        energy = self._parts().distortional(deformation_gradient, self.lame_lambda, self.lame_mu)
+        return self._with_network(energy, deformation_gradient, cells)
+
+    def volumetric_energy(self, jacobian: Any) -> Any:
+        """The volumetric part of the matrix, U(J)."""
+        return self._parts().volumetric(jacobian, self.lame_lambda, self.lame_mu)
+
+    def _parts(self) -> Matrix:
+        if isinstance(self.matrix, Matrix):
+            return self.matrix
+        raise TypeError(
+            "the volumetric part of this matrix energy is not told apart: it must be a tissue.energy.Matrix"
+        )
+
+    def _with_network(self, energy: Any, deformation_gradient: Any, cells: Sequence[UnitCell]) -> Any:
+        """An energy plus that of the chains, where there are any."""
+        if self.chain is None:
+            return energy
+        length = sqrt(squared_end_to_end_length(deformation_gradient, cells))
+        chains = self.chain.energy(length, self.contour_length)
+        if not is_array(deformation_gradient) and self.repulsion.derivatives is not None:
+            return energy + self.network_modulus * chains
+        stiffness = self.chain.stiffness(self.end_to_end_length, self.contour_length)
+        repulsion = -stiffness / 2 * self.repulsion.sum(deformation_gradient, cells, self.end_to_end_length)
+        return energy + self.network_modulus * (chains + repulsion)
+
+    @property
+    def repulsion_modulus(self) -> Any:
+        """c g(r0): W_rep = -c g(r0) M / 2."""
+        assert self.chain is not None
+        return self.network_modulus * self.chain.stiffness(self.end_to_end_length, self.contour_length)
+
+    def stresses(self, deformation_gradient: Any, cells: Sequence[UnitCell]) -> Stresses:
+        """P = dW/dF, S = F^-1 P and sigma = P F^T / J (eqs. 6 and 7 with erratum 5), by differentiation of W; UFL."""
+        import ufl
+
+        F = ufl.variable(deformation_gradient)
+        return _stresses(F, ufl.diff(self.strain_energy(F, cells), F))
+
+    def stresses_of_parts(self, deformation_gradient: Any, cells: Sequence[UnitCell], jacobian: Any) -> Stresses:
+        """The same with U at another J than det F: P = d(W - U)/dF + J U'(J) F^-T, J U' the Kirchhoff pressure; UFL."""
+        import ufl
+
+        F, J = ufl.variable(deformation_gradient), ufl.variable(jacobian)
+        pressure = J * ufl.diff(self.volumetric_energy(J), J)
+        return _stresses(F, ufl.diff(self.distortional_energy(F, cells), F) + pressure * ufl.inv(F).T)
+
+    def energy_increment(self, deformation_gradient: Any, old: UnitCell, new: UnitCell) -> Any:
+        """First-order change of W at frozen F when the cells become others, per reference volume; arrays.
+
+        W depends on the cells through r^2 = A : C and M = sum_I l_I^2 ln I_I only:
+        dW = c g(r)/2 d(r^2) - c/2 g(r0) dM, taken at the old cells, where r < L. (Remark 6; the new cells themselves
+        may have r > L until the next solve, so their energy is not always defined.)
+        """
+        F = deformation_gradient
+        if self.chain is None:
+            return 0.0 * det(F)
+        C = F.swapaxes(-1, -2) @ F
+        squared = (structure_tensor(*old[:2]) * C).sum(axis=(-1, -2))
+        squared_change = (structure_tensor(*new[:2]) * C).sum(axis=(-1, -2)) - squared
+        r0 = self.end_to_end_length
+        repulsion_change = self.repulsion.sum(F, [new], r0) - self.repulsion.sum(F, [old], r0)
+        return self.increment(squared, squared_change, repulsion_change)
+
+    def increment(self, squared: Any, squared_change: Any, repulsion_change: Any) -> Any:
+        """The same from the old r^2, its change and that of M: for those who have them already; arrays."""
+        assert self.chain is not None
+        stiffness = self.chain.stiffness(sqrt(squared), self.contour_length)
+        initial = self.chain.stiffness(self.end_to_end_length, self.contour_length)
+        return self.network_modulus / 2 * (stiffness * squared_change - initial * repulsion_change)
+
+
+def _stresses(F: Any, first: Any) -> Stresses:
+    """All of them from P; UFL."""
+    import ufl
+
+    return Stresses(first, ufl.dot(ufl.inv(F), first), ufl.dot(first, F.T) / ufl.det(F))

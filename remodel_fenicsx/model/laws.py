@@ -1,0 +1,316 @@
+"""Evolution laws: what the unit cells become while a drive acts on them. Pure functions on arrays.
+
+A law is `update(cells, drive, time_old, time_new) -> cells` with cells of shape (n, 3) and (n, 3, 3). The paper's laws
+(one for each way to integrate its eq. 10) change the dimensions towards a target while the axes turn at once: `ranked`
+makes a law of such a function. `rotation` is the older law that the paper argues against: the axes turn gradually and
+the dimensions stay.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from remodel_fenicsx.model import spectral, tensor_law
+from remodel_fenicsx.model.cells import UnitCell, structure_tensor
+from remodel_fenicsx.model.drivers import Driver, Frame, carried_axes
+
+Array = NDArray[np.float64]
+
+
+class Drive(NamedTuple):
+    """What acts on the cells of n points during a step.
+
+    Attributes
+    ----------
+    deformation_gradient
+        F, (n, 3, 3).
+    tensor
+        The driving tensor, symmetric, (n, 3, 3).
+    driver, frame
+        Where the tensor's eigenvectors live, and what becomes of them.
+    threshold
+        Principal values up to this size are zero, in the unit of the tensor; (n,) or a number.
+    initial_dimensions
+        l0_I by rank, (n, 3), in link lengths.
+    end_to_end_length
+        r0, in link lengths; (n,) or a number.
+    kappa
+        Speed of remodeling, in 1/time.
+    pairing
+        Of `spectral.PAIRINGS`: principal values and axes, in the order in which they belong to the cell's dimensions.
+    rotation_time
+        Time in which the law `rotation` turns a small angle to 1/e of it.
+    kernels
+        Whose `principal` and `positive_direction` are called: those of `spectral`, or of C (`kernels.points`).
+    rounding
+        The part of the threshold that is the rounding of a stress.
+    """
+
+    deformation_gradient: Array
+    tensor: Array
+    driver: Driver
+    frame: Frame
+    threshold: Array | float
+    initial_dimensions: Array
+    end_to_end_length: Array | float
+    kappa: float
+    pairing: spectral.Pairing = spectral.principal
+    rotation_time: float = 40.0
+    kernels: Any = spectral
+    rounding: Array | float = 0.0
+
+    @property
+    def floor(self) -> Array | float:
+        """Of `tensor_law.target`."""
+        floor: Array | float = tensor_law.floor_above(self.threshold, self.rounding)
+        return floor
+
+
+def relaxed(old: UnitCell, new: UnitCell, factor: float) -> UnitCell:
+    """The cells that a pass has reached with a share of its change: A = A_old + factor (A_new - A_old).
+
+    A = sum_I l_I^2 n_I (x) n_I; the dimensions are the roots of its eigenvalues, the axes its eigenvectors, in the
+    order of the new axes that they continue. Where eigenvalues agree, the new axes decide. Arrays of n points; a factor
+    of 1 gives the new cells as they are.
+    """
+    if factor == 1.0:
+        return new
+    before, after = structure_tensor(*old[:2]), structure_tensor(*new[:2])
+    squared, axes = spectral.continued(before + factor * (after - before), new.axes)
+    return UnitCell(np.sqrt(np.maximum(squared, 0.0)), axes)
+
+
+RankedFunction = Callable[[Array, Array, Array, float, float, float], Array]
+
+
+@dataclass(frozen=True)
+class Law:
+    """An evolution law.
+
+    Attributes
+    ----------
+    update
+        New cells from (cells, drive, time_old, time_new).
+    has_limit
+        Whether the cells tend to a limit under a constant drive that does not depend on the way there.
+    remodels
+        False where cells never change: then there is no pass at all.
+    of_absolute_time
+        Whether a pass makes up for what the ones before have left out. The cells of other laws change by steps: those
+        that make a share of each are slower.
+    target, follow
+        Of laws whose cells tend to a tensor: ``target(drive)`` and ``follow(cells, target, r0, kappa dt)``, of which
+        `update` is made. A scheme of second order needs them apart.
+    dimensions
+        Of laws towards a target by rank (`ranked`): the function of which `update` is made. The coupling "implicit"
+        asks for its slope.
+    keeps_symmetry
+        Whether planes of symmetry of cells and drive stay such: False where the law turns an axis to one of two sides.
+    asks_kappa
+        Whether kappa = 0 means that cells never change, so that there is no pass at all.
+    share
+        Cells that have made a share of a change, from (old, new, factor); `relaxed` where the law has none of its own.
+    """
+
+    update: Callable[[UnitCell, Drive, float, float], UnitCell]
+    has_limit: bool = False
+    remodels: bool = True
+    of_absolute_time: bool = False
+    target: Callable[[Drive], tensor_law.Target] | None = None
+    follow: Callable[[UnitCell, tensor_law.Target, Array | float, float], UnitCell] | None = None
+    dimensions: RankedFunction | None = None
+    share: Callable[[UnitCell, UnitCell, float], UnitCell] = relaxed
+    keeps_symmetry: bool = False
+    asks_kappa: bool = False
+
+
+def ranked(function: RankedFunction, has_limit: bool = False, of_absolute_time: bool = False) -> Law:
+    """A law of the paper's kind: axes at the drive's principal directions, dimensions by rank from `function`.
+
+    Parameters
+    ----------
+    function
+        ``function(l, l0, target, kappa, time_old, time_new) -> l_new`` with l and l0 (n, 3) by rank (column 0: largest
+        principal value; with the pairing "continuous" by axis instead), target = r0 e, e = lambda^+ / |lambda^+|.
+        Points without a positive value keep their cells.
+    has_limit, of_absolute_time
+        As in `Law`.
+    """
+
+    def update(cells: UnitCell, drive: Drive, time_old: float, time_new: float) -> UnitCell:
+        values, axes = principal_directions(drive, cells.axes, drive.pairing)
+        direction, active = drive.kernels.positive_direction(values, threshold=drive.threshold)
+        target = np.reshape(drive.end_to_end_length, (-1, 1)) * direction
+        dimensions = function(cells.dimensions, drive.initial_dimensions, target, drive.kappa, time_old, time_new)
+        axes = framed(drive, axes, None if drive.pairing is spectral.principal else dimensions)
+        if active.all():
+            return UnitCell(dimensions, axes)
+        return UnitCell(
+            np.where(active[:, None], dimensions, cells.dimensions),
+            np.where(active[:, None, None], axes, cells.axes),
+        )
+
+    return Law(
+        update,
+        has_limit,
+        of_absolute_time=of_absolute_time,
+        dimensions=function,
+        keeps_symmetry=True,
+        asks_kappa=True,
+    )
+
+
+def principal_directions(drive: Drive, previous: Array, pairing: spectral.Pairing) -> tuple[Array, Array]:
+    """Principal values and directions of the drive, in the space in which it lives; `previous`: the cells' axes."""
+    if not drive.driver.material and drive.frame.carries_axes:
+        previous = carried_axes(drive.deformation_gradient, previous)
+    function: spectral.Pairing = drive.kernels.principal if pairing is spectral.principal else pairing
+    return function(drive.tensor, previous, threshold=drive.threshold)
+
+
+def framed(drive: Drive, axes: Array, dimensions: Array | None = None) -> Array:
+    """Axes of the cells from the drive's principal directions, by rank or in an order of their own.
+
+    A frame may treat its axes in their order (the material one takes the first as it is). By rank it is the largest
+    principal value that comes first. With `dimensions` it is the largest dimension: where two of them change their
+    order they are equal, so that A does not depend on which is first, and does not jump.
+    """
+    if drive.driver.material:
+        return axes
+    if dimensions is None:
+        return drive.frame.axes(drive.deformation_gradient, axes)
+    order = np.argsort(-dimensions, axis=1, kind="stable")[:, :, None]
+    framed = drive.frame.axes(drive.deformation_gradient, np.take_along_axis(axes, order, axis=1))
+    return np.take_along_axis(framed, np.argsort(order, axis=1), axis=1)
+
+
+def explicit(l: Array, l0: Array, target: Array, kappa: float, time_old: float, time_new: float) -> Array:
+    """Eq. (11): l = l0 + (r0 e - l0)(1 - exp(-kappa t)), a function of the absolute time and the present target."""
+    return l0 - (target - l0) * np.expm1(-kappa * time_new)
+
+
+def rate(l: Array, l0: Array, target: Array, kappa: float, time_old: float, time_new: float) -> Array:
+    """Eq. (10): dl/dt = kappa (r0 e - l0) exp(-kappa t), integrated exactly over the step with e frozen."""
+    return l - (target - l0) * np.exp(-kappa * time_old) * np.expm1(-kappa * (time_new - time_old))
+
+
+def relaxation(l: Array, l0: Array, target: Array, kappa: float, time_old: float, time_new: float) -> Array:
+    """Autonomous form dl/dt = kappa (r0 e - l), integrated exactly over the step with e frozen."""
+    return l - (target - l) * np.expm1(-kappa * (time_new - time_old))
+
+
+def rotation(cells: UnitCell, drive: Drive, time_old: float, time_new: float) -> UnitCell:
+    """Remark 5: the fibre turns gradually towards the largest tension, the other axes turn along, dimensions stay.
+
+    n <- exp(dt [omega]) n with omega = n_new x n_max / tau (tau: `Drive.rotation_time`, n_new: at the end of the step).
+    The fibre n is the axis of the largest dimension (the first of equal ones). n_max is the principal direction of the
+    largest value, a line: of its two senses the one nearer to n. Where n is orthogonal to it within
+    `spectral.DECISIVE`, both are as near, and the one nearer to the next of the cell's axes is taken. Where the largest
+    values agree, n_max is the direction of their plane that is nearest to n. Points without tension keep their cells.
+    """
+    order = (np.argmax(cells.dimensions, axis=1)[:, None] + np.arange(3)) % 3
+    axes = np.take_along_axis(cells.axes, order[:, :, None], axis=1)
+    values, towards = principal_directions(drive, axes, spectral.principal)
+    _, active = spectral.positive_direction(values, threshold=drive.threshold)
+    largest = spectral.with_signs_of(axes, framed(drive, towards))[:, 0]
+    vectors = _turn_towards(axes[:, 0], largest, (time_new - time_old) / drive.rotation_time)
+    return UnitCell(cells.dimensions, turned(cells.axes, np.where(active[:, None], vectors, 0.0)))
+
+
+def _turn_towards(fibre: Array, goal: Array, relative_step: float) -> Array:
+    """Rotation vectors dt omega (n, 3) of Remark 5's implicit step, |dt omega| = dt/tau sin(angle at its end)."""
+    across = np.cross(fibre, goal)
+    sine = np.linalg.norm(across, axis=1)
+    angle = np.arctan2(sine, np.einsum("na,na->n", fibre, goal))
+    turn = angle - angle_left(angle, relative_step)
+    return across * np.divide(turn, sine, out=np.zeros_like(sine), where=sine > 0.0)[:, None]  # 0: parallel
+
+
+def angle_left(angle: Array, relative_step: float) -> Array:
+    """The root a of a + (dt/tau) sin a = angle: what an implicit step leaves of angles (n,) in [0, pi/2], radians.
+
+    Newton's method from angle / (1 + dt/tau), which is below the root: the left side is increasing and concave, so each
+    iterate comes nearer from below.
+
+    Raises
+    ------
+    FloatingPointError
+        If an angle is not finite.
+    """
+    left = np.asarray(angle / (1.0 + relative_step), dtype=np.float64)
+    for _ in range(50):
+        missing = angle - left - relative_step * np.sin(left)
+        correction = missing / (1.0 + relative_step * np.cos(left))
+        left = np.asarray(left + correction, dtype=np.float64)
+        if np.all(correction <= 1e-15 * angle):
+            return left
+    raise FloatingPointError(f"no angle is left by a rotation with a step of {relative_step:g} rotation times")
+
+
+def turned(axes: Array, vectors: Array) -> Array:
+    """Axes (n, 3, 3), rows, after rotations by vectors (n, 3): axis times angle in radians (Rodrigues' formula)."""
+    angle = np.linalg.norm(vectors, axis=1)[:, None, None]
+    # sin(a)/a and (1 - cos a)/a^2, both without cancellation; np.sinc(x) is sin(pi x)/(pi x)
+    first, second = np.sinc(angle / np.pi), 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
+    along = np.broadcast_to(vectors[:, None], axes.shape)
+    once = np.cross(along, axes)
+    return axes + first * once + second * np.cross(along, once)
+
+
+def turned_in_part(old: UnitCell, new: UnitCell, factor: float) -> UnitCell:
+    """The old cells after a share of the rotation, of less than 180 degrees, that leads to the axes of the new ones."""
+    if factor == 1.0:
+        return new
+    across = 0.5 * np.cross(old.axes, new.axes).sum(axis=1)  # sin(angle) times the axis
+    sine = np.linalg.norm(across, axis=1)
+    angle = np.arctan2(sine, 0.5 * (np.einsum("nia,nia->n", old.axes, new.axes) - 1.0))
+    part = factor * np.divide(angle, sine, out=np.zeros_like(sine), where=sine > 0.0)
+    return UnitCell(new.dimensions, turned(old.axes, part[:, None] * across))
+
+
+def keep(cells: UnitCell, drive: Drive, time_old: float, time_new: float) -> UnitCell:
+    """The same cells."""
+    return cells
+
+
+def tensor_target(drive: Drive) -> tensor_law.Target:
+    """What the structure tensor tends to (`tensor_law.target`)."""
+    tensor = drive.tensor
+    if not drive.driver.material:
+        tensor = drive.frame.tensor(drive.deformation_gradient, tensor)
+    return tensor_law.target(tensor, drive.floor)
+
+
+def follow_tensor(
+    cells: UnitCell, target: tensor_law.Target, end_to_end_length: Array | float, rate: float
+) -> UnitCell:
+    """Cells whose structure tensor is `tensor_law.follow`; where its eigenvalues agree, the axes stay.
+
+    Lengths are NaN where the target, extrapolated, makes the tensor indefinite by more than rounding.
+    """
+    structure = tensor_law.follow(structure_tensor(*cells[:2]), target, end_to_end_length, rate)
+    squared, axes = spectral.continued(structure, cells.axes)
+    rounding = spectral.ROUNDING * np.abs(squared).max(axis=-1, keepdims=True)
+    return UnitCell(np.where(squared < -rounding, np.nan, np.sqrt(np.maximum(squared, 0.0))), axes)
+
+
+def tensor(cells: UnitCell, drive: Drive, time_old: float, time_new: float) -> UnitCell:
+    """dA/dt = kappa s (r0^2 E - A) with E and s frozen over the step (docs/theory.md, "The consistent variant")."""
+    return follow_tensor(cells, tensor_target(drive), drive.end_to_end_length, drive.kappa * (time_new - time_old))
+
+
+LAWS: dict[str, Law] = {
+    "explicit": ranked(explicit, has_limit=True, of_absolute_time=True),
+    "rate": ranked(rate),
+    "relaxation": ranked(relaxation, has_limit=True),
+    "tensor": Law(
+        tensor, has_limit=True, target=tensor_target, follow=follow_tensor, keeps_symmetry=True, asks_kappa=True
+    ),
+    "rotation": Law(rotation, share=turned_in_part),
+    "none": Law(keep, remodels=False, keeps_symmetry=True),
+}

@@ -1,0 +1,160 @@
+"""The consistent evolution law: one symmetric tensor A per point, without ranks and without axes (docs/theory.md).
+
+    dA/dt = kappa s (r0^2 E - A),    E = N / tr N,  N = (D+)^2
+
+D is the driving tensor in material space, D+ its positive part, s a switch that is one under tension and vanishes with
+it. For the driver `finger` D is C. E has trace one, so tr A stays r0^2. Pure functions on arrays (n, 3, 3).
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from remodel_fenicsx.model import mandel
+
+Array = NDArray[np.float64]
+
+COMPRESSION = 0.01
+"""Share of the squared compression that counts against the tension: the switch is one half where n+ = COMPRESSION n-,
+a tension of a tenth of the compression."""
+
+ABOVE_ROUNDING = 7000.0
+"""Where the switch sets in, over the rounding of a principal value (1e-10 of the stiffness): wide enough that Newton's
+method sees a smooth function."""
+
+
+def floor_above(noise: Any, rounding: Any) -> Any:
+    """Tension at which the switch is one half, where there is no compression.
+
+    What the solver's tolerance leaves out of balance counts as it is: multiplied like the rounding, it would be stress.
+
+    Parameters
+    ----------
+    noise
+        Size up to which a principal value may be an error: of rounding, or of the equilibrium as it was accepted.
+    rounding
+        The part of it that the rounding of a stress at given F is.
+    """
+    return ABOVE_ROUNDING * rounding + noise
+
+
+class Target(NamedTuple):
+    """What A tends to, and how much of it.
+
+    Attributes
+    ----------
+    direction
+        E, (n, 3, 3), trace one (zero where nothing is positive).
+    share
+        s, (n,), between 0 and 1.
+    """
+
+    direction: Array
+    share: Array
+
+    def towards(self, other: Target, weight: Array | float) -> Target:
+        """sE + weight (s'E' - sE), of another target s'E'; weights below 0 or above 1 extrapolate.
+
+        What acts on A is kappa (r0^2 sE - sA): it is sE that changes linearly, and s is its trace. So a target that
+        does not count takes no part, and E has trace one. An s below 0 is 0, one above 1 is 1.
+        """
+        ends = (self.share[:, None, None] * self.direction, other.share[:, None, None] * other.direction)
+        changed = ends[0] + np.reshape(weight, (-1, 1, 1)) * (ends[1] - ends[0])
+        share = np.einsum("nii->n", changed)
+        some = share > 0.0
+        direction = changed / np.where(some, share, 1.0)[:, None, None]
+        return Target(direction, np.where(some, np.minimum(share, 1.0), 0.0))
+
+    def where(self, chosen: NDArray[np.bool_], other: Target) -> Target:
+        """Itself, and at the chosen points another target."""
+        return Target(
+            np.where(chosen[:, None, None], other.direction, self.direction), np.where(chosen, other.share, self.share)
+        )
+
+
+def target(tensor: Array, floor: Array | float) -> Target:
+    """E and s of driving tensors in material space.
+
+    Parameters
+    ----------
+    tensor
+        D, symmetric, (n, 3, 3), any unit.
+    floor
+        Tension below which next to nothing remodels (`floor_above`), in the same unit; (n,) or a number.
+    """
+    values, vectors = np.linalg.eigh(tensor)
+    largest = np.abs(values).max(axis=1)
+    unit = np.where(largest > 0, largest, 1.0)
+    values = values / unit[:, None]  # squares must neither overflow nor underflow
+    positive = np.maximum(values, 0.0) ** 2
+    tension, compression = positive.sum(axis=1), (np.minimum(values, 0.0) ** 2).sum(axis=1)
+    weights = positive / np.where(tension > 0, tension, 1.0)[:, None]
+    direction = (vectors * weights[:, None, :]) @ np.swapaxes(vectors, 1, 2)
+    total = tension + COMPRESSION * compression + (np.asarray(floor) / unit) ** 2
+    return Target(direction, tension / np.where(total > 0, total, 1.0))
+
+
+def weight_of_the_end(rate: float) -> float:
+    """Weight of the target at the end of a step in the one that acts, if targets change linearly over it.
+
+    A forgets: A(h) = (1 - w) A(0) + w (E_0 + weight (E_1 - E_0)), w = 1 - exp(-z), weight = 1/w - 1/z, z = kappa h:
+    one half for short steps, one for long ones.
+    """
+    if rate < 1e-3:
+        return 0.5 + rate / 12
+    return float(-1.0 / np.expm1(-rate) - 1.0 / rate)
+
+
+def target_derivatives(tensor: Array, floor: Array | float) -> tuple[Array, Array]:
+    """dE/dD as Mandel matrices (n, 6, 6) and ds/dD as Mandel vectors (n, 6); arguments as for `target`.
+
+    With v the principal values of D, N = (D+)^2 changes across two of its axes by v_i + v_j, where both are positive,
+    by v+^2 / |v_i - v_j| where one is: no difference of nearly equal numbers, and continuous where they agree.
+    """
+    values, vectors = np.linalg.eigh(tensor)
+    largest = np.abs(values).max(axis=1)
+    unit = np.where(largest > 0, largest, 1.0)
+    v = values / unit[:, None]
+    tension, compression = np.maximum(v, 0.0), np.minimum(v, 0.0)
+    positive, negative = (tension**2).sum(axis=1), (compression**2).sum(axis=1)
+    some = np.where(positive > 0, positive, 1.0)
+    by_values = np.zeros((len(v), 6, 6))
+    weights = tension**2 / some[:, None]
+    by_values[:, range(3), range(3)] = 2 * tension / some[:, None]
+    by_values[:, :3, :3] -= weights[:, :, None] * 2 * tension[:, None, :] / some[:, None, None]
+    for row, (i, j) in enumerate(mandel.PAIRS, start=3):
+        apart = np.maximum(np.abs(v[:, i] - v[:, j]), np.finfo(float).tiny)
+        both = (v[:, i] > 0) & (v[:, j] > 0)
+        one = np.maximum(tension[:, i], tension[:, j]) ** 2 / apart
+        by_values[:, row, row] = np.where(both, v[:, i] + v[:, j], one) / some
+    to_axes = mandel.congruence(vectors)
+    direction = to_axes @ (by_values / unit[:, None, None]) @ np.swapaxes(to_axes, 1, 2)
+    against = COMPRESSION * negative + (np.asarray(floor) / unit) ** 2
+    total = positive + against
+    slope = 2 * (tension * against[:, None] - COMPRESSION * positive[:, None] * compression)
+    slope /= (np.where(total > 0, total, 1.0) ** 2 * unit)[:, None]
+    share: Array = np.einsum("nab,nb->na", to_axes, mandel.on_diagonal(slope))
+    return direction, share
+
+
+def follow(structure: Array, towards: Target, end_to_end_length: Array | float, rate: float) -> Array:
+    """A after a time in which the target does not change: exact.
+
+    Parameters
+    ----------
+    structure
+        A, (n, 3, 3), in squared link lengths.
+    towards
+        E and s.
+    end_to_end_length
+        r0, (n,) or a number.
+    rate
+        kappa times the time.
+    """
+    squared = np.reshape(np.asarray(end_to_end_length, dtype=np.float64) ** 2, (-1, 1, 1))
+    weight = -np.expm1(-rate * towards.share)[:, None, None]
+    change: Array = weight * (squared * towards.direction - structure)
+    return structure + change

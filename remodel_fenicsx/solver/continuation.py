@@ -1,0 +1,277 @@
+"""A change in as many parts as Newton's method needs: half the part after a failure, twice after a success."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from remodel_fenicsx.fem.ranks import over_ranks
+from remodel_fenicsx.solver.blend import KEPT_RESERVE
+from remodel_fenicsx.solver.equilibrium import Extension
+from remodel_fenicsx.solver.newton import NOTICEABLE, GuardedNewton, Solution, SolveFailure
+from remodel_fenicsx.solver.refusals import BIFURCATION, LIMIT_POINT, SEVERAL_SOLUTIONS, Refusal, diagnosed
+from remodel_fenicsx.state.memory import Numbers
+
+SLOPE_SHARE = 1e-3  # of the bounded part: over it the slope of the residual is taken
+SAME = 1e-4  # of the way to them: by what two solutions may differ that are one; of other branches it is a good part
+FASTER = 4.0  # than the part before: a way that comes to a limit point is up to 3 times as fast in its last equal part
+WAYS_END = (LIMIT_POINT.kind, BIFURCATION.kind)  # refusals for which no smaller step helps
+PROOF = 8  # halvings without which a jump is not told from a step that is only too large
+MOST_JUMPS = 3  # that are looked into in a run, each by some 25 solves: a body that falls apart jumps in every step
+log = logging.getLogger(__name__)
+
+
+@dataclass
+class Work:
+    """Solver work of one step, failed attempts included."""
+
+    newton_iterations: int = 0
+    linear_iterations: int = 0
+    substeps: int = 0
+    residual: float = 0.0  # of the last solution, in the unit of force
+    tangents: int = 0  # that were assembled
+    extension: Extension | None = None  # of the last solution, where it was looked at with the cells of the row
+    is_far: bool = False  # whether the last solution is (`Solution.is_far`)
+    held_points: int = 0  # points whose cells do not belong to their stress, of the coupling "implicit"
+
+    def add(self, done: Solution | SolveFailure | Work) -> None:
+        """Count a solve, or the work of a step that was taken back."""
+        self.newton_iterations += done.newton_iterations
+        self.linear_iterations += done.linear_iterations
+        self.tangents += done.tangents
+        if isinstance(done, Solution):
+            self.residual, self.extension = done.residual, done.extension
+            self.is_far = done.is_far
+
+
+class StepFailure(RuntimeError):
+    """A step cannot be solved, or is not wanted; the state is that of the last accepted step.
+
+    Attributes
+    ----------
+    time
+        Of the step.
+    refusal
+        Why, and what helps.
+    """
+
+    def __init__(self, time: float, text: str, refusal: Refusal):
+        super().__init__(text)
+        self.time, self.refusal = time, refusal
+
+
+def failure_text(time: float, stage: str, fraction: float, cause: SolveFailure) -> str:
+    """Where a change of the problem has stopped, and why."""
+    point = ", ".join(f"{c:.3f}" for c in cause.extension.worst_point)
+    return (
+        f"no equilibrium at time {time:g}: {stage} stops at {100 * fraction:.3g} % of the step ({cause.reason}; "
+        f"largest r/L = {cause.extension.max_chain_extension:.4f} at ({point}), "
+        f"smallest J = {cause.extension.min_jacobian:.4g})"
+    )
+
+
+@dataclass
+class Change:
+    """A change of the problem that can be applied in parts.
+
+    Attributes
+    ----------
+    time, stage
+        Time of the step and name of the change, for messages.
+    set_fraction
+        Applies a fraction of it, 0 to 1.
+    newton
+        Solves the problem with what is applied.
+    maximum_halvings
+        How often the whole is halved before it has failed.
+    largest_part
+        Largest further part from a fraction on, where there is a bound.
+    roughly
+        Whether all parts but the last may be solved coarsely. Not near a limit of the load: it would be passed.
+    """
+
+    time: float
+    stage: str
+    set_fraction: Callable[[float], None]
+    newton: GuardedNewton
+    maximum_halvings: int
+    largest_part: Callable[[float], float] = lambda done: 1.0
+    roughly: bool = False
+    refusal: Refusal | None = field(default=None, init=False)  # what there was no way past but by a jump
+    _direction: NDArray[np.float64] | None = field(default=None, init=False)  # of the unknowns over the last part
+
+    def advance(self, work: Work, failure: SolveFailure | None = None, part: float = 1.0) -> None:
+        """Go from 0 to 1.
+
+        A part that ends far from where its tangent points to is halved like one that fails. If it is the smallest, the
+        way ends here: this is said, and the change goes on beyond the jump.
+
+        Parameters
+        ----------
+        work
+            What the parts add theirs to.
+        failure
+            That of the whole, if it was tried.
+        part
+            The first part.
+
+        Raises
+        ------
+        StepFailure
+            If the smallest part fails.
+        """
+        done = 0.0
+        if failure is not None:
+            part = self._halved(part, done, failure)
+        while done < 1.0:
+            before = self.newton.unknown.x.array.copy()
+            part = self._started(min(part, 1.0 - done), done, work)
+            is_last = done + part > 1.0 - 1e-12
+            self.set_fraction(1.0 if is_last else done + part)
+            self.newton.on_the_way = self.roughly and not is_last
+            try:
+                solution = self.newton.solve()
+                work.add(solution)
+            except SolveFailure as failed:
+                self.newton.unknown.x.array[:] = before
+                work.add(failed)
+                part = self._halved(part, done, failed)
+            else:
+                if self._is_far(solution, before, part) and self._looks():
+                    solved, self.newton.unknown.x.array[:] = self.newton.unknown.x.array.copy(), before
+                    if part / 2 >= self._smallest:
+                        log.debug(
+                            "%s: far from the last part, %.3g of the first Newton step", self.stage, solution.reach
+                        )
+                        part /= 2
+                        continue
+                    self.set_fraction(done)
+                    refusal = diagnosed(self.newton, None, self._direction)
+                    self._jumped(solved, refusal if refusal.kind else SEVERAL_SOLUTIONS)
+                    self.set_fraction(1.0 if is_last else done + part)
+                    self.newton.unknown.x.array[:] = solved
+                done = 1.0 if is_last else done + part
+                self._direction = (self.newton.unknown.x.array - before) / part
+                part *= 2
+                work.substeps += 1
+            finally:
+                self.newton.on_the_way = False
+
+    def _started(self, wanted: float, done: float, work: Work) -> float:
+        """The next part, with the unknowns that it starts from.
+
+        Where the bound at the present unknowns is smaller than what is wanted, they go on as over the last part: along
+        that way chains keep about their length, and parts can be larger. Every point keeps its reserve there too.
+        """
+        bound = min(wanted, self.largest_part(done))
+        if bound >= wanted:
+            return bound
+        if self._direction is None:
+            self._direction = self.newton.tangent_direction(self.set_fraction, done, SLOPE_SHARE * bound)
+            work.newton_iterations += 1
+            work.linear_iterations += 1
+        if not np.all(np.isfinite(self._direction)):
+            self._direction = None
+            return bound
+        unknown, equilibrium = self.newton.unknown.x.array, self.newton.equilibrium
+        before = unknown.copy()
+        self.set_fraction(done)
+        present = equilibrium.look().stretches
+        while wanted > bound:
+            self.set_fraction(done + wanted)
+            unknown[:] = before + wanted * self._direction
+            expected = equilibrium.look()
+            if expected.extension.admissible and equilibrium.keeps_reserve(present, expected.stretches, KEPT_RESERVE):
+                return wanted
+            wanted /= 2
+        unknown[:] = before
+        return bound
+
+    def look_back(self, before: NDArray[np.float64], work: Work) -> bool:
+        """After a step: look into one that has ended far from its tangent or from the step before; whether it did."""
+        unknown, last = self.newton.unknown.x.array, self._jumps["moved"]
+        moved, least = self._size(unknown - before), NOTICEABLE * self.newton.equilibrium.state.loading.domain.size
+        is_far = work.is_far or (last > 0.0 and moved > max(least, FASTER * last))
+        looked = is_far and self._looks()
+        if looked:
+            self.confirm(before, work)
+        self._jumps["moved"] = self._size(unknown - before)
+        return looked
+
+    def confirm(self, before: NDArray[np.float64], work: Work) -> None:
+        """Go the way again in parts, from the unknowns before it, where the whole was solved far from its tangent.
+
+        Where there is no such way, the solution stays, and a warning says so. Where it leads to another solution, this
+        one is taken: the body comes to it.
+        """
+        unknown = self.newton.unknown.x.array
+        found, parts = unknown.copy(), Work()
+        unknown[:] = before
+        try:
+            self.advance(parts, part=0.5)
+        except StepFailure as failure:
+            if self.refusal is None and failure.refusal.kind in WAYS_END:
+                self._jumped(found, failure.refusal)
+            leads_on = False
+            log.info("time %g: far from where its tangent points to, and not solved in parts: %s", self.time, failure)
+        else:
+            leads_on = self.refusal is None
+        work.newton_iterations += parts.newton_iterations
+        work.linear_iterations += parts.linear_iterations
+        work.tangents += parts.tangents
+        if leads_on and self._size(unknown - found) > SAME * self._size(found - before):
+            log.info("time %g: several solutions; taken is the one to which parts of the step lead", self.time)
+            work.residual, work.extension, work.substeps = parts.residual, parts.extension, parts.substeps
+            return
+        unknown[:] = found
+        self.set_fraction(1.0)
+
+    @property
+    def _smallest(self) -> float:
+        return 2.0**-self.maximum_halvings
+
+    def _is_far(self, solution: Solution, before: NDArray[np.float64], part: float) -> bool:
+        """Whether a part ends far from where its tangent, or the part before, points to."""
+        if solution.is_far or not solution.reach or self._direction is None:
+            return solution.is_far
+        return self._size(self.newton.unknown.x.array - before) > FASTER * part * self._size(self._direction)
+
+    def _size(self, change: NDArray[np.float64]) -> float:
+        """Largest change of an unknown, over all ranks."""
+        return float(over_ranks(self.newton.equilibrium.comm, float(np.abs(change).max(initial=0.0)), MPI.MAX))
+
+    def _looks(self) -> bool:
+        """Whether a part that has ended far away is looked into."""
+        enough = self.maximum_halvings >= PROOF
+        return enough and self.refusal is None and self._jumps["found"] < MOST_JUMPS
+
+    @property
+    def _jumps(self) -> Numbers:
+        return Numbers(self.newton.equilibrium.state, "jumps", {"found": 0, "moved": 0})
+
+    def _jumped(self, solved: NDArray[np.float64], refusal: Refusal) -> None:
+        """Say that there is no way to what was solved; unknowns and loads are those where the way ends."""
+        self.refusal = refusal
+        self._jumps["found"] += 1
+        state, far = self.newton.equilibrium.state, self._size(solved - self.newton.unknown.x.array)
+        if state.comm.rank == 0:
+            loads = ", ".join(f"{name} {value:.4g}" for name, value in state.loading.values.items() if value)
+            log.warning(
+                "time %g: the body jumps by %.3g to another solution, there is no way on beyond %s. %s; a smaller "
+                "time.step shows the way there", self.time, far, loads or "the start", refusal,
+            )  # fmt: skip
+
+    def _halved(self, part: float, done: float, failure: SolveFailure) -> float:
+        if part / 2 < self._smallest:
+            text = failure_text(self.time, self.stage, done, failure)
+            self.set_fraction(done)  # the last state that was solved
+            found = diagnosed(self.newton, failure, self._direction)
+            refusal = found if found.kind or self.refusal is None else self.refusal
+            raise StepFailure(self.time, text, refusal) from failure
+        log.debug("%s: %s; next part %g", self.stage, failure.reason, part / 2)
+        return part / 2

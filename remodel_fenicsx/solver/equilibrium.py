@@ -1,0 +1,273 @@
+"""Equilibrium at given loads and cells: residual, tangent, stored energy, and how far a state is from its limits."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import dolfinx.fem
+import dolfinx.fem.petsc
+import numpy as np
+import ufl
+from mpi4py import MPI
+from numpy.typing import NDArray
+from petsc4py import PETSc
+
+from remodel_fenicsx.fem import jit
+from remodel_fenicsx.fem.ranks import of_all_ranks, over_ranks
+from remodel_fenicsx.fem.remembered import Remembered
+from remodel_fenicsx.fem.second_derivative import second_derivative
+from remodel_fenicsx.fem.tangent_matrix import assemble_matrix, create_matrix
+from remodel_fenicsx.model.cells import UnitCell
+from remodel_fenicsx.model.energy import Tissue
+from remodel_fenicsx.model.operators import passes_through_zero
+from remodel_fenicsx.model.repulsion import squared_end_to_end_length
+from remodel_fenicsx.solver.pointwise import Shares, pointwise_repulsion
+from remodel_fenicsx.state.parameters import Parameters, on_mesh
+from remodel_fenicsx.state.state import State
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Extension:
+    """How far a state is from its limits: the largest r/L and the smallest J, and where r/L is largest (reference).
+
+    `stop_signal` is the largest signal number that any rank has received, 0 for none: it travels with this reduction.
+    """
+
+    max_chain_extension: float
+    min_jacobian: float
+    worst_point: tuple[float, float, float]
+    stop_signal: int = 0
+
+    @property
+    def admissible(self) -> bool:
+        """True when every chain is shorter than its contour length and no volume has collapsed; False for NaN."""
+        return self.max_chain_extension < 1.0 and self.min_jacobian > 0.0
+
+
+class Look(NamedTuple):
+    """At a state: how far it is from its limits.
+
+    Attributes
+    ----------
+    extension
+        Over all points of all ranks.
+    stretches
+        r/L at the points of this rank's own elements, (elements, points); infinite where it is no finite number.
+    states
+        `Equilibrium.states` of these points, in one row.
+    """
+
+    extension: Extension
+    stretches: Array
+    states: Array
+
+
+class Equilibrium:
+    """The balance of internal forces and loads, compiled; it changes nothing but `state.unknown`, and that on request.
+
+    Parameters
+    ----------
+    state
+        Unknowns, cells and loads.
+    tissue
+        Its parameters; numbers become Constants of the mesh.
+    shares, point_shares
+        The cells as the energy takes them, when not simply the state's (a blend of two), and a function that gives them
+        as arrays.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If a parameter is neither a number, nor a Constant, nor a DG0 Function of the mesh.
+    """
+
+    def __init__(
+        self,
+        state: State,
+        tissue: Tissue,
+        shares: Sequence[UnitCell] | None = None,
+        point_shares: Shares | None = None,
+    ):
+        self.state, self.quadrature = state, state.cells.quadrature
+        mesh = self.quadrature.mesh
+        self.comm = mesh.comm
+        self.tissue = on_mesh(tissue, mesh)
+        self.parameters = Parameters(self.tissue, self.quadrature)
+        # asked on each rank whenever limits are reduced: the signal (SIGINT, SIGTERM) that should end the solve, or 0
+        self.stop_signal: Callable[[], int] = lambda: 0
+        u, shares, loading = state.unknown, shares or [state.cells.ufl_cell], state.loading
+        test, trial = ufl.TestFunction(u.function_space), ufl.TrialFunction(u.function_space)
+        F = state.kinematics.deformation_gradient(u)
+        self.energies = state.dilatation.energies(self.tissue, F, shares, state.kinematics.weight(mesh))
+        external = loading.external_residual(test)
+        self.pointwise = pointwise_repulsion(state, self.tissue, point_shares)
+        internal, tangents = self.internal_and_tangents(F, test, trial)
+        self.internal_forms = [jit.form(form) for form in internal]
+        self.external_form = None if external is None else jit.form(external)
+        # apart, so that bodies with other loads share the costly one
+        self.tangent_forms = [jit.form(form) for form in tangents]
+        if external is not None and _depends_on(external, u):
+            self.tangent_forms.append(jit.form(ufl.derivative(external, u, trial)))
+        squared = squared_end_to_end_length(F, shares) if self.tissue.chain is not None else ufl.as_ufl(0.0)
+        limits = ufl.as_vector([squared, ufl.det(F), *(F[i, j] for i in range(3) for j in range(3))])
+        self._limits = jit.expression(limits, self.quadrature.points)
+        length = ufl.as_ufl(0.0 if self.tissue.locking_length is None else self.tissue.locking_length)
+        self._known: Remembered[Look] = Remembered(self.comm, limits, length)
+        self._energy_forms: list[Any] = []
+
+    def internal_and_tangents(self, F: Any, test: Any, trial: Any) -> tuple[list[Any], list[Any]]:
+        """Virtual work of the stresses and its derivative by the unknowns, UFL forms to be added up."""
+        u = self.state.unknown
+        internal = [ufl.derivative(energy, u, test) for energy in self.energies]
+        tangents = [second_derivative(energy, u, test, trial) for energy in self.energies]
+        if self.pointwise is not None:
+            weight, dx = self.state.kinematics.weight(self.quadrature.mesh), self.quadrature.dx
+            internal[0] += self.pointwise.residual(u, F, test) * weight * dx
+            tangents[0] += self.pointwise.tangent(u, F, test, trial) * weight * dx
+        return internal, tangents
+
+    # ------------------------------------------------------------ what users ask
+    def extension(self) -> Extension:
+        """Largest r/L and smallest J of the present unknowns over all points of all ranks."""
+        return self.look().extension
+
+    def look(self) -> Look:
+        """Extension, and what it was made of, of the present unknowns; one state is looked at once."""
+        look = self._known(self._look)
+        if look.extension.stop_signal:
+            self._known.forget()  # who asked for the end may take it back
+        return look
+
+    def _look(self) -> Look:
+        number = self.quadrature.number_of_owned_elements
+        states, shape = self.quadrature.owned(self.states()).reshape(-1, 11), (number, self.quadrature.shape[1])
+        lengths = self.quadrature.owned(self.locking_length()).reshape(-1)
+        stretch, worst, smallest = self.state.cells.kernels.extension(states, lengths)
+        of_formulation = self.quadrature.owned(self.state.dilatation.jacobians())
+        if of_formulation.size:
+            smallest = min(smallest, float(of_formulation.min()) if np.isfinite(of_formulation).all() else -np.inf)
+        local: tuple[float, tuple[float, ...]] = (-np.inf, (np.nan,) * 3)
+        if stretch.size:
+            local = stretch.item(worst), tuple(self.quadrature.coordinates.reshape(-1, 3)[worst].tolist())
+        ranks = of_all_ranks(self.comm, (*local, smallest, self.stop_signal()))
+        largest, worst_point, _, _ = max(ranks, key=lambda rank: rank[0])
+        extension = Extension(largest, min(rank[2] for rank in ranks), worst_point, max(rank[3] for rank in ranks))
+        return Look(extension, stretch.reshape(shape), states)
+
+    def keeps_reserve(self, before: Any, after: Any, share: float, nearer_than: float = 0.0) -> bool:
+        """Whether every point of all ranks keeps a share of its 1 - r/L; `nearer_than`: only those with r/L above it.
+
+        Parameters
+        ----------
+        before, after
+            r/L at the points, `Look.stretches`.
+        """
+        lost = bool(np.any((after > nearer_than) & (1 - after < share * (1 - before))))
+        return not over_ranks(self.comm, lost, MPI.LOR)
+
+    def turns_inside_out(self, before: Array, after: Array) -> bool:
+        """Whether J vanishes on the straight way between two states at a point of any rank; `Look.states` of both."""
+        at = self.state.cells.kernels.may_turn(before, after)
+        turns = at.size > 0 and bool(passes_through_zero(*(_gradients(ends[at]) for ends in (before, after))).any())
+        return bool(over_ranks(self.comm, turns, MPI.LOR))
+
+    def states(self) -> Array:
+        """r^2 in squared link lengths (0 without chains), J and F, eleven numbers: (elements, points, 11)."""
+        return self.quadrature.evaluate(self._limits, (11,))
+
+    def limit_values(self) -> tuple[Array, Array]:
+        """r^2 in squared link lengths (0 without chains) and J at all points, each (elements, points)."""
+        states = self.states()
+        return states[..., 0], states[..., 1]
+
+    def locking_length(self) -> NDArray[np.float64]:
+        """Length at which a chain locks at all points, (elements, points); infinite where nothing locks."""
+        return self.parameters.locking_length()
+
+    def stored_energy(self) -> float:
+        """Integral of W over the body."""
+        if not self._energy_forms:
+            self.compile_energy()
+        local = sum(np.real(dolfinx.fem.assemble_scalar(form)) for form in self._energy_forms)
+        pointwise = 0.0 if self.pointwise is None else self.pointwise.energy()
+        return float(over_ranks(self.comm, local, MPI.SUM)) + pointwise
+
+    def compile_energy(self) -> None:
+        """Make `stored_energy` ready; apart, because a blend needs none."""
+        self._energy_forms = [jit.form(energy) for energy in self.energies]
+
+    # ------------------------------------------------------------ what a solver asks
+    def assemble_internal(self, vector: Any) -> None:
+        """Internal nodal forces of the present unknowns."""
+        if self.pointwise is not None:
+            self.pointwise.update()
+        self._assemble(vector, self.internal_forms)
+
+    def assemble_external(self, vector: Any) -> None:
+        """Minus the nodal forces of the loads."""
+        self._assemble(vector, [] if self.external_form is None else [self.external_form])
+
+    def _assemble(self, vector: Any, forms: Sequence[Any]) -> None:
+        with vector.localForm() as local:
+            values = local.array_w
+            values.fill(0.0)
+            for form in forms:
+                dolfinx.fem.assemble_vector(values, form)
+        vector.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
+
+    def assemble_lifting(self, vector: Any, x: Any) -> None:
+        """What the tangent makes of the distance between prescribed values and x: K (u_prescribed - x)."""
+        with vector.localForm() as local:
+            local.set(0.0)
+        conditions = self.state.loading.boundary_conditions
+        self._update_tangent()
+        for form in self.tangent_forms:
+            dolfinx.fem.petsc.apply_lifting(vector, [form], bcs=[conditions], x0=[x], alpha=-1.0)
+        vector.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
+
+    def create_matrix(self) -> Any:
+        """An empty matrix with the pattern of the tangent."""
+        return create_matrix(self.tangent_forms[0])
+
+    def assemble_tangent(self, matrix: Any) -> None:
+        """Derivative of the residual at the present unknowns, one on the diagonal where they are prescribed."""
+        self._update_tangent()
+        assemble_matrix(matrix, self.tangent_forms, self.state.loading.boundary_conditions)
+
+    def _update_tangent(self) -> None:
+        if self.pointwise is not None:
+            self.pointwise.update(stiffness=True)
+
+    def prescribed_values(self) -> NDArray[np.float64]:
+        """What supports and loads prescribe of this rank's unknowns, ghosts included; NaN where they are free."""
+        values = np.full_like(self.state.unknown.x.array, np.nan)
+        for condition in self.state.loading.boundary_conditions:
+            condition.set(values)
+        return values
+
+    def prescribed_gap(self, x: Any) -> float:
+        """Largest distance of a prescribed value from its target, over all ranks."""
+        conditions = self.state.loading.boundary_conditions
+        if not conditions:
+            return 0.0
+        with x.localForm() as local:
+            values = local.array_r
+            target = values.copy()
+            for condition in conditions:
+                condition.set(target)
+            target -= values
+        return float(over_ranks(self.comm, float(np.abs(target).max(initial=0.0)), MPI.MAX))
+
+
+def _gradients(states: Array) -> Array:
+    """F (n, 3, 3) of states (n, 11)."""
+    return states[:, 2:].reshape(-1, 3, 3)
+
+
+def _depends_on(form: Any, unknown: Any) -> bool:
+    """Whether a form's derivative with respect to the unknown is not zero."""
+    return unknown in form.coefficients()

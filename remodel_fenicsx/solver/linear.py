@@ -1,0 +1,317 @@
+"""How the linear systems of Newton's method are solved: with every tangent, with kept factors, by multigrid."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from typing import Any
+
+import numpy as np
+from petsc4py import PETSc
+
+from remodel_fenicsx.fem.petsc_options import ProblemOptions
+from remodel_fenicsx.fem.solver_methods import DEFINITE, EXACT, GENERAL, LAGGED, SYMMETRIC, factor_options
+from remodel_fenicsx.solver.equilibrium import Equilibrium
+from remodel_fenicsx.solver.quasi_newton import Secants
+
+log = logging.getLogger(__name__)
+
+SAME = 1e-10  # relative to the largest row: what a symmetric tangent may be unsymmetric by
+WORTH = 12  # iterations that a new factor must save: it costs about as much as they do
+OVER = 3  # iterations over which the rate of convergence is taken
+SLOW_STEP = 8  # iterations after which the next step starts with a new factor
+MOST_RENEWALS = 6  # of one solve: what needs more is no matter of old factors
+FIRST_ACCURACY, MOST_ACCURACY, LEAST_ACCURACY = 1e-3, 1e-10, 1e-2  # of a linear system's solution, relative
+ENOUGH = 0.3  # of the tolerance: what the last linear system may leave of the residual
+
+
+class KeptFactor:
+    """Factors of an earlier tangent, which PETSc takes as a preconditioner of Python's.
+
+    CHOLMOD takes definite tangents only, and then raises; so factors are made here, outside SNES, and MUMPS follows.
+    """
+
+    def __init__(self, comm: Any):
+        self.comm = comm
+        self.preconditioner: Any = None
+        self._options: ProblemOptions | None = None
+        self._kind = ""
+
+    def apply(self, _: Any, x: Any, y: Any) -> None:
+        """PETSc asks for y, the inverse of the kept tangent times x; NaN where there is none: the solve then fails."""
+        if self.preconditioner is None:
+            y.set(np.nan)
+        else:
+            self.preconditioner.apply(x, y)
+
+    def renew(self, matrix: Any) -> None:
+        """Factorise a tangent. Where that fails there are no factors at all, and a log line."""
+        symmetric = self.comm.size == 1 and matrix.isSymmetric(SAME * matrix.norm(PETSc.NormType.NORM_INFINITY))
+        for kind in (DEFINITE, SYMMETRIC, GENERAL) if symmetric else (GENERAL,):
+            if self._factorised(kind, matrix):
+                return
+
+    def close(self) -> None:
+        """Free PETSc's objects."""
+        if self.preconditioner is not None:
+            self.preconditioner.destroy()
+        if self._options is not None:
+            self._options.close()
+        self.preconditioner, self._options, self._kind = None, None, ""
+
+    def _factorised(self, kind: str, matrix: Any) -> bool:
+        if self._kind != kind:
+            self.close()
+            self._options = ProblemOptions(factor_options(kind, self.comm.size), {})
+            self.preconditioner, self._kind = PETSc.PC().create(self.comm), kind
+            self._options.apply(self.preconditioner)
+        matrix.setOption(PETSc.Mat.Option.SPD, kind == DEFINITE)
+        self.preconditioner.setOperators(matrix)
+        try:
+            self.preconditioner.setReusePreconditioner(False)
+            self.preconditioner.setUp()
+            failed = bool(self.preconditioner.getFailedReason())
+            self.preconditioner.setReusePreconditioner(True)  # whatever the matrix becomes
+        except PETSc.Error:
+            failed = True
+        if failed:
+            log.info("the tangent cannot be factorised as %s", kind)
+            self.close()
+        return not failed
+
+
+class EveryTangent:
+    """As PETSc's options say, with the tangent of every iteration.
+
+    Parameters
+    ----------
+    equilibrium
+        Whose tangents they are.
+    snes, matrix
+        PETSc's solver with its options, and the tangent.
+    options
+        Those of the problem.
+    """
+
+    given_up = False  # whether this way leads to nothing
+    keeps = False  # whether factors outlast a solve
+    more_iterations = 1  # times solver.maximum_iterations before a solve has failed
+
+    def __init__(self, equilibrium: Equilibrium, snes: Any, matrix: Any, options: ProblemOptions):
+        self.equilibrium, self.snes, self.matrix, self.options = equilibrium, snes, matrix, options
+        self.tangents = 0
+        self._always = False  # whether what may be kept is made anew in every iteration
+
+    def begin(self) -> None:
+        """A solve begins."""
+
+    def tangent(self, norm: float, tolerance: float) -> None:
+        """A linear system is about to be solved, at a residual of this norm."""
+        self.renew()
+
+    def renew(self) -> None:
+        """The tangent of the present unknowns."""
+        self.equilibrium.assemble_tangent(self.matrix)
+        self.tangents += 1
+
+    def improve(self, x: Any, residual: Any, step: Any, is_exact: bool) -> bool:
+        """Better a step (trial: x - step) by what earlier ones have shown; whether it was changed."""
+        return False
+
+    def ended(self, iterations: int) -> None:
+        """A solve has ended well."""
+
+    def second_try(self) -> tuple[str, AbstractContextManager[None]] | None:
+        """A slower and safer way for a solve that has failed, and in words; None where this was it."""
+        return None
+
+    @contextmanager
+    def _anew(self) -> Iterator[None]:
+        """Meanwhile nothing is kept from one iteration to the next."""
+        self._always = True
+        try:
+            yield
+        finally:
+            self._always = False
+
+    def factorisation(self) -> Any | None:
+        """PETSc's preconditioner with the factors of the last tangent; None where there are none."""
+        preconditioner = self.snes.getKSP().getPC()
+        return preconditioner if preconditioner.getType() in ("lu", "cholesky", "telescope") else None
+
+    def close(self) -> None:
+        """Free PETSc's objects."""
+
+
+class Multigrid(EveryTangent):
+    """Needs to know the motions of a rigid body; keeps its levels as long as PETSc's options say."""
+
+    def __init__(self, equilibrium: Equilibrium, snes: Any, matrix: Any, options: ProblemOptions):
+        super().__init__(equilibrium, snes, matrix, options)
+        if not equilibrium.state.kinematics.reduced:
+            place = matrix.createVecRight()
+            nodes = equilibrium.state.unknown.function_space.tabulate_dof_coordinates()
+            place.array[:] = nodes[: place.getLocalSize() // 3].ravel()
+            matrix.setNearNullSpace(PETSc.NullSpace().createRigidBody(place))
+            place.destroy()
+
+    def renew(self) -> None:
+        super().renew()
+        if self._always:
+            preconditioner = self.snes.getKSP().getPC()
+            preconditioner.setReusePreconditioner(False)
+            preconditioner.setOperators(self.matrix)
+            preconditioner.setUp()
+
+    def second_try(self) -> tuple[str, AbstractContextManager[None]] | None:
+        return "with new levels in every iteration", self._anew()
+
+
+class _Kept(EveryTangent):
+    """What methods with a kept factor have in common; where the user names a preconditioner, that one is kept."""
+
+    def __init__(self, equilibrium: Equilibrium, snes: Any, matrix: Any, options: ProblemOptions):
+        super().__init__(equilibrium, snes, matrix, options)
+        self.factor = KeptFactor(equilibrium.comm)
+        self._own = "pc_type" not in options.given
+        if self._own:
+            preconditioner = snes.getKSP().getPC()
+            preconditioner.setType(PETSc.PC.Type.PYTHON)
+            preconditioner.setPythonContext(self.factor)
+
+    def renew(self) -> None:
+        super().renew()
+        self._factorise()
+
+    def _factorise(self) -> None:
+        if self._own:
+            self.factor.renew(self.matrix)
+
+    def second_try(self) -> tuple[str, AbstractContextManager[None]] | None:
+        return "with new factors in every iteration", self._with_every_tangent()
+
+    @contextmanager
+    def _with_every_tangent(self) -> Iterator[None]:
+        with self._anew(), _krylov(self.snes, "preonly"):
+            yield
+
+    def factorisation(self) -> Any | None:
+        return self.factor.preconditioner if self._own else super().factorisation()
+
+    def close(self) -> None:
+        self.factor.close()
+
+
+class Lagged(_Kept):
+    """Modified Newton with quasi-Newton steps: the tangent is renewed where that costs less than going on without."""
+
+    more_iterations, keeps = 3, True
+
+    def __init__(self, equilibrium: Equilibrium, snes: Any, matrix: Any, options: ProblemOptions):
+        super().__init__(equilibrium, snes, matrix, options)
+        self.secants = Secants()
+        self._before = 0  # tangents before the solve
+        self._norms: list[float] = []  # since the tangent was renewed, of this solve
+        self._due = True
+
+    def begin(self) -> None:
+        self._norms = []
+        self._before = self.tangents
+        self.secants.interrupt()
+
+    @property
+    def given_up(self) -> bool:  # type: ignore[override]
+        return not self._always and self.tangents - self._before > MOST_RENEWALS
+
+    def tangent(self, norm: float, tolerance: float) -> None:
+        self._norms.append(norm)
+        if self._always or self._due or self._costs_more(tolerance):
+            self.renew()
+
+    def renew(self) -> None:
+        super().renew()
+        self.secants.forget()
+        self._norms, self._due = self._norms[-1:], False
+
+    def improve(self, x: Any, residual: Any, step: Any, is_exact: bool) -> bool:
+        if self._always or not is_exact:
+            self.secants.interrupt()
+            return False
+        return self.secants.improve(x, residual, step)
+
+    def ended(self, iterations: int) -> None:
+        self._due = self._always or iterations > SLOW_STEP
+
+    def _costs_more(self, tolerance: float) -> bool:
+        """Whether the iterations that are left cost more than new factors; also where the residual rises."""
+        if len(self._norms) <= OVER:
+            return False
+        rate = (self._norms[-1] / self._norms[-1 - OVER]) ** (1 / OVER)
+        return bool(not rate < 1 or np.log(tolerance / self._norms[-1]) / np.log(rate) > WORTH)
+
+    def close(self) -> None:
+        super().close()
+        self.secants.forget()
+
+
+class Exact(_Kept):
+    """The tangent of every iteration, by GMRES with the factors of an earlier one: any tangent, any factors.
+
+    Systems are solved as accurately as Newton's method has use for. Factors are renewed where a system takes more
+    iterations than the average since they were made, their own cost included: sooner or later would both cost more.
+    """
+
+    def __init__(self, equilibrium: Equilibrium, snes: Any, matrix: Any, options: ProblemOptions):
+        super().__init__(equilibrium, snes, matrix, options)
+        self._sets_tolerance = "ksp_rtol" not in options.given
+        self._systems = self._iterations = 0  # since the factors were made
+        self._before = np.inf  # norm of the residual at the last system of this solve
+
+    def begin(self) -> None:
+        self._before = np.inf
+
+    def tangent(self, norm: float, tolerance: float) -> None:
+        EveryTangent.renew(self)
+        solver = self.snes.getKSP()
+        if self._always or self.factor.preconditioner is None or self._costs_more(solver.getIterationNumber()):
+            self._factorise()
+            self._systems = self._iterations = 0
+        if self._sets_tolerance:
+            solver.setTolerances(rtol=useful_accuracy(norm, self._before, tolerance))
+        self._before = norm
+
+    def _costs_more(self, last: int) -> bool:
+        """Whether the last system took more than the average of all since the factors were made, these included."""
+        self._systems, self._iterations = self._systems + 1, self._iterations + last
+        return last * self._systems > WORTH + self._iterations
+
+
+def useful_accuracy(norm: float, before: float, tolerance: float) -> float:
+    """Relative accuracy of a linear system: what it does not solve is below what Newton's method leaves.
+
+    Parameters
+    ----------
+    norm, before, tolerance
+        Of the residual, of the one before (infinite for the first system), and the one that is asked for.
+    """
+    if not np.isfinite(before):
+        return FIRST_ACCURACY
+    return float(np.clip(max((norm / before) ** 2, ENOUGH * tolerance / norm), MOST_ACCURACY, LEAST_ACCURACY))
+
+
+@contextmanager
+def _krylov(snes: Any, kind: str) -> Iterator[None]:
+    """Another Krylov method meanwhile."""
+    solver = snes.getKSP()
+    before = solver.getType()
+    solver.setType(kind)
+    try:
+        yield
+    finally:
+        solver.setType(before)
+
+
+LinearMethod = Callable[[Equilibrium, Any, Any, ProblemOptions], EveryTangent]
+LINEAR_METHODS: dict[str, LinearMethod] = {LAGGED: Lagged, EXACT: Exact, "iterative": Multigrid}
+"""Methods (`fem.solver_methods.METHODS`) that want more than PETSc's options."""

@@ -1,0 +1,166 @@
+"""The state of a simulation: what a step changes, a transaction restores and a checkpoint holds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from remodel_fenicsx.body.loading import Loading
+from remodel_fenicsx.fem import jit
+from remodel_fenicsx.fem.formulations import FORMULATIONS, Formulation
+from remodel_fenicsx.fem.kinematics import Kinematics
+from remodel_fenicsx.state.unit_cells import CellField, UnitCells
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """Values of a state: arrays by the names of `State.functions`, loads, time, number of steps, further numbers."""
+
+    arrays: dict[str, NDArray[np.float64]]
+    loads: dict[str, float]
+    time: float
+    number: int
+    numbers: dict[str, float]
+
+
+class State:
+    """Unknowns, unit cells, loads and time.
+
+    Parameters
+    ----------
+    unknown
+        dolfinx function of the unknowns (for full kinematics the displacement).
+    kinematics
+        What the unknowns mean.
+    cells
+        The unit cells.
+    loading
+        Supports and loads; its magnitudes are part of the state.
+    formulation
+        Where the elements take the change of volume; default: "displacement".
+
+    Attributes
+    ----------
+    dilatation
+        The formulation for these unknowns.
+    equilibrium_cells
+        The cells with which the unknowns are in equilibrium. After a staggered step the cells themselves are one pass
+        ahead of them.
+    time, number
+        Time of the last committed step, and how many there were.
+    numbers
+        What else is remembered from step to step, by name: a coupling puts its own here, its functions by `remember`.
+    counts
+        Functions that a checkpoint may lack, each with the name of the number that is 0 then: how many are known.
+    """
+
+    def __init__(
+        self,
+        unknown: Any,
+        kinematics: Kinematics,
+        cells: UnitCells,
+        loading: Loading,
+        formulation: Formulation = FORMULATIONS["displacement"],
+    ):
+        self.unknown, self.kinematics, self.cells, self.loading = unknown, kinematics, cells, loading
+        self.dilatation = formulation.on(kinematics, unknown, cells.quadrature)
+        F = kinematics.deformation_gradient(unknown)
+        self._deformation_gradient = jit.expression(F, cells.quadrature.points)
+        self.equilibrium_cells = CellField(cells.quadrature, "equilibrium_cell")
+        self.settle_cells()
+        solved = self.equilibrium_cells
+        self._functions: dict[str, Any] = {}
+        self._arrays: dict[str, NDArray[np.float64]] = {}  # the functions' own memory
+        for function in (self.unknown, cells.dimensions, cells.axes, solved.dimensions, solved.axes):
+            self._add(function)
+        self.time, self.number = 0.0, 0
+        self.numbers: dict[str, float] = {}
+        self.counts: dict[str, str] = {}
+        # the body starts unloaded; a load that is there from t = 0 on comes with the first step
+        loading.set(dict.fromkeys(loading.values, 0.0))
+
+    @property
+    def comm(self) -> Any:
+        """Communicator of the mesh."""
+        return self.cells.quadrature.mesh.comm
+
+    @property
+    def number_of_owned_unknowns(self) -> int:
+        """How many of this rank's unknowns are its own: they come first, ghosts follow."""
+        space = self.unknown.function_space.dofmap
+        return int(space.index_map.size_local * space.index_map_bs)
+
+    def deformation_gradient(self) -> NDArray[np.float64]:
+        """F of the present unknowns at all points of this rank in one row, ghosts included, (n, 3, 3)."""
+        return self.cells.quadrature.evaluate(self._deformation_gradient, (3, 3)).reshape(-1, 3, 3)
+
+    def functions(self) -> dict[str, Any]:
+        """Every dolfinx function of the state by its name."""
+        return dict(self._functions)
+
+    def _add(self, function: Any) -> None:
+        self._functions[function.name], self._arrays[function.name] = function, function.x.array
+
+    def remember(self, function: Any, count: str | None = None) -> None:
+        """From now on a dolfinx function (with a name of its own) is part of the state.
+
+        For what a coupling carries from step to step: transactions restore it, checkpoints hold it.
+
+        Parameters
+        ----------
+        function
+            The function.
+        count
+            Name of the number that says how many of its kind are known; with it a checkpoint may lack the function.
+
+        Raises
+        ------
+        ValueError
+            If the state has a function of this name.
+        """
+        if function.name in self._functions:
+            raise ValueError(f"the state has a function {function.name!r} already")
+        self._add(function)
+        if count is not None:
+            self.counts[function.name] = count
+
+    def settle_cells(self) -> None:
+        """The present cells are those with which the unknowns are in equilibrium."""
+        self.equilibrium_cells.set(self.cells.dimension_values, self.cells.axis_values)
+
+    def snapshot(self) -> Snapshot:
+        """A copy of all values."""
+        arrays = {name: array.copy() for name, array in self._arrays.items()}
+        return Snapshot(arrays, dict(self.loading.values), self.time, self.number, dict(self.numbers))
+
+    def restore(self, snapshot: Snapshot) -> None:
+        """Take all values from a snapshot."""
+        for name, array in self._arrays.items():
+            array[:] = snapshot.arrays[name]
+        self.loading.set(snapshot.loads)
+        self.time, self.number = snapshot.time, snapshot.number
+        self.numbers = dict(snapshot.numbers)
+
+    @contextmanager
+    def tentative(self) -> Iterator[None]:
+        """Whatever happens in the block, the state is afterwards what it was before."""
+        before = self.snapshot()
+        try:
+            yield
+        finally:
+            self.restore(before)
+
+    @contextmanager
+    def transaction(self) -> Iterator[None]:
+        """All that happens in the block, or nothing: whatever is raised in it, the state is what it was before."""
+        before = self.snapshot()
+        try:
+            yield
+        except BaseException:
+            self.restore(before)
+            raise

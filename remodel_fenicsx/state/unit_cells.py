@@ -1,0 +1,95 @@
+"""The unit cells at the quadrature points: l_I and n_I as functions that forms take and passes change."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from remodel_fenicsx.fem.quadrature import Quadrature
+from remodel_fenicsx.kernels.points import PointKernels, point_kernels
+from remodel_fenicsx.model.cells import CellSettings, UnitCell, initial_axes, initial_dimensions
+
+Array = NDArray[np.float64]
+
+
+class CellField:
+    """Cell dimensions and axes as quadrature functions.
+
+    Attributes
+    ----------
+    dimensions, axes
+        dolfinx quadrature functions of shape (3,) and (3, 3); row I of `axes` is n_I.
+    dimension_values, axis_values
+        l_I (cells, points, 3), and n_I as rows (cells, points, 3, 3): the functions' own memory.
+    point_cells
+        The cells of all points in one row, (cells * points, ...): the functions' own memory.
+    """
+
+    def __init__(self, quadrature: Quadrature, name: str):
+        self.quadrature = quadrature
+        self.dimensions = quadrature.function(f"{name}_dimensions", (3,))
+        self.axes = quadrature.function(f"{name}_axes", (3, 3))
+        self.dimension_values: Array = quadrature.values(self.dimensions, (3,))
+        self.axis_values: Array = quadrature.values(self.axes, (3, 3))
+        self.point_cells = UnitCell(self.dimension_values.reshape(-1, 3), self.axis_values.reshape(-1, 3, 3))
+
+    @property
+    def ufl_cell(self) -> UnitCell:
+        """The cell as the energy takes it."""
+        return UnitCell(self.dimensions, self.axes)
+
+    def set(self, dimensions: Array, axes: Array) -> None:
+        """Replace all dimensions (cells, points, 3) and axes (cells, points, 3, 3)."""
+        self.dimension_values[:] = dimensions
+        self.axis_values[:] = axes
+
+    def equals(self, other: CellField) -> bool:
+        """Whether all values of this rank are the same numbers."""
+        mine, others = (self.dimensions, self.axes), (other.dimensions, other.axes)
+        return all(np.array_equal(a.x.array, b.x.array) for a, b in zip(mine, others, strict=True))
+
+    @cached_property
+    def kernels(self) -> PointKernels:
+        """What a pass computes at points. Collective, the first time."""
+        return point_kernels(self.quadrature.mesh.comm)
+
+    def structure_tensor(self) -> Array:
+        """A = sum_I l_I^2 n_I (x) n_I, shape (cells, points, 3, 3), in squared link lengths. Collective at first."""
+        return self.kernels.structure_tensor(self.dimension_values, self.axis_values)
+
+
+class UnitCells(CellField):
+    """Orthotropic unit cells at the quadrature points (paper, Fig. 2).
+
+    Parameters
+    ----------
+    quadrature
+        The points.
+    element_number
+        Number of each local element (ghosts included) in the mesh file's order, shape (elements,): the seed's index,
+        so that random cells do not depend on the number of ranks.
+    number_of_elements
+        Elements of the whole mesh.
+    settings
+        Initial dimensions, axes, seed, r0.
+
+    Attributes
+    ----------
+    initial_dimensions
+        l0_I by rank (not by direction), shape (cells, points, 3), in link lengths.
+    """
+
+    def __init__(
+        self,
+        quadrature: Quadrature,
+        element_number: NDArray[np.int64],
+        number_of_elements: int,
+        settings: CellSettings,
+    ):
+        super().__init__(quadrature, "cell")
+        self.settings = settings
+        self.dimension_values[:] = initial_dimensions(settings, number_of_elements)[element_number][:, None, :]
+        self.axis_values[:] = initial_axes(settings.axes, quadrature.coordinates)
+        self.initial_dimensions: Array = self.dimension_values.copy()

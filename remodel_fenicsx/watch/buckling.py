@@ -1,0 +1,191 @@
+"""Whether a body that a reduction keeps in its symmetry would buckle: thrust, and suction on a ring."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from functools import cached_property
+
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from remodel_fenicsx.body.buckling import Strut
+from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
+from remodel_fenicsx.model.cells import UnitCell
+from remodel_fenicsx.model.energy import Tissue
+from remodel_fenicsx.state.memory import Numbers, Occasions
+from remodel_fenicsx.state.parameters import at_points
+
+log = logging.getLogger(__name__)
+
+Array = NDArray[np.float64]
+STRAINS = {1: 1e-5, 2: 1e-3}  # of the differences of W that make stresses and moduli: these are right to about 1e-6
+# The estimate is 0.8 to 1.1 where whole slender tubes lose their stability (docs/theory.md, Buckling)
+LIMIT = 0.9
+ACROSS, AROUND, ALONG = range(3)
+_SIGNS = {1: np.array([[1.0], [-1.0]]), 2: np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])}
+
+
+class BucklingWarning(Watcher):
+    """Says once that the whole body would buckle, where a reduced kinematics cannot.
+
+    Nothing that a reduction can do tells of a column that bends, so its eigenvalues do not. What it carries and how
+    stiff it is does. With W's derivatives by logarithmic strains along z and across, at the present state and cells,
+    the thrust p pi r_i^2 - int sigma_zz da is held against Euler's load pi^2 EI / (k l)^2, EI = int E x^2 da, E the
+    modulus along z at constant stress across; and suction in a cavity against 3 EI'/R^3 of its wall as a ring.
+
+    Parameters
+    ----------
+    stepper
+        Whose states are looked at.
+    strut
+        What of the body buckles; None for one that does not.
+    """
+
+    def __init__(self, stepper: Stepper, strut: Strut | None):
+        self.stepper, self.state = stepper, stepper.state
+        self.strut = strut if self.state.kinematics.reduced else None
+        self._numbers, self._occasions = Numbers(self.state, "buckling", {"said": 0}), Occasions(self.state, "buckling")
+
+    def solved(self, step: Step) -> None:
+        """Look, until it was said."""
+        if self.strut is None or self._numbers["said"] or not self._occasions.due():
+            return
+        found = self.in_words()
+        if found:
+            self._numbers["said"] = True
+            if self.state.comm.rank == 0:
+                log.warning("time %g: %s", step.time, found)
+
+    def in_words(self) -> str:
+        """What is too much in the present state; nothing where it is stable."""
+        shares = {"thrust along z": self.thrust_share(), "suction": self.suction_share()}
+        said = [f"{name} is about {share:.2g} of what it bears" for name, share in shares.items() if share > LIMIT]
+        if not said:
+            return ""
+        return (
+            f"the whole body would buckle (its {' and its '.join(said)}), which kinematics "
+            f"{self.state.kinematics.name!r} cannot show; set model.kinematics = 'full' (docs/theory.md, Buckling)"
+        )
+
+    def thrust_share(self) -> float:
+        """Thrust over Euler's load; 0 under tension."""
+        thrust = self.thrust()
+        return thrust / self.euler_load() if thrust > 0 else 0.0
+
+    def thrust(self) -> float:
+        """Of the wall and of what fills the cavity, along z."""
+        stress = self._derivatives([(ALONG,)])[0]
+        force = self._integral(stress) / self._length()
+        if self.strut is None or self.strut.radii is None:
+            return -force
+        return self.state.loading.values["pressure"] * np.pi * self._radii()[0] ** 2 - force
+
+    def euler_load(self) -> float:
+        """Of the present body."""
+        assert self.strut is not None
+        H = self._moduli()
+        across = H[:2, :2]
+        coupling = H[:2, ALONG].T[..., None]
+        modulus = H[ALONG, ALONG] - (coupling * np.linalg.solve(np.moveaxis(across, -1, 0), coupling)).sum(axis=(1, 2))
+        stretch = np.einsum("nij,nj->ni", self._gradients(), self._directions[:, :, AROUND])
+        squares = self.strut.squared_distances(self._places) * np.square(stretch).sum(axis=1)
+        length = self._length()
+        return self.strut.euler_load(self._integral(modulus * squares) / length, length)
+
+    def suction_share(self) -> float:
+        """Pressure below zero over that at which the wall turns oval, a ring in plane strain."""
+        if self.strut is None or self.strut.radii is None or self.state.loading.values["pressure"] >= 0:
+            return 0.0
+        (inner, outer), H = self._radii(), self._moduli()
+        modulus = H[AROUND, AROUND] - H[AROUND, ACROSS] ** 2 / H[ACROSS, ACROSS]
+        area = np.pi * (outer**2 - inner**2)
+        stiffness = self._integral(modulus) / (self._length() * area) * (outer - inner) ** 3 / 12
+        return float(-self.state.loading.values["pressure"] * inner / (3 * stiffness / ((inner + outer) / 2) ** 2))
+
+    # ------------------------------------------------------------ the present state
+    def _gradients(self) -> Array:
+        """F at this rank's points, (n, 3, 3)."""
+        return self.stepper.coupling.equilibrium.look().states[:, 2:].reshape(-1, 3, 3)
+
+    def _length(self) -> float:
+        assert self.strut is not None
+        stretch = self._integral(self._gradients()[:, 2, 2]) / self._integral(np.ones(len(self._places)))
+        return self.strut.length * stretch
+
+    def _radii(self) -> tuple[float, float]:
+        """Of the cavity's wall, inside and outside: means over the nodes there."""
+        assert self.strut is not None and self.strut.radii is not None
+        kinematics, unknown = self.state.kinematics, self.state.unknown
+        nodes = kinematics.nodal_space(unknown).tabulate_dof_coordinates()
+        deformed = np.linalg.norm((nodes + kinematics.nodal_displacement(unknown))[:, :2], axis=1)
+        reference = np.linalg.norm(nodes[:, :2], axis=1)
+        at = [np.isclose(reference, radius, rtol=1e-6) for radius in self.strut.radii]
+        local = np.array([[deformed[here].sum(), here.sum()] for here in at])
+        inner, outer = self.state.comm.allreduce(local, MPI.SUM)
+        return float(inner[0] / inner[1]), float(outer[0] / outer[1])
+
+    def _integral(self, values: Array) -> float:
+        """Over the reference body, of values (n,)."""
+        quadrature = self.state.cells.quadrature
+        return float(self.state.comm.allreduce(float(values @ quadrature.owned(quadrature.volumes).ravel()), MPI.SUM))
+
+    def _moduli(self) -> Array:
+        """Second derivatives of W by logarithmic strains, (3, 3, n)."""
+        pairs = [(i, j) for i in range(3) for j in range(i + 1)]
+        H = np.empty((3, 3, len(self._places)))
+        for (i, j), values in zip(pairs, self._derivatives(pairs), strict=True):
+            H[i, j] = H[j, i] = values
+        return H
+
+    def _derivatives(self, wanted: Sequence[tuple[int, ...]]) -> list[Array]:
+        """Of W at the points, by one or two logarithmic strains of the present body each: central differences."""
+        room = 1 - max(0.0, self.stepper.coupling.equilibrium.extension().max_chain_extension)  # no chain reaches L
+        steps = [STRAINS[len(key)] * room for key in wanted]
+        strains = []
+        for key, h in zip(wanted, steps, strict=True):
+            for signs in _SIGNS[len(key)]:
+                strain = np.zeros(3)
+                np.add.at(strain, list(key), h * signs)
+                strains.append(strain)
+        energies, found = self._energies(np.array(strains)), []
+        for key, h in zip(wanted, steps, strict=True):
+            weights = _SIGNS[len(key)].prod(axis=1) / (2 * h) ** len(key)
+            found.append(weights @ energies[: len(weights)])
+            energies = energies[len(weights) :]
+        return found
+
+    def _energies(self, strains: Array) -> Array:
+        """W at the points (k, n) after further stretches exp(strains), (k, 3), along the directions."""
+        Q = self._directions
+        stretch = (Q * np.exp(strains)[:, None, None]) @ Q.swapaxes(1, 2)
+        F = self._as_elements_take_it()
+        cells = self.state.cells.point_cells
+        number = len(F)
+        cell = UnitCell(cells.dimensions[:number], cells.axes[:number])
+        energies: Array = self._tissue.strain_energy(stretch @ F, [cell])
+        return energies
+
+    def _as_elements_take_it(self) -> Array:
+        """F, with one J in an element where differences of it cost nothing."""
+        F, quadrature = self._gradients(), self.state.cells.quadrature
+        if self.state.dilatation.jacobians().size == 0:
+            return F
+        states = np.log(self.stepper.coupling.equilibrium.look().states[:, 1]).reshape(-1, quadrature.shape[1], 1)
+        return F * np.exp(-quadrature.beyond(0, states).reshape(-1) / 3)[:, None, None]
+
+    @cached_property
+    def _places(self) -> Array:
+        quadrature = self.state.cells.quadrature
+        return quadrature.owned(quadrature.coordinates).reshape(-1, 3)
+
+    @cached_property
+    def _directions(self) -> Array:
+        assert self.strut is not None
+        return self.strut.directions(self._places)
+
+    @cached_property
+    def _tissue(self) -> Tissue:
+        number = len(self._places)
+        return at_points(self.stepper.tissue, self.state.cells.quadrature).map(lambda name, value: value[:number])
