@@ -26,6 +26,7 @@ from remodel_fenicsx.system.environment import kernels, reason_undrawable, reaso
 from remodel_fenicsx.system.regular_files import ForeignFileError
 
 BAD_INPUT, SOLVE_FAILED, STOPPED, BAD_ENVIRONMENT = 2, 3, interrupts.PAUSED, 5
+STUDY_STOPPED = "stopped; all that is recorded is kept, the same command goes on"
 EXIT_CODES = {
     0: "finished",
     BAD_INPUT: "bad input",
@@ -259,8 +260,8 @@ def _study(options: argparse.Namespace, task: Callable[[Scene], tuple[Path, str,
     scene = read_scene(options.scene, options.set, options.profile)
     if reason := reason_unusable() or reason_undrawable():
         return _fail(f"the environment is not usable: {reason}; run through ./with-fenicsx", BAD_ENVIRONMENT)
-    from remodel_fenicsx.paper.errors import FigureError
-    from remodel_fenicsx.studies.members import TooFewRuns
+    from remodel_fenicsx.studies.page import FigureError
+    from remodel_fenicsx.studies.runs import TooFewRuns
 
     try:
         with interrupts.StopRequest(), interrupts.stopping_at_once():
@@ -271,7 +272,7 @@ def _study(options: argparse.Namespace, task: Callable[[Scene], tuple[Path, str,
     except FigureError as refusal:  # a picture or a table of somebody else's stands in its place
         return _fail(str(refusal), refusal.exit_code)
     except interrupts.Interrupted as interruption:
-        return _fail("stopped; all that is recorded is kept, the same command goes on", interruption.exit_code)
+        return _fail(STUDY_STOPPED, interruption.exit_code)
     except ForeignFileError as error:
         return _fail(f"{error.filename}: {error.strerror}", BAD_INPUT)
     except OSError as error:
@@ -389,7 +390,7 @@ def _figures(options: argparse.Namespace) -> int:
     except figures.FigureError as error:
         return _fail(str(error), error.exit_code)
     except interrupts.Interrupted as interruption:
-        return _fail("stopped; finished runs and figures are kept", interruption.exit_code)
+        return _fail(STUDY_STOPPED, interruption.exit_code)
     except OSError as error:
         return _fail(f"cannot write the figures: {error}", BAD_ENVIRONMENT)
     print("\n".join(map(str, written)))

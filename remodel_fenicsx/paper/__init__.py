@@ -15,11 +15,9 @@ from mpi4py import MPI
 
 from remodel_fenicsx.paper import bodies, curves, structures
 from remodel_fenicsx.paper.captions import CAPTIONS
-from remodel_fenicsx.paper.cases import KAPPAS, LOAD_CASES, load_case_name, scenes
-from remodel_fenicsx.paper.errors import FigureError
-from remodel_fenicsx.paper.output import FORMATS, STYLE, Page, check_folder
-from remodel_fenicsx.paper.runs import RunCache
+from remodel_fenicsx.paper.runs import KAPPAS, LOAD_CASES, load_case_name, obtain, scenes
 from remodel_fenicsx.results.recording import Recording
+from remodel_fenicsx.studies.page import FORMATS, STYLE, FigureError, Page, check_folder
 from remodel_fenicsx.system.children import cores
 from remodel_fenicsx.system.terminal import Line
 
@@ -82,7 +80,9 @@ def draw(
     Raises
     ------
     FigureError
-        One line and the exit code of the command: bad input 2, a run that failed, no 3D drawing 5, stopped 130 or 143.
+        One line and the exit code of the command: bad input 2, a run that failed, no 3D drawing 5.
+    Interrupted
+        If a signal asked for the end, SIGUSR1 after the steps under way; the same call goes on from there.
     OSError
         If something cannot be written.
     """
@@ -102,7 +102,7 @@ def draw(
     check_folder(folder, chosen, formats)
     known = scenes()
     needed = dict.fromkeys(run for name in chosen for run in FIGURES[name].runs)
-    recorded = RunCache(runs).obtain([known[run] for run in needed], jobs or cores())
+    recorded = obtain([known[run] for run in needed], runs, jobs or cores())
     recordings = {name: Recording(path) for name, path in recorded.items()}
     progress, written = Line("figures"), []
     for number, name in enumerate(chosen, start=1):

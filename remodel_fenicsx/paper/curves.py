@@ -8,10 +8,10 @@ from matplotlib.figure import Figure
 
 from remodel_fenicsx.model.chains import CHAINS
 from remodel_fenicsx.paper.bodies import angle_scale, place
-from remodel_fenicsx.paper.cases import KAPPAS
-from remodel_fenicsx.paper.output import COLOURS, Page, panel_letters
+from remodel_fenicsx.paper.runs import KAPPAS, first_cells, made_with
+from remodel_fenicsx.studies.page import COLOURS, Page, panel_letters
 from remodel_fenicsx.paper.rendering import render
-from remodel_fenicsx.paper.snapshots import Array, Snapshot, Table, first_cells, made_with
+from remodel_fenicsx.paper.snapshots import Array, Snapshot, Table
 from remodel_fenicsx.paper.structures import SOLVED, at, joined, layer_table, peeled, tube_picture, wall_table
 from remodel_fenicsx.results.recording import Recording
 

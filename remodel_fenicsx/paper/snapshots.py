@@ -1,4 +1,4 @@
-"""What the figures take from a recording: the body at a time, its layers, and what it was made with."""
+"""What the figures take from a recording: the body at a time, and its layers."""
 
 from __future__ import annotations
 
@@ -15,21 +15,6 @@ Table = dict[str, NDArray[Any]]  # columns by name, all of one length
 
 # faces of VTK's hexahedron, by its local nodes
 _FACES = np.array([(0, 3, 2, 1), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7)])
-
-
-def first_cells(run: Recording) -> str:
-    """How the cells of a run were at first, in words."""
-    cells = run.scene.cells
-    return f"random cells of seed {cells.seed}" if cells.initial == "random" else f"{cells.initial} cells"
-
-
-def made_with(run: Recording, cells: str | None = None) -> str:
-    """Package, library and scene of a run, in a line; `cells` says more than `first_cells` of this run alone."""
-    scene, versions = run.scene, run.versions
-    libraries = ", ".join(f"{name} {versions.get(name, '?')}" for name in ("remodel_fenicsx", "dolfinx"))
-    kinematics = "" if scene.model.kinematics == "full" else f" with kinematics {scene.model.kinematics}"
-    method = f"preset {scene.preset}{kinematics}, frame {scene.remodeling.frame}"
-    return f"{libraries}; {method}, {cells or first_cells(run)}"
 
 
 @dataclass(frozen=True)

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.model.cells import initial_axes, radial_direction
 from remodel_fenicsx.paper.bodies import angle_scale, body, place
-from remodel_fenicsx.paper.cases import ELONGATION_COLUMN, LOAD_CASES, load_case_name
-from remodel_fenicsx.paper.output import COLOURS, Page, panel_letters
+from remodel_fenicsx.paper.runs import ELONGATION_COLUMN, LOAD_CASES, load_case_name, made_with
+from remodel_fenicsx.studies.page import COLOURS, Page, panel_letters
 from remodel_fenicsx.paper.rendering import Picture, View, render
-from remodel_fenicsx.paper.snapshots import Array, Snapshot, Table, layers, made_with, radii, rank_of
+from remodel_fenicsx.paper.snapshots import Array, Snapshot, Table, layers, radii, rank_of
 from remodel_fenicsx.results.recording import Recording
 
 TENDON_TIMES = (1.0, 12.0, 25.0, 50.0, 150.0)

@@ -15,7 +15,7 @@ from remodel_fenicsx.studies import trade_output
 from remodel_fenicsx.studies.convergence import typical
 from remodel_fenicsx.studies.estimates import Result, Trade, estimated
 from remodel_fenicsx.studies.ladder import Setting, as_run, compared_lengths, compared_times, ladder
-from remodel_fenicsx.studies.members import LEAST, Member, Study, TooFewRuns, run_members
+from remodel_fenicsx.studies.runs import LEAST, Run, TooFewRuns, run_all, write_study
 from remodel_fenicsx.system.children import cores
 
 NAME = "trade"
@@ -57,7 +57,7 @@ def trade(
     TooFewRuns
         If fewer than two settings reach the end; it says what a budget for two would be.
     Interrupted
-        If a signal asked for the end: the same call goes on from there.
+        If a signal asked for the end, SIGUSR1 after the steps under way: the same call goes on from there.
     OSError
         If a file cannot be written.
     """
@@ -66,13 +66,13 @@ def trade(
     times = compared_times(scene, settings)
     members = {
         setting.name: [
-            Member(f"{setting.name}-{seed}", as_run(setting, seed, times), place / f"{setting.name}-{seed}")
+            Run(f"{setting.name}-{seed}", as_run(setting, seed, times), place / f"{setting.name}-{seed}")
             for seed in setting.seeds
         ]
         for setting in settings
     }
     runner = _Runner(settings, members, times, budget, say)
-    failed = runner.run(jobs or cores(), Study(NAME, scene.name, place))
+    failed = runner.run(jobs or cores(), place, scene.name)
     results = runner.results()
     if len(results) < LEAST:
         reached = f"{len(results)} of {len(settings)} settings reached the end within the budget of {budget:g} s"
@@ -91,7 +91,7 @@ class _Runner:
     def __init__(
         self,
         settings: Sequence[Setting],
-        members: dict[str, list[Member]],
+        members: dict[str, list[Run]],
         times: list[float],
         budget: float,
         say: Callable[[str], None] | None,
@@ -101,11 +101,20 @@ class _Runner:
         self._results: dict[str, Result] = {}
         self._pace: dict[tuple[str, str], float] = {}  # seconds over those expected, by kinematics and coupling
 
-    def run(self, jobs: int, study: Study) -> dict[str, str]:
-        """All that fits; returns the last words of those that failed."""
+    def run(self, jobs: int, place: Path, name: str) -> dict[str, str]:
+        """All that fits, of the scene of this name in a folder; returns the last words of those that failed."""
         self._finished()
-        every = [member for setting in self.settings for member in self.members[setting.name]]
-        return run_members(every, jobs, study, self.say is None, self.deadline, self._fits, self._finished)
+        every = [run for setting in self.settings for run in self.members[setting.name]]
+        return run_all(
+            every,
+            jobs,
+            f"{name} {NAME}",
+            quiet=self.say is None,
+            deadline=self.deadline,
+            fits=self._fits,
+            ended=lambda *_: self._finished(),
+            checked=lambda: write_study(place, NAME, name, every),
+        )
 
     def results(self) -> list[Result]:
         """Of the settings all of whose runs have reached the end, the cheapest expected first."""
@@ -129,7 +138,7 @@ class _Runner:
         """Seconds of one of its runs, by what others have taken."""
         return self._pace.get(setting.way, 1.0) * setting.expected_seconds
 
-    def _fits(self, member: Member) -> bool:
+    def _fits(self, member: Run) -> bool:
         """Whether a run that begins now would end in time."""
         setting = next(setting for setting in self.settings if member in self.members[setting.name])
         return clock.monotonic() + self._expected(setting) < self.deadline
@@ -149,7 +158,7 @@ class _Runner:
                 self.say(f"{setting.in_words()}: {result.seconds:.2g} s, {so_far}")
 
 
-def read(setting: Setting, members: Sequence[Member], times: Sequence[float]) -> Result:
+def read(setting: Setting, members: Sequence[Run], times: Sequence[float]) -> Result:
     """The rows at some times of the runs of a setting."""
     angles, lengths, seconds, wall = [], [], [], []
     for member in members:

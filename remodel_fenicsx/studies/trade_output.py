@@ -10,7 +10,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from remodel_fenicsx.paper.output import COLOURS, STYLE, Page
+from remodel_fenicsx.studies.page import COLOURS, STYLE, Page
 from remodel_fenicsx.scene.scene import Scene
 from remodel_fenicsx.studies.estimates import Row, Trade
 from remodel_fenicsx.studies.ladder import compared_lengths
