@@ -26,7 +26,6 @@ from compare_consistent import page_values  # noqa: E402
 from verification_studies import study  # noqa: E402
 
 from remodel_fenicsx import paper as figures  # noqa: E402
-from remodel_fenicsx.paper.captions import CAPTIONS  # noqa: E402
 from remodel_fenicsx.paper.runs import LOAD_CASES  # noqa: E402
 from remodel_fenicsx.studies.page import COLOURS, STYLE, Page, read_table  # noqa: E402
 from tests.reference.radial import RadialHistory, solve_radial  # noqa: E402
@@ -409,7 +408,7 @@ def page(kept: Path = KEPT) -> str:
         "table_turned": invariance_table(kept, "deformed body"),
         "table_everything": invariance_table(kept, "everything"),
         "made_with": made_with(kept),
-        **{f"caption_{name}": caption for name, (_, caption) in CAPTIONS.items()},
+        **{f"caption_{name}": figure.caption for name, figure in figures.FIGURES.items()},
         "caption_reference": REFERENCE_CAPTION[1],
     }  # fmt: skip
     return (DOCS / "make_verification.template.md").read_text(encoding="utf-8").format_map(values)

@@ -246,7 +246,7 @@ def _stability(options: argparse.Namespace) -> int:
         return _fail(f"the environment is not usable: {missing}; run through ./with-fenicsx", BAD_ENVIRONMENT)
 
     def analyse(scene: Scene, folder: Path | None, quiet: bool) -> Path:
-        from remodel_fenicsx.stability import in_words, stability
+        from remodel_fenicsx.studies.stability import in_words, stability
 
         place, table, unseen = stability(scene, folder, options.times, quiet=quiet)
         _say(in_words(table, unseen))
@@ -303,11 +303,10 @@ def _ensemble(options: argparse.Namespace) -> int:
 def _trade(options: argparse.Namespace) -> int:
     def task(scene: Scene) -> tuple[Path, str, dict[str, str]]:
         from remodel_fenicsx.studies import trade as study
-        from remodel_fenicsx.studies import trade_output
 
         say = None if options.quiet else _say
         folder, found = study.trade(scene, options.output, options.budget, options.jobs, say)
-        return folder, trade_output.in_words(found), found.failed
+        return folder, study.in_words(found), found.failed
 
     return _study(options, task)
 

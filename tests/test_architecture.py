@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[1]
 PACKAGE = "remodel_fenicsx"
 # what a room may import: itself, and those before it
 ROOMS = ("_version", "system", "schema", "model", "fem", "kernels", "body", "scene", "state", "solver", "evolution",
-         "watch", "results", "simulation", "running", "stability", "studies", "paper", "cli", "parts",
+         "watch", "results", "simulation", "running", "studies", "paper", "cli", "parts",
          "extend")  # fmt: skip
 # imports that only the type checker follows: of what is there without dolfinx, to what is not
 TYPES_ONLY = {

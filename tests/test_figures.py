@@ -26,8 +26,7 @@ from PIL import Image
 import remodel_fenicsx
 from remodel_fenicsx import cli
 from remodel_fenicsx.body.columns import columns_of
-from remodel_fenicsx.paper import FIGURES, bodies, curves, rendering, runs, snapshots
-from remodel_fenicsx.paper.captions import CAPTIONS
+from remodel_fenicsx.paper import FIGURES, bodies, curves, rendering, runs
 from remodel_fenicsx.paper.runs import LOAD_CASES
 from remodel_fenicsx.results import vtkhdf
 from remodel_fenicsx.results.recording import Recording, RecordingError
@@ -75,7 +74,6 @@ def test_every_name_of_the_contract_is_there() -> None:
     assert list(FIGURES) == ["fig1", *(f"fig{n}" for n in range(5, 12)), "rate", "energy"]
     known = runs.scenes()
     assert {run for figure in FIGURES.values() for run in figure.runs} == set(known)
-    assert set(CAPTIONS) == set(FIGURES)
     assert all(scene.name == name for name, scene in known.items())
 
 
@@ -351,7 +349,7 @@ def test_figures_say_with_what_they_were_made(drawn: Path) -> None:
         assert picture.size[0] > 800
         notes = picture.text  # type: ignore[attr-defined]
     assert notes["Comment"] == "remodel-fenicsx figures fig5"
-    assert (notes["Title"], notes["Description"]) == CAPTIONS["fig5"]
+    assert (notes["Title"], notes["Description"]) == (FIGURES["fig5"].title, FIGURES["fig5"].caption)
     version = runs.library_versions()["fenics-dolfinx"].split(".post")[0]
     for text in (notes["Source"], (drawn / "fig5.csv").read_text().splitlines()[1]):
         assert f"remodel_fenicsx {remodel_fenicsx.__version__}, dolfinx {version}" in text
@@ -372,7 +370,7 @@ def formats(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_figure_in_every_format_says_what_it_is(formats: Path) -> None:
     assert sorted(os.listdir(formats / "plain")) == ["fig1.csv", "fig1.pdf", "fig1.png", "fig1.svg"]
-    title, caption = CAPTIONS["fig1"]
+    title, caption = FIGURES["fig1"].title, FIGURES["fig1"].caption
     pdf, svg = (formats / "plain" / "fig1.pdf").read_bytes(), (formats / "plain" / "fig1.svg").read_text()
     assert pdf.startswith(b"%PDF-") and title.replace("(", "\\(").replace(")", "\\)").encode() in pdf
     assert b"/Subject" in pdf and caption.encode("utf-16-be")[:40] in pdf and b"no simulation" in pdf
@@ -445,7 +443,7 @@ def test_valid_runs_are_used_again_and_own_figures_drawn_anew(drawn: Path) -> No
 # ---------------------------------------------------------------- pictures in space
 
 
-def two_hexahedra() -> snapshots.Snapshot:
+def two_hexahedra() -> bodies.Snapshot:
     """Two unit cubes side by side in x, beginning at x = 1; all chains along z, stretched to twice in z."""
     x, y, z = np.meshgrid([1.0, 2.0, 3.0], [-0.5, 0.5], [0.0, 1.0], indexing="ij")
     points = np.stack([x, y, z], axis=-1).reshape(-1, 3)
@@ -458,12 +456,12 @@ def two_hexahedra() -> snapshots.Snapshot:
         "deformation_gradient": np.tile(np.diag([1.0, 1.0, 2.0]).ravel(), (2, 1)),
         "fibre_angle_deformed": np.array([0.0, 90.0]),
     }
-    return snapshots.Snapshot(0.0, points, np.array([first, first + 4]), points * [0.0, 0.0, 1.0], fields)
+    return bodies.Snapshot(0.0, points, np.array([first, first + 4]), points * [0.0, 0.0, 1.0], fields)
 
 
 def test_exterior_has_the_faces_that_no_other_element_covers() -> None:
     snapshot = two_hexahedra()
-    faces, elements = snapshot.exterior(np.array([True, True]))
+    faces, elements = snapshot.exterior()
     assert len(faces) == 10 and np.array_equal(np.bincount(elements), [5, 5])
     centres = snapshot.points[faces].mean(axis=1)
     assert not np.any(np.all(np.isclose(centres, [2.0, 0.0, 0.5]), axis=1))
@@ -486,7 +484,7 @@ def test_chains_lie_on_the_deformed_face_along_their_deformed_direction() -> Non
     assert ribbons.lies_on > 0
 
 
-def outline(snapshot: snapshots.Snapshot) -> tuple[np.ndarray, np.ndarray]:
+def outline(snapshot: bodies.Snapshot) -> tuple[np.ndarray, np.ndarray]:
     """Of the ribbons on the face x = 3 the places (n, 2) in the undeformed face, a square, and the lengths."""
     corners = bodies.body(snapshot)[1].corners
     gradient = snapshot.fields["deformation_gradient"][0].reshape(3, 3)
@@ -545,8 +543,8 @@ def test_a_recording_gives_back_what_was_run(tiny_run: Recording) -> None:
     assert tiny_run.scene == tiny()
     assert tiny_run.value("force", 2.0) == pytest.approx(50.0)
     with pytest.raises(RecordingError, match="no fields at time 7"):
-        snapshots.Snapshot.of(tiny_run, 7.0)
-    snapshot = snapshots.Snapshot.of(tiny_run, 2.0)
+        bodies.Snapshot.of(tiny_run, 7.0)
+    snapshot = bodies.Snapshot.of(tiny_run, 2.0)
     assert snapshot.elements.shape == (480, 8)
     top = snapshot.points[:, 2] > 10.0 - 1e-9
     assert np.all(snapshot.displacement[snapshot.points[:, 2] < 1e-9, 2] == 0)
@@ -558,7 +556,7 @@ def test_a_recording_gives_back_what_was_run(tiny_run: Recording) -> None:
 @pytest.fixture(scope="module")
 def pictures(tiny_run: Recording) -> list[np.ndarray]:
     """Of the tendon with and without chains, of chains on the near side and on the far one; drawn by one process."""
-    snapshot = snapshots.Snapshot.of(tiny_run, 2.0)
+    snapshot = bodies.Snapshot.of(tiny_run, 2.0)
     middle = (0.0, 0.0, snapshot.deformed[:, 2].max() / 2)
     view = rendering.View((0.3, -1.0, 0.14), middle, 14.0, (120, 320))
     patches = bodies.body(snapshot)
@@ -570,7 +568,7 @@ def pictures(tiny_run: Recording) -> list[np.ndarray]:
 
 def test_a_snapshot_is_really_drawn(tiny_run: Recording, pictures: list[np.ndarray]) -> None:
     both, bare, *_ = pictures
-    length = snapshots.Snapshot.of(tiny_run, 2.0).deformed[:, 2].max()
+    length = bodies.Snapshot.of(tiny_run, 2.0).deformed[:, 2].max()
     assert both.shape == bare.shape == (320, 120, 3)
     assert np.all(both[0, 0] == 255)
     body = np.any(bare < 245, axis=2)
