@@ -27,7 +27,6 @@ from remodel_fenicsx.model.energy import MATRICES, Matrix, Stresses, neo_hookean
 from remodel_fenicsx.model.laws import LAWS, Drive, Law, ranked
 from remodel_fenicsx.model.repulsion import REPULSIONS, Repulsion, axes_sum, squared_end_to_end_length
 from remodel_fenicsx.model.spectral import PAIRINGS, principal
-from remodel_fenicsx.scene.parameters import COUPLING_MEANINGS
 from remodel_fenicsx.schema.tables import markdown_reference
 from remodel_fenicsx.schema.units import (
     AREA,
@@ -40,6 +39,7 @@ from remodel_fenicsx.schema.units import (
     TEMPERATURE,
     Dimension,
 )
+from remodel_fenicsx.settings import COUPLING_MEANINGS
 
 if TYPE_CHECKING:
     from remodel_fenicsx.evolution.coupling import COUPLINGS, Coupling, Staggered
