@@ -9,8 +9,10 @@ from __future__ import annotations
 import bisect
 import itertools
 import math
+import pkgutil
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -33,18 +35,6 @@ from remodel_fenicsx.schema.units import FORCE, NUMBER_DENSITY, STRESS, TEMPERAT
 
 STRESS_UNITS = {"Pa": 1.0, "kPa": 1.0e3, "MPa": 1.0e6}  # in Pa
 INITIAL_CELLS = ("random", "isotropic", "aligned")
-COUPLING_MEANINGS = {
-    "staggered": "solve with the cells of the step before, then remodel once",
-    "relaxed": "the same with a share, relaxation_factor, of what the pass changes: half of it is stable for every "
-    "driver and frame but under weak loads, where 'staggered' over-corrects with 'pk2' and 'finger'",
-    "extrapolated": "remodel first, towards the stress of the middle of the step, extrapolated from the two steps "
-    "before; then solve: of second order, for the law 'tensor'",
-    "implicit": "the cells belong to the stress of the same step: Newton's method on both, for the law 'tensor' (with "
-    "a repulsion that sees no axes) and the laws of the paper",
-}
-"""What each of `evolution.coupling.COUPLINGS` does: a test holds the two together."""
-OF_SHARES = ("relaxed",)
-FOR_LAWS_WITH_A_TARGET = ("extrapolated",)
 MOST_STEPS = 1_000_000
 
 
@@ -267,6 +257,59 @@ class Cells(Table):
         return np.tile(np.array(lengths), (number_of_elements, 1))
 
 
+@dataclass(frozen=True)
+class CouplingKind:
+    """How equilibrium and remodeling of one step are coupled, as scenes know it.
+
+    Attributes
+    ----------
+    meaning
+        What it does, for docs/scene.md.
+    place
+        The class of the `Coupling`, or its dotted name: scenes are read without dolfinx, which it needs.
+    makes_a_share
+        Whether it makes the share `relaxation_factor` of a pass.
+    needs_a_target
+        Whether it is for laws with a target alone (`Law.target`).
+    """
+
+    meaning: str
+    place: Callable[..., Any] | str
+    makes_a_share: bool = False
+    needs_a_target: bool = False
+
+    @property
+    def make(self) -> Callable[..., Any]:
+        """Makes the coupling of a state, a tissue, a remodeling pass and settings of the solver."""
+        found: Callable[..., Any] = pkgutil.resolve_name(self.place) if isinstance(self.place, str) else self.place
+        return found
+
+
+COUPLINGS = {
+    "staggered": CouplingKind(
+        "solve with the cells of the step before, then remodel once", "remodel_fenicsx.evolution.coupling:Staggered"
+    ),
+    "relaxed": CouplingKind(
+        "the same with a share, relaxation_factor, of what the pass changes: half of it is stable for every driver and "
+        "frame but under weak loads, where 'staggered' over-corrects with 'pk2' and 'finger'",
+        "remodel_fenicsx.evolution.coupling:Relaxed",
+        makes_a_share=True,
+    ),
+    "extrapolated": CouplingKind(
+        "remodel first, towards the stress of the middle of the step, extrapolated from the two steps before; then "
+        "solve: of second order, for the law 'tensor'",
+        "remodel_fenicsx.evolution.coupling:Extrapolated",
+        needs_a_target=True,
+    ),
+    "implicit": CouplingKind(
+        "the cells belong to the stress of the same step: Newton's method on both, for the law 'tensor' (with a "
+        "repulsion that sees no axes) and the laws of the paper",
+        "remodel_fenicsx.evolution.implicit:Implicit",
+    ),
+}
+"""Couplings by the name that a scene gives them."""
+
+
 class Remodeling(Table):
     """How the cells follow the load: driving tensor, evolution law, frame and speed."""
 
@@ -295,9 +338,9 @@ class Remodeling(Table):
         "cross, the cell turns by 90 degrees at once), 'continuous' by axis (each principal direction goes on from the "
         "axis that it overlaps most). The law 'rotation' does not ask.",
     )
-    coupling: Annotated[str, one_of(COUPLING_MEANINGS)] = Field(
+    coupling: Annotated[str, one_of(COUPLINGS)] = Field(
         default="staggered",
-        description="; ".join(f"{name!r}: {text}" for name, text in COUPLING_MEANINGS.items())
+        description="; ".join(f"{name!r}: {kind.meaning}" for name, kind in COUPLINGS.items())
         + ". Where neither scene nor preset says it: 'extrapolated' with the law 'tensor'.",
     )
     relaxation_factor: float = Field(
@@ -319,7 +362,7 @@ class Remodeling(Table):
     def warnings(self) -> list[str]:
         """A line on a law that a share of each pass makes slower."""
         law, share = LAWS[self.law], self.relaxation_factor
-        if self.coupling not in OF_SHARES or share == 1 or not law.remodels or law.of_absolute_time:
+        if not COUPLINGS[self.coupling].makes_a_share or share == 1 or not law.remodels or law.of_absolute_time:
             return []
         return [
             f"remodeling.coupling = {self.coupling!r} makes a share of {share:g} of each pass, and the law "
@@ -328,7 +371,7 @@ class Remodeling(Table):
 
     @model_validator(mode="after")
     def _coupling_fits_the_law(self) -> Remodeling:
-        if self.coupling in FOR_LAWS_WITH_A_TARGET and LAWS[self.law].target is None:
+        if COUPLINGS[self.coupling].needs_a_target and LAWS[self.law].target is None:
             laws = ", ".join(repr(name) for name, law in LAWS.items() if law.target is not None)
             raise fault(
                 f"needs a remodeling.law with a target that can be extrapolated: {laws}", "coupling", self.coupling

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from remodel_fenicsx.body.loading import LoadValues
-from remodel_fenicsx.evolution.implicit import Implicit
 from remodel_fenicsx.evolution.predictor import PREDICTORS, LoadStep
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
 from remodel_fenicsx.model.cells import UnitCell
@@ -333,9 +332,3 @@ class Extrapolated(Staggered):
 
 
 Maker = Callable[[State, Tissue, RemodelingPass, Solver], Coupling]
-COUPLINGS: dict[str, Maker] = {
-    "staggered": Staggered,
-    "relaxed": Relaxed,
-    "extrapolated": Extrapolated,
-    "implicit": Implicit,
-}
