@@ -205,19 +205,6 @@ class Quadrature:
         complement: NDArray[np.float64] = self._complements[degree] @ values
         return complement
 
-    def smooth_share(self, values: NDArray[np.float64], weights: NDArray[np.float64]) -> float:
-        """How alike values vary inside neighbouring elements: 1 for a smooth field, near 0 for noise, over all ranks.
-
-        The slopes in space of values (owned elements, points) are compared with the means over their neighbours;
-        `weights` of the points, of the same shape, beside their volume.
-        """
-        places, values = self.owned(self.coordinates), values - values.mean(axis=1, keepdims=True)
-        places = places - places.mean(axis=1, keepdims=True)
-        slopes = np.einsum("eip,ep->ei", np.linalg.pinv(places, rcond=1e-6), values)
-        own, theirs = (np.einsum("epi,ei->ep", places, s) for s in (slopes, self._mean_of_neighbours(slopes)))
-        square = self.integral(weights * own**2)
-        return self.integral(weights * own * theirs) / square if square > 0 else 0.0
-
     def jumps(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """How far values (owned elements, points, n) lie from their neighbours': a mean square, (owned elements,).
 

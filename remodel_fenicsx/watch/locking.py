@@ -55,10 +55,10 @@ class LockingWarning(Watcher):
         shape  = int mu |F - F_e|^2 dV / (f . u / 2),                F_e the element's,
 
     f the internal nodal forces: ln J_e is the mean of ln J over the element, F_e the polynomial through F of one
-    degree less than the displacement. An element that cannot keep its volume spends all of `volume` in vain. Of the strain
-    that it cannot follow, `shape` counts twice what it has: about as much again is what it lacks (in a thick tube the
-    radial strain, constant in an element, beside the circumferential one). Their sum is about the part of its way that
-    the body lacks. (The stored energy is no scale: chains have some without any load.)
+    degree less than the displacement. An element that cannot keep its volume spends all of `volume` in vain. Of the
+    strain that it cannot follow, `shape` counts twice what it has: about as much again is what it lacks (in a thick
+    tube the radial strain, constant in an element, beside the circumferential one). Their sum is about the part of its
+    way that the body lacks. (The stored energy is no scale: chains have some without any load.)
 
     The work is no scale either where an elongation is prescribed: that work drives the free part of the motion only in
     part. So `VolumeResponse` asks the tangent how the body would move if changes of volume inside elements cost
@@ -221,7 +221,23 @@ class VolumeResponse:
             lacking = self._part_of_the_way(first, 1 / (1 - min(max(share, 0.0), MOST_HELD)))
         for vector in (forces, first):
             vector.destroy()
-        return lacking, self.quadrature.smooth_share(changes, self.stiffness)
+        return lacking, self._smooth_share(changes)
+
+    def _smooth_share(self, changes: Array) -> float:
+        """How alike values (elements, points) vary in neighbouring elements: 1 for a smooth field, near 0 for noise.
+
+        One less the squared jumps of the slopes in space between elements, over the squared slopes.
+        """
+        quadrature = self.quadrature
+        places = quadrature.owned(quadrature.coordinates)
+        places = places - places.mean(axis=1, keepdims=True)
+        slopes = np.einsum("eip,ep->ei", np.linalg.pinv(places, rcond=1e-6), changes)
+        jumps = quadrature.jumps(np.repeat(slopes[:, None], quadrature.shape[1], axis=1))
+        weights = self.stiffness * np.square(places).sum(axis=-1)
+        squares, jumped = (
+            quadrature.integral(weights * values[:, None]) for values in (np.square(slopes).sum(axis=1), jumps)
+        )
+        return max(1 - jumped / squares, 0.0) if squares > 0 else 0.0
 
     def _stress(self) -> tuple[Array, Array]:
         """ln J - ln J_e (elements, points), and P (elements, points, 3, 3) of the present unknowns."""
