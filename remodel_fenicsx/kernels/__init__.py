@@ -10,14 +10,14 @@ in C                stands for
 principal           tissue.spectral.principal
 positive_direction  tissue.spectral.positive_direction
 without_noise       tissue.spectral.without_noise
-stretches           tissue.repulsion.squared_end_to_end_length, tissue.repulsion.axes_sum
+stretches           tissue.energy.squared_end_to_end_length, tissue.energy.axes_sum
 parts               kernels.points.PointKernels.gradient_and_driver
 structure           tissue.cells.structure_tensor
 extension           kernels.points.PointKernels.extension
 may_turn            kernels.points.PointKernels.may_turn
 room                kernels.points.PointKernels.room
-log_sum             tissue.repulsion.log_sum
-log_derivatives     tissue.repulsion.log_derivatives
+log_sum             tissue.energy.log_sum
+log_derivatives     tissue.energy.log_derivatives
 target              tissue.laws.tensor_target
 solve               tissue.condensed.CondensedPoints.solve
 tangent             tissue.condensed.CondensedPoints.tangent

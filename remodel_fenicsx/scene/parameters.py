@@ -16,7 +16,7 @@ from remodel_fenicsx.model.chains import BOLTZMANN_CONSTANT, CHAINS
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
 from remodel_fenicsx.model.energy import MATRICES, Tissue
 from remodel_fenicsx.model.laws import LAWS
-from remodel_fenicsx.model.repulsion import REPULSIONS
+from remodel_fenicsx.model.energy import REPULSIONS
 from remodel_fenicsx.model.spectral import PAIRINGS
 from remodel_fenicsx.schema.tables import Table, checked, fault, is_number, one_of, shown
 from remodel_fenicsx.schema.units import NUMBER_DENSITY, STRESS, TEMPERATURE

@@ -24,7 +24,7 @@ from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
 from remodel_fenicsx.model.energy import MATRICES, Matrix
 from remodel_fenicsx.model.implicit.condensed import refused
 from remodel_fenicsx.model.laws import LAWS
-from remodel_fenicsx.model.repulsion import REPULSIONS
+from remodel_fenicsx.model.energy import REPULSIONS
 from remodel_fenicsx.scene.parameters import FORMAT, PRESETS, RENAMED, Cells, Material, Remodeling, default_method
 from remodel_fenicsx.scene.plausibility import doubts, largest_stress
 from remodel_fenicsx.scene.profiles import EXACT, PROFILES, known_profile
