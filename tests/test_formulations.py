@@ -343,7 +343,7 @@ def test_what_does_not_fit_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(SceneError, match=f"^mesh.formulation = 'selective-integration': {line}"):
         Scene(**cubic, material={"matrix": "plain"}, mesh={"formulation": SELECTIVE})
     made = distorted_cube()
-    with pytest.raises(TypeError, match="it must be a tissue.energy.Matrix$"):
+    with pytest.raises(TypeError, match="it must be a remodel_fenicsx.extend.Matrix$"):
         made.problem(material=Material(matrix="plain"))
 
 
