@@ -13,10 +13,11 @@ from remodel_fenicsx.body import gmsh_model as model
 from remodel_fenicsx.body.buckling import Strut
 from remodel_fenicsx.body.column import Column
 from remodel_fenicsx.body.reductions import Reduction, about_z
-from remodel_fenicsx.body.shape import Array, LoadKind, MeshSettings, Shape, check_lengths
+from remodel_fenicsx.body.shape import Array, LoadKind, Shape, check_lengths
 from remodel_fenicsx.model.cells import pitch_angle, radial_share
 from remodel_fenicsx.schema.tables import fault, shown
 from remodel_fenicsx.schema.units import FORCE, LENGTH, STRESS
+from remodel_fenicsx.settings import Mesh
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -155,7 +156,7 @@ class Tube(Shape):
         check_lengths(self, {"inner_radius": self.inner_radius, "outer_radius": wall, "length": self.length})
         return self
 
-    def build(self, mesh: MeshSettings, comm: MPI.Intracomm | None = None) -> Domain:
+    def build(self, mesh: Mesh, comm: MPI.Intracomm | None = None) -> Domain:
         """Mesh the whole tube."""
         size = self.inner_radius, self.outer_radius, self.length
         return tube(*size, mesh.refinement, mesh.element, mesh.degree, comm)

@@ -193,7 +193,7 @@ class Tissue:
         if isinstance(self.matrix, Matrix):
             return self.matrix
         raise TypeError(
-            "the volumetric part of this matrix energy is not told apart: it must be a tissue.energy.Matrix"
+            "the volumetric part of this matrix energy is not told apart: it must be a remodel_fenicsx.extend.Matrix"
         )
 
     def _with_network(self, energy: Any, deformation_gradient: Any, cells: Sequence[UnitCell]) -> Any:

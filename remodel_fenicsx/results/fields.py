@@ -18,7 +18,7 @@ from remodel_fenicsx.fem import compat, jit
 from remodel_fenicsx.results.chain_lines import chain_displacement, chain_lines
 from remodel_fenicsx.results.recording import CHAINS, FIELDS, RecordingError
 from remodel_fenicsx.results.vtkhdf import LINE, TransientGrid, cell_type_and_permutation
-from remodel_fenicsx.scene.settings import FIELDS_BY_NAME
+from remodel_fenicsx.settings import FIELDS_BY_NAME
 from remodel_fenicsx.schema.times import SAME_TIME, same_time
 from remodel_fenicsx.solver.pointwise import PointStresses
 from remodel_fenicsx.state.state import State
@@ -130,7 +130,7 @@ class Fields(Watcher):
     after
         Where a run goes on: time of the last step that was done. Fields of later ones are dropped.
     names
-        Of `scene.settings.FIELDS_BY_NAME`, what is written; the lines only with "chains".
+        Of `settings.FIELDS_BY_NAME`, what is written; the lines only with "chains".
     times
         Further times that are written.
 
