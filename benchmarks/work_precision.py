@@ -87,7 +87,7 @@ class Point:
 def scene(method: Method) -> Scene:
     """The artery of isotropic cells."""
     changes = {"cells.initial": "isotropic", "remodeling.coupling": method.coupling}
-    return preset_scene(method.preset, "tube").with_values(changes)
+    return preset_scene(method.preset, "tube").with_values(whole.EVERY_TANGENT | changes)
 
 
 def settings(method: Method) -> list[rungs.Setting]:

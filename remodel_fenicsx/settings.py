@@ -20,7 +20,16 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.fem.kinematics import KINEMATICS
-from remodel_fenicsx.fem.solver_methods import AUTO, LARGE, LARGE_ON_RANKS, MEANINGS, METHODS, SMALL, fault_of_option
+from remodel_fenicsx.fem.solver_methods import (
+    AUTO,
+    LARGE,
+    LARGE_ON_RANKS,
+    MEANINGS,
+    METHODS,
+    SMALL_BODY,
+    SMALL_REDUCTION,
+    fault_of_option,
+)
 from remodel_fenicsx.model.cells import AXES
 from remodel_fenicsx.model.chains import BOLTZMANN_CONSTANT, CHAINS
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
@@ -540,7 +549,8 @@ class Solver(Table):
 
     method: Annotated[str, _auto_or(METHODS)] = Field(
         default=AUTO,
-        description=f"'auto': 'direct' up to {SMALL} unknowns, then 'lagged', above {LARGE} 'iterative'; "
+        description=f"'auto': 'direct' up to {SMALL_BODY} unknowns ({SMALL_REDUCTION} of a reduction), then 'lagged', "
+        f"above {LARGE} 'iterative'; "
         f"on more ranks 'direct' up to {LARGE_ON_RANKS}, then 'iterative'; "
         + "; ".join(f"{name!r}: {meaning}" for name, meaning in MEANINGS.items())
         + " (docs/speed.md).",
@@ -549,9 +559,9 @@ class Solver(Table):
     predictor: Literal["none", "autoregressive", "with-tolerance"] = Field(
         default="autoregressive",
         description="Where Newton's method starts a step: 'none': at the displacement of the step before; "
-        "'autoregressive': where the last increments let expect the solution; 'with-tolerance', that of the presets: "
-        "the latter where steps are chosen (time.tolerance), 'none' where they are equal. The solutions are the same "
-        "to the tolerance.",
+        "'autoregressive': at what the increments of the last steps predict; 'with-tolerance': as predicted where "
+        "steps are chosen (time.tolerance), 'none' where they are equal. The solutions are the same to the "
+        "tolerance.",
     )
     absolute_tolerance: Annotated[float, FORCE] = Field(
         default=0.0,
