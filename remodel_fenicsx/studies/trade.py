@@ -12,7 +12,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from remodel_fenicsx.body.profile import PROFILE
+from remodel_fenicsx.body.columns import PROFILE
 from remodel_fenicsx.scene.scene import Scene
 from remodel_fenicsx.schema.times import same_time
 from remodel_fenicsx.studies.estimates import Result, Row, Trade, estimated, typical
