@@ -279,12 +279,14 @@ def test_a_run_whose_command_is_killed_before_it_begins_does_not_begin(tmp_path:
     late.chmod(0o755)
     code = f"""
 import os, pathlib, signal
-from remodel_fenicsx.system.children import Worker
+from remodel_fenicsx.system.children import Worker, wait_for_one
 child = Worker()
 child.begin(["info"], pathlib.Path({str(messages)!r}))
 print(child.process.pid, flush=True)
 if {{killed}}:
     os.kill(os.getpid(), signal.SIGKILL)
+wait_for_one([child], 100.0)
+child.poll()
 child.stop()
 """
     environment = os.environ | {"PATH": f"{tmp_path}:{os.environ['PATH']}"}

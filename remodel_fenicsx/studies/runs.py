@@ -275,10 +275,10 @@ class _Executor:
     def progress(self) -> str:
         """How far all runs are, and those under way."""
         total = sum(run.scene.time.number_of_steps for run in self.runs)
-        done = sum(run.steps_done for run in self.runs)
-        parts = [f"{run.name} {run.steps_done}/{run.scene.time.number_of_steps}" for run in self.running.values()]
+        done = {run.name: run.steps_done for run in self.runs}
+        parts = [f"{run.name} {done[run.name]}/{run.scene.time.number_of_steps}" for run in self.running.values()]
         more = [f"{len(self.waiting)} more to start"] if self.waiting else []
-        return f"{100 * done // total} % of {len(self.runs)} runs: {', '.join(parts + more) or 'done'}"
+        return f"{100 * sum(done.values()) // total} % of {len(self.runs)} runs: {', '.join(parts + more) or 'done'}"
 
 
 def _begin(worker: Worker, run: Run) -> None:
