@@ -385,7 +385,12 @@ BAD_SCENES = [
     (
         CUBE,
         {"solver.method": "magic"},
-        "solver.method = 'magic': allowed are 'auto', 'direct', 'lagged', 'exact', 'iterative'",
+        "solver.method = 'magic': allowed are 'auto', 'direct', 'lagged', 'iterative'",
+    ),
+    (
+        CUBE,
+        {"solver.method": "exact"},
+        "solver.method = 'exact': was removed, 'lagged' is faster everywhere; take 'lagged', or 'direct' for every tangent",
     ),
     (
         CUBE,

@@ -20,6 +20,7 @@ from remodel_fenicsx.fem.solver_methods import (
     LARGE_ON_RANKS,
     MEANINGS,
     METHODS,
+    REMOVED,
     SMALL_BODY,
     SMALL_REDUCTION,
     fault_of_option,
@@ -251,6 +252,8 @@ def _petsc_options(value: Any) -> Any:
 
 
 def _method(value: Any) -> Any:
+    if isinstance(value, str) and value in REMOVED:
+        raise fault(REMOVED[value])
     if value not in (AUTOMATIC, *METHODS):
         raise fault("allowed are " + ", ".join(map(repr, (AUTOMATIC, *METHODS))))
     return value
