@@ -3,9 +3,9 @@
 
     ./with-fenicsx benchmarks/kinematics.py [--steps N] [--rounds N] [--without-full]
 
-The preset's tube with isotropic cells, its ramp and a part of the hold; every tangent is factorised. Only solving and remodeling count: no columns,
-no fields, no record; kernels are warm. The kinematics take turns, and the least time of each counts, so that what else
-the machine does falls on all of them. The full model makes its steps once.
+The preset's tube with isotropic cells, its ramp and a part of the hold, every tangent factorised. Only solving and
+remodeling count: no columns, no fields, no record; kernels are warm. The kinematics take turns, and the least time of
+each counts, so that what else the machine does falls on all of them. The full model makes its steps once.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ from remodel_fenicsx.body import cube, tube
 from remodel_fenicsx.model.drivers import DRIVERS
 from remodel_fenicsx.model.energy import MATRICES, neo_hookean
 from remodel_fenicsx.scene import preset_scene
-from remodel_fenicsx.scene.parameters import Cells, Material
+from remodel_fenicsx.settings import Cells, Material
 from remodel_fenicsx.watch.locking import LockingWarning
 from tests import parts
 from tests.conftest import Case, slowly
@@ -343,7 +343,7 @@ def test_what_does_not_fit_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(SceneError, match=f"^mesh.formulation = 'selective-integration': {line}"):
         Scene(**cubic, material={"matrix": "plain"}, mesh={"formulation": SELECTIVE})
     made = distorted_cube()
-    with pytest.raises(TypeError, match="it must be a tissue.energy.Matrix$"):
+    with pytest.raises(TypeError, match="it must be a remodel_fenicsx.extend.Matrix$"):
         made.problem(material=Material(matrix="plain"))
 
 

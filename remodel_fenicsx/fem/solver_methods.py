@@ -46,7 +46,7 @@ MEANINGS = {
 }
 """In words, for docs/scene.md; those of one's own need none."""
 
-REMOVED = {"exact": "was removed, 'lagged' is faster everywhere; take 'lagged', or 'direct' for every tangent"}
+REMOVED = {"exact": "was removed; take 'lagged', or 'direct' for a new tangent in every iteration"}
 """Methods of earlier versions, and what to take in their place."""
 
 # MUMPS on several ranks adds up in the order in which messages come: its last digits differ from run to run. So one
