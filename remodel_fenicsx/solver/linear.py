@@ -1,4 +1,4 @@
-"""How the linear systems of Newton's method are solved: with every tangent, with the factor of an earlier one, by multigrid."""
+"""How the linear systems of Newton's method are solved: with every tangent, an earlier factor, or multigrid."""
 
 from __future__ import annotations
 
