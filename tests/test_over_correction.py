@@ -216,3 +216,12 @@ def test_cells_that_make_up_for_a_rest_are_warned_of(
     assert said in caplog.text
     if said:
         assert "1e+02 % of the body" in caplog.text
+
+
+def test_a_rest_without_loads_is_no_matter_of_steps(caplog: pytest.LogCaptureFixture) -> None:
+    """Cells rest because the force is off: they would with any step."""
+    ramp = [[0.0, 0.0], [2.0, 1.0], [8.0, 1.0], [9.0, 0.0], [14.0, 0.0], [15.0, 1.0]]
+    simulation = cube(10.0, loads__force__ramp=ramp, remodeling__law="explicit", remodeling__kappa=0.1, time__end=17.0)
+    with caplog.at_level(logging.WARNING, logger="remodel_fenicsx"):
+        list(simulation.steps())
+    assert "had rested" not in caplog.text

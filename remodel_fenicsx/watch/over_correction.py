@@ -114,7 +114,7 @@ class OverCorrection(WarnsOnce):
         self.swing = None
         if self._cells.known > ORDER:
             cells, body = [structure, *self._cells.values], [self.state.unknown.x.array, *self._body.values]
-            self.swing = self._measured(cells, body, [step.time, *self._times])
+            self.swing = self._measured(cells, body, [step.time, *self.times])
             tells = not self._loads_jump(step) and not self._rested(cells) and self._evenly(step)
             self._count("growing", tells and self.swing.cells_factor < GROWTH)
             self._count("sustained", tells and self.swing.body_factor < SUSTAINED)
@@ -142,7 +142,7 @@ class OverCorrection(WarnsOnce):
         self._numbers["time_0"] = step.time
 
     @property
-    def _times(self) -> list[float]:
+    def times(self) -> list[float]:
         """Of the passes that are remembered, the newest first."""
         return [self._numbers[f"time_{age}"] for age in range(ORDER + 1)]
 
@@ -161,11 +161,11 @@ class OverCorrection(WarnsOnce):
 
     def _evenly(self, step: Step) -> bool:
         """Whether the passes are about as far from each other: of others a single jump looks like a swing."""
-        lengths = [later - earlier for later, earlier in pairwise([step.time, *self._times])]
+        lengths = [later - earlier for later, earlier in pairwise([step.time, *self.times])]
         return max(lengths) <= UNEVEN * min(lengths)
 
     def _loads_jump(self, step: Step) -> bool:
-        times = self._times[:ORDER]
+        times = self.times[:ORDER]
         earlier = [self.stepper.load_values(time) if time else {} for time in times]  # the body starts unloaded
 
         def jump(name: str, value: float) -> float:
@@ -214,7 +214,7 @@ class OverCorrection(WarnsOnce):
 
     def _place(self) -> tuple[float, float, float]:
         """Reference place of the largest swing of the cells."""
-        swing = self._at_points(_difference(self._cells.values, self._times))
+        swing = self._at_points(_difference(self._cells.values, self.times))
         return self.quadrature.place_of_largest(np.linalg.norm(swing, axis=-1))
 
 
@@ -261,10 +261,14 @@ class RestedCells(WarnsOnce):
         now = _differ(cells[0], cells[1]) if len(cells) > 1 else nowhere
         moved = self._moved.values[0].reshape(self.quadrature.shape) > 0 if self._moved.known else nowhere
         self._squares = np.zeros(self.quadrature.shape)
-        if len(cells) > 2:
+        if len(cells) > 2 and self._loaded_before():
             resumed = now & moved & ~_differ(cells[1], cells[2])
             self._squares = np.where(resumed, np.sum((cells[0] - cells[1]) ** 2, axis=-1), 0.0)
         self._moved.push((now | moved).astype(np.float64).ravel())
+
+    def _loaded_before(self) -> bool:
+        """Whether there was a load at the pass before: a rest without loads is the loads', and no matter of steps."""
+        return any(value != 0 for value in self.stepper.load_values(self.passes.times[1]).values())
 
     def committed(self, step: Step) -> None:
         """Warn."""
