@@ -14,12 +14,12 @@ from pathlib import Path
 
 from remodel_fenicsx.body.gmsh_model import write_msh
 from remodel_fenicsx.body.tendon import draw_tendon
-from remodel_fenicsx.body.tube import draw_tube
+from remodel_fenicsx.body.tube import PAPER, draw_tube
 
 # file -> what is in it, as in the paper: Figs. 6 and 7
 MESHES = {
     "tendon.msh": lambda: draw_tendon(length=10.0, area=10.0),
-    "artery.msh": lambda: draw_tube(inner_radius=1.0, outer_radius=3.0, length=8.0),
+    "artery.msh": lambda: draw_tube(1.0, 3.0, 8.0, PAPER, "hexahedron", 1),
 }
 
 

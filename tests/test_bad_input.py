@@ -30,7 +30,7 @@ from hypothesis import strategies as st
 
 from remodel_fenicsx import Recording, Scene, SceneError, cli, running
 from remodel_fenicsx.body.domain import Domain
-from remodel_fenicsx.body.tube import Tube, tube
+from remodel_fenicsx.body.tube import Tube
 from remodel_fenicsx.results.checkpoint_file import CheckpointError, read_checkpoint, read_pointer
 from remodel_fenicsx.results.recording import RecordingError
 from remodel_fenicsx.results.vtkhdf import TransientGrid
@@ -40,6 +40,7 @@ from remodel_fenicsx.schema.toml import parse_override
 from remodel_fenicsx.simulation import checked_domain
 from tests.forks import forked
 from tests.test_resume import SELF, first_half, rows
+from tests.parts import tube
 
 __all__ = ["first_half"]  # a fixture
 FACTOR = int(os.environ.get("BAD_INPUTS", "1"))
@@ -228,7 +229,9 @@ def place(tmp_path_factory: pytest.TempPathFactory, first_half: Path) -> Iterato
 
 FILES = "scene.toml binary folder circle gone run nowhere /dev/null . a/b".split() + ["", "x" * 300]
 SETTINGS = """time.end=3 time.end=nan cells.seed=-1 = a.b time=1 time.end.x=1 cells.seed=1e400 a..b=1 name='../x'
-    geometry.shape=tube x=[[[[ name="a time.end=0x""".split() + ["loads.force.value=1 N"]
+    geometry.shape=tube x=[[[[ name="a time.end=0x""".split() + [
+    "loads.force.value=1 N"
+]
 WORDS = st.one_of(
     st.sampled_from(["run", "status", "validate", "new", "info", "figures"]),
     st.sampled_from(FILES),
