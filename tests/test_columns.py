@@ -10,10 +10,10 @@ from mpi4py import MPI
 
 from remodel_fenicsx.body import SHAPES
 from remodel_fenicsx.body.columns import PROFILE, columns_of
-from remodel_fenicsx.model.cells import cylindrical_axes, initial_dimensions
+from remodel_fenicsx.model.cells import cylindrical_axes
 from remodel_fenicsx.results.columns import Observer
 from remodel_fenicsx.results.fields import ElementFields
-from remodel_fenicsx.scene.parameters import Cells
+from remodel_fenicsx.settings import Cells
 from tests import parts
 from tests.parts import cube, tube
 
@@ -130,5 +130,5 @@ def test_random_cells_belong_to_the_elements_of_the_mesh_file() -> None:
     made = parts.body(domain, settings)
     assert not np.array_equal(domain.element_number, np.arange(domain.number_of_elements))
     first_points = domain.gather_elements(made.cells.initial_dimensions[:, 0])
-    np.testing.assert_array_equal(first_points, initial_dimensions(settings, domain.number_of_elements))
+    np.testing.assert_array_equal(first_points, settings.dimensions(domain.number_of_elements))
     assert np.all(np.ptp(made.cells.initial_dimensions, axis=1) == 0.0)  # one draw per element

@@ -16,7 +16,7 @@ from remodel_fenicsx import Scene, SceneError, Simulation
 from remodel_fenicsx.model.drivers import DRIVERS
 from remodel_fenicsx.model.energy import MATRICES, neo_hookean
 from remodel_fenicsx.scene import preset_scene
-from remodel_fenicsx.scene.parameters import Cells, Material
+from remodel_fenicsx.settings import Cells, Material
 from remodel_fenicsx.watch.locking import LockingWarning
 from tests import parts
 from tests.conftest import Case, slowly

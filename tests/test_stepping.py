@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from remodel_fenicsx.evolution.stepper import Stepper, times
-from remodel_fenicsx.scene.parameters import Cells
+from remodel_fenicsx.settings import Cells
 from remodel_fenicsx.scene.scene import Load, preset_scene
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.solver.blend import KEPT_RESERVE, Blend

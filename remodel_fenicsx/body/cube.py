@@ -10,8 +10,9 @@ from pydantic import Field, model_validator
 from remodel_fenicsx.body import gmsh_model as model
 from remodel_fenicsx.body.columns import Column
 from remodel_fenicsx.body.reductions import Reduction
-from remodel_fenicsx.body.shape import LoadKind, MeshSettings, Shape, check_lengths, homogeneous_bar, uniaxial_columns
+from remodel_fenicsx.body.shape import LoadKind, Shape, check_lengths, homogeneous_bar, uniaxial_columns
 from remodel_fenicsx.schema.units import FORCE, LENGTH
+from remodel_fenicsx.settings import Mesh
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -63,7 +64,7 @@ class Cube(Shape):
         check_lengths(self, {"side": self.side})
         return self
 
-    def build(self, mesh: MeshSettings, comm: MPI.Intracomm | None = None) -> Domain:
+    def build(self, mesh: Mesh, comm: MPI.Intracomm | None = None) -> Domain:
         """The cube [0, side]^3; with refinement 1 the paper's single element."""
         from remodel_fenicsx.body.domain import build_domain
 

@@ -266,7 +266,7 @@ def _domain_from_gmsh(
     model: Any, comm: MPI.Intracomm, faces: dict[str, int], shape: str, dimensions: dict[str, float]
 ) -> Domain:
     mesh, facet_tags = compat.mesh_from_gmsh(model, comm)
-    symbolic = SymbolicMesh(mesh.ufl_domain_from_gmsh().ufl_coordinate_element())
+    symbolic = SymbolicMesh(mesh.ufl_domain().ufl_coordinate_element())
     return Domain(type(mesh)(mesh._cpp_object, symbolic), facet_tags, faces, shape, dimensions)
 
 

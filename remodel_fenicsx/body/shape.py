@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from remodel_fenicsx.body.reductions import Reduction, homogeneous, known_loads,
 from remodel_fenicsx.model.cells import angle_to_axis
 from remodel_fenicsx.schema.tables import Table, fault
 from remodel_fenicsx.schema.units import Dimension, LengthUnit
+from remodel_fenicsx.settings import Mesh
 
 if TYPE_CHECKING:  # shapes are part of every scene: they are read without dolfinx
     from mpi4py import MPI
@@ -26,19 +27,6 @@ if TYPE_CHECKING:  # shapes are part of every scene: they are read without dolfi
     from remodel_fenicsx.body.loading import Loading
 
 Array = NDArray[np.float64]
-
-
-class MeshSettings(Protocol):
-    """The finite elements (`scene.Mesh`)."""
-
-    @property
-    def refinement(self) -> int: ...
-
-    @property
-    def element(self) -> str: ...
-
-    @property
-    def degree(self) -> int: ...
 
 
 @dataclass(frozen=True)
@@ -163,7 +151,7 @@ class Shape(Table):
         return self.shape
 
     @abstractmethod
-    def build(self, mesh: MeshSettings, comm: MPI.Intracomm | None = None) -> Domain:
+    def build(self, mesh: Mesh, comm: MPI.Intracomm | None = None) -> Domain:
         """Mesh the body. Collective.
 
         Raises

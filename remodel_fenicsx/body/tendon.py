@@ -13,8 +13,9 @@ from remodel_fenicsx.body import gmsh_model as model
 from remodel_fenicsx.body.buckling import Strut
 from remodel_fenicsx.body.columns import Column
 from remodel_fenicsx.body.reductions import Reduction, unturned
-from remodel_fenicsx.body.shape import LoadKind, MeshSettings, Shape, check_lengths, homogeneous_bar, uniaxial_columns
+from remodel_fenicsx.body.shape import LoadKind, Shape, check_lengths, homogeneous_bar, uniaxial_columns
 from remodel_fenicsx.schema.units import AREA, FORCE, LENGTH
+from remodel_fenicsx.settings import Mesh
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -90,7 +91,7 @@ class Tendon(Shape):
         check_lengths(self, {"length": self.length, "area": math.sqrt(self.area)})
         return self
 
-    def build(self, mesh: MeshSettings, comm: MPI.Intracomm | None = None) -> Domain:
+    def build(self, mesh: Mesh, comm: MPI.Intracomm | None = None) -> Domain:
         """A core of 4 x 4 elements with rounded sides inside two rings of 16, ten layers; times the refinement.
 
         There are nodes in the centre of the section and on the axes. `dimensions["radius"]` is the radius of the outer

@@ -23,10 +23,11 @@ from remodel_fenicsx.body.reductions import (
     symmetric_law,
     symmetric_planes,
 )
-from remodel_fenicsx.body.shape import Array, LoadKind, MeshSettings, Shape, check_lengths
+from remodel_fenicsx.body.shape import Array, LoadKind, Shape, check_lengths
 from remodel_fenicsx.model.cells import pitch_angle, radial_share
 from remodel_fenicsx.schema.tables import fault, shown
 from remodel_fenicsx.schema.units import FORCE, LENGTH, STRESS
+from remodel_fenicsx.settings import Mesh
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -109,7 +110,7 @@ def _faces(shape: Any, *names: str) -> dict[str, Any]:
     return {name: places[name] for name in names}
 
 
-def _counts(mesh: MeshSettings) -> tuple[int, int, int]:
+def _counts(mesh: Mesh) -> tuple[int, int, int]:
     """Elements of the whole tube around, through the wall and along."""
     around, through, along = (mesh.refinement * count for count in PAPER)
     return around, through, along
@@ -274,7 +275,7 @@ class Tube(Shape):
         check_lengths(self, {"inner_radius": self.inner_radius, "outer_radius": wall, "length": self.length})
         return self
 
-    def build(self, mesh: MeshSettings, comm: MPI.Intracomm | None = None) -> Domain:
+    def build(self, mesh: Mesh, comm: MPI.Intracomm | None = None) -> Domain:
         """The paper's 16 elements around, 8 through the wall and 12 along, times the refinement."""
         return whole_tube(self, _counts(mesh), mesh.element, mesh.degree, comm)
 

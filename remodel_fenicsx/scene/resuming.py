@@ -6,8 +6,8 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from remodel_fenicsx.scene.scene import Scene
-from remodel_fenicsx.scene.settings import Load
 from remodel_fenicsx.schema.tables import SceneError, shown
+from remodel_fenicsx.settings import Load
 
 # what decides no number of the steps done, or only how they were solved
 FREE = ("format", "name", "preset", "profile", "output", "solver", "loads", "time.end")

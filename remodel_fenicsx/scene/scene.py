@@ -21,18 +21,29 @@ from remodel_fenicsx.body.reductions import AUTO, objections
 from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.model.chains import CHAINS
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
-from remodel_fenicsx.model.energy import MATRICES, Matrix
+from remodel_fenicsx.model.energy import MATRICES, REPULSIONS, Matrix
 from remodel_fenicsx.model.implicit.condensed import refused
 from remodel_fenicsx.model.laws import LAWS
-from remodel_fenicsx.model.energy import REPULSIONS
-from remodel_fenicsx.scene.parameters import FORMAT, PRESETS, RENAMED, Cells, Material, Remodeling, default_method
 from remodel_fenicsx.scene.plausibility import doubts, largest_stress
+from remodel_fenicsx.scene.presets import PRESETS, default_method
 from remodel_fenicsx.scene.profiles import EXACT, PROFILES, known_profile
-from remodel_fenicsx.scene.settings import Load, Mesh, Model, Output, Solver, Supports, Time, nearest_multiples
-from remodel_fenicsx.scene.values import in_own_units, in_present_format, known_shape
+from remodel_fenicsx.scene.values import FORMAT, RENAMED, in_own_units, in_present_format, known_shape
 from remodel_fenicsx.schema.tables import SceneError, Table, checked, fault, quoted, shown, variant_of
 from remodel_fenicsx.schema.toml import merged, parse_override, put, read_toml, toml_text
 from remodel_fenicsx.schema.units import FORCE
+from remodel_fenicsx.settings import (
+    Cells,
+    Load,
+    Material,
+    Mesh,
+    Model,
+    Output,
+    Remodeling,
+    Solver,
+    Supports,
+    Time,
+    nearest_multiples,
+)
 
 LIMIT = 1000.0  # times 1/kappa after which nothing is left of a start, of cells under a hundredth of a tension too
 LARGEST_MESH = 10_000_000  # hexahedra; Gmsh, which is serial, needs about 10 GB for them

@@ -6,9 +6,13 @@ from collections.abc import Collection, Mapping
 from typing import Any
 
 from remodel_fenicsx.body import Shape
-from remodel_fenicsx.scene.parameters import FORMAT, STRESS_UNITS, Material
 from remodel_fenicsx.schema.tables import Table, allowed, fault
 from remodel_fenicsx.schema.units import LENGTH_UNIT, LENGTH_UNITS, STRESS_UNIT, in_units
+from remodel_fenicsx.settings import STRESS_UNITS, Material
+
+FORMAT = 2  # of recorded scenes: raised where a reader of the one before would not understand them
+RENAMED = {"mesh.cell": "mesh.element", "loads.stretch": "loads.elongation", "solver.profile": "solver.method"}
+"""Dotted key of an earlier format -> the key that has taken its place, for the error."""
 
 
 def in_present_format(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,26 +1,43 @@
-"""The tables of a scene beside material, cells and remodeling: mesh, model, loads, time, solver, output."""
+"""The tables of a scene: what can be set, with units, limits and meanings; one class each, which all rooms take.
+
+Source of the defaults of tissue and cells: E. Kuhl, G. A. Holzapfel, J. Mater. Sci. 42 (2007) 8811-8823;
+docs/theory.md has the equations as implemented. A `Scene` (`scene.scene`) is made of these tables.
+"""
 
 from __future__ import annotations
 
 import bisect
 import itertools
 import math
+import pkgutil
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from remodel_fenicsx.body.reductions import AUTO
 from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.fem.kinematics import KINEMATICS
-from remodel_fenicsx.fem.solver_methods import AUTO as AUTOMATIC
-from remodel_fenicsx.fem.solver_methods import LARGE, LARGE_ON_RANKS, MEANINGS, METHODS, SMALL, fault_of_option
+from remodel_fenicsx.fem.solver_methods import AUTO, LARGE, LARGE_ON_RANKS, MEANINGS, METHODS, SMALL, fault_of_option
+from remodel_fenicsx.model.cells import AXES
+from remodel_fenicsx.model.chains import BOLTZMANN_CONSTANT, CHAINS
+from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
+from remodel_fenicsx.model.energy import MATRICES, REPULSIONS, Tissue
+from remodel_fenicsx.model.laws import LAWS
+from remodel_fenicsx.model.spectral import PAIRINGS
 from remodel_fenicsx.schema.tables import Table, checked, fault, is_number, one_of, quoted, shown
 from remodel_fenicsx.schema.times import is_multiple, same_time
-from remodel_fenicsx.schema.units import FORCE
+from remodel_fenicsx.schema.units import FORCE, NUMBER_DENSITY, STRESS, TEMPERATURE
 
+STRESS_UNITS = {"Pa": 1.0, "kPa": 1.0e3, "MPa": 1.0e6}  # in Pa
+INITIAL_CELLS = ("random", "isotropic", "aligned")
 MOST_STEPS = 1_000_000
+
+
+# ---------------------------------------------------------------- body and mesh
 
 
 class Mesh(Table):
@@ -80,6 +97,285 @@ class Supports(Table):
         "or 'closed': free, with caps on which the pressure acts, and the length an unknown.",
         json_schema_extra={"allowed": "'free', for a tube also 'clamped' and 'closed'"},
     )
+
+
+# ---------------------------------------------------------------- tissue and cells
+
+
+class Material(Table):
+    """The tissue: an isotropic matrix (Lame constants) with a network of collagen chains."""
+
+    lame_lambda: Annotated[float, STRESS] = Field(
+        default=27.293, ge=0, description="First Lame constant lambda of the matrix, in stress_unit."
+    )
+    lame_mu: Annotated[float, STRESS] = Field(
+        default=3.103, gt=0, description="Second Lame constant mu of the matrix, in stress_unit."
+    )
+    chain_density: Annotated[float, NUMBER_DENSITY] = Field(
+        default=2.0e21, ge=0, description="Number of chains n_chn per volume, in 1/m^3; 0: no chains."
+    )
+    contour_length: float = Field(
+        default=1.594, gt=0, description="Contour length L of a chain, at which it locks, in link lengths."
+    )
+    persistence_length: float = Field(
+        default=1.365,
+        gt=0,
+        description="Persistence length A_p of a chain, its bending stiffness over k theta, in link lengths.",
+    )
+    temperature: Annotated[float, TEMPERATURE] = Field(
+        default=310.0, gt=0, description="Absolute temperature theta, in K."
+    )
+    energy_factor: Annotated[int, one_of((1, 4))] = Field(
+        default=1,
+        description="Factor omega of the chain energy: 1 is the stress as printed (eq. 7; reproduces Fig. 6), "
+        "4 the energy as printed (eq. 4b).",
+    )
+    matrix: Annotated[str, one_of(MATRICES)] = Field(default="neo-hookean", description="Energy of the matrix.")
+    chain: Annotated[str, one_of(CHAINS)] = Field(default="wormlike", description="Force law of a single chain.")
+    repulsion: Annotated[str, one_of(REPULSIONS)] = Field(
+        default="axes",
+        description="Form of the repulsive energy that makes the reference state stress-free: 'axes' is the paper's, "
+        "in the stretches along the three cell axes; 'log' sees the structure tensor alone (A : ln C), equals it where "
+        "both have the same axes and suits the law 'tensor'; 'length' is a function of the chains' length alone. Where "
+        "neither scene nor preset says it: 'log' with the law 'tensor'.",
+    )
+    stress_unit: Literal["Pa", "kPa", "MPa"] = Field(
+        default="Pa",
+        description="Unit of every stress, pressure and Lame constant of the scene; forces are in it times the unit of "
+        "length squared.",
+    )
+
+    @property
+    def network_modulus(self) -> float:
+        """c = omega k theta n_chn / (4 A_p), in stress_unit (1.568 Pa for the defaults)."""
+        pascal = BOLTZMANN_CONSTANT * self.temperature * self.chain_density / (4 * self.persistence_length)
+        return self.energy_factor * pascal / STRESS_UNITS[self.stress_unit]
+
+    def tissue(self, end_to_end_length: float) -> Tissue:
+        """The tissue of these parameters; without chains where there are none.
+
+        Parameters
+        ----------
+        end_to_end_length
+            r0, in link lengths.
+        """
+        return Tissue(
+            self.lame_lambda,
+            self.lame_mu,
+            self.network_modulus,
+            self.contour_length,
+            end_to_end_length,
+            CHAINS[self.chain] if self.chain_density > 0 else None,
+            MATRICES[self.matrix],
+            REPULSIONS[self.repulsion],
+        )
+
+    def summary(self, loads: Mapping[str, float]) -> str:
+        """Stiffness of network and matrix and the loads, in one unit and on one line.
+
+        Parameters
+        ----------
+        loads
+            Stresses by the words for them, in stress_unit.
+        """
+        stresses = {"network modulus c =": self.network_modulus, "shear modulus mu =": self.lame_mu, **loads}
+        return ", ".join(f"{words} {value:.4g} {self.stress_unit}" for words, value in stresses.items())
+
+
+def _initial_cells(value: Any) -> Any:
+    """A list of three lengths becomes a tuple of floats; names pass."""
+    if isinstance(value, (list, tuple)):
+        if len(value) != 3 or not all(is_number(length) and length >= 0 for length in value):
+            raise fault("must be three lengths [l1, l2, l3], each at least 0")
+        return tuple(float(length) for length in value)
+    if not isinstance(value, str) or value not in INITIAL_CELLS:
+        raise fault("allowed are " + ", ".join(map(repr, INITIAL_CELLS)) + " or three lengths [l1, l2, l3]")
+    return value
+
+
+class Cells(Table):
+    """The orthotropic unit cells of the collagen network before the first remodeling pass."""
+
+    initial: Annotated[str | tuple[float, float, float], checked(_initial_cells)] = Field(
+        default="random",
+        description="Cell dimensions l_I at t = 0, with |l| = end_to_end_length: 'random' (one draw per element, "
+        "uniform on the positive octant of the sphere), 'isotropic' (three equal ones), 'aligned' (all of it along "
+        "aligned_axis), or [l1, l2, l3] in link lengths.",
+        json_schema_extra={"allowed": "'random', 'isotropic', 'aligned' or three lengths [l1, l2, l3]"},
+    )
+    axes: Annotated[str, one_of(AXES)] = Field(
+        default="global",
+        description="Cell axes n_I before the first pass: 'global' (x, y, z) or 'cylindrical' (circumferential, axial, "
+        "radial, about the z axis). Where neither scene nor preset says it: a tube starts with 'cylindrical'.",
+    )
+    aligned_axis: Annotated[int, one_of((1, 2, 3))] = Field(
+        default=3,
+        description="Number of the axis that 'aligned' cells lie along: with global axes 3 is z, the load axis of cube "
+        "and tendon; with cylindrical axes 1 is circumferential, 2 axial, 3 radial.",
+    )
+    seed: int = Field(
+        default=1,
+        ge=0,
+        description="Seed of the random cells. The same seed and mesh give the same cells on any number of processes.",
+    )
+    end_to_end_length: float = Field(
+        default=1.0,
+        gt=0,
+        description="Length r0 of a chain at t = 0, in link lengths; smaller than material.contour_length. A material "
+        "constant: it keeps its value in the repulsive energy while the cells remodel.",
+    )
+
+    @model_validator(mode="after")
+    def _length_of_the_chain(self) -> Cells:
+        if not isinstance(self.initial, str):
+            length = math.hypot(*self.initial)
+            if abs(length - self.end_to_end_length) > 1e-6 * self.end_to_end_length:
+                raise fault(
+                    f"the root of the sum of squares is {length:.7g}, it must be "
+                    f"cells.end_to_end_length = {shown(self.end_to_end_length)}",
+                    "initial",
+                    self.initial,
+                )
+        return self
+
+    def dimensions(self, number_of_elements: int) -> NDArray[np.float64]:
+        """l_I at t = 0 of every element of the mesh file, shape (number_of_elements, 3), in link lengths.
+
+        The whole list of random cells is drawn on every rank, in the mesh file's order: the same element gets the same
+        draw for any number of ranks.
+        """
+        r0 = self.end_to_end_length
+        if self.initial == "random":
+            draws = np.abs(np.random.default_rng(self.seed).standard_normal((number_of_elements, 3)))
+            return r0 * draws / np.linalg.norm(draws, axis=1, keepdims=True)
+        lengths: Any = self.initial
+        if self.initial == "isotropic":
+            lengths = [r0 / np.sqrt(3)] * 3
+        elif self.initial == "aligned":
+            lengths = [r0 if axis == self.aligned_axis else 0.0 for axis in (1, 2, 3)]
+        return np.tile(np.array(lengths), (number_of_elements, 1))
+
+
+@dataclass(frozen=True)
+class CouplingKind:
+    """How equilibrium and remodeling of one step are coupled, as scenes know it.
+
+    Attributes
+    ----------
+    meaning
+        What it does, for docs/scene.md.
+    place
+        The class of the `Coupling`, or its dotted name: scenes are read without dolfinx, which it needs.
+    makes_a_share
+        Whether it makes the share `relaxation_factor` of a pass.
+    needs_a_target
+        Whether it is for laws with a target alone (`Law.target`).
+    """
+
+    meaning: str
+    place: Callable[..., Any] | str
+    makes_a_share: bool = False
+    needs_a_target: bool = False
+
+    @property
+    def make(self) -> Callable[..., Any]:
+        """Makes the coupling of a state, a tissue, a remodeling pass and settings of the solver."""
+        found: Callable[..., Any] = pkgutil.resolve_name(self.place) if isinstance(self.place, str) else self.place
+        return found
+
+
+COUPLINGS = {
+    "staggered": CouplingKind(
+        "solve with the cells of the step before, then remodel once", "remodel_fenicsx.evolution.coupling:Staggered"
+    ),
+    "relaxed": CouplingKind(
+        "the same with a share, relaxation_factor, of what the pass changes: half of it is stable for every driver and "
+        "frame but under weak loads, where 'staggered' over-corrects with 'pk2' and 'finger'",
+        "remodel_fenicsx.evolution.coupling:Relaxed",
+        makes_a_share=True,
+    ),
+    "extrapolated": CouplingKind(
+        "remodel first, towards the stress of the middle of the step, extrapolated from the two steps before; then "
+        "solve: of second order, for the law 'tensor'",
+        "remodel_fenicsx.evolution.coupling:Extrapolated",
+        needs_a_target=True,
+    ),
+    "implicit": CouplingKind(
+        "the cells belong to the stress of the same step: Newton's method on both, for the law 'tensor' (with a "
+        "repulsion that sees no axes) and the laws of the paper",
+        "remodel_fenicsx.evolution.implicit:Implicit",
+    ),
+}
+"""Couplings by the name that a scene gives them."""
+
+
+class Remodeling(Table):
+    """How the cells follow the load: driving tensor, evolution law, frame and speed."""
+
+    driver: Annotated[str, one_of(DRIVERS)] = Field(
+        default="cauchy",
+        description="Tensor whose positive eigenvalues the cells follow: 'cauchy' stress, second Piola-Kirchhoff "
+        "stress 'pk2', or 'finger' tensor b (it remodels even a body without load, and l_3 does not vanish).",
+    )
+    law: Annotated[str, one_of(LAWS)] = Field(
+        default="explicit",
+        description="Evolution of the cells: 'explicit' is eq. (11), in absolute time; 'rate' integrates eq. (10); "
+        "'relaxation' is dl/dt = kappa (r0 e - l), right for changing loads; 'rotation' (Remark 5) turns the axis of "
+        "the largest dimension gradually and leaves the dimensions alone; 'tensor' is 'relaxation' for the "
+        "structure tensor as a whole, without ranks and axes; 'none' leaves the cells alone. Where neither scene nor "
+        "preset says it: 'tensor'.",
+    )
+    frame: Annotated[str, one_of(FRAMES)] = Field(
+        default="material",
+        description="Axes of the remodeled cells, for the drivers 'cauchy' and 'finger': 'material' takes the fibres "
+        "that the deformation carries onto the principal directions (objective), 'spatial' the principal directions "
+        "themselves, as printed. The driver 'pk2' has material eigenvectors of its own.",
+    )
+    pairing: Annotated[str, one_of(PAIRINGS)] = Field(
+        default="sorted",
+        description="Which dimension follows which principal value: 'sorted' by rank, as printed (where two values "
+        "cross, the cell turns by 90 degrees at once), 'continuous' by axis (each principal direction goes on from the "
+        "axis that it overlaps most). The law 'rotation' does not ask.",
+    )
+    coupling: Annotated[str, one_of(COUPLINGS)] = Field(
+        default="staggered",
+        description="; ".join(f"{name!r}: {kind.meaning}" for name, kind in COUPLINGS.items())
+        + ". Where neither scene nor preset says it: 'extrapolated' with the law 'tensor'.",
+    )
+    relaxation_factor: float = Field(
+        default=0.5,
+        gt=0,
+        le=1,
+        description="Share theta of a pass's change of the structure tensor that 'relaxed' makes; 1 is 'staggered'.",
+    )
+    kappa: float = Field(
+        default=0.025, ge=0, description="Speed of remodeling kappa, in 1/time; a difference fades like exp(-kappa t)."
+    )
+    rotation_time: float = Field(
+        default=40.0,
+        gt=0,
+        description="Time of the law 'rotation': a small angle between fibre and tension fades like "
+        "exp(-t / rotation_time).",
+    )
+
+    def warnings(self) -> list[str]:
+        """A line on a law that a share of each pass makes slower."""
+        law, share = LAWS[self.law], self.relaxation_factor
+        if not COUPLINGS[self.coupling].makes_a_share or share == 1 or not law.remodels or law.of_absolute_time:
+            return []
+        return [
+            f"remodeling.coupling = {self.coupling!r} makes a share of {share:g} of each pass, and the law "
+            f"{self.law!r} does not make up for the rest: cells remodel at about {share:g} times the speed"
+        ]
+
+    @model_validator(mode="after")
+    def _coupling_fits_the_law(self) -> Remodeling:
+        if COUPLINGS[self.coupling].needs_a_target and LAWS[self.law].target is None:
+            laws = ", ".join(repr(name) for name, law in LAWS.items() if law.target is not None)
+            raise fault(
+                f"needs a remodeling.law with a target that can be extrapolated: {laws}", "coupling", self.coupling
+            )
+        return self
 
 
 # ---------------------------------------------------------------- loads and time
@@ -243,8 +539,8 @@ def _petsc_options(value: Any) -> Any:
 
 
 def _method(value: Any) -> Any:
-    if value not in (AUTOMATIC, *METHODS):
-        raise fault("allowed are " + ", ".join(map(repr, (AUTOMATIC, *METHODS))))
+    if value not in (AUTO, *METHODS):
+        raise fault("allowed are " + ", ".join(map(repr, (AUTO, *METHODS))))
     return value
 
 
@@ -252,12 +548,12 @@ class Solver(Table):
     """Solution of the nonlinear problem of each step."""
 
     method: Annotated[str, checked(_method)] = Field(
-        default=AUTOMATIC,
+        default=AUTO,
         description=f"'auto': 'direct' up to {SMALL} unknowns, then 'lagged', above {LARGE} 'iterative'; "
         f"on more ranks 'direct' up to {LARGE_ON_RANKS}, then 'iterative'; "
         + "; ".join(f"{name!r}: {meaning}" for name, meaning in MEANINGS.items())
         + " (docs/speed.md).",
-        json_schema_extra={"allowed": "one of " + ", ".join(map(repr, (AUTOMATIC, *METHODS)))},
+        json_schema_extra={"allowed": "one of " + ", ".join(map(repr, (AUTO, *METHODS)))},
     )
     predictor: Literal["none", "autoregressive", "with-tolerance"] = Field(
         default="autoregressive",
