@@ -12,7 +12,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from remodel_fenicsx.body.gmsh_model import write_msh
+from remodel_fenicsx.body.gmsh_model import gmsh_model
 from remodel_fenicsx.body.tendon import draw_tendon
 from remodel_fenicsx.body.tube import PAPER, draw_tube
 
@@ -26,7 +26,11 @@ MESHES = {
 def make(folder: Path) -> None:
     """Write both files into `folder`."""
     for name, draw in MESHES.items():
-        write_msh(folder / name, draw)
+        with gmsh_model(Path(name).stem) as gmsh:
+            draw()
+            gmsh.option.setNumber("Mesh.MshFileVersion", 4.1)
+            gmsh.option.setNumber("Mesh.Binary", 0)
+            gmsh.write(str(folder / name))
 
 
 if __name__ == "__main__":

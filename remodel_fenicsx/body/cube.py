@@ -45,11 +45,6 @@ class Cube(Shape):
     )
 
     @property
-    def loaded_area(self) -> float:
-        """Area that carries `force`."""
-        return self.side**2
-
-    @property
     def axial_length(self) -> float:
         """The side."""
         return self.side

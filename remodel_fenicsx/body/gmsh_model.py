@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -79,15 +78,6 @@ def named_faces() -> dict[str, int]:
     if len(volumes) != 1 or len(kinds) != 1 or not faces:
         raise GeometryError(f"{len(volumes)} named volumes, {len(kinds)} types of elements, {len(faces)} named faces")
     return {gmsh.model.getPhysicalName(2, tag): tag for _, tag in faces}
-
-
-def write_msh(path: str | Path, draw: Callable[[], None]) -> None:
-    """Write what `draw` makes as a Gmsh file (format 4.1, ASCII); call it on one rank only."""
-    with gmsh_model(Path(path).stem) as gmsh:
-        draw()
-        gmsh.option.setNumber("Mesh.MshFileVersion", 4.1)
-        gmsh.option.setNumber("Mesh.Binary", 0)
-        gmsh.write(str(path))
 
 
 # ---------------------------------------------------------------- what the shapes are made of

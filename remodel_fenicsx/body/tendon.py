@@ -62,11 +62,6 @@ class Tendon(Shape):
     )
 
     @property
-    def loaded_area(self) -> float:
-        """Area that carries `force`."""
-        return self.area
-
-    @property
     def axial_length(self) -> float:
         """The length."""
         return self.length

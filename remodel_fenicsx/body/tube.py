@@ -299,11 +299,6 @@ class Tube(Shape):
         loading.has_caps = True
 
     @property
-    def loaded_area(self) -> float:
-        """Of the wall."""
-        return self.section_area
-
-    @property
     def axial_length(self) -> float:
         """The length."""
         return self.length
