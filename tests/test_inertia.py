@@ -12,7 +12,6 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from remodel_fenicsx import Scene, Simulation, read_scene
-from remodel_fenicsx.body import cube, tube
 from remodel_fenicsx.evolution.stepper import Step
 from remodel_fenicsx.fem.petsc_options import ProblemOptions
 from remodel_fenicsx.fem.solver_methods import SYMMETRIC, factor_options, method_options
@@ -27,6 +26,7 @@ from remodel_fenicsx.solver.refusals import diagnosed
 from remodel_fenicsx.watch import equilibrium_stability
 from remodel_fenicsx.watch.equilibrium_stability import EquilibriumStability
 from tests import parts
+from tests.parts import cube, tube
 
 DEMOS = Path(__file__).parents[1] / "demos"
 COLUMN = {"output.columns": ["negative_eigenvalues"]}
