@@ -35,7 +35,7 @@ from remodel_fenicsx.watch.buckling import BucklingWarning
 from remodel_fenicsx.watch.chatter import Chatter
 from remodel_fenicsx.watch.locking import LockingWarning
 from remodel_fenicsx.watch.monitor import StabilityWatcher
-from remodel_fenicsx.watch.radial_chains import RadialChains
+from remodel_fenicsx.watch.radial_chains import FrontsInLayers, RadialChains
 from remodel_fenicsx.watch.resting import Resting
 from remodel_fenicsx.watch.volume import VolumeLoss
 
@@ -122,6 +122,7 @@ class Simulation:
             BucklingWarning(self.stepper, shape.strut(scene.supports.ends)),
             VolumeLoss(self.stepper),
             RadialChains(self.stepper, shape.radial_share),
+            FrontsInLayers(self.stepper, shape, domain),
         ]
         if self.stepper.remodeling.law.remodels and not at_once:
             chatter = Chatter(self.stepper)

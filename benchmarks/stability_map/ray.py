@@ -166,11 +166,15 @@ MEAN_TOLERANCE = 0.03  # of the volume mean of A along the axis, over r0^2
 
 @lru_cache
 def growing_steps(ramped: float) -> tuple[float, ...]:
-    """Ends of steps of 1 while loads change, then longer ones, until nothing moves: kappa t = 25."""
-    found, step = [], 1.0
+    """Ends of steps of 1/4 while loads change and fronts move, then longer ones, until nothing moves: kappa t = 25.
+
+    A staggered pass lags a step behind, and a front between two states rests where the lag has left it. With steps of 1
+    that of the carotid (elongation 0.3, pressure 8) came to rest at R = 4.168, with 1/4, 1/8, 1/16 at 4.19, 4.20, 4.20.
+    """
+    found, step = [], 0.25
     while not found or found[-1] < 1000.0:
         found.append((found[-1] if found else 0.0) + step)
-        step = min(1.05 * step, 8.0) if found[-1] > ramped + 40 else 1.0
+        step = min(1.05 * step, 8.0) if found[-1] > ramped + 40 else 0.25
     return tuple(found)
 
 
