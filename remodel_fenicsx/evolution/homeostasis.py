@@ -19,8 +19,7 @@ from remodel_fenicsx.body.loading import LoadValues
 from remodel_fenicsx.evolution.implicit import RESIDUAL, Implicit
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
 from remodel_fenicsx.evolution.step_control import StepControl
-from remodel_fenicsx.fem import coefficients
-from remodel_fenicsx.fem.ranks import of_all_ranks
+from remodel_fenicsx.fem import assembly
 from remodel_fenicsx.model.cells import structure_tensor
 from remodel_fenicsx.solver.continuation import Work
 from remodel_fenicsx.solver.equilibrium import Equilibrium
@@ -197,7 +196,7 @@ class Homeostasis:
     def _largest(self, change: Array) -> float:
         """Over r0^2, of all points."""
         quadrature = self.state.cells.quadrature
-        r0 = coefficients.point_values(self.equilibrium.tissue.end_to_end_length, quadrature)
+        r0 = assembly.point_values(self.equilibrium.tissue.end_to_end_length, quadrature)
         return quadrature.maximum(np.linalg.norm(change, axis=(-1, -2)) / r0**2)
 
     def _largest_jump(self) -> tuple[float, NDArray[np.float64]]:
@@ -206,10 +205,10 @@ class Homeostasis:
         Collective: a neighbour may belong to another rank.
         """
         quadrature = self.state.cells.quadrature
-        r0 = coefficients.point_values(self.equilibrium.tissue.end_to_end_length, quadrature)
+        r0 = assembly.point_values(self.equilibrium.tissue.end_to_end_length, quadrature)
         tensors = self.state.cells.structure_tensor() / r0[..., None, None] ** 2
         found = [quadrature.owned(values) for values in (quadrature.coordinates, tensors)]
-        all_ranks = zip(*of_all_ranks(quadrature.mesh.comm, found), strict=True)
+        all_ranks = zip(*assembly.of_all_ranks(quadrature.mesh.comm, found), strict=True)
         places, structure = (
             np.concatenate([values.reshape(-1, size) for values in parts])
             for parts, size in zip(all_ranks, (3, 9), strict=True)
@@ -228,7 +227,7 @@ class Homeostasis:
         """Nothing is left to do but to say how far the state is from the cells of its own stress."""
         self.remodeling.look_ahead(time, self._residual)
         quadrature, r0 = self.state.cells.quadrature, self.equilibrium.tissue.end_to_end_length
-        left = self.remodeling.residual() / float(coefficients.largest(r0, quadrature.mesh)) ** 2
+        left = self.remodeling.residual() / float(assembly.largest(r0, quadrature.mesh)) ** 2
         share = quadrature.mean(self.remodeling.without_tension(self._residual).reshape(quadrature.shape).astype(float))
         if self.state.comm.rank == 0:
             log.log(NOTICE, "cells and stress agree to |A_pass - A| = %.2g r0^2, after %d steps", left, self.steps)
