@@ -26,6 +26,7 @@ from remodel_fenicsx.fem.solver_methods import (
     LARGE_ON_RANKS,
     MEANINGS,
     METHODS,
+    REMOVED,
     SMALL_BODY,
     SMALL_REDUCTION,
     fault_of_option,
@@ -78,10 +79,15 @@ class Mesh(Table):
         return self
 
 
-def _auto_or(names: Collection[str]) -> BeforeValidator:
-    """Annotation of a field that is `AUTO` or one of a registry's keys, those registered later included."""
+def _auto_or(names: Collection[str], removed: Mapping[str, str] | None = None) -> BeforeValidator:
+    """Annotation of a field that is `AUTO` or one of a registry's keys, those registered later included.
+
+    `removed`: names of earlier versions, with what to say of each.
+    """
 
     def check(value: Any) -> Any:
+        if removed and isinstance(value, str) and value in removed:
+            raise fault(removed[value])
         if value not in (AUTO, *names):
             raise fault("allowed are " + ", ".join(map(repr, (AUTO, *names))))
         return value
@@ -547,7 +553,7 @@ def _petsc_options(value: Any) -> Any:
 class Solver(Table):
     """Solution of the nonlinear problem of each step."""
 
-    method: Annotated[str, _auto_or(METHODS)] = Field(
+    method: Annotated[str, _auto_or(METHODS, REMOVED)] = Field(
         default=AUTO,
         description=f"'auto': 'direct' up to {SMALL_BODY} unknowns ({SMALL_REDUCTION} of a reduction), then 'lagged', "
         f"above {LARGE} 'iterative'; "

@@ -167,9 +167,7 @@ def cube_case(
 ) -> Case:
     """The demo's cube with other values."""
     scene = with_values(CUBE, changes)
-    return Case(
-        family, named(family, place), scene, check, reference, place, base=("demos/cube.toml", changes), **more
-    )
+    return Case(family, named(family, place), scene, check, reference, place, base=("demos/cube.toml", changes), **more)
 
 
 def element(p: Place) -> Values:
