@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import os
+import platform
 import signal
 import subprocess
 import sys
@@ -12,7 +13,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
 import pytest
+
+from remodel_fenicsx.fem import jit
 
 from tests.conftest import mpirun, slowly
 from tests.forks import forked
@@ -271,3 +275,41 @@ def test_functions_in_c_that_do_not_compile_leave_nothing(tmp_path: Path) -> Non
     assert done.returncode != 0
     assert "the first rank could not compile what doubles" in done.stderr  # said by the second
     assert not list(tmp_path.rglob("libremodel_*.*"))
+
+
+LOGARITHMS = """
+import sys, dolfinx, numpy as np, ufl
+from mpi4py import MPI
+from remodel_fenicsx.fem import jit
+jit.COMPILER_FLAGS[:] = [flag for flag in jit.COMPILER_FLAGS if flag not in sys.argv[1:]]
+mesh = dolfinx.mesh.create_unit_cube(MPI.COMM_WORLD, 5, 3, 2, dolfinx.mesh.CellType.hexahedron)
+V = dolfinx.fem.functionspace(mesh, ("DG", 1))
+u = dolfinx.fem.Function(V)
+form = jit.form(ufl.ln(u) * ufl.TestFunction(V) * ufl.dx(degree=4))
+u.x.array[:] = np.random.default_rng(1).uniform(1e-3, 1e3, u.x.array.size)
+print(*dolfinx.fem.assemble_vector(form).array.tolist())
+for element, bad in enumerate((np.nan, np.inf, 0.0, -1.0)):
+    u.x.array[8 * element : 8 * element + 8] = bad
+print(*dolfinx.fem.assemble_vector(form).array[:48:8].tolist())
+"""
+
+
+def test_the_simd_logarithm_is_the_scalar_one_and_lets_nothing_pass_the_guards(tmp_path: Path) -> None:
+    """Equal but for rounding; what is no number or infinite is so afterwards, in its own element alone."""
+    said = []
+    for left_out in ((), ("-D__FAST_MATH__",)):
+        command, environment = program(tmp_path, LOGARITHMS)
+        done = subprocess.run([*command, *left_out], env=environment, capture_output=True, text=True, timeout=300)
+        assert done.returncode == 0, done.stderr
+        said.append([np.array(line.split(), dtype=float) for line in done.stdout.splitlines()])
+    (vectors, bad), (scalars, bad_scalars) = said
+    assert np.abs(vectors - scalars).max() <= 1e-14 * np.abs(scalars).max()
+    assert np.isnan(bad[[0, 3]]).all() and bad[1] == np.inf and bad[2] == -np.inf and np.isfinite(bad[4:]).all()
+    np.testing.assert_array_equal(np.isfinite(bad), np.isfinite(bad_scalars))
+
+
+def test_kernels_have_a_simd_logarithm_here() -> None:
+    """On x86-64 with glibc; `info` says whether."""
+    said = forked("remodel-fenicsx", "info").stdout
+    assert jit.has_simd_logarithm() == ("of several points at once" in said)
+    assert jit.has_simd_logarithm() or platform.machine() != "x86_64" or platform.libc_ver()[0] != "glibc"

@@ -11,6 +11,7 @@ import logging
 import os
 import platform
 import resource
+import shlex
 import subprocess
 import sysconfig
 import tempfile
@@ -40,10 +41,11 @@ log = logging.getLogger(__name__)
 TIMEOUT = 600  # seconds that FFCx waits for another process to compile a form; none was cut off (_compiling)
 COMPILED = "REMODEL_FENICSX_COMPILED"  # names a file that gets a line for each kernel that is really compiled
 
-# Faster than -O2 by a third for this energy, and NaN and infinity keep their meaning: the guards rely on them.
+# NaN and infinity keep their meaning, which the guards rely on: no -ffast-math. Its name alone, defined for glibc's
+# headers, declares their SIMD logarithm (at most 4 ulp off): the loops over the points of an element become vectors.
 # -g0: Python's own flags have -g, and their table takes up to half of the compiler's time; the same machine code
 COMPILER_FLAGS = [
-    "-O2", "-g0", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros", "-freciprocal-math",
+    "-O3", "-D__FAST_MATH__", "-g0", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros", "-freciprocal-math",
     "-fassociative-math", "-w",
 ]  # fmt: skip
 
@@ -105,6 +107,18 @@ def _read_users_options() -> None:
 
 
 _read_users_options()
+
+
+@functools.cache
+def has_simd_logarithm() -> bool:
+    """Whether kernels take logarithms of several points at once: compiler, C library and processor know how."""
+    source = "#include <math.h>\nvoid f(double *restrict y) { for (int i = 0; i < 64; i++) y[i] = log(y[i]); }\n"
+    command = [*shlex.split(os.environ.get("CC") or sysconfig.get_config_var("CC")), *COMPILER_FLAGS]
+    try:
+        done = subprocess.run([*command, "-S", "-x", "c", "-", "-o", "-"], input=source, capture_output=True, text=True)
+    except OSError:  # no compiler: cached kernels run without one
+        return False
+    return "_ZGV" in done.stdout
 
 
 def jit_options() -> dict[str, Any]:
