@@ -9,11 +9,11 @@ Importing this needs no dolfinx; asking for couplings, measurements, linear solv
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from remodel_fenicsx._lazy import on_demand
 from remodel_fenicsx.body import SHAPES, LoadKind, Shape
-from remodel_fenicsx.body.column import Column
+from remodel_fenicsx.body.columns import Column
 from remodel_fenicsx.body.columns import COLUMNS, COLUMNS_ON_REQUEST
 from remodel_fenicsx.body.reductions import Reduction
 from remodel_fenicsx.body.shape import uniaxial_columns
@@ -25,9 +25,8 @@ from remodel_fenicsx.model.chains import CHAINS, Chain
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES, Driver, Frame
 from remodel_fenicsx.model.energy import MATRICES, Matrix, Stresses, neo_hookean
 from remodel_fenicsx.model.laws import LAWS, Drive, Law, ranked
-from remodel_fenicsx.model.repulsion import REPULSIONS, Repulsion, axes_sum, squared_end_to_end_length
+from remodel_fenicsx.model.energy import REPULSIONS, Repulsion, axes_sum, squared_end_to_end_length
 from remodel_fenicsx.model.spectral import PAIRINGS, principal
-from remodel_fenicsx.scene.parameters import COUPLING_MEANINGS
 from remodel_fenicsx.schema.tables import markdown_reference
 from remodel_fenicsx.schema.units import (
     AREA,
@@ -40,9 +39,10 @@ from remodel_fenicsx.schema.units import (
     TEMPERATURE,
     Dimension,
 )
+from remodel_fenicsx.settings import COUPLINGS, CouplingKind
 
 if TYPE_CHECKING:
-    from remodel_fenicsx.evolution.coupling import COUPLINGS, Coupling, Staggered
+    from remodel_fenicsx.evolution.coupling import Coupling, Staggered
     from remodel_fenicsx.fem.jit import form
     from remodel_fenicsx.results.columns import Measurement
     from remodel_fenicsx.solver.linear import LINEAR_METHODS, EveryTangent
@@ -54,10 +54,10 @@ __all__ = [
     "COLUMNS",
     "COLUMNS_ON_REQUEST",
     "COUPLINGS",
-    "COUPLING_MEANINGS",
     "Chain",
     "Column",
     "Coupling",
+    "CouplingKind",
     "DRIVERS",
     "Dimension",
     "Drive",
@@ -106,16 +106,12 @@ __all__ = [
     "uniaxial_columns",
 ]
 
-_WITH_DOLFINX = {
-    **dict.fromkeys(("COUPLINGS", "Coupling", "Staggered"), "evolution.coupling"),
-    **dict.fromkeys(("EveryTangent", "LINEAR_METHODS"), "solver.linear"),
-    "Measurement": "results.columns",
-    "form": "fem.jit",
-}
-
-
-def __getattr__(name: str) -> Any:
-    """Names that need dolfinx, when they are first asked for."""
-    if name not in _WITH_DOLFINX:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"remodel_fenicsx.{_WITH_DOLFINX[name]}"), name)
+__getattr__ = on_demand(
+    __name__,
+    {
+        **dict.fromkeys(("Coupling", "Staggered"), "evolution.coupling"),
+        **dict.fromkeys(("EveryTangent", "LINEAR_METHODS"), "solver.linear"),
+        "Measurement": "results.columns",
+        "form": "fem.jit",
+    },
+)

@@ -20,14 +20,14 @@ from remodel_fenicsx.evolution.step_control import StepControl
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher, times
 from remodel_fenicsx.evolution.time_error import TimeError
 from remodel_fenicsx.fem.formulations import FORMULATIONS
-from remodel_fenicsx.fem.free_length import FreeLength
+from remodel_fenicsx.fem.kinematics import FreeLength
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.model.laws import LAWS
 from remodel_fenicsx.results.columns import Observer
 from remodel_fenicsx.scene import Scene, SceneError
-from remodel_fenicsx.solver.newton import SolverSettings
+from remodel_fenicsx.settings import Solver
 from remodel_fenicsx.state.state import State
 from remodel_fenicsx.state.unit_cells import UnitCells
 from remodel_fenicsx.system.interrupts import take_back_signals
@@ -129,7 +129,7 @@ class Simulation:
             if self.stepper.remodeling.law.of_absolute_time:
                 self.warnings.append(Resting(self.stepper, chatter))
 
-    def _at_once(self, tissue: Tissue, solver: SolverSettings) -> Maker:
+    def _at_once(self, tissue: Tissue, solver: Solver) -> Maker:
         """The coupling that goes to the equilibrium, with the steps of a stepper of its own on the same state."""
         scene, stops = self.scene, self.scene.stops()
         settings, tolerance = scene.remodeling, scene.time.tolerance
@@ -143,7 +143,7 @@ class Simulation:
         control = StepControl(way, tolerance, scene.time.step, stops)
         until = scene.solver.model_copy(update={"maximum_iterations": ITERATIONS})
 
-        def make(state: State, tissue: Tissue, remodeling: RemodelingPass, solver: SolverSettings) -> Coupling:
+        def make(state: State, tissue: Tissue, remodeling: RemodelingPass, solver: Solver) -> Coupling:
             limit = Limit(state, tissue, remodeling, until) if scene.missing_for_implicit() is None else None
             return Homeostasis(control, remodeling, max(stops[:-1], default=0.0), limit)
 

@@ -17,7 +17,7 @@ from remodel_fenicsx.evolution.stepper import Stepper
 from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.fem.kinematics import FullKinematics
 from remodel_fenicsx.fem.quadrature import Quadrature
-from remodel_fenicsx.scene.parameters import Cells, Material, Remodeling
+from remodel_fenicsx.settings import Cells, Material, Remodeling
 from remodel_fenicsx.scene.scene import Scene, Solver
 from remodel_fenicsx.solver.equilibrium import Equilibrium
 from remodel_fenicsx.solver.newton import GuardedNewton, Solution

@@ -228,7 +228,9 @@ def place(tmp_path_factory: pytest.TempPathFactory, first_half: Path) -> Iterato
 
 FILES = "scene.toml binary folder circle gone run nowhere /dev/null . a/b".split() + ["", "x" * 300]
 SETTINGS = """time.end=3 time.end=nan cells.seed=-1 = a.b time=1 time.end.x=1 cells.seed=1e400 a..b=1 name='../x'
-    geometry.shape=tube x=[[[[ name="a time.end=0x""".split() + ["loads.force.value=1 N"]
+    geometry.shape=tube x=[[[[ name="a time.end=0x""".split() + [
+    "loads.force.value=1 N"
+]
 WORDS = st.one_of(
     st.sampled_from(["run", "status", "validate", "new", "info", "figures"]),
     st.sampled_from(FILES),

@@ -11,11 +11,10 @@ from remodel_fenicsx.model.cells import (
     angle_to_axis,
     cylindrical_axes,
     initial_axes,
-    initial_dimensions,
     pitch_angle,
     structure_tensor,
 )
-from remodel_fenicsx.scene.parameters import Cells
+from remodel_fenicsx.settings import Cells
 from tests import parts
 
 R0 = 1.3
@@ -32,7 +31,7 @@ def places(count: int = 40) -> np.ndarray:
 # ---------------------------------------------------------------- at t = 0
 def test_random_cells_are_uniform_on_the_octant_of_the_sphere() -> None:
     """On a sphere each coordinate is uniform: the means of l and l^2 are r0/2 and r0^2/3."""
-    found = initial_dimensions(Cells(initial="random", seed=5, end_to_end_length=R0), 20_000)
+    found = Cells(initial="random", seed=5, end_to_end_length=R0).dimensions(20_000)
     assert found.shape == (20_000, 3) and found.min() > 0.0
     np.testing.assert_allclose(np.linalg.norm(found, axis=1), R0, rtol=1e-14)
     np.testing.assert_allclose(found.mean(axis=0), R0 / 2, atol=0.01)
@@ -40,18 +39,18 @@ def test_random_cells_are_uniform_on_the_octant_of_the_sphere() -> None:
 
 
 def test_random_cells_are_the_seeds() -> None:
-    one, again, other = (initial_dimensions(Cells(initial="random", seed=seed), 4) for seed in (5, 5, 6))
+    one, again, other = (Cells(initial="random", seed=seed).dimensions(4) for seed in (5, 5, 6))
     np.testing.assert_array_equal(one, again)
     assert np.abs(one - other).max() > 0.1
 
 
 def test_other_cells_are_what_their_names_say() -> None:
-    isotropic = initial_dimensions(Cells(initial="isotropic", end_to_end_length=R0), 2)
+    isotropic = Cells(initial="isotropic", end_to_end_length=R0).dimensions(2)
     np.testing.assert_allclose(isotropic, np.full((2, 3), R0 / np.sqrt(3)), rtol=1e-15)
     for axis in (1, 2, 3):
-        aligned = initial_dimensions(Cells(initial="aligned", aligned_axis=axis, end_to_end_length=R0), 2)
+        aligned = Cells(initial="aligned", aligned_axis=axis, end_to_end_length=R0).dimensions(2)
         np.testing.assert_array_equal(aligned, np.tile(R0 * np.eye(3)[axis - 1], (2, 1)))
-    given = initial_dimensions(Cells(initial=(0.0, 0.6, 0.8)), 2)
+    given = Cells(initial=(0.0, 0.6, 0.8)).dimensions(2)
     np.testing.assert_array_equal(given, [[0.0, 0.6, 0.8]] * 2)
 
 

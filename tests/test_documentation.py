@@ -59,7 +59,23 @@ def test_the_python_of_the_readme_runs_as_it_stands(tmp_path: Path) -> None:
 def test_files_and_modules_that_a_page_names_are_there(name: str) -> None:
     """Paths in backticks or links, and modules after the package's name."""
     text = re.sub(r"```.*?```", "", page(name), flags=re.DOTALL)
-    rooms = "|".join(("model", "fem", "kernels", "body", "scene", "state", "solver", "evolution", "watch", "results", "paper", "system", "schema"))
+    rooms = "|".join(
+        (
+            "model",
+            "fem",
+            "kernels",
+            "body",
+            "scene",
+            "state",
+            "solver",
+            "evolution",
+            "watch",
+            "results",
+            "paper",
+            "system",
+            "schema",
+        )
+    )
     paths = re.findall(rf"`((?:{rooms}|tests|docs|demos|benchmarks|meshes)/[\w/-]+\.\w+)`", text)
     for path in paths:
         places = (ROOT / path, ROOT / "remodel_fenicsx" / path)

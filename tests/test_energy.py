@@ -15,7 +15,7 @@ from mpi4py import MPI
 from remodel_fenicsx.body import cube
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.model.cells import UnitCell
-from remodel_fenicsx.scene.parameters import Cells, Material
+from remodel_fenicsx.settings import Cells, Material
 from remodel_fenicsx.solver.blend import shares
 from remodel_fenicsx.solver.equilibrium import Equilibrium
 from tests import parts

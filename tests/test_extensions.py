@@ -24,7 +24,6 @@ from remodel_fenicsx.extend import (
     AXES,
     CHAINS,
     COLUMNS,
-    COUPLING_MEANINGS,
     COUPLINGS,
     DRIVERS,
     FORCE,
@@ -42,6 +41,7 @@ from remodel_fenicsx.extend import (
     STRESS_UNIT,
     Chain,
     Column,
+    CouplingKind,
     Dimension,
     Drive,
     Driver,
@@ -419,21 +419,17 @@ def test_a_coupling(monkeypatch: pytest.MonkeyPatch) -> None:
         def remodel(self, time: float) -> float:
             return super().remodel(time) if time > 2.0 else 0.0
 
-    monkeypatch.setitem(COUPLINGS, "late", Late)
     with pytest.raises(
         SceneError,
         match="^remodeling.coupling = 'late': allowed are 'staggered', 'relaxed', 'extrapolated', 'implicit'$",
     ):
         scene(remodeling={"coupling": "late"})
-    monkeypatch.setitem(COUPLING_MEANINGS, "late", "as staggered, but the cells stay as they are up to t = 2")
+    late = CouplingKind("as staggered, but the cells stay as they are up to t = 2", Late)
+    monkeypatch.setitem(COUPLINGS, "late", late)
     angles = column(rows_of(scene(remodeling={"coupling": "late"})), "mean_fibre_angle")
     isotropic = np.degrees(np.arccos(3**-0.5))
     np.testing.assert_allclose(angles[:3], isotropic, rtol=1e-12)
     assert angles[3] < isotropic - 5
-
-
-def test_every_coupling_is_told_to_scenes() -> None:
-    assert set(COUPLING_MEANINGS) == set(COUPLINGS)
 
 
 def test_a_kinematics(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -198,7 +198,7 @@ def copy(tmp_path: Path) -> Path:
 
 def test_only_source_that_decides_numbers_makes_runs_stale(copy: Path) -> None:
     before = validity.source_fingerprint()
-    laws, text = copy / "tissue" / "laws.py", (copy / "tissue" / "laws.py").read_text()
+    laws, text = copy / "model" / "laws.py", (copy / "model" / "laws.py").read_text()
     laws.write_text("# a remark\n" + text.replace('"""', '"""Said better. ', 1))
     (copy / "paper" / "curves.py").write_text("X = 1\n")
     (copy / "cli.py").write_text("Y = 2\n")
@@ -219,15 +219,15 @@ def test_a_moved_module_leaves_runs_valid_and_another_of_its_names_does_not(copy
     """Where a file lies and what it is called decides no number; from which source a name comes does."""
     user = copy / "simulation.py"
     text = user.read_text()
-    (copy / "tissue" / "one.py").write_text("def f() -> int:\n    return 1\n")
-    (copy / "tissue" / "two.py").write_text("def f() -> int:\n    return 2\n")
+    (copy / "model" / "one.py").write_text("def f() -> int:\n    return 1\n")
+    (copy / "model" / "two.py").write_text("def f() -> int:\n    return 2\n")
 
     def fingerprint(*lines: str) -> str:
         user.write_text(text + "\n".join(("", *lines, "")))
         return validity.source_fingerprint(copy)
 
     one, two = (
-        f"from remodel_fenicsx.tissue.{name} import f as {alias}" for name, alias in (("one", "a"), ("two", "b"))
+        f"from remodel_fenicsx.model.{name} import f as {alias}" for name, alias in (("one", "a"), ("two", "b"))
     )
     before = fingerprint(one, two)
     assert fingerprint(two, one) == before  # the order of imports
@@ -235,8 +235,8 @@ def test_a_moved_module_leaves_runs_valid_and_another_of_its_names_does_not(copy
     assert fingerprint(one, two.replace("as b", "as c")) != before
     (copy / "moved").mkdir()
     (copy / "moved" / "__init__.py").write_text('"""A new room."""\n')
-    (copy / "tissue" / "one.py").rename(copy / "moved" / "of_another_name.py")
-    assert fingerprint(one.replace("tissue.one", "moved.of_another_name"), two) == before
+    (copy / "model" / "one.py").rename(copy / "moved" / "of_another_name.py")
+    assert fingerprint(one.replace("model.one", "moved.of_another_name"), two) == before
     # a module of the package, as it is imported in most places
     for source in copy.rglob("*.py"):
         old = source.read_text()
@@ -247,7 +247,7 @@ def test_a_moved_module_leaves_runs_valid_and_another_of_its_names_does_not(copy
             old = source.read_text()
             source.write_text(old.replace(f"remodel_fenicsx.fem.{module}", f"remodel_fenicsx.moved.{module}"))
     text = user.read_text().split("\nfrom remodel_fenicsx.moved.of_another")[0]
-    assert fingerprint(one.replace("tissue.one", "moved.of_another_name"), two) == before
+    assert fingerprint(one.replace("model.one", "moved.of_another_name"), two) == before
 
 
 def test_a_failing_run_ends_with_its_own_code_and_leaves_nothing_that_looks_valid(tmp_path: Path) -> None:

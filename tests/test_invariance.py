@@ -20,15 +20,13 @@ from mpi4py import MPI
 from remodel_fenicsx.body import cube
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.loading import Loading
-from remodel_fenicsx.evolution.coupling import COUPLINGS
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
 from remodel_fenicsx.fem.kinematics import FullKinematics
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.model import spectral
 from remodel_fenicsx.model.cells import angle_to_axis, structure_tensor
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES, material_frame, spatial_frame
-from remodel_fenicsx.scene import parameters
-from remodel_fenicsx.scene.parameters import Cells, Remodeling
+from remodel_fenicsx.settings import Cells, Remodeling
 from remodel_fenicsx.state.state import State
 from remodel_fenicsx.state.unit_cells import UnitCells
 from tests import parts
@@ -432,7 +430,6 @@ def test_a_driver_that_is_not_finite_is_refused(points: Points) -> None:
 
 # ---------------------------------------------------------------- registries
 def test_registries_are_what_the_scene_offers() -> None:
-    assert set(COUPLINGS) == set(parameters.COUPLING_MEANINGS)
     assert FRAMES["material"].axes is material_frame and FRAMES["spatial"].axes is spatial_frame
     assert Remodeling().frame == "material"
 

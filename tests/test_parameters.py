@@ -18,7 +18,7 @@ from remodel_fenicsx.body import cube, tube
 from remodel_fenicsx.evolution.stepper import Stepper
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.model.energy import Tissue
-from remodel_fenicsx.scene.parameters import Cells, Remodeling
+from remodel_fenicsx.settings import Cells, Remodeling
 from tests import parts
 
 PARAMETERS = ("lame_lambda", "lame_mu", "network_modulus", "contour_length", "end_to_end_length")

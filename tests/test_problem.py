@@ -12,7 +12,7 @@ import ufl
 from remodel_fenicsx.body import cube, tube
 from remodel_fenicsx.fem import jit, quadrature
 from remodel_fenicsx.model.operators import passes_through_zero
-from remodel_fenicsx.scene.parameters import Cells, Material
+from remodel_fenicsx.settings import Cells, Material
 from remodel_fenicsx.solver.equilibrium import Extension, Look
 from remodel_fenicsx.solver.newton import SolveFailure
 from remodel_fenicsx.system.interrupts import Interrupted

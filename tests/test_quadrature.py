@@ -12,7 +12,7 @@ from remodel_fenicsx.body import cube, tube
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.kinematics import FullKinematics
 from remodel_fenicsx.fem.quadrature import Quadrature
-from remodel_fenicsx.scene.parameters import Cells
+from remodel_fenicsx.settings import Cells
 from tests import parts
 
 AROUND, LENGTH, RADII = 8, 1.5, (1.0, 2.0, 3.0)

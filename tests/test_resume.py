@@ -21,7 +21,7 @@ from mpi4py import MPI
 
 from remodel_fenicsx import Recording, Scene, SceneError, Simulation
 from remodel_fenicsx.body.domain import Domain
-from remodel_fenicsx.evolution.coupling import COUPLINGS, Staggered
+from remodel_fenicsx.evolution.coupling import Staggered
 from remodel_fenicsx.model.cells import structure_tensor
 from remodel_fenicsx.results.checkpoint import Checkpoints, gather_state, restore_state
 from remodel_fenicsx.results.checkpoint_file import Checkpoint, CheckpointError, _read, read_checkpoint, read_pointer
@@ -30,6 +30,7 @@ from remodel_fenicsx.results.run_lock import FolderTaken, RunLock, lock_holder
 from remodel_fenicsx.results.status import status
 from remodel_fenicsx.running import resume, run
 from remodel_fenicsx.scene import preset_scene
+from remodel_fenicsx.settings import COUPLINGS, CouplingKind
 from remodel_fenicsx.solver.continuation import StepFailure, Work
 from remodel_fenicsx.state.state import State
 from remodel_fenicsx.system.interrupts import Paused
@@ -472,7 +473,7 @@ def test_what_a_coupling_remembers_is_kept(tmp_path: Path, monkeypatch: pytest.M
                 raise RuntimeError("tired")
             return super().solve(time, loads)
 
-    monkeypatch.setitem(COUPLINGS, "staggered", Remembering)
+    monkeypatch.setitem(COUPLINGS, "staggered", CouplingKind("as before", Remembering))
     fails = True
     with pytest.raises(RuntimeError, match="tired"):
         run(scene(4.0, checkpoint=1), tmp_path / "run", SELF)

@@ -8,7 +8,7 @@ from mpi4py import MPI
 
 from remodel_fenicsx.body import cube
 from remodel_fenicsx.scene import preset_scene
-from remodel_fenicsx.scene.parameters import Cells
+from remodel_fenicsx.settings import Cells
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.solver import newton
 from remodel_fenicsx.solver.continuation import StepFailure

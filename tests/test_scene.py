@@ -15,12 +15,11 @@ import pytest
 from remodel_fenicsx.body import Cube, Tendon, Tube
 from remodel_fenicsx.model.chains import wormlike_stiffness
 from remodel_fenicsx.model.laws import LAWS
-from remodel_fenicsx.scene import parameters
-from remodel_fenicsx.scene.parameters import PRESET_NOTES, PRESETS, Cells, Material, Remodeling
+from remodel_fenicsx.scene.presets import PRESET_NOTES, PRESETS
 from remodel_fenicsx.scene.reference import scene_reference
-from remodel_fenicsx.scene.scene import Scene, preset_scene, read_scene, scene_from_dict
-from remodel_fenicsx.scene.settings import Load, Solver, Time
+from remodel_fenicsx.scene.scene import FORMAT, RENAMED, Scene, preset_scene, read_scene, scene_from_dict
 from remodel_fenicsx.schema.tables import SceneError, sections
+from remodel_fenicsx.settings import Cells, Load, Material, Remodeling, Solver, Time
 
 ROOT = Path(__file__).resolve().parent.parent
 DEMOS = sorted((ROOT / "demos").glob("*.toml"))
@@ -327,8 +326,8 @@ BAD_SCENES = [
     (
         CUBE,
         {"remodeling.coupling": "implicit", "mesh.formulation": "selective-integration"},
-        "remodeling.coupling = 'implicit': needs mesh.formulation = 'displacement': with another one the stress at a "
-        "point belongs to its element",
+        "remodeling.coupling = 'implicit': needs mesh.formulation = 'displacement': in the others the stress at a "
+        "point depends on its whole element",
     ),
     (
         CUBE,
@@ -467,14 +466,14 @@ def test_a_preset_without_the_shape(monkeypatch):
 
 
 def test_a_law_registered_later_is_allowed(monkeypatch):
-    monkeypatch.setitem(parameters.LAWS, "mine", parameters.LAWS["rate"])
+    monkeypatch.setitem(LAWS, "mine", LAWS["rate"])
     assert scene_from_dict(changed(CUBE, {"remodeling.law": "mine"})).remodeling.law == "mine"
     assert "'none', 'mine'" in refusal(changed(CUBE, {"remodeling.law": "yours"}))
 
 
 def test_a_key_of_an_earlier_format_is_refused_with_its_new_name(monkeypatch):
-    monkeypatch.setitem(parameters.RENAMED, "mesh.finite_cell", "mesh.degree")
-    monkeypatch.setitem(parameters.RENAMED, "loads.lengthening", "loads.pressure")
+    monkeypatch.setitem(RENAMED, "mesh.finite_cell", "mesh.degree")
+    monkeypatch.setitem(RENAMED, "loads.lengthening", "loads.pressure")
     assert refusal(changed(TUBE, {"format": 1, "mesh.finite_cell": 1})) == "mesh.finite_cell = 1: is now mesh.degree"
     assert refusal(changed(TUBE, {"mesh.finite_cell": 1})) == "mesh.finite_cell = 1: is now mesh.degree"
     line = "loads.lengthening = {value = 1.0}: is now loads.pressure"
@@ -484,7 +483,7 @@ def test_a_key_of_an_earlier_format_is_refused_with_its_new_name(monkeypatch):
 def test_what_is_read_is_of_the_present_format():
     assert scene_from_dict(CUBE) == scene_from_dict({**CUBE, "format": 1})
     text = scene_from_dict({**CUBE, "format": 1}).to_toml("as run")
-    assert tomllib.loads(text)["format"] == parameters.FORMAT
+    assert tomllib.loads(text)["format"] == FORMAT
     assert [line for line in text.splitlines() if line and not line.startswith("#")][0] == "format = 2"
 
 

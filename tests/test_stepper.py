@@ -11,9 +11,9 @@ from mpi4py import MPI
 
 from remodel_fenicsx.body import cube
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
-from remodel_fenicsx.scene.parameters import Cells
+from remodel_fenicsx.settings import Cells
 from remodel_fenicsx.scene.scene import scene_from_dict
-from remodel_fenicsx.scene.settings import Load
+from remodel_fenicsx.settings import Load
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.solver.equilibrium import Extension
 from remodel_fenicsx.state.state import State

@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.body.buckling import expected_thrust
 from remodel_fenicsx.fem.kinematics import KINEMATICS
-from remodel_fenicsx.model.cells import cylindrical_axes, global_axes, initial_dimensions
+from remodel_fenicsx.fem.solver_methods import AUTO
+from remodel_fenicsx.model.cells import cylindrical_axes, global_axes
 from remodel_fenicsx.model.laws import LAWS
 
 Rule = Callable[[Any], str | None]
 Turn = Callable[[NDArray[np.float64]], NDArray[np.float64]]
-AUTO = "auto"
 POINTS = {
     ("interval", 1): 2, ("interval", 2): 3, ("quadrilateral", 1): 4, ("quadrilateral", 2): 9,
     ("hexahedron", 1): 8, ("hexahedron", 2): 27, ("tetrahedron", 1): 1, ("tetrahedron", 2): 4,
@@ -248,5 +248,5 @@ def known_loads(name: str) -> Rule:
 
 def _dimensions(scene: Any) -> tuple[float, float, float]:
     """l1, l2, l3 of the first cell at the start."""
-    first, second, third = np.asarray(initial_dimensions(scene.cells, 1)[0], dtype=float)
+    first, second, third = np.asarray(scene.cells.dimensions(1)[0], dtype=float)
     return float(first), float(second), float(third)

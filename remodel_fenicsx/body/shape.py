@@ -5,19 +5,20 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
 from remodel_fenicsx.body.buckling import Strut
-from remodel_fenicsx.body.column import Column
+from remodel_fenicsx.body.columns import Column
 from remodel_fenicsx.body.gmsh_model import length_fault
 from remodel_fenicsx.body.reductions import Reduction, homogeneous, known_loads, same_cells, symmetric_law, unturned
 from remodel_fenicsx.model.cells import angle_to_axis
 from remodel_fenicsx.schema.tables import Table, fault
 from remodel_fenicsx.schema.units import Dimension, LengthUnit
+from remodel_fenicsx.settings import Mesh
 
 if TYPE_CHECKING:  # shapes are part of every scene: they are read without dolfinx
     from mpi4py import MPI
@@ -26,19 +27,6 @@ if TYPE_CHECKING:  # shapes are part of every scene: they are read without dolfi
     from remodel_fenicsx.body.loading import Loading
 
 Array = NDArray[np.float64]
-
-
-class MeshSettings(Protocol):
-    """The finite elements (`scene.Mesh`)."""
-
-    @property
-    def refinement(self) -> int: ...
-
-    @property
-    def element(self) -> str: ...
-
-    @property
-    def degree(self) -> int: ...
 
 
 @dataclass(frozen=True)
@@ -163,7 +151,7 @@ class Shape(Table):
         return self.shape
 
     @abstractmethod
-    def build(self, mesh: MeshSettings, comm: MPI.Intracomm | None = None) -> Domain:
+    def build(self, mesh: Mesh, comm: MPI.Intracomm | None = None) -> Domain:
         """Mesh the body. Collective.
 
         Raises
@@ -256,7 +244,7 @@ def homogeneous_bar(bottom: str, top: str, dimensions: Callable[[Any], dict[str,
     """
 
     def build(scene: Any, comm: Any = None) -> Domain:
-        from remodel_fenicsx.body.lattice import interval_domain
+        from remodel_fenicsx.body.domain import interval_domain
 
         shape, length = scene.geometry, scene.geometry.axial_length
         faces = {bottom: lambda x: np.isclose(x[2], 0.0), top: lambda x: np.isclose(x[2], length)}

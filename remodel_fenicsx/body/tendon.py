@@ -11,10 +11,11 @@ from pydantic import Field, model_validator
 
 from remodel_fenicsx.body import gmsh_model as model
 from remodel_fenicsx.body.buckling import Strut
-from remodel_fenicsx.body.column import Column
+from remodel_fenicsx.body.columns import Column
 from remodel_fenicsx.body.reductions import Reduction, unturned
-from remodel_fenicsx.body.shape import LoadKind, MeshSettings, Shape, check_lengths, homogeneous_bar, uniaxial_columns
+from remodel_fenicsx.body.shape import LoadKind, Shape, check_lengths, homogeneous_bar, uniaxial_columns
 from remodel_fenicsx.schema.units import AREA, FORCE, LENGTH
+from remodel_fenicsx.settings import Mesh
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -90,7 +91,7 @@ class Tendon(Shape):
         check_lengths(self, {"length": self.length, "area": math.sqrt(self.area)})
         return self
 
-    def build(self, mesh: MeshSettings, comm: MPI.Intracomm | None = None) -> Domain:
+    def build(self, mesh: Mesh, comm: MPI.Intracomm | None = None) -> Domain:
         """Mesh the tendon."""
         return tendon(self.length, self.area, mesh.refinement, mesh.element, mesh.degree, comm)
 
@@ -141,7 +142,7 @@ def tendon(
     model.check_arguments({"length": length, "area": area}, refinement, element, degree)
     model.check_lengths({"length": length, "area": math.sqrt(area)})
     dimensions = _dimensions(length, area, outer_radius(area, refinement, degree))
-    from remodel_fenicsx.body.meshing import build_domain
+    from remodel_fenicsx.body.domain import build_domain
 
     return build_domain(lambda: draw_tendon(length, area, refinement, element, degree), "tendon", dimensions, comm)
 

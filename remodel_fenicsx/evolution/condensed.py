@@ -22,8 +22,9 @@ from remodel_fenicsx.model.implicit import condensed
 from remodel_fenicsx.model.implicit.responses import StepOfCells, jumps_by_rank
 from remodel_fenicsx.model.laws import relaxed
 from remodel_fenicsx.model.operators import determinant
+from remodel_fenicsx.settings import Solver
 from remodel_fenicsx.solver.equilibrium import Equilibrium, Look
-from remodel_fenicsx.solver.newton import GuardedNewton, Solution, SolveFailure, SolverSettings
+from remodel_fenicsx.solver.newton import GuardedNewton, Solution, SolveFailure
 from remodel_fenicsx.state.parameters import at_points
 from remodel_fenicsx.state.state import State
 
@@ -292,7 +293,7 @@ class AnsweringEquilibrium(Equilibrium):
 class AnsweringNewton(GuardedNewton):
     """Newton's method for cells that answer."""
 
-    def __init__(self, equilibrium: AnsweringEquilibrium, settings: SolverSettings):
+    def __init__(self, equilibrium: AnsweringEquilibrium, settings: Solver):
         # cells that answer make steps far more nonlinear, and tangents unsymmetric: nothing is gained by old factors
         super().__init__(equilibrium, settings, robust=settings.method == AUTO)
         self.answering = equilibrium.answering

@@ -11,16 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from remodel_fenicsx.body.loading import LoadValues
-from remodel_fenicsx.evolution.implicit import Implicit
 from remodel_fenicsx.evolution.predictor import PREDICTORS, LoadStep
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.model.tensor_law import Target, weight_of_the_end
+from remodel_fenicsx.settings import Solver
 from remodel_fenicsx.solver.blend import Blend
 from remodel_fenicsx.solver.continuation import Change, Work
 from remodel_fenicsx.solver.equilibrium import Equilibrium
-from remodel_fenicsx.solver.newton import GuardedNewton, SolveFailure, SolverSettings
+from remodel_fenicsx.solver.newton import GuardedNewton, SolveFailure
 from remodel_fenicsx.state.state import State
 
 Array = NDArray[np.float64]
@@ -84,7 +84,7 @@ class Staggered:
 
     order, accumulates, longest = 1, False, math.inf
 
-    def __init__(self, state: State, tissue: Tissue, remodeling: RemodelingPass, settings: SolverSettings):
+    def __init__(self, state: State, tissue: Tissue, remodeling: RemodelingPass, settings: Solver):
         self.state, self.remodeling, self.settings = state, remodeling, settings
         self.equilibrium = Equilibrium(state, tissue)
         self.equilibrium.compile_energy()
@@ -218,7 +218,7 @@ class Relaxed(Staggered):
     The cells then lag by (1 - factor)/factor further steps (docs/theory.md, "The relaxed pass").
     """
 
-    def __init__(self, state: State, tissue: Tissue, remodeling: RemodelingPass, settings: SolverSettings):
+    def __init__(self, state: State, tissue: Tissue, remodeling: RemodelingPass, settings: Solver):
         super().__init__(state, tissue, remodeling, settings)
         self.share = remodeling.settings.relaxation_factor
 
@@ -233,7 +233,7 @@ class Extrapolated(Staggered):
 
     order, accumulates, longest = 2, True, 0.5
 
-    def __init__(self, state: State, tissue: Tissue, remodeling: RemodelingPass, settings: SolverSettings):
+    def __init__(self, state: State, tissue: Tissue, remodeling: RemodelingPass, settings: Solver):
         super().__init__(state, tissue, remodeling, settings)
         self._targets = state.cells.quadrature.function("targets", (2, 11))  # the last first: E, s, its time
         self._values[..., 10] = NEVER
@@ -331,10 +331,4 @@ class Extrapolated(Staggered):
         return int(self.state.comm.allreduce(int(quadrature.owned(points.reshape(quadrature.shape)).sum())))
 
 
-Maker = Callable[[State, Tissue, RemodelingPass, SolverSettings], Coupling]
-COUPLINGS: dict[str, Maker] = {
-    "staggered": Staggered,
-    "relaxed": Relaxed,
-    "extrapolated": Extrapolated,
-    "implicit": Implicit,
-}
+Maker = Callable[[State, Tissue, RemodelingPass, Solver], Coupling]

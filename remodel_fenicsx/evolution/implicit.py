@@ -12,9 +12,10 @@ from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.model.laws import relaxed
 from remodel_fenicsx.model.tensor_law import weight_of_the_end
+from remodel_fenicsx.settings import Solver
 from remodel_fenicsx.solver.continuation import Change, StepFailure, Work
 from remodel_fenicsx.solver.equilibrium import Equilibrium
-from remodel_fenicsx.solver.newton import GuardedNewton, SolveFailure, SolverSettings
+from remodel_fenicsx.solver.newton import GuardedNewton, SolveFailure
 from remodel_fenicsx.state.memory import Numbers
 from remodel_fenicsx.state.state import State
 
@@ -37,7 +38,7 @@ class Implicit:
 
     order, accumulates, longest = 1, True, math.inf
 
-    def __init__(self, state: State, tissue: Tissue, remodeling: RemodelingPass, settings: SolverSettings):
+    def __init__(self, state: State, tissue: Tissue, remodeling: RemodelingPass, settings: Solver):
         self.state, self.remodeling, self.settings = state, remodeling, settings
         self.equilibrium: Equilibrium = Equilibrium(state, tissue)  # of solved states
         self.equilibrium.compile_energy()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 import ufl
@@ -11,15 +11,16 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from remodel_fenicsx.fem import jit
-from remodel_fenicsx.fem.ranks import over_ranks
+from remodel_fenicsx.fem.assembly import over_ranks
 from remodel_fenicsx.kernels.tensor import tensor_kernels, with_kernels
 from remodel_fenicsx.model import spectral
 from remodel_fenicsx.model.cells import UnitCell, structure_tensor
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES, carried_axes
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.model.laws import LAWS, Drive, tensor_target
-from remodel_fenicsx.model.repulsion import axes_sum
+from remodel_fenicsx.model.energy import axes_sum
 from remodel_fenicsx.model.tensor_law import ABOVE_ROUNDING, Target
+from remodel_fenicsx.settings import Remodeling
 from remodel_fenicsx.solver.pointwise import PointStresses
 from remodel_fenicsx.state.memory import Numbers
 from remodel_fenicsx.state.parameters import Parameters, on_mesh, stress_rounding
@@ -36,34 +37,6 @@ WORTH_A_WORD = 0.1
 ROUNDINGS = 64.0  # how many times the rounding of a stress its principal values may be off
 
 AWAKE = 0.5  # of the speed of remodeling under tension alone
-
-
-class RemodelingSettings(Protocol):
-    """How the cells follow the load (`scene.parameters.Remodeling`)."""
-
-    @property
-    def driver(self) -> str: ...
-
-    @property
-    def law(self) -> str: ...
-
-    @property
-    def frame(self) -> str: ...
-
-    @property
-    def coupling(self) -> str: ...
-
-    @property
-    def relaxation_factor(self) -> float: ...
-
-    @property
-    def kappa(self) -> float: ...
-
-    @property
-    def pairing(self) -> str: ...
-
-    @property
-    def rotation_time(self) -> float: ...
 
 
 class Noise(NamedTuple):
@@ -94,7 +67,7 @@ class RemodelingPass:
         Driver, law, frame, pairing, kappa and rotation time.
     """
 
-    def __init__(self, state: State, tissue: Tissue, settings: RemodelingSettings):
+    def __init__(self, state: State, tissue: Tissue, settings: Remodeling):
         self.state, self.settings = state, settings
         self.quadrature = state.cells.quadrature
         self.tissue = with_kernels(on_mesh(tissue, self.quadrature.mesh), state.comm)

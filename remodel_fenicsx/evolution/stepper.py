@@ -10,12 +10,12 @@ from dataclasses import dataclass, field
 from decimal import Decimal
 
 from remodel_fenicsx.body.loading import LoadValues
-from remodel_fenicsx.evolution.coupling import COUPLINGS, Coupling, Maker
-from remodel_fenicsx.evolution.remodeling import RemodelingPass, RemodelingSettings
+from remodel_fenicsx.evolution.coupling import Coupling, Maker
+from remodel_fenicsx.evolution.remodeling import RemodelingPass
 from remodel_fenicsx.model.energy import Tissue
+from remodel_fenicsx.settings import COUPLINGS, Remodeling, Solver
 from remodel_fenicsx.solver.continuation import Work
 from remodel_fenicsx.solver.equilibrium import Extension
-from remodel_fenicsx.solver.newton import SolverSettings
 from remodel_fenicsx.state.parameters import on_mesh
 from remodel_fenicsx.state.state import State
 
@@ -110,8 +110,8 @@ class Stepper:
         self,
         state: State,
         tissue: Tissue,
-        remodeling: RemodelingSettings,
-        solver: SolverSettings,
+        remodeling: Remodeling,
+        solver: Solver,
         load_values: Callable[[float], LoadValues],
         coupling: Maker | None = None,
     ):
@@ -120,7 +120,7 @@ class Stepper:
         self.remodeling = RemodelingPass(state, self.tissue, remodeling)
         # cells that never change are coupled to nothing
         name = remodeling.coupling if self.remodeling.law.remodels else "staggered"
-        make = coupling or COUPLINGS[name]
+        make = coupling or COUPLINGS[name].make
         self.coupling: Coupling = make(state, self.tissue, self.remodeling, solver)
         self._closed = False
         # asked on each rank in every solve: the signal (SIGINT, SIGTERM) that should end it, or 0

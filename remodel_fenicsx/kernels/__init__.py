@@ -7,19 +7,19 @@ function of the package: it is the reference, decides where C leaves a point ope
 =================== =====================================================================================
 in C                stands for
 =================== =====================================================================================
-principal           tissue.spectral.principal
-positive_direction  tissue.spectral.positive_direction
-without_noise       tissue.spectral.without_noise
-stretches           tissue.repulsion.squared_end_to_end_length, tissue.repulsion.axes_sum
+principal           model.spectral.principal
+positive_direction  model.spectral.positive_direction
+without_noise       model.spectral.without_noise
+stretches           model.energy.squared_end_to_end_length, model.energy.axes_sum
 parts               kernels.points.PointKernels.gradient_and_driver
-structure           tissue.cells.structure_tensor
+structure           model.cells.structure_tensor
 extension           kernels.points.PointKernels.extension
 may_turn            kernels.points.PointKernels.may_turn
 room                kernels.points.PointKernels.room
-log_sum             tissue.repulsion.log_sum
-log_derivatives     tissue.repulsion.log_derivatives
-target              tissue.laws.tensor_target
-solve               tissue.condensed.CondensedPoints.solve
-tangent             tissue.condensed.CondensedPoints.tangent
+log_sum             model.energy.log_sum
+log_derivatives     model.energy.log_derivatives
+target              model.laws.tensor_target
+solve               model.implicit.condensed.CondensedPoints.solve
+tangent             model.implicit.condensed.CondensedPoints.tangent
 =================== =====================================================================================
 """

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,48 +36,10 @@ class UnitCell(NamedTuple):
         return [squared_stretch(deformation_gradient, self.axes, i) for i in range(3)]
 
 
-class CellSettings(Protocol):
-    """What decides the cells at t = 0 (`scene.parameters.Cells`)."""
-
-    @property
-    def initial(self) -> str | tuple[float, float, float]: ...
-
-    @property
-    def axes(self) -> str: ...
-
-    @property
-    def aligned_axis(self) -> int: ...
-
-    @property
-    def seed(self) -> int: ...
-
-    @property
-    def end_to_end_length(self) -> float: ...
-
-
 def structure_tensor(dimensions: Array, axes: Array) -> Array:
     """A = sum_I l_I^2 n_I (x) n_I from l (..., 3) and axes as rows (..., 3, 3)."""
     scaled = dimensions[..., :, None] * axes
     return np.swapaxes(scaled, -1, -2) @ scaled
-
-
-def initial_dimensions(settings: CellSettings, number_of_elements: int) -> Array:
-    """l_I at t = 0 of every element of the mesh file, shape (number_of_elements, 3), in link lengths.
-
-    `random`: |l| = r0 and l uniform on the positive octant of the sphere, one draw per element. The whole list is drawn
-    on every rank, in the mesh file's order: the same element gets the same draw for any number of ranks.
-    """
-    r0 = settings.end_to_end_length
-    if settings.initial == "random":
-        draws = np.abs(np.random.default_rng(settings.seed).standard_normal((number_of_elements, 3)))
-        return r0 * draws / np.linalg.norm(draws, axis=1, keepdims=True)
-    if settings.initial == "isotropic":
-        lengths = [r0 / np.sqrt(3)] * 3
-    elif settings.initial == "aligned":
-        lengths = [r0 if axis == settings.aligned_axis else 0.0 for axis in (1, 2, 3)]
-    else:
-        lengths = [float(length) for length in settings.initial]
-    return np.tile(lengths, (number_of_elements, 1))
 
 
 def global_axes(coordinates: Array) -> Array:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from pathlib import Path
-from types import TracebackType
 
 import numpy as np
 import ufl
@@ -16,9 +15,9 @@ from remodel_fenicsx.body.shape import Shape
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
 from remodel_fenicsx.fem import compat, jit
 from remodel_fenicsx.results.chain_lines import chain_displacement, chain_lines
-from remodel_fenicsx.results.recording import CHAINS, FIELDS, RecordingError
-from remodel_fenicsx.results.vtkhdf import LINE, TransientGrid, cell_type_and_permutation
-from remodel_fenicsx.scene.settings import FIELDS_BY_NAME
+from remodel_fenicsx.results.recording import CHAINS, FIELDS
+from remodel_fenicsx.results.vtkhdf import LINE, TransientGrid, vtk_cells
+from remodel_fenicsx.settings import FIELDS_BY_NAME
 from remodel_fenicsx.schema.times import SAME_TIME, same_time
 from remodel_fenicsx.solver.pointwise import PointStresses
 from remodel_fenicsx.state.state import State
@@ -130,7 +129,7 @@ class Fields(Watcher):
     after
         Where a run goes on: time of the last step that was done. Fields of later ones are dropped.
     names
-        Of `scene.settings.FIELDS_BY_NAME`, what is written; the lines only with "chains".
+        Of `settings.FIELDS_BY_NAME`, what is written; the lines only with "chains".
     times
         Further times that are written.
 
@@ -166,10 +165,9 @@ class Fields(Watcher):
         self._chains: TransientGrid | None = None
         if points is not None and elements is not None:
             geometry = domain.mesh.geometry.cmap
-            cell_type, order = cell_type_and_permutation(domain.mesh.topology.cell_name(), geometry.degree)
-            self._grid = _continued(folder / FIELDS, after) or TransientGrid(
-                folder / FIELDS, points, elements[:, order], cell_type
-            )
+            cell_type, cells = vtk_cells(domain.mesh.topology.cell_name(), geometry.degree, elements)
+            self._grid = _continued(folder / FIELDS, after)
+            self._grid = self._grid or TransientGrid(folder / FIELDS, points, cells, cell_type)
             self._chains = _continued(folder / CHAINS, after) if "chains" in self.names else None
             self._centres = points[elements].mean(axis=1)
             self._elements = elements
@@ -226,9 +224,7 @@ class Fields(Watcher):
     def __enter__(self) -> Fields:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
 
@@ -239,10 +235,7 @@ def _continued(path: Path, after: float | None) -> TransientGrid | None:
     if not path.exists():
         log.warning("%s is not there: a new one begins with the next step", path.name)
         return None
-    try:
-        return TransientGrid.continued(path, after * (1 + SAME_TIME))
-    except ValueError as error:
-        raise RecordingError(f"{error}; the run goes on without this file") from error
+    return TransientGrid.continued(path, after * (1 + SAME_TIME))
 
 
 class NodalGather:

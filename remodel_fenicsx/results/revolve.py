@@ -13,7 +13,7 @@ from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.results.chain_lines import chain_displacement, chain_lines
 from remodel_fenicsx.results.fields import AXES, OF_CHAINS
 from remodel_fenicsx.results.recording import Recording, RecordingError
-from remodel_fenicsx.results.vtkhdf import LINE, TransientGrid, cell_type_and_permutation
+from remodel_fenicsx.results.vtkhdf import LINE, TransientGrid, vtk_cells
 
 Array = NDArray[np.float64]
 
@@ -53,7 +53,7 @@ def revolve(folder: Path | str) -> list[Path]:
     if not len(recording.times):
         raise RecordingError(f"{recording.path}: the run recorded no fields")
     image = _Image(recording, recording.scene.geometry.reductions[name].turn)
-    with TransientGrid(paths[0], image.points, image.elements[:, image.order], image.cell_type) as grid:
+    with TransientGrid(paths[0], image.points, image.cells, image.cell_type) as grid:
         chains: TransientGrid | None = None
         for time in recording.times:
             displacement, fields = image(recording.fields(float(time)))
@@ -75,7 +75,7 @@ class _Image:
         assert points is not None and elements is not None
         self.points, self.elements = points, elements
         kind = domain.mesh.topology.cell_name()
-        self.cell_type, self.order = cell_type_and_permutation(kind, domain.mesh.geometry.cmap.degree)
+        self.cell_type, self.cells = vtk_cells(kind, domain.mesh.geometry.cmap.degree, elements)
         self.turns = turn(points)
         own_points, own_elements = recording.points, recording.elements
         back = np.einsum("nji,nj->ni", self.turns, points)  # Q^T X

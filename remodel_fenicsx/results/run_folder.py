@@ -13,7 +13,7 @@ from mpi4py import MPI
 
 from remodel_fenicsx.evolution.stepper import Step, Watcher
 from remodel_fenicsx.results.history import History
-from remodel_fenicsx.results.recording import CHAINS, FIELDS, HISTORY, LOG, SCENE, RecordingError
+from remodel_fenicsx.results.recording import CHAINS, FIELDS, HISTORY, LOG, SCENE
 from remodel_fenicsx.results.run_lock import FolderTaken, RunLock, is_vacant
 from remodel_fenicsx.results.vtkhdf import check_file
 from remodel_fenicsx.system.regular_files import open_own, write_whole
@@ -152,11 +152,8 @@ def check_kept(folder: Path, after: LastStep | None, fields: bool) -> None:
         return
     History.size_of(folder / HISTORY, after.columns, after.number + 1, after.time)
     for name in (FIELDS, CHAINS) if fields else ():
-        try:
-            if (folder / name).exists():
-                check_file(folder / name)
-        except ValueError as error:
-            raise RecordingError(f"{error}; the run goes on without this file") from error
+        if (folder / name).exists():
+            check_file(folder / name)
 
 
 def forget_steps(folder: Path) -> None:

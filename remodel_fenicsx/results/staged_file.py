@@ -24,20 +24,18 @@ _MARK = b"remodel1"
 def signals_held_back() -> Iterator[None]:
     """Let Python's signal handlers (Ctrl-C, termination) run after the block: an exception inside a call-back that
     HDF5 makes into `StagedFile` would crash it."""
-    if threading.current_thread() is not threading.main_thread():  # handlers run in the main thread only
-        yield
-        return
     caught: list[int] = []
     handlers = {int(number): signal.getsignal(number) for number in signal.valid_signals()}
+    if threading.current_thread() is not threading.main_thread():  # handlers run in the main thread only
+        handlers = {}
+    handlers = {number: handler for number, handler in handlers.items() if callable(handler)}
     try:
-        for number, handler in handlers.items():
-            if callable(handler):
-                signal.signal(number, lambda number, _: caught.append(number))
+        for number in handlers:
+            signal.signal(number, lambda number, _: caught.append(number))
         yield
     finally:
         for number, handler in handlers.items():
-            if callable(handler):
-                signal.signal(number, handler)
+            signal.signal(number, handler)
         for number in caught:
             signal.raise_signal(number)
 
@@ -68,7 +66,6 @@ class StagedFile(io.RawIOBase):
     def __init__(self, path: Path, existing: bool = False):
         self._descriptor = -1
         super().__init__()
-        self._path = path
         self._descriptor = open_own(path, os.O_RDWR | (0 if existing else os.O_CREAT | os.O_EXCL))
         if existing:
             self._finish_changes()
@@ -151,20 +148,20 @@ class StagedFile(io.RawIOBase):
     def _finish_changes(self) -> None:
         """Make the changes of a commit that was cut off."""
         size = os.fstat(self._descriptor).st_size
-        if size < _END.size:
-            return
-        length, check_sum, mark = _END.unpack(os.pread(self._descriptor, _END.size, size - _END.size))
+        end = os.pread(self._descriptor, _END.size, max(0, size - _END.size))
+        length, check_sum, mark = _END.unpack(end) if len(end) == _END.size else (0, 0, b"")
         start = size - _END.size - length
         if mark != _MARK or start < 0:
             return
         journal = os.pread(self._descriptor, length, start)
-        if zlib.crc32(journal) == check_sum:
-            self._make_changes(_changes(journal), start)
-
-    def discard(self) -> None:
-        """Close and remove a file that was not even begun."""
-        self.close()
-        self._path.unlink(missing_ok=True)
+        if zlib.crc32(journal) != check_sum:
+            return
+        changes, position = [], 0
+        while position < length:
+            offset, count = _CHANGE.unpack_from(journal, position)
+            position += _CHANGE.size + count
+            changes.append((offset, journal[position - count : position]))
+        self._make_changes(changes, start)
 
     def close(self) -> None:
         descriptor, self._descriptor = self._descriptor, -1
@@ -185,13 +182,3 @@ def _journal(changes: list[tuple[int, bytes]]) -> bytes:
         return b""
     whole = b"".join(_CHANGE.pack(offset, len(change)) + change for offset, change in changes)
     return whole + _END.pack(len(whole), zlib.crc32(whole), _MARK)
-
-
-def _changes(journal: bytes) -> list[tuple[int, bytes]]:
-    """The changes of a journal without its end."""
-    found, position = [], 0
-    while position < len(journal):
-        offset, length = _CHANGE.unpack_from(journal, position)
-        position += _CHANGE.size + length
-        found.append((offset, journal[position - length : position]))
-    return found

@@ -4,23 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from typing import Protocol
 
 from remodel_fenicsx.body import Shape
-from remodel_fenicsx.scene.parameters import STRESS_UNITS, Material
 from remodel_fenicsx.schema.units import FORCE, STRESS
+from remodel_fenicsx.settings import STRESS_UNITS, Load, Material
 
 # Decades in which a ratio may lie. Units differ by a thousand and more, choices seldom by a hundred.
 NETWORK = (-2, 2)  # initial stiffness of the network over that of the matrix; the paper's bodies: 1.1 and 1.5
 LOAD = (-4, 2)  # largest stress of a load over the stiffness of both; the paper's: 0.7 to 4.6. Weak loads are a choice
 TEMPERATURES = (250.0, 400.0)  # K: of what is neither ice nor cooked
-
-
-class Load(Protocol):
-    """Of a scene (`scene.settings.Load`)."""
-
-    def largest(self, end: float) -> float:
-        """The value of largest magnitude up to a time."""
 
 
 def doubts(

@@ -10,8 +10,9 @@ from petsc4py import PETSc
 
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.energy import Tissue
+from remodel_fenicsx.settings import Solver
 from remodel_fenicsx.solver.equilibrium import Equilibrium
-from remodel_fenicsx.solver.newton import GuardedNewton, SolverSettings
+from remodel_fenicsx.solver.newton import GuardedNewton
 from remodel_fenicsx.state.state import State
 
 KEPT_RESERVE = 0.2  # share of 1 - r/L that a part of a remodeling increment leaves at every point
@@ -24,7 +25,7 @@ class Blend:
     at once; PETSc's objects are made when they are first needed.
     """
 
-    def __init__(self, state: State, tissue: Tissue, settings: SolverSettings):
+    def __init__(self, state: State, tissue: Tissue, settings: Solver):
         self.settings = settings
         self.theta = dolfinx.fem.Constant(state.cells.quadrature.mesh, PETSc.ScalarType(0.0))
         old, new = state.equilibrium_cells, state.cells

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
-from typing import Any, Protocol
+from collections.abc import Callable
+from typing import Any
 
 import dolfinx.fem.petsc
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from remodel_fenicsx.fem.assembly import over_ranks
 from remodel_fenicsx.fem.petsc_options import ProblemOptions
-from remodel_fenicsx.fem.ranks import over_ranks
-from remodel_fenicsx.fem.solver_methods import AUTO, EXACT, LAGGED, SMALL, chosen, method_options
+from remodel_fenicsx.fem.solver_methods import AUTO, EXACT, LAGGED, chosen, is_small, method_options
+from remodel_fenicsx.settings import Solver
 from remodel_fenicsx.solver.equilibrium import Equilibrium, Look
 from remodel_fenicsx.solver.limits import Limits
 from remodel_fenicsx.solver.linear import LINEAR_METHODS, EveryTangent
@@ -34,31 +35,6 @@ NEAR_LOCKING, KEPT_RESERVE = 0.95, 0.3  # a Newton step that ends above this r/L
 NEARLY_LOCKED, COARSE, GOES_DOWN = 0.99, 1e-8, 0.25  # see GuardedNewton._is_small
 
 
-class SolverSettings(Protocol):
-    """How a step is solved (`scene.Solver`)."""
-
-    @property
-    def method(self) -> str: ...
-
-    @property
-    def predictor(self) -> str: ...
-
-    @property
-    def absolute_tolerance(self) -> float: ...
-
-    @property
-    def relative_tolerance(self) -> float: ...
-
-    @property
-    def maximum_iterations(self) -> int: ...
-
-    @property
-    def maximum_halvings(self) -> int: ...
-
-    @property
-    def petsc_options(self) -> Mapping[str, Any]: ...
-
-
 class GuardedNewton:
     """Solves an equilibrium from the present unknowns; use `close` (or `with`) when it is needed no more.
 
@@ -77,17 +53,18 @@ class GuardedNewton:
         Name of the method, where the settings leave it open.
     """
 
-    def __init__(self, equilibrium: Equilibrium, settings: SolverSettings, robust: bool = False):
+    def __init__(self, equilibrium: Equilibrium, settings: Solver, robust: bool = False):
         self.equilibrium, self.settings = equilibrium, settings
         self.unknown = equilibrium.state.unknown
         self._values = self.unknown.x.array
         self._x = self.unknown.x.petsc_vec.duplicate()
         unknowns, ranks = self._x.getSize(), equilibrium.comm.size
-        self.method = chosen(settings.method, unknowns, ranks)
+        reduced = equilibrium.state.kinematics.reduced
+        self.method = chosen(settings.method, unknowns, ranks, reduced)
         if robust and self.method in (LAGGED, EXACT):
             self.method = "direct"
         # where a method is named, three dimensions stay with it: its numbers shall not depend on their size
-        small = unknowns <= SMALL and (equilibrium.state.kinematics.reduced or settings.method == AUTO)
+        small = is_small(unknowns, reduced) and (reduced or settings.method == AUTO)
         self._options = ProblemOptions(method_options(self.method, ranks, small), settings.petsc_options)
         self._residual, self._external, self._trial = (self._x.duplicate() for _ in range(3))
         self._matrix = equilibrium.create_matrix()

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.kernels.points import PointKernels, point_kernels
-from remodel_fenicsx.model.cells import CellSettings, UnitCell, initial_axes, initial_dimensions
+from remodel_fenicsx.model.cells import UnitCell, initial_axes
+from remodel_fenicsx.settings import Cells
 
 Array = NDArray[np.float64]
 
@@ -86,10 +87,10 @@ class UnitCells(CellField):
         quadrature: Quadrature,
         element_number: NDArray[np.int64],
         number_of_elements: int,
-        settings: CellSettings,
+        settings: Cells,
     ):
         super().__init__(quadrature, "cell")
         self.settings = settings
-        self.dimension_values[:] = initial_dimensions(settings, number_of_elements)[element_number][:, None, :]
+        self.dimension_values[:] = settings.dimensions(number_of_elements)[element_number][:, None, :]
         self.axis_values[:] = initial_axes(settings.axes, quadrature.coordinates)
         self.initial_dimensions: Array = self.dimension_values.copy()

@@ -1,0 +1,26 @@
+"""Names of a module that are imported when they are first asked for: a leaf."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Mapping
+from typing import Any
+
+
+def on_demand(module: str, places: Mapping[str, str]) -> Callable[[str], Any]:
+    """The `__getattr__` of a module (PEP 562).
+
+    Parameters
+    ----------
+    module
+        Its name.
+    places
+        Module of the package, dotted, in which each name is.
+    """
+
+    def imported(name: str) -> Any:
+        if name not in places:
+            raise AttributeError(f"module {module!r} has no attribute {name!r}")
+        return getattr(importlib.import_module(f"remodel_fenicsx.{places[name]}"), name)
+
+    return imported

@@ -1,0 +1,192 @@
+"""What lies under or over the keys of a scene that names it: the presets of the paper, and profiles of accuracy.
+
+Source: E. Kuhl, G. A. Holzapfel, J. Mater. Sci. 42 (2007) 8811-8823; docs/theory.md has the equations as implemented.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from remodel_fenicsx.schema.toml import put
+
+# ---------------------------------------------------------------- without a preset
+
+DEFAULT_LAW = "tensor"
+_METHODS: dict[str, dict[str, dict[str, Any]]] = {
+    DEFAULT_LAW: {"material": {"repulsion": "log"}, "remodeling": {"law": DEFAULT_LAW, "coupling": "extrapolated"}},
+}
+
+
+def default_method(values: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """What lies under the keys of a scene without a preset: the law, and what goes with the law that it has.
+
+    It is what measures best (docs/couplings.md); a scene that names another law has the defaults of the tables.
+    """
+    remodeling = values.get("remodeling")
+    law = remodeling.get("law", DEFAULT_LAW) if isinstance(remodeling, Mapping) else DEFAULT_LAW
+    return _METHODS.get(law, {}) if isinstance(law, str) else {}
+
+
+# ---------------------------------------------------------------- presets
+
+
+def _printed_method(
+    geometry: dict[str, Any], loads: dict[str, Any], end: float, material: dict[str, Any], cells: dict[str, Any]
+) -> dict[str, dict[str, Any]]:
+    """The paper's method on one of its bodies, every choice spelled out; how systems are solved is none of them."""
+    common_material = {
+        "lame_lambda": 27.293,
+        "lame_mu": 3.103,
+        "temperature": 310.0,
+        "energy_factor": 1,
+        "matrix": "neo-hookean",
+        "chain": "wormlike",
+        "repulsion": "axes",
+        "stress_unit": "Pa",
+    }
+    return {
+        "geometry": geometry,
+        "mesh": {"refinement": 1, "element": "hexahedron", "degree": 1, "formulation": "displacement"},
+        "model": {"kinematics": "full"},
+        "material": common_material | material,
+        "cells": {"end_to_end_length": 1.0} | cells,
+        "loads": loads,
+        "remodeling": {
+            "driver": "cauchy",
+            "law": "explicit",
+            "frame": "spatial",
+            "pairing": "sorted",
+            "coupling": "staggered",
+            "kappa": 0.025,
+        },
+        "time": {"end": end, "step": 1.0},
+    }
+
+
+def _load(value: float, end_of_ramp: float) -> dict[str, Any]:
+    return {"value": value, "ramp": [[0.0, 0.0], [end_of_ramp, 1.0]]}
+
+
+_STIFFER_CHAINS = {"chain_density": 7.0e21, "contour_length": 2.125, "persistence_length": 1.82}
+_CHAINS = {"chain_density": 2.0e21, "contour_length": 1.594, "persistence_length": 1.365}
+
+_PAPER = {
+    "cube": _printed_method(
+        {"side": 1.0},
+        {"force": _load(10.0, 10.0)},
+        100.0,
+        _STIFFER_CHAINS,
+        {"initial": "isotropic", "axes": "global"},
+    ),
+    "tendon": _printed_method(
+        {"length": 10.0, "area": 10.0},
+        {"force": _load(300.0, 12.0)},
+        150.0,
+        _CHAINS,
+        {"initial": "random", "axes": "global", "seed": 1},
+    ),
+    "tube": _printed_method(
+        {"inner_radius": 1.0, "outer_radius": 3.0, "length": 8.0},
+        {"pressure": _load(4.8, 25.0), "elongation": _load(0.1, 25.0)},
+        150.0,
+        _CHAINS,
+        {"initial": "random", "axes": "cylindrical", "seed": 1},
+    ),
+}
+
+# Lengths in nm. r0 is the root mean square end-to-end length of the free chain,
+# sqrt(2 A_p L (1 - A_p/L (1 - e^(-L/A_p)))), and the density makes c g(r0) r0^2, the initial stiffness of
+# the network, that of the paper's tendon and artery.
+_MEASURED_COLLAGEN = {"chain_density": 9.0e20, "contour_length": 309.0, "persistence_length": 14.5}
+_FREE_CHAIN = 92.4
+
+
+def _with_measured_collagen(scene: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    return scene | {
+        "material": scene["material"] | _MEASURED_COLLAGEN,
+        "cells": scene["cells"] | {"end_to_end_length": _FREE_CHAIN},
+    }
+
+
+def _consistent(scene: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    changes = {"law": "tensor", "frame": "material", "coupling": "extrapolated"}
+    return scene | {
+        "material": scene["material"] | {"repulsion": "log"},
+        "remodeling": {name: value for name, value in (scene["remodeling"] | changes).items() if name != "pairing"},
+    }
+
+
+PRESETS: dict[str, dict[str, dict[str, Any]]] = {
+    "kuhl-holzapfel-2007": _PAPER,
+    "consistent": {shape: _consistent(scene) for shape, scene in _PAPER.items()},
+    "sun-2002": {shape: _with_measured_collagen(scene) for shape, scene in _PAPER.items()},
+}
+"""Preset name -> shape -> scene keys; they lie under the keys of the scene that names the preset."""
+
+PRESET_NOTES = {
+    "kuhl-holzapfel-2007": "The printed method on the three bodies of the paper: Fig. 5 (cube), Fig. 6 (tendon), "
+    "Figs. 7 to 11 (tube). The frame is 'spatial', as printed in eq. (9).",
+    "consistent": "The paper's bodies and parameters with a law and an energy that see the structure tensor alone "
+    "(docs/theory.md, The consistent variant), second order in the time step.",
+    "sun-2002": "The printed method with collagen I as measured with optical tweezers (paper, Remark 2): contour "
+    "length 309 nm, persistence length 14.5 nm, all chain lengths in nm. End-to-end length (that of a free chain) and "
+    "chain density (the same initial stiffness of the network) are choices of this project, not of the paper.",
+}
+
+# ---------------------------------------------------------------- profiles
+
+EXACT = "implicit"  # coupling
+
+
+@dataclass(frozen=True)
+class Profile:
+    """How much accuracy a run shall have: settings, with the error and cost that were measured on the artery.
+
+    Attributes
+    ----------
+    values
+        Over those of the preset, by dotted key.
+    takes_exact_coupling
+        Whether the coupling is `EXACT` too where that leaves no error in time (`Scene.has_exact_coupling`).
+    degrees, percent, seconds
+        Error of the fibre angle, root mean square, and of the radii, and time of the processor in the steps, as
+        measured on the paper's artery with isotropic cells.
+    """
+
+    values: dict[str, Any]
+    degrees: float
+    percent: float
+    seconds: float
+    takes_exact_coupling: bool = False
+
+    def in_words(self, name: str) -> str:
+        """What it was measured to be."""
+        settings = ", ".join(f"{key} = {value}" for key, value in self.values.items())
+        if self.takes_exact_coupling:
+            settings += f", remodeling.coupling = {EXACT} where that leaves no error in time"
+        return (
+            f"profile {name!r}: {settings}; measured on the artery of isotropic cells: {self.degrees:g} degrees, radii "
+            f"{self.percent:g} %, {self.seconds:g} s (docs/speed_and_accuracy.md)"
+        )
+
+    def tables(self) -> dict[str, Any]:
+        """Its values as tables of a scene."""
+        tables: dict[str, Any] = {}
+        for key, value in self.values.items():
+            put(tables, key, value)
+        return tables
+
+
+def _values(refinement: int, degree: int, tolerance: float) -> dict[str, Any]:
+    values = {"model.kinematics": "auto", "mesh.refinement": refinement, "mesh.degree": degree}
+    return values | {"time.tolerance": tolerance}
+
+
+PROFILES: dict[str, Profile] = {
+    "fast": Profile(_values(1, 1, 1.0), 1.4, 0.7, 0.2),
+    "balanced": Profile(_values(1, 2, 0.5), 0.5, 0.5, 0.4),
+    "reference": Profile(_values(2, 2, 0.1), 0.0036, 0.0008, 1.4, takes_exact_coupling=True),
+}
+"""Points of the front of docs/speed_and_accuracy.md; `remodel-fenicsx trade SCENE` measures any scene."""

@@ -1,0 +1,665 @@
+"""The tables of a scene: what can be set, with units, limits and meanings; one class each, which all rooms take.
+
+Source of the defaults of tissue and cells: E. Kuhl, G. A. Holzapfel, J. Mater. Sci. 42 (2007) 8811-8823;
+docs/theory.md has the equations as implemented. A `Scene` (`scene.scene`) is made of these tables.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import pkgutil
+import re
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BeforeValidator, Field, model_validator
+
+from remodel_fenicsx.fem.formulations import FORMULATIONS
+from remodel_fenicsx.fem.kinematics import KINEMATICS
+from remodel_fenicsx.fem.solver_methods import (
+    AUTO,
+    LARGE,
+    LARGE_ON_RANKS,
+    MEANINGS,
+    METHODS,
+    SMALL_BODY,
+    SMALL_REDUCTION,
+    fault_of_option,
+)
+from remodel_fenicsx.model.cells import AXES
+from remodel_fenicsx.model.chains import BOLTZMANN_CONSTANT, CHAINS
+from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
+from remodel_fenicsx.model.energy import MATRICES, REPULSIONS, Tissue
+from remodel_fenicsx.model.laws import LAWS
+from remodel_fenicsx.model.spectral import PAIRINGS
+from remodel_fenicsx.schema.tables import OneOf, Table, checked, fault, is_number, quoted, shown
+from remodel_fenicsx.schema.times import is_multiple, same_time
+from remodel_fenicsx.schema.units import FORCE, NUMBER_DENSITY, STRESS, TEMPERATURE
+
+STRESS_UNITS = {"Pa": 1.0, "kPa": 1.0e3, "MPa": 1.0e6}  # in Pa
+INITIAL_CELLS = ("random", "isotropic", "aligned")
+MOST_STEPS = 1_000_000
+
+
+# ---------------------------------------------------------------- body and mesh
+
+
+class Mesh(Table):
+    """The finite elements."""
+
+    refinement: int = Field(
+        default=1,
+        ge=1,
+        description="Factor on the paper's number of elements in every direction (1: its own meshes). More than 10 "
+        "million hexahedra, or those split into tetrahedra, are refused.",
+    )
+    element: Literal["hexahedron", "tetrahedron"] = Field(default="hexahedron", description="Shape of the elements.")
+    degree: Annotated[int, OneOf((1, 2))] = Field(
+        default=1, description="Polynomial degree of the displacement: 1 (the paper's) or 2."
+    )
+    formulation: Annotated[str, OneOf(FORMULATIONS)] = Field(
+        default="displacement",
+        description="Where the elements take the change of volume: "
+        + "; ".join(f"{name!r}: {formulation.meaning}" for name, formulation in FORMULATIONS.items())
+        + ".",
+    )
+
+    @model_validator(mode="after")
+    def _formulation_has_the_element(self) -> Mesh:
+        pair = self.element, self.degree
+        if not FORMULATIONS[self.formulation].has(*pair):
+            able = [name for name, formulation in FORMULATIONS.items() if formulation.has(*pair)]
+            rule = f"allowed for elements {self.element!r} of degree {self.degree} is {', '.join(map(repr, able))}"
+            raise fault(rule, "formulation", self.formulation)
+        return self
+
+
+def _auto_or(names: Collection[str]) -> BeforeValidator:
+    """Annotation of a field that is `AUTO` or one of a registry's keys, those registered later included."""
+
+    def check(value: Any) -> Any:
+        if value not in (AUTO, *names):
+            raise fault("allowed are " + ", ".join(map(repr, (AUTO, *names))))
+        return value
+
+    return checked(check)
+
+
+class Model(Table):
+    """Which unknowns describe the deformation."""
+
+    kinematics: Annotated[str, _auto_or(KINEMATICS)] = Field(
+        default=AUTO,
+        description="'auto': the cheapest that is exact for the scene; a scene as run has its name. "
+        + "; ".join(f"{name!r}: {kinematics.meaning}" for name, kinematics in KINEMATICS.items())
+        + ". One that would be wrong for the scene is refused with the reason (docs/kinematics.md).",
+        json_schema_extra={"allowed": "one of " + ", ".join(map(repr, (AUTO, *KINEMATICS)))},
+    )
+
+
+class Supports(Table):
+    """How the body is held."""
+
+    ends: str = Field(
+        default="free",
+        description="Ends of a tube: 'free' to move radially in their planes; 'clamped', which keeps their circles; "
+        "or 'closed': free, with caps on which the pressure acts, and the length an unknown.",
+        json_schema_extra={"allowed": "'free', for a tube also 'clamped' and 'closed'"},
+    )
+
+
+# ---------------------------------------------------------------- tissue and cells
+
+
+class Material(Table):
+    """The tissue: an isotropic matrix (Lame constants) with a network of collagen chains."""
+
+    lame_lambda: Annotated[float, STRESS] = Field(
+        default=27.293, ge=0, description="First Lame constant lambda of the matrix, in stress_unit."
+    )
+    lame_mu: Annotated[float, STRESS] = Field(
+        default=3.103, gt=0, description="Second Lame constant mu of the matrix, in stress_unit."
+    )
+    chain_density: Annotated[float, NUMBER_DENSITY] = Field(
+        default=2.0e21, ge=0, description="Number of chains n_chn per volume, in 1/m^3; 0: no chains."
+    )
+    contour_length: float = Field(
+        default=1.594, gt=0, description="Contour length L of a chain, at which it locks, in link lengths."
+    )
+    persistence_length: float = Field(
+        default=1.365,
+        gt=0,
+        description="Persistence length A_p of a chain, its bending stiffness over k theta, in link lengths.",
+    )
+    temperature: Annotated[float, TEMPERATURE] = Field(
+        default=310.0, gt=0, description="Absolute temperature theta, in K."
+    )
+    energy_factor: Annotated[int, OneOf((1, 4))] = Field(
+        default=1,
+        description="Factor omega of the chain energy: 1 is the stress as printed (eq. 7; reproduces Fig. 6), "
+        "4 the energy as printed (eq. 4b).",
+    )
+    matrix: Annotated[str, OneOf(MATRICES)] = Field(default="neo-hookean", description="Energy of the matrix.")
+    chain: Annotated[str, OneOf(CHAINS)] = Field(default="wormlike", description="Force law of a single chain.")
+    repulsion: Annotated[str, OneOf(REPULSIONS)] = Field(
+        default="axes",
+        description="Form of the repulsive energy that makes the reference state stress-free: 'axes' is the paper's, "
+        "in the stretches along the three cell axes; 'log' sees the structure tensor alone (A : ln C), equals it where "
+        "both have the same axes and suits the law 'tensor'; 'length' is a function of the chains' length alone. Where "
+        "neither scene nor preset says it: 'log' with the law 'tensor'.",
+    )
+    stress_unit: Literal["Pa", "kPa", "MPa"] = Field(
+        default="Pa",
+        description="Unit of every stress, pressure and Lame constant of the scene; forces are in it times the unit of "
+        "length squared.",
+    )
+
+    @property
+    def network_modulus(self) -> float:
+        """c = omega k theta n_chn / (4 A_p), in stress_unit (1.568 Pa for the defaults)."""
+        pascal = BOLTZMANN_CONSTANT * self.temperature * self.chain_density / (4 * self.persistence_length)
+        return self.energy_factor * pascal / STRESS_UNITS[self.stress_unit]
+
+    def tissue(self, end_to_end_length: float) -> Tissue:
+        """The tissue of these parameters; without chains where there are none.
+
+        Parameters
+        ----------
+        end_to_end_length
+            r0, in link lengths.
+        """
+        return Tissue(
+            self.lame_lambda,
+            self.lame_mu,
+            self.network_modulus,
+            self.contour_length,
+            end_to_end_length,
+            CHAINS[self.chain] if self.chain_density > 0 else None,
+            MATRICES[self.matrix],
+            REPULSIONS[self.repulsion],
+        )
+
+    def summary(self, loads: Mapping[str, float]) -> str:
+        """Stiffness of network and matrix and the loads, in one unit and on one line.
+
+        Parameters
+        ----------
+        loads
+            Stresses by the words for them, in stress_unit.
+        """
+        stresses = {"network modulus c =": self.network_modulus, "shear modulus mu =": self.lame_mu, **loads}
+        return ", ".join(f"{words} {value:.4g} {self.stress_unit}" for words, value in stresses.items())
+
+
+def _initial_cells(value: Any) -> Any:
+    """A list of three lengths becomes a tuple of floats; names pass."""
+    if isinstance(value, (list, tuple)):
+        if len(value) != 3 or not all(is_number(length) and length >= 0 for length in value):
+            raise fault("must be three lengths [l1, l2, l3], each at least 0")
+        return tuple(float(length) for length in value)
+    if not isinstance(value, str) or value not in INITIAL_CELLS:
+        raise fault("allowed are " + ", ".join(map(repr, INITIAL_CELLS)) + " or three lengths [l1, l2, l3]")
+    return value
+
+
+class Cells(Table):
+    """The orthotropic unit cells of the collagen network before the first remodeling pass."""
+
+    initial: Annotated[str | tuple[float, float, float], checked(_initial_cells)] = Field(
+        default="random",
+        description="Cell dimensions l_I at t = 0, with |l| = end_to_end_length: 'random' (one draw per element, "
+        "uniform on the positive octant of the sphere), 'isotropic' (three equal ones), 'aligned' (all of it along "
+        "aligned_axis), or [l1, l2, l3] in link lengths.",
+        json_schema_extra={"allowed": "'random', 'isotropic', 'aligned' or three lengths [l1, l2, l3]"},
+    )
+    axes: Annotated[str, OneOf(AXES)] = Field(
+        default="global",
+        description="Cell axes n_I before the first pass: 'global' (x, y, z) or 'cylindrical' (circumferential, axial, "
+        "radial, about the z axis). Where neither scene nor preset says it: a tube starts with 'cylindrical'.",
+    )
+    aligned_axis: Annotated[int, OneOf((1, 2, 3))] = Field(
+        default=3,
+        description="Number of the axis that 'aligned' cells lie along: with global axes 3 is z, the load axis of cube "
+        "and tendon; with cylindrical axes 1 is circumferential, 2 axial, 3 radial.",
+    )
+    seed: int = Field(
+        default=1,
+        ge=0,
+        description="Seed of the random cells. The same seed and mesh give the same cells on any number of processes.",
+    )
+    end_to_end_length: float = Field(
+        default=1.0,
+        gt=0,
+        description="Length r0 of a chain at t = 0, in link lengths; smaller than material.contour_length. A material "
+        "constant: it keeps its value in the repulsive energy while the cells remodel.",
+    )
+
+    @model_validator(mode="after")
+    def _length_of_the_chain(self) -> Cells:
+        if not isinstance(self.initial, str):
+            length = math.hypot(*self.initial)
+            if abs(length - self.end_to_end_length) > 1e-6 * self.end_to_end_length:
+                raise fault(
+                    f"the root of the sum of squares is {length:.7g}, it must be "
+                    f"cells.end_to_end_length = {shown(self.end_to_end_length)}",
+                    "initial",
+                    self.initial,
+                )
+        return self
+
+    def dimensions(self, number_of_elements: int) -> NDArray[np.float64]:
+        """l_I at t = 0 of every element of the mesh file, shape (number_of_elements, 3), in link lengths.
+
+        The whole list of random cells is drawn on every rank, in the mesh file's order: the same element gets the same
+        draw for any number of ranks.
+        """
+        r0 = self.end_to_end_length
+        if self.initial == "random":
+            draws = np.abs(np.random.default_rng(self.seed).standard_normal((number_of_elements, 3)))
+            return r0 * draws / np.linalg.norm(draws, axis=1, keepdims=True)
+        lengths: Any = self.initial
+        if self.initial == "isotropic":
+            lengths = [r0 / np.sqrt(3)] * 3
+        elif self.initial == "aligned":
+            lengths = [r0 if axis == self.aligned_axis else 0.0 for axis in (1, 2, 3)]
+        return np.tile(np.array(lengths), (number_of_elements, 1))
+
+
+@dataclass(frozen=True)
+class CouplingKind:
+    """How equilibrium and remodeling of one step are coupled, as scenes know it.
+
+    Attributes
+    ----------
+    meaning
+        What it does, for docs/scene.md.
+    place
+        The class of the `Coupling`, or its dotted name: scenes are read without dolfinx, which it needs.
+    makes_a_share
+        Whether it makes the share `relaxation_factor` of a pass.
+    needs_a_target
+        Whether it is for laws with a target alone (`Law.target`).
+    """
+
+    meaning: str
+    place: Callable[..., Any] | str
+    makes_a_share: bool = False
+    needs_a_target: bool = False
+
+    @property
+    def make(self) -> Callable[..., Any]:
+        """Makes the coupling of a state, a tissue, a remodeling pass and settings of the solver."""
+        found: Callable[..., Any] = pkgutil.resolve_name(self.place) if isinstance(self.place, str) else self.place
+        return found
+
+
+COUPLINGS = {
+    "staggered": CouplingKind(
+        "solve with the cells of the step before, then remodel once", "remodel_fenicsx.evolution.coupling:Staggered"
+    ),
+    "relaxed": CouplingKind(
+        "the same with a share, relaxation_factor, of what the pass changes: half of it is stable for every driver and "
+        "frame but under weak loads, where 'staggered' over-corrects with 'pk2' and 'finger'",
+        "remodel_fenicsx.evolution.coupling:Relaxed",
+        makes_a_share=True,
+    ),
+    "extrapolated": CouplingKind(
+        "remodel first, towards the stress of the middle of the step, extrapolated from the two steps before; then "
+        "solve: of second order, for the law 'tensor'",
+        "remodel_fenicsx.evolution.coupling:Extrapolated",
+        needs_a_target=True,
+    ),
+    "implicit": CouplingKind(
+        "the cells belong to the stress of the same step: Newton's method on both, for the law 'tensor' (with a "
+        "repulsion that sees no axes) and the laws of the paper",
+        "remodel_fenicsx.evolution.implicit:Implicit",
+    ),
+}
+"""Couplings by the name that a scene gives them."""
+
+
+class Remodeling(Table):
+    """How the cells follow the load: driving tensor, evolution law, frame and speed."""
+
+    driver: Annotated[str, OneOf(DRIVERS)] = Field(
+        default="cauchy",
+        description="Tensor whose positive eigenvalues the cells follow: 'cauchy' stress, second Piola-Kirchhoff "
+        "stress 'pk2', or 'finger' tensor b (it remodels even a body without load, and l_3 does not vanish).",
+    )
+    law: Annotated[str, OneOf(LAWS)] = Field(
+        default="explicit",
+        description="Evolution of the cells: 'explicit' is eq. (11), in absolute time; 'rate' integrates eq. (10); "
+        "'relaxation' is dl/dt = kappa (r0 e - l), right for changing loads; 'rotation' (Remark 5) turns the axis of "
+        "the largest dimension gradually and leaves the dimensions alone; 'tensor' is 'relaxation' for the "
+        "structure tensor as a whole, without ranks and axes; 'none' leaves the cells alone. Where neither scene nor "
+        "preset says it: 'tensor'.",
+    )
+    frame: Annotated[str, OneOf(FRAMES)] = Field(
+        default="material",
+        description="Axes of the remodeled cells, for the drivers 'cauchy' and 'finger': 'material' takes the fibres "
+        "that the deformation carries onto the principal directions (objective), 'spatial' the principal directions "
+        "themselves, as printed. The driver 'pk2' has material eigenvectors of its own.",
+    )
+    pairing: Annotated[str, OneOf(PAIRINGS)] = Field(
+        default="sorted",
+        description="Which dimension follows which principal value: 'sorted' by rank, as printed (where two values "
+        "cross, the cell turns by 90 degrees at once), 'continuous' by axis (each principal direction goes on from the "
+        "axis that it overlaps most). The law 'rotation' does not ask.",
+    )
+    coupling: Annotated[str, OneOf(COUPLINGS)] = Field(
+        default="staggered",
+        description="; ".join(f"{name!r}: {kind.meaning}" for name, kind in COUPLINGS.items())
+        + ". Where neither scene nor preset says it: 'extrapolated' with the law 'tensor'.",
+    )
+    relaxation_factor: float = Field(
+        default=0.5,
+        gt=0,
+        le=1,
+        description="Share theta of a pass's change of the structure tensor that 'relaxed' makes; 1 is 'staggered'.",
+    )
+    kappa: float = Field(
+        default=0.025, ge=0, description="Speed of remodeling kappa, in 1/time; a difference fades like exp(-kappa t)."
+    )
+    rotation_time: float = Field(
+        default=40.0,
+        gt=0,
+        description="Time of the law 'rotation': a small angle between fibre and tension fades like "
+        "exp(-t / rotation_time).",
+    )
+
+    def warnings(self) -> list[str]:
+        """A line on a law that a share of each pass makes slower."""
+        law, share = LAWS[self.law], self.relaxation_factor
+        if not COUPLINGS[self.coupling].makes_a_share or share == 1 or not law.remodels or law.of_absolute_time:
+            return []
+        return [
+            f"remodeling.coupling = {self.coupling!r} makes a share of {share:g} of each pass, and the law "
+            f"{self.law!r} does not make up for the rest: cells remodel at about {share:g} times the speed"
+        ]
+
+    @model_validator(mode="after")
+    def _coupling_fits_the_law(self) -> Remodeling:
+        if COUPLINGS[self.coupling].needs_a_target and LAWS[self.law].target is None:
+            laws = ", ".join(repr(name) for name, law in LAWS.items() if law.target is not None)
+            raise fault(
+                f"needs a remodeling.law with a target that can be extrapolated: {laws}", "coupling", self.coupling
+            )
+        return self
+
+
+# ---------------------------------------------------------------- loads and time
+
+
+def _ramp(value: Any) -> tuple[tuple[float, float], ...]:
+    """Pairs (time, factor) whose times increase; anything else is a fault that names the entry."""
+    if not isinstance(value, (list, tuple)) or not value:
+        raise fault("must be a list of pairs [time, factor], at least one")
+    for index, entry in enumerate(value):
+        if not isinstance(entry, (list, tuple)) or len(entry) != 2 or not all(map(is_number, entry)):
+            raise fault("must be a pair [time, factor] of finite numbers", f"[{index}]", entry)
+    for index, (time, _) in enumerate(value):
+        if time < 0:
+            raise fault("must be at least 0, where the simulation starts", f"[{index}][0]", time)
+        if index and time <= value[index - 1][0]:
+            rule = f"must be later than the time {shown(value[index - 1][0])} of the entry before"
+            raise fault(rule, f"[{index}][0]", time)
+    return tuple((float(time), float(factor)) for time, factor in value)
+
+
+class Load(Table):
+    """A load by name: `force` of cube and tendon, `pressure` and `elongation` of a tube; zero if it is not listed.
+
+    `force` is the total dead force along z on the top; `pressure` acts on the deformed inner face; `elongation` is the
+    prescribed engineering strain of the length (0.1: 10 % longer). A tube with `axial_force` in place of `elongation`
+    has a length that is an unknown.
+    """
+
+    value: float = Field(
+        description="Full value at factor 1: force in stress_unit times length squared, pressure in stress_unit, "
+        "elongation without unit (above -1)."
+    )
+    ramp: Annotated[tuple[tuple[float, float], ...], checked(_ramp)] = Field(
+        description="Factor on the value over time, as [time, factor] pairs with increasing times: linear in between, "
+        "held before the first and after the last pair. Times up to time.end must be multiples of time.step; with "
+        "time.tolerance they are hit.",
+        json_schema_extra={"allowed": "a list of pairs [time, factor] with increasing times"},
+    )
+
+    def factor(self, time: float) -> float:
+        """Factor on the value at a time: piecewise linear, held before the first and after the last pair."""
+        hit = next((corner for corner, _ in self.ramp if same_time(time, corner)), time)  # exact at its own times
+        times, factors = zip(*self.ramp, strict=True)
+        return float(np.interp(hit, times, factors))
+
+    @property
+    def falls(self) -> bool:
+        """Whether it is ever smaller than before, or changes its sign."""
+        factors = [0.0, *(factor for _, factor in self.ramp)]
+        return any(abs(new) < abs(old) or new * old < 0 for old, new in itertools.pairwise(factors))
+
+    def largest(self, end: float) -> float:
+        """The value of largest magnitude from time 0 to `end`, with its sign."""
+        times = [end, *(time for time, _ in self.ramp if time < end)]
+        return max((self.value * self.factor(time) for time in times), key=abs)
+
+
+EQUILIBRIUM = "equilibrium"
+"""What `time.end` says where the way there is not asked for."""
+
+
+def _end(value: Any) -> Any:
+    """A time, or the word."""
+    if value == EQUILIBRIUM:
+        return value
+    if not is_number(value) or not value > 0:
+        raise fault(f"must be a finite number greater than 0, or {EQUILIBRIUM!r}")
+    return float(value)
+
+
+class Time(Table):
+    """Simulated time, in the unit of 1/kappa. It starts at 0 with the unloaded body."""
+
+    # a number for all who step through time; those who take the word ask `is_equilibrium` first
+    end: Annotated[Any, checked(_end)] = Field(
+        description="Last time, a whole number of steps, or any time with a tolerance; or 'equilibrium': at once to "
+        "the state that remodeling comes to under the loads at the end of their ramps (docs/theory.md, Equilibrium at "
+        "once).",
+        json_schema_extra={"allowed": "a finite number greater than 0, or 'equilibrium'"},
+    )
+    step: float = Field(
+        default=1.0, gt=0, description="Time between two remodeling passes; with a tolerance the first step."
+    )
+    tolerance: float | None = Field(
+        default=None,
+        gt=0,
+        description="Where it is given, steps are as long as the estimated error in time stays below it, in degrees: "
+        "of the direction of the chains, root mean square over the body, and of lengths, relative, as an angle (1 "
+        "degree is 1.7 %). Times of ramps and output.times are hit. On the way to an equilibrium steps are always "
+        "chosen so; default there: 3 degrees, 0.5 where a load falls.",
+        json_schema_extra={"allowed": "a number greater than 0, in degrees"},
+    )
+
+    @model_validator(mode="after")
+    def _whole_number_of_steps(self) -> Time:
+        if self.is_equilibrium:
+            return self
+        if self.step > self.end:
+            raise fault(f"must be at most time.end = {shown(self.end)}", "step", self.step)
+        if self.end / self.step > MOST_STEPS:
+            rule = f"must be at least time.end / {MOST_STEPS} = {self.end / MOST_STEPS:.6g}"
+            raise fault(rule, "step", self.step)
+        if not self.is_hit(self.end):
+            raise fault(nearest_multiples(self.end, self.step, "time.step"), "end", self.end)
+        return self
+
+    @property
+    def is_equilibrium(self) -> bool:
+        """Whether the end is no time."""
+        return bool(self.end == EQUILIBRIUM)
+
+    @property
+    def number_of_steps(self) -> int:
+        """Number of steps from 0 to the end, the equilibrium is one; with a tolerance the run's own are others."""
+        return 1 if self.is_equilibrium else round(self.end / self.step)
+
+    def is_hit(self, time: float) -> bool:
+        """Whether a step ends at a time, or may end there."""
+        return self.tolerance is not None or is_multiple(time, self.step)
+
+    def progress(self, number: int, time: float) -> int:
+        """How many of `number_of_steps` are behind a step; with a tolerance, by its time."""
+        return number if self.tolerance is None or self.is_equilibrium else math.floor(time / self.step * (1 + 1e-12))
+
+    def in_words(self) -> str:
+        """How it is divided."""
+        if self.tolerance is None:
+            return f"{self.number_of_steps} steps"
+        return f"steps of an error below {self.tolerance:g} degrees"
+
+
+def nearest_multiples(time: float, step: float, name: str) -> str:
+    below = math.floor(time / step)
+    nearest = f"{below * step:.12g} and {(below + 1) * step:.12g}"
+    return f"must be a multiple of {name} = {shown(step)}; the nearest are {nearest}"
+
+
+# ---------------------------------------------------------------- solver and output
+
+
+def _petsc_options(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        for name, entry in value.items():
+            if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z]\w*", name):
+                raise fault("not a PETSc option; write its name without the leading '-'", quoted(str(name)), entry)
+            if name in ("snes_rtol", "snes_atol", "snes_stol"):
+                raise fault("has no effect; use solver.relative_tolerance, solver.absolute_tolerance", name, entry)
+            if not isinstance(entry, (str, bool)) and not is_number(entry):
+                raise fault("must be a string, a finite number, true or false", name, entry)
+            if refused := fault_of_option(name, entry):
+                raise fault(refused, name, entry)
+    return value
+
+
+class Solver(Table):
+    """Solution of the nonlinear problem of each step."""
+
+    method: Annotated[str, _auto_or(METHODS)] = Field(
+        default=AUTO,
+        description=f"'auto': 'direct' up to {SMALL_BODY} unknowns ({SMALL_REDUCTION} of a reduction), then 'lagged', "
+        f"above {LARGE} 'iterative'; "
+        f"on more ranks 'direct' up to {LARGE_ON_RANKS}, then 'iterative'; "
+        + "; ".join(f"{name!r}: {meaning}" for name, meaning in MEANINGS.items())
+        + " (docs/speed.md).",
+        json_schema_extra={"allowed": "one of " + ", ".join(map(repr, (AUTO, *METHODS)))},
+    )
+    predictor: Literal["none", "autoregressive", "with-tolerance"] = Field(
+        default="autoregressive",
+        description="Where Newton's method starts a step: 'none': at the displacement of the step before; "
+        "'autoregressive': at what the increments of the last steps predict; 'with-tolerance': as predicted where "
+        "steps are chosen (time.tolerance), 'none' where they are equal. The solutions are the same to the "
+        "tolerance.",
+    )
+    absolute_tolerance: Annotated[float, FORCE] = Field(
+        default=0.0,
+        ge=0,
+        description="A step is solved when |R| <= absolute_tolerance + relative_tolerance |nodal forces|, R the "
+        "vector of out-of-balance nodal forces; in the unit of force, so that it depends on the units of the scene.",
+    )
+    relative_tolerance: float = Field(
+        default=1e-10,
+        ge=0,
+        lt=1,
+        description="See absolute_tolerance; relative to the norm of the internal nodal forces, which stays when the "
+        "load is held.",
+    )
+    maximum_iterations: int = Field(default=25, ge=1, description="Newton iterations before a step counts as failed.")
+    maximum_halvings: int = Field(
+        default=12, ge=0, description="How often a failed step is halved before the run ends with an error."
+    )
+    unstable: Literal["warn", "stop"] = Field(
+        default="warn",
+        description="What happens at an equilibrium that the body would leave, one with more negative eigenvalues of "
+        "the tangent than before: a warning that says where, or, looked for in every step, the end of the run after "
+        "the last stable step (exit code 3).",
+    )
+    petsc_options: Annotated[dict[str, Any], checked(_petsc_options)] = Field(
+        default_factory=dict,
+        description="PETSc options that override the method's, without the leading '-': snes_..., ksp_..., pc_... "
+        "and mat_.... None that runs code or writes files; those of PETSC_OPTIONS are the user's own.",
+    )
+
+    @model_validator(mode="after")
+    def _has_a_tolerance(self) -> Solver:
+        if self.absolute_tolerance == 0.0 and self.relative_tolerance == 0.0:
+            raise fault("must be greater than 0 where absolute_tolerance is 0", "relative_tolerance", 0.0)
+        return self
+
+
+FIELDS_BY_NAME = (
+    "displacement", "deformation_gradient", "cauchy_stress", "cell_dimensions", "axis_1", "axis_2", "axis_3",
+    "fibre_angle", "fibre_angle_deformed", "chain_extension", "chains",
+)  # fmt: skip
+"""What `output.fields` may name (`results.fields`); "chains" are the lines of fields_chains.vtkhdf."""
+
+
+def _fields(value: Any) -> Any:
+    if isinstance(value, bool):
+        return value
+    if not isinstance(value, (list, tuple)) or not all(isinstance(name, str) for name in value):
+        raise fault("must be true, false or a list of names of fields")
+    for name in value:
+        if name not in FIELDS_BY_NAME:
+            raise fault(f"no such field; allowed are {', '.join(map(repr, FIELDS_BY_NAME))}", value=name)
+    return tuple(value)
+
+
+def _columns(value: Any) -> Any:
+    if not isinstance(value, (list, tuple)) or not all(isinstance(name, str) for name in value):
+        raise fault("must be a list of names of columns")
+    return tuple(dict.fromkeys(value))
+
+
+def _times(value: Any) -> Any:
+    if not isinstance(value, (list, tuple)) or not all(is_number(time) and time > 0 for time in value):
+        raise fault("must be a list of times above 0")
+    times = tuple(map(float, value))
+    if any(later <= time for time, later in zip(times, times[1:], strict=False)):
+        raise fault("must increase from time to time")
+    return times
+
+
+class Output(Table):
+    """What a run writes beside its history table."""
+
+    fields: Annotated[bool | tuple[str, ...], checked(_fields)] = Field(
+        default=True,
+        description="Fields to write for ParaView: true for all, false for none, or names (docs/commands.md), 'chains' "
+        "for the chain lines. What no name asks for is not computed.",
+        json_schema_extra={"allowed": "true, false or a list of names of fields"},
+    )
+    columns: Annotated[tuple[str, ...], checked(_columns)] = Field(
+        default=(),
+        description="Columns of the history: 'pass_residual' and 'negative_eigenvalues' come beside those that it "
+        "has without being asked; where some of these are named, only they are measured, with time and loads "
+        "(docs/commands.md).",
+        json_schema_extra={"allowed": "a list of names of columns"},
+    )
+    every: int = Field(default=1, ge=1, description="Write the fields of every n-th step; the last one always.")
+    times: Annotated[tuple[float, ...], checked(_times)] = Field(
+        default=(),
+        description="Times up to time.end that have a row and whose fields are written beside those of every n-th "
+        "step: multiples of time.step; with time.tolerance a step ends there.",
+        json_schema_extra={"allowed": "a list of increasing times above 0"},
+    )
+    checkpoint: int | None = Field(
+        default=None,
+        ge=0,
+        description="Steps between two checkpoints, from which a run can be resumed; 0: only at the end. Without it "
+        "they are chosen by time: at most 10 minutes are lost, and they cost below 5 % of the run. There is always one "
+        "at the end, however the run ends.",
+        json_schema_extra={"allowed": "a whole number at least 0"},
+    )
