@@ -12,7 +12,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
-from remodel_fenicsx.fem.ranks import over_ranks
+from remodel_fenicsx.fem.assembly import over_ranks
 from remodel_fenicsx.fem.solver_methods import AUTO
 from remodel_fenicsx.kernels.tensor import condensed_points, tensor_kernels
 from remodel_fenicsx.model import spectral
@@ -34,9 +34,8 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 BEFORE_HOLDING = 5
-"""Newton iterations after which cells that still jump stay as they are: by rank there are states without a solution."""
-BEFORE_REFUSING = 2
-"""Newton iterations after which, where no cells may be held, states with points without a solution are refused."""
+"""Newton iterations after which cells that still jump stay as they are (by rank there are states without a solution),
+or after which states where cells are not found are refused (where none may be held)."""
 PASSES = 8  # with frozen cells, before a second try
 SETTLES = 0.5  # of the largest change of the unknowns over a pass: what the last may be
 JUMP = 0.02
@@ -239,12 +238,12 @@ class AnsweringCells:
     @property
     def _refused(self) -> Flags:
         """Points without a solution, after so many iterations that none is expected, that may not be held."""
-        return ~(self._found.converged | self._may_hold) & (self._iterations > BEFORE_REFUSING)
+        return ~(self._found.converged | self._may_hold) & (self._iterations > BEFORE_HOLDING)
 
-    def unsolved(self) -> bool:
-        """Whether the present unknowns are refused, for points on any rank have no solution."""
+    def unsolved(self, locking_length: Array) -> bool:
+        """Whether the present unknowns are refused for points, on any rank, that have no solution with r < L."""
         self.update()
-        return self._count(self._refused) > 0
+        return self._count(self._refused & (self._found.squared_lengths < locking_length.reshape(-1) ** 2)) > 0
 
 
 class AnsweringEquilibrium(Equilibrium):
@@ -353,8 +352,9 @@ class AnsweringNewton(GuardedNewton):
 
     def _may_go(self, before: Look, after: Look) -> bool:
         """As of `GuardedNewton`; where cells have no solution no shorter step is looked for, which would cost more."""
-        right_way_out = after.extension.min_jacobian > 0
-        return (right_way_out and self.answering.unsolved()) or super()._may_go(before, after)
+        if after.extension.min_jacobian > 0 and self.answering.unsolved(self.equilibrium.locking_length()):
+            return True
+        return super()._may_go(before, after)
 
     def _solved(self) -> Solution:
         self.answering.release()

@@ -68,8 +68,8 @@ class SolveFailure(RuntimeError):
         self.linear_iterations = linear_iterations
         self.extension = extension
 
-    def count(self, earlier: SolveFailure) -> None:
-        """With the work of an attempt that had failed before."""
+    def count(self, earlier: SolveFailure | Solution) -> None:
+        """With the work of a solve before."""
         self.newton_iterations += earlier.newton_iterations
         self.linear_iterations += earlier.linear_iterations
         self.tangents += earlier.tangents

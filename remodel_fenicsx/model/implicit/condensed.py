@@ -206,7 +206,9 @@ class CondensedPoints:
             place = np.tile(np.arange(3), (len(F), 1))
         stress = self.stress(strain, inside)
         tensor = self._tensor(strain, stress, False)[0]
-        return Solution(strain, tensor.copy(), Response(inside, place=place), stress, np.ones(len(F), dtype=bool), np.zeros(len(F)))
+        return Solution(
+            strain, tensor.copy(), Response(inside, place=place), stress, np.ones(len(F), dtype=bool), np.zeros(len(F))
+        )
 
     def passed(self, F: Array, found: Solution) -> Solution:
         """Points with the cells that a pass with their driving tensor makes."""
@@ -250,9 +252,9 @@ class CondensedPoints:
 
     def _iterate(self, found: Solution) -> None:
         """Newton's method where there is no solution yet."""
-        open_points = np.flatnonzero(~found.converged)
+        open_points: NDArray[Any] = np.flatnonzero(~found.converged)
         jumps = jumps_by_rank(self.step)[open_points]
-        most = np.where(jumps, PATIENCE, ITERATIONS)  # the others have a solution
+        most: NDArray[Any] = np.where(jumps, PATIENCE, ITERATIONS)  # the others have a solution
         least, patience = np.full(open_points.size, np.inf), most
         for _ in range(ITERATIONS):
             if not open_points.size:
@@ -375,7 +377,10 @@ def _some_cells(cells: Cells, chosen: Any) -> Cells:
 def _taken(found: Solution, chosen: Any) -> Solution:
     """A solution of some of the points: what a step of Newton's method needs."""
     return replace(
-        found, strain=found.strain.at(chosen), tensor=found.tensor[chosen], converged=found.converged[chosen],
+        found,
+        strain=found.strain.at(chosen),
+        tensor=found.tensor[chosen],
+        converged=found.converged[chosen],
         missing=found.missing[chosen],
     )
 
