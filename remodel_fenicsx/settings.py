@@ -26,6 +26,7 @@ from remodel_fenicsx.fem.solver_methods import (
     LARGE_ON_RANKS,
     MEANINGS,
     METHODS,
+    REMOVED,
     SMALL_BODY,
     SMALL_REDUCTION,
     fault_of_option,
@@ -78,10 +79,15 @@ class Mesh(Table):
         return self
 
 
-def _auto_or(names: Collection[str]) -> BeforeValidator:
-    """Annotation of a field that is `AUTO` or one of a registry's keys, those registered later included."""
+def _auto_or(names: Collection[str], removed: Mapping[str, str] | None = None) -> BeforeValidator:
+    """Annotation of a field that is `AUTO` or one of a registry's keys, those registered later included.
+
+    `removed`: names of earlier versions, with what to say of each.
+    """
 
     def check(value: Any) -> Any:
+        if removed and isinstance(value, str) and value in removed:
+            raise fault(removed[value])
         if value not in (AUTO, *names):
             raise fault("allowed are " + ", ".join(map(repr, (AUTO, *names))))
         return value
@@ -277,7 +283,7 @@ class CouplingKind:
     ----------
     meaning
         What it does, for docs/scene.md.
-    place
+    coupling
         The class of the `Coupling`, or its dotted name: scenes are read without dolfinx, which it needs.
     makes_a_share
         Whether it makes the share `relaxation_factor` of a pass.
@@ -286,14 +292,16 @@ class CouplingKind:
     """
 
     meaning: str
-    place: Callable[..., Any] | str
+    coupling: Callable[..., Any] | str
     makes_a_share: bool = False
     needs_a_target: bool = False
 
     @property
     def make(self) -> Callable[..., Any]:
         """Makes the coupling of a state, a tissue, a remodeling pass and settings of the solver."""
-        found: Callable[..., Any] = pkgutil.resolve_name(self.place) if isinstance(self.place, str) else self.place
+        found: Callable[..., Any] = (
+            pkgutil.resolve_name(self.coupling) if isinstance(self.coupling, str) else self.coupling
+        )
         return found
 
 
@@ -547,7 +555,7 @@ def _petsc_options(value: Any) -> Any:
 class Solver(Table):
     """Solution of the nonlinear problem of each step."""
 
-    method: Annotated[str, _auto_or(METHODS)] = Field(
+    method: Annotated[str, _auto_or(METHODS, REMOVED)] = Field(
         default=AUTO,
         description=f"'auto': 'direct' up to {SMALL_BODY} unknowns ({SMALL_REDUCTION} of a reduction), then 'lagged', "
         f"above {LARGE} 'iterative'; "

@@ -384,7 +384,12 @@ BAD_SCENES = [
     (
         CUBE,
         {"solver.method": "magic"},
-        "solver.method = 'magic': allowed are 'auto', 'direct', 'lagged', 'exact', 'iterative'",
+        "solver.method = 'magic': allowed are 'auto', 'direct', 'lagged', 'iterative'",
+    ),
+    (
+        CUBE,
+        {"solver.method": "exact"},
+        "solver.method = 'exact': was removed; take 'lagged', or 'direct' for a new tangent in every iteration",
     ),
     (
         CUBE,

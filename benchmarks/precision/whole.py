@@ -23,7 +23,6 @@ OTHERS = {
     "selective integration": {"mesh.formulation": "selective-integration"},
     "residual to 1e-6": {"solver.relative_tolerance": 1e-6},
     "residual to 1e-4": {"solver.relative_tolerance": 1e-4},
-    "method exact": {"solver.method": "exact"},
     "method iterative": {"solver.method": "iterative"},
     "no predictor": {"solver.predictor": "none"},
 }

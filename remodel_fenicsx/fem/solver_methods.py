@@ -6,7 +6,7 @@ import re
 from typing import Any
 
 AUTO = "auto"
-LAGGED, EXACT = "lagged", "exact"  # those whose factors may be of an earlier tangent (`solver.linear`)
+LAGGED = "lagged"  # whose factor may be of an earlier tangent (`solver.linear`)
 
 # MUMPS: robust for indefinite tangents too, one factorisation pattern for all steps
 METHODS: dict[str, dict[str, Any]] = {
@@ -19,7 +19,6 @@ METHODS: dict[str, dict[str, Any]] = {
         "mat_mumps_icntl_33": 1,  # the determinant, whose sign tells of unstable equilibria; costs nothing
     },
     LAGGED: {"snes_type": "newtonls", "snes_linesearch_type": "basic", "ksp_type": "preonly"},
-    EXACT: {"snes_type": "newtonls", "snes_linesearch_type": "basic", "ksp_type": "fgmres", "ksp_max_it": 60},
     # GMRES, because tangents of random cells are not always definite; levels cost as much as 20 of its iterations, and
     # those of an older tangent serve as well
     "iterative": {
@@ -43,10 +42,12 @@ MEANINGS = {
     "direct": "Newton's method, each system factorised by MUMPS; runs on so many ranks are the same "
     "to the last digit",
     LAGGED: "few tangents are factorised, and quasi-Newton steps (L-BFGS) make up for it",
-    EXACT: "a new tangent in every iteration, its system solved by GMRES with an earlier factor",
     "iterative": "Newton's method with GMRES and algebraic multigrid (GAMG), whose levels are kept for some iterations",
 }
 """In words, for docs/scene.md; those of one's own need none."""
+
+REMOVED = {"exact": "was removed; take 'lagged', or 'direct' for a new tangent in every iteration"}
+"""Methods of earlier versions, and what to take in their place."""
 
 # MUMPS on several ranks adds up in the order in which messages come: its last digits differ from run to run. So one
 # rank has the whole matrix and factorises it, which for the sizes that are factorised at all costs little

@@ -13,7 +13,7 @@ from petsc4py import PETSc
 
 from remodel_fenicsx.fem.assembly import over_ranks
 from remodel_fenicsx.fem.petsc_options import ProblemOptions
-from remodel_fenicsx.fem.solver_methods import AUTO, EXACT, LAGGED, chosen, is_small, method_options
+from remodel_fenicsx.fem.solver_methods import AUTO, LAGGED, chosen, is_small, method_options
 from remodel_fenicsx.settings import Solver
 from remodel_fenicsx.solver.equilibrium import Equilibrium, Look
 from remodel_fenicsx.solver.limits import Limits
@@ -61,7 +61,7 @@ class GuardedNewton:
         unknowns, ranks = self._x.getSize(), equilibrium.comm.size
         reduced = equilibrium.state.kinematics.reduced
         self.method = chosen(settings.method, unknowns, ranks, reduced)
-        if robust and self.method in (LAGGED, EXACT):
+        if robust and self.method == LAGGED:
             self.method = "direct"
         # where a method is named, three dimensions stay with it: its numbers shall not depend on their size
         small = is_small(unknowns, reduced) and (reduced or settings.method == AUTO)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -13,13 +12,13 @@ import ufl
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
+from remodel_fenicsx.evolution.stepper import Step, Stepper
 from remodel_fenicsx.fem import jit
-from remodel_fenicsx.state.memory import Numbers, Occasions
+from remodel_fenicsx.state.memory import Occasions
 from remodel_fenicsx.state.parameters import at_points
+from remodel_fenicsx.watch.once import WarnsOnce
 
 Array = NDArray[np.float64]
-log = logging.getLogger(__name__)
 
 # The part of its way that a body lacks, from which it is said. docs/locking.md: estimate and error over lambda/mu and
 # radii; the paper's bodies come to 3.6 % (artery with random cells, t = 5)
@@ -46,7 +45,7 @@ class Missing(NamedTuple):
     shape: float
 
 
-class LockingWarning(Watcher):
+class LockingWarning(WarnsOnce):
     """Says once that elements hold the body back, as soon as a solved state shows it.
 
     What an element cannot represent costs work. Two integrals over the body estimate how much,
@@ -73,7 +72,7 @@ class LockingWarning(Watcher):
     """
 
     def __init__(self, stepper: Stepper, locks: bool):
-        self.stepper, self.quadrature = stepper, stepper.state.cells.quadrature
+        super().__init__(stepper, "locking", {"energy": 0, "vain": 0})
         tissue = at_points(stepper.tissue, self.quadrature)
         shape = self.quadrature.shape
         self.stiffnesses = [self.quadrature.owned(v.reshape(shape)) for v in (tissue.lame_lambda, tissue.lame_mu)]
@@ -81,7 +80,6 @@ class LockingWarning(Watcher):
         self.response = VolumeResponse(stepper, self.stiffnesses[0])
         self.homogeneous = stepper.state.kinematics.homogeneous  # then there are no elements that could hold it back
         self._occasions = Occasions(stepper.state, "locking")
-        self._numbers = Numbers(stepper.state, "locking", {"said": 0, "energy": 0, "vain": 0})
 
     def stiffness_ratio(self) -> float:
         """Largest lambda/mu in the body."""
@@ -94,15 +92,19 @@ class LockingWarning(Watcher):
         driven = Missing(0.0, 0.0)
         if work > DRIVEN * energy > 0:
             driven = Missing(volume / work, shape / work)
-        if volume <= NOTICEABLE * energy or not (answer := self.response()):
+        if volume <= NOTICEABLE * energy or (lacking := self.response()) is None:
             return driven
-        lacking, smooth = answer
         driven = driven._replace(volume=min(driven.volume, lacking))
-        # 0.35 in a wall that its random cells alone deform; at least 0.87 in the paper's artery and in tubes that lock
-        alone = max(2 * smooth - 1, 0.0) * lacking
+        if max(free_work, 0.0) + self._energy_of_elongation() < DRIVEN * energy:
+            return driven
         if free_work > 0:
-            alone = min(alone, volume / free_work)
-        return max(driven, Missing(alone, 0.0), key=sum)
+            lacking = min(lacking, volume / free_work)
+        return max(driven, Missing(lacking, 0.0), key=sum)
+
+    def _energy_of_elongation(self) -> float:
+        """That a prescribed elongation e gives a matrix of constant volume: 3/2 mu e^2 over the body."""
+        elongation = self.stepper.state.loading.values.get("elongation", 0.0)
+        return self.quadrature.integral(1.5 * self.stiffnesses[1] * elongation**2) if elongation else 0.0
 
     def energies(self) -> tuple[float, float, float]:
         """Of the matrix, with the mean J of each element; of changes of J inside; twice that of changes of F there."""
@@ -150,14 +152,11 @@ class LockingWarning(Watcher):
 
     def solved(self, step: Step) -> None:
         """Look, until it was said."""
-        if self.homogeneous or self._numbers["said"] or not self._occasions.due() or not self._is_news():
+        if self.homogeneous or self.said or not self._occasions.due() or not self._is_news():
             return
         missing = self.missing()
-        if sum(missing) <= LIMIT:
-            return
-        self._numbers["said"] = True
-        if self.stepper.state.comm.rank == 0:
-            log.warning("time %g: %s", step.time, self.in_words(missing))
+        if sum(missing) > LIMIT:
+            self.say(step, self.in_words(missing))
 
     def _is_news(self) -> bool:
         """Whether energies differ from those of the last look."""
@@ -201,15 +200,15 @@ class VolumeResponse:
         self.stepper, self.state, self.stiffness = stepper, stepper.state, stiffness
         self.quadrature = stepper.state.cells.quadrature
 
-    def __call__(self) -> tuple[float, float] | None:
-        """Which part of its way the body lacks, and how smooth it is what holds it back, both from 0 to 1.
+    def __call__(self) -> float | None:
+        """Which part of its way the body lacks, from 0 to 1.
 
         None where it is not known: the solver keeps no factors, or elements of a single point have nothing inside.
         """
         factors = self.stepper.coupling.newton.factorisation()
         if factors is None or self.quadrature.shape[1] == 1 or not factors.getOperators()[0].assembled:
             return None
-        changes, stress = self._stress()
+        stress = self._stress()
         forces, first = factors.getOperators()[0].createVecs()
         self._assemble(stress, forces)
         factors.apply(forces, first)
@@ -221,32 +220,17 @@ class VolumeResponse:
             lacking = self._part_of_the_way(first, 1 / (1 - min(max(share, 0.0), MOST_HELD)))
         for vector in (forces, first):
             vector.destroy()
-        return lacking, self._smooth_share(changes)
+        return lacking
 
-    def _smooth_share(self, changes: Array) -> float:
-        """How alike values (elements, points) vary in neighbouring elements: 1 for a smooth field, near 0 for noise.
-
-        One less the squared jumps of the slopes in space between elements, over the squared slopes.
-        """
-        quadrature = self.quadrature
-        places = quadrature.owned(quadrature.coordinates)
-        places = places - places.mean(axis=1, keepdims=True)
-        slopes = np.einsum("eip,ep->ei", np.linalg.pinv(places, rcond=1e-6), changes)
-        jumps = quadrature.jumps(np.repeat(slopes[:, None], quadrature.shape[1], axis=1))
-        weights = self.stiffness * np.square(places).sum(axis=-1)
-        squares, jumped = (
-            quadrature.integral(weights * values[:, None]) for values in (np.square(slopes).sum(axis=1), jumps)
-        )
-        return max(1 - jumped / squares, 0.0) if squares > 0 else 0.0
-
-    def _stress(self) -> tuple[Array, Array]:
-        """ln J - ln J_e (elements, points), and P (elements, points, 3, 3) of the present unknowns."""
+    def _stress(self) -> Array:
+        """P of the present unknowns, (elements, points, 3, 3)."""
         quadrature = self.quadrature
         states = quadrature.owned(self.stepper.coupling.equilibrium.states())
         changes = quadrature.beyond(0, np.log(states[..., 1])[..., None])[..., 0]
         F = states[..., 2:].reshape(*changes.shape, 3, 3)
         inverse = np.swapaxes(np.linalg.inv(F), -1, -2)
-        return changes, (self.stiffness * changes)[..., None, None] * inverse
+        stress: Array = (self.stiffness * changes)[..., None, None] * inverse
+        return stress
 
     def _assemble(self, stress: Array, forces: Any) -> None:
         """Nodal forces of a stress, zero where displacements are prescribed."""
@@ -279,7 +263,7 @@ class VolumeResponse:
         try:
             for sign, end in zip((1.0, -1.0), ends, strict=True):
                 values[:] = start + sign * step * change
-                self._assemble(self._stress()[1], end)
+                self._assemble(self._stress(), end)
         finally:
             values[:] = start
         ends[0].axpy(-1.0, ends[1])
