@@ -296,6 +296,7 @@ class AnsweringNewton(GuardedNewton):
         # cells that answer make steps far more nonlinear, and tangents unsymmetric: nothing is gained by old factors
         super().__init__(equilibrium, settings, robust=settings.method == AUTO)
         self.answering = equilibrium.answering
+        self._patient = False  # whether shorter steps are looked for where cells have no solution
 
     def solve(self) -> Solution:
         """As of `GuardedNewton`; at first no cells are held.
@@ -311,15 +312,32 @@ class AnsweringNewton(GuardedNewton):
                 raise
             log.info("solved once more, after passes: %s", failure.reason)
             try:
-                if not self._pass(failure):
-                    log.info("passes do not settle")
-                    raise failure
-                return self._solved().after(failure)
-            except SolveFailure as again:
+                return self._after_passes(failure, start, accepted)
+            except SolveFailure:
                 self.unknown.x.array[:], self.answering.accepted = start, accepted
-                if again is not failure:
-                    again.count(failure)
                 raise
+
+    def _after_passes(self, failure: SolveFailure, start: Any, accepted: Any) -> Solution:
+        """Solve from where passes lead; where no law jumps, at last from the start with shorter steps."""
+        try:
+            if not self._pass(failure):
+                log.info("passes do not settle")
+                raise failure
+            return self._solved().after(failure)
+        except SolveFailure as again:
+            if again is not failure:
+                again.count(failure)
+            if self.answering.may_hold():
+                raise
+            self.unknown.x.array[:], self.answering.accepted, self._patient = start, accepted, True
+            log.info("solved once more, with shorter steps: %s", again.reason)
+            try:
+                return self._solved().after(again)
+            except SolveFailure as last:
+                last.count(again)
+                raise
+        finally:
+            self._patient = False
 
     def _pass(self, work: SolveFailure) -> bool:
         """Passes with frozen cells, each with its equilibrium, up to one that changes nothing; adds what they cost.
@@ -352,7 +370,8 @@ class AnsweringNewton(GuardedNewton):
 
     def _may_go(self, before: Look, after: Look) -> bool:
         """As of `GuardedNewton`; where cells have no solution no shorter step is looked for, which would cost more."""
-        if after.extension.min_jacobian > 0 and self.answering.unsolved(self.equilibrium.locking_length()):
+        right_way_out = after.extension.min_jacobian > 0 and not self._patient
+        if right_way_out and self.answering.unsolved(self.equilibrium.locking_length()):
             return True
         return super()._may_go(before, after)
 

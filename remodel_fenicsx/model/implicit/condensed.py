@@ -255,7 +255,8 @@ class CondensedPoints:
         open_points: NDArray[Any] = np.flatnonzero(~found.converged)
         jumps = jumps_by_rank(self.step)[open_points]
         most: NDArray[Any] = np.where(jumps, PATIENCE, ITERATIONS)  # the others have a solution
-        least, patience = np.full(open_points.size, np.inf), most
+        least: Array = np.full(open_points.size, np.inf)
+        patience: NDArray[Any] = most
         for _ in range(ITERATIONS):
             if not open_points.size:
                 break
@@ -263,7 +264,8 @@ class CondensedPoints:
             put(found, open_points, improved)
             patience = np.where(improved.missing < PROGRESS * least, most, patience - 1)
             least, goes_on = np.fmin(least, improved.missing), ~improved.converged & (patience > 0)
-            open_points, least, patience, most = (a[goes_on] for a in (open_points, least, patience, most))
+            open_points, least = open_points[goes_on], least[goes_on]
+            patience, most = patience[goes_on], most[goes_on]
 
     def _followed(self, F: Array, strain: Strain) -> Solution:
         """The solution that the cells at the start come to when the time of the step passes in parts."""
