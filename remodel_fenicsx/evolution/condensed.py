@@ -323,7 +323,9 @@ class AnsweringNewton(GuardedNewton):
             if not self._pass(failure):
                 log.info("passes do not settle")
                 raise failure
-            return self._solved().after(failure)
+            solution = self._solved()
+            solution.count(failure)
+            return solution
         except SolveFailure as again:
             if again is not failure:
                 again.count(failure)
@@ -332,7 +334,9 @@ class AnsweringNewton(GuardedNewton):
             self.unknown.x.array[:], self.answering.accepted, self._patient = start, accepted, True
             log.info("solved once more, with shorter steps: %s", again.reason)
             try:
-                return self._solved().after(again)
+                solution = self._solved()
+                solution.count(again)
+                return solution
             except SolveFailure as last:
                 last.count(again)
                 raise
@@ -368,12 +372,10 @@ class AnsweringNewton(GuardedNewton):
             answering.frozen = None
         return bool(ways) and ways[-1] <= SETTLES * max(ways)
 
-    def _may_go(self, before: Look, after: Look) -> bool:
-        """As of `GuardedNewton`; where cells have no solution no shorter step is looked for, which would cost more."""
-        right_way_out = after.extension.min_jacobian > 0 and not self._patient
-        if right_way_out and self.answering.unsolved(self.equilibrium.locking_length()):
-            return True
-        return super()._may_go(before, after)
+    def gives_up(self, trial: Look) -> bool:
+        """Where cells have no solution: passes cost less than shorter steps."""
+        right_way_out = trial.extension.min_jacobian > 0 and not self._patient
+        return right_way_out and self.answering.unsolved(self.equilibrium.locking_length())
 
     def _solved(self) -> Solution:
         self.answering.release()
