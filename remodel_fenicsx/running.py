@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import logging
 import tomllib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TypeVar, cast
+from typing import cast
 
 from mpi4py import MPI
 
@@ -22,6 +22,7 @@ from remodel_fenicsx.results.run_folder import (
     FolderTaken,
     LastStep,
     RunFolder,
+    agreed,
     check_kept,
     chosen_folder,
     forget_steps,
@@ -145,22 +146,18 @@ def resume(
 
 def _kept(place: Path, overrides: Sequence[str], comm: MPI.Intracomm) -> tuple[Scene, Checkpoint | None]:
     """Scene, and checkpoint on rank 0, of a run that goes on; or the refusal on all ranks."""
-    scene = checkpoint = refusal = None
-    if comm.rank == 0:
-        try:
-            scene = read_scene(place / SCENE, overrides)
-            checkpoint = read_checkpoint(place)
-            if checkpoint is not None:
-                check_continuation(_scene_of(checkpoint), scene, checkpoint.time)
-                _say_where(checkpoint)
-            else:
-                log.info("no checkpoint yet: starts again at t = 0")
-        except (SceneError, CheckpointError) as error:
-            refusal = error
-    refusal = comm.bcast(refusal)
-    if refusal is not None:
-        raise refusal
-    return comm.bcast(scene), checkpoint
+    scene, checkpoint = agreed(comm, lambda: _looked_at(place, overrides) if comm.rank == 0 else (None, None))
+    return cast(Scene, comm.bcast(scene)), checkpoint
+
+
+def _looked_at(place: Path, overrides: Sequence[str]) -> tuple[Scene, Checkpoint | None]:
+    scene, checkpoint = read_scene(place / SCENE, overrides), read_checkpoint(place)
+    if checkpoint is not None:
+        check_continuation(_scene_of(checkpoint), scene, checkpoint.time)
+        _say_where(checkpoint)
+    else:
+        log.info("no checkpoint yet: starts again at t = 0")
+    return scene, checkpoint
 
 
 def _scene_of(checkpoint: Checkpoint) -> Scene:
@@ -223,11 +220,11 @@ def _record(simulation: Simulation, place: Path, around: _Circumstances) -> None
     after = LastStep(columns, state.number, state.time) if state.number else None
     if around.resumes:
         wanted = bool(scene.output.fields)
-        _agreed(comm, lambda: check_kept(place, after, wanted) if comm.rank == 0 else None)
+        agreed(comm, lambda: check_kept(place, after, wanted) if comm.rank == 0 else None)
         if after is None and comm.rank == 0:
             forget_steps(place)
     with ExitStack() as stack:
-        record = stack.enter_context(_agreed(comm, lambda: RunFolder(place, text, comm.rank, after)))
+        record = stack.enter_context(agreed(comm, lambda: RunFolder(place, text, comm.rank, after)))
         stack.enter_context(open_log(place / LOG, comm.rank, quiet=around.quiet, held=around.held))
         steps = scene.time.number_of_steps if simulation.control else state.number + len(simulation.remaining())
         rank, done = -1 if around.quiet else comm.rank, scene.time.progress(state.number, state.time)
@@ -241,7 +238,7 @@ def _record(simulation: Simulation, place: Path, around: _Circumstances) -> None
             names = field_names(scene.output.fields)
             parts = place, scene.geometry, simulation.stepper, scene.output.every, after and after.time, names
             times = scene.output.times
-            watchers.append(stack.enter_context(_agreed(comm, lambda: Fields(*parts, times))))
+            watchers.append(stack.enter_context(agreed(comm, lambda: Fields(*parts, times))))
         checkpoints = Checkpoints(place, state, text, scene.output.checkpoint, record.flush)
         pause = Pause(comm, place, lambda: around.stop.pause, around.deadline)
         watchers += [record, _Report(scene, progress), checkpoints, pause]
@@ -262,22 +259,6 @@ def _record(simulation: Simulation, place: Path, around: _Circumstances) -> None
                 log.info(FAILED + "%s: %s", type(defect).__name__, defect)
             raise
         log.info("finished")
-
-
-T = TypeVar("T")
-
-
-def _agreed(comm: MPI.Intracomm, make: Callable[[], T]) -> T:
-    """What `make` makes of the files of a run that goes on, or its refusal on all ranks. Collective."""
-    made = refusal = None
-    try:
-        made = make()
-    except RecordingError as error:  # rank 0 alone reads
-        refusal = error
-    refusal = comm.bcast(refusal)
-    if refusal is not None:
-        raise refusal
-    return cast(T, made)
 
 
 class _Report(Watcher):
