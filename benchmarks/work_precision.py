@@ -26,7 +26,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from benchmarks.precision import end, hold, places, spread, tendon, whole
-from remodel_fenicsx.body.profile import PROFILE, weights
+from remodel_fenicsx.body.columns import PROFILE, profile_weights
 from remodel_fenicsx.paper.output import COLOURS, STYLE, Page
 from remodel_fenicsx.scene.profiles import PROFILES
 from remodel_fenicsx.scene.scene import Scene, preset_scene, read_scene
@@ -131,7 +131,7 @@ def reference(law: str, folder: Path) -> tuple[Array, Array]:
 
 def _reference(law: str, step: float, elements: int) -> tuple[Array, Array]:
     history = solve_radial(step=step, elements=elements, law=law)
-    hats = weights((history.points - 1.0) / 2.0) * history.areas[:, None]
+    hats = profile_weights((history.points - 1.0) / 2.0) * history.areas[:, None]
     rows = [round(time / step) - 1 for time in TIMES]
     dimensions = history.dimensions[rows]
     angles = np.degrees(np.arctan2(dimensions[..., 1], dimensions[..., 0])) @ hats / hats.sum(axis=0)

@@ -25,9 +25,8 @@ from remodel_fenicsx.fem.solver_methods import AUTO, LARGE, LARGE_ON_RANKS, MEAN
 from remodel_fenicsx.model.cells import AXES
 from remodel_fenicsx.model.chains import BOLTZMANN_CONSTANT, CHAINS
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
-from remodel_fenicsx.model.energy import MATRICES, Tissue
+from remodel_fenicsx.model.energy import MATRICES, REPULSIONS, Tissue
 from remodel_fenicsx.model.laws import LAWS
-from remodel_fenicsx.model.repulsion import REPULSIONS
 from remodel_fenicsx.model.spectral import PAIRINGS
 from remodel_fenicsx.schema.tables import Table, checked, fault, is_number, one_of, quoted, shown
 from remodel_fenicsx.schema.times import is_multiple, same_time

@@ -20,7 +20,7 @@ from remodel_fenicsx.evolution.step_control import StepControl
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher, times
 from remodel_fenicsx.evolution.time_error import TimeError
 from remodel_fenicsx.fem.formulations import FORMULATIONS
-from remodel_fenicsx.fem.free_length import FreeLength
+from remodel_fenicsx.fem.kinematics import FreeLength
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.model.energy import Tissue

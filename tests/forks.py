@@ -225,7 +225,7 @@ def serve() -> None:
 
 
 if __name__ == "__main__":
-    for module in ("gmsh", "h5py", "remodel_fenicsx.body.meshing", "remodel_fenicsx.running", "tests.run_case"):
+    for module in ("gmsh", "h5py", "remodel_fenicsx.body.domain", "remodel_fenicsx.running", "tests.run_case"):
         importlib.import_module(module)
     what_is_imported_stays()
     gc.freeze()  # children share what is there: no collection goes through it

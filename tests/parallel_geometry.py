@@ -9,7 +9,7 @@ import numpy as np
 from mpi4py import MPI
 
 from remodel_fenicsx import body as geometry
-from remodel_fenicsx.body import meshing
+from remodel_fenicsx.body import domain
 
 
 def digest(domain):
@@ -49,7 +49,7 @@ def failures(comm):
     said = []
     for draw in (broken, lambda: None):
         try:
-            meshing.build_domain(draw, "cube", {"side": 1.0}, comm)
+            domain.build_domain(draw, "cube", {"side": 1.0}, comm)
         except geometry.GeometryError as error:
             said.append(str(error))
     return comm.gather(said, root=0)

@@ -18,7 +18,7 @@ from remodel_fenicsx.kernels.tensor import TensorKernels, condensed_points
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.model.implicit.condensed import CondensedPoints
-from remodel_fenicsx.model.repulsion import REPULSIONS
+from remodel_fenicsx.model.energy import REPULSIONS
 from remodel_fenicsx.scene import preset_scene
 from remodel_fenicsx.scene.scene import Scene
 from remodel_fenicsx.simulation import Simulation

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from remodel_fenicsx.body import SHAPES, cube, profile, tube
-from remodel_fenicsx.body.columns import columns_of
+from remodel_fenicsx.body import SHAPES, cube, tube
+from remodel_fenicsx.body.columns import PROFILE, columns_of
 from remodel_fenicsx.model.cells import cylindrical_axes
 from remodel_fenicsx.results.columns import Observer
 from remodel_fenicsx.results.fields import ElementFields
@@ -71,7 +71,7 @@ def test_layer_angles_are_those_of_the_elements_at_the_radius(wall: tuple[parts.
 def test_chains_out_of_the_wall_have_no_angle(wall: tuple[parts.Body, Any]) -> None:
     """Layers of pitch 10, none, 60, none and shares of the radial direction: means are over the others, or empty."""
     made, _ = wall
-    on_request = [*profile.PROFILE, "radial_share"]
+    on_request = [*PROFILE, "radial_share"]
     shape = SHAPES["tube"](shape="tube", inner_radius=INNER, outer_radius=OUTER, length=LENGTH)
     observer = Observer(shape, made.stepper(lambda t: {}), columns_of(shape, on_request, made.loading.values))
     radius = np.hypot(*made.quadrature.coordinates[..., :2].mean(axis=1).T)
@@ -88,7 +88,7 @@ def test_chains_out_of_the_wall_have_no_angle(wall: tuple[parts.Body, Any]) -> N
     assert found["fibre_angle_middle"] == pytest.approx(60.0, abs=1e-9)
     assert np.isnan(found["fibre_angle_outer"])
     assert found["radial_share"] == pytest.approx((0.5 * 1.25 + 1.75 + (1 - 1e-7) * 2.75) / 8.0, abs=1e-9)
-    places = [found[name] for name in profile.PROFILE]
+    places = [found[name] for name in PROFILE]
     assert places[0] == pytest.approx(10.0) and places[5] == pytest.approx(60.0) and np.isnan(places[8])
     fields = ElementFields(shape, observer.stepper, ("fibre_angle", "fibre_angle_deformed"))()
     for angles in fields.values():

@@ -9,7 +9,7 @@ from mpi4py import MPI
 from remodel_fenicsx.body.tube import tube
 from remodel_fenicsx.evolution.stepper import Step, Watcher
 from remodel_fenicsx.kernels.points import CompiledPointKernels, PointKernels
-from remodel_fenicsx.model import repulsion, spectral
+from remodel_fenicsx.model import energy, spectral
 from remodel_fenicsx.model.cells import UnitCell, structure_tensor
 from remodel_fenicsx.model.operators import passes_through_zero
 from remodel_fenicsx.scene import preset_scene
@@ -157,8 +157,8 @@ def test_stretches_and_structure(kernels: PointKernels) -> None:
     rng = np.random.default_rng(7)
     F, cell = np.eye(3) + 0.2 * rng.normal(size=(COUNT, 3, 3)), UnitCell(rng.random((COUNT, 3)), random_axes(rng))
     squared, logarithms = kernels.squared_length_and_sum(F, cell)
-    np.testing.assert_allclose(squared, repulsion.squared_end_to_end_length(F, [cell]), rtol=1e-14)
-    np.testing.assert_allclose(logarithms, repulsion.axes_sum(F, [cell], 1.0), rtol=0, atol=1e-14)
+    np.testing.assert_allclose(squared, energy.squared_end_to_end_length(F, [cell]), rtol=1e-14)
+    np.testing.assert_allclose(logarithms, energy.axes_sum(F, [cell], 1.0), rtol=0, atol=1e-14)
     np.testing.assert_array_equal(kernels.squared_length(F, cell), squared)
     wanted = structure_tensor(*cell[:2])
     np.testing.assert_allclose(kernels.structure_tensor(*cell[:2]), wanted, rtol=0, atol=1e-15)

@@ -10,7 +10,7 @@ from mpi4py import MPI
 from scipy.spatial.transform import Rotation
 
 from remodel_fenicsx.kernels.tensor import CompiledPoints, TensorKernels, condensed_points
-from remodel_fenicsx.model import repulsion
+from remodel_fenicsx.model import energy
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.chains import CHAINS
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
@@ -33,9 +33,7 @@ def test_derivatives_of_the_logarithm(kernels: TensorKernels, second: bool) -> N
     """Equal and nearly equal eigenvalues too, on both sides of the series' threshold."""
     C = right_cauchy_green()
     A = structures(len(C))
-    expected, found = (
-        derivatives(C, A, second) for derivatives in (repulsion.log_derivatives, kernels.log_derivatives)
-    )
+    expected, found = (derivatives(C, A, second) for derivatives in (energy.log_derivatives, kernels.log_derivatives))
     np.testing.assert_allclose(found[0], expected[0], atol=1e-13)
     if not second:
         assert found[1] is None
@@ -45,7 +43,7 @@ def test_derivatives_of_the_logarithm(kernels: TensorKernels, second: bool) -> N
 
 def test_the_sum_of_the_energy(kernels: TensorKernels) -> None:
     F, cells = np.linalg.cholesky(right_cauchy_green()), cells_of(structures(26))
-    expected = repulsion.log_sum(F, [cells], 1.0)
+    expected = energy.log_sum(F, [cells], 1.0)
     np.testing.assert_allclose(kernels.log_sum(F, [cells], 1.0), expected, atol=1e-13)
     half = [UnitCell(*cells[:2], weight=0.5)] * 2
     np.testing.assert_allclose(kernels.log_sum(F, half, 1.0), expected, atol=1e-13)

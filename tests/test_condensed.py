@@ -19,7 +19,7 @@ from remodel_fenicsx.model.implicit.condensed import CondensedPoints, Solution
 from remodel_fenicsx.model.implicit.network import OrthotropicCells, Strain
 from remodel_fenicsx.model.implicit.responses import StepOfCells, jumps_by_rank, response
 from remodel_fenicsx.model.laws import LAWS, Drive
-from remodel_fenicsx.model.repulsion import REPULSIONS
+from remodel_fenicsx.model.energy import REPULSIONS
 
 Array = NDArray[np.float64]
 

@@ -20,7 +20,7 @@ from mpi4py import MPI
 from scipy.spatial import cKDTree
 
 from remodel_fenicsx.body import SHAPES, Cube, Tendon, Tube, cube, tendon, tube
-from remodel_fenicsx.body.lattice import interval_domain
+from remodel_fenicsx.body.domain import interval_domain
 from tests import parallel_geometry
 
 ROOT = Path(__file__).resolve().parents[1]

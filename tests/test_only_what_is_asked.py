@@ -15,7 +15,7 @@ from mpi4py import MPI
 
 from remodel_fenicsx import Recording, Scene, SceneError, Simulation, run
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
-from remodel_fenicsx.fem import coefficients, jit
+from remodel_fenicsx.fem import assembly, jit
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.results import history
 from remodel_fenicsx.scene import scene_from_dict
@@ -60,9 +60,7 @@ def test_a_state_is_evaluated_once(monkeypatch: pytest.MonkeyPatch) -> None:
     simulation = Simulation(scene(), SELF)
     march = simulation.stepper.march([1.0, 2.0, 3.0])
     next(march)
-    evaluations, parameters = Calls(monkeypatch, Quadrature, "evaluate"), Calls(
-        monkeypatch, coefficients, "point_values"
-    )
+    evaluations, parameters = Calls(monkeypatch, Quadrature, "evaluate"), Calls(monkeypatch, assembly, "point_values")
     iterations = sum(step.work.newton_iterations for step in march)
     assert evaluations.number <= iterations + 2 * 2 and parameters.number == 0
     simulation.close()

@@ -14,10 +14,10 @@ import ufl
 from ufl.algorithms.apply_algebra_lowering import apply_algebra_lowering
 from ufl.algorithms.apply_derivatives import apply_derivatives
 
-from remodel_fenicsx.fem.second_derivative import invariants, second_derivative
+from remodel_fenicsx.fem.assembly import invariants, second_derivative
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.energy import Tissue
-from remodel_fenicsx.model.repulsion import REPULSIONS
+from remodel_fenicsx.model.energy import REPULSIONS
 
 MESH = ufl.Mesh(basix.ufl.element("P", "hexahedron", 1, shape=(3,)))
 SPACE = ufl.FunctionSpace(MESH, basix.ufl.element("P", "hexahedron", 1, shape=(3,)))

@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import logm
 from scipy.spatial.transform import Rotation
 
-from remodel_fenicsx.model import logarithm, repulsion
+from remodel_fenicsx.model import energy, logarithm
 from remodel_fenicsx.model.cells import UnitCell, structure_tensor
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
 from remodel_fenicsx.model.energy import Tissue
@@ -58,7 +58,7 @@ def test_first_derivative_against_the_integral_of_resolvents() -> None:
     share = ((1 + t) / 2)[:, None, None, None]
     X = np.linalg.inv((1 - share) * np.eye(3) + share * C)
     expected = np.einsum("t,tnij->nij", w / 2, X @ A @ X)
-    first, none = repulsion.log_derivatives(C, A, second=False)
+    first, none = energy.log_derivatives(C, A, second=False)
     np.testing.assert_allclose(first, expected, atol=1e-11 * np.abs(expected).max())
     assert none is None
 
@@ -66,9 +66,9 @@ def test_first_derivative_against_the_integral_of_resolvents() -> None:
 def test_second_derivative_against_central_differences() -> None:
     C = right_cauchy_green()
     A, H, h = structures(len(C)), symmetric(RNG.standard_normal(C.shape)), 1e-5
-    _, second = repulsion.log_derivatives(C, A)
+    _, second = energy.log_derivatives(C, A)
     assert second is not None
-    number = (repulsion.log_derivatives(C + h * H, A)[0] - repulsion.log_derivatives(C - h * H, A)[0]) / (2 * h)
+    number = (energy.log_derivatives(C + h * H, A)[0] - energy.log_derivatives(C - h * H, A)[0]) / (2 * h)
     found = from_mandel(np.einsum("nab,nb->na", second, to_mandel(H)))
     error = np.abs(found - number).max(axis=(1, 2)) / np.abs(number).max(axis=(1, 2))
     assert np.median(error) < 1e-8 and error.max() < 1e-7
@@ -108,16 +108,16 @@ def test_log_is_the_papers_repulsion_where_cell_and_stretch_are_coaxial() -> Non
     stretches = RNG.uniform(0.5, 2.0, (8, 3))
     U = np.swapaxes(axes, 1, 2) @ (stretches[:, :, None] * axes)
     F = Rotation.random(8, random_state=RNG).as_matrix() @ U
-    np.testing.assert_allclose(repulsion.log_sum(F, [cells], 1.0), repulsion.axes_sum(F, [cells], 1.0), rtol=1e-12)
+    np.testing.assert_allclose(energy.log_sum(F, [cells], 1.0), energy.axes_sum(F, [cells], 1.0), rtol=1e-12)
     turned = F @ Rotation.random(8, random_state=RNG).as_matrix()
-    differences = repulsion.log_sum(turned, [cells], 1.0) - repulsion.axes_sum(turned, [cells], 1.0)
+    differences = energy.log_sum(turned, [cells], 1.0) - energy.axes_sum(turned, [cells], 1.0)
     assert np.abs(differences).max() > 0.1
 
 
 @pytest.mark.parametrize("name", ["log", "length"])
 def test_energy_is_stress_free_unloaded_for_every_structure(name: str) -> None:
     """dW/dF = 0 at F = I whatever A, if tr A = r0^2; only 'length' needs A isotropic."""
-    tissue = Tissue(27.3, 3.1, 1.57, 1.594, 1.0, repulsion=repulsion.REPULSIONS[name])
+    tissue = Tissue(27.3, 3.1, 1.57, 1.594, 1.0, repulsion=energy.REPULSIONS[name])
     A = structures(5) if name == "log" else np.tile(np.eye(3) / 3, (5, 1, 1))
     for _ in range(6):
         H, h = RNG.standard_normal((5, 3, 3)), 1e-6

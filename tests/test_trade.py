@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from remodel_fenicsx import Recording, cli, read_scene
-from remodel_fenicsx.body.profile import PLACES, PROFILE, weights
+from remodel_fenicsx.body.columns import PROFILE, PROFILE_PLACES, profile_weights
 from remodel_fenicsx.results.recording import HistoryColumns
 from remodel_fenicsx.results.status import status
 from remodel_fenicsx.scene.profiles import PROFILES
@@ -196,8 +196,8 @@ def test_a_point_has_no_mesh() -> None:
 
 
 def test_hats_add_up_to_one_and_are_one_at_their_places() -> None:
-    np.testing.assert_allclose(weights(np.linspace(0, 1, 37)).sum(axis=-1), 1.0)
-    np.testing.assert_allclose(weights(np.linspace(0, 1, PLACES)), np.eye(PLACES), atol=1e-15)
+    np.testing.assert_allclose(profile_weights(np.linspace(0, 1, 37)).sum(axis=-1), 1.0)
+    np.testing.assert_allclose(profile_weights(np.linspace(0, 1, PROFILE_PLACES)), np.eye(PROFILE_PLACES), atol=1e-15)
 
 
 def test_noise_is_the_standard_error_of_the_mean() -> None:
@@ -346,7 +346,7 @@ def test_estimates_of_the_artery_are_the_true_errors(tmp_path: Path) -> None:
 def _reference(step: float, times: list[float]) -> np.ndarray:
     """Angles of the reference, at the times and places that are compared."""
     history = solve_radial(step=step, elements=150)
-    hats = weights((history.points - 1.0) / 2.0) * history.areas[:, None]
+    hats = profile_weights((history.points - 1.0) / 2.0) * history.areas[:, None]
     rows = [history.dimensions[round(time / step) - 1] for time in times]
     angles = np.array([np.degrees(np.arctan2(row[:, 1], row[:, 0])) for row in rows])
     return np.asarray(angles @ hats / hats.sum(axis=0))

@@ -16,7 +16,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from remodel_fenicsx import Scene, SceneError, Simulation
-from remodel_fenicsx.body.column import Column
+from remodel_fenicsx.body.columns import Column
 from remodel_fenicsx.evolution.stepper import Step, Watcher
 from remodel_fenicsx.results.fields import Fields
 from remodel_fenicsx.results.recording import Recording

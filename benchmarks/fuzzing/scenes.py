@@ -50,7 +50,7 @@ def made(seed: int) -> tuple[Values, Values]:
     _rarely(Random(f"more of {seed}"), scene, stiffness)
     small = shape == "tube" and scene["model"]["kinematics"] in ("full", "sector", "auto", "axisymmetric")
     elements = list(COARSE if small else RAY)
-    return scene, {**COUNTS, "tube": {"PAPER": elements}, "tube_reductions": {"PAPER": elements}}
+    return scene, {**COUNTS, "tube": {"PAPER": elements}}
 
 
 def cheap(scene: Values) -> bool:

@@ -1,13 +1,84 @@
-"""The columns of a history by name: those of every shape, those on request, and which a scene has."""
+"""The columns of a history: those of every shape, those on request, and which a scene has."""
 
 from __future__ import annotations
 
-from collections.abc import Container, Sequence
+from collections.abc import Callable, Container, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
-from remodel_fenicsx.body import profile
-from remodel_fenicsx.body.column import Column
-from remodel_fenicsx.body.shape import Shape
+import numpy as np
+from numpy.typing import NDArray
 
+if TYPE_CHECKING:  # a shape has columns
+    from remodel_fenicsx.body.shape import Shape
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of history.csv.
+
+    Attributes
+    ----------
+    name
+        As in the file's first row.
+    unit
+        In words, for the documentation: "stress", "length", "degrees", "" for none.
+    meaning
+        One sentence.
+    value
+        Its value from a `results.columns.Measurement`.
+    after_pass
+        Whether it is known only when the cells have remodeled; all others belong to the solved state.
+    extreme
+        Whether it is the largest or smallest value of the body: of random cells it goes with their number.
+    """
+
+    name: str
+    unit: str
+    meaning: str
+    value: Callable[[Any], float]
+    after_pass: bool = False
+    extreme: bool = False
+
+
+# ---------------------------------------------------------------- the fibre angle through a body, whatever the mesh
+PROFILE_PLACES = 9
+PROFILE = tuple(f"angle_profile_{number}" for number in range(PROFILE_PLACES))
+
+
+def profile_weights(depth: Array) -> Array:
+    """Hat functions about equally spaced depths from 0 to 1, along one more axis; their sum is one."""
+    return np.maximum(
+        0.0, 1.0 - np.abs(np.asarray(depth)[..., None] * (PROFILE_PLACES - 1) - np.arange(PROFILE_PLACES))
+    )
+
+
+def _profile_value(number: int, measurement: Any) -> float:
+    return float(measurement.tool_of_step("angle profile", lambda: _profile(measurement))[number])
+
+
+def _profile(measurement: Any) -> Array:
+    quadrature, shape = measurement.quadrature, measurement.observer.shape
+    hats = measurement.tool("hats", lambda: profile_weights(shape.depth(quadrature.coordinates)))
+    return np.array([quadrature.mean_of_known(measurement.fibre_angle, hats[..., k]) for k in range(PROFILE_PLACES)])
+
+
+_PROFILE_COLUMNS = tuple(
+    Column(
+        name,
+        "degrees",
+        f"mean of the reference fibre angle about {number}/{PROFILE_PLACES - 1} of the way through the wall of a tube, "
+        "or along z, weighted with a hat function as wide as a quarter of the way",
+        partial(_profile_value, number),
+    )
+    for number, name in enumerate(PROFILE)
+)
+
+
+# ---------------------------------------------------------------- which a history has
 FIRST_COLUMN = Column("time", "time", "time of the scene", lambda m: m.step.time)
 COLUMNS: dict[str, Column] = {
     column.name: column
@@ -83,7 +154,7 @@ COLUMNS_ON_REQUEST: dict[str, Column] = {
             lambda m: m.step.processor_seconds,
             after_pass=True,
         ),
-        *profile.COLUMNS,
+        *_PROFILE_COLUMNS,
     )
 }
 """Columns that a scene may name in `output.columns`; a script adds its own."""

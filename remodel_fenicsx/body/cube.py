@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from remodel_fenicsx.body import gmsh_model as model
-from remodel_fenicsx.body.column import Column
+from remodel_fenicsx.body.columns import Column
 from remodel_fenicsx.body.reductions import Reduction
 from remodel_fenicsx.body.shape import LoadKind, Shape, check_lengths, homogeneous_bar, uniaxial_columns
 from remodel_fenicsx.schema.units import FORCE, LENGTH
@@ -105,7 +105,7 @@ def cube(
     """
     model.check_arguments({"side": side}, refinement, element, degree)
     model.check_lengths({"side": side})
-    from remodel_fenicsx.body.meshing import build_domain
+    from remodel_fenicsx.body.domain import build_domain
 
     return build_domain(lambda: draw_cube(side, refinement, element, degree), "cube", {"side": float(side)}, comm)
 

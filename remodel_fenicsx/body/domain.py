@@ -1,16 +1,29 @@
-"""The meshed body, shared by all ranks, and its data in the order in which it was built."""
+"""The meshed body, shared by all ranks, and its data in the order in which it was built.
+
+Gmsh draws it on rank 0 (`body.gmsh_model`); intervals and quadrilaterals, on which a part of a body stands for all of
+it, are structured meshes without Gmsh.
+"""
 
 from __future__ import annotations
 
+import os
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+import basix.ufl
+import dolfinx.mesh
 import numpy as np
 import numpy.typing as npt
+import ufl
 from mpi4py import MPI
 
+from remodel_fenicsx.body.gmsh_model import GeometryError, gmsh_model, named_faces
 from remodel_fenicsx.fem import compat
-from remodel_fenicsx.fem.ranks import over_ranks
+from remodel_fenicsx.fem.assembly import over_ranks
+
+Array = npt.NDArray[np.float64]
+Marker = Callable[[Array], npt.NDArray[np.bool_]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,3 +195,163 @@ class _Order:
         target = [numbers, counts, MPI.INT64_T] if comm.rank == 0 else None
         comm.Gatherv([np.ascontiguousarray(number), len(number), MPI.INT64_T], target)
         return cls(numbers, counts)
+
+
+class SymbolicMesh(ufl.Mesh):
+    """A `ufl.Mesh` that makes its cell once.
+
+    UFL asks for the cell thousands of times while it handles a form. What it asks, basix answers with a new cell each
+    time, and a hexahedron makes its faces and edges anew: a third of what a cached kernel costs.
+    """
+
+    def __init__(self, coordinate_element: Any) -> None:
+        super().__init__(coordinate_element)
+        self._cell = super().ufl_cell()
+
+    def ufl_cell(self) -> Any:
+        """The same cell each time."""
+        return self._cell
+
+
+# ---------------------------------------------------------------- drawn by Gmsh
+
+
+def build_domain(
+    draw: Callable[[], None], shape: str, dimensions: dict[str, float], comm: MPI.Intracomm | None = None
+) -> Domain:
+    """Draw and mesh on rank 0, then share the mesh. Collective.
+
+    Parameters
+    ----------
+    draw
+        Draws and meshes the body in the current Gmsh model, with physical groups for the volume and the faces.
+    shape, dimensions
+        As in `Domain`.
+    comm
+        Ranks that share the mesh; default: all.
+
+    Raises
+    ------
+    GeometryError
+        On all ranks, if `draw` fails on rank 0.
+    """
+    comm = comm or MPI.COMM_WORLD
+    # with several threads Scotch parts the same mesh differently from run to run
+    os.environ.setdefault("SCOTCH_PTHREAD_NUMBER", "1")
+    if comm.rank != 0:
+        verdict, faces = comm.bcast(None, root=0)
+        if verdict:
+            raise GeometryError(verdict)
+        return _domain_from_gmsh(None, comm, faces, shape, dimensions)
+    # the verdict goes out exactly once, whether Gmsh is missing, fails or is interrupted: nobody waits for ever
+    told = False
+    try:
+        with gmsh_model(shape) as gmsh:
+            draw()
+            faces = named_faces()
+            told = True
+            comm.bcast(("", faces), root=0)
+            return _domain_from_gmsh(gmsh.model, comm, faces, shape, dimensions)
+    except BaseException as error:
+        if told:
+            raise
+        verdict = f"Gmsh could not mesh the {shape}: {str(error) or type(error).__name__}"
+        comm.bcast((verdict, {}), root=0)
+        if not isinstance(error, Exception):  # Ctrl-C on rank 0 stays what it is there
+            raise
+        raise GeometryError(verdict) from error
+
+
+def _domain_from_gmsh(
+    model: Any, comm: MPI.Intracomm, faces: dict[str, int], shape: str, dimensions: dict[str, float]
+) -> Domain:
+    mesh, facet_tags = compat.mesh_from_gmsh(model, comm)
+    symbolic = SymbolicMesh(mesh.ufl_domain().ufl_coordinate_element())
+    return Domain(type(mesh)(mesh._cpp_object, symbolic), facet_tags, faces, shape, dimensions)
+
+
+# ---------------------------------------------------------------- structured, without Gmsh
+
+
+def interval_domain(
+    start: tuple[float, float, float],
+    end: tuple[float, float, float],
+    elements: int,
+    degree: int,
+    faces: Mapping[str, Marker],
+    shape: str,
+    dimensions: dict[str, float],
+    comm: MPI.Intracomm | None = None,
+) -> Domain:
+    """Equal elements on a straight line. Collective.
+
+    Parameters
+    ----------
+    start, end
+        Of the line.
+    elements, degree
+        Number of elements, and degree of their geometry.
+    faces
+        Name of a face of the body -> function of coordinates (3, n) that is true on its place on the line.
+    shape, dimensions
+        As in `Domain`.
+    comm
+        Ranks that share the mesh; default: all.
+    """
+    share = np.linspace(0.0, 1.0, degree * elements + 1)[:, None]
+    points = (1.0 - share) * np.array(start) + share * np.array(end)
+    return _domain_from_lattice("interval", degree, points, _lines(elements, degree), faces, shape, dimensions, comm)
+
+
+def half_plane_domain(
+    radii: tuple[float, float],
+    length: float,
+    elements: tuple[int, int],
+    degree: int,
+    faces: Mapping[str, Marker],
+    shape: str,
+    dimensions: dict[str, float],
+    comm: MPI.Intracomm | None = None,
+) -> Domain:
+    """Equal quadrilaterals on a rectangle of the half-plane y = 0, x > 0; elements along x and z. Collective."""
+    across, along = (degree * number + 1 for number in elements)
+    x, z = np.linspace(*radii, across), np.linspace(0.0, length, along)
+    points = np.stack([np.tile(x, along), np.zeros(across * along), np.repeat(z, across)], axis=1)
+    first, second = (_lines(number, degree, in_order=True) for number in elements)
+    # dolfinx's order on a quadrilateral of any degree: corners, then edges and inside, from the two lines
+    nodes = second[:, None, :, None] * across + first[None, :, None, :]
+    quadrilaterals = nodes.reshape(elements[0] * elements[1], -1)[:, _QUADRILATERAL[degree]]
+    return _domain_from_lattice("quadrilateral", degree, points, quadrilaterals, faces, shape, dimensions, comm)
+
+
+# places (second line, first line) of a quadrilateral's nodes in the order of basix; a line's own order is ascending
+_QUADRILATERAL = {1: [0, 1, 2, 3], 2: [0, 2, 6, 8, 1, 3, 5, 7, 4]}
+
+
+def _lines(elements: int, degree: int, in_order: bool = False) -> npt.NDArray[np.int64]:
+    """Nodes of each element of a line, ends first unless they are wanted in order; (elements, degree + 1)."""
+    nodes = degree * np.arange(elements)[:, None] + np.arange(degree + 1)
+    return nodes if in_order else nodes[:, [0, degree, *range(1, degree)]]
+
+
+def _domain_from_lattice(
+    kind: str,
+    degree: int,
+    points: Array,
+    elements: npt.NDArray[np.int64],
+    faces: Mapping[str, Marker],
+    shape: str,
+    dimensions: dict[str, float],
+    comm: MPI.Intracomm | None,
+) -> Domain:
+    comm = comm or MPI.COMM_WORLD
+    here = slice(None) if comm.rank == 0 else slice(0)
+    geometry = SymbolicMesh(basix.ufl.element("Lagrange", kind, degree, shape=(3,)))
+    mesh: Any = dolfinx.mesh.create_mesh(comm, cells=elements[here], x=points[here], e=geometry)
+    dimension = mesh.topology.dim - 1
+    found = [dolfinx.mesh.locate_entities_boundary(mesh, dimension, marker) for marker in faces.values()]
+    values = np.repeat(np.arange(1, len(found) + 1, dtype=np.int32), [len(one) for one in found])
+    facets = np.concatenate(found).astype(np.int32)
+    order = np.argsort(facets)
+    tags = dolfinx.mesh.meshtags(mesh, dimension, facets[order], values[order])
+    return Domain(mesh, tags, {name: number + 1 for number, name in enumerate(faces)}, shape, dimensions)

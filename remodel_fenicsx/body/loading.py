@@ -13,7 +13,7 @@ from petsc4py import PETSc
 
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.fem import jit
-from remodel_fenicsx.fem.free_length import field_degree
+from remodel_fenicsx.fem.kinematics import field_degree
 from remodel_fenicsx.fem.kinematics import FullKinematics, Kinematics
 
 LoadValues = dict[str, float]
@@ -117,7 +117,7 @@ class Loading:
         self.add_potential(potential)
 
     def add_axial_force(self, name: str) -> None:
-        """A force on the ends along z, of kinematics whose length is an unknown (`fem.free_length`); others lack it."""
+        """A force on the ends along z, of kinematics whose length is an unknown (`FreeLength`); others lack it."""
         change = getattr(self.kinematics, "change_of_length", None)
         if change is None:
             return

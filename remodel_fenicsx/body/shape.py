@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from remodel_fenicsx.body.buckling import Strut
-from remodel_fenicsx.body.column import Column
+from remodel_fenicsx.body.columns import Column
 from remodel_fenicsx.body.gmsh_model import length_fault
 from remodel_fenicsx.body.reductions import Reduction, homogeneous, known_loads, same_cells, symmetric_law, unturned
 from remodel_fenicsx.model.cells import angle_to_axis
@@ -244,7 +244,7 @@ def homogeneous_bar(bottom: str, top: str, dimensions: Callable[[Any], dict[str,
     """
 
     def build(scene: Any, comm: Any = None) -> Domain:
-        from remodel_fenicsx.body.lattice import interval_domain
+        from remodel_fenicsx.body.domain import interval_domain
 
         shape, length = scene.geometry, scene.geometry.axial_length
         faces = {bottom: lambda x: np.isclose(x[2], 0.0), top: lambda x: np.isclose(x[2], length)}

@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 
 from remodel_fenicsx.body import gmsh_model as model
 from remodel_fenicsx.body.buckling import Strut
-from remodel_fenicsx.body.column import Column
+from remodel_fenicsx.body.columns import Column
 from remodel_fenicsx.body.reductions import Reduction, unturned
 from remodel_fenicsx.body.shape import LoadKind, Shape, check_lengths, homogeneous_bar, uniaxial_columns
 from remodel_fenicsx.schema.units import AREA, FORCE, LENGTH
@@ -142,7 +142,7 @@ def tendon(
     model.check_arguments({"length": length, "area": area}, refinement, element, degree)
     model.check_lengths({"length": length, "area": math.sqrt(area)})
     dimensions = _dimensions(length, area, outer_radius(area, refinement, degree))
-    from remodel_fenicsx.body.meshing import build_domain
+    from remodel_fenicsx.body.domain import build_domain
 
     return build_domain(lambda: draw_tendon(length, area, refinement, element, degree), "tendon", dimensions, comm)
 

@@ -18,7 +18,7 @@ from remodel_fenicsx.body.loading import LoadValues
 from remodel_fenicsx.evolution.implicit import RESIDUAL, Implicit
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
 from remodel_fenicsx.evolution.step_control import StepControl
-from remodel_fenicsx.fem import coefficients
+from remodel_fenicsx.fem import assembly
 from remodel_fenicsx.model.cells import structure_tensor
 from remodel_fenicsx.solver.continuation import Work
 from remodel_fenicsx.solver.equilibrium import Equilibrium
@@ -175,7 +175,7 @@ class Homeostasis:
     def _largest(self, change: Array) -> float:
         """Over r0^2, of all points."""
         quadrature = self.state.cells.quadrature
-        r0 = coefficients.point_values(self.equilibrium.tissue.end_to_end_length, quadrature)
+        r0 = assembly.point_values(self.equilibrium.tissue.end_to_end_length, quadrature)
         return quadrature.maximum(np.linalg.norm(change, axis=(-1, -2)) / r0**2)
 
     def _warn(self, text: str, value: float) -> None:
@@ -186,7 +186,7 @@ class Homeostasis:
         """Nothing is left to do but to say how far the state is from the cells of its own stress."""
         self.remodeling.look_ahead(time, self._residual)
         quadrature, r0 = self.state.cells.quadrature, self.equilibrium.tissue.end_to_end_length
-        left = self.remodeling.residual() / float(coefficients.largest(r0, quadrature.mesh)) ** 2
+        left = self.remodeling.residual() / float(assembly.largest(r0, quadrature.mesh)) ** 2
         share = quadrature.mean(self.remodeling.without_tension(self._residual).reshape(quadrature.shape).astype(float))
         if self.state.comm.rank == 0:
             log.log(NOTICE, "cells and stress agree to |A_pass - A| = %.2g r0^2, after %d steps", left, self.steps)

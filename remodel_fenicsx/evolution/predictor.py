@@ -9,7 +9,7 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from remodel_fenicsx.fem.ranks import over_ranks
+from remodel_fenicsx.fem.assembly import over_ranks
 from remodel_fenicsx.model import mandel
 from remodel_fenicsx.state.memory import Earlier, Numbers
 from remodel_fenicsx.state.state import State

@@ -11,14 +11,14 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from remodel_fenicsx.fem import jit
-from remodel_fenicsx.fem.ranks import over_ranks
+from remodel_fenicsx.fem.assembly import over_ranks
 from remodel_fenicsx.kernels.tensor import tensor_kernels, with_kernels
 from remodel_fenicsx.model import spectral
 from remodel_fenicsx.model.cells import UnitCell, structure_tensor
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES, carried_axes
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.model.laws import LAWS, Drive, tensor_target
-from remodel_fenicsx.model.repulsion import axes_sum
+from remodel_fenicsx.model.energy import axes_sum
 from remodel_fenicsx.model.tensor_law import ABOVE_ROUNDING, Target
 from remodel_fenicsx.settings import Remodeling
 from remodel_fenicsx.solver.pointwise import PointStresses

@@ -1,19 +1,356 @@
 """Kinematics: which unknowns describe the deformation, and the deformation gradient that follows from them.
 
-Everything else asks the object: F is always 3x3, a displacement always has three components.
+Everything else asks the object: F is always 3x3, a displacement always has three components. dolfinx is imported when
+it is needed: scenes, which name kinematics, are read without it.
 """
 
 from __future__ import annotations
 
-from remodel_fenicsx.fem.full_kinematics import FullKinematics, Kinematics
-from remodel_fenicsx.fem.reduced_kinematics import (
-    AxisymmetricKinematics,
-    PointKinematics,
-    RadialKinematics,
-    SectorKinematics,
-)
+from collections.abc import Mapping
+from typing import Any, ClassVar, Protocol
 
-__all__ = ["KINEMATICS", "FullKinematics", "Kinematics"]
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+class Body(Protocol):
+    """What a reduced kinematics must know of a body (`body.shape.Shape`)."""
+
+    @property
+    def axial_length(self) -> float: ...
+
+    @property
+    def section_area(self) -> float: ...
+
+
+class Kinematics(Protocol):
+    """What forms, supports and records need to know of the unknowns.
+
+    Attributes
+    ----------
+    name
+        Under which scenes know it.
+    meaning
+        What it does, for docs/scene.md.
+    reduced
+        Whether it needs a mesh of its own, which a shape's `reductions` make, and is exact for some scenes only.
+    moves_rigidly
+        Whether the body can move as a whole across z, or turn about it: then supports at single nodes hold it.
+    symmetry_planes
+        Faces of the mesh that are planes of symmetry, and the component of the displacement that is zero there.
+    homogeneous
+        Whether the strain is the same everywhere: then no mesh changes what is found.
+    cost
+        Of a step for each quadrature point, in that of one of a hexahedron, as measured on the artery.
+    """
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def meaning(self) -> str: ...
+
+    @property
+    def reduced(self) -> bool: ...
+
+    @property
+    def moves_rigidly(self) -> bool: ...
+
+    @property
+    def symmetry_planes(self) -> Mapping[str, int]: ...
+
+    @property
+    def homogeneous(self) -> bool: ...
+
+    @property
+    def cost(self) -> float: ...
+
+    def element(self, kind: str) -> str:
+        """Kind of the mesh's elements where the scene asks for elements of the body of this kind."""
+
+    def on(self, mesh: Any, body: Body) -> Kinematics:
+        """The kinematics for the mesh of a body."""
+
+    def unknown(self, mesh: Any, degree: int) -> Any:
+        """A dolfinx function of the unknowns, zero, with elements of this degree."""
+
+    def displacement(self, unknown: Any) -> Any:
+        """UFL 3-vector, linear in the unknown: so it is also the virtual displacement of a test function."""
+
+    def deformation_gradient(self, unknown: Any) -> Any:
+        """F, UFL, always of shape (3, 3)."""
+
+    def weight(self, mesh: Any) -> Any:
+        """Volume of the body per unit of mesh, a number or UFL."""
+
+    def subspace(self, space: Any, component: int) -> Any:
+        """The part of the unknown's space that a support of the displacement in x, y or z (0, 1, 2) holds, or None."""
+
+    def uniform_strain(self, component: int) -> Any:
+        """The Constant that is the engineering strain along x, y or z where it is prescribed as a whole, or None."""
+
+    def nodal_space(self, unknown: Any) -> Any:
+        """A space, scalar or blocked, with the mesh's nodes in the order of `nodal_displacement`."""
+
+    def nodal_displacement(self, unknown: Any) -> Array:
+        """Displacement of the local nodes, (nodes, 3)."""
+
+
+class FullKinematics:
+    """The displacement field in three dimensions: F = I + grad u."""
+
+    name: ClassVar[str] = "full"
+    meaning: ClassVar[str] = "the displacement in three dimensions"
+    reduced: ClassVar[bool] = False
+    moves_rigidly: ClassVar[bool] = True
+    symmetry_planes: ClassVar[Mapping[str, int]] = {}
+    homogeneous: ClassVar[bool] = False
+    cost: ClassVar[float] = 1.0
+
+    def element(self, kind: str) -> str:
+        """The same."""
+        return kind
+
+    def on(self, mesh: Any, body: Body) -> Kinematics:
+        """The same for every mesh."""
+        return self
+
+    def unknown(self, mesh: Any, degree: int) -> Any:
+        """A vector function, zero."""
+        return lagrange(mesh, degree, (3,))
+
+    def displacement(self, unknown: Any) -> Any:
+        """The unknown itself."""
+        return unknown
+
+    def deformation_gradient(self, unknown: Any) -> Any:
+        """F = I + grad u."""
+        import ufl
+
+        return ufl.Identity(3) + ufl.grad(unknown)
+
+    def weight(self, mesh: Any) -> Any:
+        """One: the mesh is the body."""
+        return 1
+
+    def subspace(self, space: Any, component: int) -> Any:
+        """The component's own subspace."""
+        return space.sub(component)
+
+    def uniform_strain(self, component: int) -> Any:
+        """None: every strain follows from the field."""
+        return None
+
+    def nodal_space(self, unknown: Any) -> Any:
+        """The unknown's own."""
+        return unknown.function_space
+
+    def nodal_displacement(self, unknown: Any) -> Array:
+        """The unknown's own memory, (nodes, 3)."""
+        values: Array = unknown.x.array.reshape(-1, 3)
+        return values
+
+
+# ---------------------------------------------------------------- a part of the body that stands for all of it
+# Such a mesh lies in three dimensions where the part lies: a ray on the x axis, a half-plane in y = 0, a quarter, a bar
+# along z beside the axis. There the radial, circumferential and axial directions are x, y and z: axes of cells, normals
+# and places need no other coordinates, and no tensor another basis.
+
+
+class SectorKinematics(FullKinematics):
+    """The full displacement of a quarter of a tube between its planes of symmetry x = 0 and y = 0."""
+
+    name = "sector"
+    meaning = "the same on a quarter of a tube, with planes of symmetry"
+    reduced = True
+    homogeneous = False
+    moves_rigidly = False
+    symmetry_planes: ClassVar[Mapping[str, int]] = {"plane_x": 0, "plane_y": 1}
+
+    def weight(self, mesh: Any) -> Any:
+        """Four of them are the body."""
+        return 4
+
+
+class _Reduced:
+    """What the kinematics with fewer dimensions have in common."""
+
+    reduced: ClassVar[bool] = True
+    homogeneous: ClassVar[bool] = False
+    moves_rigidly: ClassVar[bool] = False
+    symmetry_planes: ClassVar[Mapping[str, int]] = {}
+    element_kind: ClassVar[str]
+    components: ClassVar[tuple[int | None, int | None, int | None]]  # of the unknown, by that of the displacement
+
+    def __init__(self, mesh: Any = None, body: Body | None = None):
+        self.mesh, self.body = mesh, body
+        if mesh is not None and body is not None:  # Constants, so that another body compiles nothing
+            self.axial_length = _constant(mesh, body.axial_length)
+            self.section_area = _constant(mesh, body.section_area)
+
+    def element(self, kind: str) -> str:
+        """Of fewer dimensions."""
+        return self.element_kind
+
+    def on(self, mesh: Any, body: Body) -> Any:
+        """One of its own: its numbers belong to the mesh."""
+        return type(self)(mesh, body)
+
+    def subspace(self, space: Any, component: int) -> Any:
+        """The component's own subspace, if it is a field."""
+        own = self.components[component]
+        return None if own is None else space.sub(own)
+
+    def uniform_strain(self, component: int) -> Any:
+        """None."""
+        return None
+
+    def nodal_space(self, unknown: Any) -> Any:
+        """The unknown's own."""
+        return unknown.function_space
+
+
+class AxisymmetricKinematics(_Reduced):
+    """A body of revolution about z that does not twist: u_r and u_z on the half-plane y = 0, x > 0.
+
+    F = I + grad d + u_r/x e_y (x) e_y with d = u_r e_x + u_z e_z.
+    """
+
+    name = "axisymmetric"
+    meaning = "a tube that stays one of revolution: u_r and u_z over radius and length"
+    element_kind = "quadrilateral"
+    components = (0, None, 1)
+    cost = 0.3
+
+    def unknown(self, mesh: Any, degree: int) -> Any:
+        """(u_r, u_z), zero."""
+        return lagrange(mesh, degree, (2,))
+
+    def displacement(self, unknown: Any) -> Any:
+        """u_r e_x + u_z e_z."""
+        import ufl
+
+        return ufl.as_vector([unknown[0], 0.0, unknown[1]])
+
+    def deformation_gradient(self, unknown: Any) -> Any:
+        """With the circumferential stretch 1 + u_r/r."""
+        import ufl
+
+        r, _, _ = ufl.SpatialCoordinate(self.mesh)
+        return ufl.Identity(3) + ufl.grad(self.displacement(unknown)) + _along(1, unknown[0] / r)
+
+    def weight(self, mesh: Any) -> Any:
+        """2 pi r."""
+        return _circumference(mesh)
+
+    def nodal_displacement(self, unknown: Any) -> Array:
+        """Of the nodes in the half-plane, (nodes, 3)."""
+        values = unknown.x.array.reshape(-1, 2)
+        return np.stack([values[:, 0], np.zeros(len(values)), values[:, 1]], axis=1)
+
+
+class RadialKinematics(_Reduced):
+    """A tube whose sections stay round, plane and alike: u_r on the x axis, and one axial stretch.
+
+    F = diag(1 + du_r/dr, 1 + u_r/r, 1 + axial strain). The axial strain is prescribed.
+    """
+
+    name = "radial"
+    meaning = "a tube whose sections stay round, plane and alike: u_r over the radius"
+    element_kind = "interval"
+    components = (None, None, None)
+    cost = 0.2
+
+    def __init__(self, mesh: Any = None, body: Body | None = None):
+        super().__init__(mesh, body)
+        if mesh is not None:
+            self.axial_strain = _constant(mesh, 0.0)
+
+    def unknown(self, mesh: Any, degree: int) -> Any:
+        """u_r, zero."""
+        return lagrange(mesh, degree, ())
+
+    def displacement(self, unknown: Any) -> Any:
+        """u_r e_x: the ray lies in the plane z = 0."""
+        import ufl
+
+        return ufl.as_vector([unknown, 0.0, 0.0])
+
+    def deformation_gradient(self, unknown: Any) -> Any:
+        """Diagonal."""
+        import ufl
+
+        r, _, _ = ufl.SpatialCoordinate(self.mesh)
+        stretches = _along(1, unknown / r) + _along(2, self.axial_strain)
+        return ufl.Identity(3) + ufl.grad(self.displacement(unknown)) + stretches
+
+    def weight(self, mesh: Any) -> Any:
+        """2 pi r times the length."""
+        return self.axial_length * _circumference(mesh)
+
+    def uniform_strain(self, component: int) -> Any:
+        """The axial strain."""
+        return self.axial_strain if component == 2 else None
+
+    def nodal_displacement(self, unknown: Any) -> Array:
+        """Of the nodes on the ray, (nodes, 3)."""
+        return unknown.x.array[:, None] * np.array([1.0, 0.0, 0.0])
+
+
+class PointKinematics(_Reduced):
+    """A body with the same strain everywhere: three numbers u, F = I + diag(u)/length.
+
+    Number i is the displacement along axis i at a distance of the body's length, so that it and its force have the same
+    units as everywhere. The mesh is one bar along z as long as the body.
+    """
+
+    name = "point"
+    meaning = "a cube or tendon with the same strain everywhere: three numbers"
+    element_kind = "interval"
+    components = (None, None, None)
+    homogeneous = True
+    cost = 0.2
+
+    def unknown(self, mesh: Any, degree: int) -> Any:
+        """Three numbers on the one element, zero."""
+        import basix.ufl
+        import dolfinx.fem
+
+        self._nodes = lagrange(mesh, degree, ()).function_space
+        element = basix.ufl.element("DG", mesh.topology.cell_name(), 0, shape=(3,))
+        return dolfinx.fem.Function(dolfinx.fem.functionspace(mesh, element), name="displacement")
+
+    def displacement(self, unknown: Any) -> Any:
+        """u_i x_i / length."""
+        import ufl
+
+        x = ufl.SpatialCoordinate(self.mesh)
+        return ufl.as_vector([unknown[i] * x[i] / self.axial_length for i in range(3)])
+
+    def deformation_gradient(self, unknown: Any) -> Any:
+        """Diagonal and constant."""
+        import ufl
+
+        stretches = (_along(i, unknown[i] / self.axial_length) for i in range(3))
+        return sum(stretches, ufl.Identity(3))
+
+    def weight(self, mesh: Any) -> Any:
+        """Area of the section."""
+        return self.section_area
+
+    def nodal_space(self, unknown: Any) -> Any:
+        """Continuous on the bar."""
+        return self._nodes
+
+    def nodal_displacement(self, unknown: Any) -> Array:
+        """Of the nodes of the bar, (nodes, 3)."""
+        assert self.body is not None
+        places: Array = self._nodes.tabulate_dof_coordinates()
+        # a rank without the element has neither nodes nor numbers
+        return places * unknown.x.array.reshape(-1, 3)[:1] / self.body.axial_length if len(places) else places
+
 
 KINEMATICS: dict[str, Kinematics] = {
     kinematics.name: kinematics
@@ -26,3 +363,168 @@ KINEMATICS: dict[str, Kinematics] = {
     )
 }
 """Kinematics by the name that a scene gives them."""
+
+
+# ---------------------------------------------------------------- the length as an unknown
+
+
+class FreeLength:
+    """A body whose length is one more unknown: the axial force is given, or a pressure acts on caps at its ends.
+
+    The field of any other kinematics keeps u_z = 0 at both ends; all of it is stretched by one number e, the change of
+    the length: u + e z/length e_z. The number belongs to all elements, so its row of the tangent is full.
+
+    Parameters
+    ----------
+    kinematics
+        On a mesh; what is not said here it answers itself.
+    body
+        Whose length it is.
+    """
+
+    def __init__(self, kinematics: Kinematics, body: Body):
+        self.field, self.body = kinematics, body
+
+    def __getattr__(self, name: str) -> Any:
+        if name == "field":  # while it is copied it has none
+            raise AttributeError(name)
+        return getattr(self.field, name)
+
+    def unknown(self, mesh: Any, degree: int) -> Any:
+        """(u, e), zero."""
+        import basix.ufl
+        import dolfinx.fem
+        from petsc4py import PETSc
+
+        element = self.field.unknown(mesh, degree).function_space.ufl_element()
+        number = basix.ufl.element("DG", mesh.topology.cell_name(), 0)
+        space = dolfinx.fem.functionspace(mesh, basix.ufl.mixed_element([element, number]))
+        unknown = dolfinx.fem.Function(with_one_value(space, 1), name="displacement")
+        nodes, self._dofs = unknown.function_space.sub(0).collapse()
+        self._nodal = dolfinx.fem.Function(nodes)
+        length: Any = PETSc.ScalarType(self.body.axial_length)  # type: ignore[attr-defined]
+        self._length = dolfinx.fem.Constant(mesh, length)
+        return unknown
+
+    def change_of_length(self, unknown: Any) -> Any:
+        """e, UFL; linear in the unknown."""
+        import ufl
+
+        return ufl.split(unknown)[1]
+
+    def displacement(self, unknown: Any) -> Any:
+        """u + e z/length e_z."""
+        import ufl
+
+        u, change = ufl.split(unknown)
+        z = ufl.SpatialCoordinate(unknown.ufl_function_space().mesh)[2]
+        return self.field.displacement(u) + ufl.as_vector([0.0, 0.0, change * z / self._length])
+
+    def deformation_gradient(self, unknown: Any) -> Any:
+        """The field's, and e/length along z."""
+        import ufl
+
+        u, change = ufl.split(unknown)
+        stretch = change / self._length
+        return self.field.deformation_gradient(u) + ufl.as_tensor(
+            [[stretch if i == j == 2 else 0.0 for j in range(3)] for i in range(3)]
+        )
+
+    def subspace(self, space: Any, component: int) -> Any:
+        """The field's."""
+        return self.field.subspace(space.sub(0), component)
+
+    def nodal_space(self, unknown: Any) -> Any:
+        """The field's."""
+        return self.field.nodal_space(self._nodal)
+
+    def nodal_displacement(self, unknown: Any) -> Array:
+        """Displacement of the local nodes, (nodes, 3)."""
+        self._nodal.x.array[:] = unknown.x.array[self._dofs]
+        places: Array = self.nodal_space(unknown).tabulate_dof_coordinates()
+        displacement = self.field.nodal_displacement(self._nodal).copy()
+        displacement[:, 2] += self.strain_of_length(unknown) * places[:, 2]
+        return displacement
+
+    def strain_of_length(self, unknown: Any) -> float:
+        """e/length; the same on every rank."""
+        from mpi4py import MPI
+
+        dofs = unknown.function_space.sub(1).dofmap.list.flatten()
+        here = float(unknown.x.array[dofs[0]]) if len(dofs) else -np.inf
+        return float(unknown.function_space.mesh.comm.allreduce(here, MPI.MAX)) / self.body.axial_length
+
+
+def with_one_value(space: Any, component: int) -> Any:
+    """A mixed space in which a component, constant in each element, has one value for the whole mesh. Collective.
+
+    The first rank with elements owns it, for all others it is a ghost.
+    """
+    import dolfinx.la
+    from mpi4py import MPI
+
+    from remodel_fenicsx.fem import compat
+
+    dofmap, comm = space.dofmap, space.mesh.comm
+    old = dofmap.index_map
+    is_one = np.zeros(old.size_local + old.num_ghosts, dtype=bool)
+    is_one[space.sub(component).dofmap.list.flatten()] = True
+    owned, ghosts = ~is_one[: old.size_local], ~is_one[old.size_local :]
+    has_elements = len(dofmap.list) > 0
+    owner = comm.allreduce(comm.rank if has_elements else comm.size, MPI.MIN)
+    is_owner = comm.rank == owner
+    size = int(owned.sum()) + is_owner
+    offset = comm.exscan(size) or 0
+    numbers = dolfinx.la.vector(old, 1, dtype=np.float64)  # exact for whole numbers
+    numbers.array[: old.size_local][owned] = offset + np.arange(owned.sum())
+    numbers.scatter_forward()
+    one = comm.bcast(offset + int(owned.sum()), root=owner)
+    is_ghost = has_elements and not is_owner
+    new_ghosts = numbers.array[old.size_local :][ghosts].astype(np.int64)
+    owners = np.asarray(old.owners)[ghosts]
+    if is_ghost:
+        new_ghosts, owners = np.append(new_ghosts, one), np.append(owners, owner)
+    place = np.zeros(len(is_one), dtype=np.int32)
+    place[: old.size_local][owned] = np.arange(owned.sum())
+    place[old.size_local :][ghosts] = size + np.arange(ghosts.sum())
+    place[is_one] = size - 1 if is_owner else size + ghosts.sum()
+    return compat.space_with_dofs(space, size, new_ghosts, owners.astype(np.int32), place[dofmap.list])
+
+
+def field_degree(space: Any) -> int:
+    """Polynomial degree of a kinematics' unknown, of the field where there is a number beside it."""
+    element = space.ufl_element()
+    return int((element.sub_elements or [element])[0].degree)
+
+
+# ---------------------------------------------------------------- what they are made of
+
+
+def lagrange(mesh: Any, degree: int, shape: tuple[int, ...]) -> Any:
+    """A continuous function "displacement", zero, with values of this shape."""
+    import basix.ufl
+    import dolfinx.fem
+
+    element = basix.ufl.element("Lagrange", mesh.topology.cell_name(), degree, shape=shape)
+    return dolfinx.fem.Function(dolfinx.fem.functionspace(mesh, element), name="displacement")
+
+
+def _constant(mesh: Any, value: float) -> Any:
+    import dolfinx.fem
+    from petsc4py import PETSc
+
+    return dolfinx.fem.Constant(mesh, PETSc.ScalarType(value))  # type: ignore[attr-defined]
+
+
+def _along(axis: int, value: Any) -> Any:
+    """value e (x) e along an axis, UFL."""
+    import ufl
+
+    return ufl.as_tensor([[value if i == j == axis else 0.0 for j in range(3)] for i in range(3)])
+
+
+def _circumference(mesh: Any) -> Any:
+    """2 pi r on the half-plane y = 0."""
+    import ufl
+
+    return 2 * np.pi * ufl.SpatialCoordinate(mesh)[0]

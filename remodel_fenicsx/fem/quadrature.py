@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.compat import geometry_dofmap
-from remodel_fenicsx.fem.ranks import of_all_ranks, over_ranks
+from remodel_fenicsx.fem.assembly import of_all_ranks, over_ranks
 
 # the rule that the element wants; UFL's estimate for this energy is huge
 DEGREES = {

@@ -10,14 +10,14 @@ in C                stands for
 principal           model.spectral.principal
 positive_direction  model.spectral.positive_direction
 without_noise       model.spectral.without_noise
-stretches           model.repulsion.squared_end_to_end_length, model.repulsion.axes_sum
+stretches           model.energy.squared_end_to_end_length, model.energy.axes_sum
 parts               kernels.points.PointKernels.gradient_and_driver
 structure           model.cells.structure_tensor
 extension           kernels.points.PointKernels.extension
 may_turn            kernels.points.PointKernels.may_turn
 room                kernels.points.PointKernels.room
-log_sum             model.repulsion.log_sum
-log_derivatives     model.repulsion.log_derivatives
+log_sum             model.energy.log_sum
+log_derivatives     model.energy.log_derivatives
 target              model.laws.tensor_target
 solve               model.implicit.condensed.CondensedPoints.solve
 tangent             model.implicit.condensed.CondensedPoints.tangent

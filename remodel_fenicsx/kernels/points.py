@@ -9,7 +9,7 @@ from mpi4py import MPI
 from numpy.typing import ArrayLike, NDArray
 
 from remodel_fenicsx.kernels.library import Library, in_numpy
-from remodel_fenicsx.model import cells, repulsion, spectral
+from remodel_fenicsx.model import cells, energy, spectral
 from remodel_fenicsx.model.cells import UnitCell
 
 Array = NDArray[np.float64]
@@ -27,12 +27,12 @@ class PointKernels:
     structure_tensor: Callable[..., Array] = staticmethod(cells.structure_tensor)
 
     def squared_length(self, F: Array, cell: UnitCell) -> Array:
-        """`repulsion.squared_end_to_end_length` of one whole cell."""
-        return np.asarray(repulsion.squared_end_to_end_length(F, [cell]))
+        """`energy.squared_end_to_end_length` of one whole cell."""
+        return np.asarray(energy.squared_end_to_end_length(F, [cell]))
 
     def squared_length_and_sum(self, F: Array, cell: UnitCell) -> tuple[Array, Array]:
-        """The same, and `repulsion.axes_sum`."""
-        return self.squared_length(F, cell), np.asarray(repulsion.axes_sum(F, [cell], 1.0))
+        """The same, and `energy.axes_sum`."""
+        return self.squared_length(F, cell), np.asarray(energy.axes_sum(F, [cell], 1.0))
 
     def gradient_and_driver(self, both: Array) -> tuple[Array, Array]:
         """F and the symmetric part of the driving tensor, (n, 3, 3) each, from both (n, 2, 3, 3)."""

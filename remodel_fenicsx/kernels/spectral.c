@@ -206,7 +206,7 @@ void without_noise(int64_t n, const double *tensors, const double *axes, const d
     }
 }
 
-/* repulsion.squared_end_to_end_length and repulsion.axes_sum: r^2 = sum l_I^2 I_I and M = sum l_I^2 ln I_I. */
+/* energy.squared_end_to_end_length and energy.axes_sum: r^2 = sum l_I^2 I_I and M = sum l_I^2 ln I_I. */
 void stretches(int64_t n, const double *F, const double *dimensions, const double *axes, double *squared, double *sum)
 {
     for (int64_t at = 0; at < n; ++at) {

@@ -50,7 +50,7 @@ static void second_derivative(const double *c, tensor first, tensor A, matrix re
     }
 }
 
-/* repulsion.log_sum: A : ln C. */
+/* energy.log_sum: A : ln C. */
 void log_sum(int64_t n, const double *F, const double *A, double *result)
 {
     for (int64_t at = 0; at < n; ++at) {
@@ -68,7 +68,7 @@ void log_sum(int64_t n, const double *F, const double *A, double *result)
     }
 }
 
-/* repulsion.log_derivatives; second may be null. */
+/* energy.log_derivatives; second may be null. */
 void log_derivatives(int64_t n, const double *C, const double *A, double *first, double *second)
 {
     for (int64_t at = 0; at < n; ++at) {

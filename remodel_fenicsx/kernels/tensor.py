@@ -20,7 +20,7 @@ from remodel_fenicsx.model.implicit import condensed
 from remodel_fenicsx.model.implicit.condensed import CondensedPoints
 from remodel_fenicsx.model.implicit.responses import StepOfCells
 from remodel_fenicsx.model.laws import LAWS, Drive
-from remodel_fenicsx.model.repulsion import REPULSIONS, Repulsion, whole_structure_tensor
+from remodel_fenicsx.model.energy import REPULSIONS, Repulsion, whole_structure_tensor
 from remodel_fenicsx.model.tensor_law import Target
 
 Array = NDArray[np.float64]
@@ -80,13 +80,13 @@ class TensorKernels:
         return Target(direction, share)
 
     def log_sum(self, F: Array, cells: Sequence[UnitCell], end_to_end_length: Any) -> Array:
-        """`repulsion.log_sum`."""
+        """`energy.log_sum`."""
         result = np.empty(len(F))
         self.call("log_sum", len(F), F, whole_structure_tensor(cells), result)
         return result
 
     def log_derivatives(self, C: Array, A: Array, second: bool = True) -> tuple[Array, Array | None]:
-        """`repulsion.log_derivatives`."""
+        """`energy.log_derivatives`."""
         first, matrices = np.empty(C.shape), np.empty((len(C), 6, 6)) if second else None
         self.call("log_derivatives", len(C), C, A, first, matrices)
         return first, matrices

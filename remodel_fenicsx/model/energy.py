@@ -15,13 +15,14 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from remodel_fenicsx.model import logarithm, mandel
 from remodel_fenicsx.model.cells import UnitCell, structure_tensor
 from remodel_fenicsx.model.chains import CHAINS, Chain
-from remodel_fenicsx.model.mandel import MANDEL
-from remodel_fenicsx.model.operators import det, is_array, ln, sqrt, squared_norm
-from remodel_fenicsx.model.repulsion import REPULSIONS, Repulsion, squared_end_to_end_length
+from remodel_fenicsx.model.operators import component, det, is_array, ln, sqrt, squared_norm
 
+Array = NDArray[np.float64]
 Term = Callable[[Any, Any, Any], Any]
 
 
@@ -71,7 +72,7 @@ def neo_hookean_derivatives(squared: Any, lame_lambda: Any, lame_mu: Any, second
         return value, None
     entries = np.concatenate([inverse, np.zeros_like(inverse)], axis=1)
     dyad = np.reshape(lame_lambda, (-1, 1, 1)) / 2 * entries[:, :, None] * entries[:, None, :]
-    rows, columns = np.array(MANDEL).T
+    rows, columns = mandel.ROWS, mandel.COLUMNS
     dyad[:, range(6), range(6)] -= volumetric[:, None] * inverse[:, rows] * inverse[:, columns]
     return value, dyad
 
@@ -87,6 +88,88 @@ neo_hookean = Matrix(
 MATRICES: dict[str, Term] = {"neo-hookean": neo_hookean}
 """Energies of the matrix by name: functions of F, lambda and mu (UFL or arrays), zero and stress-free at F = I; those
 that formulations other than "displacement" can take are a `Matrix`."""
+
+
+# ---------------------------------------------------------------- the repulsion: W_rep = -c/2 g(r0) M
+# It makes the unloaded tissue stress-free. M has several forms. `axes` is the paper's (eq. 4c): it sees the axes of a
+# cell. `log` sees the structure tensor A = sum_I l_I^2 n_I (x) n_I alone: it equals `axes` where C and the cell are
+# coaxial, is isotropic for isotropic cells in every frame, and leaves C = I stress-free for every A (docs/theory.md,
+# "The consistent variant"). `length` is the simplest function of A; it has no shear stiffness from isotropic cells.
+
+
+def squared_end_to_end_length(deformation_gradient: Any, cells: Sequence[UnitCell]) -> Any:
+    """r^2 = sum_I l_I^2 n_I . C n_I (eq. 5)."""
+    return sum(
+        cell.weight * component(cell.dimensions, i) ** 2 * stretch
+        for cell in cells
+        for i, stretch in enumerate(cell.squared_stretches(deformation_gradient))
+    )
+
+
+def axes_sum(deformation_gradient: Any, cells: Sequence[UnitCell], end_to_end_length: Any) -> Any:
+    """M = sum_I l_I^2 ln(n_I . C n_I); UFL or arrays."""
+    return sum(
+        cell.weight * component(cell.dimensions, i) ** 2 * ln(stretch)
+        for cell in cells
+        for i, stretch in enumerate(cell.squared_stretches(deformation_gradient))
+    )
+
+
+def length_sum(deformation_gradient: Any, cells: Sequence[UnitCell], end_to_end_length: Any) -> Any:
+    """M = r0^2 ln(r^2 / r0^2), r^2 = A : C; UFL or arrays."""
+    squared = squared_end_to_end_length(deformation_gradient, cells)
+    return end_to_end_length**2 * ln(squared / end_to_end_length**2)
+
+
+def log_sum(deformation_gradient: Array, cells: Sequence[UnitCell], end_to_end_length: Any) -> Any:
+    """M = A : ln C; arrays."""
+    C = np.swapaxes(deformation_gradient, -1, -2) @ deformation_gradient
+    return (whole_structure_tensor(cells) * logarithm.logarithm(C)).sum(axis=(-1, -2))
+
+
+def whole_structure_tensor(cells: Sequence[UnitCell]) -> Array:
+    """A of a cell, or of its shares with numbers for weights, (n, 3, 3)."""
+    total: Array = sum(cell.weight * structure_tensor(cell.dimensions, cell.axes) for cell in cells)  # type: ignore
+    return total
+
+
+def log_derivatives(C: Array, A: Array, second: bool = True) -> tuple[Array, Array | None]:
+    """dM/dC (n, 3, 3) and d^2M/dC^2 as Mandel matrices (n, 6, 6) of M = A : ln C, the second on request."""
+    values, vectors = logarithm.eigen(C)
+    components = logarithm.rotated(A, vectors)
+    back = np.swapaxes(vectors, -1, -2)
+    first = logarithm.rotated(logarithm.derivative(values, components), back)
+    if not second:
+        return first, None
+    rotation = mandel.congruence(vectors)
+    return first, rotation @ logarithm.second_derivative(values, components) @ np.swapaxes(rotation, 1, 2)
+
+
+@dataclass(frozen=True)
+class Repulsion:
+    """A form of the repulsive energy.
+
+    Attributes
+    ----------
+    sum
+        M from (F, cells, r0): arrays, and UFL too where there are no `derivatives`.
+    derivatives
+        Where M is no closed expression for UFL: dM/dC and, on request, d^2M/dC^2 as Mandel matrices from (C, A,
+        second), arrays.
+    """
+
+    sum: Callable[[Any, Sequence[UnitCell], Any], Any]
+    derivatives: Callable[..., tuple[Array, Array | None]] | None = None
+
+
+REPULSIONS: dict[str, Repulsion] = {
+    "axes": Repulsion(axes_sum),
+    "log": Repulsion(log_sum, log_derivatives),
+    "length": Repulsion(length_sum),
+}
+
+
+# ---------------------------------------------------------------- the tissue
 
 
 class Stresses(NamedTuple):
@@ -111,7 +194,7 @@ class Tissue:
     """Matrix and collagen network: the constitutive parameters and what follows from them.
 
     Every parameter is a number, a dolfinx Constant, a DG0 function (regions) or an array over points: the same
-    functions serve forms and arrays. `fem.coefficients` makes one kind of the other.
+    functions serve forms and arrays. `fem.assembly` makes one kind of the other.
 
     Attributes
     ----------

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from remodel_fenicsx.body import SHAPES
-from remodel_fenicsx.body.column import Column
+from remodel_fenicsx.body.columns import Column
 from remodel_fenicsx.body.columns import COLUMNS_ON_REQUEST, columns_of
 
 

@@ -21,10 +21,9 @@ from remodel_fenicsx.body.reductions import AUTO, objections
 from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.model.chains import CHAINS
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
-from remodel_fenicsx.model.energy import MATRICES, Matrix
+from remodel_fenicsx.model.energy import MATRICES, REPULSIONS, Matrix
 from remodel_fenicsx.model.implicit.condensed import refused
 from remodel_fenicsx.model.laws import LAWS
-from remodel_fenicsx.model.repulsion import REPULSIONS
 from remodel_fenicsx.scene.plausibility import doubts, largest_stress
 from remodel_fenicsx.scene.presets import PRESETS, default_method
 from remodel_fenicsx.scene.profiles import EXACT, PROFILES, known_profile

@@ -10,7 +10,7 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from remodel_fenicsx.fem.ranks import over_ranks
+from remodel_fenicsx.fem.assembly import over_ranks
 from remodel_fenicsx.solver.blend import KEPT_RESERVE
 from remodel_fenicsx.solver.equilibrium import Extension
 from remodel_fenicsx.solver.newton import NOTICEABLE, GuardedNewton, Solution, SolveFailure

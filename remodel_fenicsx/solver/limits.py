@@ -6,7 +6,7 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from remodel_fenicsx.fem.ranks import over_ranks
+from remodel_fenicsx.fem.assembly import over_ranks
 from remodel_fenicsx.solver.equilibrium import Equilibrium, Look
 
 Array = NDArray[np.float64]

@@ -12,7 +12,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from remodel_fenicsx.fem.petsc_options import ProblemOptions
-from remodel_fenicsx.fem.ranks import over_ranks
+from remodel_fenicsx.fem.assembly import over_ranks
 from remodel_fenicsx.fem.solver_methods import AUTO, EXACT, LAGGED, SMALL, chosen, method_options
 from remodel_fenicsx.settings import Solver
 from remodel_fenicsx.solver.equilibrium import Equilibrium, Look

@@ -9,12 +9,12 @@ import numpy as np
 import ufl
 from numpy.typing import NDArray
 
-from remodel_fenicsx.fem import coefficients
+from remodel_fenicsx.fem import assembly
 from remodel_fenicsx.kernels.tensor import with_kernels
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.energy import Stresses, Tissue
 from remodel_fenicsx.model.mandel import MANDEL
-from remodel_fenicsx.model.repulsion import whole_structure_tensor
+from remodel_fenicsx.model.energy import whole_structure_tensor
 from remodel_fenicsx.state.state import State
 
 Array = NDArray[np.float64]
@@ -81,7 +81,7 @@ class PointwiseRepulsion:
     def energy(self) -> float:
         """Its part of the stored energy, over all ranks."""
         F = self.state.deformation_gradient()
-        r0 = coefficients.point_values(self.tissue.end_to_end_length, self.quadrature).reshape(-1)
+        r0 = assembly.point_values(self.tissue.end_to_end_length, self.quadrature).reshape(-1)
         values = -self._modulus() / 2 * self.tissue.repulsion.sum(F, self.shares(), r0)
         return self.quadrature.integral(values.reshape(self.quadrature.shape))
 
@@ -99,7 +99,7 @@ class PointwiseRepulsion:
         return geometric + ufl.inner(ufl.dot(self.stiffness, along), across)
 
     def _modulus(self) -> Array:
-        points = self.tissue.map(lambda name, value: coefficients.point_values(value, self.quadrature).reshape(-1))
+        points = self.tissue.map(lambda name, value: assembly.point_values(value, self.quadrature).reshape(-1))
         modulus: Array = points.repulsion_modulus
         return modulus
 

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from remodel_fenicsx.fem import coefficients
+from remodel_fenicsx.fem import assembly
 from remodel_fenicsx.fem.quadrature import Quadrature
-from remodel_fenicsx.fem.remembered import Remembered
+from remodel_fenicsx.fem.assembly import Remembered
 from remodel_fenicsx.model.energy import Tissue
 
 Array = NDArray[np.float64]
@@ -23,12 +23,12 @@ def on_mesh(tissue: Tissue, mesh: Any) -> Tissue:
     TypeError, ValueError
         If a parameter is neither a number, nor a Constant, nor a DG0 Function of the mesh.
     """
-    return tissue.map(lambda name, value: coefficients.coefficient(mesh, name, value))
+    return tissue.map(lambda name, value: assembly.coefficient(mesh, name, value))
 
 
 def at_points(tissue: Tissue, quadrature: Quadrature) -> Tissue:
     """A tissue on a mesh with its parameters as arrays over the points in one row, (elements * points,)."""
-    return tissue.map(lambda name, value: coefficients.point_values(value, quadrature).reshape(-1))
+    return tissue.map(lambda name, value: assembly.point_values(value, quadrature).reshape(-1))
 
 
 def stress_rounding(numbers: Tissue, max_chain_extension: float) -> float:
@@ -72,9 +72,7 @@ class Parameters:
 
     def largest(self) -> Tissue:
         """The largest value of each in the body, numbers. Collective."""
-        return self._largest(
-            lambda: self.tissue.map(lambda name, value: coefficients.largest(value, self.quadrature.mesh))
-        )
+        return self._largest(lambda: self.tissue.map(lambda name, value: assembly.largest(value, self.quadrature.mesh)))
 
     def at_points(self) -> Tissue:
         """`at_points`; not to be written into."""

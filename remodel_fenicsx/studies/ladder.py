@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from remodel_fenicsx.body.profile import PROFILE
+from remodel_fenicsx.body.columns import PROFILE
 from remodel_fenicsx.body.reductions import AUTO, choice, objections, step_cost
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.model.laws import LAWS

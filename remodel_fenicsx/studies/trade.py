@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from remodel_fenicsx.body.profile import PROFILE
+from remodel_fenicsx.body.columns import PROFILE
 from remodel_fenicsx.scene.scene import Scene
 from remodel_fenicsx.schema.times import same_time
 from remodel_fenicsx.studies import trade_output

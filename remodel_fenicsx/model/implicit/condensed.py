@@ -26,7 +26,7 @@ from remodel_fenicsx.model.implicit import network, tangents
 from remodel_fenicsx.model.implicit.network import Cells, OrthotropicCells, Strain, Stress, StructureCells
 from remodel_fenicsx.model.implicit.responses import Response, StepOfCells, response
 from remodel_fenicsx.model.laws import LAWS, Law
-from remodel_fenicsx.model.repulsion import REPULSIONS, Repulsion
+from remodel_fenicsx.model.energy import REPULSIONS, Repulsion
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]

@@ -180,7 +180,7 @@ TERMS: dict[str, Callable[[Strain, Cells, Array, bool], Terms]] = {
     "log": log_terms,
     "length": length_terms,
 }
-"""Of the repulsions, by their names in `repulsion.REPULSIONS`."""
+"""Of the repulsions, by their names in `energy.REPULSIONS`."""
 
 
 class Stress(NamedTuple):

@@ -1,0 +1,274 @@
+"""Forms and their numbers: what dolfinx and UFL leave to do so that a small problem is fast.
+
+Sums over ranks, parameters as arguments of compiled kernels, values that are computed once for each state, tangents of
+energies in few operations, matrices in memory that dolfinx and PETSc share.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from numbers import Real
+from typing import Any, Generic, TypeVar
+
+import dolfinx.fem
+import dolfinx.fem.petsc
+import dolfinx.la
+import numpy as np
+import ufl
+from mpi4py import MPI
+from numpy.typing import NDArray
+from petsc4py import PETSc
+from ufl.algorithms.map_integrands import map_integrands
+from ufl.classes import Determinant, Inner, Sqrt, Trace
+from ufl.corealg.traversal import traverse_unique_terminals, unique_post_traversal
+
+T = TypeVar("T")
+
+# ---------------------------------------------------------------- over ranks
+
+
+def over_ranks(comm: MPI.Intracomm, value: Any, operation: MPI.Op) -> Any:
+    """The operation over the values of all ranks, on all ranks. Collective.
+
+    A run of one rank makes some ten of these in a Newton iteration, and a small problem has no time for them.
+    """
+    return value if comm.size == 1 else comm.allreduce(value, operation)
+
+
+def of_all_ranks(comm: MPI.Intracomm, value: Any) -> list[Any]:
+    """The values of all ranks, on all ranks. Collective."""
+    return [value] if comm.size == 1 else comm.allgather(value)
+
+
+# ---------------------------------------------------------------- parameters of kernels
+
+
+def coefficient(mesh: Any, name: str, value: Any) -> Any:
+    """The value as forms take it, so that another value compiles nothing.
+
+    Parameters
+    ----------
+    mesh
+        dolfinx mesh of the forms.
+    name
+        Of the parameter, for errors.
+    value
+        A number, which becomes a Constant; a scalar dolfinx Constant, or a scalar DG0 Function of this mesh, which stay
+        the user's: what is returned shares their memory. It is an object of its own, because UFL numbers constants and
+        functions by their age, and kernels are found again by these numbers.
+
+    Raises
+    ------
+    TypeError
+        If it is anything else.
+    ValueError
+        If a value is not finite, or a Constant or Function belongs to another mesh or has another shape.
+    """
+    if isinstance(value, Real) and not isinstance(value, (bool, np.bool_)):
+        if not np.isfinite(float(value)):
+            raise ValueError(f"{name} = {value}: must be finite")
+        return dolfinx.fem.Constant(mesh, PETSc.ScalarType(float(value)))
+    if isinstance(value, dolfinx.fem.Constant):
+        _require_this_mesh(mesh, name, value.ufl_domain())
+        if value.ufl_shape != ():
+            raise ValueError(f"{name}: a Constant of shape {value.ufl_shape}; must be a scalar")
+        if not np.all(np.isfinite(value.value)):
+            raise ValueError(f"{name} = {value.value}: must be finite")
+        own = dolfinx.fem.Constant(mesh, PETSc.ScalarType(value.value))
+        own._cpp_object = value._cpp_object
+        return own
+    if isinstance(value, dolfinx.fem.Function):
+        space = value.function_space
+        _require_this_mesh(mesh, name, space.mesh.ufl_domain())
+        element = space.ufl_element()
+        if element.degree != 0 or not element.discontinuous or value.ufl_shape != ():
+            raise ValueError(f"{name}: {_described(value)}; must be a scalar DG0 Function, one value an element")
+        finite = bool(np.all(np.isfinite(value.x.array)))
+        if not mesh.comm.allreduce(finite, MPI.LAND):
+            raise ValueError(f"{name}: a Function with values that are not finite; every one must be")
+        return dolfinx.fem.Function(space, value.x, name=name)
+    raise TypeError(
+        f"{name} = {value!r:.60}: must be a number, a dolfinx Constant or a DG0 Function of this mesh, "
+        f"not a {type(value).__name__}"
+    )
+
+
+def _described(function: Any) -> str:
+    """What a Function is, on one line."""
+    element = function.function_space.ufl_element()
+    family, shape = getattr(element, "family_name", "quadrature"), function.ufl_shape
+    return f"a Function of {family} elements of degree {element.degree}" + (f" and shape {shape}" if shape else "")
+
+
+def _require_this_mesh(mesh: Any, name: str, domain: Any) -> None:
+    if domain is None or domain.ufl_cargo() is not mesh.ufl_domain().ufl_cargo():
+        raise ValueError(f"{name}: belongs to another mesh; must be of this one")
+
+
+def point_values(value: Any, quadrature: Any) -> NDArray[np.float64]:
+    """Values of a coefficient at the quadrature points, (elements, points); ghosts included."""
+    if isinstance(value, dolfinx.fem.Function):
+        dofs = value.function_space.dofmap.list.reshape(-1)
+        return np.repeat(np.real(value.x.array[dofs])[:, None], quadrature.shape[1], axis=1)
+    return np.full(quadrature.shape, float(np.real(value.value)))
+
+
+def largest(value: Any, mesh: Any) -> float:
+    """Largest value of a coefficient in the body, over all ranks."""
+    if isinstance(value, dolfinx.fem.Function):
+        owned = value.function_space.dofmap.index_map.size_local
+        local = float(np.max(np.real(value.x.array[:owned]), initial=-np.inf))
+        return float(mesh.comm.allreduce(local, MPI.MAX))
+    return float(np.real(value.value))
+
+
+# ---------------------------------------------------------------- values computed once for each state
+
+
+class Remembered(Generic[T]):
+    """The last value, as long as nothing has changed that it depends on.
+
+    Parameters
+    ----------
+    comm
+        Ranks that must agree on whether something has changed: collective, as what it spares may be. None where each
+        rank has values of its own.
+    expressions
+        UFL: the value depends on their functions and constants, and on nothing else.
+    """
+
+    def __init__(self, comm: MPI.Intracomm | None, *expressions: Any):
+        self._comm = comm
+        terminals = {terminal for expression in expressions for terminal in traverse_unique_terminals(expression)}
+        functions = [terminal for terminal in terminals if isinstance(terminal, dolfinx.fem.Function)]
+        constants = [terminal for terminal in terminals if isinstance(terminal, dolfinx.fem.Constant)]
+        # their own memory; what is small is asked first, for one difference is enough
+        self._arrays: list[NDArray[np.float64]] = sorted((f.x.array for f in functions), key=lambda array: array.size)
+        self._numbers = [np.asarray(c.value) for c in constants]
+        self._seen: list[NDArray[np.float64]] = []
+        self._seen_numbers: list[bytes] | None = None
+        self._value: T
+
+    def __call__(self, make: Callable[[], T]) -> T:
+        """The value, of `make` where it is not known yet."""
+        numbers = [number.tobytes() for number in self._numbers]
+        known = numbers == self._seen_numbers and all(map(_same, self._arrays, self._seen))
+        if self._comm is not None:
+            known = bool(over_ranks(self._comm, known, MPI.LAND))
+        if not known:
+            self.forget()  # should `make` fail
+            self._value = make()
+            self._remember(numbers)
+        return self._value
+
+    def forget(self) -> None:
+        """The next value is made anew."""
+        self._seen_numbers = None
+
+    def _remember(self, numbers: list[bytes]) -> None:
+        if not self._seen:
+            self._seen = [array.copy() for array in self._arrays]
+        for array, seen in zip(self._arrays, self._seen, strict=True):
+            if not _same(array, seen):
+                seen[:] = array
+        self._seen_numbers = numbers
+
+
+def _same(one: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
+    return bool((one == other).all())
+
+
+# ---------------------------------------------------------------- the tangent of an energy
+
+
+def second_derivative(energy: Any, unknown: Any, test: Any, trial: Any) -> Any:
+    """Derivative of an energy by its unknowns, twice; its kernel takes a third of the time.
+
+    An energy W(I_1, I_2, ...) of scalar invariants of F has sum_m W_m D(d I_m) + sum_mn W_mn d I_m D I_n. Left to
+    itself UFL puts test and trial function through every operation of W, and each of these is then 81 at a point in
+    three dimensions. Here they are operations on numbers, and each pair of invariants that W couples has one dyad.
+
+    Parameters
+    ----------
+    energy
+        UFL form without arguments.
+    unknown, test, trial
+        What it is differentiated by, and the directions.
+    """
+    return map_integrands(lambda density: _of_density(density, unknown, test, trial), energy)
+
+
+def _of_density(density: Any, unknown: Any, test: Any, trial: Any) -> Any:
+    found = invariants(density, unknown)
+    if not found:
+        return ufl.derivative(ufl.derivative(density, unknown, test), unknown, trial)
+    by_number = [(ufl.variable(invariant), invariant) for invariant in found]
+    function = ufl.replace(density, {invariant: number for number, invariant in by_number})
+    changes = [[ufl.derivative(invariant, unknown, way) for invariant in found] for way in (test, trial)]
+    total = ufl.as_ufl(0)
+    for (number, _), change in zip(by_number, changes[0], strict=True):
+        slope = ufl.diff(function, number)
+        total += slope * ufl.derivative(change, unknown, trial)
+        for (other, _), other_change in zip(by_number, changes[1], strict=True):
+            total += ufl.diff(slope, other) * (change * other_change)
+    return total
+
+
+def invariants(density: Any, unknown: Any) -> list[Any]:
+    """Scalar products, determinants, traces and squared lengths through which alone a density depends on the unknown.
+
+    The outermost ones; none at all where it depends on the unknown in another way too.
+    """
+    depends: set[Any] = set()
+    for part in unique_post_traversal(density):  # operands come before what is made of them
+        if part == unknown or any(operand in depends for operand in part.ufl_operands):
+            depends.add(part)
+    found: dict[Any, None] = {}
+    stack, seen = [density], set()
+    while stack:
+        part = stack.pop()
+        if part in seen or part not in depends:
+            continue
+        seen.add(part)
+        if part.ufl_shape == () and isinstance(part, (Inner, Determinant, Trace)):
+            found[part] = None
+        elif isinstance(part, Sqrt):
+            found[part.ufl_operands[0]] = None
+        elif part.ufl_operands:
+            stack.extend(reversed(part.ufl_operands))
+        else:
+            return []
+    return list(found)
+
+
+# ---------------------------------------------------------------- matrices
+SHARED = "dolfinx"  # attribute of a PETSc matrix: dolfinx's own, with the same numbers
+
+
+def create_matrix(form: Any) -> Any:
+    """An empty PETSc matrix with the pattern of a compiled bilinear form. Collective.
+
+    On one rank its rows are those of a `dolfinx.la.MatrixCSR`: then no value goes through PETSc's insertion, which
+    takes as long as the kernels.
+    """
+    if form.mesh.comm.size > 1:
+        return dolfinx.fem.petsc.create_matrix(form)
+    shared = dolfinx.fem.create_matrix(form, dolfinx.la.BlockMode.expanded)
+    rows = shared.indptr.astype(PETSc.IntType), shared.indices.astype(PETSc.IntType, copy=False), shared.data
+    size, block = len(rows[0]) - 1, form.function_spaces[0].dofmap.index_map_bs
+    matrix = PETSc.Mat().createAIJWithArrays((size, size), rows, comm=form.mesh.comm)
+    matrix.setBlockSizes(block, block)  # for multigrid
+    matrix.setAttr(SHARED, shared)
+    return matrix
+
+
+def assemble_matrix(matrix: Any, forms: Sequence[Any], conditions: Sequence[Any]) -> None:
+    """The sum of compiled bilinear forms; zero in the rows and columns of conditions, one on their diagonal."""
+    matrix.zeroEntries()
+    target: Any = matrix.getAttr(SHARED)
+    assemble: Any = dolfinx.fem.assemble_matrix  # mypy sees one overload of a single-dispatch function
+    if target is None:
+        target, assemble = matrix, dolfinx.fem.petsc.assemble_matrix
+    for form in forms:
+        assemble(target, form, bcs=list(conditions))
+        matrix.assemble()
