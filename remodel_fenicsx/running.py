@@ -23,7 +23,7 @@ from remodel_fenicsx.results.run_folder import (
     LastStep,
     RunFolder,
     agreed,
-    check_kept,
+    check_before_resuming,
     chosen_folder,
     forget_steps,
     locked,
@@ -220,7 +220,7 @@ def _record(simulation: Simulation, place: Path, around: _Circumstances) -> None
     after = LastStep(columns, state.number, state.time) if state.number else None
     if around.resumes:
         wanted = bool(scene.output.fields)
-        agreed(comm, lambda: check_kept(place, after, wanted) if comm.rank == 0 else None)
+        agreed(comm, lambda: check_before_resuming(place, after, wanted) if comm.rank == 0 else None)
         if after is None and comm.rank == 0:
             forget_steps(place)
     with ExitStack() as stack:

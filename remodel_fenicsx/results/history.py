@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import errno
 import io
 import math
 import os
@@ -13,7 +14,7 @@ from typing import NamedTuple
 
 from remodel_fenicsx.results.recording import LARGEST_HISTORY, RecordingError
 from remodel_fenicsx.schema.times import same_time
-from remodel_fenicsx.system.regular_files import check_still_there, open_own, read_regular
+from remodel_fenicsx.system.regular_files import open_own, read_regular
 
 FLUSHED_AFTER = 0.5  # seconds: rows that come faster are brought to the disk together
 
@@ -99,7 +100,9 @@ class History:
         """
         if not self._is_flushed:
             os.fsync(self._file.fileno())
-            check_still_there(self._file.fileno(), self._path, "the rows of this run, and what else was in its folder")
+            if os.fstat(self._file.fileno()).st_nlink == 0:
+                lost = "the rows of this run, and what else was in its folder"
+                raise FileNotFoundError(errno.ENOENT, f"the file was deleted during the run; lost: {lost}", self._path)
             self._flushed_at, self._is_flushed = clock.monotonic(), True
 
     def drop_last(self) -> None:

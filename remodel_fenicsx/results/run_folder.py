@@ -117,7 +117,7 @@ def _lock(folder: Path, ranks: int, new: bool) -> RunLock:
     return lock
 
 
-def check_kept(folder: Path, after: LastStep | None, fields: bool) -> None:
+def check_before_resuming(folder: Path, after: LastStep | None, fields: bool) -> None:
     """Look at all that a run goes on with, before anything is changed.
 
     Parameters
