@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from benchmarks.precision import end, hold, places, spread, tendon, whole
 from remodel_fenicsx.body.columns import PROFILE, profile_weights
 from remodel_fenicsx.paper.output import COLOURS, STYLE, Page
-from remodel_fenicsx.scene.profiles import PROFILES
+from remodel_fenicsx.scene.presets import PROFILES
 from remodel_fenicsx.scene.scene import Scene, preset_scene, read_scene
 from remodel_fenicsx.schema.times import same_time
 from remodel_fenicsx.simulation import Simulation
@@ -87,7 +87,7 @@ class Point:
 def scene(method: Method) -> Scene:
     """The artery of isotropic cells."""
     changes = {"cells.initial": "isotropic", "remodeling.coupling": method.coupling}
-    return preset_scene(method.preset, "tube").with_values(changes)
+    return preset_scene(method.preset, "tube").with_values(whole.EVERY_TANGENT | changes)
 
 
 def settings(method: Method) -> list[rungs.Setting]:

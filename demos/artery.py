@@ -72,7 +72,7 @@ def load_values(time: float) -> dict[str, float]:
 # %%
 remodeling = parts.Remodeling(driver="cauchy", law="explicit", frame="spatial", kappa=0.025)
 state = parts.State(displacement, kinematics, cells, loading)
-stepper = parts.Stepper(state, tissue, remodeling, parts.Solver(method="direct", predictor="none"), load_values)
+stepper = parts.Stepper(state, tissue, remodeling, parts.Solver(), load_values)
 line = "t = {time:5.1f}  outer radius {outer_radius:.4f}  angles {fibre_angle_inner:.1f} to {fibre_angle_outer:.1f}"
 with parts.RunFolder(folder, "# made by demos/artery.py\n", comm.rank) as record:
     for step in stepper.march(parts.times(end, step=1.0), [parts.Observer(body, stepper), record]):

@@ -62,7 +62,7 @@ def load_values(time: float) -> dict[str, float]:
 kappa = 0.025
 remodeling = parts.Remodeling(driver="cauchy", law="explicit", frame="spatial", kappa=kappa)
 state = parts.State(displacement, kinematics, cells, loading)
-stepper = parts.Stepper(state, tissue, remodeling, parts.Solver(method="direct", predictor="none"), load_values)
+stepper = parts.Stepper(state, tissue, remodeling, parts.Solver(), load_values)
 
 
 def closed_form(time: float) -> float:

@@ -23,8 +23,7 @@ from mpi4py import MPI
 import remodel_fenicsx
 from remodel_fenicsx import Scene, cli, extend, parts
 from remodel_fenicsx.body.columns import columns_of, columns_on_request
-from remodel_fenicsx.scene.presets import PRESETS
-from remodel_fenicsx.scene.profiles import PROFILES
+from remodel_fenicsx.scene.presets import PRESETS, PROFILES
 from remodel_fenicsx.schema.tables import Table, sections
 
 PAGE = Path(__file__).with_name("interface.md")

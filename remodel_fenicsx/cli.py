@@ -15,8 +15,7 @@ from typing import Any, NoReturn
 
 from remodel_fenicsx._version import __version__
 from remodel_fenicsx.body.reductions import explained
-from remodel_fenicsx.scene.presets import PRESETS
-from remodel_fenicsx.scene.profiles import PROFILES
+from remodel_fenicsx.scene.presets import PRESETS, PROFILES
 from remodel_fenicsx.scene.scene import Scene, SceneError, preset_scene, read_scene
 from remodel_fenicsx.schema.tables import printable
 from remodel_fenicsx.system import interrupts
@@ -55,84 +54,65 @@ def parser() -> argparse.ArgumentParser:
     main_parser.add_argument("--version", action="version", version=__version__)
     commands = main_parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
-    def scene_command(name: str, text: str, resumes: bool = False) -> argparse.ArgumentParser:
-        command = commands.add_parser(name, help=text, description=text)
-        meaning = "scene file (TOML), see docs/scene.md"
-        if resumes:
-            which = command.add_mutually_exclusive_group(required=True)
+    def command(name: str, text: str) -> argparse.ArgumentParser:
+        return commands.add_parser(name, help=text, description=text)
+
+    def scene_command(name: str, text: str) -> argparse.ArgumentParser:
+        """One that reads a scene, which `run --resume` finds in the folder."""
+        found, meaning = command(name, text), "scene file (TOML), see docs/scene.md"
+        if name == "run":
+            which = found.add_mutually_exclusive_group(required=True)
             which.add_argument("scene", type=Path, nargs="?", metavar="SCENE", help=meaning)
             text = "go on with the run in DIR from its last checkpoint"
             which.add_argument("--resume", type=Path, metavar="DIR", help=text)
         else:
-            command.add_argument("scene", type=Path, metavar="SCENE", help=meaning)
-        command.add_argument(
-            "--set",
-            action="append",
-            default=[],
-            metavar="KEY=VALUE",
-            help="set a key of the scene, e.g. cells.seed=2 or time.end=10; may be repeated",
-        )
-        command.add_argument("--profile", choices=PROFILES, help="lay the settings of a profile over the scene's own")
-        return command
+            found.add_argument("scene", type=Path, metavar="SCENE", help=meaning)
+        text = "set a key of the scene, e.g. cells.seed=2 or time.end=10; may be repeated"
+        found.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help=text)
+        found.add_argument("--profile", choices=PROFILES, help="lay the settings of a profile over the scene's own")
+        return found
 
-    text = "Run a scene; mpirun -n N remodel-fenicsx run ... is the same run on N ranks."
-    run_command = scene_command("run", text, resumes=True)
-    run_command.add_argument(
-        "-o", "--output", type=Path, metavar="DIR", help="new or empty folder for the results (default: results/NAME)"
-    )
-    run_command.add_argument(
-        "--max-wall-time",
-        type=wall_time,
-        metavar="TIME",
-        help="stop before this time is over, after a whole step, with exit code 4: 90s, 30min, 2h, 1.5d",
-    )
-    run_command.add_argument("-q", "--quiet", action="store_true", help="no progress")
-    stability = scene_command(
-        "stability", "Run a scene and say by what its passes multiply a small change of the cells."
-    )
-    stability.add_argument(
-        "-o", "--output", type=Path, metavar="DIR", help="new or empty folder (default: results/NAME-stability)"
-    )
+    def writes(found: argparse.ArgumentParser, text: str) -> None:
+        found.add_argument("-o", "--output", type=Path, metavar="DIR", help=text)
+
+    run_command = scene_command("run", "Run a scene; mpirun -n N remodel-fenicsx run ... is the same run on N ranks.")
+    writes(run_command, "new or empty folder for the results (default: results/NAME)")
+    text = "stop before this time is over, after a whole step, with exit code 4: 90s, 30min, 2h, 1.5d"
+    run_command.add_argument("--max-wall-time", type=wall_time, metavar="TIME", help=text)
+    stability = scene_command("stability", "Run a scene and say whether its passes damp small changes of the cells.")
+    writes(stability, "new or empty folder (default: results/NAME-stability)")
     stability.add_argument("--times", type=positive, default=10, metavar="N", help="times to analyse (default: 10)")
-    stability.add_argument("-q", "--quiet", action="store_true", help="no progress")
     stability.set_defaults(resume=None, max_wall_time=None)
     ensemble = scene_command("ensemble", "Run a scene of random cells with many seeds, and with isotropic cells.")
     ensemble.add_argument("--seeds", type=positive, default=32, metavar="N", help="how many (default: 32; at least 2)")
     trade = scene_command("trade", "Run a scene with a ladder of settings: what each costs, and how far off it is.")
-    meaning = "wall time for the runs: 90s, 10min, 2h (default: 10min); cheap settings first"
-    trade.add_argument("--budget", type=wall_time, default=600.0, metavar="TIME", help=meaning)
-    meaning = "what it holds of the same scene is used, and gone on with"
+    text = "wall time for the runs: 90s, 10min, 2h (default: 10min); cheap settings first"
+    trade.add_argument("--budget", type=wall_time, default=600.0, metavar="TIME", help=text)
     for study, name in ((ensemble, "ensemble"), (trade, "trade")):
-        folder = f"folder (default: results/NAME-{name}); {meaning}"
-        study.add_argument("-o", "--output", type=Path, metavar="DIR", help=folder)
+        text = "finished runs of the same scene that it holds are used, others go on"
+        writes(study, f"folder (default: results/NAME-{name}); {text}")
         study.add_argument("--jobs", type=positive, metavar="N", help="runs at a time (default: as many as cores)")
-        study.add_argument("-q", "--quiet", action="store_true", help="no progress")
-    text = "Say where the run in DIR is, how fast, and whether it is alive."
-    status = commands.add_parser("status", help=text, description=text)
+    for found in (run_command, stability, ensemble, trade):
+        found.add_argument("-q", "--quiet", action="store_true", help="no progress")
+    status = command("status", "Say where the run in DIR is, how fast, and whether it is alive.")
     status.add_argument("folder", type=Path, metavar="DIR", help="folder of a run")
-    text = "Write the fields of a reduced run in DIR on the whole body: fields_body.vtkhdf."
-    revolve = commands.add_parser("revolve", help=text, description=text)
+    revolve = command("revolve", "Write the fields of a reduced run in DIR on the whole body: fields_body.vtkhdf.")
     revolve.add_argument("folder", type=Path, metavar="DIR", help="folder of a run")
     scene_command("validate", "Check a scene without running it.")
-    new = commands.add_parser("new", help="Print a scene of a preset.", description="Print a scene of a preset.")
+    new = command("new", "Print a scene of a preset.")
     new.add_argument("preset", metavar="PRESET", help=", ".join(PRESETS))
     new.add_argument("--shape", default="tube", help="cube, tendon or tube (default: tube)")
     text = "Draw the paper's figures from own runs, each with its data as CSV; runs still valid are used again."
     figures = commands.add_parser("figures", help="Draw the paper's figures.", description=text)
     figures.add_argument("names", nargs="*", metavar="NAME", help="fig1, fig5 to fig11, rate, energy (default: all)")
-    figures.add_argument("-o", "--output", type=Path, metavar="DIR", help="folder for the figures (default: figures)")
+    writes(figures, "folder for the figures (default: figures)")
     figures.add_argument("--runs", type=Path, metavar="DIR", help="recorded runs (default: results/figures-cache)")
-    figures.add_argument(
-        "--format",
-        action="append",
-        default=[],
-        metavar="FORMAT",
-        help="png, pdf or svg, or several with commas between; may be repeated (default: png)",
-    )
+    text = "png, pdf or svg, or several with commas between; may be repeated (default: png)"
+    figures.add_argument("--format", action="append", default=[], metavar="FORMAT", help=text)
     figures.add_argument("--stamp", action="store_true", help="show in each picture what it was made with")
     figures.add_argument("--jobs", type=int, metavar="N", help="runs at a time (default: as many as there are cores)")
     commands.add_parser(SERVE)  # of the processes of a study; not listed
-    commands.add_parser("info", help="Print versions, solvers and BLAS.", description="Print versions and solvers.")
+    command("info", "Print versions, solvers and BLAS.")
     return main_parser
 
 

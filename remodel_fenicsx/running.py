@@ -6,9 +6,7 @@ import logging
 import tomllib
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import cast
 
 from mpi4py import MPI
 
@@ -30,7 +28,7 @@ from remodel_fenicsx.results.run_folder import (
 )
 from remodel_fenicsx.results.status import BEGUN, FAILED, STOPPED
 from remodel_fenicsx.scene import Scene, SceneError, read_scene, scene_from_dict
-from remodel_fenicsx.scene.resuming import check_continuation
+from remodel_fenicsx.scene.scene import check_continuation
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.system.environment import versions
@@ -93,7 +91,7 @@ def run(
             simulation = _built(scene, comm)
             place = place or chosen_folder(None, scene.name, comm)
         with _closing(simulation), locked(place, comm, new=True):
-            _record(simulation, place, _Circumstances(stop, quiet, held, deadline))
+            _record(simulation, place, stop, held, quiet, deadline)
     return place
 
 
@@ -139,25 +137,24 @@ def resume(
                 with hold_log(comm.rank, quiet=quiet) as more:
                     restore_state(simulation.state, checkpoint)
                 held += more
-            around = _Circumstances(stop, quiet, held, deadline, resumes=True)
-            _record(simulation, place, around)
+            _record(simulation, place, stop, held, quiet, deadline, resumes=True)
     return place
 
 
 def _kept(place: Path, overrides: Sequence[str], comm: MPI.Intracomm) -> tuple[Scene, Checkpoint | None]:
     """Scene, and checkpoint on rank 0, of a run that goes on; or the refusal on all ranks."""
-    scene, checkpoint = agreed(comm, lambda: _looked_at(place, overrides) if comm.rank == 0 else (None, None))
-    return cast(Scene, comm.bcast(scene)), checkpoint
 
+    def read() -> tuple[Scene, Checkpoint | None]:
+        scene, checkpoint = read_scene(place / SCENE, overrides), read_checkpoint(place)
+        if checkpoint is None:
+            log.info("no checkpoint yet: starts again at t = 0")
+        else:
+            check_continuation(_scene_of(checkpoint), scene, checkpoint.time)
+            _say_where(checkpoint)
+        return scene, checkpoint
 
-def _looked_at(place: Path, overrides: Sequence[str]) -> tuple[Scene, Checkpoint | None]:
-    scene, checkpoint = read_scene(place / SCENE, overrides), read_checkpoint(place)
-    if checkpoint is not None:
-        check_continuation(_scene_of(checkpoint), scene, checkpoint.time)
-        _say_where(checkpoint)
-    else:
-        log.info("no checkpoint yet: starts again at t = 0")
-    return scene, checkpoint
+    scene, checkpoint = agreed(comm, lambda: read() if comm.rank == 0 else (None, None))
+    return comm.bcast(scene), checkpoint
 
 
 def _scene_of(checkpoint: Checkpoint) -> Scene:
@@ -199,18 +196,16 @@ def _closing(simulation: Simulation) -> Iterator[None]:
     simulation.close()
 
 
-@dataclass
-class _Circumstances:
-    """Of a run: who may stop it, what was logged before it had a folder, whether it goes on."""
-
-    stop: StopRequest
-    quiet: bool
-    held: list[logging.LogRecord] = field(default_factory=list)
-    deadline: float | None = None
-    resumes: bool = False
-
-
-def _record(simulation: Simulation, place: Path, around: _Circumstances) -> None:
+def _record(
+    simulation: Simulation,
+    place: Path,
+    stop: StopRequest,
+    held: list[logging.LogRecord],
+    quiet: bool,
+    deadline: float | None,
+    resumes: bool = False,
+) -> None:
+    """March through time in the folder; `held` is what was logged before the run had one."""
     scene, comm, state = simulation.scene, simulation.domain.mesh.comm, simulation.state
     header = "as run: all values, also those of preset and defaults\n" + "\n".join(
         f"{name} {version}" for name, version in versions().items()
@@ -218,16 +213,16 @@ def _record(simulation: Simulation, place: Path, around: _Circumstances) -> None
     text = scene.to_toml(header)
     columns = [column.name for column in simulation.observer.columns]
     after = LastStep(columns, state.number, state.time) if state.number else None
-    if around.resumes:
+    if resumes:
         wanted = bool(scene.output.fields)
         agreed(comm, lambda: check_before_resuming(place, after, wanted) if comm.rank == 0 else None)
         if after is None and comm.rank == 0:
             forget_steps(place)
     with ExitStack() as stack:
         record = stack.enter_context(agreed(comm, lambda: RunFolder(place, text, comm.rank, after)))
-        stack.enter_context(open_log(place / LOG, comm.rank, quiet=around.quiet, held=around.held))
+        stack.enter_context(open_log(place / LOG, comm.rank, quiet=quiet, held=held))
         steps = scene.time.number_of_steps if simulation.control else state.number + len(simulation.remaining())
-        rank, done = -1 if around.quiet else comm.rank, scene.time.progress(state.number, state.time)
+        rank, done = -1 if quiet else comm.rank, scene.time.progress(state.number, state.time)
         progress = stack.enter_context(Progress(steps, scene.name, rank, done=done))
         log.info(BEGUN + "%s on %d ranks, results in %s", scene.name, comm.size, place)
         log.info("%s", scene.summary())
@@ -240,9 +235,9 @@ def _record(simulation: Simulation, place: Path, around: _Circumstances) -> None
             times = scene.output.times
             watchers.append(stack.enter_context(agreed(comm, lambda: Fields(*parts, times))))
         checkpoints = Checkpoints(place, state, text, scene.output.checkpoint, record.flush)
-        pause = Pause(comm, place, lambda: around.stop.pause, around.deadline)
+        pause = Pause(comm, place, lambda: stop.pause, deadline)
         watchers += [record, _Report(scene, progress), checkpoints, pause]
-        simulation.stepper.stop_signal = lambda: around.stop.number
+        simulation.stepper.stop_signal = lambda: stop.number
         try:
             for _ in simulation.steps(watchers):
                 pass

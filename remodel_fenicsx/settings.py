@@ -6,29 +6,38 @@ docs/theory.md has the equations as implemented. A `Scene` (`scene.scene`) is ma
 
 from __future__ import annotations
 
-import bisect
 import itertools
 import math
 import pkgutil
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.fem.kinematics import KINEMATICS
-from remodel_fenicsx.fem.solver_methods import AUTO, LARGE, LARGE_ON_RANKS, MEANINGS, METHODS, SMALL, fault_of_option
+from remodel_fenicsx.fem.solver_methods import (
+    AUTO,
+    LARGE,
+    LARGE_ON_RANKS,
+    MEANINGS,
+    METHODS,
+    REMOVED,
+    SMALL_BODY,
+    SMALL_REDUCTION,
+    fault_of_option,
+)
 from remodel_fenicsx.model.cells import AXES
 from remodel_fenicsx.model.chains import BOLTZMANN_CONSTANT, CHAINS
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
 from remodel_fenicsx.model.energy import MATRICES, REPULSIONS, Tissue
 from remodel_fenicsx.model.laws import LAWS
 from remodel_fenicsx.model.spectral import PAIRINGS
-from remodel_fenicsx.schema.tables import Table, checked, fault, is_number, one_of, quoted, shown
+from remodel_fenicsx.schema.tables import OneOf, Table, checked, fault, is_number, quoted, shown
 from remodel_fenicsx.schema.times import is_multiple, same_time
 from remodel_fenicsx.schema.units import FORCE, NUMBER_DENSITY, STRESS, TEMPERATURE
 
@@ -50,10 +59,10 @@ class Mesh(Table):
         "million hexahedra, or those split into tetrahedra, are refused.",
     )
     element: Literal["hexahedron", "tetrahedron"] = Field(default="hexahedron", description="Shape of the elements.")
-    degree: Annotated[int, one_of((1, 2))] = Field(
+    degree: Annotated[int, OneOf((1, 2))] = Field(
         default=1, description="Polynomial degree of the displacement: 1 (the paper's) or 2."
     )
-    formulation: Annotated[str, one_of(FORMULATIONS)] = Field(
+    formulation: Annotated[str, OneOf(FORMULATIONS)] = Field(
         default="displacement",
         description="Where the elements take the change of volume: "
         + "; ".join(f"{name!r}: {formulation.meaning}" for name, formulation in FORMULATIONS.items())
@@ -70,16 +79,26 @@ class Mesh(Table):
         return self
 
 
-def _kinematics(value: Any) -> Any:
-    if value not in (AUTO, *KINEMATICS):
-        raise fault("allowed are " + ", ".join(map(repr, (AUTO, *KINEMATICS))))
-    return value
+def _auto_or(names: Collection[str], removed: Mapping[str, str] | None = None) -> BeforeValidator:
+    """Annotation of a field that is `AUTO` or one of a registry's keys, those registered later included.
+
+    `removed`: names of earlier versions, with what to say of each.
+    """
+
+    def check(value: Any) -> Any:
+        if removed and isinstance(value, str) and value in removed:
+            raise fault(removed[value])
+        if value not in (AUTO, *names):
+            raise fault("allowed are " + ", ".join(map(repr, (AUTO, *names))))
+        return value
+
+    return checked(check)
 
 
 class Model(Table):
     """Which unknowns describe the deformation."""
 
-    kinematics: Annotated[str, checked(_kinematics)] = Field(
+    kinematics: Annotated[str, _auto_or(KINEMATICS)] = Field(
         default=AUTO,
         description="'auto': the cheapest that is exact for the scene; a scene as run has its name. "
         + "; ".join(f"{name!r}: {kinematics.meaning}" for name, kinematics in KINEMATICS.items())
@@ -125,14 +144,14 @@ class Material(Table):
     temperature: Annotated[float, TEMPERATURE] = Field(
         default=310.0, gt=0, description="Absolute temperature theta, in K."
     )
-    energy_factor: Annotated[int, one_of((1, 4))] = Field(
+    energy_factor: Annotated[int, OneOf((1, 4))] = Field(
         default=1,
         description="Factor omega of the chain energy: 1 is the stress as printed (eq. 7; reproduces Fig. 6), "
         "4 the energy as printed (eq. 4b).",
     )
-    matrix: Annotated[str, one_of(MATRICES)] = Field(default="neo-hookean", description="Energy of the matrix.")
-    chain: Annotated[str, one_of(CHAINS)] = Field(default="wormlike", description="Force law of a single chain.")
-    repulsion: Annotated[str, one_of(REPULSIONS)] = Field(
+    matrix: Annotated[str, OneOf(MATRICES)] = Field(default="neo-hookean", description="Energy of the matrix.")
+    chain: Annotated[str, OneOf(CHAINS)] = Field(default="wormlike", description="Force law of a single chain.")
+    repulsion: Annotated[str, OneOf(REPULSIONS)] = Field(
         default="axes",
         description="Form of the repulsive energy that makes the reference state stress-free: 'axes' is the paper's, "
         "in the stretches along the three cell axes; 'log' sees the structure tensor alone (A : ln C), equals it where "
@@ -203,12 +222,12 @@ class Cells(Table):
         "aligned_axis), or [l1, l2, l3] in link lengths.",
         json_schema_extra={"allowed": "'random', 'isotropic', 'aligned' or three lengths [l1, l2, l3]"},
     )
-    axes: Annotated[str, one_of(AXES)] = Field(
+    axes: Annotated[str, OneOf(AXES)] = Field(
         default="global",
         description="Cell axes n_I before the first pass: 'global' (x, y, z) or 'cylindrical' (circumferential, axial, "
         "radial, about the z axis). Where neither scene nor preset says it: a tube starts with 'cylindrical'.",
     )
-    aligned_axis: Annotated[int, one_of((1, 2, 3))] = Field(
+    aligned_axis: Annotated[int, OneOf((1, 2, 3))] = Field(
         default=3,
         description="Number of the axis that 'aligned' cells lie along: with global axes 3 is z, the load axis of cube "
         "and tendon; with cylindrical axes 1 is circumferential, 2 axial, 3 radial.",
@@ -312,12 +331,12 @@ COUPLINGS = {
 class Remodeling(Table):
     """How the cells follow the load: driving tensor, evolution law, frame and speed."""
 
-    driver: Annotated[str, one_of(DRIVERS)] = Field(
+    driver: Annotated[str, OneOf(DRIVERS)] = Field(
         default="cauchy",
         description="Tensor whose positive eigenvalues the cells follow: 'cauchy' stress, second Piola-Kirchhoff "
         "stress 'pk2', or 'finger' tensor b (it remodels even a body without load, and l_3 does not vanish).",
     )
-    law: Annotated[str, one_of(LAWS)] = Field(
+    law: Annotated[str, OneOf(LAWS)] = Field(
         default="explicit",
         description="Evolution of the cells: 'explicit' is eq. (11), in absolute time; 'rate' integrates eq. (10); "
         "'relaxation' is dl/dt = kappa (r0 e - l), right for changing loads; 'rotation' (Remark 5) turns the axis of "
@@ -325,19 +344,19 @@ class Remodeling(Table):
         "structure tensor as a whole, without ranks and axes; 'none' leaves the cells alone. Where neither scene nor "
         "preset says it: 'tensor'.",
     )
-    frame: Annotated[str, one_of(FRAMES)] = Field(
+    frame: Annotated[str, OneOf(FRAMES)] = Field(
         default="material",
         description="Axes of the remodeled cells, for the drivers 'cauchy' and 'finger': 'material' takes the fibres "
         "that the deformation carries onto the principal directions (objective), 'spatial' the principal directions "
         "themselves, as printed. The driver 'pk2' has material eigenvectors of its own.",
     )
-    pairing: Annotated[str, one_of(PAIRINGS)] = Field(
+    pairing: Annotated[str, OneOf(PAIRINGS)] = Field(
         default="sorted",
         description="Which dimension follows which principal value: 'sorted' by rank, as printed (where two values "
         "cross, the cell turns by 90 degrees at once), 'continuous' by axis (each principal direction goes on from the "
         "axis that it overlaps most). The law 'rotation' does not ask.",
     )
-    coupling: Annotated[str, one_of(COUPLINGS)] = Field(
+    coupling: Annotated[str, OneOf(COUPLINGS)] = Field(
         default="staggered",
         description="; ".join(f"{name!r}: {kind.meaning}" for name, kind in COUPLINGS.items())
         + ". Where neither scene nor preset says it: 'extrapolated' with the law 'tensor'.",
@@ -418,16 +437,9 @@ class Load(Table):
 
     def factor(self, time: float) -> float:
         """Factor on the value at a time: piecewise linear, held before the first and after the last pair."""
-        for ramp_time, factor in self.ramp:  # exact at its own times
-            if same_time(time, ramp_time):
-                return factor
-        after = bisect.bisect_right(self.ramp, time, key=lambda pair: pair[0])
-        if after == 0:
-            return self.ramp[0][1]
-        if after == len(self.ramp):
-            return self.ramp[-1][1]
-        (time0, factor0), (time1, factor1) = self.ramp[after - 1], self.ramp[after]
-        return factor0 + (factor1 - factor0) * (time - time0) / (time1 - time0)
+        hit = next((corner for corner, _ in self.ramp if same_time(time, corner)), time)  # exact at its own times
+        times, factors = zip(*self.ramp, strict=True)
+        return float(np.interp(hit, times, factors))
 
     @property
     def falls(self) -> bool:
@@ -538,18 +550,13 @@ def _petsc_options(value: Any) -> Any:
     return value
 
 
-def _method(value: Any) -> Any:
-    if value not in (AUTO, *METHODS):
-        raise fault("allowed are " + ", ".join(map(repr, (AUTO, *METHODS))))
-    return value
-
-
 class Solver(Table):
     """Solution of the nonlinear problem of each step."""
 
-    method: Annotated[str, checked(_method)] = Field(
+    method: Annotated[str, _auto_or(METHODS, REMOVED)] = Field(
         default=AUTO,
-        description=f"'auto': 'direct' up to {SMALL} unknowns, then 'lagged', above {LARGE} 'iterative'; "
+        description=f"'auto': 'direct' up to {SMALL_BODY} unknowns ({SMALL_REDUCTION} of a reduction), then 'lagged', "
+        f"above {LARGE} 'iterative'; "
         f"on more ranks 'direct' up to {LARGE_ON_RANKS}, then 'iterative'; "
         + "; ".join(f"{name!r}: {meaning}" for name, meaning in MEANINGS.items())
         + " (docs/speed.md).",
@@ -558,9 +565,9 @@ class Solver(Table):
     predictor: Literal["none", "autoregressive", "with-tolerance"] = Field(
         default="autoregressive",
         description="Where Newton's method starts a step: 'none': at the displacement of the step before; "
-        "'autoregressive': where the last increments let expect the solution; 'with-tolerance', that of the presets: "
-        "the latter where steps are chosen (time.tolerance), 'none' where they are equal. The solutions are the same "
-        "to the tolerance.",
+        "'autoregressive': at what the increments of the last steps predict; 'with-tolerance': as predicted where "
+        "steps are chosen (time.tolerance), 'none' where they are equal. The solutions are the same to the "
+        "tolerance.",
     )
     absolute_tolerance: Annotated[float, FORCE] = Field(
         default=0.0,

@@ -15,7 +15,7 @@ from tests.conftest import Case
 ARTERY = {
     "preset": "kuhl-holzapfel-2007",
     "geometry": {"shape": "tube", "inner_radius": 1.0, "outer_radius": 3.0, "length": 8.0},
-    "solver": {"absolute_tolerance": 1e-10, "relative_tolerance": 0.0},
+    "solver": {"method": "direct", "predictor": "none", "absolute_tolerance": 1e-10, "relative_tolerance": 0.0},
 }
 
 

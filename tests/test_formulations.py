@@ -216,6 +216,26 @@ def test_a_run_knows_what_its_elements_lack(
     assert all(cause in line for line in told)
 
 
+@pytest.mark.parametrize(("kinematics", "pressure"), [("radial", 0.0), ("radial", 0.3), ("axisymmetric", 0.3)])
+def test_elements_that_lock_in_an_elongated_tube_are_told(kinematics: str, pressure: float, caplog: Any) -> None:
+    """Most of the lateral motion is the contraction, which elements follow, and most of the work the elongation's.
+
+    Chains along the radius make the contraction differ between the directions across, so that strain varies.
+    """
+    scene = thick_tube(250.0, "displacement", pressure, chain_density=2e21).with_values({
+        "model.kinematics": kinematics, "cells.initial": "aligned", "cells.aligned_axis": 1,
+        "cells.axes": "cylindrical", "loads.elongation": {"value": 0.1, "ramp": [[0.0, 0.0], [4.0, 1.0]]},
+    })  # fmt: skip
+    with caplog.at_level(logging.WARNING), simulated(scene) as (simulation, rows):
+        missing = sum(LockingWarning(simulation.stepper, True).missing())
+    with simulated(scene.with_values({"mesh.refinement": 2, "mesh.degree": 2})) as (_, fine):
+        pass
+    found, exact = (np.array([of[-1]["inner_radius"] - 1, of[-1]["outer_radius"] - 3]) for of in (rows, fine))
+    assert np.abs(found - exact).max() > 0.05 * np.abs(exact).max()
+    assert missing > 0.05
+    assert ["the elements lock" in record.getMessage() for record in caplog.records] == [True]
+
+
 @pytest.mark.parametrize(("changes", "told"), [
     ({}, False), ({"material.lame_lambda": 100 * 3.103}, True),
     ({"mesh.element": "tetrahedron", "material.lame_lambda": 100 * 3.103}, True),

@@ -27,6 +27,7 @@ def artery(end: float, step: float = 1.0, law: str = "tensor", **changes: Any) -
         "material": {"repulsion": "log" if law == "tensor" else "axes"},
         "remodeling": remodeling,
         "time": {"end": end, "step": step},
+        "solver": {"method": "direct", "predictor": "none"},
         "output": {"columns": COLUMNS, "fields": False},
     } | tables
 

@@ -18,12 +18,12 @@ from tests.parts import pulled_cube
 from tests.test_resume import SELF, rows
 
 RATES = {"force": 2.0}
-PREDICTED = {"predictor": "autoregressive"}
+PREDICTED, NOT_PREDICTED = {"predictor": "autoregressive"}, {"predictor": "none"}
 
 
 @pytest.fixture
 def simulation() -> Any:
-    made = Simulation(pulled_cube(9.0), SELF)
+    made = Simulation(pulled_cube(9.0, solver=NOT_PREDICTED), SELF)
     yield made
     made.close()
 
@@ -95,7 +95,7 @@ def test_a_body_that_answers_its_cells_is_expected_whatever_the_steps(simulation
     assert predictor.expected(LoadStep(time + 1.0, 1.0, {"force": 2.0})) is None
 
 
-def test_the_presets_predict_where_steps_are_chosen() -> None:
+def test_with_tolerance_predicts_where_steps_are_chosen() -> None:
     equal = pulled_cube(9.0).with_values({"solver.predictor": "with-tolerance"})
     for scene, kind in ((equal, NoPredictor), (equal.with_values({"time.tolerance": 1.0}), Responsive)):
         simulation = Simulation(scene, SELF)
@@ -126,7 +126,7 @@ def predicted(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_solutions_are_the_same_with_less_work(predicted: Path, tmp_path: Path) -> None:
-    plain = run(pulled_cube(16.0, output={"fields": False}), tmp_path / "plain", SELF)
+    plain = run(pulled_cube(16.0, solver=NOT_PREDICTED, output={"fields": False}), tmp_path / "plain", SELF)
     found, expected = Recording(predicted).history, Recording(plain).history
     for name in ("mean_stretch", "stored_energy", "max_chain_extension", "remodeling_power"):
         np.testing.assert_allclose(found[name], expected[name], rtol=1e-8, err_msg=name)
@@ -154,7 +154,7 @@ def test_it_is_resumed_with_what_it_remembers(predicted: Path, tmp_path: Path) -
 def test_what_is_expected_wrongly_costs_no_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Not admissible, or a start from which the solve fails: the step is solved as without."""
     scene = pulled_cube(4.0, solver=PREDICTED, output={"fields": False})
-    plain = run(pulled_cube(4.0, output={"fields": False}), tmp_path / "plain", SELF)
+    plain = run(pulled_cube(4.0, solver=NOT_PREDICTED, output={"fields": False}), tmp_path / "plain", SELF)
     monkeypatch.setattr(Autoregressive, "expected", lambda self, step: -50.0 * self.state.unknown.x.array)
     assert rows(run(scene, tmp_path / "far", SELF)) == rows(plain)
     solve, failed = GuardedNewton.solve, []

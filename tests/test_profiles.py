@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from remodel_fenicsx import SceneError, cli, read_scene
-from remodel_fenicsx.scene.profiles import PROFILES
+from remodel_fenicsx.scene.presets import PROFILES
 from remodel_fenicsx.scene.scene import preset_scene, scene_from_dict
 
 TUBE = {"preset": "kuhl-holzapfel-2007", "geometry": {"shape": "tube"}}

@@ -17,8 +17,7 @@ from remodel_fenicsx.model.chains import wormlike_stiffness
 from remodel_fenicsx.model.laws import LAWS
 from remodel_fenicsx.scene.presets import PRESET_NOTES, PRESETS
 from remodel_fenicsx.scene.reference import scene_reference
-from remodel_fenicsx.scene.scene import Scene, preset_scene, read_scene, scene_from_dict
-from remodel_fenicsx.scene.values import FORMAT, RENAMED
+from remodel_fenicsx.scene.scene import FORMAT, RENAMED, Scene, preset_scene, read_scene, scene_from_dict
 from remodel_fenicsx.schema.tables import SceneError, sections
 from remodel_fenicsx.settings import Cells, Load, Material, Remodeling, Solver, Time
 
@@ -327,8 +326,8 @@ BAD_SCENES = [
     (
         CUBE,
         {"remodeling.coupling": "implicit", "mesh.formulation": "selective-integration"},
-        "remodeling.coupling = 'implicit': needs mesh.formulation = 'displacement': with another one the stress at a "
-        "point belongs to its element",
+        "remodeling.coupling = 'implicit': needs mesh.formulation = 'displacement': in the others the stress at a "
+        "point depends on its whole element",
     ),
     (
         CUBE,
@@ -385,7 +384,12 @@ BAD_SCENES = [
     (
         CUBE,
         {"solver.method": "magic"},
-        "solver.method = 'magic': allowed are 'auto', 'direct', 'lagged', 'exact', 'iterative'",
+        "solver.method = 'magic': allowed are 'auto', 'direct', 'lagged', 'iterative'",
+    ),
+    (
+        CUBE,
+        {"solver.method": "exact"},
+        "solver.method = 'exact': was removed; take 'lagged', or 'direct' for a new tangent in every iteration",
     ),
     (
         CUBE,

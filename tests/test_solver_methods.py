@@ -12,17 +12,17 @@ from petsc4py import PETSc
 
 from remodel_fenicsx import Simulation
 from remodel_fenicsx.body.tube import tube
-from remodel_fenicsx.fem.solver_methods import LARGE, LARGE_ON_RANKS, METHODS, SMALL, chosen
+from remodel_fenicsx.fem.solver_methods import LARGE, LARGE_ON_RANKS, METHODS, SMALL_BODY, SMALL_REDUCTION, chosen
 from remodel_fenicsx.scene import preset_scene
 from remodel_fenicsx.solver import linear
 from remodel_fenicsx.solver.limits import Limits
-from remodel_fenicsx.solver.linear import Exact, KeptFactor, Lagged, useful_accuracy
+from remodel_fenicsx.solver.linear import KeptFactor, Lagged
 from remodel_fenicsx.solver.quasi_newton import Secants
 from tests import parts
 
 SELF = MPI.COMM_SELF
 TUBE = {"geometry.length": 2.0, "time.end": 8.0, "loads.pressure.ramp": [[0.0, 0.0], [5.0, 1.0]],
-        "loads.elongation.ramp": [[0.0, 0.0], [5.0, 1.0]]}  # fmt: skip
+        "loads.elongation.ramp": [[0.0, 0.0], [5.0, 1.0]], "solver.predictor": "none"}  # fmt: skip
 
 
 def simulated(method: str, **changes: Any) -> tuple[Simulation, list[dict[str, float]]]:
@@ -47,25 +47,27 @@ def assert_same(found: list[dict[str, float]], expected: list[dict[str, float]])
 
 
 # ---------------------------------------------------------------- what is chosen
-@pytest.mark.parametrize(
-    ("unknowns", "ranks", "method"),
-    [(SMALL, 1, "direct"), (SMALL + 1, 1, "lagged"), (SMALL + 1, 2, "direct"), (LARGE, 1, "lagged"),
-     (LARGE + 1, 1, "iterative"), (LARGE_ON_RANKS, 2, "direct"), (LARGE_ON_RANKS + 1, 2, "iterative")],
-)  # fmt: skip
-def test_auto_goes_by_the_size(unknowns: int, ranks: int, method: str) -> None:
-    assert chosen("auto", unknowns, ranks) == method
-    assert all(chosen(name, unknowns, ranks) == name for name in METHODS)
+@pytest.mark.parametrize(("small", "reduced"), [(SMALL_BODY, False), (SMALL_REDUCTION, True)])
+def test_auto_goes_by_the_size(small: int, reduced: bool) -> None:
+    for unknowns, ranks, method in (
+        (small, 1, "direct"), (small + 1, 1, "lagged"), (small + 1, 2, "direct"), (LARGE, 1, "lagged"),
+        (LARGE + 1, 1, "iterative"), (LARGE_ON_RANKS, 2, "direct"), (LARGE_ON_RANKS + 1, 2, "iterative"),
+    ):  # fmt: skip
+        assert chosen("auto", unknowns, ranks, reduced) == method
+        assert all(chosen(name, unknowns, ranks, reduced) == name for name in METHODS)
 
 
-def test_presets_name_their_method() -> None:
-    for shape in ("cube", "tendon", "tube"):
-        solver = preset_scene("kuhl-holzapfel-2007", shape).solver
-        assert (solver.method, solver.predictor) == ("direct", "with-tolerance")
+def test_the_paper_s_tendon_has_few_factors() -> None:
+    """Its 1,881 unknowns are many for a body in three dimensions; the preset leaves the method open."""
+    scene = preset_scene("kuhl-holzapfel-2007", "tendon").with_values({"time.end": 1.0})
+    simulation = Simulation(scene, SELF)
+    assert (scene.solver.method, simulation.stepper.coupling.newton.method) == ("auto", "lagged")
+    simulation.close()
 
 
 # ---------------------------------------------------------------- same states, other work
 @pytest.mark.parametrize("predictor", ["none", "autoregressive"])
-@pytest.mark.parametrize("method", ["lagged", "exact", "iterative"])
+@pytest.mark.parametrize("method", ["lagged", "iterative"])
 def test_all_methods_come_to_the_same_states(
     method: str, predictor: str, direct: list[dict[str, float]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -78,8 +80,6 @@ def test_all_methods_come_to_the_same_states(
     tangents, krylov = newton._linear.tangents, sum(row["linear_iterations"] for row in rows)
     if method == "lagged":
         assert len(factors) == tangents < iterations / 2 and krylov == iterations
-    elif method == "exact":
-        assert len(factors) < iterations / 2 <= tangents / 2 and krylov > iterations
     else:
         assert not factors and krylov > 4 * iterations
     simulation.close()
@@ -161,53 +161,20 @@ def test_a_factor_is_renewed_where_that_costs_less(norms: list[float], renewed: 
     assert lagged._costs_more(1e-8) is renewed
 
 
-@pytest.mark.parametrize(
-    ("iterations", "renewed"),
-    [([3, 3, 3, 3, 3, 3], False), ([1, 3, 3, 7], True), ([1, 3, 3, 5], False), ([12], False), ([1, 14], True)],
-)
-def test_factors_are_renewed_where_a_system_costs_more_than_the_average(iterations: list[int], renewed: bool) -> None:
-    """Iterations of systems since the factors were made, which count as twelve."""
-    exact = object.__new__(Exact)
-    exact._systems = exact._iterations = 0
-    *others, last = iterations
-    assert not any(exact._costs_more(number) for number in others)
-    assert exact._costs_more(last) is renewed
-
-
-@pytest.mark.parametrize(
-    ("norm", "before", "accuracy"),
-    [
-        (1e3, np.inf, 1e-3),  # the first
-        (1e3, 1e6, 1e-6),  # Newton's method squares what it has left
-        (1e3, 1.5e3, 1e-2),
-        (1e-6, 1e3, 0.3 * 1e-8 / 1e-6),  # no more than what is asked for
-        (2e-8, 1e3, 1e-2),
-        (1e13, 1e20, 1e-10),
-    ],
-)
-def test_a_system_is_solved_as_accurately_as_newton_has_use_for(norm: float, before: float, accuracy: float) -> None:
-    assert useful_accuracy(norm, before, 1e-8) == pytest.approx(accuracy, rel=1e-12)
-
-
 def test_an_indefinite_tangent_is_solved_by_every_method(caplog: pytest.LogCaptureFixture) -> None:
-    """The paper's artery begins with one, by the stress of random cells. CHOLMOD cannot take it, and CG not always."""
+    """The paper's artery begins with one, by the stress of random cells. CHOLMOD cannot take it."""
     caplog.set_level(logging.INFO)
     scene, rows, said = preset_scene("kuhl-holzapfel-2007", "tube"), {}, {}
-    cases = {method: (method, METHODS[method]["ksp_type"]) for method in ("direct", "lagged", "exact", "iterative")}
-    for name, (method, krylov) in (cases | {"exact with CG": ("exact", "cg")}).items():
+    for method in METHODS:
         domain = tube(divisions=(12, 4, 8), comm=SELF)
-        values = {"time.end": 1.0, "solver.method": method, "solver.petsc_options": {"ksp_type": krylov}}
-        simulation = Simulation(scene.with_values(values), SELF, domain)
-        rows[name] = [step.row for step in simulation.steps()]
-        said[name] = caplog.text
-        assert simulation.stepper.coupling.newton._snes.getKSP().getType() == krylov
+        simulation = Simulation(scene.with_values({"time.end": 1.0, "solver.method": method}), SELF, domain)
+        rows[method] = [step.row for step in simulation.steps()]
+        said[method] = caplog.text
         caplog.clear()
         simulation.close()
-        assert_same(rows[name], rows["direct"])
-    again = "solved once more, with"
-    assert not any(again in said[name] for name in ("direct", "lagged", "exact", "iterative"))
-    assert all("cannot be factorised as positive definite" in said[name] for name in ("lagged", "exact"))
-    assert f"{again} new factors in every iteration: the linear solver failed" in said["exact with CG"]
+        assert_same(rows[method], rows["direct"])
+        assert "solved once more, with" not in said[method]
+    assert "cannot be factorised as positive definite" in said["lagged"]
 
 
 def test_levels_that_have_become_useless_are_made_anew(caplog: pytest.LogCaptureFixture) -> None:

@@ -16,7 +16,7 @@ from remodel_fenicsx import Recording, cli, read_scene
 from remodel_fenicsx.body.columns import PROFILE, PROFILE_PLACES, profile_weights
 from remodel_fenicsx.results.recording import HistoryColumns
 from remodel_fenicsx.results.status import status
-from remodel_fenicsx.scene.profiles import PROFILES
+from remodel_fenicsx.scene.presets import PROFILES
 from remodel_fenicsx.scene.scene import Scene, preset_scene
 from remodel_fenicsx.studies import ladder as rungs
 from remodel_fenicsx.studies import trade as study

@@ -119,7 +119,7 @@ def rows(folder: Path) -> str:
 
 
 def _shares(found: Mapping[tuple[str, str], Ended], words: str) -> list[str]:
-    """Of seconds and of iterations of equal steps of the same error: as the presets do, predicted both, neither."""
+    """Of seconds and of iterations of equal steps of the same error: predicted chosen steps alone, both, neither."""
     if words.startswith("step"):
         return ["", "", ""]
     plain, predicted = PREDICTORS

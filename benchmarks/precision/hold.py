@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.precision.whole import EVERY_TANGENT
 from remodel_fenicsx.scene.scene import Scene, preset_scene
 
 Array = NDArray[np.float64]
@@ -61,7 +62,7 @@ WAYS = {
 def scene(way: Way, changes: Mapping[str, Any]) -> Scene:
     """The wall of isotropic cells."""
     values = {"cells.initial": "isotropic", "time.end": TIMES[-1], **MESH, **way.changes, **changes}
-    return preset_scene(way.preset, "tube").with_values(values)
+    return preset_scene(way.preset, "tube").with_values({**EVERY_TANGENT, **values})
 
 
 def runs(name: str) -> dict[str, Mapping[str, Any]]:

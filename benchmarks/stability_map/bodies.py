@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import lru_cache
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from benchmarks.stability_map.cases import Case, Finding, Run, family, with_values
 from benchmarks.stability_map.homogeneous import CUBE, DRIVERS, FRAMES, material
+from benchmarks.stability_map.tube_march import load_at
 from tests.reference.radial import RadialHistory, RadialMaterial, Tube, solve_radial
 
 SOFT = {"chain_density": 2.0e21, "contour_length": 1.594, "persistence_length": 1.365}
@@ -97,17 +99,19 @@ def check_tube(case: Case, run: Run) -> Finding:
 
 
 def check_inner_displacement(case: Case, run: Run) -> Finding:
-    """Displacement of the inner face under the last pressure, elastic."""
-    m = case.scene["material"]
-    tube = Tube(1.0, 3.0, 400, RadialMaterial(m["lame_lambda"], m["lame_mu"], 0.0, 1e9))
-    radii, cells = tube.nodes.copy(), np.full((len(tube.points), 3), 1 / 3)
-    pressure = case.scene["loads"]["pressure"]["value"]
-    for share in np.linspace(0.1, 1.0, 10):
-        radii = tube.advance(radii, (cells, pressure * (share - 0.1), 1.0), (cells, pressure * share, 1.0))
-    found = run.column("inner_radius")
-    if not len(found):
-        return Finding(0.0, "no row")
-    error = (found[-1] - 1) / (radii[0] - 1) - 1 if run.code == 0 else 0.0
+    """Displacement of the inner face in every row, elastic."""
+    if run.code != 0:
+        return Finding(0.0, "not to its end")
+    m, geometry = case.scene["material"], case.scene["geometry"]
+    elastic = RadialMaterial(m["lame_lambda"], m["lame_mu"], 0.0, 1e9)
+    tube = Tube(geometry["inner_radius"], geometry["outer_radius"], 400, elastic)
+    radii, cells, errors = tube.nodes.copy(), np.full((len(tube.points), 3), 1 / 3), []
+    pressures = [load_at(case.scene, "pressure", time) for time in run.column("time")]
+    for before, pressure, found in zip(pressures, pressures[1:], run.column("inner_radius")[1:], strict=False):
+        for start, end in pairwise(np.linspace(before, pressure, 4)):
+            radii = tube.advance(radii, (cells, start, 1.0), (cells, end, 1.0))
+        errors.append((found - tube.nodes[0]) / (radii[0] - tube.nodes[0]) - 1)
+    error = max(errors, key=abs)
     return Finding(abs(error) / case.options["tolerance"], f"inner displacement off by {100 * error:.3g} %")
 
 
@@ -198,10 +202,10 @@ def suctions() -> Iterator[Case]:
 
 
 ELASTIC = {"material.chain_density": 0.0, "remodeling.law": "none", "loads.elongation.value": 0.0}
-# the tolerance is the error that the mesh has where nothing locks, or 3.5 %
+# the tolerance is the error that the mesh has where nothing locks, at most the 5 % from which a run warns, or 3.5 %
 MESHES = {
     "hex1 16x8": ("hexahedron", 1, ring(16, 8), 0.05), "hex1 32x16": ("hexahedron", 1, ring(32, 16), 0.035),
-    "hex2 8x4": ("hexahedron", 2, ring(8, 4), 0.035), "tet1 16x8": ("tetrahedron", 1, ring(16, 8), 0.1),
+    "hex2 8x4": ("hexahedron", 2, ring(8, 4), 0.035), "tet1 16x8": ("tetrahedron", 1, ring(16, 8), 0.05),
     "tet2 16x8": ("tetrahedron", 2, ring(16, 8), 0.035),  # 8 x 4 of them: 1.1 to 5.6 % off, eight times as much
 }  # fmt: skip
 

@@ -6,7 +6,7 @@ import re
 from typing import Any
 
 AUTO = "auto"
-LAGGED, EXACT = "lagged", "exact"  # those whose factors may be of an earlier tangent (`solver.linear`)
+LAGGED = "lagged"  # whose factor may be of an earlier tangent (`solver.linear`)
 
 # MUMPS: robust for indefinite tangents too, one factorisation pattern for all steps
 METHODS: dict[str, dict[str, Any]] = {
@@ -19,7 +19,6 @@ METHODS: dict[str, dict[str, Any]] = {
         "mat_mumps_icntl_33": 1,  # the determinant, whose sign tells of unstable equilibria; costs nothing
     },
     LAGGED: {"snes_type": "newtonls", "snes_linesearch_type": "basic", "ksp_type": "preonly"},
-    EXACT: {"snes_type": "newtonls", "snes_linesearch_type": "basic", "ksp_type": "fgmres", "ksp_max_it": 60},
     # GMRES, because tangents of random cells are not always definite; levels cost as much as 20 of its iterations, and
     # those of an older tangent serve as well
     "iterative": {
@@ -43,10 +42,12 @@ MEANINGS = {
     "direct": "Newton's method, each system factorised by MUMPS; runs on so many ranks are the same "
     "to the last digit",
     LAGGED: "few tangents are factorised, and quasi-Newton steps (L-BFGS) make up for it",
-    EXACT: "a new tangent in every iteration, its system solved by GMRES with an earlier factor",
     "iterative": "Newton's method with GMRES and algebraic multigrid (GAMG), whose levels are kept for some iterations",
 }
 """In words, for docs/scene.md; those of one's own need none."""
+
+REMOVED = {"exact": "was removed; take 'lagged', or 'direct' for a new tangent in every iteration"}
+"""Methods of earlier versions, and what to take in their place."""
 
 # MUMPS on several ranks adds up in the order in which messages come: its last digits differ from run to run. So one
 # rank has the whole matrix and factorises it, which for the sizes that are factorised at all costs little
@@ -77,22 +78,30 @@ FACTORS: dict[str, dict[str, Any]] = {
     GENERAL: METHODS["direct"],
 }
 
-SMALL = 2000  # unknowns up to which MUMPS costs more than all the rest of a problem: then PETSc factorises by itself
+# Unknowns up to which PETSc's own LU of every tangent is the fastest on one rank. A reduction has narrow bands: above
+# 2,000 unknowns MUMPS is faster. A body in three dimensions fills its factors: `lagged` takes as long at about 200
+# unknowns, 0.6 of it at 380, 0.4 at 650 and 0.25 at 1,500 (cubes and tubes of random cells, 40 steps).
+SMALL_REDUCTION, SMALL_BODY = 2000, 200
 LARGE = 100_000  # unknowns from which on even a few factors cost more than multigrid, in time and in memory
 LARGE_ON_RANKS = 20_000  # the same on several ranks, where every tangent is factorised, on one of them
 
 
-def chosen(method: str, unknowns: int, ranks: int) -> str:
+def is_small(unknowns: int, reduced: bool) -> bool:
+    """Whether a reduction, or a body in three dimensions, is best factorised by PETSc itself."""
+    return unknowns <= (SMALL_REDUCTION if reduced else SMALL_BODY)
+
+
+def chosen(method: str, unknowns: int, ranks: int, reduced: bool) -> str:
     """The method that `auto` stands for."""
     if method != AUTO:
         return method
     if unknowns > (LARGE if ranks == 1 else LARGE_ON_RANKS):
         return "iterative"
-    return "direct" if unknowns <= SMALL or ranks > 1 else LAGGED
+    return "direct" if ranks > 1 or is_small(unknowns, reduced) else LAGGED
 
 
 def method_options(method: str, ranks: int, small: bool = False) -> dict[str, Any]:
-    """PETSc options of a method on so many ranks; `small`: for a problem of up to `SMALL` unknowns, on one rank."""
+    """PETSc options of a method on so many ranks; `small`: for a problem that `is_small`, on one rank."""
     options = dict(METHODS[method])
     if small and ranks == 1 and options.get("pc_factor_mat_solver_type") == "mumps":
         options |= {"pc_factor_mat_solver_type": "petsc", "mat_mumps_icntl_33": False}

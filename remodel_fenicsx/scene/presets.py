@@ -1,4 +1,4 @@
-"""The named presets of the paper, and what lies under a scene that names none.
+"""What lies under or over the keys of a scene that names it: the presets of the paper, and profiles of accuracy.
 
 Source: E. Kuhl, G. A. Holzapfel, J. Mater. Sci. 42 (2007) 8811-8823; docs/theory.md has the equations as implemented.
 """
@@ -6,7 +6,10 @@ Source: E. Kuhl, G. A. Holzapfel, J. Mater. Sci. 42 (2007) 8811-8823; docs/theor
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
+
+from remodel_fenicsx.schema.toml import put
 
 # ---------------------------------------------------------------- without a preset
 
@@ -32,7 +35,7 @@ def default_method(values: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
 def _printed_method(
     geometry: dict[str, Any], loads: dict[str, Any], end: float, material: dict[str, Any], cells: dict[str, Any]
 ) -> dict[str, dict[str, Any]]:
-    """The paper's method on one of its bodies, every choice spelled out."""
+    """The paper's method on one of its bodies, every choice spelled out; how systems are solved is none of them."""
     common_material = {
         "lame_lambda": 27.293,
         "lame_mu": 3.103,
@@ -59,7 +62,6 @@ def _printed_method(
             "kappa": 0.025,
         },
         "time": {"end": end, "step": 1.0},
-        "solver": {"method": "direct", "predictor": "with-tolerance"},
     }
 
 
@@ -132,3 +134,59 @@ PRESET_NOTES = {
     "length 309 nm, persistence length 14.5 nm, all chain lengths in nm. End-to-end length (that of a free chain) and "
     "chain density (the same initial stiffness of the network) are choices of this project, not of the paper.",
 }
+
+# ---------------------------------------------------------------- profiles
+
+EXACT = "implicit"  # coupling
+
+
+@dataclass(frozen=True)
+class Profile:
+    """How much accuracy a run shall have: settings, with the error and cost that were measured on the artery.
+
+    Attributes
+    ----------
+    values
+        Over those of the preset, by dotted key.
+    takes_exact_coupling
+        Whether the coupling is `EXACT` too where that leaves no error in time (`Scene.has_exact_coupling`).
+    degrees, percent, seconds
+        Error of the fibre angle, root mean square, and of the radii, and time of the processor in the steps, as
+        measured on the paper's artery with isotropic cells.
+    """
+
+    values: dict[str, Any]
+    degrees: float
+    percent: float
+    seconds: float
+    takes_exact_coupling: bool = False
+
+    def in_words(self, name: str) -> str:
+        """What it was measured to be."""
+        settings = ", ".join(f"{key} = {value}" for key, value in self.values.items())
+        if self.takes_exact_coupling:
+            settings += f", remodeling.coupling = {EXACT} where that leaves no error in time"
+        return (
+            f"profile {name!r}: {settings}; measured on the artery of isotropic cells: {self.degrees:g} degrees, radii "
+            f"{self.percent:g} %, {self.seconds:g} s (docs/speed_and_accuracy.md)"
+        )
+
+    def tables(self) -> dict[str, Any]:
+        """Its values as tables of a scene."""
+        tables: dict[str, Any] = {}
+        for key, value in self.values.items():
+            put(tables, key, value)
+        return tables
+
+
+def _values(refinement: int, degree: int, tolerance: float) -> dict[str, Any]:
+    values = {"model.kinematics": "auto", "mesh.refinement": refinement, "mesh.degree": degree}
+    return values | {"time.tolerance": tolerance}
+
+
+PROFILES: dict[str, Profile] = {
+    "fast": Profile(_values(1, 1, 1.0), 1.4, 0.7, 0.2),
+    "balanced": Profile(_values(1, 2, 0.5), 0.5, 0.5, 0.4),
+    "reference": Profile(_values(2, 2, 0.1), 0.0036, 0.0008, 1.4, takes_exact_coupling=True),
+}
+"""Points of the front of docs/speed_and_accuracy.md; `remodel-fenicsx trade SCENE` measures any scene."""

@@ -7,8 +7,7 @@ from collections.abc import Iterator
 import tomlkit
 
 from remodel_fenicsx.body import SHAPES
-from remodel_fenicsx.scene.presets import PRESET_NOTES, PRESETS
-from remodel_fenicsx.scene.profiles import PROFILES
+from remodel_fenicsx.scene.presets import PRESET_NOTES, PRESETS, PROFILES
 from remodel_fenicsx.scene.scene import Scene
 from remodel_fenicsx.schema.tables import markdown_reference
 from remodel_fenicsx.schema.toml import merged

@@ -9,11 +9,11 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
-from pydantic import BaseModel, Field, SerializeAsAny, model_validator
+from pydantic import BaseModel, Field, ModelWrapValidatorHandler, SerializeAsAny, model_validator
 
 from remodel_fenicsx.body import SHAPES, Shape
 from remodel_fenicsx.body.columns import columns_of, columns_on_request
@@ -25,13 +25,12 @@ from remodel_fenicsx.model.energy import MATRICES, REPULSIONS, Matrix
 from remodel_fenicsx.model.implicit.condensed import refused
 from remodel_fenicsx.model.laws import LAWS
 from remodel_fenicsx.scene.plausibility import doubts, largest_stress
-from remodel_fenicsx.scene.presets import PRESETS, default_method
-from remodel_fenicsx.scene.profiles import EXACT, PROFILES, known_profile
-from remodel_fenicsx.scene.values import FORMAT, RENAMED, in_own_units, in_present_format, known_shape
-from remodel_fenicsx.schema.tables import SceneError, Table, checked, fault, quoted, shown, variant_of
+from remodel_fenicsx.scene.presets import EXACT, PRESETS, PROFILES, default_method
+from remodel_fenicsx.schema.tables import SceneError, Table, VariantOf, allowed, checked, fault, quoted, shown
 from remodel_fenicsx.schema.toml import merged, parse_override, put, read_toml, toml_text
-from remodel_fenicsx.schema.units import FORCE
+from remodel_fenicsx.schema.units import FORCE, LENGTH_UNIT, LENGTH_UNITS, STRESS_UNIT, in_units
 from remodel_fenicsx.settings import (
+    STRESS_UNITS,
     Cells,
     Load,
     Material,
@@ -45,6 +44,9 @@ from remodel_fenicsx.settings import (
     nearest_multiples,
 )
 
+FORMAT = 2  # of recorded scenes: raised where a reader of the one before would not understand them
+RENAMED = {"mesh.cell": "mesh.element", "loads.stretch": "loads.elongation", "solver.profile": "solver.method"}
+"""Dotted key of an earlier format -> the key that has taken its place, for the error."""
 LIMIT = 1000.0  # times 1/kappa after which nothing is left of a start, of cells under a hundredth of a tension too
 LARGEST_MESH = 10_000_000  # hexahedra; Gmsh, which is serial, needs about 10 GB for them
 
@@ -85,7 +87,7 @@ class Scene(Table):
         "the scene's own keys (docs/speed_and_accuracy.md has their errors and costs). `--profile` lays them over all.",
         json_schema_extra={"allowed": "one of " + ", ".join(map(repr, PROFILES))},
     )
-    geometry: Annotated[SerializeAsAny[Shape], variant_of(SHAPES, "shape")]
+    geometry: Annotated[SerializeAsAny[Shape], VariantOf(SHAPES, "shape")]
     mesh: Mesh = Mesh()
     model: Model = Model()
     material: Material = Material()
@@ -97,33 +99,35 @@ class Scene(Table):
     solver: Solver = Solver()
     output: Output = Output()
 
-    @model_validator(mode="before")
+    @model_validator(mode="wrap")
     @classmethod
-    def _merge_preset(cls, values: Any) -> Any:
-        """The scene's keys over those of its preset over those of its shape; numbers in place of values with units."""
+    def _on_its_preset(cls, values: Any, handler: ModelWrapValidatorHandler[Scene]) -> Scene:
+        """The scene's keys over those of profile, preset and shape; numbers in place of values with units."""
         if not isinstance(values, dict):
-            return values
-        plain = in_present_format(_plain(values))
-        preset = plain.get("preset")
-        if preset is not None and (not isinstance(preset, str) or preset not in PRESETS):
-            raise fault("allowed are " + ", ".join(map(repr, PRESETS)), "preset", preset)
-        shape = known_shape(plain.get("geometry", {}), SHAPES)
-        _check_load_names(shape, plain.get("loads"))
+            return handler(values)
+        own = _in_present_format(_plain(values))
+        preset, profile = own.get("preset"), own.get("profile")
+        if preset is not None:
+            _check_name("preset", preset, PRESETS)
+        shape = _known_shape(own.get("geometry", {}))
+        _check_load_names(shape, own.get("loads"))
         base = SHAPES[shape].defaults
         if preset is None:
-            base = merged(base, default_method(plain))
+            base = merged(base, default_method(own))
         else:
             if shape not in PRESETS[preset]:
                 known = ", ".join(map(repr, PRESETS[preset]))
                 raise fault(f"the preset {preset!r} has {known}", "geometry.shape", shape)
             base = merged(base, PRESETS[preset][shape])
-        profile = plain.get("profile")
         if profile is not None:
-            base = merged(base, known_profile(profile).tables())
-        values = in_own_units(merged(base, plain), cls, SHAPES[shape], Load)
-        if profile is not None and PROFILES[profile].takes_exact_coupling and _leaves_coupling_open(plain, values):
-            values = merged(values, {"remodeling": {"coupling": EXACT}})
-        return values
+            _check_name("profile", profile, PROFILES)
+            base = merged(base, PROFILES[profile].tables())
+        values = _in_own_units(merged(base, own), SHAPES[shape])
+        scene = handler(values)
+        if profile is not None and PROFILES[profile].takes_exact_coupling and scene.has_exact_coupling:
+            if "coupling" not in own.get("remodeling", {}):
+                scene = handler(merged(values, {"remodeling": {"coupling": EXACT}}))
+        return scene
 
     @model_validator(mode="after")
     def _tables_fit_together(self) -> Scene:
@@ -131,9 +135,13 @@ class Scene(Table):
         if CHAINS[material.chain].locks and cells.end_to_end_length >= material.contour_length:
             rule = f"must be smaller than material.contour_length = {shown(material.contour_length)}"
             raise fault(rule, "cells.end_to_end_length", cells.end_to_end_length)
-        if cells.axes not in geometry.axis_kinds:
-            rule = f"allowed for shape {geometry.name!r} is " + ", ".join(map(repr, geometry.axis_kinds))
-            raise fault(rule, "cells.axes", cells.axes)
+        ends = self.supports.ends
+        for key, name, names in (
+            ("cells.axes", cells.axes, geometry.axis_kinds),
+            ("supports.ends", ends, geometry.ends),
+        ):
+            if name not in names:
+                raise fault(f"allowed for shape {geometry.name!r} is {', '.join(map(repr, names))}", key, name)
         formulation = self.mesh.formulation
         if FORMULATIONS[formulation].takes_parts and not isinstance(MATRICES[material.matrix], Matrix):
             rule = f"needs the volumetric part of material.matrix = {material.matrix!r}: an energy made as a Matrix"
@@ -148,9 +156,6 @@ class Scene(Table):
             largest = math.floor((LARGEST_MESH / geometry.number_of_elements) ** (1 / 3))
             rule = f"must be at most {largest} for a {geometry.name}: more makes over {LARGEST_MESH:g} elements"
             raise fault(rule, "mesh.refinement", self.mesh.refinement)
-        if self.supports.ends not in geometry.ends:
-            rule = f"allowed for shape {geometry.name!r} is " + ", ".join(map(repr, geometry.ends))
-            raise fault(rule, "supports.ends", self.supports.ends)
         for name, load in self.loads.items():
             self._check_load(name, load)
         self._check_output_times()
@@ -161,8 +166,14 @@ class Scene(Table):
         return self
 
     def missing_for_implicit(self) -> str | None:
-        """What the coupling "implicit" would need."""
-        return _missing_for_implicit(self.mesh, self.material, self.remodeling)
+        """What the scene lacks for the coupling "implicit"; None where it lacks nothing."""
+        material, remodeling = self.material, self.remodeling
+        if self.mesh.formulation != "displacement":
+            return "mesh.formulation = 'displacement': in the others the stress at a point depends on its whole element"
+        if not material.chain_density:
+            return "chains: material.chain_density above 0"
+        parts = LAWS[remodeling.law], DRIVERS[remodeling.driver], FRAMES[remodeling.frame]
+        return refused(*parts, MATRICES[material.matrix], REPULSIONS[material.repulsion])
 
     @property
     def has_exact_coupling(self) -> bool:
@@ -171,10 +182,11 @@ class Scene(Table):
         So it is where the cells depend on the time and the tension that they have then alone. From random cells some
         points have no such state and are held (docs/couplings.md).
         """
-        return _has_exact_coupling(self.mesh, self.material, self.cells, self.remodeling)
+        depends_on_now = LAWS[self.remodeling.law].of_absolute_time and self.cells.initial != "random"
+        return depends_on_now and self.missing_for_implicit() is None
 
     def _missing_for_equilibrium(self) -> str | None:
-        """Why time has no end that does not depend on the way there."""
+        """Why there is no equilibrium of the cells, or one that depends on the way there; None where neither is so."""
         law, laws = self.remodeling.law, ", ".join(repr(name) for name, law in LAWS.items() if law.has_limit)
         if not LAWS[law].has_limit:
             return f"remodeling.law = {law!r} has no limit that the way there does not decide; those with one: {laws}"
@@ -281,30 +293,52 @@ class Scene(Table):
         return toml_text(self, header)
 
 
-def _missing_for_implicit(mesh: Mesh, material: Material, remodeling: Remodeling) -> str | None:
-    if mesh.formulation != "displacement":
-        return "mesh.formulation = 'displacement': with another one the stress at a point belongs to its element"
-    if not material.chain_density:
-        return "chains: material.chain_density above 0"
-    parts = LAWS[remodeling.law], DRIVERS[remodeling.driver], FRAMES[remodeling.frame]
-    return refused(*parts, MATRICES[material.matrix], REPULSIONS[material.repulsion])
+# ---------------------------------------------------------------- values as they were read
 
 
-def _has_exact_coupling(mesh: Mesh, material: Material, cells: Cells, remodeling: Remodeling) -> bool:
-    if not LAWS[remodeling.law].of_absolute_time or cells.initial == "random":
-        return False
-    return _missing_for_implicit(mesh, material, remodeling) is None
+def _in_present_format(values: Mapping[str, Any]) -> dict[str, Any]:
+    """The values with the present format number; a newer one is refused before the keys that are new in it are."""
+    written = values.get("format")
+    if not isinstance(written, int) or isinstance(written, bool) or written < 1:
+        return dict(values)  # none, or a fault that the field's own error describes
+    if written > FORMAT:
+        rule = f"written by a newer version of remodel_fenicsx; this one reads formats up to {FORMAT}"
+        raise fault(rule, "format", written)
+    return {**values, "format": FORMAT}
 
 
-def _leaves_coupling_open(own: Mapping[str, Any], values: Mapping[str, Any]) -> bool:
-    """Whether a scene's own keys name no coupling, and all its values, not validated yet, have an exact one."""
-    if "coupling" in own.get("remodeling", {}):
-        return False
-    kinds: dict[str, Any] = {"mesh": Mesh, "material": Material, "cells": Cells, "remodeling": Remodeling}
-    try:
-        return _has_exact_coupling(*(kind(**values.get(name, {})) for name, kind in kinds.items()))
-    except (SceneError, TypeError):  # what is wrong will be said, with its whole key
-        return False
+def _check_name(key: str, name: Any, names: Iterable[str]) -> None:
+    if not isinstance(name, str) or name not in names:
+        raise fault("allowed are " + ", ".join(map(repr, names)), key, name)
+
+
+def _known_shape(geometry: Any) -> str:
+    """The shape that is asked for. Without it nothing else can be judged: preset, loads and units depend on it."""
+    if not isinstance(geometry, Mapping):
+        raise fault("must be a table", "geometry", geometry)
+    if "shape" not in geometry:
+        raise fault("missing; allowed are " + ", ".join(map(repr, SHAPES)), "geometry.shape", None)
+    _check_name("geometry.shape", geometry["shape"], SHAPES)
+    return str(geometry["shape"])
+
+
+def _in_own_units(values: Mapping[str, Any], shape: type[Shape]) -> dict[str, Any]:
+    """The values, those of preset and shape among them, with numbers in the scene's units in place of "5 mm"."""
+    units: dict[str, str | None] = {}
+    for key, table, known in ((STRESS_UNIT, Material, tuple(STRESS_UNITS)), (LENGTH_UNIT, shape, LENGTH_UNITS)):
+        table_name, name = key.split(".")
+        chosen, field = values.get(table_name), table.model_fields[name]
+        units[key] = chosen.get(name, field.default) if isinstance(chosen, Mapping) else field.default
+        if units[key] not in (*known, None):
+            raise fault(allowed(field), key, units[key])
+    result: dict[str, Any] = in_units(values, Scene, units)
+    result["geometry"] = in_units(result["geometry"], shape, units, "geometry")
+    if isinstance(loads := result.get("loads"), Mapping):
+        result["loads"] = {
+            name: in_units(entry, Load, units, f"loads.{name}", {"value": shape.loads[name].dimension})
+            for name, entry in loads.items()
+        }
+    return result
 
 
 def _check_load_names(shape: str, loads: Any) -> None:
@@ -386,3 +420,52 @@ def read_scene(path: str | os.PathLike[str], overrides: Iterable[str] = (), prof
         return scene
     asked = any(parse_override(override)[0] == "remodeling.coupling" for override in overrides)
     return scene if asked else scene.with_values({"remodeling.coupling": EXACT})
+
+
+# ---------------------------------------------------------------- where a run goes on
+
+# what decides no number of the steps done, or only how they were solved
+FREE = ("format", "name", "preset", "profile", "output", "solver", "loads", "time.end")
+SAME_LOAD = 1e-12  # relative difference of two loads that are the same
+
+
+def check_continuation(old: Scene, new: Scene, time: float) -> None:
+    """Check that the physics of a scene is that of the run so far, until `time`.
+
+    End time, output, solver and the loads after `time` may change.
+
+    Raises
+    ------
+    SceneError
+        One line: the first key that differs, and what it was.
+    """
+    rule = f"a resumed run may change time.end, output, solver, and loads after its checkpoint at {time:g}"
+    before, now = (dict(_physics(scene.model_dump(mode="json"))) for scene in (old, new))
+    for key in [*before, *(key for key in now if key not in before)]:
+        if before.get(key) != now.get(key):
+            was = shown(before[key]) if key in before else "not there"
+            raise SceneError(f"{key} = {shown(now.get(key))}: was {was}; {rule}")
+    for name in new.geometry.loads:
+        first, second = old.loads.get(name), new.loads.get(name)
+        for moment in sorted({0.0, time, *_ramp_times(first), *_ramp_times(second)}):
+            old_value, value = (0.0 if one is None else one.value * one.factor(moment) for one in (first, second))
+            if moment <= time and abs(old_value - value) > SAME_LOAD * max(abs(old_value), abs(value)):
+                raise SceneError(f"loads.{name} = {value:g} at time {moment:g}: was {old_value:g}; {rule}")
+    if new.last_time < time:
+        raise SceneError(f"time.end = {shown(new.time.end)}: must be at least {time:g}, where the checkpoint is")
+
+
+def _ramp_times(load: Load | None) -> list[float]:
+    return [] if load is None else [time for time, _ in load.ramp]
+
+
+def _physics(table: Mapping[str, Any], key: str = "") -> Iterator[tuple[str, Any]]:
+    """(dotted key, value) of all values that must stay."""
+    for name, value in table.items():
+        path = f"{key}.{name}" if key else name
+        if path in FREE:
+            continue
+        if isinstance(value, Mapping):
+            yield from _physics(value, path)
+        else:
+            yield path, value

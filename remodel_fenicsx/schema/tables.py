@@ -10,11 +10,12 @@ import inspect
 import math
 import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args, get_origin
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, GetCoreSchemaHandler, ValidationError
 from pydantic.fields import FieldInfo
-from pydantic_core import ErrorDetails, PydanticCustomError, PydanticUndefined
+from pydantic_core import CoreSchema, ErrorDetails, PydanticCustomError, PydanticUndefined, core_schema
 
 LONGEST_VALUE = 60  # characters of a value in an error
 _MISSING = object()
@@ -61,32 +62,26 @@ def _of_python(value: Any) -> Any:
     return type(value)(map(_of_python, value)) if type(value) in (list, tuple) else value
 
 
+@dataclass(frozen=True)
 class OneOf:
-    """Validator: the value is one of a registry's keys, those registered later included."""
+    """Annotation of a field whose value is one of a registry's keys, those registered later included."""
 
-    def __init__(self, choices: Collection[Any]):
-        self.choices = choices
+    choices: Collection[Any]
 
-    def __call__(self, value: Any) -> Any:
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return core_schema.no_info_after_validator_function(self._check, handler(source))
+
+    def _check(self, value: Any) -> Any:
         if value not in self.choices:
             raise ValueError("not registered")
         return value
 
 
-def one_of(choices: Collection[Any]) -> AfterValidator:
-    """Annotation of a field whose value is one of `choices`."""
-    return AfterValidator(OneOf(choices))
-
-
-def checked(check: Callable[[Any], Any]) -> BeforeValidator:
-    """Annotation of a field whose value goes through `check` before its type is looked at."""
-    return BeforeValidator(check)
-
-
+@dataclass(frozen=True)
 class VariantOf:
-    """Validator of a table that has several kinds: the key `tag` names one of a registry, later ones included.
+    """Annotation of a field that is one of several tables, those registered later included.
 
-    Parameters
+    Attributes
     ----------
     registry
         Table class by name; each has a field `tag` with that name.
@@ -94,10 +89,13 @@ class VariantOf:
         The key that tells them apart.
     """
 
-    def __init__(self, registry: Mapping[str, type[BaseModel]], tag: str):
-        self.registry, self.tag = registry, tag
+    registry: Mapping[str, type[BaseModel]]
+    tag: str
 
-    def __call__(self, value: Any) -> Any:
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return core_schema.no_info_before_validator_function(self._table, handler(source))
+
+    def _table(self, value: Any) -> Any:
         if isinstance(value, BaseModel):
             return value
         if not isinstance(value, Mapping):
@@ -108,16 +106,15 @@ class VariantOf:
         name = value[self.tag]
         if not isinstance(name, str) or name not in self.registry:
             raise fault(listed, self.tag, name)
-        table = self.registry[name]
         try:
-            return table.model_validate(dict(value))
+            return self.registry[name].model_validate(dict(value))
         except ValidationError as error:
             raise PydanticCustomError("inner", "faults in {name}", {"name": name, "error": error}) from None
 
 
-def variant_of(registry: Mapping[str, type[BaseModel]], tag: str) -> BeforeValidator:
-    """Annotation of a field that is one of the tables of a registry."""
-    return BeforeValidator(VariantOf(registry, tag))
+def checked(check: Callable[[Any], Any]) -> BeforeValidator:
+    """Annotation of a field whose value goes through `check` before its type is looked at."""
+    return BeforeValidator(check)
 
 
 def fault(rule: str, key: str = "", value: Any = _MISSING) -> PydanticCustomError:
@@ -286,10 +283,7 @@ def _fields(annotation: Any) -> dict[str, FieldInfo]:
 
 def variant_of_field(field: FieldInfo) -> VariantOf | None:
     """The registry behind a field that has several kinds of tables, or None."""
-    for entry in field.metadata:
-        if isinstance(entry, BeforeValidator) and isinstance(entry.func, VariantOf):
-            return entry.func
-    return None
+    return next((entry for entry in field.metadata if isinstance(entry, VariantOf)), None)
 
 
 def choices(field: FieldInfo) -> list[Any]:
@@ -297,8 +291,8 @@ def choices(field: FieldInfo) -> list[Any]:
     if variant := variant_of_field(field):
         return list(variant.registry)
     for entry in field.metadata:
-        if isinstance(entry, AfterValidator) and isinstance(entry.func, OneOf):
-            return list(entry.func.choices)
+        if isinstance(entry, OneOf):
+            return list(entry.choices)
     return list(get_args(field.annotation)) if get_origin(field.annotation) is Literal else []
 
 

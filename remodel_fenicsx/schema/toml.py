@@ -62,17 +62,10 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 def _depth_exceeds(value: Any, most: int) -> bool:
     """Whether tables and lists lie in more than so many others."""
-    level = [value]
-    for _ in range(most):
-        level = [
-            entry
-            for outer in level
-            for entry in (outer.values() if isinstance(outer, dict) else outer)
-            if isinstance(entry, (dict, list))
-        ]
-        if not level:
-            return False
-    return True
+    if not isinstance(value, (dict, list)):
+        return False
+    entries = value.values() if isinstance(value, dict) else value
+    return most == 0 or any(_depth_exceeds(entry, most - 1) for entry in entries)
 
 
 def parse_override(text: str) -> tuple[str, Any]:
@@ -133,36 +126,16 @@ def toml_text(table: BaseModel, header: str = "") -> str:
     return tomlkit.dumps(document)
 
 
-def _fill(container: Any, table: BaseModel) -> None:
-    fields = type(table).model_fields
+def _fill(container: Any, table: BaseModel | Mapping[str, Any]) -> None:
+    fields = type(table).model_fields if isinstance(table, BaseModel) else {}
     # TOML wants a table's own values before the tables in it
-    for name, field in sorted(fields.items(), key=lambda item: isinstance(getattr(table, item[0]), (BaseModel, dict))):
-        value = getattr(table, name)
-        if value is None:
-            continue
-        if isinstance(value, BaseModel):
-            inner = tomlkit.table()
+    for name, value in sorted(dict(table).items(), key=lambda item: isinstance(item[1], (BaseModel, dict))):
+        if isinstance(value, (BaseModel, dict)):
+            of_tables = isinstance(value, dict) and any(isinstance(entry, BaseModel) for entry in value.values())
+            inner = tomlkit.table(is_super_table=of_tables)
             _fill(inner, value)
             container.add(name, inner)
-        elif isinstance(value, dict):
-            container.add(name, _toml_table(value))
-        else:
-            for line in textwrap.wrap(field.description or "", COMMENT_WIDTH):
+        elif value is not None:
+            for line in textwrap.wrap((name in fields and fields[name].description) or "", COMMENT_WIDTH):
                 container.add(tomlkit.comment(line))
-            container.add(name, _plain(value))
-
-
-def _toml_table(values: Mapping[str, Any]) -> Any:
-    table = tomlkit.table(is_super_table=any(isinstance(value, BaseModel) for value in values.values()))
-    for name, value in values.items():
-        if isinstance(value, BaseModel):
-            inner = tomlkit.table()
-            _fill(inner, value)
-            table.add(name, inner)
-        else:
-            table.add(name, value)
-    return table
-
-
-def _plain(value: Any) -> Any:
-    return [_plain(entry) for entry in value] if isinstance(value, (list, tuple)) else value
+            container.add(name, value)

@@ -1,4 +1,4 @@
-"""How the linear systems of Newton's method are solved: with every tangent, with kept factors, by multigrid."""
+"""How the linear systems of Newton's method are solved: with every tangent, an earlier factor, or multigrid."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from remodel_fenicsx.fem.petsc_options import ProblemOptions
-from remodel_fenicsx.fem.solver_methods import DEFINITE, EXACT, GENERAL, LAGGED, SYMMETRIC, factor_options
+from remodel_fenicsx.fem.solver_methods import DEFINITE, GENERAL, LAGGED, SYMMETRIC, factor_options
 from remodel_fenicsx.solver.equilibrium import Equilibrium
 from remodel_fenicsx.solver.quasi_newton import Secants
 
@@ -22,8 +22,6 @@ WORTH = 12  # iterations that a new factor must save: it costs about as much as 
 OVER = 3  # iterations over which the rate of convergence is taken
 SLOW_STEP = 8  # iterations after which the next step starts with a new factor
 MOST_RENEWALS = 6  # of one solve: what needs more is no matter of old factors
-FIRST_ACCURACY, MOST_ACCURACY, LEAST_ACCURACY = 1e-3, 1e-10, 1e-2  # of a linear system's solution, relative
-ENOUGH = 0.3  # of the tolerance: what the last linear system may leave of the residual
 
 
 class KeptFactor:
@@ -116,7 +114,10 @@ class EveryTangent:
         self.tangents += 1
 
     def improve(self, x: Any, residual: Any, step: Any, is_exact: bool) -> bool:
-        """Better a step (trial: x - step) by what earlier ones have shown; whether it was changed."""
+        """Improve the Newton step in place (the trial state is x - step); returns whether it was changed.
+
+        `is_exact`: the residual at x is that of the prescribed values too.
+        """
         return False
 
     def ended(self, iterations: int) -> None:
@@ -168,8 +169,14 @@ class Multigrid(EveryTangent):
         return "with new levels in every iteration", self._anew()
 
 
-class _Kept(EveryTangent):
-    """What methods with a kept factor have in common; where the user names a preconditioner, that one is kept."""
+class Lagged(EveryTangent):
+    """Modified Newton with quasi-Newton steps: the tangent is renewed where that costs less than going on without.
+
+    The factor of an earlier tangent serves many iterations, and L-BFGS improves its steps. Where the user names a
+    preconditioner, that one is kept in place of the factor.
+    """
+
+    more_iterations, keeps = 3, True
 
     def __init__(self, equilibrium: Equilibrium, snes: Any, matrix: Any, options: ProblemOptions):
         super().__init__(equilibrium, snes, matrix, options)
@@ -179,40 +186,9 @@ class _Kept(EveryTangent):
             preconditioner = snes.getKSP().getPC()
             preconditioner.setType(PETSc.PC.Type.PYTHON)
             preconditioner.setPythonContext(self.factor)
-
-    def renew(self) -> None:
-        super().renew()
-        self._factorise()
-
-    def _factorise(self) -> None:
-        if self._own:
-            self.factor.renew(self.matrix)
-
-    def second_try(self) -> tuple[str, AbstractContextManager[None]] | None:
-        return "with new factors in every iteration", self._with_every_tangent()
-
-    @contextmanager
-    def _with_every_tangent(self) -> Iterator[None]:
-        with self._anew(), _krylov(self.snes, "preonly"):
-            yield
-
-    def factorisation(self) -> Any | None:
-        return self.factor.preconditioner if self._own else super().factorisation()
-
-    def close(self) -> None:
-        self.factor.close()
-
-
-class Lagged(_Kept):
-    """Modified Newton with quasi-Newton steps: the tangent is renewed where that costs less than going on without."""
-
-    more_iterations, keeps = 3, True
-
-    def __init__(self, equilibrium: Equilibrium, snes: Any, matrix: Any, options: ProblemOptions):
-        super().__init__(equilibrium, snes, matrix, options)
         self.secants = Secants()
         self._before = 0  # tangents before the solve
-        self._norms: list[float] = []  # since the tangent was renewed, of this solve
+        self._norms: list[float] = []  # of the residual since the tangent was renewed, of this solve
         self._due = True
 
     def begin(self) -> None:
@@ -231,6 +207,8 @@ class Lagged(_Kept):
 
     def renew(self) -> None:
         super().renew()
+        if self._own:
+            self.factor.renew(self.matrix)
         self.secants.forget()
         self._norms, self._due = self._norms[-1:], False
 
@@ -243,6 +221,9 @@ class Lagged(_Kept):
     def ended(self, iterations: int) -> None:
         self._due = self._always or iterations > SLOW_STEP
 
+    def second_try(self) -> tuple[str, AbstractContextManager[None]] | None:
+        return "with new factors in every iteration", self._anew()
+
     def _costs_more(self, tolerance: float) -> bool:
         """Whether the iterations that are left cost more than new factors; also where the residual rises."""
         if len(self._norms) <= OVER:
@@ -250,68 +231,14 @@ class Lagged(_Kept):
         rate = (self._norms[-1] / self._norms[-1 - OVER]) ** (1 / OVER)
         return bool(not rate < 1 or np.log(tolerance / self._norms[-1]) / np.log(rate) > WORTH)
 
+    def factorisation(self) -> Any | None:
+        return self.factor.preconditioner if self._own else super().factorisation()
+
     def close(self) -> None:
-        super().close()
+        self.factor.close()
         self.secants.forget()
 
 
-class Exact(_Kept):
-    """The tangent of every iteration, by GMRES with the factors of an earlier one: any tangent, any factors.
-
-    Systems are solved as accurately as Newton's method has use for. Factors are renewed where a system takes more
-    iterations than the average since they were made, their own cost included: sooner or later would both cost more.
-    """
-
-    def __init__(self, equilibrium: Equilibrium, snes: Any, matrix: Any, options: ProblemOptions):
-        super().__init__(equilibrium, snes, matrix, options)
-        self._sets_tolerance = "ksp_rtol" not in options.given
-        self._systems = self._iterations = 0  # since the factors were made
-        self._before = np.inf  # norm of the residual at the last system of this solve
-
-    def begin(self) -> None:
-        self._before = np.inf
-
-    def tangent(self, norm: float, tolerance: float) -> None:
-        EveryTangent.renew(self)
-        solver = self.snes.getKSP()
-        if self._always or self.factor.preconditioner is None or self._costs_more(solver.getIterationNumber()):
-            self._factorise()
-            self._systems = self._iterations = 0
-        if self._sets_tolerance:
-            solver.setTolerances(rtol=useful_accuracy(norm, self._before, tolerance))
-        self._before = norm
-
-    def _costs_more(self, last: int) -> bool:
-        """Whether the last system took more than the average of all since the factors were made, these included."""
-        self._systems, self._iterations = self._systems + 1, self._iterations + last
-        return last * self._systems > WORTH + self._iterations
-
-
-def useful_accuracy(norm: float, before: float, tolerance: float) -> float:
-    """Relative accuracy of a linear system: what it does not solve is below what Newton's method leaves.
-
-    Parameters
-    ----------
-    norm, before, tolerance
-        Of the residual, of the one before (infinite for the first system), and the one that is asked for.
-    """
-    if not np.isfinite(before):
-        return FIRST_ACCURACY
-    return float(np.clip(max((norm / before) ** 2, ENOUGH * tolerance / norm), MOST_ACCURACY, LEAST_ACCURACY))
-
-
-@contextmanager
-def _krylov(snes: Any, kind: str) -> Iterator[None]:
-    """Another Krylov method meanwhile."""
-    solver = snes.getKSP()
-    before = solver.getType()
-    solver.setType(kind)
-    try:
-        yield
-    finally:
-        solver.setType(before)
-
-
 LinearMethod = Callable[[Equilibrium, Any, Any, ProblemOptions], EveryTangent]
-LINEAR_METHODS: dict[str, LinearMethod] = {LAGGED: Lagged, EXACT: Exact, "iterative": Multigrid}
+LINEAR_METHODS: dict[str, LinearMethod] = {LAGGED: Lagged, "iterative": Multigrid}
 """Methods (`fem.solver_methods.METHODS`) that want more than PETSc's options."""

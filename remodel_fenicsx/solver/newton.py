@@ -11,9 +11,9 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from remodel_fenicsx.fem.petsc_options import ProblemOptions
 from remodel_fenicsx.fem.assembly import over_ranks
-from remodel_fenicsx.fem.solver_methods import AUTO, EXACT, LAGGED, SMALL, chosen, method_options
+from remodel_fenicsx.fem.petsc_options import ProblemOptions
+from remodel_fenicsx.fem.solver_methods import AUTO, LAGGED, chosen, is_small, method_options
 from remodel_fenicsx.settings import Solver
 from remodel_fenicsx.solver.equilibrium import Equilibrium, Look
 from remodel_fenicsx.solver.limits import Limits
@@ -59,11 +59,12 @@ class GuardedNewton:
         self._values = self.unknown.x.array
         self._x = self.unknown.x.petsc_vec.duplicate()
         unknowns, ranks = self._x.getSize(), equilibrium.comm.size
-        self.method = chosen(settings.method, unknowns, ranks)
-        if robust and self.method in (LAGGED, EXACT):
+        reduced = equilibrium.state.kinematics.reduced
+        self.method = chosen(settings.method, unknowns, ranks, reduced)
+        if robust and self.method == LAGGED:
             self.method = "direct"
         # where a method is named, three dimensions stay with it: its numbers shall not depend on their size
-        small = unknowns <= SMALL and (equilibrium.state.kinematics.reduced or settings.method == AUTO)
+        small = is_small(unknowns, reduced) and (reduced or settings.method == AUTO)
         self._options = ProblemOptions(method_options(self.method, ranks, small), settings.petsc_options)
         self._residual, self._external, self._trial = (self._x.duplicate() for _ in range(3))
         self._matrix = equilibrium.create_matrix()

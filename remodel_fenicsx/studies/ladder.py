@@ -11,7 +11,7 @@ from remodel_fenicsx.body.columns import PROFILE
 from remodel_fenicsx.body.reductions import AUTO, choice, objections, step_cost
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.model.laws import LAWS
-from remodel_fenicsx.scene.profiles import EXACT, PROFILES
+from remodel_fenicsx.scene.presets import EXACT, PROFILES
 from remodel_fenicsx.scene.scene import Scene, SceneError
 
 log = logging.getLogger(__name__)
