@@ -22,12 +22,13 @@ from matplotlib.figure import Figure
 from mpi4py import MPI
 
 from remodel_fenicsx import Simulation, read_scene
-from remodel_fenicsx.body import tube
+from remodel_fenicsx.body.tube import Tube, whole_tube
 from remodel_fenicsx.paper.output import COLOURS, STYLE, Page, panel_letters, read_table
 
 DOCS = Path(__file__).parents[1] / "docs"
 ARTERY = Path(__file__).parents[1] / "demos" / "artery.toml"
 END, STEPS = 40.0, (5.0, 2.5, 1.25, 0.625)
+TUBE = Tube(inner_radius=1.0, outer_radius=3.0, length=0.5)
 FINEST = 0.15625  # of the limits
 PRINTED = {"remodeling.law": "explicit", "remodeling.frame": "material"}
 CONSISTENT = {"remodeling.law": "tensor", "remodeling.frame": "material", "material.repulsion": "log"}
@@ -67,7 +68,7 @@ def layer(scheme: Scheme, cells: str, step: float, coupling: str) -> tuple[np.nd
     """A and u at the end, processor time of the steps, Newton iterations."""
     changes = {"geometry.length": 0.5, "cells.initial": cells, "output.fields": False, "remodeling.coupling": coupling}
     scene = read_scene(ARTERY, ["time.end=40.0", f"time.step={step}"]).with_values(scheme.values | changes)
-    domain = tube(1.0, 3.0, 0.5, divisions=(12, 8, 1), comm=MPI.COMM_SELF)
+    domain = whole_tube(TUBE, (12, 8, 1), "hexahedron", 1, MPI.COMM_SELF)
     simulation = Simulation(scene, MPI.COMM_SELF, domain)
     start = clock.process_time()
     iterations = sum(step.work.newton_iterations for step in simulation.steps())

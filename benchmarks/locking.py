@@ -18,13 +18,13 @@ import numpy as np
 from mpi4py import MPI
 
 from remodel_fenicsx import Scene, Simulation
-from remodel_fenicsx.body import tube
 from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.system.environment import versions
 from remodel_fenicsx.watch.locking import LockingWarning
 from tests.locking_bodies import EXACT_TUBE, bar_scene, membrane_scene, registered, thick_tube
 from tests.reference.radial import RadialMaterial, solve_radial
+from tests.parts import tube
 
 PAGE = Path(__file__).parents[1] / "docs" / "locking.md"
 TIP = 4.17  # mm; S. Land et al. 2015, problem 1

@@ -47,7 +47,7 @@ def measure(unknowns: int, steps: int, method: str) -> None:
     from mpi4py import MPI
     from petsc4py import PETSc
 
-    from remodel_fenicsx.body.tube import tube
+    from remodel_fenicsx.body.tube import Tube, whole_tube
     from remodel_fenicsx.scene import preset_scene
     from remodel_fenicsx.simulation import Simulation
 
@@ -57,7 +57,9 @@ def measure(unknowns: int, steps: int, method: str) -> None:
     )
     PETSc.Log.begin()
     begun = clock.perf_counter()
-    simulation = Simulation(scene, comm, tube(length=8.0, divisions=chosen, comm=comm))
+    simulation = Simulation(
+        scene, comm, whole_tube(Tube(inner_radius=1.0, outer_radius=3.0, length=8.0), chosen, "hexahedron", 1, comm)
+    )
     made = clock.perf_counter() - begun
     wall, cpu, newton, linear = [], [], [], []
     before, spent = clock.perf_counter(), clock.process_time()

@@ -25,7 +25,7 @@ sys.path[:0] = [str(DOCS), str(DOCS.parent)]
 from remodel_fenicsx import Scene, Simulation  # noqa: E402
 from remodel_fenicsx.body import Cube, LoadKind  # noqa: E402
 from remodel_fenicsx.body.domain import Domain  # noqa: E402
-from remodel_fenicsx.body.tube import tube  # noqa: E402
+from remodel_fenicsx.body.tube import Tube, whole_tube  # noqa: E402
 from remodel_fenicsx.paper.output import COLOURS, STYLE, Page, panel_letters, read_table  # noqa: E402
 from remodel_fenicsx.schema.units import FORCE  # noqa: E402
 from remodel_fenicsx.solver.continuation import StepFailure  # noqa: E402
@@ -102,7 +102,9 @@ CASES = {
         {"geometry": {"shape": "tube", "length": 0.5}, "time": {"end": 100.0}},
         "fibre_angle_outer",
         "outer_radius",
-        lambda: tube(1.0, 3.0, 0.5, divisions=(12, 8, 1), comm=MPI.COMM_SELF),
+        lambda: whole_tube(
+            Tube(inner_radius=1.0, outer_radius=3.0, length=0.5), (12, 8, 1), "hexahedron", 1, MPI.COMM_SELF
+        ),
     ),
 }
 COLUMNS = ("time", "angle", "size", "change", "newton_iterations", "substeps")

@@ -12,21 +12,25 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from remodel_fenicsx.body.gmsh_model import write_msh
+from remodel_fenicsx.body.gmsh_model import gmsh_model
 from remodel_fenicsx.body.tendon import draw_tendon
-from remodel_fenicsx.body.tube import draw_tube
+from remodel_fenicsx.body.tube import PAPER, draw_tube
 
 # file -> what is in it, as in the paper: Figs. 6 and 7
 MESHES = {
     "tendon.msh": lambda: draw_tendon(length=10.0, area=10.0),
-    "artery.msh": lambda: draw_tube(inner_radius=1.0, outer_radius=3.0, length=8.0),
+    "artery.msh": lambda: draw_tube(1.0, 3.0, 8.0, PAPER, "hexahedron", 1),
 }
 
 
 def make(folder: Path) -> None:
     """Write both files into `folder`."""
     for name, draw in MESHES.items():
-        write_msh(folder / name, draw)
+        with gmsh_model(Path(name).stem) as gmsh:
+            draw()
+            gmsh.option.setNumber("Mesh.MshFileVersion", 4.1)
+            gmsh.option.setNumber("Mesh.Binary", 0)
+            gmsh.write(str(folder / name))
 
 
 if __name__ == "__main__":

@@ -37,6 +37,15 @@ EXIT_CODES = {
 }
 
 
+class _UnusableEnvironment(Exception):  # noqa: N818
+    """What a command needs is missing; the text says what."""
+
+
+def _check(reason: str | None) -> None:
+    if reason is not None:
+        raise _UnusableEnvironment(reason)
+
+
 class _Parser(argparse.ArgumentParser):
     """What it complains of stays on one line, control characters and all."""
 
@@ -127,14 +136,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         try:
             code = COMMANDS[options.command](options)
             sys.stdout.flush()
+            return code
         except SceneError as error:
             return _fail(str(error), BAD_INPUT)
+        except _UnusableEnvironment as error:
+            return _fail(f"the environment is not usable: {error}; run through ./with-fenicsx", BAD_ENVIRONMENT)
         except OSError as error:  # all others are caught where files are written
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python will flush once more
             if isinstance(error, BrokenPipeError):  # whoever read the output has seen enough
                 return 0
             return _fail(f"cannot write to the standard output: {error.strerror}", BAD_ENVIRONMENT)
-        return code
 
 
 def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -177,9 +188,7 @@ def _run(options: argparse.Namespace, task: Callable[..., Path] | None = None) -
     wishes: Any = {"quiet": options.quiet, "deadline": deadline}
     if options.resume and (options.output or options.profile):
         return _fail(f"{'-o' if options.output else '--profile'}: a run goes on in its own folder, as it is", BAD_INPUT)
-    reason = reason_unusable()
-    if reason is not None:
-        return _fail(f"the environment is not usable: {reason}; run through ./with-fenicsx", BAD_ENVIRONMENT)
+    _check(reason_unusable())
     interrupts.take_back_signals()
     from remodel_fenicsx.body import GeometryError
     from remodel_fenicsx.results.checkpoint_file import CheckpointError
@@ -221,8 +230,7 @@ def _run(options: argparse.Namespace, task: Callable[..., Path] | None = None) -
 
 
 def _stability(options: argparse.Namespace) -> int:
-    if missing := reason_undrawable():
-        return _fail(f"the environment is not usable: {missing}; run through ./with-fenicsx", BAD_ENVIRONMENT)
+    _check(reason_undrawable())
 
     def analyse(scene: Scene, folder: Path | None, quiet: bool) -> Path:
         from remodel_fenicsx.stability import in_words, stability
@@ -237,8 +245,7 @@ def _stability(options: argparse.Namespace) -> int:
 def _study(options: argparse.Namespace, task: Callable[[Scene], tuple[Path, str, dict[str, str]]]) -> int:
     """Several runs that answer one question: `task` makes the folder, the answer in words, and what has failed."""
     scene = read_scene(options.scene, options.set, options.profile)
-    if reason := reason_unusable() or reason_undrawable():
-        return _fail(f"the environment is not usable: {reason}; run through ./with-fenicsx", BAD_ENVIRONMENT)
+    _check(reason_unusable() or reason_undrawable())
     from remodel_fenicsx.paper.errors import FigureError
     from remodel_fenicsx.studies.members import TooFewRuns
 
@@ -319,9 +326,7 @@ def _status(options: argparse.Namespace) -> int:
 
 
 def _revolve(options: argparse.Namespace) -> int:
-    reason = reason_unusable()
-    if reason is not None:
-        return _fail(f"the environment is not usable: {reason}; run through ./with-fenicsx", BAD_ENVIRONMENT)
+    _check(reason_unusable())
     if not interrupts.is_first_rank():  # the work of one process
         return 0
     from remodel_fenicsx.results.recording import RecordingError
@@ -360,7 +365,7 @@ def _figures(options: argparse.Namespace) -> int:
     try:
         from remodel_fenicsx import paper as figures
     except ImportError as error:
-        return _fail(f"the environment is not usable: {error}; run through ./with-fenicsx", BAD_ENVIRONMENT)
+        raise _UnusableEnvironment(error) from error
     folder, runs = options.output or figures.DEFAULT_FOLDER, options.runs or figures.DEFAULT_RUNS
     try:
         formats = [name for text in options.format for name in text.split(",")] or ["png"]
@@ -377,9 +382,7 @@ def _figures(options: argparse.Namespace) -> int:
 
 
 def _info(options: argparse.Namespace) -> int:
-    reason = reason_unusable()
-    if reason is not None:
-        return _fail(f"the environment is not usable: {reason}; run through ./with-fenicsx", BAD_ENVIRONMENT)
+    _check(reason_unusable())
     from remodel_fenicsx.fem.solver_methods import METHODS
 
     for name, version in versions().items():

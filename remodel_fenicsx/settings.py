@@ -283,7 +283,7 @@ class CouplingKind:
     ----------
     meaning
         What it does, for docs/scene.md.
-    place
+    coupling
         The class of the `Coupling`, or its dotted name: scenes are read without dolfinx, which it needs.
     makes_a_share
         Whether it makes the share `relaxation_factor` of a pass.
@@ -292,14 +292,16 @@ class CouplingKind:
     """
 
     meaning: str
-    place: Callable[..., Any] | str
+    coupling: Callable[..., Any] | str
     makes_a_share: bool = False
     needs_a_target: bool = False
 
     @property
     def make(self) -> Callable[..., Any]:
         """Makes the coupling of a state, a tissue, a remodeling pass and settings of the solver."""
-        found: Callable[..., Any] = pkgutil.resolve_name(self.place) if isinstance(self.place, str) else self.place
+        found: Callable[..., Any] = (
+            pkgutil.resolve_name(self.coupling) if isinstance(self.coupling, str) else self.coupling
+        )
         return found
 
 

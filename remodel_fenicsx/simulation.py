@@ -32,12 +32,10 @@ from remodel_fenicsx.state.state import State
 from remodel_fenicsx.state.unit_cells import UnitCells
 from remodel_fenicsx.system.interrupts import take_back_signals
 from remodel_fenicsx.watch.buckling import BucklingWarning
-from remodel_fenicsx.watch.chatter import Chatter
+from remodel_fenicsx.watch.equilibrium_stability import EquilibriumStability
 from remodel_fenicsx.watch.locking import LockingWarning
-from remodel_fenicsx.watch.monitor import StabilityWatcher
-from remodel_fenicsx.watch.radial_chains import RadialChains
-from remodel_fenicsx.watch.resting import Resting
-from remodel_fenicsx.watch.volume import VolumeLoss
+from remodel_fenicsx.watch.over_correction import OverCorrection, RestedCells
+from remodel_fenicsx.watch.tissue import RadialChains, VolumeLoss
 
 log = logging.getLogger(__name__)
 
@@ -63,8 +61,8 @@ class Simulation:
     control
         Chooses the steps, where the scene has a tolerance.
     stability, warnings
-        Watchers of stability, over-correction, locking, volume, and chains that point out of the wall; what they
-        remember is part of the state.
+        Watchers of the stability of equilibria, and of over-correction, locking, volume, and chains that point out of
+        the wall; what they remember is part of the state.
 
     Raises
     ------
@@ -107,7 +105,7 @@ class Simulation:
         self.stepper = Stepper(*parts, self._at_once(tissue, solver) if at_once else None)
         self.tissue = self.stepper.tissue
         counted = "negative_eigenvalues" in scene.output.columns
-        self.stability = StabilityWatcher(self.stepper, scene.solver.unstable, every_step=counted)
+        self.stability = EquilibriumStability(self.stepper, scene.solver.unstable, every_step=counted)
         columns = list(scene.output.columns)
         self.control: StepControl | None = None
         if scene.time.tolerance is not None and not at_once:
@@ -124,10 +122,10 @@ class Simulation:
             RadialChains(self.stepper, shape.radial_share),
         ]
         if self.stepper.remodeling.law.remodels and not at_once:
-            chatter = Chatter(self.stepper)
-            self.warnings.insert(0, chatter)
+            over_correction = OverCorrection(self.stepper)
+            self.warnings.insert(0, over_correction)
             if self.stepper.remodeling.law.of_absolute_time:
-                self.warnings.append(Resting(self.stepper, chatter))
+                self.warnings.append(RestedCells(self.stepper, over_correction))
 
     def _at_once(self, tissue: Tissue, solver: Solver) -> Maker:
         """The coupling that goes to the equilibrium, with the steps of a stepper of its own on the same state."""

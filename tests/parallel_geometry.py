@@ -1,4 +1,4 @@
-"""What the tests compare between numbers of ranks: mpirun -n 2 python3 -m mpi4py tests/parallel_geometry.py."""
+"""What the tests compare between numbers of ranks: mpirun -n 2 python3 -m mpi4py tests/parallel_parts.py."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import json
 import numpy as np
 from mpi4py import MPI
 
-from remodel_fenicsx import body as geometry
-from remodel_fenicsx.body import domain
+from remodel_fenicsx.body import GeometryError, domain
+from tests import parts
 
 
 def digest(domain):
@@ -17,7 +17,7 @@ def digest(domain):
     points, cells = domain.gather_mesh()
     table = np.random.default_rng(1).random((max(domain.number_of_elements, domain.number_of_nodes), 3))
     values = domain.gather_elements(table[domain.element_number]), domain.gather_nodes(table[domain.node_number])
-    parts = [points, cells, *values]
+    pieces = [points, cells, *values]
     facets = domain.mesh.topology.index_map(2)
     sizes = [
         domain.comm.allreduce(int(np.sum(domain.facet_tags.find(tag) < facets.size_local)))
@@ -25,18 +25,18 @@ def digest(domain):
     ]
     if domain.comm.rank != 0:
         return None
-    gathered = hashlib.sha256(b"".join(np.ascontiguousarray(part).tobytes() for part in parts)).hexdigest()
+    gathered = hashlib.sha256(b"".join(np.ascontiguousarray(part).tobytes() for part in pieces)).hexdigest()
     return [gathered, dict(zip(domain.faces, sizes, strict=True))]
 
 
 def digests(comm):
     """Digests of all shapes; the cube of one element leaves a rank without a cell."""
     return {
-        "cube": digest(geometry.cube(comm=comm)),
-        "tendon": digest(geometry.tendon(comm=comm)),
-        "tendon of tetrahedra": digest(geometry.tendon(element="tetrahedron", comm=comm)),
-        "tube": digest(geometry.tube(comm=comm)),
-        "tube of degree 2": digest(geometry.tube(degree=2, divisions=(16, 3, 2), comm=comm)),
+        "cube": digest(parts.cube(comm=comm)),
+        "tendon": digest(parts.tendon(comm=comm)),
+        "tendon of tetrahedra": digest(parts.tendon(element="tetrahedron", comm=comm)),
+        "tube": digest(parts.tube(comm=comm)),
+        "tube of degree 2": digest(parts.tube(degree=2, divisions=(16, 3, 2), comm=comm)),
     }
 
 
@@ -50,7 +50,7 @@ def failures(comm):
     for draw in (broken, lambda: None):
         try:
             domain.build_domain(draw, "cube", {"side": 1.0}, comm)
-        except geometry.GeometryError as error:
+        except GeometryError as error:
             said.append(str(error))
     return comm.gather(said, root=0)
 

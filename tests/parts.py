@@ -8,17 +8,20 @@ from typing import Any
 
 import numpy as np
 
-from remodel_fenicsx.body import SHAPES
+from mpi4py import MPI
+
+from remodel_fenicsx.body import SHAPES, Cube, Tendon, Tube
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.loading import Loading, LoadValues
 from remodel_fenicsx.body.shape import Shape
+from remodel_fenicsx.body.tube import PAPER, whole_tube
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
 from remodel_fenicsx.evolution.stepper import Stepper
 from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.fem.kinematics import FullKinematics
 from remodel_fenicsx.fem.quadrature import Quadrature
+from remodel_fenicsx.scene.scene import Mesh, Scene, Solver
 from remodel_fenicsx.settings import Cells, Material, Remodeling
-from remodel_fenicsx.scene.scene import Scene, Solver
 from remodel_fenicsx.solver.equilibrium import Equilibrium
 from remodel_fenicsx.solver.newton import GuardedNewton, Solution
 from remodel_fenicsx.state.state import State
@@ -26,6 +29,45 @@ from remodel_fenicsx.state.unit_cells import UnitCells
 
 MATERIAL = Material()
 TIGHT = Solver(absolute_tolerance=1e-11, relative_tolerance=1e-13)
+
+
+def cube(
+    side: float = 1.0,
+    refinement: int = 1,
+    element: Any = "hexahedron",
+    degree: Any = 1,
+    comm: MPI.Intracomm | None = None,
+) -> Domain:
+    """The mesh of a cube."""
+    return Cube(side=side).build(Mesh(refinement=refinement, element=element, degree=degree), comm)
+
+
+def tendon(
+    length: float = 10.0,
+    area: float = 10.0,
+    refinement: int = 1,
+    element: Any = "hexahedron",
+    degree: Any = 1,
+    comm: MPI.Intracomm | None = None,
+) -> Domain:
+    """The mesh of a tendon."""
+    return Tendon(length=length, area=area).build(Mesh(refinement=refinement, element=element, degree=degree), comm)
+
+
+def tube(
+    inner_radius: float = 1.0,
+    outer_radius: float = 3.0,
+    length: float = 8.0,
+    refinement: int = 1,
+    element: str = "hexahedron",
+    degree: int = 1,
+    comm: MPI.Intracomm | None = None,
+    divisions: tuple[int, int, int] = PAPER,
+) -> Domain:
+    """The mesh of a tube with elements around, through the wall and along, times the refinement."""
+    shape = Tube(inner_radius=inner_radius, outer_radius=outer_radius, length=length)
+    around, through, along = (refinement * count for count in divisions)
+    return whole_tube(shape, (around, through, along), element, degree, comm)
 
 
 def rotation(axis: tuple[float, float, float], degrees: float) -> np.ndarray:

@@ -14,11 +14,11 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from remodel_fenicsx.body import tube
 from remodel_fenicsx.results.columns import Measurement
 from remodel_fenicsx.scene.scene import Scene, scene_from_dict
 from remodel_fenicsx.simulation import Simulation
 from tests.reference.radial import RadialHistory, solve_radial
+from tests.parts import tube
 
 LENGTH = 0.5
 Divisions = tuple[int, int, int]

@@ -14,12 +14,12 @@ import sys
 import numpy as np
 from mpi4py import MPI
 
-from remodel_fenicsx.body import tube
 from remodel_fenicsx.evolution.stepper import Step, Watcher
 from remodel_fenicsx.results.columns import Measurement
 from remodel_fenicsx.results.fields import NodalGather
 from remodel_fenicsx.scene.scene import scene_from_dict
 from remodel_fenicsx.simulation import Simulation
+from tests.parts import tube
 
 
 def main(out: str, request: dict) -> None:

@@ -20,7 +20,7 @@ from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.stability import verdict
 from remodel_fenicsx.watch.amplification import AmplificationWatcher, LinearPass
 from tests.conftest import mpirun
-from tests.test_chatter import Tilt
+from tests.test_over_correction import Tilt
 
 PAPER = "kuhl-holzapfel-2007"
 SOLVED = 20.0

@@ -30,7 +30,7 @@ from hypothesis import strategies as st
 
 from remodel_fenicsx import Recording, Scene, SceneError, cli, running
 from remodel_fenicsx.body.domain import Domain
-from remodel_fenicsx.body.tube import Tube, tube
+from remodel_fenicsx.body.tube import Tube
 from remodel_fenicsx.results.checkpoint_file import CheckpointError, read_checkpoint, read_pointer
 from remodel_fenicsx.results.recording import RecordingError
 from remodel_fenicsx.results.vtkhdf import TransientGrid
@@ -40,6 +40,7 @@ from remodel_fenicsx.schema.toml import parse_override
 from remodel_fenicsx.simulation import checked_domain
 from tests.forks import forked
 from tests.test_resume import SELF, first_half, rows
+from tests.parts import tube
 
 __all__ = ["first_half"]  # a fixture
 FACTOR = int(os.environ.get("BAD_INPUTS", "1"))

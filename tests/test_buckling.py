@@ -13,10 +13,10 @@ import pytest
 from mpi4py import MPI
 
 from remodel_fenicsx import Scene, Simulation
-from remodel_fenicsx.body import tube
 from remodel_fenicsx.body.reductions import choice, explained
 from remodel_fenicsx.stability import in_words, stability
 from remodel_fenicsx.watch.buckling import BucklingWarning
+from tests.parts import tube
 
 MU, LAME = 3.103, 27.293
 YOUNG, POISSON = MU * (3 * LAME + 2 * MU) / (LAME + MU), LAME / (2 * (LAME + MU))

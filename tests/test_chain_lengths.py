@@ -22,7 +22,7 @@ from remodel_fenicsx.model.energy import REPULSIONS
 from remodel_fenicsx.scene import preset_scene
 from remodel_fenicsx.scene.scene import Scene
 from remodel_fenicsx.simulation import Simulation
-from tests.test_chatter import Tilt
+from tests.test_over_correction import Tilt
 from tests.test_condensed import deformations, points, solved
 
 PAPER, CONSISTENT = "kuhl-holzapfel-2007", "consistent"

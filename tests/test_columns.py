@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from remodel_fenicsx.body import SHAPES, cube, tube
+from remodel_fenicsx.body import SHAPES
 from remodel_fenicsx.body.columns import PROFILE, columns_of
 from remodel_fenicsx.model.cells import cylindrical_axes
 from remodel_fenicsx.results.columns import Observer
 from remodel_fenicsx.results.fields import ElementFields
 from remodel_fenicsx.settings import Cells
 from tests import parts
+from tests.parts import cube, tube
 
 INNER, OUTER, LENGTH = 1.0, 3.0, 1.0
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from remodel_fenicsx.body.tube import tube
 from remodel_fenicsx.evolution.stepper import Step, Watcher
 from remodel_fenicsx.kernels.points import CompiledPointKernels, PointKernels
 from remodel_fenicsx.model import energy, spectral
@@ -14,6 +13,7 @@ from remodel_fenicsx.model.cells import UnitCell, structure_tensor
 from remodel_fenicsx.model.operators import passes_through_zero
 from remodel_fenicsx.scene import preset_scene
 from remodel_fenicsx.simulation import Simulation
+from tests.parts import tube
 
 COUNT = 203  # no multiple of the eight that are done at once
 

@@ -9,9 +9,9 @@ import pytest
 from mpi4py import MPI
 
 from remodel_fenicsx import Simulation, cli
-from remodel_fenicsx.body import tube
 from remodel_fenicsx.scene import Scene, scene_from_dict
 from tests.reference.radial import solve_radial
+from tests.parts import tube
 
 SELF = MPI.COMM_SELF
 END = 2.0

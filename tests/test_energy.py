@@ -12,13 +12,13 @@ import pytest
 import ufl
 from mpi4py import MPI
 
-from remodel_fenicsx.body import cube
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.settings import Cells, Material
 from remodel_fenicsx.solver.blend import shares
 from remodel_fenicsx.solver.equilibrium import Equilibrium
 from tests import parts
+from tests.parts import cube
 
 Array = npt.NDArray[np.float64]
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from remodel_fenicsx.body import SHAPES, tube
+from remodel_fenicsx.body import SHAPES
 from remodel_fenicsx.body.shape import Shape
 from remodel_fenicsx.evolution.stepper import Step
 from remodel_fenicsx.model.cells import cylindrical_axes, structure_tensor
@@ -18,6 +18,7 @@ from remodel_fenicsx.settings import Cells
 from remodel_fenicsx.scene.scene import scene_from_dict
 from remodel_fenicsx.simulation import Simulation
 from tests import parts
+from tests.parts import tube
 
 SIZE = {"inner_radius": 1.0, "outer_radius": 3.0, "length": 1.0}
 

@@ -12,13 +12,13 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from remodel_fenicsx import Recording, Scene, SceneError, Simulation, cli
-from remodel_fenicsx.body import tube
 from remodel_fenicsx.body.reductions import AUTO, choice
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.running import resume, run
 from remodel_fenicsx.scene import scene_from_dict
 from remodel_fenicsx.solver.pointwise import PointStresses
 from tests.conftest import Case
+from tests.parts import tube
 
 SELF = MPI.COMM_SELF
 END = 4.0

@@ -12,12 +12,12 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from remodel_fenicsx import Recording, Scene, SceneError, Simulation
-from remodel_fenicsx.body import tube
 from remodel_fenicsx.evolution.homeostasis import Homeostasis
 from remodel_fenicsx.results.columns import Measurement
 from remodel_fenicsx.running import resume, run
 from remodel_fenicsx.scene import scene_from_dict
 from tests.conftest import Case, slowly
+from tests.parts import tube
 
 SELF = MPI.COMM_SELF
 Array = NDArray[np.float64]

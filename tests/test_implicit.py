@@ -10,7 +10,6 @@ import pytest
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from remodel_fenicsx.body import tube
 from remodel_fenicsx.evolution.implicit import Implicit
 from remodel_fenicsx.model.cells import structure_tensor
 from remodel_fenicsx.results.recording import Recording
@@ -20,6 +19,7 @@ from remodel_fenicsx.scene.scene import scene_from_dict
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.solver.continuation import PROOF
 from tests.conftest import Case, slowly
+from tests.parts import tube
 
 Array = NDArray[np.float64]
 

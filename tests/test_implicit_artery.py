@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from remodel_fenicsx.body import tube
 from remodel_fenicsx.scene.scene import Scene, scene_from_dict
 from remodel_fenicsx.simulation import Simulation
 from tests.conftest import Case
+from tests.parts import tube
 
 pytestmark = pytest.mark.slow
 COLUMNS = ["newton_iterations", "substeps", "held_points", "inner_radius", "outer_radius"]

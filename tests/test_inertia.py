@@ -12,7 +12,6 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from remodel_fenicsx import Scene, Simulation, read_scene
-from remodel_fenicsx.body import cube, tube
 from remodel_fenicsx.evolution.stepper import Step
 from remodel_fenicsx.fem.petsc_options import ProblemOptions
 from remodel_fenicsx.fem.solver_methods import SYMMETRIC, factor_options, method_options
@@ -24,9 +23,10 @@ from remodel_fenicsx.solver.equilibrium import Extension
 from remodel_fenicsx.solver.inertia import Inertia
 from remodel_fenicsx.solver.newton import SolveFailure
 from remodel_fenicsx.solver.refusals import diagnosed
-from remodel_fenicsx.watch import monitor
-from remodel_fenicsx.watch.monitor import StabilityWatcher
+from remodel_fenicsx.watch import equilibrium_stability
+from remodel_fenicsx.watch.equilibrium_stability import EquilibriumStability
 from tests import parts
+from tests.parts import cube, tube
 
 DEMOS = Path(__file__).parents[1] / "demos"
 COLUMN = {"output.columns": ["negative_eigenvalues"]}
@@ -59,7 +59,7 @@ def negative_pivots_of(matrix: Any, options: dict[str, Any]) -> int | None:
     owned.apply(preconditioner)
     preconditioner.setOperators(matrix)
     preconditioner.setUp()
-    found = monitor.negative_pivots(preconditioner)
+    found = equilibrium_stability.negative_pivots(preconditioner)
     preconditioner.destroy()
     owned.close()
     return found
@@ -123,12 +123,12 @@ def test_a_large_body_is_counted_on_request_only(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO)
-    monkeypatch.setattr(monitor, "MOST_UNKNOWNS", 23)  # the cube has 24
-    monkeypatch.setattr(monitor, "ITERATIONS_BETWEEN_LOOKS", 1)
+    monkeypatch.setattr(equilibrium_stability, "MOST_UNKNOWNS", 23)  # the cube has 24
+    monkeypatch.setattr(equilibrium_stability, "ITERATIONS_BETWEEN_LOOKS", 1)
     assert np.isnan([step.negative_eigenvalues for step in run(pushed_cube(10.0))]).all()
     assert caplog.text.count("the stability of equilibria was not looked at: with 24 unknowns") == 1
     assert [step.negative_eigenvalues for step in run(pushed_cube(10.0, **COLUMN))] == [0] * 4
-    monkeypatch.setattr(monitor, "MOST_UNKNOWNS", 24)
+    monkeypatch.setattr(equilibrium_stability, "MOST_UNKNOWNS", 24)
     assert run(pushed_cube(10.0))[-1].negative_eigenvalues == 0
 
 
@@ -143,11 +143,13 @@ def collapsing_tube(monkeypatch: pytest.MonkeyPatch) -> list[Step]:
         "geometry.length": 1.0, "cells.initial": "isotropic", "loads.elongation.value": 0.0, "time.end": 12.0,
         "loads.pressure.value": -12.0, "loads.pressure.ramp": [[0.0, 0.0], [12.0, 1.0]], "solver.method": "auto",
     })  # fmt: skip
-    monkeypatch.setattr(monitor, "ITERATIONS_BETWEEN_LOOKS", 10**9)
+    monkeypatch.setattr(equilibrium_stability, "ITERATIONS_BETWEEN_LOOKS", 10**9)
     return run(scene, tube(length=1.0, divisions=(8, 3, 1)))
 
 
-@pytest.mark.parametrize("without", [(monitor, "negative_pivots", None), (monitor.Signs, "_curvature", np.inf)])
+@pytest.mark.parametrize(
+    "without", [(equilibrium_stability, "negative_pivots", None), (equilibrium_stability.Signs, "_curvature", np.inf)]
+)
 def test_each_sign_alone_sees_a_pair(without: tuple[Any, str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
     """Of the tube's modes two come at a time: the determinant does not change its sign."""
     place, name, value = without
@@ -165,7 +167,7 @@ def test_a_dead_hydrostatic_load_beyond_rivlins(caplog: pytest.LogCaptureFixture
         made.loading.hold_face(face, component)
         made.loading.add_dead_force("force", face.replace("0", "1"), component)
     stepper = made.stepper(lambda t: {"force": 10.0 * t}, law="none")
-    watcher = StabilityWatcher(stepper, every_step=True)
+    watcher = EquilibriumStability(stepper, every_step=True)
     steps = list(stepper.march([1.0, 2.0, 3.0], [watcher]))
     watcher.close()
     stretch = 1 + made.displacement.x.array.max()
@@ -177,7 +179,7 @@ def test_a_dead_hydrostatic_load_beyond_rivlins(caplog: pytest.LogCaptureFixture
 def test_a_start_that_is_indefinite_is_told_apart(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(monitor, "of_the_unloaded_body", lambda inertia: (1, -0.1))
+    monkeypatch.setattr(equilibrium_stability, "of_the_unloaded_body", lambda inertia: (1, -0.1))
     caplog.set_level(logging.INFO)
     run(pushed_cube(-20.0, **COLUMN, **{"remodeling.law": "none", "solver.unstable": "stop"}))
     assert not warnings(caplog)

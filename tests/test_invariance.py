@@ -17,7 +17,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mpi4py import MPI
 
-from remodel_fenicsx.body import cube
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.loading import Loading
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
@@ -30,6 +29,7 @@ from remodel_fenicsx.settings import Cells, Remodeling
 from remodel_fenicsx.state.state import State
 from remodel_fenicsx.state.unit_cells import UnitCells
 from tests import parts
+from tests.parts import cube
 
 QUARTER = parts.rotation((1.0, 0.0, 0.0), 90.0)  # carries the load axis z to -y
 OBLIQUE = parts.rotation((1.0, -2.0, 0.7), 71.0)

@@ -14,12 +14,12 @@ import ufl
 from mpi4py import MPI
 
 from remodel_fenicsx import Scene, SceneError, Simulation
-from remodel_fenicsx.body import cube, tube
 from remodel_fenicsx.evolution.stepper import Stepper
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.settings import Cells, Remodeling
 from tests import parts
+from tests.parts import cube, tube
 
 PARAMETERS = ("lame_lambda", "lame_mu", "network_modulus", "contour_length", "end_to_end_length")
 FORCE = 6.0

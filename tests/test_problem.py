@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import ufl
 
-from remodel_fenicsx.body import cube, tube
 from remodel_fenicsx.fem import jit, quadrature
 from remodel_fenicsx.model.operators import passes_through_zero
 from remodel_fenicsx.settings import Cells, Material
@@ -18,6 +17,7 @@ from remodel_fenicsx.solver.newton import SolveFailure
 from remodel_fenicsx.system.interrupts import Interrupted
 from tests import parts
 from tests.conftest import slowly
+from tests.parts import cube, tube
 
 RANDOM = Cells(initial="random", seed=3)
 

@@ -8,12 +8,12 @@ import pytest
 import ufl
 from mpi4py import MPI
 
-from remodel_fenicsx.body import cube, tube
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.kinematics import FullKinematics
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.settings import Cells
 from tests import parts
+from tests.parts import cube, tube
 
 AROUND, LENGTH, RADII = 8, 1.5, (1.0, 2.0, 3.0)
 

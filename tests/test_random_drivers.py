@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from remodel_fenicsx.body import tube
 from remodel_fenicsx.scene.scene import scene_from_dict
 from remodel_fenicsx.simulation import Simulation
 from tests.conftest import slowly
+from tests.parts import tube
 
 LENGTH = 0.5  # of a layer of elements
 SCENE = {

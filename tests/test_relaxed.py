@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from remodel_fenicsx.body import tube
 from remodel_fenicsx.model.cells import UnitCell, structure_tensor
 from remodel_fenicsx.model.laws import relaxed
 from remodel_fenicsx.scene import SceneError, preset_scene, scene_from_dict
 from remodel_fenicsx.simulation import Simulation
 from tests import parts
+from tests.parts import tube
 
 PAPER = "kuhl-holzapfel-2007"
 

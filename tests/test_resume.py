@@ -34,10 +34,10 @@ from remodel_fenicsx.settings import COUPLINGS, CouplingKind
 from remodel_fenicsx.solver.continuation import StepFailure, Work
 from remodel_fenicsx.state.state import State
 from remodel_fenicsx.system.interrupts import Paused
-from remodel_fenicsx.watch import chatter, monitor
-from remodel_fenicsx.watch.chatter import Chatter
+from remodel_fenicsx.watch import equilibrium_stability, over_correction
 from remodel_fenicsx.watch.locking import LockingWarning, Missing
-from remodel_fenicsx.watch.monitor import StabilityWatcher
+from remodel_fenicsx.watch.equilibrium_stability import EquilibriumStability
+from remodel_fenicsx.watch.over_correction import OverCorrection
 from tests.conftest import mpirun
 from tests.forks import forked
 from tests.parts import pulled_cube
@@ -492,21 +492,21 @@ def test_runs_that_go_on_say_what_one_run_says(tmp_path: Path, monkeypatch: pyte
     """Stopped after every step: nobody has forgotten what was seen, nothing is said twice."""
     push = {"loads.force.value": -30.0, "loads.force.ramp": [[0.0, 0.0], [3.0, 1.0]], "time.end": 8.0}
     cube = preset_scene("kuhl-holzapfel-2007", "cube").with_values({**push, "remodeling.kappa": 0.1})
-    monkeypatch.setattr(chatter, "GROWTH", np.inf)  # five passes are warned of, whatever they do
-    monkeypatch.setattr(chatter, "CELL_TOLERANCE", 0.0)
-    monkeypatch.setattr(chatter, "MOST", 1.0)
-    monkeypatch.setattr(Chatter, "_advice", lambda watcher, factor: "nothing")
+    monkeypatch.setattr(over_correction, "GROWTH", np.inf)  # five passes are warned of, whatever they do
+    monkeypatch.setattr(over_correction, "CELL_TOLERANCE", 0.0)
+    monkeypatch.setattr(over_correction, "RESTED_SHARE", 1.0)
+    monkeypatch.setattr(OverCorrection, "_advice", lambda watcher, factor: "nothing")
     monkeypatch.setattr(LockingWarning, "stiffness_ratio", lambda watcher: 1e9)
     monkeypatch.setattr(LockingWarning, "missing", lambda watcher: Missing(1.0, 0.0))
-    monkeypatch.setattr(monitor, "ITERATIONS_BETWEEN_LOOKS", 9)
+    monkeypatch.setattr(equilibrium_stability, "ITERATIONS_BETWEEN_LOOKS", 9)
     counts: list[int] = []
-    count = StabilityWatcher._count
+    count = EquilibriumStability._count
 
-    def counted(watcher: StabilityWatcher) -> float:
+    def counted(watcher: EquilibriumStability) -> float:
         counts.append(watcher.state.number)
         return count(watcher)
 
-    monkeypatch.setattr(StabilityWatcher, "_count", counted)
+    monkeypatch.setattr(EquilibriumStability, "_count", counted)
     expected = said(run(cube, tmp_path / "whole", SELF))
     looks = counts.copy()
     counts.clear()

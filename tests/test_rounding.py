@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from remodel_fenicsx.body import cube
 from remodel_fenicsx.scene import preset_scene
 from remodel_fenicsx.settings import Cells
 from remodel_fenicsx.simulation import Simulation
@@ -14,6 +13,7 @@ from remodel_fenicsx.solver import newton
 from remodel_fenicsx.solver.continuation import StepFailure
 from tests import parts
 from tests.reference.radial import RadialMaterial, Tube
+from tests.parts import cube
 
 PAPER = "kuhl-holzapfel-2007"
 

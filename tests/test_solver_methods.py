@@ -11,7 +11,6 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from remodel_fenicsx import Simulation
-from remodel_fenicsx.body.tube import tube
 from remodel_fenicsx.fem.solver_methods import LARGE, LARGE_ON_RANKS, METHODS, SMALL_BODY, SMALL_REDUCTION, chosen
 from remodel_fenicsx.scene import preset_scene
 from remodel_fenicsx.solver import linear
@@ -19,6 +18,7 @@ from remodel_fenicsx.solver.limits import Limits
 from remodel_fenicsx.solver.linear import KeptFactor, Lagged
 from remodel_fenicsx.solver.quasi_newton import Secants
 from tests import parts
+from tests.parts import tube
 
 SELF = MPI.COMM_SELF
 TUBE = {"geometry.length": 2.0, "time.end": 8.0, "loads.pressure.ramp": [[0.0, 0.0], [5.0, 1.0]],

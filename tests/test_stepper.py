@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from remodel_fenicsx.body import cube
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
 from remodel_fenicsx.settings import Cells
 from remodel_fenicsx.scene.scene import scene_from_dict
@@ -18,6 +17,7 @@ from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.solver.equilibrium import Extension
 from remodel_fenicsx.state.state import State
 from tests import parts
+from tests.parts import cube
 
 KAPPA = 0.4
 

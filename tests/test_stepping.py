@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from remodel_fenicsx.body import cube, tube
 from remodel_fenicsx.evolution.stepper import Stepper, times
 from remodel_fenicsx.settings import Cells
 from remodel_fenicsx.scene.scene import Load, preset_scene
@@ -18,6 +17,7 @@ from remodel_fenicsx.solver.equilibrium import Extension
 from remodel_fenicsx.solver.newton import GuardedNewton, Solution, SolveFailure
 from tests import parts
 from tests.conftest import slowly
+from tests.parts import cube, tube
 
 FORCE = 14.0
 

@@ -10,7 +10,7 @@ import pytest
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from remodel_fenicsx.body import Cube, LoadKind, tube
+from remodel_fenicsx.body import Cube, LoadKind
 from remodel_fenicsx.results.recording import Recording
 from remodel_fenicsx.running import resume
 from remodel_fenicsx.running import run as record
@@ -18,6 +18,7 @@ from remodel_fenicsx.scene.scene import SceneError, scene_from_dict
 from remodel_fenicsx.schema.units import FORCE
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.solver.blend import Blend
+from tests.parts import tube
 
 Array = NDArray[np.float64]
 KAPPA = 0.025

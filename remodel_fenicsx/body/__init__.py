@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from remodel_fenicsx.body.cube import Cube, cube
+from remodel_fenicsx.body.cube import Cube
 from remodel_fenicsx.body.gmsh_model import GeometryError
 from remodel_fenicsx.body.shape import LoadKind, Shape
-from remodel_fenicsx.body.tendon import Tendon, tendon
-from remodel_fenicsx.body.tube import Tube, tube
+from remodel_fenicsx.body.tendon import Tendon
+from remodel_fenicsx.body.tube import Tube
 
 __all__ = [
     "SHAPES",
@@ -16,9 +16,6 @@ __all__ = [
     "Shape",
     "Tendon",
     "Tube",
-    "cube",
-    "tendon",
-    "tube",
 ]
 
 SHAPES: dict[str, type[Shape]] = {"cube": Cube, "tendon": Tendon, "tube": Tube}

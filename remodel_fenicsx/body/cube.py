@@ -45,11 +45,6 @@ class Cube(Shape):
     )
 
     @property
-    def loaded_area(self) -> float:
-        """Area that carries `force`."""
-        return self.side**2
-
-    @property
     def axial_length(self) -> float:
         """The side."""
         return self.side
@@ -65,49 +60,18 @@ class Cube(Shape):
         return self
 
     def build(self, mesh: Mesh, comm: MPI.Intracomm | None = None) -> Domain:
-        """Mesh the cube."""
-        return cube(self.side, mesh.refinement, mesh.element, mesh.degree, comm)
+        """The cube [0, side]^3; with refinement 1 the paper's single element."""
+        from remodel_fenicsx.body.domain import build_domain
+
+        def draw() -> None:
+            draw_cube(self.side, mesh.refinement, mesh.element, mesh.degree)
+
+        return build_domain(draw, self.name, {"side": self.side}, comm)
 
     def hold(self, loading: Loading) -> None:
         """Symmetry planes x = y = z = 0."""
         for component, face in enumerate(("x0", "y0", "z0")):
             loading.hold_face(face, component)
-
-
-def cube(
-    side: float = 1.0,
-    refinement: int = 1,
-    element: str = "hexahedron",
-    degree: int = 1,
-    comm: MPI.Intracomm | None = None,
-) -> Domain:
-    """Cube [0, side]^3 with the faces x0, x1, y0, y1, z0, z1. Collective.
-
-    Parameters
-    ----------
-    side
-        Length of the edges.
-    refinement
-        Elements along each edge; 1 is the paper's single element.
-    element
-        "hexahedron", or "tetrahedron": each hexahedron split into six.
-    degree
-        Of the geometry, 1 or 2.
-    comm
-        Ranks that share the mesh; default: all.
-
-    Raises
-    ------
-    ValueError
-        If a value is not allowed.
-    GeometryError
-        On all ranks, if Gmsh fails on rank 0.
-    """
-    model.check_arguments({"side": side}, refinement, element, degree)
-    model.check_lengths({"side": side})
-    from remodel_fenicsx.body.domain import build_domain
-
-    return build_domain(lambda: draw_cube(side, refinement, element, degree), "cube", {"side": float(side)}, comm)
 
 
 def draw_cube(side: float, refinement: int = 1, element: str = "hexahedron", degree: int = 1) -> None:

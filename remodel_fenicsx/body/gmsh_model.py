@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-ELEMENTS = ("hexahedron", "tetrahedron")
-DEGREES = (1, 2)
 # Gmsh takes points that are closer than 1e-8 for one, and crashes on much longer or flatter bodies
 SMALLEST_LENGTH, LARGEST_LENGTH, LARGEST_LENGTH_RATIO = 1e-6, 1e6, 1e4
 
@@ -38,26 +35,6 @@ def length_fault(lengths: Mapping[str, float]) -> tuple[str, str] | None:
         f"a length of {lengths[smallest]:g} is too small beside one of {lengths[largest]:g}; "
         f"allowed is a ratio up to {LARGEST_LENGTH_RATIO:g}"
     )
-
-
-def check_arguments(lengths: Mapping[str, float], refinement: Any, element: str, degree: int) -> None:
-    """Refuse what is no body or no mesh, by the same one-line ValueError on every rank."""
-    for name, value in lengths.items():
-        if not (np.isfinite(value) and value > 0.0):
-            raise ValueError(f"{name} = {value}: must be a positive number")
-    if not (isinstance(refinement, (int, np.integer)) and refinement >= 1):
-        raise ValueError(f"refinement = {refinement}: must be a whole number of at least 1")
-    if element not in ELEMENTS:
-        raise ValueError(f"element = {element!r}: allowed are {', '.join(ELEMENTS)}")
-    if degree not in DEGREES:
-        raise ValueError(f"degree = {degree}: allowed are 1 and 2")
-
-
-def check_lengths(lengths: Mapping[str, float]) -> None:
-    """Refuse lengths and thicknesses, by the argument that decides them, with which Gmsh fails (`length_fault`)."""
-    found = length_fault(lengths)
-    if found is not None:
-        raise ValueError(f"{found[0]}: {found[1]}")
 
 
 @contextmanager
@@ -101,15 +78,6 @@ def named_faces() -> dict[str, int]:
     if len(volumes) != 1 or len(kinds) != 1 or not faces:
         raise GeometryError(f"{len(volumes)} named volumes, {len(kinds)} types of elements, {len(faces)} named faces")
     return {gmsh.model.getPhysicalName(2, tag): tag for _, tag in faces}
-
-
-def write_msh(path: str | Path, draw: Callable[[], None]) -> None:
-    """Write what `draw` makes as a Gmsh file (format 4.1, ASCII); call it on one rank only."""
-    with gmsh_model(Path(path).stem) as gmsh:
-        draw()
-        gmsh.option.setNumber("Mesh.MshFileVersion", 4.1)
-        gmsh.option.setNumber("Mesh.Binary", 0)
-        gmsh.write(str(path))
 
 
 # ---------------------------------------------------------------- what the shapes are made of

@@ -136,13 +136,8 @@ def threats(scene: Any) -> list[str]:
     return words
 
 
-def expected_cost(scene: Any, name: str) -> float:
-    """Of a step, in that of the full kinematics; a rough figure from the number of quadrature points."""
-    return step_cost(scene, name) / step_cost(scene, "full")
-
-
 def step_cost(scene: Any, name: str) -> float:
-    """In that of one point of a hexahedron."""
+    """Of a step, in that of one point of a hexahedron; a rough figure from the number of quadrature points."""
     kinematics, mesh = KINEMATICS[name], scene.mesh
     element, number = kinematics.element(mesh.element), scene.geometry.number_of_elements * mesh.refinement**3
     if element == "tetrahedron":
@@ -153,7 +148,7 @@ def step_cost(scene: Any, name: str) -> float:
 
 
 def _cost(scene: Any, name: str) -> str:
-    cost = expected_cost(scene, name)
+    cost = step_cost(scene, name) / step_cost(scene, "full")
     if cost > 0.7:
         return "about the cost of 'full'"
     return f"about 1/{float(f'{1 / cost:.1g}'):g} of the cost of 'full'"

@@ -119,8 +119,8 @@ class Shape(Table):
 
     @property
     def loaded_area(self) -> float:
-        """Reference area that carries a force, in the scene's unit of length squared."""
-        raise NotImplementedError(f"a {self.name} has no loads of the dimension of a force")
+        """Reference area that carries a force, in the scene's unit of length squared; here the section's."""
+        return self.section_area
 
     @property
     def axial_length(self) -> float:
@@ -129,7 +129,7 @@ class Shape(Table):
 
     @property
     def section_area(self) -> float:
-        """Area of every section across z, for reduced kinematics."""
+        """Area of every section across z."""
         raise NotImplementedError(f"a {self.name} has no section across z")
 
     @property

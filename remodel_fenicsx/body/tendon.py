@@ -62,11 +62,6 @@ class Tendon(Shape):
     )
 
     @property
-    def loaded_area(self) -> float:
-        """Area that carries `force`."""
-        return self.area
-
-    @property
     def axial_length(self) -> float:
         """The length."""
         return self.length
@@ -92,8 +87,18 @@ class Tendon(Shape):
         return self
 
     def build(self, mesh: Mesh, comm: MPI.Intracomm | None = None) -> Domain:
-        """Mesh the tendon."""
-        return tendon(self.length, self.area, mesh.refinement, mesh.element, mesh.degree, comm)
+        """A core of 4 x 4 elements with rounded sides inside two rings of 16, ten layers; times the refinement.
+
+        There are nodes in the centre of the section and on the axes. `dimensions["radius"]` is the radius of the outer
+        nodes: a little more than sqrt(area / pi), so that the area of the mesh is `area`.
+        """
+        from remodel_fenicsx.body.domain import build_domain
+
+        def draw() -> None:
+            draw_tendon(self.length, self.area, mesh.refinement, mesh.element, mesh.degree)
+
+        radius = outer_radius(self.area, mesh.refinement, mesh.degree)
+        return build_domain(draw, self.name, _dimensions(self.length, self.area, radius), comm)
 
     def hold(self, loading: Loading) -> None:
         """u_z = 0 at the bottom, the rigid motions held at two of its nodes."""
@@ -101,50 +106,6 @@ class Tendon(Shape):
         loading.hold_node((0.0, 0.0, 0.0), 0)
         loading.hold_node((0.0, 0.0, 0.0), 1)
         loading.hold_node((loading.domain.dimensions["radius"], 0.0, 0.0), 1)
-
-
-def tendon(
-    length: float = 10.0,
-    area: float = 10.0,
-    refinement: int = 1,
-    element: str = "hexahedron",
-    degree: int = 1,
-    comm: MPI.Intracomm | None = None,
-) -> Domain:
-    """Tendon around the z axis, 0 <= z <= length, with the faces bottom, top, side. Collective.
-
-    The cross-section is a 4 x 4 core with rounded sides inside two rings of 16 elements. There are nodes in its centre
-    and on the axes. `dimensions["radius"]` is the radius of the outer nodes: a little more than sqrt(area / pi), so
-    that the area of the mesh is `area`.
-
-    Parameters
-    ----------
-    length
-        Height, in the scene's unit of length.
-    area
-        Of the meshed cross-section, exactly.
-    refinement
-        Multiplies the paper's counts in every direction: a core of 4 x 4, two rings of 16, ten layers.
-    element
-        "hexahedron", or "tetrahedron": each hexahedron split into six.
-    degree
-        Of the geometry, 1 or 2 (curved).
-    comm
-        Ranks that share the mesh; default: all.
-
-    Raises
-    ------
-    ValueError
-        If a value is not allowed.
-    GeometryError
-        On all ranks, if Gmsh fails on rank 0.
-    """
-    model.check_arguments({"length": length, "area": area}, refinement, element, degree)
-    model.check_lengths({"length": length, "area": math.sqrt(area)})
-    dimensions = _dimensions(length, area, outer_radius(area, refinement, degree))
-    from remodel_fenicsx.body.domain import build_domain
-
-    return build_domain(lambda: draw_tendon(length, area, refinement, element, degree), "tendon", dimensions, comm)
 
 
 def _dimensions(length: float, area: float, radius: float) -> dict[str, float]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -47,7 +47,7 @@ def build_ray(scene: Any, comm: Any = None) -> Domain:
     shape, faces = scene.geometry, _faces(scene.geometry, "inner", "outer")
     ends = (shape.inner_radius, 0.0, 0.0), (shape.outer_radius, 0.0, 0.0)
     elements = PAPER[1] * scene.mesh.refinement
-    return interval_domain(*ends, elements, scene.mesh.degree, faces, shape.name, _named_dimensions(shape), comm)
+    return interval_domain(*ends, elements, scene.mesh.degree, faces, shape.name, _dimensions(shape), comm)
 
 
 def build_half_plane(scene: Any, comm: Any = None) -> Domain:
@@ -58,7 +58,7 @@ def build_half_plane(scene: Any, comm: Any = None) -> Domain:
     elements = PAPER[1] * scene.mesh.refinement, PAPER[2] * scene.mesh.refinement
     radii = shape.inner_radius, shape.outer_radius
     return half_plane_domain(
-        radii, shape.length, elements, scene.mesh.degree, faces, shape.name, _named_dimensions(shape), comm
+        radii, shape.length, elements, scene.mesh.degree, faces, shape.name, _dimensions(shape), comm
     )
 
 
@@ -67,12 +67,12 @@ def build_quarter(scene: Any, comm: Any = None) -> Domain:
     from remodel_fenicsx.body.domain import build_domain
 
     shape, mesh = scene.geometry, scene.mesh
-    counts = PAPER[0] * mesh.refinement, PAPER[1] * mesh.refinement, layers(scene)
+    counts = (*_counts(mesh)[:2], layers(scene))
 
     def draw() -> None:
         draw_quarter(shape.inner_radius, shape.outer_radius, shape.length, counts, mesh.element, mesh.degree)
 
-    return build_domain(draw, shape.name, _named_dimensions(shape), comm)
+    return build_domain(draw, shape.name, _dimensions(shape), comm)
 
 
 def layers(scene: Any) -> int:
@@ -110,7 +110,13 @@ def _faces(shape: Any, *names: str) -> dict[str, Any]:
     return {name: places[name] for name in names}
 
 
-def _named_dimensions(shape: Any) -> dict[str, float]:
+def _counts(mesh: Mesh) -> tuple[int, int, int]:
+    """Elements of the whole tube around, through the wall and along."""
+    around, through, along = (mesh.refinement * count for count in PAPER)
+    return around, through, along
+
+
+def _dimensions(shape: Any) -> dict[str, float]:
     return {name: float(getattr(shape, name)) for name in ("inner_radius", "outer_radius", "length")}
 
 
@@ -270,9 +276,8 @@ class Tube(Shape):
         return self
 
     def build(self, mesh: Mesh, comm: MPI.Intracomm | None = None) -> Domain:
-        """Mesh the whole tube."""
-        size = self.inner_radius, self.outer_radius, self.length
-        return tube(*size, mesh.refinement, mesh.element, mesh.degree, comm)
+        """The paper's 16 elements around, 8 through the wall and 12 along, times the refinement."""
+        return whole_tube(self, _counts(mesh), mesh.element, mesh.degree, comm)
 
     def hold(self, loading: Loading) -> None:
         """u_z = 0 at the bottom, the rigid motions held at three of its nodes."""
@@ -292,11 +297,6 @@ class Tube(Shape):
         """As with free ends, with caps on which the pressure acts."""
         self.hold(loading)
         loading.has_caps = True
-
-    @property
-    def loaded_area(self) -> float:
-        """Of the wall."""
-        return self.section_area
 
     @property
     def axial_length(self) -> float:
@@ -341,71 +341,27 @@ class Tube(Shape):
         return radial_share(dimensions, axes, coordinates)
 
 
-def tube(
-    inner_radius: float = 1.0,
-    outer_radius: float = 3.0,
-    length: float = 8.0,
-    refinement: int = 1,
-    element: str = "hexahedron",
-    degree: int = 1,
-    comm: MPI.Intracomm | None = None,
-    divisions: tuple[int, int, int] | None = None,
+def whole_tube(
+    shape: Tube, counts: tuple[int, int, int], element: str, degree: int, comm: MPI.Intracomm | None = None
 ) -> Domain:
-    """Tube around the z axis, 0 <= z <= length, with the faces bottom, top, inner, outer. Collective.
+    """The mesh of a tube with so many elements around (a multiple of 4), through the wall and along. Collective.
 
     The nodes lie exactly on the radii, equally spaced through the wall; some are on the positive and negative x and y
     axes. Elements of degree 1 have plane faces: their inner and outer faces are regular prisms inside the cylinders.
-
-    Parameters
-    ----------
-    inner_radius, outer_radius, length
-        Of the reference body, in the scene's unit of length.
-    refinement
-        Multiplies the paper's 16 elements around, 8 through the wall, 12 along.
-    element
-        "hexahedron", or "tetrahedron": each hexahedron split into six.
-    degree
-        Of the geometry, 1 or 2 (curved).
-    comm
-        Ranks that share the mesh; default: all.
-    divisions
-        Elements around (a multiple of 4), through the wall and along, in place of the paper's 16, 8, 12; `refinement`
-        multiplies them too.
-
-    Raises
-    ------
-    ValueError
-        If a value is not allowed.
-    GeometryError
-        On all ranks, if Gmsh fails on rank 0.
     """
-    dimensions = {"inner_radius": inner_radius, "outer_radius": outer_radius, "length": length}
-    model.check_arguments(dimensions, refinement, element, degree)
-    if not inner_radius < outer_radius:
-        raise ValueError(f"inner_radius = {inner_radius}: must be smaller than outer_radius = {outer_radius}")
-    model.check_lengths({"inner_radius": inner_radius, "outer_radius": outer_radius - inner_radius, "length": length})
-    counts = PAPER if divisions is None else _checked(divisions)
     from remodel_fenicsx.body.domain import build_domain
 
-    return build_domain(
-        lambda: draw_tube(inner_radius, outer_radius, length, refinement, element, degree, counts),
-        "tube",
-        {name: float(value) for name, value in dimensions.items()},
-        comm,
-    )
+    def draw() -> None:
+        draw_tube(shape.inner_radius, shape.outer_radius, shape.length, counts, element, degree)
+
+    return build_domain(draw, shape.name, _dimensions(shape), comm)
 
 
 def draw_tube(
-    inner_radius: float,
-    outer_radius: float,
-    length: float,
-    refinement: int = 1,
-    element: str = "hexahedron",
-    degree: int = 1,
-    divisions: tuple[int, int, int] = PAPER,
+    inner_radius: float, outer_radius: float, length: float, counts: tuple[int, int, int], element: str, degree: int
 ) -> None:
     """Draw and mesh the tube in the current Gmsh model: four quarters, swept along z."""
-    number, through, along = (refinement * count for count in divisions)
+    number, through, along = counts
     quarter = number // 4
     inner = model.points(model.circle(inner_radius, number))
     outer = model.points(model.circle(outer_radius, number))
@@ -424,15 +380,3 @@ def draw_tube(
         section.append(model.block(edges, [inner[k], outer[k], outer[m], inner[m]], element))
     model.extrude(section, length, along, element, {"inner": inner_lines, "outer": outer_lines})
     model.raise_degree(degree, np.ones_like)
-
-
-def _checked(divisions: Sequence[int]) -> tuple[int, int, int]:
-    """The three counts, or the ValueError that says what they must be."""
-    whole = all(isinstance(count, (int, np.integer)) and count >= 1 for count in divisions)
-    if len(divisions) != 3 or not whole or divisions[0] % 4:
-        raise ValueError(
-            f"divisions = {tuple(divisions)}: must be three whole numbers of at least 1 (elements around, through the "
-            "wall, along), the first a multiple of 4"
-        )
-    around, through, along = divisions
-    return around, through, along

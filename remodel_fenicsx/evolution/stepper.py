@@ -43,7 +43,8 @@ class Step:
     time_error
         Estimated error in time of the solved state, degrees; NaN where nobody estimates it (`time_error.TimeError`).
     negative_eigenvalues
-        Of the tangent at the solved state, where somebody has counted them; NaN where not (`monitor.StabilityWatcher`).
+        Of the tangent at the solved state, where somebody has counted them; NaN where not
+        (`watch.equilibrium_stability`).
     row
         Its columns by name, where somebody measures (`results.columns.Observer`).
     """

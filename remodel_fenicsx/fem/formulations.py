@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,45 +17,37 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 
-class TwoParts(Protocol):
-    """What a formulation needs of a material (`model.energy.Tissue`), cells as it takes them."""
+class Dilatation:
+    """A formulation on a mesh: the energy's integral, and stresses and J to go with it; here J at all points."""
 
-    def strain_energy(self, deformation_gradient: Any, cells: Any) -> Any:
-        """All of W."""
+    def __init__(self, quadrature: Any):
+        self.quadrature = quadrature
 
-    def distortional_energy(self, deformation_gradient: Any, cells: Any) -> Any:
-        """W without its volumetric part."""
-
-    def volumetric_energy(self, jacobian: Any) -> Any:
-        """The volumetric part."""
-
-    def stresses(self, deformation_gradient: Any, cells: Any) -> Any:
-        """Stresses of W."""
-
-    def stresses_of_parts(self, deformation_gradient: Any, cells: Any, jacobian: Any) -> Any:
-        """Stresses of W with the Kirchhoff pressure that belongs to another J."""
-
-
-class Dilatation(Protocol):
-    """A formulation on a mesh: the energy's integral, and stresses and J to go with it."""
-
-    def energies(self, tissue: TwoParts, deformation_gradient: Any, cells: Any, weight: Any) -> list[Any]:
+    def energies(self, tissue: Any, deformation_gradient: Any, cells: Any, weight: Any) -> list[Any]:
         """UFL forms whose sum is the integral of W over the body; `weight` is the body's volume per unit of mesh.
 
         They are compiled one by one: FFCx mixes up values of two quadrature rules that meet in one kernel.
-        """
 
-    def stresses(self, tissue: TwoParts, deformation_gradient: Any, cells: Any) -> Any:
+        Parameters
+        ----------
+        tissue
+            Whose energy it is (`model.energy.Tissue`), cells as it takes them.
+        """
+        return [tissue.strain_energy(deformation_gradient, cells) * weight * self.quadrature.dx]
+
+    def stresses(self, tissue: Any, deformation_gradient: Any, cells: Any) -> Any:
         """Stresses (UFL) at the quadrature points, as the residual has them. They belong to the last `refresh`."""
+        return tissue.stresses(deformation_gradient, cells)
 
     def refresh(self) -> None:
         """Take what `stresses` needs beside F from the present unknowns."""
 
     def jacobians(self) -> Array:
         """J of the present unknowns where the formulation takes it beside the quadrature points, (elements, any)."""
+        return np.empty((len(self.quadrature.elements), 0))
 
 
-class Formulation(Protocol):
+class Formulation:
     """What scenes, states and warnings ask of a formulation.
 
     Attributes
@@ -68,64 +60,31 @@ class Formulation(Protocol):
         Whether differences of J inside an element cost energy: elements lock where the bulk is stiff.
     """
 
-    @property
-    def meaning(self) -> str: ...
-
-    @property
-    def takes_parts(self) -> bool: ...
-
-    @property
-    def locks(self) -> bool: ...
-
-    def has(self, element: str, degree: int) -> bool:
-        """Whether it changes anything for such an element."""
-
-    def on(self, kinematics: Any, unknown: Any, quadrature: Any) -> Dilatation:
-        """The formulation for these unknowns at these points."""
-
-
-# ---------------------------------------------------------------- J at all points
-
-
-@dataclass(frozen=True)
-class AtAllPoints:
-    """W as it stands, at all quadrature points."""
-
     meaning: str
     takes_parts: bool = False
     locks: bool = True
 
     def has(self, element: str, degree: int) -> bool:
-        """Always."""
+        """Whether it changes anything for such an element."""
         return True
 
     def on(self, kinematics: Any, unknown: Any, quadrature: Any) -> Dilatation:
-        """Nothing to prepare."""
-        return _WholeEnergy(quadrature)
+        """The formulation for these unknowns at these points."""
+        return Dilatation(quadrature)
 
 
-class _WholeEnergy:
-    def __init__(self, quadrature: Any):
-        self.quadrature = quadrature
+@dataclass(frozen=True)
+class AtAllPoints(Formulation):
+    """W as it stands, at all quadrature points."""
 
-    def energies(self, tissue: TwoParts, deformation_gradient: Any, cells: Any, weight: Any) -> list[Any]:
-        return [tissue.strain_energy(deformation_gradient, cells) * weight * self.quadrature.dx]
-
-    def stresses(self, tissue: TwoParts, deformation_gradient: Any, cells: Any) -> Any:
-        return tissue.stresses(deformation_gradient, cells)
-
-    def refresh(self) -> None:
-        pass
-
-    def jacobians(self) -> Array:
-        return np.empty((len(self.quadrature.elements), 0))
+    meaning: str
 
 
 # ---------------------------------------------------------------- J at fewer points
 
 
 @dataclass(frozen=True)
-class Selective:
+class Selective(Formulation):
     """The volumetric part by a rule of fewer points; in between, its J is the polynomial through them.
 
     Attributes
@@ -149,14 +108,14 @@ class Selective:
         return _PartsApart(kinematics, unknown, quadrature, degree)
 
 
-class _PartsApart:
+class _PartsApart(Dilatation):
     def __init__(self, kinematics: Any, unknown: Any, quadrature: Any, degree: int):
         import basix
         import ufl
 
         from remodel_fenicsx.fem import jit
 
-        self.quadrature = quadrature
+        super().__init__(quadrature)
         self.dx = ufl.Measure("dx", domain=quadrature.mesh, metadata={"quadrature_degree": degree})
         kind = basix.CellType[quadrature.element_kind]
         points = np.asarray(basix.make_quadrature(kind, degree)[0], dtype=np.float64)
@@ -168,14 +127,14 @@ class _PartsApart:
         self._jacobian = quadrature.function("jacobian_of_the_formulation", ())
         self.refresh()
 
-    def energies(self, tissue: TwoParts, deformation_gradient: Any, cells: Any, weight: Any) -> list[Any]:
+    def energies(self, tissue: Any, deformation_gradient: Any, cells: Any, weight: Any) -> list[Any]:
         import ufl
 
         distortional = tissue.distortional_energy(deformation_gradient, cells)
         volumetric = tissue.volumetric_energy(ufl.det(deformation_gradient))
         return [distortional * weight * self.quadrature.dx, volumetric * weight * self.dx]
 
-    def stresses(self, tissue: TwoParts, deformation_gradient: Any, cells: Any) -> Any:
+    def stresses(self, tissue: Any, deformation_gradient: Any, cells: Any) -> Any:
         return tissue.stresses_of_parts(deformation_gradient, cells, self._jacobian)
 
     def refresh(self) -> None:

@@ -6,8 +6,9 @@ it is needed: scenes, which name kinematics, are read without it.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,17 +16,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 
-class Body(Protocol):
-    """What a reduced kinematics must know of a body (`body.shape.Shape`)."""
-
-    @property
-    def axial_length(self) -> float: ...
-
-    @property
-    def section_area(self) -> float: ...
-
-
-class Kinematics(Protocol):
+class Kinematics(ABC):
     """What forms, supports and records need to know of the unknowns.
 
     Attributes
@@ -46,76 +37,62 @@ class Kinematics(Protocol):
         Of a step for each quadrature point, in that of one of a hexahedron, as measured on the artery.
     """
 
-    @property
-    def name(self) -> str: ...
-
-    @property
-    def meaning(self) -> str: ...
-
-    @property
-    def reduced(self) -> bool: ...
-
-    @property
-    def moves_rigidly(self) -> bool: ...
-
-    @property
-    def symmetry_planes(self) -> Mapping[str, int]: ...
-
-    @property
-    def homogeneous(self) -> bool: ...
-
-    @property
-    def cost(self) -> float: ...
-
-    def element(self, kind: str) -> str:
-        """Kind of the mesh's elements where the scene asks for elements of the body of this kind."""
-
-    def on(self, mesh: Any, body: Body) -> Kinematics:
-        """The kinematics for the mesh of a body."""
-
-    def unknown(self, mesh: Any, degree: int) -> Any:
-        """A dolfinx function of the unknowns, zero, with elements of this degree."""
-
-    def displacement(self, unknown: Any) -> Any:
-        """UFL 3-vector, linear in the unknown: so it is also the virtual displacement of a test function."""
-
-    def deformation_gradient(self, unknown: Any) -> Any:
-        """F, UFL, always of shape (3, 3)."""
-
-    def weight(self, mesh: Any) -> Any:
-        """Volume of the body per unit of mesh, a number or UFL."""
-
-    def subspace(self, space: Any, component: int) -> Any:
-        """The part of the unknown's space that a support of the displacement in x, y or z (0, 1, 2) holds, or None."""
-
-    def uniform_strain(self, component: int) -> Any:
-        """The Constant that is the engineering strain along x, y or z where it is prescribed as a whole, or None."""
-
-    def nodal_space(self, unknown: Any) -> Any:
-        """A space, scalar or blocked, with the mesh's nodes in the order of `nodal_displacement`."""
-
-    def nodal_displacement(self, unknown: Any) -> Array:
-        """Displacement of the local nodes, (nodes, 3)."""
-
-
-class FullKinematics:
-    """The displacement field in three dimensions: F = I + grad u."""
-
-    name: ClassVar[str] = "full"
-    meaning: ClassVar[str] = "the displacement in three dimensions"
-    reduced: ClassVar[bool] = False
-    moves_rigidly: ClassVar[bool] = True
+    name: ClassVar[str]
+    meaning: ClassVar[str]
+    reduced: ClassVar[bool] = True
+    moves_rigidly: ClassVar[bool] = False
     symmetry_planes: ClassVar[Mapping[str, int]] = {}
     homogeneous: ClassVar[bool] = False
     cost: ClassVar[float] = 1.0
 
     def element(self, kind: str) -> str:
-        """The same."""
+        """Kind of the mesh's elements where the scene asks for elements of the body of this kind."""
         return kind
 
-    def on(self, mesh: Any, body: Body) -> Kinematics:
-        """The same for every mesh."""
+    def on(self, mesh: Any, body: Any) -> Kinematics:
+        """The kinematics for the mesh of a body (`body.shape.Shape`)."""
         return self
+
+    @abstractmethod
+    def unknown(self, mesh: Any, degree: int) -> Any:
+        """A dolfinx function of the unknowns, zero, with elements of this degree."""
+
+    @abstractmethod
+    def displacement(self, unknown: Any) -> Any:
+        """UFL 3-vector, linear in the unknown: so it is also the virtual displacement of a test function."""
+
+    @abstractmethod
+    def deformation_gradient(self, unknown: Any) -> Any:
+        """F, UFL, always of shape (3, 3)."""
+
+    def weight(self, mesh: Any) -> Any:
+        """Volume of the body per unit of mesh, a number or UFL; one where the mesh is the body."""
+        return 1
+
+    def subspace(self, space: Any, component: int) -> Any:
+        """The part of the unknown's space that a support of the displacement in x, y or z (0, 1, 2) holds, or None."""
+        return space.sub(component)
+
+    def uniform_strain(self, component: int) -> Any:
+        """The Constant that is the engineering strain along x, y or z where it is prescribed as a whole, or None."""
+        return None
+
+    def nodal_space(self, unknown: Any) -> Any:
+        """A space, scalar or blocked, with the mesh's nodes in the order of `nodal_displacement`."""
+        return unknown.function_space
+
+    @abstractmethod
+    def nodal_displacement(self, unknown: Any) -> Array:
+        """Displacement of the local nodes, (nodes, 3)."""
+
+
+class FullKinematics(Kinematics):
+    """The displacement field in three dimensions: F = I + grad u."""
+
+    name = "full"
+    meaning = "the displacement in three dimensions"
+    reduced = False
+    moves_rigidly = True
 
     def unknown(self, mesh: Any, degree: int) -> Any:
         """A vector function, zero."""
@@ -130,22 +107,6 @@ class FullKinematics:
         import ufl
 
         return ufl.Identity(3) + ufl.grad(unknown)
-
-    def weight(self, mesh: Any) -> Any:
-        """One: the mesh is the body."""
-        return 1
-
-    def subspace(self, space: Any, component: int) -> Any:
-        """The component's own subspace."""
-        return space.sub(component)
-
-    def uniform_strain(self, component: int) -> Any:
-        """None: every strain follows from the field."""
-        return None
-
-    def nodal_space(self, unknown: Any) -> Any:
-        """The unknown's own."""
-        return unknown.function_space
 
     def nodal_displacement(self, unknown: Any) -> Array:
         """The unknown's own memory, (nodes, 3)."""
@@ -165,7 +126,6 @@ class SectorKinematics(FullKinematics):
     name = "sector"
     meaning = "the same on a quarter of a tube, with planes of symmetry"
     reduced = True
-    homogeneous = False
     moves_rigidly = False
     symmetry_planes: ClassVar[Mapping[str, int]] = {"plane_x": 0, "plane_y": 1}
 
@@ -174,17 +134,13 @@ class SectorKinematics(FullKinematics):
         return 4
 
 
-class _Reduced:
+class _Reduced(Kinematics):
     """What the kinematics with fewer dimensions have in common."""
 
-    reduced: ClassVar[bool] = True
-    homogeneous: ClassVar[bool] = False
-    moves_rigidly: ClassVar[bool] = False
-    symmetry_planes: ClassVar[Mapping[str, int]] = {}
     element_kind: ClassVar[str]
     components: ClassVar[tuple[int | None, int | None, int | None]]  # of the unknown, by that of the displacement
 
-    def __init__(self, mesh: Any = None, body: Body | None = None):
+    def __init__(self, mesh: Any = None, body: Any = None):
         self.mesh, self.body = mesh, body
         if mesh is not None and body is not None:  # Constants, so that another body compiles nothing
             self.axial_length = _constant(mesh, body.axial_length)
@@ -194,7 +150,7 @@ class _Reduced:
         """Of fewer dimensions."""
         return self.element_kind
 
-    def on(self, mesh: Any, body: Body) -> Any:
+    def on(self, mesh: Any, body: Any) -> Kinematics:
         """One of its own: its numbers belong to the mesh."""
         return type(self)(mesh, body)
 
@@ -202,14 +158,6 @@ class _Reduced:
         """The component's own subspace, if it is a field."""
         own = self.components[component]
         return None if own is None else space.sub(own)
-
-    def uniform_strain(self, component: int) -> Any:
-        """None."""
-        return None
-
-    def nodal_space(self, unknown: Any) -> Any:
-        """The unknown's own."""
-        return unknown.function_space
 
 
 class AxisymmetricKinematics(_Reduced):
@@ -263,7 +211,7 @@ class RadialKinematics(_Reduced):
     components = (None, None, None)
     cost = 0.2
 
-    def __init__(self, mesh: Any = None, body: Body | None = None):
+    def __init__(self, mesh: Any = None, body: Any = None):
         super().__init__(mesh, body)
         if mesh is not None:
             self.axial_strain = _constant(mesh, 0.0)
@@ -346,7 +294,6 @@ class PointKinematics(_Reduced):
 
     def nodal_displacement(self, unknown: Any) -> Array:
         """Of the nodes of the bar, (nodes, 3)."""
-        assert self.body is not None
         places: Array = self._nodes.tabulate_dof_coordinates()
         # a rank without the element has neither nodes nor numbers
         return places * unknown.x.array.reshape(-1, 3)[:1] / self.body.axial_length if len(places) else places
@@ -382,7 +329,7 @@ class FreeLength:
         Whose length it is.
     """
 
-    def __init__(self, kinematics: Kinematics, body: Body):
+    def __init__(self, kinematics: Kinematics, body: Any):
         self.field, self.body = kinematics, body
 
     def __getattr__(self, name: str) -> Any:

@@ -1,1 +1,21 @@
-"""What the paper says: chains, energy, drivers, laws, unit cells. Plain functions on arrays or UFL, no mesh."""
+"""What the paper says, in its order. Plain functions on arrays or UFL, no mesh.
+
+========= ====================================================== ================================================
+eq.       what it says                                           where
+========= ====================================================== ================================================
+(1), (2)  energy and force of one wormlike chain                 `chains`
+(3), (4)  W = W_iso + W_chn + W_rep                              `energy` (the only place where W is written)
+(5)       end-to-end length r from the cell's I_I = n_I . C n_I  `cells` (the unit cell), `energy`
+(6), (7)  Cauchy stress, by differentiation of W                 `energy`: `Tissue.stresses`
+(8)       principal values and axes of the driving tensor        `drivers` (which tensor), `spectral` (its axes)
+(9)       n_I = the principal axes, l_I -> r0 e                  `drivers` (frames), `spectral.positive_direction`
+(10)      rate of l_I                                            `laws.rate`
+(11)      l_I in closed form                                     `laws.explicit`
+Remark 5  the older law, which turns the fibres                  `laws.rotation`
+Remark 6  power of remodeling                                    `energy`: `Tissue.energy_increment`
+========= ====================================================== ================================================
+
+What the printed equations get wrong is mended where they stand, under the numbers of docs/theory.md ("erratum 1"). Not
+in the paper: the law for the structure tensor (`tensor_law`, `logarithm`), and cells that answer within a solve
+(`implicit`). Tools: `operators` (one name on arrays and in UFL), `mandel` (symmetric tensors as six numbers).
+"""

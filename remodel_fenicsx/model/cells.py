@@ -52,9 +52,10 @@ def global_axes(coordinates: Array) -> Array:
 def cylindrical_axes(coordinates: Array) -> Array:
     """Circumferential, axial and radial direction about the z axis: rows, (..., 3, 3), at coordinates (..., 3)."""
     axes = np.zeros((*coordinates.shape[:-1], 3, 3))
-    axes[..., 0, :] = circumferential_direction(coordinates)
+    radial = radial_direction(coordinates)
+    axes[..., 0, 0], axes[..., 0, 1] = -radial[..., 1], radial[..., 0]
     axes[..., 1, 2] = 1.0
-    axes[..., 2, :] = radial_direction(coordinates)
+    axes[..., 2, :] = radial
     return axes
 
 
@@ -71,12 +72,6 @@ def radial_direction(coordinates: Array) -> Array:
     """Unit vector away from the z axis at coordinates (..., 3)."""
     radius = np.sqrt(coordinates[..., 0] ** 2 + coordinates[..., 1] ** 2)[..., None]
     return np.concatenate([coordinates[..., :2] / radius, np.zeros_like(radius)], axis=-1)
-
-
-def circumferential_direction(coordinates: Array) -> Array:
-    """Unit vector about the z axis, counter-clockwise, at coordinates (..., 3)."""
-    radial = radial_direction(coordinates)
-    return np.stack([-radial[..., 1], radial[..., 0], np.zeros_like(radial[..., 0])], axis=-1)
 
 
 def angle_to_axis(dimensions: Array, axes: Array, direction: Array) -> Array:

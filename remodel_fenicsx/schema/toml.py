@@ -21,7 +21,7 @@ from remodel_fenicsx.system.regular_files import read_regular
 
 COMMENT_WIDTH = 100  # characters of a line of comment
 LARGEST = 10**6  # bytes: thirty times a scene with all keys and their comments
-MOST_PARTS = 100  # of a dotted key: TOML's reader takes the square of them in time
+MOST_PARTS = 100  # of a dotted key: tomllib's time grows with their square
 _DECIMAL = re.compile(r"(?<![\w.])[+-]?\d[\d_]*\.\d[\d_]*(?:[eE][+-]?\d+)?(?![\w.])")
 
 

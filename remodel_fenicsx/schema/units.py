@@ -87,8 +87,8 @@ def in_units(
     Parameters
     ----------
     values
-        The keys as they were read. What is no table passes, and so does a text that is neither number nor quantity
-        where no unit is allowed: the fields say what is wrong with them.
+        The keys as they were read. Anything that is no table, and text without a number where no unit is allowed, is
+        left as it is: the fields refuse it.
     table
         Their table class. Tables in it are done too, but for those that have variants or free names.
     units

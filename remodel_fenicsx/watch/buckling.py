@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from functools import cached_property
 
@@ -11,13 +10,12 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from remodel_fenicsx.body.buckling import Strut
-from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
+from remodel_fenicsx.evolution.stepper import Step, Stepper
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.energy import Tissue
-from remodel_fenicsx.state.memory import Numbers, Occasions
+from remodel_fenicsx.state.memory import Occasions
 from remodel_fenicsx.state.parameters import at_points
-
-log = logging.getLogger(__name__)
+from remodel_fenicsx.watch.once import WarnsOnce
 
 Array = NDArray[np.float64]
 STRAINS = {1: 1e-5, 2: 1e-3}  # of the differences of W that make stresses and moduli: these are right to about 1e-6
@@ -27,7 +25,7 @@ ACROSS, AROUND, ALONG = range(3)
 _SIGNS = {1: np.array([[1.0], [-1.0]]), 2: np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])}
 
 
-class BucklingWarning(Watcher):
+class BucklingWarning(WarnsOnce):
     """Says once that the whole body would buckle, where a reduced kinematics cannot.
 
     Nothing that a reduction can do tells of a column that bends, so its eigenvalues do not. What it carries and how
@@ -44,19 +42,14 @@ class BucklingWarning(Watcher):
     """
 
     def __init__(self, stepper: Stepper, strut: Strut | None):
-        self.stepper, self.state = stepper, stepper.state
+        super().__init__(stepper, "buckling")
         self.strut = strut if self.state.kinematics.reduced else None
-        self._numbers, self._occasions = Numbers(self.state, "buckling", {"said": 0}), Occasions(self.state, "buckling")
+        self._occasions = Occasions(self.state, "buckling")
 
     def solved(self, step: Step) -> None:
         """Look, until it was said."""
-        if self.strut is None or self._numbers["said"] or not self._occasions.due():
-            return
-        found = self.in_words()
-        if found:
-            self._numbers["said"] = True
-            if self.state.comm.rank == 0:
-                log.warning("time %g: %s", step.time, found)
+        if self.strut is not None and not self.said and self._occasions.due() and (found := self.in_words()):
+            self.say(step, found)
 
     def in_words(self) -> str:
         """What is too much in the present state; nothing where it is stable."""
@@ -128,8 +121,7 @@ class BucklingWarning(Watcher):
 
     def _integral(self, values: Array) -> float:
         """Over the reference body, of values (n,)."""
-        quadrature = self.state.cells.quadrature
-        return float(self.state.comm.allreduce(float(values @ quadrature.owned(quadrature.volumes).ravel()), MPI.SUM))
+        return self.quadrature.integral(values.reshape(-1, self.quadrature.shape[1]))
 
     def _moduli(self) -> Array:
         """Second derivatives of W by logarithmic strains, (3, 3, n)."""
@@ -169,16 +161,15 @@ class BucklingWarning(Watcher):
 
     def _as_elements_take_it(self) -> Array:
         """F, with one J in an element where differences of it cost nothing."""
-        F, quadrature = self._gradients(), self.state.cells.quadrature
+        F = self._gradients()
         if self.state.dilatation.jacobians().size == 0:
             return F
-        states = np.log(self.stepper.coupling.equilibrium.look().states[:, 1]).reshape(-1, quadrature.shape[1], 1)
-        return F * np.exp(-quadrature.beyond(0, states).reshape(-1) / 3)[:, None, None]
+        states = np.log(self.stepper.coupling.equilibrium.look().states[:, 1]).reshape(-1, self.quadrature.shape[1], 1)
+        return F * np.exp(-self.quadrature.beyond(0, states).reshape(-1) / 3)[:, None, None]
 
     @cached_property
     def _places(self) -> Array:
-        quadrature = self.state.cells.quadrature
-        return quadrature.owned(quadrature.coordinates).reshape(-1, 3)
+        return self.quadrature.owned(self.quadrature.coordinates).reshape(-1, 3)
 
     @cached_property
     def _directions(self) -> Array:
@@ -188,4 +179,4 @@ class BucklingWarning(Watcher):
     @cached_property
     def _tissue(self) -> Tissue:
         number = len(self._places)
-        return at_points(self.stepper.tissue, self.state.cells.quadrature).map(lambda name, value: value[:number])
+        return at_points(self.stepper.tissue, self.quadrature).map(lambda name, value: value[:number])

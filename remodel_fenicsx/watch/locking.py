@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -13,13 +12,13 @@ import ufl
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
+from remodel_fenicsx.evolution.stepper import Step, Stepper
 from remodel_fenicsx.fem import jit
-from remodel_fenicsx.state.memory import Numbers, Occasions
+from remodel_fenicsx.state.memory import Occasions
 from remodel_fenicsx.state.parameters import at_points
+from remodel_fenicsx.watch.once import WarnsOnce
 
 Array = NDArray[np.float64]
-log = logging.getLogger(__name__)
 
 # The part of its way that a body lacks, from which it is said. docs/locking.md: estimate and error over lambda/mu and
 # radii; the paper's bodies come to 3.6 % (artery with random cells, t = 5)
@@ -34,6 +33,9 @@ NEWS = 0.1  # relative change of energies from which on the work, an assembly, i
 # Of the matrix's energy: less of it, lost inside elements, costs no noticeable part of the way. Energies go with
 # squares of displacements; where 5.1 % of the way are missing, 8e-4 was measured
 NOTICEABLE = 1e-4
+# Of the matrix's energy: with less from loads and elongation it is the cells that deform the body. Elongated tubes have
+# about 1, bodies that their cells deform under weak loads nearly 0
+ELONGATED = 0.5
 # Change of a displacement, over its largest value, by which forces of the elements are differentiated
 DIFFERENCE = 1e-4
 MOST_HELD = 0.99  # part of a motion that elements hold back, in the sum of a geometric series
@@ -46,7 +48,7 @@ class Missing(NamedTuple):
     shape: float
 
 
-class LockingWarning(Watcher):
+class LockingWarning(WarnsOnce):
     """Says once that elements hold the body back, as soon as a solved state shows it.
 
     What an element cannot represent costs work. Two integrals over the body estimate how much,
@@ -73,7 +75,7 @@ class LockingWarning(Watcher):
     """
 
     def __init__(self, stepper: Stepper, locks: bool):
-        self.stepper, self.quadrature = stepper, stepper.state.cells.quadrature
+        super().__init__(stepper, "locking", {"energy": 0, "vain": 0})
         tissue = at_points(stepper.tissue, self.quadrature)
         shape = self.quadrature.shape
         self.stiffnesses = [self.quadrature.owned(v.reshape(shape)) for v in (tissue.lame_lambda, tissue.lame_mu)]
@@ -81,7 +83,6 @@ class LockingWarning(Watcher):
         self.response = VolumeResponse(stepper, self.stiffnesses[0])
         self.homogeneous = stepper.state.kinematics.homogeneous  # then there are no elements that could hold it back
         self._occasions = Occasions(stepper.state, "locking")
-        self._numbers = Numbers(stepper.state, "locking", {"said": 0, "energy": 0, "vain": 0})
 
     def stiffness_ratio(self) -> float:
         """Largest lambda/mu in the body."""
@@ -98,11 +99,18 @@ class LockingWarning(Watcher):
             return driven
         lacking, smooth = answer
         driven = driven._replace(volume=min(driven.volume, lacking))
+        if max(free_work, 0.0) + self._energy_of_elongation() < ELONGATED * energy:
+            return driven
         # 0.35 in a wall that its random cells alone deform; at least 0.87 in the paper's artery and in tubes that lock
         alone = max(2 * smooth - 1, 0.0) * lacking
         if free_work > 0:
             alone = min(alone, volume / free_work)
         return max(driven, Missing(alone, 0.0), key=sum)
+
+    def _energy_of_elongation(self) -> float:
+        """That a prescribed elongation e gives a matrix of constant volume: 3/2 mu e^2 over the body."""
+        elongation = self.stepper.state.loading.values.get("elongation", 0.0)
+        return self.quadrature.integral(1.5 * self.stiffnesses[1] * elongation**2) if elongation else 0.0
 
     def energies(self) -> tuple[float, float, float]:
         """Of the matrix, with the mean J of each element; of changes of J inside; twice that of changes of F there."""
@@ -150,14 +158,11 @@ class LockingWarning(Watcher):
 
     def solved(self, step: Step) -> None:
         """Look, until it was said."""
-        if self.homogeneous or self._numbers["said"] or not self._occasions.due() or not self._is_news():
+        if self.homogeneous or self.said or not self._occasions.due() or not self._is_news():
             return
         missing = self.missing()
-        if sum(missing) <= LIMIT:
-            return
-        self._numbers["said"] = True
-        if self.stepper.state.comm.rank == 0:
-            log.warning("time %g: %s", step.time, self.in_words(missing))
+        if sum(missing) > LIMIT:
+            self.say(step, self.in_words(missing))
 
     def _is_news(self) -> bool:
         """Whether energies differ from those of the last look."""

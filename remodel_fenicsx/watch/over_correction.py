@@ -1,10 +1,10 @@
-"""Whether the pass over-corrects, told from the run itself: a swing of cells and body from pass to pass."""
+"""Whether passes over-correct, told from the run itself: cells that swing, or that make up for a rest at once."""
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from math import prod
 from typing import Any
@@ -13,13 +13,13 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
+from remodel_fenicsx.evolution.stepper import Step, Stepper
 from remodel_fenicsx.fem.assembly import over_ranks
 from remodel_fenicsx.model import mandel
-from remodel_fenicsx.state.memory import Earlier, Numbers
+from remodel_fenicsx.state.memory import Earlier
+from remodel_fenicsx.watch.once import WarnsOnce
 
 Array = NDArray[np.float64]
-log = logging.getLogger(__name__)
 
 ORDER = 3  # of the difference over passes that takes a smooth course away and keeps what changes its sign each time
 GAIN = 2.0**ORDER  # by which it magnifies that
@@ -28,9 +28,11 @@ GAIN = 2.0**ORDER  # by which it magnifies that
 GROWTH, GROWING_PASSES, CELL_TOLERANCE = -1.2, 2, 2e-2
 # its end: random cells swing for ever at single points, each its own way, which the body hardly feels
 SUSTAINED, SUSTAINED_PASSES, BODY_TOLERANCE = -0.9, 3, 0.02  # the same of the displacement, over the displacement
-MOST = 0.5  # of the body
+RESTED_SHARE = 0.5  # of the body: after a pass that has left so much of it as it was, a jump is no swing
 UNEVEN = 1.5  # ratio of two steps up to which they are about alike
 LOAD_JUMP = 1e-3  # share of a load by which it may swing itself
+# root mean square over the body of what cells after a rest change in A in one pass, over r0^2
+RESUMED_CHANGE = 0.03
 
 
 def _difference(values: Sequence[Any], times: Sequence[float]) -> Any:
@@ -66,7 +68,7 @@ class Swing:
     body_factor: float
 
 
-class Chatter(Watcher):
+class OverCorrection(WarnsOnce):
     """Warns, once, when the cells swing to and fro from pass to pass so that results suffer.
 
     The solve takes the cells as they are, the pass replaces them: where the stress answers a change of the cells by
@@ -84,29 +86,21 @@ class Chatter(Watcher):
     ----------
     swing
         That of the last pass; None before there have been enough.
-    warned
-        Whether the warning has been given.
     """
 
     def __init__(self, stepper: Stepper):
-        self.stepper, self.state = stepper, stepper.state
-        state, self.quadrature = self.state, stepper.state.cells.quadrature
+        times = {f"time_{age}": 0.0 for age in range(ORDER + 1)}
+        super().__init__(stepper, "over_correction", {"growing": 0, "sustained": 0} | times)
         self.swing: Swing | None = None
         # of the passes before, with the newest one
-        self._cells = Earlier(state, "chatter_cells", lambda: self.quadrature.function("", (6,)), ORDER + 1)
-        self._body = Earlier(state, "chatter_body", state.unknown.copy, ORDER + 1)
-        times = {f"time_{age}": 0.0 for age in range(ORDER + 1)}
-        self._numbers = Numbers(state, "chatter", {"growing": 0, "sustained": 0, "warned": 0} | times)
+        cells = partial(self.quadrature.function, "", (6,))
+        self._cells = Earlier(self.state, "over_correction_cells", cells, ORDER + 1)
+        self._body = Earlier(self.state, "over_correction_body", self.state.unknown.copy, ORDER + 1)
 
     @property
     def structures(self) -> list[Array]:
         """A of the last passes as Mandel components (elements, points, 6), the newest first."""
         return [self._at_points(values) for values in self._cells.values]
-
-    @property
-    def warned(self) -> bool:
-        """Whether the warning has been given."""
-        return bool(self._numbers["warned"])
 
     def started(self, step: Step) -> None:
         """The cells before the first pass."""
@@ -120,7 +114,7 @@ class Chatter(Watcher):
         self.swing = None
         if self._cells.known > ORDER:
             cells, body = [structure, *self._cells.values], [self.state.unknown.x.array, *self._body.values]
-            self.swing = self._measured(cells, body, [step.time, *self._times])
+            self.swing = self._measured(cells, body, [step.time, *self.times])
             tells = not self._loads_jump(step) and not self._rested(cells) and self._evenly(step)
             self._count("growing", tells and self.swing.cells_factor < GROWTH)
             self._count("sustained", tells and self.swing.body_factor < SUSTAINED)
@@ -128,14 +122,13 @@ class Chatter(Watcher):
 
     def committed(self, step: Step) -> None:
         """Warn."""
-        if self.warned or self.swing is None:
+        if self.said or self.swing is None:
             return
         next_one = self.swing.cells * abs(self.swing.cells_factor)  # as large as it will be after one pass more
         begins = self._numbers["growing"] >= GROWING_PASSES and next_one >= CELL_TOLERANCE
         lasts = self._numbers["sustained"] >= SUSTAINED_PASSES and self.swing.body >= BODY_TOLERANCE
         if begins or lasts:
-            self._numbers["warned"] = True
-            self._warn(step, self.swing)
+            self.say(step, self._in_words(self.swing))
 
     def _count(self, name: str, once_more: bool) -> None:
         """Passes in a row."""
@@ -149,7 +142,7 @@ class Chatter(Watcher):
         self._numbers["time_0"] = step.time
 
     @property
-    def _times(self) -> list[float]:
+    def times(self) -> list[float]:
         """Of the passes that are remembered, the newest first."""
         return [self._numbers[f"time_{age}"] for age in range(ORDER + 1)]
 
@@ -162,17 +155,17 @@ class Chatter(Watcher):
         return components.reshape(*self.quadrature.shape, len(mandel.MANDEL))
 
     def _rested(self, cells: list[Array]) -> bool:
-        """Whether one of the passes has left most cells as they were: what goes on after that jumps (`resting`)."""
+        """Whether one of the passes has left most cells as they were: what goes on after that jumps."""
         same = [self._at_points(a == b).all(axis=-1) for a, b in pairwise(cells[: ORDER + 1])]
-        return any(self.quadrature.mean(passed.astype(np.float64)) > MOST for passed in same)
+        return any(self.quadrature.mean(passed.astype(np.float64)) > RESTED_SHARE for passed in same)
 
     def _evenly(self, step: Step) -> bool:
         """Whether the passes are about as far from each other: of others a single jump looks like a swing."""
-        lengths = [later - earlier for later, earlier in pairwise([step.time, *self._times])]
+        lengths = [later - earlier for later, earlier in pairwise([step.time, *self.times])]
         return max(lengths) <= UNEVEN * min(lengths)
 
     def _loads_jump(self, step: Step) -> bool:
-        times = self._times[:ORDER]
+        times = self.times[:ORDER]
         earlier = [self.stepper.load_values(time) if time else {} for time in times]  # the body starts unloaded
 
         def jump(name: str, value: float) -> float:
@@ -202,21 +195,14 @@ class Chatter(Watcher):
         )
 
     # ------------------------------------------------------------ words
-    def _warn(self, step: Step, swing: Swing) -> None:
-        place = self._place()
-        if self.state.comm.rank == 0:
-            log.warning(
-                "time %g: the remodeling pass over-corrects: from pass to pass the cells swing to and fro, A by %.2g "
-                "r0^2 (root mean square; most at %.4g, %.4g, %.4g), the displacement by %.2g of itself; a pass "
-                "multiplies this by about %.2g. Results may be wrong from here on; set %s (docs/theory.md, Stability "
-                "of the pass)",
-                step.time,
-                swing.cells,
-                *place,
-                swing.body,
-                swing.cells_factor,
-                self._advice(swing.cells_factor),
-            )
+    def _in_words(self, swing: Swing) -> str:
+        place = ", ".join(f"{coordinate:.4g}" for coordinate in self._place())
+        return (
+            f"the remodeling pass over-corrects: from pass to pass the cells swing to and fro, A by {swing.cells:.2g} "
+            f"r0^2 (root mean square; most at {place}), the displacement by {swing.body:.2g} of itself; a pass "
+            f"multiplies this by about {swing.cells_factor:.2g}. Results may be wrong from here on; set "
+            f"{self._advice(swing.cells_factor)} (docs/theory.md, Stability of the pass)"
+        )
 
     def _advice(self, factor: float) -> str:
         """A share of the pass with which the swing dies out: 1 - theta (1 - f) > -1."""
@@ -228,10 +214,82 @@ class Chatter(Watcher):
 
     def _place(self) -> tuple[float, float, float]:
         """Reference place of the largest swing of the cells."""
-        swing = self._at_points(_difference(self._cells.values, self._times))
+        swing = self._at_points(_difference(self._cells.values, self.times))
         return self.quadrature.place_of_largest(np.linalg.norm(swing, axis=-1))
 
 
 def _ratio(value: float, size: float) -> float:
     """value / size; 0 where there is nothing to compare with."""
     return value / size if size > 0.0 else 0.0
+
+
+class RestedCells(WarnsOnce):
+    """Warns, once, when cells that had rested change in one pass as much as if they had remodeled all the time.
+
+    A pass leaves cells as they are where no principal value of the driver is positive. The law `explicit` (eq. 11)
+    gives the cells of a time, not their rate: if tension comes back there, the next pass makes up for all that have
+    been left out. Where remodeling itself takes the tension away and brings it back, as under weak loads with a strong
+    network, when it stops and goes on depends on the step, and so does the result.
+
+    Parameters
+    ----------
+    stepper
+        Whose state is followed; where cells have moved is part of it from now on.
+    passes
+        Remembers the cells of the passes before; it watches the same steps, and is asked first.
+    """
+
+    def __init__(self, stepper: Stepper, passes: OverCorrection):
+        super().__init__(stepper, "rested_cells")
+        self.passes = passes
+        self._moved = Earlier(self.state, "rested_cells_moved", partial(self.quadrature.function, "", ()), 1)
+        # of the last pass: |change of A|^2 where it was made up for
+        self._squares: Array = np.zeros(self.quadrature.shape)
+
+    def started(self, step: Step) -> None:
+        """No pass yet."""
+        self._moved.forget()
+        self._numbers.forget()
+        self._moved.push(np.zeros(self.quadrature.shape).ravel())
+
+    def completed(self, step: Step) -> None:
+        """One pass more."""
+        if self.said:
+            return
+        cells = self.passes.structures
+        nowhere = np.zeros(self.quadrature.shape, dtype=bool)  # where memory begins anew there is nothing to tell
+        now = _differ(cells[0], cells[1]) if len(cells) > 1 else nowhere
+        moved = self._moved.values[0].reshape(self.quadrature.shape) > 0 if self._moved.known else nowhere
+        self._squares = np.zeros(self.quadrature.shape)
+        if len(cells) > 2 and self._loaded_before():
+            resumed = now & moved & ~_differ(cells[1], cells[2])
+            self._squares = np.where(resumed, np.sum((cells[0] - cells[1]) ** 2, axis=-1), 0.0)
+        self._moved.push((now | moved).astype(np.float64).ravel())
+
+    def _loaded_before(self) -> bool:
+        """Whether there was a load at the pass before: a rest without loads is the loads', and no matter of steps."""
+        return any(value != 0 for value in self.stepper.load_values(self.passes.times[1]).values())
+
+    def committed(self, step: Step) -> None:
+        """Warn."""
+        if self.said:
+            return
+        squares = self._squares
+        change = np.sqrt(self.quadrature.mean(squares)) / self.state.cells.settings.end_to_end_length**2
+        if change < RESUMED_CHANGE:
+            return
+        share, place = self.quadrature.mean((squares > 0).astype(float)), self.quadrature.place_of_largest(squares)
+        self.say(
+            step,
+            "cells that had rested for want of tension remodel again, and the law makes up for it in one pass: "
+            f"{100 * share:.2g} % of the body, A by {change:.2g} r0^2 (root mean square over the body; most at "
+            f"{', '.join(f'{coordinate:.4g}' for coordinate in place)}). When they rest depends on time.step, and so "
+            'does the result; set remodeling.coupling = "relaxed", or a remodeling.law that is a rate (docs/theory.md, '
+            "Stability of the pass)",
+        )
+
+
+def _differ(one: Array, other: Array) -> NDArray[np.bool_]:
+    """Where tensors (elements, points, 6) are not the same to the last bit."""
+    differ: NDArray[np.bool_] = np.any(one != other, axis=-1)
+    return differ

@@ -15,7 +15,7 @@ from remodel_fenicsx.model.cells import angle_to_axis
 from remodel_fenicsx.scene import preset_scene
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.solver.continuation import Work
-from remodel_fenicsx.watch.chatter import Chatter
+from remodel_fenicsx.watch.over_correction import OverCorrection
 from tests import parts
 from tests.conftest import slowly
 from tests.test_cube import closed_form_angle, uniaxial_stretches
@@ -106,7 +106,7 @@ class Scripted:
     def __init__(self, factor: float, size: float):
         self.simulation = cube(1.0, loads__force__ramp=[[0.0, 1.0]])
         self.stepper: Stepper = self.simulation.stepper
-        (self.watcher,) = (watcher for watcher in self.simulation.warnings if isinstance(watcher, Chatter))
+        (self.watcher,) = (watcher for watcher in self.simulation.warnings if isinstance(watcher, OverCorrection))
         self.factor, self.size = factor, size
 
     def step(self, number: int) -> Step:
@@ -129,7 +129,7 @@ def test_factor_and_size_of_a_swing_are_found_beside_a_smooth_course(factor: flo
     # the third difference of f^k is f^(k-3) (f - 1)^3
     expected = 4e-5 * abs(factor) ** 3 * abs(factor - 1) ** 3 / 8
     assert scripted.watcher.swing.cells == pytest.approx(expected, rel=1e-6)
-    assert scripted.watcher.warned == (factor == -3.0)
+    assert scripted.watcher.said == (factor == -3.0)
 
 
 def test_passes_around_a_rest_do_not_count() -> None:
@@ -142,7 +142,7 @@ def test_passes_around_a_rest_do_not_count() -> None:
             scripted.step(4)  # cells as they were
         scripted.watcher.completed(step)
         scripted.watcher.committed(step)
-    assert not scripted.watcher.warned
+    assert not scripted.watcher.said
 
 
 def test_a_step_that_is_undone_leaves_no_trace() -> None:
@@ -216,3 +216,12 @@ def test_cells_that_make_up_for_a_rest_are_warned_of(
     assert said in caplog.text
     if said:
         assert "1e+02 % of the body" in caplog.text
+
+
+def test_a_rest_without_loads_is_no_matter_of_steps(caplog: pytest.LogCaptureFixture) -> None:
+    """Cells rest because the force is off: they would with any step."""
+    ramp = [[0.0, 0.0], [2.0, 1.0], [8.0, 1.0], [9.0, 0.0], [14.0, 0.0], [15.0, 1.0]]
+    simulation = cube(10.0, loads__force__ramp=ramp, remodeling__law="explicit", remodeling__kappa=0.1, time__end=17.0)
+    with caplog.at_level(logging.WARNING, logger="remodel_fenicsx"):
+        list(simulation.steps())
+    assert "had rested" not in caplog.text

@@ -21,7 +21,7 @@ MOST_UNKNOWNS = 200_000  # of a look that nobody has asked for: factors of more 
 FIRST_INVERSE_ITERATIONS = 3  # later steps go on from the vector of the step before: one each
 
 
-class StabilityWatcher(Watcher):
+class EquilibriumStability(Watcher):
     """Knows the number of negative eigenvalues of the tangent at solved states, and says when it changes.
 
     A count costs about as much as a Newton iteration. So it is made where somebody wants it in every row, at the last

@@ -1,0 +1,41 @@
+"""What warnings have in common: they follow the steps of a run, and speak once."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+
+from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
+from remodel_fenicsx.state.memory import Numbers
+
+log = logging.getLogger(__name__)
+
+
+class WarnsOnce(Watcher):
+    """Says one thing about a run, once; resumed runs know whether it was said.
+
+    Parameters
+    ----------
+    stepper
+        Whose states are looked at; what is remembered of them is part of its state.
+    name
+        What the names of all that is remembered begin with.
+    initial
+        Numbers to be remembered beside "said", and what they are at the start.
+    """
+
+    def __init__(self, stepper: Stepper, name: str, initial: Mapping[str, float] | None = None):
+        self.stepper, self.state = stepper, stepper.state
+        self.quadrature = stepper.state.cells.quadrature
+        self._numbers = Numbers(stepper.state, name, {"said": 0} | dict(initial or {}))
+
+    @property
+    def said(self) -> bool:
+        """Whether it was."""
+        return bool(self._numbers["said"])
+
+    def say(self, step: Step, text: str, level: int = logging.WARNING) -> None:
+        """Now, on the first rank, with the time of the step."""
+        self._numbers["said"] = True
+        if self.state.comm.rank == 0:
+            log.log(level, "time %g: %s", step.time, text)

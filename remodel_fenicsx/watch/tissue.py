@@ -1,0 +1,99 @@
+"""What a run says of its tissue: volume that is lost, and chains that do not lie in the wall."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from remodel_fenicsx.evolution.stepper import Step, Stepper
+from remodel_fenicsx.system.terminal import NOTICE
+from remodel_fenicsx.watch.once import WarnsOnce
+
+Array = NDArray[np.float64]
+log = logging.getLogger(__name__)
+
+# Of its volume a soft tissue is measured to lose a few per cent at most: what is beyond is a choice of lambda. The
+# paper's tendon and artery, lambda/mu = 8.8, keep J above 0.92 at every point.
+NOTED = 0.05  # mean loss that the log mentions at the end
+MEAN_LOSS, LEAST_JACOBIAN = 0.2, 0.6  # from where on it is hardly meant
+RADIAL_SHARE = 0.5  # of the chains: more of them out of the wall are said
+
+
+class VolumeLoss(WarnsOnce):
+    """Warns, once, where the tissue loses much of its volume, and says at the end how much it has lost at most.
+
+    Where the formulation takes J at points of its own, J is that: at the others nothing holds it.
+    """
+
+    def __init__(self, stepper: Stepper):
+        initial = {"mean": 1.0, "mean_time": 0.0, "least": 1.0, "least_time": 0.0}
+        super().__init__(stepper, "volume", initial | dict.fromkeys("xyz", 0.0))
+
+    def solved(self, step: Step) -> None:
+        """Look at J."""
+        numbers, look = self._numbers, self.stepper.coupling.equilibrium.look()
+        jacobians = look.states[:, 1].reshape(look.stretches.shape)
+        mean = self.quadrature.integral(jacobians) / self.quadrature.volume
+        if mean < numbers["mean"]:
+            numbers["mean"], numbers["mean_time"] = mean, step.time
+        of_formulation = self.quadrature.owned(self.state.dilatation.jacobians())
+        if of_formulation.shape[1]:
+            jacobians = np.broadcast_to(of_formulation.min(axis=1)[:, None], jacobians.shape)
+        least = self.quadrature.minimum(jacobians)
+        if least < numbers["least"]:
+            numbers["least"], numbers["least_time"] = least, step.time
+            for name, value in zip("xyz", self.quadrature.place_of_largest(-jacobians), strict=True):
+                numbers[name] = value
+
+    def committed(self, step: Step) -> None:
+        """Say what there is to say."""
+        numbers = self._numbers
+        if not self.said and (1 - numbers["mean"] >= MEAN_LOSS or numbers["least"] < LEAST_JACOBIAN):
+            self.say(step, f"{self._in_words()}; set a larger material.lame_lambda (docs/commands.md)")
+        elif step.is_last and 1 - numbers["mean"] >= NOTED and self.state.comm.rank == 0:
+            log.info("%s", self._in_words())
+
+    def _in_words(self) -> str:
+        found = {name: self._numbers[name] for name in self._numbers.initial}
+        return (
+            "the tissue has lost up to {lost:.2g} % of its volume (mean J {mean:.3g} at time {mean_time:g}; least "
+            "J {least:.3g} at {x:.4g}, {y:.4g}, {z:.4g}, time {least_time:g})"
+        ).format(lost=100 * (1 - found["mean"]), **found)
+
+
+class RadialChains(WarnsOnce):
+    """Says once that more than half of the chains point out of the wall: the columns' angles are those of the others.
+
+    A notice and no warning: the results are right, they have to be read otherwise.
+
+    Parameters
+    ----------
+    stepper
+        Whose solved states are looked at.
+    radial_share
+        Of dimensions, axes and places, as `Shape.radial_share`.
+    """
+
+    def __init__(self, stepper: Stepper, radial_share: Callable[[Array, Array, Array], Array]):
+        super().__init__(stepper, "radial_chains", {"share": 0.0})
+        self.radial_share = radial_share
+
+    def solved(self, step: Step) -> None:
+        """Measure, until it was said."""
+        if not self.said:
+            cells = self.state.cells
+            share = self.radial_share(cells.dimension_values, cells.axis_values, self.quadrature.coordinates)
+            self._numbers["share"] = self.quadrature.mean(share)
+
+    def committed(self, step: Step) -> None:
+        """Say it."""
+        if not self.said and self._numbers["share"] > RADIAL_SHARE:
+            self.say(
+                step,
+                f"more than half of the chains point out of the wall (radial_share {self._numbers['share']:.2g}); the "
+                "fibre angles are those of the others",
+                NOTICE,
+            )
