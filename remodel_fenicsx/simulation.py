@@ -35,7 +35,7 @@ from remodel_fenicsx.watch.buckling import BucklingWarning
 from remodel_fenicsx.watch.equilibrium_stability import EquilibriumStability
 from remodel_fenicsx.watch.locking import LockingWarning
 from remodel_fenicsx.watch.over_correction import OverCorrection, RestedCells
-from remodel_fenicsx.watch.tissue import RadialChains, VolumeLoss
+from remodel_fenicsx.watch.tissue import FrontsInLayers, RadialChains, VolumeLoss
 
 log = logging.getLogger(__name__)
 
@@ -120,6 +120,7 @@ class Simulation:
             BucklingWarning(self.stepper, shape.strut(scene.supports.ends)),
             VolumeLoss(self.stepper),
             RadialChains(self.stepper, shape.radial_share),
+            FrontsInLayers(self.stepper, shape, domain),
         ]
         if self.stepper.remodeling.law.remodels and not at_once:
             over_correction = OverCorrection(self.stepper)

@@ -187,6 +187,25 @@ def test_a_step_that_leads_elsewhere_does_not_count() -> None:
     np.testing.assert_allclose(cells, others, atol=0.01)
 
 
+def test_a_front_rests_where_time_leaves_it(caplog: pytest.LogCaptureFixture) -> None:
+    """Axial chains outside, circumferential ones inside: rows that lag by long steps put the front 0.08 further in."""
+    caplog.set_level(logging.INFO)
+    chains = {"chain_density": 2e22, "contour_length": 1.594, "persistence_length": 1.365}
+    tables = {"material": {"lame_lambda": 600.0, "lame_mu": 3.0, **chains}, "mesh": {"degree": 2, "refinement": 2}}
+    tables |= {"remodeling": {"law": "explicit", "frame": "spatial", "coupling": "staggered", "kappa": 0.025}}
+    (at_once, cells, simulation), (in_time, others, _) = tube_in_time(
+        8.0, 0.3, [(0.0, 0.0), (25.0, 1.0)], **{**CAROTID, **tables}
+    )
+    axial = [
+        simulation.quadrature.mean(A.reshape(*simulation.quadrature.shape, 3, 3)[..., 2, 2]) for A in (cells, others)
+    ]
+    r0 = simulation.scene.cells.end_to_end_length
+    assert axial[0] / r0**2 == pytest.approx(axial[1] / r0**2, abs=0.025)  # a point of the mesh is 0.02 of the volume
+    assert at_once["inner_radius"] == pytest.approx(in_time["inner_radius"], rel=2e-3)
+    assert at_once["fibre_angle_outer"] > 85 and at_once["fibre_angle_inner"] < 5
+    assert "the cells have a front about 4.1" in caplog.text
+
+
 def test_cells_without_tension_stay_where_the_way_has_left_them(caplog: pytest.LogCaptureFixture) -> None:
     """After a reversal of the loads, and the share of the body where it matters is said."""
     (_, cells, _), (_, others, simulation) = tube_in_time(3.0, 0.1, HALF_WAY_BACK)

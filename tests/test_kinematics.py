@@ -343,8 +343,9 @@ def test_another_size_compiles_nothing(shape: str, name: str, size: dict[str, fl
 
 
 def test_small_reduced_problems_are_factorised_by_petsc_itself() -> None:
-    for name, package in (("point", "petsc"), ("full", "mumps")):
-        simulation = Simulation(scene("cube", name, 1.0), SELF)
+    """Whole bodies only where the choice is left to `auto`."""
+    for name, method, package in (("point", "direct", "petsc"), ("full", "auto", "petsc"), ("full", "direct", "mumps")):
+        simulation = Simulation(scene("cube", name, 1.0, solver={"method": method}), SELF)
         list(simulation.steps())
         factorisation = simulation.stepper.coupling.newton.factorisation()
         assert factorisation is not None and factorisation.getFactorSolverType() == package

@@ -12,8 +12,8 @@ from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.solver import newton
 from remodel_fenicsx.solver.continuation import StepFailure
 from tests import parts
-from tests.reference.radial import RadialMaterial, Tube
 from tests.parts import cube
+from tests.reference.radial import RadialMaterial, Tube
 
 PAPER = "kuhl-holzapfel-2007"
 
@@ -33,7 +33,8 @@ def test_uniaxial_compression_remodels_nothing(density: float, frame: str) -> No
 
 def test_what_a_loose_tolerance_leaves_is_no_tension() -> None:
     """Out-of-balance forces that were accepted are lateral stresses of 1e-3 here, far above rounding."""
-    changes = {"loads.force.value": -10.0, "material.chain_density": 1e24, "solver.relative_tolerance": 1e-4}
+    loose = {"solver.relative_tolerance": 1e-4, "solver.predictor": "none"}  # a predictor leaves less
+    changes = {"loads.force.value": -10.0, "material.chain_density": 1e24, **loose}
     scene = preset_scene(PAPER, "cube").with_values({**changes, "time.end": 12.0})
     steps = list(Simulation(scene).steps())
     assert 1e-5 < max(step.work.residual for step in steps) < 1e-2

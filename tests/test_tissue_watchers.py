@@ -106,6 +106,18 @@ def test_chains_that_point_out_of_the_wall_are_said(caplog: pytest.LogCaptureFix
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("refinement", [1, 2])
+def test_a_front_within_the_inner_layer_is_said(refinement: int, caplog: pytest.LogCaptureFixture) -> None:
+    """Chains turn from circumferential to axial at R = 1.2: in the first of 8 elements, or the second of 16."""
+    ramp = [[0, 0], [25, 1]]
+    loads = {"pressure": {"value": 3.0, "ramp": ramp}, "elongation": {"value": 0.3, "ramp": ramp}}
+    time, remodeling = {"end": "equilibrium"}, {"law": "explicit"}
+    scene = tube_scene(loads=loads, mesh={"degree": 2, "refinement": refinement}, remodeling=remodeling, time=time)
+    found = said(scene, caplog, "a front lies in")
+    assert [level for level, _ in found] == [logging.WARNING] * (refinement == 1)
+    assert all("fibre_angle_inner" in text for _, text in found)
+
+
 def test_one_and_two_ranks_agree(case: Case) -> None:
     """Of random cells on the whole tube: forces, shares and angles."""
     columns = ["axial_force", "reduced_axial_force", "radial_share", "fibre_angle_inner", "angle_profile_4"]

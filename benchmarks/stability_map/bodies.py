@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from functools import lru_cache
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
-from benchmarks.stability_map.cases import Case, Finding, Run, family, with_values
-from benchmarks.stability_map.homogeneous import CUBE, DRIVERS, FRAMES, material
+from benchmarks.stability_map.cases import MU, Case, Check, Finding, Place, Run, Values, named, table, with_values
+from benchmarks.stability_map.homogeneous import CUBE, DRIVERS, FRAMES, RAMP, element, has_frame, material
+from benchmarks.stability_map.judging import SAME_MESH
 from benchmarks.stability_map.tube_march import load_at
 from tests.reference.radial import RadialHistory, RadialMaterial, Tube, solve_radial
 
@@ -35,7 +35,6 @@ TENDON: dict[str, Any] = {
     "loads": {"force": {"value": 300.0, "ramp": [[0.0, 0.0], [12.0, 1.0]]}},
     "time": {"end": 40.0, "step": 1.0},
 }
-RAMP = [[0.0, 0.0], [10.0, 1.0]]
 COARSE_TENDON = {"tendon": {"AROUND": 8, "CORE": 2, "RINGS": 1, "ALONG": 3}}
 RADIUS_TOLERANCE, STEP_TOLERANCE = 0.01, 0.01
 ANGLE_TOLERANCE = 1.5  # degrees, of the mean over a body
@@ -115,52 +114,6 @@ def check_inner_displacement(case: Case, run: Run) -> Finding:
     return Finding(abs(error) / case.options["tolerance"], f"inner displacement off by {100 * error:.3g} %")
 
 
-def tube_case(family_name: str, changes: dict[str, Any], place: dict[str, Any], **more: Any) -> Case:
-    """A short piece of the demo's artery with isotropic cells."""
-    key = f"{family_name}: " + ", ".join(f"{name} {value}" for name, value in place.items())
-    options: dict[str, Any] = {
-        "reference": REFERENCE,
-        "place": place,
-        "check": check_tube,
-        "counts": ring(8, 4),
-        **more,
-    }
-    return Case(family_name, key, with_values(TUBE, changes), **options)
-
-
-@family("tube")
-def tubes() -> Iterator[Case]:
-    """Pressure and axial stretch, drivers, frames."""
-    for pressure in (0.0, 0.01, 0.5, 2.4, 4.8, 12.0, 48.0):
-        for stretch in (-0.2, 0.0, 0.1, 0.3, 0.55):
-            changes = {"loads.pressure.value": pressure, "loads.elongation.value": stretch}
-            place, reduced = {"pressure": pressure, "stretch": stretch}, (pressure, stretch) == (2.4, 0.1)
-            # larger strains need smaller elements: at 48 the radius is off by 1.3 % on 8, by 0.7 % on 12 of them
-            counts = ring(8, 4) if pressure < 10 else ring(16, 8) if pressure < 40 else ring(24, 12)
-            yield tube_case("tube", changes, place, reduced=reduced, counts=counts)
-    for driver in DRIVERS:
-        for frame in FRAMES:
-            for coupling in ("staggered", "relaxed"):
-                if coupling == "relaxed":
-                    continue  # the reference is staggered; `tube, long` has the relaxed ones
-                changes = {"remodeling.driver": driver, "remodeling.frame": frame}
-                place = {"driver": driver, "frame": frame, "coupling": coupling}
-                yield tube_case("tube", changes, place)
-
-
-@family("tube, long")
-def long_tubes() -> Iterator[Case]:
-    """Hundred passes, where what over-corrects has left the symmetric solution."""
-    for driver in DRIVERS:
-        for frame in FRAMES:
-            for coupling in ("staggered", "relaxed"):
-                changes = {"remodeling.driver": driver, "remodeling.frame": frame, "remodeling.coupling": coupling}
-                changes |= {"time.end": 120.0, "time.step": 1.0, "mesh.degree": 1}
-                place = {"driver": driver, "frame": frame, "coupling": coupling}
-                options = {"counts": ring(16, 8), "check": check_long}
-                yield tube_case("tube, long", changes, place, **options)
-
-
 LONG_TOLERANCE = 0.02  # trilinear elements: 1 % of error of their own
 
 
@@ -170,38 +123,57 @@ def check_long(case: Case, run: Run) -> Finding:
     return Finding(finding.ratio * RADIUS_TOLERANCE / LONG_TOLERANCE, finding.words, finding.unstable, finding.solvable)
 
 
-@family("tube, parameters")
-def tube_parameters() -> Iterator[Case]:
-    """r0/L, lambda/mu with chains, speed, laws."""
-    for share in (0.05, 0.3, 0.6, 0.9, 0.99):
-        for pressure in (0.5, 2.4):
-            changes = {"cells.end_to_end_length": share * 1.594, "loads.pressure.value": pressure}
-            changes |= {"loads.elongation.value": 0.0}
-            yield tube_case("tube, parameters", changes, {"r0/L": share, "pressure": pressure})
-    for ratio in (0.1, 10.0, 100.0, 1e3, 1e4):
-        for element, degree in (("hex1", 1), ("hex2", 2)):
-            changes = {"material.lame_lambda": ratio * 3.103, "loads.pressure.value": 2.4, "mesh.degree": degree}
-            counts = ring(16, 8) if degree == 1 else ring(8, 4)
-            place = {"lambda/mu": ratio, "element": element}
-            yield tube_case("tube, parameters", changes, place, counts=counts, check=check_long)
-    for speed in (1e-3, 0.25, 10.0):
-        for law in ("explicit", "rate", "relaxation"):
-            changes = {"remodeling.kappa": speed / 2, "remodeling.law": law, "loads.pressure.value": 2.4}
-            yield tube_case("tube, parameters", changes, {"kappa dt": speed, "law": law})
+# ---------------------------------------------------------------- families of tubes
+def tube_case(family: str, changes: Values, place: Place, check: Check = check_tube, **more: Any) -> Case:
+    """A short piece of the demo's artery with isotropic cells."""
+    given = {"counts": ring(8, 4), **more}
+    return Case(family, named(family, place), with_values(TUBE, changes), check, REFERENCE, place, **given)
 
 
-@family("suction")
-def suctions() -> Iterator[Case]:
-    """Inner pressure below zero: a ring that buckles. That -4.8 is unstable was measured on 0.1.0 (eigenvalue -8.7)."""
-    for pressure in (-0.1, -1.0, -4.8):
-        for degree, counts in ((1, ring(16, 8)), (2, ring(8, 4))):
-            changes = {"loads.pressure.value": pressure, "loads.elongation.value": 0.0, "mesh.degree": degree}
-            options = {"unstable": True if pressure == -4.8 else None}
-            place = {"pressure": pressure, "degree": degree}
-            yield tube_case("suction", changes, place, counts=counts, options=options, check=check_long)
+# larger strains need smaller elements: at 48 the radius is off by 1.3 % on 8, by 0.7 % on 12 of them
+table(
+    "tube", tube_case,
+    {"pressure": (0.0, 0.01, 0.5, 2.4, 4.8, 12.0, 48.0), "stretch": (-0.2, 0.0, 0.1, 0.3, 0.55)},
+    reduced=lambda p: (p["pressure"], p["stretch"]) == (2.4, 0.1),
+    more=lambda p: {"counts": ring(8, 4) if p["pressure"] < 10 else ring(*(16, 8) if p["pressure"] < 40 else (24, 12))},
+)  # fmt: skip
+# the reference is staggered; `tube, long` has the relaxed ones
+table("tube", tube_case, {"driver": DRIVERS, "frame": FRAMES, "coupling": ("staggered",)})
 
+# hundred passes, where what over-corrects has left the symmetric solution
+table(
+    "tube, long", tube_case, {"driver": DRIVERS, "frame": FRAMES, "coupling": ("staggered", "relaxed")},
+    {"time.end": 120.0, "time.step": 1.0, "mesh.degree": 1}, more={"counts": ring(16, 8), "check": check_long},
+)  # fmt: skip
+
+table(
+    "tube, parameters", tube_case, {"r0/L": (0.05, 0.3, 0.6, 0.9, 0.99), "pressure": (0.5, 2.4)},
+    lambda p: {"cells.end_to_end_length": p["r0/L"] * 1.594, "loads.elongation.value": 0.0},
+)  # fmt: skip
+table(
+    "tube, parameters", tube_case, {"lambda/mu": (0.1, 10.0, 100.0, 1e3, 1e4), "element": ("hex1", "hex2")},
+    lambda p: {**element(p), "loads.pressure.value": 2.4},
+    more=lambda p: {"counts": ring(16, 8) if p["element"] == "hex1" else ring(8, 4), "check": check_long},
+)  # fmt: skip
+table(
+    "tube, parameters", tube_case,
+    {"kappa dt": (1e-3, 0.25, 10.0), "law": ("explicit", "rate", "relaxation")},
+    lambda p: {"remodeling.kappa": p["kappa dt"] / TUBE["time"]["step"], "loads.pressure.value": 2.4},
+)  # fmt: skip
+
+# inner pressure below zero: a ring that buckles; that -4.8 is unstable was measured on 0.1.0 (eigenvalue -8.7)
+table(
+    "suction", tube_case, {"pressure": (-0.1, -1.0, -4.8), "degree": (1, 2)}, {"loads.elongation.value": 0.0},
+    more=lambda p: {
+        "counts": ring(16, 8) if p["degree"] == 1 else ring(8, 4), "check": check_long,
+        "options": {"unstable": True if p["pressure"] == -4.8 else None},
+    },
+)  # fmt: skip
 
 ELASTIC = {"material.chain_density": 0.0, "remodeling.law": "none", "loads.elongation.value": 0.0}
+PRESSED = {**ELASTIC, "loads.pressure": {"value": 2.0, "ramp": [[0.0, 0.0], [4.0, 1.0]]}}
+PRESSED |= {"time.end": 4.0, "time.step": 1.0}
+RATIOS = (0.1, 1.0, 10.0, 100.0, 1e3, 1e4, 1e5)
 # the tolerance is the error that the mesh has where nothing locks, at most the 5 % from which a run warns, or 3.5 %
 MESHES = {
     "hex1 16x8": ("hexahedron", 1, ring(16, 8), 0.05), "hex1 32x16": ("hexahedron", 1, ring(32, 16), 0.035),
@@ -210,18 +182,19 @@ MESHES = {
 }  # fmt: skip
 
 
-@family("locking")
-def locking() -> Iterator[Case]:
-    """Thick tube without chains, p = 2, towards incompressibility."""
-    for mesh, (kind, degree, counts, tolerance) in MESHES.items():
-        for ratio in (0.1, 1.0, 10.0, 100.0, 1e3, 1e4, 1e5):
-            changes = {
-                **ELASTIC, "loads.pressure": {"value": 2.0, "ramp": [[0.0, 0.0], [4.0, 1.0]]}, "mesh.element": kind,
-                "mesh.degree": degree, "material.lame_lambda": ratio * 3.103, "time.end": 4.0, "time.step": 1.0,
-            }  # fmt: skip
-            place = {"mesh": mesh, "lambda/mu": ratio}
-            options = {"check": check_inner_displacement, "counts": counts, "options": {"tolerance": tolerance}}
-            yield tube_case("locking", changes, place, reduced=mesh == "hex2 8x4" and ratio in (1.0, 100.0), **options)
+def thick_wall(family: str, changes: Values, place: Place, **more: Any) -> Case:
+    """Without chains, p = 2, on one of the meshes."""
+    kind, degree, counts, tolerance = MESHES[place["mesh"]]
+    changes = {**PRESSED, "mesh.element": kind, "mesh.degree": degree, **changes}
+    more |= {"counts": counts, "options": {"tolerance": tolerance}}
+    return tube_case(family, changes, place, check_inner_displacement, **more)
+
+
+# towards incompressibility
+table(
+    "locking", thick_wall, {"mesh": MESHES, "lambda/mu": RATIOS},
+    reduced=lambda p: p["mesh"] == "hex2 8x4" and p["lambda/mu"] in (1.0, 100.0),
+)  # fmt: skip
 
 
 # ---------------------------------------------------------------- tendons
@@ -241,50 +214,6 @@ def check_half_step(case: Case, run: Run) -> Finding:
     return Finding(float(ratio), words)
 
 
-def tendon_case(family_name: str, changes: dict[str, Any], place: dict[str, Any], **more: Any) -> Case:
-    """A coarse tendon."""
-    key = f"{family_name}: " + ", ".join(f"{name} {value}" for name, value in place.items())
-    options: dict[str, Any] = {"reference": "half of the step", "place": place, "counts": COARSE_TENDON}
-    options |= {"check": check_half_step, **more}
-    scene = with_values(TENDON, changes)
-    if options["check"] is check_half_step:
-        options["companion"] = with_values(scene, {"time.step": scene["time"]["step"] / 2})
-    return Case(family_name, key, scene, **options)
-
-
-@family("random cells")
-def random_cells() -> Iterator[Case]:
-    """A tendon of random cells: every driver, frame and coupling, from weak loads to locking."""
-    for driver in DRIVERS:
-        for frame in FRAMES:
-            for coupling in ("staggered", "relaxed"):
-                for force in (30.0, 300.0):
-                    changes = {"remodeling.driver": driver, "remodeling.frame": frame, "loads.force.value": force}
-                    changes |= {"remodeling.coupling": coupling}
-                    place = {"driver": driver, "frame": frame, "coupling": coupling, "force": force}
-                    yield tendon_case("random cells", changes, place)
-    for force in (0.01, 1.0, 1000.0, 3000.0):
-        for frame in FRAMES:
-            changes = {"loads.force.value": force, "remodeling.frame": frame}
-            yield tendon_case("random cells", changes, {"frame": frame, "force": force})
-
-
-@family("buckling")
-def buckling() -> Iterator[Case]:
-    """A slender column without chains, clamped at its bottom: Euler's load is the reference."""
-    length, area, mu, lame = 10.0, 0.1, 3.103, 27.293
-    modulus = mu * (3 * lame + 2 * mu) / (lame + mu)
-    euler = np.pi**2 * modulus * area**2 / (4 * np.pi) / (4 * length**2)
-    for share in (0.25, 0.5, 2.0, 10.0, 100.0):
-        changes = {
-            "geometry.area": area, "material.chain_density": 0.0, "remodeling.law": "none", "mesh.degree": 2,
-            "loads.force": {"value": -share * euler, "ramp": [[0.0, 0.0], [4.0, 1.0]]}, "time.end": 4.0,
-        }  # fmt: skip
-        options = {"unstable": share > 1, "strain": -share * euler / area / modulus}
-        place = {"force over Euler's": share}
-        yield tendon_case("buckling", changes, place, check=check_column, options=options, reference="Euler's load")
-
-
 def check_column(case: Case, run: Run) -> Finding:
     """The straight column's linear strain, and whether it can stay straight."""
     found = run.column("mean_stretch")
@@ -294,18 +223,49 @@ def check_column(case: Case, run: Run) -> Finding:
     return Finding(error / 0.02, f"strain off by {100 * error:.3g} %", case.options["unstable"])
 
 
-@family("torsion")
-def torsions() -> Iterator[Case]:
+# ---------------------------------------------------------------- families of tendons
+def tendon_case(
+    family: str, changes: Values, place: Place, check: Check = check_half_step, reference: str = SAME_MESH, **more: Any
+) -> Case:
+    """A coarse tendon."""
+    scene = with_values(TENDON, changes)
+    if check is check_half_step:
+        more["companion"] = with_values(scene, {"time.step": scene["time"]["step"] / 2})
+    return Case(family, named(family, place), scene, check, reference, place, COARSE_TENDON, **more)
+
+
+def twisted_case(family: str, changes: Values, place: Place, **more: Any) -> Case:
     """A bar that is twisted and stretched: no axes are coaxial but those on its axis."""
-    for driver in DRIVERS:
-        for frame in FRAMES[:1] if driver == "pk2" else FRAMES:
-            for coupling in ("staggered", "relaxed"):
-                for twist in (0.5, 3.0):
-                    loads = {"twist": {"value": twist, "ramp": RAMP}, "elongation": {"value": 0.1, "ramp": RAMP}}
-                    changes = {
-                        "geometry.shape": "twisted", "loads": loads, "cells.initial": "isotropic",
-                        "remodeling.driver": driver, "remodeling.frame": frame, "remodeling.coupling": coupling,
-                    }  # fmt: skip
-                    place = {"driver": driver, "frame": frame, "coupling": coupling, "twist": twist}
-                    options = {"options": {"column": "stored_energy"}, "extended": True}
-                    yield tendon_case("torsion", changes, place, **options)
+    loads = {"twist": {"value": place["twist"], "ramp": RAMP}, "elongation": {"value": 0.1, "ramp": RAMP}}
+    changes = {**changes, "geometry.shape": "twisted", "loads": loads, "cells.initial": "isotropic"}
+    return tendon_case(family, changes, place, options={"column": "stored_energy"}, extended=True, **more)
+
+
+# every driver, frame and coupling, from weak loads to locking
+table(
+    "random cells", tendon_case,
+    {"driver": DRIVERS, "frame": FRAMES, "coupling": ("staggered", "relaxed"), "force": (30.0, 300.0)},
+)  # fmt: skip
+table("random cells", tendon_case, {"frame": FRAMES, "force": (0.01, 1.0, 1000.0, 3000.0)})
+
+# a slender column without chains, clamped at its bottom
+COLUMN_AREA = 0.1
+YOUNG = MU * (3 * 27.293 + 2 * MU) / (27.293 + MU)
+EULER = np.pi**2 * YOUNG * COLUMN_AREA**2 / (4 * np.pi) / (4 * 10.0**2)
+table(
+    "buckling", tendon_case, {"force over Euler's": (0.25, 0.5, 2.0, 10.0, 100.0)},
+    lambda p: {
+        "geometry.area": COLUMN_AREA, "material.chain_density": 0.0, "remodeling.law": "none", "mesh.degree": 2,
+        "loads.force": {"value": -p["force over Euler's"] * EULER, "ramp": [[0.0, 0.0], [4.0, 1.0]]}, "time.end": 4.0,
+    },
+    more=lambda p: {
+        "check": check_column, "reference": "Euler's load", "options": {
+            "unstable": p["force over Euler's"] > 1, "strain": -p["force over Euler's"] * EULER / COLUMN_AREA / YOUNG,
+        },
+    },
+)  # fmt: skip
+
+table(
+    "torsion", twisted_case,
+    {"driver": DRIVERS, "frame": FRAMES, "coupling": ("staggered", "relaxed"), "twist": (0.5, 3.0)}, only=has_frame,
+)  # fmt: skip

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
+from itertools import chain, product
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -140,20 +142,62 @@ def with_values(scene: Mapping[str, Any], changes: Mapping[str, Any]) -> Values:
     return copy
 
 
-Family = Callable[[], Iterator[Case]]
 MODULES = ("homogeneous", "bodies", "prescribed", "consistent", "variants", "instant", "ray")
-FAMILIES: dict[str, Family] = {}
-"""Generators of cases by name, in the order of the table."""
+Place = dict[str, Any]
+OfPlace = Mapping[str, Any] | Callable[[Place], Mapping[str, Any]]
+FAMILIES: dict[str, list[Callable[[], Iterator[Case]]]] = {}
+"""Tables of cases by the name of their family, in the order of the report."""
+KEYS = {
+    "frame": "remodeling.frame", "driver": "remodeling.driver", "law": "remodeling.law",
+    "coupling": "remodeling.coupling", "kappa dt": "remodeling.kappa", "force": "loads.force.value",
+    "pressure": "loads.pressure.value", "stretch": "loads.elongation.value", "density": "material.chain_density",
+    "lambda/mu": "material.lame_lambda", "distortion": "geometry.distortion", "degree": "mesh.degree",
+    "refinement": "mesh.refinement", "outer radius": "geometry.outer_radius",
+}  # fmt: skip
+"""Coordinates of places that are keys of scenes."""
+MU = 3.103  # of all bodies but the carotid
 
 
-def family(name: str) -> Callable[[Family], Family]:
-    """Register a generator of cases."""
+def table(
+    family: str,
+    make: Callable[..., Case],
+    axes: Mapping[str, Iterable[Any]],
+    changes: OfPlace = MappingProxyType({}),
+    only: Callable[[Place], bool] | None = None,
+    reduced: Callable[[Place], bool] | None = None,
+    more: OfPlace = MappingProxyType({}),
+) -> None:
+    """Register a case for each place of a grid.
 
-    def registered(function: Family) -> Family:
-        FAMILIES[name] = function
-        return function
+    Parameters
+    ----------
+    make
+        Of family, changes of the scene by dotted key, place and further arguments.
+    axes
+        Values by coordinate. Those in `KEYS` change the scene by themselves; lambda/mu is times mu there.
+    changes, more
+        Further changes and arguments: mappings, or functions of the place.
+    only, reduced
+        Whether a place is there, and whether it is in the reduced map; default: all are, none is.
+    """
 
-    return registered
+    def cases() -> Iterator[Case]:
+        for values in product(*axes.values()):
+            place = dict(zip(axes, values, strict=True))
+            if only is None or only(place):
+                asked = {KEYS[name]: value for name, value in place.items() if name in KEYS}
+                if "lambda/mu" in place:
+                    asked[KEYS["lambda/mu"]] *= MU
+                asked |= changes(place) if callable(changes) else changes
+                given = dict(more(place) if callable(more) else more)
+                yield make(family, asked, place, reduced=reduced is not None and reduced(place), **given)
+
+    FAMILIES.setdefault(family, []).append(cases)
+
+
+def named(family: str, place: Place) -> str:
+    """The key of a case."""
+    return f"{family}: " + ", ".join(f"{name} {value}" for name, value in place.items())
 
 
 def all_cases() -> dict[str, Case]:
@@ -167,8 +211,8 @@ def all_cases() -> dict[str, Case]:
     for name in MODULES:
         import_module(f"benchmarks.stability_map.{name}")  # it registers its families
     found: dict[str, Case] = {}
-    for make in FAMILIES.values():
-        for case in make():
+    for tables in FAMILIES.values():
+        for case in chain.from_iterable(make() for make in tables):
             if case.key in found:
                 raise ValueError(f"two cases are called {case.key}")
             found[case.key] = case

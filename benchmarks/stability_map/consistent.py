@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from functools import partial
-from typing import Any
 
 import numpy as np
 
-from benchmarks.stability_map.bodies import check_long, ring, tendon_case, tube_case
-from benchmarks.stability_map.cases import Case, Finding, Run, family
+from benchmarks.stability_map.bodies import check_long, ring, tendon_case, tube_case, twisted_case
+from benchmarks.stability_map.cases import Case, Finding, Run, table
 from benchmarks.stability_map.homogeneous import (
     DRIVERS,
     ELEMENTS,
@@ -18,13 +16,15 @@ from benchmarks.stability_map.homogeneous import (
     case_of_shape,
     compared,
     cube_case,
+    element,
     initial,
     material,
     nominal_stress,
     step_times,
+    triaxial,
 )
 from benchmarks.stability_map.point import Array, NoEquilibrium, Path, advance
-from benchmarks.stability_map.prescribed import FINER, compared_with_limit, gradients
+from benchmarks.stability_map.prescribed import FINER, REFERENCE, REVERSED, compared_with_limit, gradients
 from tests.reference.radial import RadialMaterial, cauchy_stress, driving_values, secant_stiffness
 
 SCHEMES = ("staggered", "extrapolated")
@@ -165,81 +165,53 @@ def check_limit(case: Case, run: Run) -> Finding:
 
 # ---------------------------------------------------------------- families
 variant_case = partial(cube_case, check=check_point)
+table(
+    "consistent", variant_case,
+    {"driver": DRIVERS, "coupling": SCHEMES, "force": (0.01, 0.1, 1.0, 10.0, 100.0, 1e4, -3.0)},
+    {**VARIANT, "time.end": 40.0}, reduced=lambda p: p["driver"] == "cauchy" and p["force"] == 10,
+)  # fmt: skip
+table(
+    "consistent", variant_case, {"driver": DRIVERS, "coupling": SCHEMES, "kappa dt": (1e-3, 0.25, 1.0, 10.0, 1e3)},
+    {**VARIANT, "time.end": 20.0},
+)  # fmt: skip
+table(
+    "consistent", variant_case, {"driver": DRIVERS, "element": ELEMENTS},
+    lambda p: {
+        **VARIANT, **element(p), "remodeling.coupling": "extrapolated", "time.end": 20.0, "time.step": 2.0,
+    },
+)  # fmt: skip
 
+# repeated and crossing principal stresses, loads that turn
+table(
+    "consistent, three axes", partial(case_of_shape, "block", check_point),
+    {"load": TRIAXIAL, "driver": DRIVERS, "coupling": SCHEMES}, lambda p: {**VARIANT, **triaxial(p)},
+    only=lambda p: p["driver"] == "cauchy" or p["coupling"] == "extrapolated",
+)  # fmt: skip
 
-def _changes(driver: str, scheme: str, **more: Any) -> dict[str, Any]:
-    return {**VARIANT, "remodeling.driver": driver, "remodeling.coupling": scheme, **more}
+# axes that are not coaxial, and a shear that changes its sign
+table(
+    "consistent, shear", partial(case_of_shape, "driven", check_limit, reference=REFERENCE),
+    {"shear": (0.3, 1.0), "history": ("held", "reversed"), "driver": DRIVERS, "coupling": SCHEMES},
+    lambda p: {
+        **VARIANT, "loads.h_xz": {"value": p["shear"], "ramp": RAMP if p["history"] == "held" else REVERSED},
+        "time.end": 40.0 if p["history"] == "held" else 80.0,
+    },
+    only=lambda p: p["history"] == "held" or p["shear"] == 0.3,
+    reduced=lambda p: (p["driver"], p["shear"], p["history"]) == ("cauchy", 0.3, "held"),
+)  # fmt: skip
 
+# random cells from weak loads to locking, and a twisted bar
+table(
+    "consistent, bodies", tendon_case,
+    {"cells": ("random",), "driver": DRIVERS, "coupling": SCHEMES, "force": (30.0, 300.0, 1000.0)}, VARIANT,
+)  # fmt: skip
+table(
+    "consistent, bodies", twisted_case, {"driver": DRIVERS, "coupling": SCHEMES, "twist": (0.5, 3.0)}, VARIANT
+)  # fmt: skip
 
-@family("consistent")
-def homogeneous() -> Iterator[Case]:
-    """Loads, speeds, elements on the cube."""
-    for driver in DRIVERS:
-        for scheme in SCHEMES:
-            for load in (0.01, 0.1, 1.0, 10.0, 100.0, 1e4, -3.0):
-                changes = _changes(driver, scheme, **{"loads.force.value": load, "time.end": 40.0})
-                place = {"driver": driver, "coupling": scheme, "force": load}
-                yield variant_case("consistent", changes, place, reduced=driver == "cauchy" and load == 10)
-            for speed in (1e-3, 0.25, 1.0, 10.0, 1e3):
-                changes = _changes(driver, scheme, **{"remodeling.kappa": speed, "time.end": 20.0})
-                yield variant_case("consistent", changes, {"driver": driver, "coupling": scheme, "kappa dt": speed})
-        for element, (kind, degree) in ELEMENTS.items():
-            changes = _changes(driver, "extrapolated", **{"mesh.element": kind, "mesh.degree": degree})
-            changes |= {"time.end": 20.0, "time.step": 2.0}
-            yield variant_case("consistent", changes, {"driver": driver, "element": element})
-
-
-@family("consistent, three axes")
-def three_axes() -> Iterator[Case]:
-    """Repeated and crossing principal stresses, loads that turn."""
-    block = partial(case_of_shape, "block", check_point)
-    for name, (forces, end) in TRIAXIAL.items():
-        for driver in DRIVERS:
-            for scheme in SCHEMES if driver == "cauchy" else SCHEMES[1:]:
-                changes = {f"loads.force_{a}": {"value": v, "ramp": ramp} for a, (v, ramp) in forces.items()}
-                changes |= _changes(driver, scheme, **{"time.end": end})
-                place = {"load": name, "driver": driver, "coupling": scheme}
-                yield block("consistent, three axes", changes, place)
-
-
-@family("consistent, shear")
-def shears() -> Iterator[Case]:
-    """Axes that are not coaxial, and a shear that changes its sign."""
-    driven = partial(case_of_shape, "driven", check_limit, reference="material point, dt -> 0")
-    reversed_ramp = [[0, 0], [10, 1], [30, 1], [50, -1]]
-    for driver in DRIVERS:
-        for scheme in SCHEMES:
-            for amount, ramp, end in ((0.3, RAMP, 40.0), (1.0, RAMP, 40.0), (0.3, reversed_ramp, 80.0)):
-                loads = {"loads.h_xz": {"value": amount, "ramp": ramp}, "time.end": end}
-                history = "reversed" if end > 40 else "held"
-                place = {"shear": amount, "history": history, "driver": driver, "coupling": scheme}
-                reduced = (driver, amount, history) == ("cauchy", 0.3, "held")
-                yield driven("consistent, shear", _changes(driver, scheme, **loads), place, reduced=reduced)
-
-
-@family("consistent, bodies")
-def bodies() -> Iterator[Case]:
-    """Random cells from weak loads to locking, and a twisted bar."""
-    for driver in DRIVERS:
-        for scheme in SCHEMES:
-            for force in (30.0, 300.0, 1000.0):
-                changes = _changes(driver, scheme, **{"loads.force.value": force})
-                place = {"cells": "random", "driver": driver, "coupling": scheme, "force": force}
-                yield tendon_case("consistent, bodies", changes, place)
-            for twist in (0.5, 3.0):
-                loads = {"twist": {"value": twist, "ramp": RAMP}, "elongation": {"value": 0.1, "ramp": RAMP}}
-                changes = _changes(driver, scheme, **{"geometry.shape": "twisted", "loads": loads})
-                changes |= {"cells.initial": "isotropic"}
-                place = {"driver": driver, "coupling": scheme, "twist": twist}
-                options = {"options": {"column": "stored_energy"}, "extended": True}
-                yield tendon_case("consistent, bodies", changes, place, **options)
-
-
-@family("consistent, tube")
-def tubes() -> Iterator[Case]:
-    """Figs. 7, 10 and 11 to their end; a row of the reference is a pass behind that of the schemes but `staggered`."""
-    for driver in DRIVERS:
-        for scheme in (*SCHEMES, "implicit"):
-            changes = _changes(driver, scheme, **{"time.end": 150.0, "time.step": 1.0, "mesh.degree": 1})
-            place = {"driver": driver, "coupling": scheme}
-            yield tube_case("consistent, tube", changes, place, counts=ring(16, 8), check=check_long)
+# Figs. 7, 10 and 11 to their end; a row of the reference is a pass behind that of the schemes but `staggered`
+table(
+    "consistent, tube", tube_case, {"driver": DRIVERS, "coupling": (*SCHEMES, "implicit")},
+    {**VARIANT, "time.end": 150.0, "time.step": 1.0, "mesh.degree": 1},
+    more={"counts": ring(16, 8), "check": check_long},
+)  # fmt: skip

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from benchmarks.stability_map.cases import Case, Check, Finding, Run, family, with_values
+from benchmarks.stability_map.cases import Case, Check, Finding, Place, Run, Values, named, table, with_values
 from benchmarks.stability_map.point import Path, diagonal_path
 from benchmarks.stability_map.solid import smallest_eigenvalue
 from tests.reference.radial import RadialMaterial
@@ -163,109 +163,79 @@ def deviations(scene: dict[str, Any], run: Run, path: Path, rows: int) -> dict[s
 
 # ---------------------------------------------------------------- families
 def cube_case(
-    family_name: str, changes: dict[str, Any], place: dict[str, Any], check: Check = check_point, **more: Any
+    family: str, changes: Values, place: Place, check: Check = check_point, reference: str = REFERENCE, **more: Any
 ) -> Case:
     """The demo's cube with other values."""
     scene = with_values(CUBE, changes)
-    key = f"{family_name}: " + ", ".join(f"{name} {value}" for name, value in place.items())
-    options = {"reference": REFERENCE, "place": place, "base": ("demos/cube.toml", changes), **more}
-    return Case(family_name, key, scene, check, **options)
+    return Case(family, named(family, place), scene, check, reference, place, base=("demos/cube.toml", changes), **more)
+
+
+def element(p: Place) -> Values:
+    """Kind and degree of the coordinate `element`."""
+    return dict(zip(("mesh.element", "mesh.degree"), ELEMENTS[p["element"]], strict=True))
 
 
 LOADS = (0.0, 1e-4, 1e-3, 0.01, 0.03, 0.1, 0.3, 0.5, 1.0, 3.0, 10.0, 30.0, 100.0, 1e3, 1e4, 1e6, 1e9)
+RAMP = [[0.0, 0.0], [10.0, 1.0]]
 
 
-@family("load")
-def loads() -> Iterator[Case]:
-    """From 1e-4 of the network's stiffness to far beyond locking."""
-    for frame in FRAMES:
-        for load in LOADS:
-            changes = {"loads.force.value": load, "remodeling.frame": frame}
-            # a tilt needs many passes to grow; a load far beyond locking needs many solves for each
-            changes |= {} if load <= 0.5 or load == 10 else {"time.end": 40.0 if load < 1e5 else 12.0}
-            yield cube_case("load", changes, {"frame": frame, "force": load}, reduced=load in (1e-4, 0.1, 10.0, 1e3))
+def spatial_explicit(p: Place) -> bool:
+    """The method as printed."""
+    return p["frame"] == "spatial" and p["law"] == "explicit"
 
 
-@family("weak load")
-def weak_loads() -> Iterator[Case]:
-    """The same ratio of load and network with other networks and cells."""
-    for frame in FRAMES:
-        for density in (1e20, 1e23, 1e25, 1e27):
-            for share in (1e-4, 1e-3, 1e-2, 3e-2, 0.1):
-                stiffness = 1.381e-23 * 310.0 * density / (4 * 1.82) * 1.8
-                changes = {
-                    "material.chain_density": density, "loads.force.value": share * stiffness,
-                    "remodeling.frame": frame, "time.end": 100.0, "time.step": 2.0,
-                }  # fmt: skip
-                yield cube_case("weak load", changes, {"frame": frame, "density": density, "load over network": share})
+# from 1e-4 of the network's stiffness to far beyond locking: a tilt needs many passes to grow; a load far beyond
+# locking needs many solves for each
+table(
+    "load", cube_case, {"frame": FRAMES, "force": LOADS},
+    lambda p: {} if p["force"] <= 0.5 or p["force"] == 10 else {"time.end": 40.0 if p["force"] < 1e5 else 12.0},
+    reduced=lambda p: p["force"] in (1e-4, 0.1, 10.0, 1e3),
+)  # fmt: skip
 
+# the same ratio of load and network with other networks and cells
+table(
+    "weak load", cube_case,
+    {"frame": FRAMES, "density": (1e20, 1e23, 1e25, 1e27), "load over network": (1e-4, 1e-3, 1e-2, 3e-2, 0.1)},
+    lambda p: {
+        "loads.force.value": p["load over network"] * (1.381e-23 * 310.0 * p["density"] / (4 * 1.82) * 1.8),
+        "time.end": 100.0, "time.step": 2.0,
+    },
+)  # fmt: skip
 
-@family("speed")
-def speeds() -> Iterator[Case]:
-    """kappa dt from 1e-4 to 1e3."""
-    for law in ("explicit", "rate", "relaxation"):
-        for frame in FRAMES:
-            for speed in (1e-4, 1e-3, 1e-2, 0.1, 1.0, 10.0, 100.0, 1e3):
-                changes = {
-                    "remodeling.kappa": speed, "remodeling.law": law, "remodeling.frame": frame, "time.end": 20.0,
-                }  # fmt: skip
-                place = {"law": law, "frame": frame, "kappa dt": speed}
-                yield cube_case("speed", changes, place, reduced=law == "explicit" and speed in (1e-4, 1e3))
+table(
+    "speed", cube_case,
+    {
+        "law": ("explicit", "rate", "relaxation"), "frame": FRAMES,
+        "kappa dt": (1e-4, 1e-3, 1e-2, 0.1, 1.0, 10.0, 100.0, 1e3),
+    },
+    {"time.end": 20.0}, reduced=lambda p: p["law"] == "explicit" and p["kappa dt"] in (1e-4, 1e3),
+)  # fmt: skip
 
+table(
+    "compressibility", cube_case,
+    {"frame": FRAMES, "force": (1.0, 30.0), "lambda/mu": (0.0, 0.1, 1.0, 10.0, 100.0, 1e3, 1e4, 1e5)},
+    {"time.end": 30.0}, reduced=lambda p: p["lambda/mu"] in (0.0, 1e5) and p["force"] == 30,
+)  # fmt: skip
 
-@family("compressibility")
-def compressibilities() -> Iterator[Case]:
-    """lambda/mu from 0 to 1e5."""
-    for frame in FRAMES:
-        for ratio in (0.0, 0.1, 1.0, 10.0, 100.0, 1e3, 1e4, 1e5):
-            for load in (1.0, 30.0):
-                changes = {
-                    "material.lame_lambda": ratio * 3.103, "loads.force.value": load, "remodeling.frame": frame,
-                    "time.end": 30.0,
-                }  # fmt: skip
-                place = {"frame": frame, "force": load, "lambda/mu": ratio}
-                yield cube_case("compressibility", changes, place, reduced=ratio in (0.0, 1e5) and load == 30)
+table(
+    "chain length", cube_case,
+    {"frame": FRAMES, "force": (1.0, 10.0), "r0/L": (0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95, 0.99, 0.999)},
+    lambda p: {"cells.end_to_end_length": p["r0/L"] * 2.125, "time.end": 40.0},
+    reduced=lambda p: p["r0/L"] in (0.05, 0.9, 0.999) and p["force"] == 10,
+)  # fmt: skip
 
+table(
+    "chain density", cube_case,
+    {"frame": FRAMES, "force": (3.0, 30.0), "density": (0.0, *(10.0**n for n in range(17, 28)))},
+    {"time.end": 40.0}, reduced=lambda p: p["density"] in (0.0, 1e17, 1e27) and p["force"] == 30,
+)  # fmt: skip
 
-@family("chain length")
-def chain_lengths() -> Iterator[Case]:
-    """r0/L from 0.05 to 0.999."""
-    for frame in FRAMES:
-        for share in (0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95, 0.99, 0.999):
-            for load in (1.0, 10.0):
-                changes = {
-                    "cells.end_to_end_length": share * 2.125, "loads.force.value": load, "remodeling.frame": frame,
-                    "time.end": 40.0,
-                }  # fmt: skip
-                place = {"frame": frame, "force": load, "r0/L": share}
-                yield cube_case("chain length", changes, place, reduced=share in (0.05, 0.9, 0.999) and load == 10)
-
-
-@family("chain density")
-def chain_densities() -> Iterator[Case]:
-    """n_chn over ten decades, and zero."""
-    for frame in FRAMES:
-        for density in (0.0, *(10.0**n for n in range(17, 28))):
-            changes = {"material.chain_density": density, "remodeling.frame": frame, "time.end": 40.0}
-            for load in (3.0, 30.0):
-                place = {"frame": frame, "force": load, "density": density}
-                reduced = density in (0.0, 1e17, 1e27) and load == 30
-                yield cube_case("chain density", {**changes, "loads.force.value": load}, place, reduced=reduced)
-
-
-@family("compression")
-def compressions() -> Iterator[Case]:
-    """Stable and not: the tangent of one element is the reference."""
-    for frame in FRAMES:
-        for density in (0.0, 7e21, 1e24):
-            for load in (-0.01, -1.0, -3.0, -10.0, -30.0, -100.0):
-                changes = {
-                    "loads.force.value": load, "material.chain_density": density, "remodeling.frame": frame,
-                    "time.end": 12.0,
-                }  # fmt: skip
-                place = {"frame": frame, "density": density, "force": load}
-                yield cube_case("compression", changes, place, reduced=density == 7e21 and load in (-10.0, -30.0))
-
+# stable and not: the tangent of one element is the reference
+table(
+    "compression", cube_case,
+    {"frame": FRAMES, "density": (0.0, 7e21, 1e24), "force": (-0.01, -1.0, -3.0, -10.0, -30.0, -100.0)},
+    {"time.end": 12.0}, reduced=lambda p: p["density"] == 7e21 and p["force"] in (-10.0, -30.0),
+)  # fmt: skip
 
 HISTORIES = {
     "unloaded": [[0.0, 0.0], [10.0, 1.0], [30.0, 1.0], [40.0, 0.0]],
@@ -273,86 +243,51 @@ HISTORIES = {
     "cycled": [[0.0, 0.0], [10.0, 1.0], [20.0, 0.1], [30.0, 1.0], [40.0, 0.1], [50.0, 1.0]],
     "released at once": [[0.0, 0.0], [10.0, 1.0], [30.0, 1.0], [31.0, 0.0]],
 }
+table(
+    "unloading", cube_case,
+    {"history": HISTORIES, "law": ("explicit", "rate", "relaxation"), "frame": FRAMES, "force": (10.0, 100.0)},
+    lambda p: {"loads.force.ramp": HISTORIES[p["history"]], "time.end": 60.0},
+    only=lambda p: p["force"] == 10 or spatial_explicit(p),
+    reduced=lambda p: p["force"] == 10 and spatial_explicit(p),
+)  # fmt: skip
 
+# all of a chain along one axis, l = 0 along the others, along and across the load
+PATTERNS: dict[str, Any] = {
+    **{f"axis {a}": ("aligned", a) for a in (1, 2, 3)},
+    "0.6, 0.8, 0": ([0.6, 0.8, 0.0], 3), "0, 0.6, 0.8": ([0.0, 0.6, 0.8], 3),
+}  # fmt: skip
+table(
+    "aligned cells", cube_case,
+    {"cells": PATTERNS, "law": ("explicit", "relaxation"), "frame": FRAMES, "force": (10.0, -3.0)},
+    lambda p: {
+        "cells.initial": PATTERNS[p["cells"]][0], "cells.aligned_axis": PATTERNS[p["cells"]][1], "time.end": 40.0,
+    },
+    reduced=lambda p: p["force"] == 10 and spatial_explicit(p),
+)  # fmt: skip
 
-@family("unloading")
-def unloadings() -> Iterator[Case]:
-    """After remodeling."""
-    for name, ramp in HISTORIES.items():
-        for law in ("explicit", "rate", "relaxation"):
-            for frame in FRAMES:
-                for load in (10.0, 100.0) if (law, frame) == ("explicit", "spatial") else (10.0,):
-                    changes = {
-                        "loads.force.value": load, "loads.force.ramp": ramp, "remodeling.law": law,
-                        "remodeling.frame": frame, "time.end": 60.0,
-                    }  # fmt: skip
-                    place = {"history": name, "law": law, "frame": frame, "force": load}
-                    reduced = frame == "spatial" and load == 10 and law == "explicit"
-                    yield cube_case("unloading", changes, place, reduced=reduced)
+# one huge step, and a thousand tiny ones
+STEPS = {
+    1: {"time.end": 100.0, "time.step": 100.0, "loads.force.ramp": [[0.0, 1.0]]},
+    4: {"time.end": 200.0, "time.step": 50.0, "loads.force.ramp": [[0.0, 0.0], [50.0, 1.0]]},
+    1000: {"time.end": 20.0, "time.step": 0.02, "loads.force.ramp": [[0, 0], [10, 1]]},
+}
+table(
+    "steps", cube_case, {"frame": FRAMES, "steps": STEPS, "force": (1.0, 10.0, 100.0, 1e4)},
+    lambda p: STEPS[p["steps"]], only=lambda p: p["steps"] < 1000 or p["force"] == 10,
+    reduced=lambda p: p["steps"] == 1 and p["force"] == 1e4,
+)  # fmt: skip
 
-
-@family("aligned cells")
-def aligned_cells() -> Iterator[Case]:
-    """All of a chain along one axis, l = 0 along the others, along and across the load."""
-    patterns: dict[str, Any] = {f"axis {a}": ("aligned", a) for a in (1, 2, 3)}
-    patterns |= {"0.6, 0.8, 0": ([0.6, 0.8, 0.0], 3), "0, 0.6, 0.8": ([0.0, 0.6, 0.8], 3)}
-    for name, (start, axis) in patterns.items():
-        for law in ("explicit", "relaxation"):
-            for frame in FRAMES:
-                for load in (10.0, -3.0):
-                    changes = {
-                        "cells.initial": start, "cells.aligned_axis": axis, "remodeling.law": law,
-                        "remodeling.frame": frame, "loads.force.value": load, "time.end": 40.0,
-                    }  # fmt: skip
-                    place = {"cells": name, "law": law, "frame": frame, "force": load}
-                    reduced = law == "explicit" and frame == "spatial" and load == 10
-                    yield cube_case("aligned cells", changes, place, reduced=reduced)
-
-
-@family("steps")
-def steps() -> Iterator[Case]:
-    """One huge step, and a thousand tiny ones."""
-    for frame in FRAMES:
-        for load in (1.0, 10.0, 100.0, 1e4):
-            changes = {"time.end": 100.0, "time.step": 100.0, "loads.force.ramp": [[0.0, 1.0]]}
-            changes |= {"loads.force.value": load, "remodeling.frame": frame}
-            yield cube_case("steps", changes, {"frame": frame, "steps": 1, "force": load}, reduced=load == 1e4)
-            changes = {"time.end": 200.0, "time.step": 50.0, "loads.force.ramp": [[0.0, 0.0], [50.0, 1.0]]}
-            changes |= {"loads.force.value": load, "remodeling.frame": frame}
-            yield cube_case("steps", changes, {"frame": frame, "steps": 4, "force": load})
-        changes = {
-            "time.end": 20.0,
-            "time.step": 0.02,
-            "remodeling.frame": frame,
-            "loads.force.ramp": [[0, 0], [10, 1]],
-        }
-        yield cube_case("steps", changes, {"frame": frame, "steps": 1000, "force": 10.0})
-
-
-@family("method")
-def methods() -> Iterator[Case]:
-    """Every driver, law, frame, coupling and element."""
-    for element, (kind, degree) in ELEMENTS.items():
-        for driver in DRIVERS:
-            for law in LAWS:
-                for frame in FRAMES:
-                    for coupling in COUPLINGS:
-                        if law == "none" and (frame, coupling) != ("spatial", "staggered"):
-                            continue  # nothing passes there
-                        changes = {
-                            "mesh.element": kind, "mesh.degree": degree, "remodeling.driver": driver,
-                            "remodeling.law": law, "remodeling.frame": frame, "remodeling.coupling": coupling,
-                            "time.end": 20.0, "time.step": 2.0,
-                        }  # fmt: skip
-                        place = {
-                            "element": element, "driver": driver, "law": law, "frame": frame, "coupling": coupling,
-                        }  # fmt: skip
-                        reduced = element == "hex1" and law == "explicit" and coupling == "relaxed"
-                        yield cube_case("method", changes, place, reduced=reduced)
+table(
+    "method", cube_case,
+    {"element": ELEMENTS, "driver": DRIVERS, "law": LAWS, "frame": FRAMES, "coupling": COUPLINGS},
+    lambda p: {**element(p), "time.end": 20.0, "time.step": 2.0},
+    # nothing passes with the law "none"
+    only=lambda p: p["law"] != "none" or (p["frame"], p["coupling"]) == ("spatial", "staggered"),
+    reduced=lambda p: (p["element"], p["law"], p["coupling"]) == ("hex1", "explicit", "relaxed"),
+)  # fmt: skip
 
 
 # ---------------------------------------------------------------- loads along all axes, bad elements
-RAMP = [[0.0, 0.0], [10.0, 1.0]]
 TRIAXIAL: dict[str, tuple[dict[str, tuple[float, list[list[float]]]], float]] = {
     "equibiaxial 3": ({"x": (3.0, RAMP), "z": (3.0, RAMP)}, 80.0),
     "equibiaxial 20": ({"x": (20.0, RAMP), "z": (20.0, RAMP)}, 80.0),
@@ -366,47 +301,47 @@ TRIAXIAL: dict[str, tuple[dict[str, tuple[float, list[list[float]]]], float]] = 
 }
 
 
+def triaxial(p: Place) -> Values:
+    """Dead forces along the axes, for the coordinate `load`."""
+    forces, end = TRIAXIAL[p["load"]]
+    return {f"loads.force_{a}": {"value": v, "ramp": ramp} for a, (v, ramp) in forces.items()} | {"time.end": end}
+
+
+def has_frame(p: Place) -> bool:
+    """S is of the reference: its frame is one."""
+    return p["driver"] != "pk2" or p["frame"] == FRAMES[0]
+
+
 def case_of_shape(
-    shape: str, check: Check, family_name: str, changes: dict[str, Any], place: dict[str, Any], **more: Any
+    shape: str, check: Check, family: str, changes: Values, place: Place, reference: str = REFERENCE, **more: Any
 ) -> Case:
     """A shape of `extensions` of the cube's size and material."""
     base = {**CUBE, "geometry": {"shape": shape, "side": 1.0}, "loads": {}}
-    key = f"{family_name}: " + ", ".join(f"{name} {value}" for name, value in place.items())
-    options = {"reference": REFERENCE, "place": place, "extended": True, **more}
-    return Case(family_name, key, with_values(base, changes), check, **options)
+    scene = with_values(base, changes)
+    return Case(family, named(family, place), scene, check, reference, place, extended=True, **more)
 
 
 block_case = partial(case_of_shape, "block", check_point)
+# repeated and crossing principal stresses, loads that turn, hydrostatic dead loads
+table(
+    "three axes", block_case, {"load": TRIAXIAL, "driver": DRIVERS, "frame": FRAMES, "coupling": COUPLINGS}, triaxial,
+    only=lambda p: has_frame(p)
+    and (not p["load"].startswith("hydrostatic") or (p["driver"], p["coupling"]) == ("cauchy", "staggered")),
+    reduced=lambda p: (p["driver"], p["coupling"], p["frame"]) == ("cauchy", "staggered", "spatial"),
+)  # fmt: skip
 
-
-@family("three axes")
-def three_axes() -> Iterator[Case]:
-    """Repeated and crossing principal stresses, loads that turn, hydrostatic dead loads."""
-    for name, (forces, end) in TRIAXIAL.items():
-        for driver in DRIVERS:
-            for frame in FRAMES[:1] if driver == "pk2" else FRAMES:
-                for coupling in COUPLINGS:
-                    if name.startswith("hydrostatic") and (driver, coupling) != ("cauchy", "staggered"):
-                        continue
-                    changes = {f"loads.force_{a}": {"value": v, "ramp": ramp} for a, (v, ramp) in forces.items()}
-                    changes |= {"remodeling.driver": driver, "remodeling.frame": frame, "time.end": end}
-                    changes |= {"remodeling.coupling": coupling}
-                    place = {"load": name, "driver": driver, "frame": frame, "coupling": coupling}
-                    reduced = driver == "cauchy" and coupling == "staggered" and frame == "spatial"
-                    yield block_case("three axes", changes, place, reduced=reduced)
-
-
-@family("bad elements")
-def bad_elements() -> Iterator[Case]:
-    """A homogeneous state is exact on any elements: flat ones, and nearly inverted ones."""
-    force = {"loads.force_z": {"value": 10.0, "ramp": RAMP}, "time.end": 12.0}
-    for aspect in (1.0, 10.0, 100.0, 1e3, 1e4):
-        for kind in ("hexahedron", "tetrahedron"):
-            changes = {**force, "loads.force_z": {"value": 10.0 / aspect, "ramp": RAMP}, "geometry.aspect": aspect}
-            changes |= {"mesh.element": kind, "mesh.refinement": 2}
-            yield block_case("bad elements", changes, {"element": kind, "aspect ratio": aspect}, reduced=aspect == 100)
-    for distortion in (0.5, 0.9, 0.99, 0.999, 1.1):
-        for frame in FRAMES:
-            changes = {**force, "geometry.distortion": distortion, "mesh.refinement": 2, "remodeling.frame": frame}
-            place = {"distortion": distortion, "frame": frame}
-            yield block_case("bad elements", changes, place, reduced=distortion == 0.99)
+# a homogeneous state is exact on any elements: flat ones, and nearly inverted ones
+table(
+    "bad elements", block_case,
+    {"element": ("hexahedron", "tetrahedron"), "aspect ratio": (1.0, 10.0, 100.0, 1e3, 1e4)},
+    lambda p: {
+        "loads.force_z": {"value": 10.0 / p["aspect ratio"], "ramp": RAMP}, "geometry.aspect": p["aspect ratio"],
+        "mesh.element": p["element"], "mesh.refinement": 2, "time.end": 12.0,
+    },
+    reduced=lambda p: p["aspect ratio"] == 100,
+)  # fmt: skip
+table(
+    "bad elements", block_case, {"distortion": (0.5, 0.9, 0.99, 0.999, 1.1), "frame": FRAMES},
+    {"loads.force_z": {"value": 10.0, "ramp": RAMP}, "mesh.refinement": 2, "time.end": 12.0},
+    reduced=lambda p: p["distortion"] == 0.99,
+)  # fmt: skip

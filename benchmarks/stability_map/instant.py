@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from benchmarks.stability_map import consistent
-from benchmarks.stability_map.cases import Case, Finding, Run, family
+from benchmarks.stability_map.cases import Case, Finding, Place, Run, Values, table
 from benchmarks.stability_map.homogeneous import (
     CUBE,
     cube_case,
@@ -72,26 +72,34 @@ LATE = {
 }
 
 
-@family("late load")
-def late_loads() -> Iterator[Case]:
+def late_case(family: str, changes: Values, place: Place, **more: Any) -> Case:
+    """The scheme itself where that is staggered, else small steps of the law."""
+    if place["coupling"] == "staggered":
+        given = {"check": consistent.check_point, "reference": "material point, the same scheme"}
+    else:
+        given = {"check": check_small_steps, "reference": f"material point, 1/{FINER} of the step"}
+    return cube_case(family, changes, place, **given, **more)
+
+
+def late(p: Place) -> Values:
     """Tension that is not there from the start, or goes and comes again."""
-    for history, ramp in LATE.items():
-        loads = {"loads.force.ramp": ramp, "time.end": 24.0}
-        for coupling in ("extrapolated", "implicit", "staggered"):
-            for driver in ("cauchy", "pk2", "finger"):
-                for force, kappa in ((10.0, 0.025), (10.0, 0.25)) if driver == "cauchy" else ((10.0, 0.1),):
-                    changes = {**TENSOR, **loads, "remodeling.coupling": coupling, "remodeling.driver": driver}
-                    changes |= {"remodeling.kappa": kappa, "loads.force.value": force}
-                    place = {"history": history, "coupling": coupling, "driver": driver, "kappa dt": kappa}
-                    if coupling == "staggered":
-                        check, reference = consistent.check_point, "material point, the same scheme"
-                    else:
-                        check, reference = check_small_steps, f"material point, 1/{FINER} of the step"
-                    reduced = history == "ramp at 4" and driver == "cauchy"
-                    yield cube_case("late load", changes, place, check, reference=reference, reduced=reduced)
-        for law in ("explicit", "rate", "relaxation"):
-            changes = {**POINT, **loads, "remodeling.law": law}
-            yield cube_case("late load", changes, {"history": history, "law": law})
+    return {"loads.force.ramp": LATE[p["history"]], "time.end": 24.0}
+
+
+table(
+    "late load", late_case,
+    {
+        "history": LATE, "coupling": ("extrapolated", "implicit", "staggered"), "driver": ("cauchy", "pk2", "finger"),
+        "kappa dt": (0.025, 0.1, 0.25),
+    },
+    lambda p: {**TENSOR, **late(p), "loads.force.value": 10.0},
+    only=lambda p: (p["driver"] == "cauchy") == (p["kappa dt"] != 0.1),
+    reduced=lambda p: p["history"] == "ramp at 4" and p["driver"] == "cauchy",
+)  # fmt: skip
+table(
+    "late load", cube_case, {"history": LATE, "law": ("explicit", "rate", "relaxation")},
+    lambda p: {**POINT, **late(p)},
+)  # fmt: skip
 
 
 # ---------------------------------------------------------------- the implicit coupling and weak jumps
@@ -125,55 +133,48 @@ def check_closed_form(case: Case, run: Run) -> Finding:
     return Finding(float(ratio), f"{words} off by {ratio:.3g} tolerances")
 
 
-@family("implicit, jump")
-def implicit_jumps() -> Iterator[Case]:
-    """All of the load at once, from weak to strong, soft to nearly incompressible: no point may keep its cells."""
-    for law in ("explicit", "tensor"):
-        base = {**(TENSOR if law == "tensor" else POINT), "remodeling.law": law, "remodeling.coupling": "implicit"}
-        base |= {"loads.force.ramp": [[0.0, 1.0]], "time.end": 6.0}
-        for force in (0.01, 0.05, 0.2, 1.0, 10.0):
-            for kappa in (0.025, 0.5):
-                changes = {**base, "loads.force.value": force, "remodeling.kappa": kappa}
-                place, reduced = {"law": law, "force": force, "kappa dt": kappa}, (force, kappa) == (0.2, 0.5)
-                options = {"reference": "closed form", "reduced": reduced}
-                yield cube_case("implicit, jump", changes, place, check_closed_form, **options)
-        for ratio in (100.0, 1e4, 1e5):
-            for force in (0.2, 10.0):
-                changes = {**base, "loads.force.value": force, "material.lame_lambda": 3.103 * ratio}
-                place = {"law": law, "force": force, "lambda/mu": ratio}
-                yield cube_case("implicit, jump", changes, place, check_closed_form, reference="closed form")
+def jump(p: Place) -> Values:
+    """All of the load at once: no point may keep its cells."""
+    base = TENSOR if p["law"] == "tensor" else POINT
+    return {**base, "remodeling.coupling": "implicit", "loads.force.ramp": [[0.0, 1.0]], "time.end": 6.0}
+
+
+# from weak to strong, soft to nearly incompressible
+closed_case = partial(cube_case, check=check_closed_form, reference="closed form")
+table(
+    "implicit, jump", closed_case,
+    {"law": ("explicit", "tensor"), "force": (0.01, 0.05, 0.2, 1.0, 10.0), "kappa dt": (0.025, 0.5)}, jump,
+    reduced=lambda p: (p["force"], p["kappa dt"]) == (0.2, 0.5),
+)  # fmt: skip
+table(
+    "implicit, jump", closed_case,
+    {"law": ("explicit", "tensor"), "force": (0.2, 10.0), "lambda/mu": (100.0, 1e4, 1e5)}, jump,
+)  # fmt: skip
 
 
 # ---------------------------------------------------------------- units
 UNITS = (1e-9, 1e-3, 92.4, 1e6)
 
 
-def in_units(changes: dict[str, Any], unit: float) -> dict[str, Any]:
+LENGTHS = (("material", "contour_length"), ("material", "persistence_length"), ("cells", "end_to_end_length"))
+
+
+def in_units(p: Place, changes: Values) -> Values:
     """Chain lengths in another unit; c times r0 is what stresses have, so that n_chn stays."""
-    own = {**CUBE["material"], **CUBE["cells"]}
-    return {
-        **changes,
-        "material.contour_length": own["contour_length"] * unit,
-        "material.persistence_length": own["persistence_length"] * unit,
-        "cells.end_to_end_length": own["end_to_end_length"] * unit,
-    }
+    return {**changes, **{f"{part}.{key}": CUBE[part][key] * p["unit"] for part, key in LENGTHS}}
 
 
-@family("units")
-def units() -> Iterator[Case]:
-    """L, A_p and r0 in other units: the reference is that of the numbers as they are."""
-    for unit in UNITS:
-        for law in ("explicit", "rate", "relaxation"):
-            for driver in ("cauchy", "pk2"):
-                changes = in_units({**POINT, "remodeling.law": law, "remodeling.driver": driver}, unit)
-                yield cube_case("units", changes | {"time.end": 20.0}, {"law": law, "driver": driver, "unit": unit})
-        for coupling in ("staggered", "extrapolated"):
-            changes = in_units({**TENSOR, "remodeling.coupling": coupling, "time.end": 20.0}, unit)
-            place = {"law": "tensor", "coupling": coupling, "unit": unit}
-            yield cube_case("units", changes, place, consistent.check_point)
-        for law in ("explicit", "tensor"):
-            base = TENSOR if law == "tensor" else POINT
-            changes = {**base, "remodeling.law": law, "remodeling.coupling": "implicit", "time.end": 6.0}
-            changes = in_units({**changes, "loads.force.ramp": [[0.0, 1.0]]}, unit)
-            place = {"law": law, "coupling": "implicit", "unit": unit}
-            yield cube_case("units", changes, place, check_closed_form, reference="closed form")
+# L, A_p and r0 in other units: the reference is that of the numbers as they are
+table(
+    "units", cube_case, {"law": ("explicit", "rate", "relaxation"), "driver": ("cauchy", "pk2"), "unit": UNITS},
+    lambda p: in_units(p, {**POINT, "time.end": 20.0}),
+)  # fmt: skip
+table(
+    "units", partial(cube_case, check=consistent.check_point),
+    {"law": ("tensor",), "coupling": ("staggered", "extrapolated"), "unit": UNITS},
+    lambda p: in_units(p, {**TENSOR, "time.end": 20.0}),
+)  # fmt: skip
+table(
+    "units", closed_case, {"law": ("explicit", "tensor"), "coupling": ("implicit",), "unit": UNITS},
+    lambda p: in_units(p, jump(p)),
+)  # fmt: skip

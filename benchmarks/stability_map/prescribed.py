@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from benchmarks.stability_map.cases import Case, Finding, Run, family
+from benchmarks.stability_map.cases import Case, Finding, Run, table
 from benchmarks.stability_map.homogeneous import (
     COUPLINGS,
     DRIVERS,
     FRAMES,
+    RAMP,
     case_of_shape,
     factor,
+    has_frame,
     initial,
     material,
     step_times,
@@ -25,7 +26,6 @@ FINER = 16  # steps of the reference in one of the scene's
 LIMIT_TOLERANCE = 0.03  # of A over r0^2: the staggered pass has an error of the order of kappa dt = 0.025
 SETTLED = 0.01  # of A between two references, or there is no limit
 REFERENCE = "material point, dt -> 0"
-RAMP = [[0.0, 0.0], [10.0, 1.0]]
 
 
 def gradients(scene: dict[str, Any], times: np.ndarray) -> np.ndarray:
@@ -74,48 +74,31 @@ def compared_with_limit(scene: dict[str, Any], run: Run, expected: np.ndarray, c
 
 driven_case = partial(case_of_shape, "driven", check_limit, reference=REFERENCE)
 
+# the principal directions turn with the load and differ between stress, strain and cells
+table(
+    "shear", driven_case, {"shear": (0.01, 0.3, 1.0), "driver": DRIVERS, "frame": FRAMES, "coupling": COUPLINGS},
+    lambda p: {"loads.h_xz": {"value": p["shear"], "ramp": RAMP}, "time.end": 40.0},
+    only=has_frame, reduced=lambda p: p["shear"] == 0.3 and p["driver"] == "cauchy",
+)  # fmt: skip
 
-@family("shear")
-def shears() -> Iterator[Case]:
-    """Simple shear: the principal directions turn with the load and differ between stress, strain and cells."""
-    for amount in (0.01, 0.3, 1.0):
-        for driver in DRIVERS:
-            for frame in FRAMES[:1] if driver == "pk2" else FRAMES:
-                for coupling in COUPLINGS:
-                    changes = {"loads.h_xz": {"value": amount, "ramp": RAMP}, "time.end": 40.0}
-                    changes |= {"remodeling.driver": driver, "remodeling.frame": frame}
-                    changes |= {"remodeling.coupling": coupling}
-                    place = {"shear": amount, "driver": driver, "frame": frame, "coupling": coupling}
-                    yield driven_case("shear", changes, place, reduced=amount == 0.3 and driver == "cauchy")
+# the patch test under shear and stretch, with a node inside that is moved
+table(
+    "shear of bad elements", driven_case,
+    {"distortion": (0.0, 0.9, 0.999), "law": ("explicit", "relaxation"), "frame": FRAMES},
+    {
+        "loads.h_xz": {"value": 0.3, "ramp": RAMP}, "loads.h_zz": {"value": 0.2, "ramp": RAMP}, "mesh.refinement": 2,
+        "time.end": 30.0,
+    },
+    reduced=lambda p: p["distortion"] == 0.9,
+)  # fmt: skip
 
-
-@family("shear of bad elements")
-def bad_shears() -> Iterator[Case]:
-    """The patch test under shear and stretch, with a node inside that is moved."""
-    for distortion in (0.0, 0.9, 0.999):
-        for law in ("explicit", "relaxation"):
-            for frame in FRAMES:
-                changes = {
-                    "loads.h_xz": {"value": 0.3, "ramp": RAMP}, "loads.h_zz": {"value": 0.2, "ramp": RAMP},
-                    "mesh.refinement": 2, "geometry.distortion": distortion, "remodeling.law": law,
-                    "remodeling.frame": frame, "time.end": 30.0,
-                }  # fmt: skip
-                place = {"distortion": distortion, "law": law, "frame": frame}
-                yield driven_case("shear of bad elements", changes, place, reduced=distortion == 0.9)
-
-
-@family("shear reversed")
-def reversed_shears() -> Iterator[Case]:
-    """Shear that changes its sign, under a constant stretch; laws that forget."""
-    for law in ("explicit", "relaxation"):
-        for driver in DRIVERS:
-            for frame in FRAMES[:1] if driver == "pk2" else FRAMES:
-                for coupling in COUPLINGS:
-                    changes = {
-                        "loads.h_xz": {"value": 0.3, "ramp": [[0, 0], [10, 1], [30, 1], [50, -1]]},
-                        "loads.h_zz": {"value": 0.1, "ramp": RAMP}, "remodeling.law": law,
-                        "remodeling.driver": driver, "remodeling.frame": frame, "remodeling.coupling": coupling,
-                        "time.end": 80.0,
-                    }  # fmt: skip
-                    place = {"law": law, "driver": driver, "frame": frame, "coupling": coupling}
-                    yield driven_case("shear reversed", changes, place)
+# shear that changes its sign, under a constant stretch; laws that forget
+REVERSED = [[0, 0], [10, 1], [30, 1], [50, -1]]
+table(
+    "shear reversed", driven_case,
+    {"law": ("explicit", "relaxation"), "driver": DRIVERS, "frame": FRAMES, "coupling": COUPLINGS},
+    {
+        "loads.h_xz": {"value": 0.3, "ramp": REVERSED}, "loads.h_zz": {"value": 0.1, "ramp": RAMP}, "time.end": 80.0,
+    },
+    only=has_frame,
+)  # fmt: skip

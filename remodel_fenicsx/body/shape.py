@@ -86,6 +86,8 @@ class Shape(Table):
         Columns of the history beside those of the loads.
     columns_on_request
         Further ones that a scene may name in `output.columns`.
+    angle_layers
+        Columns of the fibre angle that are means over one layer of elements, each with the layer's `depth`.
     axis_kinds
         What `cells.axes` may be (`model.cells.AXES`).
     number_of_elements
@@ -106,6 +108,7 @@ class Shape(Table):
     loads: ClassVar[dict[str, LoadKind]]
     columns: ClassVar[tuple[Column, ...]]
     columns_on_request: ClassVar[tuple[Column, ...]] = ()
+    angle_layers: ClassVar[dict[str, float]] = {}
     axis_kinds: ClassVar[tuple[str, ...]] = ("global",)
     number_of_elements: ClassVar[int]
     faces: ClassVar[tuple[str, ...]] = ()

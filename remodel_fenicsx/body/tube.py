@@ -165,6 +165,9 @@ def _layer_angle(share: float) -> Callable[[Any], float]:
     return value
 
 
+_LAYERS = {"fibre_angle_inner": 0.0, "fibre_angle_middle": 0.5, "fibre_angle_outer": 1.0}
+
+
 def _add_pressure(loading: Loading, name: str) -> None:
     (loading.add_cavity_pressure if loading.has_caps else loading.add_follower_pressure)(name, "inner")
 
@@ -230,10 +233,11 @@ class Tube(Shape):
         Column(
             "outer_radius", "length", "mean distance from the axis over the deformed outer face", _mean_radius("outer")
         ),
-        Column("fibre_angle_inner", "degrees", f"{_ANGLE} R_i", _layer_angle(0.0)),
-        Column("fibre_angle_middle", "degrees", f"{_ANGLE} (R_i + R_o)/2", _layer_angle(0.5)),
-        Column("fibre_angle_outer", "degrees", f"{_ANGLE} R_o", _layer_angle(1.0)),
+        Column("fibre_angle_inner", "degrees", f"{_ANGLE} R_i", _layer_angle(_LAYERS["fibre_angle_inner"])),
+        Column("fibre_angle_middle", "degrees", f"{_ANGLE} (R_i + R_o)/2", _layer_angle(_LAYERS["fibre_angle_middle"])),
+        Column("fibre_angle_outer", "degrees", f"{_ANGLE} R_o", _layer_angle(_LAYERS["fibre_angle_outer"])),
     )
+    angle_layers: ClassVar[dict[str, float]] = _LAYERS
     columns_on_request: ClassVar[tuple[Column, ...]] = (
         Column(
             "reduced_axial_force",

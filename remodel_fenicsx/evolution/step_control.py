@@ -74,6 +74,7 @@ class StepControl:
         self.stepper, self.state, self.tolerance = stepper, stepper.state, tolerance
         self.first, self.stops = first, list(stops)
         self.error = TimeError(stepper)
+        self.level = logging.WARNING  # of what is said of steps above the tolerance
         initial = {"wanted": first, "effective": 0.0, "before": 1.0, "said": 0.0}
         initial |= {"usual": first, "in_vain": 0.0, "goes_on": 0.0}
         initial |= {"refused": 0.0, "refused_error": 0.0}  # a longer step, since which all have been shorter
@@ -215,7 +216,8 @@ class StepControl:
         if self.state.comm.rank:
             return
         goes_on = f"; steps of {self._numbers['usual']:.3g} go on" if self._numbers["goes_on"] else ""
-        log.warning(
+        log.log(
+            self.level,
             "time %g: the estimated error in time, %.3g degrees, does not fall to time.tolerance = %g with steps of "
             "%.3g: cells turn over at once there, or the pass over-corrects%s. The column time_error has what was "
             "reached",

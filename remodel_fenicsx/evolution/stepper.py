@@ -43,8 +43,7 @@ class Step:
     time_error
         Estimated error in time of the solved state, degrees; NaN where nobody estimates it (`time_error.TimeError`).
     negative_eigenvalues
-        Of the tangent at the solved state, where somebody has counted them; NaN where not
-        (`watch.equilibrium_stability`).
+        Of the tangent at the solved state; NaN where nobody counts them (`watch.equilibrium_stability`).
     row
         Its columns by name, where somebody measures (`results.columns.Observer`).
     """

@@ -33,9 +33,6 @@ NEWS = 0.1  # relative change of energies from which on the work, an assembly, i
 # Of the matrix's energy: less of it, lost inside elements, costs no noticeable part of the way. Energies go with
 # squares of displacements; where 5.1 % of the way are missing, 8e-4 was measured
 NOTICEABLE = 1e-4
-# Of the matrix's energy: with less from loads and elongation it is the cells that deform the body. Elongated tubes have
-# about 1, bodies that their cells deform under weak loads nearly 0
-ELONGATED = 0.5
 # Change of a displacement, over its largest value, by which forces of the elements are differentiated
 DIFFERENCE = 1e-4
 MOST_HELD = 0.99  # part of a motion that elements hold back, in the sum of a geometric series
@@ -95,17 +92,14 @@ class LockingWarning(WarnsOnce):
         driven = Missing(0.0, 0.0)
         if work > DRIVEN * energy > 0:
             driven = Missing(volume / work, shape / work)
-        if volume <= NOTICEABLE * energy or not (answer := self.response()):
+        if volume <= NOTICEABLE * energy or (lacking := self.response()) is None:
             return driven
-        lacking, smooth = answer
         driven = driven._replace(volume=min(driven.volume, lacking))
-        if max(free_work, 0.0) + self._energy_of_elongation() < ELONGATED * energy:
+        if max(free_work, 0.0) + self._energy_of_elongation() < DRIVEN * energy:
             return driven
-        # 0.35 in a wall that its random cells alone deform; at least 0.87 in the paper's artery and in tubes that lock
-        alone = max(2 * smooth - 1, 0.0) * lacking
         if free_work > 0:
-            alone = min(alone, volume / free_work)
-        return max(driven, Missing(alone, 0.0), key=sum)
+            lacking = min(lacking, volume / free_work)
+        return max(driven, Missing(lacking, 0.0), key=sum)
 
     def _energy_of_elongation(self) -> float:
         """That a prescribed elongation e gives a matrix of constant volume: 3/2 mu e^2 over the body."""
@@ -206,15 +200,15 @@ class VolumeResponse:
         self.stepper, self.state, self.stiffness = stepper, stepper.state, stiffness
         self.quadrature = stepper.state.cells.quadrature
 
-    def __call__(self) -> tuple[float, float] | None:
-        """Which part of its way the body lacks, and how smooth it is what holds it back, both from 0 to 1.
+    def __call__(self) -> float | None:
+        """Which part of its way the body lacks, from 0 to 1.
 
         None where it is not known: the solver keeps no factors, or elements of a single point have nothing inside.
         """
         factors = self.stepper.coupling.newton.factorisation()
         if factors is None or self.quadrature.shape[1] == 1 or not factors.getOperators()[0].assembled:
             return None
-        changes, stress = self._stress()
+        stress = self._stress()
         forces, first = factors.getOperators()[0].createVecs()
         self._assemble(stress, forces)
         factors.apply(forces, first)
@@ -226,32 +220,17 @@ class VolumeResponse:
             lacking = self._part_of_the_way(first, 1 / (1 - min(max(share, 0.0), MOST_HELD)))
         for vector in (forces, first):
             vector.destroy()
-        return lacking, self._smooth_share(changes)
+        return lacking
 
-    def _smooth_share(self, changes: Array) -> float:
-        """How alike values (elements, points) vary in neighbouring elements: 1 for a smooth field, near 0 for noise.
-
-        One less the squared jumps of the slopes in space between elements, over the squared slopes.
-        """
-        quadrature = self.quadrature
-        places = quadrature.owned(quadrature.coordinates)
-        places = places - places.mean(axis=1, keepdims=True)
-        slopes = np.einsum("eip,ep->ei", np.linalg.pinv(places, rcond=1e-6), changes)
-        jumps = quadrature.jumps(np.repeat(slopes[:, None], quadrature.shape[1], axis=1))
-        weights = self.stiffness * np.square(places).sum(axis=-1)
-        squares, jumped = (
-            quadrature.integral(weights * values[:, None]) for values in (np.square(slopes).sum(axis=1), jumps)
-        )
-        return max(1 - jumped / squares, 0.0) if squares > 0 else 0.0
-
-    def _stress(self) -> tuple[Array, Array]:
-        """ln J - ln J_e (elements, points), and P (elements, points, 3, 3) of the present unknowns."""
+    def _stress(self) -> Array:
+        """P of the present unknowns, (elements, points, 3, 3)."""
         quadrature = self.quadrature
         states = quadrature.owned(self.stepper.coupling.equilibrium.states())
         changes = quadrature.beyond(0, np.log(states[..., 1])[..., None])[..., 0]
         F = states[..., 2:].reshape(*changes.shape, 3, 3)
         inverse = np.swapaxes(np.linalg.inv(F), -1, -2)
-        return changes, (self.stiffness * changes)[..., None, None] * inverse
+        stress: Array = (self.stiffness * changes)[..., None, None] * inverse
+        return stress
 
     def _assemble(self, stress: Array, forces: Any) -> None:
         """Nodal forces of a stress, zero where displacements are prescribed."""
@@ -284,7 +263,7 @@ class VolumeResponse:
         try:
             for sign, end in zip((1.0, -1.0), ends, strict=True):
                 values[:] = start + sign * step * change
-                self._assemble(self._stress()[1], end)
+                self._assemble(self._stress(), end)
         finally:
             values[:] = start
         ends[0].axpy(-1.0, ends[1])

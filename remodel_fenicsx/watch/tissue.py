@@ -1,4 +1,4 @@
-"""What a run says of its tissue: volume that is lost, and chains that do not lie in the wall."""
+"""What a run says of its tissue: volume that is lost, chains that do not lie in the wall, and fronts."""
 
 from __future__ import annotations
 
@@ -8,7 +8,10 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from remodel_fenicsx.evolution.stepper import Step, Stepper
+from remodel_fenicsx.body.domain import Domain
+from remodel_fenicsx.body.shape import Shape
+from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
+from remodel_fenicsx.fem.compat import geometry_dofmap
 from remodel_fenicsx.system.terminal import NOTICE
 from remodel_fenicsx.watch.once import WarnsOnce
 
@@ -20,6 +23,9 @@ log = logging.getLogger(__name__)
 NOTED = 0.05  # mean loss that the log mentions at the end
 MEAN_LOSS, LEAST_JACOBIAN = 0.2, 0.6  # from where on it is hardly meant
 RADIAL_SHARE = 0.5  # of the chains: more of them out of the wall are said
+# degrees between two points of an element that are a front, not a slope: within its elements the paper's artery turns
+# by up to 14 degrees; and the share of a layer that such elements make up
+FRONT_ANGLE, FRONT_SHARE = 45.0, 0.5
 
 
 class VolumeLoss(WarnsOnce):
@@ -96,4 +102,59 @@ class RadialChains(WarnsOnce):
                 f"more than half of the chains point out of the wall (radial_share {self._numbers['share']:.2g}); the "
                 "fibre angles are those of the others",
                 NOTICE,
+            )
+
+
+class FrontsInLayers(Watcher):
+    """Warns at the end where a layer's mean fibre angle is one of two families, with a front between them.
+
+    Inside of an element a front lies between two points, wherever it would be: the mean over the element moves by steps
+    with the mesh. What is no mean over a single layer of elements hardly notices.
+
+    Parameters
+    ----------
+    stepper
+        Whose last state is looked at.
+    shape, domain
+        With the layers (`Shape.angle_layers`) and the angles.
+    """
+
+    def __init__(self, stepper: Stepper, shape: Shape, domain: Domain):
+        self.state, self.shape, self._found = stepper.state, shape, list[tuple[str, float, float]]()
+        nodes = domain.mesh.geometry.x[geometry_dofmap(domain.mesh)]
+        depths = shape.depth(nodes) if shape.angle_layers else np.zeros(nodes.shape[:-1])
+        self._layers = {
+            name: (depths.min(axis=1) <= share + 1e-6) & (depths.max(axis=1) >= share - 1e-6)
+            for name, share in shape.angle_layers.items()
+        }
+
+    def solved(self, step: Step) -> None:
+        """Look at the last state."""
+        self._found = []
+        if not step.is_last:
+            return
+        cells, quadrature = self.state.cells, self.state.cells.quadrature
+        angles = self.shape.fibre_angle(cells.dimension_values, cells.axis_values, quadrature.coordinates)
+        known = ~np.isnan(angles)
+        least = np.where(known, angles, np.inf).min(axis=1)
+        most = np.where(known, angles, -np.inf).max(axis=1)
+        has_front = most - least > FRONT_ANGLE
+        for name, layer in self._layers.items():
+            share = quadrature.mean(np.repeat(has_front[:, None], quadrature.shape[1], axis=1).astype(float), layer)
+            if share > FRONT_SHARE:
+                inside = (layer & has_front)[:, None]
+                low = quadrature.minimum(np.where(inside, least[:, None], np.inf))
+                high = quadrature.maximum(np.where(inside, most[:, None], -np.inf))
+                self._found.append((name, low, high))
+
+    def committed(self, step: Step) -> None:
+        """Say it."""
+        for name, low, high in self._found if self.state.comm.rank == 0 else ():
+            log.warning(
+                "time %g: %s is a mean over elements in which the angle jumps, from %.3g to %.3g degrees: a front lies "
+                "in them, and the mean depends on the mesh; set a larger mesh.refinement",
+                step.time,
+                name,
+                low,
+                high,
             )
