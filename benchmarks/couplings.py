@@ -23,7 +23,7 @@ from mpi4py import MPI
 
 from remodel_fenicsx import Simulation, read_scene
 from remodel_fenicsx.body.tube import Tube, whole_tube
-from remodel_fenicsx.paper.output import COLOURS, STYLE, Page, panel_letters, read_table
+from remodel_fenicsx.studies.page import COLOURS, STYLE, Page, panel_letters, read_table
 
 DOCS = Path(__file__).parents[1] / "docs"
 ARTERY = Path(__file__).parents[1] / "demos" / "artery.toml"

@@ -25,7 +25,7 @@ DOCS = Path(__file__).resolve().parent
 sys.path[:0] = [str(DOCS), str(DOCS.parent)]
 
 from remodel_fenicsx import Simulation  # noqa: E402
-from remodel_fenicsx.paper.output import COLOURS, STYLE, Page, panel_letters, read_table  # noqa: E402
+from remodel_fenicsx.studies.page import COLOURS, STYLE, Page, panel_letters, read_table  # noqa: E402
 from remodel_fenicsx.results.columns import Measurement  # noqa: E402
 from remodel_fenicsx.scene import preset_scene  # noqa: E402
 

@@ -26,7 +26,7 @@ from remodel_fenicsx import Scene, Simulation  # noqa: E402
 from remodel_fenicsx.body import Cube, LoadKind  # noqa: E402
 from remodel_fenicsx.body.domain import Domain  # noqa: E402
 from remodel_fenicsx.body.tube import Tube, whole_tube  # noqa: E402
-from remodel_fenicsx.paper.output import COLOURS, STYLE, Page, panel_letters, read_table  # noqa: E402
+from remodel_fenicsx.studies.page import COLOURS, STYLE, Page, panel_letters, read_table  # noqa: E402
 from remodel_fenicsx.schema.units import FORCE  # noqa: E402
 from remodel_fenicsx.solver.continuation import StepFailure  # noqa: E402
 

@@ -1,9 +1,10 @@
-"""Makes docs/verification.md and docs/figures/ anew: ./with-fenicsx python3 docs/make_verification.py
+"""Makes docs/verification.md and docs/figures/ anew: ./with-fenicsx python3 docs/make_verification.py [--keep]
 
-Draws every figure (runs that are still valid are used again), solves the independent radial reference of tests/, makes
-the studies of verification_studies.py, and keeps the pictures and the small tables in docs/figures/. The page is
-make_verification.template.md; each {name} in it is computed from the tables in docs/figures/, so that a test can do the
-same without a run.
+Draws every figure, solves the independent radial reference of tests/, makes the studies of verification_studies.py, and
+keeps the pictures and the small tables in docs/figures/. The page is make_verification.template.md; each {name} in it
+is computed from the tables in docs/figures/, so that a test can do the same without a run.
+
+All runs are made anew. --keep uses runs and tables that are there: after a stop, or where results have not changed.
 """
 
 from __future__ import annotations
@@ -25,9 +26,8 @@ from compare_consistent import page_values  # noqa: E402
 from verification_studies import study  # noqa: E402
 
 from remodel_fenicsx import paper as figures  # noqa: E402
-from remodel_fenicsx.paper.captions import CAPTIONS  # noqa: E402
-from remodel_fenicsx.paper.cases import LOAD_CASES  # noqa: E402
-from remodel_fenicsx.paper.output import COLOURS, STYLE, Page, read_table  # noqa: E402
+from remodel_fenicsx.paper.runs import LOAD_CASES  # noqa: E402
+from remodel_fenicsx.studies.page import COLOURS, STYLE, Page, read_table  # noqa: E402
 from tests.reference.radial import RadialHistory, solve_radial  # noqa: E402
 
 KEPT = DOCS / "figures"
@@ -408,7 +408,7 @@ def page(kept: Path = KEPT) -> str:
         "table_turned": invariance_table(kept, "deformed body"),
         "table_everything": invariance_table(kept, "everything"),
         "made_with": made_with(kept),
-        **{f"caption_{name}": caption for name, (_, caption) in CAPTIONS.items()},
+        **{f"caption_{name}": figure.caption for name, figure in figures.FIGURES.items()},
         "caption_reference": REFERENCE_CAPTION[1],
     }  # fmt: skip
     return (DOCS / "make_verification.template.md").read_text(encoding="utf-8").format_map(values)
@@ -416,11 +416,13 @@ def page(kept: Path = KEPT) -> str:
 
 def main() -> None:
     """Draw, compare, keep, write."""
-    drawn = figures.DEFAULT_FOLDER
-    figures.draw(folder=drawn)
+    keep, drawn, runs = sys.argv[1:] == ["--keep"], figures.DEFAULT_FOLDER, Path("results/verification-runs")
+    if not keep:
+        shutil.rmtree(runs, ignore_errors=True)
+    figures.draw(folder=drawn, runs=runs)
     with matplotlib.rc_context(STYLE):
         radial_reference(Page(drawn, "radial-reference", *REFERENCE_CAPTION))
-    studies = study(drawn)
+    studies = study(drawn, keep)
     KEPT.mkdir(exist_ok=True)
     pictures = (*figures.FIGURES, "radial-reference")
     for name in pictures:

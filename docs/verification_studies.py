@@ -1,6 +1,6 @@
 """What docs/make_verification.py computes beside the figures: comparisons with the radial reference, invariance.
 
-Each study is a table, NAME.csv. They take minutes, so a table is used again while the source it depends on stays.
+Each study is a table, NAME.csv. They take minutes; a table may be used again where versions and the files below stay.
 """
 
 from __future__ import annotations
@@ -23,11 +23,10 @@ sys.path.insert(0, str(ROOT))
 from remodel_fenicsx.evolution.remodeling import RemodelingPass  # noqa: E402
 from remodel_fenicsx.evolution.stepper import Step, Watcher  # noqa: E402
 from remodel_fenicsx.model.spectral import positive_direction  # noqa: E402
-from remodel_fenicsx.paper.cases import scenes  # noqa: E402
-from remodel_fenicsx.paper.output import Page, read_table  # noqa: E402
-from remodel_fenicsx.paper.validity import library_versions, source_fingerprint  # noqa: E402
+from remodel_fenicsx.paper.runs import library_versions, scenes  # noqa: E402
 from remodel_fenicsx.results.columns import Measurement  # noqa: E402
 from remodel_fenicsx.simulation import Simulation  # noqa: E402
+from remodel_fenicsx.studies.page import Page, read_table  # noqa: E402
 from remodel_fenicsx.system.children import cores  # noqa: E402
 
 Row = dict[str, Any]
@@ -188,12 +187,12 @@ def _called(job: tuple[Callable[[Any], Any], Any]) -> Any:
     return job[0](job[1])
 
 
-def study(folder: Path) -> list[str]:
-    """Write the tables that are not there or no longer valid; returns the names of all."""
+def study(folder: Path, keep: bool) -> list[str]:
+    """Write the tables, or with `keep` only those not there or no longer valid; returns the names of all."""
     key = f"key {_key()}"
     single = {"stopped-points": (stopped_points, "artery-0-4.8"), "stiff-tendon": (stiff_tendon, "tendon")}
     tables: dict[str, Any] = {**single, **comparison_jobs(), **invariance_jobs()}
-    wanted = [name for name in tables if not _is_valid(folder / f"{name}.csv", key)]
+    wanted = [name for name in tables if not (keep and _is_valid(folder / f"{name}.csv", key))]
     os.environ["OMP_NUM_THREADS"] = "1"  # of the processes below, one for each core
     pool = ProcessPoolExecutor(cores(), multiprocessing.get_context("spawn"))
     try:
@@ -213,7 +212,7 @@ def study(folder: Path) -> list[str]:
 
 def _key() -> str:
     """Hash of what the tables depend on."""
-    digest = hashlib.sha256(f"{source_fingerprint()} {library_versions()}".encode())
+    digest = hashlib.sha256(str(library_versions()).encode())
     for name in USED_BY_STUDIES:
         digest.update((ROOT / name).read_bytes())
     return digest.hexdigest()[:12]

@@ -25,6 +25,7 @@ from remodel_fenicsx.system.environment import kernels, reason_undrawable, reaso
 from remodel_fenicsx.system.regular_files import ForeignFileError
 
 BAD_INPUT, SOLVE_FAILED, STOPPED, BAD_ENVIRONMENT = 2, 3, interrupts.PAUSED, 5
+STUDY_STOPPED = "stopped; all that is recorded is kept, the same command goes on"
 EXIT_CODES = {
     0: "finished",
     BAD_INPUT: "bad input",
@@ -233,7 +234,7 @@ def _stability(options: argparse.Namespace) -> int:
     _check(reason_undrawable())
 
     def analyse(scene: Scene, folder: Path | None, quiet: bool) -> Path:
-        from remodel_fenicsx.stability import in_words, stability
+        from remodel_fenicsx.studies.stability import in_words, stability
 
         place, table, unseen = stability(scene, folder, options.times, quiet=quiet)
         _say(in_words(table, unseen))
@@ -246,8 +247,8 @@ def _study(options: argparse.Namespace, task: Callable[[Scene], tuple[Path, str,
     """Several runs that answer one question: `task` makes the folder, the answer in words, and what has failed."""
     scene = read_scene(options.scene, options.set, options.profile)
     _check(reason_unusable() or reason_undrawable())
-    from remodel_fenicsx.paper.errors import FigureError
-    from remodel_fenicsx.studies.members import TooFewRuns
+    from remodel_fenicsx.studies.page import FigureError
+    from remodel_fenicsx.studies.runs import TooFewRuns
 
     try:
         with interrupts.StopRequest(), interrupts.stopping_at_once():
@@ -258,7 +259,7 @@ def _study(options: argparse.Namespace, task: Callable[[Scene], tuple[Path, str,
     except FigureError as refusal:  # a picture or a table of somebody else's stands in its place
         return _fail(str(refusal), refusal.exit_code)
     except interrupts.Interrupted as interruption:
-        return _fail("stopped; all that is recorded is kept, the same command goes on", interruption.exit_code)
+        return _fail(STUDY_STOPPED, interruption.exit_code)
     except ForeignFileError as error:
         return _fail(f"{error.filename}: {error.strerror}", BAD_INPUT)
     except OSError as error:
@@ -289,11 +290,10 @@ def _ensemble(options: argparse.Namespace) -> int:
 def _trade(options: argparse.Namespace) -> int:
     def task(scene: Scene) -> tuple[Path, str, dict[str, str]]:
         from remodel_fenicsx.studies import trade as study
-        from remodel_fenicsx.studies import trade_output
 
         say = None if options.quiet else _say
         folder, found = study.trade(scene, options.output, options.budget, options.jobs, say)
-        return folder, trade_output.in_words(found), found.failed
+        return folder, study.in_words(found), found.failed
 
     return _study(options, task)
 
@@ -374,7 +374,7 @@ def _figures(options: argparse.Namespace) -> int:
     except figures.FigureError as error:
         return _fail(str(error), error.exit_code)
     except interrupts.Interrupted as interruption:
-        return _fail("stopped; finished runs and figures are kept", interruption.exit_code)
+        return _fail(STUDY_STOPPED, interruption.exit_code)
     except OSError as error:
         return _fail(f"cannot write the figures: {error}", BAD_ENVIRONMENT)
     print("\n".join(map(str, written)))

@@ -37,7 +37,7 @@ from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
 from remodel_fenicsx.model.energy import MATRICES, REPULSIONS, Tissue
 from remodel_fenicsx.model.laws import LAWS
 from remodel_fenicsx.model.spectral import PAIRINGS
-from remodel_fenicsx.schema.tables import OneOf, Table, checked, fault, is_number, quoted, shown
+from remodel_fenicsx.schema.tables import OneOf, Table, fault, is_number, quoted, shown
 from remodel_fenicsx.schema.times import is_multiple, same_time
 from remodel_fenicsx.schema.units import FORCE, NUMBER_DENSITY, STRESS, TEMPERATURE
 
@@ -92,7 +92,7 @@ def _auto_or(names: Collection[str], removed: Mapping[str, str] | None = None) -
             raise fault("allowed are " + ", ".join(map(repr, (AUTO, *names))))
         return value
 
-    return checked(check)
+    return BeforeValidator(check)
 
 
 class Model(Table):
@@ -215,7 +215,7 @@ def _initial_cells(value: Any) -> Any:
 class Cells(Table):
     """The orthotropic unit cells of the collagen network before the first remodeling pass."""
 
-    initial: Annotated[str | tuple[float, float, float], checked(_initial_cells)] = Field(
+    initial: Annotated[str | tuple[float, float, float], BeforeValidator(_initial_cells)] = Field(
         default="random",
         description="Cell dimensions l_I at t = 0, with |l| = end_to_end_length: 'random' (one draw per element, "
         "uniform on the positive octant of the sphere), 'isotropic' (three equal ones), 'aligned' (all of it along "
@@ -430,7 +430,7 @@ class Load(Table):
         description="Full value at factor 1: force in stress_unit times length squared, pressure in stress_unit, "
         "elongation without unit (above -1)."
     )
-    ramp: Annotated[tuple[tuple[float, float], ...], checked(_ramp)] = Field(
+    ramp: Annotated[tuple[tuple[float, float], ...], BeforeValidator(_ramp)] = Field(
         description="Factor on the value over time, as [time, factor] pairs with increasing times: linear in between, "
         "held before the first and after the last pair. Times up to time.end must be multiples of time.step; with "
         "time.tolerance they are hit.",
@@ -472,7 +472,7 @@ class Time(Table):
     """Simulated time, in the unit of 1/kappa. It starts at 0 with the unloaded body."""
 
     # a number for all who step through time; those who take the word ask `is_equilibrium` first
-    end: Annotated[Any, checked(_end)] = Field(
+    end: Annotated[Any, BeforeValidator(_end)] = Field(
         description="Last time, a whole number of steps, or any time with a tolerance; or 'equilibrium': at once to "
         "the state that remodeling comes to under the loads at the end of their ramps (docs/theory.md, Equilibrium at "
         "once).",
@@ -594,7 +594,7 @@ class Solver(Table):
         "the tangent than before: a warning that says where, or, looked for in every step, the end of the run after "
         "the last stable step (exit code 3).",
     )
-    petsc_options: Annotated[dict[str, Any], checked(_petsc_options)] = Field(
+    petsc_options: Annotated[dict[str, Any], BeforeValidator(_petsc_options)] = Field(
         default_factory=dict,
         description="PETSc options that override the method's, without the leading '-': snes_..., ksp_..., pc_... "
         "and mat_.... None that runs code or writes files; those of PETSC_OPTIONS are the user's own.",
@@ -643,13 +643,13 @@ def _times(value: Any) -> Any:
 class Output(Table):
     """What a run writes beside its history table."""
 
-    fields: Annotated[bool | tuple[str, ...], checked(_fields)] = Field(
+    fields: Annotated[bool | tuple[str, ...], BeforeValidator(_fields)] = Field(
         default=True,
         description="Fields to write for ParaView: true for all, false for none, or names (docs/commands.md), 'chains' "
         "for the chain lines. What no name asks for is not computed.",
         json_schema_extra={"allowed": "true, false or a list of names of fields"},
     )
-    columns: Annotated[tuple[str, ...], checked(_columns)] = Field(
+    columns: Annotated[tuple[str, ...], BeforeValidator(_columns)] = Field(
         default=(),
         description="Columns of the history: 'pass_residual' and 'negative_eigenvalues' come beside those that it "
         "has without being asked; where some of these are named, only they are measured, with time and loads "
@@ -657,7 +657,7 @@ class Output(Table):
         json_schema_extra={"allowed": "a list of names of columns"},
     )
     every: int = Field(default=1, ge=1, description="Write the fields of every n-th step; the last one always.")
-    times: Annotated[tuple[float, ...], checked(_times)] = Field(
+    times: Annotated[tuple[float, ...], BeforeValidator(_times)] = Field(
         default=(),
         description="Times up to time.end that have a row and whose fields are written beside those of every n-th "
         "step: multiples of time.step; with time.tolerance a step ends there.",

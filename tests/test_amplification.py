@@ -17,7 +17,7 @@ from remodel_fenicsx.evolution.stepper import Step, Watcher
 from remodel_fenicsx.model.cells import structure_tensor
 from remodel_fenicsx.scene import preset_scene
 from remodel_fenicsx.simulation import Simulation
-from remodel_fenicsx.stability import verdict
+from remodel_fenicsx.studies.stability import verdict
 from remodel_fenicsx.watch.amplification import AmplificationWatcher, LinearPass
 from tests.conftest import mpirun
 from tests.test_over_correction import Tilt

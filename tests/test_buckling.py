@@ -14,7 +14,7 @@ from mpi4py import MPI
 
 from remodel_fenicsx import Scene, Simulation
 from remodel_fenicsx.body.reductions import choice, explained
-from remodel_fenicsx.stability import in_words, stability
+from remodel_fenicsx.studies.stability import in_words, stability
 from remodel_fenicsx.watch.buckling import BucklingWarning
 from tests.parts import tube
 

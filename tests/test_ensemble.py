@@ -20,7 +20,7 @@ from remodel_fenicsx.results.status import status
 from remodel_fenicsx.running import run
 from remodel_fenicsx.scene.scene import Scene
 from remodel_fenicsx.studies import ensemble as study
-from remodel_fenicsx.studies.members import Member, TooFewRuns, run_members
+from remodel_fenicsx.studies.runs import Run, TooFewRuns, run_all
 from remodel_fenicsx.system.interrupts import Paused
 from tests import forks
 from tests.conftest import forked_children
@@ -142,7 +142,7 @@ def test_what_was_stopped_goes_on(
         run(member.scene, member.folder, MPI.COMM_SELF)
     assert member.steps_done == 2 and not member.is_complete()
     with forked_children():
-        assert run_members([member], 1, study.Study("test", "scene", tmp_path), quiet=True) == {}
+        assert run_all([member], 1, "test", quiet=True) == {}
     assert member.is_complete()
     whole = Recording(made[0] / "seed-3").history
     np.testing.assert_array_equal(member.history()["mean_stretch"], whole["mean_stretch"])
@@ -184,16 +184,16 @@ def test_a_signal_ends_all_runs(
 ) -> None:
     path, out = tmp_path / "scene.toml", tmp_path / "out"
     path.write_text(pulled_cube(5000.0).to_toml())
-    asked = Member.steps_done.fget
+    asked = Run.steps_done.fget
     assert asked is not None
 
-    def then_stop(member: Member) -> int:
+    def then_stop(member: Run) -> int:
         steps = asked(member)
         if steps:
             os.kill(os.getpid(), signal.SIGTERM)
         return int(steps)
 
-    monkeypatch.setattr(Member, "steps_done", property(then_stop))
+    monkeypatch.setattr(Run, "steps_done", property(then_stop))
     code = cli.main(["ensemble", str(path), "-o", str(out), "--seeds", "2", "--jobs", "1"])
     assert code == 128 + signal.SIGTERM
     assert "stopped; all that is recorded is kept, the same command goes on" in capsys.readouterr().err

@@ -8,6 +8,7 @@ import math
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import time as clock
@@ -24,13 +25,14 @@ from PIL import Image
 
 import remodel_fenicsx
 from remodel_fenicsx import cli
-from remodel_fenicsx.paper import FIGURES, bodies, cases, curves, output, rendering, runs, snapshots, validity
-from remodel_fenicsx.paper.captions import CAPTIONS
-from remodel_fenicsx.paper.cases import LOAD_CASES
-from remodel_fenicsx.paper.errors import FigureError
+from remodel_fenicsx.body.columns import columns_of
+from remodel_fenicsx.paper import FIGURES, bodies, curves, rendering, runs
+from remodel_fenicsx.paper.runs import LOAD_CASES
 from remodel_fenicsx.results import vtkhdf
 from remodel_fenicsx.results.recording import Recording, RecordingError
 from remodel_fenicsx.scene.scene import Scene, scene_from_dict
+from remodel_fenicsx.studies import page
+from remodel_fenicsx.studies.page import FigureError
 from tests import forks
 from tests.conftest import forked_children
 
@@ -70,9 +72,8 @@ def test_bad_input_is_one_line_and_writes_nothing(
 
 def test_every_name_of_the_contract_is_there() -> None:
     assert list(FIGURES) == ["fig1", *(f"fig{n}" for n in range(5, 12)), "rate", "energy"]
-    known = cases.scenes()
+    known = runs.scenes()
     assert {run for figure in FIGURES.values() for run in figure.runs} == set(known)
-    assert set(CAPTIONS) == set(FIGURES)
     assert all(scene.name == name for name, scene in known.items())
 
 
@@ -93,47 +94,61 @@ def tiny(**changes: float | str) -> Scene:
     return scene_from_dict(TINY).with_values({key.replace("__", "."): value for key, value in changes.items()})
 
 
-def record(cache: runs.RunCache, scene: Scene, last: float | None = None) -> Path:
-    """What a run leaves, as far as the cache looks: one hexahedron that does not move."""
-    folder = cache.path(scene)
+def record(runs_folder: Path, scene: Scene, last: float | None = None) -> Path:
+    """What a run leaves, as far as the command looks: one hexahedron that does not move. Returns its folder."""
+    folder = runs.kept_run(scene, runs_folder).folder
     folder.mkdir(parents=True)
     (folder / "scene.toml").write_text(scene.to_toml("as run\ndolfinx 0.0"))
     corners = np.array([(x, y, z) for z in (0.0, 1.0) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))])
     with vtkhdf.TransientGrid(folder / "fields.vtkhdf", corners, np.arange(8).reshape(1, 8), 12) as grid:
         for time in np.arange(scene.time.number_of_steps + 1.0):
             grid.append(time, {"displacement": 0 * corners}, {"fibre_angle": np.array([1.0])})
-    times = np.arange(1.0, (scene.time.end if last is None else last) + 0.5)
-    (folder / "history.csv").write_text("time,force\n" + "".join(f"{time},1.0\n" for time in times))
+    names = [column.name for column in columns_of(scene.geometry, scene.output.columns, scene.loads)]
+    rows = [[time, *[1.0] * (len(names) - 1)] for time in np.arange(0.0, (last or scene.time.end) + 0.5)]
+    (folder / "history.csv").write_text("\n".join(",".join(map(str, row)) for row in [names, *rows]) + "\n")
     return folder
 
 
-def test_a_recorded_run_is_valid_until_scene_source_or_libraries_change(tmp_path: Path) -> None:
-    cache = runs.RunCache(tmp_path, "source", {"fenics-dolfinx": "0.9.0"})
+def is_whole(runs_folder: Path, scene: Scene) -> bool:
+    """Whether the record of a scene counts as its run."""
+    return runs.kept_run(scene, runs_folder).is_complete()
+
+
+def test_a_recorded_run_is_valid_until_scene_or_versions_change(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     scene = tiny()
-    assert not cache.is_valid(scene)
-    record(cache, scene)
-    assert cache.is_valid(scene)
-    assert runs.RunCache(tmp_path, "source", {"fenics-dolfinx": "0.9.0"}).is_valid(tiny())
-    assert not cache.is_valid(tiny(remodeling__kappa=0.03))
-    assert not cache.is_valid(tiny(solver__maximum_halvings=11))  # a default that the scene does not name
-    assert not runs.RunCache(tmp_path, "other source", cache.libraries).is_valid(scene)
-    assert not runs.RunCache(tmp_path, "source", {"fenics-dolfinx": "0.11.0"}).is_valid(scene)
+    assert not is_whole(tmp_path, scene)
+    record(tmp_path, scene)
+    assert is_whole(tmp_path, scene) and is_whole(tmp_path, tiny())
+    assert not is_whole(tmp_path, tiny(remodeling__kappa=0.03))
+    assert not is_whole(tmp_path, tiny(solver__maximum_halvings=11))  # a default that the scene does not name
+    versions = runs.library_versions()
+    for name in ("fenics-dolfinx", "remodel_fenicsx"):
+        with monkeypatch.context() as patch:
+            patch.setattr(runs, "library_versions", lambda name=name: versions | {name: "0.0"})
+            assert not is_whole(tmp_path, scene)
+    assert is_whole(tmp_path, scene)
 
 
 def test_a_run_that_is_not_whole_is_not_valid(tmp_path: Path) -> None:
-    cache = runs.RunCache(tmp_path, "source", {})
-    record(cache, tiny(time__end=5.0), last=4.0)
-    assert not cache.is_valid(tiny(time__end=5.0))
-    changed = record(cache, tiny())
-    (changed / "scene.toml").write_text(tiny(cells__seed=2).to_toml())
-    assert not cache.is_valid(tiny())
-    (changed / "scene.toml").write_text(tiny().to_toml())
-    assert cache.is_valid(tiny())
-    (changed / "fields.vtkhdf").unlink()
-    assert not cache.is_valid(tiny())
+    record(tmp_path, tiny(time__end=5.0), last=4.0)
+    assert not is_whole(tmp_path, tiny(time__end=5.0))
     without = tiny(output__fields=False)
-    (record(cache, without) / "fields.vtkhdf").unlink()
-    assert cache.is_valid(without)
+    (record(tmp_path, without) / "fields.vtkhdf").unlink()
+    assert is_whole(tmp_path, without)
+
+
+def another_scene(folder: Path) -> None:
+    (folder / "scene.toml").write_text(tiny(cells__seed=2).to_toml())
+
+
+def no_scene(folder: Path) -> None:
+    (folder / "scene.toml").unlink()
+
+
+def no_fields(folder: Path) -> None:
+    (folder / "fields.vtkhdf").unlink()
 
 
 def history_without_its_second_row(folder: Path) -> None:
@@ -164,100 +179,33 @@ def fields_without_their_last_time(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("damage", [
-    history_without_its_second_row, history_with_half_a_row, fields_cut_short, fields_that_are_none,
-    fields_without_their_last_values, fields_without_their_last_time,
+    another_scene, no_scene, no_fields, history_without_its_second_row, history_with_half_a_row, fields_cut_short,
+    fields_that_are_none, fields_without_their_last_values, fields_without_their_last_time,
 ])  # fmt: skip
-def test_a_damaged_run_is_not_valid(damage: Callable[[Path], None], tmp_path: Path) -> None:
-    cache, scene = runs.RunCache(tmp_path, "source", {}), tiny(time__end=5.0)
-    folder = record(cache, scene)
-    assert validity.fault(folder, scene) is None
+def test_a_damaged_run_is_made_again_and_that_is_said(
+    damage: Callable[[Path], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    """It is removed; one that is whole is left alone."""
+    begun: list[str] = []
+    monkeypatch.setattr(runs, "run_all", lambda missing, *of, **more: begun.extend(run.name for run in missing))
+    scene = tiny(time__end=5.0)
+    folder = record(tmp_path, scene)
+    assert runs.obtain([scene], tmp_path, jobs=1) == {"tiny": folder}
+    assert not begun and not capsys.readouterr().err
     damage(folder)
-    assert not cache.is_valid(scene)
-    fault = validity.fault(folder, scene)
-    assert fault is not None and "\n" not in fault
-
-
-def test_a_damaged_run_is_made_again_and_that_is_said(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    cache, scene = runs.RunCache(tmp_path), tiny(output__fields=False, time__end=1.0)
-    folder = cache.path(scene)
-    folder.mkdir()
-    (folder / "history.csv").write_text("time\n")
-    with forked_children():
-        cache.obtain([scene], jobs=1)
-    assert cache.is_valid(scene) and os.listdir(tmp_path) == [folder.name]
-    assert f"figures: run again: {folder}: " in capsys.readouterr().err
-
-
-@pytest.fixture
-def copy(tmp_path: Path) -> Path:
-    """The package's source, to be changed."""
-    folder = tmp_path / PACKAGE.name
-    shutil.copytree(PACKAGE, folder, ignore=shutil.ignore_patterns("__pycache__"))
-    return folder
-
-
-def test_only_source_that_decides_numbers_makes_runs_stale(copy: Path) -> None:
-    before = validity.source_fingerprint()
-    laws, text = copy / "model" / "laws.py", (copy / "model" / "laws.py").read_text()
-    laws.write_text("# a remark\n" + text.replace('"""', '"""Said better. ', 1))
-    (copy / "paper" / "curves.py").write_text("X = 1\n")
-    (copy / "cli.py").write_text("Y = 2\n")
-    (copy / "body" / "more.py").write_text("Z = 3\n")  # nothing imports it
-    assert validity.source_fingerprint(copy) == before
-    in_c = copy / "kernels" / "tensor.c"
-    in_c.write_text(in_c.read_text().replace("1 / ", "2 / "))
-    assert validity.source_fingerprint(copy) != before
-    shutil.copy(PACKAGE / "kernels" / "tensor.c", in_c)
-    laws.write_text(text + "\nLAWS.pop('rate')\n")
-    assert validity.source_fingerprint(copy) != before
-    laws.write_text(text + "\nimport remodel_fenicsx.body.more\n")
-    assert validity.source_fingerprint(copy) != before
-
-
-@pytest.mark.slow
-def test_a_moved_module_leaves_runs_valid_and_another_of_its_names_does_not(copy: Path) -> None:
-    """Where a file lies and what it is called decides no number; from which source a name comes does."""
-    user = copy / "simulation.py"
-    text = user.read_text()
-    (copy / "model" / "one.py").write_text("def f() -> int:\n    return 1\n")
-    (copy / "model" / "two.py").write_text("def f() -> int:\n    return 2\n")
-
-    def fingerprint(*lines: str) -> str:
-        user.write_text(text + "\n".join(("", *lines, "")))
-        return validity.source_fingerprint(copy)
-
-    one, two = (
-        f"from remodel_fenicsx.model.{name} import f as {alias}" for name, alias in (("one", "a"), ("two", "b"))
-    )
-    before = fingerprint(one, two)
-    assert fingerprint(two, one) == before  # the order of imports
-    assert fingerprint(one.replace("one", "two"), two.replace("two", "one")) != before
-    assert fingerprint(one, two.replace("as b", "as c")) != before
-    (copy / "moved").mkdir()
-    (copy / "moved" / "__init__.py").write_text('"""A new room."""\n')
-    (copy / "model" / "one.py").rename(copy / "moved" / "of_another_name.py")
-    assert fingerprint(one.replace("model.one", "moved.of_another_name"), two) == before
-    # a module of the package, as it is imported in most places
-    for source in copy.rglob("*.py"):
-        old = source.read_text()
-        source.write_text(old.replace("from remodel_fenicsx.fem import", "from remodel_fenicsx.moved import"))
-    for module in sorted(path.stem for path in (copy / "fem").glob("[!_]*.py")):
-        (copy / "fem" / f"{module}.py").rename(copy / "moved" / f"{module}.py")
-        for source in copy.rglob("*.py"):
-            old = source.read_text()
-            source.write_text(old.replace(f"remodel_fenicsx.fem.{module}", f"remodel_fenicsx.moved.{module}"))
-    text = user.read_text().split("\nfrom remodel_fenicsx.moved.of_another")[0]
-    assert fingerprint(one.replace("model.one", "moved.of_another_name"), two) == before
+    runs.obtain([scene], tmp_path, jobs=1)
+    assert begun == ["tiny"] and not folder.exists()
+    said = capsys.readouterr().err
+    assert said.startswith(f"figures: run again: {folder}: ") and said.count("\n") == 1
 
 
 def test_a_failing_run_ends_with_its_own_code_and_leaves_nothing_that_looks_valid(tmp_path: Path) -> None:
     # more than any chain can bear at once, and no part of the step is tried
     scene = tiny(name="torn", loads__force__value=1e9, solver__maximum_halvings=0)
-    cache = runs.RunCache(tmp_path)
-    with forked_children(), pytest.raises(FigureError, match="the run torn in .*torn: .*time") as failure:
-        cache.obtain([scene], jobs=1)
+    with forked_children(), pytest.raises(FigureError, match="the run torn in .*torn-.*: .*time") as failure:
+        runs.obtain([scene], tmp_path, jobs=1)
     assert failure.value.exit_code == 3
-    assert not cache.is_valid(scene) and not cache.path(scene).exists()
+    assert not is_whole(tmp_path, scene)
 
 
 @pytest.mark.parametrize(("code", "expected"), [(3, 3), (4, 4), (143, 143), (-9, 137)])
@@ -276,27 +224,28 @@ def test_the_command_ends_as_the_run_that_failed_or_was_stopped(
     assert "its last words" in capsys.readouterr().err and not (tmp_path / "out").exists()
 
 
-def test_a_run_whose_source_changed_meanwhile_is_not_kept(tmp_path: Path) -> None:
-    cache = runs.RunCache(tmp_path, source="of another time")
-    scene = tiny(output__fields=False, time__end=1.0)
-    said = "the package's source changed during the run tiny: start again"
-    with forked_children(), pytest.raises(FigureError, match=said):
-        cache.obtain([scene], jobs=1)
-    assert not cache.is_valid(scene)
+COMMAND = "import sys; from remodel_fenicsx.cli import main; sys.exit(main(sys.argv[1:]))"
 
 
-def test_a_stopped_command_ends_its_runs(tmp_path: Path) -> None:
-    code = "import sys; from remodel_fenicsx.cli import main; sys.exit(main(sys.argv[1:]))"
-    command = [sys.executable, "-c", code, "figures", "fig7", "--jobs", "1", "--runs", str(tmp_path / "runs")]
-    with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True) as process:
+def artery_under_way(tmp_path: Path) -> subprocess.Popen[str]:
+    """The command that draws Fig. 7, once its run has begun."""
+    command = [sys.executable, "-c", COMMAND, "figures", "fig7", "--jobs", "1", "--runs", str(tmp_path / "runs")]
+    process = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True)
+    assert process.stderr is not None
+    assert process.stderr.readline().startswith("figures: 0 % of 1 runs: artery 0/150")
+    return process
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGUSR1])
+def test_a_stopped_command_ends_its_runs(number: int, tmp_path: Path) -> None:
+    with artery_under_way(tmp_path) as process:
+        (worker,) = children_of(process.pid)
+        process.send_signal(number)
         assert process.stderr is not None
-        first = process.stderr.readline()
-        assert first.startswith("figures: 0 % of the runs: artery 0/150")
-        process.terminate()
         rest = process.stderr.read()
-    assert process.returncode == 143
-    assert rest.splitlines()[-1] == "remodel-fenicsx: stopped; finished runs are kept"
-    assert os.listdir(tmp_path / "runs") == [] and not (tmp_path / "figures").exists()
+    assert process.returncode == (4 if number == signal.SIGUSR1 else 143) and not is_alive(worker)
+    said = "remodel-fenicsx: stopped; all that is recorded is kept, the same command goes on"
+    assert rest.splitlines()[-1] == said and not (tmp_path / "figures").exists()
 
 
 def children_of(number: int) -> list[int]:
@@ -312,25 +261,15 @@ def is_alive(number: int) -> bool:
         return False
 
 
-def test_runs_do_not_outlive_a_killed_command_and_what_they_leave_is_removed(tmp_path: Path) -> None:
-    code = "import sys; from remodel_fenicsx.cli import main; sys.exit(main(sys.argv[1:]))"
-    command = [sys.executable, "-c", code, "figures", "fig7", "--jobs", "1", "--runs", str(tmp_path / "runs")]
-    with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True) as process:
-        assert process.stderr is not None and "artery 0/150" in process.stderr.readline()
-        (run,) = children_of(process.pid)
-        litter = set(os.listdir(tmp_path / "runs"))
-        assert litter
-        # another command at the same time takes nothing away
-        runs._remove_litter(tmp_path / "runs")
-        assert litter <= set(os.listdir(tmp_path / "runs"))
+def test_runs_do_not_outlive_a_killed_command(tmp_path: Path) -> None:
+    with artery_under_way(tmp_path) as process:
+        (worker,) = children_of(process.pid)
         process.kill()
     for _ in range(300):
-        if not is_alive(run):
+        if not is_alive(worker):
             break
         clock.sleep(0.1)
-    assert not is_alive(run)
-    runs._remove_litter(tmp_path / "runs")
-    assert os.listdir(tmp_path / "runs") == []
+    assert not is_alive(worker)
 
 
 def test_a_run_whose_command_is_killed_before_it_begins_does_not_begin(tmp_path: Path) -> None:
@@ -340,12 +279,15 @@ def test_a_run_whose_command_is_killed_before_it_begins_does_not_begin(tmp_path:
     late.chmod(0o755)
     code = f"""
 import os, pathlib, signal
-from remodel_fenicsx.system.children import Child
-child = Child(["info"], pathlib.Path({str(messages)!r}))
+from remodel_fenicsx.system.children import Worker, wait_for_one
+child = Worker()
+child.begin(["info"], pathlib.Path({str(messages)!r}))
 print(child.process.pid, flush=True)
 if {{killed}}:
     os.kill(os.getpid(), signal.SIGKILL)
-child.process.wait()
+wait_for_one([child], 100.0)
+child.poll()
+child.stop()
 """
     environment = os.environ | {"PATH": f"{tmp_path}:{os.environ['PATH']}"}
     for killed in (True, False):
@@ -383,7 +325,7 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def numbers(path: Path) -> dict[str, np.ndarray]:
     """Columns of a figure's table."""
-    return {name: np.array(values, dtype=float) for name, values in output.read_table(path).items()}
+    return {name: np.array(values, dtype=float) for name, values in page.read_table(path).items()}
 
 
 def test_fig1_is_eq_2(drawn: Path) -> None:
@@ -409,8 +351,8 @@ def test_figures_say_with_what_they_were_made(drawn: Path) -> None:
         assert picture.size[0] > 800
         notes = picture.text  # type: ignore[attr-defined]
     assert notes["Comment"] == "remodel-fenicsx figures fig5"
-    assert (notes["Title"], notes["Description"]) == CAPTIONS["fig5"]
-    version = validity.library_versions()["fenics-dolfinx"].split(".post")[0]
+    assert (notes["Title"], notes["Description"]) == (FIGURES["fig5"].title, FIGURES["fig5"].caption)
+    version = runs.library_versions()["fenics-dolfinx"].split(".post")[0]
     for text in (notes["Source"], (drawn / "fig5.csv").read_text().splitlines()[1]):
         assert f"remodel_fenicsx {remodel_fenicsx.__version__}, dolfinx {version}" in text
         assert "preset kuhl-holzapfel-2007 with kinematics point, frame spatial, isotropic cells" in text
@@ -430,7 +372,7 @@ def formats(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_figure_in_every_format_says_what_it_is(formats: Path) -> None:
     assert sorted(os.listdir(formats / "plain")) == ["fig1.csv", "fig1.pdf", "fig1.png", "fig1.svg"]
-    title, caption = CAPTIONS["fig1"]
+    title, caption = FIGURES["fig1"].title, FIGURES["fig1"].caption
     pdf, svg = (formats / "plain" / "fig1.pdf").read_bytes(), (formats / "plain" / "fig1.svg").read_text()
     assert pdf.startswith(b"%PDF-") and title.replace("(", "\\(").replace(")", "\\)").encode() in pdf
     assert b"/Subject" in pdf and caption.encode("utf-16-be")[:40] in pdf and b"no simulation" in pdf
@@ -451,7 +393,7 @@ def test_only_the_format_that_is_wanted_is_written_and_the_same_figure_is_the_sa
     assert cli.main(["figures", "fig1", "-o", str(tmp_path), "--format", "pdf"]) == 0
     assert sorted(os.listdir(tmp_path)) == ["fig1.csv", "fig1.pdf"]
     again = {"pdf": tmp_path / "fig1.pdf", "svg": formats / "first.svg", "png": drawn / "fig1.png"}
-    assert set(again) == set(output.FORMATS)
+    assert set(again) == set(page.FORMATS)
     for ending, path in again.items():
         assert path.read_bytes() == (formats / "plain" / f"fig1.{ending}").read_bytes(), ending
 
@@ -461,7 +403,7 @@ def test_panels_are_lettered_in_line_with_their_titles() -> None:
     panels = [figure.add_axes((left, low, 0.3, 0.3)) for low in (0.6, 0.1) for left in (0.15, 0.6)]
     panels[0].set_ylabel("a long way out")
     panels[1].set_title("title")
-    output.panel_letters(*panels)
+    page.panel_letters(*panels)
     renderer = FigureCanvasAgg(figure).get_renderer()
     letters = [axes.texts[0] for axes in panels]
     assert [letter.get_text() for letter in letters] == ["a", "b", "c", "d"]
@@ -476,17 +418,14 @@ def test_panels_are_lettered_in_line_with_their_titles() -> None:
 # ---------------------------------------------------------------- curves
 
 
-@pytest.mark.parametrize("first", [0.0, 1.0])
-def test_curves_show_the_rows_that_there_are(first: float, tmp_path: Path) -> None:
-    """With the row of t = 0 they begin there, without it with the rows; a pass belongs to the whole of its step."""
-    folder = record(runs.RunCache(tmp_path, "source", {}), tiny(time__end=3.0))
-    rows = [(time, 10.0 - time, 1.0 if time == 1.0 else -time) for time in np.arange(first, 4.0)]
+def test_curves_show_a_pass_over_the_whole_of_its_step(tmp_path: Path) -> None:
+    folder = record(tmp_path, tiny(time__end=3.0))
+    rows = [(time, 10.0 - time, 1.0 if time == 1.0 else -time) for time in np.arange(4.0)]
     text = "\n".join(",".join(map(str, row)) for row in rows)
     (folder / "history.csv").write_text(f"time,stored_energy,remodeling_power\n{text}\n")
-    assert validity.fault(folder, tiny(time__end=3.0)) is None
     above, below = Figure().subplots(2)
     curves._draw_energy(above, below, Recording(folder))
-    assert above.lines[0].get_xdata()[0] == first and above.lines[0].get_ydata()[0] == 10.0 - first
+    assert above.lines[0].get_xdata()[0] == 0.0 and above.lines[0].get_ydata()[0] == 10.0
     steps = below.patches[-1].get_data()
     np.testing.assert_array_equal(steps.edges, [0.0, 1.0, 2.0, 3.0])
     np.testing.assert_array_equal(steps.values, [1.0, -2.0, -3.0])
@@ -506,7 +445,7 @@ def test_valid_runs_are_used_again_and_own_figures_drawn_anew(drawn: Path) -> No
 # ---------------------------------------------------------------- pictures in space
 
 
-def two_hexahedra() -> snapshots.Snapshot:
+def two_hexahedra() -> bodies.Snapshot:
     """Two unit cubes side by side in x, beginning at x = 1; all chains along z, stretched to twice in z."""
     x, y, z = np.meshgrid([1.0, 2.0, 3.0], [-0.5, 0.5], [0.0, 1.0], indexing="ij")
     points = np.stack([x, y, z], axis=-1).reshape(-1, 3)
@@ -519,12 +458,12 @@ def two_hexahedra() -> snapshots.Snapshot:
         "deformation_gradient": np.tile(np.diag([1.0, 1.0, 2.0]).ravel(), (2, 1)),
         "fibre_angle_deformed": np.array([0.0, 90.0]),
     }
-    return snapshots.Snapshot(0.0, points, np.array([first, first + 4]), points * [0.0, 0.0, 1.0], fields)
+    return bodies.Snapshot(0.0, points, np.array([first, first + 4]), points * [0.0, 0.0, 1.0], fields)
 
 
 def test_exterior_has_the_faces_that_no_other_element_covers() -> None:
     snapshot = two_hexahedra()
-    faces, elements = snapshot.exterior(np.array([True, True]))
+    faces, elements = snapshot.exterior()
     assert len(faces) == 10 and np.array_equal(np.bincount(elements), [5, 5])
     centres = snapshot.points[faces].mean(axis=1)
     assert not np.any(np.all(np.isclose(centres, [2.0, 0.0, 0.5]), axis=1))
@@ -547,7 +486,7 @@ def test_chains_lie_on_the_deformed_face_along_their_deformed_direction() -> Non
     assert ribbons.lies_on > 0
 
 
-def outline(snapshot: snapshots.Snapshot) -> tuple[np.ndarray, np.ndarray]:
+def outline(snapshot: bodies.Snapshot) -> tuple[np.ndarray, np.ndarray]:
     """Of the ribbons on the face x = 3 the places (n, 2) in the undeformed face, a square, and the lengths."""
     corners = bodies.body(snapshot)[1].corners
     gradient = snapshot.fields["deformation_gradient"][0].reshape(3, 3)
@@ -588,7 +527,7 @@ def test_every_colour_of_the_scale_stays_as_it_is_in_the_palette() -> None:
     # beside them many other colours, among them the grey that Pillow alone takes for one of the scale
     others = np.concatenate([np.tile([[234, 234, 234]], (500, 1)), rng.integers(0, 256, (18_000, 3))]).astype(np.uint8)
     pixels = np.concatenate([scale, others[: 10_000 - len(scale)]]).reshape(100, 100, 3)
-    drawn = output.with_palette(Image.fromarray(pixels), bodies.scale_colours())
+    drawn = page.with_palette(Image.fromarray(pixels), bodies.scale_colours())
     assert drawn.mode == "P"
     found = np.asarray(drawn.convert("RGB")).reshape(-1, 3)
     np.testing.assert_array_equal(found[: len(scale)], scale)
@@ -597,18 +536,17 @@ def test_every_colour_of_the_scale_stays_as_it_is_in_the_palette() -> None:
 
 @pytest.fixture(scope="module")
 def tiny_run(tmp_path_factory: pytest.TempPathFactory) -> Recording:
-    """Two steps of the tendon, run by the cache."""
-    cache = runs.RunCache(tmp_path_factory.mktemp("runs"))
+    """Two steps of the tendon, as the command runs them."""
     with forked_children():
-        return Recording(cache.obtain([tiny()], jobs=1)["tiny"])
+        return Recording(runs.obtain([tiny()], tmp_path_factory.mktemp("runs"), jobs=1)["tiny"])
 
 
 def test_a_recording_gives_back_what_was_run(tiny_run: Recording) -> None:
     assert tiny_run.scene == tiny()
     assert tiny_run.value("force", 2.0) == pytest.approx(50.0)
     with pytest.raises(RecordingError, match="no fields at time 7"):
-        snapshots.Snapshot.of(tiny_run, 7.0)
-    snapshot = snapshots.Snapshot.of(tiny_run, 2.0)
+        bodies.Snapshot.of(tiny_run, 7.0)
+    snapshot = bodies.Snapshot.of(tiny_run, 2.0)
     assert snapshot.elements.shape == (480, 8)
     top = snapshot.points[:, 2] > 10.0 - 1e-9
     assert np.all(snapshot.displacement[snapshot.points[:, 2] < 1e-9, 2] == 0)
@@ -620,7 +558,7 @@ def test_a_recording_gives_back_what_was_run(tiny_run: Recording) -> None:
 @pytest.fixture(scope="module")
 def pictures(tiny_run: Recording) -> list[np.ndarray]:
     """Of the tendon with and without chains, of chains on the near side and on the far one; drawn by one process."""
-    snapshot = snapshots.Snapshot.of(tiny_run, 2.0)
+    snapshot = bodies.Snapshot.of(tiny_run, 2.0)
     middle = (0.0, 0.0, snapshot.deformed[:, 2].max() / 2)
     view = rendering.View((0.3, -1.0, 0.14), middle, 14.0, (120, 320))
     patches = bodies.body(snapshot)
@@ -632,7 +570,7 @@ def pictures(tiny_run: Recording) -> list[np.ndarray]:
 
 def test_a_snapshot_is_really_drawn(tiny_run: Recording, pictures: list[np.ndarray]) -> None:
     both, bare, *_ = pictures
-    length = snapshots.Snapshot.of(tiny_run, 2.0).deformed[:, 2].max()
+    length = bodies.Snapshot.of(tiny_run, 2.0).deformed[:, 2].max()
     assert both.shape == bare.shape == (320, 120, 3)
     assert np.all(both[0, 0] == 255)
     body = np.any(bare < 245, axis=2)
@@ -688,10 +626,10 @@ def test_every_figure_has_a_picture_and_its_data(everything: Path) -> None:
         with Image.open(everything / f"{name}.png") as picture:
             colours = picture.convert("RGB").getcolors(100_000)
         assert colours is not None and len(colours) > 50
-        assert len(next(iter(output.read_table(everything / f"{name}.csv").values()))) >= 5
+        assert len(next(iter(page.read_table(everything / f"{name}.csv").values()))) >= 5
         assert (everything / f"{name}.png").stat().st_size < 300_000
     for name in ("fig6", "fig7", "fig8", "fig9", "fig10", "fig11"):
-        assert len(output.read_table(everything / f"{name}-elements.csv")["fibre_angle_deformed"]) > 300
+        assert len(page.read_table(everything / f"{name}-elements.csv")["fibre_angle_deformed"]) > 300
 
 
 @pytest.mark.slow

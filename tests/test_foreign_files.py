@@ -35,7 +35,7 @@ from remodel_fenicsx.running import resume
 from remodel_fenicsx.running import run as run_scene
 from remodel_fenicsx.scene import preset_scene, read_scene
 from remodel_fenicsx.schema.toml import LARGEST, MOST_PARTS
-from remodel_fenicsx.studies.members import Member
+from remodel_fenicsx.studies.runs import Run
 from tests.conftest import slowly
 from tests.parts import pulled_cube
 from tests.test_run import demo, run
@@ -399,7 +399,7 @@ def test_a_field_without_end_in_a_history_is_refused(folder: Path) -> None:
     ids=["columns fewer", "columns others", "rows fewer", "rows more"],
 )  # fmt: skip
 def test_a_study_takes_no_history_that_is_not_its_scenes(forge: Callable[[str], str], folder: Path) -> None:
-    member = Member("run", Recording(folder).scene, folder)
+    member = Run("run", Recording(folder).scene, folder)
     assert member.is_complete()
     (folder / "history.csv").write_text(forge((folder / "history.csv").read_text()))
     with pytest.raises(SceneError, match="its history has other columns or rows than its scene asks for"):

@@ -11,8 +11,7 @@ from remodel_fenicsx.evolution.stepper import Stepper, times
 from remodel_fenicsx.settings import Cells
 from remodel_fenicsx.scene.scene import Load, preset_scene
 from remodel_fenicsx.simulation import Simulation
-from remodel_fenicsx.solver.blend import KEPT_RESERVE, Blend
-from remodel_fenicsx.solver.continuation import Change, StepFailure, Work
+from remodel_fenicsx.solver.continuation import KEPT_RESERVE, Blend, Change, StepFailure, Work
 from remodel_fenicsx.solver.equilibrium import Extension
 from remodel_fenicsx.solver.newton import GuardedNewton, Solution, SolveFailure
 from tests import parts

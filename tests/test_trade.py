@@ -20,10 +20,10 @@ from remodel_fenicsx.scene.presets import PROFILES
 from remodel_fenicsx.scene.scene import Scene, preset_scene
 from remodel_fenicsx.studies import ladder as rungs
 from remodel_fenicsx.studies import trade as study
-from remodel_fenicsx.studies.convergence import limit, pareto, typical
+from remodel_fenicsx.studies.estimates import limit, pareto, typical
 from remodel_fenicsx.studies.estimates import Result, Trade, estimated
 from remodel_fenicsx.studies.ladder import Setting, compared_times, ladder
-from remodel_fenicsx.studies.trade_output import in_words, picture, write
+from remodel_fenicsx.studies.trade import in_words, picture, write
 from tests.conftest import forked_children
 from tests.reference.radial import solve_radial
 

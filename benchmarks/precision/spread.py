@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from remodel_fenicsx.paper.output import COLOURS, STYLE, Page
+from remodel_fenicsx.studies.page import COLOURS, STYLE, Page
 from remodel_fenicsx.scene.scene import Scene
 from remodel_fenicsx.schema.times import same_time
 from remodel_fenicsx.studies.ensemble import WITHIN, Ensemble, ensemble, gathered, members_of

@@ -14,12 +14,9 @@ import matplotlib
 from mpi4py import MPI
 
 from remodel_fenicsx.paper import bodies, curves, structures
-from remodel_fenicsx.paper.captions import CAPTIONS
-from remodel_fenicsx.paper.cases import KAPPAS, LOAD_CASES, load_case_name, scenes
-from remodel_fenicsx.paper.errors import FigureError
-from remodel_fenicsx.paper.output import FORMATS, STYLE, Page, check_folder
-from remodel_fenicsx.paper.runs import RunCache
+from remodel_fenicsx.paper.runs import KAPPAS, LOAD_CASES, load_case_name, obtain, scenes
 from remodel_fenicsx.results.recording import Recording
+from remodel_fenicsx.studies.page import FORMATS, STYLE, FigureError, Page, check_folder
 from remodel_fenicsx.system.children import cores
 from remodel_fenicsx.system.terminal import Line
 
@@ -27,26 +24,98 @@ __all__ = ["DEFAULT_FOLDER", "DEFAULT_RUNS", "FIGURES", "FigureError", "draw"]
 
 DEFAULT_FOLDER, DEFAULT_RUNS = Path("figures"), Path("results/figures-cache")
 
+# of captions
+CHAINS = (
+    "Black: the four chains of each element's mean cell, deformed and projected on its face, cut off before its edge."
+)
+PEELED = "the outer layers of elements cut shorter than the inner ones"
+WALL = "coloured by the deformed angle of the chains in the wall"
+PROFILE = "reference fibre angle over the radius at t = 150; lines: means of the element layers, bands: all elements"
+RELAXED = (
+    "The printed pass over-corrects with {}: here it is relaxed by one half, in the material frame "
+    "(docs/theory.md, Stability of the pass)."
+)
+
 
 @dataclass(frozen=True)
 class FigureSpec:
-    """The names of the runs that a figure needs, and how it is drawn from them."""
+    """Title and caption of a figure, the names of the runs that it needs, and how it is drawn from them.
 
+    Title and caption stand in the files of the pictures, and captions in docs/verification.md too.
+    """
+
+    title: str
+    caption: str
     runs: tuple[str, ...]
     draw: Callable[[dict[str, Recording], Page], None]
 
 
 FIGURES: dict[str, FigureSpec] = {
-    "fig1": FigureSpec((), curves.draw_chain_force),
-    "fig5": FigureSpec(tuple(f"cube-{kappa:g}" for kappa in KAPPAS), curves.draw_alignment),
-    "fig6": FigureSpec(("tendon",), structures.draw_tendon),
-    "fig7": FigureSpec(("artery",), structures.draw_artery),
-    "fig8": FigureSpec(("artery",), structures.draw_layers),
-    "fig9": FigureSpec(tuple(load_case_name(*case) for case in LOAD_CASES), structures.draw_load_cases),
-    "fig10": FigureSpec(("artery", "artery-pk2"), partial(curves.draw_drivers, other="pk2")),
-    "fig11": FigureSpec(("artery", "artery-finger"), partial(curves.draw_drivers, other="finger")),
-    "rate": FigureSpec(("artery", "artery-rate"), curves.draw_rate),
-    "energy": FigureSpec(("cube-0.025", "tendon", "artery"), curves.draw_energy),
+    "fig1": FigureSpec(
+        "Force of a single chain (Fig. 1)",
+        "Force of a wormlike chain, eq. (2), for kθ = 1 and three persistence lengths A. It locks at r = L (dotted).",
+        (),
+        curves.draw_chain_force,
+    ),
+    "fig5": FigureSpec(
+        "Alignment of the chains of a cube under tension (Fig. 5)",
+        "Mean reference angle between chains and load for four values of κ. Circles: closed form of the same cells.",
+        tuple(f"cube-{kappa:g}" for kappa in KAPPAS),
+        curves.draw_alignment,
+    ),
+    "fig6": FigureSpec(
+        "Cylindrical tendon under uniaxial tension (Fig. 6)",
+        "(a) Stretch over time; points: the times of the pictures. (b) to (f) Its elements by their deformed angle "
+        f"between chains and load axis. {CHAINS}",
+        ("tendon",),
+        structures.draw_tendon,
+    ),
+    "fig7": FigureSpec(
+        "Artery under axial elongation and inner pressure (Fig. 7)",
+        f"(a) to (e) The wall at five times, {WALL}; below, the loads. {CHAINS}",
+        ("artery",),
+        structures.draw_artery,
+    ),
+    "fig8": FigureSpec(
+        "Chains in the layers of the artery's wall (Fig. 8)",
+        f"(a) The innermost, (b) the fourth and (c) the outermost of eight layers of elements at t = 150, {WALL}. "
+        f"{CHAINS}",
+        ("artery",),
+        structures.draw_layers,
+    ),
+    "fig9": FigureSpec(
+        "Load cases from pure elongation to pure pressure (Fig. 9)",
+        f"(a) to (e) The wall at t = 150 under five pairs of axial elongation and inner pressure p, {PEELED}, {WALL}. "
+        f"{CHAINS}",
+        tuple(load_case_name(*case) for case in LOAD_CASES),
+        structures.draw_load_cases,
+    ),
+    "fig10": FigureSpec(
+        "Remodeling driven by the Cauchy or the second Piola-Kirchhoff stress (Fig. 10)",
+        f"(a) {PROFILE.capitalize()}. (b), (c) The wall, {PEELED}. {CHAINS} {RELAXED.format('S')}",
+        ("artery", "artery-pk2"),
+        partial(curves.draw_drivers, other="pk2"),
+    ),
+    "fig11": FigureSpec(
+        "Remodeling driven by the Cauchy stress or the Finger tensor (Fig. 11)",
+        f"(a) {PROFILE.capitalize()}. (b), (c) The wall, {PEELED}. {CHAINS} {RELAXED.format('b')}",
+        ("artery", "artery-finger"),
+        partial(curves.draw_drivers, other="finger"),
+    ),
+    "rate": FigureSpec(
+        "Eqs. (10) and (11) on the same artery (erratum 7)",
+        "(a) Mean reference fibre angle of the innermost, middle and outermost elements over time. "
+        f"(b) {PROFILE.capitalize()}.",
+        ("artery", "artery-rate"),
+        curves.draw_rate,
+    ),
+    "energy": FigureSpec(
+        "Stored energy and power of remodeling (Remark 6)",
+        "(a) to (c) Stored energy. (d) to (f) Power of each step's remodeling pass; green: it releases stored energy, "
+        "red: it takes energy in. Dotted: end of the ramp.",
+        ("cube-0.025", "tendon", "artery"),
+        curves.draw_energy,
+    ),
 }
 
 
@@ -82,7 +151,9 @@ def draw(
     Raises
     ------
     FigureError
-        One line and the exit code of the command: bad input 2, a run that failed, no 3D drawing 5, stopped 130 or 143.
+        One line and the exit code of the command: bad input 2, a run that failed, no 3D drawing 5.
+    Interrupted
+        If a signal asked for the end, SIGUSR1 after the steps under way; the same call goes on from there.
     OSError
         If something cannot be written.
     """
@@ -102,15 +173,17 @@ def draw(
     check_folder(folder, chosen, formats)
     known = scenes()
     needed = dict.fromkeys(run for name in chosen for run in FIGURES[name].runs)
-    recorded = RunCache(runs).obtain([known[run] for run in needed], jobs or cores())
+    recorded = obtain([known[run] for run in needed], runs, jobs or cores())
     recordings = {name: Recording(path) for name, path in recorded.items()}
     progress, written = Line("figures"), []
     for number, name in enumerate(chosen, start=1):
         progress.show(f"drawing {name} ({number}/{len(chosen)})", at_once=True)
-        title, caption = CAPTIONS[name]
-        page = Page(folder, name, title, caption, bodies.scale_colours(), tuple(dict.fromkeys(formats)), stamp)
+        figure = FIGURES[name]
+        page = Page(
+            folder, name, figure.title, figure.caption, bodies.scale_colours(), tuple(dict.fromkeys(formats)), stamp
+        )
         with matplotlib.rc_context(STYLE):
-            FIGURES[name].draw(recordings, page)
+            figure.draw(recordings, page)
         written += page.written
     progress.end()
     return written

@@ -1,7 +1,8 @@
-"""Bodies in space as pictures: elements coloured by their fibre angle, with the chains of each on the surface."""
+"""Bodies at a time of a recording, and in pictures: elements by their fibre angle, with the chains on the surface."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import matplotlib
@@ -13,10 +14,13 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from remodel_fenicsx.paper.rendering import AMBIENT, Patch, Pixels
-from remodel_fenicsx.paper.snapshots import Snapshot
 from remodel_fenicsx.results.chain_lines import chain_lines
+from remodel_fenicsx.results.recording import Recording
 
 Array = NDArray[np.float64]
+Table = dict[str, NDArray[Any]]  # columns by name, all of one length
+Shown = NDArray[np.bool_] | slice  # which elements
+ALL = slice(None)
 
 LEVELS = 18  # steps of 5 degrees: a colour can be read off the scale
 CHAIN_COLOUR = (0.08, 0.08, 0.10)
@@ -24,6 +28,81 @@ CHAIN_REACH = 0.39  # half a chain's length over the shorter side of its face, b
 CHAIN_ROOM = 0.78  # how far a chain goes at most, over the way from the middle to the edge of its face
 CHAIN_WIDTH = 0.06  # over the shorter side
 CHAIN_LIFT = 0.2  # towards the eye, over the same: faces need not be plane
+
+# faces of VTK's hexahedron, by its local nodes
+_FACES = np.array([(0, 3, 2, 1), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7)])
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """A body of hexahedra at one time.
+
+    Attributes
+    ----------
+    time
+    points, displacement
+        Reference coordinates and displacements of the nodes, (nodes, 3).
+    elements
+        Nodes of the elements in VTK's order, (elements, 8).
+    fields
+        Means over the elements, by name (docs/commands.md): (elements,) or (elements, n).
+    """
+
+    time: float
+    points: Array
+    elements: NDArray[np.int64]
+    displacement: Array
+    fields: dict[str, Array]
+
+    @classmethod
+    def of(cls, run: Recording, time: float) -> Snapshot:
+        """The solved state of a run at a recorded time.
+
+        Raises
+        ------
+        RecordingError
+            If there is none.
+        """
+        fields = run.fields(time)
+        return cls(time, run.points, run.elements, fields.pop("displacement"), fields)
+
+    @property
+    def centres(self) -> Array:
+        """Reference centres of the elements, (elements, 3)."""
+        return self.points[self.elements].mean(axis=1)
+
+    @property
+    def deformed(self) -> Array:
+        """Deformed coordinates of the nodes, (nodes, 3)."""
+        return self.points + self.displacement
+
+    def exterior(self, shown: Shown = ALL) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Faces of the shown elements that no other shown element covers: nodes (m, 4), elements (m,)."""
+        elements = np.arange(len(self.elements))[shown]
+        faces = self.elements[elements][:, _FACES].reshape(-1, 4)
+        _, number, count = np.unique(np.sort(faces, axis=1), axis=0, return_inverse=True, return_counts=True)
+        alone = count[np.ravel(number)] == 1
+        return faces[alone], np.repeat(elements, len(_FACES))[alone]
+
+
+def rank_of(values: Array) -> NDArray[np.int64]:
+    """Number of each value among the distinct ones, ascending, from 0: layers, rows or columns of a regular mesh."""
+    ordered = np.sort(values)
+    starts = np.concatenate([[True], np.diff(ordered) > 1e-6 * (ordered[-1] - ordered[0])])
+    return np.searchsorted(ordered[starts], values + 1e-7 * (ordered[-1] - ordered[0])) - 1
+
+
+def radii(points: Array, elements: NDArray[np.int64]) -> Array:
+    """Mean distance of each element's nodes from the z axis, (elements,)."""
+    return np.linalg.norm(points[:, :2], axis=1)[elements].mean(axis=1)
+
+
+def layers(snapshot: Snapshot) -> NDArray[np.int64]:
+    """Number of each element's layer in the wall of a tube, from the inside, (elements,)."""
+    return rank_of(radii(snapshot.points, snapshot.elements))
+
+
+# ---------------------------------------------------------------- pictures
 
 
 def scale() -> tuple[Colormap, BoundaryNorm]:
@@ -43,28 +122,23 @@ def scale_colours() -> Array:
     return np.concatenate([share * coloured(middle) for share in np.linspace(1.0, AMBIENT, 5)])
 
 
-def body(snapshot: Snapshot, shown: NDArray[np.bool_] | None = None, chains_on: str = "side") -> list[Patch]:
-    """The surface of the shown elements in the deformed configuration, and their chains on it.
+def body(snapshot: Snapshot, shown: Shown = ALL) -> list[Patch]:
+    """The surface of the shown elements in the deformed configuration, and chains where it looks away from the z axis.
 
     Parameters
     ----------
     snapshot
         The body.
     shown
-        Which elements, (elements,); default: all.
-    chains_on
-        "side": chains on faces that look away from the z axis; "none".
+        Which elements, (elements,).
     """
-    shown = np.ones(len(snapshot.elements), dtype=bool) if shown is None else shown
     faces, elements = snapshot.exterior(shown)
     angle = snapshot.fields["fibre_angle_deformed"][elements]
-    patches = [Patch(snapshot.deformed[faces], coloured(angle), edges=True)]
-    if chains_on == "side":
-        centres, outward = snapshot.points[faces].mean(axis=1), _normals(snapshot.points[faces])
-        outward *= np.sign(np.sum(outward * (centres - snapshot.centres[elements]), axis=1))[:, None]
-        away = np.sum(outward[:, :2] * centres[:, :2], axis=1) > 0.5 * np.linalg.norm(centres[:, :2], axis=1)
-        patches.append(chains(snapshot, faces[away], elements[away]))
-    return patches
+    centres, outward = snapshot.points[faces].mean(axis=1), _normals(snapshot.points[faces])
+    outward *= np.sign(np.sum(outward * (centres - snapshot.centres[elements]), axis=1))[:, None]
+    away = np.sum(outward[:, :2] * centres[:, :2], axis=1) > 0.5 * np.linalg.norm(centres[:, :2], axis=1)
+    surface = Patch(snapshot.deformed[faces], coloured(angle), edges=True)
+    return [surface, chains(snapshot, faces[away], elements[away])]
 
 
 def chains(snapshot: Snapshot, faces: NDArray[np.int64], elements: NDArray[np.int64]) -> Patch:

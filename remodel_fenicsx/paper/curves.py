@@ -7,11 +7,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from remodel_fenicsx.model.chains import CHAINS
-from remodel_fenicsx.paper.bodies import angle_scale, place
-from remodel_fenicsx.paper.cases import KAPPAS
-from remodel_fenicsx.paper.output import COLOURS, Page, panel_letters
+from remodel_fenicsx.paper.bodies import Array, Snapshot, Table, angle_scale, place
+from remodel_fenicsx.paper.runs import KAPPAS, first_cells, made_with
+from remodel_fenicsx.studies.page import COLOURS, Page, panel_letters
 from remodel_fenicsx.paper.rendering import render
-from remodel_fenicsx.paper.snapshots import Array, Snapshot, Table, first_cells, made_with
 from remodel_fenicsx.paper.structures import SOLVED, at, joined, layer_table, peeled, tube_picture, wall_table
 from remodel_fenicsx.results.recording import Recording
 
@@ -207,9 +206,9 @@ def draw_energy(runs: dict[str, Recording], page: Page) -> None:
 
 def _draw_energy(above: Axes, below: Axes, run: Recording) -> None:
     """Stored energy above; below the power of remodeling, a pass's over the whole of its step."""
-    time, passes = run.history["time"], run.history["time"] > 0
+    time = run.history["time"]
     above.plot(time, run.history["stored_energy"], color=COLOURS[0])
-    _draw_power(below, np.concatenate([[0.0], time[passes]]), run.history["remodeling_power"][passes])
+    _draw_power(below, time, run.history["remodeling_power"][1:])  # no pass comes before t = 0
     ramp_end = max(load.ramp[-1][0] for load in run.scene.loads.values())
     for axes in (above, below):
         axes.axvline(ramp_end, color="0.6", lw=0.8, ls=":")

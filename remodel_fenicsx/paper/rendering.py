@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from remodel_fenicsx.paper.errors import FigureError
+from remodel_fenicsx.studies.page import FigureError
 
 Array = NDArray[np.float64]
 Pixels = NDArray[np.uint8]

@@ -1,180 +1,142 @@
-"""A cache of recorded runs: what is not there, or no longer valid, is run in processes of its own."""
+"""The runs behind the figures: the paper's preset with what each figure varies, and the folder where they are kept.
+
+The printed pass over-corrects with the drivers of Figs. 10 and 11 (docs/theory.md, "Stability of the pass"), so these
+two runs relax it, in the frame that is objective.
+"""
 
 from __future__ import annotations
 
-import fcntl
-import os
+import hashlib
+import importlib.metadata
+import json
 import shutil
-import tempfile
-import time as clock
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from collections.abc import Iterable
 from pathlib import Path
 
-from remodel_fenicsx.paper.errors import FigureError
-from remodel_fenicsx.paper.validity import fault, library_versions, run_key, source_fingerprint
-from remodel_fenicsx.results.recording import steps_recorded
-from remodel_fenicsx.scene.scene import Scene
-from remodel_fenicsx.system.children import Child
-from remodel_fenicsx.system.interrupts import StopRequest
-from remodel_fenicsx.system.terminal import Line, announce
+from remodel_fenicsx._version import __version__
+from remodel_fenicsx.body.reductions import AUTO, choice
+from remodel_fenicsx.results.recording import Recording, RecordingError
+from remodel_fenicsx.results.run_lock import is_vacant
+from remodel_fenicsx.scene.scene import Scene, SceneError, preset_scene
+from remodel_fenicsx.studies.page import FigureError
+from remodel_fenicsx.studies.runs import Run, run_all
+from remodel_fenicsx.system.terminal import announce
 
-_WORK = ".part-"  # and letters: a folder of unfinished runs, locked by the command they belong to and by each of them
-_POLL = 0.25  # seconds
+PRESET = "kuhl-holzapfel-2007"
+KAPPAS = (0.01, 0.025, 0.05, 0.1)  # those of the printed Fig. 5 cannot be read
+LOAD_CASES = ((0.10, 0.0), (0.10, 2.4), (0.10, 4.8), (0.05, 4.8), (0.0, 4.8))  # Fig. 9: (elongation, pressure)
+
+# how the package names the prescribed engineering strain of a tube: the load of a scene, the column of a history
+ELONGATION_LOAD, ELONGATION_COLUMN = "elongation", "axial_elongation"
+
+_LIBRARIES = ("fenics-dolfinx", "fenics-ufl", "fenics-ffcx", "petsc4py", "gmsh", "numpy")
 _COST = {"tendon": 0.2, "cube": 0.01}  # of a step, beside those of other shapes
 
 
-@dataclass
-class RunCache:
-    """Recorded runs in a folder, each in NAME-KEY: a run whose scene, source or libraries have changed has another key.
+def load_case_name(elongation: float, pressure: float) -> str:
+    """Name of the run of one of Fig. 9's load cases."""
+    return "artery" if (elongation, pressure) == (0.10, 4.8) else f"artery-{100 * elongation:g}-{pressure:g}"
+
+
+def cheapest(scene: Scene) -> Scene:
+    """With the cheapest kinematics that is exact for it: for scenes of which a figure shows the history alone."""
+    return scene.with_values({"model.kinematics": choice(scene.with_values({"model.kinematics": AUTO})).name})
+
+
+def scenes() -> dict[str, Scene]:
+    """Every scene that a figure needs, by name."""
+    found = {"tendon": preset_scene(PRESET, "tendon"), "artery": preset_scene(PRESET, "tube")}
+    last_only = {"output.every": found["artery"].time.number_of_steps}
+    for elongation, pressure in LOAD_CASES:
+        changes = {f"loads.{ELONGATION_LOAD}.value": elongation, "loads.pressure.value": pressure}
+        found.setdefault(load_case_name(elongation, pressure), found["artery"].with_values(changes | last_only))
+    for driver in ("pk2", "finger"):
+        method = {"remodeling.driver": driver, "remodeling.frame": "material", "remodeling.coupling": "relaxed"}
+        found[f"artery-{driver}"] = found["artery"].with_values(method | last_only)
+    found["artery-rate"] = found["artery"].with_values({"remodeling.law": "rate"} | last_only)
+    for kappa in KAPPAS:
+        changes = {"remodeling.kappa": kappa, "output.fields": False}
+        found[f"cube-{kappa:g}"] = cheapest(preset_scene(PRESET, "cube").with_values(changes))
+    return {name: scene.with_values({"name": name}) for name, scene in found.items()}
+
+
+# ---------------------------------------------------------------- the folder where they are kept
+
+
+def library_versions() -> dict[str, str]:
+    """Versions of package and libraries that decide a run's numbers, without importing them."""
+    return {name: importlib.metadata.version(name) for name in _LIBRARIES} | {"remodel_fenicsx": __version__}
+
+
+def kept_run(scene: Scene, folder: Path) -> Run:
+    """The run of a scene in FOLDER/NAME-KEY; KEY is a hash of the scene with all its defaults and the versions."""
+    everything = json.dumps([scene.model_dump(mode="json"), library_versions()], sort_keys=True)
+    key = hashlib.sha256(everything.encode()).hexdigest()[:12]
+    return Run(scene.name, scene, folder / f"{scene.name}-{key}")
+
+
+def obtain(wanted: Iterable[Scene], folder: Path, jobs: int) -> dict[str, Path]:
+    """Folders of whole runs by name of scene; what is not recorded with the present versions is run first.
 
     Parameters
     ----------
+    wanted
+        Scenes.
     folder
-        Where the runs are; made when the first one is.
-    source, libraries
-        What the present numbers depend on beside the scene.
+        Of the recorded runs; made when it is needed.
+    jobs
+        Runs at a time; the longest begin first.
+
+    Raises
+    ------
+    FigureError
+        If a run fails, with its exit code; the others are stopped.
+    Interrupted
+        If a signal asked for the end. What is recorded stays, and the same call goes on from there.
+    OSError
+        If the folder cannot be written.
     """
 
-    folder: Path
-    source: str = field(default_factory=source_fingerprint)
-    libraries: Mapping[str, str] = field(default_factory=library_versions)
+    def cost(run: Run) -> float:
+        return _COST.get(run.scene.geometry.name, 1.0) * run.scene.time.number_of_steps
 
-    def path(self, scene: Scene) -> Path:
-        """Folder of a scene's run, whether it exists or not."""
-        return self.folder / f"{scene.name}-{run_key(scene, self.source, self.libraries)}"
-
-    def is_valid(self, scene: Scene) -> bool:
-        """Whether a whole run of this very scene with the present source and libraries is recorded."""
-        return fault(self.path(scene), scene) is None
-
-    def obtain(self, wanted: Iterable[Scene], jobs: int) -> dict[str, Path]:
-        """Folders by name of scene; what is not valid is run first, so many at a time.
-
-        Raises
-        ------
-        FigureError
-            If a run fails (with its exit code) or the command is stopped (130, 143). Finished runs stay.
-        OSError
-            If the folder cannot be written.
-        """
-        wanted = list(wanted)
-        missing = []
-        for scene in wanted:
-            reason = fault(self.path(scene), scene)
-            if reason is not None:
-                missing.append(scene)
-                if self.path(scene).exists():
-                    announce(f"figures: run again: {self.path(scene)}: {reason}")
-        if missing:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            self._run(missing, jobs)
-        return {scene.name: self.path(scene) for scene in wanted}
-
-    def _run(self, missing: Sequence[Scene], jobs: int) -> None:
-        """Run scenes, the longest first."""
-        waiting = sorted(missing, key=lambda scene: _COST.get(scene.geometry.name, 1.0) * scene.time.number_of_steps)
-        running: list[_Run] = []
-        finished, total = 0, sum(scene.time.number_of_steps for scene in missing)
-        progress = Line("figures")
-        with StopRequest() as stop, _work_folder(self.folder) as (work, lock):
-            try:
-                while waiting or running:
-                    if stop.number:
-                        raise FigureError("stopped; finished runs are kept", 128 + stop.number)
-                    while waiting and len(running) < jobs:
-                        running.append(_Run(waiting.pop(), work, lock))
-                    for run in [run for run in running if run.child.process.poll() is not None]:
-                        running.remove(run)
-                        self._keep(run)
-                        finished += run.scene.time.number_of_steps
-                    done = 100 * (finished + sum(run.steps_done() for run in running)) // total
-                    parts = [f"{run.scene.name} {run.steps_done()}/{run.scene.time.number_of_steps}" for run in running]
-                    more = f", {len(waiting)} more to start" if waiting else ""
-                    progress.show(f"{done} % of the runs: {', '.join(parts)}{more}")
-                    clock.sleep(_POLL)
-            finally:
-                for run in running:
-                    run.child.stop()
-                progress.end()
-
-    def _keep(self, run: _Run) -> None:
-        """Give the folder of a run that has ended its name, or say why there is none."""
-        code, name, target = run.child.process.returncode, run.scene.name, self.path(run.scene)
+    def ended(run: Run, code: int, last_words: str) -> None:
         if code != 0:
-            message = f"the run {name} in {run.folder}: {run.child.last_words()}"
-            raise _RunFailed(message, code if code > 0 else 128 - code)
-        if source_fingerprint() != self.source:
-            raise FigureError(f"the package's source changed during the run {name}: start again", 1)
-        try:
-            run.folder.rename(target)
-        except OSError:
-            if not target.is_dir():
-                raise
-            # the same run by another process in the meantime, or what is left of one that is not whole
-            shutil.rmtree(target)
-            run.folder.rename(target)
+            message = f"the run {run.name} in {run.folder}: {last_words}"
+            raise FigureError(message, code if code > 0 else 128 - code)
+
+    runs = [kept_run(scene, folder) for scene in wanted]
+    missing = [run for run in runs if run.is_under_way() or not _is_whole(run)]
+    run_all(sorted(missing, key=cost, reverse=True), jobs, "figures", ended=ended)
+    return {run.name: run.folder for run in runs}
 
 
-class _RunFailed(FigureError):
-    """What the run has left may say why."""
-
-
-class _Run:
-    """One scene in one process."""
-
-    def __init__(self, scene: Scene, work: Path, lock: int):
-        self.scene, self.folder = scene, work / scene.name
-        scene_file = work / f"{scene.name}.toml"
-        scene_file.write_text(scene.to_toml(), encoding="utf-8")
-        arguments = ["run", str(scene_file), "-o", str(self.folder), "-q"]
-        self.child = Child(arguments, work / f"{scene.name}.txt", [lock])
-
-    def steps_done(self) -> int:
-        return min(steps_recorded(self.folder), self.scene.time.number_of_steps)
-
-
-# ---------------------------------------------------------------- unfinished runs
-
-
-@contextmanager
-def _work_folder(folder: Path) -> Iterator[tuple[Path, int]]:
-    """A new folder for unfinished runs, and its lock, which each run shares; what a run that failed left stays."""
-    with _lock(folder):
-        work = Path(tempfile.mkdtemp(prefix=_WORK, dir=folder))
-        lock = os.open(work, os.O_RDONLY)
-        fcntl.flock(lock, fcntl.LOCK_EX)
+def _is_whole(run: Run) -> bool:
+    """Whether all of a run is there; what is damaged, so that it could not go on, is removed."""
+    if not run.folder.exists() or is_vacant(run.folder):
+        return False
     try:
-        _remove_litter(folder)
-        yield work, lock
-    except _RunFailed:
-        raise  # until the next command
-    except BaseException:
-        shutil.rmtree(work)
-        raise
-    else:
-        shutil.rmtree(work)
-    finally:
-        os.close(lock)
+        _ = Recording(run.folder).history
+        return run.is_complete()
+    except (SceneError, RecordingError, OSError) as error:
+        announce(f"figures: run again: {run.folder}: {' '.join(str(error).split())}")
+        shutil.rmtree(run.folder)
+        return False
 
 
-def _remove_litter(folder: Path) -> None:
-    """Remove what failed runs and killed commands have left: unfinished runs whose folder nobody locks any more."""
-    with _lock(folder):
-        for work in folder.glob(f"{_WORK}*/"):
-            try:
-                with _lock(work, fcntl.LOCK_NB):
-                    shutil.rmtree(work)
-            except BlockingIOError:  # runs under way
-                continue
+# ---------------------------------------------------------------- what they were made with
 
 
-@contextmanager
-def _lock(folder: Path, how: int = 0) -> Iterator[None]:
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | how)
-        yield
-    finally:
-        os.close(descriptor)
+def first_cells(run: Recording) -> str:
+    """How the cells of a run were at first, in words."""
+    cells = run.scene.cells
+    return f"random cells of seed {cells.seed}" if cells.initial == "random" else f"{cells.initial} cells"
+
+
+def made_with(run: Recording, cells: str | None = None) -> str:
+    """Package, library and scene of a run, in a line; `cells` says more than `first_cells` of this run alone."""
+    scene, versions = run.scene, run.versions
+    libraries = ", ".join(f"{name} {versions.get(name, '?')}" for name in ("remodel_fenicsx", "dolfinx"))
+    kinematics = "" if scene.model.kinematics == "full" else f" with kinematics {scene.model.kinematics}"
+    method = f"preset {scene.preset}{kinematics}, frame {scene.remodeling.frame}"
+    return f"{libraries}; {method}, {cells or first_cells(run)}"

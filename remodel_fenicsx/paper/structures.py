@@ -10,11 +10,12 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from remodel_fenicsx.model.cells import initial_axes, radial_direction
-from remodel_fenicsx.paper.bodies import angle_scale, body, place
-from remodel_fenicsx.paper.cases import ELONGATION_COLUMN, LOAD_CASES, load_case_name
-from remodel_fenicsx.paper.output import COLOURS, Page, panel_letters
+from remodel_fenicsx.paper.bodies import (
+    ALL, Array, Shown, Snapshot, Table, angle_scale, body, layers, place, radii, rank_of,
+)  # fmt: skip
+from remodel_fenicsx.paper.runs import ELONGATION_COLUMN, LOAD_CASES, load_case_name, made_with
+from remodel_fenicsx.studies.page import COLOURS, Page, panel_letters
 from remodel_fenicsx.paper.rendering import Picture, View, render
-from remodel_fenicsx.paper.snapshots import Array, Snapshot, Table, layers, made_with, radii, rank_of
 from remodel_fenicsx.results.recording import Recording
 
 TENDON_TIMES = (1.0, 12.0, 25.0, 50.0, 150.0)
@@ -28,15 +29,14 @@ SOLVED = "fields belong to the solved state of their time, before that time's re
 FROM_ABOVE = (0.35, -1.0, 0.42)  # the direction from which tubes are seen
 
 
-def element_table(snapshot: Snapshot, shown: NDArray[np.bool_] | None = None) -> Table:
+def element_table(snapshot: Snapshot, shown: Shown = ALL) -> Table:
     """What is drawn of each element: reference centre, angles in degrees, cell dimensions, r/L."""
-    shown = np.ones(len(snapshot.elements), dtype=bool) if shown is None else shown
     x, y, z = snapshot.centres[shown].T
     fields = {name: values[shown] for name, values in snapshot.fields.items()}
     lengths = {f"l_{i + 1}": fields["cell_dimensions"][:, i] for i in range(3)}
     return {
-        "time": np.full(shown.sum(), snapshot.time),
-        "element": np.flatnonzero(shown),
+        "time": np.full(len(x), snapshot.time),
+        "element": np.arange(len(snapshot.elements))[shown],
         "x": x,
         "y": y,
         "z": z,
@@ -48,9 +48,8 @@ def element_table(snapshot: Snapshot, shown: NDArray[np.bool_] | None = None) ->
     }
 
 
-def wall_table(snapshot: Snapshot, shown: NDArray[np.bool_] | None = None) -> Table:
+def wall_table(snapshot: Snapshot, shown: Shown = ALL) -> Table:
     """`element_table` of a tube, with the radial component of its cells."""
-    shown = np.ones(len(snapshot.elements), dtype=bool) if shown is None else shown
     return element_table(snapshot, shown) | {"l_radial": radial_dimension(snapshot)[shown]}
 
 
@@ -72,9 +71,7 @@ def at(snapshot: Snapshot) -> str:
     return f" at $t$ = {snapshot.time:g}"
 
 
-def tube_picture(
-    snapshot: Snapshot, shown: NDArray[np.bool_] | None, height: float, pixels: tuple[int, int]
-) -> Picture:
+def tube_picture(snapshot: Snapshot, shown: Shown, height: float, pixels: tuple[int, int]) -> Picture:
     """A tube seen obliquely from above, its middle in the middle."""
     top = snapshot.deformed[:, 2].max()
     return Picture(View(FROM_ABOVE, (0.0, 0.0, top / 2), height, pixels), body(snapshot, shown))
@@ -148,16 +145,11 @@ def draw_artery(runs: dict[str, Recording], page: Page) -> None:
     """Fig. 7: five snapshots of the artery."""
     run = runs["artery"]
     snapshots = [Snapshot.of(run, time) for time in ARTERY_TIMES]
-    tallest = max(snapshot.deformed[:, 2].max() for snapshot in snapshots)
-    images = render([tube_picture(s, None, 1.25 * tallest, (360, 560)) for s in snapshots])
     figure = Figure(figsize=(8.2, 3.5))
-    panels = []
-    for number, (time, image) in enumerate(zip(ARTERY_TIMES, images, strict=True)):
-        axes = figure.add_axes((0.005 + 0.198 * number, 0.215, 0.198, 0.72))
-        panels.append(axes)
-        place(axes, image)
+    loads = [(run.value(ELONGATION_COLUMN, time), run.value("pressure", time)) for time in ARTERY_TIMES]
+    panels = _tubes(figure, snapshots, [ALL] * len(snapshots), loads)
+    for axes, time in zip(panels, ARTERY_TIMES, strict=True):
         axes.set_title(f"$t$ = {time:g}")
-        _write_loads(axes, run.value(ELONGATION_COLUMN, time), run.value("pressure", time))
     angle_scale(figure, (0.25, 0.125, 0.5, 0.026), IN_WALL.format(""))
     panel_letters(*panels)
     page.save_figure(figure, made_with(run))
@@ -173,10 +165,22 @@ def draw_artery(runs: dict[str, Recording], page: Page) -> None:
     page.save_table(joined(tables), [made_with(run), f"what is drawn; {SOLVED}"], "elements")
 
 
-def _write_loads(axes: Axes, elongation: float, pressure: float) -> None:
-    """Below a picture."""
-    text = f"elongation {100 * elongation:.2g} %,  $p$ = {pressure:.3g}"
-    axes.text(0.5, -0.015, text, transform=axes.transAxes, ha="center", va="top", fontsize=7, color="0.35")
+def _tubes(
+    figure: Figure, snapshots: Sequence[Snapshot], shown: Sequence[Shown], loads: Sequence[tuple[float, float]]
+) -> list[Axes]:
+    """Five tubes beside each other, on one scale, with elongation and pressure below each; returns their panels."""
+    height = 1.25 * max(snapshot.deformed[:, 2].max() for snapshot in snapshots)
+    images = render([tube_picture(*one, height, (360, 560)) for one in zip(snapshots, shown, strict=True)])
+    panels = []
+    for number, ((elongation, pressure), image) in enumerate(zip(loads, images, strict=True)):
+        panels.append(figure.add_axes((0.005 + 0.198 * number, 0.215, 0.198, 0.72)))
+        place(panels[-1], image)
+        _write_below(panels[-1], f"elongation {100 * elongation:.2g} %,  $p$ = {pressure:.3g}", 7)
+    return panels
+
+
+def _write_below(axes: Axes, text: str, size: float) -> None:
+    axes.text(0.5, -0.015, text, transform=axes.transAxes, ha="center", va="top", fontsize=size, color="0.35")
 
 
 def layer_table(snapshot: Snapshot) -> Table:
@@ -186,28 +190,25 @@ def layer_table(snapshot: Snapshot) -> Table:
     stays round, large where it swirls or where elements are sheared to and fro.
     """
     number = layers(snapshot)
-    radius = radii(snapshot.points, snapshot.elements)
+    of_layer = [number == k for k in range(number.max() + 1)]
     count = np.bincount(number)
 
-    def per_layer(name: str) -> Array:
+    def means(values: Array) -> Array:
         # the elements of a layer are alike: their mean is the volume mean
-        return np.bincount(number, snapshot.fields[name]) / count
+        return np.bincount(number, values) / count
 
-    reference = snapshot.fields["fibre_angle"]
-    shear = local_shear(snapshot)
-    dimensions = [np.bincount(number, snapshot.fields["cell_dimensions"][:, i]) / count for i in range(3)]
-    deformed = radii(snapshot.deformed, snapshot.elements)
+    fields, shear = snapshot.fields, local_shear(snapshot)
     return {
         "layer": np.arange(1, len(count) + 1),
-        "radius": np.bincount(number, radius) / count,
-        "deformed_radius": np.bincount(number, deformed) / count,
-        "fibre_angle": per_layer("fibre_angle"),
-        "fibre_angle_least": np.array([reference[number == k].min() for k in range(len(count))]),
-        "fibre_angle_most": np.array([reference[number == k].max() for k in range(len(count))]),
-        "fibre_angle_deformed": per_layer("fibre_angle_deformed"),
-        **{f"l_{i + 1}": values for i, values in enumerate(dimensions)},
-        "l_radial": np.bincount(number, radial_dimension(snapshot)) / count,
-        "shear": np.array([np.sqrt(np.mean(shear[number == k] ** 2, axis=0)).max() for k in range(len(count))]),
+        "radius": means(radii(snapshot.points, snapshot.elements)),
+        "deformed_radius": means(radii(snapshot.deformed, snapshot.elements)),
+        "fibre_angle": means(fields["fibre_angle"]),
+        "fibre_angle_least": np.array([fields["fibre_angle"][those].min() for those in of_layer]),
+        "fibre_angle_most": np.array([fields["fibre_angle"][those].max() for those in of_layer]),
+        "fibre_angle_deformed": means(fields["fibre_angle_deformed"]),
+        **{f"l_{i + 1}": means(fields["cell_dimensions"][:, i]) for i in range(3)},
+        "l_radial": means(radial_dimension(snapshot)),
+        "shear": np.array([np.sqrt(np.mean(shear[those] ** 2, axis=0)).max() for those in of_layer]),
     }
 
 
@@ -234,8 +235,7 @@ def draw_layers(runs: dict[str, Recording], page: Page) -> None:
         place(axes, image)
         axes.set_title(name)
         means = f"{table['fibre_angle'][k]:.1f}° reference, {table['fibre_angle_deformed'][k]:.1f}° deformed"
-        text = f"layer {k + 1} of {len(table['layer'])}; mean angle\n{means}"
-        axes.text(0.5, -0.015, text, transform=axes.transAxes, ha="center", va="top", fontsize=7.5, color="0.35")
+        _write_below(axes, f"layer {k + 1} of {len(table['layer'])}; mean angle\n{means}", 7.5)
     angle_scale(figure, (0.2, 0.125, 0.6, 0.025), IN_WALL.format(at(snapshot)))
     panel_letters(*panels)
     page.save_figure(figure, made_with(run))
@@ -254,28 +254,19 @@ def draw_load_cases(runs: dict[str, Recording], page: Page) -> None:
     """Fig. 9: the ends of five load cases, the layers virtually peeled off."""
     cases = [runs[load_case_name(*case)] for case in LOAD_CASES]
     snapshots = [Snapshot.of(run, run.scene.time.end) for run in cases]
-    tallest = max(snapshot.deformed[:, 2].max() for snapshot in snapshots)
-    images = render([tube_picture(s, peeled(s), 1.25 * tallest, (360, 560)) for s in snapshots])
     figure = Figure(figsize=(8.2, 3.4))
-    panels = []
-    for number, ((elongation, pressure), image) in enumerate(zip(LOAD_CASES, images, strict=True)):
-        axes = figure.add_axes((0.005 + 0.198 * number, 0.215, 0.198, 0.72))
-        panels.append(axes)
-        place(axes, image)
-        _write_loads(axes, elongation, pressure)
+    panels = _tubes(figure, snapshots, [peeled(s) for s in snapshots], LOAD_CASES)
     angle_scale(figure, (0.25, 0.125, 0.5, 0.026), IN_WALL.format(at(snapshots[0])))
     panel_letters(*panels)
     made = made_with(cases[0])
     page.save_figure(figure, made)
-    tables = []
-    for (stretch, pressure), snapshot in zip(LOAD_CASES, snapshots, strict=True):
-        table = layer_table(snapshot)
-        loads = {"stretch": np.full(len(table["layer"]), stretch), "pressure": np.full(len(table["layer"]), pressure)}
-        tables.append(loads | table)
-    page.save_table(joined(tables), [made, f"means over element layers; {SOLVED}"])
-    elements = []
-    for (stretch, pressure), snapshot in zip(LOAD_CASES, snapshots, strict=True):
-        table = wall_table(snapshot, peeled(snapshot))
-        loads = {"stretch": np.full(len(table["x"]), stretch), "pressure": np.full(len(table["x"]), pressure)}
-        elements.append(loads | table)
-    page.save_table(joined(elements), [made, f"the elements that are drawn; {SOLVED}"], "elements")
+    layered = [_with_loads(case, layer_table(s)) for case, s in zip(LOAD_CASES, snapshots, strict=True)]
+    page.save_table(joined(layered), [made, f"means over element layers; {SOLVED}"])
+    drawn = [_with_loads(case, wall_table(s, peeled(s))) for case, s in zip(LOAD_CASES, snapshots, strict=True)]
+    page.save_table(joined(drawn), [made, f"the elements that are drawn; {SOLVED}"], "elements")
+
+
+def _with_loads(case: tuple[float, float], table: Table) -> Table:
+    """A table with the loads of its case in front; `stretch` is the elongation."""
+    rows = len(next(iter(table.values())))
+    return {"stretch": np.full(rows, case[0]), "pressure": np.full(rows, case[1])} | table

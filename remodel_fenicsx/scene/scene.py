@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
-from pydantic import BaseModel, Field, ModelWrapValidatorHandler, SerializeAsAny, model_validator
+from pydantic import BaseModel, BeforeValidator, Field, ModelWrapValidatorHandler, SerializeAsAny, model_validator
 
 from remodel_fenicsx.body import SHAPES, Shape
 from remodel_fenicsx.body.columns import columns_of, columns_on_request
@@ -26,7 +26,7 @@ from remodel_fenicsx.model.implicit.condensed import refused
 from remodel_fenicsx.model.laws import LAWS
 from remodel_fenicsx.scene.plausibility import doubts, largest_stress
 from remodel_fenicsx.scene.presets import EXACT, PRESETS, PROFILES, default_method
-from remodel_fenicsx.schema.tables import SceneError, Table, VariantOf, allowed, checked, fault, quoted, shown
+from remodel_fenicsx.schema.tables import SceneError, Table, VariantOf, allowed, fault, quoted, shown
 from remodel_fenicsx.schema.toml import merged, parse_override, put, read_toml, toml_text
 from remodel_fenicsx.schema.units import FORCE, LENGTH_UNIT, LENGTH_UNITS, STRESS_UNIT, in_units
 from remodel_fenicsx.settings import (
@@ -71,7 +71,7 @@ class Scene(Table):
         le=FORMAT,
         description="Number of the form in which a scene is written; a scene as run has it. Version 0.1.0 wrote none.",
     )
-    name: Annotated[str, checked(_name)] = Field(
+    name: Annotated[str, BeforeValidator(_name)] = Field(
         default="scene",
         description="Name of the scene and of its results folder. Default: the file's name without `.toml`.",
         json_schema_extra={"allowed": "a file name without a path"},

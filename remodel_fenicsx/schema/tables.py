@@ -9,11 +9,11 @@ import difflib
 import inspect
 import math
 import re
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args, get_origin
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, GetCoreSchemaHandler, ValidationError
+from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import CoreSchema, ErrorDetails, PydanticCustomError, PydanticUndefined, core_schema
 
@@ -110,11 +110,6 @@ class VariantOf:
             return self.registry[name].model_validate(dict(value))
         except ValidationError as error:
             raise PydanticCustomError("inner", "faults in {name}", {"name": name, "error": error}) from None
-
-
-def checked(check: Callable[[Any], Any]) -> BeforeValidator:
-    """Annotation of a field whose value goes through `check` before its type is looked at."""
-    return BeforeValidator(check)
 
 
 def fault(rule: str, key: str = "", value: Any = _MISSING) -> PydanticCustomError:
@@ -277,10 +272,6 @@ def is_table(annotation: Any) -> bool:
     return isinstance(annotation, type) and issubclass(annotation, BaseModel)
 
 
-def _fields(annotation: Any) -> dict[str, FieldInfo]:
-    return annotation.model_fields if is_table(annotation) else {}
-
-
 def variant_of_field(field: FieldInfo) -> VariantOf | None:
     """The registry behind a field that has several kinds of tables, or None."""
     return next((entry for entry in field.metadata if isinstance(entry, VariantOf)), None)
@@ -303,7 +294,8 @@ def allowed(field: FieldInfo) -> str:
     if isinstance(field.json_schema_extra, dict):
         return f"must be {field.json_schema_extra['allowed']}"
     if is_table(field.annotation) or get_origin(field.annotation) is dict:
-        required = [name for name, inner in _fields(field.annotation).items() if inner.is_required()]
+        fields: dict[str, FieldInfo] = getattr(field.annotation, "model_fields", {})
+        required = [name for name, inner in fields.items() if inner.is_required()]
         return "must be a table" + (f" with {', '.join(required)}" if required else "")
     nouns: dict[Any, str] = {float: "a finite number", int: "a whole number", bool: "true or false", str: "a string"}
     words = {"gt": "greater than", "ge": "at least", "lt": "less than", "le": "at most"}

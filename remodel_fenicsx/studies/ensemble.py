@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +13,10 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from remodel_fenicsx.body.columns import columns_of
-from remodel_fenicsx.paper.output import COLOURS, STYLE, Page
 from remodel_fenicsx.scene.scene import Scene, SceneError
 from remodel_fenicsx.schema.times import same_time
-from remodel_fenicsx.studies.members import LEAST, Member, Study, TooFewRuns, run_members
+from remodel_fenicsx.studies.page import COLOURS, STYLE, Page
+from remodel_fenicsx.studies.runs import LEAST, Run, TooFewRuns, run_all, write_study
 from remodel_fenicsx.system.children import cores
 from remodel_fenicsx.system.environment import versions
 
@@ -81,7 +82,7 @@ class Ensemble:
         return found
 
 
-def members_of(scene: Scene, folder: Path, seeds: int) -> list[Member]:
+def members_of(scene: Scene, folder: Path, seeds: int) -> list[Run]:
     """A run for each seed from the scene's own on, and one with isotropic cells.
 
     Raises
@@ -97,7 +98,7 @@ def members_of(scene: Scene, folder: Path, seeds: int) -> list[Member]:
     every: dict[str, dict[str, Any]] = {f"seed-{number}": {"cells.seed": number} for number in numbers}
     every[ISOTROPIC] = {"cells.initial": ISOTROPIC}
     return [
-        Member(name, scene.with_values({"output.fields": False, "name": name, **change}), folder / name)
+        Run(name, scene.with_values({"output.fields": False, "name": name, **change}), folder / name)
         for name, change in every.items()
     ]
 
@@ -132,19 +133,20 @@ def ensemble(
     TooFewRuns
         If fewer than two seeds reach the end.
     Interrupted
-        If a signal asked for the end; the same call goes on from there.
+        If a signal asked for the end, SIGUSR1 after the steps under way; the same call goes on from there.
     OSError
         If a file cannot be written.
     """
     place = Path(folder or Path("results") / f"{scene.name}-{NAME}")
     members = members_of(scene, place, seeds)
-    failed = run_members(members, jobs or cores(), Study(NAME, scene.name, place), quiet)
+    checked = partial(write_study, place, NAME, scene.name, members)
+    failed = run_all(members, jobs or cores(), f"{scene.name} {NAME}", quiet, checked=checked)
     found = gathered(members, failed)
     draw(found, place, scene)
     return place, found
 
 
-def gathered(members: list[Member], failed: dict[str, str]) -> Ensemble:
+def gathered(members: list[Run], failed: dict[str, str]) -> Ensemble:
     """The histories of all that have not failed.
 
     Raises

@@ -1,4 +1,7 @@
-"""The errors of settings from what all of them give: the table of a trade, and what it rests on."""
+"""The errors of settings from what all of them give: the table of a trade, and what it rests on.
+
+What ever finer settings tend to is known by Richardson's extrapolation, where their results show an order.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,6 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.schema.times import same_time
-from remodel_fenicsx.studies.convergence import Limit, limit, pareto, typical
 from remodel_fenicsx.studies.ladder import KINEMATIC, Setting, is_reduced
 
 Array = NDArray[np.float64]
@@ -18,8 +20,70 @@ Array = NDArray[np.float64]
 CLOSE = 0.5  # of an error: what is left unknown may be so much of it
 NO_ERROR = 1e-6  # degrees: what solves leave is less, what elements and steps leave more
 SPREAD = 2.0  # noise of the mean over the seeds that an error must be above
+RATIOS = (1.35, 40.0)  # of differences of one halving and the next that are those of an order
+ALIGNED = 0.5  # cosine of the angle between two differences, as vectors, that shrink along one way
 
 
+# ---------------------------------------------------------------- an order, and what is left with it
+@dataclass(frozen=True)
+class Limit:
+    """What a sweep of one factor tends to.
+
+    Attributes
+    ----------
+    beyond
+        What is left from its finest member to the limit; zero where no order shows.
+    order
+        Power of the step or of the size of the elements; NaN where none shows.
+    last
+        Difference of the finest two.
+    """
+
+    beyond: Array
+    order: float
+    last: Array
+
+    @property
+    def trusted(self) -> bool:
+        """Whether an order shows."""
+        return bool(np.isfinite(self.order))
+
+
+def limit(results: Sequence[Array]) -> Limit:
+    """The limit of results of settings that are each half of the one before, the finest last.
+
+    Differences d of results Q fall by a ratio q = 2^p from halving to halving; what is left is d / (q - 1). An order
+    shows where the differences shrink along one way: by a ratio in RATIOS, ALIGNED.
+    """
+    if len(results) < 3:
+        last = results[-1] - results[-2] if len(results) == 2 else np.full_like(results[-1], np.nan)
+        return Limit(np.zeros_like(results[-1]), np.nan, last)
+    before, last = results[-2] - results[-3], results[-1] - results[-2]
+    size_before, size = typical(before), typical(last)
+    if size == 0:
+        return Limit(np.zeros_like(last), np.inf, last)
+    ratio = size_before / size
+    cosine = float(np.nansum(before * last) / max(np.nansum(before**2) ** 0.5 * np.nansum(last**2) ** 0.5, 1e-300))
+    if not RATIOS[0] < ratio < RATIOS[1] or cosine < ALIGNED:
+        return Limit(np.zeros_like(last), np.nan, last)
+    return Limit(np.asarray(last / (ratio - 1), dtype=np.float64), float(np.log2(ratio)), last)
+
+
+def typical(values: Array) -> float:
+    """Root mean square of what is known."""
+    return float(np.sqrt(np.nanmean(values**2)))
+
+
+def pareto(costs: Sequence[float], errors: Sequence[float]) -> list[bool]:
+    """Which of some settings no other one beats in cost and error."""
+    pairs = list(zip(costs, errors, strict=True))
+    return [
+        np.isfinite(error) and not any((c <= cost and e < error) or (c < cost and e <= error) for c, e in pairs)
+        for cost, error in pairs
+    ]
+
+
+# ---------------------------------------------------------------- the table
 @dataclass(frozen=True)
 class Result:
     """What a setting gives: means over its seeds.

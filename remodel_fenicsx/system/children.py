@@ -20,40 +20,11 @@ PATIENCE = 30.0  # seconds
 SERVE = "serve"  # the command of a worker's process
 
 
-class Child:
-    """A command of remodel-fenicsx in a process, which ends with this one, even if that is killed (with setpriv).
-
-    Parameters
-    ----------
-    arguments
-        Of the command line.
-    messages
-        File for all that it says.
-    keep
-        Descriptors that it inherits.
-    """
-
-    def __init__(self, arguments: Sequence[str], messages: Path, keep: Sequence[int] = ()):
-        self.messages = messages
-        with _emptied(messages) as output:
-            self.process = _process(
-                arguments, stdin=subprocess.DEVNULL, stdout=output, stderr=output, pass_fds=tuple(keep)
-            )
-
-    def last_words(self) -> str:
-        """The last line that it has said."""
-        return _last_words(self.messages)
-
-    def stop(self) -> None:
-        """End it, by force if it takes too long."""
-        self.process.terminate()
-        _wait(self.process)
-
-
 class Worker:
     """A process that does commands one after the other: what it has imported and compiled serves all of them.
 
-    It ends with the process that has started it, as a `Child` does. One thread, as there are jobs for the cores.
+    It ends with the process that has started it, even if that is killed (with setpriv). One thread, as there are jobs
+    for the cores.
     """
 
     def __init__(self) -> None:

@@ -22,11 +22,15 @@ SIGNALS: tuple[int, ...] = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # ask
 PAUSE = signal.SIGUSR1  # asks a run to end with the step under way; batch systems send it before they kill
 PAUSED = 4  # exit code
 
-_EXIT_CODE_BASE = 128
 _ONE_SIGNAL = 0.2  # seconds: timeout, for one, sends its signal to the process, and then to the group that this is in
 
 # PETSc aborts on all of these, and on some that a run outlives: a closed pipe, the hang-up that nohup ignores
 _NOT_PETSCS = (signal.SIGHUP, signal.SIGINT, signal.SIGPIPE, signal.SIGQUIT, signal.SIGTERM, signal.SIGURG)
+
+
+def _exit_code(number: int) -> int:
+    """Of a process that a signal has asked to end."""
+    return PAUSED if number == PAUSE else 128 + number
 
 
 class Interrupted(Exception):  # noqa: N818 - no error: somebody asked for it
@@ -35,7 +39,7 @@ class Interrupted(Exception):  # noqa: N818 - no error: somebody asked for it
     Attributes
     ----------
     exit_code
-        128 and the number of the signal.
+        128 and the number of the signal; `PAUSED` for SIGUSR1.
     on_all_ranks
         Whether it is raised on every rank; if not, others wait for this one and must be ended.
     kept
@@ -45,7 +49,7 @@ class Interrupted(Exception):  # noqa: N818 - no error: somebody asked for it
     def __init__(self, number: int, on_all_ranks: bool = True):
         super().__init__(signal.Signals(number).name)
         self.on_all_ranks = on_all_ranks
-        self.exit_code = _EXIT_CODE_BASE + number
+        self.exit_code = _exit_code(number)
         self.kept = "every finished step is kept"
 
 
@@ -158,7 +162,7 @@ def _end(number: int, frame: FrameType | None) -> None:
     if is_first_rank():
         with suppress(OSError):  # the terminal is gone
             os.write(2, f"remodel-fenicsx: stopped by {signal.Signals(number).name}\n".encode())
-    os._exit(PAUSED if number == PAUSE else _EXIT_CODE_BASE + number)
+    os._exit(_exit_code(number))
 
 
 # ---------------------------------------------------------------- a run
@@ -167,7 +171,7 @@ def _end(number: int, frame: FrameType | None) -> None:
 class StopRequest:
     """Context that turns the first SIGINT, SIGTERM or SIGHUP into a request; a second one stops at once.
 
-    SIGUSR1 sets `pause`.
+    SIGUSR1 sets `pause`; one that came to a request around this one counts too.
 
     PETSc must not see an exception from a callback, so a handler that raises is not enough: the solver asks `number`.
     Elsewhere see `stopping_at_once`. A signal that is ignored (a background job of a script, nohup) stays ignored.
@@ -185,6 +189,7 @@ class StopRequest:
                 self._previous[number] = signal.signal(number, self._remember)
         if _is_main_thread() and signal.getsignal(PAUSE) != signal.SIG_IGN:
             self._previous[PAUSE] = signal.signal(PAUSE, self._remember_pause)
+        self.pause = any(request.pause for request in _requests)
         _requests.append(self)
         return self
 

@@ -1,4 +1,7 @@
-"""What a figure leaves in its folder: its picture, in some formats, and its data; each says what it was made with."""
+"""What a figure or a study leaves in its folder: a picture, in some formats, and its data.
+
+Each file says what it was made with.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +22,6 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
 from remodel_fenicsx._version import __version__
-from remodel_fenicsx.paper.errors import FigureError
 from remodel_fenicsx.system.regular_files import write_whole
 
 MARK = "remodel_fenicsx figures"  # in every file: what bears it may be drawn anew
@@ -44,6 +46,14 @@ STYLE: dict[str, Any] = {
     "svg.hashsalt": MARK,  # the same figure, the same file
 }
 COLOURS = ("#1b4f9c", "#d1495b", "#2a9d6f", "#e09f3e", "#6c4f9c")  # apart in lightness too
+
+
+class FigureError(Exception):
+    """No figure for a reason that its one line names; `exit_code` is the command's."""
+
+    def __init__(self, message: str, exit_code: int):
+        super().__init__(message)
+        self.exit_code = exit_code
 
 
 class Page:

@@ -15,12 +15,12 @@ from mpi4py import MPI
 
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.model.laws import LAWS
-from remodel_fenicsx.paper.output import COLOURS, STYLE, Page
+from remodel_fenicsx.studies.page import COLOURS, STYLE, Page
 from remodel_fenicsx.results.run_folder import RunFolder, chosen_folder
 from remodel_fenicsx.scene import Scene, SceneError
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.system.environment import versions
-from remodel_fenicsx.system.interrupts import StopRequest, end_all_ranks_on_exception
+from remodel_fenicsx.system.interrupts import PAUSE, StopRequest, end_all_ranks_on_exception
 from remodel_fenicsx.system.terminal import Progress, hold_log, open_log
 from remodel_fenicsx.watch.amplification import SHARE_NAMES, AmplificationWatcher, Mode
 
@@ -80,7 +80,7 @@ def stability(
     analysis = AmplificationWatcher(simulation.stepper, lambda step: step.number in chosen)
     with ExitStack() as stack:
         stop = stack.enter_context(StopRequest())
-        simulation.stepper.stop_signal = lambda: stop.number
+        simulation.stepper.stop_signal = lambda: stop.number or (PAUSE if stop.pause else 0)
         record = stack.enter_context(RunFolder(place, scene.to_toml("as analysed: all values"), comm.rank))
         stack.enter_context(open_log(place / "run.log", comm.rank, quiet=quiet, held=held))
         _say(
