@@ -281,6 +281,22 @@ def test_the_number_of_halvings_is_the_scenes(halvings: int, monkeypatch: pytest
     assert made.loading.values == {"force": 0.0}
 
 
+def test_a_change_ends_when_its_iterations_are_spent() -> None:
+    """However many halvings are left: the next failure is the last."""
+    made = clamped_cube()
+    stepper = made.stepper(lambda t: {"force": 8.0 * t})
+    newton: Any = stepper.coupling.newton  # type: ignore[attr-defined]
+    newton.solve = Refusing(made, 2.5)
+
+    def set_fraction(fraction: float) -> None:
+        made.loading.set({"force": 8.0 * fraction})
+
+    change = Change(1.0, "the step", set_fraction, newton, 10, most_iterations=30)
+    with pytest.raises(StepFailure, match="the step stops at 50 % of the step"):
+        change.advance(Work())
+    assert newton.solve.accepted == [0.0, 2.0, 4.0] and made.loading.values == {"force": 4.0}
+
+
 def test_times_are_computed_from_their_numbers() -> None:
     assert list(times(150.0, 1.0)) == [float(k) for k in range(1, 151)]
     assert list(times(100.0, 0.1)) == [k / 10 for k in range(1, 1001)]  # 0.3, not 3 * 0.1 = 0.30000000000000004

@@ -98,6 +98,8 @@ class Change:
         Largest further part from a fraction on, where there is a bound.
     roughly
         Whether all parts but the last may be solved coarsely. Not near a limit of the load: it would be passed.
+    most_iterations
+        Newton iterations in `work` above which no further part is tried.
     """
 
     time: float
@@ -107,6 +109,7 @@ class Change:
     maximum_halvings: int
     largest_part: Callable[[float], float] = lambda done: 1.0
     roughly: bool = False
+    most_iterations: float = np.inf
     refusal: Refusal | None = field(default=None, init=False)  # what there was no way past but by a jump
     _direction: NDArray[np.float64] | None = field(default=None, init=False)  # of the unknowns over the last part
 
@@ -132,7 +135,7 @@ class Change:
         """
         done = 0.0
         if failure is not None:
-            part = self._halved(part, done, failure)
+            part = self._halved(part, done, failure, work)
         while done < 1.0:
             before = self.newton.unknown.x.array.copy()
             part = self._started(min(part, 1.0 - done), done, work)
@@ -145,7 +148,7 @@ class Change:
             except SolveFailure as failed:
                 self.newton.unknown.x.array[:] = before
                 work.add(failed)
-                part = self._halved(part, done, failed)
+                part = self._halved(part, done, failed, work)
             else:
                 if self._is_far(solution, before, part) and self._looks():
                     solved, self.newton.unknown.x.array[:] = self.newton.unknown.x.array.copy(), before
@@ -269,8 +272,8 @@ class Change:
                 "time.step shows the way there", self.time, far, loads or "the start", refusal,
             )  # fmt: skip
 
-    def _halved(self, part: float, done: float, failure: SolveFailure) -> float:
-        if part / 2 < self._smallest:
+    def _halved(self, part: float, done: float, failure: SolveFailure, work: Work) -> float:
+        if part / 2 < self._smallest or work.newton_iterations > self.most_iterations:
             text = failure_text(self.time, self.stage, done, failure)
             self.set_fraction(done)  # the last state that was solved
             found = diagnosed(self.newton, failure, self._direction)

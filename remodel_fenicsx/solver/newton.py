@@ -17,7 +17,7 @@ from remodel_fenicsx.fem.petsc_options import ProblemOptions
 from remodel_fenicsx.fem.solver_methods import AUTO, LAGGED, chosen, is_small, method_options
 from remodel_fenicsx.settings import Solver
 from remodel_fenicsx.solver.convergence import PRESCRIBED_ROUNDING, Convergence
-from remodel_fenicsx.solver.equilibrium import Equilibrium, Extension
+from remodel_fenicsx.solver.equilibrium import Equilibrium, Extension, Look
 from remodel_fenicsx.solver.limits import Limits
 from remodel_fenicsx.solver.linear import LINEAR_METHODS, EveryTangent
 from remodel_fenicsx.system.interrupts import Interrupted
@@ -242,6 +242,10 @@ class GuardedNewton:
                 solution.count(failure)
                 return solution
 
+    def gives_up(self, trial: Look) -> bool:
+        """Whether no step shorter than the one to this trial state is worth its cost; the solve then fails."""
+        return False
+
     def may_start(self) -> bool:
         """Whether the present unknowns, from which `solve` is to start, are admissible."""
         self.limits.forget()
@@ -418,7 +422,7 @@ class GuardedNewton:
             trial.waxpy(-1.0, step, x)
             self._push(trial)
             after = self.limits.look()
-            if after.extension.stop_signal or self.limits.allow(before, after):
+            if after.extension.stop_signal or self.limits.allow(before, after) or self.gives_up(after):
                 break
             step.scale(0.5)
         else:
