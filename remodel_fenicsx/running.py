@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import logging
 import tomllib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import TypeVar, cast
 
 from mpi4py import MPI
 
@@ -21,7 +20,8 @@ from remodel_fenicsx.results.run_folder import (
     FolderTaken,
     LastStep,
     RunFolder,
-    check_kept,
+    agreed,
+    check_before_resuming,
     chosen_folder,
     forget_steps,
     locked,
@@ -153,7 +153,7 @@ def _kept(place: Path, overrides: Sequence[str], comm: MPI.Intracomm) -> tuple[S
             _say_where(checkpoint)
         return scene, checkpoint
 
-    scene, checkpoint = _agreed(comm, lambda: read() if comm.rank == 0 else (None, None))
+    scene, checkpoint = agreed(comm, lambda: read() if comm.rank == 0 else (None, None))
     return comm.bcast(scene), checkpoint
 
 
@@ -215,11 +215,11 @@ def _record(
     after = LastStep(columns, state.number, state.time) if state.number else None
     if resumes:
         wanted = bool(scene.output.fields)
-        _agreed(comm, lambda: check_kept(place, after, wanted) if comm.rank == 0 else None)
+        agreed(comm, lambda: check_before_resuming(place, after, wanted) if comm.rank == 0 else None)
         if after is None and comm.rank == 0:
             forget_steps(place)
     with ExitStack() as stack:
-        record = stack.enter_context(_agreed(comm, lambda: RunFolder(place, text, comm.rank, after)))
+        record = stack.enter_context(agreed(comm, lambda: RunFolder(place, text, comm.rank, after)))
         stack.enter_context(open_log(place / LOG, comm.rank, quiet=quiet, held=held))
         steps = scene.time.number_of_steps if simulation.control else state.number + len(simulation.remaining())
         rank, done = -1 if quiet else comm.rank, scene.time.progress(state.number, state.time)
@@ -233,7 +233,7 @@ def _record(
             names = field_names(scene.output.fields)
             parts = place, scene.geometry, simulation.stepper, scene.output.every, after and after.time, names
             times = scene.output.times
-            watchers.append(stack.enter_context(_agreed(comm, lambda: Fields(*parts, times))))
+            watchers.append(stack.enter_context(agreed(comm, lambda: Fields(*parts, times))))
         checkpoints = Checkpoints(place, state, text, scene.output.checkpoint, record.flush)
         pause = Pause(comm, place, lambda: stop.pause, deadline)
         watchers += [record, _Report(scene, progress), checkpoints, pause]
@@ -254,22 +254,6 @@ def _record(
                 log.info(FAILED + "%s: %s", type(defect).__name__, defect)
             raise
         log.info("finished")
-
-
-T = TypeVar("T")
-
-
-def _agreed(comm: MPI.Intracomm, make: Callable[[], T]) -> T:
-    """What `make` makes of the files of a run, or its refusal on all ranks. Collective."""
-    made = refusal = None
-    try:
-        made = make()
-    except (SceneError, CheckpointError, RecordingError) as error:  # rank 0 alone reads
-        refusal = error
-    refusal = comm.bcast(refusal)
-    if refusal is not None:
-        raise refusal
-    return cast(T, made)
 
 
 class _Report(Watcher):

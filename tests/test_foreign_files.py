@@ -373,7 +373,7 @@ def headed(head: bytes) -> bytes:
     [marked(1, 6, 8), marked(99, 8, 10), marked(14, 8, 10), other_archive(headed(b"(" * 9000 + b"\n")),
      bomb, pickled, other_archive(b"no archive"), other_archive(empty_archive()), other_archive(b""),
      pointing(file="../run/checkpoint-a.npz"), pointing(file="/etc/passwd"), pointing(file="scene.toml"),
-     pointing(sha256=0), pointing(number="1"), pointing(time=1), pointing(more=1),
+     pointing(sha256=0), pointing(number="1"), pointing(time="1"), pointing(more=1),
      lambda folder: (folder / "checkpoint.json").write_text("[" * 10**5),
      lambda folder: (folder / "checkpoint.json").write_bytes(b" " * (10**6 + 1))],
 )  # fmt: skip

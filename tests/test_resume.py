@@ -26,7 +26,7 @@ from remodel_fenicsx.model.cells import structure_tensor
 from remodel_fenicsx.results.checkpoint import Checkpoints, gather_state, restore_state
 from remodel_fenicsx.results.checkpoint_file import Checkpoint, CheckpointError, _read, read_checkpoint, read_pointer
 from remodel_fenicsx.results.recording import RecordingError
-from remodel_fenicsx.results.run_lock import FolderTaken, RunLock, lock_holder
+from remodel_fenicsx.results.run_lock import FolderTaken, RunLock, writer
 from remodel_fenicsx.results.status import status
 from remodel_fenicsx.running import resume, run
 from remodel_fenicsx.scene import preset_scene
@@ -263,7 +263,7 @@ def test_what_may_change_changes(half: Path) -> None:
 def test_a_folder_that_a_run_writes_is_refused(half: Path) -> None:
     with RunLock(half), pytest.raises(FolderTaken, match=f"half: process {os.getpid()} on .* writes in it"):
         resume(half, [], SELF)
-    assert lock_holder(half) == (None, False)
+    assert writer(half) == (None, False)
     resume(half, [], SELF)
 
 
@@ -362,7 +362,7 @@ def test_a_lost_rank_loses_the_steps_since_the_checkpoint(
     """The other rank does not go on alone; nobody holds the folder."""
     lost = shutil.copytree(two_ranks[0] / "lost", tmp_path / "lost")
     assert read_pointer(lost)[0].time == 4.0 and Recording(lost).history["time"][-1] == LOST_AT - 1
-    assert not lock_holder(lost)[1]
+    assert not writer(lost)[1]
     resume(lost, [], SELF)
     assert_close(lost, whole)
 

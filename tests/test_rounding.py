@@ -9,8 +9,8 @@ from mpi4py import MPI
 from remodel_fenicsx.scene import preset_scene
 from remodel_fenicsx.settings import Cells
 from remodel_fenicsx.simulation import Simulation
-from remodel_fenicsx.solver import newton
 from remodel_fenicsx.solver.continuation import StepFailure
+from remodel_fenicsx.solver.convergence import Convergence
 from tests import parts
 from tests.parts import cube
 from tests.reference.radial import RadialMaterial, Tube
@@ -97,7 +97,7 @@ def test_the_tolerance_is_a_force() -> None:
         problem = made.problem(parts.TIGHT.model_copy(update={"absolute_tolerance": 0.0, "relative_tolerance": 1e-30}))
         made.loading.set({"force": side**2})
         problem.solve()
-        found.append(problem.newton._tolerance())
+        found.append(problem.newton.convergence.tolerance())
     assert 0.0 < found[0] < 1e-12
     assert found[1] == pytest.approx(1e6 * found[0], rel=1e-6)
 
@@ -136,7 +136,7 @@ def test_thin_walls_are_solved(lame_lambda: float) -> None:
 
 def test_a_refusal_names_a_tolerance_that_works(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where it was too small: made so here by a solver that knows nothing of rounded displacements."""
-    monkeypatch.setattr(newton.GuardedNewton._tolerance, "__defaults__", (0.0,))
+    monkeypatch.setattr(Convergence.tolerance, "__defaults__", (0.0,))
     with pytest.raises(StepFailure) as caught:
         list(Simulation(preset_scene(PAPER, "tube").with_values(THIN)).steps())
     assert caught.value.refusal.kind == "solver tolerance"

@@ -247,9 +247,9 @@ def test_a_pause_for_the_whole_group_spares_the_compiler() -> None:
     """Batch systems send SIGUSR1 to all that a job has started."""
     program = """
 import os, signal, subprocess
-from remodel_fenicsx.system.interrupts import StopRequest, pause_held_back
+from remodel_fenicsx.system.interrupts import PAUSE, StopRequest, blocked
 with StopRequest() as stop:
-    with pause_held_back():
+    with blocked(PAUSE):
         compiler = subprocess.Popen(["sleep", "0.3"])
         os.killpg(0, signal.SIGUSR1)
         assert compiler.wait() == 0 and not stop.pause

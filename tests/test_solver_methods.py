@@ -250,14 +250,14 @@ def test_no_displacement_changes_f_by_more_than_the_bound() -> None:
 def test_what_the_bound_spares_is_admissible(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each state that nobody looked at is looked at here; far more are spared than not."""
     spared = []
-    spare = Limits.spare
+    spare = Limits.certainly_allow
 
     def checked(self: Limits, largest_displacement: float) -> bool:
         found = spare(self, largest_displacement)
         spared.append(found)
         return found
 
-    monkeypatch.setattr(Limits, "spare", checked)
+    monkeypatch.setattr(Limits, "certainly_allow", checked)
     simulation, _ = simulated("lagged", solver__predictor="autoregressive", time__end=4.0)
     newton = simulation.stepper.coupling.newton
     assert sum(spared) > len(spared) / 2

@@ -143,10 +143,8 @@ def test_the_command_lists_and_goes_on(tmp_path: Path, capsys: pytest.CaptureFix
     """What is there is not run again: nothing is started here."""
     key, source = QUICK[0], source_of(PROJECT)
     assert main("", ["--list", "--only", key]) == 0
-    assert (
-        f"{key}\n    ./with-fenicsx remodel-fenicsx run demos/cube.toml --set loads.force.value=10.0"
-        in capsys.readouterr().out
-    )
+    command = "remodel-fenicsx run demos/cube.toml --set remodeling.frame=spatial --set loads.force.value=10.0"
+    assert f"{key}\n    ./with-fenicsx {command}" in capsys.readouterr().out
     record = {"key": key, "family": "load", "source": source, "digest": digest(CASES[key]), "outcome": "wrong",
               "words": "off", "false_alarm": False, "cause_named": None}  # fmt: skip
     (tmp_path / f"{source.partition('+')[0]}.jsonl").write_text(json.dumps(record) + "\n")

@@ -11,8 +11,7 @@ from remodel_fenicsx.evolution.stepper import Stepper, times
 from remodel_fenicsx.settings import Cells
 from remodel_fenicsx.scene.scene import Load, preset_scene
 from remodel_fenicsx.simulation import Simulation
-from remodel_fenicsx.solver.blend import KEPT_RESERVE, Blend
-from remodel_fenicsx.solver.continuation import Change, StepFailure, Work
+from remodel_fenicsx.solver.continuation import KEPT_RESERVE, Blend, Change, StepFailure, Work
 from remodel_fenicsx.solver.equilibrium import Extension
 from remodel_fenicsx.solver.newton import GuardedNewton, Solution, SolveFailure
 from tests import parts
@@ -280,6 +279,22 @@ def test_the_number_of_halvings_is_the_scenes(halvings: int, monkeypatch: pytest
         stepper.advance(1.0)
     assert refusing.tried == [8.0 / 2**k for k in range(halvings + 1)]
     assert made.loading.values == {"force": 0.0}
+
+
+def test_a_change_ends_when_its_iterations_are_spent() -> None:
+    """However many halvings are left: the next failure is the last."""
+    made = clamped_cube()
+    stepper = made.stepper(lambda t: {"force": 8.0 * t})
+    newton: Any = stepper.coupling.newton  # type: ignore[attr-defined]
+    newton.solve = Refusing(made, 2.5)
+
+    def set_fraction(fraction: float) -> None:
+        made.loading.set({"force": 8.0 * fraction})
+
+    change = Change(1.0, "the step", set_fraction, newton, 10, most_iterations=30)
+    with pytest.raises(StepFailure, match="the step stops at 50 % of the step"):
+        change.advance(Work())
+    assert newton.solve.accepted == [0.0, 2.0, 4.0] and made.loading.values == {"force": 4.0}
 
 
 def test_times_are_computed_from_their_numbers() -> None:

@@ -17,7 +17,7 @@ from remodel_fenicsx.running import run as record
 from remodel_fenicsx.scene.scene import SceneError, scene_from_dict
 from remodel_fenicsx.schema.units import FORCE
 from remodel_fenicsx.simulation import Simulation
-from remodel_fenicsx.solver.blend import Blend
+from remodel_fenicsx.solver.continuation import Blend
 from tests.parts import tube
 
 Array = NDArray[np.float64]

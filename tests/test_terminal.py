@@ -60,7 +60,7 @@ def test_a_terminal_gets_a_bar(tmp_path):
     assert status == 0, text
     lines = [line.strip() for line in re.split(r"[\r\n]+", plain(text))]
     bars = [line for line in lines if "━" in line]
-    assert re.match(r"artery \[4\] ━+ 8/8 t = 8, pressure \[0.5\], 3 Newton 0:00:0\d", bars[-1]), bars[-1]
+    assert re.match(r"artery \[4\] ━+ 8/8 t = 8, 3 Newton, pressure \[0.5\] 0:00:0\d", bars[-1]), bars[-1]
     assert any(re.search(r"[2-7]/8 .* left$", line) for line in bars)
     assert "two substeps" in lines and "WARNING: careful" in lines  # lines of their own, above the bar
     assert lines[-2:] == ["the end", ""]
@@ -82,11 +82,10 @@ def test_a_narrow_terminal_gets_one_line(tmp_path):
 @pytest.mark.parametrize(
     ("columns", "shown"),
     [
-        (120, "artery [4] BAR N/8 t = N, pressure 0.192, axial_stretch 0.004, 3 Newton N:N:N N s left"),
-        (80, "artery [4] BAR N/8 t = N, 3 Newton N:N:N N s left"),
-        (60, "artery [4] BAR N/8 t = N N s left"),
-        (40, "artery [4] BAR N/8 N s left"),
-        (30, "ar… BAR N/8 N s left"),
+        (120, "artery [4] BAR N/8 t = N, 3 Newton, pressure 0.192, axial_stretch 0.004 N:N:N N s left"),
+        (80, "artery [4] BAR N/8 t = N, 3 Newton, pres… N:N:N N s left"),
+        (60, "artery [4] BAR N/8 t = N, 3 Ne… N:N:N N s left"),
+        (50, "artery … BAR N/8 t = N, … N:N:N N s left"),
     ],
 )
 def test_bar_and_time_left_stay_where_it_is_narrow(columns, shown, tmp_path):
@@ -98,7 +97,7 @@ def test_bar_and_time_left_stay_where_it_is_narrow(columns, shown, tmp_path):
     underway = [line.strip() for line in lines if "left" in line]
     normal = re.sub(r"[━╸╺]+", "BAR", underway[-1])
     assert re.sub(r"(?<=BAR )\d|(?<=t = )\d|\d+(?=:)|(?<=:)\d+|\d+(?= s left)", "N", normal) == shown
-    assert len(re.findall("[━╸╺]", underway[-1])) >= 10
+    assert len(re.findall("[━╸╺]", underway[-1])) >= 8
 
 
 def test_output_that_goes_to_a_file_stays_there(tmp_path):

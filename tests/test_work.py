@@ -13,8 +13,7 @@ from remodel_fenicsx import Simulation
 from remodel_fenicsx.evolution import stepper
 from remodel_fenicsx.scene.scene import Scene, scene_from_dict
 from remodel_fenicsx.solver.continuation import PROOF
-from remodel_fenicsx.solver.newton import GuardedNewton
-from remodel_fenicsx.solver.solution import Solution, SolveFailure
+from remodel_fenicsx.solver.newton import GuardedNewton, Solution, SolveFailure
 
 Attempt = Solution | SolveFailure
 PRESETS = {"staggered": "kuhl-holzapfel-2007", "extrapolated": "consistent", "implicit": "consistent"}

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from benchmarks.stability_map.cases import MU, Case, Check, Finding, Place, Run, Values, named, table, with_values
-from benchmarks.stability_map.homogeneous import CUBE, DRIVERS, FRAMES, RAMP, element, has_frame, material
+from benchmarks.stability_map.homogeneous import CUBE, DRIVERS, FRAMES, RAMP, element, has_frame, step_times
 from benchmarks.stability_map.judging import SAME_MESH
-from benchmarks.stability_map.tube_march import load_at
-from tests.reference.radial import RadialHistory, RadialMaterial, Tube, solve_radial
+from benchmarks.stability_map.tube_march import load_at, march
+from tests.reference.radial import RadialMaterial, Tube
 
 SOFT = {"chain_density": 2.0e21, "contour_length": 1.594, "persistence_length": 1.365}
 TUBE: dict[str, Any] = {
@@ -49,46 +48,20 @@ def ring(around: int, through: int) -> dict[str, Any]:
 
 
 # ---------------------------------------------------------------- the tube in one dimension
-@lru_cache(maxsize=None)
-def radial(end: float, **arguments: Any) -> RadialHistory:
-    """The reference up to a time."""
-    return solve_radial(end=end, elements=60, **arguments)
-
-
-def reference(scene: dict[str, Any]) -> tuple[RadialHistory | None, bool]:
-    """As far as the reference goes, and whether that is the end."""
-    loads, r, time = scene["loads"], scene["remodeling"], scene["time"]
-    arguments: dict[str, Any] = {
-        "pressure": loads["pressure"]["value"], "stretch": loads["elongation"]["value"],
-        "ramp_time": loads["pressure"]["ramp"][-1][0], "step": time["step"], "driver": r["driver"], "law": r["law"],
-        "kappa": r["kappa"], "material": material(scene),
-    }  # fmt: skip
-    last = round(time["end"] / time["step"])
-    low, high, found = 0, last + 1, None  # the last step that it reaches lies in [low, high)
-    while high - low > 1:
-        middle = high - 1 if high == last + 1 and low == 0 else (low + high) // 2
-        try:
-            found, low = radial(middle * time["step"], **arguments), middle
-        except (RuntimeError, ValueError, np.linalg.LinAlgError):
-            high = middle
-    return found, low == last
-
-
 def check_tube(case: Case, run: Run) -> Finding:
     """Inner and outer radius by step, and the fibre angle of the outermost elements, where it is no steep function."""
-    expected, whole = reference(case.scene)
-    rows = min(len(run.column("time")), 0 if expected is None else len(expected.times))
-    known = case.options.get("unstable")
-    if expected is None or not rows:
+    expected, known = march(case.scene, step_times(case.scene), 60), case.options.get("unstable")
+    rows, whole = min(len(run.column("time")), len(expected.times)), not expected.ended
+    if not rows:
         return Finding(np.inf if run.code == 0 else 0.0, "no row to compare", known, whole)
-    inner, outer = expected.inner_radii[:rows], expected.outer_radii[:rows]
+    inner, outer = np.array(expected.inner[:rows]), np.array(expected.outer[:rows])
     off = {
         name: float(np.max(np.abs(run.column(name)[:rows] / radii - 1)))
         for name, radii in (("inner_radius", inner), ("outer_radius", outer))
     }
     words = ", ".join(f"{name} off by {100 * value:.3g} %" for name, value in off.items())
     layer = 2.0 / case.counts["tube"]["PAPER"][1]
-    angles = [expected.mean_fibre_angle(3.0 - layer, 3.0, row) for row in range(rows)]
+    angles = [expected.mean_angle(3.0 - layer, 3.0, row) for row in range(rows)]
     angle = float(np.max(np.abs(run.column("fibre_angle_outer")[:rows] - angles)))
     words += f", outer angle by {angle:.3g} degrees"
     if not whole:

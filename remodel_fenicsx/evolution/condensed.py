@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import ufl
+from mpi4py import MPI
 from numpy.typing import NDArray
 
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
+from remodel_fenicsx.fem.assembly import over_ranks
 from remodel_fenicsx.fem.solver_methods import AUTO
 from remodel_fenicsx.kernels.tensor import condensed_points, tensor_kernels
 from remodel_fenicsx.model import spectral
@@ -17,6 +20,7 @@ from remodel_fenicsx.model.cells import UnitCell, structure_tensor
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.model.implicit import condensed
 from remodel_fenicsx.model.implicit.responses import StepOfCells, jumps_by_rank
+from remodel_fenicsx.model.laws import relaxed
 from remodel_fenicsx.model.operators import determinant
 from remodel_fenicsx.settings import Solver
 from remodel_fenicsx.solver.equilibrium import Equilibrium, Look
@@ -24,12 +28,16 @@ from remodel_fenicsx.solver.newton import GuardedNewton, Solution, SolveFailure
 from remodel_fenicsx.state.parameters import at_points
 from remodel_fenicsx.state.state import State
 
+log = logging.getLogger(__name__)
+
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 BEFORE_HOLDING = 5
 """Newton iterations after which cells that still jump stay as they are (by rank there are states without a solution),
-or after which states where cells are not found are refused (other laws)."""
+or after which states where cells are not found are refused (where none may be held)."""
+PASSES = 8  # with frozen cells, before a second try
+SETTLES = 0.5  # of the largest change of the unknowns over a pass: what the last may be
 JUMP = 0.02
 """Change of A over r0^2 from one iteration to the next that is a jump after so many."""
 
@@ -52,8 +60,8 @@ class AnsweringCells:
         P (3, 3) and dP/dF (9, 9), row by row: dolfinx functions that belong to the last `update`.
     held
         Points whose cells answer no more in this solve.
-    keeps
-        Whether no cells answer at all: those at the start of the step stay.
+    frozen
+        Cells, and their A, of all points where none answers: those at the start of the step, or those of a pass.
     holds
         Whether points where the law jumps (`responses.jumps_by_rank`) may be held; otherwise a state with points that
         have no solution is refused.
@@ -64,7 +72,7 @@ class AnsweringCells:
         self.quadrature = state.cells.quadrature
         self.stress = self.quadrature.function("answering_stress", (3, 3))
         self.tangent = self.quadrature.function("answering_tangent", (9, 9))
-        self.keeps = False
+        self.frozen: tuple[UnitCell, Array] | None = None
         self.holds = True
         self.held: Flags = np.zeros(int(np.prod(self.quadrature.shape)), dtype=bool)
         self._kernels = None
@@ -72,12 +80,11 @@ class AnsweringCells:
             self._kernels = tensor_kernels(state.comm)
         self._points: condensed.CondensedPoints
         self._jumps: Flags  # points where the law jumps
-        self._lost: Flags  # those that have not been solved after so many iterations, where none may be held
         self._found: condensed.Solution
         self._gradient: Array | None = None  # F of what was found
         self._tangent_is_there = False
         self._start: Array
-        self._accepted: Array
+        self.accepted: Array
         self._iterations = 0
         self._last_structure: Array | None = None
 
@@ -103,7 +110,7 @@ class AnsweringCells:
             *self.remodeling.noise(F, tensor, residual),
         )
         self._points = condensed_points(self._kernels, tissue, step)
-        self._accepted = self._points.kept(F, old, step.structure).driving_tensor
+        self.accepted = self._points.kept(F, old, step.structure).driving_tensor
         self._jumps = jumps_by_rank(step)
         self.release()
 
@@ -114,20 +121,35 @@ class AnsweringCells:
 
     def release(self) -> None:
         """All cells answer again, from the driving tensor of the last accepted state."""
-        self.held, self._lost = np.zeros_like(self.held), np.zeros_like(self.held)
-        self._start, self._gradient, self._last_structure, self._iterations = self._accepted, None, None, 0
+        self.held = np.zeros_like(self.held)
+        self._start, self._gradient, self._last_structure, self._iterations = self.accepted, None, None, 0
+
+    def freeze(self) -> None:
+        """No cells answer: those at the start of the step stay."""
+        self.frozen = self._points.step.cells, self._points.step.structure
+
+    def follow(self, factor: float) -> None:
+        """Frozen cells make a share of a pass with the present stress: towards what it asks for at the step's end."""
+        assert self.frozen is not None
+        self.update()
+        F = self.state.deformation_gradient()
+        cells = relaxed(self.frozen[0], self._cells_of(self._points.passed(F, self._found)), factor)
+        self.frozen, self._gradient = (cells, structure_tensor(*cells[:2])), None
 
     def accept(self) -> None:
         """The present state is a solved one."""
         self.update()
-        self._accepted = self._found.driving_tensor
+        self.accepted = self._found.driving_tensor
 
     @property
     def asked(self) -> UnitCell:
         """The cells of the last update."""
+        return self._cells_of(self._found)
+
+    def _cells_of(self, found: condensed.Solution) -> UnitCell:
         if self._points.step.law.dimensions is not None:
-            return self._found.cells
-        squared, axes = spectral.continued(self._found.structure, self._points.step.cells.axes)
+            return found.cells
+        squared, axes = spectral.continued(found.structure, self._points.step.cells.axes)
         return UnitCell(np.sqrt(np.maximum(squared, 0.0)), axes)
 
     @property
@@ -172,7 +194,7 @@ class AnsweringCells:
         if tangent and not self._tangent_is_there:
             self._hold_what_jumps()
             self._start = self._found.driving_tensor
-            kept = np.ones_like(self.held) if self.keeps else self.held
+            kept = self.held if self.frozen is None else np.ones_like(self.held)
             values = self._points.tangent(self._found, kept).reshape(*self.quadrature.shape, 9, 9)
             self.quadrature.values(self.tangent, (9, 9))[:] = values
             self._tangent_is_there = True
@@ -183,12 +205,11 @@ class AnsweringCells:
         F = np.where(usable[:, None, None], F, np.eye(3))
         step = self._points.step
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            if self.keeps:
-                self._found = self._points.kept(F, step.cells, step.structure)
+            if self.frozen is not None:
+                self._found = self._points.kept(F, *self.frozen)
                 return
             before = getattr(self, "_found", None)
-            found = self._points.solve(F, self._start, self.held | self._lost)
-            found.converged[self._lost] = False
+            found = self._points.solve(F, self._start, self.held)
             if self.held.any():
                 assert before is not None
                 cells = before.cells
@@ -201,21 +222,28 @@ class AnsweringCells:
         """From an iteration on; only laws by rank jump, others fail and the step is made in parts."""
         self._iterations += 1
         structure = self._found.structure
-        if self._iterations > BEFORE_HOLDING and not self.keeps:
+        if self._iterations > BEFORE_HOLDING and self.frozen is None:
             assert self._last_structure is not None
             change = np.linalg.norm(structure - self._last_structure, axis=(1, 2))
             jumps = change > JUMP * self._points.step.end_to_end_length**2
-            self._lost = self._jumps & ~self._may_hold & ~self._found.converged  # no work more for a step that fails
             self.held = self.held | (self._may_hold & (jumps | ~self._found.converged))
         self._last_structure = structure
 
     def squared_lengths(self) -> Array:
         """r^2 at all points, (elements, points); infinite where there are no cells for these unknowns."""
         self.update()
-        squared = self._found.squared_lengths
-        if self._iterations > BEFORE_HOLDING:
-            squared = np.where(self._found.converged | self._may_hold, squared, np.inf)
+        squared = np.where(self._refused, np.inf, self._found.squared_lengths)
         return squared.reshape(self.quadrature.shape)
+
+    @property
+    def _refused(self) -> Flags:
+        """Points without a solution, after so many iterations that none is expected, that may not be held."""
+        return ~(self._found.converged | self._may_hold) & (self._iterations > BEFORE_HOLDING)
+
+    def unsolved(self, locking_length: Array) -> bool:
+        """Whether the present unknowns are refused for points, on any rank, that have no solution with r < L."""
+        self.update()
+        return self._count(self._refused & (self._found.squared_lengths < locking_length.reshape(-1) ** 2)) > 0
 
 
 class AnsweringEquilibrium(Equilibrium):
@@ -247,8 +275,9 @@ class AnsweringEquilibrium(Equilibrium):
 
     def states(self) -> Array:
         """As of `Equilibrium`, with the cells that belong to the present unknowns."""
-        squared, states = self.answering.squared_lengths(), super().states()
-        states[..., 0] = squared
+        states = super().states()
+        if np.all(states[..., 1] > 0):  # for a state that is inside out no cells are looked for
+            states[..., 0] = self.answering.squared_lengths()
         return states
 
     def assemble_internal(self, vector: Any) -> None:
@@ -267,9 +296,88 @@ class AnsweringNewton(GuardedNewton):
         # cells that answer make steps far more nonlinear, and tangents unsymmetric: nothing is gained by old factors
         super().__init__(equilibrium, settings, robust=settings.method == AUTO)
         self.answering = equilibrium.answering
+        self._patient = False  # whether shorter steps are looked for where cells have no solution
 
     def solve(self) -> Solution:
-        """As of `GuardedNewton`; at first no cells are held."""
+        """As of `GuardedNewton`; at first no cells are held.
+
+        Where Newton's method fails, or some cells have no solution at its deformations, it starts again from the
+        equilibrium to which passes with frozen cells come: it often is near.
+        """
+        start, accepted = self.unknown.x.array.copy(), self.answering.accepted
+        try:
+            return self._solved()
+        except SolveFailure as failure:
+            if self.answering.frozen is not None:
+                raise
+            log.info("solved once more, after passes: %s", failure.reason)
+            try:
+                return self._after_passes(failure, start, accepted)
+            except SolveFailure:
+                self.unknown.x.array[:], self.answering.accepted = start, accepted
+                raise
+
+    def _after_passes(self, failure: SolveFailure, start: Any, accepted: Any) -> Solution:
+        """Solve from where passes lead; where no law jumps, at last from the start with shorter steps."""
+        try:
+            if not self._pass(failure):
+                log.info("passes do not settle")
+                raise failure
+            solution = self._solved()
+            solution.count(failure)
+            return solution
+        except SolveFailure as again:
+            if again is not failure:
+                again.count(failure)
+            if self.answering.may_hold():
+                raise
+            self.unknown.x.array[:], self.answering.accepted, self._patient = start, accepted, True
+            log.info("solved once more, with shorter steps: %s", again.reason)
+            try:
+                solution = self._solved()
+                solution.count(again)
+                return solution
+            except SolveFailure as last:
+                last.count(again)
+                raise
+        finally:
+            self._patient = False
+
+    def _pass(self, work: SolveFailure) -> bool:
+        """Passes with frozen cells, each with its equilibrium, up to one that changes nothing; adds what they cost.
+
+        Returns whether they come nearer to each other.
+        """
+        answering, values, share = self.answering, self.unknown.x.array, 1.0
+        ways: list[float] = []  # of the unknowns, over each pass
+        try:
+            answering.freeze()
+            work.count(self._solved())
+            for _ in range(PASSES):
+                before, frozen = values.copy(), answering.frozen
+                try:
+                    answering.follow(share)
+                    solution = self._solved()
+                except SolveFailure as failure:  # too large a change of the cells: r >= L where they are longer
+                    work.count(failure)
+                    values[:], answering.frozen, share = before, frozen, share / 2
+                    continue
+                work.count(solution)
+                way = over_ranks(self.equilibrium.comm, float(np.abs(values - before).max(initial=0.0)), MPI.MAX)
+                ways.append(way / share)
+                if share == 1.0 and not solution.newton_iterations:
+                    break
+                share = min(1.0, 2 * share)
+        finally:
+            answering.frozen = None
+        return bool(ways) and ways[-1] <= SETTLES * max(ways)
+
+    def gives_up(self, trial: Look) -> bool:
+        """Where cells have no solution: passes cost less than shorter steps."""
+        right_way_out = trial.extension.min_jacobian > 0 and not self._patient
+        return right_way_out and self.answering.unsolved(self.equilibrium.locking_length())
+
+    def _solved(self) -> Solution:
         self.answering.release()
         start = self.unknown.x.array.copy()
         solution = super().solve()

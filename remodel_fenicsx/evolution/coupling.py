@@ -17,8 +17,7 @@ from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.model.tensor_law import Target, weight_of_the_end
 from remodel_fenicsx.settings import Solver
-from remodel_fenicsx.solver.blend import Blend
-from remodel_fenicsx.solver.continuation import Change, Work
+from remodel_fenicsx.solver.continuation import Blend, Change, Work
 from remodel_fenicsx.solver.equilibrium import Equilibrium
 from remodel_fenicsx.solver.newton import GuardedNewton, SolveFailure
 from remodel_fenicsx.state.state import State
@@ -281,9 +280,7 @@ class Extrapolated(Staggered):
         again = super().solve(time, loads)
         self._found = self.remodeling.target(self._residual)
         again.substeps += work.substeps - 1
-        again.newton_iterations += work.newton_iterations
-        again.linear_iterations += work.linear_iterations
-        again.tangents += work.tangents
+        again.count(work)
         return again
 
     def remodel(self, time: float) -> float:

@@ -23,7 +23,8 @@ log = logging.getLogger(__name__)
 
 RESIDUAL = "residual of the last step"
 MUCH_MORE = 2.0  # times the share that was said
-HALVINGS = 2  # of a step, before points are held; where there is no solution parts cost, and do not help
+HALVINGS = 1  # of a step, before points are held; where there is no solution parts cost, and do not help
+MOST_SOLVES = 20  # of all Newton iterations that one may have, for a step with its parts; then it is refused
 
 
 class Implicit:
@@ -140,15 +141,18 @@ class Implicit:
             loading.set({name: old[name] + fraction * (loads[name] - old[name]) for name in loads})
             answers.set_time(start + fraction * (time - start))
 
-        answers.keeps = not answering
+        if not answering:
+            answers.freeze()
         before, stage = self.state.unknown.x.array.copy(), "the step" if answering else "the change of the loads"
-        change = Change(time, stage, set_fraction, self.newton, halvings)
+        most = MOST_SOLVES * self.settings.maximum_iterations + work.newton_iterations
+        change = Change(time, stage, set_fraction, self.newton, halvings, most_iterations=most)
         try:
             set_fraction(1.0)
             loading.set(loads)
             work.add(self.newton.solve())
             work.substeps += 1
-            if change.look_back(before, work):
+            # with cells that are held the way in parts has been tried already
+            if not answers.held_points() and change.look_back(before, work):
                 work.add(self.newton.solve())  # the cells that answer the unknowns: there is nothing else to do
         except SolveFailure as failure:
             work.add(failure)
@@ -157,4 +161,4 @@ class Implicit:
             loading.set(loads)
             log.info("time %g solved in %d parts", time, work.substeps)
         finally:
-            answers.keeps = False
+            answers.frozen = None

@@ -33,7 +33,7 @@ from ufl.corealg.map_dag import map_expr_dag
 from ufl.corealg.multifunction import MultiFunction
 from ufl.domain import extract_unique_domain
 
-from remodel_fenicsx.system.interrupts import SIGNALS, Interrupted, pause_held_back, stopping_at_once
+from remodel_fenicsx.system.interrupts import PAUSE, SIGNALS, Interrupted, blocked, stopping_at_once
 from remodel_fenicsx.system.terminal import NOTICE
 
 log = logging.getLogger(__name__)
@@ -254,7 +254,8 @@ def _compiler_watched(comm: MPI.Intracomm, what: str, seconds: int) -> Iterator[
 @contextmanager
 def _compiling(kernel: str, what: str, seconds: int) -> Iterator[None]:
     """The only process that compiles this kernel; a signal stops it at once, and then nothing of the kernel stays."""
-    with stopping_at_once(), pause_held_back(), _alone(kernel):
+    # SIGUSR1 waits: one sent to the whole group would kill a compiler
+    with stopping_at_once(), blocked(PAUSE), _alone(kernel):
         if _is_cached(kernel):  # by the run that this one has waited for
             yield
             return

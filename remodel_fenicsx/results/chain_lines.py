@@ -1,9 +1,17 @@
-"""The chains of unit cells as lines to draw."""
+"""The chains of unit cells as lines to draw, and a file of them over time. This needs no dolfinx."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from pathlib import Path
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from remodel_fenicsx.results.vtkhdf import LINE, TransientGrid
+
+AXES = ("axis_1", "axis_2", "axis_3")
+OF_CHAINS = ("cell_dimensions", *AXES, "deformation_gradient", "fibre_angle")  # fields that the lines are made of
 
 
 def chain_lines(
@@ -49,3 +57,25 @@ def chain_displacement(
     ends = np.asarray(points, dtype=np.float64).reshape(-1, 8, 3) - np.asarray(centres)[:, None, :]
     gradient = np.asarray(deformation_gradient) - np.eye(3)
     return (np.asarray(displacement)[:, None, :] + ends @ np.swapaxes(gradient, 1, 2)).reshape(-1, 3)
+
+
+def append_chains(
+    grid: TransientGrid | Path,
+    time: float,
+    centres: NDArray[np.float64],
+    scale: float,
+    displacement: NDArray[np.float64],
+    fields: Mapping[str, NDArray[np.float64]],
+) -> TransientGrid:
+    """Add a step to a file of chain lines; it is made at its first step, where `grid` is still its path.
+
+    With the displacement (m, 3) at the centres of the elements (m, 3), and their fields `OF_CHAINS`.
+    """
+    axes = np.stack([fields[name] for name in AXES], axis=1)
+    points, lines = chain_lines(centres, fields["cell_dimensions"], axes, scale)
+    moved = chain_displacement(points, centres, displacement, fields["deformation_gradient"].reshape(-1, 3, 3))
+    if isinstance(grid, Path):
+        grid = TransientGrid(grid, points, lines, LINE, point_dtype=np.float32)
+    angle = np.repeat(fields["fibre_angle"], len(lines) // len(centres))
+    grid.append(time, {"displacement": moved}, {"fibre_angle": angle}, points=points)
+    return grid

@@ -6,12 +6,14 @@ import logging
 import time as clock
 from collections.abc import Callable
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.evolution.stepper import Step, Watcher
 from remodel_fenicsx.results.checkpoint_file import Array, Checkpoint, CheckpointError, write_checkpoint
+from remodel_fenicsx.results.run_folder import agreed
 from remodel_fenicsx.state.state import State
 from remodel_fenicsx.system.environment import versions
 
@@ -88,23 +90,20 @@ class Checkpoints(Watcher):
             return
         start = clock.monotonic()
         self.before()
-        arrays = gather_state(self.state)
+        state, arrays = self.state, gather_state(self.state)
         if arrays is not None and self._mesh is not None:
-            state = self.state
-            write_checkpoint(
-                self.folder,
-                Checkpoint(
-                    state.time,
-                    state.number,
-                    self.scene_text,
-                    self._versions,
-                    dict(state.loading.values),
-                    dict(state.numbers),
-                    list(state.functions()),
-                    {f"function/{name}": values for name, values in arrays.items()} | self._mesh,
-                ),
+            checkpoint = Checkpoint(
+                time=state.time,
+                number=state.number,
+                scene=self.scene_text,
+                versions=self._versions,
+                loads=dict(state.loading.values),
+                numbers=dict(state.numbers),
+                functions=list(arrays),
+                arrays={f"function/{name}": values for name, values in arrays.items()} | self._mesh,
             )
-        self._number, self._written_at = self.state.number, clock.monotonic()
+            write_checkpoint(self.folder, checkpoint)
+        self._number, self._written_at = state.number, clock.monotonic()
         self._cost = self._written_at - start
 
 
@@ -142,47 +141,40 @@ def restore_state(state: State, checkpoint: Checkpoint | None) -> None:
         If it does not belong to this mesh or to these functions; on all ranks, and nothing has changed.
     """
     domain, comm = state.loading.domain, state.comm
-    mesh = mesh_arrays(domain)
-    fault = None
-    if comm.rank == 0:
-        assert checkpoint is not None and mesh is not None
-        fault = _fault(state, domain, checkpoint, mesh)
-    fault = comm.bcast(fault, root=0)
-    if fault is not None:
-        raise CheckpointError(fault)
-    kept = comm.bcast(None if checkpoint is None or comm.rank else checkpoint.functions, root=0)
-    missing = [name for name in state.functions() if name not in kept]
+    mesh, first = mesh_arrays(domain), comm.rank == 0
+    agreed(comm, lambda: _check(state, domain, cast(Checkpoint, checkpoint), mesh or {}) if first else None)
+    header = comm.bcast(checkpoint.model_copy(update={"arrays": {}}) if first and checkpoint else None)
+    missing = [name for name in state.functions() if name not in header.functions]
     for name, function in state.functions().items():
-        if name in missing:
-            continue
-        values = None if checkpoint is None or comm.rank else checkpoint.arrays[f"function/{name}"]
-        function.x.array[_places(function)] = domain.scatter_elements(values)
-    told = None if checkpoint is None or comm.rank else (checkpoint.loads, checkpoint.time, checkpoint.number)
-    numbers = None if checkpoint is None or comm.rank else checkpoint.numbers
-    loads, state.time, state.number = comm.bcast(told, root=0)
-    state.numbers |= comm.bcast(numbers, root=0) | {state.counts[name]: 0.0 for name in missing}
-    if missing and comm.rank == 0:
+        if name not in missing:
+            values = checkpoint.arrays[f"function/{name}"] if first and checkpoint else None
+            function.x.array[_places(function)] = domain.scatter_elements(values)
+    state.time, state.number = header.time, header.number
+    state.numbers |= header.numbers | {state.counts[name]: 0.0 for name in missing}
+    if missing and first:
         log.info("what the checkpoint does not hold begins anew: %s", ", ".join(missing))
-    state.loading.set(loads)
+    state.loading.set(header.loads)
 
 
-def _fault(state: State, domain: Domain, checkpoint: Checkpoint, mesh: dict[str, Array]) -> str | None:
-    """Why the checkpoint is not one of this state."""
+def _check(state: State, domain: Domain, checkpoint: Checkpoint, mesh: dict[str, Array]) -> None:
+    """Raise CheckpointError unless the checkpoint is one of this state."""
     here, there = state.functions(), checkpoint.functions
     if any(name not in there and name not in state.counts for name in here):
-        return f"the checkpoint has the functions {', '.join(there)}, this run has {', '.join(here)}"
-    if set(checkpoint.loads) != set(state.loading.values):
-        return f"the checkpoint has the loads {sorted(checkpoint.loads)}, this run has {sorted(state.loading.values)}"
-    for name, function in here.items():
-        wanted = domain.number_of_elements, _places(function).shape[1]
-        shape = checkpoint.arrays[f"function/{name}"].shape if name in there else wanted
+        raise CheckpointError(f"the checkpoint has the functions {', '.join(there)}, this run has {', '.join(here)}")
+    loads, own = sorted(checkpoint.loads), sorted(state.loading.values)
+    if loads != own:
+        raise CheckpointError(f"the checkpoint has the loads {loads}, this run has {own}")
+    for name in [name for name in here if name in there]:
+        shape = checkpoint.arrays[f"function/{name}"].shape
+        wanted = domain.number_of_elements, _places(here[name]).shape[1]
         if shape != wanted:
-            return f"the checkpoint's function {name} has the shape {shape}, that of this run has {wanted}"
+            words = f"has the shape {shape}, that of this run has {wanted}"
+            raise CheckpointError(f"the checkpoint's function {name} {words}")
     points, elements = checkpoint.arrays["points"], checkpoint.arrays["elements"]
     same = points.shape == mesh["points"].shape and np.array_equal(elements, mesh["elements"])
     if not same or not np.allclose(points, mesh["points"], rtol=0.0, atol=1e-9 * domain.size):
-        return "the checkpoint has another mesh: perhaps Gmsh is of another version, run.log says which it was"
-    return None
+        words = "the checkpoint has another mesh: perhaps Gmsh is of another version, run.log says which it was"
+        raise CheckpointError(words)
 
 
 def _places(function: object) -> Array:

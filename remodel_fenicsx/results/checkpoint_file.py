@@ -11,10 +11,8 @@ import hashlib
 import io
 import json
 import logging
-import math
 import tokenize
 import zipfile
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -37,18 +35,27 @@ class CheckpointError(ValueError):
     """A checkpoint is damaged or does not belong to the run; one line."""
 
 
-@dataclass(frozen=True)
-class Generation:
+class _Model(BaseModel):
+    model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, arbitrary_types_allowed=True)
+
+
+class Generation(_Model):
     """What the pointer says of a checkpoint."""
 
-    file: str
-    number: int
+    file: str = Field(pattern=r"^checkpoint-[ab]\.npz$")
+    number: int = Field(ge=0)
     time: float
     sha256: str
 
 
-@dataclass(frozen=True)
-class Checkpoint:
+class _Pointer(_Model):
+    """checkpoint.json."""
+
+    format: int = Field(default=FORMAT, ge=1, le=FORMAT)
+    generations: list[Generation] = Field(min_length=1)  # the newest first
+
+
+class Checkpoint(_Model):
     """A state by the input mesh's numbering.
 
     Attributes
@@ -67,22 +74,7 @@ class Checkpoint:
         ``function/NAME``: the values of a function, (elements, values of one); ``points``, ``elements``: the mesh.
     """
 
-    time: float
-    number: int
-    scene: str
-    versions: dict[str, str]
-    loads: dict[str, float]
-    numbers: dict[str, float]
-    functions: list[str]
-    arrays: dict[str, Array]
-
-
-class _Header(BaseModel):
-    """What a checkpoint's JSON must be: `Checkpoint` without the arrays."""
-
-    model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
-
-    format: int = Field(ge=1, le=FORMAT)
+    format: int = Field(default=FORMAT, ge=1, le=FORMAT)
     time: float = Field(ge=0)
     number: int = Field(ge=0)
     scene: str
@@ -90,6 +82,7 @@ class _Header(BaseModel):
     loads: dict[str, float]
     numbers: dict[str, float]
     functions: list[str]
+    arrays: dict[str, Array] = Field({}, exclude=True)
 
 
 def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
@@ -100,8 +93,7 @@ def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
     OSError
         If it cannot be written (disk full); the newest one before it still counts.
     """
-    header = {name: value for name, value in vars(checkpoint).items() if name != "arrays"} | {"format": FORMAT}
-    text = np.frombuffer(json.dumps(header, allow_nan=False).encode(), dtype=np.uint8)
+    text = np.frombuffer(checkpoint.model_dump_json().encode(), dtype=np.uint8)
     whole = io.BytesIO()
     np.savez(whole, **{_HEADER: text}, **checkpoint.arrays)  # type: ignore[arg-type]
     data = whole.getvalue()
@@ -111,9 +103,11 @@ def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
         newest = []
     file = next(name for name in GENERATIONS if name not in [one.file for one in newest])
     write_whole(folder / file, data)
-    generation = Generation(file, checkpoint.number, checkpoint.time, hashlib.sha256(data).hexdigest())
-    pointer = {"format": FORMAT, "generations": [asdict(one) for one in (generation, *newest)]}
-    write_whole(folder / POINTER, (json.dumps(pointer, indent=1) + "\n").encode())
+    sha256 = hashlib.sha256(data).hexdigest()
+    generation = Generation(file=file, number=checkpoint.number, time=checkpoint.time, sha256=sha256)
+    write_whole(
+        folder / POINTER, (_Pointer(generations=[generation, *newest]).model_dump_json(indent=1) + "\n").encode()
+    )
 
 
 def read_pointer(folder: Path) -> list[Generation]:
@@ -128,24 +122,16 @@ def read_pointer(folder: Path) -> list[Generation]:
     """
     path = folder / POINTER
     try:
-        pointer = json.loads(read_regular(path, LARGEST_POINTER))
-        if pointer["format"] > FORMAT:
+        data = read_regular(path, LARGEST_POINTER)
+        if json.loads(data)["format"] > FORMAT:
             raise CheckpointError(f"{path}: was written by a newer version")
-        generations = [Generation(**one) for one in pointer["generations"]]
-        good = all(
-            one.file in GENERATIONS and type(one.number) is int and one.number >= 0
-            and type(one.time) is float and math.isfinite(one.time) and isinstance(one.sha256, str)
-            for one in generations
-        )  # fmt: skip
+        return _Pointer.model_validate_json(data).generations
     except FileNotFoundError:
         return []
     except CheckpointError:
         raise
     except (ValueError, KeyError, TypeError, RecursionError, ForeignFileError) as error:
         raise CheckpointError(f"{path}: is damaged or of another kind") from error
-    if not good or not generations:
-        raise CheckpointError(f"{path}: is damaged or of another kind")
-    return generations
 
 
 def read_checkpoint(folder: Path) -> Checkpoint | None:
@@ -188,8 +174,8 @@ def _read(path: Path, generation: Generation) -> Checkpoint:
                 raise ValueError("compressed")
         with np.load(io.BytesIO(data), allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files if name != _HEADER}
-            header = _Header.model_validate_json(file[_HEADER].tobytes())
-        for name in ("points", "elements", *(f"function/{function}" for function in header.functions)):
+            checkpoint = Checkpoint.model_validate_json(file[_HEADER].tobytes())
+        for name in ("points", "elements", *(f"function/{function}" for function in checkpoint.functions)):
             _check_table(arrays[name])
     except (
         ValueError,
@@ -205,7 +191,7 @@ def _read(path: Path, generation: Generation) -> Checkpoint:
         raise CheckpointError(f"{path}: is of another kind than the checkpoints of this version") from error
     except zipfile.BadZipFile as error:
         raise CheckpointError(f"{path}: is no archive of numpy's") from error
-    return Checkpoint(**header.model_dump(exclude={"format"}), arrays=arrays)
+    return checkpoint.model_copy(update={"arrays": arrays})
 
 
 def _check_table(array: Array) -> None:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
+import basix.ufl
 import dolfinx.fem
 import numpy as np
 import ufl
@@ -19,7 +20,7 @@ from remodel_fenicsx.body.shape import Shape
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
 from remodel_fenicsx.fem import compat, jit
 from remodel_fenicsx.fem.quadrature import Quadrature
-from remodel_fenicsx.results.end_force import EndForce, EndForceMeasure
+from remodel_fenicsx.solver.equilibrium import Equilibrium
 
 Array = NDArray[np.float64]
 
@@ -91,8 +92,8 @@ class Measurement:
         self.domain, self.quadrature, self.state = observer.domain, observer.quadrature, observer.state
 
     @property
-    def equilibrium(self) -> Any:
-        """The forms of the solved state (`solver.equilibrium.Equilibrium`)."""
+    def equilibrium(self) -> Equilibrium:
+        """The forms of the solved state."""
         return self.observer.stepper.coupling.equilibrium
 
     @cached_property
@@ -132,7 +133,7 @@ class Measurement:
     def end_force(self, face: str) -> EndForce:
         """Of a tube whose inner face has this name, at the end z = length."""
         length = self.domain.dimensions["length"]
-        measure = self.tool(("end force", face), lambda: EndForceMeasure(self.equilibrium, face, length))
+        measure = self.tool(("end force", face), lambda: _EndForceForms(self.equilibrium, face, length))
         found: EndForce = self.tool_of_step(("end force", face), measure)
         return found
 
@@ -193,3 +194,72 @@ class _FaceMean:
     def _integral(self, nodal_values: Array | float) -> float:
         self.field.x.array.reshape(-1, self._size)[:, 0] = nodal_values
         return float(np.real(dolfinx.fem.assemble_scalar(self._form)))
+
+
+class EndForce(NamedTuple):
+    """What a virtual lengthening v = z/L e_z of a tube does, per unit of its displacement of the end z = L.
+
+    Attributes
+    ----------
+    internal
+        Work of the stresses, integral of P_zz over the body over L: a force.
+    inward
+        Flux of v through the deformed inner face, out of the wall: an area. It is 0 where the lumen is a cylinder.
+    lumen
+        Change of the volume between the inner face and plane caps: the lumen's area, at the end z = L, less `inward`.
+    """
+
+    internal: float
+    inward: float
+    lumen: float
+
+    def of_the_wall(self, pressure: float) -> float:
+        """The force that the wall carries through its section at z = L, with a pressure on the inner face.
+
+        v is 0 at the bottom, and the body is in equilibrium: the work of the end is that of the stresses less that of
+        the pressure on the inner face.
+        """
+        return self.internal + pressure * self.inward
+
+    def reduced(self, pressure: float) -> float:
+        """The same less pressure times the lumen's area at z = L: what must be applied if the ends are capped."""
+        return self.internal - pressure * self.lumen
+
+
+class _EndForceForms:
+    """The forms of `EndForce`, in any kinematics and formulation.
+
+    The work is that of the residual to the last digit: of the formulation and the repulsion, with their quadrature.
+    """
+
+    def __init__(self, equilibrium: Equilibrium, face: str, length: float):
+        state, mesh = equilibrium.state, equilibrium.quadrature.mesh
+        self._pointwise, self._comm = equilibrium.pointwise, equilibrium.comm
+        weight, F = state.kinematics.weight(mesh), state.kinematics.deformation_gradient(state.unknown)
+        # a function where a number would do: UFL differentiates by functions only, and some kinematics prescribe F_zz
+        element = basix.ufl.element("DG", mesh.topology.cell_name(), 0)
+        change: Any = dolfinx.fem.Function(dolfinx.fem.functionspace(mesh, element))
+        one, size = (dolfinx.fem.Constant(mesh, np.float64(value)) for value in (1.0, length))
+        along = ufl.as_tensor([[1.0 / size if i == j == 2 else 0.0 for j in range(3)] for i in range(3)])
+        longer = F + change * along
+        energies = state.dilatation.energies(equilibrium.tissue, longer, [state.cells.ufl_cell], weight)
+        internal = [ufl.derivative(energy, change, one) for energy in energies]
+        if self._pointwise is not None:
+            work = ufl.inner(ufl.dot(F, self._pointwise.stress), along)
+            internal[0] += work * weight * equilibrium.quadrature.dx
+        place, normal = ufl.SpatialCoordinate(mesh), ufl.FacetNormal(mesh)
+        surface = state.loading.surface_measure(face)
+        inward = ufl.dot(ufl.cofac(F), normal)[2] * place[2] / size
+        moved = place + state.kinematics.displacement(state.unknown)
+        # as in Loading.add_cavity_pressure: caps, across which z alone changes, add nothing
+        across = ufl.as_vector([moved[0], moved[1], 0.0])
+        volume = -ufl.inner(across, ufl.dot(ufl.cofac(longer), normal)) / 2 * weight * surface
+        groups = internal, [inward * weight * surface], [ufl.derivative(volume, change, one)]
+        self._forms = [[jit.form(form) for form in group] for group in groups]
+
+    def __call__(self) -> EndForce:
+        """Of the present unknowns. Collective."""
+        if self._pointwise is not None:
+            self._pointwise.update()
+        local = [sum(float(np.real(dolfinx.fem.assemble_scalar(form))) for form in group) for group in self._forms]
+        return EndForce(*map(float, self._comm.allreduce(np.array(local), MPI.SUM)))

@@ -14,9 +14,9 @@ from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.shape import Shape
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
 from remodel_fenicsx.fem import compat, jit
-from remodel_fenicsx.results.chain_lines import chain_displacement, chain_lines
+from remodel_fenicsx.results.chain_lines import AXES, OF_CHAINS, append_chains
 from remodel_fenicsx.results.recording import CHAINS, FIELDS
-from remodel_fenicsx.results.vtkhdf import LINE, TransientGrid, vtk_cells
+from remodel_fenicsx.results.vtkhdf import TransientGrid, vtk_cells
 from remodel_fenicsx.settings import FIELDS_BY_NAME
 from remodel_fenicsx.schema.times import SAME_TIME, same_time
 from remodel_fenicsx.solver.pointwise import PointStresses
@@ -25,10 +25,7 @@ from remodel_fenicsx.state.state import State
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
-
-AXES = tuple(name for name in FIELDS_BY_NAME if name.startswith("axis_"))
 OF_ELEMENTS = tuple(name for name in FIELDS_BY_NAME if name not in ("displacement", "chains"))
-OF_CHAINS = ("cell_dimensions", *AXES, "deformation_gradient", "fibre_angle")  # what the lines are made of
 
 
 def field_names(asked: bool | Sequence[str]) -> tuple[str, ...]:
@@ -202,18 +199,8 @@ class Fields(Watcher):
         at_nodes = {"displacement": displacement} if "displacement" in self.names else {}
         self._grid.append(time, at_nodes, {name: fields[name] for name in fields if name in self.names})
         if "chains" in self.names:
-            self._append_chains(time, displacement, fields)
-
-    def _append_chains(self, time: float, displacement: Array, fields: dict[str, Array]) -> None:
-        axes = np.stack([fields[f"axis_{i + 1}"] for i in range(3)], axis=1)
-        points, lines = chain_lines(self._centres, fields["cell_dimensions"], axes, self._scale)
-        gradient = fields["deformation_gradient"].reshape(-1, 3, 3)
-        moved = chain_displacement(points, self._centres, displacement[self._elements].mean(axis=1), gradient)
-        if self._chains is None:
-            assert self._grid is not None
-            self._chains = TransientGrid(self._grid.path.with_name(CHAINS), points, lines, LINE, point_dtype=np.float32)
-        angle = np.repeat(fields["fibre_angle"], len(lines) // len(self._centres))
-        self._chains.append(time, {"displacement": moved}, {"fibre_angle": angle}, points=points)
+            grid, middle = self._chains or self._grid.path.with_name(CHAINS), displacement[self._elements].mean(axis=1)
+            self._chains = append_chains(grid, time, self._centres, self._scale, middle, fields)
 
     def close(self) -> None:
         """Close the files."""

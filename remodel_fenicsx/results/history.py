@@ -3,18 +3,28 @@
 from __future__ import annotations
 
 import csv
+import errno
 import io
 import math
 import os
 import time as clock
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 from remodel_fenicsx.results.recording import LARGEST_HISTORY, RecordingError
 from remodel_fenicsx.schema.times import same_time
-from remodel_fenicsx.system.regular_files import check_still_there, open_own, read_regular
+from remodel_fenicsx.system.regular_files import open_own, read_regular
 
 FLUSHED_AFTER = 0.5  # seconds: rows that come faster are brought to the disk together
+
+
+class LastStep(NamedTuple):
+    """Where a run goes on: columns of its history, number and time of the last step that was done."""
+
+    columns: Sequence[str]
+    number: int
+    time: float
 
 
 class History:
@@ -27,65 +37,26 @@ class History:
     Parameters
     ----------
     path
-        A new file.
+        A new file, or the one to go on with.
+    after
+        Where a run goes on: the rows of later steps are cut off.
 
     Raises
     ------
     FileExistsError, OSError
-        If the file is there or cannot be made.
+        If a new file is there already, or the file cannot be opened or written.
+    RecordingError
+        If it has not the columns and rows to go on with; nothing has changed then.
     """
 
-    def __init__(self, path: Path):
-        self._path, self._file = path, open(open_own(path, os.O_RDWR | os.O_CREAT | os.O_EXCL), "r+b", buffering=0)
-        self._columns: list[str] | None = None
-        self._sizes = [0]  # bytes up to the end of each whole row
+    def __init__(self, path: Path, after: LastStep | None = None):
+        size = 0 if after is None else size_of_rows(path, after)
+        flags = os.O_RDWR | (os.O_CREAT | os.O_EXCL if after is None else 0)
+        self._path, self._file = path, open(open_own(path, flags), "r+b", buffering=0)
+        self._columns = None if after is None else list(after.columns)
+        self._sizes = [size]  # bytes up to the end of the last whole row, and before of the one before it
         self._flushed_at, self._is_flushed = -math.inf, True
-
-    @classmethod
-    def continued(cls, path: Path, columns: Sequence[str], rows: int, time: float) -> History:
-        """Open a file again, to go on behind its first `rows` rows, the last of which is that of `time`.
-
-        What comes after them is cut off.
-
-        Raises
-        ------
-        RecordingError
-            If it has not these columns and rows; nothing has changed then.
-        OSError
-            If it cannot be opened or written.
-        """
-        history = cls.__new__(cls)
-        history._path, history._columns = path, list(columns)
-        history._sizes = [cls.size_of(path, columns, rows, time)]
-        history._file = open(open_own(path, os.O_RDWR), "r+b", buffering=0)
-        history._flushed_at, history._is_flushed = -math.inf, True
-        history._cut()
-        return history
-
-    @staticmethod
-    def size_of(path: Path, columns: Sequence[str], rows: int, time: float) -> int:
-        """Bytes of the head and the first `rows` rows of a history, the last of which is that of `time`.
-
-        Raises
-        ------
-        RecordingError
-            If it has not these columns and rows.
-        OSError
-            If it cannot be read.
-        """
-        lines = read_regular(path, LARGEST_HISTORY).splitlines(keepends=True)[: rows + 1]
-        try:
-            texts = [line.decode("utf-8") for line in lines]
-            found, *read = csv.reader(texts)
-            whole = len(read) == rows and texts[-1].endswith("\n")
-            right = whole and same_time(float(read[-1][found.index("time")]), time)
-        except (ValueError, IndexError, csv.Error):
-            right = False
-        if not right:
-            raise RecordingError(f"{path}: has not the {rows} rows up to time {time:g} that belong to the checkpoint")
-        if found != list(columns):
-            raise RecordingError(f"{path}: has other columns than this run; output.columns must stay what it was")
-        return sum(map(len, lines))
+        self._cut()
 
     def append(self, row: dict[str, float]) -> None:
         """Write one row; the first one decides the columns.
@@ -129,7 +100,9 @@ class History:
         """
         if not self._is_flushed:
             os.fsync(self._file.fileno())
-            check_still_there(self._file.fileno(), self._path, "the rows of this run, and what else was in its folder")
+            if os.fstat(self._file.fileno()).st_nlink == 0:
+                lost = "the rows of this run, and what else was in its folder"
+                raise FileNotFoundError(errno.ENOENT, f"the file was deleted during the run; lost: {lost}", self._path)
             self._flushed_at, self._is_flushed = clock.monotonic(), True
 
     def drop_last(self) -> None:
@@ -148,6 +121,32 @@ class History:
                 self.flush()
             finally:
                 self._file.close()
+
+
+def size_of_rows(path: Path, after: LastStep) -> int:
+    """Bytes of a history's head and of its rows up to a step.
+
+    Raises
+    ------
+    RecordingError
+        If it has not these columns and rows.
+    OSError
+        If it cannot be read.
+    """
+    rows = after.number + 1
+    lines = read_regular(path, LARGEST_HISTORY).splitlines(keepends=True)[: rows + 1]
+    try:
+        texts = [line.decode("utf-8") for line in lines]
+        found, *read = csv.reader(texts)
+        whole = len(read) == rows and texts[-1].endswith("\n")
+        right = whole and same_time(float(read[-1][found.index("time")]), after.time)
+    except (ValueError, IndexError, csv.Error):
+        right = False
+    if not right:
+        raise RecordingError(f"{path}: has not the {rows} rows up to time {after.time:g} that belong to the checkpoint")
+    if found != list(after.columns):
+        raise RecordingError(f"{path}: has other columns than this run; output.columns must stay what it was")
+    return sum(map(len, lines))
 
 
 def _number(value: float) -> str:

@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.body.reductions import Turn
 from remodel_fenicsx.fem.kinematics import KINEMATICS
-from remodel_fenicsx.results.chain_lines import chain_displacement, chain_lines
-from remodel_fenicsx.results.fields import AXES, OF_CHAINS
+from remodel_fenicsx.results.chain_lines import AXES, OF_CHAINS, append_chains
 from remodel_fenicsx.results.recording import Recording, RecordingError
-from remodel_fenicsx.results.vtkhdf import LINE, TransientGrid, vtk_cells
+from remodel_fenicsx.results.vtkhdf import TransientGrid, vtk_cells
 
 Array = NDArray[np.float64]
 
@@ -59,7 +58,8 @@ def revolve(folder: Path | str) -> list[Path]:
             displacement, fields = image(recording.fields(float(time)))
             grid.append(float(time), {} if displacement is None else {"displacement": displacement}, fields)
             if displacement is not None and set(OF_CHAINS) <= set(fields):
-                chains = image.append_chains(chains, paths[1], float(time), displacement, fields)
+                middle = displacement[image.elements].mean(axis=1)
+                chains = append_chains(chains or paths[1], float(time), image.centres, image.scale, middle, fields)
         if chains is not None:
             chains.close()
     return paths if chains is not None else paths[:1]
@@ -105,20 +105,6 @@ class _Image:
         gradient = fields["deformation_gradient"].reshape(-1, 3, 3)[self.owners] - np.eye(3)
         moved = fields["displacement"][self.nodes] + np.einsum("nij,nj->ni", gradient, self.offsets)
         return np.einsum("nij,nj->ni", self.turns, moved), found
-
-    def append_chains(
-        self, chains: TransientGrid | None, path: Path, time: float, displacement: Array, fields: dict[str, Array]
-    ) -> TransientGrid:
-        """The chain lines of every element, as `Fields` writes them."""
-        axes = np.stack([fields[name] for name in AXES], axis=1)
-        points, lines = chain_lines(self.centres, fields["cell_dimensions"], axes, self.scale)
-        gradient = fields["deformation_gradient"].reshape(-1, 3, 3)
-        moved = chain_displacement(points, self.centres, displacement[self.elements].mean(axis=1), gradient)
-        if chains is None:
-            chains = TransientGrid(path, points, lines, LINE, point_dtype=np.float32)
-        angle = np.repeat(fields["fibre_angle"], len(lines) // len(self.centres))
-        chains.append(time, {"displacement": moved}, {"fibre_angle": angle}, points=points)
-        return chains
 
 
 def nearest(places: Array, candidates: Array) -> NDArray[np.int64]:

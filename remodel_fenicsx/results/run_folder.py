@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+import itertools
 import os
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
-from types import TracebackType
-from typing import NamedTuple
+from typing import TypeVar, cast
 
 from mpi4py import MPI
 
 from remodel_fenicsx.evolution.stepper import Step, Watcher
-from remodel_fenicsx.results.history import History
+from remodel_fenicsx.results.history import History, LastStep, size_of_rows
 from remodel_fenicsx.results.recording import CHAINS, FIELDS, HISTORY, LOG, SCENE
 from remodel_fenicsx.results.run_lock import FolderTaken, RunLock, is_vacant
 from remodel_fenicsx.results.vtkhdf import check_file
@@ -21,12 +21,20 @@ from remodel_fenicsx.system.regular_files import open_own, write_whole
 DEEPEST = 100  # folders in folders: Python makes them by a function that calls itself
 
 
-class LastStep(NamedTuple):
-    """Where a run goes on."""
+T = TypeVar("T")
 
-    columns: Sequence[str]
-    number: int
-    time: float
+
+def agreed(comm: MPI.Intracomm, make: Callable[[], T]) -> T:
+    """What `make` makes on every rank; what one of them refuses with a ValueError is refused on all. Collective."""
+    made = refusal = None
+    try:
+        made = make()
+    except ValueError as error:
+        refusal = error
+    refusal = next(filter(None, comm.allgather(refusal)), None)
+    if refusal is not None:
+        raise refusal
+    return cast(T, made)
 
 
 def choose_folder(requested: Path | None, name: str) -> Path:
@@ -50,15 +58,12 @@ def choose_folder(requested: Path | None, name: str) -> Path:
             raise FolderTaken(f"-o {requested}: is not empty; allowed is a new or an empty folder")
         return requested
     Path("results").mkdir(exist_ok=True)
-    number, folder = 1, Path("results") / name
-    while True:
-        try:
+    for number in itertools.count(1):
+        folder = Path("results") / (name if number == 1 else f"{name}-{number}")
+        with suppress(FileExistsError):
             folder.mkdir()
-        except FileExistsError:
-            number += 1
-            folder = Path("results") / f"{name}-{number}"
-        else:
-            return folder
+            break
+    return folder
 
 
 def chosen_folder(requested: Path | str | None, name: str, comm: MPI.Intracomm) -> Path:
@@ -66,20 +71,14 @@ def chosen_folder(requested: Path | str | None, name: str, comm: MPI.Intracomm) 
 
     Raises
     ------
-    FolderTaken, OSError
+    FolderTaken
         As `choose_folder` does, on all ranks.
+    OSError
+        As `choose_folder` does, on rank 0.
     """
-    verdict: Path | FolderTaken | OSError | None = None
-    if comm.rank == 0:
-        try:
-            verdict = choose_folder(None if requested is None else Path(requested), name)
-        except (FolderTaken, OSError) as refusal:
-            verdict = refusal
-    verdict = comm.bcast(verdict)
-    if isinstance(verdict, Exception):
-        raise verdict
-    assert verdict is not None
-    return verdict
+    wanted = None if requested is None else Path(requested)
+    chosen = agreed(comm, lambda: choose_folder(wanted, name) if comm.rank == 0 else None)
+    return cast(Path, comm.bcast(chosen))
 
 
 @contextmanager
@@ -103,28 +102,22 @@ def locked(folder: Path, comm: MPI.Intracomm, new: bool) -> Iterator[None]:
     OSError
         On rank 0, if the folder cannot be made or written.
     """
-    lock = refusal = None
-    if comm.rank == 0:
-        try:
-            if not new and not (folder / SCENE).is_file():
-                raise FolderTaken(f"{folder}: is not the folder of a run, it has no {SCENE}")
-            lock = RunLock(folder, comm.size)
-            if new and (folder / SCENE).exists():
-                lock.close()
-                raise FolderTaken(f"-o {folder}: is not empty; allowed is a new or an empty folder")
-        except FolderTaken as taken:
-            refusal = taken
-    refusal = comm.bcast(refusal)
-    if refusal is not None:
-        raise refusal
-    try:
+    lock = agreed(comm, lambda: _lock(folder, comm.size, new) if comm.rank == 0 else nullcontext())
+    with lock:
         yield
-    finally:
-        if lock is not None:
-            lock.close()
 
 
-def check_kept(folder: Path, after: LastStep | None, fields: bool) -> None:
+def _lock(folder: Path, ranks: int, new: bool) -> RunLock:
+    if not new and not (folder / SCENE).is_file():
+        raise FolderTaken(f"{folder}: is not the folder of a run, it has no {SCENE}")
+    lock = RunLock(folder, ranks)
+    if new and (folder / SCENE).exists():
+        lock.close()
+        raise FolderTaken(f"-o {folder}: is not empty; allowed is a new or an empty folder")
+    return lock
+
+
+def check_before_resuming(folder: Path, after: LastStep | None, fields: bool) -> None:
     """Look at all that a run goes on with, before anything is changed.
 
     Parameters
@@ -150,7 +143,7 @@ def check_kept(folder: Path, after: LastStep | None, fields: bool) -> None:
             os.close(open_own(folder / name, os.O_RDONLY))
     if after is None:
         return
-    History.size_of(folder / HISTORY, after.columns, after.number + 1, after.time)
+    size_of_rows(folder / HISTORY, after)
     for name in (FIELDS, CHAINS) if fields else ():
         if (folder / name).exists():
             check_file(folder / name)
@@ -180,8 +173,7 @@ class RunFolder(Watcher):
     rank
         Rank in the communicator: all but rank 0 write nothing.
     after
-        Where a run goes on: columns of its history, number and time of the last step that was done. The history is cut
-        there.
+        Where a run goes on: the history is cut there.
 
     Raises
     ------
@@ -199,12 +191,10 @@ class RunFolder(Watcher):
         self._last_row = -1  # number of its step
         if rank == 0:
             self.folder.mkdir(parents=True, exist_ok=True)
-            history, scene = self.folder / HISTORY, self.folder / SCENE
             if after is not None:  # what is refused leaves the scene as it is
-                self.history = History.continued(history, after.columns, after.number + 1, after.time)
-            write_whole(scene, scene_text.encode("utf-8"))
-            if after is None:
-                self.history = History(history)
+                self.history = History(self.folder / HISTORY, after)
+            write_whole(self.folder / SCENE, scene_text.encode("utf-8"))
+            self.history = self.history or History(self.folder / HISTORY)
 
     def started(self, step: Step) -> None:
         """Write the row at the start."""
@@ -235,7 +225,5 @@ class RunFolder(Watcher):
     def __enter__(self) -> RunFolder:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()

@@ -24,7 +24,7 @@ from remodel_fenicsx.results.recording import (
     RecordingError,
     read_history,
 )
-from remodel_fenicsx.results.run_lock import lock_holder
+from remodel_fenicsx.results.run_lock import writer
 from remodel_fenicsx.schema.times import same_time
 from remodel_fenicsx.system.arguments import MOST
 from remodel_fenicsx.system.regular_files import ForeignFileError, read_regular
@@ -50,7 +50,7 @@ def status(folder: Path) -> list[str]:
     """
     if (folder / STUDY).is_file():
         return _of_study(folder)
-    holder, lives = lock_holder(folder)
+    holder, lives = writer(folder)
     if not lives or (folder / HISTORY).exists():
         recording = Recording(folder)  # what is no run's folder is refused
     else:
@@ -134,7 +134,7 @@ def _state(folder: Path) -> tuple[str, str]:
         said = data.decode(errors="replace").split("\n")
         last = next((line for line in reversed(said) if line), "")
         return ("failed", f"{FAILED}{last.removeprefix('remodel-fenicsx: ')}") if last else ("not begun", "")
-    if lock_holder(folder)[1]:
+    if writer(folder)[1]:
         return "running", ""
     with suppress(RecordingError):
         recording = Recording(folder)

@@ -5,17 +5,23 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
+import dolfinx.fem
 import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
+from petsc4py import PETSc
 
 from remodel_fenicsx.fem.assembly import over_ranks
-from remodel_fenicsx.solver.blend import KEPT_RESERVE
-from remodel_fenicsx.solver.equilibrium import Extension
-from remodel_fenicsx.solver.newton import NOTICEABLE, GuardedNewton, Solution, SolveFailure
+from remodel_fenicsx.model.cells import UnitCell
+from remodel_fenicsx.model.energy import Tissue
+from remodel_fenicsx.settings import Solver
+from remodel_fenicsx.solver.equilibrium import Equilibrium, Extension
+from remodel_fenicsx.solver.newton import NOTICEABLE, Counted, GuardedNewton, Solution, SolveFailure
 from remodel_fenicsx.solver.refusals import BIFURCATION, LIMIT_POINT, SEVERAL_SOLUTIONS, Refusal, diagnosed
 from remodel_fenicsx.state.memory import Numbers
+from remodel_fenicsx.state.state import State
 
 SLOPE_SHARE = 1e-3  # of the bounded part: over it the slope of the residual is taken
 SAME = 1e-4  # of the way to them: by what two solutions may differ that are one; of other branches it is a good part
@@ -23,11 +29,12 @@ FASTER = 4.0  # than the part before: a way that comes to a limit point is up to
 WAYS_END = (LIMIT_POINT.kind, BIFURCATION.kind)  # refusals for which no smaller step helps
 PROOF = 8  # halvings without which a jump is not told from a step that is only too large
 MOST_JUMPS = 3  # that are looked into in a run, each by some 25 solves: a body that falls apart jumps in every step
+KEPT_RESERVE = 0.2  # share of 1 - r/L that a part of a remodeling increment leaves at every point
 log = logging.getLogger(__name__)
 
 
 @dataclass
-class Work:
+class Work(Counted):
     """Solver work of one step, failed attempts included."""
 
     newton_iterations: int = 0
@@ -41,9 +48,7 @@ class Work:
 
     def add(self, done: Solution | SolveFailure | Work) -> None:
         """Count a solve, or the work of a step that was taken back."""
-        self.newton_iterations += done.newton_iterations
-        self.linear_iterations += done.linear_iterations
-        self.tangents += done.tangents
+        self.count(done)
         if isinstance(done, Solution):
             self.residual, self.extension = done.residual, done.extension
             self.is_far = done.is_far
@@ -93,6 +98,8 @@ class Change:
         Largest further part from a fraction on, where there is a bound.
     roughly
         Whether all parts but the last may be solved coarsely. Not near a limit of the load: it would be passed.
+    most_iterations
+        Newton iterations in `work` above which no further part is tried.
     """
 
     time: float
@@ -102,6 +109,7 @@ class Change:
     maximum_halvings: int
     largest_part: Callable[[float], float] = lambda done: 1.0
     roughly: bool = False
+    most_iterations: float = np.inf
     refusal: Refusal | None = field(default=None, init=False)  # what there was no way past but by a jump
     _direction: NDArray[np.float64] | None = field(default=None, init=False)  # of the unknowns over the last part
 
@@ -127,20 +135,20 @@ class Change:
         """
         done = 0.0
         if failure is not None:
-            part = self._halved(part, done, failure)
+            part = self._halved(part, done, failure, work)
         while done < 1.0:
             before = self.newton.unknown.x.array.copy()
             part = self._started(min(part, 1.0 - done), done, work)
             is_last = done + part > 1.0 - 1e-12
             self.set_fraction(1.0 if is_last else done + part)
-            self.newton.on_the_way = self.roughly and not is_last
+            self.newton.convergence.intermediate = self.roughly and not is_last
             try:
                 solution = self.newton.solve()
                 work.add(solution)
             except SolveFailure as failed:
                 self.newton.unknown.x.array[:] = before
                 work.add(failed)
-                part = self._halved(part, done, failed)
+                part = self._halved(part, done, failed, work)
             else:
                 if self._is_far(solution, before, part) and self._looks():
                     solved, self.newton.unknown.x.array[:] = self.newton.unknown.x.array.copy(), before
@@ -160,7 +168,7 @@ class Change:
                 part *= 2
                 work.substeps += 1
             finally:
-                self.newton.on_the_way = False
+                self.newton.convergence.intermediate = False
 
     def _started(self, wanted: float, done: float, work: Work) -> float:
         """The next part, with the unknowns that it starts from.
@@ -221,9 +229,7 @@ class Change:
             log.info("time %g: far from where its tangent points to, and not solved in parts: %s", self.time, failure)
         else:
             leads_on = self.refusal is None
-        work.newton_iterations += parts.newton_iterations
-        work.linear_iterations += parts.linear_iterations
-        work.tangents += parts.tangents
+        work.count(parts)
         if leads_on and self._size(unknown - found) > SAME * self._size(found - before):
             log.info("time %g: several solutions; taken is the one to which parts of the step lead", self.time)
             work.residual, work.extension, work.substeps = parts.residual, parts.extension, parts.substeps
@@ -266,8 +272,8 @@ class Change:
                 "time.step shows the way there", self.time, far, loads or "the start", refusal,
             )  # fmt: skip
 
-    def _halved(self, part: float, done: float, failure: SolveFailure) -> float:
-        if part / 2 < self._smallest:
+    def _halved(self, part: float, done: float, failure: SolveFailure, work: Work) -> float:
+        if part / 2 < self._smallest or work.newton_iterations > self.most_iterations:
             text = failure_text(self.time, self.stage, done, failure)
             self.set_fraction(done)  # the last state that was solved
             found = diagnosed(self.newton, failure, self._direction)
@@ -275,3 +281,60 @@ class Change:
             raise StepFailure(self.time, text, refusal) from failure
         log.debug("%s: %s; next part %g", self.stage, failure.reason, part / 2)
         return part / 2
+
+
+class Blend:
+    """Equilibrium with (1 - theta) old + theta new cells in r^2 and in W_rep: the old and the new model at the ends.
+
+    Old are the cells with which the unknowns are in equilibrium, new the state's present ones. Everything is compiled
+    at once; PETSc's objects are made when they are first needed.
+    """
+
+    def __init__(self, state: State, tissue: Tissue, settings: Solver):
+        self.settings = settings
+        self.theta = dolfinx.fem.Constant(state.cells.quadrature.mesh, PETSc.ScalarType(0.0))
+        old, new = state.equilibrium_cells, state.cells
+
+        def at_points() -> list[UnitCell]:
+            return shares(old.point_cells, new.point_cells, float(np.real(self.theta.value)))
+
+        self.equilibrium = Equilibrium(state, tissue, shares(old.ufl_cell, new.ufl_cell, self.theta), at_points)
+        self._newton: GuardedNewton | None = None
+
+    @property
+    def newton(self) -> GuardedNewton:
+        """The solver."""
+        if self._newton is None:
+            self._newton = GuardedNewton(self.equilibrium, self.settings, robust=True)
+        return self._newton
+
+    def close(self) -> None:
+        """Free PETSc's objects."""
+        if self._newton is not None:
+            self._newton.close()
+            self._newton = None
+
+    def set(self, fraction: float) -> None:
+        """theta."""
+        self.theta.value = fraction
+
+    def largest_part(self, done: float) -> float:
+        """Largest further part of theta that keeps KEPT_RESERVE of 1 - r/L at every point of the present unknowns.
+
+        r^2 is linear in theta at a frozen deformation, so the bound is in closed form.
+        """
+        equilibrium, quadrature = self.equilibrium, self.equilibrium.quadrature
+        length = quadrature.owned(equilibrium.locking_length())
+        self.theta.value = done
+        now = quadrature.owned(equilibrium.limit_values()[0])
+        self.theta.value = 1.0
+        end = quadrature.owned(equilibrium.limit_values()[0])
+        allowed = ((1 - KEPT_RESERVE) * length + KEPT_RESERVE * np.sqrt(now)) ** 2  # infinite where nothing locks
+        growth = end - now
+        room = np.where(growth > 0, (allowed - now) / np.where(growth > 0, growth, 1.0), np.inf)
+        return (1.0 - done) * quadrature.minimum(room)
+
+
+def shares(old: UnitCell, new: UnitCell, theta: Any) -> list[UnitCell]:
+    """(1 - theta) of an old cell and theta of a new one, UFL or arrays."""
+    return [UnitCell(*old[:2], 1 - theta), UnitCell(*new[:2], theta)]

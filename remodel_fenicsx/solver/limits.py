@@ -1,4 +1,4 @@
-"""The limits r < L and J > 0 along Newton's way: each state is looked at once, and those near it need no look."""
+"""Admissible states: the limits r < L and J > 0 in the line search of Newton's method."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from remodel_fenicsx.solver.equilibrium import Equilibrium, Look
 
 Array = NDArray[np.float64]
 
-FAR_FROM_LOCKING = 0.95  # r/L up to which no point has to keep a reserve
+NEAR_LIMIT, RESERVE = 0.95, 0.3  # a Newton step that ends above this r/L keeps this share of 1 - r/L
 
 
 class Limits:
-    """How far from their limits the states are that Newton's method comes to, within one solve.
+    """How far from their limits r < L and J > 0 the states of one solve are; each is evaluated once.
 
     Parameters
     ----------
@@ -48,8 +48,17 @@ class Limits:
                 self._room, self._travelled = self._room_around(self._found), 0.0
         return self._found
 
-    def spare(self, largest_displacement: float) -> bool:
-        """Whether a further step is certainly admissible, so that nobody need look; it is then as if it were made.
+    def allow(self, before: Look, after: Look) -> bool:
+        """Whether a step may end there: at an admissible state, with a reserve near L, and no J <= 0 on the way."""
+        if not after.extension.admissible:
+            return False
+        near = after.extension.max_chain_extension > NEAR_LIMIT
+        if near and not self.equilibrium.keeps_reserve(before.stretches, after.stretches, RESERVE, NEAR_LIMIT):
+            return False
+        return not self.equilibrium.turns_inside_out(before.states, after.states)
+
+    def certainly_allow(self, largest_displacement: float) -> bool:
+        """Whether a further step is admissible by the bound, without a look at its end; it then counts as made.
 
         Parameters
         ----------
@@ -67,14 +76,14 @@ class Limits:
         return bool(over_ranks(self.equilibrium.comm, here, MPI.LAND))
 
     def _room_around(self, look: Look) -> float:
-        """Largest |dF| at which J > 0 and r/L < FAR_FROM_LOCKING at every point of all ranks."""
+        """Largest |dF| at which J > 0 and r/L < NEAR_LIMIT at every point of all ranks."""
         if not look.extension.admissible:
             return 0.0
         quadrature, cells = self.equilibrium.quadrature, self.equilibrium.state.cells
         if self._chains is None:
             length = np.sqrt(squares_of(cells.dimension_values)) / self.equilibrium.locking_length()
             self._chains = np.maximum(quadrature.owned(length), 1e-300).reshape(-1)
-        room = cells.kernels.room(look.states, look.stretches.reshape(-1), self._chains, FAR_FROM_LOCKING)
+        room = cells.kernels.room(look.states, look.stretches.reshape(-1), self._chains, NEAR_LIMIT)
         return float(over_ranks(self.equilibrium.comm, room, MPI.MIN))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import dolfinx.fem.petsc
@@ -15,24 +16,136 @@ from remodel_fenicsx.fem.assembly import over_ranks
 from remodel_fenicsx.fem.petsc_options import ProblemOptions
 from remodel_fenicsx.fem.solver_methods import AUTO, LAGGED, chosen, is_small, method_options
 from remodel_fenicsx.settings import Solver
-from remodel_fenicsx.solver.equilibrium import Equilibrium, Look
+from remodel_fenicsx.solver.convergence import PRESCRIBED_ROUNDING, Convergence
+from remodel_fenicsx.solver.equilibrium import Equilibrium, Extension, Look
 from remodel_fenicsx.solver.limits import Limits
 from remodel_fenicsx.solver.linear import LINEAR_METHODS, EveryTangent
-from remodel_fenicsx.solver.solution import Solution, SolveFailure, failure_text
-from remodel_fenicsx.state.parameters import stress_rounding
 from remodel_fenicsx.system.interrupts import Interrupted
 
 log = logging.getLogger(__name__)
 
 LINE_SEARCH_HALVINGS = 20  # of one Newton step, before the solve is given up
-ROUNDINGS = 8.0  # how many times the rounding of assembled forces a residual may be
 NOTICEABLE = 1e-3  # of the body's size: displacements that may be a jump; 1 % of the radius of a tube of this length
-ROUNDED_STRAINS = 2.0  # the same of the rounding of displacements; on thin walls 0.07 to 0.96 were measured
-MET = 1e-13  # of the body's size: prescribed values that are met to rounding
-PRESCRIBED_MET = 1e-10  # of the body's size: how far a prescribed displacement may be missed; no force measures it
-ON_THE_WAY = 1e-3  # of the nodal forces: residual of a part that others follow
-NEAR_LOCKING, KEPT_RESERVE = 0.95, 0.3  # a Newton step that ends above this r/L keeps this share of 1 - r/L
-NEARLY_LOCKED, COARSE, GOES_DOWN = 0.99, 1e-8, 0.25  # see GuardedNewton._is_small
+FAR = 2.0
+"""`Solution.reach` from which on a way is looked at again in parts. The paper's bodies have at most 1.25, a tube
+without chains that comes near its largest pressure in one step 2.9, a jump over a limit point 3.9 and more."""
+
+NEAR, MANY = 0.5, 12  # chains near their contour length make ends nearer too, but within 11 iterations
+
+
+class Counted:
+    """Work of the solver."""
+
+    newton_iterations: int
+    linear_iterations: int
+    tangents: int  # that were assembled
+
+    def count(self, other: Counted) -> None:
+        """Add the work of another solve."""
+        self.newton_iterations += other.newton_iterations
+        self.linear_iterations += other.linear_iterations
+        self.tangents += other.tangents
+
+
+@dataclass
+class Solution(Counted):
+    """A solve that has ended well.
+
+    Attributes
+    ----------
+    newton_iterations, linear_iterations, tangents
+        Its work.
+    residual
+        Norm of the out-of-balance nodal forces that was accepted.
+    extension
+        How far the solution is from the limits r < L and J > 0.
+    reach
+        Distance of the solution from the start over the length of the first Newton step; 0 where it is too short to
+        matter.
+    """
+
+    newton_iterations: int
+    linear_iterations: int
+    residual: float = 0.0
+    tangents: int = 0
+    extension: Extension | None = None
+    reach: float = 0.0
+
+    @property
+    def is_far(self) -> bool:
+        """Whether it may lie on another branch: much farther than the tangent at the start points, or much nearer after
+        many iterations, as from a start at which the tangent is almost singular."""
+        return self.reach > FAR or (0.0 < self.reach < NEAR and self.newton_iterations > MANY)
+
+
+class SolveFailure(Counted, RuntimeError):
+    """SNES did not find an admissible equilibrium; the unknowns before the call are restored.
+
+    Attributes
+    ----------
+    reason
+        In words.
+    extension
+        How far the state at which it stopped is from the limits.
+    residual_over_tolerance, relative_residual
+        Norm of the residual there over the tolerance, and over that of the nodal forces.
+    """
+
+    def __init__(
+        self,
+        reason: str,
+        newton_iterations: int,
+        linear_iterations: int,
+        extension: Extension,
+        residual_over_tolerance: float = np.inf,
+        tangents: int = 0,
+        relative_residual: float = np.inf,
+    ):
+        super().__init__(reason)
+        self.reason, self.extension = reason, extension
+        self.newton_iterations, self.linear_iterations, self.tangents = newton_iterations, linear_iterations, tangents
+        self.residual_over_tolerance, self.relative_residual = residual_over_tolerance, relative_residual
+
+
+@dataclass
+class _Solve:
+    """What is known within one solve.
+
+    Attributes
+    ----------
+    first_step
+        Length of the first Newton step.
+    norm
+        Norm of the residual in the last iteration.
+    inadmissible
+        Whether the present state violates r < L or J > 0, or a signal has asked for the end.
+    bounded
+        Whether the present trial state is admissible by the bound of `Limits` alone.
+    """
+
+    first_step: float | None = None
+    norm: float = np.inf
+    inadmissible: bool = False
+    bounded: bool = False
+
+
+# by PETSc's SNESConvergedReason; numbers, for the names differ between its versions
+FAILURES = {
+    -3: "the linear solver failed",
+    -4: "forces or parameters are too large or too small for floating-point numbers",
+    -6: "the line search found no better state",
+    -9: "the residual grew beyond all bounds",
+}
+MOST_ITERATIONS = -5
+
+
+def failure_text(reason: int, iterations: int, extension: Extension) -> str:
+    """Why SNES has ended; where it did not fail itself, the state is not admissible."""
+    if reason >= 0:
+        return f"reached r/L = {extension.max_chain_extension:.4f}, J = {extension.min_jacobian:.4g}"
+    if reason == MOST_ITERATIONS:
+        return f"no equilibrium within {iterations} Newton iterations"
+    return FAILURES.get(reason, f"SNES stopped with reason {reason}")
 
 
 class GuardedNewton:
@@ -68,20 +181,11 @@ class GuardedNewton:
         self._options = ProblemOptions(method_options(self.method, ranks, small), settings.petsc_options)
         self._residual, self._external, self._trial = (self._x.duplicate() for _ in range(3))
         self._matrix = equilibrium.create_matrix()
-        self._force_scale = self._extension = 0.0
-        self._largest = equilibrium.parameters.largest()
-        self._rounds_at, self._rounding = 0.0, (np.nan, 0.0)  # r/L of an admissible state; r/L and its rounding
-        areas, gradients = equilibrium.quadrature.largest_areas, equilibrium.quadrature.gradients
-        self._area = equilibrium.quadrature.norm(areas)
-        self._area_of_gradients = equilibrium.quadrature.norm(areas * gradients)  # per displacement
-        self._displacement = 0.0  # largest unknown of an admissible state
-        self.on_the_way = False  # whether the solution is only the start of a further one: then it may be coarser
-        self._lost, self._gap, self._last_norm = False, np.inf, np.inf
+        self.convergence = Convergence(equilibrium, settings)
         bounded = self.method == LAGGED and "snes_linesearch_type" not in self._options.given
         self.limits = Limits(equilibrium, bounded)
-        self._first: float | None = None  # length of the first Newton step of a solve
-        self._looked = False  # whether the limits of the start are known
-        self._spared = False  # whether the present trial is admissible by the bound alone
+        self._present = _Solve()
+        self._start_is_known = False  # whether the limits have been asked for the start of the next solve
         self._options_checked = False
         snes: Any = PETSc.SNES().create(equilibrium.comm)
         snes.setFunction(self._assemble_residual, self._residual)
@@ -131,27 +235,32 @@ class GuardedNewton:
             log.info("solved once more, %s: %s", words, failure.reason)
             with other_way:
                 try:
-                    return self._attempt().after(failure)
+                    solution = self._attempt()
                 except SolveFailure as again:
                     again.count(failure)
                     raise
+                solution.count(failure)
+                return solution
+
+    def gives_up(self, trial: Look) -> bool:
+        """Whether no step shorter than the one to this trial state is worth its cost; the solve then fails."""
+        return False
 
     def may_start(self) -> bool:
         """Whether the present unknowns, from which `solve` is to start, are admissible."""
         self.limits.forget()
-        self._looked = self.limits.look().extension.admissible
-        return self._looked
+        self._start_is_known = self.limits.look().extension.admissible
+        return self._start_is_known
 
     def _attempt(self, more_iterations: int = 1) -> Solution:
         start, tangents = self._values.copy(), self._linear.tangents
         self._snes.setTolerances(max_it=more_iterations * self._most_iterations)
-        # they may be others from solve to solve, not within one
-        self._largest, self._rounding = self.equilibrium.parameters.largest(), (np.nan, 0.0)
+        self.convergence.begin()
         self._pull(self._x)
-        self._lost, self._spared, self._first = False, False, None
-        if not self._looked:
+        self._present = _Solve()
+        if not self._start_is_known:
             self.limits.forget()
-        self._looked = False
+        self._start_is_known = False
         self._linear.begin()
         self._snes.solve(None, self._x)
         self._warn_of_unused_options()
@@ -159,17 +268,15 @@ class GuardedNewton:
         newton, linear = self._snes.getIterationNumber(), self._snes.getLinearSolveIterations()
         self._push(self._x)
         extension = self.limits.look().extension if self.limits.bounded else self.equilibrium.extension()
-        if reason < 0 or self._lost or not extension.admissible:
+        if reason < 0 or self._present.inadmissible or not extension.admissible:
             self._values[:] = start
             if extension.stop_signal:
                 raise Interrupted(extension.stop_signal)
             norm, tiny = float(self._snes.getFunctionNorm()), float(np.finfo(np.float64).tiny)
-            left, relative = norm / max(self._tolerance(), tiny), norm / max(self._force_scale, tiny)
-            text, tangents = (
-                failure_text(0 if self._lost else reason, newton, extension),
-                self._linear.tangents - tangents,
-            )
-            raise SolveFailure(text, newton, linear, extension, left, tangents, relative)
+            text = failure_text(0 if self._present.inadmissible else reason, newton, extension)
+            left = norm / max(self.convergence.tolerance(), tiny)
+            relative = norm / max(self.convergence.force_scale, tiny)
+            raise SolveFailure(text, newton, linear, extension, left, self._linear.tangents - tangents, relative)
         self._linear.ended(newton)
         norm, tangents = float(self._snes.getFunctionNorm()), self._linear.tangents - tangents
         return Solution(newton, linear, norm, tangents, extension, self._reach(self._values - start))
@@ -178,10 +285,10 @@ class GuardedNewton:
         """`Solution.reach` of a solve that has changed the unknowns so."""
         comm, state = self.equilibrium.comm, self.equilibrium.state
         largest = over_ranks(comm, np.abs(change).max(initial=0.0), MPI.MAX)
-        if not self._first or largest < NOTICEABLE * state.loading.domain.size:
+        if not self._present.first_step or largest < NOTICEABLE * state.loading.domain.size:
             return 0.0
         owned = change[: state.number_of_owned_unknowns]
-        return float(np.sqrt(over_ranks(comm, owned @ owned, MPI.SUM))) / self._first
+        return float(np.sqrt(over_ranks(comm, owned @ owned, MPI.SUM))) / self._present.first_step
 
     def tangent_direction(self, set_fraction: Callable[[float], None], done: float, distance: float) -> Any:
         """Change of the unknowns per fraction of a change of the problem, at a solved state; one linear solve.
@@ -270,27 +377,29 @@ class GuardedNewton:
         equilibrium.assemble_internal(residual)
         equilibrium.assemble_external(self._external)
         # forces at the nodes, reactions included: what the residual must be small against
-        self._force_scale = max(residual.norm(), self._external.norm())
+        self.convergence.force_scale = max(residual.norm(), self._external.norm())
         residual.axpy(1.0, self._external)
-        self._gap = equilibrium.prescribed_gap(x) / loading.domain.size
-        if self._gap > MET:
+        self.convergence.prescribed_gap = equilibrium.prescribed_gap(x) / loading.domain.size
+        if self.convergence.prescribed_gap > PRESCRIBED_ROUNDING:
             # lifting assembles tangents of the constrained elements; it adds exactly zero once x meets the conditions
             equilibrium.assemble_lifting(self._external, x)
             residual.axpy(1.0, self._external)
         dolfinx.fem.petsc.set_bc(residual, loading.boundary_conditions, x, -1.0)
-        if self._spared:
-            self._lost = over_ranks(equilibrium.comm, equilibrium.stop_signal(), MPI.MAX) > 0
+        present = self._present
+        if present.bounded:
+            present.inadmissible = over_ranks(equilibrium.comm, equilibrium.stop_signal(), MPI.MAX) > 0
         else:
             extension = self.limits.look().extension
-            self._lost = not extension.admissible or extension.stop_signal > 0
-            self._extension = extension.max_chain_extension
-        if self._lost:
+            present.inadmissible = not extension.admissible or extension.stop_signal > 0
+            if not present.inadmissible:
+                self.convergence.extended(extension.max_chain_extension)
+        if present.inadmissible:
             residual.set(np.nan)
             return
-        self._rounds_at, self._displacement = self._extension, x.norm(PETSc.NormType.NORM_INFINITY)
+        self.convergence.displacement = x.norm(PETSc.NormType.NORM_INFINITY)
 
     def _assemble_tangent(self, snes: Any, x: Any, matrix: Any, preconditioner: Any) -> None:
-        self._linear.tangent(self._last_norm, self._tolerance())
+        self._linear.tangent(self._present.norm, self.convergence.tolerance())
 
     def _keep_admissible(self, x: Any, step: Any) -> bool:
         """Halve the Newton step until r < L and J > 0 everywhere (trial: x - step). True when it changed the step.
@@ -299,11 +408,13 @@ class GuardedNewton:
         Near L each point also keeps a share of its 1 - r/L: from a point much too near, where forces are huge, Newton's
         method comes back only by a factor of 1.5 an iteration.
         """
-        improved = self._linear.improve(x, self._snes.getFunction()[0], step, self._gap <= MET)
-        if self._first is None:
-            self._first = float(step.norm())
-        self._spared = self.limits.bounded and self.limits.spare(np.sqrt(3) * step.norm(PETSc.NormType.NORM_INFINITY))
-        if self._spared:
+        met, present = self.convergence.prescribed_gap <= PRESCRIBED_ROUNDING, self._present
+        improved = self._linear.improve(x, self._snes.getFunction()[0], step, met)
+        if present.first_step is None:
+            present.first_step = float(step.norm())
+        length = np.sqrt(3) * step.norm(PETSc.NormType.NORM_INFINITY)
+        present.bounded = self.limits.bounded and self.limits.certainly_allow(length)
+        if present.bounded:
             return improved
         self._push(x)
         before, trial = self.limits.look(), self._trial
@@ -311,7 +422,7 @@ class GuardedNewton:
             trial.waxpy(-1.0, step, x)
             self._push(trial)
             after = self.limits.look()
-            if after.extension.stop_signal or self._may_go(before, after):
+            if after.extension.stop_signal or self.limits.allow(before, after) or self.gives_up(after):
                 break
             step.scale(0.5)
         else:
@@ -320,53 +431,14 @@ class GuardedNewton:
             log.debug("Newton step shortened to 1/%d to keep r < L and J > 0", 2**halving)
         return improved or halving > 0
 
-    def _may_go(self, before: Look, after: Look) -> bool:
-        """Whether a Newton step ends at an admissible state, with some reserve, and turns nothing inside out."""
-        if not after.extension.admissible:
-            return False
-        near = after.extension.max_chain_extension > NEAR_LOCKING
-        if near and not self.equilibrium.keeps_reserve(before.stretches, after.stretches, KEPT_RESERVE, NEAR_LOCKING):
-            return False
-        return not self.equilibrium.turns_inside_out(before.states, after.states)
-
     def _converged(self, snes: Any, iteration: int, norms: tuple[float, float, float]) -> int:
-        """|R| <= absolute_tolerance + relative_tolerance * |nodal forces|: a scale that does not vanish in a hold."""
+        """SNES asks after every iteration: `Convergence`, or no more iterations."""
         norm = norms[2]
         if not np.isfinite(norm):
             return PETSc.SNES.ConvergedReason.DIVERGED_FNORM_NAN
-        last, self._last_norm = self._last_norm if iteration else np.inf, norm
-        if self._gap <= PRESCRIBED_MET and self._is_small(norm, last):
+        previous, self._present.norm = self._present.norm if iteration else np.inf, norm
+        if self.convergence.reached(norm, previous):
             return PETSc.SNES.ConvergedReason.CONVERGED_FNORM_ABS
         if iteration >= snes.getTolerances()[3] or self._linear.given_up:
             return PETSc.SNES.ConvergedReason.DIVERGED_MAX_IT
         return PETSc.SNES.ConvergedReason.ITERATING
-
-    def _is_small(self, norm: float, last: float) -> bool:
-        """Whether a residual may be accepted; `last`: that of the iteration before.
-
-        Near L the rounding of the worst point may be far above that of all others, and the largest displacement is not
-        that of all elements. What is below such a rounding counts as solved only when it goes no further down.
-        """
-        if self.on_the_way and norm <= ON_THE_WAY * self._force_scale:
-            return True
-        if norm > self._tolerance():
-            return False
-        relative = self.settings.absolute_tolerance + self.settings.relative_tolerance * self._force_scale
-        coarse = self._extension > NEARLY_LOCKED and self._tolerance() > COARSE * self._force_scale
-        certain = relative if coarse else self._tolerance(rounded_strains=0.0)
-        return norm <= certain or norm > GOES_DOWN * last
-
-    def _tolerance(self, rounded_strains: float = ROUNDED_STRAINS) -> float:
-        """Relative to the forces at the nodes, not below the rounding of forces that add up to nothing there.
-
-        Stresses are rounded, and so are displacements: over a thin element that is a strain of eps |u|/h.
-        """
-        relative = self.settings.relative_tolerance * self._force_scale
-        area = ROUNDINGS * self._area + rounded_strains * self._displacement * self._area_of_gradients
-        return self.settings.absolute_tolerance + max(relative, self._stress_rounding() * area)
-
-    def _stress_rounding(self) -> float:
-        """At the last admissible state."""
-        if self._rounding[0] != self._rounds_at:
-            self._rounding = self._rounds_at, stress_rounding(self._largest, self._rounds_at)
-        return self._rounding[1]

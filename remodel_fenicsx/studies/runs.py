@@ -27,7 +27,7 @@ from remodel_fenicsx.results.recording import (
     read_history,
     steps_recorded,
 )
-from remodel_fenicsx.results.run_lock import lock_holder
+from remodel_fenicsx.results.run_lock import writer
 from remodel_fenicsx.scene.scene import Scene, SceneError
 from remodel_fenicsx.schema.times import same_time
 from remodel_fenicsx.system.children import Worker, wait_for_one
@@ -87,7 +87,7 @@ class Run:
 
     def is_under_way(self) -> bool:
         """Whether a process writes in its folder."""
-        return self.folder.is_dir() and lock_holder(self.folder)[1]
+        return self.folder.is_dir() and writer(self.folder)[1]
 
     def is_complete(self) -> bool:
         """Whether this very scene is recorded to its end.

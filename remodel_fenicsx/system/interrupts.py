@@ -72,13 +72,11 @@ class Paused(Exception):  # noqa: N818 - no error: somebody asked for it
 def take_back_signals() -> None:
     """Load MPI and PETSc, where nobody has yet, so that signals stay what Python has set.
 
-    A closed pipe is then a BrokenPipeError, and an ignored signal is ignored. PETSc reads no `.petscrc` of the
-    working folder. While the libraries are loaded signals
-    wait: PETSc's handlers would abort the process, and UCX, below MPI, has one for SIGHUP that swallows it.
+    A closed pipe is then a BrokenPipeError, and an ignored signal is ignored. PETSc reads no `.petscrc` of the working
+    folder. While the libraries are loaded signals wait: PETSc's handlers would abort the process, and UCX, below MPI,
+    has one for SIGHUP that swallows it.
     """
-    asked = {*SIGNALS, PAUSE}
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, asked)  # the libraries' threads inherit it, and never take one
-    try:
+    with blocked(*SIGNALS, PAUSE):  # the libraries' threads inherit it, and never take one
         import mpi4py.MPI  # noqa: F401
         import petsc4py
 
@@ -90,6 +88,14 @@ def take_back_signals() -> None:
             handler = signal.getsignal(number)  # what Python remembers: it does not see what libraries put below
             if handler is not None:
                 signal.signal(number, handler)
+
+
+@contextmanager
+def blocked(*numbers: int) -> Iterator[None]:
+    """Within, these signals wait, also for programs that are started."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
+    try:
+        yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
@@ -184,31 +190,25 @@ class StopRequest:
         self._previous: dict[int, object] = {}
 
     def __enter__(self) -> StopRequest:
-        for number in SIGNALS if _is_main_thread() else ():
+        for number in (*SIGNALS, PAUSE) if _is_main_thread() else ():
             if signal.getsignal(number) != signal.SIG_IGN:
                 self._previous[number] = signal.signal(number, self._remember)
-        if _is_main_thread() and signal.getsignal(PAUSE) != signal.SIG_IGN:
-            self._previous[PAUSE] = signal.signal(PAUSE, self._remember_pause)
         self.pause = any(request.pause for request in _requests)
         _requests.append(self)
         return self
 
     def _remember(self, number: int, frame: FrameType | None) -> None:
-        if number == self.number:  # during the sleep below
-            return
-        self.number = number
-        clock.sleep(_ONE_SIGNAL)
-        signal.signal(number, signal.SIG_DFL)
-        if self.raises:
-            _end_children(number)
-            raise Interrupted(number, on_all_ranks=False)
+        if number == PAUSE:
+            self.pause = True
+        elif number != self.number:  # not during the sleep below
+            self.number = number
+            clock.sleep(_ONE_SIGNAL)
+            signal.signal(number, signal.SIG_DFL)
+            if self.raises:
+                _end_descendants(os.getpid(), number)
+                raise Interrupted(number, on_all_ranks=False)
 
-    def _remember_pause(self, number: int, frame: FrameType | None) -> None:
-        self.pause = True
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         _requests.remove(self)
         for number, handler in self._previous.items():
             signal.signal(number, handler)  # type: ignore[arg-type]
@@ -247,31 +247,15 @@ def stopping_at_once() -> Iterator[None]:
         request.raises = before
 
 
-@contextmanager
-def pause_held_back() -> Iterator[None]:
-    """Within, SIGUSR1 waits, also for programs that are started: one sent to the whole group would kill a compiler."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {PAUSE})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
 def _check(request: StopRequest) -> None:
     if request.number:
         raise Interrupted(request.number, on_all_ranks=False)
 
 
-def _end_children(number: int) -> None:
+def _end_descendants(process: int, number: int) -> None:
     """A signal for this process alone would leave gcc's own children working for nobody (Linux; elsewhere it does)."""
-    for process in _descendants(os.getpid()):
-        with suppress(ProcessLookupError):
-            os.kill(process, number)
-
-
-def _descendants(process: int) -> list[int]:
-    try:
-        children = [int(word) for word in Path(f"/proc/{process}/task/{process}/children").read_text().split()]
-    except OSError:  # it has ended, or this is no Linux
-        return []
-    return [one for child in children for one in (child, *_descendants(child))]
+    with suppress(OSError):  # it has ended, or this is no Linux
+        for child in map(int, Path(f"/proc/{process}/task/{process}/children").read_text().split()):
+            _end_descendants(child, number)
+            with suppress(ProcessLookupError):
+                os.kill(child, number)

@@ -98,25 +98,6 @@ def check_no_link(path: Path) -> None:
         raise ForeignFileError(errno.ELOOP, LINK, str(path))
 
 
-def check_still_there(descriptor: int, path: Path, lost: str) -> None:
-    """Raise where an open file has been deleted: what is written to it is gone.
-
-    Parameters
-    ----------
-    descriptor, path
-        Of the open file, and the name under which it was opened.
-    lost
-        What is lost with it, in words.
-
-    Raises
-    ------
-    FileNotFoundError
-        If the file has no name any more.
-    """
-    if os.fstat(descriptor).st_nlink == 0:
-        raise FileNotFoundError(errno.ENOENT, f"the file was deleted during the run; lost: {lost}", str(path))
-
-
 def part_of(path: Path) -> Path:
     """Where a file is written before it gets its name."""
     return path.with_name(f"{path.name}.part")
@@ -135,10 +116,9 @@ def write_whole(path: Path, data: bytes) -> None:
     part = part_of(path)
     part.unlink(missing_ok=True)  # of a run that was killed
     try:
-        with open(open_own(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL), "wb", buffering=0) as file:
-            view = memoryview(data)
-            while view:
-                view = view[file.write(view) :]
+        with open(open_own(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL), "wb") as file:
+            file.write(data)
+            file.flush()
             os.fsync(file.fileno())
         part.replace(path)
     except OSError:

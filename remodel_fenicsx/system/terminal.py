@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 import shutil
 import sys
@@ -11,7 +12,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from io import TextIOWrapper
 from pathlib import Path
-from types import TracebackType
 from typing import Any, cast
 
 from remodel_fenicsx.system.regular_files import open_own
@@ -46,11 +46,9 @@ class Progress:
 
     def __init__(self, total_steps: int, title: str, comm_rank: int = 0, *, interval: float = 60.0, done: int = 0):
         self._total, self._title, self._done = total_steps, title, done
-        self._interval = interval
-        self._start = self._last_line = clock.monotonic()
-        self._started = False
+        self._silent, self._interval = comm_rank != 0, interval
+        self._start, self._line_is_due = clock.monotonic(), -math.inf
         self._pending: str | None = None  # the newest line that was not printed
-        self._silent = comm_rank != 0
         self._bar: Any = None  # `bar.Bar`, on a terminal
 
     def __enter__(self) -> Progress:
@@ -59,16 +57,15 @@ class Progress:
             from remodel_fenicsx.system.bar import Bar  # late: most runs have no terminal
 
             self._bar = Bar(self._title, self._total, self._done)
+            self._bar.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         if self._bar is not None:
             with suppress(OSError):  # the terminal is gone
                 self._bar.stop()
         elif self._pending is not None:
-            self._print(self._pending)
+            announce(self._pending)
         self._bar, self._pending = None, None
 
     def step(
@@ -89,18 +86,17 @@ class Progress:
         """
         if self._silent:
             return
-        state: dict[str, Any] = {"time": f"t = {time:g}", "loads": load_text, "newton": f"{newton_iterations} Newton"}
-        left = self._time_left(index)
         if message is not None:
             self.message(message)
-        if self._bar is not None:
-            self._bar.update(index, left=left, **state)
+        at, newton, left = f"t = {time:g}", f"{newton_iterations} Newton", self._time_left(index)
+        if self._bar is not None:  # what stands last is lost first where the terminal is narrow
+            self._bar.show(index, _joined(at, newton, load_text), left)
             return
-        self._pending = f"{self._title}: " + _joined(f"step {index}/{self._total}", *state.values(), left)
+        self._pending = f"{self._title}: " + _joined(f"step {index}/{self._total}", at, load_text, newton, left)
         now = clock.monotonic()
-        if not self._started or index >= self._total or now - self._last_line >= self._interval:
-            self._print(self._pending)
-            self._started, self._last_line, self._pending = True, now, None
+        if index >= self._total or now >= self._line_is_due:
+            announce(self._pending)
+            self._line_is_due, self._pending = now + self._interval, None
 
     def message(self, text: str) -> None:
         """Print a line above the bar, or between the plain lines."""
@@ -108,7 +104,7 @@ class Progress:
             with suppress(OSError):
                 self._bar.say(text)
         elif not self._silent:
-            self._print(f"{self._title}: {text}")
+            announce(f"{self._title}: {text}")
 
     def _time_left(self, index: int) -> str:
         """The mean of this run's steps so far, times the steps that are left; steps alike take alike long."""
@@ -117,12 +113,13 @@ class Progress:
             return ""
         return f"{duration((clock.monotonic() - self._start) / (index - self._done) * remaining)} left"
 
-    def _print(self, line: str) -> None:
-        announce(line)
-
 
 def _joined(*parts: str) -> str:
     return ", ".join(filter(None, parts))
+
+
+def _is_terminal() -> bool:
+    return sys.stderr is not None and sys.stderr.isatty() and os.environ.get("TERM", "dumb") not in ("dumb", "unknown")
 
 
 def announce(line: str, end: str = "\n") -> None:
@@ -136,7 +133,7 @@ class Line:
 
     def __init__(self, title: str) -> None:
         self._title = title
-        self._last, self._terminal, self._width = -1e9, sys.stderr.isatty(), 0
+        self._due, self._terminal, self._width = -math.inf, sys.stderr.isatty(), 0
 
     def show(self, text: str, at_once: bool = False) -> None:
         """Show a line; where lines stay, only now and then unless it is wanted at once."""
@@ -145,9 +142,9 @@ class Line:
             text = text[: max(20, shutil.get_terminal_size().columns - 1)]
             announce(f"\r{text:{self._width}}", end="")
             self._width = len(text)
-        elif at_once or clock.monotonic() - self._last >= LINE_EVERY:
+        elif at_once or clock.monotonic() >= self._due:
             announce(text)
-            self._last = clock.monotonic()
+            self._due = clock.monotonic() + LINE_EVERY
 
     def end(self) -> None:
         """Leave the last line as it is."""
@@ -158,10 +155,10 @@ class Line:
 
 @contextmanager
 def hold_log(comm_rank: int = 0, *, quiet: bool = True) -> Iterator[list[logging.LogRecord]]:
-    """Keep what the package logs for `open_log`, until there is a folder for it; the terminal gets its part at once."""
-    held = _Held()
-    with _logged_to([held, _screen(quiet)], comm_rank):
-        yield held.records
+    """Collect what the package logs until there is a folder for it (`open_log`); the terminal gets its part at once."""
+    early = _Early()
+    with _logged_to([early, _Screen(quiet)], comm_rank):
+        yield early.records
 
 
 @contextmanager
@@ -196,8 +193,8 @@ def open_log(
     handlers: list[logging.Handler] = []
     if comm_rank == 0:
         file = _LogFile(path, encoding="utf-8")
-        file.setFormatter(_OneBlock(LOG_FORMAT))
-        handlers = [file, _screen(quiet)]
+        file.setFormatter(logging.Formatter(LOG_FORMAT))
+        handlers = [file, _Screen(quiet)]
         for record in held:
             file.handle(record)
     with _logged_to(handlers, comm_rank) as logger:
@@ -229,26 +226,6 @@ def _logged_to(handlers: list[logging.Handler], comm_rank: int) -> Iterator[logg
             handler.close()  # last: a full disk makes this an error
 
 
-def _screen(quiet: bool) -> logging.Handler:
-    screen = _Screen(logging.WARNING if quiet else NOTICE)
-    screen.setFormatter(_ForPeople("%(levelname)s: %(message)s"))
-    return screen
-
-
-class _OneBlock(logging.Formatter):
-    """No empty line after Python's warnings, which end in a newline."""
-
-    def format(self, record: logging.LogRecord) -> str:
-        return super().format(record).rstrip()
-
-
-class _ForPeople(_OneBlock):
-    """Notices are sentences; only what is wrong says how wrong."""
-
-    def format(self, record: logging.LogRecord) -> str:
-        return record.getMessage() if record.levelno == NOTICE else super().format(record)
-
-
 class _LogFile(logging.FileHandler):
     """A log whose write errors are errors, and which follows no link."""
 
@@ -256,12 +233,15 @@ class _LogFile(logging.FileHandler):
         descriptor = open_own(Path(self.baseFilename), os.O_WRONLY | os.O_CREAT | os.O_APPEND)
         return cast(TextIOWrapper, open(descriptor, "a", encoding=self.encoding))
 
+    def format(self, record: logging.LogRecord) -> str:
+        return super().format(record).rstrip()  # Python's warnings end in a newline
+
     def handleError(self, record: logging.LogRecord) -> None:
         # called inside logging's own `except`: logging would print a traceback for every line and go on
         raise
 
 
-class _Held(logging.Handler):
+class _Early(logging.Handler):
     def __init__(self) -> None:
         super().__init__()
         self.records: list[logging.LogRecord] = []
@@ -271,14 +251,17 @@ class _Held(logging.Handler):
 
 
 class _Screen(logging.Handler):
-    """Lines on what is stderr at that moment: under a bar rich has put a stream there that prints above it."""
+    """Lines on what is stderr at that moment: under a bar rich has put a stream there that prints above it.
+
+    Notices are sentences; only what is wrong says how wrong.
+    """
+
+    def __init__(self, quiet: bool):
+        super().__init__(logging.WARNING if quiet else NOTICE)
 
     def emit(self, record: logging.LogRecord) -> None:
-        announce(self.format(record))
-
-
-def _is_terminal() -> bool:
-    return sys.stderr is not None and sys.stderr.isatty() and os.environ.get("TERM", "dumb") not in ("dumb", "unknown")
+        level = "" if record.levelno == NOTICE else f"{record.levelname}: "
+        announce(level + self.format(record).rstrip())
 
 
 def duration(seconds: float) -> str:

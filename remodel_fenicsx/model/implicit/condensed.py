@@ -24,7 +24,7 @@ from remodel_fenicsx.model.drivers import DRIVERS, FRAMES, Driver, Frame
 from remodel_fenicsx.model.energy import Matrix, Tissue
 from remodel_fenicsx.model.implicit import network, tangents
 from remodel_fenicsx.model.implicit.network import Cells, OrthotropicCells, Strain, Stress, StructureCells
-from remodel_fenicsx.model.implicit.responses import Response, StepOfCells, response
+from remodel_fenicsx.model.implicit.responses import Response, StepOfCells, jumps_by_rank, response
 from remodel_fenicsx.model.laws import LAWS, Law
 from remodel_fenicsx.model.energy import REPULSIONS, Repulsion
 
@@ -33,6 +33,8 @@ Flags = NDArray[np.bool_]
 
 ITERATIONS = 25  # of the local Newton method
 PARTS = 8  # of a step where the method does not find its end at once, each twice as long as what is before it
+PATIENCE = 3  # of them in a row that do not leave PROGRESS times the residual: without a solution they go in a circle
+PROGRESS = 0.9
 HALVINGS = 12  # of one of its steps, where it would lead to r >= L
 TOLERANCE = 1e-12  # of D: where the local Newton method stops
 IDENTITY = np.eye(6)
@@ -117,6 +119,8 @@ class Solution:
         Cells and S there.
     converged
         Whether they do, (n,); where not, they belong to the last D.
+    missing
+        |D(F, cells) - D|, (n,).
     """
 
     strain: Strain
@@ -124,6 +128,7 @@ class Solution:
     response: Response
     stress: Stress
     converged: Flags
+    missing: Array
 
     @property
     def first_piola_kirchhoff(self) -> Array:
@@ -201,7 +206,14 @@ class CondensedPoints:
             place = np.tile(np.arange(3), (len(F), 1))
         stress = self.stress(strain, inside)
         tensor = self._tensor(strain, stress, False)[0]
-        return Solution(strain, tensor.copy(), Response(inside, place=place), stress, np.ones(len(F), dtype=bool))
+        return Solution(
+            strain, tensor.copy(), Response(inside, place=place), stress, np.ones(len(F), dtype=bool), np.zeros(len(F))
+        )
+
+    def passed(self, F: Array, found: Solution) -> Solution:
+        """Points with the cells that a pass with their driving tensor makes."""
+        strain = Strain.of(F)
+        return self._at_tensor(strain, strain.inside(found.driving_tensor))
 
     # ------------------------------------------------------------ X of D
     def _place(self, strain: Strain, tensor: Array) -> Array:
@@ -240,13 +252,20 @@ class CondensedPoints:
 
     def _iterate(self, found: Solution) -> None:
         """Newton's method where there is no solution yet."""
-        open_points = np.flatnonzero(~found.converged)
+        open_points: NDArray[Any] = np.flatnonzero(~found.converged)
+        jumps = jumps_by_rank(self.step)[open_points]
+        most: NDArray[Any] = np.where(jumps, PATIENCE, ITERATIONS)  # the others have a solution
+        least: Array = np.full(open_points.size, np.inf)
+        patience: NDArray[Any] = most
         for _ in range(ITERATIONS):
             if not open_points.size:
                 break
             improved = self.at(open_points)._iterated(_taken(found, open_points))
             put(found, open_points, improved)
-            open_points = open_points[~improved.converged]
+            patience = np.where(improved.missing < PROGRESS * least, most, patience - 1)
+            least, goes_on = np.fmin(least, improved.missing), ~improved.converged & (patience > 0)
+            open_points, least = open_points[goes_on], least[goes_on]
+            patience, most = patience[goes_on], most[goes_on]
 
     def _followed(self, F: Array, strain: Strain) -> Solution:
         """The solution that the cells at the start come to when the time of the step passes in parts."""
@@ -266,10 +285,9 @@ class CondensedPoints:
             tensor[:, range(3), range(3)] = strain.squared
         answer = response(self.step, strain, self._place(strain, tensor), derivatives=False)
         stress = self.stress(strain, answer.cells)
-        missing = self._tensor(strain, stress, False)[0] - tensor
-        size = np.linalg.norm(tensor, axis=(1, 2))
-        converged = np.linalg.norm(missing, axis=(1, 2)) <= TOLERANCE * size + self.step.rounding
-        return Solution(strain, tensor, answer, stress, converged & (stress.extension < 1.0))
+        missing = np.linalg.norm(self._tensor(strain, stress, False)[0] - tensor, axis=(1, 2))
+        converged = missing <= TOLERANCE * np.linalg.norm(tensor, axis=(1, 2)) + self.step.rounding
+        return Solution(strain, tensor, answer, stress, converged & (stress.extension < 1.0), missing)
 
     def _iterated(self, found: Solution) -> Solution:
         """One step of Newton's method, not longer than D, halved where it leads to r >= L."""
@@ -361,7 +379,11 @@ def _some_cells(cells: Cells, chosen: Any) -> Cells:
 def _taken(found: Solution, chosen: Any) -> Solution:
     """A solution of some of the points: what a step of Newton's method needs."""
     return replace(
-        found, strain=found.strain.at(chosen), tensor=found.tensor[chosen], converged=found.converged[chosen]
+        found,
+        strain=found.strain.at(chosen),
+        tensor=found.tensor[chosen],
+        converged=found.converged[chosen],
+        missing=found.missing[chosen],
     )
 
 
@@ -369,6 +391,7 @@ def put(found: Solution, chosen: Any, better: Solution) -> None:
     """Put some of the points into a solution."""
     found.tensor[chosen] = better.tensor
     found.converged[chosen] = better.converged
+    found.missing[chosen] = better.missing
     found.stress.value[chosen] = better.stress.value
     found.stress.extension[chosen] = better.stress.extension
     mine, others = found.response.cells, better.response.cells

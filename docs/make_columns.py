@@ -1,15 +1,15 @@
-"""The table of columns in docs/commands.md, made from the code: ``python3 -m remodel_fenicsx.results.reference``."""
+#!/usr/bin/env python3
+"""Prints the table of columns in docs/commands.md: ``./with-fenicsx python3 docs/make_columns.py``."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
 from remodel_fenicsx.body import SHAPES
-from remodel_fenicsx.body.columns import Column
-from remodel_fenicsx.body.columns import COLUMNS_ON_REQUEST, columns_of
+from remodel_fenicsx.body.columns import COLUMNS_ON_REQUEST, Column, columns_of
 
 
-def column_reference() -> str:
+def table() -> str:
     """A Markdown table: the name of every column, the shapes that have it, unit and meaning."""
     return "| column | of | unit | meaning |\n|---|---|---|---|\n" + "\n".join(_rows()) + "\n"
 
@@ -36,4 +36,4 @@ def _key(column: Column) -> tuple[str, str, str]:
 
 
 if __name__ == "__main__":
-    print(column_reference(), end="")
+    print(table(), end="")
