@@ -45,8 +45,8 @@ COMPILED = "REMODEL_FENICSX_COMPILED"  # names a file that gets a line for each 
 # headers, declares their SIMD logarithm (at most 4 ulp off): the loops over the points of an element become vectors.
 # -g0: Python's own flags have -g, and their table takes up to half of the compiler's time; the same machine code
 COMPILER_FLAGS = [
-    "-O3", "-D__FAST_MATH__", "-g0", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros", "-freciprocal-math",
-    "-fassociative-math", "-w",
+    "-O3", "-D__FAST_MATH__", "-g0", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros",
+    "-freciprocal-math", "-fassociative-math", "-w",
 ]  # fmt: skip
 
 # of our own C functions: no sum is taken in another order than it is written in
