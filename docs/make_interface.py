@@ -3,7 +3,7 @@
 
     ./with-fenicsx python3 docs/make_interface.py
 
-tests/test_interface.py compares the page with the code: a change of the interface is a change of this page.
+tests/house/test_interface.py compares the page with the code: a change of the interface is a change of this page.
 """
 
 from __future__ import annotations

@@ -34,7 +34,7 @@ USED_BY_STUDIES = (
     "docs/verification_studies.py",
     "tests/radial_comparison.py",
     "tests/reference/radial.py",
-    "tests/test_invariance.py",
+    "tests/model/test_invariance.py",
     "tests/parts.py",
 )
 
@@ -99,9 +99,9 @@ def comparison_jobs() -> dict[str, list[tuple[Callable[[Any], Row], Any]]]:
 
 
 def invariance(case: tuple[str, str, str]) -> Row:
-    """The bar of tests/test_invariance.py twice, once turned: what differs, measured by r0, the side and the energy."""
+    """The bar of tests/model/test_invariance.py twice, once turned: what differs, measured by r0, the side and the energy."""
     from remodel_fenicsx.model.cells import angle_to_axis
-    from tests import test_invariance as bars
+    from tests.model import test_invariance as bars
 
     driver, frame, turned = case
     if turned == "deformed body":

@@ -1,4 +1,4 @@
-"""Runs on this process group that tests/test_resume.py looks at: mpirun -n 2 python3 on_two_ranks.py FOLDER.
+"""Runs on this process group that tests/results/test_resume.py looks at: mpirun -n 2 python3 on_two_ranks.py FOLDER.
 
 FOLDER holds `half`, a run on one rank. Made are: `whole`, `resumed` (the same, stopped and gone on), what `half`
 becomes on these ranks, `one element` (so that a rank has none), `codes.json` (exit codes of commands), and `lost`:
@@ -19,7 +19,7 @@ from mpi4py import MPI
 from remodel_fenicsx import cli
 from remodel_fenicsx.evolution.coupling import Staggered
 from remodel_fenicsx.running import resume, run
-from tests.test_resume import LOST_AT, scene
+from tests.results.test_resume import LOST_AT, scene
 
 
 def main(folder: Path) -> None:

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-
 from mpi4py import MPI
 
 from remodel_fenicsx.body import SHAPES, Cube, Tendon, Tube

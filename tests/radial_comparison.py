@@ -17,8 +17,8 @@ from petsc4py import PETSc
 from remodel_fenicsx.results.columns import Measurement
 from remodel_fenicsx.scene.scene import Scene, scene_from_dict
 from remodel_fenicsx.simulation import Simulation
-from tests.reference.radial import RadialHistory, solve_radial
 from tests.parts import tube
+from tests.reference.radial import RadialHistory, solve_radial
 
 LENGTH = 0.5
 Divisions = tuple[int, int, int]
@@ -46,7 +46,7 @@ class Setting:
 
 
 LOAD_CASES = tuple(Setting(*loads) for loads in ((0.1, 0.0), (0.1, 2.4), (0.1, 4.8), (0.05, 4.8), (0.0, 4.8)))  # Fig. 9
-# Which supports, elements and times, and why: tests/test_radial_comparison.py
+# Which supports, elements and times, and why: tests/body/test_radial_comparison.py
 PK2 = Setting(driver="pk2", planes=True, divisions=(8, 8, 1))
 FINGER = Setting(driver="finger", planes=True, divisions=(48, 16, 1), degree=1)
 PK2_FREE = Setting(driver="pk2", divisions=(8, 8, 1), end=60.0)

@@ -136,7 +136,10 @@ class LauncherTests:
 def launcher_key() -> str:
     """Hash of what these tests look at."""
     files = ["with-fenicsx", "Dockerfile", "bin/remodel-fenicsx", ".ci/run", "tests/run", "tests/container/run"]
-    files += [f"tests/{LAUNCHER_TEST}", *(f"environment/{path.name}" for path in (PROJECT / "environment").iterdir())]
+    files += [
+        f"tests/launcher/{LAUNCHER_TEST}",
+        *(f"environment/{path.name}" for path in (PROJECT / "environment").iterdir()),
+    ]
     key = hashlib.sha256(f"{platform.platform()} {os.getuid()} {os.environ.get('REMODEL_FENICSX_ROOT')}".encode())
     for name in sorted(files):
         path = PROJECT / name
@@ -176,11 +179,12 @@ def pytest_collection(session: pytest.Session) -> None:
     worker = getattr(session.config, "workerinput", None)
     if worker is None or session.config.args_source is not pytest.Config.ArgsSource.TESTPATHS:
         return
-    files = sorted(Path(__file__).parent.glob("test_*.py"))
+    tests = Path(__file__).parent
+    files = sorted(tests.rglob("test_*.py"))
     first = int(worker["workerid"].removeprefix("gw")) * len(files) // worker["workercount"]
     for path in files[first:] + files[:first]:
         with contextlib.suppress(Exception):  # collecting it says what is wrong
-            importlib.import_module(f"tests.{path.stem}")
+            importlib.import_module(".".join(("tests", *path.relative_to(tests).with_suffix("").parts)))
 
 
 # ---------------------------------------------------------------- the session

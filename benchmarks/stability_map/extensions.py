@@ -1,4 +1,4 @@
-"""Bodies and loads that scenes do not have, as a script of a user's adds them (tests/test_extensions.py)."""
+"""Bodies and loads that scenes do not have, as a script of a user's adds them (tests/body/test_extensions.py)."""
 
 from __future__ import annotations
 

@@ -1,0 +1,434 @@
+"""Meshes of the three shapes: counts, sizes, named faces, nodes for the supports, the files, two ranks."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import basix
+import dolfinx
+import numpy as np
+import pytest
+import ufl
+from mpi4py import MPI
+from scipy.spatial import cKDTree
+
+from remodel_fenicsx.body import SHAPES, Cube, Tendon, Tube
+from remodel_fenicsx.body.domain import interval_domain
+from tests import parallel_geometry
+from tests.parts import cube, tendon, tube
+
+ROOT = Path(__file__).resolve().parents[2]
+TUBE = {"inner_radius": 1.0, "outer_radius": 2.0, "length": 3.0}
+BUILDERS = {"cube": cube, "tendon": tendon, "tube": tube}
+SIDES = {"cube": 1.0, "tendon": 10.0, "tube": 8.0}  # height of each shape
+KINDS = [(element, degree) for element in ("hexahedron", "tetrahedron") for degree in (1, 2)]
+_built = {}
+
+
+def domain_of(shape, element="hexahedron", degree=1, refinement=1):
+    key = shape, element, degree, refinement
+    if key not in _built:
+        _built[key] = BUILDERS[shape](element=element, degree=degree, refinement=refinement, comm=MPI.COMM_SELF)
+    return _built[key]
+
+
+def jacobians(domain):
+    """Weights of a quadrature rule and det J there and at the corners, (cells, points)."""
+    element = domain.mesh.ufl_domain().ufl_coordinate_element().basix_element
+    points, weights = basix.make_quadrature(element.cell_type, 8 if element.degree == 2 else 4)
+    corners = basix.geometry(element.cell_type)
+    nodes, cells = domain.gather_mesh()
+
+    def determinants(at):
+        gradients = element.tabulate(1, at)[1:, :, :, 0]
+        return np.linalg.det(np.einsum("dpk,nki->npid", gradients, nodes[cells]))
+
+    return weights, determinants(points), determinants(corners)
+
+
+def area(domain, face):
+    mesh = domain.mesh
+    facets = domain.facet_tags.find(domain.faces[face])
+    one = dolfinx.mesh.meshtags(mesh, 2, facets, np.ones(len(facets), dtype=np.int32))
+    measure = ufl.Measure("ds", domain=mesh, subdomain_data=one, metadata={"quadrature_degree": 8})
+    return dolfinx.fem.assemble_scalar(dolfinx.fem.form(dolfinx.fem.Constant(mesh, 1.0) * measure(1)))
+
+
+def has_node(points, *wanted):
+    return [bool(np.any(np.linalg.norm(points - point, axis=1) < 1e-14)) for point in wanted]
+
+
+# ---------------------------------------------------------------- counts
+@pytest.mark.parametrize(
+    ("shape", "cells", "nodes"),
+    [
+        ("cube", 1, 8),
+        ("tendon", 480, 57 * 11),
+        ("tube", 1536, 16 * 9 * 13),
+    ],
+)
+@pytest.mark.parametrize("refinement", [1, 2])
+def test_hexahedra_are_the_papers_times_the_refinement_in_every_direction(shape, cells, nodes, refinement):
+    domain = domain_of(shape, refinement=refinement)
+    assert domain.number_of_elements == cells * refinement**3
+    tables = {"cube": Cube, "tendon": Tendon, "tube": Tube}
+    assert tables[shape].number_of_elements == cells  # by which a scene refuses a mesh before it is made
+    refined = {"cube": 27, "tendon": (81 + 4 * 32) * 21, "tube": 32 * 17 * 25}
+    assert domain.number_of_nodes == (nodes if refinement == 1 else refined[shape])
+    assert domain.mesh.topology.cell_name() == "hexahedron"
+
+
+@pytest.mark.parametrize("shape", BUILDERS)
+def test_each_hexahedron_makes_six_tetrahedra_on_the_same_nodes(shape):
+    hexahedra, tetrahedra = domain_of(shape), domain_of(shape, "tetrahedron")
+    assert tetrahedra.mesh.topology.cell_name() == "tetrahedron"
+    assert tetrahedra.number_of_elements == 6 * hexahedra.number_of_elements
+    distance, match = cKDTree(hexahedra.gather_mesh()[0]).query(tetrahedra.gather_mesh()[0])
+    assert distance.max() < 1e-13 and len(set(match)) == hexahedra.number_of_nodes
+
+
+@pytest.mark.parametrize("shape", BUILDERS)
+@pytest.mark.parametrize("element", ["hexahedron", "tetrahedron"])
+def test_degree_two_has_the_nodes_of_degree_one_between_new_ones(shape, element):
+    domain = domain_of(shape, element, 2)
+    assert domain.number_of_nodes == domain_of(shape, refinement=2).number_of_nodes
+    assert domain.mesh.ufl_domain().ufl_coordinate_element().basix_element.degree == 2
+    assert domain.gather_mesh()[1].shape[1] == {"hexahedron": 27, "tetrahedron": 10}[element]
+
+
+# ---------------------------------------------------------------- sizes
+@pytest.mark.parametrize("shape", BUILDERS)
+@pytest.mark.parametrize(("element", "degree"), KINDS)
+def test_volumes_and_jacobians(shape, element, degree):
+    domain = domain_of(shape, element, degree)
+    weights, inside, corners = jacobians(domain)
+    # relative to a element's mean: neither turned inside out nor nearly flat anywhere
+    assert np.min(inside / np.mean(inside, axis=1, keepdims=True)) > 0.5
+    assert np.min(corners / np.mean(inside, axis=1, keepdims=True)) > 0.4
+    polygon = 16 / 2 * np.sin(np.pi / 8)
+    exact = {"cube": 1.0, "tendon": 100.0, "tube": (polygon if degree == 1 else np.pi) * (9 - 1) * 8}[shape]
+    tolerance = 1e-4 if (shape, degree) == ("tube", 2) else 1e-12
+    assert np.sum(inside * weights) == pytest.approx(exact, rel=tolerance)
+
+
+@pytest.mark.parametrize(("element", "degree"), KINDS)
+def test_face_areas_of_the_cube(element, degree):
+    domain = domain_of("cube", element, degree)
+    assert set(domain.faces) == {"x0", "x1", "y0", "y1", "z0", "z1"}
+    assert [area(domain, face) for face in domain.faces] == pytest.approx([1.0] * 6, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("element", "degree", "refinement"),
+    [
+        *((element, degree, 1) for element, degree in KINDS),
+        ("hexahedron", 1, 2),
+        ("hexahedron", 2, 2),
+    ],
+)
+def test_the_area_of_the_meshed_tendon_is_the_scenes(element, degree, refinement):
+    domain = domain_of("tendon", element, degree, refinement)
+    assert set(domain.faces) == {"bottom", "top", "side"}
+    assert area(domain, "bottom") == pytest.approx(10.0, rel=1e-12)
+    assert area(domain, "top") == pytest.approx(10.0, rel=1e-12)
+    radius, number = domain.dimensions["radius"], 16 * refinement
+    if degree == 1:
+        assert area(domain, "side") == pytest.approx(number * 2 * radius * np.sin(np.pi / number) * 10.0, rel=1e-12)
+        assert radius > np.sqrt(10.0 / np.pi)
+    else:
+        assert area(domain, "side") == pytest.approx(2 * np.sqrt(np.pi * 10.0) * 10.0, rel=1e-4)
+        assert radius == pytest.approx(np.sqrt(10.0 / np.pi), rel=1e-4)
+
+
+@pytest.mark.parametrize(("element", "degree"), KINDS)
+def test_face_areas_of_the_tube(element, degree):
+    domain = domain_of("tube", element, degree)
+    assert set(domain.faces) == {"bottom", "top", "inner", "outer"}
+    if degree == 1:
+        edge, plane, tolerance = 32 * np.sin(np.pi / 16), 8 * np.sin(np.pi / 8) * 8, 1e-12
+    else:
+        edge, plane, tolerance = 2 * np.pi, np.pi * 8, 1e-4
+    areas = [area(domain, face) for face in ("inner", "outer", "bottom", "top")]
+    assert areas == pytest.approx([8 * edge, 24 * edge, plane, plane], rel=tolerance)
+
+
+@pytest.mark.parametrize("refinement", [1, 2, 3])
+def test_no_hexahedron_of_the_tendon_is_distorted(refinement):
+    points, cells = domain_of("tendon", refinement=refinement).gather_mesh()
+    corner = points[cells][:, [0, 1, 3, 2]]  # bottom quadrilateral in cyclic order: the cells are right prisms
+    after, before = np.roll(corner, -1, axis=1) - corner, np.roll(corner, 1, axis=1) - corner
+    sine = np.cross(after, before)[..., 2] / np.linalg.norm(after, axis=2) / np.linalg.norm(before, axis=2)
+    assert np.abs(sine).min() > 0.8 and np.all(sine > 0) | np.all(sine < 0)
+
+
+# ---------------------------------------------------------------- faces and nodes
+@pytest.mark.parametrize("shape", BUILDERS)
+@pytest.mark.parametrize(("element", "degree"), KINDS)
+def test_the_named_faces_cover_the_boundary_exactly_once(shape, element, degree):
+    domain = domain_of(shape, element, degree)
+    mesh = domain.mesh
+    mesh.topology.create_connectivity(2, 3)
+    named = np.concatenate([domain.facet_tags.find(tag) for tag in domain.faces.values()])
+    assert sorted(named) == sorted(dolfinx.mesh.exterior_facet_indices(mesh.topology))
+
+
+def on_faces(shape, domain):
+    """name -> largest distance of the face's corners from the surface it should lie on."""
+    height, inner, outer = SIDES[shape], 1.0, 3.0
+    where = {
+        "x0": lambda x: x[:, 0],
+        "x1": lambda x: x[:, 0] - 1,
+        "y0": lambda x: x[:, 1],
+        "y1": lambda x: x[:, 1] - 1,
+        "z0": lambda x: x[:, 2],
+        "z1": lambda x: x[:, 2] - 1,
+        "bottom": lambda x: x[:, 2],
+        "top": lambda x: x[:, 2] - height,
+        "inner": lambda x: np.hypot(x[:, 0], x[:, 1]) - inner,
+        "outer": lambda x: np.hypot(x[:, 0], x[:, 1]) - outer,
+        "side": lambda x: np.hypot(x[:, 0], x[:, 1]) - domain.dimensions["radius"],
+    }
+    mesh = domain.mesh
+    mesh.topology.create_connectivity(2, 3)
+    mesh.topology.create_connectivity(2, 0)
+    for name, tag in domain.faces.items():
+        nodes = dolfinx.mesh.entities_to_geometry(mesh, 2, domain.facet_tags.find(tag))
+        yield name, np.abs(where[name](mesh.geometry.x[np.unique(nodes)])).max()
+
+
+@pytest.mark.parametrize("shape", BUILDERS)
+@pytest.mark.parametrize("refinement", [1, 2])
+def test_each_named_face_lies_where_its_name_says(shape, refinement):
+    distances = dict(on_faces(shape, domain_of(shape, refinement=refinement)))
+    assert max(distances.values()) < 1e-14
+
+
+@pytest.mark.parametrize(
+    ("element", "degree", "refinement"),
+    [
+        *((element, degree, 1) for element, degree in KINDS),
+        ("hexahedron", 1, 2),
+        ("hexahedron", 1, 3),
+    ],
+)
+def test_nodes_for_the_supports(element, degree, refinement):
+    body = domain_of("tendon", element, degree, refinement)
+    assert all(has_node(body.gather_mesh()[0], (0, 0, 0), (body.dimensions["radius"], 0, 0)))
+    body = (
+        domain_of("tube", element, degree, refinement)
+        if refinement < 3
+        else tube(refinement=refinement, divisions=(16, 8, 1), comm=MPI.COMM_SELF)
+    )
+    assert all(has_node(body.gather_mesh()[0], (1, 0, 0), (-1, 0, 0), (0, 1, 0)))
+    assert not any(has_node(body.gather_mesh()[0], (0, 0, 0), (1, 1e-3, 0)))
+
+
+@pytest.mark.parametrize(("element", "degree"), KINDS)
+def test_the_tube_is_equally_divided_through_the_wall_around_and_along(element, degree):
+    points, _ = domain_of("tube", element, degree).gather_mesh()
+    steps = (
+        np.column_stack(
+            (
+                (np.hypot(points[:, 0], points[:, 1]) - 1) * 4,
+                np.arctan2(points[:, 1], points[:, 0]) * 8 / np.pi,
+                points[:, 2] * 1.5,
+            )
+        )
+        * degree
+    )
+    if (element, degree) == ("tetrahedron", 2):
+        steps = steps[:, [0, 2]]  # the middle of a diagonal is not quite half-way around
+    assert np.abs(steps - np.round(steps)).max() < 1e-12
+
+
+@pytest.mark.parametrize(("element", "degree", "refinement"), [*((*kind, 1) for kind in KINDS), ("hexahedron", 1, 2)])
+def test_a_tube_with_divisions_of_its_own(element, degree, refinement):
+    body = tube(
+        1.0, 2.0, 0.25, element=element, degree=degree, refinement=refinement, divisions=(12, 3, 1), comm=MPI.COMM_SELF
+    )
+    around, through, along = 12 * refinement, 3 * refinement, refinement
+    assert body.number_of_elements == around * through * along * (6 if element == "tetrahedron" else 1)
+    points = body.gather_mesh()[0]
+    radii = np.hypot(points[:, 0], points[:, 1])
+    corners = np.isclose(radii * through, np.round(radii * through), rtol=0, atol=1e-12)
+    assert len(np.unique(np.round(radii[corners], 9))) == through + 1
+    assert all(has_node(points, (1, 0, 0), (-1, 0, 0), (0, 1, 0)))
+    assert np.array_equal(np.unique(points[:, 2]), np.linspace(0.0, 0.25, along * degree + 1))
+    on_the_inner_circle = (np.abs(radii - 1.0) < 1e-12) & (points[:, 2] == 0.0)
+    assert np.count_nonzero(on_the_inner_circle) == around * degree
+    assert area(body, "inner") == pytest.approx(
+        0.25 * (2 * around * np.sin(np.pi / around) if degree == 1 else 2 * np.pi), rel=1e-3 if degree == 2 else 1e-12
+    )
+
+
+@pytest.mark.parametrize("kind", ["drawn", "points"])
+def test_ufls_side_of_a_mesh_is_ufls_own_but_for_the_number_of_its_cells(kind):
+    """The same forms, so that kernels have the same names; one cell, however often it is asked for."""
+    line, faces = ((1.0, 0.0, 0.0), (2.0, 0.0, 0.0), 3, 2), {"inner": lambda x: np.isclose(x[0], 1.0)}
+    domain = domain_of("tube") if kind == "drawn" else interval_domain(*line, faces, "tube", {}, MPI.COMM_SELF)
+    ours = domain.mesh.ufl_domain()
+    theirs = ufl.Mesh(ours.ufl_coordinate_element())
+    assert ours.ufl_cell() == theirs.ufl_cell() and ours.ufl_cell() is ours.ufl_cell()
+    assert ours.ufl_cargo() is domain.mesh._cpp_object and ours.ufl_id() != theirs.ufl_id()
+    signatures = {(ufl.SpatialCoordinate(mesh)[0] * ufl.dx(mesh)).signature() for mesh in (ours, theirs)}
+    assert len(signatures) == 1
+
+
+def test_the_papers_divisions_are_the_default():
+    points, cells = tube(divisions=(16, 8, 12), comm=MPI.COMM_SELF).gather_mesh()
+    default_points, default_cells = domain_of("tube").gather_mesh()
+    assert np.array_equal(points, default_points) and np.array_equal(cells, default_cells)
+
+
+# ---------------------------------------------------------------- arguments
+def test_dimensions_and_the_scale_of_lengths():
+    assert tendon(length=2.0, area=50.0, comm=MPI.COMM_SELF).size == pytest.approx(4.04, abs=0.01)
+    body = tube(0.5, 0.75, 1.5, comm=MPI.COMM_SELF)
+    assert body.dimensions == {"inner_radius": 0.5, "outer_radius": 0.75, "length": 1.5} and body.size == 1.5
+    points, _ = cube(side=2.0, comm=MPI.COMM_SELF).gather_mesh()
+    assert points.min() == 0.0 and points.max() == 2.0
+
+
+@pytest.mark.parametrize("body", [Cube(side=2.0), Tendon(length=3.0, area=4.0), Tube(**TUBE)], ids=list(SHAPES))
+def test_a_scenes_shape_builds_its_own_mesh(body):
+    mesh = SimpleNamespace(refinement=1, element="tetrahedron", degree=2)
+    domain = body.build(mesh, MPI.COMM_SELF)
+    assert domain.shape == body.name and domain.mesh.topology.cell_name() == "tetrahedron"
+    assert set(body.faces) == set(domain.faces)
+    for name, value in domain.dimensions.items():
+        if name != "radius":
+            assert value == getattr(body, name)
+
+
+@pytest.mark.parametrize("unit", [1e-2, 1e2])
+@pytest.mark.parametrize(
+    ("shape", "lengths"),
+    [
+        ("cube", (1.0,)),
+        ("tendon", (1.0, 1.02e-8)),
+        ("tendon", (1.01e-4, 1.0)),
+        ("tube", (1.01e-4, 1.0, 1.0)),
+        ("tube", (1.0, 1.000101, 1.0)),
+        ("tube", (0.5, 1.0, 1.01e-4)),
+        ("tube", (1.01e-4, 2.02e-4, 1.0)),
+    ],
+)
+def test_bodies_of_extreme_proportions_are_meshed(shape, lengths, unit):
+    """At the limits that are allowed no two nodes become one, in any unit of length."""
+    powers = (1, 2) if shape == "tendon" else (1, 1, 1)
+    scaled = [length * unit**power for length, power in zip(lengths, powers, strict=False)]
+    domain, ordinary = BUILDERS[shape](*scaled, refinement=2, comm=MPI.COMM_SELF), domain_of(shape, refinement=2)
+    assert domain.number_of_elements == ordinary.number_of_elements
+    assert domain.number_of_nodes == ordinary.number_of_nodes
+
+
+def test_gathering_too_few_rows_is_refused():
+    domain = domain_of("tendon")
+    with pytest.raises(ValueError, match="479 rows for 480 owned entities on rank 0"):
+        domain.gather_elements(np.zeros(479))
+
+
+# ---------------------------------------------------------------- Gmsh's manners
+def test_gmsh_is_left_as_it_was(capfd):
+    import gmsh
+
+    handler = signal.getsignal(signal.SIGINT)
+    cube(comm=MPI.COMM_SELF)
+    assert not gmsh.isInitialized() and signal.getsignal(signal.SIGINT) is handler
+    gmsh.initialize(interruptible=False)  # else Gmsh would leave Ctrl-C deadly for all tests that follow
+    try:
+        gmsh.model.add("somebody's")
+        gmsh.model.geo.addPoint(0.0, 0.0, 0.0, tag=7)
+        gmsh.model.geo.synchronize()
+        terminal = gmsh.option.getNumber("General.Terminal")
+        cube(comm=MPI.COMM_SELF)
+        assert gmsh.model.getCurrent() == "somebody's" and gmsh.model.getEntities(0) == [(0, 7)]
+        assert gmsh.option.getNumber("General.Terminal") == terminal
+    finally:
+        gmsh.finalize()
+    assert capfd.readouterr() == ("", "")
+
+
+# ---------------------------------------------------------------- files
+def read_msh(path):
+    """Points, hexahedra and the quadrilaterals of each named face of a Gmsh file, as rows of the points."""
+    import gmsh
+
+    gmsh.initialize(readConfigFiles=False, interruptible=False)
+    try:
+        gmsh.option.setNumber("General.Terminal", 0)
+        gmsh.open(str(path))
+        tags, coordinates, _ = gmsh.model.mesh.getNodes()
+        row = np.zeros(int(tags.max()) + 1, dtype=int)
+        row[tags] = np.arange(len(tags))
+        hexahedra = row[gmsh.model.mesh.getElementsByType(5)[1]].reshape(-1, 8)
+        faces = {}
+        for _, group in gmsh.model.getPhysicalGroups(2):
+            surfaces = gmsh.model.getEntitiesForPhysicalGroup(2, group)
+            nodes = [gmsh.model.mesh.getElementsByType(3, surface)[1] for surface in surfaces]
+            faces[gmsh.model.getPhysicalName(2, group)] = row[np.concatenate(nodes)].reshape(-1, 4)
+    finally:
+        gmsh.finalize()
+    return coordinates.reshape(-1, 3), hexahedra, faces
+
+
+def make_script():
+    spec = importlib.util.spec_from_file_location("make_meshes", ROOT / "meshes" / "make.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize(("name", "shape"), [("tendon.msh", "tendon"), ("artery.msh", "tube")])
+def test_the_mesh_files_are_what_the_builders_make(name, shape):
+    points, hexahedra, faces = read_msh(ROOT / "meshes" / name)
+    domain = domain_of(shape)
+    built, cells = domain.gather_mesh()
+    distance, match = cKDTree(built).query(points)
+    assert distance.max() < 1e-12 and sorted(match) == list(range(domain.number_of_nodes))
+    assert {frozenset(element) for element in match[hexahedra].tolist()} == {
+        frozenset(element) for element in cells.tolist()
+    }
+    assert len(hexahedra) == domain.number_of_elements
+    domain.mesh.topology.create_connectivity(2, 3)
+    for face, tag in domain.faces.items():
+        nodes = dolfinx.mesh.entities_to_geometry(domain.mesh, 2, domain.facet_tags.find(tag))
+        ours = {frozenset(facet) for facet in domain.node_number[nodes].tolist()}
+        assert {frozenset(facet) for facet in match[faces[face]].tolist()} == ours
+
+
+def test_the_script_makes_the_mesh_files_again(tmp_path):
+    script = make_script()
+    script.make(tmp_path)
+    for name in script.MESHES:
+        old, new = read_msh(ROOT / "meshes" / name), read_msh(tmp_path / name)
+        assert np.abs(old[0] - new[0]).max() < 1e-12 and np.array_equal(old[1], new[1])
+
+
+# ---------------------------------------------------------------- ranks
+def test_two_ranks_gather_what_one_rank_has_and_fail_together():
+    alone = json.loads(json.dumps(parallel_geometry.digests(MPI.COMM_SELF)))
+    environment = {k: v for k, v in os.environ.items() if not k.startswith(("OMPI_COMM_", "PMIX_", "PRTE_JOB"))}
+    run = subprocess.run(
+        ["mpirun", "-n", "2", "--oversubscribe", sys.executable, "-m", "mpi4py", parallel_geometry.__file__],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        env=environment,
+    )
+    assert run.returncode == 0, run.stderr
+    together = json.loads(run.stdout)
+    assert together["ranks"] == 2
+    assert together["digests"] == alone
+    said = [
+        "Gmsh could not mesh the cube: no more ink",
+        "Gmsh could not mesh the cube: 0 named volumes, 0 types of elements, 0 named faces",
+    ]
+    assert together["failures"] == [said, said]

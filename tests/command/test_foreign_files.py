@@ -1,0 +1,723 @@
+"""A scene and the folder of a run are data: what somebody else has put into them runs nothing and leads nowhere.
+
+Each attack is tried through the command line or the function that it goes through; the victim is a file beside.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import io
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import tomllib
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from remodel_fenicsx import Recording, SceneError, Simulation
+from remodel_fenicsx.results.checkpoint_file import CheckpointError, read_checkpoint
+from remodel_fenicsx.results.recording import RecordingError
+from remodel_fenicsx.results.run_folder import choose_folder
+from remodel_fenicsx.results.vtkhdf import check_file
+from remodel_fenicsx.running import resume
+from remodel_fenicsx.running import run as run_scene
+from remodel_fenicsx.scene import preset_scene, read_scene
+from remodel_fenicsx.schema.toml import LARGEST, MOST_PARTS
+from remodel_fenicsx.studies.runs import Run
+from tests.command.test_run import demo, run
+from tests.conftest import slowly
+from tests.parts import pulled_cube
+
+PROJECT = Path(__file__).parents[2]
+SELF = MPI.COMM_SELF
+LONGER = ["time.end=4.0"]
+MINE = b"what a user would not like to lose\n"
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A cube to t = 3, with a checkpoint after each step."""
+    scene = pulled_cube(3.0, output={"checkpoint": 1})
+    return run_scene(scene, tmp_path_factory.mktemp("finished") / "run", SELF)
+
+
+@pytest.fixture
+def folder(tmp_path: Path, finished: Path) -> Path:
+    """A copy of it."""
+    return shutil.copytree(finished, tmp_path / "run")
+
+
+@pytest.fixture
+def victim(tmp_path: Path) -> Path:
+    """A file outside of the folder."""
+    path = tmp_path / "victim"
+    path.write_bytes(MINE)
+    return path
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    """Of all its files."""
+    return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
+
+
+def refused(*words: str | Path, **options: Any) -> str:
+    """The one line of a command that ends with exit code 2."""
+    done = run(*words, **options)
+    assert done.returncode == 2, (done.returncode, done.stdout, done.stderr)
+    assert done.stderr.count("\n") == 1 and done.stderr.startswith("remodel-fenicsx: "), done.stderr
+    return done.stderr
+
+
+# ---------------------------------------------------------------- PETSc's options
+CODE = {
+    "snes_type": "python", "ksp_type": "python", "pc_type": "python", "mat_type": "python", "pc_python_type": "mine.py",
+    "snes_python_type": "mine.Solver", "ksp_monitor_python": "mine.watch", "npc_snes_type": "python",
+    "mg_levels_pc_type": "python", "pc_composite_pcs": "jacobi,python", "snes_composite_sneses": "newtonls,python",
+    "telescope_pc_type": "shell", "pc_type_": "shell", "sub_pc_type": "PYTHON",
+    "KSP_TYPE": "Python", "mg_levels_1_sub_ksp_type": "python",
+}  # fmt: skip
+WRITES = {
+    "snes_monitor": "ascii:victim", "ksp_monitor": "ascii:victim::append", "snes_view": "ascii:victim:ascii_info",
+    "ksp_view_mat": "binary", "ksp_view_rhs": "binary:victim", "snes_monitor_solution": "hdf5:victim",
+    "ksp_converged_reason": "ascii:victim", "snes_converged_reason": "victim/x", "pc_view": "vtk", "mat_view": "draw",
+    "ksp_monitor_solution": "saws", "snes_linesearch_monitor": "ascii:victim", "mat_mumps_icntl_2": 77,
+    "mat_mumps_icntl_3": "78", "mat_mumps_icntl_22": 1, "mat_mumps_ooc_tmpdir": "here", "mat_mumps_icntl_1": 11,
+    "MAT_MUMPS_ICNTL_3": 9, "pc_asm_print_subdomains": "victim", "pc_gasm_print_subdomains": 5,
+    "snes_mf_noise_file": "victim", "mat_factor_dump_on_error": True, "pc_bddc_save": True,
+    "pc_nn_save_coarse_matrix": True, "pc_mg_dump_binary": True, "ksp_view_diagonal_scale": "xbinary",
+    "ksp_View_mat": "mybinary",
+}  # fmt: skip
+ELSEWHERE = {
+    "options_file": "victim",
+    "log_view": "ascii:victim",
+    "info": "victim",
+    "malloc_dump": True,
+    "on_error_abort": True,
+    "start_in_debugger": "sh",
+    "help": True,
+    "dm_view": True,
+    "vec_view": True,
+    "tao_type": "python",
+    "ts_type": "python",
+}
+
+
+@pytest.mark.parametrize(("name", "value"), [*CODE.items(), *WRITES.items(), *ELSEWHERE.items()])
+def test_an_option_that_does_more_than_solve_is_refused(name: str, value: Any) -> None:
+    with pytest.raises(SceneError, match=rf"^solver\.petsc_options\.{name} = .*: .*allowed are") as refusal:
+        preset_scene("kuhl-holzapfel-2007", "cube").with_values({f"solver.petsc_options.{name}": value})
+    assert len(str(refusal.value).splitlines()) == 1
+
+
+def test_options_of_solvers_are_taken() -> None:
+    good = {
+        "snes_monitor": True, "snes_linesearch_type": "bt", "snes_max_it": 40, "ksp_type": "gmres", "ksp_rtol": 1e-8,
+        "ksp_view": True, "pc_type": "cholesky", "pc_factor_mat_solver_type": "mumps", "mat_mumps_icntl_14": 50,
+        "mat_mumps_cntl_1": "1e-3", "mg_levels_ksp_type": "chebyshev", "telescope_pc_type": "lu", "pc_gamg_type": "agg",
+        "pc_fieldsplit_0_fields": "0,1", "ksp_converged_reason": True, "mat_mumps_icntl_33": False, "snes_ksp_ew": True,
+    }  # fmt: skip
+    scene = preset_scene("kuhl-holzapfel-2007", "cube").with_values({"solver.petsc_options": good})
+    assert scene.solver.petsc_options == good
+
+
+def test_a_scene_that_is_a_program_too_does_not_run(tmp_path: Path) -> None:
+    """TOML and Python at once: PETSc would import the scene itself."""
+    scene = tmp_path / "mine.py"
+    text = demo("cube").read_text() + '\n[solver.petsc_options]\nsnes_type = "python"\nsnes_python_type = "mine.py"\n'
+    scene.write_text(f'trap = """\n"""\n{text}'.replace('trap = """\n"""\n', ""))
+    (tmp_path / "sitecustomize.py").write_text("open('ran', 'w').close()\n")
+    line = refused("run", scene, "-o", tmp_path / "out", cwd=tmp_path)
+    assert "solver.petsc_options.snes_type = 'python': would run code" in line
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["mine.py", "sitecustomize.py"]
+
+
+# ---------------------------------------------------------------- links
+NEVER_THROUGH = ("run.lock", "history.csv", "run.log", "fields.vtkhdf", "fields_chains.vtkhdf")
+REPLACED = ("scene.toml.part", "checkpoint.json.part", "checkpoint-a.npz.part", "checkpoint-b.npz.part")
+
+
+@pytest.mark.parametrize("kind", ["symbolic", "hard"])
+@pytest.mark.parametrize("name", [*NEVER_THROUGH, *REPLACED])
+def test_nothing_is_written_through_a_link(name: str, kind: str, folder: Path, victim: Path) -> None:
+    path = folder / name
+    with contextlib.suppress(FileNotFoundError):  # the victim is a valid one: what matters is that it is another file
+        victim.write_bytes(path.read_bytes())
+        path.unlink()
+    before, others = victim.read_bytes(), content(folder)
+    if kind == "hard":
+        os.link(victim, path)
+    else:
+        path.symlink_to(victim)
+    if name in REPLACED:
+        resume(folder, LONGER, SELF)
+        assert Recording(folder).history["time"][-1] == 4.0
+    else:
+        assert name in refused("run", "--resume", folder, "--set", LONGER[0], "-q")
+        assert {other: data for other, data in content(folder).items() if other != name} == others
+    assert victim.read_bytes() == before
+
+
+@pytest.mark.parametrize("name", ["seed-1.toml", "seed-1.txt", "seed-1", "ensemble.csv"])
+def test_a_study_writes_through_no_link(name: str, tmp_path: Path, victim: Path) -> None:
+    """The folder of a study, with a link in it, from somebody else."""
+    study = tmp_path / "study"
+    study.mkdir()
+    target = victim
+    if name == "seed-1":
+        target = tmp_path / "elsewhere"
+        target.mkdir()
+    (study / name).symlink_to(target)
+    random = ["--set", "cells.initial=random", "--set", "time.end=1", "--set", "mesh.refinement=1"]
+    done = run("ensemble", demo("cube"), *random, "--seeds", "2", "--jobs", "1", "-o", study, "-q")
+    assert victim.read_bytes() == MINE and "Traceback" not in done.stderr
+    assert done.returncode == (2 if name in ("seed-1", "ensemble.csv") else 0), done.stderr
+    assert name != "seed-1" or not list(target.iterdir())
+
+
+# ---------------------------------------------------------------- checkpoints that somebody has made
+def forged(folder: Path, change: Callable[[dict[str, Any], dict[str, Any]], None], compressed: bool = False) -> None:
+    """Both generations with another header or other arrays, and a pointer with the right check sums."""
+    pointer = json.loads((folder / "checkpoint.json").read_bytes())
+    for generation in pointer["generations"]:
+        path = folder / generation["file"]
+        with np.load(path) as file:
+            arrays = {name: file[name] for name in file.files if name != "header"}
+            header = json.loads(file["header"].tobytes())
+        change(header, arrays)
+        whole = io.BytesIO()
+        text = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
+        (np.savez_compressed if compressed else np.savez)(whole, header=text, **arrays)
+        path.write_bytes(whole.getvalue())
+        generation["sha256"] = hashlib.sha256(whole.getvalue()).hexdigest()
+    (folder / "checkpoint.json").write_text(json.dumps(pointer))
+
+
+def put(key: str, value: Any) -> Callable[[dict[str, Any], dict[str, Any]], None]:
+    """Another entry of the header; with a value that is callable, what it makes of the old one."""
+
+    def change(header: dict[str, Any], arrays: dict[str, Any]) -> None:
+        header[key] = value(header[key]) if callable(value) else value
+
+    return change
+
+
+def array(name: str, make: Callable[[Any], Any]) -> Callable[[dict[str, Any], dict[str, Any]], None]:
+    """Another array in place of one, or of the first function's."""
+
+    def change(header: dict[str, Any], arrays: dict[str, Any]) -> None:
+        key = f"function/{header['functions'][0]}" if name == "function" else name
+        arrays[key] = make(arrays[key])
+
+    return change
+
+
+def without(name: str) -> Callable[[dict[str, Any], dict[str, Any]], None]:
+    """An entry less, of header or arrays."""
+
+    def change(header: dict[str, Any], arrays: dict[str, Any]) -> None:
+        (header if name in header else arrays).pop(name if name != "function" else f"function/{header['functions'][0]}")
+
+    return change
+
+
+ODD = {"text": "x", "none": None, "list": [1], "table": {"a": 1}, "negative": -1, "true": True, "many": 10**400}
+FORGERIES = {
+    **{
+        f"{key} {name}": put(key, value)
+        for key in ("time", "number", "scene", "versions", "loads", "numbers", "functions", "format")
+        for name, value in ODD.items()
+        if not (key == "scene" and name == "text") and not (key == "time" and name in ("true",))
+    },
+    "no time": without("time"),
+    "no header entry": without("numbers"),
+    "no points": without("points"),
+    "no elements": without("elements"),
+    "no function": without("function"),
+    "one entry more": put("more", lambda _: 1),
+    "loads of text": put("loads", {"force": "1"}),
+    "loads NaN": put("loads", {"force": float("nan")}),
+    "numbers of lists": put("numbers", {"a": [1.0]}),
+    "functions twice": put("functions", lambda names: names[:1]),
+    "functions of numbers": put("functions", [1, 2]),
+    "another load": put("loads", {"other": 1.0}),
+    "a later step": put("number", lambda number: number + 7),
+    "another time": put("time", lambda time: time + 0.5),
+    "another scene": put("scene", lambda text: text.replace("kappa = ", "kappa = 9")),
+    "no scene": put("scene", "x = 1"),
+    "no TOML": put("scene", "= ="),
+    "deep": put("numbers", {"a": json.loads("[" * 50 + "]" * 50)}),
+    "a row less": array("function", lambda old: old[:-1]),
+    "a row more": array("function", lambda old: np.vstack([old, old])),
+    "a column less": array("function", lambda old: old[:, :-1]),
+    "no table": array("function", lambda old: old[0]),
+    "deeper": array("function", lambda old: old[..., None]),
+    "empty": array("function", lambda old: old[:0]),
+    "text": array("function", lambda old: old.astype(str)),
+    "complex": array("function", lambda old: old + 1j),
+    "NaN": array("function", lambda old: old * np.nan),
+    "infinite": array("function", lambda old: old + np.inf),
+    "dates": array("function", lambda old: old.astype("datetime64[s]")),
+    "one number": array("function", lambda old: np.float64(1)),
+    "points of text": array("points", lambda old: old.astype(str)),
+    "fewer points": array("points", lambda old: old[:-1]),
+    "moved points": array("points", lambda old: old + 1.0),
+    "points NaN": array("points", lambda old: old * np.nan),
+    "other elements": array("elements", lambda old: old[:, ::-1]),
+    "fewer elements": array("elements", lambda old: old[:-1]),
+    "elements flat": array("elements", lambda old: old.ravel()),
+}
+KEEPS_GOING = {  # what is no forgery: a checkpoint that could have been written, or one whose fault is harmless
+    "numbers table",
+}
+
+
+@pytest.mark.parametrize("name", [name for name in FORGERIES if name not in KEEPS_GOING])
+def test_a_forged_checkpoint_is_refused(name: str, folder: Path) -> None:
+    """With right check sums; nothing is changed by the refusal."""
+    try:
+        forged(folder, FORGERIES[name])
+    except KeyError:  # an entry that was never there: "one entry more" makes it
+        forged(folder, lambda header, arrays: header.update(more=1))
+    before = content(folder)
+    with pytest.raises((CheckpointError, SceneError, RecordingError)) as refusal:
+        resume(folder, LONGER, SELF)
+    assert len(str(refusal.value).splitlines()) == 1
+    assert content(folder) == before
+
+
+def bomb(folder: Path) -> None:
+    """A gigabyte of zeros in a megabyte."""
+    forged(folder, array("points", lambda old: np.zeros((10**6, 3))), compressed=True)
+
+
+def pickled(folder: Path) -> None:
+    """An array of objects, which a careless reader would execute."""
+    pointer = json.loads((folder / "checkpoint.json").read_bytes())
+    for generation in pointer["generations"]:
+        whole = io.BytesIO()
+        np.savez(whole, header=np.array([{"a": os.system}], dtype=object), allow_pickle=True)
+        (folder / generation["file"]).write_bytes(whole.getvalue())
+        generation["sha256"] = hashlib.sha256(whole.getvalue()).hexdigest()
+    (folder / "checkpoint.json").write_text(json.dumps(pointer))
+
+
+def other_archive(data: bytes) -> Callable[[Path], None]:
+    """Anything in place of the archives."""
+
+    def change(folder: Path) -> None:
+        pointer = json.loads((folder / "checkpoint.json").read_bytes())
+        for generation in pointer["generations"]:
+            (folder / generation["file"]).write_bytes(data)
+            generation["sha256"] = hashlib.sha256(data).hexdigest()
+        (folder / "checkpoint.json").write_text(json.dumps(pointer))
+
+    return change
+
+
+def empty_archive() -> bytes:
+    """A zip without files."""
+    whole = io.BytesIO()
+    zipfile.ZipFile(whole, "w").close()
+    return whole.getvalue()
+
+
+def pointing(**entries: Any) -> Callable[[Path], None]:
+    """Another pointer."""
+
+    def change(folder: Path) -> None:
+        pointer = json.loads((folder / "checkpoint.json").read_bytes())
+        for generation in pointer["generations"]:
+            generation |= entries
+        (folder / "checkpoint.json").write_text(json.dumps(pointer))
+
+    return change
+
+
+def marked(flag: int, place: int, central: int) -> Callable[[Path], None]:
+    """Archives with another number in the heads of their files."""
+
+    def change(folder: Path) -> None:
+        data = bytearray((folder / "checkpoint-a.npz").read_bytes())
+        for head, offset in ((b"PK\x03\x04", place), (b"PK\x01\x02", central)):
+            start = data.find(head)
+            while start >= 0:
+                data[start + offset] = flag
+                start = data.find(head, start + 4)
+        other_archive(bytes(data))(folder)
+
+    return change
+
+
+def headed(head: bytes) -> bytes:
+    """An archive with one array that begins so."""
+    whole = io.BytesIO()
+    with zipfile.ZipFile(whole, "w") as archive:
+        archive.writestr("header.npy", b"\x93NUMPY\x02\x00" + len(head).to_bytes(4, "little") + head)
+    return whole.getvalue()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [marked(1, 6, 8), marked(99, 8, 10), marked(14, 8, 10), other_archive(headed(b"(" * 9000 + b"\n")),
+     bomb, pickled, other_archive(b"no archive"), other_archive(empty_archive()), other_archive(b""),
+     pointing(file="../run/checkpoint-a.npz"), pointing(file="/etc/passwd"), pointing(file="scene.toml"),
+     pointing(sha256=0), pointing(number="1"), pointing(time="1"), pointing(more=1),
+     lambda folder: (folder / "checkpoint.json").write_text("[" * 10**5),
+     lambda folder: (folder / "checkpoint.json").write_bytes(b" " * (10**6 + 1))],
+)  # fmt: skip
+def test_another_archive_or_pointer_is_refused(change: Callable[[Path], None], folder: Path) -> None:
+    change(folder)
+    before = content(folder)
+    refused("run", "--resume", folder, "--set", LONGER[0], "-q")
+    assert content(folder) == before
+
+
+def test_a_field_without_end_in_a_history_is_refused(folder: Path) -> None:
+    text = (folder / "history.csv").read_text()
+    (folder / "history.csv").write_text(text.replace("\n", '\n"' + "a" * 200_000 + '",', 1))
+    assert "history.csv: field larger than" in refused("status", folder)
+
+
+@pytest.mark.parametrize(
+    "forge",
+    [lambda text: "".join(",".join(line.split(",")[:3]) + "\n" for line in text.splitlines()),
+     lambda text: text.replace("mean_stretch", "mine", 1),
+     lambda text: text.replace(text.splitlines()[2] + "\n", "", 1),
+     lambda text: text.replace("\n", "\n" + text.splitlines()[1] + "\n", 1)],
+    ids=["columns fewer", "columns others", "rows fewer", "rows more"],
+)  # fmt: skip
+def test_a_study_takes_no_history_that_is_not_its_scenes(forge: Callable[[str], str], folder: Path) -> None:
+    member = Run("run", Recording(folder).scene, folder)
+    assert member.is_complete()
+    (folder / "history.csv").write_text(forge((folder / "history.csv").read_text()))
+    with pytest.raises(SceneError, match="its history has other columns or rows than its scene asks for"):
+        member.is_complete()
+
+
+@pytest.mark.parametrize("by", [10**9, -5])
+def test_elements_of_nodes_that_are_not_there_are_refused(by: int, folder: Path) -> None:
+    with h5py.File(folder / "fields.vtkhdf", "r+") as file:
+        file["VTKHDF/Connectivity"][:] += by
+    with pytest.raises(RecordingError, match="nodes that are not there"):
+        _ = Recording(folder).elements
+
+
+# ---------------------------------------------------------------- fields
+def linked(kind: str) -> Callable[[Path, Path], None]:
+    """fields.vtkhdf whose values are somewhere else."""
+
+    def change(path: Path, victim: Path) -> None:
+        with h5py.File(path, "r+") as file:
+            shape = file["VTKHDF/PointData/displacement"].shape
+            del file["VTKHDF/PointData/displacement"]
+            group = file["VTKHDF/PointData"]
+            if kind == "external link":
+                group["displacement"] = h5py.ExternalLink(str(victim), "/VTKHDF/PointData/displacement")
+            elif kind == "soft link":
+                group["displacement"] = h5py.SoftLink("/VTKHDF/Points")
+            elif kind == "external storage":
+                storage = [(str(victim), 0, h5py.h5f.UNLIMITED)]
+                group.create_dataset("displacement", shape, "f4", maxshape=(None, 3), external=storage)
+            elif kind == "virtual":
+                layout = h5py.VirtualLayout(shape, "f4")
+                layout[:] = h5py.VirtualSource(str(victim), "x", shape)
+                group.create_virtual_dataset("displacement", layout)
+            else:
+                group.create_dataset("displacement", (10**12, 3), "f4", maxshape=(None, 3), chunks=(8, 3))
+
+    return change
+
+
+@pytest.mark.parametrize("kind", ["external link", "soft link", "external storage", "virtual", "claims"])
+def test_fields_that_are_kept_elsewhere_are_refused(kind: str, folder: Path, victim: Path) -> None:
+    linked(kind)(folder / "fields.vtkhdf", victim)
+    before = content(folder)
+    assert "fields.vtkhdf" in refused("run", "--resume", folder, "--set", LONGER[0], "-q")
+    assert content(folder) == before and victim.read_bytes() == MINE
+    with contextlib.suppress(RecordingError):  # whoever reads them meets one line at most
+        Recording(folder).fields(1.0)
+
+
+@pytest.mark.parametrize("name", ["fields.vtkhdf", "fields_chains.vtkhdf"])
+def test_a_flipped_bit_in_fields_is_noticed_before_anything_changes(name: str, folder: Path) -> None:
+    """HDF5's own check sums: by a run that would go on, and by whoever reads the values."""
+    path = folder / name
+    with h5py.File(path) as file:
+        values = file["VTKHDF/PointData/displacement"]
+        chunk = values.id.get_chunk_info(1)
+    data = bytearray(path.read_bytes())
+    data[chunk.byte_offset + chunk.size // 2] ^= 1
+    path.write_bytes(data)
+    before = content(folder)
+    with pytest.raises(RecordingError, match=f"{name}: is damaged"):
+        resume(folder, LONGER, SELF)
+    assert content(folder) == before
+    if name == "fields.vtkhdf":
+        with pytest.raises(RecordingError, match="is damaged"):
+            for recorded in Recording(folder).times:
+                Recording(folder).fields(recorded)
+
+
+def test_a_file_that_is_whole_is_taken(finished: Path) -> None:
+    check_file(finished / "fields.vtkhdf")
+    check_file(finished / "fields_chains.vtkhdf")
+
+
+# ---------------------------------------------------------------- a folder that goes, or that is nobody's
+def test_a_run_whose_folder_is_deleted_ends_with_5(tmp_path: Path) -> None:
+    program = f"""
+import shutil, sys
+from remodel_fenicsx import cli
+from remodel_fenicsx.results.history import History
+append = History.append
+def append_and_delete(history, row):
+    append(history, row)
+    if row["time"] == 3.0:
+        shutil.rmtree({str(tmp_path / "out")!r})
+History.append = append_and_delete
+sys.exit(cli.main(["run", {str(demo("cube"))!r}, "--set", "time.end=5", "-q", "-o", {str(tmp_path / "out")!r}]))
+"""
+    from tests.forks import forked
+
+    done = forked("python", program)
+    assert done.returncode == 5 and done.stdout == "", (done.returncode, done.stdout, done.stderr)
+    assert done.stderr.count("\n") == 1 and "was deleted during the run; lost: the rows of this run" in done.stderr
+
+
+def test_a_folder_with_nothing_but_a_dead_lock_is_nobodys(tmp_path: Path) -> None:
+    """What a member of a study leaves that was killed before it wrote its scene."""
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "run.lock").write_text('{"number": 1, "host": "elsewhere", "ranks": 1}\n')
+    assert choose_folder(tmp_path / "out", "x") == tmp_path / "out"
+    done = run("run", demo("cube"), "--set", "time.end=1", "-q", "-o", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+
+
+# ---------------------------------------------------------------- the working folder, and what lies in it
+def test_the_working_folder_runs_nothing_and_sets_nothing(tmp_path: Path) -> None:
+    """Where a scene was unpacked there may be more: modules, and options of PETSc, dolfinx and FFCx."""
+    put_there = {
+        "numpy.py": "open('victim-of-module', 'w')",
+        ".petscrc": "-log_view ascii:victim-of-log\n-remodel_snes_view ascii:victim-of-view\n",
+        "petscrc": "-remodel_ksp_type python\n",
+        "dolfinx_jit_options.json": '{"cffi_libraries": ["mine"], "no JSON',
+        "ffcx_options.json": '{"scalar_type": "float32", "no JSON',
+    }
+    for name, text in put_there.items():
+        (tmp_path / name).write_text(text)
+    (tmp_path / "scene.toml").write_text(pulled_cube(1.0).to_toml())
+    command = [
+        sys.executable,
+        PROJECT / "bin" / "remodel-fenicsx",
+        "ensemble",
+        "scene.toml",
+        "--seeds",
+        "2",
+        "-o",
+        "out",
+    ]
+    own = {"PETSC_OPTIONS": "-remodel_snes_monitor ascii:the-users-own::append"}
+    done = subprocess.run([*command, "-q"], cwd=tmp_path, env=os.environ | own, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, ""), done.stderr
+    assert {path.name for path in tmp_path.iterdir()} == {*put_there, "scene.toml", "out", "the-users-own"}
+
+
+@pytest.mark.parametrize(
+    "study",
+    [
+        {"study": "../../x", "scene": "x", "runs": []},
+        {"study": "ensemble", "scene": "x", "runs": [".."]},
+        {"study": "ensemble", "scene": "x", "runs": ["/proc/self"]},
+        {"study": "ensemble", "scene": "x", "runs": ["a\x1b[31m"]},
+        {"study": "ensemble", "scene": "x", "runs": ["x" * 5000]},
+        {"study": {}, "scene": [], "runs": {"a": 1}},
+        {"study": "ensemble", "scene": "x", "runs": [str(number) for number in range(200_000)]},
+    ],
+    ids=["elsewhere", "above", "at the root", "control", "long", "tables", "many"],
+)
+def test_a_foreign_study_names_runs_of_its_own_folder(study: Any, tmp_path: Path) -> None:
+    """Before, 200,000 runs took the square of that."""
+    (tmp_path / "study.json").write_text(json.dumps(study))
+    assert "study.json: is damaged" in refused("status", tmp_path)
+
+
+def test_a_column_named_often_is_one_column() -> None:
+    """30,000 of them took minutes."""
+    scene = preset_scene("kuhl-holzapfel-2007", "cube").with_values({"output.columns": ["mean_stretch"] * 30_000})
+    assert scene.output.columns == ("mean_stretch",)
+
+
+# ---------------------------------------------------------------- without end
+@pytest.mark.parametrize("device", ["/dev/full", "/dev/zero", "/dev/stdin"])
+def test_a_device_is_no_scene(device: str) -> None:
+    if not os.path.exists(device):
+        pytest.skip(f"there is no {device}")
+    assert "not a file" in refused("validate", device) or "cannot be read" in refused("validate", device)
+
+
+def test_a_pipe_is_no_scene(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    assert "is a pipe or a device, not a file" in refused("validate", tmp_path / "pipe")
+
+
+@pytest.mark.parametrize("name", ["run.lock", "checkpoint.json", "checkpoint-a.npz", "history.csv", "scene.toml",
+                                  "fields.vtkhdf"])  # fmt: skip
+def test_a_pipe_in_a_folder_keeps_nobody_waiting(name: str, folder: Path) -> None:
+    (folder / name).unlink(missing_ok=True)
+    os.mkfifo(folder / name)
+    refused("run", "--resume", folder, "--set", LONGER[0], "-q")
+    assert "Traceback" not in run("status", folder).stderr
+
+
+def test_a_scene_has_bounds(tmp_path: Path) -> None:
+    path = tmp_path / "scene.toml"
+    many = ".".join(["a"] * 200_000)
+    quoted = ".".join(['"1"'] * 5000)
+    for text, words in {
+        f"{many} = 1": f"a key of more than {MOST_PARTS} parts",
+        f"[{'.'.join(['1'] * 5000)}]": f"a key of more than {MOST_PARTS} parts",
+        f"x = {{ {quoted} = 1 }}": f"a key of more than {MOST_PARTS} parts",
+        f"x = {'[' * 150}{']' * 150}": f"in more than {MOST_PARTS} others",
+        "x = 1 #" + " " * LARGEST: "is larger than 1 MB",
+    }.items():
+        path.write_text(text[: LARGEST - 1] if "larger" not in words else text)
+        with pytest.raises(SceneError, match=words):
+            read_scene(path)
+    times = ", ".join(f"{whole}.5" for whole in range(20_000))  # decimals are no keys
+    path.write_text(f"{demo('cube').read_text()}\n[output]\ntimes = [{times}]\n")
+    with pytest.raises(SceneError, match="output.times"):
+        read_scene(path)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [("run", "--set", ".".join(["a"] * 5000) + "=1"), ("ensemble", "--seeds", "1000000000"),
+     ("stability", "--times", "1000000000"), ("trade", "--jobs", "1000000000")],
+)  # fmt: skip
+def test_numbers_on_the_command_line_have_bounds(words: tuple[str, ...], tmp_path: Path) -> None:
+    done = run(words[0], demo("cube"), *words[1:], cwd=tmp_path)
+    assert done.returncode == 2 and "Traceback" not in done.stderr
+    assert "allowed is a whole number from 1 to 10000" in done.stderr or "more than 100 parts" in done.stderr
+    assert not list(tmp_path.iterdir())
+
+
+# ---------------------------------------------------------------- signals among the libraries
+@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGTERM])
+def test_a_signal_while_libraries_are_loaded_is_not_lost(number: signal.Signals, tmp_path: Path) -> None:
+    """PETSc and UCX set handlers of their own for it. One process sends it again and again while the other loads."""
+    program = f"""
+import os, signal, sys, time
+from remodel_fenicsx.system import interrupts
+taken = []
+signal.signal({int(number)}, lambda number, _: taken.append(time.monotonic()))
+parent, sent = os.getpid(), 0
+reading, writing = os.pipe()
+child = os.fork()
+if child == 0:
+    for _ in range(40):
+        os.kill(parent, {int(number)})
+        time.sleep(0.01)
+    os._exit(0)
+interrupts.take_back_signals()
+os.waitpid(child, 0)
+before = len(taken)
+os.kill(parent, {int(number)})
+assert before >= 1 and len(taken) == before + 1, taken
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=100)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+AT_ANY_MOMENT = """
+import os, runpy, sys
+class Ready:
+    def find_spec(name, path=None, target=None):
+        if name == "remodel_fenicsx":  # the command's handlers are there
+            sys.meta_path.remove(Ready)
+            os.write({writing}, b"x")
+sys.meta_path.insert(0, Ready)
+sys.argv = {words}
+runpy.run_path({program!r}, run_name="__main__")
+"""
+
+
+@pytest.mark.parametrize("moments", [3, *slowly(20)])
+@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGTERM, signal.SIGINT, signal.SIGUSR1])
+def test_a_signal_at_any_moment_of_the_start(number: signal.Signals, moments: int, tmp_path: Path) -> None:
+    """From the command's first line to its first steps: its exit code, one line, and a run that goes on."""
+    long = ["--set", "time.end=400", "--set", "time.step=0.1", "--set", "output.checkpoint=1"]
+    for moment in range(moments):
+        out = tmp_path / f"out-{moment}"
+        reading, writing = os.pipe()
+        words = ["remodel-fenicsx", "run", str(demo("cube")), *long, "-q", "-o", str(out)]
+        program = AT_ANY_MOMENT.format(
+            writing=writing, words=words, program=str(PROJECT / "bin" / "remodel-fenicsx")
+        )  # fmt: skip
+        command = [sys.executable, "-c", program]
+        with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, pass_fds=[writing]) as process:
+            os.close(writing)
+            assert os.read(reading, 1) == b"x"
+            os.close(reading)
+            time.sleep(1.5 * (moment + 0.5) / moments)
+            process.send_signal(number)
+            errors = process.communicate(timeout=100)[1]
+        assert process.returncode == (4 if number == signal.SIGUSR1 else 128 + number), (moment, errors)
+        assert errors.count("\n") == 1 and errors.startswith("remodel-fenicsx: "), (moment, errors)
+        kept = read_checkpoint(out) if (out / "scene.toml").exists() else None
+        if kept is not None:
+            resume(out, [f"time.end={kept.time + 0.1:.1f}"], SELF)
+            assert Recording(out).history["time"][-1] == pytest.approx(kept.time + 0.1)
+
+
+# ---------------------------------------------------------------- Python
+def test_numpys_numbers_are_numbers() -> None:
+    scene = preset_scene("kuhl-holzapfel-2007", "cube")
+    values = {"cells.seed": np.int64(3), "time.end": np.float32(3.0), "cells.initial": np.array([0.6, 0.8, 0.0]),
+              "output.fields": np.bool_(False), "mesh.refinement": np.uint8(2)}  # fmt: skip
+    plain = {"cells.seed": 3, "time.end": 3.0, "cells.initial": [0.6, 0.8, 0.0], "output.fields": False,
+             "mesh.refinement": 2}  # fmt: skip
+    assert scene.with_values(values) == scene.with_values(plain)
+    assert tomllib.loads(scene.with_values(values).to_toml())["cells"]["seed"] == 3
+    with pytest.raises(SceneError, match=r"cells\.seed = 1\.5"):
+        scene.with_values({"cells.seed": np.float64(1.5)})
+
+
+@pytest.mark.parametrize("scene", ["scene.toml", None, Path("scene.toml"), {"geometry": {}}])
+def test_a_simulation_says_what_it_needs(scene: Any) -> None:
+    with pytest.raises(TypeError, match=r"not a Scene: .*read_scene\(PATH\)"):
+        Simulation(scene)
+
+
+def test_no_step_after_the_end() -> None:
+    simulation = Simulation(pulled_cube(3.0), SELF)
+    steps = simulation.steps()
+    next(steps)
+    simulation.close()
+    with pytest.raises(RuntimeError, match="has been closed"):
+        next(steps)
+    with pytest.raises(RuntimeError, match="has been closed"):
+        next(simulation.steps())
+    simulation.close()
+
+
+def test_a_flipped_bit_in_the_places_of_values_is_noticed(folder: Path) -> None:
+    """Times and offsets have no check sum of their own: they follow from the numbers of nodes, elements and steps."""
+    for name, wrong in (("Steps/Values", -1.0), ("Steps/PointDataOffsets/displacement", 7)):
+        copy = folder.with_name("copy.vtkhdf")
+        shutil.copy(folder / "fields.vtkhdf", copy)
+        with h5py.File(copy, "r+") as file:
+            file[f"VTKHDF/{name}"][2] = wrong
+        with pytest.raises(ValueError, match="is damaged"):
+            check_file(copy)

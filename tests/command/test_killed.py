@@ -1,0 +1,357 @@
+"""Runs that are killed or meet a full disk, at any moment, in a write too: in the end the whole run is there."""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import gc
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time as clock
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from remodel_fenicsx import Recording
+from remodel_fenicsx.results import checkpoint
+from remodel_fenicsx.results.history import History
+from remodel_fenicsx.results.recording import read_history
+from remodel_fenicsx.results.run_folder import FolderTaken
+from remodel_fenicsx.results.vtkhdf import TransientGrid
+from remodel_fenicsx.running import resume, run
+from tests.conftest import mpirun
+from tests.forks import forked
+from tests.processes import session_members
+from tests.results.test_resume import (
+    COUNTED,
+    LONGER,
+    SELF,
+    assert_close,
+    assert_same,
+    first_half,
+    half,
+    rows,
+    scene,
+    whole,
+)
+
+__all__ = ["first_half", "half", "whole"]  # fixtures
+
+
+# ---------------------------------------------------------------- in the middle of a write
+class Camera:
+    """Copies a folder as it is before, and in the middle of, what changes the disk; so many random moments of all.
+
+    What a process that is killed there leaves behind.
+    """
+
+    def __init__(self, folder: Path, copies: Path, seed: int, number: int):
+        self.folder, self.copies, self.number = folder, copies, number
+        self.random, self.seen = random.Random(seed), 0
+        self.moments: dict[Path, str] = {}
+
+    def look(self, what: str) -> None:
+        """Every moment has the same chance to be kept."""
+        self.seen += 1
+        place = self.seen - 1 if self.seen <= self.number else self.random.randrange(self.seen)
+        if place < self.number:
+            copy = self.copies / str(place)
+            shutil.rmtree(copy, ignore_errors=True)
+            if self.folder.exists():
+                shutil.copytree(self.folder, copy)
+                self.moments[copy] = f"moment {self.seen}: {what}"
+
+    @contextmanager
+    def running(self, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+        """Within, it looks."""
+        pwrite, row = os.pwrite, History._write
+
+        def half_and_whole(descriptor: int, data: Any, offset: int) -> int:
+            self.look("before a write of fields")
+            pwrite(descriptor, bytes(data)[: len(data) // 2], offset)
+            self.look("in a write of fields")
+            return pwrite(descriptor, data, offset)
+
+        def half_row(history: History, data: bytes) -> None:
+            history._file.write(data[: len(data) // 2])
+            self.look("in a row")
+            history._cut()
+            row(history, data)
+
+        def before(owner: Any, name: str) -> None:
+            real: Callable[..., Any] = getattr(owner, name)
+
+            def looking(*arguments: Any, **options: Any) -> Any:
+                self.look(f"before {name}")
+                return real(*arguments, **options)
+
+            patch.setattr(owner, name, looking)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(os, "pwrite", half_and_whole)
+            patch.setattr(History, "_write", half_row)
+            for owner, name in ((os, "ftruncate"), (os, "fsync"), (Path, "replace"), (Path, "unlink")):
+                before(owner, name)
+            yield
+
+
+@pytest.mark.parametrize(("kind", "seed"), [("new", 1), ("resumed", 2), ("restarted", 3)])
+def test_a_run_that_is_killed_in_a_write_goes_on(
+    kind: str, seed: int, half: Path, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A new run; one that goes on; one that starts again, for it was killed before its first checkpoint."""
+    folder = half
+    if kind == "new":
+        folder = tmp_path / "run"
+    elif kind == "restarted":
+        for path in half.glob("checkpoint*"):
+            path.unlink()
+    camera = Camera(folder, tmp_path / "copies", seed, number=3)
+    with camera.running(monkeypatch):
+        if kind == "new":
+            run(scene(checkpoint=2), folder, SELF)
+        else:
+            resume(folder, LONGER, SELF)
+    assert camera.seen > 100 and len(camera.moments) == 3
+    assert_same(folder, whole)
+    for copy, moment in camera.moments.items():
+        print(f"seed {seed}, {moment}")
+        try:
+            resume(copy, LONGER, SELF)
+        except FolderTaken:
+            assert not (copy / "scene.toml").exists(), moment
+        else:
+            assert_same(copy, whole)
+
+
+# ---------------------------------------------------------------- kill -9
+COMMAND = ("-m", "remodel_fenicsx.cli")
+FOUR_LAYERS = (str(Path(__file__).parents[1] / "forks.py"),)
+
+
+def words_for(folder: Path, scene_file: Path) -> list[str]:
+    """Of the run, or of what goes on with it."""
+    if folder.exists() and not (folder / "scene.toml").exists():  # killed before there was anything
+        shutil.rmtree(folder)
+    begun = ["--resume", folder] if folder.exists() else [scene_file, "-o", folder]
+    return ["run", *map(str, begun), "-q"]
+
+
+def start(
+    folder: Path, scene_file: Path, ranks: int = 1, program: tuple[str, ...] = COMMAND
+) -> subprocess.Popen[bytes]:
+    """In a session of its own."""
+    command = mpirun(ranks, sys.executable, *program, *words_for(folder, scene_file))
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True)
+
+
+def kill_again_and_again(
+    folder: Path,
+    scene_file: Path,
+    delays: list[float],
+    ranks: Callable[[int], int],
+    program: tuple[str, ...] = COMMAND,
+) -> int:
+    """Run to the end, killed after each of these seconds; how many kills a process lived to see."""
+    kills = 0
+    for number, delay in enumerate(delays):
+        process = start(folder, scene_file, ranks(number), program)
+        try:
+            process.wait(delay)
+        except subprocess.TimeoutExpired:
+            kills += 1
+            kill_all(process.pid)
+        process.communicate()
+        print(f"killed after {delay:.2f} s on {ranks(number)} ranks: return code {process.returncode}", flush=True)
+    process = start(folder, scene_file, program=program)
+    errors = process.communicate(timeout=600)[1].decode()
+    assert process.returncode == 0, errors
+    return kills
+
+
+def kill_all(session: int) -> None:
+    """mpirun's ranks too, which would go on for a while without it."""
+    while members := session_members(session):
+        for number in members:
+            with suppress(ProcessLookupError):
+                os.kill(number, signal.SIGKILL)
+        clock.sleep(0.01)
+
+
+TUBE = """
+preset = "kuhl-holzapfel-2007"
+geometry = {shape = "tube", inner_radius = 1.0, outer_radius = 3.0, length = 2.0}
+time = {end = 12.0}
+output = {every = 4, checkpoint = 2}
+"""
+
+
+def test_a_run_that_is_killed_20_times_goes_on(tmp_path: Path) -> None:
+    """At random moments of its work: while it meshes, in steps, in writes; after its end, of another one."""
+    (tmp_path / "tube.toml").write_text(TUBE)
+    seed = random.randrange(10**6)
+    print(f"seed {seed}")
+    moments, kills, whole = random.Random(seed), 0, 0
+
+    def status(folder: str, seconds: float | None) -> int:
+        words = words_for(tmp_path / folder, tmp_path / "tube.toml")
+        return forked("four layers", *words, seconds=seconds).returncode
+
+    assert status("expected", None) == 0
+    while kills < 20:
+        ended = status(f"run-{whole}", moments.uniform(0.1, 0.4))
+        assert ended in (0, -signal.SIGKILL)
+        kills, whole = kills + (ended != 0), whole + (ended == 0)
+    assert status(f"run-{whole}", None) == 0
+    for number in range(whole + 1):
+        assert_same(tmp_path / f"run-{number}", tmp_path / "expected")
+
+
+ARTERY = """
+preset = "kuhl-holzapfel-2007"
+geometry = {shape = "tube", inner_radius = 1.0, outer_radius = 3.0, length = 8.0}
+time = {end = 30.0}
+solver = {absolute_tolerance = 1e-10, relative_tolerance = 0.0}
+output = {fields = false, checkpoint = 2}
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ranks", [(1, 1), (1, 2)])
+def test_an_artery_that_is_killed_20_times_goes_on(ranks: tuple[int, int], tmp_path: Path) -> None:
+    """On one rank to the last bit; on one and two by turns to rounding."""
+    (tmp_path / "artery.toml").write_text(ARTERY)
+    assert start(tmp_path / "expected", tmp_path / "artery.toml").wait() == 0
+    seed = random.randrange(10**6)
+    print(f"seed {seed}")
+    # a row every so many seconds: kills come among the imports, while it meshes, in steps and in writes
+    seconds = float(sum(read_history(tmp_path / "expected")["seconds"]))
+    delays = [random.Random(seed + number).uniform(0.5, 4.0 + seconds / 8) for number in range(20)]
+    kills = kill_again_and_again(tmp_path / "run", tmp_path / "artery.toml", delays, lambda number: ranks[number % 2])
+    assert kills >= 10
+    if ranks == (1, 1):
+        assert rows(tmp_path / "run") == rows(tmp_path / "expected")
+    assert_close(tmp_path / "run", tmp_path / "expected")
+
+
+@pytest.mark.slow
+def test_one_and_two_ranks_by_turns_to_the_end(tmp_path: Path) -> None:
+    """150 steps of a tube of four layers, killed on one and two ranks by turns: rounding stays rounding."""
+    (tmp_path / "tube.toml").write_text(TUBE.replace("12.0", "150.0").replace("every = 4", "fields = false"))
+    assert start(tmp_path / "expected", tmp_path / "tube.toml", program=FOUR_LAYERS).wait() == 0
+    for number, last in enumerate([30, 60, 90, 120]):
+        process = start(tmp_path / "run", tmp_path / "tube.toml", 1 + number % 2, FOUR_LAYERS)
+        history = tmp_path / "run" / "history.csv"
+        while not history.exists() or len(history.read_text().splitlines()) < last:
+            clock.sleep(0.02)
+            assert process.poll() is None
+        kill_all(process.pid)
+        process.communicate()
+    assert start(tmp_path / "run", tmp_path / "tube.toml", 2, FOUR_LAYERS).wait() == 0
+    found, expected = (read_history(tmp_path / name) for name in ("run", "expected"))
+    largest = {
+        name: float(np.max(np.abs(found[name] - expected[name]) / np.maximum(np.abs(expected[name]), 1.0)))
+        for name in found
+        if name not in COUNTED
+    }
+    print(f"largest differences: {largest}")
+    assert_close(tmp_path / "run", tmp_path / "expected", history=1e-7, values=1e-4)
+
+
+# ---------------------------------------------------------------- a full disk
+READ_ONLY, REMOUNT = 1, 32  # flags of mount(2)
+
+
+def system_call(name: str, *arguments: Any) -> None:
+    """One of libc's that return 0, or OSError; the environment has no program for these two."""
+    library = ctypes.CDLL(None, use_errno=True)
+    if getattr(library, name)(*arguments):
+        raise OSError(ctypes.get_errno(), f"{name}: {os.strerror(ctypes.get_errno())}")
+
+
+@pytest.fixture
+def disk(tmp_path: Path) -> Iterator[Path]:
+    """A disk of two megabytes."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    place = str(folder).encode()
+    try:
+        system_call("mount", b"tmpfs", place, b"tmpfs", 0, b"size=2m")
+    except OSError as error:
+        pytest.skip(f"NO SMALL DISK CAN BE MOUNTED HERE, so a full one is not tested: {error}")
+    yield folder
+    gc.collect()  # files that an exception has kept open
+    system_call("umount2", place, 2)  # 2: as soon as nobody uses it
+
+
+def fill(disk: Path) -> None:
+    """Leave no room."""
+    with (disk / "filler").open("ab", buffering=0) as file:
+        try:
+            while file.write(bytes(4096)):
+                pass
+        except OSError as error:
+            assert error.errno == errno.ENOSPC
+
+
+def needs_a_page(history: History, data: bytes) -> bool:
+    """Whether a row does not fit into the file's last page, which needs no room."""
+    return history._sizes[-1] // 4096 < (history._sizes[-1] + len(data)) // 4096
+
+
+@pytest.mark.parametrize("what", ["history", "fields", "checkpoint"])
+def test_a_full_disk_loses_nothing(
+    what: str, disk: Path, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every finished row is there; with room again the run goes on to its end."""
+    settings = scene(6.0, checkpoint=1).with_values({"time.step": 0.25, "output.fields": what == "fields"})
+    expected = run(settings, tmp_path / "expected", SELF)
+    folder, calls = disk / "run", []
+
+    def before(owner: Any, name: str, full: Callable[..., bool]) -> None:
+        real: Callable[..., Any] = getattr(owner, name)
+
+        def filling(*arguments: Any, **options: Any) -> Any:
+            if full(*arguments):
+                calls.append(name)
+                fill(disk)
+            return real(*arguments, **options)
+
+        patch.setattr(owner, name, filling)
+
+    with monkeypatch.context() as patch:
+        if what == "history":
+            before(History, "_write", needs_a_page)
+        elif what == "fields":
+            before(TransientGrid, "append", lambda grid, time, *_: time >= 4.0)
+        else:
+            before(checkpoint, "write_checkpoint", lambda folder, kept: kept.time >= 4.0)
+        with pytest.raises(OSError) as full:
+            run(settings, folder, SELF)
+    assert full.value.errno == errno.ENOSPC and calls
+    left = rows(folder)
+    assert left == rows(expected)[: len(left)] and len(left) > 10
+    if what != "fields":
+        assert len(left) == {"history": len(left), "checkpoint": 18}[what]
+    else:
+        assert Recording(folder).times[-1] == 3.5
+    (disk / "filler").unlink()
+    resume(folder, [], SELF)
+    assert_same(folder, expected)
+
+
+def test_a_disk_that_cannot_be_written_is_exit_code_5(disk: Path, half: Path) -> None:
+    folder = shutil.copytree(half, disk / "run")
+    system_call("mount", b"tmpfs", str(disk).encode(), b"tmpfs", READ_ONLY | REMOUNT, None)
+    done = forked("remodel-fenicsx", "run", "--resume", folder, "--set", "time.end=9")
+    assert done.returncode == 5 and done.stdout == "", done.stderr
+    assert done.stderr.startswith("remodel-fenicsx: cannot write the results: [Errno 30] Read-only file system")
+    assert done.stderr.count("\n") == 1

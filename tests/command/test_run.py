@@ -1,0 +1,605 @@
+"""The command line as a user meets it: what a run leaves behind, exit codes, signals, bad input, the demos."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from remodel_fenicsx import cli
+from remodel_fenicsx.body.columns import COLUMNS
+from remodel_fenicsx.results.recording import read_history
+from remodel_fenicsx.scene.scene import read_scene
+from tests.conftest import mpirun, slowly
+from tests.forks import COARSE, forked
+
+PROJECT = Path(__file__).parents[2]
+COMMAND = [sys.executable, "-m", "remodel_fenicsx.cli"]
+
+
+def run(*arguments: str | Path, ranks: int = 1, **options: object) -> subprocess.CompletedProcess[str]:
+    """remodel-fenicsx ARGUMENTS on so many ranks; a process of its own, imports and all, where a test asks for more."""
+    if ranks == 1 and options.keys() <= {"cwd"}:
+        return forked("remodel-fenicsx", *arguments, **options)
+    command = mpirun(ranks, *COMMAND, *map(str, arguments))
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, **options)  # type: ignore
+
+
+def demo(name: str) -> Path:
+    """Path of a demo's scene."""
+    return PROJECT / "demos" / f"{name}.toml"
+
+
+# ---------------------------------------------------------------- on two ranks, which start once
+IMPOSSIBLE = """
+cells.initial=aligned | cells.aligned_axis=2 | loads.elongation.value=1.0 | loads.pressure.value=0
+loads.elongation.ramp=[[0.0, 0.0], [5.0, 1.0]] | remodeling.law=none | solver.maximum_halvings=3
+"""
+UNSTABLE = "loads.force.value=-30 | mesh.refinement=2 | solver.unstable=stop | output.fields=false"
+# by name: the demo (none: another command), what is set, and the folder where that is not one of the command's own
+ON_RANKS = {
+    "figures": ("", "", ""),
+    "files": ("cube", "time.end=3 | mesh.refinement=3 | cells.initial=random", ""),
+    "taken": ("cube", "", ""),
+    # axial chains lock at a stretch of L / r0 = 1.594: reached between t = 2 and t = 3
+    "impossible": ("artery", IMPOSSIBLE, ""),
+    # elements enough for both ranks: with eight the cube can leave its shape earlier, between -3 and -6
+    "unstable": ("cube", UNSTABLE, ""),
+    "nowhere": ("cube", "", "/proc/below"),  # found by one rank, which ends the others: the last
+}
+Done = tuple[subprocess.CompletedProcess[str], Path]
+
+
+def words_on_ranks(name: str, parent: Path) -> tuple[list[str], Path]:
+    """Of a command of `ON_RANKS`, and its folder."""
+    scene, settings, folder = ON_RANKS[name]
+    out = Path(folder or parent / name)
+    if name == "taken":
+        out.mkdir()
+        (out / "mine.txt").write_text("dear")
+    changes = [f"--set={setting.strip()}" for setting in settings.strip().replace("\n", "|").split("|") if setting]
+    command = ["run", str(demo(scene))] if scene else ["figures", "fig1"]
+    return [*command, *changes, "-o", str(out)], out
+
+
+@pytest.fixture(scope="module")
+def two_ranks(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Done]:
+    """What tests/commands.py makes of all of them."""
+    parent = tmp_path_factory.mktemp("ranks")
+    commands = {name: words_on_ranks(name, parent) for name in ON_RANKS}
+    (parent / "commands.json").write_text(json.dumps({name: words for name, (words, _) in commands.items()}))
+    program = [sys.executable, str(Path(__file__).parents[1] / "commands.py"), str(parent)]
+    done = subprocess.run(mpirun(2, *program), capture_output=True, text=True, timeout=300)
+    codes = json.loads((parent / "codes.json").read_text()) | {"nowhere": [done.returncode] * 2}
+    assert codes.keys() == commands.keys(), done.stderr
+    found = {}
+    for name, (first, second) in codes.items():
+        assert first == second, name
+        said = [(parent / f"{name}.{ending}").read_text() for ending in ("out", "err")]
+        found[name] = subprocess.CompletedProcess(commands[name][0], first, *said), commands[name][1]
+    return found
+
+
+@pytest.fixture
+def on_ranks(request: pytest.FixtureRequest, tmp_path: Path) -> Callable[[str, int], Done]:
+    """on_ranks(name, ranks) -> what a command of `ON_RANKS` said, the same on all ranks, and its folder."""
+
+    def command(name: str, ranks: int) -> Done:
+        if ranks == 2:
+            return request.getfixturevalue("two_ranks")[name]
+        words, folder = words_on_ranks(name, tmp_path)
+        return run(*words), folder
+
+    return command
+
+
+# ---------------------------------------------------------------- what a run leaves
+
+
+@pytest.fixture(scope="module")
+def tendon_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three steps of the tendon demo."""
+    folder = tmp_path_factory.mktemp("runs") / "tendon"
+    done = run("run", demo("tendon"), "--set", "time.end=3", "-o", folder)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == f"results in {folder}\n"
+    return folder
+
+
+def test_folder_holds_history_fields_scene_and_log(tendon_run: Path) -> None:
+    names = {path.name for path in tendon_run.iterdir()}
+    # on a slow machine there is a second checkpoint
+    files = {"history.csv", "fields.vtkhdf", "fields_chains.vtkhdf", "scene.toml", "run.log", "checkpoint.json"}
+    assert names - {"checkpoint-b.npz"} == files | {"checkpoint-a.npz"}
+    log = (tendon_run / "run.log").read_text()
+    assert "finished" in log
+    # 25 a time unit, over an area of 10
+    line = "network modulus c = 1.568 Pa, shear modulus mu = 3.103 Pa, largest force over its area 7.5 Pa"
+    assert f"INFO {line}\n" in log
+
+
+def test_history_has_the_columns_of_the_contract(tendon_run: Path) -> None:
+    history = read_history(tendon_run)
+    uniaxial = {"force", "mean_stretch", "min_stretch", "max_stretch", "mean_fibre_angle"}
+    assert set(history) == {"time", *COLUMNS} | uniaxial
+    np.testing.assert_array_equal(history["time"], [0.0, 1.0, 2.0, 3.0])
+    np.testing.assert_allclose(history["force"], [0.0, 25.0, 50.0, 75.0], rtol=1e-14)
+    assert np.all(history["min_stretch"][1:] < history["mean_stretch"][1:])
+    assert np.all(history["mean_stretch"][1:] < history["max_stretch"][1:])
+
+
+def test_the_first_row_is_the_unloaded_body(tendon_run: Path) -> None:
+    first = {name: values[0] for name, values in read_history(tendon_run).items()}
+    nothing = ("time", "force", "remodeling_power", "newton_iterations", "linear_iterations", "substeps", "seconds")
+    assert all(first[name] == 0.0 for name in nothing)
+    for name in ("mean_stretch", "min_stretch", "max_stretch", "min_jacobian"):
+        assert first[name] == pytest.approx(1.0, abs=1e-14)
+    assert first["max_chain_extension"] == pytest.approx(1.0 / 1.594, rel=1e-12)
+    assert 45.0 < first["mean_fibre_angle"] < 65.0
+
+
+def test_scene_as_run_reads_back_as_the_same_scene(tendon_run: Path) -> None:
+    again = read_scene(tendon_run / "scene.toml")
+    assert again == read_scene(demo("tendon"), ["time.end=3"])
+    text = (tendon_run / "scene.toml").read_text()
+    assert "\nformat = 2\n" in text
+    assert "dolfinx" in text and "PETSc" in text
+
+
+def test_fields_are_those_of_the_history(tendon_run: Path) -> None:
+    """Top displacement, stress balance and r/L of the last step, read as ParaView reads the file."""
+    history = read_history(tendon_run)
+    with h5py.File(tendon_run / "fields.vtkhdf") as file:
+        root = file["VTKHDF"]
+        np.testing.assert_array_equal(root["Steps/Values"][:], [0.0, 1.0, 2.0, 3.0])
+        points = root["Points"][:]
+        last = root["Steps/PointDataOffsets/displacement"][-1]
+        displacement = root["PointData/displacement"][last : last + len(points)]
+        cells = int(root["NumberOfCells"][0])
+
+        def cell_data(name: str) -> np.ndarray:
+            start = root[f"Steps/CellDataOffsets/{name}"][-1]
+            return root[f"CellData/{name}"][start : start + cells]
+
+        top = points[:, 2] > 10.0 - 1e-9
+        assert top.sum() == 57  # 16 on each of three rings, 9 inside
+        assert displacement[top, 2].mean() == pytest.approx(10 * (history["mean_stretch"][-1] - 1), rel=0.02)
+        assert cell_data("chain_extension").max() == pytest.approx(history["max_chain_extension"][-1], rel=1e-6)
+        assert cell_data("deformation_gradient")[:, 8].max() == pytest.approx(history["max_stretch"][-1], rel=1e-6)
+        axes = np.stack([cell_data(f"axis_{i}") for i in (1, 2, 3)], axis=1)
+        np.testing.assert_allclose(axes @ axes.transpose(0, 2, 1), np.broadcast_to(np.eye(3), axes.shape), atol=1e-6)
+        lengths = np.linalg.norm(cell_data("cell_dimensions"), axis=1)
+        assert np.all((lengths > 0.7) & (lengths < 1.0 + 1e-6))
+        stress = cell_data("cauchy_stress").reshape(-1, 3, 3)
+        np.testing.assert_allclose(stress, stress.transpose(0, 2, 1), atol=1e-4)
+        assert stress[:, 2, 2].mean() > 5 * np.abs(stress[:, 0, 0]).mean()
+
+
+def test_one_and_two_ranks_write_the_same_files(on_ranks: Callable[[str, int], Done]) -> None:
+    (alone, here), (done, folder) = on_ranks("files", 1), on_ranks("files", 2)
+    assert alone.returncode == done.returncode == 0, done.stderr
+    assert done.stdout.count("results in") == 1  # only rank 0 speaks
+    one, two = read_history(here), read_history(folder)
+    for name in ("mean_stretch", "max_stretch", "mean_fibre_angle", "stored_energy"):
+        np.testing.assert_allclose(two[name], one[name], rtol=1e-7, err_msg=name)
+    for name in ("fields.vtkhdf", "fields_chains.vtkhdf"):
+        with h5py.File(here / name) as first, h5py.File(folder / name) as second:
+            np.testing.assert_array_equal(first["VTKHDF/Connectivity"][:], second["VTKHDF/Connectivity"][:])
+            a, b = (file["VTKHDF/PointData/displacement"][:] for file in (first, second))
+            np.testing.assert_allclose(a, b, rtol=0, atol=1e-5)
+
+
+def test_petsc_options_from_scene_and_environment(tmp_path: Path) -> None:
+    """The scene's lie over the method's, those of PETSC_OPTIONS over the scene's."""
+    one = ["run", demo("cube"), "--set", "time.end=1", "-q", "-o"]
+    quiet = run(*one, tmp_path / "quiet")
+    assert quiet.returncode == 0 and "SNES Function norm" not in quiet.stdout
+    monitored = run(*one, tmp_path / "scene", "--set", "solver.petsc_options.snes_monitor=true")
+    assert monitored.returncode == 0 and "SNES Function norm" in monitored.stdout
+    # LU of MUMPS is exact: one linear iteration a Newton iteration; GMRES with Jacobi needs more
+    loose = {**os.environ, "PETSC_OPTIONS": "-remodel_ksp_type gmres -remodel_ksp_rtol 1e-12 -remodel_pc_type jacobi"}
+    other = run(*one, tmp_path / "other", "--set", "solver.petsc_options.pc_type=cholesky", env=loose)
+    assert other.returncode == 0, other.stderr
+    direct, iterative = read_history(tmp_path / "quiet"), read_history(tmp_path / "other")
+    assert direct["linear_iterations"][1] == direct["newton_iterations"][1] > 0
+    assert iterative["linear_iterations"][1] > 2 * iterative["newton_iterations"][1]
+    np.testing.assert_allclose(iterative["mean_stretch"], direct["mean_stretch"], rtol=1e-9)
+
+
+def test_a_tube_run_has_the_columns_of_the_contract(tmp_path: Path) -> None:
+    done = run("run", demo("artery"), "--set", "time.end=1", "-o", tmp_path / "tube", "-q")
+    assert done.returncode == 0 and done.stderr == "", done.stderr
+    history = read_history(tmp_path / "tube")
+    radii = {"inner_radius", "outer_radius", "fibre_angle_inner", "fibre_angle_middle", "fibre_angle_outer"}
+    assert set(history) == {"time", *COLUMNS} | radii | {"pressure", "axial_elongation"}
+    assert history["pressure"][1] == pytest.approx(0.192)
+    assert history["axial_elongation"][1] == pytest.approx(0.004)
+    assert 1.0 < history["inner_radius"][1] < 1.05 and 3.0 < history["outer_radius"][1] < 3.01
+
+
+@pytest.mark.parametrize(("degree", "kind"), [(1, "TETRA"), *slowly((2, "LAGRANGE_TETRAHEDRON"))])
+def test_tetrahedra_are_written_whole(degree: int, kind: str, tmp_path: Path) -> None:
+    """A cube whose stress is the same everywhere, so that they know no more than one point; the matrix alone."""
+    stretches = []
+    elements = [f"mesh.degree={degree}", "mesh.element=tetrahedron"]
+    for name, settings in (("other", elements), ("usual", ["model.kinematics=point"])):
+        same = ("time.end=1", "material.chain_density=0", "remodeling.law=none")
+        changes = [word for setting in (*same, *settings) for word in ("--set", setting)]
+        done = run("run", demo("cube"), *changes, "-o", tmp_path / name)
+        assert done.returncode == 0, done.stderr
+        stretches.append(read_history(tmp_path / name)["mean_stretch"][1])
+    assert stretches[0] == pytest.approx(stretches[1], rel=1e-8)
+    pyvista = pytest.importorskip("pyvista")
+    reader = pyvista.HDFReader(str(tmp_path / "other" / "fields.vtkhdf"))
+    reader.reader.SetStep(1)
+    grid = reader.read()
+    assert set(grid.celltypes) == {getattr(pyvista.CellType, kind)} and grid.n_cells == 6
+    assert grid.compute_cell_sizes()["Volume"].sum() == pytest.approx(1.0, rel=1e-6)
+    top = grid.points[:, 2] == 1.0
+    assert top.sum() == (degree + 1) ** 2
+    np.testing.assert_allclose(grid["displacement"][top, 2], stretches[0] - 1, rtol=1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mesh", ["degree=2", "element='tetrahedron'"])
+def test_other_elements_run_and_write_fields(mesh: str, tmp_path: Path) -> None:
+    done = run("run", demo("tendon"), "--set", "time.end=1", "--set", f"mesh.{mesh}", "-o", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    # 25 on an area of 10: the stiffer tetrahedra and the softer quadratic elements stay near 1.203
+    assert read_history(tmp_path / "out")["mean_stretch"][1] == pytest.approx(1.203, abs=0.02)
+    pyvista = pytest.importorskip("pyvista")
+    reader = pyvista.HDFReader(str(tmp_path / "out" / "fields.vtkhdf"))
+    reader.reader.SetStep(1)
+    grid = reader.read()
+    # VTK measures curved cells by straight pieces: a polygon of 32 corners has 0.64 % less than its circle
+    assert grid.compute_cell_sizes()["Volume"].sum() == pytest.approx(100.0, rel=7e-3)
+
+
+# ---------------------------------------------------------------- folders
+
+
+def test_default_folder_is_numbered_when_taken(tmp_path: Path) -> None:
+    for name in ("results/cube", "results/cube-2"):
+        done = run("run", demo("cube"), "--set", "time.end=1", "-q", cwd=tmp_path)
+        assert done.stdout == f"results in {name}\n", done.stderr
+        assert (tmp_path / name / "history.csv").exists()
+
+
+@pytest.mark.parametrize("ranks", [2, *slowly(1)])
+def test_a_folder_with_files_is_never_touched(ranks: int, on_ranks: Callable[[str, int], Done]) -> None:
+    done, folder = on_ranks("taken", ranks)
+    assert done.returncode == 2
+    assert done.stderr == f"remodel-fenicsx: -o {folder}: is not empty; allowed is a new or an empty folder\n"
+    assert [path.name for path in folder.iterdir()] == ["mine.txt"]
+
+
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_output_that_cannot_be_written_is_exit_code_5(ranks: int, on_ranks: Callable[[str, int], Done]) -> None:
+    done, _ = on_ranks("nowhere", ranks)
+    assert done.returncode == 5
+    assert done.stderr.count("cannot write the results") == 1 and done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("ranks", [1, *slowly(2)])  # on two as a folder with files
+def test_a_folder_below_a_file_is_exit_code_2(tmp_path: Path, ranks: int) -> None:
+    (tmp_path / "file").touch()
+    done = run("run", demo("cube"), "-o", tmp_path / "file" / "below", ranks=ranks)
+    assert done.returncode == 2
+    assert done.stderr.count("allowed is a new or an empty folder") == 1
+    assert done.stderr.count("\n") == 1 or ranks == 2
+
+
+def test_a_default_folder_that_cannot_be_made_is_exit_code_5(tmp_path: Path) -> None:
+    (tmp_path / "results").symlink_to(tmp_path / "a disk that is not mounted")
+    done = run("run", demo("cube"), cwd=tmp_path)
+    assert done.returncode == 5
+    assert "cannot write the results" in done.stderr and done.stderr.count("\n") == 1
+
+
+def test_a_full_disk_is_exit_code_5_and_keeps_finished_steps(tmp_path: Path, tendon_run: Path) -> None:
+    """A limit on file sizes stands for the disk; the kernels are compiled already (tendon_run)."""
+    size = 600_000
+    assert (tendon_run / "fields_chains.vtkhdf").stat().st_size < size
+    program = f"""
+import resource, signal, sys
+from remodel_fenicsx import cli
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, ({size}, {size}))
+sys.exit(cli.main(sys.argv[1:]))
+"""
+    done = forked("python", program, "run", demo("tendon"), "-o", tmp_path / "out")
+    assert done.returncode == 5, done.stderr
+    assert "cannot write the results" in done.stderr
+    assert len(read_history(tmp_path / "out")["time"]) >= 3
+
+
+# ---------------------------------------------------------------- failures and signals
+
+
+def test_a_load_beyond_floating_point_is_exit_code_3_and_said_in_words(tmp_path: Path) -> None:
+    done = run("run", demo("cube"), "--set", "loads.force.value=1e300", "-o", tmp_path / "out", "-q")
+    assert done.returncode == 3, done.stderr
+    assert "no equilibrium at time 1: " in done.stderr and "too large or too small for floating-point" in done.stderr
+
+
+@pytest.mark.parametrize("ranks", [2, *slowly(1)])
+def test_an_impossible_load_is_exit_code_3_and_says_where(ranks: int, on_ranks: Callable[[str, int], Done]) -> None:
+    done, folder = on_ranks("impossible", ranks)
+    assert done.returncode == 3, done.stderr
+    line = next(line for line in done.stderr.splitlines() if line.startswith("remodel-fenicsx:"))
+    assert "no equilibrium at time 3: " in line and "largest r/L = " in line and "prescribe less elongation" in line
+    np.testing.assert_array_equal(read_history(folder)["time"], [0.0, 1.0, 2.0])
+    assert (folder / "scene.toml").exists()
+
+
+@pytest.mark.parametrize(
+    ("number", "ranks"),
+    [(signal.SIGINT, 1), (signal.SIGTERM, 2),
+     *slowly((signal.SIGINT, 2), (signal.SIGTERM, 1), (signal.SIGHUP, 1), (signal.SIGHUP, 2))],
+)  # fmt: skip
+def test_a_signal_ends_the_run_and_keeps_finished_steps(tmp_path: Path, number: signal.Signals, ranks: int) -> None:
+    folder = tmp_path / "out"
+    command = mpirun(ranks, *COMMAND, "run", str(demo("tendon")), "-o", str(folder))
+    # in a group of its own, which gets the signal as a terminal gives it
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, process_group=0)
+    history = folder / "history.csv"
+    deadline = time.monotonic() + 200
+    while time.monotonic() < deadline and not (history.exists() and history.read_text().count("\n") > 3):
+        time.sleep(0.05)
+        assert process.poll() is None, process.communicate()[1]
+    os.killpg(process.pid, number)
+    _, errors = process.communicate(timeout=200)
+    if ranks == 1:
+        assert process.returncode == 128 + number
+        assert errors.endswith(f"stopped by {number.name}; every finished step is kept\n")
+    else:
+        assert process.returncode != 0  # mpirun's own code
+    rows = read_history(folder)
+    assert len(rows["time"]) >= 3 and rows["time"][-1] == len(rows["time"]) - 1
+    assert history.read_text().endswith("\n")
+    with h5py.File(folder / "fields.vtkhdf") as file:
+        assert file["VTKHDF/Steps"].attrs["NSteps"] >= len(rows["time"])
+
+
+def test_an_exception_on_one_rank_ends_all(tmp_path: Path) -> None:
+    program = tmp_path / "program.py"
+    program.write_text(
+        "import sys\n"
+        "from mpi4py import MPI\n"
+        "from remodel_fenicsx import cli\n"
+        "from remodel_fenicsx.evolution import remodeling as remodel\n"
+        "def broken(self, *arguments):\n"
+        "    if MPI.COMM_WORLD.rank == 1: raise RuntimeError('rank 1 has had enough')\n"
+        "    MPI.COMM_WORLD.Barrier()\n"
+        "remodel.RemodelingPass.apply = broken\n"
+        f"words = ['run', {str(demo('cube'))!r}, '--set=mesh.refinement=2', '-o', {str(tmp_path / 'out')!r}]\n"
+        "sys.exit(cli.main(words))\n"
+    )
+    command = mpirun(2, sys.executable, str(program))
+    environment = {**os.environ, "PYTHONPATH": str(PROJECT)}
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, env=environment)
+    assert done.returncode == 1
+    assert "rank 1 has had enough" in done.stderr and "stopped by a defect" in done.stderr
+
+
+@pytest.mark.parametrize("kind", ["script", "demo"])
+def test_an_exception_in_a_script_on_two_ranks_ends_both(kind: str, tmp_path: Path) -> None:
+    """A place that cannot be written is found by rank 0 alone; nobody may wait for it."""
+    (tmp_path / "file").touch()
+    program = tmp_path / "program.py"
+    program.write_text(
+        "from remodel_fenicsx.scene.scene import preset_scene\n"
+        "from remodel_fenicsx.running import run\n"
+        f"run(preset_scene('kuhl-holzapfel-2007', 'cube'), {str(tmp_path / 'file' / 'below')!r})\n"
+    )
+    words = [str(program)] if kind == "script" else [str(PROJECT / "demos" / "cube.py"), "2", str(tmp_path)]
+    environment = {**os.environ, "PYTHONPATH": str(PROJECT)}
+    command = mpirun(2, sys.executable, *words)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=100, env=environment)
+    assert done.returncode != 0
+    assert ("Not a directory" if kind == "script" else "is not empty") in done.stderr
+
+
+def test_two_runs_at_once_take_two_folders(tmp_path: Path) -> None:
+    program = """
+import os, sys
+from remodel_fenicsx import cli
+other = os.fork()
+status = cli.main(sys.argv[1:])
+if other:
+    status = status or os.waitstatus_to_exitcode(os.waitpid(other, 0)[1])
+os._exit(status)
+"""
+    done = forked("python", program, "run", demo("cube"), "--set", "time.end=2", "-q", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert sorted(done.stdout.splitlines()) == ["results in results/cube", "results in results/cube-2"]
+
+
+def test_a_misspelt_petsc_option_is_said_and_logged(tmp_path: Path) -> None:
+    options = ["--set", "solver.petsc_options.snes_linesearch_typ=bt", "--set", "solver.petsc_options.ksp_type=preonly"]
+    done = run("run", demo("cube"), *options, "--set", "time.end=2", "-q", "-o", tmp_path / "out")
+    assert done.returncode == 0
+    warning = "WARNING: solver.petsc_options: without effect (misspelt?): snes_linesearch_typ\n"
+    assert done.stderr == warning  # once, and nothing about the options that were used
+    assert warning.removeprefix("WARNING: ") in (tmp_path / "out" / "run.log").read_text()
+
+
+def test_a_chain_density_of_another_stress_unit_is_said_and_logged(tmp_path: Path) -> None:
+    settings = ["--set", "material.stress_unit=kPa", "--set", "loads.force.value=1 N", "--set", "time.end=1"]
+    done = run("run", demo("cube"), *settings, "--set=geometry.length_unit=cm", "-q", "-o", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.startswith("WARNING: material.chain_density = 7e+21: the network (c g(r0) r0^2 = ")
+    assert done.stderr.count("\n") == 1
+    assert done.stderr.removeprefix("WARNING: ") in (tmp_path / "out" / "run.log").read_text()
+    assert read_scene(tmp_path / "out" / "scene.toml").loads["force"].value == 10.0  # 1 N in kPa cm^2
+
+
+def test_options_of_the_profile_that_the_scene_makes_needless_are_no_news(tmp_path: Path) -> None:
+    options = [f"--set=solver.petsc_options.{option}" for option in ("ksp_type=cg", "pc_type=none")]
+    done = run("run", demo("cube"), *options, "--set=time.end=2", "-q", "-o", tmp_path / "out")
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_the_limit_of_iterations_that_was_reached_is_named(tmp_path: Path) -> None:
+    options = ["--set=solver.petsc_options.snes_max_it=2", "--set=solver.maximum_halvings=0"]
+    done = run("run", demo("cube"), *options, "-q", "-o", tmp_path / "out")
+    assert done.returncode == 3 and "no equilibrium within 2 Newton iterations" in done.stderr
+
+
+@pytest.mark.parametrize("setting", ["pc_type=foo", "snes_rtol=0.5", "snes_type=foo"])
+def test_petsc_options_that_cannot_be(setting: str, tmp_path: Path) -> None:
+    done = run("run", demo("cube"), "--set", f"solver.petsc_options.{setting}", cwd=tmp_path)
+    assert done.returncode == 2, done.stderr
+    assert done.stderr.count("\n") == 1 and "solver.petsc_options" in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("version", ["0.5.2", "0.8.0"])
+def test_an_old_dolfinx_is_exit_code_5(
+    version: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import dolfinx
+
+    monkeypatch.setattr(dolfinx, "__version__", version)
+    assert cli.main(["run", str(demo("cube")), "-o", str(tmp_path / "out")]) == 5
+    assert f"dolfinx {version} is too old" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+# ---------------------------------------------------------------- bad input and the small commands
+
+BAD_SETTINGS = """
+geometry.inner_radius=3.0 | geometry.inner_radius = 3.0
+geometry.inner_radius=-1.0 | geometry.inner_radius = -1.0
+geometry.outer_radius=0.5 | geometry.inner_radius = 1.0
+geometry.length=0 | geometry.length = 0
+geometry.length=nan | geometry.length = nan
+geometry.shape=sphere | geometry.shape = 'sphere'
+geometry.radius=1.0 | geometry.radius
+mesh.refinement=0 | mesh.refinement = 0
+mesh.refinement=1.5 | mesh.refinement = 1.5
+mesh.element=prism | mesh.element = 'prism'
+mesh.degree=3 | mesh.degree = 3
+model.kinematics=plane | model.kinematics = 'plane'
+material.lame_lambda=-1.0 | material.lame_lambda = -1.0
+material.lame_mu=0 | material.lame_mu = 0
+material.chain_density=-2e21 | material.chain_density = -2e+21
+material.contour_length=0.9 | cells.end_to_end_length = 1.0: must be smaller than material.contour_length = 0.9
+material.persistence_length=inf | material.persistence_length = inf
+material.energy_factor=2 | material.energy_factor = 2
+material.chain=spring | material.chain = 'spring'
+cells.initial=mixed | cells.initial = 'mixed'
+cells.initial=[1.0, 1.0, 1.0] | cells.initial
+cells.end_to_end_length=1.7 | cells.end_to_end_length = 1.7
+cells.seed=-1 | cells.seed = -1
+cells.seed="one" | cells.seed = 'one'
+loads.pressure.ramp=[[0.0, 0.0], [25.0, 1.0], [20.0, 0.5]] | loads.pressure.ramp[2][0] = 20.0
+loads.pressure.ramp=[] | loads.pressure.ramp
+loads.elongation.value=-1.5 | loads.elongation
+loads.force.value=1.0 | loads.force
+remodeling.kappa=-0.1 | remodeling.kappa = -0.1
+remodeling.driver=strain | remodeling.driver = 'strain'
+remodeling.law=eq12 | remodeling.law = 'eq12'
+remodeling.frame=eulerian | remodeling.frame = 'eulerian'
+time.end=0 | time.end = 0
+time.step=0.4 | loads
+time.step=-1.0 | time.step = -1.0
+solver.method=magic | solver.method = 'magic'
+solver.relative_tolerance=-1e-8 | solver.relative_tolerance
+output.every=0 | output.every = 0
+preset=paper | preset = 'paper'
+remodelling.kappa=0.1 | remodelling
+"""
+
+
+@pytest.mark.parametrize("line", BAD_SETTINGS.strip().splitlines())
+def test_a_bad_scene_is_one_line_exit_code_2_and_nothing_written(
+    line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    setting, beginning = line.split(" | ")
+    monkeypatch.chdir(tmp_path)
+    if setting == "time.step=0.4":
+        setting = "time.step=0.6"  # 150 is a multiple of it, the kink at 25 is not
+    assert cli.main(["run", str(demo("artery")), "--set", setting]) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and err.count("\n") == 1
+    assert err.startswith(f"remodel-fenicsx: {beginning}"), err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_figures_on_two_ranks_are_refused(two_ranks: dict[str, Done]) -> None:
+    done, folder = two_ranks["figures"]
+    assert done.returncode == 2
+    assert done.stderr.count("figures: uses all cores by itself (--jobs); start it without mpirun") == 1
+    assert not folder.exists()
+
+
+def test_bad_input_ends_two_ranks_with_one_line(tmp_path: Path) -> None:
+    done = run("run", demo("artery"), "--set", "remodeling.kappa=-1", ranks=2, cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr.count("remodeling.kappa = -1") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_validate_new_and_info(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["validate", str(demo("artery"))]) == 0
+    assert (
+        "a valid scene (tube, 150 steps)\n"
+        "network modulus c = 1.568 Pa, shear modulus mu = 3.103 Pa, largest pressure 4.8 Pa\n"
+        "kinematics 'full'" in capsys.readouterr().out
+    )
+    for preset in ("kuhl-holzapfel-2007", "sun-2002"):
+        for shape in ("cube", "tendon", "tube"):
+            assert cli.main(["new", preset, "--shape", shape]) == 0
+            scene = tmp_path / f"{preset}-{shape}.toml"
+            scene.write_text(capsys.readouterr().out)
+            assert cli.main(["validate", str(scene)]) == 0, capsys.readouterr().err
+            capsys.readouterr()
+    assert cli.main(["info"]) == 0
+    out = capsys.readouterr().out
+    assert "dolfinx" in out and "blas" in out
+
+
+# ---------------------------------------------------------------- demos
+
+
+WHOLE_RAMP = slowly(("tendon", "3"), ("tendon", "14"), ("artery", "27"))
+
+
+@pytest.mark.parametrize(("name", "end"), [("cube", None), ("artery", "2"), *WHOLE_RAMP])
+def test_the_script_and_the_scene_of_a_demo_are_the_same_simulation(name: str, end: str | None, tmp_path: Path) -> None:
+    """On a coarse mesh of the tube, which both take by themselves."""
+    program = f"{COARSE}import runpy; runpy.run_path({str(PROJECT / 'demos' / name)!r} + '.py', run_name='__main__')"
+    script = forked("python", program, *([end] if end else []), cwd=tmp_path)
+    assert script.returncode == 0, script.stderr
+    settings = ["output.fields=false", *([f"time.end={end}"] if end else [])]
+    scene = forked("four layers", "run", demo(name), *(f"--set={setting}" for setting in settings), cwd=tmp_path)
+    assert scene.returncode == 0, scene.stderr
+    ours, theirs = read_history(tmp_path / "results" / f"{name}-script"), read_history(tmp_path / "results" / name)
+    assert list(ours) == list(theirs)
+    for column in set(ours) - {"seconds"}:
+        np.testing.assert_allclose(ours[column], theirs[column], rtol=1e-10, err_msg=column)
+
+
+@pytest.mark.parametrize("ranks", [2, *slowly(1)])
+def test_an_unstable_equilibrium_is_exit_code_3_where_the_scene_says_stop(
+    ranks: int, on_ranks: Callable[[str, int], Done]
+) -> None:
+    done, folder = on_ranks("unstable", ranks)
+    assert done.returncode == 3, done.stderr
+    line = next(line for line in done.stderr.splitlines() if line.startswith("remodel-fenicsx:"))
+    assert "the equilibrium at time 2 is unstable: 1 negative eigenvalue of the tangent (0 before)" in line
+    assert "lost stability: " in line and line.endswith(
+        "every finished step is kept, and run --resume goes on from there"
+    )
+    history = read_history(folder)
+    np.testing.assert_array_equal(history["time"], [0.0, 1.0])

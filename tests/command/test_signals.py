@@ -1,0 +1,279 @@
+"""Signals and broken outputs that a run outlives, or that end it without noise: with PETSc loaded, as in every run."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from remodel_fenicsx.fem import jit
+from remodel_fenicsx.results.recording import read_history
+from tests.conftest import slowly
+from tests.forks import forked
+from tests.processes import all_end, wait_for_compiler
+
+PROJECT = Path(__file__).parents[2]
+CUBE = ["run", str(PROJECT / "demos" / "cube.toml"), "--set", "time.end=10"]
+COMMAND = [sys.executable, "-m", "remodel_fenicsx.cli", *CUBE]
+
+
+@pytest.mark.parametrize("stream", ["both", *slowly("stdout", "stderr")])
+def test_a_reader_that_goes_away_costs_no_step(stream: str, tmp_path: Path) -> None:
+    """`remodel-fenicsx run ... 2>&1 | head -1`."""
+    reading, writing = os.pipe()
+    os.close(reading)
+    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    streams |= dict.fromkeys(streams if stream == "both" else [stream], writing)
+    done = subprocess.run([*COMMAND, "-o", tmp_path / "out"], timeout=200, text=True, **streams)  # type: ignore
+    os.close(writing)
+    assert read_history(tmp_path / "out")["time"][-1] == 10
+    # 120: Python itself could not say its last word
+    assert done.returncode in (0, 120), done.stderr
+    assert "Traceback" not in (done.stderr or "") and "PETSC" not in (done.stderr or "")
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="Linux has a disk that is always full")
+def test_a_full_disk_below_stdout_is_exit_code_5(tmp_path: Path) -> None:
+    program = """
+import os, sys
+from remodel_fenicsx import cli
+os.dup2(os.open("/dev/full", os.O_WRONLY), 1)
+os._exit(cli.main(sys.argv[1:]))  # what it has not written by itself is lost
+"""
+    done = forked("python", program, *CUBE, "-q", "-o", tmp_path / "out")
+    assert done.returncode == 5
+    assert done.stderr == "remodel-fenicsx: cannot write to the standard output: No space left on device\n"
+    assert read_history(tmp_path / "out")["time"][-1] == 10
+
+
+@pytest.mark.parametrize("number", [signal.SIGHUP, *slowly(signal.SIGINT)])
+def test_a_signal_that_was_ignored_from_the_start_stays_ignored(number: signal.Signals, tmp_path: Path) -> None:
+    """nohup ignores SIGHUP, a shell script SIGINT for its jobs in the background."""
+    history = tmp_path / "out" / "history.csv"
+    words = [*COMMAND, "--set", "mesh.refinement=3", "-q", "-o", str(tmp_path / "out")]
+    process = subprocess.Popen(
+        words, stderr=subprocess.PIPE, text=True, preexec_fn=lambda: signal.signal(number, signal.SIG_IGN)
+    )
+    deadline = time.monotonic() + 200
+    while time.monotonic() < deadline and not (history.exists() and history.read_text().count("\n") > 2):
+        time.sleep(0.02)
+        assert process.poll() is None
+    process.send_signal(number)
+    errors = process.communicate(timeout=200)[1]
+    assert process.returncode == 0, errors
+    assert read_history(tmp_path / "out")["time"][-1] == 10
+
+
+@pytest.mark.parametrize(
+    ("module", "number"),
+    [
+        ("pydantic", signal.SIGINT),
+        ("mpi4py", signal.SIGTERM),
+        ("petsc4py.PETSc", signal.SIGINT),
+        ("remodel_fenicsx.running", signal.SIGHUP),  # PETSc is there by then, and has taken it
+        *slowly(("pydantic", signal.SIGTERM), ("dolfinx", signal.SIGTERM)),
+    ],
+)
+def test_a_signal_among_the_imports_ends_with_a_line(module: str, number: signal.Signals, tmp_path: Path) -> None:
+    program = f"""
+import os, runpy, signal, sys
+class Signal:
+    def find_spec(name, path=None, target=None):
+        if name == {module!r}:
+            os.kill(os.getpid(), {int(number)})
+sys.meta_path.insert(0, Signal)
+sys.argv = {["remodel-fenicsx", *CUBE, "-o", str(tmp_path / "out")]!r}
+runpy.run_path({str(PROJECT / "bin" / "remodel-fenicsx")!r}, run_name="__main__")
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=100)
+    line = f"remodel-fenicsx: stopped by {number.name}\n"
+    assert (done.returncode, done.stdout, done.stderr) == (128 + number, "", line)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("module", ["running", "cli", *slowly("solver.equilibrium", "system.interrupts")])
+def test_an_import_changes_no_handler(module: str) -> None:
+    """What Python knows of; PETSc puts some of its own below (take_back_signals)."""
+    program = f"""
+import signal
+def handlers(): return [signal.getsignal(number) for number in signal.valid_signals()]
+before = handlers()
+import remodel_fenicsx.{module}
+assert handlers() == before
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=100)
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_applications_signals_are_its_own_again_with_petsc() -> None:
+    """PETSc would abort the process, with pages of advice."""
+    program = """
+import os, signal
+signal.signal(signal.SIGHUP, signal.SIG_IGN)
+from remodel_fenicsx.system.interrupts import take_back_signals
+take_back_signals()
+os.kill(os.getpid(), signal.SIGHUP)
+reading, writing = os.pipe()
+os.close(reading)
+try:
+    os.write(writing, b"nobody reads this")
+except BrokenPipeError:
+    print("a closed pipe is an error")
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=100)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "a closed pipe is an error\n", "")
+
+
+def test_a_signal_before_the_first_step_ends_the_run_where_it_comes(tmp_path: Path) -> None:
+    program = f"""
+import os, signal, sys
+from remodel_fenicsx import cli, running
+def meshing(scene, comm):
+    os.kill(os.getpid(), signal.SIGTERM)
+    raise AssertionError("it goes on")
+running.Simulation = meshing
+sys.exit(cli.main({[*CUBE, "-o", str(tmp_path / "out")]!r}))
+"""
+    done = forked("python", program)
+    assert (done.returncode, done.stdout) == (143, "")
+    assert done.stderr == "remodel-fenicsx: stopped by SIGTERM; nothing was computed\n"
+    assert list(tmp_path.iterdir()) == []
+
+
+# ---------------------------------------------------------------- while it compiles
+
+
+def start_cold(tmp_path: Path, *words: str) -> subprocess.Popen[str]:
+    """A run in a session and group of its own, with an empty cache of kernels."""
+    command = [*words, sys.executable, str(PROJECT / "bin" / "remodel-fenicsx"), *CUBE, "-o", str(tmp_path / "out")]
+    environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path / "cache")}
+    pipe = subprocess.PIPE
+    return subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, env=environment, start_new_session=True)
+
+
+def nothing_is_left(tmp_path: Path) -> bool:
+    """No results, and no kernel that the next start would have to wait for."""
+    sources = {path.name for path in (tmp_path / "cache").rglob("*.c")}
+    finished = {path.name.removesuffix(".cached") for path in (tmp_path / "cache").rglob("*.c.cached")}
+    return sources == finished and not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, *slowly(signal.SIGTERM)])
+def test_a_signal_to_the_group_while_the_compiler_runs(number: signal.Signals, tmp_path: Path) -> None:
+    process = start_cold(tmp_path)
+    wait_for_compiler(process)
+    os.killpg(process.pid, number)
+    output, errors = process.communicate(timeout=200)
+    lines = errors.splitlines()
+    assert (process.returncode, output) == (128 + number, "")
+    assert lines[-1] == f"remodel-fenicsx: stopped by {number.name}; nothing was computed"
+    assert lines[:-1] and all(line.startswith("compiling ") for line in lines[:-1])
+    assert nothing_is_left(tmp_path)
+
+
+def test_a_limit_of_time_while_the_compiler_runs(tmp_path: Path) -> None:
+    """timeout sends its signal to the process, then to the group; wherever the run is by then."""
+    process = start_cold(tmp_path, "timeout", "--preserve-status", "2")
+    errors = process.communicate(timeout=200)[1]
+    assert process.returncode == 143, errors
+    rest = [line for line in errors.splitlines() if not line.startswith("compiling ")]
+    assert len(rest) == 1 and rest[0].startswith("remodel-fenicsx: stopped by SIGTERM")
+    assert all_end(process.pid)
+    assert nothing_is_left(tmp_path)
+
+
+WHAT_IT_LOOKS_FOR = """
+import sys
+from remodel_fenicsx import cli
+from remodel_fenicsx.fem import jit
+is_cached = jit._is_cached
+def looked_for(kernel):
+    jit.log.info("looks for %s", kernel)
+    return is_cached(kernel)
+jit._is_cached = looked_for
+sys.exit(cli.main(sys.argv[1:]))
+"""
+
+
+def test_a_cold_quiet_run_leaves_what_it_compiled_in_the_log_alone(tmp_path: Path) -> None:
+    """Its cache is the usual one, in which the shortest form and the shortest expression are missing."""
+    count = tmp_path / "count"
+    own = {"XDG_CACHE_HOME": str(tmp_path / "cache"), "REMODEL_FENICSX_COMPILED": str(count)}
+
+    def log_of(name: str, variables: dict[str, str]) -> str:
+        words = [*CUBE, "--set", "time.end=1", "-q", "-o", tmp_path / name]
+        done = forked("python", WHAT_IT_LOOKS_FOR, *words, variables={**os.environ, **variables})
+        assert (done.returncode, done.stderr) == (0, "")
+        return (tmp_path / name / "run.log").read_text()
+
+    usual = log_of("usual", {})
+    # all that a run needs is there before its first step
+    assert usual.rindex("looks for ") < usual.index("INFO time ")
+    kernels = set(re.findall("looks for (.*)", usual))
+    by_length = sorted(kernels, key=lambda kernel: jit._files(kernel)[0].stat().st_size)
+    missing = [next(kernel for kernel in by_length if kind in kernel) for kind in ("forms", "expressions")]
+    assert len(kernels) > 5
+    cache = tmp_path / "cache" / "fenics" / jit.cache_folder().name
+    cache.mkdir(parents=True)
+    for path in (path for kernel in kernels.difference(missing) for path in jit._files(kernel)):
+        (cache / path.name).symlink_to(path)
+
+    log = log_of("cold", own)
+    assert sorted(count.read_text().split()) == sorted(missing)
+    assert log.count("NOTICE compiling ") == log.count("INFO compiled ") == len(missing)
+    assert log.rindex("compiled ") < log.index("INFO time ")
+    assert {path.stem for path in cache.glob("*.c")} == kernels
+    assert "compil" not in log_of("again", own)
+    assert len(count.read_text().split()) == len(missing)
+
+
+def test_a_usage_error_is_said_by_the_first_rank_alone() -> None:
+    said = []
+    for rank in ("0", "1"):
+        environment = {**os.environ, "OMPI_COMM_WORLD_RANK": rank}
+        done = forked("remodel-fenicsx", "run", "--bad", variables=environment)
+        assert done.returncode == 2
+        said.append(done.stderr + done.stdout)
+    assert "one of the arguments SCENE --resume is required" in said[0] and said[1] == ""
+
+
+def test_a_pause_for_the_whole_group_spares_the_compiler() -> None:
+    """Batch systems send SIGUSR1 to all that a job has started."""
+    program = """
+import os, signal, subprocess
+from remodel_fenicsx.system.interrupts import PAUSE, StopRequest, blocked
+with StopRequest() as stop:
+    with blocked(PAUSE):
+        compiler = subprocess.Popen(["sleep", "0.3"])
+        os.killpg(0, signal.SIGUSR1)
+        assert compiler.wait() == 0 and not stop.pause
+    assert stop.pause and not stop.number
+os.kill(os.getpid(), signal.SIGUSR1)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, process_group=0)
+    assert done.returncode == -signal.SIGUSR1, done.stderr
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, *slowly(signal.SIGINT)])
+def test_what_was_done_before_a_signal_is_resumed(number: signal.Signals, tmp_path: Path) -> None:
+    """Checkpoints only at the end: the end that a signal makes is one too."""
+    out = tmp_path / "out"
+    words = [*COMMAND, "--set", "output.checkpoint=0", "--set", "time.end=400", "-q", "-o", str(out)]
+    process = subprocess.Popen(words, stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 200
+    while time.monotonic() < deadline and not ((out / "history.csv").exists() and len(read_history(out)["time"]) > 3):
+        time.sleep(0.02)
+        assert process.poll() is None
+    process.send_signal(number)
+    assert process.wait(200) == 128 + number
+    last = read_history(out)["time"][-1]
+    done = forked("remodel-fenicsx", "run", "--resume", out, "--set", f"time.end={last + 2}")
+    assert done.returncode == 0, done.stderr
+    assert f"goes on from the checkpoint of time {last:g}, step {last:g}\n" in (out / "run.log").read_text()
+    assert read_history(out)["time"].tolist() == [float(time) for time in range(int(last) + 3)]

@@ -1,0 +1,314 @@
+"""Compiling: what is said, who waits for whom, compilations that were cut off, folders that cannot be written."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import platform
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from remodel_fenicsx.fem import jit
+from tests.conftest import mpirun, slowly
+from tests.forks import forked
+from tests.processes import all_end, wait_for_compiler
+
+PROGRAM = """
+import logging, sys, ufl, dolfinx
+from mpi4py import MPI
+from remodel_fenicsx.fem import jit
+logging.basicConfig(level=logging.INFO)
+jit.TIMEOUT = 2
+mesh = dolfinx.mesh.create_unit_cube(MPI.COMM_WORLD, 2, 2, 2)
+x = ufl.SpatialCoordinate(mesh)
+value = dolfinx.fem.assemble_scalar(jit.form(x[0] ** 3 * ufl.dx, name="the moment"))
+total = mesh.comm.allreduce(value)
+assert abs(total - 0.25) < 1e-12, total
+print(len(jit.compiled_kernels()))
+"""
+
+
+def compile_and_use(cache: Path, ranks: int = 1, **variables: str) -> subprocess.CompletedProcess[str]:
+    command, environment = program(cache)
+    if ranks == 1:
+        return forked("python", PROGRAM, variables=environment | variables)
+    command = mpirun(ranks, *command)
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, env=environment | variables)
+
+
+def program(cache: Path, text: str = PROGRAM) -> tuple[list[str], dict[str, str]]:
+    """The command and its environment."""
+    own = {"PYTHONPATH": str(Path(__file__).parents[2]), "XDG_CACHE_HOME": str(cache)}
+    return [sys.executable, "-c", text], os.environ | own
+
+
+def one_file(folder: Path, pattern: str) -> Path:
+    (file,) = folder.rglob(pattern)
+    return file
+
+
+@contextmanager
+def locked_by_this_process(cache: Path) -> Iterator[None]:
+    """As if a run with this process's number were compiling the program's kernel."""
+    with one_file(cache, "locks/libffcx_*").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        lock.write(f"{os.getpid()}\n")
+        lock.flush()
+        yield
+
+
+def test_only_what_is_really_compiled_is_said_and_counted(tmp_path: Path) -> None:
+    count = tmp_path / "count"
+    first, again = (compile_and_use(tmp_path, REMODEL_FENICSX_COMPILED=str(count)) for _ in range(2))
+    assert (first.returncode, again.returncode) == (0, 0), first.stderr[-2000:]
+    assert first.stderr.count("compiling the moment, once on this machine: about 1 s") == 1
+    assert first.stderr.count("compiled the moment in ") == 1
+    assert "compil" not in again.stderr
+    assert (first.stdout, again.stdout) == ("1\n", "0\n")
+    assert count.read_text() == one_file(tmp_path, "libffcx_forms_*.c").stem + "\n"
+
+
+def test_what_is_in_the_cache_waits_for_no_compiler(tmp_path: Path) -> None:
+    assert compile_and_use(tmp_path).returncode == 0
+    with locked_by_this_process(tmp_path):
+        warm = compile_and_use(tmp_path)
+    assert warm.returncode == 0, warm.stderr[-2000:]
+    assert "waiting" not in warm.stderr
+
+
+def test_who_waits_for_a_compiler_says_for_whose(tmp_path: Path) -> None:
+    assert compile_and_use(tmp_path).returncode == 0
+    for path in tmp_path.rglob("libffcx_*.*"):  # all but the lock
+        path.unlink()
+    command, environment = program(tmp_path)
+    with locked_by_this_process(tmp_path):
+        waiting = subprocess.Popen(command, stderr=subprocess.PIPE, env=environment, text=True)
+        assert waiting.stderr
+        line = next(line for line in waiting.stderr if "compil" in line)
+    assert f"another run is compiling the same (process {os.getpid()}): waiting for it" in line
+    assert line.startswith("NOTICE:")  # the terminal gets it
+    assert "compiling the moment" in waiting.communicate(timeout=120)[1]
+    assert waiting.returncode == 0
+
+
+def test_other_kernels_are_compiled_at_the_same_time(tmp_path: Path) -> None:
+    assert compile_and_use(tmp_path).returncode == 0
+    command, environment = program(tmp_path, PROGRAM.replace("x[0] ** 3 *", "x[1] * x[0] ** 2 * 3 / 2 *"))
+    with locked_by_this_process(tmp_path):
+        other = forked("python", command[-1], variables=environment)
+    assert other.returncode == 0, other.stderr[-2000:]
+    assert "compiling the moment" in other.stderr and "waiting" not in other.stderr
+
+
+@pytest.mark.parametrize(
+    ("ranks", "lost"), [(1, ".c"), (1, ".c.cached"), *slowly((2, ".c.cached"), (2, ".c"), (1, ".so"))]
+)
+def test_a_compilation_that_was_cut_off_is_done_again_at_once(ranks: int, lost: str, tmp_path: Path) -> None:
+    assert compile_and_use(tmp_path, ranks).returncode == 0
+    library, source = one_file(tmp_path, "libffcx_forms_*.so"), one_file(tmp_path, "libffcx_forms_*.c")
+    library.unlink()  # as if the compiler had been killed: mostly .c, the lock, stays without the end mark
+    source.with_suffix(lost).unlink(missing_ok=True)
+    again = compile_and_use(tmp_path, ranks)
+    assert again.returncode == 0, again.stderr[-2000:]
+    assert "removing a compilation that was cut off" in again.stderr
+    assert library.exists()
+    assert "removing" not in compile_and_use(tmp_path, ranks).stderr
+
+
+AT_ONCE = """
+import os, sys
+other = os.fork()
+{}
+sys.stdout.flush()
+if other:
+    assert os.waitpid(other, 0)[1] == 0
+else:
+    os._exit(0)
+"""
+
+
+def test_runs_at_once_compile_one_after_the_other(tmp_path: Path) -> None:
+    done = forked("python", AT_ONCE.format(PROGRAM), variables=program(tmp_path)[1])
+    assert done.returncode == 0, done.stderr
+    assert "removing a compilation" not in done.stderr  # none takes another's work for cut off
+    assert sorted(done.stdout.split()) == ["0", "1"]
+
+
+def test_a_cache_that_cannot_be_written_is_replaced_with_a_warning(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    done = compile_and_use(tmp_path / "file" / "cache", TMPDIR=str(temporary))
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert done.stderr.count("cannot write to") == 1 and str(temporary) in done.stderr
+    assert list(temporary.rglob("libffcx_forms_*.so"))
+
+
+DERIVED_TWICE = """
+import dolfinx, numpy, ufl
+from mpi4py import MPI
+from remodel_fenicsx.fem import jit
+mesh = dolfinx.mesh.create_unit_cube(MPI.COMM_WORLD, 1, 1, 1, dolfinx.mesh.CellType.hexahedron)
+for _ in range(2):
+    x = ufl.SpatialCoordinate(mesh)
+    first, second = ufl.variable(x[0]), ufl.variable(x[1])
+    value = first**2 * second**3
+    derivatives = ufl.as_vector([ufl.diff(value, first), ufl.diff(value, second)])
+    compiled = jit.expression(derivatives, numpy.array([[0.5, 0.25, 0.0]]))
+    numpy.testing.assert_allclose(compiled.eval(mesh, numpy.zeros(1, numpy.int32)).reshape(1, 2), [[1 / 64, 3 / 64]])
+print(len(jit.compiled_kernels()))
+"""
+
+
+def test_an_expression_with_derivatives_is_compiled_once_for_all_problems_of_a_process(tmp_path: Path) -> None:
+    """Of (0.5^2 0.25^3): UFL's numbers of variables are not part of the kernel."""
+    done = forked("python", DERIVED_TWICE, variables=program(tmp_path)[1])
+    assert (done.returncode, done.stdout) == (0, "1\n"), done.stderr[-2000:]
+
+
+# A run that is under way: a signal is a request that it looks at now and then, but not while it compiles
+IN_A_RUN = """
+import sys, ufl, dolfinx
+from mpi4py import MPI
+from remodel_fenicsx.fem import jit
+from remodel_fenicsx.system.interrupts import Interrupted, StopRequest
+mesh = dolfinx.mesh.create_unit_cube(MPI.COMM_WORLD, 2, 2, 2)
+x = ufl.SpatialCoordinate(mesh)
+# takes the compiler a while
+terms = [ufl.exp(x[0] * k) * ufl.sin(x[1] + k) * ufl.cos(x[2] * k) for k in range(1, 150)]
+with StopRequest():
+    try:
+        jit.form(sum(terms[1:], terms[0]) * ufl.dx(degree=4))
+    except Interrupted as interruption:
+        sys.exit(interruption.exit_code)
+"""
+
+
+@pytest.mark.parametrize(
+    ("target", "number"),
+    [
+        ("group", signal.SIGINT),
+        ("process and group", signal.SIGTERM),
+        ("compiler", signal.SIGTERM),
+        *slowly(("group", signal.SIGTERM), ("group", signal.SIGHUP)),
+    ],
+)
+def test_a_signal_ends_the_compiler_and_leaves_nothing(target: str, number: signal.Signals, tmp_path: Path) -> None:
+    """A terminal sends it to the group, timeout to the process and then to its group, some to all, one by one."""
+    command, environment = program(tmp_path, IN_A_RUN)
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, env=environment, text=True, start_new_session=True)
+    compiler = wait_for_compiler(process)
+    if target != "group":
+        os.kill(compiler if target == "compiler" else process.pid, number)
+        time.sleep(0.01)
+    if "group" in target:
+        os.killpg(process.pid, number)
+    errors = process.communicate(timeout=200)[1]
+    assert (process.returncode, errors) == (128 + number, "")
+    if target != "compiler":  # whoever ends gcc alone leaves gcc's own children to themselves
+        assert all_end(process.pid)
+    assert {path.parent.name for path in tmp_path.rglob("*") if path.is_file()} == {"locks"}
+
+
+def test_a_signal_for_one_process_ends_the_compilers_own_children(tmp_path: Path) -> None:
+    """As a supervisor sends it. A compiler stands in that would be at work for ever, in a program of its own."""
+    compiler = tmp_path / "compiler"
+    compiler.write_text("#!/bin/sh\nsleep 1000\nexit 1\n")
+    compiler.chmod(0o755)
+    command, environment = program(tmp_path, IN_A_RUN.replace("150", "3"))
+    environment["CC"] = str(compiler)
+    process = subprocess.Popen(command, stderr=subprocess.DEVNULL, env=environment, text=True, start_new_session=True)
+    wait_for_compiler(process, "sleep")
+    process.terminate()
+    assert process.wait(timeout=200) == 143
+    ended = all_end(process.pid)
+    if not ended:
+        os.killpg(process.pid, signal.SIGKILL)
+    assert ended
+
+
+LIBRARY = """
+import logging
+from mpi4py import MPI
+from remodel_fenicsx.fem import jit
+logging.basicConfig(level=logging.INFO)
+source = "double twice(double x) { return 2.0 * x; }"
+module = jit.library(MPI.COMM_WORLD, "double twice(double);", source, "what doubles")
+assert module.lib.twice(4.0) == 8.0
+compiled = MPI.COMM_WORLD.gather(len(jit.compiled_kernels()))
+if compiled:  # one rank writes: lines of two may come mixed
+    print(*compiled)
+"""
+
+
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_functions_in_c_are_compiled_once_like_forms(ranks: int, tmp_path: Path) -> None:
+    def run(ranks: int) -> subprocess.CompletedProcess[str]:
+        command, environment = program(tmp_path, LIBRARY)
+        if ranks == 1:
+            return forked("python", LIBRARY, variables=environment)
+        command = mpirun(ranks, *command)
+        return subprocess.run(command, capture_output=True, text=True, timeout=120, env=environment)
+
+    first, again = run(ranks), run(1)
+    assert (first.returncode, again.returncode) == (0, 0), first.stderr[-2000:]
+    assert first.stderr.count("compiling what doubles, once on this machine: about 2 s") == 1
+    assert "compil" not in again.stderr
+    assert again.stdout.split() == ["0"]
+    assert sorted(first.stdout.split()) == ["0"] * (ranks - 1) + ["1"]
+    one_file(tmp_path, "libremodel_*.so").unlink()
+    assert "removing a compilation that was cut off" in run(1).stderr
+
+
+def test_functions_in_c_that_do_not_compile_leave_nothing(tmp_path: Path) -> None:
+    command, environment = program(tmp_path, LIBRARY.replace("return", "retrun"))
+    done = subprocess.run(mpirun(2, *command), capture_output=True, text=True, timeout=120, env=environment)
+    assert done.returncode != 0
+    assert "the first rank could not compile what doubles" in done.stderr  # said by the second
+    assert not list(tmp_path.rglob("libremodel_*.*"))
+
+
+LOGARITHMS = """
+import sys, dolfinx, numpy as np, ufl
+from mpi4py import MPI
+from remodel_fenicsx.fem import jit
+jit.COMPILER_FLAGS[:] = [flag for flag in jit.COMPILER_FLAGS if flag not in sys.argv[1:]]
+mesh = dolfinx.mesh.create_unit_cube(MPI.COMM_WORLD, 5, 3, 2, dolfinx.mesh.CellType.hexahedron)
+V = dolfinx.fem.functionspace(mesh, ("DG", 1))
+u = dolfinx.fem.Function(V)
+form = jit.form(ufl.ln(u) * ufl.TestFunction(V) * ufl.dx(degree=4))
+u.x.array[:] = np.random.default_rng(1).uniform(1e-3, 1e3, u.x.array.size)
+print(*dolfinx.fem.assemble_vector(form).array.tolist())
+for element, bad in enumerate((np.nan, np.inf, 0.0, -1.0)):
+    u.x.array[8 * element : 8 * element + 8] = bad
+print(*dolfinx.fem.assemble_vector(form).array[:48:8].tolist())
+"""
+
+
+def test_the_simd_logarithm_is_the_scalar_one_and_lets_nothing_pass_the_guards(tmp_path: Path) -> None:
+    """Equal but for rounding; what is no number or infinite is so afterwards, in its own element alone."""
+    said = []
+    for left_out in ((), ("-D__FAST_MATH__",)):
+        command, environment = program(tmp_path, LOGARITHMS)
+        done = subprocess.run([*command, *left_out], env=environment, capture_output=True, text=True, timeout=300)
+        assert done.returncode == 0, done.stderr
+        said.append([np.array(line.split(), dtype=float) for line in done.stdout.splitlines()])
+    (vectors, bad), (scalars, bad_scalars) = said
+    assert np.abs(vectors - scalars).max() <= 1e-14 * np.abs(scalars).max()
+    assert np.isnan(bad[[0, 3]]).all() and bad[1] == np.inf and bad[2] == -np.inf and np.isfinite(bad[4:]).all()
+    np.testing.assert_array_equal(np.isfinite(bad), np.isfinite(bad_scalars))
+
+
+def test_kernels_have_a_simd_logarithm_here() -> None:
+    """On x86-64 with glibc; `info` says whether."""
+    said = forked("remodel-fenicsx", "info").stdout
+    assert jit.has_simd_logarithm() == ("of several points at once" in said)
+    assert jit.has_simd_logarithm() or platform.machine() != "x86_64" or platform.libc_ver()[0] != "glibc"

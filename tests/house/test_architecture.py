@@ -1,0 +1,263 @@
+"""The structure is what docs/architecture.md and CONTRIBUTING.md say: rooms, arrows, registries."""
+
+from __future__ import annotations
+
+import ast
+import functools
+import pkgutil
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+import remodel_fenicsx
+
+ROOT = Path(__file__).parents[2]
+PACKAGE = "remodel_fenicsx"
+# what a room may import: itself, and those before it
+ROOMS = ("_lazy", "_version", "system", "schema", "model", "fem", "kernels", "settings", "body", "scene", "state",
+         "solver", "evolution", "watch", "results", "simulation", "running", "studies", "paper", "cli", "parts",
+         "extend")  # fmt: skip
+# imports that only the type checker follows: of what is there without dolfinx, to what is not
+TYPES_ONLY = {
+    "__init__": {"results.recording", "running", "scene", "simulation"},
+    "body.columns": {"body.shape"},
+    "body.cube": {"body.domain", "body.loading"},
+    "body.shape": {"body.domain", "body.loading"},
+    "body.tendon": {"body.domain", "body.loading"},
+    "body.tube": {"body.domain", "body.loading"},
+    "extend": {"evolution.coupling", "solver.linear", "fem.jit", "results.columns"},
+    "results.recording": {"scene.scene"},
+}
+
+
+@dataclass(frozen=True)
+class Import:
+    """A module of the package (dotted, without the package) that another names; when: module, function or types."""
+
+    importer: str
+    imported: str
+    when: str
+
+
+def modules() -> dict[str, Path]:
+    """By dotted name without the package; a room's face is the room."""
+    found = {}
+    for path in sorted((ROOT / PACKAGE).rglob("*.py")):
+        parts = path.relative_to(ROOT / PACKAGE).with_suffix("").parts
+        found[".".join(parts[:-1] if parts[-1] == "__init__" and len(parts) > 1 else parts)] = path
+    return found
+
+
+@functools.cache
+def imports_of(path: Path) -> list[tuple[str, str]]:
+    """(dotted name of what is imported, when) for every import in a file, whatever is imported."""
+
+    def walk(nodes: list[ast.stmt], when: str) -> Iterator[tuple[str, str]]:
+        for node in nodes:
+            if isinstance(node, ast.Import):
+                yield from ((alias.name, when) for alias in node.names)
+            elif isinstance(node, ast.ImportFrom):
+                assert node.level == 0 and node.module, f"{path}: a relative import"
+                yield from ((f"{node.module}.{alias.name}", when) for alias in node.names)
+            elif isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
+                yield from walk(node.body, "types")
+                yield from walk(node.orelse, when)
+            else:
+                inside = "function" if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)) else when
+                bodies = [getattr(node, field, []) for field in ("body", "orelse", "finalbody")]
+                bodies += [handler.body for handler in getattr(node, "handlers", [])]
+                yield from walk([statement for body in bodies for statement in body], inside)
+
+    return list(walk(ast.parse(path.read_text(encoding="utf-8")).body, "module"))
+
+
+def arrows() -> list[Import]:
+    """All imports of modules of the package in the package."""
+    known, found = modules(), []
+    for name, path in known.items():
+        for imported, when in imports_of(path):
+            parts = imported.split(".")
+            if parts[0] != PACKAGE:
+                continue
+            inner = ".".join(parts[1:])
+            while inner and inner not in known:  # the name of something in a module
+                inner = inner.rpartition(".")[0]
+            found.append(Import(name, inner or "__init__", when))
+    return found
+
+
+def room(module: str) -> str:
+    """The room of a module."""
+    return module.split(".")[0]
+
+
+# ---------------------------------------------------------------- arrows
+def test_the_reader_of_imports_finds_them(tmp_path: Path) -> None:
+    """What the tests below rest on."""
+    text = "import a.b\nif TYPE_CHECKING:\n    from c import d\ntry:\n    import e\nexcept ImportError:\n    import f\n"
+    text += "def g():\n    with h:\n        from i import j, k\nclass L:\n    import m\n"
+    (tmp_path / "x.py").write_text(text)
+    found = imports_of(tmp_path / "x.py")
+    assert found == [("a.b", "module"), ("c.d", "types"), ("e", "module"), ("f", "module"), ("i.j", "function"),
+                     ("i.k", "function"), ("m", "module")]  # fmt: skip
+    assert Import("evolution.stepper", "state.state", "module") in arrows()
+    assert Import("body.cube", "body.domain", "function") in arrows()
+
+
+def test_every_file_is_in_a_room() -> None:
+    assert {room(name) for name in modules()} == {*ROOMS, "__init__", "__main__"}
+
+
+def test_no_arrow_runs_upwards() -> None:
+    """Functions that import when they are called included."""
+    floor = {name: number for number, name in enumerate(ROOMS)}
+    upward = [
+        arrow for arrow in arrows()
+        if arrow.when != "types" and room(arrow.importer) in floor and room(arrow.imported) in floor
+        and floor[room(arrow.imported)] > floor[room(arrow.importer)]
+    ]  # fmt: skip
+    assert not upward
+
+
+@pytest.mark.parametrize(
+    "pair", [("fem", "model"), *((room, "scene") for room in ("state", "solver", "evolution", "watch"))]
+)
+def test_rooms_side_by_side_do_not_know_each_other(pair: tuple[str, str]) -> None:
+    assert not [arrow for arrow in arrows() if {room(arrow.importer), room(arrow.imported)} == set(pair)]
+
+
+def test_scripts_beside_the_package_import_what_is_there() -> None:
+    """Nothing else runs most of them: what they import may move away unnoticed."""
+    scripts = [path for folder in ("benchmarks", "demos", "docs") for path in sorted((ROOT / folder).rglob("*.py"))]
+    assert len(scripts) > 20
+    for path in scripts:
+        for imported, _ in imports_of(path):
+            if imported.split(".")[0] == PACKAGE:
+                pkgutil.resolve_name(imported)  # raises, if it is not
+
+
+def test_no_benchmark_is_without_an_ending() -> None:
+    """Formatters, linters and searches go by it."""
+    assert [path.name for path in (ROOT / "benchmarks").iterdir() if not path.is_dir() and not path.suffix] == []
+
+
+def test_the_package_itself_only_hands_names_on() -> None:
+    """Whoever asks for its version imports nothing else, and no room asks the package itself."""
+    assert {arrow.imported for arrow in arrows() if arrow.importer == "__init__" and arrow.when != "types"} == {
+        "_lazy",
+        "_version",
+    }
+    assert not [arrow for arrow in arrows() if arrow.imported == "__init__"]
+    assert {room(arrow.imported) for arrow in arrows() if arrow.importer == "__main__"} == {"cli"}
+
+
+def test_no_modules_import_each_other_in_a_circle() -> None:
+    after: dict[str, set[str]] = {}
+    for arrow in arrows():
+        if arrow.when == "module" and arrow.importer != arrow.imported:
+            after.setdefault(arrow.importer, set()).add(arrow.imported)
+            parent = arrow.imported.rpartition(".")[0]  # importing a module runs the face of its room first
+            if parent and parent != room(arrow.importer):
+                after[arrow.importer].add(parent)
+
+    done: set[str] = set()
+
+    def visit(module: str, way: tuple[str, ...]) -> None:
+        assert module not in way, " -> ".join((*way[way.index(module) :], module))
+        if module not in done:
+            for following in sorted(after.get(module, ())):
+                visit(following, (*way, module))
+            done.add(module)
+
+    for module in modules():
+        visit(module, ())
+
+
+def test_imports_for_the_type_checker_alone_are_these() -> None:
+    found: dict[str, set[str]] = {}
+    for arrow in arrows():
+        if arrow.when == "types":
+            found.setdefault(arrow.importer, set()).add(arrow.imported)
+    assert found == TYPES_ONLY
+
+
+@pytest.mark.parametrize(("inside", "never"), [
+    ("model", {"dolfinx", "basix", "petsc4py", "mpi4py", "gmsh", "pydantic"}),
+    ("schema", {"dolfinx", "basix", "petsc4py", "mpi4py", "gmsh", "ufl"}),
+    ("settings", {"dolfinx", "basix", "petsc4py", "mpi4py", "gmsh", "ufl"}),
+    ("scene", {"dolfinx", "basix", "petsc4py", "mpi4py", "gmsh", "ufl"}),
+    *((room, {"gmsh", "pydantic", "h5py"}) for room in ("state", "solver", "evolution", "watch")),
+    ("fem", {"gmsh", "pydantic"}),
+])  # fmt: skip
+def test_a_room_does_without(inside: str, never: set[str]) -> None:
+    found = {
+        (name, imported.split(".")[0])
+        for name, path in modules().items()
+        if room(name) == inside
+        for imported, when in imports_of(path)
+        if when != "types" and imported.split(".")[0] in never
+    }
+    assert not found
+
+
+@pytest.mark.parametrize(("module", "never"), [
+    (PACKAGE, "numpy dolfinx basix mpi4py petsc4py gmsh ufl pint h5py pydantic"),
+    (f"{PACKAGE}.scene", "dolfinx basix mpi4py petsc4py gmsh ufl pint h5py"),
+    (f"{PACKAGE}.extend", "dolfinx basix mpi4py petsc4py gmsh ufl pint h5py"),
+    (f"{PACKAGE}.model.laws", "dolfinx basix mpi4py petsc4py gmsh ufl pydantic"),
+    (f"{PACKAGE}.results.recording", "dolfinx basix mpi4py petsc4py gmsh ufl pint pydantic"),
+])  # fmt: skip
+def test_importing_costs_no_more_than_it_must(module: str, never: str) -> None:
+    program = f"import sys, {module}; print(*(name for name in {never.split()} if name in sys.modules))"
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stdout.strip()) == (0, ""), done.stderr
+
+
+# ---------------------------------------------------------------- what to touch to add something
+THINGS = (
+    "a chain law", "a matrix energy", "a repulsive energy", "a driver", "a frame",
+    "a law towards a target, by rank", "any other law",
+    "a pairing of values and dimensions", "initial axes of the cells", "a load", "a column of every shape",
+    "a column of one shape", "a shape", "a kinematics", "a formulation", "a solver method", "a coupling",
+    "a key of a scene",
+)  # fmt: skip
+
+
+def newcomers_table() -> dict[str, tuple[list[str], list[str], list[str]]]:
+    """CONTRIBUTING.md's table: what is added -> files, registries, tests."""
+    page = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    section = page.split("## What to touch to add something")[1].split("\n## ")[0]
+    rows = [line.strip("|").split("|") for line in section.splitlines() if line.startswith("|")]
+    assert [cell.strip() for cell in rows[0]] == ["to add", "write", "in", "register in", "as in"]
+    return {
+        thing.strip(): (*(re.findall(r"`([^`]+)`", cell) for cell in (files, registries, tests)),)  # type: ignore[misc]
+        for thing, _, files, registries, tests in rows[2:]
+    }
+
+
+def test_the_newcomers_table_says_all_that_can_be_added() -> None:
+    assert tuple(newcomers_table()) == THINGS
+
+
+@pytest.mark.parametrize("thing", THINGS)
+def test_what_the_newcomers_table_names_is_there(thing: str) -> None:
+    """Files, registries that can take one more, and a test that adds one from outside."""
+    files, registries, tests = newcomers_table()[thing]
+    assert files and registries and tests
+    for name in files:
+        assert (ROOT / PACKAGE / name).is_file(), name
+    source = ast.parse((ROOT / "tests" / "body" / "test_extensions.py").read_text(encoding="utf-8"))
+    functions = {node.name: ast.unparse(node) for node in source.body if isinstance(node, ast.FunctionDef)}
+    for registry in registries:
+        found = pkgutil.resolve_name(registry := f"{PACKAGE}.{registry}")
+        assert isinstance(found, (dict, tuple, type)), registry
+        assert registry.split(".")[1] in ("extend", "parts", *remodel_fenicsx.__all__), registry
+        *_, owner, name = registry.split(".")
+        adding = (f"setitem({name}", f"setitem({owner}.{name}", f"setattr({owner}, '{name}'", f"Healing{name}(")
+        for test in tests:
+            assert any(call in functions[test] for call in adding), f"{test} adds nothing to {registry}"

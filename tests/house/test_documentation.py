@@ -1,0 +1,158 @@
+"""Pages that are made from the code are those that the code makes, and what they show runs as it stands."""
+
+from __future__ import annotations
+
+import os
+import re
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import remodel_fenicsx
+from tests.forks import COARSE, forked
+
+ROOT = Path(__file__).parents[2]
+
+
+def page(name: str) -> str:
+    """Its text."""
+    return (ROOT / name).read_text(encoding="utf-8")
+
+
+def columns_table() -> str:
+    """As the script makes it."""
+    made = runpy.run_path(str(ROOT / "docs" / "make_columns.py"))["table"]()
+    return str(made)
+
+
+def test_the_table_of_columns_is_the_one_that_the_code_makes() -> None:
+    remedy = "./with-fenicsx python3 docs/make_columns.py"
+    found = re.search(
+        rf"<!-- columns: {re.escape(remedy)} -->\n\n(.*?)\n<!-- end of columns -->", page("docs/commands.md"), re.DOTALL
+    )
+    assert found is not None and found[1] == columns_table(), f"between the two comments belongs: {remedy}"
+
+
+def test_every_column_of_every_shape_is_in_the_table() -> None:
+    """The names of the contract, one by one."""
+    names = set(re.findall(r"^\| `(\w+)` \|", columns_table(), re.MULTILINE))
+    assert names >= {"time", "max_chain_extension", "min_jacobian", "stored_energy", "remodeling_power", "seconds",
+                     "newton_iterations", "linear_iterations", "substeps", "force", "mean_stretch", "pressure",
+                     "axial_elongation", "inner_radius", "outer_radius", "mean_fibre_angle", "fibre_angle_inner",
+                     "fibre_angle_middle", "fibre_angle_outer", "min_stretch", "max_stretch"}  # fmt: skip
+    assert "| `force` | cube, tendon | force |" in columns_table()
+
+
+def test_the_python_of_the_readme_runs_as_it_stands(tmp_path: Path) -> None:
+    (code,) = re.findall(r"```python\n(.*?)```", page("README.md"), re.DOTALL)
+    short, number = re.subn(r'"time\.end": 30\.0', '"time.end": 1.0', code)
+    assert number == 1
+    done = forked("python", COARSE + short, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr[-2000:]
+    *steps, radii = done.stdout.strip().split("\n")
+    assert [float(line.split()[0]) for line in steps] == [1.0]
+    recorded = [float(radius) for radius in radii.strip("[]").split()]
+    assert recorded == pytest.approx([3.0, *(float(line.split()[1]) for line in steps)], abs=1e-7)
+    assert (tmp_path / "results" / "half-pressure" / "fields.vtkhdf").exists()
+
+
+@pytest.mark.parametrize("name", ["README.md", "CONTRIBUTING.md", *(f"docs/{name}.md" for name in (
+    "architecture", "commands", "environment", "interface", "laws", "locking", "reliability", "stability", "theory",
+    "verification"))])  # fmt: skip
+def test_files_and_modules_that_a_page_names_are_there(name: str) -> None:
+    """Paths in backticks or links, and modules after the package's name."""
+    text = re.sub(r"```.*?```", "", page(name), flags=re.DOTALL)
+    rooms = "|".join(
+        (
+            "model",
+            "fem",
+            "kernels",
+            "body",
+            "scene",
+            "state",
+            "solver",
+            "evolution",
+            "watch",
+            "results",
+            "paper",
+            "system",
+            "schema",
+        )
+    )
+    paths = re.findall(rf"`((?:{rooms}|tests|docs|demos|benchmarks|meshes)/[\w/-]+\.\w+)`", text)
+    for path in paths:
+        places = (ROOT / path, ROOT / "remodel_fenicsx" / path)
+        assert any(place.exists() for place in places), path
+    for module in re.findall(r"remodel_fenicsx(?:\.\w+)+", text):
+        assert (ROOT / module.replace(".", "/")).with_suffix(".py").exists(), module
+    for link in re.findall(r"\]\((?!http)([\w./-]+)\)", text):
+        assert (ROOT / name).parent.joinpath(link).exists(), link
+
+
+def test_a_name_that_the_package_does_not_have_is_refused() -> None:
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        remodel_fenicsx.nothing  # noqa: B018
+
+
+# ---------------------------------------------------------------- scripts beside the package
+def script(program: list[str], folder: Path) -> str:
+    """What it prints."""
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join((str(ROOT), str(ROOT / "docs")))}
+    done = subprocess.run(
+        [sys.executable, *program], cwd=folder, env=environment, capture_output=True, text=True, timeout=500
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    return done.stdout
+
+
+def test_the_benchmark_says_where_the_time_goes(tmp_path: Path) -> None:
+    mesh = COARSE.replace("(8, 4, 1)", "(24, 6, 4)")  # large enough for times of two digits
+    program = f"{mesh}import runpy; runpy.run_path({str(ROOT / 'benchmarks' / 'artery.py')!r}, run_name='__main__')"
+    done = forked("python", program, "--steps", "2", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr[-2000:]
+    printed = done.stdout
+    (total,) = re.findall(r"^artery: 2 steps, \d+ Newton iterations, ([\d.]+) s$", printed, re.MULTILINE)
+    parts = dict(re.findall(r"^(\w[\w ]*?) +([\d.]+) s +[\d.]+ %$", printed, re.MULTILINE))
+    assert set(parts) == {"tangent", "residual", "linear solve", "guards and the rest of SNES", "remodeling",
+                          "columns", "record", "the rest"}  # fmt: skip
+    assert sum(map(float, parts.values())) == pytest.approx(float(total), abs=0.1)
+    assert all(float(parts[name]) > 0 for name in ("tangent", "linear solve", "remodeling", "record"))
+
+
+STUDIES = """
+import verification_studies as studies
+(row,) = studies.stiff_tendon("tendon", **{"time.end": 1.0, "material.energy_factor": 1})
+assert 1.1 < row["mean_stretch"] < 1.3 and row["time"] == 1.0, row
+# with a hint of suction some points are not pulled in any direction
+points = studies.stopped_points("artery-0-4.8", **{"time.end": 1.0, "loads.pressure.value": -1e-6})
+assert 0 < len(points) < 1536 * 8, len(points)
+for point in points:
+    assert point["passes"] == 0 and point["largest_stress"] < 1e-7 and 1 < point["radius"] < 3, point
+print(sorted(points[0]))
+"""
+
+
+LAWS = """
+import compare_laws as laws
+page = laws.PAGE.read_text(encoding="utf-8")
+assert laws.MARKS[0] + laws.comparison() + laws.MARKS[1] in page, "make the table again: docs/compare_laws.py"
+case, law = laws.CASES["cube"], laws.LAWS["relaxation-continuous"]
+rows = laws.history(case, law, **{"time.end": 2.0})
+assert [row[0] for row in rows] == [1.0, 2.0] and 60 < rows[-1][1] < 70 and rows[-1][2] < 1 < rows[-1][4], rows
+"""
+
+
+@pytest.mark.slow
+def test_the_laws_beside_each_other_are_those_of_their_table_and_run(tmp_path: Path) -> None:
+    """A short run of the cube whose load turns: it becomes shorter along z, while it is pulled along x."""
+    script(["-c", LAWS], tmp_path)
+
+
+def test_the_studies_of_the_verification_page_run(tmp_path: Path) -> None:
+    """Short ones; the comparisons with the radial reference are tests of their own."""
+    done = forked("python", f"import sys; sys.path.insert(0, {str(ROOT / 'docs')!r})\n{STUDIES}", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert done.stdout == "['element', 'fibre_angle', 'largest_stress', 'passes', 'radius']\n"

@@ -1,0 +1,100 @@
+"""tests/mutate: what it says of faults that are noticed and of those that are not; and that its table is in order."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+MUTATE = Path(__file__).parents[1] / "mutate"
+SOURCE = "def double(x):\n    return 2 * x\n\n\ndef unused():\n    return 5\n"
+TEST = "from arithmetic import double\n\n\ndef test_double():\n    assert double(2) == 4\n"
+TABLE = """
+["arithmetic.py"]
+tests = ["test_arithmetic.py"]
+half = ['return 2 * x', 'return x / 2']
+square = ['2 * x', 'x ** x']
+unused = ['return 5', 'return 6']
+endless = ['    return 2 * x', '    while True: pass']
+crash = ['    return 2 * x', '    import os; os.abort()']
+nonsense = ['return 2 * x', 'return return']
+"""
+
+
+@pytest.fixture
+def project(tmp_path: Path) -> Path:
+    """A file, its test, and faults of every kind."""
+    made = tmp_path / "project"
+    (made / "tests").mkdir(parents=True)
+    (made / "table").mkdir()
+    (made / "arithmetic.py").write_text(SOURCE)
+    (made / "tests" / "test_arithmetic.py").write_text(TEST)
+    (made / "table" / "all.toml").write_text(TABLE)
+    return made
+
+
+def mutate(project: Path, *arguments: str) -> tuple[int, str]:
+    """Exit status and what it said."""
+    command = [sys.executable, str(MUTATE), "--project", str(project), "--table", str(project / "table"), *arguments]
+    # the project's tests are plain: pytest's plugins, which take longer than they do, stay away
+    environment = {**os.environ, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, env=environment)
+    assert "Traceback" not in done.stderr, done.stderr
+    return done.returncode, done.stdout
+
+
+def test_what_is_noticed_is_killed(project: Path) -> None:
+    status, said = mutate(project, "--only", "half", "--only", "crash")
+    assert status == 0 and "2 of 2 killed" in said
+    assert "FAILED tests/test_arithmetic.py::test_double" in said and "ended by signal 6" in said
+
+
+def test_a_survivor_is_named_and_the_project_stays(project: Path) -> None:
+    before = {path: path.read_text() for path in project.rglob("*") if path.is_file()}
+    status, said = mutate(project, "--only", "square", "--only", "unused")
+    assert status == 1 and "0 of 2 killed" in said
+    assert said.endswith("survived: square\nsurvived: unused\n")  # 2 ** 2 is 4 too
+    assert before == {path: path.read_text() for path in project.rglob("*") if path.is_file()}
+
+
+def test_tests_that_hang_have_noticed(project: Path) -> None:
+    status, said = mutate(project, "--only", "endless", "--limit", "1")
+    assert status == 0 and "no end within 1 s" in said
+
+
+def test_a_fault_that_cannot_be_imported_says_nothing(project: Path) -> None:
+    status, said = mutate(project, "--only", "nonsense")
+    assert status == 1 and "no verdict: nonsense" in said and "SyntaxError" in said
+
+
+def test_tests_that_fail_anyhow_are_no_proof(project: Path) -> None:
+    (project / "tests" / "test_arithmetic.py").write_text(TEST.replace("== 4", "== 5"))
+    status, said = mutate(project, "--only", "half")
+    assert status == 1 and "the tests do not pass without a fault" in said and "killed" not in said
+
+
+@pytest.mark.parametrize(("old", "new", "words"), [
+    ("2 * x\n", "x + x\n", "half: arithmetic.py has its text 0 times: 'return 2 * x'"),
+    ("return 5", "return 2 * x", "half: arithmetic.py has its text 2 times: 'return 2 * x'"),
+])  # fmt: skip
+def test_a_table_that_has_rotted_is_refused(old: str, new: str, words: str, project: Path) -> None:
+    (project / "arithmetic.py").write_text(SOURCE.replace(old, new))
+    for arguments in (["--list"], ["--only", "half"]):
+        status, said = mutate(project, *arguments)
+        assert status == 1 and words in said and "killed" not in said
+
+
+def test_a_test_that_is_not_there_is_refused(project: Path) -> None:
+    (project / "table" / "all.toml").write_text(TABLE.replace("x / 2']", 'x / 2\', "test_arithmetic.py::test_half"]'))
+    status, said = mutate(project, "--list")
+    assert status == 1 and "half: there is no tests/test_arithmetic.py::test_half" in said
+
+
+def test_the_table_fits_the_project() -> None:
+    """Every text occurs once, every test is there: who changes such a line changes its fault in tests/mutations too."""
+    done = subprocess.run([sys.executable, str(MUTATE), "--list"], capture_output=True, text=True, timeout=200)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert len(done.stdout.splitlines()) >= 40

@@ -1,0 +1,125 @@
+"""The compiled law `tensor` and repulsion `log` do what numpy's do, without a mesh."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from scipy.spatial.transform import Rotation
+
+from remodel_fenicsx.kernels.tensor import CompiledPoints, TensorKernels, condensed_points
+from remodel_fenicsx.model import energy
+from remodel_fenicsx.model.cells import UnitCell
+from remodel_fenicsx.model.chains import CHAINS
+from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
+from remodel_fenicsx.model.implicit import condensed
+from remodel_fenicsx.model.implicit.condensed import CondensedPoints
+from remodel_fenicsx.model.laws import Drive, tensor_target
+from tests.model.test_condensed import deformations, points
+from tests.model.test_tensor_law import cells_of, right_cauchy_green, structures
+
+COUNT = 60
+
+
+@pytest.fixture(scope="module")
+def kernels() -> TensorKernels:
+    return TensorKernels(MPI.COMM_SELF)
+
+
+@pytest.mark.parametrize("second", [True, False])
+def test_derivatives_of_the_logarithm(kernels: TensorKernels, second: bool) -> None:
+    """Equal and nearly equal eigenvalues too, on both sides of the series' threshold."""
+    C = right_cauchy_green()
+    A = structures(len(C))
+    expected, found = (derivatives(C, A, second) for derivatives in (energy.log_derivatives, kernels.log_derivatives))
+    np.testing.assert_allclose(found[0], expected[0], atol=1e-13)
+    if not second:
+        assert found[1] is None
+        return
+    np.testing.assert_allclose(found[1], expected[1], atol=1e-11 * np.abs(expected[1]).max())
+
+
+def test_the_sum_of_the_energy(kernels: TensorKernels) -> None:
+    F, cells = np.linalg.cholesky(right_cauchy_green()), cells_of(structures(26))
+    expected = energy.log_sum(F, [cells], 1.0)
+    np.testing.assert_allclose(kernels.log_sum(F, [cells], 1.0), expected, atol=1e-13)
+    half = [UnitCell(*cells[:2], weight=0.5)] * 2
+    np.testing.assert_allclose(kernels.log_sum(F, half, 1.0), expected, atol=1e-13)
+
+
+@pytest.mark.parametrize("driver", ["cauchy", "pk2"])
+@pytest.mark.parametrize("frame", ["material", "spatial"])
+def test_the_target(kernels: TensorKernels, driver: str, frame: str) -> None:
+    """Tension, compression, nothing, and values near the switch."""
+    rng = np.random.default_rng(2)
+    tensors = rng.standard_normal((40, 3, 3))
+    tensors = tensors + np.swapaxes(tensors, 1, 2)
+    tensors[:4] = np.array([0.0, -1.0, 3e-11, 1e200])[:, None, None] * np.eye(3)
+    F = deformations(40, rng)
+    drive = Drive(F, tensors, DRIVERS[driver], FRAMES[frame], 1e-14, np.zeros((40, 3)), np.ones(40), 0.025)
+    for threshold, rounding in ((1e-14, 1e-14), (rng.uniform(0, 0.3, 40), 1e-14), (0.0, rng.uniform(0, 1e-4, 40))):
+        asked = drive._replace(threshold=threshold, rounding=rounding)
+        expected, found = tensor_target(asked), kernels.target(asked)
+        np.testing.assert_allclose(found.direction, expected.direction, atol=1e-12)
+        np.testing.assert_allclose(found.share, expected.share, atol=1e-12)
+
+
+def compiled_twin(kernels: TensorKernels, some: CondensedPoints) -> CompiledPoints:
+    twin = condensed_points(kernels, some.tissue, some.step)
+    assert isinstance(twin, CompiledPoints)
+    return twin
+
+
+@pytest.mark.parametrize("name", ["log", "length"])
+@pytest.mark.parametrize("driver", ["cauchy", "pk2", "finger"])
+def test_solution_and_tangent(kernels: TensorKernels, name: str, driver: str) -> None:
+    """Random cells, a stress that is partly compression; the last points with equal stretches."""
+    rng = np.random.default_rng(11)
+    F = deformations(COUNT, rng) + 0.05 * rng.standard_normal((COUNT, 3, 3))
+    F[-4:] = np.array([1.2, 1.2, 1.2, 1.2, 1.2, 0.8, 0.9, 1.3, 1.3, 0.9, 0.9, 0.9]).reshape(4, 3, 1) * np.eye(3)
+    some = points("tensor", name, driver, "material", COUNT, "random", kappa=0.1)
+    twin, start = compiled_twin(kernels, some), some.kept(F, some.step.cells, some.step.structure).driving_tensor
+    assert (np.linalg.eigvalsh(start) < 0).any() or driver == "finger"
+    expected, found = some.solve(F, start), twin.solve(F, start)
+    assert found.rest is None and expected.converged.all() and found.converged.all()
+    for quantity in ("driving_tensor", "structure", "first_piola_kirchhoff", "squared_lengths"):
+        value = getattr(expected, quantity)
+        np.testing.assert_allclose(getattr(found, quantity), value, atol=1e-10 * np.abs(value).max(), err_msg=quantity)
+    none = np.zeros(COUNT, dtype=bool)
+    tangent = some.tangent(expected, none)
+    np.testing.assert_allclose(twin.tangent(found, none), tangent, atol=1e-9 * np.abs(tangent).max())
+
+
+def test_what_the_kernel_does_not_solve_numpy_does(kernels: TensorKernels, monkeypatch: pytest.MonkeyPatch) -> None:
+    """kappa dt = 10: where Newton's method does not find the end of the step, it is followed; r >= L has none."""
+    monkeypatch.setattr(condensed, "ITERATIONS", 10)  # where there is none all are spent, in every part of the step
+    rng = np.random.default_rng(8)
+    R = Rotation.random(COUNT, random_state=rng).as_matrix()
+    F = np.swapaxes(R, 1, 2) @ ((1 + rng.uniform(-0.2, 0.3, (COUNT, 3)))[:, :, None] * R)
+    F[0] = 3.0 * np.eye(3)
+    some = points("tensor", "log", "cauchy", "material", COUNT, "random", kappa=2.5)
+    twin, start = compiled_twin(kernels, some), some.kept(F, some.step.cells, some.step.structure).driving_tensor
+    expected, found = some.solve(F, start), twin.solve(F, start)
+    assert found.rest is not None and 0 in found.rest[0]
+    assert not expected.converged[0] and expected.converged[1:].all()
+    np.testing.assert_array_equal(found.converged, expected.converged)
+    solved = found.converged
+    np.testing.assert_allclose(found.structure[solved], expected.structure[solved], atol=1e-9)
+    none = np.zeros(COUNT, dtype=bool)
+    tangent = some.tangent(expected, none)[1:]
+    np.testing.assert_allclose(twin.tangent(found, none)[1:], tangent, atol=1e-7 * np.abs(tangent).max())
+
+
+def test_parts_that_the_kernel_does_not_know_are_numpys(kernels: TensorKernels) -> None:
+    """Another law, frame or chain: no silent stand-in."""
+    some = points("tensor", "log", "cauchy", "material", 2)
+    chain = replace(CHAINS["wormlike"], locks=False)
+    for tissue, step in (
+        (some.tissue, points("explicit", "log", "cauchy", "material", 2).step),
+        (some.tissue, points("tensor", "log", "cauchy", "spatial", 2).step),
+        (replace(some.tissue, chain=chain), some.step),
+    ):
+        assert type(condensed_points(kernels, tissue, step)) is CondensedPoints
+    assert type(condensed_points(None, some.tissue, some.step)) is CondensedPoints

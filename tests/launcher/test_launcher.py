@@ -1,0 +1,781 @@
+"""./with-fenicsx: a copy of it in a clone of its own, real namespaces, and a root that a stand-in for mmdebstrap makes.
+
+The stand-in's root holds links to this machine's own /usr and /etc, so that the real enter-root has real work to do.
+No stand-in reaches the network, installs anything, or starts a container.
+"""
+
+import atexit
+import functools
+import json
+import os
+import shutil
+import signal
+import stat
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import slowly
+
+PROJECT = Path(__file__).resolve().parents[2]
+LONG = 200  # seconds, for what takes a few on an idle machine
+SYSTEM_PATH = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
+
+MMDEBSTRAP = r"""#!/bin/bash
+# the arguments, one a line, then what STUB_BUILD asks for
+[ "$1" != --unshare-helper ] || { shift; printf '%s\n' "$*" >> "$RECORD/helper"; exec "$@"; }
+printf '%s\n' "$@" '----' >> "$RECORD/mmdebstrap"
+echo $$ > "$RECORD/pid"
+readlink /proc/$$/fd/* | grep '\.lock$' > "$RECORD/held"
+echo "I: downloading packages with apt..." >&2
+target=${!#}
+[ "$target" != - ] || target=$(mktemp -d)
+mkdir -p "$target"
+touch "$target/half"
+timeout 2 cat > /dev/null
+case ${STUB_BUILD:-} in
+    fail) echo "E: no such mirror" >&2; exit 1 ;;
+    killed) sleep 100 & echo $! > "$RECORD/orphan"; kill -KILL $$ ;;
+    held) touch "$RECORD/begun"; until [ -e "$RECORD/go" ]; do sleep 0.1; done ;;
+    hang) touch "$RECORD/begun"; sleep 300 ;;
+esac
+ln -s /usr /etc "$target"; mkdir -p "$target/var/lib/dpkg"; rm "$target/half"
+[ "${!#}" != - ] || tar -C "$target" -c .
+"""
+
+# Debian's minimal roots have no mount command; in C, because a start of the launcher calls it fifteen times
+MOUNT = r"""
+#include <stdio.h>
+#include <string.h>
+#include <sys/mount.h>
+int main(int number, char **words) {
+    if (!strcmp(words[1], "-t")) return mount("tmpfs", words[6], "tmpfs", 0, words[4]);
+    unsigned long flags = !strcmp(words[1], "--bind") ? MS_BIND : MS_BIND | MS_REC;
+    if (!strcmp(words[1], "-o")) flags = MS_REMOUNT | MS_BIND | MS_RDONLY;
+    if (mount(words[2], words[3], NULL, flags, NULL)) { perror(words[number - 1]); return 1; }
+    return 0;
+}
+"""
+
+ENGINE = r"""#!/bin/bash
+# the arguments of each call, a JSON list a line
+python3 -c 'import json, sys; print(json.dumps(sys.argv[1:]))' "$(basename "$0")" "$@" >> "$RECORD/engine"
+case "$STUB_ENGINE:$1" in
+    *:info) exit 0 ;;
+    none:*) exit 125 ;;
+    built:image) exit 0 ;;
+    *:image) exit 1 ;;
+    *) exit "${STUB_STATUS:-0}" ;;
+esac
+"""
+
+
+def script(path: Path, text: str) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+    path.chmod(0o755)
+
+
+@functools.cache
+def mount_command() -> Path:
+    """A program like mount(8), compiled once."""
+    folder = Path(tempfile.mkdtemp())
+    atexit.register(shutil.rmtree, folder)
+    subprocess.run(["gcc", "-x", "c", "-", "-o", folder / "mount"], input=MOUNT, text=True, check=True)
+    return folder / "mount"
+
+
+class Clone:
+    """A copy of the launcher in a folder whose name has a space, with an empty cache and stand-ins on the PATH."""
+
+    def __init__(self, folder: Path, cache: Path | None = None):
+        self.folder = folder / "a clone"
+        self.cache = cache or folder / "cache"
+        self.record = folder / "record"
+        stubs = folder / "stubs"
+        for made in (self.folder, self.record, folder / "home"):
+            made.mkdir(parents=True)
+        shutil.copy(PROJECT / "with-fenicsx", self.folder)
+        shutil.copytree(PROJECT / "environment", self.folder / "environment")
+        shutil.copy(PROJECT / "Dockerfile", self.folder)
+        self.launcher = self.folder / "with-fenicsx"
+        self.packages = self.folder / "environment" / "debian-packages.txt"
+        self.stubs = stubs
+        script(stubs / "mmdebstrap", MMDEBSTRAP)
+        script(stubs / "newuidmap", "#!/bin/sh\nexit 1\n")
+        script(stubs / "apt-get", '#!/bin/sh\necho "$*" >> "$RECORD/apt-get"; echo "E: no network" >&2; exit 100\n')
+        for engine in ("docker", "podman"):
+            script(stubs / engine, ENGINE)
+        if not shutil.which("mount", path=SYSTEM_PATH):
+            (self.folder / "bin").mkdir()
+            shutil.copy(mount_command(), self.folder / "bin" / "mount")
+        self.environment = {
+            "PATH": f"{stubs}:{self.folder}/bin:{SYSTEM_PATH}",
+            "HOME": str(folder / "home"),
+            "LANG": "C.UTF-8",
+            "XDG_CACHE_HOME": str(self.cache),
+            "RECORD": str(self.record),
+            "WITH_FENICSX": "root",
+            "STUB_ENGINE": "none",
+        }
+
+    def start(self, *command: str, **options):
+        environment = self.environment | options.pop("environment", {})
+        environment = {name: value for name, value in environment.items() if value is not None}
+        options = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE} | options
+        return subprocess.Popen(
+            [options.pop("launcher", self.launcher), *command],
+            env=environment,
+            text=True,
+            start_new_session=True,
+            **options,
+        )
+
+    def run(self, *command: str, send: str | None = None, **options):
+        if send is not None:
+            options["stdin"] = subprocess.PIPE
+        process = self.start(*command, **options)
+        out, err = process.communicate(send, timeout=LONG)
+        return subprocess.CompletedProcess(command, process.returncode, out, err)
+
+    def builds(self) -> list[list[str]]:
+        record = self.record / "mmdebstrap"
+        return [call.split("\n") for call in record.read_text().split("\n----\n")[:-1]] if record.exists() else []
+
+    def roots(self) -> list[str]:
+        return sorted(path.name for path in (self.cache / "remodel-fenicsx").iterdir() if path.is_dir())
+
+    def engine_calls(self) -> list[list[str]]:
+        return [json.loads(line) for line in (self.record / "engine").read_text().splitlines()]
+
+
+def wait_for(condition, what: str) -> None:
+    deadline = time.monotonic() + LONG
+    while time.monotonic() < deadline:
+        if condition():
+            return
+        time.sleep(0.05)
+    pytest.fail(f"after {LONG} s still waiting for {what}")
+
+
+def namespaces_work(clone: Clone) -> bool:
+    mapped = [] if os.getuid() == 0 else ["--user", "--map-root-user"]
+    return (
+        shutil.which("unshare") is not None
+        and subprocess.run(
+            ["unshare", *mapped, "--mount", "--propagation", "private", "mount", "--bind", "/usr", "/usr"],
+            env=clone.environment,
+            capture_output=True,
+        ).returncode
+        == 0
+    )
+
+
+@pytest.fixture
+def clone(tmp_path):
+    return Clone(tmp_path)
+
+
+@pytest.fixture
+def rooted(clone):
+    if not namespaces_work(clone):
+        pytest.skip("this machine allows no mount namespaces")
+    return clone
+
+
+@pytest.fixture(scope="module")
+def ready(tmp_path_factory):
+    """A clone whose root is made already: for tests that change nothing in it."""
+    clone = Clone(tmp_path_factory.mktemp("ready"))
+    if not namespaces_work(clone):
+        pytest.skip("this machine allows no mount namespaces")
+    assert clone.run("true").returncode == 0
+    return clone
+
+
+# ---------------------------------------------------------------- the command is as if it ran here
+@pytest.mark.parametrize("code", [0, 1, 5, 37, 130])
+def test_exit_status_is_the_commands(ready, code):
+    result = ready.run("sh", "-c", f"exit {code}")
+    assert (result.returncode, result.stdout, result.stderr) == (code, "", "")
+
+
+def test_unknown_command(ready):
+    assert ready.run("no-such-command").returncode == 127
+
+
+def test_arguments_and_standard_input(ready):
+    arguments = ["a b", "", "line\nbreak", "*", "-v", "$HOME", "q'\"\\"]
+    result = ready.run(
+        "python3",
+        "-c",
+        "import json, sys; print(json.dumps([sys.argv[1:], sys.stdin.read()]))",
+        *arguments,
+        send="one\n\ntwo",
+    )
+    assert json.loads(result.stdout) == [arguments, "one\n\ntwo"]
+    assert result.stderr == ""
+
+
+@pytest.mark.parametrize("where", ["/var/tmp", "/dev/shm", "/tmp"])
+def test_working_folder_and_owner(ready, where):
+    folder = Path(subprocess.check_output(["mktemp", "-d", f"{where}/with fenicsx.XXXXXX"], text=True).strip())
+    try:
+        result = ready.run("sh", "-c", "pwd; echo data > file", cwd=folder)
+        assert (result.returncode, result.stdout.strip()) == (0, str(folder))
+        assert (folder / "file").read_text() == "data\n"
+        assert (folder / "file").stat().st_uid == os.getuid()
+    finally:
+        shutil.rmtree(folder)
+
+
+def test_through_a_link_from_elsewhere(ready, tmp_path):
+    link = tmp_path / "link"
+    link.symlink_to(ready.launcher)
+    result = ready.run("sh", "-c", 'echo "$PYTHONPATH"; pwd', launcher=link, cwd=tmp_path)
+    assert result.stdout.splitlines() == [str(ready.folder), str(tmp_path)]
+
+
+def test_process_is_the_command_and_gets_its_signals(ready):
+    for number in (signal.SIGINT, signal.SIGTERM):
+        process = ready.start("python3", "-c", "import os, time; print(os.getpid(), flush=True); time.sleep(60)")
+        assert int(process.stdout.readline()) == process.pid
+        os.killpg(process.pid, number)
+        process.communicate(timeout=LONG)
+        assert process.returncode == -number
+
+
+def test_nothing_stays_mounted(ready):
+    inside = ready.run("cat", "/proc/self/mountinfo").stdout
+    assert f"{ready.cache.name}/remodel-fenicsx" in inside or " /usr ro" in inside
+    assert str(ready.cache) not in Path("/proc/self/mountinfo").read_text()
+
+
+def test_another_python_does_not_reach_in(ready):
+    foreign = {
+        name: "/nowhere"
+        for name in (
+            "PYTHONPATH",
+            "PYTHONHOME",
+            "VIRTUAL_ENV",
+            "CONDA_PREFIX",
+            "LD_LIBRARY_PATH",
+            "CC",
+            "CFLAGS",
+            "PETSC_DIR",
+            "BASH_ENV",
+        )
+    }
+    fake = ready.stubs.parent / "conda"
+    script(fake / "python3", "#!/bin/sh\nexit 99\n")
+    result = ready.run(
+        "python3",
+        "-c",
+        "import json, os; print(json.dumps(dict(os.environ)))",
+        environment=foreign | {"PATH": f"{fake}:{ready.environment['PATH']}", "KEPT": "yes"},
+    )
+    inside = json.loads(result.stdout)
+    assert inside["KEPT"] == "yes"
+    assert inside["PYTHONPATH"] == str(ready.folder)
+    assert [name for name in foreign if name != "PYTHONPATH" and name in inside] == []
+    assert "WITH_FENICSX" not in inside  # a command that calls the launcher again is inside already
+
+
+def test_session_folder_is_private(ready):
+    result = ready.run("sh", "-c", 'stat -c "%a %u" "$TMPDIR"')
+    assert result.stdout.split()[0] == "700"
+
+
+def test_ranks_must_start_inside(ready):
+    result = ready.run("true", environment={"OMPI_COMM_WORLD_SIZE": "2"})
+    assert (result.returncode, result.stderr) == (
+        5,
+        "with-fenicsx: the ranks must start inside: ./with-fenicsx mpirun -n 2 true\n",
+    )
+
+
+# ---------------------------------------------------------------- making the root
+def test_made_once_from_the_list(rooted):
+    first = rooted.run("cat", send="made\n")
+    assert (first.returncode, first.stdout) == (0, "made\n")
+    assert "making a Debian trixie environment" in first.stderr and "downloading packages" in first.stderr
+    second = rooted.run("echo", "again")
+    assert (second.returncode, second.stdout, second.stderr) == (0, "again\n", "")
+    (arguments,) = rooted.builds()
+    (included,) = [argument.removeprefix("--include=") for argument in arguments if argument.startswith("--include=")]
+    lines = [line.split("#")[0].strip() for line in rooted.packages.read_text().splitlines()]
+    assert included.split(",") == [line for line in lines if line]
+    assert "trixie" in arguments
+
+
+def test_key_is_the_list_and_the_release(rooted):
+    rooted.run("true")
+    rooted.packages.write_text(rooted.packages.read_text() + "# a comment changes nothing\n\n")
+    rooted.run("true")
+    assert len(rooted.roots()) == 1
+    rooted.packages.write_text(rooted.packages.read_text() + "one-more\n")
+    rooted.run("true")
+    assert len(rooted.roots()) == 2
+    rooted.run("true", environment={"WITH_FENICSX_SUITE": "unstable"})
+    assert [name.split("-")[0] for name in rooted.roots()] == ["trixie", "trixie", "unstable"]
+    assert any("Check-Valid-Until" in argument for argument in rooted.builds()[-1])
+
+
+def test_two_clones_at_once_make_one(rooted, tmp_path):
+    other = Clone(tmp_path / "other", cache=rooted.cache)
+    first = rooted.start("echo", "first", environment={"STUB_BUILD": "held"})
+    wait_for((rooted.record / "begun").exists, "the first build")
+    second = other.start("echo", "second")
+    assert second.stderr.readline() == "with-fenicsx: another run is making the environment: waiting for it\n"
+    (rooted.record / "go").touch()
+    assert second.communicate(timeout=LONG)[0] == "second\n"
+    assert second.returncode == 0
+    assert first.communicate(timeout=LONG)[0] == "first\n"
+    assert (len(rooted.builds()), len(other.builds())) == (1, 0)
+
+
+@pytest.mark.parametrize("number, group", [(signal.SIGINT, True), (signal.SIGTERM, False), (signal.SIGHUP, False)])
+def test_build_ends_with_the_launcher(rooted, number, group):
+    process = rooted.start("true", environment={"STUB_BUILD": "hang"})
+    wait_for((rooted.record / "begun").exists, "the build")
+    (os.killpg if group else os.kill)(process.pid, number)
+    process.communicate(timeout=LONG)
+    assert process.returncode == 128 + number
+    builder = int((rooted.record / "pid").read_text())
+    wait_for(lambda: not Path(f"/proc/{builder}").exists(), "the end of mmdebstrap")
+    assert rooted.roots() == []
+    assert rooted.run("true").returncode == 0
+    assert len(rooted.builds()) == 2
+
+
+def test_killed_launcher_leaves_a_build_that_the_next_run_takes(rooted):
+    process = rooted.start(
+        "true", environment={"STUB_BUILD": "held"}, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    wait_for((rooted.record / "begun").exists, "the build")
+    process.kill()
+    process.wait()
+    after = rooted.start("echo", "after")
+    assert "waiting" in after.stderr.readline()
+    (rooted.record / "go").touch()
+    assert after.communicate(timeout=LONG)[0] == "after\n"
+    assert after.returncode == 0
+    assert len(rooted.builds()) == 1
+
+
+def test_killed_build_is_never_used(rooted):
+    process = rooted.start(
+        "true", environment={"STUB_BUILD": "hang"}, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    wait_for((rooted.record / "begun").exists, "the build")
+    process.kill()
+    process.wait()
+    os.killpg(os.getpgid(int((rooted.record / "pid").read_text())), signal.SIGKILL)
+    (part,) = rooted.roots()
+    assert part.endswith(".part")
+    (rooted.cache / "remodel-fenicsx" / part / "left over").touch()
+    assert rooted.run("true").returncode == 0
+    assert rooted.roots() == [part.removesuffix(".part")]
+    assert not (rooted.cache / "remodel-fenicsx" / rooted.roots()[0] / "left over").exists()
+    assert len(rooted.builds()) == 2
+
+
+def a_user_builds(rooted, tmp_path) -> dict[str, str]:
+    """The environment in which the launcher takes the way of one who is not root: the root comes as a tar stream."""
+    script(rooted.stubs / "id", "#!/bin/sh\necho 1000\n")
+    if os.getuid() == 0:  # who may mount already needs no user namespace for it
+        real = shutil.which("unshare", path=SYSTEM_PATH)
+        script(
+            rooted.stubs / "unshare",
+            f'#!/bin/bash\nshopt -s extglob\nexec {real} "${{@/--@(user|map-root-user)/--mount}}"\n',
+        )
+    (tmp_path / "temporary").mkdir()
+    return {"TMPDIR": str(tmp_path / "temporary")}
+
+
+def killed_build(rooted, environment: dict[str, str]) -> Path:
+    """Launcher and builder end by SIGKILL in the middle; the temporary folder that is left."""
+    silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    process = rooted.start("true", environment=environment | {"STUB_BUILD": "hang"}, **silent)
+    wait_for((rooted.record / "begun").exists, "the build")
+    process.kill()
+    process.wait()
+    os.killpg(os.getpgid(int((rooted.record / "pid").read_text())), signal.SIGKILL)
+    (lock,) = (rooted.cache / "remodel-fenicsx").glob("*.lock")
+    wait_for(lambda: subprocess.run(["flock", "-n", lock, "true"]).returncode == 0, "the end of all that held the lock")
+    (left,) = Path(environment["TMPDIR"]).glob("remodel-fenicsx-build-*")
+    assert list(left.glob("*/half"))
+    # as owned by a mapped user: rm alone does not get rid of it
+    script(
+        rooted.stubs / "rm",
+        f"""#!/bin/bash
+shopt -s nullglob; rest=({left}/*/*)
+[ ${{#rest[@]}} = 0 ] || [ "${{!#}}" != {left} ] || exit 1
+exec {shutil.which("rm", path=SYSTEM_PATH)} "$@"
+""",
+    )
+    return left
+
+
+@pytest.mark.parametrize("other_list", [False, True])
+def test_the_next_start_removes_what_a_killed_build_left(rooted, tmp_path, other_list):
+    environment = a_user_builds(rooted, tmp_path)
+    left = killed_build(rooted, environment)
+    (part,) = rooted.roots()
+    if other_list:
+        rooted.packages.write_text(rooted.packages.read_text() + "one-more\n")
+    after = rooted.run("echo", "after", environment=environment)
+    assert (after.returncode, after.stdout) == (0, "after\n"), after.stderr
+    assert "with-fenicsx: removing what a build that was killed has left of " in after.stderr
+    assert part not in rooted.roots() and len(rooted.roots()) == 1
+    assert list((tmp_path / "temporary").iterdir()) == []
+    assert (rooted.record / "helper").read_text() == f"find {left} -mindepth 2 -xdev -delete\n"
+    assert list((rooted.cache / "remodel-fenicsx").glob("*.building")) == []
+    assert rooted.run("true", environment=environment).stderr == ""
+
+
+def test_what_a_build_that_goes_on_needs_is_not_removed(rooted, tmp_path):
+    environment = a_user_builds(rooted, tmp_path)
+    first = rooted.start("echo", "first", environment=environment | {"STUB_BUILD": "held"})
+    wait_for((rooted.record / "begun").exists, "the first build")
+    other = Clone(tmp_path / "other", cache=rooted.cache)
+    other.packages.write_text(other.packages.read_text() + "one-more\n")
+    a_user_builds(other, tmp_path / "other")
+    second = other.run("echo", "second", environment=environment)
+    assert (second.returncode, second.stdout) == (0, "second\n")
+    assert "removing" not in second.stderr
+    assert list((tmp_path / "temporary").glob("remodel-fenicsx-build-*/*/half"))
+    (rooted.record / "go").touch()
+    out, err = first.communicate(timeout=LONG)
+    assert (first.returncode, out) == (0, "first\n"), err
+    assert list((tmp_path / "temporary").iterdir()) == []
+    # what mmdebstrap leaves behind when it is killed must not hold up all later starts
+    assert (rooted.record / "held").read_text() == ""
+
+
+def test_processes_of_mapped_users_that_a_killed_build_left_are_ended(rooted, tmp_path):
+    """mmdebstrap's own, without a parent, hold its pipes open: they wait for ever."""
+    become = [sys.executable, "-c", "import os; os.setuid(65534)"]
+    if subprocess.run(become, stderr=subprocess.DEVNULL).returncode != 0:
+        pytest.skip("starts a process of another user: needs the real root")
+    environment = a_user_builds(rooted, tmp_path)
+    left = killed_build(rooted, environment)
+    (record,) = (rooted.cache / "remodel-fenicsx").glob("*.building")
+    others = "import os, sys, time; os.setuid(65534); print(flush=True); time.sleep(100)"
+    leader = f"import subprocess, sys; subprocess.Popen([sys.executable, '-c', {others!r}]).stdout"
+    dead = subprocess.Popen([sys.executable, "-c", leader], start_new_session=True, stdout=subprocess.PIPE)
+    other = subprocess.Popen([sys.executable, "-c", others], start_new_session=True, stdout=subprocess.DEVNULL)
+    try:
+        dead.stdout.readline()
+        dead.wait()
+        assert group_lives(dead.pid)
+        record.write_text(f"{dead.pid}\n{left}\n")
+        assert rooted.run("true", environment=environment).returncode == 0
+        wait_for(lambda: not group_lives(dead.pid), "the end of the mapped users' processes")
+        assert other.poll() is None
+    finally:
+        other.kill()
+        other.wait()
+    assert list((tmp_path / "temporary").iterdir()) == []
+
+
+def group_lives(group: int) -> bool:
+    """Whether a process group has a process that is more than a zombie."""
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            state, _, its_group = path.read_text().rpartition(")")[2].split()[:3]
+        except (FileNotFoundError, ProcessLookupError):  # it has ended meanwhile
+            continue
+        if int(its_group) == group and state != "Z":
+            return True
+    return False
+
+
+@pytest.mark.parametrize("way", ["fail", "terminated", "killed"])
+def test_a_build_that_ends_too_early_takes_its_temporary_folder_along(rooted, tmp_path, way):
+    environment = a_user_builds(rooted, tmp_path)
+    process = rooted.start("true", environment=environment | {"STUB_BUILD": "hang" if way == "terminated" else way})
+    if way == "terminated":
+        wait_for((rooted.record / "begun").exists, "the build")
+        process.terminate()
+    process.communicate(timeout=LONG)
+    assert process.returncode == {"fail": 5, "terminated": 143, "killed": 5}[way]
+    if way == "killed":
+        orphan = Path("/proc", (rooted.record / "orphan").read_text().strip())
+        wait_for(lambda: not orphan.exists() or "Z" in (orphan / "stat").read_text().split(")")[1], "the orphan's end")
+    assert list((tmp_path / "temporary").iterdir()) == []
+    assert sorted(path.suffix for path in (rooted.cache / "remodel-fenicsx").iterdir()) == [".lock", ".log"]
+
+
+@pytest.mark.parametrize("as_user", [False, True])
+@pytest.mark.parametrize("victim", ["leader", "mmdebstrap"])
+@pytest.mark.parametrize("launcher", ["killed", *slowly("alive")])
+def test_a_builder_that_is_killed_leaves_nothing(rooted, tmp_path, launcher, victim, as_user):
+    """At once, or where nobody is left to remove it at the next start, which waits for nobody."""
+    environment = a_user_builds(rooted, tmp_path) if as_user else {}
+    silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    process = rooted.start("true", environment=environment | {"STUB_BUILD": "hang"}, **silent)
+    wait_for((rooted.record / "begun").exists, "the build")
+    builder = int((rooted.record / "pid").read_text())
+    group = os.getpgid(builder)
+    try:
+        if launcher == "killed":
+            process.kill()
+            process.wait()
+        os.kill(group if victim == "leader" else builder, signal.SIGKILL)
+        wait_for(lambda: not group_lives(group), "the end of the whole group")
+        if launcher == "alive":
+            assert process.wait(LONG) == 5
+        else:
+            assert rooted.run("true", environment=environment).returncode == 0
+    finally:
+        if group_lives(group):
+            os.killpg(group, signal.SIGKILL)
+    kept = {path.suffix for path in (rooted.cache / "remodel-fenicsx").iterdir()}
+    assert kept == ({".lock", ".log"} if launcher == "alive" else {".lock", ".log", ""})
+    assert not as_user or list((tmp_path / "temporary").iterdir()) == []
+
+
+@pytest.mark.parametrize("damage", ["empty", "without /etc", "file"])
+def test_an_environment_that_is_not_whole_is_made_anew(rooted, damage):
+    assert rooted.run("true").returncode == 0
+    (root,) = (path for path in (rooted.cache / "remodel-fenicsx").iterdir() if path.is_dir())
+    (root / "etc").unlink()
+    if damage != "without /etc":
+        shutil.rmtree(root)
+        root.mkdir() if damage == "empty" else root.touch()
+    healed = rooted.run("echo", "in")
+    assert (healed.returncode, healed.stdout) == (0, "in\n"), healed.stderr
+    assert healed.stderr.startswith(f"with-fenicsx: {root} is not whole: making it anew\n")
+    assert rooted.run("true").stderr == ""
+    assert rooted.roots() == [root.name]
+
+
+def test_failed_build(rooted):
+    result = rooted.run("true", environment={"STUB_BUILD": "fail"})
+    assert result.returncode == 5
+    assert "E: no such mirror" in result.stderr.splitlines()[-1]
+    assert rooted.roots() == []
+
+
+def test_no_space(rooted):
+    script(rooted.stubs / "df", "#!/bin/sh\nprintf 'Avail\\n1000000\\n'\n")
+    result = rooted.run("true")
+    assert (result.returncode, rooted.builds()) == (5, [])
+    assert len(result.stderr.splitlines()) == 1 and "1 GB are free" in result.stderr
+
+
+def test_host_tools_missing(rooted):
+    (rooted.stubs / "mmdebstrap").unlink()
+    if shutil.which("mmdebstrap", path=SYSTEM_PATH):
+        pytest.skip("this machine has mmdebstrap")
+    result = rooted.run("true")
+    assert result.returncode == 5
+    line = "apt-get update && apt-get install --yes --no-install-recommends mmdebstrap"
+    assert line in result.stderr
+    assert (rooted.record / "apt-get").exists() == (os.getuid() == 0)
+
+
+def test_older_roots_are_pruned_unless_in_use(rooted):
+    original = rooted.packages.read_text()
+    busy = rooted.start("sh", "-c", "echo in; read line", stdin=subprocess.PIPE)
+    assert busy.stdout.readline() == "in\n"
+    (used,) = rooted.roots()
+    keys = []
+    for number in range(1, 4):
+        time.sleep(0.02)
+        rooted.packages.write_text(f"{original}package-{number}\n")
+        assert rooted.run("true").returncode == 0
+        keys += [name for name in rooted.roots() if name not in [used, *keys]]
+    assert rooted.roots() == sorted([used, *keys[1:]])  # four were made; the oldest is old, but in use
+    busy.communicate("\n")
+    assert busy.returncode == 0
+    rooted.packages.write_text(f"{original}package-4\n")
+    rooted.run("true")
+    assert used not in rooted.roots() and len(rooted.roots()) == 2
+
+
+# ---------------------------------------------------------------- what cannot work says so in one line
+@pytest.mark.parametrize(
+    "environment, words",
+    [
+        ({"XDG_CACHE_HOME": "some/where"}, "XDG_CACHE_HOME=some/where: must be an absolute path"),
+        ({"XDG_CACHE_HOME": "/dev/null"}, "cannot write to /dev/null/remodel-fenicsx: set XDG_CACHE_HOME"),
+        ({"XDG_CACHE_HOME": None, "HOME": "/dev/null"}, "cannot write to /dev/null/.cache/remodel-fenicsx"),
+        ({"WITH_FENICSX": "magic"}, "WITH_FENICSX=magic: allowed are native, root and container"),
+        ({"WITH_FENICSX_SUITE": "sid"}, "WITH_FENICSX_SUITE=sid: allowed are trixie and unstable"),
+        ({"WITH_FENICSX": "container"}, "WITH_FENICSX=container: neither docker nor podman can start a container"),
+    ],
+)
+def test_one_line_and_exit_5(rooted, environment, words):
+    result = rooted.run("true", environment=environment)
+    assert result.returncode == 5
+    assert result.stderr.startswith(f"with-fenicsx: {words}") and result.stderr.count("\n") == 1
+    assert rooted.builds() == []
+
+
+def one_line(result, words: str) -> None:
+    """The launcher's own, exit status 5."""
+    assert (result.returncode, result.stderr.count("\n")) == (5, 1), result.stderr
+    assert result.stderr.startswith("with-fenicsx: ") and words in result.stderr, result.stderr
+
+
+@pytest.mark.parametrize(("inodes", "missing"), [(1, "cache"), (2, "lock"), (3, "log"), (4, "part")])
+def test_a_file_system_without_inodes(rooted, inodes, missing):
+    """One is its own root: the cache, its lock, the log and the unfinished root need one each."""
+    rooted.cache.mkdir()
+    mounted = f'mount -t tmpfs -o nr_inodes={inodes},size=8g tmpfs "$1" && exec "$2" true'
+    namespace = [] if os.getuid() == 0 else ["--user", "--map-root-user"]
+    words = ["unshare", *namespace, "--mount", "sh", "-c", mounted, "sh", rooted.cache, rooted.launcher]
+    done = subprocess.run(words, env=rooted.environment, capture_output=True, text=True)
+    place = {"cache": "remodel-fenicsx: set", "lock": "remodel-fenicsx: set", "log": ".log: ", "part": ".part: "}
+    one_line(done, place[missing])
+    assert "No space left on device" in done.stderr
+    assert rooted.builds() == []
+
+
+def full(clone, *programs: str) -> None:
+    """Stand-ins for programs of a machine whose /tmp is full."""
+    for name in programs:
+        script(clone.stubs / name, f'#!/bin/sh\necho "{name}: cannot create: No space left on device" >&2; exit 1\n')
+
+
+def test_no_folder_for_sessions(ready, tmp_path):
+    clone = Clone(tmp_path, cache=ready.cache)
+    script(
+        clone.stubs / "mkdir", '#!/bin/sh\ncase "$*" in */tmp/*-m*|*-m*/tmp/*) exit 1 ;; esac; exec /bin/mkdir "$@"\n'
+    )
+    full(clone, "mktemp")
+    one_line(clone.run("true", environment={"TMPDIR": None}), "No space left on device: set TMPDIR to a folder")
+
+
+def test_a_file_system_without_locks(ready, tmp_path):
+    clone = Clone(tmp_path, cache=ready.cache)
+    script(clone.stubs / "flock", "#!/bin/sh\necho 'flock: 10: No locks available' >&2; exit 71\n")
+    one_line(clone.run("true"), ".lock: No locks available")
+
+
+def test_what_cannot_be_laid_over_this_machine(ready, tmp_path):
+    clone = Clone(tmp_path, cache=ready.cache)
+    real = shutil.copy(shutil.which("mount", path=clone.environment["PATH"]), tmp_path / "real")
+    refusing = "echo mount: /usr: No space left on device >&2; exit 32"
+    stand_in = f'#!/bin/sh\ncase "$*" in "--rbind "*" /usr") {refusing} ;; esac; exec {real} "$@"\n'
+    script(clone.folder / "bin" / "mount", stand_in)
+    one_line(clone.run("true"), "on /usr: No space left on device")
+
+
+@pytest.mark.parametrize("way", ["root", None])
+def test_no_namespaces(clone, way):
+    script(clone.stubs / "unshare", "#!/bin/sh\nexit 1\n")
+    script(clone.stubs / "python3", "#!/bin/sh\nexit 1\n")
+    result = clone.run("true", environment={"WITH_FENICSX": way})
+    assert result.returncode == 5 and result.stderr.count("\n") == 1
+    assert way is None or "this machine lets you mount nothing" in result.stderr
+
+
+# ---------------------------------------------------------------- native
+@pytest.mark.parametrize(
+    "version, suite, usable",
+    [
+        ("0.9.0", None, True),
+        ("0.9.0", "trixie", True),
+        ("0.9.0", "unstable", False),
+        ("0.11.0.post0", None, True),
+        ("0.11.0.post0", "trixie", False),
+        ("0.11.0.post0", "unstable", True),
+        ("0.5.2", None, False),
+        ("1.0.0", None, True),
+    ],
+)
+def test_native_version(clone, tmp_path, version, suite, usable):
+    for name in ("dolfinx", "mpi4py", "petsc4py", "gmsh", "pydantic", "pint", "tomlkit", "h5py", "rich"):
+        script(tmp_path / "site" / name / "__init__.py", "raise SystemExit('the launcher must not import this')")
+    script(
+        tmp_path / "site" / f"fenics_dolfinx-{version}.dist-info" / "METADATA",
+        f"Metadata-Version: 2.1\nName: fenics-dolfinx\nVersion: {version}\n",
+    )
+    result = clone.run(
+        "sh",
+        "-c",
+        'echo "$PYTHONPATH"; exit 7',
+        environment={"WITH_FENICSX": "native", "PYTHONPATH": str(tmp_path / "site"), "WITH_FENICSX_SUITE": suite},
+    )
+    assert result.returncode == (7 if usable else 5)
+    assert result.stdout == (f"{clone.folder}:{tmp_path / 'site'}\n" if usable else "")
+
+
+def test_native_lacks_a_package(clone):
+    script(clone.stubs / "python3", f'#!/bin/sh\nexec {sys.executable} -I -S "$@"\n')
+    result = clone.run("true", environment={"WITH_FENICSX": "native"})
+    assert result.returncode == 5 and result.stderr.count("\n") == 1
+
+
+def test_inside_an_environment_it_is_native():
+    """This very test runs where dolfinx is: the launcher must take it as it is, silently."""
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("WITH_FENICSX")}
+    result = subprocess.run(
+        [PROJECT / "with-fenicsx", "-v", "sh", "-c", "echo inside"], env=environment, capture_output=True, text=True
+    )
+    assert (result.returncode, result.stdout) == (0, "inside\n")
+    assert result.stderr == f"with-fenicsx: running in this machine's own Python ({shutil.which('python3')})\n"
+
+
+# ---------------------------------------------------------------- a container engine
+def test_container(clone, tmp_path):
+    result = clone.run(
+        "some",
+        "a b",
+        cwd=tmp_path,
+        environment={"WITH_FENICSX": "container", "STUB_ENGINE": "able", "KEPT": "yes", "LD_LIBRARY_PATH": "/x"},
+    )
+    assert result.returncode == 0
+    calls = clone.engine_calls()
+    assert [call[:2] for call in calls] == [["docker", word] for word in ("image", "run", "build", "run")]
+    build, run = calls[2], calls[3]
+    assert build[build.index("--target") + 1] == "environment" and build[-1] == str(clone.folder)
+    image = build[build.index("-t") + 1]
+    assert run[-3:] == [image, "some", "a b"]
+    pairs = list(zip(run, run[1:]))
+    assert ("--user", f"{os.getuid()}:{os.getgid()}") in pairs and ("--workdir", str(tmp_path)) in pairs
+    for folder in (tmp_path, clone.folder, clone.environment["HOME"]):
+        assert ("--volume", f"{folder}:{folder}") in pairs
+    assert ("--env", "KEPT") in pairs and ("--env", "LD_LIBRARY_PATH") not in pairs
+
+
+def test_container_names_no_mount_point_twice(clone):
+    clone.run(
+        "true",
+        cwd=clone.folder,
+        environment={
+            "WITH_FENICSX": "container",
+            "STUB_ENGINE": "built",
+            "HOME": str(clone.folder),
+            "XDG_CACHE_HOME": "/nowhere",
+        },
+    )
+    run = clone.engine_calls()[-1]
+    assert [value for option, value in zip(run, run[1:]) if option == "--volume"] == [f"{clone.folder}:{clone.folder}"]
+
+
+def test_container_made_already(clone):
+    result = clone.run("true", environment={"WITH_FENICSX": "container", "STUB_ENGINE": "built", "STUB_STATUS": "37"})
+    assert (result.returncode, result.stderr) == (37, "")
+    assert [call[1] for call in clone.engine_calls()] == ["image", "run"]
+
+
+def test_container_is_the_last_way(clone):
+    script(clone.stubs / "unshare", "#!/bin/sh\nexit 1\n")
+    fake = clone.stubs / "python3"
+    script(fake, f'#!/bin/sh\ncase "$*" in *fenics-dolfinx*) exit 1 ;; esac\nexec {sys.executable} "$@"\n')
+    result = clone.run("true", environment={"WITH_FENICSX": None, "STUB_ENGINE": "built"})
+    assert result.returncode == 0
+    assert clone.engine_calls()[-1][:2] == ["docker", "run"]
+
+
+def test_scripts_can_be_run():
+    for name in ("with-fenicsx", "tests/run", "tests/container/run", "bin/remodel-fenicsx", ".ci/run"):
+        assert (PROJECT / name).stat().st_mode & stat.S_IXUSR, name

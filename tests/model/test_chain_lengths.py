@@ -1,0 +1,186 @@
+"""Lengths of chains have any unit: L, A_p and r0 times a factor change nothing but the lengths of the cells.
+
+c = omega k theta n/(4 A_p) goes with 1/length, psi(r) with length, g(r) with 1/length: W, and all that follows from it,
+has no length of chains in it. r0 = 1, as in the paper, hides every wrong power of it.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from remodel_fenicsx.kernels.tensor import TensorKernels, condensed_points
+from remodel_fenicsx.model.cells import UnitCell
+from remodel_fenicsx.model.energy import REPULSIONS, Tissue
+from remodel_fenicsx.model.implicit.condensed import CondensedPoints
+from remodel_fenicsx.scene import preset_scene
+from remodel_fenicsx.scene.scene import Scene
+from remodel_fenicsx.simulation import Simulation
+from tests.model.test_condensed import deformations, points, solved
+from tests.watch.test_over_correction import Tilt
+
+PAPER, CONSISTENT = "kuhl-holzapfel-2007", "consistent"
+METRES = 1e-9
+POWER = 2.0**-30  # about metres
+POINT = {"model.kinematics": "point", "time.end": 12.0, "time.step": 2.0}
+RANDOM = {"mesh.refinement": 2, "cells.initial": "random", "time.end": 6.0, "time.step": 2.0}
+RADIAL = {"model.kinematics": "radial", "cells.initial": "isotropic", "time.end": 30.0, "time.step": 5.0}
+IMPLICIT = {"remodeling.coupling": "implicit", "remodeling.frame": "material", "time.end": 15.0}
+FINGER = {"remodeling.driver": "finger", "remodeling.kappa": 0.3, "remodeling.law": "relaxation"}
+AND_BACK = [[0.0, 0.0], [3.0, 1.0], [5.0, -0.1], [10.0, -0.1], [11.0, 1.0]]
+CASES: dict[str, tuple[str, str, dict[str, Any]]] = {
+    "explicit": (PAPER, "cube", POINT),
+    "rate, length": (PAPER, "cube", {**POINT, "remodeling.law": "rate", "material.repulsion": "length"}),
+    "rotation": (PAPER, "cube", {**RANDOM, "remodeling.law": "rotation"}),
+    "relaxation, random": (PAPER, "cube", {**RANDOM, "remodeling.law": "relaxation", "remodeling.frame": "material"}),
+    "tensor, random": (CONSISTENT, "cube", RANDOM),
+    "compression": (PAPER, "cube", {**RANDOM, "loads.force.value": -3.0, "mesh.refinement": 1}),
+    "extrapolated": (CONSISTENT, "tube", RADIAL),
+    "pk2, staggered": (CONSISTENT, "tube", {**RADIAL, "remodeling.driver": "pk2", "remodeling.coupling": "staggered"}),
+    "implicit": (CONSISTENT, "tube", {**RADIAL, "remodeling.coupling": "implicit"}),
+    "implicit, printed": (PAPER, "tube", {**RADIAL, **IMPLICIT}),
+    "relaxed": (PAPER, "tube", {**RADIAL, "remodeling.coupling": "relaxed", "remodeling.pairing": "continuous"}),
+    "long steps": (PAPER, "tube", {**RADIAL, **FINGER}),
+    "load to nothing and back": (PAPER, "cube", {**POINT, "time.end": 14.0, "time.step": 1.0, "remodeling.kappa": 0.1,
+                                                 "loads.force.ramp": AND_BACK}),
+    "strong": (PAPER, "tube", {**RADIAL, "loads.pressure.value": 50.0, "time.end": 60.0}),
+    "near locking": (PAPER, "cube", {**POINT, "cells.end_to_end_length": 0.999 * 2.125}),
+    "chosen steps": (CONSISTENT, "tube", {**RADIAL, "time.end": 50.0, "time.tolerance": 1.0}),
+    "chosen steps, printed": (PAPER, "tube", {**RADIAL, "time.end": 50.0, "time.tolerance": 2.0}),
+    "equilibrium": (CONSISTENT, "tube", {**RADIAL, "time.end": "equilibrium"}),
+    "equilibrium, finger": (PAPER, "tube", {**RADIAL, "time.end": "equilibrium", "remodeling.driver": "finger",
+                                            "remodeling.law": "relaxation"}),
+}  # fmt: skip
+
+
+class Run(NamedTuple):
+    """Rows by column, Newton iterations of the steps, what was said, lengths of the cells at the end over the unit."""
+
+    rows: dict[str, np.ndarray]
+    iterations: list[int]
+    said: list[str]
+    lengths: np.ndarray
+
+
+def scene_in(unit: float, preset: str, shape: str, changes: dict[str, Any]) -> Scene:
+    """Of a case, with lengths of chains in another unit; one nm is `unit` of it."""
+    scene = preset_scene(preset, shape).with_values({"output.columns": ["pass_residual"], **changes})
+    lengths = {
+        "material.contour_length": scene.material.contour_length,
+        "material.persistence_length": scene.material.persistence_length,
+        "cells.end_to_end_length": scene.cells.end_to_end_length,
+    }
+    return scene.with_values({name: unit * length for name, length in lengths.items()})
+
+
+def run(name: str, unit: float, caplog: pytest.LogCaptureFixture) -> Run:
+    caplog.clear()
+    with caplog.at_level(logging.INFO, "remodel_fenicsx"):
+        simulation = Simulation(scene_in(unit, *CASES[name]), MPI.COMM_SELF)
+        steps = list(simulation.steps())
+    said = [r.getMessage() for r in caplog.records if "compil" not in r.getMessage()]
+    rows = {column: np.array([step.row[column] for step in steps], dtype=float) for column in steps[0].row}
+    rows["pass_residual"] = rows["pass_residual"] / unit**2
+    del rows["seconds"]
+    return Run(rows, [step.work.newton_iterations for step in steps], said, simulation.cells.dimension_values / unit)
+
+
+def assert_same(found: Run, expected: Run, digits: float) -> None:
+    assert found.iterations == expected.iterations
+    assert found.said == expected.said
+    np.testing.assert_allclose(found.lengths, expected.lengths, rtol=0, atol=digits * expected.lengths.max())
+    for column, values in expected.rows.items():
+        if values.size > 1 or column not in ("remodeling_power", "pass_residual"):  # of an equilibrium: rounding
+            size = np.nanmax(np.abs(values), initial=0.0)
+            np.testing.assert_allclose(found.rows[column], values, rtol=0, atol=digits * size, err_msg=column)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_another_unit_changes_nothing(name: str, caplog: pytest.LogCaptureFixture) -> None:
+    """A power of two rounds nothing, so that all that is said, and every number, is the same."""
+    expected = run(name, 1.0, caplog)
+    assert_same(run(name, POWER, caplog), expected, 1e-15)
+    if name == "load to nothing and back":
+        assert any("cells that had rested" in text for text in expected.said)
+
+
+def test_a_swing_is_warned_of_alike(caplog: pytest.LogCaptureFixture) -> None:
+    said = []
+    for unit in (1.0, POWER):
+        caplog.clear()
+        simulation = Simulation(scene_in(unit, PAPER, "cube", {"loads.force.value": 0.01, "time.end": 35.0}))
+        list(simulation.steps([Tilt(simulation, 20.0, 1e-8)]))
+        said.append([r.getMessage() for r in caplog.records if r.levelno >= logging.WARNING])
+    assert said[1] == said[0] and "over-corrects" in said[0][0]
+
+
+@pytest.mark.parametrize("unit", [METRES, 1e-3, 92.4, 1e6])
+@pytest.mark.parametrize("name", ["explicit", "strong", "extrapolated"])
+def test_units_that_round(name: str, unit: float, caplog: pytest.LogCaptureFixture) -> None:
+    assert_same(run(name, unit, caplog), run(name, 1.0, caplog), 1e-13)
+
+
+def test_the_rounding_of_a_stress_is_one() -> None:
+    """r^2 d(g r)/dr: against differences of the network's stress in a stretch of all chains."""
+    for unit in (1.0, METRES, 1e6):
+        tissue = Tissue(0.0, 0.0, 1.57 / unit, 1.594 * unit, 1.1 * unit)
+        assert tissue.chain is not None
+        for r in np.array([0.3, 1.0, 1.5]) * unit:
+            up, down = (tissue.chain.stiffness(r * s, 1.594 * unit) * r * s for s in (1 + 1e-6, 1 - 1e-6))
+            tension = 1.57 / unit * (up - down) * r / 2e-6  # c dF/d(ln r) r
+            initial = 1.57 / unit * tissue.chain.stiffness(1.1 * unit, 1.594 * unit) * (1.1 * unit) ** 2
+            assert tissue.stiffness(r) == pytest.approx(tension + initial, rel=1e-5)
+
+
+@pytest.mark.parametrize("repulsion", REPULSIONS)
+def test_the_energy_has_no_length_in_it(repulsion: str) -> None:
+    F, found = deformations(12, np.random.default_rng(3)), []
+    for unit in (1.0, METRES, 1e6):
+        some = in_unit(points("tensor", repulsion, "cauchy", "material", 12, "random"), unit)
+        old, new = (UnitCell(l * some.step.cells.dimensions, some.step.cells.axes) for l in (1.0, 1.01))
+        found.append([some.tissue.strain_energy(F, [old]), some.tissue.energy_increment(F, old, new)])
+    for other in found[1:]:
+        np.testing.assert_allclose(other, found[0], rtol=1e-12)
+
+
+def in_unit(some: CondensedPoints, unit: float) -> CondensedPoints:
+    """The same points with lengths of chains in another unit."""
+    powers = {"network_modulus": 1 / unit, "contour_length": unit, "end_to_end_length": unit}
+    step = some.step
+    return CondensedPoints(
+        some.tissue.map(lambda name, value: powers.get(name, 1.0) * value),
+        replace(
+            step,
+            cells=UnitCell(unit * step.cells.dimensions, step.cells.axes),
+            structure=unit**2 * step.structure,
+            initial_dimensions=unit * step.initial_dimensions,
+            end_to_end_length=unit * step.end_to_end_length,
+        ),
+    )
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+@pytest.mark.parametrize(
+    ("law", "repulsion"), [("tensor", "log"), ("tensor", "length"), ("relaxation", "axes"), ("explicit", "log")]
+)
+def test_cells_that_answer(law: str, repulsion: str, compiled: bool) -> None:
+    """Their stress and its tangent, of numpy and of the kernels."""
+    some, F = points(law, repulsion, "cauchy", "material", 12, "random"), deformations(12, np.random.default_rng(3))
+    F[::2] *= 0.9  # with compression, where the switch answers too
+    kernels, answers = TensorKernels(MPI.COMM_SELF) if compiled else None, []
+    for unit in (1.0, METRES, 1e6):
+        scaled = in_unit(some, unit)
+        twin = condensed_points(kernels, scaled.tissue, scaled.step)
+        found = solved(twin, F)
+        tangent, there = twin.tangent(found, np.zeros(12, dtype=bool)).reshape(12, 81), found.converged
+        values = (found.first_piola_kirchhoff, tangent, found.structure / unit**2)
+        answers.append((there, *(value[there] for value in values)))
+    assert answers[0][0].sum() > 10  # by rank there are states without a solution
+    for other in answers[1:]:
+        for values, expected in zip(other, answers[0], strict=True):
+            np.testing.assert_allclose(values, expected, rtol=0, atol=1e-10 * np.abs(expected).max())

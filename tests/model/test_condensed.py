@@ -1,0 +1,276 @@
+"""Condensed cells at points, without a mesh: the local equation, stress and consistent tangent."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import product
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from remodel_fenicsx.model import mandel, spectral
+from remodel_fenicsx.model.cells import UnitCell, structure_tensor
+from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
+from remodel_fenicsx.model.energy import REPULSIONS, Tissue
+from remodel_fenicsx.model.implicit.condensed import CondensedPoints, Solution
+from remodel_fenicsx.model.implicit.network import OrthotropicCells, Strain
+from remodel_fenicsx.model.implicit.responses import StepOfCells, jumps_by_rank, response
+from remodel_fenicsx.model.laws import LAWS, Drive
+
+Array = NDArray[np.float64]
+
+COMBINATIONS = [
+    (law, repulsion, driver, frame)
+    for (law, repulsion), driver, frame in product(
+        [("tensor", "log"), ("tensor", "length"), ("explicit", "axes"), ("relaxation", "axes"), ("rate", "log")],
+        ("cauchy", "pk2", "finger"),
+        ("material", "spatial"),
+    )
+    if (driver, frame) != ("pk2", "spatial")
+]
+
+
+def deformations(number: int, rng: np.random.Generator) -> Array:
+    """Stretches apart, with a rotation: under tension."""
+    R = Rotation.random(2 * number, random_state=rng).as_matrix()
+    stretches = np.array([1.35, 1.12, 0.8]) + rng.uniform(-0.06, 0.06, (number, 3))
+    return R[:number] @ (stretches[:, :, None] * R[number:])
+
+
+def points(
+    law: str, repulsion: str, driver: str, frame: str, number: int, initial: str = "isotropic", **changes: Any
+) -> CondensedPoints:
+    rng = np.random.default_rng(5)
+    tissue = Tissue(27.3, 3.1, 1.57, 1.594, 1.0, repulsion=REPULSIONS[repulsion])
+    lengths = np.full((number, 3), 1 / np.sqrt(3))
+    if initial == "random":
+        lengths = np.abs(rng.standard_normal((number, 3)))
+        lengths /= np.linalg.norm(lengths, axis=1, keepdims=True)
+    cells = UnitCell(lengths, Rotation.random(number, random_state=rng).as_matrix())
+    times = {"kappa": 0.025, "time_old": 8.0, "time_new": 12.0}
+    settings: dict[str, Any] = times | {"noise": 1e-13, "rounding": 1e-13} | changes
+    step = StepOfCells(
+        LAWS[law],
+        DRIVERS[driver],
+        FRAMES[frame],
+        spectral.PAIRINGS["sorted"],
+        cells,
+        structure_tensor(*cells[:2]),
+        lengths.copy(),
+        np.ones(number),
+        **settings,
+    )
+    return CondensedPoints(tissue.map(lambda name, value: np.full(number, value)), step)
+
+
+def solved(some: CondensedPoints, F: Array, start: Array | None = None) -> Solution:
+    """From the axes of C, on which isotropic cells lie."""
+    return some.solve(F, np.swapaxes(F, 1, 2) @ F if start is None else start)
+
+
+def difference_quotient(some: CondensedPoints, F: Array, H: Array, h: float, start: Array) -> Array:
+    up, down = (solved(some, F + sign * h * H, start).first_piola_kirchhoff for sign in (1, -1))
+    return (up - down) / (2 * h)
+
+
+@pytest.mark.parametrize("law, repulsion, driver, frame", COMBINATIONS)
+def test_the_tangent_is_the_derivative(law: str, repulsion: str, driver: str, frame: str) -> None:
+    rng = np.random.default_rng(1)
+    some, F = points(law, repulsion, driver, frame, 40), deformations(40, rng)
+    found = solved(some, F)
+    assert found.converged.all()
+    tangent = some.tangent(found, np.zeros(40, dtype=bool))
+    errors = []
+    for _ in range(3):
+        H = rng.standard_normal((40, 3, 3))
+        expected = difference_quotient(some, F, H, 1e-6, found.driving_tensor)
+        error = np.einsum("niJkL,nkL->niJ", tangent, H) - expected
+        errors.append(np.linalg.norm(error, axis=(1, 2)) / np.linalg.norm(expected, axis=(1, 2)))
+    assert np.median(errors) < 1e-7 and np.max(errors) < 1e-5
+
+
+def test_points_without_tension_answer_nothing() -> None:
+    """Their axes stay, and are none of the driver's: nothing is divided by what one has along the other."""
+    some = points("relaxation", "axes", "cauchy", "material", 1)
+    some = replace(
+        some, step=replace(some.step, cells=UnitCell(some.step.cells.dimensions, np.eye(3)[None, [1, 2, 0]]))
+    )
+    strain = Strain.of(np.diag([1.2, 1.1, 1.0])[None])
+    with np.errstate(all="raise"):
+        found = response(some.step, strain, strain.inside(np.diag([-3.0, -2.0, -1.0])[None]), derivatives=True)
+    assert not np.any(found.by_tensor) and not np.any(found.by_stretch)
+
+
+def test_tension_hardly_above_noise_answers_by_the_switch_too() -> None:
+    """There the size of the stress decides how much remodels, not its directions alone."""
+    rng = np.random.default_rng(9)
+    quiet, F = points("tensor", "log", "cauchy", "material", 20), deformations(20, rng)
+    size = float(np.median(np.linalg.norm(solved(quiet, F).driving_tensor, axis=(1, 2))))
+    some = points("tensor", "log", "cauchy", "material", 20, noise=size, rounding=1e-13)
+    found = solved(some, F)
+    assert found.converged.all()
+    tangent = some.tangent(found, np.zeros(20, dtype=bool))
+    for _ in range(3):
+        H = rng.standard_normal((20, 3, 3))
+        expected = difference_quotient(some, F, H, 1e-6, found.driving_tensor)
+        error = np.linalg.norm(np.einsum("niJkL,nkL->niJ", tangent, H) - expected, axis=(1, 2))
+        assert np.max(error / np.linalg.norm(expected, axis=(1, 2))) < 1e-6
+
+
+@pytest.mark.parametrize("frame, pairing", [("material", "sorted"), ("spatial", "sorted"), ("material", "continuous")])
+def test_cells_by_rank_answer_to_the_driving_tensor_and_to_the_stretch(frame: str, pairing: str) -> None:
+    """Each alone, with axes that the two do not share: at a solution they mostly do."""
+    rng, h = np.random.default_rng(7), 1e-6
+    some = points("relaxation", "axes", "cauchy", frame, 30, "random")
+    step = replace(some.step, pairing=spectral.PAIRINGS[pairing])
+    R = Rotation.random(30, random_state=rng).as_matrix()
+    X = np.swapaxes(R, 1, 2) @ ((rng.uniform(0.8, 1.2, (30, 3)) * [6.0, 3.0, 1.0])[:, :, None] * R)
+    U, changes = np.tile(np.diag([0.8, 1.1, 1.3]), (30, 1, 1)), rng.standard_normal((30, 3, 3))
+    H, strain = changes + np.swapaxes(changes, 1, 2), Strain.of(U)
+    found = response(step, strain, strain.inside(X), derivatives=True)
+    assert found.by_tensor is not None and (found.by_stretch is not None) == (frame == "material")
+    for derivative, by_stretch in ((found.by_tensor, False), (found.by_stretch, True)):
+        if derivative is None:
+            continue
+        up, down = (outside(step, U + d * H, X) if by_stretch else outside(step, U, X + d * H) for d in (h, -h))
+        expected = numbers_of_the_change(outside(step, U, X), up, down) / (2 * h)
+        answer = np.einsum("nab,nb->na", derivative, mandel.vectors(strain.inside(H)))
+        np.testing.assert_allclose(answer, expected, rtol=1e-5, atol=1e-6)
+
+
+def outside(step: StepOfCells, U: Array, X: Array) -> UnitCell:
+    """The cells that X makes at U, in the global basis."""
+    strain = Strain.of(U)
+    cells = response(step, strain, strain.inside(X), derivatives=False).cells
+    assert isinstance(cells, OrthotropicCells)
+    return UnitCell(cells.cell.dimensions, cells.cell.axes @ np.swapaxes(strain.basis, 1, 2))
+
+
+def numbers_of_the_change(at: UnitCell, up: UnitCell, down: UnitCell) -> Array:
+    """Of lengths, and of the turns n_j . dn_i."""
+    turns = np.einsum("nia,nja->nij", up.axes - down.axes, at.axes)
+    return np.concatenate([up.dimensions - down.dimensions, *(turns[:, i, j, None] for i, j in mandel.PAIRS)], axis=1)
+
+
+@pytest.mark.parametrize("law, repulsion, driver, frame", COMBINATIONS)
+def test_the_cells_belong_to_the_stress(law: str, repulsion: str, driver: str, frame: str) -> None:
+    """A pass of the law with the stress that the energy has with these cells gives the same cells again."""
+    some, F = points(law, repulsion, driver, frame, 12), deformations(12, np.random.default_rng(2))
+    found, step = solved(some, F), some.step
+    cells = cells_of(found)
+    P = stress_of_the_energy(some.tissue, F, cells)
+    np.testing.assert_allclose(found.first_piola_kirchhoff, P, rtol=1e-7, atol=1e-7 * np.abs(P).max())
+    S, J = np.linalg.solve(F, P), np.linalg.det(F)[:, None, None]
+    b = F @ np.swapaxes(F, 1, 2)
+    tensor = {"cauchy": P @ np.swapaxes(F, 1, 2) / J, "pk2": S, "finger": b}[driver]
+    drive = Drive(
+        F,
+        (tensor + np.swapaxes(tensor, 1, 2)) / 2,
+        step.driver,
+        step.frame,
+        1e-13,
+        step.initial_dimensions,
+        step.end_to_end_length,
+        step.kappa,
+    )
+    again = LAWS[law].update(step.cells, drive, step.time_old, step.time_new)
+    np.testing.assert_allclose(structure_tensor(*again[:2]), structure_tensor(*cells[:2]), atol=1e-6)
+
+
+def cells_of(found: Solution) -> UnitCell:
+    """Of the law for A the roots and axes of A."""
+    if found.response.place is not None:
+        return found.cells
+    values, vectors = np.linalg.eigh(found.structure)
+    return UnitCell(np.sqrt(values), np.swapaxes(vectors, 1, 2))
+
+
+def stress_of_the_energy(tissue: Tissue, F: Array, cells: UnitCell) -> Array:
+    """P by central differences of W, the only place where the energy is written."""
+    P, h = np.zeros_like(F), 1e-6
+    for i, j in product(range(3), range(3)):
+        H = np.zeros((3, 3))
+        H[i, j] = h
+        up, down = (tissue.strain_energy(F + sign * H, [cells]) for sign in (1, -1))
+        P[:, i, j] = (up - down) / (2 * h)
+    return P
+
+
+@pytest.mark.parametrize("driver", ["cauchy", "pk2", "finger"])
+@pytest.mark.parametrize("initial", ["isotropic", "random"])
+def test_equal_eigenvalues_leave_the_tangent_exact(driver: str, initial: str) -> None:
+    """C, D and A with two and three equal values: the law for A sees no axes."""
+    rng = np.random.default_rng(3)
+    stretches = np.repeat([[1.2, 1.2, 0.85], [1.3, 0.9, 0.9], [1.15, 1.15, 1.15], [1.2, 1.2 + 1e-9, 0.8]], 4, axis=0)
+    R = Rotation.random(32, random_state=rng).as_matrix()
+    F = R[:16] @ np.swapaxes(R[16:], 1, 2) @ (stretches[:, :, None] * R[16:])
+    some = points("tensor", "log", driver, "material", 16, initial)
+    found = solved(some, F)
+    assert found.converged.all()
+    tangent = some.tangent(found, np.zeros(16, dtype=bool))
+    errors = []
+    for _ in range(4):
+        H = rng.standard_normal(F.shape)
+        expected = difference_quotient(some, F, H, 1e-6, found.driving_tensor)
+        error = np.einsum("niJkL,nkL->niJ", tangent, H) - expected
+        errors.append(np.linalg.norm(error, axis=(1, 2)) / np.linalg.norm(expected, axis=(1, 2)))
+    assert np.median(errors) < 1e-7 and np.max(errors) < 1e-5
+
+
+def test_the_order_of_the_axes_is_the_laws_own() -> None:
+    """With the continuous pairing lengths and axes come back in the order of the cells, whatever the frame's is."""
+    rng = np.random.default_rng(4)
+    some, F = points("relaxation", "axes", "cauchy", "material", 20, "random"), deformations(20, rng)
+    some = replace(some, step=replace(some.step, pairing=spectral.continued))
+    found = solved(some, F)
+    turned = np.argmax(np.abs(found.cells.axes @ np.swapaxes(some.step.cells.axes, 1, 2)), axis=2)
+    belongs = (np.sort(turned, axis=1) == np.arange(3)).all(axis=1)
+    assert belongs.sum() > 10 and (turned[belongs] == np.arange(3)).all()
+    tangent, ok = some.tangent(found, np.zeros(20, dtype=bool)), found.converged
+    H = rng.standard_normal(F.shape)
+    expected = difference_quotient(some, F, H, 1e-6, found.driving_tensor)
+    error = np.linalg.norm(np.einsum("niJkL,nkL->niJ", tangent, H) - expected, axis=(1, 2))
+    assert ok.sum() > 10 and np.median(error[ok] / np.linalg.norm(expected[ok], axis=(1, 2))) < 1e-7
+
+
+def test_held_points_have_the_tangent_of_their_cells() -> None:
+    """And points without tension keep their cells: there nothing answers."""
+    rng = np.random.default_rng(6)
+    some, F = points("explicit", "axes", "cauchy", "material", 10), deformations(10, rng)
+    H, other = rng.standard_normal((10, 3, 3)), points("explicit", "axes", "cauchy", "material", 10, "random").step
+    kept = [some.kept(F + h * H, other.cells, other.structure) for h in (0.0, 1e-6, -1e-6)]
+    tangent = some.tangent(kept[0], np.ones(10, dtype=bool))
+    up, down = (found.first_piola_kirchhoff for found in kept[1:])
+    np.testing.assert_allclose(np.einsum("niJkL,nkL->niJ", tangent, H), (up - down) / 2e-6, rtol=1e-5, atol=1e-6)
+    pressed = solved(some, np.tile(0.8 * np.eye(3), (10, 1, 1)), np.tile(-np.eye(3), (10, 1, 1)))
+    np.testing.assert_allclose(structure_tensor(*pressed.cells[:2]), some.step.structure, atol=1e-14)
+
+
+@pytest.mark.parametrize("law", ["explicit", "rate", "relaxation"])
+def test_where_a_law_by_rank_jumps(law: str) -> None:
+    """At equal values, which two axes share: A is the same on both sides where, and only where, it does not jump."""
+    for initial in ("isotropic", "random"):
+        some = points(law, "axes", "finger", "material", 6, initial)
+        strain = Strain.of(np.tile(np.eye(3), (6, 1, 1)))
+        sides = [np.tile(np.diag([2.0, 2.0 + h, 1.5]), (6, 1, 1)) for h in (1e-6, -1e-6)]
+        A = [response(some.step, strain, X, derivatives=False).cells.structure for X in sides]
+        apart = np.abs(A[0] - A[1]).max(axis=(1, 2)) > 1e-4
+        assert np.all(apart == (initial == "random")) and np.all(jumps_by_rank(some.step) == apart)
+    assert not jumps_by_rank(points("tensor", "log", "cauchy", "material", 6, "random").step).any()
+
+
+def test_a_long_step_is_followed_where_newtons_method_does_not_find_its_end() -> None:
+    """kappa dt = 10 from random cells: the branch that the cells at the start lead to, which 391 find of themselves."""
+    rng = np.random.default_rng(8)
+    R = Rotation.random(400, random_state=rng).as_matrix()
+    F = np.swapaxes(R, 1, 2) @ ((1 + rng.uniform(-0.2, 0.3, (400, 3)))[:, :, None] * R)
+    some = points("tensor", "log", "cauchy", "material", 400, "random", kappa=2.5)
+    start = some.kept(F, some.step.cells, some.step.structure).driving_tensor
+    found = some.solve(F, start)
+    assert found.converged.sum() >= 398
+    A = found.structure
+    np.testing.assert_allclose(np.trace(A, axis1=1, axis2=2)[found.converged], 1.0, atol=1e-12)
+    assert (np.linalg.eigvalsh(A) > -1e-12).all()

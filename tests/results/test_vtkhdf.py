@@ -1,0 +1,442 @@
+"""VTKHDF files: what VTK's own reader finds in them, also after a crash, a full disk or Ctrl-C."""
+
+from __future__ import annotations
+
+import os
+import re
+import resource
+import shutil
+import signal
+import struct
+import subprocess
+import sys
+from pathlib import Path
+
+import basix
+import h5py
+import numpy as np
+import pytest
+
+from remodel_fenicsx.results import vtkhdf
+from remodel_fenicsx.results.chain_lines import chain_displacement, chain_lines
+from remodel_fenicsx.results.staged_file import StagedFile
+from remodel_fenicsx.results.vtkhdf import LINE, TransientGrid, vtk_cells
+from tests.forks import forked
+
+# In a process of its own, as users do. Steps are read forwards and backwards: VTK keeps the meshes of earlier steps.
+READER = """
+import sys
+import numpy as np, pyvista
+found = {}
+reader = pyvista.HDFReader(sys.argv[1])
+reader.reader.UpdateInformation()
+steps = reader.reader.GetNumberOfSteps()
+for turn, order in enumerate((range(steps), reversed(range(steps)))):
+    for step in order:
+        reader.reader.SetStep(step)
+        grid = reader.read()
+        here = {"points": grid.points, "cells": grid.cell_connectivity, "types": grid.celltypes}
+        here |= {"point " + name: grid.point_data[name] for name in grid.point_data.keys()}
+        here |= {"cell " + name: grid.cell_data[name] for name in grid.cell_data.keys()}
+        here["time"] = grid.field_data["Time"][0] if "Time" in grid.field_data.keys() else np.nan
+        here["volumes"] = grid.compute_cell_sizes(length=False, area=False)["Volume"]
+        here["parametric"] = np.array(grid.GetCell(0).GetParametricCoords()[: 3 * grid.GetCell(0).GetNumberOfPoints()])
+        for name, values in here.items():
+            key = f"{step} {name}"
+            assert turn == 0 or np.array_equal(found[key], values, equal_nan=True), key
+            found[key] = np.array(values)
+np.savez(sys.argv[2], steps=steps, **found)
+"""
+
+CUBE = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], dtype=float)  # dolfinx's order of nodes
+VTK_CUBE = [[0, 1, 3, 2, 4, 5, 7, 6]]
+
+
+def read(path: Path) -> dict[str, np.ndarray]:
+    """What PyVista finds: "STEP NAME" -> array, and "steps"."""
+    target = path.with_suffix(".npz")
+    done = forked("python", READER, path, target, imports=("pyvista",))
+    assert done.returncode == 0, done.stderr
+    assert "rror" not in done.stderr, done.stderr  # VTK reports errors there and goes on
+    return dict(np.load(target))
+
+
+def raw_series(path: Path, field: str, points: int) -> list[np.ndarray]:
+    """A point field of every step that the file declares, read by its offsets."""
+    with h5py.File(path) as file:
+        root = file["VTKHDF"]
+        steps = int(root["Steps"].attrs["NSteps"])
+        offsets = root["Steps/PointDataOffsets"][field][:steps] if steps else []
+        return [root["PointData"][field][start : start + points] for start in offsets]
+
+
+def test_reader_finds_every_step(tmp_path):
+    random = np.random.default_rng(1)
+    points = random.random((9, 3))
+    cells = np.array([[0, 1, 2, 3, 4, 5, 6, 7], [1, 2, 3, 4, 5, 6, 7, 8]])
+    steps = [
+        (
+            {"displacement": random.random((9, 3)), "pressure": random.random(9)},
+            {"stress": random.random((2, 9)), "l": random.random((2, 3))},
+        )
+        for _ in range(3)
+    ]
+    path = tmp_path / "fields.vtkhdf"
+    with TransientGrid(path, points, cells, 12) as grid:
+        for k, (point_data, cell_data) in enumerate(steps):
+            grid.append(0.5 * k, point_data, cell_data)
+        found = read(path)  # while the writer has it open
+    assert found["steps"] == 3
+    for k, (point_data, cell_data) in enumerate(steps):
+        assert found[f"{k} time"] == 0.5 * k
+        assert np.array_equal(found[f"{k} points"], points) and found[f"{k} points"].dtype == np.float64
+        assert np.array_equal(found[f"{k} cells"], cells.ravel())
+        assert np.array_equal(found[f"{k} point displacement"], point_data["displacement"].astype(np.float32))
+        assert np.array_equal(found[f"{k} point pressure"], point_data["pressure"].astype(np.float32))
+        assert np.array_equal(found[f"{k} cell stress"], cell_data["stress"].astype(np.float32))
+        assert np.array_equal(found[f"{k} cell l"], cell_data["l"].astype(np.float32))
+
+
+def test_the_page_shows_what_really_steps_through_time(tmp_path):
+    page = (Path(__file__).parents[2] / "docs" / "commands.md").read_text(encoding="utf-8")
+    (code,) = [block for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "import pyvista" in block]
+    path = tmp_path / "results" / "artery" / "fields.vtkhdf"
+    path.parent.mkdir(parents=True)
+    with TransientGrid(path, CUBE, VTK_CUBE, 12) as grid:
+        for k in range(3):
+            grid.append(k, {"displacement": np.full((8, 3), 0.25 * k)})
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0 and "rror" not in done.stderr, done.stderr
+    said = [tuple(map(float, line.split())) for line in done.stdout.splitlines()]
+    assert said == [(0.0, 0.0), (1.0, 0.25), (2.0, 0.5), (1.0, 0.25)]
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+@pytest.mark.parametrize("cell", ["hexahedron", "tetrahedron"])
+def test_node_order_is_that_of_vtk(tmp_path, cell, degree):
+    # the reference cell of dolfinx, permuted, must have VTK's own parametric coordinates of that cell, node by node
+    element = basix.create_element(
+        basix.ElementFamily.P, basix.CellType[cell], degree, basix.LagrangeVariant.equispaced
+    )
+    cell_type, cells = vtk_cells(cell, degree, np.arange(len(element.points))[None])
+    assert cell_type == {"hexahedron": (12, 72), "tetrahedron": (10, 71)}[cell][degree > 1]
+    with TransientGrid(tmp_path / "f.vtkhdf", element.points, cells, cell_type) as grid:
+        grid.append(0.0)
+    found = read(grid.path)
+    assert np.allclose(found["0 parametric"].reshape(-1, 3), element.points[cells[0]], atol=1e-12)
+    assert found["0 types"].tolist() == [cell_type]
+    assert found["0 volumes"] == pytest.approx([{"hexahedron": 1.0, "tetrahedron": 1 / 6}[cell]], rel=1e-6)
+
+
+@pytest.mark.filterwarnings("ignore:dofmap is deprecated:DeprecationWarning")
+@pytest.mark.parametrize("cell", ["hexahedron", "tetrahedron"])
+def test_cells_of_a_dolfinx_mesh_have_positive_volumes(tmp_path, cell):
+    from dolfinx import mesh
+    from mpi4py import MPI
+
+    box = mesh.create_box(MPI.COMM_SELF, [[0, 0, 0], [1, 2, 3]], [2, 2, 3], mesh.to_type(cell))
+    cell_type, cells = vtk_cells(cell, 1, box.geometry.dofmap)
+    with TransientGrid(tmp_path / "f.vtkhdf", box.geometry.x, cells, cell_type) as grid:
+        grid.append(0.0)
+    volumes = read(grid.path)["0 volumes"]
+    assert volumes == pytest.approx(np.full(len(volumes), 6 / len(volumes)), rel=1e-6)
+
+
+def random_cells(m: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    random = np.random.default_rng(3)
+    axes = np.linalg.qr(random.standard_normal((m, 3, 3)))[0]
+    return random.random((m, 3)), random.random((m, 3)), axes
+
+
+def sorted_corners(points: np.ndarray) -> np.ndarray:
+    return np.array([corners[np.lexsort(corners.round(12).T)] for corners in points.reshape(-1, 8, 3)])
+
+
+def test_chain_lines_are_the_diagonals_of_the_cell():
+    centres, lengths, axes = random_cells(5)
+    points, lines = chain_lines(centres, lengths, axes, scale=0.1)
+    assert points.shape == (40, 3) and lines.shape == (20, 2)
+    first, second = points[lines[:, 0]], points[lines[:, 1]]
+    assert np.allclose((first + second) / 2, np.repeat(centres, 4, axis=0), atol=1e-15)
+    # in the axes of the cell every end is at (+-l_1, +-l_2, +-l_3), and all eight combinations occur
+    local = np.einsum("mIi,mki->mkI", axes, points.reshape(5, 8, 3) - centres[:, None]) / 0.1
+    assert np.allclose(np.abs(local), lengths[:, None], atol=1e-14)
+    for signs in np.sign(local):
+        assert len(np.unique(signs, axis=0)) == 8
+
+
+def test_chain_lines_do_not_depend_on_sign_and_order_of_the_axes():
+    centres, lengths, axes = random_cells(4)
+    points, _ = chain_lines(centres, lengths, axes, 1.0)
+    other, _ = chain_lines(centres, lengths[:, [2, 0, 1]], axes[:, [2, 0, 1]] * [[-1], [1], [-1]], 1.0)
+    assert np.allclose(sorted_corners(points), sorted_corners(other), atol=1e-14)
+
+
+def test_chain_displacement_is_that_of_the_body():
+    centres, lengths, axes = random_cells(3)
+    points, _ = chain_lines(centres, lengths, axes, 0.2)
+    F = np.eye(3) + 0.3 * np.random.default_rng(4).standard_normal((3, 3))
+    shift = np.array([1.0, 2.0, 3.0])
+    moved = chain_displacement(points, centres, centres @ (F - np.eye(3)).T + shift, np.tile(F, (3, 1, 1)))
+    assert np.allclose(points + moved, points @ F.T + shift, atol=1e-14)
+
+
+def test_reader_finds_moving_chains(tmp_path):
+    centres, lengths, axes = random_cells(3)
+    series = [chain_lines(centres, lengths * [1, 1, 1 - 0.3 * k], axes, 0.1) for k in range(4)]
+    points, lines = series[0]
+    path = tmp_path / "chains.vtkhdf"
+    with TransientGrid(path, points, lines, LINE, point_dtype=np.float32) as grid:
+        grid.append(0.0, {"displacement": 0 * points}, {"angle": np.zeros(12)}, points=points)
+        grid.append(1.0, {"displacement": 1 * points}, {"angle": np.ones(12)}, points=series[1][0])
+        grid.append(2.0, {"displacement": 2 * points}, {"angle": np.full(12, 2.0)})  # the points stay
+        grid.append(3.0, {"displacement": 3 * points}, {"angle": np.full(12, 3.0)}, points=series[3][0])
+    found = read(path)
+    assert found["steps"] == 4
+    for k, of in enumerate((0, 1, 1, 3)):
+        assert found[f"{k} time"] == k
+        assert found[f"{k} points"].dtype == np.float32
+        assert np.array_equal(found[f"{k} points"], series[of][0].astype(np.float32))
+        assert np.array_equal(found[f"{k} cells"], lines.ravel()) and set(found[f"{k} types"]) == {LINE}
+        assert np.array_equal(found[f"{k} point displacement"], (k * points).astype(np.float32))
+        assert np.array_equal(found[f"{k} cell angle"], np.full(12, k))
+
+
+def test_nothing_is_overwritten(tmp_path):
+    path = tmp_path / "f.vtkhdf"
+    path.write_text("mine")
+    with pytest.raises(FileExistsError):
+        TransientGrid(path, CUBE, VTK_CUBE, 12)
+    assert path.read_text() == "mine"
+
+
+def test_full_disk_raises_and_keeps_the_series(tmp_path):
+    # a limit on the size of files stands for the full disk: the same error from the same system call
+    path = tmp_path / "f.vtkhdf"
+    field = np.random.default_rng(5).random((4, 8, 3)).astype(np.float32)
+    old = resource.getrlimit(resource.RLIMIT_FSIZE)
+    with TransientGrid(path, CUBE, VTK_CUBE, 12) as grid:
+        grid.append(0.0, {"u": field[0]})
+        size = path.stat().st_size
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size + 20, old[1]))
+        try:
+            for k in (1, 2):  # an error again as long as there is no room
+                with pytest.raises(OSError):
+                    grid.append(k, {"u": field[k]})
+                assert path.stat().st_size == size
+                assert np.array_equal(raw_series(path, "u", 8), field[:1])
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, old)
+        grid.append(3.0, {"u": field[3]})
+        assert np.array_equal(raw_series(path, "u", 8), field)  # the steps without room were not forgotten
+    assert np.array_equal(raw_series(path, "u", 8), field)
+
+
+def test_full_disk_at_the_start_leaves_no_file(tmp_path):
+    old = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, old[1]))
+    try:
+        with pytest.raises(OSError):
+            TransientGrid(tmp_path / "f.vtkhdf", CUBE, VTK_CUBE, 12)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, old)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("steps", [0, 1, 63, 64])  # the index of HDF5 grows a level at 64 chunks
+def test_a_file_cut_off_between_any_two_writes_is_whole(tmp_path, monkeypatch, steps):
+    field = np.arange(65 * 24.0).reshape(65, 8, 3)
+    path, copy = tmp_path / "f.vtkhdf", tmp_path / "copy.vtkhdf"
+    cuts, write = [], os.pwrite
+
+    def copy_and_write(descriptor, data, offset):
+        shutil.copy(path, copy)  # what a process that is killed here leaves behind
+        series = raw_series(copy, "u", 8)
+        assert np.array_equal(series, field[: len(series)]) or not series
+        cuts.append(len(series))
+        return write(descriptor, data, offset)
+
+    monkeypatch.setattr(os, "fdatasync", lambda descriptor: None)
+    with TransientGrid(path, CUBE, VTK_CUBE, 12) as grid:
+        for k in range(steps):
+            grid.append(k, {"u": field[k]}, {"c": np.zeros(1)}, points=CUBE + k)
+        monkeypatch.setattr(os, "pwrite", copy_and_write)
+        grid.append(steps, {"u": field[steps]}, {"c": np.zeros(1)}, points=CUBE + steps)
+        monkeypatch.setattr(os, "pwrite", write)
+    assert len(cuts) > 10 and cuts == sorted(cuts) and set(cuts) <= {steps, steps + 1} and cuts[0] == steps
+
+
+def test_a_killed_run_leaves_a_series(tmp_path):
+    script = """
+import sys, numpy as np
+from pathlib import Path
+from remodel_fenicsx.results.vtkhdf import TransientGrid
+grid = TransientGrid(Path(sys.argv[1]), np.eye(4, 3), [[0, 1, 2, 3]], 10)
+for k in range(10**6):
+    grid.append(k, {"u": np.full((4, 3), k)})
+    print(k, flush=True)
+"""
+    path = tmp_path / "f.vtkhdf"
+    with subprocess.Popen([sys.executable, "-c", script, str(path)], stdout=subprocess.PIPE, text=True) as run:
+        while run.stdout.readline().strip() != "70":
+            assert run.poll() is None
+        run.send_signal(signal.SIGKILL)
+        said = 70 + len(run.stdout.readlines())
+    assert run.returncode == -signal.SIGKILL
+    found = read(path)
+    assert found["steps"] >= said + 1
+    for k in range(int(found["steps"])):
+        assert found[f"{k} time"] == k and np.array_equal(found[f"{k} point u"], np.full((4, 3), k))
+
+
+def test_ctrl_c_waits_for_the_step(tmp_path, monkeypatch):
+    # an exception that comes up while HDF5 calls back into StagedFile would crash the process
+    write, calls = StagedFile.write, []
+
+    def interrupted(self, buffer):
+        calls.append(len(buffer))
+        signal.raise_signal(signal.SIGINT)
+        return write(self, buffer)
+
+    handler = signal.getsignal(signal.SIGINT)
+    with TransientGrid(tmp_path / "f.vtkhdf", CUBE, VTK_CUBE, 12) as grid:
+        grid.append(0.0, {"u": np.zeros(8)})
+        monkeypatch.setattr(StagedFile, "write", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            grid.append(1.0, {"u": np.ones(8)})
+        monkeypatch.setattr(StagedFile, "write", write)
+        assert calls and signal.getsignal(signal.SIGINT) is handler
+        assert np.array_equal(raw_series(grid.path, "u", 8), [np.zeros(8), np.ones(8)])
+        grid.append(2.0, {"u": np.full(8, 2.0)})
+    assert np.array_equal(raw_series(grid.path, "u", 8), [np.zeros(8), np.ones(8), np.full(8, 2.0)])
+
+
+def test_what_was_staged_can_be_read_back(tmp_path):
+    # HDF5 seldom reads what it wrote, so the overlay of old bytes, changes and new end is checked by itself
+    staged, expected = StagedFile(tmp_path / "f"), bytearray()
+    random = np.random.default_rng(6)
+    for turn in range(200):
+        start, data = int(random.integers(0, len(expected) + 20)), random.bytes(int(random.integers(1, 60)))
+        expected.extend(bytes(max(0, start + len(data) - len(expected))))
+        expected[start : start + len(data)] = data
+        staged.seek(start)
+        assert staged.write(data) == len(data)
+        if turn % 7 == 0:
+            staged.commit()
+            assert (tmp_path / "f").read_bytes() == expected
+        start, size = int(random.integers(0, len(expected))), int(random.integers(1, 300))
+        buffer = bytearray(size)
+        staged.seek(start)
+        count = staged.readinto(buffer)
+        assert count == min(size, len(expected) - start) and buffer[:count] == expected[start : start + size]
+    assert staged.seek(0, os.SEEK_END) == len(expected)
+    staged.close()
+
+
+# ---------------------------------------------------------------- going on
+@pytest.mark.parametrize("steps", [2, 64])
+def test_a_file_cut_off_between_any_two_writes_goes_on(tmp_path, monkeypatch, steps):
+    field = np.arange(70 * 24.0).reshape(70, 8, 3)
+    path, copies, write = tmp_path / "f.vtkhdf", [], os.pwrite
+
+    def copy_and_write(descriptor, data, offset):
+        write(descriptor, bytes(data)[: len(data) // 2], offset)
+        copies.append(shutil.copy(path, tmp_path / f"{len(copies)}.vtkhdf"))
+        return write(descriptor, data, offset)
+
+    with TransientGrid(path, CUBE, VTK_CUBE, 12) as grid:
+        for k in range(steps):
+            grid.append(k, {"u": field[k]}, {"c": np.zeros(1)}, points=CUBE + k)
+        monkeypatch.setattr(os, "pwrite", copy_and_write)
+        grid.append(steps, {"u": field[steps]}, {"c": np.zeros(1)}, points=CUBE + steps)
+        monkeypatch.setattr(os, "pwrite", write)
+    for number, copy in enumerate(copies):
+        kept = steps - 1 if number % 2 else steps  # another time, without the last whole step
+        with TransientGrid.continued(Path(copy), kept - 0.5) as grid:
+            assert grid.number_of_steps == kept and grid.last_time == kept - 1
+            for k in range(kept, steps + 2):
+                grid.append(k, {"u": -field[k]}, {"c": np.ones(1)}, points=CUBE - k)
+        expected = [*field[:kept], *-field[kept : steps + 2]]
+        assert np.array_equal(raw_series(copy, "u", 8), expected)
+        with h5py.File(copy) as file:
+            moved = file["VTKHDF/Points"][:].reshape(-1, 8, 3)
+            assert np.array_equal(
+                moved[1:], [CUBE + k for k in range(kept)] + [CUBE - k for k in range(kept, steps + 2)]
+            )
+
+
+def test_a_commit_that_was_cut_off_is_finished_by_who_opens_the_file(tmp_path, monkeypatch):
+    path, write, done = tmp_path / "f", os.pwrite, []
+    staged = StagedFile(path)
+    staged.write(bytes(100))
+    staged.commit()
+    for start in (10, 0, 50):
+        staged.seek(start)
+        staged.write(b"changed")
+    staged.seek(100)
+    staged.write(b"new")
+
+    def killed(descriptor, data, offset):
+        if len(done) == 2:  # the new end, and one of three changes
+            raise KeyboardInterrupt
+        done.append(offset)
+        return write(descriptor, data, offset)
+
+    monkeypatch.setattr(os, "pwrite", killed)
+    with pytest.raises(KeyboardInterrupt):
+        staged.commit()
+    monkeypatch.setattr(os, "pwrite", write)
+    staged.close()
+    expected = bytearray(bytes(100) + b"new")
+    for start in (10, 0, 50):
+        expected[start : start + 7] = b"changed"
+    assert path.read_bytes()[:103] != expected and len(path.read_bytes()) > 103
+    for _ in range(2):  # a second time it is whole already
+        StagedFile(path, existing=True).close()
+        assert path.read_bytes() == expected
+
+
+def test_a_mark_without_its_changes_says_nothing(tmp_path):
+    changes = struct.pack("<QQ", 0, 3) + b"bad"
+    for end in (struct.pack("<QI8s", len(changes), 1, b"remodel1"), struct.pack("<QI8s", 2**40, 1, b"remodel1"), b"x"):
+        (tmp_path / "f").write_bytes(b"good" + changes + end)
+        StagedFile(tmp_path / "f", existing=True).close()
+        assert (tmp_path / "f").read_bytes() == b"good" + changes + end
+
+
+def test_fields_of_a_run_that_began_with_filters_go_on(tmp_path, monkeypatch):
+    """0.1.0 compressed fields; new steps of such a file stand in it as they are, and are read like the others."""
+    path, field = tmp_path / "f.vtkhdf", np.random.default_rng(1).random((4, 8, 3)).astype(np.float32)
+    create = h5py.Group.create_dataset
+    with monkeypatch.context() as patch:
+        filters = {"compression": "gzip", "shuffle": True}
+        patch.setattr(h5py.Group, "create_dataset", lambda self, *a, **k: create(self, *a, **(filters | k)))
+        patch.setattr(vtkhdf._Rows, "write", lambda self, n, block: _through_h5py(h5py.Dataset(self._id), n, block))
+        with TransientGrid(path, CUBE, VTK_CUBE, 12) as grid:
+            for k in range(3):
+                grid.append(k, {"u": field[k]}, {"c": np.full(1, k)}, points=CUBE + k)
+    with TransientGrid.continued(path, 1.0) as grid:
+        for k in (2, 3):
+            grid.append(k, {"u": field[k]}, {"c": np.full(1, k)}, points=CUBE + k)
+    with h5py.File(path) as file:
+        assert file["VTKHDF/PointData/u"].compression == "gzip"
+    np.testing.assert_array_equal(raw_series(path, "u", 8), field)
+    assert [float(points[0, 0]) for points in read_points(path)] == [CUBE[0, 0] + k for k in (0, 0, 1, 2, 3)]
+
+
+def _through_h5py(dataset, number, block):
+    block = np.reshape(block, (-1, *dataset.shape[1:]))
+    dataset.resize((number + 1) * len(block), axis=0)
+    dataset[number * len(block) :] = block
+
+
+def read_points(path: Path) -> np.ndarray:
+    with h5py.File(path) as file:
+        return file["VTKHDF/Points"][:].reshape(-1, len(CUBE), 3)
+
+
+def test_steps_are_not_compressed(tmp_path):
+    with TransientGrid(tmp_path / "f.vtkhdf", CUBE, VTK_CUBE, 12) as grid:
+        grid.append(0.0, {"u": CUBE})
+    with h5py.File(tmp_path / "f.vtkhdf") as file:
+        assert file["VTKHDF/PointData/u"].compression is None and file["VTKHDF/PointData/u"].chunks == (8, 3)

@@ -1,0 +1,966 @@
+"""Scenes: what is read, what is refused and in which words."""
+
+from __future__ import annotations
+
+import copy
+import math
+import pickle
+import re
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from remodel_fenicsx.body import Cube, Tendon, Tube
+from remodel_fenicsx.model.chains import wormlike_stiffness
+from remodel_fenicsx.model.laws import LAWS
+from remodel_fenicsx.scene.presets import PRESET_NOTES, PRESETS
+from remodel_fenicsx.scene.reference import scene_reference
+from remodel_fenicsx.scene.scene import FORMAT, RENAMED, Scene, preset_scene, read_scene, scene_from_dict
+from remodel_fenicsx.schema.tables import SceneError, sections
+from remodel_fenicsx.settings import Cells, Load, Material, Remodeling, Solver, Time
+
+ROOT = Path(__file__).resolve().parents[2]
+DEMOS = sorted((ROOT / "demos").glob("*.toml"))
+PAPER = "kuhl-holzapfel-2007"
+
+TUBE: dict[str, Any] = {
+    "geometry": {"shape": "tube", "inner_radius": 1.0, "outer_radius": 3.0, "length": 8.0},
+    "loads": {"pressure": {"value": 4.8, "ramp": [[0.0, 0.0], [25.0, 1.0]]}},
+    "time": {"end": 30.0, "step": 1.0},
+}
+CUBE: dict[str, Any] = {"geometry": {"shape": "cube"}, "time": {"end": 10.0}}
+
+
+def changed(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
+    """Nested dict with values at dotted keys."""
+    result = copy.deepcopy(base)
+    for key, value in changes.items():
+        table = result
+        *parents, name = key.split(".")
+        for parent in parents:
+            table = table.setdefault(parent, {})
+        table[name] = value
+    return result
+
+
+def refusal(values: dict[str, Any]) -> str:
+    with pytest.raises(SceneError) as caught:
+        scene_from_dict(values)
+    return str(caught.value)
+
+
+# (base, changes, the one line)
+BAD_SCENES = [
+    # geometry
+    (
+        TUBE,
+        {"geometry.inner_radius": 3.0},
+        "geometry.inner_radius = 3.0: must be smaller than geometry.outer_radius = 3.0",
+    ),
+    (
+        TUBE,
+        {"geometry.inner_radius": 5},
+        "geometry.inner_radius = 5.0: must be smaller than geometry.outer_radius = 3.0",
+    ),
+    (TUBE, {"geometry.length": 0.0}, "geometry.length = 0.0: must be a finite number greater than 0"),
+    (TUBE, {"geometry.shape": "sphere"}, "geometry.shape = 'sphere': allowed are 'cube', 'tendon', 'tube'"),
+    (TUBE, {"geometry.shape": 1}, "geometry.shape = 1: allowed are 'cube', 'tendon', 'tube'"),
+    (
+        CUBE,
+        {"geometry": {"shape": "tube", "inner_radius": 1.0, "outer_radius": 2.0}},
+        "geometry.length: missing; must be a finite number greater than 0",
+    ),
+    ({"time": {"end": 1.0}}, {}, "geometry.shape: missing; allowed are 'cube', 'tendon', 'tube'"),
+    ({"time": {"end": 1.0}}, {"preset": PAPER}, "geometry.shape: missing; allowed are 'cube', 'tendon', 'tube'"),
+    (CUBE, {"geometry": {"side": 1.0}}, "geometry.shape: missing; allowed are 'cube', 'tendon', 'tube'"),
+    (CUBE, {"geometry": 3}, "geometry = 3: must be a table"),
+    (
+        CUBE,
+        {"geometry.radius": 3.0},
+        "geometry.radius = 3.0: unknown key; allowed are geometry.shape, geometry.length_unit, geometry.side",
+    ),
+    # without a shape nothing else is judged: preset, loads and units depend on it
+    (CUBE, {"preset": PAPER, "geometry": {}}, "geometry.shape: missing; allowed are 'cube', 'tendon', 'tube'"),
+    ({}, {}, "geometry.shape: missing; allowed are 'cube', 'tendon', 'tube'"),
+    (
+        {"preset": PAPER, "geometry": {"shape": "heart"}},
+        {},
+        "geometry.shape = 'heart': allowed are 'cube', 'tendon', 'tube'",
+    ),
+    (
+        {"preset": PAPER, "geometry": {"shape": "heart"}, "loads": {"pressure": {"value": "100 mmHg"}}},
+        {},
+        "geometry.shape = 'heart': allowed are 'cube', 'tendon', 'tube'",
+    ),
+    ({"preset": PAPER, "geometry": 3}, {}, "geometry = 3: must be a table"),
+    # unknown keys
+    (
+        TUBE,
+        {"geometry": {"shape": "tube", "inner_radus": 1.0, "outer_radius": 3.0, "length": 8.0}},
+        "geometry.inner_radus = 1.0: unknown key; did you mean geometry.inner_radius?",
+    ),
+    (
+        CUBE,
+        {"time": {"ende": 3.0, "stepp": 1.0}},
+        "time.ende = 3.0: unknown key; did you mean time.end? (and 1 more fault)",
+    ),
+    (TUBE, {"cells.sed": 3}, "cells.sed = 3: unknown key; did you mean cells.seed?"),
+    (TUBE, {"kappa": 0.1}, "kappa = 0.1: unknown key; did you mean remodeling.kappa?"),
+    (TUBE, {"remodelling": {"kappa": 1.0}}, "remodelling = {kappa = 1.0}: unknown key; did you mean remodeling?"),
+    (
+        TUBE,
+        {"output.pictures!": True},
+        "output.'pictures!' = true: unknown key; allowed are output.fields, output.columns, output.every, "
+        "output.times, output.checkpoint",
+    ),
+    (TUBE, {"time.x\ny": 1}, "time.'x\\ny' = 1: unknown key; allowed are time.end, time.step, time.tolerance"),
+    # material
+    (CUBE, {"material.lame_mu": -3.0}, "material.lame_mu = -3.0: must be a finite number greater than 0"),
+    (CUBE, {"material.lame_lambda": -0.1}, "material.lame_lambda = -0.1: must be a finite number at least 0"),
+    (CUBE, {"material.lame_mu": float("nan")}, "material.lame_mu = nan: must be a finite number greater than 0"),
+    (
+        CUBE,
+        {"material.temperature": float("inf")},
+        "material.temperature = inf: must be a finite number greater than 0",
+    ),
+    (
+        CUBE,
+        {"material.lame_mu": "3.1"},
+        "material.lame_mu = '3.1': must be a finite number greater than 0, "
+        "or one with a unit of stress as in '2.4 kPa'",
+    ),
+    (CUBE, {"material.lame_mu": True}, "material.lame_mu = true: must be a finite number greater than 0"),
+    (
+        CUBE,
+        {"material.lame_mu": 10**400},
+        re.compile(r"material\.lame_mu = 10+\.\.\.: must be a finite number greater than 0"),
+    ),
+    (CUBE, {"material.lame_mu": [1.0]}, "material.lame_mu = [1.0]: must be a finite number greater than 0"),
+    (CUBE, {"material.energy_factor": 2}, "material.energy_factor = 2: allowed are 1, 4"),
+    (CUBE, {"material.energy_factor": True}, "material.energy_factor = true: allowed are 1, 4"),
+    (CUBE, {"material.chain": "rubber"}, "material.chain = 'rubber': allowed is 'wormlike'"),
+    (CUBE, {"material.stress_unit": "psi"}, "material.stress_unit = 'psi': allowed are 'Pa', 'kPa', 'MPa'"),
+    (CUBE, {"material": 3}, "material = 3: must be a table"),
+    (
+        CUBE,
+        {"material.lame_mu": -1.0, "material.lame_lambda": -1.0, "cells.seed": -1},
+        "material.lame_lambda = -1.0: must be a finite number at least 0 (and 2 more faults)",
+    ),
+    # cells
+    (
+        CUBE,
+        {"cells.end_to_end_length": 1.594},
+        "cells.end_to_end_length = 1.594: must be smaller than material.contour_length = 1.594",
+    ),
+    (
+        CUBE,
+        {"material.contour_length": 0.5},
+        "cells.end_to_end_length = 1.0: must be smaller than material.contour_length = 0.5",
+    ),
+    (CUBE, {"cells.seed": -1}, "cells.seed = -1: must be a whole number at least 0"),
+    (CUBE, {"cells.seed": 1.5}, "cells.seed = 1.5: must be a whole number at least 0"),
+    (CUBE, {"cells.seed": True}, "cells.seed = true: must be a whole number at least 0"),
+    (CUBE, {"cells.axes": "cylindrical"}, "cells.axes = 'cylindrical': allowed for shape 'cube' is 'global'"),
+    (CUBE, {"cells.axes": "polar"}, "cells.axes = 'polar': allowed are 'global', 'cylindrical'"),
+    (
+        CUBE,
+        {"cells.initial": "raindrop"},
+        "cells.initial = 'raindrop': allowed are 'random', 'isotropic', 'aligned' or three lengths [l1, l2, l3]",
+    ),
+    (
+        CUBE,
+        {"cells.initial": 1.0},
+        "cells.initial = 1.0: allowed are 'random', 'isotropic', 'aligned' or three lengths [l1, l2, l3]",
+    ),
+    (
+        CUBE,
+        {"cells.initial": [0.6, 0.8]},
+        "cells.initial = [0.6, 0.8]: must be three lengths [l1, l2, l3], each at least 0",
+    ),
+    (
+        CUBE,
+        {"cells.initial": [0.6, -0.8, 0.0]},
+        "cells.initial = [0.6, -0.8, 0.0]: must be three lengths [l1, l2, l3], each at least 0",
+    ),
+    (
+        CUBE,
+        {"cells.initial": [1, 1, 1]},
+        "cells.initial = [1.0, 1.0, 1.0]: the root of the sum of squares is 1.732051, "
+        "it must be cells.end_to_end_length = 1.0",
+    ),
+    (CUBE, {"cells.aligned_axis": 0}, "cells.aligned_axis = 0: allowed are 1, 2, 3"),
+    # loads
+    (
+        TUBE,
+        {"loads.force": {"value": 1.0}},
+        "loads.force = {value = 1.0}: a tube has no such load; "
+        "allowed: loads.pressure, loads.elongation, loads.axial_force",
+    ),
+    (
+        CUBE,
+        {"loads.presure": {"value": 1.0}},
+        "loads.presure = {value = 1.0}: a cube has no such load; allowed: loads.force",
+    ),
+    (CUBE, {"loads.force": 10.0}, "loads.force = 10.0: must be a table with value, ramp"),
+    (CUBE, {"loads": 10.0}, "loads = 10.0: must be a table"),
+    (
+        CUBE,
+        {"loads.force": {"value": 1.0}},
+        "loads.force.ramp: missing; must be a list of pairs [time, factor] with increasing times",
+    ),
+    (
+        TUBE,
+        {"loads.pressure.value": "high"},
+        "loads.pressure.value = 'high': must be a finite number, or one with a unit of stress as in '2.4 kPa'",
+    ),
+    (
+        TUBE,
+        {"loads.elongation": {"value": "much"}},
+        "loads.elongation.value = 'much': must be a finite number (and 1 more fault)",
+    ),
+    (TUBE, {"loads.pressure.rmp": []}, "loads.pressure.rmp = []: unknown key; did you mean loads.pressure.ramp?"),
+    (
+        TUBE,
+        {"loads.pressure.ramp": []},
+        "loads.pressure.ramp = []: must be a list of pairs [time, factor], at least one",
+    ),
+    (
+        TUBE,
+        {"loads.pressure.ramp": 25.0},
+        "loads.pressure.ramp = 25.0: must be a list of pairs [time, factor], at least one",
+    ),
+    (
+        TUBE,
+        {"loads.pressure.ramp": [[0.0, 0.0], [1.0]]},
+        "loads.pressure.ramp[1] = [1.0]: must be a pair [time, factor] of finite numbers",
+    ),
+    (
+        TUBE,
+        {"loads.pressure.ramp": [[0.0, 0.0, 1.0]]},
+        "loads.pressure.ramp[0] = [0.0, 0.0, 1.0]: must be a pair [time, factor] of finite numbers",
+    ),
+    (
+        TUBE,
+        {"loads.pressure.ramp": [[0.0, "all"]]},
+        "loads.pressure.ramp[0] = [0.0, 'all']: must be a pair [time, factor] of finite numbers",
+    ),
+    (
+        TUBE,
+        {"loads.pressure.ramp": [[0.0, float("nan")]]},
+        "loads.pressure.ramp[0] = [0.0, nan]: must be a pair [time, factor] of finite numbers",
+    ),
+    (
+        TUBE,
+        {"loads.pressure.ramp": [[0.0, 0.0], [5.0, 1.0], [4.0, 0.0]]},
+        "loads.pressure.ramp[2][0] = 4.0: must be later than the time 5.0 of the entry before",
+    ),
+    (
+        TUBE,
+        {"loads.pressure.ramp": [[0.0, 0.0], [0.0, 1.0]]},
+        "loads.pressure.ramp[1][0] = 0.0: must be later than the time 0.0 of the entry before",
+    ),
+    (
+        TUBE,
+        {"loads.pressure.ramp": [[-1.0, 0.0]]},
+        "loads.pressure.ramp[0][0] = -1.0: must be at least 0, where the simulation starts",
+    ),
+    (
+        TUBE,
+        {"loads.pressure.ramp": [[0.0, 0.0], [2.5, 1.0]]},
+        "loads.pressure.ramp[1][0] = 2.5: must be a multiple of time.step = 1.0; the nearest are 2 and 3",
+    ),
+    (
+        TUBE,
+        {"loads.elongation": {"value": -1.0, "ramp": [[0.0, 0.0], [5.0, 1.0]]}},
+        "loads.elongation.value = -1.0: must be greater than -1 at every time; with the factor 1.0 it is -1",
+    ),
+    (
+        TUBE,
+        {"loads.elongation": {"value": 0.5, "ramp": [[0.0, 0.0], [5.0, -3.0]]}},
+        "loads.elongation.value = 0.5: must be greater than -1 at every time; with the factor -3.0 it is -1.5",
+    ),
+    (
+        TUBE,
+        {"loads.pressure.ramp": [[0.0, 0.0], [True, 1.0]]},
+        "loads.pressure.ramp[1] = [true, 1.0]: must be a pair [time, factor] of finite numbers",
+    ),
+    (
+        TUBE,
+        {"loads.pressure.ramp": [[10**400, 0.0]]},
+        re.compile(r"loads\.pressure\.ramp\[0\] = \[10+\.\.\.: must be a pair \[time, factor\] of finite numbers"),
+    ),
+    # remodeling, model, mesh
+    (CUBE, {"remodeling.kappa": -0.1}, "remodeling.kappa = -0.1: must be a finite number at least 0"),
+    (CUBE, {"remodeling.rotation_time": 0.0}, "remodeling.rotation_time = 0.0: must be a finite number greater than 0"),
+    (CUBE, {"remodeling.pairing": "rank"}, "remodeling.pairing = 'rank': allowed are 'sorted', 'continuous'"),
+    (
+        CUBE,
+        {"remodeling.law": "foo"},
+        "remodeling.law = 'foo': allowed are 'explicit', 'rate', 'relaxation', 'tensor', 'rotation', 'none'",
+    ),
+    (
+        CUBE,
+        {"remodeling.law": 1},
+        "remodeling.law = 1: allowed are 'explicit', 'rate', 'relaxation', 'tensor', 'rotation', 'none'",
+    ),
+    (CUBE, {"remodeling.driver": "strain"}, "remodeling.driver = 'strain': allowed are 'cauchy', 'pk2', 'finger'"),
+    (CUBE, {"remodeling.frame": "corotated"}, "remodeling.frame = 'corotated': allowed are 'material', 'spatial'"),
+    (
+        CUBE,
+        {"remodeling.coupling": "monolithic"},
+        "remodeling.coupling = 'monolithic': allowed are 'staggered', 'relaxed', 'extrapolated', 'implicit'",
+    ),
+    (
+        CUBE,
+        {"remodeling.coupling": "implicit", "remodeling.law": "rotation"},
+        "remodeling.coupling = 'implicit': needs a remodeling.law towards a target: 'explicit', 'rate', 'relaxation', "
+        "'tensor'",
+    ),
+    (
+        CUBE,
+        {"remodeling.coupling": "implicit", "remodeling.law": "tensor", "material.repulsion": "axes"},
+        "remodeling.coupling = 'implicit': needs a material.repulsion that sees no axes, as its law: 'log', 'length'",
+    ),
+    (
+        CUBE,
+        {"remodeling.coupling": "implicit", "mesh.formulation": "selective-integration"},
+        "remodeling.coupling = 'implicit': needs mesh.formulation = 'displacement': in the others the stress at a "
+        "point depends on its whole element",
+    ),
+    (
+        CUBE,
+        {"remodeling.coupling": "implicit", "material.chain_density": 0.0},
+        "remodeling.coupling = 'implicit': needs chains: material.chain_density above 0",
+    ),
+    (CUBE, {"model.kinematics": "radial"}, "model.kinematics = 'radial': a cube has no such reduction; it has 'point'"),
+    (CUBE, {"geometry.side": 1e7}, "geometry.side = 10000000.0: a length of 1e+07 here; allowed are 1e-06 to 1e+06"),
+    (
+        TUBE,
+        {"geometry.length": 1e5},
+        "geometry.inner_radius = 1.0: a length of 1 is too small beside one of 100000; allowed is a ratio up to 10000",
+    ),
+    (
+        TUBE,
+        {"geometry.inner_radius": 2.9999},
+        "geometry.outer_radius = 3.0: a length of 0.0001 is too small beside one of 8; allowed is a ratio up to 10000",
+    ),
+    (
+        TUBE,
+        {"mesh.refinement": 19},
+        "mesh.refinement = 19: must be at most 18 for a tube: more makes over 1e+07 elements",
+    ),
+    (
+        CUBE,
+        {"mesh.refinement": 10**30},
+        re.compile("mesh.refinement = 10+: must be at most 215 for a cube: more makes over 1e.07 elements"),
+    ),
+    (CUBE, {"mesh.refinement": 0}, "mesh.refinement = 0: must be a whole number at least 1"),
+    (CUBE, {"mesh.refinement": 2.5}, "mesh.refinement = 2.5: must be a whole number at least 1"),
+    (CUBE, {"mesh.element": "wedge"}, "mesh.element = 'wedge': allowed are 'hexahedron', 'tetrahedron'"),
+    (CUBE, {"mesh.degree": 3}, "mesh.degree = 3: allowed are 1, 2"),
+    (CUBE, {"mesh.degree": True}, "mesh.degree = true: allowed are 1, 2"),
+    # time
+    ({"geometry": {"shape": "cube"}}, {}, "time: missing; must be a table with end"),
+    (CUBE, {"time": {"step": 1.0}}, "time.end: missing; must be a finite number greater than 0, or 'equilibrium'"),
+    (CUBE, {"time.end": 0.0}, "time.end = 0.0: must be a finite number greater than 0, or 'equilibrium'"),
+    (CUBE, {"time.step": -1.0}, "time.step = -1.0: must be a finite number greater than 0"),
+    (CUBE, {"time.step": 11.0}, "time.step = 11.0: must be at most time.end = 10.0"),
+    (CUBE, {"time.step": 3.0}, "time.end = 10.0: must be a multiple of time.step = 3.0; the nearest are 9 and 12"),
+    (CUBE, {"time.step": 1e-6}, "time.step = 1e-06: must be at least time.end / 1000000 = 1e-05"),
+    # solver and output
+    (CUBE, {"solver.absolute_tolerance": -1.0}, "solver.absolute_tolerance = -1.0: must be a finite number at least 0"),
+    (
+        CUBE,
+        {"solver.relative_tolerance": 0.0},
+        "solver.relative_tolerance = 0.0: must be greater than 0 where absolute_tolerance is 0",
+    ),
+    (
+        CUBE,
+        {"solver.relative_tolerance": 1.0},
+        "solver.relative_tolerance = 1.0: must be a finite number at least 0 and less than 1",
+    ),
+    (
+        CUBE,
+        {"solver.method": "magic"},
+        "solver.method = 'magic': allowed are 'auto', 'direct', 'lagged', 'iterative'",
+    ),
+    (
+        CUBE,
+        {"solver.method": "exact"},
+        "solver.method = 'exact': was removed; take 'lagged', or 'direct' for a new tangent in every iteration",
+    ),
+    (
+        CUBE,
+        {"solver.petsc_options": {"-ksp_type": "cg"}},
+        "solver.petsc_options.-ksp_type = 'cg': not a PETSc option; write its name without the leading '-'",
+    ),
+    (
+        CUBE,
+        {"solver.petsc_options": {"ksp_type": ["cg"]}},
+        "solver.petsc_options.ksp_type = ['cg']: must be a string, a finite number, true or false",
+    ),
+    (CUBE, {"solver.petsc_options": "-ksp_type cg"}, "solver.petsc_options = '-ksp_type cg': must be a table"),
+    (CUBE, {"output.fields": 1}, "output.fields = 1: must be true, false or a list of names of fields"),
+    (CUBE, {"output.every": 0}, "output.every = 0: must be a whole number at least 1"),
+    # format
+    (
+        CUBE,
+        {"format": 3, "new_table": {"key": 1}},
+        "format = 3: written by a newer version of remodel_fenicsx; this one reads formats up to 2",
+    ),
+    (CUBE, {"format": 0}, "format = 0: must be a whole number at least 1 and at most 2"),
+    (CUBE, {"format": "2"}, "format = '2': must be a whole number at least 1 and at most 2"),
+    (CUBE, {"format": True}, "format = true: must be a whole number at least 1 and at most 2"),
+    # name and preset
+    (
+        CUBE,
+        {"name": ""},
+        "name = '': must be a file name: letters, digits, spaces and . + - _, at most 100, " "a letter or digit first",
+    ),
+    (
+        CUBE,
+        {"name": "../up"},
+        "name = '../up': must be a file name: letters, digits, spaces and . + - _, at most 100, "
+        "a letter or digit first",
+    ),
+    (
+        CUBE,
+        {"name": "a\nb"},
+        "name = 'a\\nb': must be a file name: letters, digits, spaces and . + - _, at most 100, "
+        "a letter or digit first",
+    ),
+    (
+        CUBE,
+        {"preset": "kuhl-2007"},
+        "preset = 'kuhl-2007': allowed are 'kuhl-holzapfel-2007', 'consistent', 'sun-2002'",
+    ),
+    (CUBE, {"preset": 2007}, "preset = 2007: allowed are 'kuhl-holzapfel-2007', 'consistent', 'sun-2002'"),
+    (
+        TUBE,
+        {"preset": PAPER, "geometry.inner_radius": 4.0},
+        "geometry.inner_radius = 4.0: must be smaller than geometry.outer_radius = 3.0",
+    ),
+    (
+        TUBE,
+        {"preset": PAPER, "time.step": 2.0},
+        "loads.pressure.ramp[1][0] = 25.0: must be a multiple of time.step = 2.0; the nearest are 24 and 26",
+    ),
+]
+
+
+@pytest.mark.parametrize(("base", "changes", "line"), BAD_SCENES, ids=[str(bad[1])[:60] for bad in BAD_SCENES])
+def test_a_bad_scene_gives_one_line_with_key_value_and_what_is_allowed(base, changes, line):
+    message = refusal(changed(base, changes))
+    assert "\n" not in message
+    if isinstance(line, re.Pattern):
+        assert line.fullmatch(message)
+    else:
+        assert message == line
+
+
+def test_the_bases_of_the_bad_scenes_are_good():
+    assert scene_from_dict(TUBE).geometry == Tube(inner_radius=1.0, outer_radius=3.0, length=8.0)
+    assert scene_from_dict(CUBE).time == Time(end=10.0, step=1.0)
+
+
+def test_a_preset_without_the_shape(monkeypatch):
+    monkeypatch.setitem(PRESETS, "bent", {"tendon": {}, "tube": {}})
+    assert refusal({**CUBE, "preset": "bent"}) == "geometry.shape = 'cube': the preset 'bent' has 'tendon', 'tube'"
+
+
+def test_a_law_registered_later_is_allowed(monkeypatch):
+    monkeypatch.setitem(LAWS, "mine", LAWS["rate"])
+    assert scene_from_dict(changed(CUBE, {"remodeling.law": "mine"})).remodeling.law == "mine"
+    assert "'none', 'mine'" in refusal(changed(CUBE, {"remodeling.law": "yours"}))
+
+
+def test_a_key_of_an_earlier_format_is_refused_with_its_new_name(monkeypatch):
+    monkeypatch.setitem(RENAMED, "mesh.finite_cell", "mesh.degree")
+    monkeypatch.setitem(RENAMED, "loads.lengthening", "loads.pressure")
+    assert refusal(changed(TUBE, {"format": 1, "mesh.finite_cell": 1})) == "mesh.finite_cell = 1: is now mesh.degree"
+    assert refusal(changed(TUBE, {"mesh.finite_cell": 1})) == "mesh.finite_cell = 1: is now mesh.degree"
+    line = "loads.lengthening = {value = 1.0}: is now loads.pressure"
+    assert refusal(changed(TUBE, {"loads.lengthening": {"value": 1.0}})) == line
+
+
+def test_what_is_read_is_of_the_present_format():
+    assert scene_from_dict(CUBE) == scene_from_dict({**CUBE, "format": 1})
+    text = scene_from_dict({**CUBE, "format": 1}).to_toml("as run")
+    assert tomllib.loads(text)["format"] == FORMAT
+    assert [line for line in text.splitlines() if line and not line.startswith("#")][0] == "format = 2"
+
+
+@pytest.mark.parametrize("values", [None, [], 3, {1: 2}])
+def test_something_else_than_a_table(values):
+    with pytest.raises(SceneError, match=r"^scene = .*: must be a table$"):
+        scene_from_dict(values)
+
+
+# ---------------------------------------------------------------- files
+
+BAD_FILES = [
+    (b"name = 'a'\n[time\nend = 1", r"line 2: not TOML: Expected ']' at the end of a table declaration"),
+    (b"[time]\nend = 1.0\nend = 2.0\n", r"line 3: not TOML: Cannot overwrite a value"),
+    (b"a = [1,\n2", r"line 2: not TOML: Unclosed array"),
+    (b"[time]\nend = 150 s", r"line 2: not TOML: .*"),
+    (b"[time]\nend = 1.0\n# caf\xe9", r"line 3: not UTF-8 text; a scene is a TOML file in UTF-8"),
+    (b"a = " + b"[" * 100000, r"not TOML: .*"),
+    (b"a = " + b"9" * 5000, r"not TOML: .*"),
+]
+
+
+@pytest.mark.parametrize(("content", "line"), BAD_FILES)
+def test_a_file_that_is_not_toml_gives_one_line_with_its_line(tmp_path, content, line):
+    path = tmp_path / "bad.toml"
+    path.write_bytes(content)
+    with pytest.raises(SceneError) as caught:
+        read_scene(path)
+    assert re.fullmatch(re.escape(f"{path}: ") + line, str(caught.value))
+
+
+def test_a_missing_file_and_a_folder(tmp_path):
+    with pytest.raises(SceneError, match=r"/none\.toml: no such file; a scene is a TOML file$"):
+        read_scene(tmp_path / "none.toml")
+    with pytest.raises(SceneError, match=re.escape(f"{tmp_path}: is a folder; a scene is a TOML file")):
+        read_scene(tmp_path)
+    with pytest.raises(SceneError, match="cannot be read: .*embedded null"):
+        read_scene("a\0b")
+
+
+def test_a_byte_order_mark_and_windows_line_ends_are_read(tmp_path):
+    path = tmp_path / "from windows (2).toml"
+    path.write_bytes(b"\xef\xbb\xbf[geometry]\r\nshape = 'cube'\r\n[time]\r\nend = 1\r\n")
+    read = read_scene(path)
+    assert read.time.end == 1.0
+    assert read.name == "from windows 2"
+
+
+@pytest.mark.parametrize(("file", "name"), [
+    ("step-0.5.toml", "step-0.5"), ("step-0.25", "step-0.25"), ("a.b.TOML", "a.b"), (".toml", "scene"),
+])  # fmt: skip
+def test_a_name_is_not_cut_at_a_dot(file, name, tmp_path):
+    path = tmp_path / file
+    path.write_text("geometry = {shape = 'cube'}\ntime = {end = 1}\n")
+    assert read_scene(path).name == name
+
+
+# ---------------------------------------------------------------- overrides
+
+BAD_OVERRIDES = [
+    ("cells.seed", "--set 'cells.seed': must be KEY=VALUE, as in cells.seed=2"),
+    ("=2", "--set '=2': the key must be a dotted path, as in cells.seed=2"),
+    ("cells..seed=2", "--set 'cells..seed=2': the key must be a dotted path, as in cells.seed=2"),
+    ("cells.seed=", "--set cells.seed = '': must be a TOML value or a bare word"),
+    ("cells.seed=two words", "--set cells.seed = 'two words': must be a TOML value or a bare word"),
+    ("cells.seed=1\ntime.end=2", "--set cells.seed = '1\\ntime.end=2': must be a TOML value or a bare word"),
+    ("cells.seed=two", "cells.seed = 'two': must be a whole number at least 0"),
+    ("cells.sed=2", "cells.sed = 2: unknown key; did you mean cells.seed?"),
+    ("cell.seed=2", "cell = {seed = 2}: unknown key; did you mean cells?"),
+    ("time.end.last=3", "time.end.last = 3: time.end = 100.0 is a value, not a table"),
+    ("mesh.refinement.x=3", "mesh.refinement = {x = 3}: must be a whole number at least 1"),
+    ("loads.pressure.value=3", "loads.pressure = {value = 3}: a cube has no such load; allowed: loads.force"),
+    ("time.end=nan", "time.end = nan: must be a finite number greater than 0, or 'equilibrium'"),
+    ("time=3", "time = 3: must be a table with end"),
+    ("cells.initial=[1,", "--set cells.initial = '[1,': must be a TOML value or a bare word"),
+    ("time.end=2007-01-01", "time.end = 2007-01-01: must be a finite number greater than 0, or 'equilibrium'"),
+]
+
+
+@pytest.mark.parametrize(("override", "line"), BAD_OVERRIDES)
+def test_a_bad_override_gives_one_line(override, line):
+    with pytest.raises(SceneError) as caught:
+        read_scene(ROOT / "demos" / "cube.toml", [override])
+    assert str(caught.value) == line
+
+
+def test_overrides_lie_over_the_file_and_the_preset():
+    overrides = [
+        "remodeling.driver=pk2",
+        "cells.seed = 7",
+        "loads.pressure.value=2",
+        "time.end=40",
+        "solver.petsc_options.pc_factor_mat_solver_type=mumps",
+        "solver.petsc_options.mat_mumps_icntl_14=50",
+        "output.fields=false",
+        'name="a b"',
+    ]
+    read = read_scene(ROOT / "demos" / "artery.toml", overrides)
+    assert (read.remodeling.driver, read.cells.seed, read.time.end, read.name) == ("pk2", 7, 40.0, "a b")
+    assert read.loads["pressure"] == Load(value=2.0, ramp=((0.0, 0.0), (25.0, 1.0)))
+    assert read.solver.petsc_options == {"pc_factor_mat_solver_type": "mumps", "mat_mumps_icntl_14": 50}
+    assert read.output.fields is False
+
+
+def test_a_preset_can_be_set_on_the_command_line(tmp_path):
+    path = tmp_path / "own.toml"
+    path.write_text("[geometry]\nshape = 'tendon'\n[time]\nend = 12\n")
+    assert read_scene(path).remodeling.frame == "material"
+    read = read_scene(path, [f"preset={PAPER}"])
+    assert (read.remodeling.frame, read.loads["force"].value, read.time.end) == ("spatial", 300.0, 12.0)
+
+
+# ---------------------------------------------------------------- presets and defaults
+
+
+def test_the_preset_is_the_printed_method():
+    printed = {
+        "material.energy_factor": 1,
+        "remodeling.driver": "cauchy",
+        "remodeling.law": "explicit",
+        "remodeling.frame": "spatial",
+        "remodeling.pairing": "sorted",
+        "remodeling.coupling": "staggered",
+        "remodeling.kappa": 0.025,
+        "material.lame_lambda": 27.293,
+        "material.lame_mu": 3.103,
+        "material.temperature": 310.0,
+        "cells.end_to_end_length": 1.0,
+        "mesh.refinement": 1,
+        "mesh.element": "hexahedron",
+        "mesh.degree": 1,
+    }
+    soft = {"material.chain_density": 2e21, "material.contour_length": 1.594, "material.persistence_length": 1.365}
+    expected = {
+        "cube": {
+            "geometry.side": 1.0,
+            "time.end": 100.0,
+            "cells.initial": "isotropic",
+            "cells.axes": "global",
+            "material.chain_density": 7e21,
+            "material.contour_length": 2.125,
+            "material.persistence_length": 1.82,
+        },
+        "tendon": {
+            "geometry.length": 10.0,
+            "geometry.area": 10.0,
+            "time.end": 150.0,
+            "cells.initial": "random",
+            "cells.axes": "global",
+        }
+        | soft,
+        "tube": {
+            "geometry.inner_radius": 1.0,
+            "geometry.outer_radius": 3.0,
+            "geometry.length": 8.0,
+            "time.end": 150.0,
+            "cells.initial": "random",
+            "cells.axes": "cylindrical",
+        }
+        | soft,
+    }
+    loads = {
+        "cube": {"force": (10.0, 10.0)},
+        "tendon": {"force": (300.0, 12.0)},
+        "tube": {"pressure": (4.8, 25.0), "elongation": (0.1, 25.0)},
+    }
+    for shape, own in expected.items():
+        built = scene_from_dict({"preset": PAPER, "geometry": {"shape": shape}})
+        for key, value in (printed | own).items():
+            table, name = key.split(".")
+            assert getattr(getattr(built, table), name) == value, (shape, key)
+        assert built.loads == {
+            name: Load(value=value, ramp=[[0.0, 0.0], [end, 1.0]]) for name, (value, end) in loads[shape].items()
+        }
+
+
+def test_every_preset_gives_good_scenes_and_is_explained():
+    assert set(PRESETS) == set(PRESET_NOTES)
+    for name, shapes in PRESETS.items():
+        assert set(shapes) == {"cube", "tendon", "tube"}
+        for shape in shapes:
+            values = changed(TUBE if shape == "tube" else CUBE, {"preset": name, "geometry.shape": shape})
+            assert scene_from_dict(values).preset == name
+
+
+def test_collagen_as_measured():
+    built = preset_scene("sun-2002", "tendon")
+    lengths = (built.material.contour_length, built.material.persistence_length, built.cells.end_to_end_length)
+    assert lengths == (309.0, 14.5, 92.4)  # nm
+    free_chain = math.sqrt(2 * 14.5 * 309.0 * (1 - 14.5 / 309.0 * (1 - math.exp(-309.0 / 14.5))))
+    assert built.cells.end_to_end_length == pytest.approx(free_chain, abs=0.05)
+    paper = preset_scene("kuhl-holzapfel-2007", "tendon")
+
+    def initial_stiffness(scene):
+        material, r0 = scene.material, scene.cells.end_to_end_length
+        return material.network_modulus * wormlike_stiffness(r0, material.contour_length) * r0**2
+
+    assert initial_stiffness(built) == pytest.approx(initial_stiffness(paper), rel=0.01)
+
+
+def test_the_presets_keys_lie_under_the_scenes():
+    values = {"preset": PAPER, "geometry": {"shape": "tube", "length": 4.0}, "loads": {"pressure": {"value": 2.4}}}
+    before = copy.deepcopy(values)
+    built = scene_from_dict(values)
+    assert built.geometry == Tube(inner_radius=1.0, outer_radius=3.0, length=4.0)
+    assert built.loads["pressure"] == Load(value=2.4, ramp=[[0.0, 0.0], [25.0, 1.0]])
+    assert built.loads["elongation"].value == 0.1
+    assert values == before
+    assert PRESETS[PAPER]["tube"]["geometry"]["length"] == 8.0
+
+
+def test_a_tube_starts_with_cylindrical_axes_unless_the_scene_says_otherwise():
+    assert scene_from_dict(TUBE).cells.axes == "cylindrical"
+    assert scene_from_dict(changed(TUBE, {"cells.axes": "global"})).cells.axes == "global"
+    assert scene_from_dict({**CUBE, "geometry": {"shape": "tendon"}}).cells.axes == "global"
+
+
+def test_without_a_preset_law_repulsion_and_coupling_are_what_measures_best():
+    scene = scene_from_dict(CUBE)
+    assert scene.material.repulsion == "log"
+    assert scene.remodeling == Remodeling(
+        driver="cauchy", law="tensor", frame="material", kappa=0.025, coupling="extrapolated"
+    )
+    assert scene_from_dict(changed(CUBE, {"remodeling.coupling": "staggered"})).remodeling.coupling == "staggered"
+
+
+@pytest.mark.parametrize("law", [law for law in LAWS if law != "tensor"])
+def test_without_a_preset_another_law_has_what_goes_with_it(law):
+    scene = scene_from_dict(changed(CUBE, {"remodeling.law": law}))
+    assert (scene.material.repulsion, scene.remodeling.coupling) == ("axes", "staggered")
+    assert scene.remodeling.frame == "material"
+
+
+def test_the_default_method_changes_no_preset():
+    scene = preset_scene("kuhl-holzapfel-2007", "tube")
+    assert (scene.material.repulsion, scene.remodeling.law, scene.remodeling.coupling) == (
+        "axes",
+        "explicit",
+        "staggered",
+    )
+
+
+def test_the_network_modulus():
+    # c = k theta n / (4 A_p) by hand: 1.381e-23 * 310 * 2e21 / 5.46
+    assert Material().network_modulus == pytest.approx(1.56817, rel=1e-5)
+    assert Material(energy_factor=4).network_modulus == pytest.approx(4 * 1.56817, rel=1e-5)
+    assert Material(stress_unit="kPa", chain_density=2e24).network_modulus == pytest.approx(1.56817, rel=1e-5)
+
+
+# ---------------------------------------------------------------- Python and TOML
+
+
+@pytest.mark.parametrize("path", DEMOS, ids=lambda path: path.stem)
+def test_a_scene_as_run_reads_back_as_the_same_scene(tmp_path, path):
+    read = read_scene(path, ["solver.petsc_options.ksp_type=preonly", "cells.initial=[0.6, 0.8, 0.0]"])
+    text = read.to_toml(f"remodel-fenicsx, from {path.name}\n\nsecond\x1bline")
+    again = tmp_path / "again.toml"
+    again.write_text(text, encoding="utf-8")
+    assert read_scene(again) == read
+    assert text.startswith(f"# remodel-fenicsx, from {path.name}\n\n# second line\n\n")
+    assert "# " + (Remodeling.model_fields["kappa"].description or "") in text
+
+
+def test_the_demos_are_the_preset():
+    assert [path.stem for path in DEMOS] == ["artery", "cube", "tendon"]
+    for path, shape in zip(DEMOS, ("tube", "cube", "tendon"), strict=True):
+        printed = scene_from_dict({"name": path.stem, "preset": PAPER, "geometry": {"shape": shape}})
+        assert read_scene(path) == printed
+
+
+def test_a_preset_by_name():
+    assert preset_scene(PAPER, "tube") == read_scene(ROOT / "demos" / "artery.toml", ["name=tube"])
+    with pytest.raises(
+        SceneError, match=r"^preset = 'none': allowed are 'kuhl-holzapfel-2007', 'consistent', 'sun-2002'$"
+    ):
+        preset_scene("none", "tube")
+    with pytest.raises(SceneError, match=r"^geometry\.shape = 'heart': allowed are 'cube', 'tendon', 'tube'$"):
+        preset_scene(PAPER, "heart")
+
+
+def test_python_says_what_toml_says():
+    built = Scene(
+        name="artery",
+        preset=PAPER,
+        geometry=Tube(inner_radius=1.0, outer_radius=3.0, length=8.0),
+        cells=Cells(seed=1),
+        loads={"pressure": Load(value=4.8, ramp=[(0, 0), (25, 1)])},
+    )
+    assert built == read_scene(ROOT / "demos" / "artery.toml")
+    assert pickle.loads(pickle.dumps(built)) == built
+
+
+def test_python_objects_are_checked_with_the_same_words():
+    with pytest.raises(SceneError, match=r"^inner_radius = 3\.0: must be smaller than geometry\.outer_radius = 2\.0$"):
+        Tube(inner_radius=3.0, outer_radius=2.0, length=1.0)
+    with pytest.raises(SceneError, match=r"^kapa = 1\.0: unknown key; did you mean kappa\?$"):
+        Remodeling(kapa=1.0)  # type: ignore[call-arg]
+    with pytest.raises(SceneError, match=r"^loads\.pressure = \{value = 1\.0, ramp = .*\}: a cube has no such load"):
+        Scene(geometry=Cube(), time=Time(end=1.0), loads={"pressure": Load(value=1.0, ramp=[[0.0, 1.0]])})
+    with pytest.raises(SceneError, match=r"^cells\.axes = 'cylindrical': allowed for shape 'cube' is 'global'$"):
+        Scene(geometry=Cube(), time=Time(end=1.0), cells=Cells(axes="cylindrical"))
+
+
+def test_a_changed_copy_is_validated():
+    artery = read_scene(ROOT / "demos" / "artery.toml")
+    changed_scene = artery.with_values({"loads.pressure.value": 0.0, "remodeling.frame": "material"})
+    assert (changed_scene.loads["pressure"].value, changed_scene.remodeling.frame) == (0.0, "material")
+    assert changed_scene.loads["elongation"] == artery.loads["elongation"]
+    assert artery.loads["pressure"].value == 4.8
+    with pytest.raises(SceneError, match=r"^time\.step = 1\.0: must be at most time\.end = 0\.5$"):
+        artery.with_values({"time.end": 0.5})
+
+
+def test_a_scene_cannot_be_changed_in_place():
+    with pytest.raises(ValueError, match="frozen"):
+        read_scene(ROOT / "demos" / "cube.toml").time.end = 3.0  # type: ignore[misc]
+
+
+# ---------------------------------------------------------------- loads and time
+
+
+def test_the_factor_of_a_load_is_linear_between_and_held_outside():
+    load = Load(value=3.0, ramp=[[2.0, 0.5], [4.0, 1.0], [5.0, 0.0]])
+    times = {0.0: 0.5, 2.0: 0.5, 3.0: 0.75, 4.0: 1.0, 4.25: 0.75, 5.0: 0.0, 100.0: 0.0}
+    assert {time: load.factor(time) for time in times} == times
+
+
+def test_good_ramps_and_times():
+    assert Time(end=0.3, step=0.1).number_of_steps == 3
+    assert Time(end=150).number_of_steps == 150
+    # a kink on a step that binary fractions miss by rounding, and one beyond the end
+    ramp = [[0.3, 0.0], [0.7, 1.0], [25.05, 2.0]]
+    values = changed(TUBE, {"time": {"end": 1.2, "step": 0.1}, "loads.pressure.ramp": ramp})
+    assert scene_from_dict(values).loads["pressure"].factor(0.5) == pytest.approx(0.5)
+    held = changed(TUBE, {"loads.elongation": {"value": -0.5, "ramp": [[0, 1]]}})
+    assert scene_from_dict(held).loads["elongation"].factor(17.0) == 1.0
+
+
+def test_good_cells():
+    for initial in ("random", "isotropic", "aligned", [0.6, 0.0, 0.8], [1, 0, 0]):
+        assert scene_from_dict(changed(TUBE, {"cells.initial": initial})).cells.initial in (initial, tuple(initial))
+    assert scene_from_dict(changed(CUBE, {"cells": {"end_to_end_length": 0.5, "initial": [0.3, 0.4, 0]}}))
+    assert Tendon(length=1).length == 1.0
+    assert Solver(petsc_options={"snes_monitor": True}).petsc_options == {"snes_monitor": True}
+
+
+# ---------------------------------------------------------------- summary and warnings
+
+
+def test_the_summary_is_one_line_in_one_unit():
+    beginning = "network modulus c = 1.568 Pa, shear modulus mu = 3.103 Pa"
+    assert preset_scene(PAPER, "tube").summary() == f"{beginning}, largest pressure 4.8 Pa"
+    assert preset_scene(PAPER, "tendon").summary() == f"{beginning}, largest force over its area 30 Pa"
+    stiff = preset_scene(PAPER, "cube").with_values({"material.stress_unit": "kPa", "geometry.side": 2.0})
+    line = "network modulus c = 0.004116 kPa, shear modulus mu = 3.103 kPa, largest force over its area 2.5 kPa"
+    assert stiff.summary() == line
+    assert scene_from_dict(CUBE).summary() == beginning
+
+
+def test_the_largest_load_is_the_largest_of_the_run():
+    load = Load(value=-2.0, ramp=[[0.0, 0.5], [10.0, -1.0], [20.0, 3.0]])
+    assert load.largest(10.0) == 2.0
+    assert load.largest(12.0) == 2.0 * 1.0  # the ramp passes 0 on the way from -1 to 3
+    assert load.largest(15.0) == pytest.approx(-2.0)
+    assert load.largest(18.0) == pytest.approx(-2.0 * 2.2)
+    assert load.largest(100.0) == -6.0
+    assert Load(value=1.0, ramp=[[5.0, -2.0], [10.0, 1.0]]).largest(10.0) == -2.0  # held before the first pair
+
+
+SOFT = (
+    "material.chain_density = 2e+21: the network (c g(r0) r0^2 = 0.00341 kPa) is 910 times (3.0 decades) softer than "
+    "the matrix (lame_mu = 3.103 kPa); the density is in 1/m^3 in every scene: 2e+21 of a scene in Pa is 2e+24 in kPa"
+)
+
+
+def test_a_chain_density_of_another_stress_unit_is_warned_of():
+    printed = preset_scene(PAPER, "tube")
+    assert printed.warnings() == []
+    soft = printed.with_values({"material.stress_unit": "kPa"})
+    assert soft.warnings() == [SOFT]
+    assert scene_from_dict(changed(TUBE, {"material.stress_unit": "kPa"})).warnings() == [SOFT]  # the defaults
+    # another density than the preset's is no excuse
+    assert len(soft.with_values({"material.chain_density": 2.1e21}).warnings()) == 1
+    assert soft.with_values({"material.stress_unit": "MPa"}).warnings()[0].count("is 910000 times (6.0 decades)") == 1
+    softer = {"material.lame_mu": "3.103 Pa", "loads.pressure.value": "4.8 Pa"}
+    for remedy in ({"material.chain_density": 2e24}, {"material.chain_density": 0.0}, softer):
+        assert soft.with_values(remedy).warnings() == [], remedy
+
+
+def test_a_preset_with_units_in_another_stress_unit(monkeypatch):
+    material = {"stress_unit": "kPa", "lame_mu": "3.103 kPa", "lame_lambda": "27293 Pa", "chain_density": 2e24}
+    monkeypatch.setitem(PRESETS, "stiff", {"cube": {"material": material}})
+    stiff = scene_from_dict({**CUBE, "preset": "stiff"})
+    assert (stiff.material.lame_mu, stiff.material.lame_lambda, stiff.warnings()) == (3.103, 27.293, [])
+    assert "(3.0 decades) stiffer than" in stiff.with_values({"material.stress_unit": "Pa"}).warnings()[0]
+
+
+PULLED = {"value": 1.0, "ramp": [[0.0, 0.0], [1.0, 1.0]]}
+TRAPS = [
+    ("tube", {"loads.pressure.value": 4800.0}, r"^loads.pressure.value: a stress of 4.8e\+03 Pa .*, 740 times \(2.9 "),
+    ("tube", {"loads.pressure.value": -4800.0}, r"^loads.pressure.value: a stress of 4.8e\+03 Pa"),
+    ("tube", {"loads.pressure.value": 4.8e-6}, r"^loads.pressure.value: .* times \(6.1 decades\) less than"),
+    ("tendon", {"loads.force.value": 3e5}, r"^loads.force.value: a stress of 3e\+04 Pa"),
+    (
+        "tube",
+        {"loads.elongation.value": 1.1},
+        r"^loads.elongation.value: 1.1 at its largest; .* stretch of 1.1 is an el",
+    ),
+    ("tube", {"material.temperature": 37.0}, r"^material.temperature = 37: an absolute temperature in K; 37 degC are"),
+    ("cube", {"material.lame_mu": 3103.0}, r"^material.chain_density = 7e\+21: the network"),
+    (
+        "tube",
+        {"geometry.inner_radius": 0.001},
+        r"^geometry.inner_radius = 0.001: outer_radius / inner_radius is 3e\+03;",
+    ),
+    ("tube", {"geometry.length": 0.008}, r"^geometry.length = 0.008: length / outer_radius is 0.00267;"),
+    ("tendon", {"geometry.area": 1e-5}, r"^geometry.length = 10: length / sqrt\(area\) is 3.16e\+03;"),
+]
+
+
+@pytest.mark.parametrize(("shape", "changes", "line"), TRAPS)
+def test_numbers_of_another_unit_are_warned_of(shape, changes, line):
+    found = preset_scene(PAPER, shape).with_values(changes).warnings()
+    assert sum(bool(re.search(line, warning)) for warning in found) == 1, found
+
+
+def test_bodies_of_plausible_tissue_are_not_warned_of():
+    """All that the project ships, and neighbours of it; whatever the unit of chain lengths."""
+    for preset, shapes in PRESETS.items():
+        for shape in shapes:
+            assert preset_scene(preset, shape).warnings() == [], (preset, shape)
+    for demo in sorted((ROOT / "demos").glob("*.toml")):
+        assert read_scene(demo).warnings() == [], demo
+    tube = preset_scene(PAPER, "tube")
+    for quiet in (
+        {"geometry.inner_radius": 2.99}, {"loads.pressure.value": 0.01}, {"loads.elongation.value": 0.9},
+        {"material.temperature": "20 degC"}, {"material.chain_density": 2e22}, {"material.lame_mu": 50.0},
+        {"loads.pressure.value": 0.0}, {"geometry.length": 300.0},
+    ):  # fmt: skip
+        assert tube.with_values(quiet).warnings() == [], quiet
+    metres = {"material.contour_length": 1.594e-9, "material.persistence_length": 1.365e-9,
+              "cells.end_to_end_length": 1e-9}  # fmt: skip
+    assert [len(tube.with_values(metres | more).warnings()) for more in ({}, {"material.chain_density": 2e24})] == [
+        0,
+        1,
+    ]
+
+
+# ---------------------------------------------------------------- documentation
+
+
+def test_the_reference_page_is_the_one_that_the_code_makes():
+    remedy = "./with-fenicsx python3 -m remodel_fenicsx.scene.reference > docs/scene.md"
+    assert (ROOT / "docs" / "scene.md").read_text(encoding="utf-8") == scene_reference(), f"make it again: {remedy}"
+
+
+def test_every_key_is_described():
+    page = scene_reference()
+    tables = {"geometry", "mesh", "model", "material", "cells", "supports", "loads", "remodeling", "time", "solver",
+              "output"}  # fmt: skip
+    for key, _, table in sections(Scene):
+        for name, field in table.model_fields.items():
+            if not key and name in tables:
+                assert f"## `[{name}" in page
+            else:
+                assert field.description is not None and field.description.endswith("."), (key, name)
+                assert f"| `{name}` |" in page
+
+
+def test_a_law_that_shares_of_passes_make_slower_is_said() -> None:
+    relaxed = {"coupling": "relaxed"}
+    (line,) = scene_from_dict(CUBE | {"remodeling": relaxed | {"law": "rate"}}).warnings()
+    assert "remodel at about 0.5 times the speed" in line and "'rate'" in line
+    for quiet in (relaxed | {"law": "explicit"}, relaxed | {"law": "none"}, {"law": "rate"}):
+        assert scene_from_dict(CUBE | {"remodeling": quiet}).warnings() == []

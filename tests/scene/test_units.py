@@ -1,0 +1,232 @@
+"""Values with units in scenes: what they become, what is refused, and that pint is not loaded for nothing."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import example, given, settings, strategies
+
+from remodel_fenicsx import cli
+from remodel_fenicsx.scene.scene import read_scene, scene_from_dict
+from remodel_fenicsx.schema.tables import SceneError
+from remodel_fenicsx.schema.units import is_quantity
+
+ROOT = Path(__file__).resolve().parents[2]
+ARTERY = ROOT / "demos" / "artery.toml"
+TENDON = ROOT / "demos" / "tendon.toml"
+
+
+def artery(**changes: Any) -> Any:
+    """The artery in mm, with other values: "__" stands for the dot of a key."""
+    keys = {"geometry.length_unit": "mm"} | {name.replace("__", "."): value for name, value in changes.items()}
+    return read_scene(ARTERY).with_values(keys)
+
+
+def refusal(path: Path, *overrides: str) -> str:
+    with pytest.raises(SceneError) as caught:
+        read_scene(path, overrides)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+# ---------------------------------------------------------------- what values become
+
+# (text, number in Pa); mmHg = 13.5951 g/cm^3 * 9.80665 m/s^2 * 1 mm
+STRESSES = [
+    ("100 mmHg", 13332.2387415),
+    ("100mmHg", 13332.2387415),
+    ("2.4 kPa", 2400.0),
+    ("+1e3 Pa", 1000.0),
+    ("-.5kPa", -500.0),
+    ("0 mmHg", 0.0),
+    (" 3. Pa ", 3.0),
+    ("1 N/mm^2", 1e6),
+    ("1 N/mm**2", 1e6),
+    ("1 N / mm²", 1e6),
+    ("1 kN m^-2", 1000.0),
+    ("10 dyn/cm^2", 1.0),
+    ("100 cmH2O", 9806.65),
+    ("1 bar", 1e5),
+    ("1e-400 kPa", 0.0),
+    ("0e999999999999 kPa", 0.0),
+]
+
+
+@pytest.mark.parametrize(("text", "number"), STRESSES)
+def test_stresses_in_pascal_exactly(text, number):
+    value = artery(loads__pressure__value=text).loads["pressure"].value
+    assert value == number and type(value) is float
+
+
+LENGTHS = {"m": 0.0123, "cm": 1.23, "mm": 12.3, "um": 12300.0}
+
+
+@pytest.mark.parametrize("unit", LENGTHS)
+@pytest.mark.parametrize("text", ["12.3 mm", "1.23 cm", "12300 um", "12300 µm", "0.0123 m", "12300 micrometers"])
+def test_lengths_in_every_unit_exactly(unit, text):
+    # a product of floats gives 12.299999999999999 for some of these
+    assert scene_from_dict(
+        {"geometry": {"shape": "cube", "side": text, "length_unit": unit}, "time": {"end": 1.0}}
+    ).geometry.side == pytest.approx(LENGTHS[unit], rel=0, abs=0)
+
+
+def test_the_units_are_those_of_the_scene():
+    keys = {"material__stress_unit": "kPa", "geometry__length_unit": "cm"}
+    scene = artery(
+        **keys,
+        loads__pressure__value="100 mmHg",
+        geometry__inner_radius="1 mm",
+        geometry__length="8 mm",
+        material__lame_lambda="27.293 Pa",
+        solver__absolute_tolerance="1 mN",
+    )
+    assert scene.loads["pressure"].value == 13.3322387415
+    assert (scene.geometry.inner_radius, scene.geometry.length) == (0.1, 0.8)
+    assert scene.geometry.outer_radius == 3.0  # a number without a unit stays as it is
+    assert scene.material.lame_lambda == 0.027293
+    assert scene.solver.absolute_tolerance == 0.01  # kPa cm^2 are 100 mN
+
+
+def test_forces_and_areas():
+    values = ["geometry.length_unit=mm", "geometry.area=10 mm^2", "geometry.length=1 cm"]
+    scene = read_scene(TENDON, [*values, "material.stress_unit=kPa", "loads.force.value=300 mN"])
+    assert (scene.geometry.area, scene.geometry.length, scene.loads["force"].value) == (10.0, 10.0, 300.0)
+
+
+def test_temperature_and_chain_density():
+    assert artery(material__temperature="37 degC").material.temperature == 310.15
+    assert artery(material__temperature="98.6 degF").material.temperature == 310.15
+    assert artery(material__temperature="310 K").material.temperature == 310.0
+    for text in ("2e21 / m^3", "2e21 m^-3", "2e21/m**3", "2e15 / cm^3", "2000 / um^3"):
+        assert artery(material__chain_density=text).material.chain_density == 2e21
+
+
+def test_a_scene_as_run_holds_numbers(tmp_path):
+    text = artery(loads__pressure__value="100 mmHg", geometry__length="8 mm").to_toml()
+    again = tmp_path / "again.toml"
+    again.write_text(text)
+    values = tomllib.loads(text)
+    assert (values["loads"]["pressure"]["value"], values["geometry"]["length"]) == (13332.2387415, 8.0)
+    assert values["geometry"]["length_unit"] == "mm"
+    assert read_scene(again) == read_scene(again, ["geometry.length=8 mm"])
+
+
+# ---------------------------------------------------------------- the command line
+
+
+@pytest.mark.parametrize("value", ['"100 mmHg"', "100 mmHg", "100mmHg", "'100 mmHg'", " 13332.2387415 "])
+def test_set_with_and_without_quotes(value):
+    assert read_scene(ARTERY, [f"loads.pressure.value={value}"]).loads["pressure"].value == 13332.2387415
+
+
+@pytest.mark.parametrize("text", ["5 mm", "-5 mm", "2e21 / m^3", "37 degC", "1 N/mm^2", "1 kg m s^-2", "37 °C"])
+def test_a_quantity(text):
+    assert is_quantity(text)
+
+
+@pytest.mark.parametrize(
+    "text", ["5", "2e21", "mm", "two words", "5 mm = 3", "5 mm, 6 mm", "2 / 3", "5 m(", "", "1_000"]
+)
+def test_no_quantity(text):
+    assert not is_quantity(text)
+
+
+def test_exit_code_and_one_line(capsys):
+    assert cli.main(["validate", str(ARTERY), "--set", "loads.pressure.value=100 mmhg"]) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and err.count("\n") == 1
+    assert err.startswith("remodel-fenicsx: loads.pressure.value = '100 mmhg': 'mmhg' is no unit of stress; must be ")
+
+
+def test_validate_prints_stiffness_load_and_warnings(capsys):
+    settings = ["--set", "material.stress_unit=kPa", "--set", "loads.pressure.value=100 mmHg"]
+    assert cli.main(["validate", str(ARTERY), *settings]) == 0
+    out, err = capsys.readouterr()
+    line = "network modulus c = 0.001568 kPa, shear modulus mu = 3.103 kPa, largest pressure 13.33 kPa"
+    assert out.splitlines()[1] == line
+    assert err.startswith("remodel-fenicsx: warning: material.chain_density = 2e+21: the network (c g(r0) r0^2 = ")
+    assert err.count("\n") == 1
+
+
+# ---------------------------------------------------------------- refusals
+
+STRESS_RULE = "must be a finite number, or one with a unit of stress as in '2.4 kPa'"
+LENGTH_RULE = "must be a finite number greater than 0, or one with a unit of length as in '5 mm'"
+NO_LENGTH_UNIT = "needs the scene's unit of length: set geometry.length_unit (m, cm, mm or um), or leave the unit out"
+POSITIVE = "must be a finite number greater than 0"
+REFUSALS = [
+    ("loads.pressure.value=100 mmhg", f"loads.pressure.value = '100 mmhg': 'mmhg' is no unit of stress; {STRESS_RULE}"),
+    ("loads.pressure.value=100 mm", f"loads.pressure.value = '100 mm': 'mm' is no unit of stress; {STRESS_RULE}"),
+    ("loads.pressure.value=100 N", f"loads.pressure.value = '100 N': 'N' is no unit of stress; {STRESS_RULE}"),
+    ("loads.pressure.value='100 %'", f"loads.pressure.value = '100 %': '%' is no unit of stress; {STRESS_RULE}"),
+    ("loads.pressure.value='4,8 Pa'", f"loads.pressure.value = '4,8 Pa': ',8 Pa' is no unit of stress; {STRESS_RULE}"),
+    ("loads.pressure.value='1e999 kPa'", f"loads.pressure.value = '1e999 kPa': too large a number; {STRESS_RULE}"),
+    ("loads.pressure.value='1e308 GPa'", f"loads.pressure.value = '1e308 GPa': too large a number; {STRESS_RULE}"),
+    ("loads.elongation.value=10 mm", "loads.elongation.value = '10 mm': must be a finite number, without a unit"),
+    ("geometry.length=8 mm", f"geometry.length = '8 mm': a unit of length {NO_LENGTH_UNIT}"),
+    ("geometry.length=8 kPa", f"geometry.length = '8 kPa': 'kPa' is no unit of length; {LENGTH_RULE}"),
+    ("solver.absolute_tolerance=1 N", f"solver.absolute_tolerance = '1 N': a unit of force {NO_LENGTH_UNIT}"),
+    ("material.contour_length=309 nm", f"material.contour_length = '309 nm': {POSITIVE}, without a unit"),
+    ("material.persistence_length=1 nm", f"material.persistence_length = '1 nm': {POSITIVE}, without a unit"),
+    ("cells.end_to_end_length=1 nm", f"cells.end_to_end_length = '1 nm': {POSITIVE}, without a unit"),
+    ("remodeling.kappa=1/day", "remodeling.kappa = '1/day': must be a finite number at least 0, without a unit"),
+    ("time.end=150 s", "time.end = '150 s': must be a finite number greater than 0, or 'equilibrium'"),
+    ("cells.seed=1 mm", "cells.seed = '1 mm': must be a whole number at least 0"),
+    ("geometry.length_unit=km", "geometry.length_unit = 'km': must be one of 'm', 'cm', 'mm', 'um'"),
+    ("geometry.length_unit=[1]", "geometry.length_unit = [1]: must be one of 'm', 'cm', 'mm', 'um'"),
+    ("material.temperature=-300 degC", "material.temperature = -26.85: must be a finite number greater than 0"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("override", "line"), REFUSALS)
+def test_a_bad_unit_gives_one_line(override, line):
+    assert refusal(ARTERY, override) == line
+
+
+def test_a_force_needs_a_unit_of_length_and_a_unit_of_force():
+    line = f"loads.force.value = '10 N': a unit of force {NO_LENGTH_UNIT}"
+    assert refusal(TENDON, "loads.force.value=10 N") == line
+    rule = "must be a finite number, or one with a unit of force as in '300 mN'"
+    line = f"loads.force.value = '10 kPa': 'kPa' is no unit of force; {rule}"
+    assert refusal(TENDON, "loads.force.value=10 kPa", "geometry.length_unit=mm") == line
+
+
+def test_the_unit_of_the_scene_is_judged_before_values_in_it():
+    line = "material.stress_unit = 'psi': allowed are 'Pa', 'kPa', 'MPa'"
+    assert refusal(ARTERY, "material.stress_unit=psi", "material.lame_mu=3 kPa") == line
+    line = "geometry.length_unit = 'km': must be one of 'm', 'cm', 'mm', 'um'"
+    assert refusal(ARTERY, "geometry.length_unit=km", "geometry.length=8 mm") == line
+
+
+@settings(max_examples=100, deadline=None)
+@example("²1_")  # pint reads with Python's tokenizer, which has errors of its own
+@given(strategies.text("19.eE+-*/^()[]{}%°·²³_ \n'mkNPasgHK€", max_size=30))
+def test_any_text_becomes_a_number_or_one_line(text):
+    # towers of powers and exponents of many digits among them: neither takes long nor ends otherwise
+    for value in (text, f"1 {text}", f"{text} Pa", f"1 m**{text}"):
+        try:
+            scene = artery(loads__pressure__value=value)
+        except SceneError as error:
+            assert re.match(r"loads\.pressure\.value = .*: ", str(error)) and "\n" not in str(error)
+        else:
+            assert isinstance(scene.loads["pressure"].value, float)
+
+
+# ---------------------------------------------------------------- start-up
+
+
+@pytest.mark.parametrize(("value", "loaded"), [("4.8", False), ("4.8 Pa", True)])
+def test_pint_is_loaded_only_where_there_is_a_unit(value, loaded):
+    code = (
+        "import sys; from remodel_fenicsx.scene.scene import read_scene; read_scene(*sys.argv[1:2], sys.argv[2:]); "
+        "print('pint' in sys.modules)"
+    )
+    command = [sys.executable, "-c", code, str(ARTERY), f"loads.pressure.value={value}"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=200)
+    assert done.stdout == f"{loaded}\n"

@@ -1,0 +1,172 @@
+"""Where steps start: a predictor changes the work, not the solution."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from remodel_fenicsx import Recording, Simulation
+from remodel_fenicsx.evolution.predictor import PREDICTORS, Autoregressive, LoadStep, NoPredictor, Responsive
+from remodel_fenicsx.results.checkpoint_file import read_checkpoint
+from remodel_fenicsx.running import resume, run
+from remodel_fenicsx.solver.newton import GuardedNewton, SolveFailure
+from tests.parts import pulled_cube
+from tests.results.test_resume import SELF, rows
+
+RATES = {"force": 2.0}
+PREDICTED, NOT_PREDICTED = {"predictor": "autoregressive"}, {"predictor": "none"}
+
+
+@pytest.fixture
+def simulation() -> Any:
+    made = Simulation(pulled_cube(9.0, solver=NOT_PREDICTED), SELF)
+    yield made
+    made.close()
+
+
+def follow(simulation: Simulation, increments: list[np.ndarray], rates: dict[str, float] = RATES) -> Autoregressive:
+    """A predictor that has seen these, one a step."""
+    state = simulation.state
+    predictor = Autoregressive(state)
+    for number, increment in enumerate(increments, start=1):
+        before = state.unknown.x.array.copy()
+        state.unknown.x.array[:] += increment
+        predictor.solved(LoadStep(float(number), 1.0, rates), before)
+    return predictor
+
+
+def alternating(size: int) -> list[np.ndarray]:
+    """A trend, and what alternates from step to step as a staggered pass does."""
+    rng = np.random.default_rng(1)
+    trend, swing = rng.standard_normal((2, size))
+    return [1e-3 * (0.9**k * trend + (-0.8) ** k * swing) for k in range(8)]
+
+
+def test_a_trend_and_a_swing_are_both_continued(simulation: Simulation) -> None:
+    unknown = simulation.state.unknown.x.array
+    increments = alternating(len(unknown))
+    predictor = follow(simulation, increments[:-1])
+    found = predictor.expected(LoadStep(8.0, 1.0, RATES))
+    assert found is not None
+    free = np.isnan(simulation.stepper.coupling.equilibrium.prescribed_values())
+    np.testing.assert_allclose((found - unknown)[free], increments[-1][free], rtol=0, atol=1e-12)
+    assert np.all(found[~free] == 0.0)  # what supports prescribe
+
+
+def test_steps_of_other_lengths_go_on_at_the_same_speed(simulation: Simulation) -> None:
+    """What moves evenly is expected exactly, however long the steps were and the next one is."""
+    state = simulation.state
+    predictor, speed = Autoregressive(state), np.random.default_rng(1).standard_normal(len(state.unknown.x.array))
+    free, time = np.isnan(simulation.stepper.coupling.equilibrium.prescribed_values()), 0.0
+    for number, duration in enumerate([1.0, 2.0, 0.5, 4.0, 3.0, 1.5, 0.7], start=1):
+        time += duration
+        if number > 1:
+            found = predictor.expected(LoadStep(time, duration, RATES))
+            assert found is not None
+            np.testing.assert_allclose((found - state.unknown.x.array)[free], 1e-3 * duration * speed[free], rtol=1e-9)
+        before = state.unknown.x.array.copy()
+        state.unknown.x.array[:] += 1e-3 * duration * speed
+        predictor.solved(LoadStep(time, duration, RATES), before)
+
+
+def test_a_body_that_answers_its_cells_is_expected_whatever_the_steps(simulation: Simulation) -> None:
+    """Cells change by combinations of two fields, and the unknowns answer them linearly."""
+    state, held = simulation.state, {"force": 0.0}
+    predictor, rng, cells = Responsive(state), np.random.default_rng(1), state.cells
+    fields = 1e-3 * rng.uniform(0.0, 1.0, (2, *cells.dimension_values.shape))
+    answers = rng.standard_normal((2, len(state.unknown.x.array)))
+    free, time = np.isnan(simulation.stepper.coupling.equilibrium.prescribed_values()), 0.0
+    for number, shares in enumerate(rng.uniform(0.2, 2.0, (6, 2)), start=1):
+        duration = float(rng.uniform(0.1, 3.0))
+        time += duration
+        cells.set(np.sqrt(cells.dimension_values**2 + np.tensordot(shares, fields, axes=1)), cells.axis_values)
+        found, step = predictor.expected(LoadStep(time, duration, held)), LoadStep(time, duration, held)
+        before = state.unknown.x.array.copy()
+        state.unknown.x.array[:] += shares @ answers
+        if number > 2:
+            assert found is not None
+            np.testing.assert_allclose(found[free], state.unknown.x.array[free], rtol=0, atol=1e-7)
+        predictor.solved(step, before)
+        state.settle_cells()
+    assert predictor.expected(LoadStep(time + 1.0, 1.0, {"force": 2.0})) is None
+
+
+def test_with_tolerance_predicts_where_steps_are_chosen() -> None:
+    equal = pulled_cube(9.0).with_values({"solver.predictor": "with-tolerance"})
+    for scene, kind in ((equal, NoPredictor), (equal.with_values({"time.tolerance": 1.0}), Responsive)):
+        simulation = Simulation(scene, SELF)
+        assert type(simulation.stepper.coupling.predictor) is kind  # type: ignore[attr-defined]
+        simulation.close()
+    assert PREDICTORS["with-tolerance"] is NoPredictor
+
+
+def test_another_rate_is_a_new_beginning(simulation: Simulation) -> None:
+    step, unknown = LoadStep(8.0, 1.0, {"force": 0.0}), simulation.state.unknown.x.array
+    predictor = follow(simulation, alternating(len(unknown))[:-1])
+    assert predictor.expected(step) is None
+    predictor.solved(step, unknown - 1e-3)
+    found = predictor.expected(LoadStep(step.time + step.duration, step.duration, step.rates))
+    free = np.isnan(simulation.stepper.coupling.equilibrium.prescribed_values())
+    assert found is not None
+    np.testing.assert_allclose((found - unknown)[free], 1e-3, rtol=1e-12)
+
+
+def iterations(folder: Path) -> int:
+    return int(sum(Recording(folder).history["newton_iterations"]))
+
+
+@pytest.fixture(scope="module")
+def predicted(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    scene = pulled_cube(16.0, solver=PREDICTED, output={"fields": False, "checkpoint": 1})
+    return run(scene, tmp_path_factory.mktemp("predicted") / "run", SELF)
+
+
+def test_the_solutions_are_the_same_with_less_work(predicted: Path, tmp_path: Path) -> None:
+    plain = run(pulled_cube(16.0, solver=NOT_PREDICTED, output={"fields": False}), tmp_path / "plain", SELF)
+    found, expected = Recording(predicted).history, Recording(plain).history
+    for name in ("mean_stretch", "stored_energy", "max_chain_extension", "remodeling_power"):
+        np.testing.assert_allclose(found[name], expected[name], rtol=1e-8, err_msg=name)
+    assert iterations(predicted) <= 0.9 * iterations(plain)
+
+
+def test_it_is_resumed_with_what_it_remembers(predicted: Path, tmp_path: Path) -> None:
+    folder = run(pulled_cube(11.0, solver=PREDICTED, output={"fields": False}), tmp_path / "run", SELF)
+    shutil.copytree(folder, tmp_path / "other")
+    resume(folder, ["time.end=16.0"], SELF)
+    assert rows(folder) == rows(predicted)
+    # and without it, and again with it
+    resume(tmp_path / "other", ["time.end=13.0", "solver.predictor='none'"], SELF)
+    resume(tmp_path / "other", ["time.end=16.0", "solver.predictor='autoregressive'"], SELF)
+    assert (
+        "what the checkpoint does not hold begins anew: predictor_increment_0"
+        in (tmp_path / "other" / "run.log").read_text()
+    )
+    kept, wanted = (read_checkpoint(one) for one in (tmp_path / "other", predicted))
+    assert kept is not None and wanted is not None and kept.numbers["predictor_increment_known"] == 3
+    displacements = [one.arrays["function/displacement"] for one in (kept, wanted)]
+    np.testing.assert_allclose(*displacements, rtol=0, atol=1e-9)
+
+
+def test_what_is_expected_wrongly_costs_no_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not admissible, or a start from which the solve fails: the step is solved as without."""
+    scene = pulled_cube(4.0, solver=PREDICTED, output={"fields": False})
+    plain = run(pulled_cube(4.0, solver=NOT_PREDICTED, output={"fields": False}), tmp_path / "plain", SELF)
+    monkeypatch.setattr(Autoregressive, "expected", lambda self, step: -50.0 * self.state.unknown.x.array)
+    assert rows(run(scene, tmp_path / "far", SELF)) == rows(plain)
+    solve, failed = GuardedNewton.solve, []
+
+    def failing(newton: GuardedNewton) -> Any:
+        if not failed or failed[-1] != newton.equilibrium.state.number:
+            failed.append(newton.equilibrium.state.number)
+            raise SolveFailure("made to fail", 3, 3, newton.equilibrium.extension())
+        return solve(newton)
+
+    monkeypatch.setattr(Autoregressive, "expected", lambda self, step: self.state.unknown.x.array + 0.0)
+    monkeypatch.setattr(GuardedNewton, "solve", failing)
+    folder = run(scene, tmp_path / "failing", SELF)
+    assert failed == [0, 1, 2, 3] and iterations(folder) == iterations(plain) + 12
+    assert Recording(folder).history["substeps"].tolist()[1:] == [1, 1, 1, 1]

@@ -1,0 +1,156 @@
+"""The stability map: its reduced form, that no case gets lost, and that it can tell right from wrong."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from benchmarks.stability_map import report
+from benchmarks.stability_map.cases import Case, Finding, Run, all_cases
+from benchmarks.stability_map.command import main, measured
+from benchmarks.stability_map.homogeneous import CUBE, material, path_of
+from benchmarks.stability_map.judging import judged
+from benchmarks.stability_map.point import prescribed_path
+from benchmarks.stability_map.running import PROJECT, Runner, digest, evaluated, source_of
+from benchmarks.stability_map.solid import smallest_eigenvalue
+
+CASES = all_cases()
+REDUCED = [key for key, case in CASES.items() if case.reduced]
+EXPECTED = tomllib.loads(Path(__file__).with_name("stability_expected.toml").read_text(encoding="utf-8"))["outcomes"]
+# of each kind one, a second or less: the others of the reduced map are marked slow
+QUICK = (
+    "load: frame spatial, force 10.0", "load: frame material, force 0.0001",
+    "speed: law explicit, frame spatial, kappa dt 1000.0",
+    "chain length: frame spatial, force 10.0, r0/L 0.999", "compression: frame material, density 7e+21, force -10.0",
+    "compression: frame material, density 7e+21, force -30.0", "steps: frame spatial, steps 1, force 10000.0",
+    "unloading: history reversed, law explicit, frame spatial, force 10.0",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def runner() -> Iterator[Runner]:
+    """The package of this checkout."""
+    made = Runner(PROJECT, limit=60)
+    yield made
+    made.close()
+
+
+def hold(key: str, runner: Runner) -> None:
+    """The outcome is what the table says; else right, refused or named as unstable, and no false alarm."""
+    record = evaluated(CASES[key], runner, "test")
+    said = f"{record['outcome']}: {record['words']}\n{CASES[key].command}"
+    if key in EXPECTED:
+        assert (
+            record["outcome"] == EXPECTED[key]
+        ), f"better or worse than tests/studies/stability_expected.toml says: {said}"
+        return
+    assert record["outcome"] in ("right", "refused", "unstable"), said
+    assert not record["false_alarm"], said
+
+
+@pytest.mark.parametrize("key", QUICK)
+def test_quick_cases(key: str, runner: Runner) -> None:
+    assert key in REDUCED
+    hold(key, runner)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("key", [key for key in REDUCED if key not in QUICK])
+def test_reduced_map(key: str, runner: Runner) -> None:
+    """Two minutes on two cores."""
+    hold(key, runner)
+
+
+def test_the_table_of_known_faults_has_no_other_cases() -> None:
+    assert set(EXPECTED) <= set(REDUCED)
+    assert set(EXPECTED.values()) <= {"wrong", "warned", "unchecked"}
+
+
+# ---------------------------------------------------------------- verdicts
+def verdict(finding: Finding, **run: Any) -> Any:
+    """On a run that the reference says this of."""
+    case = Case("family", "key", {}, lambda case, run: finding, "reference")
+    return judged(case, Run(**{"code": 0, **run}))
+
+
+def test_outcomes() -> None:
+    """Every way in which a case can end."""
+    alarm, saddle = ["the pass over-corrects"], ["2 negative eigenvalues of the tangent"]
+    assert verdict(Finding(0.5)).outcome == "right"
+    assert verdict(Finding(1.5)).outcome == "wrong"
+    assert verdict(Finding(1.5), warnings=alarm).outcome == "warned"
+    assert (
+        verdict(Finding(0.5), warnings=alarm).false_alarm and verdict(Finding(0.5), warnings=alarm).outcome == "right"
+    )
+    assert verdict(Finding(0.5, unstable=True)).outcome == "wrong"
+    assert verdict(Finding(0.5, unstable=True), warnings=alarm).outcome == "wrong"
+    assert verdict(Finding(0.5, unstable=True), warnings=saddle).outcome == "unstable"
+    assert verdict(Finding(0.5, unstable=False), warnings=saddle).false_alarm
+    assert verdict(Finding(np.nan)).outcome == "unchecked"
+    assert verdict(Finding(0.0), code=None).outcome == "not there"
+    assert verdict(Finding(0.0), code=1).outcome == "wrong" and verdict(Finding(0.0), code=-1).outcome == "wrong"
+    assert verdict(Finding(0.0), code=-2).outcome == "unchecked"
+    assert verdict(Finding(np.inf), code=2, said="cells.seed = -1: must be").cause_named
+    stopped = "no equilibrium at time 3: the change of the loads stops at 5 % of the step"
+    assert verdict(Finding(0.0), code=3, said=stopped).cause_named is False
+    assert verdict(Finding(0.0), code=3, said=f"{stopped} (chain locking)").cause_named is True
+
+
+# ---------------------------------------------------------------- references
+def test_the_point_knows_the_closed_form() -> None:
+    """The cube's angle (demos/cube.toml), whatever the stretch."""
+    path = path_of(CUBE)
+    s = -np.expm1(-0.025 * (np.array(path.times) - 1))  # the row's cells are those of the step before
+    angle = np.degrees(np.arctan2(np.sqrt(2) * (1 - s), 1 - s + np.sqrt(3) * s))
+    np.testing.assert_allclose(path.angle(), angle, rtol=1e-12)
+    held = smallest_eigenvalue(np.ones(3), np.full(3, 1 / 3), material(CUBE))
+    assert held == pytest.approx(1.0)
+
+
+def test_both_points_agree_where_axes_stay() -> None:
+    """The one that solves for stretches and the one that takes any F, each driver and law."""
+    for driver in ("cauchy", "pk2", "finger"):
+        for law in ("explicit", "rate", "relaxation"):
+            scene = {
+                **CUBE,
+                "remodeling": {**CUBE["remodeling"], "driver": driver, "law": law},
+                "time": {"end": 30.0, "step": 1.0},
+            }
+            path = path_of(scene)
+            F = np.array([np.diag(stretches) for stretches in path.stretches])
+            A = prescribed_path(material(scene), F, np.array(path.times), np.full(3, 3**-0.5), driver, law)
+            along = A[:, 2, 2]
+            np.testing.assert_allclose(along, np.array(path.squares)[:, 2], atol=1e-9, err_msg=f"{driver} {law}")
+
+
+# ---------------------------------------------------------------- the command
+def test_results_are_kept_and_belong_to_package_and_case(tmp_path: Path) -> None:
+    key = QUICK[0]
+    record = {"key": key, "source": "0.2.0+a", "digest": digest(CASES[key]), "outcome": "right"}
+    file = tmp_path / "0.2.0.jsonl"
+    file.write_text(json.dumps(record) + "\n" + json.dumps({**record, "outcome": "wrong"})[:40])  # cut off
+    assert measured(file, "0.2.0+a", CASES) == {key: record}
+    assert measured(file, "0.2.0+b", CASES) == {}
+    file.write_text(json.dumps({**record, "digest": "other"}) + "\n")
+    assert measured(file, "0.2.0+a", CASES) == {}
+
+
+def test_the_command_lists_and_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """What is there is not run again: nothing is started here."""
+    key, source = QUICK[0], source_of(PROJECT)
+    assert main("", ["--list", "--only", key]) == 0
+    command = "remodel-fenicsx run demos/cube.toml --set remodeling.frame=spatial --set loads.force.value=10.0"
+    assert f"{key}\n    ./with-fenicsx {command}" in capsys.readouterr().out
+    record = {"key": key, "family": "load", "source": source, "digest": digest(CASES[key]), "outcome": "wrong",
+              "words": "off", "false_alarm": False, "cause_named": None}  # fmt: skip
+    (tmp_path / f"{source.partition('+')[0]}.jsonl").write_text(json.dumps(record) + "\n")
+    assert main("", ["--only", key, "--results", str(tmp_path)]) == 1
+    said = capsys.readouterr()
+    assert "1 cases, 0 to run" in said.err and "wrong: load: frame spatial, force 10.0: off" in said.out
+    assert report.counts([record])["**all**"]["wrong"] == 1

@@ -1,0 +1,351 @@
+"""What settings cost and how far off they are: the estimates, what is said of them, and the command."""
+
+from __future__ import annotations
+
+import csv
+import re
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from remodel_fenicsx import Recording, cli, read_scene
+from remodel_fenicsx.body.columns import PROFILE, PROFILE_PLACES, profile_weights
+from remodel_fenicsx.results.recording import HistoryColumns
+from remodel_fenicsx.results.status import status
+from remodel_fenicsx.scene.presets import PROFILES
+from remodel_fenicsx.scene.scene import Scene, preset_scene
+from remodel_fenicsx.studies import ladder as rungs
+from remodel_fenicsx.studies import trade as study
+from remodel_fenicsx.studies.estimates import Result, Trade, estimated, limit, pareto, typical
+from remodel_fenicsx.studies.ladder import Setting, compared_times, ladder
+from remodel_fenicsx.studies.trade import in_words, picture, write
+from tests.conftest import forked_children
+from tests.reference.radial import solve_radial
+
+PAPER = "kuhl-holzapfel-2007"
+SMOOTH = np.array([[1.0, 2.0, -1.0], [0.5, 1.0, 0.0]])
+
+
+def artery(**changes: Any) -> Scene:
+    """Isotropic cells."""
+    return preset_scene(PAPER, "tube").with_values({"cells.initial": "isotropic", **changes})
+
+
+def made_up(setting: Setting, noise: float = 0.0, jagged: float = 0.0) -> Result:
+    """A result with an error of first order in the step and of second in the size of elements over their degree."""
+    kinematics, refinement, degree = setting.mesh
+    step = setting.step or setting.scene.time.tolerance or 0.0
+    in_time = 0.0 if setting.scene.remodeling.coupling == "implicit" else 0.4 * step
+    error = in_time * SMOOTH + 1.6 / (refinement * degree**2) ** 2 * SMOOTH[:, ::-1]
+    if jagged:
+        error = jagged * np.sin(1e3 * step + refinement) * SMOOTH
+    angles, lengths = 45.0 + error, 2.0 * (1 + 0.01 * error[:, :2])
+    dear = {"full": 100.0}.get(kinematics, 1.0) * (20.0 if setting.scene.remodeling.coupling == "implicit" else 1.0)
+    cost = refinement * degree / step * dear
+    return Result(setting, angles, lengths, cost, cost, noise, (angles, lengths))
+
+
+def exact(result: Result) -> float:
+    return typical(result.angles - 45.0)
+
+
+# ---------------------------------------------------------------- estimates
+def test_an_order_is_seen_and_what_is_left_with_it() -> None:
+    for order in (1, 2, 4):
+        found = limit([10.0 + 0.5 ** (order * k) * SMOOTH for k in range(4)])
+        assert found.trusted and found.order == pytest.approx(order)
+        np.testing.assert_allclose(found.beyond, -(0.5 ** (3 * order)) * SMOOTH, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "results",
+    [
+        [SMOOTH, 0 * SMOOTH, SMOOTH],  # to and fro
+        [SMOOTH, 1.1 * SMOOTH, 1.21 * SMOOTH],  # growing
+        [SMOOTH, 0.5 * SMOOTH],  # too few
+        [SMOOTH, 0 * SMOOTH, np.array([[0.3, -0.3, 0.0], [0.0, 0.3, 0.3]])],  # another way
+    ],
+)
+def test_where_no_order_shows_nothing_is_extrapolated(results: list[np.ndarray]) -> None:
+    found = limit(results)
+    assert not found.trusted and not found.beyond.any()
+
+
+def test_estimates_are_the_errors_of_a_smooth_problem() -> None:
+    results = [made_up(setting) for setting in ladder(artery())]
+    rows, notes = estimated(results)
+    for row in rows:
+        assert row.angle_error == pytest.approx(exact(row.result), rel=0.05, abs=2e-3), row.result.setting.name
+        assert not row.doubt
+    said = "\n".join(notes)
+    assert "time: no error (steps 5, 2.5 on refinement 1, degree 1)" in said  # of 'implicit', whose guess is taken
+    assert "mesh: order 2 (refinements 1, 2, 4 of degree 2)" in said
+    assert "couplings: what 'staggered' tends to is " in said
+    exact_ones = {row.result.setting.scene.remodeling.coupling for row in rows if row.angle_error < 0.02}
+    assert exact_ones == {"implicit"}
+
+
+def test_without_an_exact_coupling_orders_in_time_and_mesh_are_seen() -> None:
+    results = [made_up(setting) for setting in ladder(artery()) if setting.way[1] == "staggered"]
+    rows, notes = estimated(results)
+    for row in rows:
+        assert row.angle_error == pytest.approx(exact(row.result), rel=0.05, abs=2e-3), row.result.setting.name
+    assert any(note.startswith("time: order 1 (steps 1, 0.5, 0.25 on refinement 2, degree 2)") for note in notes)
+    assert any(note.startswith("mesh: order 2 (refinements 1, 2, 4 of degree 2)") for note in notes)
+
+
+def test_a_budget_that_ends_early_still_estimates_both_factors() -> None:
+    """The finest of each sweep stand beside each other; nothing has both."""
+    results = [made_up(s) for s in ladder(artery()) if s.factor != "both" and s.mesh[0] == "radial"]
+    for row in estimated(results)[0]:
+        assert row.angle_error == pytest.approx(exact(row.result), rel=0.05, abs=2e-3)
+
+
+def test_doubts_are_said() -> None:
+    rows, notes = estimated([made_up(setting, jagged=1.0) for setting in ladder(artery())])
+    assert any("no order seen" in note for note in notes)
+    assert any(row.doubt == "no order seen" for row in rows)
+    rows, _ = estimated([made_up(setting, noise=1.0) for setting in ladder(artery())])
+    assert {row.doubt for row in rows if row.angle_error < 1.0} == {"cells' noise 1"}
+    only_time = [made_up(s) for s in ladder(artery()) if s.mesh == ("radial", 1, 1)]
+    rows, notes = estimated(only_time)
+    assert "mesh: fewer than two settings of it: its error is in no estimate" in notes
+    assert {row.doubt for row in rows} == {"a factor was not varied"}
+
+
+def test_random_cells_are_compared_in_the_mean() -> None:
+    """A step on the cells of one seed is compared with another step on the same cells."""
+    shift = 5.0
+    results = []
+    for setting in ladder(artery(**{"cells.initial": "random"})):
+        result = made_up(setting)
+        single = result.angles + shift, result.lengths
+        if len(setting.seeds) == 1:
+            result = replace(result, angles=result.angles + shift, single=single)
+        else:
+            result = replace(result, noise=0.01, single=single)
+        results.append(result)
+    assert {len(result.setting.seeds) for result in results} == {1, rungs.SEEDS}
+    rows, notes = estimated(results)
+    for row in rows:
+        assert row.angle_error < 5.0
+    # what steps cost does not drown in the noise of cells: 0.4 of SMOOTH for a step of one
+    cost = 0.4 * typical(SMOOTH)
+    words = next(note for note in notes if note.startswith("steps alone, on the same cells"))
+    assert "an order shows" in words and f"step 2.5 {2.5 * cost:.2g}, " in words and f"step 1 {cost:.2g}, " in words
+    assert not any("same cells" in note for note in estimated([made_up(setting) for setting in ladder(artery())])[1])
+
+
+def test_the_front() -> None:
+    assert pareto([1.0, 2.0, 3.0, 3.0], [4.0, 2.0, 3.0, 1.0]) == [True, True, False, True]
+    assert pareto([1.0, 2.0], [np.nan, 1.0]) == [False, True]
+
+
+# ---------------------------------------------------------------- the ladder
+def test_the_ladder_has_each_setting_once_and_all_can_be_run() -> None:
+    scene = artery()
+    settings = ladder(scene)
+    assert len({setting.name for setting in settings}) == len(settings) > 20
+    assert {setting.mesh[0] for setting in settings} == {"radial", "sector", "full"}
+    coarse = [s for s in settings if s.mesh == ("radial", 1, 1) and s.step]
+    assert sorted(s.step or 0 for s in coarse if s.way[1] == "staggered") == [0.125, 0.25, 0.5, 1, 2.5, 5]
+    assert sorted(s.step or 0 for s in coarse if s.way[1] == "implicit") == [2.5, 5]
+    profiles = {s.profile: s for s in settings if s.profile}
+    assert list(profiles) == [s.profile for s in settings if s.profile] and set(profiles) == set(PROFILES)
+    assert profiles["fast"].scene == scene.with_values({"model.kinematics": "radial", "time.tolerance": 1.0})
+    assert profiles["reference"].expected_seconds < 5.0  # measured: 1.4
+    assert profiles["reference"].scene.remodeling.coupling == "implicit"
+    times = compared_times(scene, settings)
+    assert times[0] == 5.0 and 25.0 in times and times[-1] == 150.0
+    for setting in settings:
+        run = rungs.as_run(setting, 3, times)
+        assert run.cells.seed == 3 and run.output.times == tuple(times) and not run.output.fields
+        assert setting.scene.output == scene.output
+
+
+def test_a_tendon_of_random_cells_stays_whole_and_has_seeds() -> None:
+    settings = ladder(preset_scene(PAPER, "tendon"))
+    assert {setting.mesh[0] for setting in settings} == {"full"}
+    assert {setting.seeds for setting in settings} == {(1,), (1, 2, 3)}
+
+
+@pytest.mark.parametrize("changes", [
+    {"cells.initial": "random"}, {"remodeling.law": "rate"}, {"material.chain_density": 0.0},
+    {"mesh.formulation": "selective-integration"},
+])  # fmt: skip
+def test_implicit_is_there_where_it_has_no_error_in_time(changes: dict[str, Any]) -> None:
+    settings = ladder(artery(**changes))
+    assert {setting.scene.remodeling.coupling for setting in settings} == {"staggered"} and len(settings) > 15
+
+
+def test_a_point_has_no_mesh() -> None:
+    """No row for one, no doubt for want of one, no word of one."""
+    scene = preset_scene(PAPER, "cube").with_values({"cells.initial": "isotropic"})
+    settings = ladder(scene)
+    assert {setting.mesh[1:] for setting in settings} == {(1, 1)} and len(settings) > 15
+    points = [setting for setting in settings if setting.mesh[0] == "point"]
+    assert not any("refinement" in setting.in_words() for setting in points)
+    for coupling in ("staggered", "implicit"):
+        rows, notes = estimated([made_up(setting) for setting in points if setting.way[1] == coupling])
+        assert not any(row.doubt for row in rows) and not any("mesh" in note for note in notes)
+
+
+def test_hats_add_up_to_one_and_are_one_at_their_places() -> None:
+    np.testing.assert_allclose(profile_weights(np.linspace(0, 1, 37)).sum(axis=-1), 1.0)
+    np.testing.assert_allclose(profile_weights(np.linspace(0, 1, PROFILE_PLACES)), np.eye(PROFILE_PLACES), atol=1e-15)
+
+
+def test_noise_is_the_standard_error_of_the_mean() -> None:
+    """Of seeds whose angles differ by a known standard deviation; the angles are their mean."""
+    setting = next(s for s in ladder(artery(**{"cells.initial": "random"})) if len(s.seeds) == rungs.SEEDS)
+    spread, times = np.array([-1.0, 0.0, 1.0]), [0.0, 1.0]  # a sample of standard deviation 1
+
+    def history(number: int) -> HistoryColumns:
+        columns = dict.fromkeys(PROFILE, np.full(2, 30.0 + spread[number]))
+        columns |= dict.fromkeys(("inner_radius", "outer_radius", "seconds"), np.ones(2))
+        return HistoryColumns(columns, time=np.array(times), processor_seconds=np.full(2, 1.0 + number))
+
+    members = [SimpleNamespace(history=lambda number=number: history(number)) for number in range(3)]
+    result = study.read(setting, members, times)  # type: ignore[arg-type]
+    assert result.noise == pytest.approx(3**-0.5)
+    np.testing.assert_allclose(result.angles, 30.0)
+    assert result.seconds == pytest.approx(4.0)  # of one run, two rows of 1, 2 and 3
+    assert study.read(setting, members[:1], times).noise == 0.0  # type: ignore[arg-type]
+
+
+# ---------------------------------------------------------------- the command
+def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """On a cube whose stress is the same everywhere: three steps; again: nothing is run; a row is a scene."""
+    for name, value in (
+        ("STEPS", (2.0,)),
+        ("HALVINGS", 1),
+        ("MESHES", ()),
+        ("TOGETHER", ()),
+        ("TOLERANCES", ()),
+        ("PROFILES", {}),
+    ):
+        monkeypatch.setattr(rungs, name, value)
+    path, out = tmp_path / "cube.toml", tmp_path / "out"
+    changes = {"model.kinematics": "point", "time.end": 20.0, "remodeling.kappa": 0.1}
+    path.write_text(preset_scene(PAPER, "cube").with_values(changes).to_toml())
+    monkeypatch.setattr(rungs, "objections", lambda scene, name: ["left out by the test"])
+    out.mkdir()
+    (out / "point-1-degree-1-step-0.5-1").write_text("a file of the user's: this run fails")
+    with forked_children():
+        assert cli.main(["trade", str(path), "-o", str(out), "--jobs", "12", "-q"]) == 3
+        assert "point-1-degree-1-step-0.5-1 has failed: " in capsys.readouterr().err
+        assert status(out)[0].endswith("3 finished, 1 failed")
+        (out / "point-1-degree-1-step-0.5-1").unlink()
+        assert cli.main(["trade", str(path), "-o", str(out), "--jobs", "12", "--budget", "10min"]) == 0
+    words = capsys.readouterr().out
+    assert "time: order 1.1 (steps 2, 1, 0.5 on refinement 1, degree 1)" in words and "mesh:" not in words
+    names = [f"point-1-degree-1-step-{step}" for step in ("2", "1", "0.5")]
+    assert [name in (out / "trade.csv").read_text() for name in names] == [True] * 3
+    with (out / "trade.csv").open() as file:
+        table = list(csv.DictReader(line for line in file if not line.startswith("#")))
+    assert list(table[0])[:7] == ["setting", "scene", "error_degrees", "error_stretch", "cpu_seconds", "on_front",
+                                  "trusted"]  # fmt: skip
+    for entry in table:
+        assert read_scene(out / entry["scene"]).time.step == float(entry["setting"].split("-")[5])
+        assert entry["trusted"] == "1" and float(entry["error_degrees"]) > 0 and float(entry["cpu_seconds"]) > 0
+    assert (out / "trade.png").stat().st_size > 10_000
+    assert [read_scene(out / f"{name}-1.toml").time.step for name in names] == [2.0, 1.0, 0.5]
+    row = read_scene(out / "rows" / f"{names[2]}.toml")
+    assert row.time.step == 0.5 and row.output.fields is True and row.name == "cube"
+    # the closed form of the printed scheme: a row of fixed steps has the angle of one step before
+    last = Recording(out / f"{names[0]}-1").history["angle_profile_2"][-1]
+    s = 1 - np.exp(-0.1 * 18.0)
+    assert last == pytest.approx(np.degrees(np.arctan(np.sqrt(2) * (1 - s) / (1 - s + np.sqrt(3) * s))), abs=1e-6)
+
+    assert status(out) == [f"{out}: trade of cube, 4 runs: 4 finished", f"its answer: {out / 'trade.csv'}"]
+    before = {file: file.stat().st_mtime_ns for file in out.glob("*/history.csv")}
+    assert len(before) == 4  # the three, and 'implicit'
+    assert cli.main(["trade", str(path), "-o", str(out), "-q"]) == 0
+    assert {file: file.stat().st_mtime_ns for file in out.glob("*/history.csv")} == before
+    assert cli.main(["trade", str(path), "-o", str(tmp_path / "none"), "--budget", "0.001s"]) == 4
+    said = capsys.readouterr().err
+    assert said.startswith("remodel-fenicsx: 0 of 4 settings reached the end within the budget of 0.001 s, at least 2")
+    assert re.search(r"is kept, a larger budget goes on; the cheapest 2 need about \S+ s for their steps", said)
+    assert said.count("\n") == 1
+
+    monkeypatch.setattr(study, "ladder", lambda scene: ladder(scene)[:2])
+    lone = tmp_path / "lone"
+    lone.mkdir()
+    (lone / f"{ladder(read_scene(path))[0].name}-1").write_text("a file of the user's")
+    with forked_children():
+        assert cli.main(["trade", str(path), "-o", str(lone), "--jobs", "2", "-q"]) == 3
+    failure, verdict = capsys.readouterr().err.splitlines()
+    assert " has failed: -o " in failure and "1 of 2 settings reached the end" in verdict
+    assert verdict.endswith("is kept, the same command tries again what has failed")
+
+
+def test_words() -> None:
+    rows, notes = estimated([made_up(setting) for setting in ladder(artery())])
+    text = in_words(Trade(rows, notes, ["full-1-degree-1-step-1"], {}))
+    assert "left out, over the budget: full-1-degree-1-step-1" in text and "order 2" in text
+    assert sum(line.startswith("* ") for line in text.splitlines()) == sum(row.on_front for row in rows) > 2
+    assert "radial       refinement 1 degree 1 tolerance 1 (profile fast)" in text and "radii %" in text
+    assert "refinement 2 degree 2 tolerance 0.1 implicit (profile reference)" in text
+
+
+def test_what_is_doubted_is_not_trusted(tmp_path: Path) -> None:
+    rows, notes = estimated([made_up(setting, noise=0.3) for setting in ladder(artery())])
+    write(Trade(rows, notes, [], {}), tmp_path, artery())
+    with (tmp_path / "trade.csv").open() as file:
+        table = list(csv.DictReader(line for line in file if not line.startswith("#")))
+    assert [entry["trusted"] == "1" for entry in table] == [entry["doubt"] == "" for entry in table]
+    assert {entry["trusted"] for entry in table} == {"0", "1"} and "error_radii" in table[0]
+
+
+def test_the_picture_stays_in_its_frame_and_no_word_lies_on_a_point() -> None:
+    """Numbers lie in their own points alone."""
+    rows, _ = estimated([made_up(setting) for setting in ladder(artery())])
+    figure = picture(rows)
+    figure.draw_without_rendering()
+    (axes,) = figure.axes
+    shown = [row for row in rows if row.angle_error > 0]
+    front = [row for row in shown if row.on_front]
+    boxes = [text.get_window_extent() for text in axes.texts]
+    assert [text.get_text() for text in axes.texts] == [str(number + 1) for number in range(len(boxes))]
+    assert 5 < len(boxes) <= len(front)
+    for number, box in enumerate(boxes):
+        inside = [
+            row for row in shown if box.contains(*axes.transData.transform((row.result.seconds, row.angle_error)))
+        ]
+        assert any(row.on_front for row in inside)
+        assert not any(box.overlaps(other) for other in boxes[:number])
+    frame = axes.get_window_extent()
+    assert all(frame.contains(*axes.transData.transform((row.result.seconds, row.angle_error))) for row in shown)
+    whole = figure.bbox
+    for legend in figure.legends:
+        box = legend.get_window_extent()
+        assert whole.x0 <= box.x0 and box.x1 <= whole.x1 and whole.y0 <= box.y0 and box.y1 <= whole.y1
+        assert not box.overlaps(frame)
+    named = " | ".join(text.get_text() for text in figure.legends[1].get_texts())
+    numbered = [row for row in front if " ".join(row.result.setting.in_words().split()) in named]
+    assert len(numbered) == len(boxes) and front[0] in numbered
+
+
+@pytest.mark.slow
+def test_estimates_of_the_artery_are_the_true_errors(tmp_path: Path) -> None:
+    """Against the one-dimensional reference with small steps: eight of ten rows within a factor of two."""
+    scene = artery(**{"model.kinematics": "radial"})
+    folder, found = study.trade(scene, tmp_path / "out", budget=3000.0)
+    times = compared_times(scene, ladder(scene))
+    coarse, fine = (_reference(step, times) for step in (1 / 8, 1 / 16))
+    true = {row.result.setting.name: typical(row.result.angles - (2 * fine - coarse)) for row in found.rows}
+    ratios = [row.angle_error / true[row.result.setting.name] for row in found.rows]
+    assert np.mean([0.5 <= ratio <= 2.0 for ratio in ratios]) >= 0.8, sorted(ratios)
+
+
+def _reference(step: float, times: list[float]) -> np.ndarray:
+    """Angles of the reference, at the times and places that are compared."""
+    history = solve_radial(step=step, elements=150)
+    hats = profile_weights((history.points - 1.0) / 2.0) * history.areas[:, None]
+    rows = [history.dimensions[round(time / step) - 1] for time in times]
+    angles = np.array([np.degrees(np.arctan2(row[:, 1], row[:, 0])) for row in rows])
+    return np.asarray(angles @ hats / hats.sum(axis=0))

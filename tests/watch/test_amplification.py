@@ -1,0 +1,164 @@
+"""By what a pass multiplies a small change of the cells: against full solves, against runs, and as a command."""
+
+from __future__ import annotations
+
+import csv
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from remodel_fenicsx.cli import main
+from remodel_fenicsx.evolution.stepper import Step, Watcher
+from remodel_fenicsx.model.cells import structure_tensor
+from remodel_fenicsx.scene import preset_scene
+from remodel_fenicsx.simulation import Simulation
+from remodel_fenicsx.studies.stability import verdict
+from remodel_fenicsx.watch.amplification import AmplificationWatcher, LinearPass
+from tests.conftest import mpirun
+from tests.watch.test_over_correction import Tilt
+
+PAPER = "kuhl-holzapfel-2007"
+SOLVED = 20.0
+
+
+def weak_cube(end: float, frame: str = "spatial") -> Simulation:
+    """The preset's cube under a force at which its pass over-corrects."""
+    changes = {"loads.force.value": 0.03, "time.end": end, "remodeling.frame": frame}
+    return Simulation(preset_scene(PAPER, "cube").with_values(changes), MPI.COMM_SELF)
+
+
+class AtSolved(Watcher):
+    """Does something once, in the solved state of a time."""
+
+    def __init__(self, time: float, what: object):
+        self.time, self.what = time, what
+
+    def solved(self, step: Step) -> None:
+        """Do it."""
+        if step.time == self.time:
+            self.what(step)  # type: ignore[operator]
+
+
+@pytest.mark.parametrize("frame", ["spatial", "material"])
+def test_the_map_is_what_a_solve_and_a_pass_make_of_other_cells(frame: str) -> None:
+    """Newton's method to the end, both ways, in place of the linear answer; and the state is left as it was."""
+    simulation = weak_cube(SOLVED, frame)
+    stepper, cells, unknown = simulation.stepper, simulation.cells, simulation.unknown
+    compared = []
+
+    def compare(step: Step) -> None:
+        change = np.random.default_rng(2).standard_normal((8, 3, 3))
+        change = change + np.swapaxes(change, 1, 2)
+        change[:, 0, 1] = change[:, 1, 0] = 0.0  # l_2 = l_3: a turn there is no change of A
+        change[:, 1, 1] = change[:, 0, 0]
+        before = [f.x.array.copy() for f in (unknown, cells.dimensions, cells.axes)]
+        with LinearPass(stepper, step.time, step.work.residual) as linear:
+            expected = linear(change)
+            other = structure_tensor(*linear._changed(1e-5 * change)[:2]) - structure_tensor(*linear.cells[:2])
+            np.testing.assert_allclose(other, 1e-5 * change, atol=1e-8)
+            for array, f in zip(before, (unknown, cells.dimensions, cells.axes), strict=True):
+                np.testing.assert_array_equal(f.x.array, array)
+            passed = []
+            for sign in (1.0, -1.0):
+                linear._set(linear._changed(sign * 1e-5 * change))
+                stepper.coupling.newton.solve()  # type: ignore[attr-defined]
+                new, _ = stepper.remodeling.updated_cells(step.time - 1.0, step.time, step.work.residual)
+                passed.append(structure_tensor(*new[:2]))
+            linear._set(linear.cells)
+        unknown.x.array[:] = before[0]
+        compared.append(((passed[0] - passed[1]) / 2e-5, expected))
+
+    for _ in simulation.steps([AtSolved(SOLVED, compare)]):
+        pass
+    ((found, expected),) = compared
+    assert np.abs(expected).max() > 1.0
+    np.testing.assert_allclose(found, expected, atol=2e-3 * np.abs(expected).max())
+
+
+def test_the_factor_is_that_by_which_a_tilt_grows_in_a_run() -> None:
+    straight, tilted = weak_cube(26.0), weak_cube(26.0)
+    analysis = AmplificationWatcher(straight.stepper, lambda step: step.number == 26)
+    straight_cells = [straight.cells.structure_tensor() for _ in straight.steps([analysis])]
+    tilted_cells = [tilted.cells.structure_tensor() for _ in tilted.steps([Tilt(tilted, 16.0, 1e-8)])]
+    last, one_more = (tilted_cells[k] - straight_cells[k] for k in (-2, -1))
+    grown = float(np.sum(last * one_more) / np.sum(last**2))
+    (found,) = analysis.found
+    # lateral stresses are zero, where the positive part has a kink: a run sees one side, central differences their mean
+    assert found.reversing is not None and found.reversing.factor == pytest.approx(grown, rel=0.15)
+    assert grown < -2.5
+    shares = found.reversing.shares
+    assert sum(shares.values()) == pytest.approx(1.0, abs=1e-9)
+    assert shares["turn_12"] + shares["turn_13"] > 0.8  # the direction of the load turns
+    assert 0.1 < found.reversing.volume_share <= 1.0
+
+
+def read(folder: Path) -> dict[str, list[float]]:
+    """Columns of stability.csv."""
+    with (folder / "stability.csv").open() as file:
+        rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
+    return {name: [float(row[name]) for row in rows] for name in rows[0]}
+
+
+def test_the_command_writes_table_and_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = tmp_path / "weak.toml"
+    scene.write_text(f'preset = "{PAPER}"\n[geometry]\nshape = "cube"\n')
+    folder = tmp_path / "out"
+    settings = ["time.end=14", "loads.force.value=0.01", "remodeling.coupling=relaxed"]
+    arguments = [str(scene), *(f"--set={text}" for text in settings), "-o", str(folder), "--times", "2", "-q"]
+    assert main(["stability", *arguments]) == 0
+    table = read(folder)
+    assert table["time"] == [7.0, 14.0] and table["factor"][1] < -1.0
+    np.testing.assert_allclose(table["factor_of_coupling"], 1 - 0.5 * (1 - np.array(table["factor"])), rtol=1e-5)
+    np.testing.assert_allclose(1 - np.array(table["stable_share"]) * (1 - np.array(table["factor"])), -1.0, rtol=1e-5)
+    assert (folder / "stability.png").read_bytes().startswith(b"\x89PNG")
+    assert {"history.csv", "scene.toml", "run.log"} <= {path.name for path in folder.iterdir()}
+    printed = capsys.readouterr().out.splitlines()
+    assert printed[0].split()[:3] == ["time", "factor", "factor_of_coupling"] and len(printed) == 5
+    assert printed[3].startswith("Unstable: passes over-correct at 1 of 2 times, first at 14; ")
+    assert main(["stability", *arguments]) == 2  # the folder is taken
+    assert main(["stability", str(scene), "--set", "remodeling.law=none", "-o", str(tmp_path / "none")]) == 2
+    assert "nothing remodels" in capsys.readouterr().err and not (tmp_path / "none").exists()
+
+
+@pytest.mark.slow
+def test_two_ranks_find_the_same_factor(tmp_path: Path) -> None:
+    scene = tmp_path / "weak.toml"
+    scene.write_text(f'preset = "{PAPER}"\n[geometry]\nshape = "cube"\n[mesh]\nrefinement = 2\n')
+    found = []
+    for ranks in (1, 2):
+        folder = tmp_path / f"out{ranks}"
+        command = ["-m", "remodel_fenicsx", "stability", str(scene), "-o", str(folder), "-q", "--times", "1"]
+        command += ["--set", "time.end=14", "--set", "loads.force.value=0.01"]
+        environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
+        done = subprocess.run(mpirun(ranks, sys.executable, *command), env=environment, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr[-2000:]
+        found.append(read(folder)["factor"][0])
+    assert found[1] == pytest.approx(found[0], rel=1e-2) and found[0] < -1.0
+
+
+def table(factors: list[float], growing: float = 0.5, share: float = 1.0) -> dict[str, list[float]]:
+    """Of an analysis at times 1, 2, ..."""
+    return {
+        "time": [float(number + 1) for number in range(len(factors))],
+        "factor": factors,
+        "factor_of_coupling": [1 - share * (1 - factor) for factor in factors],
+        "stable_share": [min(1.0, 2 / (1 - min(factor, 0.0))) for factor in factors],
+        "growing_factor": [growing] * len(factors),
+    }
+
+
+@pytest.mark.parametrize(("found", "words"), [
+    (table([-0.5, 0.2, -0.99]), "Stable: at all 3 times"),
+    (table([-0.5, -1.5, -3.0]), "Unstable: passes over-correct at 2 of 3 times, first at 2; the worst multiplies a "
+     "small change by -3 at time 3. The coupling 'relaxed' with a relaxation_factor below 0.5 does not."),
+    (table([-0.5, -1.5, -2.9], share=0.5), "Stable: at all 3 times"),
+    (table([-0.5, 0.2], growing=1.2), "Unstable: at 2 of 2 times a small change of the cells grows from pass to pass"),
+    (table([-0.5, np.nan]), "Not known: at 1 of 2 times no mode was found"),
+])  # fmt: skip
+def test_the_verdict(found: dict[str, list[float]], words: str) -> None:
+    assert verdict(found).startswith(words)

@@ -1,0 +1,245 @@
+"""Equilibria are known for what they are: negative eigenvalues of the tangent, who looks when, and what is said."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from remodel_fenicsx import Scene, Simulation, read_scene
+from remodel_fenicsx.evolution.stepper import Step
+from remodel_fenicsx.fem.petsc_options import ProblemOptions
+from remodel_fenicsx.fem.solver_methods import SYMMETRIC, factor_options, method_options
+from remodel_fenicsx.results.history import History
+from remodel_fenicsx.results.recording import read_history
+from remodel_fenicsx.settings import Cells
+from remodel_fenicsx.solver.continuation import StepFailure
+from remodel_fenicsx.solver.equilibrium import Extension
+from remodel_fenicsx.solver.inertia import Inertia
+from remodel_fenicsx.solver.newton import SolveFailure
+from remodel_fenicsx.solver.refusals import diagnosed
+from remodel_fenicsx.watch import equilibrium_stability
+from remodel_fenicsx.watch.equilibrium_stability import EquilibriumStability
+from tests import parts
+from tests.parts import cube, tube
+
+DEMOS = Path(__file__).parents[2] / "demos"
+COLUMN = {"output.columns": ["negative_eigenvalues"]}
+
+
+def pushed_cube(force: float, **values: Any) -> Scene:
+    """The demo's cube under a force that is there after three steps."""
+    scene = read_scene(DEMOS / "cube.toml")
+    ramp = [[0.0, 0.0], [3.0, 1.0]]
+    return scene.with_values({"loads.force.value": force, "loads.force.ramp": ramp, "time.end": 4.0, **values})
+
+
+def run(scene: Scene, domain: Any = None) -> list[Step]:
+    """Its steps."""
+    simulation = Simulation(scene, MPI.COMM_SELF, domain)
+    try:
+        return list(simulation.steps())
+    finally:
+        simulation.close()
+
+
+def warnings(caplog: pytest.LogCaptureFixture) -> list[str]:
+    return [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING]
+
+
+def negative_pivots_of(matrix: Any, options: dict[str, Any]) -> int | None:
+    """What is seen of a factorisation of PETSc's."""
+    owned = ProblemOptions(options, {})
+    preconditioner = PETSc.PC().create(matrix.comm)
+    owned.apply(preconditioner)
+    preconditioner.setOperators(matrix)
+    preconditioner.setUp()
+    found = equilibrium_stability.negative_pivots(preconditioner)
+    preconditioner.destroy()
+    owned.close()
+    return found
+
+
+# ---------------------------------------------------------------- the count
+def test_count_and_lowest_eigenvalue_are_those_of_the_dense_matrix() -> None:
+    """A follower pressure and random cells: the tangent has every kind of entry; prescribed unknowns do not count."""
+    made = parts.body(tube(length=1.0, divisions=(8, 2, 1)), Cells(initial="random", axes="cylindrical")).supported()
+    problem = made.problem()
+    made.loading.set({"pressure": -20.0, "elongation": 0.0})  # no equilibrium: a tangent is one anywhere
+    rng = np.random.default_rng(5)
+    made.set_displacement(0.03 * rng.standard_normal(made.nodes.shape))
+    matrix = problem.create_matrix()
+    problem.assemble_tangent(matrix)
+    entries = matrix.copy()
+    dense = matrix.convert("dense").getDenseArray()
+    free = np.isnan(problem.prescribed_values())
+    expected, modes = np.linalg.eigh((dense + dense.T)[np.ix_(free, free)] / 2)
+    assert np.abs(dense - dense.T).max() > 1e-6 * np.abs(dense).max() and (expected < 0).sum() > 1
+    inertia = Inertia(problem)
+    count = inertia.negative_eigenvalues()
+    assert count == (expected < 0).sum()
+    assert negative_pivots_of(entries, method_options("direct", 1, small=True)) == count
+    assert negative_pivots_of(entries, factor_options(SYMMETRIC, 1)) == count
+    assert negative_pivots_of(entries, method_options("direct", 1)) == count % 2  # of LU only the determinant
+    mode = inertia.lowest()
+    assert mode.eigenvalue == pytest.approx(expected[0], rel=1e-6)
+    full = np.zeros(len(free))
+    full[free] = modes[:, 0]
+    assert inertia.cosine(mode, full) == pytest.approx(1.0, abs=1e-6)
+    assert inertia.cosine(mode, np.where(free, 0.0, 1.0)) == pytest.approx(0.0, abs=1e-12)
+    largest = made.nodes[np.argmax(np.linalg.norm(full.reshape(-1, 3), axis=1))]
+    np.testing.assert_allclose(mode.place, largest, atol=1e-9)
+    made.set_displacement(np.zeros(made.nodes.shape))
+    made.loading.set({"pressure": 0.0})
+    assert inertia.negative_eigenvalues() == 0 and inertia.lowest().eigenvalue > 0
+    inertia.close()
+
+
+@pytest.mark.parametrize(("force", "expected"), [(-30.0, [0, 0, 1, 3, 3]), (-10.0, [0] * 5), (10.0, [0] * 5)])
+def test_a_compressed_cube_in_every_row(force: float, expected: list[int], caplog: pytest.LogCaptureFixture) -> None:
+    """At -30 its lowest eigenvalue is -2.3 of the unloaded one, at -10 still 0.16."""
+    scene = pushed_cube(force, **COLUMN, **{"remodeling.law": "none"})
+    rows = [step.row["negative_eigenvalues"] for step in run(scene)]
+    assert rows == expected[1:]
+    said = [line for line in warnings(caplog) if "unstable" in line]
+    assert len(said) == len(set(expected)) - 1  # each change once
+    if said:
+        assert "time 2: the equilibrium is unstable" in said[0] and "1 negative eigenvalue of the tangent (0" in said[0]
+        assert "the lowest is -2.3 of its unloaded value, its mode largest at (1, 1, 0)" in said[1]
+
+
+# ---------------------------------------------------------------- when somebody looks
+def test_nobody_counts_without_a_sign_but_at_the_end() -> None:
+    counts = [step.negative_eigenvalues for step in run(pushed_cube(10.0))]
+    assert np.isnan(counts[:-1]).all() and counts[-1] == 0
+
+
+def test_a_large_body_is_counted_on_request_only(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    monkeypatch.setattr(equilibrium_stability, "MOST_UNKNOWNS", 23)  # the cube has 24
+    monkeypatch.setattr(equilibrium_stability, "ITERATIONS_BETWEEN_LOOKS", 1)
+    assert np.isnan([step.negative_eigenvalues for step in run(pushed_cube(10.0))]).all()
+    assert caplog.text.count("the stability of equilibria was not looked at: with 24 unknowns") == 1
+    assert [step.negative_eigenvalues for step in run(pushed_cube(10.0, **COLUMN))] == [0] * 4
+    monkeypatch.setattr(equilibrium_stability, "MOST_UNKNOWNS", 24)
+    assert run(pushed_cube(10.0))[-1].negative_eigenvalues == 0
+
+
+def test_the_sign_of_the_determinant_tells_at_once(caplog: pytest.LogCaptureFixture) -> None:
+    steps = run(pushed_cube(-30.0, **{"time.end": 2.0, "loads.force.ramp": [[0.0, 0.0], [12.0, 4.0]]}))
+    assert [step.negative_eigenvalues for step in steps][-1] == 1 and len(warnings(caplog)) == 1
+
+
+def collapsing_tube(monkeypatch: pytest.MonkeyPatch) -> list[Step]:
+    """Suction on a tube of equal cells; nobody looks because it is time to."""
+    scene = read_scene(DEMOS / "artery.toml").with_values({
+        "geometry.length": 1.0, "cells.initial": "isotropic", "loads.elongation.value": 0.0, "time.end": 12.0,
+        "loads.pressure.value": -12.0, "loads.pressure.ramp": [[0.0, 0.0], [12.0, 1.0]], "solver.method": "auto",
+    })  # fmt: skip
+    monkeypatch.setattr(equilibrium_stability, "ITERATIONS_BETWEEN_LOOKS", 10**9)
+    return run(scene, tube(length=1.0, divisions=(8, 3, 1)))
+
+
+@pytest.mark.parametrize(
+    "without", [(equilibrium_stability, "negative_pivots", None), (equilibrium_stability.Signs, "_curvature", np.inf)]
+)
+def test_each_sign_alone_sees_a_pair(without: tuple[Any, str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the tube's modes two come at a time: the determinant does not change its sign."""
+    place, name, value = without
+    monkeypatch.setattr(place, name, lambda *arguments: value)
+    counts = [step.negative_eigenvalues for step in collapsing_tube(monkeypatch)]
+    found = np.flatnonzero(np.nan_to_num(counts) > 0)
+    assert found.size and found[0] < len(counts) - 1  # before the last step
+    assert counts[found[0]] % 2 == 0
+
+
+def test_a_dead_hydrostatic_load_beyond_rivlins(caplog: pytest.LogCaptureFixture) -> None:
+    """The cube that stays a cube is no minimum any more; its symmetry planes do not hide that."""
+    made = parts.body(cube(comm=MPI.COMM_SELF), Cells(initial="isotropic"))
+    for component, face in enumerate(("x0", "y0", "z0")):
+        made.loading.hold_face(face, component)
+        made.loading.add_dead_force("force", face.replace("0", "1"), component)
+    stepper = made.stepper(lambda t: {"force": 10.0 * t}, law="none")
+    watcher = EquilibriumStability(stepper, every_step=True)
+    steps = list(stepper.march([1.0, 2.0, 3.0], [watcher]))
+    watcher.close()
+    stretch = 1 + made.displacement.x.array.max()
+    assert stretch > 1.05 and made.displacement.x.array.min() == pytest.approx(0.0, abs=1e-9)
+    assert steps[-1].negative_eigenvalues > 0 and warnings(caplog)
+
+
+# ---------------------------------------------------------------- what is said, and done
+def test_a_start_that_is_indefinite_is_told_apart(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(equilibrium_stability, "of_the_unloaded_body", lambda inertia: (1, -0.1))
+    caplog.set_level(logging.INFO)
+    run(pushed_cube(-20.0, **COLUMN, **{"remodeling.law": "none", "solver.unstable": "stop"}))
+    assert not warnings(caplog)
+    assert sum("no lost equilibrium" in record.getMessage() for record in caplog.records) == 1
+
+
+def test_stop_ends_before_the_first_unstable_step() -> None:
+    simulation = Simulation(pushed_cube(-30.0, **{"solver.unstable": "stop"}), MPI.COMM_SELF)
+    done = []
+    with pytest.raises(StepFailure, match="the equilibrium at time 2 is unstable: 1 negative eigenvalue") as caught:
+        for step in simulation.steps():
+            done.append(step.negative_eigenvalues)
+    assert done == [0] and simulation.state.time == 1.0 and simulation.loading.values == {"force": -10.0}
+    assert caught.value.refusal.kind == "lost stability" and 'solver.unstable = "warn"' in caught.value.refusal.advice
+    simulation.close()
+
+
+def test_what_was_not_counted_is_an_empty_field(tmp_path: Path) -> None:
+    history = History(tmp_path / "history.csv")
+    history.append({"time": 1.0, "negative_eigenvalues": np.nan})
+    history.append({"time": 2.0, "negative_eigenvalues": 3})
+    history.close()
+    assert (tmp_path / "history.csv").read_text() == "time,negative_eigenvalues\n1.0,\n2.0,3\n"
+    np.testing.assert_array_equal(read_history(tmp_path)["negative_eigenvalues"], [np.nan, 3.0])
+
+
+# ---------------------------------------------------------------- refusals
+def refused(values: dict[str, Any]) -> tuple[StepFailure, float]:
+    """The failure of a short, coarse artery of equal cells, and its last time."""
+    base = {"geometry.length": 1.0, "cells.initial": "isotropic", "loads.pressure.value": 0.0}
+    scene = read_scene(DEMOS / "artery.toml").with_values({**base, **values})
+    simulation = Simulation(scene, MPI.COMM_SELF, tube(length=1.0, divisions=(8, 3, 1)))
+    with pytest.raises(StepFailure) as caught:
+        for _ in simulation.steps():
+            pass
+    simulation.close()
+    return caught.value, simulation.state.time
+
+
+def test_an_asymptote_of_the_pressure_is_a_limit_point() -> None:
+    """Without chains p(r_i) rises to mu ln(R_o/R_i) and no further; on this mesh, a prism of eight sides, to more."""
+    rising = {"loads.pressure.value": 8.0, "loads.pressure.ramp": [[0.0, 0.0], [10.0, 1.0]], "time.end": 10.0}
+    failure, last = refused(
+        {"material.chain_density": 0.0, "remodeling.law": "none", "loads.elongation.value": 0.0, **rising}
+    )
+    assert failure.refusal.kind == "limit point" and 2.0 <= last < 10.0
+    assert "approaches the largest that the body can carry" in failure.refusal.advice
+    assert "the lowest eigenvalue of the tangent is" in failure.refusal.finding
+
+
+def test_more_elongation_than_chains_allow_is_chain_locking() -> None:
+    """All chains axial: l lambda = L at a stretch of 1.594. Newton's method must not end with the elongation unmet."""
+    failure, last = refused({"loads.elongation.value": 0.6, "remodeling.kappa": 0.5, "time.end": 25.0})
+    assert failure.refusal.kind == "chain locking" and last == 24.0
+    reached = 0.024 * (24 + float(str(failure).split(" stops at ")[1].split(" %")[0]) / 100)
+    assert reached == pytest.approx(0.594, abs=1e-3)
+
+
+@pytest.mark.parametrize(("left", "kind"), [(50.0, "solver tolerance"), (1e6, "")])
+def test_a_residual_that_is_almost_small_enough_is_a_matter_of_the_tolerance(left: float, kind: str) -> None:
+    made = parts.body(cube(comm=MPI.COMM_SELF), Cells(initial="isotropic")).supported()
+    failure = SolveFailure("refused", 25, 25, Extension(0.7, 1.0, (0.0, 0.0, 0.0)), left)
+    assert diagnosed(made.problem().newton, failure).kind == kind

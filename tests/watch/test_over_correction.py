@@ -1,0 +1,227 @@
+"""Passes that over-correct: what starts from rounding alone does not start, all else is warned of, nothing else is."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
+from remodel_fenicsx.model import spectral
+from remodel_fenicsx.model.cells import angle_to_axis
+from remodel_fenicsx.scene import preset_scene
+from remodel_fenicsx.simulation import Simulation
+from remodel_fenicsx.solver.continuation import Work
+from remodel_fenicsx.watch.over_correction import OverCorrection
+from tests import parts
+from tests.body.test_cube import closed_form_angle, uniaxial_stretches
+from tests.conftest import slowly
+
+PAPER = "kuhl-holzapfel-2007"
+KAPPA, END = 0.025, 100.0
+
+
+def cube(force: float, **changes: Any) -> Simulation:
+    """The preset's cube under another load."""
+    values = {"loads.force.value": force} | {name.replace("__", "."): value for name, value in changes.items()}
+    return Simulation(preset_scene(PAPER, "cube").with_values(values), MPI.COMM_SELF)
+
+
+def tilt(simulation: Simulation, angle: float) -> None:
+    """Turn the cell of one point about y, by an angle in radians."""
+    axes = simulation.cells.axis_values
+    axes[0, 0] = axes[0, 0] @ parts.rotation((0.0, 1.0, 0.0), np.degrees(angle)).T
+
+
+class Tilt(Watcher):
+    """Turns the cell of one point once, at a time."""
+
+    def __init__(self, simulation: Simulation, time: float, angle: float):
+        self.simulation, self.time, self.angle = simulation, time, angle
+
+    def completed(self, step: Step) -> None:
+        """Turn it."""
+        if step.time == self.time:
+            tilt(self.simulation, self.angle)
+
+
+def angles(simulation: Simulation) -> np.ndarray:
+    """Angle between chains and load after the last pass, degrees, all points."""
+    return angle_to_axis(simulation.cells.dimension_values, simulation.cells.axis_values, np.array([0.0, 0.0, 1.0]))
+
+
+# ---------------------------------------------------------------- weak loads
+@pytest.mark.parametrize("frame", ["spatial", "material"])
+@pytest.mark.parametrize("force", [0.03, *slowly(1e-4, 0.01, 0.1, 0.5)])
+def test_the_angle_under_a_weak_load_is_the_closed_form(
+    force: float, frame: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Where a pass multiplies a tilt by -100 (force 1e-4 to 1e-3), rounding must not be one. No false alarm either."""
+    simulation = cube(force, remodeling__frame=frame)
+    with caplog.at_level(logging.WARNING, logger="remodel_fenicsx"):
+        *_, last = simulation.steps()
+    np.testing.assert_allclose(angles(simulation), closed_form_angle(KAPPA, np.array(END)), rtol=0, atol=1e-8)
+    share = 1 - np.exp(-KAPPA * (END - 1.0))
+    across = (1 - share) / np.sqrt(3)
+    assert last.row["mean_stretch"] == pytest.approx(uniaxial_stretches(force, across + share, across)[0], abs=1e-8)
+    assert "over-corrects" not in caplog.text
+
+
+@pytest.mark.parametrize(("force", "swings"), [(0.01, True), (0.5, False)])
+def test_a_tilt_that_grows_is_warned_of_before_the_angle_is_off(
+    force: float, swings: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    simulation = cube(force, time__end=45.0)
+    warned, off = [], []
+    with caplog.at_level(logging.WARNING, logger="remodel_fenicsx"):
+        for step in simulation.steps([Tilt(simulation, 20.0, 1e-8)]):
+            if "over-corrects" in caplog.text:
+                warned.append(step.time)
+            if abs(np.mean(angles(simulation)) - closed_form_angle(KAPPA, np.array(step.time))) > 0.5:
+                off.append(step.time)
+    assert bool(warned) == bool(off) == swings
+    if swings:
+        assert warned[0] <= off[0] + 1
+        (record,) = caplog.records
+        assert record.levelname == "WARNING" and record.message.startswith(f"time {warned[0]:g}: the remodeling pass")
+        assert 'coupling = "relaxed" with a relaxation_factor below 0.1' in record.message
+
+
+def test_loads_that_swing_themselves_are_no_over_correction(caplog: pytest.LogCaptureFixture) -> None:
+    ramp = [[float(time), 1.0 if time % 2 else 0.3] for time in range(21)]
+    simulation = cube(10.0, time__end=20.0, loads__force__ramp=ramp, remodeling__law="relaxation")
+    with caplog.at_level(logging.WARNING, logger="remodel_fenicsx"):
+        rows = [step.row for step in simulation.steps()]
+    assert np.ptp([row["mean_stretch"] for row in rows[10:]]) > 0.1
+    assert "over-corrects" not in caplog.text
+
+
+# ---------------------------------------------------------------- the measure
+class Scripted:
+    """Sets the cells and the displacement after each pass to A_0 + a smooth course + a swing, instead of a law."""
+
+    def __init__(self, factor: float, size: float):
+        self.simulation = cube(1.0, loads__force__ramp=[[0.0, 1.0]])
+        self.stepper: Stepper = self.simulation.stepper
+        (self.watcher,) = (watcher for watcher in self.simulation.warnings if isinstance(watcher, OverCorrection))
+        self.factor, self.size = factor, size
+
+    def step(self, number: int) -> Step:
+        """The state of a number."""
+        swing = self.size * self.factor**number
+        self.simulation.cells.dimension_values[..., 2] = np.sqrt(0.5 + 0.01 * number + swing)
+        return Step(float(number), number, {"force": 1.0}, self.stepper.coupling.equilibrium.extension(), Work())
+
+
+@pytest.mark.parametrize("factor", [-3.0, -1.1, -0.5, 0.9])
+def test_factor_and_size_of_a_swing_are_found_beside_a_smooth_course(factor: float) -> None:
+    scripted = Scripted(factor, 4e-5)
+    scripted.watcher.started(scripted.step(0))
+    for number in range(1, 7):
+        step = scripted.step(number)
+        scripted.watcher.completed(step)
+        scripted.watcher.committed(step)
+    assert scripted.watcher.swing is not None
+    assert scripted.watcher.swing.cells_factor == pytest.approx(factor, rel=1e-6)
+    # the third difference of f^k is f^(k-3) (f - 1)^3
+    expected = 4e-5 * abs(factor) ** 3 * abs(factor - 1) ** 3 / 8
+    assert scripted.watcher.swing.cells == pytest.approx(expected, rel=1e-6)
+    assert scripted.watcher.said == (factor == -3.0)
+
+
+def test_passes_around_a_rest_do_not_count() -> None:
+    """Cells that go on after a rest jump. The same swing without one is warned of at 6, as above."""
+    scripted = Scripted(-3.0, 4e-5)
+    scripted.watcher.started(scripted.step(0))
+    for number in range(1, 9):
+        step = scripted.step(number)
+        if number == 5:
+            scripted.step(4)  # cells as they were
+        scripted.watcher.completed(step)
+        scripted.watcher.committed(step)
+    assert not scripted.watcher.said
+
+
+def test_a_step_that_is_undone_leaves_no_trace() -> None:
+    """What is remembered is part of the state, which forgets the step."""
+    scripted = Scripted(-3.0, 1e-6)
+    watcher = scripted.watcher
+    watcher.started(scripted.step(0))
+    for number in range(1, 6):
+        with pytest.raises(KeyboardInterrupt), scripted.simulation.state.transaction():
+            watcher.completed(scripted.step(number))
+            raise KeyboardInterrupt
+        step = scripted.step(number)
+        watcher.completed(step)
+        watcher.committed(step)
+    assert watcher.swing is not None and watcher.swing.cells_factor == pytest.approx(-3.0, rel=1e-6)
+
+
+# ---------------------------------------------------------------- rounding
+def test_axes_stay_where_the_tensor_says_so_within_its_error() -> None:
+    rng = np.random.default_rng(1)
+    axes = parts.random_rotations(rng, 20)
+    values = np.sort(rng.uniform(1e-9, 1.0, (20, 3)), axis=1)[:, ::-1]
+    values[:, 1] = values[:, 0] - 1e-9  # so close that an error of 1e-12 turns them by a milliradian
+    exact = np.swapaxes(axes, 1, 2) @ (values[:, :, None] * axes)
+    error = rng.standard_normal((20, 3, 3)) * 1e-13
+    noisy = exact + error + np.swapaxes(error, 1, 2)
+    cleaned = spectral.without_noise(noisy, 3.0 * axes, 1e-11)
+    kept = axes @ cleaned @ np.swapaxes(axes, 1, 2)
+    assert np.abs(kept * (1 - np.eye(3))).max() < 1e-15
+    np.testing.assert_allclose(np.einsum("nii->ni", kept), values, atol=1e-12)
+    np.testing.assert_array_equal(spectral.without_noise(noisy, axes, 1e-14), noisy)  # more than its error
+
+
+# ---------------------------------------------------------------- cells that rest
+class Shut(Watcher):
+    """Lets no cell of some points remodel in some passes, as if there were no tension."""
+
+    def __init__(self, simulation: Simulation, passes: set[int], points: slice):
+        self.simulation, self.passes, self.points = simulation, passes, points
+
+    def solved(self, step: Step) -> None:
+        """What the cells are."""
+        cells = self.simulation.cells
+        self.kept = cells.dimension_values.copy(), cells.axis_values.copy()
+
+    def completed(self, step: Step) -> None:
+        """They are it again."""
+        if step.number in self.passes:
+            cells = self.simulation.cells
+            cells.dimension_values[:, self.points] = self.kept[0][:, self.points]
+            cells.axis_values[:, self.points] = self.kept[1][:, self.points]
+
+
+@pytest.mark.parametrize(
+    ("law", "passes", "points", "said"),
+    [
+        ("explicit", range(5, 12), slice(None), "time 12: cells that had rested"),
+        ("explicit", range(1, 12), slice(None), ""),  # had never moved: a load that comes late
+        ("explicit", range(12, 13), slice(0, 1), ""),  # a little, in a part of the body
+        ("relaxation", range(5, 12), slice(None), ""),  # does not make up for it
+    ],
+)
+def test_cells_that_make_up_for_a_rest_are_warned_of(
+    law: str, passes: range, points: slice, said: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    simulation = cube(10.0, remodeling__law=law, remodeling__kappa=0.1, time__end=14.0)
+    with caplog.at_level(logging.WARNING, logger="remodel_fenicsx"):
+        simulation.warnings.insert(0, Shut(simulation, set(passes), points))
+        list(simulation.steps())
+    assert caplog.text.count("cells that had rested") == bool(said)
+    assert said in caplog.text
+    if said:
+        assert "1e+02 % of the body" in caplog.text
+
+
+def test_a_rest_without_loads_is_no_matter_of_steps(caplog: pytest.LogCaptureFixture) -> None:
+    """Cells rest because the force is off: they would with any step."""
+    ramp = [[0.0, 0.0], [2.0, 1.0], [8.0, 1.0], [9.0, 0.0], [14.0, 0.0], [15.0, 1.0]]
+    simulation = cube(10.0, loads__force__ramp=ramp, remodeling__law="explicit", remodeling__kappa=0.1, time__end=17.0)
+    with caplog.at_level(logging.WARNING, logger="remodel_fenicsx"):
+        list(simulation.steps())
+    assert "had rested" not in caplog.text
