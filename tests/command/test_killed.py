@@ -190,6 +190,7 @@ TUBE = """
 preset = "kuhl-holzapfel-2007"
 geometry = {shape = "tube", inner_radius = 1.0, outer_radius = 3.0, length = 2.0}
 time = {end = 12.0}
+solver = {method = "direct"}  # resumed to the last digit
 output = {every = 4, checkpoint = 2}
 """
 
@@ -219,7 +220,7 @@ ARTERY = """
 preset = "kuhl-holzapfel-2007"
 geometry = {shape = "tube", inner_radius = 1.0, outer_radius = 3.0, length = 8.0}
 time = {end = 30.0}
-solver = {absolute_tolerance = 1e-10, relative_tolerance = 0.0}
+solver = {method = "direct", absolute_tolerance = 1e-10, relative_tolerance = 0.0}
 output = {fields = false, checkpoint = 2}
 """
 
