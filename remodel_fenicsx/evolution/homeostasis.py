@@ -13,7 +13,6 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from remodel_fenicsx.body.loading import LoadValues
 from remodel_fenicsx.evolution.implicit import RESIDUAL, Implicit
@@ -204,6 +203,8 @@ class Homeostasis:
 
         Collective: a neighbour may belong to another rank.
         """
+        from scipy.spatial import cKDTree  # only runs that end in an equilibrium need it
+
         quadrature = self.state.cells.quadrature
         r0 = assembly.point_values(self.equilibrium.tissue.end_to_end_length, quadrature)
         tensors = self.state.cells.structure_tensor() / r0[..., None, None] ** 2

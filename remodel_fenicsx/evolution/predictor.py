@@ -140,12 +140,12 @@ class Responsive:
 
     def __init__(self, state: State):
         self.state, self.quadrature = state, state.cells.quadrature
-        self._increments = Earlier(state, "predictor_increment", state.unknown.copy, ANSWERS)
+        self._increments = Earlier(state, "responsive_increment", state.unknown.copy, ANSWERS)
         components = (len(mandel.MANDEL),)
-        self._changes = Earlier(state, "predictor_change", lambda: self.quadrature.function("", components), ANSWERS)
+        self._changes = Earlier(state, "responsive_change", lambda: self.quadrature.function("", components), ANSWERS)
         rates = {f"rate_{name}": 0.0 for name in state.loading.values}
         durations = {f"duration_{age}": 0.0 for age in range(ANSWERS)}  # the newest first
-        self._numbers = Numbers(state, "predictor", {"time": 0.0} | durations | rates)
+        self._numbers = Numbers(state, "responsive", {"time": 0.0} | durations | rates)
         shares = self.quadrature.owned(self.quadrature.volumes).ravel()
         self._roots = np.repeat(np.sqrt(shares), *components)  # of the points' volumes
         self._asked: Array | None = None  # the change of the step under way
