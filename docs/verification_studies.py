@@ -99,7 +99,7 @@ def comparison_jobs() -> dict[str, list[tuple[Callable[[Any], Row], Any]]]:
 
 
 def invariance(case: tuple[str, str, str]) -> Row:
-    """The bar of tests/model/test_invariance.py twice, once turned: what differs, measured by r0, the side and the energy."""
+    """The bar of tests/model/test_invariance.py twice, once turned: what differs, by r0, the side and the energy."""
     from remodel_fenicsx.model.cells import angle_to_axis
     from tests.model import test_invariance as bars
 

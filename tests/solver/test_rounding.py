@@ -143,7 +143,8 @@ def test_a_refusal_names_a_tolerance_that_works(monkeypatch: pytest.MonkeyPatch)
     assert caught.value.refusal.kind == "solver tolerance"
     named = float(caught.value.refusal.advice.split("solver.relative_tolerance = ")[1].split()[0])
     assert 1e-10 < named <= 1e-6
-    list(Simulation(preset_scene(PAPER, "tube").with_values({**THIN, **DIRECT, "solver.relative_tolerance": named})).steps())
+    changes = THIN | DIRECT | {"solver.relative_tolerance": named}
+    list(Simulation(preset_scene(PAPER, "tube").with_values(changes)).steps())
 
 
 def test_chains_near_their_contour_length_are_solved_to_rounding() -> None:
