@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING
 
 from remodel_fenicsx._lazy import on_demand
 from remodel_fenicsx.body import SHAPES, LoadKind, Shape
-from remodel_fenicsx.body.columns import Column
-from remodel_fenicsx.body.columns import COLUMNS, COLUMNS_ON_REQUEST
+from remodel_fenicsx.body.columns import COLUMNS, COLUMNS_ON_REQUEST, Column
 from remodel_fenicsx.body.reductions import Reduction
 from remodel_fenicsx.body.shape import uniaxial_columns
 from remodel_fenicsx.fem.formulations import FORMULATIONS, Formulation, Selective
@@ -23,9 +22,17 @@ from remodel_fenicsx.fem.solver_methods import METHODS
 from remodel_fenicsx.model.cells import AXES, UnitCell, angle_to_axis
 from remodel_fenicsx.model.chains import CHAINS, Chain
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES, Driver, Frame
-from remodel_fenicsx.model.energy import MATRICES, Matrix, Stresses, neo_hookean
+from remodel_fenicsx.model.energy import (
+    MATRICES,
+    REPULSIONS,
+    Matrix,
+    Repulsion,
+    Stresses,
+    axes_sum,
+    neo_hookean,
+    squared_end_to_end_length,
+)
 from remodel_fenicsx.model.laws import LAWS, Drive, Law, ranked
-from remodel_fenicsx.model.energy import REPULSIONS, Repulsion, axes_sum, squared_end_to_end_length
 from remodel_fenicsx.model.spectral import PAIRINGS, principal
 from remodel_fenicsx.schema.tables import markdown_reference
 from remodel_fenicsx.schema.units import (

@@ -14,14 +14,21 @@ from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.loading import Loading, LoadValues
 from remodel_fenicsx.body.reductions import AUTO, choice, explained
 from remodel_fenicsx.evolution.coupling import Coupling, Maker
-from remodel_fenicsx.evolution.homeostasis import COARSE, ITERATIONS, LONGEST, TOLERANCE, UNLOADING, Homeostasis, Limit
+from remodel_fenicsx.evolution.homeostasis import (
+    COARSE,
+    LIMIT_ITERATIONS,
+    LONGEST,
+    TOLERANCE,
+    UNLOADING,
+    Homeostasis,
+    Limit,
+)
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
 from remodel_fenicsx.evolution.step_control import StepControl
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher, times
 from remodel_fenicsx.evolution.time_error import TimeError
 from remodel_fenicsx.fem.formulations import FORMULATIONS
-from remodel_fenicsx.fem.kinematics import FreeLength
-from remodel_fenicsx.fem.kinematics import KINEMATICS
+from remodel_fenicsx.fem.kinematics import KINEMATICS, FreeLength
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.model.laws import LAWS
@@ -140,7 +147,7 @@ class Simulation:
         way = Stepper(self.state, tissue, settings, solver, self.load_values)
         way.coupling.longest = min(way.coupling.longest, LONGEST)
         control = StepControl(way, tolerance, scene.time.step, stops)
-        until = scene.solver.model_copy(update={"maximum_iterations": ITERATIONS})
+        until = scene.solver.model_copy(update={"maximum_iterations": LIMIT_ITERATIONS})
 
         def make(state: State, tissue: Tissue, remodeling: RemodelingPass, solver: Solver) -> Coupling:
             limit = Limit(state, tissue, remodeling, until) if scene.missing_for_implicit() is None else None

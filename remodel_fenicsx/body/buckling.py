@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 NEAR_LOCKING = 0.9  # r/L that chains of the inner face are thought to reach
-POINTS = 100  # through the wall
+WALL_POINTS = 100  # through the wall
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ def inflated(pressure: float, inner: float, outer: float, stretch: float, longes
     p = int (t^2 - 1/(t z)^2) dr/r,  F = pi int (2 z^2 - 1/(t z)^2 - t^2) r dr,  t = r/R, z the axial stretch. Chains of
     isotropic cells bound t: their mean stretch stays below `longest`.
     """
-    R2 = np.linspace(inner**2, outer**2, POINTS)
+    R2 = np.linspace(inner**2, outer**2, WALL_POINTS)
 
     def of(radius: float) -> tuple[float, float]:
         r2 = radius**2 + (R2 - inner**2) / stretch

@@ -13,8 +13,7 @@ from petsc4py import PETSc
 
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.fem import jit
-from remodel_fenicsx.fem.kinematics import field_degree
-from remodel_fenicsx.fem.kinematics import FullKinematics, Kinematics
+from remodel_fenicsx.fem.kinematics import FullKinematics, Kinematics, field_degree
 
 LoadValues = dict[str, float]
 

@@ -80,7 +80,7 @@ class AnsweringCells:
             self._kernels = tensor_kernels(state.comm)
         self._points: condensed.CondensedPoints
         self._jumps: Flags  # points where the law jumps
-        self._found: condensed.Solution
+        self._found: condensed.LocalSolution
         self._gradient: Array | None = None  # F of what was found
         self._tangent_is_there = False
         self._start: Array
@@ -146,7 +146,7 @@ class AnsweringCells:
         """The cells of the last update."""
         return self._cells_of(self._found)
 
-    def _cells_of(self, found: condensed.Solution) -> UnitCell:
+    def _cells_of(self, found: condensed.LocalSolution) -> UnitCell:
         if self._points.step.law.dimensions is not None:
             return found.cells
         squared, axes = spectral.continued(found.structure, self._points.step.cells.axes)

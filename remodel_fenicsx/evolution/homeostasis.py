@@ -34,7 +34,7 @@ TOLERANCE, UNLOADING = 3.0, 0.5
 There points lose their tension, and their cells stay as exact as the way. The paper's artery takes 25 solves."""
 COARSE = 90.0  # degrees: more than any step's error, where it leaves nothing
 LONGEST = 1.0  # step on the way, times kappa: longer ones leave too few looks at cells that come to rest slowly
-ITERATIONS = 10
+LIMIT_ITERATIONS = 10
 """Of Newton's method in the step to the limit: from near it takes 3 to 7, and one that fails costs more than steps."""
 NEAR, AGAIN, TRIES = 0.05, 0.7, 6
 """Change of A over r0^2 by a pass to the limit from which on the rest is tried in one step, how much nearer the cells
@@ -49,7 +49,7 @@ direction that turn by 58 degrees. The paper's artery has 0.67 at most, tubes wi
 REST = 1e-4
 """Change of A over r0^2 in a time of 1/kappa at which cells rest. The slowest bodies seen forget at a twentieth of
 kappa: what is left is 0.002, a tenth of a degree."""
-PATIENCE = 100.0  # times 1/kappa under held loads after which cells that do not rest are left
+LONGEST_HOLD = 100.0  # times 1/kappa under held loads after which cells that do not rest are left
 
 
 class Limit(Implicit):
@@ -155,9 +155,9 @@ class Homeostasis:
         soon = self.state.time + 1 / self.remodeling.settings.kappa
         if self._largest(self._change_by_a_pass(soon, work.residual)) <= REST:
             return True
-        if waiting > PATIENCE:
+        if waiting > LONGEST_HOLD:
             self._warn("the cells do not come to rest: a pass to the limit changes A by up to %.2g r0^2", rest)
-        return waiting > PATIENCE
+        return waiting > LONGEST_HOLD
 
     def _arrived(self, limit: Limit, time: float, loads: LoadValues, towards: Array, work: Work) -> bool:
         """Make the rest of the way in one step; if it is not solved or leads elsewhere, all is as before."""

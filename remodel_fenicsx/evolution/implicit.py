@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 
 RESIDUAL = "residual of the last step"
 MUCH_MORE = 2.0  # times the share that was said
-HALVINGS = 1  # of a step, before points are held; where there is no solution parts cost, and do not help
+STEP_HALVINGS = 1  # of a step, before points are held; where there is no solution parts cost, and do not help
 MOST_SOLVES = 20  # of all Newton iterations that one may have, for a step with its parts; then it is refused
 
 
@@ -121,7 +121,7 @@ class Implicit:
             return
         answers.holds = False
         try:
-            self._solve_or_part(time, loads, work, answering, min(HALVINGS, most))
+            self._solve_or_part(time, loads, work, answering, min(STEP_HALVINGS, most))
         except StepFailure as failure:
             log.info("some cells are held: %s", failure)
             unknown[:] = before

@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 
 ANSWERS = 5  # increments of which `Responsive` combines the next one
 ORDER, FITTED = 3, 2  # increments that predict the next one; increments to which the weights are fitted
-SAME = 1e-9  # relative difference of two rates of a load, and of two steps in time, that are the same
+SAME_RATE = 1e-9  # relative difference of two rates of a load, and of two steps in time, that are the same
 INDEPENDENT = 1e-12  # of increments: what is less is rounding
 
 
@@ -215,7 +215,7 @@ def _remember(step: LoadStep, known: Numbers, count: int) -> None:
 
 
 def _same(first: float, second: float) -> bool:
-    return abs(first - second) <= SAME * max(abs(first), abs(second))
+    return abs(first - second) <= SAME_RATE * max(abs(first), abs(second))
 
 
 PREDICTORS: dict[str, Callable[[State], Predictor]] = {

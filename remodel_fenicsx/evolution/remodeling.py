@@ -16,9 +16,8 @@ from remodel_fenicsx.kernels.tensor import tensor_kernels, with_kernels
 from remodel_fenicsx.model import spectral
 from remodel_fenicsx.model.cells import UnitCell, structure_tensor
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES, carried_axes
-from remodel_fenicsx.model.energy import Tissue
+from remodel_fenicsx.model.energy import Tissue, axes_sum
 from remodel_fenicsx.model.laws import LAWS, Drive, tensor_target
-from remodel_fenicsx.model.energy import axes_sum
 from remodel_fenicsx.model.tensor_law import ABOVE_ROUNDING, Target
 from remodel_fenicsx.settings import Remodeling
 from remodel_fenicsx.solver.pointwise import PointStresses
@@ -34,7 +33,7 @@ TYPICAL_SHARE = 1e-2  # of the body's stress: the most that the residual counts 
 # Of the body's stress, from which on the residual is said. The artery on one radius, law "tensor": at 0.02 to 0.05
 # radii are within 0.1 %, at 0.4 they are 2 % off
 WORTH_A_WORD = 0.1
-ROUNDINGS = 64.0  # how many times the rounding of a stress its principal values may be off
+STRESS_ROUNDINGS = 64.0  # how many times the rounding of a stress its principal values may be off
 
 AWAKE = 0.5  # of the speed of remodeling under tension alone
 
@@ -133,7 +132,7 @@ class RemodelingPass:
         """
         if not self.driver.is_stress:
             return Noise(spectral.ROUNDING, spectral.ROUNDING)
-        rounding = ROUNDINGS * stress_rounding(self.parameters.largest(), self._max_chain_extension(F))
+        rounding = STRESS_ROUNDINGS * stress_rounding(self.parameters.largest(), self._max_chain_extension(F))
         displacement = float(np.abs(self.state.unknown.x.array).max(initial=0.0))
         displacement = over_ranks(self.state.comm, displacement, MPI.MAX)
         rounded = rounding * (1 + self.quadrature.largest_gradient * displacement)

@@ -15,7 +15,7 @@ from remodel_fenicsx.state.memory import Numbers
 log = logging.getLogger(__name__)
 
 AIM = 0.85  # share of the tolerance that another length aims at
-MOST = 0.97  # where steps as they are would come above it, the next one is shorter
+NEARLY_THE_TOLERANCE = 0.97  # where steps as they are would come above it, the next one is shorter
 WORTHWHILE = 1.5  # ratio from which on steps are lengthened
 GROWTH, SHRINKAGE = 2.0, 0.1  # limits of the ratio of two steps
 LATEST = 0.5  # share of the last step in an error that lags behind; the rest is of those before
@@ -28,8 +28,8 @@ SHORT = 0.3  # of such a time: longer steps may have an error that has saturated
 IN_VAIN = 20  # steps above the tolerance in such a time that shorter ones would not help, until longer ones go on
 AGAIN = 0.5  # share of these that is left when shorter steps are tried again
 NEAR = 4.0  # tolerances: below such an error they are tried at once
-FAILURES = 3  # steps in a row that could not be solved, each a quarter of the one before
-LEAST = 1e-4  # of the tolerance: smaller errors say nothing about the next step
+FAILED_STEPS = 3  # steps in a row that could not be solved, each a quarter of the one before
+TELLING_ERROR = 1e-4  # of the tolerance: smaller errors say nothing about the next step
 
 
 class StepTooLongError(Exception):
@@ -109,7 +109,7 @@ class StepControl:
             except StepFailure as failure:
                 failures += 1
                 duration = (time - self.state.time) / 4
-                if failures > FAILURES or duration < SMALLEST * self.first:
+                if failures > FAILED_STEPS or duration < SMALLEST * self.first:
                     raise
                 log.info("%s; a shorter step is tried", failure)
 
@@ -141,7 +141,7 @@ class StepControl:
         wanted = max(numbers["usual"] if numbers["goes_on"] else wanted, shortest)
         kappa = self.stepper.remodeling.settings.kappa
         numbers["wanted"] = min(wanted, self.stepper.coupling.longest / kappa if kappa else wanted)
-        numbers["before"], numbers["effective"] = max(error, LEAST), self._effective(duration)
+        numbers["before"], numbers["effective"] = max(error, TELLING_ERROR), self._effective(duration)
 
     def _longer_with_the_same(self, error: float, duration: float) -> float:
         """Length of a much longer step that was refused for about the same error, now or before a few accepted ones.
@@ -205,10 +205,10 @@ class StepControl:
         """Length of the next steps: as they are, or another one where it is worth it."""
         numbers, order = self._numbers, self.stepper.coupling.order
         wanted = duration if self._rejected else numbers["wanted"]
-        settled = max(error, LEAST) * (wanted / self._effective(duration)) ** order  # of steps as they are
+        settled = max(error, TELLING_ERROR) * (wanted / self._effective(duration)) ** order  # of steps as they are
         rising = max(0.0, error - numbers["before"]) if numbers["effective"] else 0.0
         ratio = (AIM / settled) ** (1 / order)
-        if settled + rising > MOST:
+        if settled + rising > NEARLY_THE_TOLERANCE:
             return wanted * min(1.0, max(SHRINKAGE, ratio))
         return wanted * min(GROWTH, ratio) if ratio >= WORTHWHILE and not self._rejected else wanted
 

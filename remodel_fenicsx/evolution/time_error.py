@@ -16,7 +16,7 @@ from remodel_fenicsx.state.memory import Earlier, Numbers
 Array = NDArray[np.float64]
 
 SLOWEST = 20.0  # times as slowly as the cells alone body and cells may forget
-MOST = 1.0  # change of a length: a linear answer says no more
+LARGEST_LINEAR_CHANGE = 1.0  # change of a length: a linear answer says no more
 COMPONENTS = (len(mandel.MANDEL),)
 
 
@@ -162,5 +162,5 @@ class TimeError:
         equilibrium, newton = self.stepper.coupling.equilibrium, self.stepper.coupling.newton
         state.unknown.x.array[:] += newton.answer(equilibrium, step.work.tangents)
         after, admissible = state.deformation_gradient(), equilibrium.extension().admissible
-        changes = np.minimum(largest_change_of_length(before, after), MOST).reshape(shape)
+        changes = np.minimum(largest_change_of_length(before, after), LARGEST_LINEAR_CHANGE).reshape(shape)
         return float(np.degrees(self.quadrature.maximum(changes))), admissible

@@ -15,8 +15,8 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from remodel_fenicsx.fem import jit
-from remodel_fenicsx.fem.compat import geometry_dofmap
 from remodel_fenicsx.fem.assembly import of_all_ranks, over_ranks
+from remodel_fenicsx.fem.compat import geometry_dofmap
 
 # the rule that the element wants; UFL's estimate for this energy is huge
 DEGREES = {

@@ -62,7 +62,7 @@ ON_SEVERAL_RANKS: dict[str, dict[str, Any]] = {
 
 # Factors that are kept, by what is known of the tangent, the best first; each but the last may be refused
 DEFINITE, SYMMETRIC, GENERAL = "positive definite", "symmetric", "general"
-FACTORS: dict[str, dict[str, Any]] = {
+FACTOR_OPTIONS: dict[str, dict[str, Any]] = {
     DEFINITE: {
         "pc_type": "cholesky",
         "pc_factor_mat_solver_type": "cholmod",
@@ -109,8 +109,8 @@ def method_options(method: str, ranks: int, small: bool = False) -> dict[str, An
 
 
 def factor_options(kind: str, ranks: int) -> dict[str, Any]:
-    """PETSc options of a preconditioner that factorises, a key of `FACTORS`."""
-    options = {name: value for name, value in FACTORS[kind].items() if name.startswith(("pc_", "mat_"))}
+    """PETSc options of a preconditioner that factorises, a key of `FACTOR_OPTIONS`."""
+    options = {name: value for name, value in FACTOR_OPTIONS[kind].items() if name.startswith(("pc_", "mat_"))}
     return _on_ranks(options, "direct", ranks)
 
 

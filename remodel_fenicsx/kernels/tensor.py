@@ -15,12 +15,11 @@ from remodel_fenicsx.model import logarithm, tensor_law
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.chains import CHAINS
 from remodel_fenicsx.model.drivers import DRIVERS, rotated_back
-from remodel_fenicsx.model.energy import MATRICES, Tissue
+from remodel_fenicsx.model.energy import MATRICES, REPULSIONS, Repulsion, Tissue, whole_structure_tensor
 from remodel_fenicsx.model.implicit import condensed
 from remodel_fenicsx.model.implicit.condensed import CondensedPoints
 from remodel_fenicsx.model.implicit.responses import StepOfCells
 from remodel_fenicsx.model.laws import LAWS, Drive
-from remodel_fenicsx.model.energy import REPULSIONS, Repulsion, whole_structure_tensor
 from remodel_fenicsx.model.tensor_law import Target
 
 Array = NDArray[np.float64]
@@ -31,14 +30,14 @@ PARAMETERS = ("lame_lambda", "lame_mu", "network_modulus", "contour_length", "en
 NUMBERS = {
     **{
         name.upper(): i
-        for names in (condensed.TENSORS, COMPILED_REPULSIONS, PARAMETERS)
+        for names in (condensed.DRIVING_TENSORS, COMPILED_REPULSIONS, PARAMETERS)
         for i, name in enumerate(names)
     },
     "PARAMETERS": len(PARAMETERS),
-    "ITERATIONS": condensed.ITERATIONS,
-    "HALVINGS": condensed.HALVINGS,
+    "ITERATIONS": condensed.LOCAL_ITERATIONS,
+    "HALVINGS": condensed.LOCAL_HALVINGS,
     "TOLERANCE": condensed.TOLERANCE,
-    "CLOSE": logarithm.CLOSE,
+    "CLOSE": logarithm.CLOSE_EIGENVALUES,
     "COMPRESSION": tensor_law.COMPRESSION,
 }
 """What tensor.c takes from Python: the numbers of drivers, repulsions and parameters, and those that tune."""
@@ -54,7 +53,7 @@ class CompiledSolution:
     first_piola_kirchhoff: Array
     squared_lengths: Array
     converged: Flags
-    rest: tuple[NDArray[np.intp], condensed.Solution] | None = None
+    rest: tuple[NDArray[np.intp], condensed.LocalSolution] | None = None
 
 
 class TensorKernels:
@@ -109,7 +108,7 @@ def condensed_points(kernels: TensorKernels | None, tissue: Tissue, step: StepOf
     """Tissue and step of n points: in C, where that knows all of its parts."""
     known = (
         step.law is LAWS["tensor"]
-        and step.driver in (DRIVERS[name] for name in condensed.TENSORS)
+        and step.driver in (DRIVERS[name] for name in condensed.DRIVING_TENSORS)
         and not step.is_spatial
         and tissue.chain is CHAINS["wormlike"]
         and tissue.matrix is MATRICES["neo-hookean"]
@@ -128,7 +127,7 @@ class CompiledPoints(CondensedPoints):
     def _given(self) -> tuple[Any, ...]:
         """Cells at the start, parameters, and what else C takes of tissue and step."""
         step, tissue = self.step, self.tissue
-        driver = next(i for i, name in enumerate(condensed.TENSORS) if step.driver is DRIVERS[name])
+        driver = next(i for i, name in enumerate(condensed.DRIVING_TENSORS) if step.driver is DRIVERS[name])
         repulsion = next(i for i, name in enumerate(COMPILED_REPULSIONS) if tissue.repulsion is REPULSIONS[name])
         parameters = np.stack([getattr(tissue, name) for name in PARAMETERS])
         rate = step.kappa * (step.time_new - step.time_old)

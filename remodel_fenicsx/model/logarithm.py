@@ -20,7 +20,7 @@ from remodel_fenicsx.model.mandel import MANDEL
 
 Array = NDArray[np.float64]
 
-CLOSE = 1e-3
+CLOSE_EIGENVALUES = 1e-3
 """Relative distance of two or three eigenvalues below which a series stands for a quotient of differences: the quotient
 loses eps / CLOSE, the series CLOSE^5."""
 
@@ -28,7 +28,7 @@ loses eps / CLOSE, the series CLOSE^5."""
 def first_divided_difference(a: Array, b: Array) -> Array:
     """f[a, b] = (ln a - ln b)/(a - b) of positive numbers, 1/a where they agree: atanh(x)/x at x = (a - b)/(a + b)."""
     x = (a - b) / (a + b)
-    small = np.abs(x) < CLOSE
+    small = np.abs(x) < CLOSE_EIGENVALUES
     series = 1 + x**2 / 3 + x**4 / 5
     quotient = np.arctanh(np.where(small, 0.5, x)) / np.where(small, 0.5, x)
     return 2 / (a + b) * np.where(small, series, quotient)
@@ -44,7 +44,7 @@ def second_divided_difference(a: Array, b: Array, c: Array) -> Array:
 def _second_of_ordered(least: Array, middle: Array, largest: Array, first: Array, last: Array) -> Array:
     """f[a, b, c] of ascending numbers, from f[a, b] and f[b, c]."""
     gap = largest - least
-    close = gap < CLOSE * largest
+    close = gap < CLOSE_EIGENVALUES * largest
     result: Array = (last - first) / np.where(close, 1.0, gap)
     at = np.nonzero(close)
     if at[0].size:

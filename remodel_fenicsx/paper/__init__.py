@@ -25,12 +25,14 @@ __all__ = ["DEFAULT_FOLDER", "DEFAULT_RUNS", "FIGURES", "FigureError", "draw"]
 DEFAULT_FOLDER, DEFAULT_RUNS = Path("figures"), Path("results/figures-cache")
 
 # of captions
-CHAINS = (
+CHAINS_CAPTION = (
     "Black: the four chains of each element's mean cell, deformed and projected on its face, cut off before its edge."
 )
 PEELED = "the outer layers of elements cut shorter than the inner ones"
 WALL = "coloured by the deformed angle of the chains in the wall"
-PROFILE = "reference fibre angle over the radius at t = 150; lines: means of the element layers, bands: all elements"
+PROFILE_CAPTION = (
+    "reference fibre angle over the radius at t = 150; lines: means of the element layers, bands: all elements"
+)
 RELAXED = (
     "The printed pass over-corrects with {}: here it is relaxed by one half, in the material frame "
     "(docs/theory.md, Stability of the pass)."
@@ -66,46 +68,46 @@ FIGURES: dict[str, FigureSpec] = {
     "fig6": FigureSpec(
         "Cylindrical tendon under uniaxial tension (Fig. 6)",
         "(a) Stretch over time; points: the times of the pictures. (b) to (f) Its elements by their deformed angle "
-        f"between chains and load axis. {CHAINS}",
+        f"between chains and load axis. {CHAINS_CAPTION}",
         ("tendon",),
         structures.draw_tendon,
     ),
     "fig7": FigureSpec(
         "Artery under axial elongation and inner pressure (Fig. 7)",
-        f"(a) to (e) The wall at five times, {WALL}; below, the loads. {CHAINS}",
+        f"(a) to (e) The wall at five times, {WALL}; below, the loads. {CHAINS_CAPTION}",
         ("artery",),
         structures.draw_artery,
     ),
     "fig8": FigureSpec(
         "Chains in the layers of the artery's wall (Fig. 8)",
         f"(a) The innermost, (b) the fourth and (c) the outermost of eight layers of elements at t = 150, {WALL}. "
-        f"{CHAINS}",
+        f"{CHAINS_CAPTION}",
         ("artery",),
         structures.draw_layers,
     ),
     "fig9": FigureSpec(
         "Load cases from pure elongation to pure pressure (Fig. 9)",
         f"(a) to (e) The wall at t = 150 under five pairs of axial elongation and inner pressure p, {PEELED}, {WALL}. "
-        f"{CHAINS}",
+        f"{CHAINS_CAPTION}",
         tuple(load_case_name(*case) for case in LOAD_CASES),
         structures.draw_load_cases,
     ),
     "fig10": FigureSpec(
         "Remodeling driven by the Cauchy or the second Piola-Kirchhoff stress (Fig. 10)",
-        f"(a) {PROFILE.capitalize()}. (b), (c) The wall, {PEELED}. {CHAINS} {RELAXED.format('S')}",
+        f"(a) {PROFILE_CAPTION.capitalize()}. (b), (c) The wall, {PEELED}. {CHAINS_CAPTION} {RELAXED.format('S')}",
         ("artery", "artery-pk2"),
         partial(curves.draw_drivers, other="pk2"),
     ),
     "fig11": FigureSpec(
         "Remodeling driven by the Cauchy stress or the Finger tensor (Fig. 11)",
-        f"(a) {PROFILE.capitalize()}. (b), (c) The wall, {PEELED}. {CHAINS} {RELAXED.format('b')}",
+        f"(a) {PROFILE_CAPTION.capitalize()}. (b), (c) The wall, {PEELED}. {CHAINS_CAPTION} {RELAXED.format('b')}",
         ("artery", "artery-finger"),
         partial(curves.draw_drivers, other="finger"),
     ),
     "rate": FigureSpec(
         "Eqs. (10) and (11) on the same artery (erratum 7)",
         "(a) Mean reference fibre angle of the innermost, middle and outermost elements over time. "
-        f"(b) {PROFILE.capitalize()}.",
+        f"(b) {PROFILE_CAPTION.capitalize()}.",
         ("artery", "artery-rate"),
         curves.draw_rate,
     ),

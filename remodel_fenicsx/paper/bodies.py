@@ -34,7 +34,7 @@ _FACES = np.array([(0, 3, 2, 1), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3
 
 
 @dataclass(frozen=True)
-class Snapshot:
+class DrawnBody:
     """A body of hexahedra at one time.
 
     Attributes
@@ -55,7 +55,7 @@ class Snapshot:
     fields: dict[str, Array]
 
     @classmethod
-    def of(cls, run: Recording, time: float) -> Snapshot:
+    def of(cls, run: Recording, time: float) -> DrawnBody:
         """The solved state of a run at a recorded time.
 
         Raises
@@ -97,7 +97,7 @@ def radii(points: Array, elements: NDArray[np.int64]) -> Array:
     return np.linalg.norm(points[:, :2], axis=1)[elements].mean(axis=1)
 
 
-def layers(snapshot: Snapshot) -> NDArray[np.int64]:
+def layers(snapshot: DrawnBody) -> NDArray[np.int64]:
     """Number of each element's layer in the wall of a tube, from the inside, (elements,)."""
     return rank_of(radii(snapshot.points, snapshot.elements))
 
@@ -122,7 +122,7 @@ def scale_colours() -> Array:
     return np.concatenate([share * coloured(middle) for share in np.linspace(1.0, AMBIENT, 5)])
 
 
-def body(snapshot: Snapshot, shown: Shown = ALL) -> list[Patch]:
+def body(snapshot: DrawnBody, shown: Shown = ALL) -> list[Patch]:
     """The surface of the shown elements in the deformed configuration, and chains where it looks away from the z axis.
 
     Parameters
@@ -141,7 +141,7 @@ def body(snapshot: Snapshot, shown: Shown = ALL) -> list[Patch]:
     return [surface, chains(snapshot, faces[away], elements[away])]
 
 
-def chains(snapshot: Snapshot, faces: NDArray[np.int64], elements: NDArray[np.int64]) -> Patch:
+def chains(snapshot: DrawnBody, faces: NDArray[np.int64], elements: NDArray[np.int64]) -> Patch:
     """The four chains of each element, deformed, projected on one of its faces: narrow ribbons.
 
     They stay in their face and clear of its edge, so that those of neighbours do not read as one line.

@@ -7,16 +7,16 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from remodel_fenicsx.model.chains import CHAINS
-from remodel_fenicsx.paper.bodies import Array, Snapshot, Table, angle_scale, place
-from remodel_fenicsx.paper.runs import KAPPAS, first_cells, made_with
-from remodel_fenicsx.studies.page import COLOURS, Page, panel_letters
+from remodel_fenicsx.paper.bodies import Array, DrawnBody, Table, angle_scale, place
 from remodel_fenicsx.paper.rendering import render
+from remodel_fenicsx.paper.runs import KAPPAS, first_cells, made_with
 from remodel_fenicsx.paper.structures import SOLVED, at, joined, layer_table, peeled, tube_picture, wall_table
 from remodel_fenicsx.results.recording import Recording
+from remodel_fenicsx.studies.page import COLOURS, Page, panel_letters
 
 PERSISTENCE_LENGTHS = (0.1, 0.4, 0.8)  # Remark 1
 ANGLE_LABEL = "reference fibre angle{} (degrees)"
-DRIVERS = {
+DRIVER_LABELS = {
     "cauchy": ("Cauchy stress", r"$\sigma$"),
     "pk2": ("second Piola-Kirchhoff stress", "$S$"),
     "finger": ("Finger tensor", "$b$"),
@@ -80,20 +80,20 @@ def draw_alignment(runs: dict[str, Recording], page: Page) -> None:
 def draw_drivers(runs: dict[str, Recording], page: Page, other: str) -> None:
     """Figs. 10 and 11: angle over radius (left), peeled tubes (right), for the Cauchy stress and another driver."""
     pair = {"cauchy": runs["artery"], other: runs[f"artery-{other}"]}
-    ends = {driver: Snapshot.of(run, run.scene.time.end) for driver, run in pair.items()}
+    ends = {driver: DrawnBody.of(run, run.scene.time.end) for driver, run in pair.items()}
     tallest = max(snapshot.deformed[:, 2].max() for snapshot in ends.values())
     images = render([tube_picture(s, peeled(s), 1.25 * tallest, (390, 560)) for s in ends.values()])
     when = at(ends["cauchy"])
     figure = Figure(figsize=(8.2, 3.5))
     axes = figure.add_axes((0.065, 0.145, 0.40, 0.79))
-    _draw_profiles(axes, {" ".join(DRIVERS[driver]): layer_table(snapshot) for driver, snapshot in ends.items()})
+    _draw_profiles(axes, {" ".join(DRIVER_LABELS[driver]): layer_table(snapshot) for driver, snapshot in ends.items()})
     axes.set(xlabel="reference radius $R$", ylabel=ANGLE_LABEL.format(when))
     axes.legend(loc="upper left", title="driven by", alignment="left")
     panels = [axes]
     for number, (driver, image) in enumerate(zip(ends, images, strict=True)):
         panels.append(figure.add_axes((0.50 + 0.245 * number, 0.215, 0.24, 0.72)))
         place(panels[-1], image)
-        panels[-1].set_title(f"driven by {DRIVERS[driver][1]}")
+        panels[-1].set_title(f"driven by {DRIVER_LABELS[driver][1]}")
     angle_scale(figure, (0.545, 0.15, 0.40, 0.026), f"deformed angle{when}: 0° circumferential, 90° axial")
     panel_letters(*panels)
     page.save_figure(figure, made_with(pair["cauchy"]))
@@ -111,7 +111,7 @@ def _draw_profiles(axes: Axes, tables: dict[str, Table]) -> None:
     axes.set_yticks(range(0, 91, 15))
 
 
-def _save_drivers(pair: dict[str, Recording], ends: dict[str, Snapshot], page: Page) -> None:
+def _save_drivers(pair: dict[str, Recording], ends: dict[str, DrawnBody], page: Page) -> None:
     """Layers, histories and every element that is drawn, of both drivers."""
     made = made_with(pair["cauchy"])
     layers: Table = {}
@@ -136,7 +136,7 @@ def draw_rate(runs: dict[str, Recording], page: Page) -> None:
     pair = {"eq. (11), explicit": runs["artery"], "eq. (10), rate": runs["artery-rate"]}
     figure = Figure(figsize=(7.8, 3.6))
     over_time, over_radius = figure.add_axes((0.065, 0.135, 0.42, 0.79)), figure.add_axes((0.56, 0.135, 0.415, 0.79))
-    ends = {label: Snapshot.of(run, run.scene.time.end) for label, run in pair.items()}
+    ends = {label: DrawnBody.of(run, run.scene.time.end) for label, run in pair.items()}
     tables = {label: layer_table(snapshot) for label, snapshot in ends.items()}
     _draw_rate_histories(over_time, pair)
     _draw_profiles(over_radius, tables)

@@ -11,12 +11,22 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.model.cells import initial_axes, radial_direction
 from remodel_fenicsx.paper.bodies import (
-    ALL, Array, Shown, Snapshot, Table, angle_scale, body, layers, place, radii, rank_of,
+    ALL,
+    Array,
+    DrawnBody,
+    Shown,
+    Table,
+    angle_scale,
+    body,
+    layers,
+    place,
+    radii,
+    rank_of,
 )  # fmt: skip
-from remodel_fenicsx.paper.runs import ELONGATION_COLUMN, LOAD_CASES, load_case_name, made_with
-from remodel_fenicsx.studies.page import COLOURS, Page, panel_letters
 from remodel_fenicsx.paper.rendering import Picture, View, render
+from remodel_fenicsx.paper.runs import ELONGATION_COLUMN, LOAD_CASES, load_case_name, made_with
 from remodel_fenicsx.results.recording import Recording
+from remodel_fenicsx.studies.page import COLOURS, Page, panel_letters
 
 TENDON_TIMES = (1.0, 12.0, 25.0, 50.0, 150.0)
 ARTERY_TIMES = (1.0, 24.0, 50.0, 100.0, 150.0)
@@ -29,7 +39,7 @@ SOLVED = "fields belong to the solved state of their time, before that time's re
 FROM_ABOVE = (0.35, -1.0, 0.42)  # the direction from which tubes are seen
 
 
-def element_table(snapshot: Snapshot, shown: Shown = ALL) -> Table:
+def element_table(snapshot: DrawnBody, shown: Shown = ALL) -> Table:
     """What is drawn of each element: reference centre, angles in degrees, cell dimensions, r/L."""
     x, y, z = snapshot.centres[shown].T
     fields = {name: values[shown] for name, values in snapshot.fields.items()}
@@ -48,12 +58,12 @@ def element_table(snapshot: Snapshot, shown: Shown = ALL) -> Table:
     }
 
 
-def wall_table(snapshot: Snapshot, shown: Shown = ALL) -> Table:
+def wall_table(snapshot: DrawnBody, shown: Shown = ALL) -> Table:
     """`element_table` of a tube, with the radial component of its cells."""
     return element_table(snapshot, shown) | {"l_radial": radial_dimension(snapshot)[shown]}
 
 
-def radial_dimension(snapshot: Snapshot) -> Array:
+def radial_dimension(snapshot: DrawnBody) -> Array:
     """The radial component sqrt(e_r . A e_r) of each element's cell, A = sum l_I^2 n_I n_I^T its mean, (elements,)."""
     radial = radial_direction(snapshot.centres)
     axes = np.stack([snapshot.fields[f"axis_{i + 1}"] for i in range(3)], axis=1)
@@ -66,12 +76,12 @@ def joined(tables: Sequence[Table]) -> Table:
     return {name: np.concatenate([table[name] for table in tables]) for name in tables[0]}
 
 
-def at(snapshot: Snapshot) -> str:
+def at(snapshot: DrawnBody) -> str:
     """The time, to stand in a label."""
     return f" at $t$ = {snapshot.time:g}"
 
 
-def tube_picture(snapshot: Snapshot, shown: Shown, height: float, pixels: tuple[int, int]) -> Picture:
+def tube_picture(snapshot: DrawnBody, shown: Shown, height: float, pixels: tuple[int, int]) -> Picture:
     """A tube seen obliquely from above, its middle in the middle."""
     top = snapshot.deformed[:, 2].max()
     return Picture(View(FROM_ABOVE, (0.0, 0.0, top / 2), height, pixels), body(snapshot, shown))
@@ -83,7 +93,7 @@ def tube_picture(snapshot: Snapshot, shown: Shown, height: float, pixels: tuple[
 def draw_tendon(runs: dict[str, Recording], page: Page) -> None:
     """Fig. 6: stretch over time, and snapshots coloured by the angle to the load axis."""
     run = runs["tendon"]
-    snapshots = [Snapshot.of(run, time) for time in TENDON_TIMES]
+    snapshots = [DrawnBody.of(run, time) for time in TENDON_TIMES]
     longest = max(snapshot.deformed[:, 2].max() for snapshot in snapshots)
     height, pixels = 1.1 * longest, (270, 1000)
     pictures = [
@@ -117,7 +127,7 @@ def draw_tendon(runs: dict[str, Recording], page: Page) -> None:
     page.save_table(snapshot_summary(snapshots), [made_with(run), f"over all elements; {SOLVED}"], "snapshots")
 
 
-def snapshot_summary(snapshots: Sequence[Snapshot]) -> Table:
+def snapshot_summary(snapshots: Sequence[DrawnBody]) -> Table:
     """What the paper says of the tendon's elements, by time: angles, least l_1, stretch of the extreme tenths."""
     rows = []
     for snapshot in snapshots:
@@ -144,7 +154,7 @@ def snapshot_summary(snapshots: Sequence[Snapshot]) -> Table:
 def draw_artery(runs: dict[str, Recording], page: Page) -> None:
     """Fig. 7: five snapshots of the artery."""
     run = runs["artery"]
-    snapshots = [Snapshot.of(run, time) for time in ARTERY_TIMES]
+    snapshots = [DrawnBody.of(run, time) for time in ARTERY_TIMES]
     figure = Figure(figsize=(8.2, 3.5))
     loads = [(run.value(ELONGATION_COLUMN, time), run.value("pressure", time)) for time in ARTERY_TIMES]
     panels = _tubes(figure, snapshots, [ALL] * len(snapshots), loads)
@@ -166,7 +176,7 @@ def draw_artery(runs: dict[str, Recording], page: Page) -> None:
 
 
 def _tubes(
-    figure: Figure, snapshots: Sequence[Snapshot], shown: Sequence[Shown], loads: Sequence[tuple[float, float]]
+    figure: Figure, snapshots: Sequence[DrawnBody], shown: Sequence[Shown], loads: Sequence[tuple[float, float]]
 ) -> list[Axes]:
     """Five tubes beside each other, on one scale, with elongation and pressure below each; returns their panels."""
     height = 1.25 * max(snapshot.deformed[:, 2].max() for snapshot in snapshots)
@@ -183,7 +193,7 @@ def _write_below(axes: Axes, text: str, size: float) -> None:
     axes.text(0.5, -0.015, text, transform=axes.transAxes, ha="center", va="top", fontsize=size, color="0.35")
 
 
-def layer_table(snapshot: Snapshot) -> Table:
+def layer_table(snapshot: DrawnBody) -> Table:
     """Means and extremes over each element layer of a tube's wall, from the inside; angles in degrees.
 
     `shear` is the largest root mean square of a shear component of F in the local directions: nearly 0 in a tube that
@@ -212,7 +222,7 @@ def layer_table(snapshot: Snapshot) -> Table:
     }
 
 
-def local_shear(snapshot: Snapshot) -> Array:
+def local_shear(snapshot: DrawnBody) -> Array:
     """The six off-diagonal components of F in circumferential, axial and radial direction, (elements, 6)."""
     directions = initial_axes("cylindrical", snapshot.centres)
     gradient = snapshot.fields["deformation_gradient"].reshape(-1, 3, 3)
@@ -223,7 +233,7 @@ def local_shear(snapshot: Snapshot) -> Array:
 def draw_layers(runs: dict[str, Recording], page: Page) -> None:
     """Fig. 8: the end of Fig. 7, three layers of its wall apart."""
     run = runs["artery"]
-    snapshot = Snapshot.of(run, run.scene.time.end)
+    snapshot = DrawnBody.of(run, run.scene.time.end)
     number, table = layers(snapshot), layer_table(snapshot)
     tallest = snapshot.deformed[:, 2].max()
     images = render([tube_picture(snapshot, number == k, 1.27 * tallest, (440, 600)) for k in WALL_LAYERS.values()])
@@ -244,7 +254,7 @@ def draw_layers(runs: dict[str, Recording], page: Page) -> None:
     page.save_table(wall_table(snapshot, drawn), [made_with(run), "the elements that are drawn"], "elements")
 
 
-def peeled(snapshot: Snapshot) -> NDArray[np.bool_]:
+def peeled(snapshot: DrawnBody) -> NDArray[np.bool_]:
     """The elements that stay when each layer of the wall but the innermost is cut shorter than the one inside it."""
     row = rank_of(snapshot.centres[:, 2])
     return row < row.max() + 1 - layers(snapshot)
@@ -253,7 +263,7 @@ def peeled(snapshot: Snapshot) -> NDArray[np.bool_]:
 def draw_load_cases(runs: dict[str, Recording], page: Page) -> None:
     """Fig. 9: the ends of five load cases, the layers virtually peeled off."""
     cases = [runs[load_case_name(*case)] for case in LOAD_CASES]
-    snapshots = [Snapshot.of(run, run.scene.time.end) for run in cases]
+    snapshots = [DrawnBody.of(run, run.scene.time.end) for run in cases]
     figure = Figure(figsize=(8.2, 3.4))
     panels = _tubes(figure, snapshots, [peeled(s) for s in snapshots], LOAD_CASES)
     angle_scale(figure, (0.25, 0.125, 0.5, 0.026), IN_WALL.format(at(snapshots[0])))

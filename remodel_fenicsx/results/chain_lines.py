@@ -10,8 +10,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from remodel_fenicsx.results.vtkhdf import LINE, TransientGrid
 
-AXES = ("axis_1", "axis_2", "axis_3")
-OF_CHAINS = ("cell_dimensions", *AXES, "deformation_gradient", "fibre_angle")  # fields that the lines are made of
+AXIS_FIELDS = ("axis_1", "axis_2", "axis_3")
+OF_CHAINS = (
+    "cell_dimensions",
+    *AXIS_FIELDS,
+    "deformation_gradient",
+    "fibre_angle",
+)  # fields that the lines are made of
 
 
 def chain_lines(
@@ -71,7 +76,7 @@ def append_chains(
 
     With the displacement (m, 3) at the centres of the elements (m, 3), and their fields `OF_CHAINS`.
     """
-    axes = np.stack([fields[name] for name in AXES], axis=1)
+    axes = np.stack([fields[name] for name in AXIS_FIELDS], axis=1)
     points, lines = chain_lines(centres, fields["cell_dimensions"], axes, scale)
     moved = chain_displacement(points, centres, displacement, fields["deformation_gradient"].reshape(-1, 3, 3))
     if isinstance(grid, Path):

@@ -13,8 +13,7 @@ import ufl
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from remodel_fenicsx.body.columns import Column
-from remodel_fenicsx.body.columns import columns_of
+from remodel_fenicsx.body.columns import Column, columns_of
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.shape import Shape
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher

@@ -14,11 +14,11 @@ from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.shape import Shape
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
 from remodel_fenicsx.fem import compat, jit
-from remodel_fenicsx.results.chain_lines import AXES, OF_CHAINS, append_chains
-from remodel_fenicsx.results.recording import CHAINS, FIELDS
+from remodel_fenicsx.results.chain_lines import AXIS_FIELDS, OF_CHAINS, append_chains
+from remodel_fenicsx.results.recording import CHAIN_LINES, FIELDS
 from remodel_fenicsx.results.vtkhdf import TransientGrid, vtk_cells
-from remodel_fenicsx.settings import FIELDS_BY_NAME
 from remodel_fenicsx.schema.times import SAME_TIME, same_time
+from remodel_fenicsx.settings import FIELDS_BY_NAME
 from remodel_fenicsx.solver.pointwise import PointStresses
 from remodel_fenicsx.state.state import State
 
@@ -83,9 +83,9 @@ class ElementFields:
             found["deformation_gradient"] = mean(values[..., :9])
         if self._stresses is not None:
             found["cauchy_stress"] = mean(values[..., 9:18])
-        if wanted & {"cell_dimensions", *AXES}:
+        if wanted & {"cell_dimensions", *AXIS_FIELDS}:
             found["cell_dimensions"], mean_axes = self.mean_cells()
-            found |= {name: mean_axes[:, i] for i, name in enumerate(AXES)}
+            found |= {name: mean_axes[:, i] for i, name in enumerate(AXIS_FIELDS)}
         if "fibre_angle" in wanted:
             found["fibre_angle"] = mean_of_known(fibre_angle(dimensions, axes, self.quadrature.coordinates))
         if "fibre_angle_deformed" in wanted:
@@ -165,7 +165,7 @@ class Fields(Watcher):
             cell_type, cells = vtk_cells(domain.mesh.topology.cell_name(), geometry.degree, elements)
             self._grid = _continued(folder / FIELDS, after)
             self._grid = self._grid or TransientGrid(folder / FIELDS, points, cells, cell_type)
-            self._chains = _continued(folder / CHAINS, after) if "chains" in self.names else None
+            self._chains = _continued(folder / CHAIN_LINES, after) if "chains" in self.names else None
             self._centres = points[elements].mean(axis=1)
             self._elements = elements
             # a chain reaches half of the smallest mean distance between elements, so that pictures stay readable
@@ -199,7 +199,9 @@ class Fields(Watcher):
         at_nodes = {"displacement": displacement} if "displacement" in self.names else {}
         self._grid.append(time, at_nodes, {name: fields[name] for name in fields if name in self.names})
         if "chains" in self.names:
-            grid, middle = self._chains or self._grid.path.with_name(CHAINS), displacement[self._elements].mean(axis=1)
+            grid, middle = self._chains or self._grid.path.with_name(CHAIN_LINES), displacement[self._elements].mean(
+                axis=1
+            )
             self._chains = append_chains(grid, time, self._centres, self._scale, middle, fields)
 
     def close(self) -> None:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-HISTORY, FIELDS, CHAINS, SCENE = "history.csv", "fields.vtkhdf", "fields_chains.vtkhdf", "scene.toml"
+HISTORY, FIELDS, CHAIN_LINES, SCENE = "history.csv", "fields.vtkhdf", "fields_chains.vtkhdf", "scene.toml"
 LOG, STUDY = "run.log", "study.json"  # of a run; which runs a study has
 LARGEST_HISTORY = 10**9  # bytes: the million steps that a scene may have, of a thousand characters each
 

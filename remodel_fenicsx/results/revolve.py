@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.body.reductions import Turn
 from remodel_fenicsx.fem.kinematics import KINEMATICS
-from remodel_fenicsx.results.chain_lines import AXES, OF_CHAINS, append_chains
+from remodel_fenicsx.results.chain_lines import AXIS_FIELDS, OF_CHAINS, append_chains
 from remodel_fenicsx.results.recording import Recording, RecordingError
 from remodel_fenicsx.results.vtkhdf import TransientGrid, vtk_cells
 
 Array = NDArray[np.float64]
 
 BODY, BODY_CHAINS = "fields_body.vtkhdf", "fields_body_chains.vtkhdf"
-TENSORS = ("deformation_gradient", "cauchy_stress")
+TENSOR_FIELDS = ("deformation_gradient", "cauchy_stress")
 AT_ONCE = 1_000_000  # distances that are compared at a time
 
 
@@ -94,9 +94,9 @@ class _Image:
     def __call__(self, fields: dict[str, Array]) -> tuple[Array | None, dict[str, Array]]:
         """Displacement of the body's nodes, where it was recorded, and fields of its elements."""
         found = {name: values[self.sources] for name, values in fields.items() if name != "displacement"}
-        for name in set(found) & set(AXES):
+        for name in set(found) & set(AXIS_FIELDS):
             found[name] = np.einsum("nij,nj->ni", self.element_turns, found[name])
-        for name in set(found) & set(TENSORS):
+        for name in set(found) & set(TENSOR_FIELDS):
             tensors = found[name].reshape(-1, 3, 3)
             turned = self.element_turns @ tensors @ np.swapaxes(self.element_turns, 1, 2)
             found[name] = turned.reshape(-1, 9)

@@ -13,7 +13,7 @@ from mpi4py import MPI
 
 from remodel_fenicsx.evolution.stepper import Step, Watcher
 from remodel_fenicsx.results.history import History, LastStep, size_of_rows
-from remodel_fenicsx.results.recording import CHAINS, FIELDS, HISTORY, LOG, SCENE
+from remodel_fenicsx.results.recording import CHAIN_LINES, FIELDS, HISTORY, LOG, SCENE
 from remodel_fenicsx.results.run_lock import FolderTaken, RunLock, is_vacant
 from remodel_fenicsx.results.vtkhdf import check_file
 from remodel_fenicsx.system.regular_files import open_own, write_whole
@@ -144,7 +144,7 @@ def check_before_resuming(folder: Path, after: LastStep | None, fields: bool) ->
     if after is None:
         return
     size_of_rows(folder / HISTORY, after)
-    for name in (FIELDS, CHAINS) if fields else ():
+    for name in (FIELDS, CHAIN_LINES) if fields else ():
         if (folder / name).exists():
             check_file(folder / name)
 
@@ -157,7 +157,7 @@ def forget_steps(folder: Path) -> None:
     OSError
         If that cannot be done.
     """
-    for name in (HISTORY, FIELDS, CHAINS):
+    for name in (HISTORY, FIELDS, CHAIN_LINES):
         (folder / name).unlink(missing_ok=True)
 
 

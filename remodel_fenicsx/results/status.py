@@ -26,7 +26,7 @@ from remodel_fenicsx.results.recording import (
 )
 from remodel_fenicsx.results.run_lock import writer
 from remodel_fenicsx.schema.times import same_time
-from remodel_fenicsx.system.arguments import MOST
+from remodel_fenicsx.system.arguments import MOST_RUNS
 from remodel_fenicsx.system.regular_files import ForeignFileError, read_regular
 from remodel_fenicsx.system.terminal import duration
 
@@ -108,8 +108,8 @@ def _of_study(folder: Path) -> list[str]:
         name, scene, runs = study["study"], study["scene"], study["runs"]
         if not all(isinstance(text, str) and _NAME.fullmatch(text) for text in (name, scene, *runs)):
             raise ValueError("names are not those of files")
-        if len(runs) > MOST:
-            raise ValueError(f"more than {MOST} runs")
+        if len(runs) > MOST_RUNS:
+            raise ValueError(f"more than {MOST_RUNS} runs")
     except (ValueError, KeyError, TypeError, RecursionError, ForeignFileError) as error:
         raise RecordingError(f"{folder / STUDY}: is damaged: {error}") from error
     states = {run: _state(folder / run) for run in runs}

@@ -47,7 +47,9 @@ from remodel_fenicsx.settings import (
 FORMAT = 2  # of recorded scenes: raised where a reader of the one before would not understand them
 RENAMED = {"mesh.cell": "mesh.element", "loads.stretch": "loads.elongation", "solver.profile": "solver.method"}
 """Dotted key of an earlier format -> the key that has taken its place, for the error."""
-LIMIT = 1000.0  # times 1/kappa after which nothing is left of a start, of cells under a hundredth of a tension too
+FORGOTTEN_AFTER = (
+    1000.0  # times 1/kappa after which nothing is left of a start, of cells under a hundredth of a tension too
+)
 LARGEST_MESH = 10_000_000  # hexahedra; Gmsh, which is serial, needs about 10 GB for them
 
 
@@ -200,7 +202,7 @@ class Scene(Table):
         if not self.time.is_equilibrium:
             return float(self.time.end)
         ramps = [load.ramp[-1][0] for load in self.loads.values()]
-        return max(ramps, default=0.0) + LIMIT / self.remodeling.kappa
+        return max(ramps, default=0.0) + FORGOTTEN_AFTER / self.remodeling.kappa
 
     def _check_load(self, name: str, load: Load) -> None:
         step, key = self.time.step, f"loads.{name}"

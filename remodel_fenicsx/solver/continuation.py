@@ -18,13 +18,15 @@ from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.settings import Solver
 from remodel_fenicsx.solver.equilibrium import Equilibrium, Extension
-from remodel_fenicsx.solver.newton import NOTICEABLE, Counted, GuardedNewton, Solution, SolveFailure
+from remodel_fenicsx.solver.newton import POSSIBLE_JUMP, Counted, GuardedNewton, Solution, SolveFailure
 from remodel_fenicsx.solver.refusals import BIFURCATION, LIMIT_POINT, SEVERAL_SOLUTIONS, Refusal, diagnosed
 from remodel_fenicsx.state.memory import Numbers
 from remodel_fenicsx.state.state import State
 
 SLOPE_SHARE = 1e-3  # of the bounded part: over it the slope of the residual is taken
-SAME = 1e-4  # of the way to them: by what two solutions may differ that are one; of other branches it is a good part
+SAME_SOLUTION = (
+    1e-4  # of the way to them: by what two solutions may differ that are one; of other branches it is a good part
+)
 FASTER = 4.0  # than the part before: a way that comes to a limit point is up to 3 times as fast in its last equal part
 WAYS_END = (LIMIT_POINT.kind, BIFURCATION.kind)  # refusals for which no smaller step helps
 PROOF = 8  # halvings without which a jump is not told from a step that is only too large
@@ -203,7 +205,7 @@ class Change:
     def look_back(self, before: NDArray[np.float64], work: Work) -> bool:
         """After a step: look into one that has ended far from its tangent or from the step before; whether it did."""
         unknown, last = self.newton.unknown.x.array, self._jumps["moved"]
-        moved, least = self._size(unknown - before), NOTICEABLE * self.newton.equilibrium.state.loading.domain.size
+        moved, least = self._size(unknown - before), POSSIBLE_JUMP * self.newton.equilibrium.state.loading.domain.size
         is_far = work.is_far or (last > 0.0 and moved > max(least, FASTER * last))
         looked = is_far and self._looks()
         if looked:
@@ -230,7 +232,7 @@ class Change:
         else:
             leads_on = self.refusal is None
         work.count(parts)
-        if leads_on and self._size(unknown - found) > SAME * self._size(found - before):
+        if leads_on and self._size(unknown - found) > SAME_SOLUTION * self._size(found - before):
             log.info("time %g: several solutions; taken is the one to which parts of the step lead", self.time)
             work.residual, work.extension, work.substeps = parts.residual, parts.extension, parts.substeps
             return

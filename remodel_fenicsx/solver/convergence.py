@@ -6,7 +6,7 @@ from remodel_fenicsx.settings import Solver
 from remodel_fenicsx.solver.equilibrium import Equilibrium
 from remodel_fenicsx.state.parameters import stress_rounding
 
-ROUNDINGS = 8.0  # how many times the rounding of assembled forces a residual may be
+FORCE_ROUNDINGS = 8.0  # how many times the rounding of assembled forces a residual may be
 ROUNDED_STRAINS = 2.0  # the same of the rounding of displacements; on thin walls 0.07 to 0.96 were measured
 PRESCRIBED_TOLERANCE = (
     1e-10  # of the body's size: how far a prescribed displacement may be missed; no force measures it
@@ -84,5 +84,5 @@ class Convergence:
         Stresses are rounded, and so are displacements: over a thin element that is a strain of eps |u|/h.
         """
         relative = self.settings.relative_tolerance * self.force_scale
-        area = ROUNDINGS * self._area + rounded_strains * self.displacement * self._area_of_gradients
+        area = FORCE_ROUNDINGS * self._area + rounded_strains * self.displacement * self._area_of_gradients
         return self.settings.absolute_tolerance + max(relative, self._stress_rounding * area)

@@ -15,14 +15,17 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from remodel_fenicsx.fem import jit
-from remodel_fenicsx.fem.assembly import of_all_ranks, over_ranks
-from remodel_fenicsx.fem.assembly import Remembered
-from remodel_fenicsx.fem.assembly import second_derivative
-from remodel_fenicsx.fem.assembly import assemble_matrix, create_matrix
+from remodel_fenicsx.fem.assembly import (
+    Remembered,
+    assemble_matrix,
+    create_matrix,
+    of_all_ranks,
+    over_ranks,
+    second_derivative,
+)
 from remodel_fenicsx.model.cells import UnitCell
-from remodel_fenicsx.model.energy import Tissue
+from remodel_fenicsx.model.energy import Tissue, squared_end_to_end_length
 from remodel_fenicsx.model.operators import passes_through_zero
-from remodel_fenicsx.model.energy import squared_end_to_end_length
 from remodel_fenicsx.solver.pointwise import Shares, pointwise_repulsion
 from remodel_fenicsx.state.parameters import Parameters, on_mesh
 from remodel_fenicsx.state.state import State

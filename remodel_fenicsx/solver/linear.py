@@ -17,7 +17,7 @@ from remodel_fenicsx.solver.quasi_newton import Secants
 
 log = logging.getLogger(__name__)
 
-SAME = 1e-10  # relative to the largest row: what a symmetric tangent may be unsymmetric by
+UNSYMMETRIC = 1e-10  # relative to the largest row: what a symmetric tangent may be unsymmetric by
 WORTH = 12  # iterations that a new factor must save: it costs about as much as they do
 OVER = 3  # iterations over which the rate of convergence is taken
 SLOW_STEP = 8  # iterations after which the next step starts with a new factor
@@ -45,7 +45,7 @@ class KeptFactor:
 
     def renew(self, matrix: Any) -> None:
         """Factorise a tangent. Where that fails there are no factors at all, and a log line."""
-        symmetric = self.comm.size == 1 and matrix.isSymmetric(SAME * matrix.norm(PETSc.NormType.NORM_INFINITY))
+        symmetric = self.comm.size == 1 and matrix.isSymmetric(UNSYMMETRIC * matrix.norm(PETSc.NormType.NORM_INFINITY))
         for kind in (DEFINITE, SYMMETRIC, GENERAL) if symmetric else (GENERAL,):
             if self._factorised(kind, matrix):
                 return

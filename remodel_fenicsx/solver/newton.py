@@ -25,7 +25,7 @@ from remodel_fenicsx.system.interrupts import Interrupted
 log = logging.getLogger(__name__)
 
 LINE_SEARCH_HALVINGS = 20  # of one Newton step, before the solve is given up
-NOTICEABLE = 1e-3  # of the body's size: displacements that may be a jump; 1 % of the radius of a tube of this length
+POSSIBLE_JUMP = 1e-3  # of the body's size: displacements that may be a jump; 1 % of the radius of a tube of this length
 FAR = 2.0
 """`Solution.reach` from which on a way is looked at again in parts. The paper's bodies have at most 1.25, a tube
 without chains that comes near its largest pressure in one step 2.9, a jump over a limit point 3.9 and more."""
@@ -130,7 +130,7 @@ class _Solve:
 
 
 # by PETSc's SNESConvergedReason; numbers, for the names differ between its versions
-FAILURES = {
+SNES_REASONS = {
     -3: "the linear solver failed",
     -4: "forces or parameters are too large or too small for floating-point numbers",
     -6: "the line search found no better state",
@@ -145,7 +145,7 @@ def failure_text(reason: int, iterations: int, extension: Extension) -> str:
         return f"reached r/L = {extension.max_chain_extension:.4f}, J = {extension.min_jacobian:.4g}"
     if reason == MOST_ITERATIONS:
         return f"no equilibrium within {iterations} Newton iterations"
-    return FAILURES.get(reason, f"SNES stopped with reason {reason}")
+    return SNES_REASONS.get(reason, f"SNES stopped with reason {reason}")
 
 
 class GuardedNewton:
@@ -285,7 +285,7 @@ class GuardedNewton:
         """`Solution.reach` of a solve that has changed the unknowns so."""
         comm, state = self.equilibrium.comm, self.equilibrium.state
         largest = over_ranks(comm, np.abs(change).max(initial=0.0), MPI.MAX)
-        if not self._present.first_step or largest < NOTICEABLE * state.loading.domain.size:
+        if not self._present.first_step or largest < POSSIBLE_JUMP * state.loading.domain.size:
             return 0.0
         owned = change[: state.number_of_owned_unknowns]
         return float(np.sqrt(over_ranks(comm, owned @ owned, MPI.SUM))) / self._present.first_step

@@ -6,7 +6,7 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Any
 
-MOST = 20  # pairs that are remembered
+REMEMBERED_PAIRS = 20  # pairs that are remembered
 CURVED = 1e-8  # cosine between a step and the change of the residual, below which they say nothing of use
 
 
@@ -87,7 +87,7 @@ class Secants:
         curvature = way.dot(change)
         if curvature > CURVED * way.norm() * change.norm():
             self._pairs.append(_Pair(way, change, image, curvature))
-            if len(self._pairs) > MOST:
+            if len(self._pairs) > REMEMBERED_PAIRS:
                 self._pairs.popleft().destroy()
         else:
             for vector in pair:

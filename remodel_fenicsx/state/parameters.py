@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from remodel_fenicsx.fem import assembly
-from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.fem.assembly import Remembered
+from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.model.energy import Tissue
 
 Array = NDArray[np.float64]

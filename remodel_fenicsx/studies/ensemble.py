@@ -16,7 +16,7 @@ from remodel_fenicsx.body.columns import columns_of
 from remodel_fenicsx.scene.scene import Scene, SceneError
 from remodel_fenicsx.schema.times import same_time
 from remodel_fenicsx.studies.page import COLOURS, STYLE, Page
-from remodel_fenicsx.studies.runs import LEAST, Run, TooFewRuns, run_all, write_study
+from remodel_fenicsx.studies.runs import FEWEST_RUNS, Run, TooFewRuns, run_all, write_study
 from remodel_fenicsx.system.children import cores
 from remodel_fenicsx.system.environment import versions
 
@@ -156,7 +156,7 @@ def gathered(members: list[Run], failed: dict[str, str]) -> Ensemble:
     """
     histories = {member.name: member.history() for member in members if member.name not in failed}
     isotropic = dict(histories.pop(ISOTROPIC, {}))
-    if len(histories) < LEAST:
+    if len(histories) < FEWEST_RUNS:
         raise TooFewRuns(f"{len(histories)} of {len(members) - 1} seeds reached the end", failed)
     first = next(iter(histories.values()))
     columns = {

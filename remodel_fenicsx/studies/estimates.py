@@ -17,7 +17,7 @@ from remodel_fenicsx.studies.ladder import KINEMATIC, Setting, is_reduced
 
 Array = NDArray[np.float64]
 
-CLOSE = 0.5  # of an error: what is left unknown may be so much of it
+UNKNOWN_SHARE = 0.5  # of an error: what is left unknown may be so much of it
 NO_ERROR = 1e-6  # degrees: what solves leave is less, what elements and steps leave more
 SPREAD = 2.0  # noise of the mean over the seeds that an error must be above
 RATIOS = (1.35, 40.0)  # of differences of one halving and the next that are those of an order
@@ -26,7 +26,7 @@ ALIGNED = 0.5  # cosine of the angle between two differences, as vectors, that s
 
 # ---------------------------------------------------------------- an order, and what is left with it
 @dataclass(frozen=True)
-class Limit:
+class SweepLimit:
     """What a sweep of one factor tends to.
 
     Attributes
@@ -49,7 +49,7 @@ class Limit:
         return bool(np.isfinite(self.order))
 
 
-def limit(results: Sequence[Array]) -> Limit:
+def limit(results: Sequence[Array]) -> SweepLimit:
     """The limit of results of settings that are each half of the one before, the finest last.
 
     Differences d of results Q fall by a ratio q = 2^p from halving to halving; what is left is d / (q - 1). An order
@@ -57,16 +57,16 @@ def limit(results: Sequence[Array]) -> Limit:
     """
     if len(results) < 3:
         last = results[-1] - results[-2] if len(results) == 2 else np.full_like(results[-1], np.nan)
-        return Limit(np.zeros_like(results[-1]), np.nan, last)
+        return SweepLimit(np.zeros_like(results[-1]), np.nan, last)
     before, last = results[-2] - results[-3], results[-1] - results[-2]
     size_before, size = typical(before), typical(last)
     if size == 0:
-        return Limit(np.zeros_like(last), np.inf, last)
+        return SweepLimit(np.zeros_like(last), np.inf, last)
     ratio = size_before / size
     cosine = float(np.nansum(before * last) / max(np.nansum(before**2) ** 0.5 * np.nansum(last**2) ** 0.5, 1e-300))
     if not RATIOS[0] < ratio < RATIOS[1] or cosine < ALIGNED:
-        return Limit(np.zeros_like(last), np.nan, last)
-    return Limit(np.asarray(last / (ratio - 1), dtype=np.float64), float(np.log2(ratio)), last)
+        return SweepLimit(np.zeros_like(last), np.nan, last)
+    return SweepLimit(np.asarray(last / (ratio - 1), dtype=np.float64), float(np.log2(ratio)), last)
 
 
 def typical(values: Array) -> float:
@@ -243,7 +243,7 @@ def _row(result: Result, guess: _Guess) -> Row:
         error = float(np.hypot(error, unknown))
     length = float(np.nanmax(np.abs(result.lengths / guess.lengths - 1)))
     doubt = ""
-    if unknown > CLOSE * error:
+    if unknown > UNKNOWN_SHARE * error:
         doubt = "no order seen" if np.isfinite(unknown) else "a factor was not varied"
     if SPREAD * result.noise > error:
         doubt = f"cells' noise {result.noise:.2g}"
@@ -323,7 +323,7 @@ def _same_level(result: Result, finest: Result, factor: str) -> bool:
     return result.setting.mesh[1:] == finest.setting.mesh[1:]
 
 
-def _words(factor: str, words: str, found: Limit) -> str:
+def _words(factor: str, words: str, found: SweepLimit) -> str:
     if typical(found.last) < NO_ERROR:
         return f"{factor}: no error ({words}): the last two differ by {typical(found.last):.2g} degrees"
     if found.trusted:

@@ -20,7 +20,7 @@ SECONDS_PER_POINT = 3e-5  # of a step: a first guess, corrected by the runs
 COST_OF_EXACT = 20.0  # of a step with the coupling that has no error in time, in others, as measured on the artery
 DEGREES_PER_RUN = 60.0  # what angles turn by: steps of a tolerance are about so many tolerances
 STEPS = (8.0, 5.0, 4.0, 2.5, 2.0)  # longer ones than the scene's, in its own
-HALVINGS = 3  # of the scene's own step
+FINER_STEPS = 3  # of the scene's own step
 TOLERANCES = (2.0, 1.0, 0.5, 0.25)  # degrees
 MESHES = ((1, 1), (2, 1), (4, 1), (8, 1), (1, 2), (2, 2), (4, 2))  # refinement, degree
 TOGETHER = ((2, 1, 0.5), (2, 2, 0.5), (2, 2, 0.25), (4, 2, 0.25))  # both finer: refinement, degree, step in the scene's
@@ -132,7 +132,7 @@ def ladder(scene: Scene) -> list[Setting]:
         values = profile.values | {"model.kinematics": base.model.kinematics}
         exact = base.with_values(values).has_exact_coupling and profile.takes_exact_coupling
         add(BOTH, several, values | ({COUPLING: EXACT} if exact else {}), name)
-    for factor in [*STEPS, *(0.5**k for k in range(1, HALVINGS + 1))]:
+    for factor in [*STEPS, *(0.5**k for k in range(1, FINER_STEPS + 1))]:
         add(TIME, (seed,), {"time.step": factor * step})
     for refinement, degree in MESHES:
         add(MESH, several, meshes(refinement, degree))

@@ -36,11 +36,11 @@ from remodel_fenicsx.system.regular_files import check_no_link, make_own_folder,
 from remodel_fenicsx.system.terminal import Line
 
 POLL = 0.1  # seconds
-LEAST = 2  # runs, or settings, without which nothing is compared
+FEWEST_RUNS = 2  # runs, or settings, without which nothing is compared
 
 
 class TooFewRuns(Exception):  # noqa: N818 - what is recorded is whole, and the same call goes on
-    """Fewer than `LEAST` have reached the end, so that there is no answer yet.
+    """Fewer than `FEWEST_RUNS` have reached the end, so that there is no answer yet.
 
     Attributes
     ----------
@@ -49,7 +49,7 @@ class TooFewRuns(Exception):  # noqa: N818 - what is recorded is whole, and the 
     """
 
     def __init__(self, reached: str, failed: Mapping[str, str], advice: str = "the same command goes on"):
-        super().__init__(f"{reached}, at least {LEAST} are needed; all that is recorded is kept, {advice}")
+        super().__init__(f"{reached}, at least {FEWEST_RUNS} are needed; all that is recorded is kept, {advice}")
         self.failed = dict(failed)
 
 

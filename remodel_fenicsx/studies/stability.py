@@ -15,18 +15,18 @@ from mpi4py import MPI
 
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.model.laws import LAWS
-from remodel_fenicsx.studies.page import COLOURS, STYLE, Page
 from remodel_fenicsx.results.run_folder import RunFolder, chosen_folder
 from remodel_fenicsx.scene import Scene, SceneError
 from remodel_fenicsx.simulation import Simulation
+from remodel_fenicsx.studies.page import COLOURS, STYLE, Page
 from remodel_fenicsx.system.environment import versions
 from remodel_fenicsx.system.interrupts import PAUSE, StopRequest, end_all_ranks_on_exception
 from remodel_fenicsx.system.terminal import Progress, hold_log, open_log
-from remodel_fenicsx.watch.amplification import SHARE_NAMES, AmplificationWatcher, Mode
+from remodel_fenicsx.watch.amplification import SHARE_NAMES, AmplificationWatcher, PassMode
 
 log = logging.getLogger(__name__)
 
-NAME = "stability"
+STABILITY = "stability"
 GROWS = 1.001  # factor: changes that no pass touches, where tension is missing, keep their size to what was iterated
 LONG_SCALE = -12.0  # lowest factor that is drawn on a linear scale
 Table = dict[str, list[float]]
@@ -74,7 +74,7 @@ def stability(
     with hold_log(comm.rank, quiet=quiet) as held:
         simulation = Simulation(scene, comm)
     scene = simulation.scene  # with the kinematics that was chosen
-    place = chosen_folder(folder, f"{scene.name}-{NAME}", comm)
+    place = chosen_folder(folder, f"{scene.name}-{STABILITY}", comm)
     steps, share = scene.time.number_of_steps, simulation.stepper.coupling.share
     chosen = {round(steps * (index + 1) / number) for index in range(number)}
     analysis = AmplificationWatcher(simulation.stepper, lambda step: step.number in chosen)
@@ -93,7 +93,7 @@ def stability(
         )
         if unseen := unseen_by(scene):
             _say(comm, "%s", unseen)
-        progress = stack.enter_context(Progress(steps, f"{scene.name} {NAME}", -1 if quiet else comm.rank))
+        progress = stack.enter_context(Progress(steps, f"{scene.name} {STABILITY}", -1 if quiet else comm.rank))
         try:
             for step in simulation.steps([analysis, record]):
                 progress.step(step.number, step.time, "", step.work.newton_iterations, None)
@@ -140,7 +140,7 @@ def as_table(analysis: AmplificationWatcher, share: float) -> Table:
     return table
 
 
-def _factor(mode: Mode | None) -> float:
+def _factor(mode: PassMode | None) -> float:
     return np.nan if mode is None else mode.factor
 
 
@@ -183,7 +183,7 @@ def draw(table: Table, folder: Path, scene: Scene, share: float) -> None:
     remodeling = scene.remodeling
     title = f"{scene.name}: driver {remodeling.driver}, frame {remodeling.frame}, coupling {remodeling.coupling}"
     caption = "Factor by which one pass multiplies the worst small change of the cells; below -1 it swings and grows."
-    page = Page(folder, NAME, title, caption)
+    page = Page(folder, STABILITY, title, caption)
     made_with = ", ".join(f"{name} {version}" for name, version in versions().items() if name != "BLAS")
     page.save_table(table, [title, made_with])
     with rc_context(STYLE):

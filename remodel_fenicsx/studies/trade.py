@@ -18,12 +18,12 @@ from remodel_fenicsx.schema.times import same_time
 from remodel_fenicsx.studies.estimates import Result, Row, Trade, estimated, typical
 from remodel_fenicsx.studies.ladder import Setting, as_run, compared_lengths, compared_times, ladder
 from remodel_fenicsx.studies.page import COLOURS, STYLE, Page
-from remodel_fenicsx.studies.runs import LEAST, Run, TooFewRuns, run_all, write_study
+from remodel_fenicsx.studies.runs import FEWEST_RUNS, Run, TooFewRuns, run_all, write_study
 from remodel_fenicsx.system.children import cores
 from remodel_fenicsx.system.environment import versions
 from remodel_fenicsx.system.regular_files import make_own_folder, write_whole
 
-NAME = "trade"
+TRADE = "trade"
 BUDGET = 600.0  # seconds
 NOTHING = 1e-9  # degrees: the error of what others are compared with
 ROWS = "rows"  # folder of the scenes
@@ -69,7 +69,7 @@ def trade(
     OSError
         If a file cannot be written.
     """
-    place = Path(folder or Path("results") / f"{scene.name}-{NAME}")
+    place = Path(folder or Path("results") / f"{scene.name}-{TRADE}")
     settings = ladder(scene)
     times = compared_times(scene, settings)
     members = {
@@ -82,9 +82,9 @@ def trade(
     runner = _Runner(settings, members, times, budget, say)
     failed = runner.run(jobs or cores(), place, scene.name)
     results = runner.results()
-    if len(results) < LEAST:
+    if len(results) < FEWEST_RUNS:
         reached = f"{len(results)} of {len(settings)} settings reached the end within the budget of {budget:g} s"
-        raise TooFewRuns(reached, failed, runner.advice(LEAST - len(results), jobs or cores(), failed))
+        raise TooFewRuns(reached, failed, runner.advice(FEWEST_RUNS - len(results), jobs or cores(), failed))
     rows, notes = estimated(results)
     done = {row.result.setting.name for row in rows}
     left = [name for name, runs in members.items() if name not in done and not any(run.name in failed for run in runs)]
@@ -116,12 +116,12 @@ class _Runner:
         return run_all(
             every,
             jobs,
-            f"{name} {NAME}",
+            f"{name} {TRADE}",
             quiet=self.say is None,
             deadline=self.deadline,
             fits=self._fits,
             ended=lambda *_: self._finished(),
-            checked=lambda: write_study(place, NAME, name, every),
+            checked=lambda: write_study(place, TRADE, name, every),
         )
 
     def results(self) -> list[Result]:

@@ -21,11 +21,13 @@ def wall_time(text: str) -> float:
     return seconds
 
 
-MOST = 10_000  # of runs of a study, or of times that are analysed: each is a folder or a row that a person looks at
+MOST_RUNS = (
+    10_000  # of runs of a study, or of times that are analysed: each is a folder or a row that a person looks at
+)
 
 
 def positive(text: str) -> int:
-    """A whole number from 1 to `MOST`.
+    """A whole number from 1 to `MOST_RUNS`.
 
     Raises
     ------
@@ -33,6 +35,6 @@ def positive(text: str) -> int:
         If it is none.
     """
     number = int(text)
-    if not 1 <= number <= MOST:
-        raise argparse.ArgumentTypeError(f"{text}: allowed is a whole number from 1 to {MOST}")
+    if not 1 <= number <= MOST_RUNS:
+        raise argparse.ArgumentTypeError(f"{text}: allowed is a whole number from 1 to {MOST_RUNS}")
     return number

@@ -16,7 +16,7 @@ from typing import Any, TextIO
 
 from remodel_fenicsx.system.regular_files import open_own
 
-PATIENCE = 30.0  # seconds
+SECONDS_TO_END = 30.0  # seconds
 SERVE = "serve"  # the command of a worker's process
 
 
@@ -141,7 +141,7 @@ def _last_words(messages: Path) -> str:
 def _wait(process: subprocess.Popen[Any]) -> None:
     """Until it has ended, or is killed for taking too long."""
     try:
-        process.wait(timeout=PATIENCE)
+        process.wait(timeout=SECONDS_TO_END)
     except subprocess.TimeoutExpired:
         process.kill()
         process.wait()

@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 
 STEP = 1e-5  # of the differences, over tr A
 DISTINCT = 1e-3  # difference of two squared lengths over tr A below which a turn in their plane is no change of A
-PAIRS = ((0, 1), (0, 2), (1, 2))
+SHEAR_PLANES = ((0, 1), (0, 2), (1, 2))
 LARGEST_BASIS, RESTARTS = 40, 20  # of the Krylov space
 ENDS = {"reversing": SLEPc.EPS.Which.SMALLEST_REAL, "growing": SLEPc.EPS.Which.LARGEST_REAL}
 SHARE_NAMES = ("turn_12", "turn_13", "turn_23", "lengths")
@@ -38,7 +38,7 @@ class NotFound(RuntimeError):
 
 
 @dataclass(frozen=True)
-class Mode:
+class PassMode:
     """A change of the cells that a pass multiplies by a factor.
 
     Attributes
@@ -138,7 +138,7 @@ class LinearPass:
         squared = dimensions**2
         new = np.sqrt(np.maximum(squared + np.einsum("nii->ni", inside), 0.0))
         turn = np.zeros_like(inside)
-        for i, j in PAIRS:
+        for i, j in SHEAR_PLANES:
             gap = squared[:, i] - squared[:, j]
             distinct = np.abs(gap) > DISTINCT * self.size
             turn[:, i, j] = np.where(distinct, inside[:, i, j] / np.where(distinct, gap, 1.0), 0.0)
@@ -168,7 +168,7 @@ class LinearPass:
         self.state.cells.set(cells.dimensions.reshape(*shape, 3), cells.axes.reshape(*shape, 3, 3))
 
     # ------------------------------------------------------------ its eigenvalues
-    def modes(self, end: str = "reversing", number: int = 1, tolerance: float = 5e-3) -> list[Mode]:
+    def modes(self, end: str = "reversing", number: int = 1, tolerance: float = 5e-3) -> list[PassMode]:
         """The modes with the most negative factors ("reversing") or the largest ("growing"), the extreme one first.
 
         Raises
@@ -202,7 +202,7 @@ class LinearPass:
             thing.destroy()
         return modes
 
-    def _mode(self, factor: float, change: Array) -> Mode:
+    def _mode(self, factor: float, change: Array) -> PassMode:
         comm, volumes = self.equilibrium.comm, self._weights**2
         axes = self.cells.axes[: self.owned]
         inside = axes @ change @ np.swapaxes(axes, 1, 2)
@@ -210,11 +210,11 @@ class LinearPass:
         first, second, whole = (
             float(comm.allreduce(np.sum(volumes * values))) for values in (square, square**2, np.ones(self.owned))
         )
-        parts = [2 * inside[:, i, j] ** 2 for i, j in PAIRS]
+        parts = [2 * inside[:, i, j] ** 2 for i, j in SHEAR_PLANES]
         parts.append(square - np.sum(parts, axis=0))
         shares = [float(comm.allreduce(np.sum(volumes * part))) / first for part in parts]
         place = self.quadrature.place_of_largest(square.reshape(-1, self.quadrature.shape[1]))
-        return Mode(factor, place, first**2 / second / whole, dict(zip(SHARE_NAMES, shares, strict=True)))
+        return PassMode(factor, place, first**2 / second / whole, dict(zip(SHARE_NAMES, shares, strict=True)))
 
     # ------------------------------------------------------------ tensors as vectors
     def tensors(self, vector: Array) -> Array:
@@ -223,14 +223,14 @@ class LinearPass:
         found = np.zeros((len(six), 3, 3))
         for index in range(3):
             found[:, index, index] = six[:, index]
-        for index, (i, j) in enumerate(PAIRS, start=3):
+        for index, (i, j) in enumerate(SHEAR_PLANES, start=3):
             found[:, i, j] = found[:, j, i] = six[:, index] / np.sqrt(2)
         return found
 
     def vector(self, tensors: Array) -> Array:
         """The inverse of `tensors`."""
         diagonal = [tensors[:, i, i] for i in range(3)]
-        others = [np.sqrt(2) * tensors[:, i, j] for i, j in PAIRS]
+        others = [np.sqrt(2) * tensors[:, i, j] for i, j in SHEAR_PLANES]
         six: Array = np.stack(diagonal + others, axis=1) * self._weights[:, None]
         return six.reshape(-1)
 
@@ -251,8 +251,8 @@ class Amplification:
     """The extreme modes of a step's pass; None for one that was not found."""
 
     time: float
-    reversing: Mode | None
-    growing: Mode | None
+    reversing: PassMode | None
+    growing: PassMode | None
 
 
 class AmplificationWatcher(Watcher):
@@ -283,7 +283,7 @@ class AmplificationWatcher(Watcher):
             ends = [self._first_mode(linear, end, step) for end in ENDS]
         self.found.append(Amplification(step.time, *ends))
 
-    def _first_mode(self, linear: LinearPass, end: str, step: Step) -> Mode | None:
+    def _first_mode(self, linear: LinearPass, end: str, step: Step) -> PassMode | None:
         try:
             return linear.modes(end)[0]
         except NotFound as reason:

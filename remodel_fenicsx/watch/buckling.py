@@ -20,7 +20,7 @@ from remodel_fenicsx.watch.once import WarnsOnce
 Array = NDArray[np.float64]
 STRAINS = {1: 1e-5, 2: 1e-3}  # of the differences of W that make stresses and moduli: these are right to about 1e-6
 # The estimate is 0.8 to 1.1 where whole slender tubes lose their stability (docs/theory.md, Buckling)
-LIMIT = 0.9
+WARNED_LOAD = 0.9
 ACROSS, AROUND, ALONG = range(3)
 _SIGNS = {1: np.array([[1.0], [-1.0]]), 2: np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])}
 
@@ -54,7 +54,9 @@ class BucklingWarning(WarnsOnce):
     def in_words(self) -> str:
         """What is too much in the present state; nothing where it is stable."""
         shares = {"thrust along z": self.thrust_share(), "suction": self.suction_share()}
-        said = [f"{name} is about {share:.2g} of what it bears" for name, share in shares.items() if share > LIMIT]
+        said = [
+            f"{name} is about {share:.2g} of what it bears" for name, share in shares.items() if share > WARNED_LOAD
+        ]
         if not said:
             return ""
         return (

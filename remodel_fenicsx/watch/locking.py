@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 
 # The part of its way that a body lacks, from which it is said. docs/locking.md: estimate and error over lambda/mu and
 # radii; the paper's bodies come to 3.6 % (artery with random cells, t = 5)
-LIMIT = 0.05
+WARNED_SHARE = 0.05
 # Of the matrix's energy: with less work it is not the loads that deform the body, but its cells. Elastic tubes have at
 # least 0.93 (up to 0.9 of the pressure that bursts them), the paper's bodies 1.4
 DRIVEN = 0.9
@@ -155,7 +155,7 @@ class LockingWarning(WarnsOnce):
         if self.homogeneous or self.said or not self._occasions.due() or not self._is_news():
             return
         missing = self.missing()
-        if sum(missing) > LIMIT:
+        if sum(missing) > WARNED_SHARE:
             self.say(step, self.in_words(missing))
 
     def _is_news(self) -> bool:

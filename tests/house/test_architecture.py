@@ -261,3 +261,21 @@ def test_what_the_newcomers_table_names_is_there(thing: str) -> None:
         adding = (f"setitem({name}", f"setitem({owner}.{name}", f"setattr({owner}, '{name}'", f"Healing{name}(")
         for test in tests:
             assert any(call in functions[test] for call in adding), f"{test} adds nothing to {registry}"
+
+
+# ---------------------------------------------------------------- one name, one meaning
+def test_no_name_has_two_meanings() -> None:
+    """No two classes of one name, and no constant of one name with two values."""
+    classes: dict[str, set[str]] = {}
+    constants: dict[str, set[str]] = {}
+    for module, path in modules().items():
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.ClassDef):
+                classes.setdefault(node.name, set()).add(module)
+            targets = [node.target] if isinstance(node, ast.AnnAssign) else getattr(node, "targets", [])
+            for target in targets:
+                if isinstance(target, ast.Name) and target.id.isupper() and getattr(node, "value", None) is not None:
+                    constants.setdefault(target.id, set()).add(ast.unparse(node.value))
+    assert len(classes) > 100 and len(constants) > 100
+    assert not {name: places for name, places in classes.items() if len(places) > 1}
+    assert not {name: values for name, values in constants.items() if len(values) > 1}

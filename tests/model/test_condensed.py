@@ -15,7 +15,7 @@ from remodel_fenicsx.model import mandel, spectral
 from remodel_fenicsx.model.cells import UnitCell, structure_tensor
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
 from remodel_fenicsx.model.energy import REPULSIONS, Tissue
-from remodel_fenicsx.model.implicit.condensed import CondensedPoints, Solution
+from remodel_fenicsx.model.implicit.condensed import CondensedPoints, LocalSolution
 from remodel_fenicsx.model.implicit.network import OrthotropicCells, Strain
 from remodel_fenicsx.model.implicit.responses import StepOfCells, jumps_by_rank, response
 from remodel_fenicsx.model.laws import LAWS, Drive
@@ -66,7 +66,7 @@ def points(
     return CondensedPoints(tissue.map(lambda name, value: np.full(number, value)), step)
 
 
-def solved(some: CondensedPoints, F: Array, start: Array | None = None) -> Solution:
+def solved(some: CondensedPoints, F: Array, start: Array | None = None) -> LocalSolution:
     """From the axes of C, on which isotropic cells lie."""
     return some.solve(F, np.swapaxes(F, 1, 2) @ F if start is None else start)
 
@@ -180,7 +180,7 @@ def test_the_cells_belong_to_the_stress(law: str, repulsion: str, driver: str, f
     np.testing.assert_allclose(structure_tensor(*again[:2]), structure_tensor(*cells[:2]), atol=1e-6)
 
 
-def cells_of(found: Solution) -> UnitCell:
+def cells_of(found: LocalSolution) -> UnitCell:
     """Of the law for A the roots and axes of A."""
     if found.response.place is not None:
         return found.cells

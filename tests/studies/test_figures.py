@@ -445,7 +445,7 @@ def test_valid_runs_are_used_again_and_own_figures_drawn_anew(drawn: Path) -> No
 # ---------------------------------------------------------------- pictures in space
 
 
-def two_hexahedra() -> bodies.Snapshot:
+def two_hexahedra() -> bodies.DrawnBody:
     """Two unit cubes side by side in x, beginning at x = 1; all chains along z, stretched to twice in z."""
     x, y, z = np.meshgrid([1.0, 2.0, 3.0], [-0.5, 0.5], [0.0, 1.0], indexing="ij")
     points = np.stack([x, y, z], axis=-1).reshape(-1, 3)
@@ -458,7 +458,7 @@ def two_hexahedra() -> bodies.Snapshot:
         "deformation_gradient": np.tile(np.diag([1.0, 1.0, 2.0]).ravel(), (2, 1)),
         "fibre_angle_deformed": np.array([0.0, 90.0]),
     }
-    return bodies.Snapshot(0.0, points, np.array([first, first + 4]), points * [0.0, 0.0, 1.0], fields)
+    return bodies.DrawnBody(0.0, points, np.array([first, first + 4]), points * [0.0, 0.0, 1.0], fields)
 
 
 def test_exterior_has_the_faces_that_no_other_element_covers() -> None:
@@ -486,7 +486,7 @@ def test_chains_lie_on_the_deformed_face_along_their_deformed_direction() -> Non
     assert ribbons.lies_on > 0
 
 
-def outline(snapshot: bodies.Snapshot) -> tuple[np.ndarray, np.ndarray]:
+def outline(snapshot: bodies.DrawnBody) -> tuple[np.ndarray, np.ndarray]:
     """Of the ribbons on the face x = 3 the places (n, 2) in the undeformed face, a square, and the lengths."""
     corners = bodies.body(snapshot)[1].corners
     gradient = snapshot.fields["deformation_gradient"][0].reshape(3, 3)
@@ -545,8 +545,8 @@ def test_a_recording_gives_back_what_was_run(tiny_run: Recording) -> None:
     assert tiny_run.scene == tiny()
     assert tiny_run.value("force", 2.0) == pytest.approx(50.0)
     with pytest.raises(RecordingError, match="no fields at time 7"):
-        bodies.Snapshot.of(tiny_run, 7.0)
-    snapshot = bodies.Snapshot.of(tiny_run, 2.0)
+        bodies.DrawnBody.of(tiny_run, 7.0)
+    snapshot = bodies.DrawnBody.of(tiny_run, 2.0)
     assert snapshot.elements.shape == (480, 8)
     top = snapshot.points[:, 2] > 10.0 - 1e-9
     assert np.all(snapshot.displacement[snapshot.points[:, 2] < 1e-9, 2] == 0)
@@ -558,7 +558,7 @@ def test_a_recording_gives_back_what_was_run(tiny_run: Recording) -> None:
 @pytest.fixture(scope="module")
 def pictures(tiny_run: Recording) -> list[np.ndarray]:
     """Of the tendon with and without chains, of chains on the near side and on the far one; drawn by one process."""
-    snapshot = bodies.Snapshot.of(tiny_run, 2.0)
+    snapshot = bodies.DrawnBody.of(tiny_run, 2.0)
     middle = (0.0, 0.0, snapshot.deformed[:, 2].max() / 2)
     view = rendering.View((0.3, -1.0, 0.14), middle, 14.0, (120, 320))
     patches = bodies.body(snapshot)
@@ -570,7 +570,7 @@ def pictures(tiny_run: Recording) -> list[np.ndarray]:
 
 def test_a_snapshot_is_really_drawn(tiny_run: Recording, pictures: list[np.ndarray]) -> None:
     both, bare, *_ = pictures
-    length = bodies.Snapshot.of(tiny_run, 2.0).deformed[:, 2].max()
+    length = bodies.DrawnBody.of(tiny_run, 2.0).deformed[:, 2].max()
     assert both.shape == bare.shape == (320, 120, 3)
     assert np.all(both[0, 0] == 255)
     body = np.any(bare < 245, axis=2)

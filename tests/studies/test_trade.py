@@ -222,7 +222,7 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     """On a cube whose stress is the same everywhere: three steps; again: nothing is run; a row is a scene."""
     for name, value in (
         ("STEPS", (2.0,)),
-        ("HALVINGS", 1),
+        ("FINER_STEPS", 1),
         ("MESHES", ()),
         ("TOGETHER", ()),
         ("TOLERANCES", ()),

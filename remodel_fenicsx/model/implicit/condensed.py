@@ -21,21 +21,22 @@ from numpy.typing import NDArray
 from remodel_fenicsx.model import mandel
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES, Driver, Frame
-from remodel_fenicsx.model.energy import Matrix, Tissue
+from remodel_fenicsx.model.energy import REPULSIONS, Matrix, Repulsion, Tissue
 from remodel_fenicsx.model.implicit import network, tangents
-from remodel_fenicsx.model.implicit.network import Cells, OrthotropicCells, Strain, Stress, StructureCells
+from remodel_fenicsx.model.implicit.network import LocalCells, OrthotropicCells, Strain, Stress, StructureCells
 from remodel_fenicsx.model.implicit.responses import Response, StepOfCells, jumps_by_rank, response
 from remodel_fenicsx.model.laws import LAWS, Law
-from remodel_fenicsx.model.energy import REPULSIONS, Repulsion
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-ITERATIONS = 25  # of the local Newton method
+LOCAL_ITERATIONS = 25  # of the local Newton method
 PARTS = 8  # of a step where the method does not find its end at once, each twice as long as what is before it
-PATIENCE = 3  # of them in a row that do not leave PROGRESS times the residual: without a solution they go in a circle
+STALLED_ITERATIONS = (
+    3  # of them in a row that do not leave PROGRESS times the residual: without a solution they go in a circle
+)
 PROGRESS = 0.9
-HALVINGS = 12  # of one of its steps, where it would lead to r >= L
+LOCAL_HALVINGS = 12  # of one of its steps, where it would lead to r >= L
 TOLERANCE = 1e-12  # of D: where the local Newton method stops
 IDENTITY = np.eye(6)
 
@@ -76,7 +77,7 @@ def _stretch_by_strain(strain: Strain) -> Array:
     return mandel.diagonal(1 / (u[:, :, None] + u[:, None, :]))
 
 
-TENSORS: dict[str, Callable[..., tuple[Array, Any, Any]]] = {
+DRIVING_TENSORS: dict[str, Callable[..., tuple[Array, Any, Any]]] = {
     "cauchy": _cauchy,
     "pk2": _second_piola_kirchhoff,
     "finger": _right_cauchy_green,
@@ -89,8 +90,8 @@ def refused(law: Law, driver: Driver, frame: Frame, matrix: Any, repulsion: Repu
     if law.dimensions is None and law.target is None:
         laws = ", ".join(repr(name) for name, other in LAWS.items() if other.dimensions or other.target)
         return f"a remodeling.law towards a target: {laws}"
-    if all(driver is not DRIVERS.get(name) for name in TENSORS):
-        return "a remodeling.driver with derivatives: " + ", ".join(map(repr, TENSORS))
+    if all(driver is not DRIVERS.get(name) for name in DRIVING_TENSORS):
+        return "a remodeling.driver with derivatives: " + ", ".join(map(repr, DRIVING_TENSORS))
     if all(frame is not FRAMES.get(name) for name in ("material", "spatial")):
         return "a remodeling.frame with derivatives: 'material', 'spatial'"
     if not isinstance(matrix, Matrix) or matrix.derivatives is None:
@@ -106,7 +107,7 @@ def refused(law: Law, driver: Driver, frame: Frame, matrix: Any, repulsion: Repu
 
 
 @dataclass(frozen=True)
-class Solution:
+class LocalSolution:
     """Points whose cells belong to their stress.
 
     Attributes
@@ -190,27 +191,27 @@ class CondensedPoints:
 
     @property
     def _tensor(self) -> Callable[..., tuple[Array, Any, Any]]:
-        return next(tensor for name, tensor in TENSORS.items() if DRIVERS.get(name) is self.step.driver)
+        return next(tensor for name, tensor in DRIVING_TENSORS.items() if DRIVERS.get(name) is self.step.driver)
 
-    def stress(self, strain: Strain, cells: Cells, derivatives: bool = False) -> Stress:
+    def stress(self, strain: Strain, cells: LocalCells, derivatives: bool = False) -> Stress:
         """S with these cells."""
         return network.stress(self.tissue, self._terms, strain, cells, derivatives)
 
-    def kept(self, F: Array, cells: UnitCell, structure: Array) -> Solution:
+    def kept(self, F: Array, cells: UnitCell, structure: Array) -> LocalSolution:
         """The points with cells that do not answer, given in the global basis (A for the law for A)."""
         strain = Strain.of(F)
-        inside: Cells = StructureCells(strain.inside(structure))
+        inside: LocalCells = StructureCells(strain.inside(structure))
         place = None
         if self.step.law.dimensions is not None:
             inside = OrthotropicCells(UnitCell(cells.dimensions, cells.axes @ strain.basis))
             place = np.tile(np.arange(3), (len(F), 1))
         stress = self.stress(strain, inside)
         tensor = self._tensor(strain, stress, False)[0]
-        return Solution(
+        return LocalSolution(
             strain, tensor.copy(), Response(inside, place=place), stress, np.ones(len(F), dtype=bool), np.zeros(len(F))
         )
 
-    def passed(self, F: Array, found: Solution) -> Solution:
+    def passed(self, F: Array, found: LocalSolution) -> LocalSolution:
         """Points with the cells that a pass with their driving tensor makes."""
         strain = Strain.of(F)
         return self._at_tensor(strain, strain.inside(found.driving_tensor))
@@ -225,7 +226,7 @@ class CondensedPoints:
         return turned
 
     # ------------------------------------------------------------ Newton's method
-    def solve(self, F: Array, start: Array, left_out: Flags | None = None) -> Solution:
+    def solve(self, F: Array, start: Array, left_out: Flags | None = None) -> LocalSolution:
         """Cells that belong to the stress at F.
 
         Parameters
@@ -250,14 +251,14 @@ class CondensedPoints:
             put(found, lost, self.at(lost)._followed(F[lost], found.strain.at(lost)))
         return found
 
-    def _iterate(self, found: Solution) -> None:
+    def _iterate(self, found: LocalSolution) -> None:
         """Newton's method where there is no solution yet."""
         open_points: NDArray[Any] = np.flatnonzero(~found.converged)
         jumps = jumps_by_rank(self.step)[open_points]
-        most: NDArray[Any] = np.where(jumps, PATIENCE, ITERATIONS)  # the others have a solution
+        most: NDArray[Any] = np.where(jumps, STALLED_ITERATIONS, LOCAL_ITERATIONS)  # the others have a solution
         least: Array = np.full(open_points.size, np.inf)
         patience: NDArray[Any] = most
-        for _ in range(ITERATIONS):
+        for _ in range(LOCAL_ITERATIONS):
             if not open_points.size:
                 break
             improved = self.at(open_points)._iterated(_taken(found, open_points))
@@ -267,7 +268,7 @@ class CondensedPoints:
             open_points, least = open_points[goes_on], least[goes_on]
             patience, most = patience[goes_on], most[goes_on]
 
-    def _followed(self, F: Array, strain: Strain) -> Solution:
+    def _followed(self, F: Array, strain: Strain) -> LocalSolution:
         """The solution that the cells at the start come to when the time of the step passes in parts."""
         tensor = self.kept(F, self.step.cells, self.step.structure).tensor
         duration = self.step.time_new - self.step.time_old
@@ -279,7 +280,7 @@ class CondensedPoints:
             tensor = found.tensor
         return found
 
-    def _at_tensor(self, strain: Strain, tensor: Array) -> Solution:
+    def _at_tensor(self, strain: Strain, tensor: Array) -> LocalSolution:
         if self.step.driver is DRIVERS["finger"]:
             tensor = np.zeros_like(tensor)
             tensor[:, range(3), range(3)] = strain.squared
@@ -287,9 +288,9 @@ class CondensedPoints:
         stress = self.stress(strain, answer.cells)
         missing = np.linalg.norm(self._tensor(strain, stress, False)[0] - tensor, axis=(1, 2))
         converged = missing <= TOLERANCE * np.linalg.norm(tensor, axis=(1, 2)) + self.step.rounding
-        return Solution(strain, tensor, answer, stress, converged & (stress.extension < 1.0), missing)
+        return LocalSolution(strain, tensor, answer, stress, converged & (stress.extension < 1.0), missing)
 
-    def _iterated(self, found: Solution) -> Solution:
+    def _iterated(self, found: LocalSolution) -> LocalSolution:
         """One step of Newton's method, not longer than D, halved where it leads to r >= L."""
         strain = found.strain
         answer, stress, by_stress, _ = self._derivatives(found)
@@ -301,7 +302,7 @@ class CondensedPoints:
         size = np.maximum(size, np.linalg.norm(missing, axis=1))
         share = np.minimum(1.0, size / np.where(length > 0, length, 1.0))
         best = self._at_tensor(strain, found.tensor + share[:, None, None] * change)
-        for _ in range(HALVINGS):
+        for _ in range(LOCAL_HALVINGS):
             lost = np.flatnonzero(~(best.stress.extension < 1.0))
             if not lost.size:
                 break
@@ -310,20 +311,22 @@ class CondensedPoints:
             put(best, lost, self.at(lost)._at_tensor(strain.at(lost), tensors))
         return best
 
-    def _frozen(self, strain: Strain, cells: Cells) -> Array:
+    def _frozen(self, strain: Strain, cells: LocalCells) -> Array:
         """dS/dC of cells that do not answer."""
         by_strain = self.stress(strain, cells, derivatives=True).by_strain
         assert by_strain is not None
         return by_strain
 
-    def _derivatives(self, found: Solution) -> tuple[Response, Stress, Array, Array]:
+    def _derivatives(self, found: LocalSolution) -> tuple[Response, Stress, Array, Array]:
         strain = found.strain
         answer = response(self.step, strain, self._place(strain, found.tensor), derivatives=True)
         stress = self.stress(strain, answer.cells, derivatives=True)
         _, by_stress, by_strain = self._tensor(strain, stress, True)
         return answer, stress, by_stress, by_strain
 
-    def _equation(self, found: Solution, answer: Response, stress: Stress, by_stress: Array) -> tuple[Array, Array]:
+    def _equation(
+        self, found: LocalSolution, answer: Response, stress: Stress, by_stress: Array
+    ) -> tuple[Array, Array]:
         """1 - dD/dcells dcells/dD, and D(cells) - D as Mandel vectors."""
         by_tensor = answer.by_tensor
         assert by_tensor is not None and stress.by_cells is not None
@@ -334,7 +337,7 @@ class CondensedPoints:
         return matrix, mandel.vectors(missing)
 
     # ------------------------------------------------------------ the tangent
-    def tangent(self, found: Solution, held: Flags) -> Array:
+    def tangent(self, found: LocalSolution, held: Flags) -> Array:
         """dP/dF, (n, 3, 3, 3, 3); of points that are held, and of those that have not converged, at their cells."""
         strain, spatial = found.strain, self.step.is_spatial
         answer, stress, by_stress, by_strain = self._derivatives(found)
@@ -366,7 +369,7 @@ class CondensedPoints:
         return result
 
 
-def _some_cells(cells: Cells, chosen: Any) -> Cells:
+def _some_cells(cells: LocalCells, chosen: Any) -> LocalCells:
     """Of some of the points."""
     if isinstance(cells, OrthotropicCells):
         return OrthotropicCells(UnitCell(cells.cell.dimensions[chosen], cells.cell.axes[chosen]))
@@ -376,7 +379,7 @@ def _some_cells(cells: Cells, chosen: Any) -> Cells:
 # ---------------------------------------------------------------- some of the points
 
 
-def _taken(found: Solution, chosen: Any) -> Solution:
+def _taken(found: LocalSolution, chosen: Any) -> LocalSolution:
     """A solution of some of the points: what a step of Newton's method needs."""
     return replace(
         found,
@@ -387,7 +390,7 @@ def _taken(found: Solution, chosen: Any) -> Solution:
     )
 
 
-def put(found: Solution, chosen: Any, better: Solution) -> None:
+def put(found: LocalSolution, chosen: Any, better: LocalSolution) -> None:
     """Put some of the points into a solution."""
     found.tensor[chosen] = better.tensor
     found.converged[chosen] = better.converged

@@ -70,7 +70,7 @@ class Strain(NamedTuple):
         return logarithm.rotated(tensors, np.swapaxes(self.basis, 1, 2))
 
 
-class Cells(Protocol):
+class LocalCells(Protocol):
     """Cells of n points in the eigenbasis of C, with six numbers y of their own."""
 
     @property
@@ -126,7 +126,7 @@ class Terms(NamedTuple):
     by_strain: Array | None
 
 
-def log_terms(strain: Strain, cells: Cells, r0: Array, derivatives: bool) -> Terms:
+def log_terms(strain: Strain, cells: LocalCells, r0: Array, derivatives: bool) -> Terms:
     """Of M = A : ln C."""
     values, A = strain.squared, cells.structure
     quotients = logarithm.first_divided_differences(values)
@@ -136,7 +136,7 @@ def log_terms(strain: Strain, cells: Cells, r0: Array, derivatives: bool) -> Ter
     return Terms(quotients * A, by_cells, logarithm.second_derivative(values, A))
 
 
-def length_terms(strain: Strain, cells: Cells, r0: Array, derivatives: bool) -> Terms:
+def length_terms(strain: Strain, cells: LocalCells, r0: Array, derivatives: bool) -> Terms:
     """Of M = r0^2 ln(A : C / r0^2)."""
     A, scale = cells.structure, r0[:, None, None] ** 2
     squared = np.einsum("nii,ni->n", A, strain.squared)[:, None, None]
@@ -152,7 +152,7 @@ def length_terms(strain: Strain, cells: Cells, r0: Array, derivatives: bool) -> 
     )
 
 
-def axes_terms(strain: Strain, cells: Cells, r0: Array, derivatives: bool) -> Terms:
+def axes_terms(strain: Strain, cells: LocalCells, r0: Array, derivatives: bool) -> Terms:
     """Of M = sum_I l_I^2 ln(n_I . C n_I); for cells with axes."""
     assert isinstance(cells, OrthotropicCells)
     lengths, axes = cells.cell.dimensions, cells.cell.axes
@@ -175,7 +175,7 @@ def axes_terms(strain: Strain, cells: Cells, r0: Array, derivatives: bool) -> Te
     return Terms(value, to_axes @ changes, along @ np.swapaxes(to_axes, 1, 2))
 
 
-TERMS: dict[str, Callable[[Strain, Cells, Array, bool], Terms]] = {
+TERMS: dict[str, Callable[[Strain, LocalCells, Array, bool], Terms]] = {
     "axes": axes_terms,
     "log": log_terms,
     "length": length_terms,
@@ -192,7 +192,7 @@ class Stress(NamedTuple):
     by_strain: Array | None = None
 
 
-def stress(tissue: Tissue, terms: Callable[..., Terms], strain: Strain, cells: Cells, derivatives: bool) -> Stress:
+def stress(tissue: Tissue, terms: Callable[..., Terms], strain: Strain, cells: LocalCells, derivatives: bool) -> Stress:
     """S of points whose parameters are arrays (n,).
 
     Parameters

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from remodel_fenicsx.model import mandel, spectral, tensor_law
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.drivers import Driver, Frame, carried_axes
-from remodel_fenicsx.model.implicit.network import Cells, OrthotropicCells, Strain, StructureCells
+from remodel_fenicsx.model.implicit.network import LocalCells, OrthotropicCells, Strain, StructureCells
 from remodel_fenicsx.model.laws import Drive, Law, framed, principal_directions
 
 Array = NDArray[np.float64]
@@ -87,7 +87,7 @@ class Response(NamedTuple):
     `place`: for cells with axes, where each of them stands among the lengths and axes of the law, (n, 3).
     """
 
-    cells: Cells
+    cells: LocalCells
     by_tensor: Array | None = None
     by_stretch: Array | None = None
     place: NDArray[np.intp] | None = None
