@@ -57,12 +57,16 @@ class Finding:
         Whether the state is known to be a saddle of the energy; None where nobody has computed it.
     solvable
         Whether the reference reaches the end.
+    confirmed
+        Beginnings of warnings' texts, after the time, that the reference finds true although the row is within the
+        tolerance, which has to be wide on such a mesh.
     """
 
     ratio: float
     words: str = ""
     unstable: bool | None = None
     solvable: bool = True
+    confirmed: tuple[str, ...] = ()
 
 
 Check = Callable[["Case", Run], Finding]

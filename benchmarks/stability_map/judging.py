@@ -79,7 +79,7 @@ def judged(case: Case, run: Run) -> Verdict:
     if finding.ratio <= 1:
         if named and finding.unstable is None:
             return Verdict("unstable", named[0], ratio)
-        said = [*named, *others]
+        said = [line for line in (*named, *others) if not any(text in line for text in finding.confirmed)]
         return Verdict("right", said[0] if said else finding.words, ratio, false_alarm=bool(said))
     if warnings:
         return Verdict("unstable" if named else "warned", f"{finding.words}; said: {warnings[0]}", ratio)

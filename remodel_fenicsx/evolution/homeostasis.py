@@ -93,6 +93,9 @@ class Homeostasis:
         if limit is not None:
             limit.equilibrium.stop_signal = lambda: self.equilibrium.stop_signal()
         self.compares, self.steps, self._residual = False, 0, 0.0
+        way.level = (
+            logging.INFO
+        )  # no row of the way is a result; where points turn over at once, the end tells of fronts
         self.near, self.tries = NEAR, TRIES
         self._held: Snapshot | None = None  # the first state on the way under held loads
 
@@ -112,7 +115,6 @@ class Homeostasis:
         if loosens and self._held is not None and self._largest_jump()[0] > FRONT:
             log.info("the cells have a front, and its place depends on the way: it is gone again with the tolerance")
             state.restore(self._held)
-            self.way.level = logging.INFO  # points that turn over at once are the front, of which the end tells
             self._go(time, loads, max(start, self.held_from), False, work)
         state.time, state.number = start, number
         state.settle_cells()
@@ -242,8 +244,9 @@ class Homeostasis:
                 *place,
                 jump,
             )
-        if share:
-            self._warn(
+        if share and self.state.comm.rank == 0:
+            log.log(
+                NOTICE,
                 "%.3g %% of the body has no tension at rest, or hardly any beside compression: cells there stay where "
                 "the way has left them, and depend on it (docs/theory.md, Equilibrium at once)",
                 100 * share,

@@ -208,6 +208,7 @@ def test_a_front_rests_where_time_leaves_it(caplog: pytest.LogCaptureFixture) ->
 
 def test_cells_without_tension_stay_where_the_way_has_left_them(caplog: pytest.LogCaptureFixture) -> None:
     """After a reversal of the loads, and the share of the body where it matters is said."""
+    caplog.set_level("INFO")
     (_, cells, _), (_, others, simulation) = tube_in_time(3.0, 0.1, HALF_WAY_BACK)
     np.testing.assert_allclose(cells, others, atol=0.03)
     (said,) = [record.getMessage() for record in caplog.records if "no tension at rest" in record.getMessage()]
@@ -221,6 +222,7 @@ def test_cells_without_tension_stay_where_the_way_has_left_them(caplog: pytest.L
 
 def test_an_unloaded_body_keeps_its_cells_and_says_so(caplog: pytest.LogCaptureFixture) -> None:
     """Cells have turned before the load went; nothing asks them to turn back."""
+    caplog.set_level("INFO")
     loads = {"force": {"value": 10.0, "ramp": [[0.0, 0.0], [10.0, 1.0], [30.0, 0.0]]}}
     cube = {"geometry": {"shape": "cube"}, "loads": loads, "output": {"fields": False}}
     found = []
