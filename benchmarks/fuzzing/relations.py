@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.fuzzing.scenes import Values
+from benchmarks.fuzzing.scenes import Values, has_free_length
 from benchmarks.stability_map.cases import Finding, Run
 
 EXACT, SOLVED = 1e-6, 1e-4  # relative tolerance of lengths: of the same arithmetic; of another way to the same solution
@@ -157,9 +157,9 @@ def _kinematics(scene: Values, random: Random) -> Other | None:
 
 
 def _solver(scene: Values, random: Random) -> Other:
-    s = deepcopy(scene)
+    s, method = deepcopy(scene), random.choice(("direct", "lagged", "iterative"))
     s["solver"] = {
-        "method": random.choice(("direct", "lagged", "iterative")), "relative_tolerance": 1e-10,
+        "method": "lagged" if method == "iterative" and has_free_length(scene) else method, "relative_tolerance": 1e-10,
         "predictor": random.choice(("none", "autoregressive")),
     }  # fmt: skip
     loose = 1e-3 if scene["solver"]["relative_tolerance"] > 1e-9 else SOLVED

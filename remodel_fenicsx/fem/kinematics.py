@@ -33,6 +33,8 @@ class Kinematics(ABC):
         Faces of the mesh that are planes of symmetry, and the component of the displacement that is zero there.
     homogeneous
         Whether the strain is the same everywhere: then no mesh changes what is found.
+    suits_multigrid
+        Whether algebraic multigrid solves for these unknowns.
     cost
         Of a step for each quadrature point, in that of one of a hexahedron, as measured on the artery.
     """
@@ -43,6 +45,7 @@ class Kinematics(ABC):
     moves_rigidly: ClassVar[bool] = False
     symmetry_planes: ClassVar[Mapping[str, int]] = {}
     homogeneous: ClassVar[bool] = False
+    suits_multigrid: ClassVar[bool] = True
     cost: ClassVar[float] = 1.0
 
     def element(self, kind: str) -> str:
@@ -328,6 +331,8 @@ class FreeLength:
     body
         Whose length it is.
     """
+
+    suits_multigrid = False  # GMRES with GAMG does not converge where a row is full
 
     def __init__(self, kinematics: Kinematics, body: Any):
         self.field, self.body = kinematics, body

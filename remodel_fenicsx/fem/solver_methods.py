@@ -91,11 +91,11 @@ def is_small(unknowns: int, reduced: bool) -> bool:
     return unknowns <= (SMALL_REDUCTION if reduced else SMALL_BODY)
 
 
-def chosen(method: str, unknowns: int, ranks: int, reduced: bool) -> str:
-    """The method that `auto` stands for."""
+def chosen(method: str, unknowns: int, ranks: int, reduced: bool, multigrid: bool = True) -> str:
+    """The method that `auto` stands for; `multigrid`: whether that solves for these unknowns."""
     if method != AUTO:
         return method
-    if unknowns > (LARGE if ranks == 1 else LARGE_ON_RANKS):
+    if multigrid and unknowns > (LARGE if ranks == 1 else LARGE_ON_RANKS):
         return "iterative"
     return "direct" if ranks > 1 or is_small(unknowns, reduced) else LAGGED
 

@@ -19,6 +19,7 @@ from remodel_fenicsx.body import SHAPES, Shape
 from remodel_fenicsx.body.columns import columns_of, columns_on_request
 from remodel_fenicsx.body.reductions import AUTO, objections
 from remodel_fenicsx.fem.formulations import FORMULATIONS
+from remodel_fenicsx.fem.solver_methods import METHODS
 from remodel_fenicsx.model.chains import CHAINS
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
 from remodel_fenicsx.model.energy import MATRICES, REPULSIONS, Matrix
@@ -253,6 +254,10 @@ class Scene(Table):
         if self.has_free_length and load is not None and any(load.value * factor for _, factor in load.ramp):
             rule = "must be 0 where the length is an unknown, with loads.axial_force or closed ends"
             raise fault(rule, "loads.elongation.value", load.value)
+        if self.has_free_length and self.solver.method == "iterative":
+            names = ", ".join(repr(name) for name in (AUTO, *METHODS) if name != "iterative")
+            rule = f"allowed where the length is an unknown, with loads.axial_force or closed ends, are {names}"
+            raise fault(rule, "solver.method", self.solver.method)
 
     def summary(self) -> str:
         """Stiffness of network and matrix and the largest loads, in one unit and on one line."""

@@ -172,8 +172,9 @@ class GuardedNewton:
         self._values = self.unknown.x.array
         self._x = self.unknown.x.petsc_vec.duplicate()
         unknowns, ranks = self._x.getSize(), equilibrium.comm.size
-        reduced = equilibrium.state.kinematics.reduced
-        self.method = chosen(settings.method, unknowns, ranks, reduced)
+        kinematics = equilibrium.state.kinematics
+        reduced = kinematics.reduced
+        self.method = chosen(settings.method, unknowns, ranks, reduced, kinematics.suits_multigrid)
         if robust and self.method == LAGGED:
             self.method = "direct"
         # where a method is named, three dimensions stay with it: its numbers shall not depend on their size

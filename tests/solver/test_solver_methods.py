@@ -12,7 +12,7 @@ from petsc4py import PETSc
 
 from remodel_fenicsx import Simulation
 from remodel_fenicsx.fem.solver_methods import LARGE, LARGE_ON_RANKS, METHODS, SMALL_BODY, SMALL_REDUCTION, chosen
-from remodel_fenicsx.scene import preset_scene
+from remodel_fenicsx.scene import SceneError, preset_scene
 from remodel_fenicsx.solver import linear
 from remodel_fenicsx.solver.limits import Limits
 from remodel_fenicsx.solver.linear import KeptFactor, Lagged
@@ -55,6 +55,19 @@ def test_auto_goes_by_the_size(small: int, reduced: bool) -> None:
     ):  # fmt: skip
         assert chosen("auto", unknowns, ranks, reduced) == method
         assert all(chosen(name, unknowns, ranks, reduced) == name for name in METHODS)
+    assert chosen("auto", LARGE + 1, 1, reduced, multigrid=False) == "lagged"
+    assert chosen("auto", LARGE_ON_RANKS + 1, 2, reduced, multigrid=False) == "direct"
+
+
+@pytest.mark.parametrize(
+    "changes", [{"supports.ends": "closed"}, {"loads.axial_force": {"value": 1.0, "ramp": [[0.0, 0.0], [25.0, 1.0]]}}]
+)
+def test_multigrid_is_refused_where_the_length_is_an_unknown(changes: dict[str, Any]) -> None:
+    """One row of the tangent is full then: GMRES with GAMG ends after thousands of iterations, or not."""
+    scene = preset_scene("kuhl-holzapfel-2007", "tube").with_values({"loads.elongation.value": 0.0} | changes)
+    with pytest.raises(SceneError, match="solver.method = 'iterative': allowed where the length is an unknown"):
+        scene.with_values({"solver.method": "iterative"})
+    assert scene.with_values({"solver.method": "lagged"}).has_free_length
 
 
 def test_the_paper_s_tendon_has_few_factors() -> None:
