@@ -11,6 +11,7 @@ import shutil
 import subprocess
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -59,7 +60,7 @@ class Browser:
         self._profile = tempfile.TemporaryDirectory(prefix="remodel-fenicsx-browser-", ignore_cleanup_errors=True)
         to_read, self._write = os.pipe()
         self._read, to_write = os.pipe()
-        command = ["sh", "-c", f'exec "$@" 3<&{to_read} 4>&{to_write}', "sh", path, *OPTIONS, *options]
+        command = ["bash", "-c", f'exec "$@" 3<&{to_read} 4>&{to_write}', "bash", path, *OPTIONS, *options]
         command += [f"--user-data-dir={self._profile.name}", "about:blank"]
         self.process = subprocess.Popen(
             command, pass_fds=(to_read, to_write), stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
@@ -126,7 +127,7 @@ class Browser:
         self.said, self.requests = [], []
         self.call("Page.navigate", url=page.as_uri())
         if wait:
-            self.wait_for("document.documentElement.dataset.ready === 'yes'")
+            self.wait_for("document.documentElement?.dataset.ready === 'yes'")
 
     def wait_for(self, condition: str, seconds: float = 20.0) -> None:
         """Until an expression of the page is true."""
@@ -134,6 +135,15 @@ class Browser:
         while not self.value(condition):
             if time.monotonic() > deadline:
                 raise PageError(f"not within {seconds} s: {condition}; the page said {self.said}")
+            time.sleep(0.02)
+
+    def wait_until(self, is_so: Callable[[], bool], seconds: float = 20.0) -> None:
+        """Until something outside of the page is so; the browser is asked meanwhile, so that it goes on."""
+        deadline = time.monotonic() + seconds
+        while not is_so():
+            if time.monotonic() > deadline:
+                raise PageError(f"not within {seconds} s")
+            self.value("1")
             time.sleep(0.02)
 
     def value(self, expression: str) -> Any:
@@ -205,5 +215,7 @@ class Browser:
     def __enter__(self) -> Browser:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         self.close()

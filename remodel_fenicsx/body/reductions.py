@@ -48,14 +48,15 @@ class Reduction:
     turn
         Q (n, 3, 3) for places X (n, 3) of the body: Q^T X lies in, or beside, the part that stands for it.
     whole
-        Function of the shape and of the reduction's mesh: the whole body for pictures (`body.whole`).
+        Function of the shape and of the reduction's mesh: the whole body for reports (`body.whole`); None: they show
+        none.
     """
 
     build: Callable[[Any, Any], Any]
     elements: Callable[[Any], int]
     rules: tuple[Rule, ...]
     turn: Turn
-    whole: Callable[[Any, NDArray[np.float64], Corners], Body]
+    whole: Callable[[Any, NDArray[np.float64], Corners], Body] | None = None
 
 
 @dataclass(frozen=True)

@@ -48,6 +48,8 @@ class ShownBody:
         Deformed fibre angle in degrees (t, m), largest r/L (t, m), l_I F n_I (t, m, 3, 3); None if not recorded.
     is_turned
         Whether a reduction was solved.
+    is_deformed
+        Whether displacements were recorded.
     """
 
     times: Numbers
@@ -61,6 +63,7 @@ class ShownBody:
     extension: NDArray[np.float32] | None
     edges: NDArray[np.float32] | None
     is_turned: bool
+    is_deformed: bool
 
     @classmethod
     def of(cls, recording: Recording, times: Numbers) -> ShownBody:
@@ -77,15 +80,18 @@ class ShownBody:
         layer, depth = _layers(recording.scene.geometry.depth(points[elements].mean(axis=1)))
         volume = _volumes(points[elements])
         rows: dict[str, list[NDArray[np.float32]]] = {name: [] for name in ("position", "angle", "extension", "edges")}
+        is_deformed = True
         for time in times:
             displacement, found = fields(float(time))
+            is_deformed = displacement is not None
             moved = 0.0 if displacement is None else displacement[used]
             rows["position"].append((points + moved).astype(np.float32))
             for name, values in _of_elements(found).items():
                 rows[name].append(values.astype(np.float32))
         series = {name: np.stack(values) if values else None for name, values in rows.items()}
-        is_turned = KINEMATICS[recording.scene.model.kinematics].reduced
-        return cls(times, points, elements, layer, depth, volume, **series, is_turned=is_turned)  # type: ignore
+        reduced = KINEMATICS[recording.scene.model.kinematics].reduced
+        known: Any = {**series, "is_turned": reduced, "is_deformed": is_deformed}
+        return cls(times, points, elements, layer, depth, volume, **known)
 
     def arrays(self) -> tuple[dict[str, Array], dict[str, Any]]:
         """The same in few bytes, and the numbers that lead back."""
@@ -114,6 +120,13 @@ class ShownBody:
         return 6 * len(self.points) + 11 * len(self.elements)
 
 
+def has_a_body(recording: Recording) -> bool:
+    """Whether a run recorded fields of a body that can be shown."""
+    scene = recording.scene
+    reduction = scene.geometry.reductions.get(scene.model.kinematics)
+    return bool(len(recording.times)) and (reduction is None or reduction.whole is not None)
+
+
 def _whole_body(recording: Recording) -> tuple[Numbers, NDArray[np.int64], Callable[[float], Fields]]:
     """Points, corners, and a function of time: displacement of the points and fields of the elements."""
     scene = recording.scene
@@ -128,6 +141,7 @@ def _whole_body(recording: Recording) -> tuple[Numbers, NDArray[np.int64], Calla
     if not KINEMATICS[name].reduced:
         return points, corners, recorded
     reduction = shape.reductions[name]
+    assert reduction.whole is not None
     body, hexahedra = reduction.whole(shape, points, corners)
     turned = TurnedFields(body, hexahedra, points, elements, reduction.turn)
     return body, hexahedra, lambda time: turned(recording.fields(time, NAMES))
@@ -190,6 +204,6 @@ def kept_times(history: HistoryColumns, times: Numbers, most: int) -> Numbers:
     rows = np.where(np.isfinite(rows), rows, 0.0)
     change = np.abs(np.diff(rows, axis=1)) / np.maximum(np.ptp(rows, axis=1), np.finfo(float).tiny)[:, None]
     share = [np.concatenate([[0.0], np.cumsum(part)]) for part in (np.diff(times), change.sum(axis=0))]
-    place = sum(part / (part[-1] or 1.0) for part in share)
+    place = np.sum([part / (part[-1] or 1.0) for part in share], axis=0)
     wanted = np.linspace(0.0, float(place[-1]), most)
     return times[np.unique(np.abs(place[:, None] - wanted).argmin(axis=0))]

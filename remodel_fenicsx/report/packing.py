@@ -39,9 +39,9 @@ def packed(arrays: Mapping[str, Array]) -> tuple[str, dict[str, dict[str, Any]]]
     return base64.b64encode(deflate.compress(bytes(block)) + deflate.flush()).decode("ascii"), table
 
 
-def of_angles(degrees: NDArray[np.float64]) -> NDArray[np.uint8]:
+def of_angles(degrees: NDArray[np.floating]) -> NDArray[np.uint8]:
     """Angles from 0 to 90 degrees in `ANGLE_STEPS` levels; `NO_ANGLE` where there is none."""
-    steps = np.clip(np.floor(degrees * (ANGLE_STEPS / 90.0)), 0, ANGLE_STEPS - 1)
+    steps = np.clip(np.floor(degrees * ANGLE_STEPS / 90.0), 0, ANGLE_STEPS - 1)
     return np.where(np.isnan(degrees), NO_ANGLE, steps).astype(np.uint8)
 
 

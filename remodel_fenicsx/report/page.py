@@ -12,18 +12,20 @@ from pathlib import Path
 from typing import Any
 
 from remodel_fenicsx._version import __version__
-from remodel_fenicsx.report.body import ShownBody, kept_times
+from remodel_fenicsx.report.body import ShownBody, has_a_body, kept_times
 from remodel_fenicsx.report.card import Card
 from remodel_fenicsx.report.packing import packed
 from remodel_fenicsx.report.parts import ASSETS, ReportedRun, cards, data_of
 from remodel_fenicsx.report.story import Story
 from remodel_fenicsx.results.recording import Recording
-from remodel_fenicsx.system.regular_files import write_whole
+from remodel_fenicsx.system.regular_files import read_regular, write_whole
 
 REPORT = "report.html"
-SIZE = 20.0  # MB that a page has at most, if it need not be larger for two times
+PAGE_SIZE = 20.0  # MB that a page has at most, if it need not be larger for two times
 SCRIPTS = ("data.js", "body.js", "angles.js", "curves.js", "page.js")
 STYLES = ("report.bundle.css", "page.css")
+GENERATOR_TAG = b'name="generator" content="remodel_fenicsx'  # what bears it may be made anew
+LARGEST_PAGE = 10**9  # bytes
 FEWEST_TIMES = 2
 BEST_RATIO = 0.15  # of deflated to plain bytes of fields: none was smaller, so that no time is left out too early
 TRIES = 4
@@ -33,7 +35,7 @@ class ReportError(ValueError):
     """No report for a reason that its one line names."""
 
 
-def write_report(folder: str | os.PathLike[str], path: Path | None = None, size: float = SIZE) -> Path:
+def write_report(folder: str | os.PathLike[str], path: Path | None = None, size: float = PAGE_SIZE) -> Path:
     """Make the report of a run, finished or not, from its folder.
 
     Parameters
@@ -54,23 +56,25 @@ def write_report(folder: str | os.PathLike[str], path: Path | None = None, size:
     RecordingError, SceneError
         If it is no folder of a run, or damaged.
     ReportError
-        If the file is there already.
+        If the file is there already, or a report.html that this command has not made.
     OSError
         If it cannot be read or written.
     """
     recording = Recording(folder)
     if path is not None and (path.exists() or path.is_symlink()):
         raise ReportError(f"-o {path}: is there already; allowed is a new file")
-    page = page_of(recording, size)
     path = path or recording.path / REPORT
+    if path.exists() and GENERATOR_TAG not in read_regular(path, LARGEST_PAGE)[:4096]:
+        raise ReportError(f"{path}: is no report of this command and is not overwritten; choose another file with -o")
+    page = page_of(recording, size)
     write_whole(path, page.encode("utf-8"))
     return path
 
 
-def page_of(recording: Recording, size: float = SIZE) -> str:
+def page_of(recording: Recording, size: float = PAGE_SIZE) -> str:
     """The page as text; parameters and errors as of `write_report`."""
     story = Story.of(recording)
-    if not len(recording.times):
+    if not has_a_body(recording):
         return _page(cards(ReportedRun(recording, story, None)))
     most = _times_at_most(recording, size)
     for _ in range(TRIES):

@@ -1,9 +1,9 @@
-"""The parts of the page, from top to bottom. What comes later adds one: a function of the run that gives a card or None."""
+"""The parts of the page, from top to bottom: functions of the run that give a card, or None with nothing to say."""
 
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from html import escape
@@ -64,6 +64,8 @@ class ReportedRun:
         known = {column.name: column for column in columns_of(scene.geometry, scene.output.columns, scene.loads)}
         own = {column.name for column in scene.geometry.columns}
         names = [name for name in history if name != "time" and np.isfinite(history[name]).any()]
+        if "substeps" in names and np.nanmax(history["substeps"]) <= 1:
+            names.remove("substeps")
         names.sort(key=lambda name: (name not in own, name in LAST))
         return [known.get(name) or Column(name, "", "", lambda m: np.nan) for name in names]
 
@@ -102,7 +104,8 @@ def head(run: ReportedRun) -> Card:
 
 def tiles(run: ReportedRun) -> Card | None:
     """The shape's own columns and r/L: the last value and the first."""
-    history, found = run.story.history, []
+    history = run.story.history
+    found: list[str] = []
     own = [column.name for column in run.recording.scene.geometry.columns]
     for column in run.columns:
         if column.name not in (*own, "max_chain_extension") or len(found) == MOST_TILES:
@@ -124,35 +127,40 @@ def view(run: ReportedRun) -> Card | None:
         text = "The run recorded no fields (output.fields), so there is no body to be seen."
         return Card("no_view", section("The body", f'<p class="note">{text}</p>', "whole"))
     arrays, scales = body.arrays()
-    shape = run.recording.scene.geometry
-    shown = {
-        "angle": "angle" in arrays, "chains": "edges" in arrays and "angle" in arrays, "extension": "extension" in arrays
-    }  # fmt: skip
-    modes = [
-        ("both", "angle and chains", shown["angle"] and shown["chains"]),
-        ("coloured", "chains in colour", shown["chains"]),
-        ("alone", "chains alone", shown["chains"]),
-        ("angle", "angle", shown["angle"]),
-        ("extension", "r/L", shown["extension"]),
-        ("shape", "shape alone", True),
-    ]
-    options = "".join(f'<option value="{name}">{text}</option>' for name, text, there in modes if there)
-    note = ""
-    if body.is_turned:
-        note = f"solved as {run.recording.scene.model.kinematics}, shown as the whole body"
-    elif np.array_equal(body.position[-1], body.position[0]) and len(body.times) > 1:
-        note = "displacements were not recorded: the reference body"
-    least = 0.0 if body.extension is None else float(np.floor(20 * np.nanmin(body.extension)) / 20)
     data = {
-        **scales, "times": [float(time) for time in body.times], "words": shape.angle_in_words, "least_extension": least,
-        "colours": ANGLE_COLOURS, "ambient": AMBIENT, "layers": len(body.depth),
+        **scales, "times": [float(time) for time in body.times], "layers": len(body.depth),
+        "words": run.recording.scene.geometry.angle_in_words, "colours": ANGLE_COLOURS, "ambient": AMBIENT,
+        "least_extension": 0.0 if body.extension is None else float(np.floor(20 * np.nanmin(body.extension)) / 20),
         "chain": {"colour": CHAIN_COLOUR, "reach": CHAIN_REACH, "room": CHAIN_ROOM, "width": CHAIN_WIDTH,
                   "lift": CHAIN_LIFT},
     }  # fmt: skip
     html = (ASSETS / "view.html").read_text(encoding="utf-8")
-    html = html.replace("@OPTIONS@", options).replace("@LAST_LAYER@", str(len(body.depth) - 1))
-    html = html.replace("@NOTE@", f'<p class="note">{escape(note)}</p>' if note else "")
+    html = html.replace("@OPTIONS@", _ways_to_show(arrays)).replace("@LAST_LAYER@", str(len(body.depth) - 1))
+    html = html.replace("@NOTES@", "".join(f'<p class="note">{escape(note)}</p>' for note in _notes(run, body)))
     return Card("view", html, data, arrays)
+
+
+def _ways_to_show(arrays: Mapping[str, Array]) -> str:
+    """The choices of what is shown, as far as it was recorded."""
+    ways = {
+        "both": ("angle and chains", {"angle", "edges"}), "coloured": ("chains in colour", {"angle", "edges"}),
+        "alone": ("chains alone", {"edges"}), "angle": ("angle", {"angle"}), "extension": ("r/L", {"extension"}),
+        "shape": ("shape alone", set()),
+    }  # fmt: skip
+    there = {name: text for name, (text, needed) in ways.items() if needed <= set(arrays)}
+    return "".join(f'<option value="{name}">{text}</option>' for name, text in there.items())
+
+
+def _notes(run: ReportedRun, body: ShownBody) -> list[str]:
+    """What is to be known of the view."""
+    found = []
+    if body.is_turned:
+        found.append(f"Solved with the kinematics {run.recording.scene.model.kinematics!r}, shown as the whole body.")
+    if not body.is_deformed:
+        found.append("Displacements were not recorded: this is the reference body.")
+    if len(body.times) < len(run.recording.times):
+        found.append(f"{len(body.times)} of {len(run.recording.times)} recorded times are kept here, to save room.")
+    return found
 
 
 def angles(run: ReportedRun) -> Card | None:
@@ -162,7 +170,8 @@ def angles(run: ReportedRun) -> Card | None:
         return None
     through, start, end = shape.depth_in_words
     along, across = shape.angle_in_words
-    profile = section(f"Collagen angle {through}, deformed", '<div id="profile"></div>', "narrow")
+    legend = '<p class="note">Red: now, mean and 10 to 90 % of the volume. Grey: other times.</p>'
+    profile = section(f"Collagen angle {through}, deformed", f'<div id="profile"></div>{legend}', "narrow")
     rose = section("Where the collagen points, by volume", '<div id="rose"></div>', "narrow")
     data = {"depth": body.depth.tolist(), "through": f"{through} (0 {start}, 1 {end})", "along": along,
             "across": across, "colours": ANGLE_COLOURS}  # fmt: skip
@@ -191,7 +200,7 @@ def curves(run: ReportedRun) -> Card | None:
         ]
         data.append({"title": title, "unit": unit, "series": series})
     times = [float(time) for time in history["time"][rows]]
-    return Card("curves", "".join(cards), {"times": times, "curves": data})
+    return Card("curves", f'<div class="curves whole">{"".join(cards)}</div>', {"times": times, "curves": data})
 
 
 def _together(first: Column, second: Column) -> bool:
@@ -203,7 +212,7 @@ def _together(first: Column, second: Column) -> bool:
 def _title(names: list[str]) -> str:
     """What names have in common."""
     if len(names) == 1:
-        return words(names[0]).capitalize() if names[0] not in WORDS else words(names[0])
+        return words(names[0])[0].upper() + words(names[0])[1:]
     parts = [name.split("_") for name in names]
     common = parts[0][:2] if all(part[:2] == parts[0][:2] for part in parts) else parts[0][-1:]
     return " ".join(common).capitalize()
@@ -221,16 +230,18 @@ def facts(run: ReportedRun) -> Card:
     sizes = ", ".join(
         f"{words(name)} {value:g}" for name, value in shape.model_dump().items() if isinstance(value, (int, float))
     )
-    elements = f"{len(run.recording.elements):,} elements" if run.body else f"refinement {mesh.refinement}"
+    count = f", {len(run.recording.elements):,} in number" if run.body else ""
     name = KINEMATICS[scene.model.kinematics].element(mesh.element)
-    cells = f"{scene.cells.initial}, seed {scene.cells.seed}" if scene.cells.initial == "random" else scene.cells.initial
+    cells = (
+        f"{scene.cells.initial}, seed {scene.cells.seed}" if scene.cells.initial == "random" else scene.cells.initial
+    )
     loads = "; ".join(f"{words(name)} {load.value:g}" for name, load in scene.loads.items())
     seconds = story.history.get("seconds", np.zeros(0))
     solving = f"; {duration(float(np.nansum(seconds)))} of solving" if len(seconds) else ""
     ranks = f", {story.ranks} ranks" if story.ranks not in ("", "1") else ""
     rows = [
         ("Body", f"{shape.name}: {sizes}"),
-        ("Mesh", f"{elements}, {name}, degree {mesh.degree}, {mesh.formulation}"),
+        ("Mesh", f"{name} elements{count}, degree {mesh.degree}, refinement {mesh.refinement}, {mesh.formulation}"),
         ("Kinematics", f"{scene.model.kinematics}: {KINEMATICS[scene.model.kinematics].meaning}"),
         ("Supports", f"ends {scene.supports.ends}"),
         ("Cells", f"{cells}, axes {scene.cells.axes}, r0 = {scene.cells.end_to_end_length:g}"),
@@ -238,7 +249,7 @@ def facts(run: ReportedRun) -> Card:
         ("Material", scene.summary()),
         ("Remodeling", f"law {remodeling.law}, driver {remodeling.driver}, frame {remodeling.frame}, "
                        f"coupling {remodeling.coupling}, kappa {remodeling.kappa:g}"),
-        ("Time", f"{max(0, len(story.history['time']) - 1)} steps, {scene.time.in_words()}{solving}{ranks}"),
+        ("Time", f"{max(0, len(story.history['time']) - 1)} of {scene.time.in_words()}{solving}{ranks}"),
     ]  # fmt: skip
     return Card("facts", section("What was run", table(rows)))
 
@@ -285,13 +296,13 @@ def versions(run: ReportedRun) -> Card:
     return Card("versions", folded("Versions and licences", table(rows) + note + licences))
 
 
-PARTS: list[Part] = [head, tiles, view, angles, curves, facts, warnings, scene, versions]
+PAGE_PARTS: list[Part] = [head, tiles, view, angles, curves, facts, warnings, scene, versions]
 """In the order of the page."""
 
 
 def cards(run: ReportedRun) -> list[Card]:
     """Of all parts that have something to say."""
-    return [card for card in (part(run) for part in PARTS) if card is not None]
+    return [card for card in (part(run) for part in PAGE_PARTS) if card is not None]
 
 
 def data_of(cards_: list[Card]) -> tuple[dict[str, Any], dict[str, Array]]:

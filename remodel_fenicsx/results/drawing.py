@@ -1,4 +1,4 @@
-"""What all pictures of bodies have in common, figures and reports alike: the colours of angles, how chains are drawn."""
+"""What pictures of bodies have in common, figures and reports alike: colours of angles, how chains are drawn."""
 
 from __future__ import annotations
 

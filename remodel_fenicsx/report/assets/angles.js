@@ -48,7 +48,7 @@ PARTS.angles = (data, arrays, clock) => {
 
 function profileDrawing(data, clock, others, profileAt) {
   const x = (depth) => 34 + 226 * depth, y = (degrees) => 168 - 1.7 * degrees;
-  const drawing = element("svg", { viewBox: "0 0 330 205", role: "img" });
+  const drawing = element("svg", { viewBox: "0 0 330 196", role: "img" });
   drawing.append(element("title", {}, `Mean fibre angle ${data.through} at t = ${inDigits(clock.time)}`));
   for (const degrees of [0, 30, 60, 90]) {
     drawing.append(element("line", { x1: 34, x2: 260, y1: y(degrees), y2: y(degrees), stroke: "var(--line)" }));
@@ -79,13 +79,12 @@ function profileDrawing(data, clock, others, profileAt) {
     drawing.append(element("text", { x: 266, y: label.place }, label.text));
   });
   drawing.append(element("text", { x: 147, y: 188, "text-anchor": "middle" }, data.through));
-  drawing.append(element("text", { x: 34, y: 203 }, "Red: now, mean and 10 to 90 % of the volume. Grey: other times."));
   return drawing;
 }
 
 function roseDrawing(data, clock, shares) {
   const radius = 88, largest = Math.max(...shares, 1e-9), step = Math.PI / 2 / shares.length;
-  const drawing = element("svg", { viewBox: "-165 -112 330 236", role: "img" });
+  const drawing = element("svg", { viewBox: "-190 -112 380 236", role: "img" });
   drawing.append(element("title", {}, `Share of the volume by fibre angle at t = ${inDigits(clock.time)}`));
   for (const part of [0.25, 0.5, 0.75, 1]) {
     const r = radius * Math.sqrt(part);

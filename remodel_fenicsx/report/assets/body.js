@@ -88,6 +88,12 @@ class Elements {
     return found.filter((face) => face.size > 0);
   }
 
+  // Mean over the faces of an element of their smallest sides.
+  size(e) {
+    const sides = this.faces.map((face) => this.smallestSide(face.map((corner) => this.node(e, corner))));
+    return sides.reduce((a, b) => a + b) / sides.length;
+  }
+
   smallestSide(nodes) {
     const places = nodes.map((node) => this.reference(node));
     return Math.min(...places.map((place, k) => Math.hypot(...add(places[(k + 1) % places.length], place, -1))));
@@ -289,7 +295,7 @@ class Body {
     for (let e = 0; areWanted && e < this.elements.count; e++) {
       if (!this.shown[e]) continue;
       const middle = this.elements.centre(e), colour = this.colourOf(e);
-      const size = this.elements.smallestSide(this.elements.faces[0].map((corner) => this.elements.node(e, corner)));
+      const size = this.elements.size(e);
       for (const chain of this.elements.chains(this.clock.index, e)) {
         places.push(...add(middle, chain, this.data.chain.reach * size), ...add(middle, chain, -this.data.chain.reach * size));
         colours.push(...colour, ...colour);
@@ -302,8 +308,12 @@ class Body {
   scale() {
     if (this.mode === "shape" || (this.mode !== "extension" && !this.arrays.angle)) return [];
     const isExtension = this.mode === "extension", bar = element("div", { class: "bar" });
-    const hexes = isExtension ? EXTENSION_COLOURS : this.data.colours;
-    for (const hex of hexes) bar.append(Object.assign(element("i"), {})), (bar.lastChild.style.background = hex);
+    const least = this.data.least_extension, count = this.data.colours.length;
+    this.colours.forEach((colour, k) => {
+      const shown = isExtension ? this.warmth(least + ((1 - least) * (k + 0.5)) / count) : colour, part = element("i");
+      part.style.background = `rgb(${shown.map((share) => Math.round(255 * share))})`;
+      bar.append(part);
+    });
     const [first, last] = isExtension ? [inDigits(this.data.least_extension), "1"]
       : [`0° ${this.data.words[0]}`, `90° ${this.data.words[1]}`];
     const ends = element("div", { class: "ends" }, element("span", {}, first), element("span", {}, last));
@@ -312,14 +322,13 @@ class Body {
 }
 
 PARTS.view = (data, arrays, clock) => {
-  let body = null;
-  try {
-    body = new Body(data, arrays, clock);
-  } catch (error) {  // a browser without WebGL: all else works
-    document.querySelector(".stage").append(element("p", { class: "none" }, `The body cannot be drawn here: ${error.message}`));
-  }
   connectTime(clock);
-  if (body) connectBody(body, clock);
+  if (document.createElement("canvas").getContext("webgl2")) {
+    connectBody(new Body(data, arrays.view, clock), clock);
+  } else {  // all else works
+    const words = "This browser has no WebGL: the body cannot be drawn.";
+    document.querySelector(".stage").append(element("p", { class: "none" }, words));
+  }
 };
 
 function connectTime(clock) {

@@ -4,7 +4,7 @@ const PAGE = JSON.parse(document.getElementById("page-data").textContent);
 const TYPES = {
   uint8: Uint8Array, int8: Int8Array, uint16: Uint16Array, uint32: Uint32Array, float32: Float32Array,
 };
-const PARTS = {};  // by the name of a card: function(data, arrays, clock), called when the page is ready
+const PARTS = {};  // by the name of a card: function(data of the card, arrays of all by card and name, clock)
 
 async function unpacked() {
   const text = document.getElementById("page-arrays").textContent;
