@@ -17,7 +17,6 @@ from remodel_fenicsx.running import resume
 from remodel_fenicsx.running import run as record
 from remodel_fenicsx.scene.scene import scene_from_dict
 from remodel_fenicsx.simulation import Simulation
-from remodel_fenicsx.solver.continuation import PROOF
 from tests.conftest import Case, slowly
 from tests.parts import tube
 
@@ -35,8 +34,6 @@ def short_tube(end: float, step: float = 1.0, law: str = "tensor", comm: Any = M
         "time": {"end": end, "step": step},
         "output": {"columns": ["held_points", "pass_residual"]},
         "remodeling": {"law": law, "coupling": "implicit", "frame": "material"} | changes,
-        # too few for steps that go far to be looked into again (`parts.PROOF`): what is counted is the plain solve
-        "solver": {"maximum_halvings": PROOF - 1},
     }
     domain = tube(1.0, 3.0, 1.0, degree=1, divisions=divisions, comm=comm)
     return Simulation(scene_from_dict(values), comm, domain)

@@ -219,7 +219,7 @@ class Refusing:
         self.tried: list[float] = []
         self.accepted = [0.0]
 
-    def __call__(self) -> Solution:
+    def __call__(self, origin: object = None) -> Solution:
         force = self.made.loading.values["force"]
         self.tried.append(force)
         if force - self.accepted[-1] > self.limit:
