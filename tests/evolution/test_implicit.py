@@ -255,10 +255,10 @@ def cube(law: str, end: float) -> dict[str, Any]:
 ON_ONE_AND_TWO_RANKS = [{"scene": cube("tensor", 4.0)}]
 
 
-@pytest.mark.parametrize("law", ["tensor", *slowly("relaxation")])
-def test_one_and_two_ranks_agree(case: Case, law: str) -> None:
-    """With points that are held too."""
-    one, two = (case(cube(law, 4.0 if law == "tensor" else 8.0), ranks=ranks) for ranks in (1, 2))
+@pytest.mark.parametrize("law, end", [("tensor", 4.0), *slowly(("relaxation", 2.0))])
+def test_one_and_two_ranks_agree(case: Case, law: str, end: float) -> None:
+    """With points that are held too, in the first steps: later it hangs on rounding which of them are."""
+    one, two = (case(cube(law, end), ranks=ranks) for ranks in (1, 2))
     for name in ("u", "l"):
         np.testing.assert_allclose(two[name], one[name], atol=1e-8 if law == "tensor" else 1e-6)  # held: less smooth
     np.testing.assert_array_equal(two["held_points"], one["held_points"])
