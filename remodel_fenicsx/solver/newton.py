@@ -19,7 +19,7 @@ from remodel_fenicsx.fem.solver_methods import AUTO, LAGGED, chosen, is_small, m
 from remodel_fenicsx.settings import Solver
 from remodel_fenicsx.solver.convergence import PRESCRIBED_ROUNDING, Convergence
 from remodel_fenicsx.solver.equilibrium import Equilibrium, Extension, Look
-from remodel_fenicsx.solver.limits import Limits
+from remodel_fenicsx.solver.limits import Limits, reserved
 from remodel_fenicsx.solver.linear import LINEAR_METHODS, EveryTangent
 from remodel_fenicsx.system.interrupts import Interrupted
 
@@ -257,10 +257,17 @@ class GuardedNewton:
         """Whether no step shorter than the one to this trial state is worth its cost; the solve then fails."""
         return False
 
-    def may_start(self) -> bool:
-        """Whether the present unknowns, from which `solve` is to start, are admissible."""
+    def may_start(self, last_extension: float) -> bool:
+        """Whether the present unknowns, from which `solve` is to start, are admissible and not too near to locking.
+
+        Parameters
+        ----------
+        last_extension
+            Largest r/L of the last solution.
+        """
         self.limits.forget()
-        self._start_is_known = self.limits.look().extension.admissible
+        extension = self.limits.look().extension
+        self._start_is_known = extension.admissible and reserved(last_extension, extension.max_chain_extension)
         return self._start_is_known
 
     def _attempt(self, origin: Array | None, more_iterations: int = 1) -> Solution:
