@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import json
 import os
 import shlex
 import sys
@@ -112,6 +113,8 @@ def parser() -> argparse.ArgumentParser:
     new = command("new", "Print a scene of a preset.")
     new.add_argument("preset", metavar="PRESET", help=", ".join(PRESETS))
     new.add_argument("--shape", default="tube", help="cube, tendon or tube (default: tube)")
+    schema = command("schema", "Print the JSON Schema of scenes, with which an editor completes and checks keys.")
+    schema.add_argument("-o", "--output", type=Path, metavar="FILE", help="new file for it (default: print it)")
     text = "Draw the paper's figures from own runs, each with its data as CSV; runs still valid are used again."
     figures = commands.add_parser("figures", help="Draw the paper's figures.", description=text)
     figures.add_argument("names", nargs="*", metavar="NAME", help="fig1, fig5 to fig11, rate, energy (default: all)")
@@ -361,6 +364,26 @@ def _new(options: argparse.Namespace) -> int:
     return 0
 
 
+def _schema(options: argparse.Namespace) -> int:
+    from remodel_fenicsx.scene.json_schema import json_schema
+
+    text = json.dumps(json_schema(), indent=2, ensure_ascii=False)
+    if options.output is None:
+        _say(text)
+        return 0
+    if not interrupts.is_first_rank():  # the work of one process
+        return 0
+    try:
+        with open(options.output, "x", encoding="utf-8") as file:
+            file.write(text + "\n")
+    except FileExistsError:
+        return _fail(f"-o {options.output}: exists; allowed is a file that does not", BAD_INPUT)
+    except OSError as error:
+        return _fail(f"-o {options.output}: cannot be written: {error.strerror}", BAD_ENVIRONMENT)
+    _say(f"JSON Schema in {options.output}")
+    return 0
+
+
 def _figures(options: argparse.Namespace) -> int:
     try:
         from remodel_fenicsx import paper as figures
@@ -402,6 +425,7 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
     "revolve": _revolve,
     "validate": _validate,
     "new": _new,
+    "schema": _schema,
     "figures": _figures,
     "info": _info,
     SERVE: lambda options: serve(main),

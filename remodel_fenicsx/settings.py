@@ -10,13 +10,14 @@ import itertools
 import math
 import pkgutil
 import re
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, model_validator
+from pydantic.config import JsonDict
 
 from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.fem.kinematics import KINEMATICS
@@ -44,6 +45,7 @@ from remodel_fenicsx.schema.units import FORCE, NUMBER_DENSITY, STRESS, TEMPERAT
 STRESS_UNITS = {"Pa": 1.0, "kPa": 1.0e3, "MPa": 1.0e6}  # in Pa
 INITIAL_CELLS = ("random", "isotropic", "aligned")
 MOST_STEPS = 1_000_000
+NOT_NEGATIVE: JsonDict = {"type": "number", "minimum": 0}
 
 
 # ---------------------------------------------------------------- body and mesh
@@ -79,31 +81,14 @@ class Mesh(Table):
         return self
 
 
-def _auto_or(names: Collection[str], removed: Mapping[str, str] | None = None) -> BeforeValidator:
-    """Annotation of a field that is `AUTO` or one of a registry's keys, those registered later included.
-
-    `removed`: names of earlier versions, with what to say of each.
-    """
-
-    def check(value: Any) -> Any:
-        if removed and isinstance(value, str) and value in removed:
-            raise fault(removed[value])
-        if value not in (AUTO, *names):
-            raise fault("allowed are " + ", ".join(map(repr, (AUTO, *names))))
-        return value
-
-    return BeforeValidator(check)
-
-
 class Model(Table):
     """Which unknowns describe the deformation."""
 
-    kinematics: Annotated[str, _auto_or(KINEMATICS)] = Field(
+    kinematics: Annotated[str, OneOf(KINEMATICS, (AUTO,))] = Field(
         default=AUTO,
         description="'auto': the cheapest that is exact for the scene; a scene as run has its name. "
         + "; ".join(f"{name!r}: {kinematics.meaning}" for name, kinematics in KINEMATICS.items())
         + ". One that would be wrong for the scene is refused with the reason (docs/kinematics.md).",
-        json_schema_extra={"allowed": "one of " + ", ".join(map(repr, (AUTO, *KINEMATICS)))},
     )
 
 
@@ -220,7 +205,13 @@ class Cells(Table):
         description="Cell dimensions l_I at t = 0, with |l| = end_to_end_length: 'random' (one draw per element, "
         "uniform on the positive octant of the sphere), 'isotropic' (three equal ones), 'aligned' (all of it along "
         "aligned_axis), or [l1, l2, l3] in link lengths.",
-        json_schema_extra={"allowed": "'random', 'isotropic', 'aligned' or three lengths [l1, l2, l3]"},
+        json_schema_extra={
+            "allowed": "'random', 'isotropic', 'aligned' or three lengths [l1, l2, l3]",
+            "anyOf": [
+                {"enum": [*INITIAL_CELLS]},
+                {"type": "array", "items": NOT_NEGATIVE, "minItems": 3, "maxItems": 3},
+            ],
+        },
     )
     axes: Annotated[str, OneOf(AXES)] = Field(
         default="global",
@@ -476,7 +467,10 @@ class Time(Table):
         description="Last time, a whole number of steps, or any time with a tolerance; or 'equilibrium': at once to "
         "the state that remodeling comes to under the loads at the end of their ramps (docs/theory.md, Equilibrium at "
         "once).",
-        json_schema_extra={"allowed": "a finite number greater than 0, or 'equilibrium'"},
+        json_schema_extra={
+            "allowed": "a finite number greater than 0, or 'equilibrium'",
+            "anyOf": [{"type": "number", "exclusiveMinimum": 0}, {"const": EQUILIBRIUM}],
+        },
     )
     step: float = Field(
         default=1.0, gt=0, description="Time between two remodeling passes; with a tolerance the first step."
@@ -555,14 +549,13 @@ def _petsc_options(value: Any) -> Any:
 class Solver(Table):
     """Solution of the nonlinear problem of each step."""
 
-    method: Annotated[str, _auto_or(METHODS, REMOVED)] = Field(
+    method: Annotated[str, OneOf(METHODS, (AUTO,), REMOVED)] = Field(
         default=AUTO,
         description=f"'auto': 'direct' up to {SMALL_BODY} unknowns ({SMALL_REDUCTION} of a reduction), then 'lagged', "
         f"above {LARGE} 'iterative'; "
         f"on more ranks 'direct' up to {LARGE_ON_RANKS}, then 'iterative'; "
         + "; ".join(f"{name!r}: {meaning}" for name, meaning in MEANINGS.items())
         + " (docs/speed.md).",
-        json_schema_extra={"allowed": "one of " + ", ".join(map(repr, (AUTO, *METHODS)))},
     )
     predictor: Literal["none", "autoregressive", "with-tolerance"] = Field(
         default="autoregressive",
@@ -647,7 +640,10 @@ class Output(Table):
         default=True,
         description="Fields to write for ParaView: true for all, false for none, or names (docs/commands.md), 'chains' "
         "for the chain lines. What no name asks for is not computed.",
-        json_schema_extra={"allowed": "true, false or a list of names of fields"},
+        json_schema_extra={
+            "allowed": "true, false or a list of names of fields",
+            "anyOf": [{"type": "boolean"}, {"type": "array", "items": {"enum": [*FIELDS_BY_NAME]}}],
+        },
     )
     columns: Annotated[tuple[str, ...], BeforeValidator(_columns)] = Field(
         default=(),

@@ -30,6 +30,10 @@ replaced whole. A preset's load stays when the scene names only another one; to 
 `--set cells.seed=2`, `--set remodeling.frame=spatial`, `--set 'loads.pressure.ramp=[[0, 0], [25, 1]]'`,
 `--set loads.pressure.value="100 mmHg"`.
 
+An editor that knows JSON Schema completes keys and marks faults. For Even Better TOML (VS Code) or taplo write the
+schema with `remodel-fenicsx schema -o scene.schema.json` and begin the scene with the line
+`#:schema ./scene.schema.json`. The schema sees each key by itself; `remodel-fenicsx validate SCENE` sees them together.
+
 """
 
 _UNITS = """## Values with units

@@ -64,14 +64,33 @@ def _of_python(value: Any) -> Any:
 
 @dataclass(frozen=True)
 class OneOf:
-    """Annotation of a field whose value is one of a registry's keys, those registered later included."""
+    """Annotation of a field whose value is one of a registry's keys, those registered later included.
 
-    choices: Collection[Any]
+    Attributes
+    ----------
+    registry
+        Its keys are allowed.
+    also
+        Allowed too.
+    removed
+        Names of earlier versions, with what to say of each.
+    """
+
+    registry: Collection[Any]
+    also: tuple[Any, ...] = ()
+    removed: Mapping[str, str] | None = None
+
+    @property
+    def choices(self) -> list[Any]:
+        """All that is allowed."""
+        return [*self.also, *self.registry]
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         return core_schema.no_info_after_validator_function(self._check, handler(source))
 
     def _check(self, value: Any) -> Any:
+        if self.removed and value in self.removed:
+            raise fault(self.removed[value])
         if value not in self.choices:
             raise ValueError("not registered")
         return value
@@ -283,7 +302,7 @@ def choices(field: FieldInfo) -> list[Any]:
         return list(variant.registry)
     for entry in field.metadata:
         if isinstance(entry, OneOf):
-            return list(entry.choices)
+            return entry.choices
     return list(get_args(field.annotation)) if get_origin(field.annotation) is Literal else []
 
 

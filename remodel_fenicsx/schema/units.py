@@ -39,7 +39,10 @@ LengthUnit = Annotated[
 # A number, and a unit without brackets: pint would work out towers of powers, which may take for ever.
 _TERM = r"°?[^\W\d_]\w*(?:\s*(?:\^|\*\*)\s*[+-]?[0-9]{1,2}(?![0-9]))?"
 _UNIT = re.compile(rf"(?:/\s*)?{_TERM}(?:\s*[*/·]\s*{_TERM}|\s+{_TERM})*")
-_QUANTITY = re.compile(r"((?>[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?))\s*([^\s0-9.].*)")
+_NUMBER, _REST = r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?", r"[^\s0-9.].*"
+_QUANTITY = re.compile(rf"((?>{_NUMBER}))\s*({_REST})")
+QUANTITY = rf"{_NUMBER}\s*{_REST}"
+"""A number with a unit as a regular expression of JSON Schema, which has no atomic groups."""
 
 
 @dataclass(frozen=True)

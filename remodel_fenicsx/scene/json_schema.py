@@ -1,0 +1,121 @@
+"""A JSON Schema of scenes: what an editor needs to complete keys, to show their meanings and to mark faults.
+
+It knows each key by itself. What depends on several keys (`time.end` on `time.step`, say) `remodel-fenicsx validate`
+alone can tell.
+"""
+
+from __future__ import annotations
+
+import inspect
+from typing import Any, get_args, get_origin
+
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+
+from remodel_fenicsx.body import SHAPES, Shape
+from remodel_fenicsx.scene.presets import PRESETS, PROFILES
+from remodel_fenicsx.scene.scene import FORMAT, Scene
+from remodel_fenicsx.schema.tables import choices, is_table
+from remodel_fenicsx.schema.units import QUANTITY, Dimension, dimension_of
+from remodel_fenicsx.settings import Load
+
+Schema = dict[str, Any]
+
+
+def json_schema() -> Schema:
+    """The JSON Schema (draft 2020-12) of a scene file of this version, what scripts have registered included."""
+    schema = _table(Scene)
+    schema["properties"] |= _of_any_shape()
+    schema["properties"]["preset"] |= {"enum": list(PRESETS)}
+    schema["properties"]["profile"] |= {"enum": list(PROFILES)}
+    head = {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "$id": f"urn:remodel-fenicsx:scene:{FORMAT}",
+        "title": "A scene of remodel_fenicsx",
+    }
+    whole = {"if": {"not": {"required": ["preset"]}}, "then": _required(Scene)}
+    return head | schema | {"required": ["geometry"], "allOf": [whole, *map(_of_shape, SHAPES.values())]}
+
+
+def _table(table: type[BaseModel]) -> Schema:
+    """Of a table with all its keys; none of them is required."""
+    by_pydantic = table.model_json_schema()["properties"]
+    properties = {name: _field(field, by_pydantic[name]) for name, field in table.model_fields.items()}
+    meaning = {"description": inspect.cleandoc(table.__doc__)} if table.__doc__ else {}
+    return {"type": "object", **meaning, "properties": properties, "additionalProperties": False}
+
+
+def _field(field: FieldInfo, by_pydantic: Schema) -> Schema:
+    """Of a key: a table, or the values that it takes."""
+    if is_table(field.annotation):
+        return _table(field.annotation)  # type: ignore[arg-type]
+    schema = {name: entry for name, entry in by_pydantic.items() if name not in ("title", "allowed")}
+    if listed := choices(field):
+        schema["enum"] = listed
+    if dimension := dimension_of(field):
+        schema = _with_unit(schema, dimension)
+    return _without_null(schema)
+
+
+def _with_unit(schema: Schema, dimension: Dimension) -> Schema:
+    """A number, or one with a unit as text."""
+    limits = {name: schema.pop(name) for name in list(schema) if name in ("type", "minimum", "exclusiveMinimum")}
+    text = {"type": "string", "pattern": f"^\\s*{QUANTITY}\\s*$", "examples": [dimension.example]}
+    return schema | {"anyOf": [limits, text]}
+
+
+def _without_null(schema: Schema) -> Schema:
+    """TOML has no null: a key that may be None may be absent."""
+    schema = {name: entry for name, entry in schema.items() if (name, entry) != ("default", None)}
+    kinds = [kind for kind in schema.get("anyOf", []) if kind != {"type": "null"}]
+    return schema if len(kinds) != 1 else {name: e for name, e in schema.items() if name != "anyOf"} | kinds[0]
+
+
+def _of_any_shape() -> Schema:
+    """Keys of the geometry and loads that some shape has: editors complete these; `_of_shape` tells what is allowed."""
+    geometry: Schema = {}
+    loads: Schema = {}
+    for shape in SHAPES.values():
+        geometry |= {name: {"description": field.description} for name, field in shape.model_fields.items()}
+        loads |= {name: {"type": "object", "description": kind.meaning} for name, kind in shape.loads.items()}
+    geometry["shape"]["enum"] = list(SHAPES)
+    return {
+        "geometry": {"type": "object", "properties": geometry, "required": ["shape"]},
+        "loads": {"type": "object", "properties": loads},
+    }
+
+
+def _of_shape(shape: type[Shape]) -> Schema:
+    """What a shape decides: the keys of its geometry, its loads, its supports, its axes."""
+    name = shape.model_fields["shape"].default
+    geometry = _table(shape)
+    geometry["properties"]["shape"] = {"const": name}
+    loads = {load: _load(kind.meaning, kind.dimension) for load, kind in shape.loads.items()}
+    tables = {
+        "geometry": geometry,
+        "loads": {"type": "object", "properties": loads, "additionalProperties": False},
+        "supports": {"properties": {"ends": {"enum": list(shape.ends)}}},
+        "cells": {"properties": {"axes": {"enum": list(shape.axis_kinds)}}},
+    }
+    chosen = {"properties": {"geometry": {"properties": {"shape": {"const": name}}}}}
+    without_preset = {"if": {"not": {"required": ["preset"]}}, "then": {"properties": {"geometry": _required(shape)}}}
+    return {"if": chosen, "then": {"properties": tables, "allOf": [without_preset]}}
+
+
+def _load(meaning: str, dimension: Dimension | None) -> Schema:
+    table = _table(Load)
+    value = table["properties"]["value"]
+    table["properties"]["value"] = _with_unit(value, dimension) if dimension else value
+    return table | {"description": meaning}
+
+
+def _required(table: type[BaseModel]) -> Schema:
+    """Which keys of a table and of the tables in it must be there, where nothing lies under them."""
+    schema: Schema = {"required": [name for name, field in table.model_fields.items() if field.is_required()]}
+    inner = {}
+    for name, field in table.model_fields.items():
+        if is_table(field.annotation):
+            inner[name] = _required(field.annotation)  # type: ignore[arg-type]
+        elif get_origin(field.annotation) is dict and is_table(kind := get_args(field.annotation)[1]):
+            inner[name] = {"additionalProperties": _required(kind)}
+    return schema | {"properties": inner}
