@@ -20,6 +20,7 @@ from remodel_fenicsx.settings import Solver
 from remodel_fenicsx.solver.continuation import Blend, Change, Work
 from remodel_fenicsx.solver.equilibrium import Equilibrium
 from remodel_fenicsx.solver.newton import GuardedNewton, SolveFailure
+from remodel_fenicsx.state.memory import Numbers
 from remodel_fenicsx.state.state import State
 
 Array = NDArray[np.float64]
@@ -89,6 +90,7 @@ class Staggered:
         self.equilibrium.compile_energy()
         self.newton = GuardedNewton(self.equilibrium, settings)
         self.predictor = PREDICTORS[settings.predictor](state)
+        self._last = Numbers(state, "last_solution", {"extension": 0.0})  # its largest r/L
         self.share, self.compares, self._residual = 1.0, False, 0.0
         self.blend: Blend | None = None
         if remodeling.law.remodels:  # now, for no form is compiled in the middle of a run
@@ -116,6 +118,8 @@ class Staggered:
         self.predictor.solved(step, before)
         self.state.settle_cells()
         self._residual = work.residual
+        work.extension = work.extension or self.equilibrium.extension()
+        self._last["extension"] = work.extension.max_chain_extension
         return work
 
     def remodel(self, time: float) -> float:
@@ -137,7 +141,11 @@ class Staggered:
 
     # ------------------------------------------------------------ in one piece: the paper's step
     def _solved_as_expected(self, step: LoadStep, loads: LoadValues, work: Work) -> bool:
-        """Solve from where the predictor expects the solution; if that fails, all is as before."""
+        """Solve from where the predictor expects the solution; if that fails, all is as before.
+
+        Where chains would be almost straight the forces are huge, and Newton's method comes back slowly: from the last
+        displacement it takes fewer iterations.
+        """
         unknown, loading = self.state.unknown.x.array, self.state.loading
         before, old_loads = unknown.copy(), dict(loading.values)
         loading.set(loads)  # what they prescribe is part of what is expected
@@ -145,8 +153,8 @@ class Staggered:
         try:
             if expected is not None:
                 unknown[:] = expected
-            if expected is not None and self.newton.may_start():
-                work.add(self.newton.solve())
+            if expected is not None and self.newton.may_start(self._last["extension"]):
+                work.add(self.newton.solve(origin=before))
                 work.substeps = 1
                 return True
         except SolveFailure as failure:

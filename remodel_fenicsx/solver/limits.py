@@ -87,6 +87,11 @@ class Limits:
         return float(over_ranks(self.equilibrium.comm, room, MPI.MIN))
 
 
+def reserved(before: float, after: float) -> bool:
+    """Whether of two largest r/L the later one is no nearer to 1 than a Newton step would come."""
+    return not after > NEAR_LIMIT or 1 - after >= RESERVE * (1 - before)
+
+
 def squares_of(vectors: Array) -> Array:
     """Squared length of vectors (..., 3)."""
     squares: Array = vectors[..., 0] ** 2 + vectors[..., 1] ** 2 + vectors[..., 2] ** 2

@@ -19,7 +19,7 @@ log = logging.getLogger(__name__)
 
 UNSYMMETRIC = 1e-10  # relative to the largest row: what a symmetric tangent may be unsymmetric by
 WORTH = 12  # iterations that a new factor must save: it costs about as much as they do
-OVER = 3  # iterations over which the rate of convergence is taken
+OVER = 3  # iterations over which the rate of convergence is taken, but for the first one
 SLOW_STEP = 8  # iterations after which the next step starts with a new factor
 MOST_RENEWALS = 6  # of one solve: what needs more is no matter of old factors
 
@@ -46,7 +46,10 @@ class KeptFactor:
     def renew(self, matrix: Any) -> None:
         """Factorise a tangent. Where that fails there are no factors at all, and a log line."""
         symmetric = self.comm.size == 1 and matrix.isSymmetric(UNSYMMETRIC * matrix.norm(PETSc.NormType.NORM_INFINITY))
-        for kind in (DEFINITE, SYMMETRIC, GENERAL) if symmetric else (GENERAL,):
+        kinds = [DEFINITE, SYMMETRIC, GENERAL] if symmetric else [GENERAL]
+        if symmetric and self._was_indefinite():
+            kinds.remove(DEFINITE)  # most likely refused again
+        for kind in kinds:
             if self._factorised(kind, matrix):
                 return
 
@@ -57,6 +60,10 @@ class KeptFactor:
         if self._options is not None:
             self._options.close()
         self.preconditioner, self._options, self._kind = None, None, ""
+
+    def _was_indefinite(self) -> bool:
+        """Whether the kept factor has negative pivots, which MUMPS counts of a symmetric tangent."""
+        return self._kind == SYMMETRIC and self.preconditioner.getFactorMatrix().getMumpsInfog(12) > 0
 
     def _factorised(self, kind: str, matrix: Any) -> bool:
         if self._kind != kind:
@@ -225,10 +232,16 @@ class Lagged(EveryTangent):
         return "with new factors in every iteration", self._anew()
 
     def _costs_more(self, tolerance: float) -> bool:
-        """Whether the iterations that are left cost more than new factors; also where the residual rises."""
-        if len(self._norms) <= OVER:
+        """Whether the iterations that are left cost more than new factors; also where the residual rises.
+
+        The first iteration with a factor tells whether the problem is near linear. The second one often is worse, and
+        L-BFGS makes up for it: only three of them tell more.
+        """
+        since = len(self._norms) - 1
+        if since != 1 and since < OVER:
             return False
-        rate = (self._norms[-1] / self._norms[-1 - OVER]) ** (1 / OVER)
+        over = min(since, OVER)
+        rate = (self._norms[-1] / self._norms[-1 - over]) ** (1 / over)
         return bool(not rate < 1 or np.log(tolerance / self._norms[-1]) / np.log(rate) > WORTH)
 
     def factorisation(self) -> Any | None:

@@ -13,6 +13,7 @@ from remodel_fenicsx import Recording, Simulation
 from remodel_fenicsx.evolution.predictor import PREDICTORS, Autoregressive, LoadStep, NoPredictor, Responsive
 from remodel_fenicsx.results.checkpoint_file import read_checkpoint
 from remodel_fenicsx.running import resume, run
+from remodel_fenicsx.solver.equilibrium import Equilibrium
 from remodel_fenicsx.solver.newton import GuardedNewton, SolveFailure
 from tests.parts import pulled_cube
 from tests.results.test_resume import SELF, rows
@@ -151,19 +152,36 @@ def test_it_is_resumed_with_what_it_remembers(predicted: Path, tmp_path: Path) -
     np.testing.assert_allclose(*displacements, rtol=0, atol=1e-9)
 
 
+def nearly_straight(predictor: Autoregressive, step: LoadStep) -> np.ndarray | None:
+    """The last displacement, stretched until the longest chain has 0.999 of its contour length."""
+    tissue = pulled_cube(4.0).material.tissue(pulled_cube(4.0).cells.end_to_end_length)
+    unknown, extension = predictor.state.unknown.x.array, Equilibrium(predictor.state, tissue).extension
+    last, factors = unknown.copy(), [1.0, 20.0]
+    if not predictor.state.number:
+        return None
+    while factors[1] - factors[0] > 1e-9:
+        middle = sum(factors) / 2
+        unknown[:] = middle * last
+        factors[int(extension().max_chain_extension > 0.999)] = middle
+    unknown[:] = last
+    return factors[0] * last
+
+
 def test_what_is_expected_wrongly_costs_no_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Not admissible, or a start from which the solve fails: the step is solved as without."""
+    """Not admissible, with chains nearly straight, or a start from which the solve fails: all is as without."""
     scene = pulled_cube(4.0, solver=PREDICTED, output={"fields": False})
     plain = run(pulled_cube(4.0, solver=NOT_PREDICTED, output={"fields": False}), tmp_path / "plain", SELF)
     monkeypatch.setattr(Autoregressive, "expected", lambda self, step: -50.0 * self.state.unknown.x.array)
     assert rows(run(scene, tmp_path / "far", SELF)) == rows(plain)
+    monkeypatch.setattr(Autoregressive, "expected", nearly_straight)
+    assert rows(run(scene, tmp_path / "straight", SELF)) == rows(plain)
     solve, failed = GuardedNewton.solve, []
 
-    def failing(newton: GuardedNewton) -> Any:
+    def failing(newton: GuardedNewton, origin: Any = None) -> Any:
         if not failed or failed[-1] != newton.equilibrium.state.number:
             failed.append(newton.equilibrium.state.number)
             raise SolveFailure("made to fail", 3, 3, newton.equilibrium.extension())
-        return solve(newton)
+        return solve(newton, origin)
 
     monkeypatch.setattr(Autoregressive, "expected", lambda self, step: self.state.unknown.x.array + 0.0)
     monkeypatch.setattr(GuardedNewton, "solve", failing)
