@@ -608,6 +608,8 @@ def test_older_roots_are_pruned_unless_in_use(rooted):
         ({"XDG_CACHE_HOME": None, "HOME": "/dev/null"}, "cannot write to /dev/null/.cache/remodel-fenicsx"),
         ({"WITH_FENICSX": "magic"}, "WITH_FENICSX=magic: allowed are native, root and container"),
         ({"WITH_FENICSX_SUITE": "sid"}, "WITH_FENICSX_SUITE=sid: allowed are trixie and unstable"),
+        ({"WITH_FENICSX_ADD": "window"}, "WITH_FENICSX_ADD=window: allowed is browser"),
+        ({"WITH_FENICSX_ADD": "../x"}, "WITH_FENICSX_ADD=../x: allowed is browser"),
         ({"WITH_FENICSX": "container"}, "WITH_FENICSX=container: neither docker nor podman can start a container"),
     ],
 )

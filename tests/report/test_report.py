@@ -204,7 +204,8 @@ def test_a_hundred_thousand_elements_fit(monkeypatch: pytest.MonkeyPatch) -> Non
         return {
             "displacement": 0.002 * t * points, "deformation_gradient": np.tile(np.eye(3).ravel(), (len(elements), 1)),
             "fibre_angle_deformed": np.clip(45 + scatter * np.exp(-t / 50), 0, 90),
-            "chain_extension": np.full(len(elements), 0.7), "cell_dimensions": rng.uniform(0.3, 0.8, (len(elements), 3)),
+            "chain_extension": np.full(len(elements), 0.7),
+            "cell_dimensions": rng.uniform(0.3, 0.8, (len(elements), 3)),
             **{f"axis_{k + 1}": axes[:, k] for k in range(3)},
         }  # fmt: skip
 
