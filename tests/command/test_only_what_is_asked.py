@@ -22,6 +22,8 @@ from remodel_fenicsx.scene import scene_from_dict
 from remodel_fenicsx.settings import FIELDS_BY_NAME
 from remodel_fenicsx.solver.continuation import Blend, Work
 from remodel_fenicsx.solver.equilibrium import Equilibrium
+from remodel_fenicsx.watch.locking import LockingWarning
+from tests.parts import pulled_cube
 
 SELF = MPI.COMM_SELF
 
@@ -62,6 +64,15 @@ def test_a_state_is_evaluated_once(monkeypatch: pytest.MonkeyPatch) -> None:
     evaluations, parameters = Calls(monkeypatch, Quadrature, "evaluate"), Calls(monkeypatch, assembly, "point_values")
     iterations = sum(step.work.newton_iterations for step in march)
     assert evaluations.number <= iterations + 2 * 2 and parameters.number == 0
+    simulation.close()
+
+
+def test_energies_of_elements_are_summed_up_once_a_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They tell whether to look for elements that lock, and what such a look begins with."""
+    calls, looks = (Calls(monkeypatch, LockingWarning, name) for name in ("energies", "work"))
+    simulation = Simulation(pulled_cube(3.0), SELF)
+    assert len(list(simulation.steps())) == 3 == calls.number
+    assert looks.number
     simulation.close()
 
 
