@@ -298,7 +298,7 @@ class AnsweringNewton(GuardedNewton):
         self.answering = equilibrium.answering
         self._patient = False  # whether shorter steps are looked for where cells have no solution
 
-    def solve(self) -> Solution:
+    def solve(self, origin: Array | None = None) -> Solution:
         """As of `GuardedNewton`; at first no cells are held.
 
         Where Newton's method fails, or some cells have no solution at its deformations, it starts again from the
@@ -306,7 +306,7 @@ class AnsweringNewton(GuardedNewton):
         """
         start, accepted = self.unknown.x.array.copy(), self.answering.accepted
         try:
-            return self._solved()
+            return self._solved(origin)
         except SolveFailure as failure:
             if self.answering.frozen is not None:
                 raise
@@ -377,10 +377,10 @@ class AnsweringNewton(GuardedNewton):
         right_way_out = trial.extension.min_jacobian > 0 and not self._patient
         return right_way_out and self.answering.unsolved(self.equilibrium.locking_length())
 
-    def _solved(self) -> Solution:
+    def _solved(self, origin: Array | None = None) -> Solution:
         self.answering.release()
         start = self.unknown.x.array.copy()
-        solution = super().solve()
+        solution = super().solve(origin)
         if not self.answering.complete():
             extension = self.equilibrium.extension()
             self.unknown.x.array[:] = start

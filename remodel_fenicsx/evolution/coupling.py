@@ -154,7 +154,7 @@ class Staggered:
             if expected is not None:
                 unknown[:] = expected
             if expected is not None and self.newton.may_start(self._last["extension"]):
-                work.add(self.newton.solve())
+                work.add(self.newton.solve(origin=before))
                 work.substeps = 1
                 return True
         except SolveFailure as failure:

@@ -145,7 +145,7 @@ class Change:
             self.set_fraction(1.0 if is_last else done + part)
             self.newton.convergence.intermediate = self.roughly and not is_last
             try:
-                solution = self.newton.solve()
+                solution = self.newton.solve(origin=before)
                 work.add(solution)
             except SolveFailure as failed:
                 self.newton.unknown.x.array[:] = before
@@ -204,13 +204,16 @@ class Change:
 
     def look_back(self, before: NDArray[np.float64], work: Work) -> bool:
         """After a step: look into one that has ended far from its tangent or from the step before; whether it did."""
-        unknown, last = self.newton.unknown.x.array, self._jumps["moved"]
-        moved, least = self._size(unknown - before), POSSIBLE_JUMP * self.newton.equilibrium.state.loading.domain.size
-        is_far = work.is_far or (last > 0.0 and moved > max(least, FASTER * last))
+        unknown, jumps = self.newton.unknown.x.array, self._jumps
+        moved, last = self._size(unknown - before), jumps["moved"]
+        least = POSSIBLE_JUMP * self.newton.equilibrium.state.loading.domain.size
+        again = jumps["time"] == self.time  # solved once more, with other cells: that is no step of its own
+        is_far = work.is_far or (not again and last > 0.0 and moved > max(least, FASTER * last))
         looked = is_far and self._looks()
         if looked:
             self.confirm(before, work)
-        self._jumps["moved"] = self._size(unknown - before)
+            moved = self._size(unknown - before)
+        jumps["moved"], jumps["time"] = max(moved, last) if again else moved, self.time
         return looked
 
     def confirm(self, before: NDArray[np.float64], work: Work) -> None:
@@ -260,7 +263,7 @@ class Change:
 
     @property
     def _jumps(self) -> Numbers:
-        return Numbers(self.newton.equilibrium.state, "jumps", {"found": 0, "moved": 0})
+        return Numbers(self.newton.equilibrium.state, "jumps", {"found": 0, "moved": 0, "time": 0})
 
     def _jumped(self, solved: NDArray[np.float64], refusal: Refusal) -> None:
         """Say that there is no way to what was solved; unknowns and loads are those where the way ends."""

@@ -10,6 +10,7 @@ from typing import Any
 import dolfinx.fem.petsc
 import numpy as np
 from mpi4py import MPI
+from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from remodel_fenicsx.fem.assembly import over_ranks
@@ -23,6 +24,8 @@ from remodel_fenicsx.solver.linear import LINEAR_METHODS, EveryTangent
 from remodel_fenicsx.system.interrupts import Interrupted
 
 log = logging.getLogger(__name__)
+
+Array = NDArray[np.float64]
 
 LINE_SEARCH_HALVINGS = 20  # of one Newton step, before the solve is given up
 POSSIBLE_JUMP = 1e-3  # of the body's size: displacements that may be a jump; 1 % of the radius of a tube of this length
@@ -60,8 +63,7 @@ class Solution(Counted):
     extension
         How far the solution is from the limits r < L and J > 0.
     reach
-        Distance of the solution from the start over the length of the first Newton step; 0 where it is too short to
-        matter.
+        Distance of the solution from the origin over that of the first iterate; 0 where it is too short to matter.
     """
 
     newton_iterations: int
@@ -113,8 +115,10 @@ class _Solve:
 
     Attributes
     ----------
-    first_step
-        Length of the first Newton step.
+    origin
+        Unknowns at which the way to the solution begins.
+    first_iterate
+        Its distance from the origin.
     norm
         Norm of the residual in the last iteration.
     inadmissible
@@ -123,7 +127,8 @@ class _Solve:
         Whether the present trial state is admissible by the bound of `Limits` alone.
     """
 
-    first_step: float | None = None
+    origin: Array
+    first_iterate: float | None = None
     norm: float = np.inf
     inadmissible: bool = False
     bounded: bool = False
@@ -185,7 +190,7 @@ class GuardedNewton:
         self.convergence = Convergence(equilibrium, settings)
         bounded = self.method == LAGGED and "snes_linesearch_type" not in self._options.given
         self.limits = Limits(equilibrium, bounded)
-        self._present = _Solve()
+        self._present = _Solve(self._values.copy())
         self._start_is_known = False  # whether the limits have been asked for the start of the next solve
         self._options_checked = False
         snes: Any = PETSc.SNES().create(equilibrium.comm)
@@ -215,8 +220,13 @@ class GuardedNewton:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def solve(self) -> Solution:
+    def solve(self, origin: Array | None = None) -> Solution:
         """Solve from the present unknowns; on success they are the solution.
+
+        Parameters
+        ----------
+        origin
+            Unknowns at which the way to it begins, where the present ones are only what is expected.
 
         Raises
         ------
@@ -227,7 +237,7 @@ class GuardedNewton:
             If a signal asked for the end; the unknowns are restored.
         """
         try:
-            return self._attempt(self._linear.more_iterations)
+            return self._attempt(origin, self._linear.more_iterations)
         except SolveFailure as failure:
             second = self._linear.second_try()
             if second is None:
@@ -236,7 +246,7 @@ class GuardedNewton:
             log.info("solved once more, %s: %s", words, failure.reason)
             with other_way:
                 try:
-                    solution = self._attempt()
+                    solution = self._attempt(origin)
                 except SolveFailure as again:
                     again.count(failure)
                     raise
@@ -260,12 +270,12 @@ class GuardedNewton:
         self._start_is_known = extension.admissible and reserved(last_extension, extension.max_chain_extension)
         return self._start_is_known
 
-    def _attempt(self, more_iterations: int = 1) -> Solution:
+    def _attempt(self, origin: Array | None, more_iterations: int = 1) -> Solution:
         start, tangents = self._values.copy(), self._linear.tangents
         self._snes.setTolerances(max_it=more_iterations * self._most_iterations)
         self.convergence.begin()
         self._pull(self._x)
-        self._present = _Solve()
+        self._present = _Solve(start if origin is None else origin)
         if not self._start_is_known:
             self.limits.forget()
         self._start_is_known = False
@@ -287,16 +297,20 @@ class GuardedNewton:
             raise SolveFailure(text, newton, linear, extension, left, self._linear.tangents - tangents, relative)
         self._linear.ended(newton)
         norm, tangents = float(self._snes.getFunctionNorm()), self._linear.tangents - tangents
-        return Solution(newton, linear, norm, tangents, extension, self._reach(self._values - start))
+        return Solution(newton, linear, norm, tangents, extension, self._reach())
 
-    def _reach(self, change: Any) -> float:
-        """`Solution.reach` of a solve that has changed the unknowns so."""
-        comm, state = self.equilibrium.comm, self.equilibrium.state
+    def _reach(self) -> float:
+        """`Solution.reach` of the present unknowns."""
+        comm, state, present = self.equilibrium.comm, self.equilibrium.state, self._present
+        change = self._values - present.origin
         largest = over_ranks(comm, np.abs(change).max(initial=0.0), MPI.MAX)
-        if not self._present.first_step or largest < POSSIBLE_JUMP * state.loading.domain.size:
+        if not present.first_iterate or largest < POSSIBLE_JUMP * state.loading.domain.size:
             return 0.0
-        owned = change[: state.number_of_owned_unknowns]
-        return float(np.sqrt(over_ranks(comm, owned @ owned, MPI.SUM))) / self._present.first_step
+        return self._length(change[: state.number_of_owned_unknowns]) / present.first_iterate
+
+    def _length(self, change: Array) -> float:
+        """Norm of a change of the unknowns; of this rank only those that it owns."""
+        return float(np.sqrt(over_ranks(self.equilibrium.comm, float(change @ change), MPI.SUM)))
 
     def tangent_direction(self, set_fraction: Callable[[float], None], done: float, distance: float) -> Any:
         """Change of the unknowns per fraction of a change of the problem, at a solved state; one linear solve.
@@ -418,8 +432,9 @@ class GuardedNewton:
         """
         met, present = self.convergence.prescribed_gap <= PRESCRIBED_ROUNDING, self._present
         improved = self._linear.improve(x, self._snes.getFunction()[0], step, met)
-        if present.first_step is None:
-            present.first_step = float(step.norm())
+        if present.first_iterate is None:
+            first = x.array_r - step.array_r
+            present.first_iterate = self._length(first - present.origin[: first.size])
         length = np.sqrt(3) * step.norm(PETSc.NormType.NORM_INFINITY)
         present.bounded = self.limits.bounded and self.limits.certainly_allow(length)
         if present.bounded:

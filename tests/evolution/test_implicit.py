@@ -17,7 +17,6 @@ from remodel_fenicsx.running import resume
 from remodel_fenicsx.running import run as record
 from remodel_fenicsx.scene.scene import scene_from_dict
 from remodel_fenicsx.simulation import Simulation
-from remodel_fenicsx.solver.continuation import PROOF
 from tests.conftest import Case, slowly
 from tests.parts import tube
 
@@ -35,8 +34,6 @@ def short_tube(end: float, step: float = 1.0, law: str = "tensor", comm: Any = M
         "time": {"end": end, "step": step},
         "output": {"columns": ["held_points", "pass_residual"]},
         "remodeling": {"law": law, "coupling": "implicit", "frame": "material"} | changes,
-        # too few for steps that go far to be looked into again (`parts.PROOF`): what is counted is the plain solve
-        "solver": {"maximum_halvings": PROOF - 1},
     }
     domain = tube(1.0, 3.0, 1.0, degree=1, divisions=divisions, comm=comm)
     return Simulation(scene_from_dict(values), comm, domain)
@@ -258,10 +255,10 @@ def cube(law: str, end: float) -> dict[str, Any]:
 ON_ONE_AND_TWO_RANKS = [{"scene": cube("tensor", 4.0)}]
 
 
-@pytest.mark.parametrize("law", ["tensor", *slowly("relaxation")])
-def test_one_and_two_ranks_agree(case: Case, law: str) -> None:
-    """With points that are held too."""
-    one, two = (case(cube(law, 4.0 if law == "tensor" else 8.0), ranks=ranks) for ranks in (1, 2))
+@pytest.mark.parametrize("law, end", [("tensor", 4.0), *slowly(("relaxation", 2.0))])
+def test_one_and_two_ranks_agree(case: Case, law: str, end: float) -> None:
+    """With points that are held too, in the first steps: later it hangs on rounding which of them are."""
+    one, two = (case(cube(law, end), ranks=ranks) for ranks in (1, 2))
     for name in ("u", "l"):
         np.testing.assert_allclose(two[name], one[name], atol=1e-8 if law == "tensor" else 1e-6)  # held: less smooth
     np.testing.assert_array_equal(two["held_points"], one["held_points"])

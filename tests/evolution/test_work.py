@@ -40,9 +40,9 @@ def attempts(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Attempt]]:
     found: list[Attempt] = []
     solve = GuardedNewton.solve
 
-    def counted(self: GuardedNewton) -> Solution:
+    def counted(self: GuardedNewton, origin: Any = None) -> Solution:
         try:
-            solution = solve(self)
+            solution = solve(self, origin)
         except SolveFailure as failure:
             found.append(failure)
             raise

@@ -16,6 +16,7 @@ from remodel_fenicsx.solver.continuation import Change, StepFailure
 from remodel_fenicsx.solver.equilibrium import Extension
 from remodel_fenicsx.solver.newton import GuardedNewton, SolveFailure
 from remodel_fenicsx.solver.refusals import diagnosed
+from tests.locking_bodies import thick_tube
 
 LARGEST = 0.3018  # pressure of this tube: benchmarks/stability_map/tube_march.py, with the inner radius prescribed
 
@@ -101,6 +102,21 @@ def test_a_far_step_with_a_way_to_it_says_nothing(
     assert whole == pytest.approx(small[-1], rel=1e-8)
 
 
+def test_where_a_step_is_expected_to_end_is_no_start_of_its_way(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An increment like the last one changes the volume of a stiff body: its first Newton step is short, no way far."""
+    looked: list[int] = []
+    monkeypatch.setattr(Change, "confirm", lambda *arguments: looked.append(1))
+    found = []
+    for predictor in ("autoregressive", "none"):
+        scene = thick_tube(1e3, "displacement").with_values(
+            {"model.kinematics": "radial", "mesh.degree": 2, "solver.predictor": predictor}
+        )
+        found.append(radii(scene))
+    (radius, iterations), (without, _) = found
+    assert not looked and iterations <= 6 * len(radius)
+    assert radius == pytest.approx(without, rel=1e-8)
+
+
 def test_of_several_solutions_the_one_that_parts_lead_to_is_taken(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -113,15 +129,15 @@ def test_of_several_solutions_the_one_that_parts_lead_to_is_taken(
     wide.close()
     solve, starts = GuardedNewton.solve, [far]
 
-    def misled(newton: GuardedNewton) -> Any:
+    def misled(newton: GuardedNewton, origin: Any = None) -> Any:
         if starts:
             first = newton.unknown.x.array.copy()
             newton.unknown.x.array[:] = starts.pop()
-            solution = solve(newton)
+            solution = solve(newton, origin)
             assert np.abs(newton.unknown.x.array - first).max() > 1.0
             object.__setattr__(solution, "reach", 10.0)
             return solution
-        return solve(newton)
+        return solve(newton, origin)
 
     monkeypatch.setattr(GuardedNewton, "solve", misled)
     found, _ = radii(thin_tube(0.29, **{"solver.relative_tolerance": 1e-9}))

@@ -177,11 +177,11 @@ def test_what_is_expected_wrongly_costs_no_step(tmp_path: Path, monkeypatch: pyt
     assert rows(run(scene, tmp_path / "straight", SELF)) == rows(plain)
     solve, failed = GuardedNewton.solve, []
 
-    def failing(newton: GuardedNewton) -> Any:
+    def failing(newton: GuardedNewton, origin: Any = None) -> Any:
         if not failed or failed[-1] != newton.equilibrium.state.number:
             failed.append(newton.equilibrium.state.number)
             raise SolveFailure("made to fail", 3, 3, newton.equilibrium.extension())
-        return solve(newton)
+        return solve(newton, origin)
 
     monkeypatch.setattr(Autoregressive, "expected", lambda self, step: self.state.unknown.x.array + 0.0)
     monkeypatch.setattr(GuardedNewton, "solve", failing)

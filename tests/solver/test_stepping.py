@@ -123,12 +123,12 @@ def test_each_part_of_the_exchange_leaves_a_reserve_at_every_point(
     coupling.blend.set(0.0)
     reserve_before = [1 - np.sqrt(coupling.blend.equilibrium.limit_values()[0]) / length]
 
-    def watched(newton: GuardedNewton) -> Solution:
+    def watched(newton: GuardedNewton, origin: Any = None) -> Solution:
         if newton is coupling.newton:
-            return real(newton)
+            return real(newton, origin)
         now = 1 - np.sqrt(newton.equilibrium.limit_values()[0]) / length
         reserve.append(float(np.min(now / reserve_before[-1])))
-        solution = real(newton)
+        solution = real(newton, origin)
         reserve_before.append(1 - np.sqrt(newton.equilibrium.limit_values()[0]) / length)
         return solution
 
@@ -193,8 +193,8 @@ def test_cells_that_cannot_be_exchanged_are_a_failure_that_changes_nothing(monke
     before = state(made)
     real = GuardedNewton.solve
 
-    def refuse(newton: GuardedNewton) -> Solution:
-        real(newton)
+    def refuse(newton: GuardedNewton, origin: Any = None) -> Solution:
+        real(newton, origin)
         made.displacement.x.array[:] = before["u"]
         raise SolveFailure("refused", 2, 3, Extension(0.9, 0.5, (0.25, 0.5, 1.0)))
 
@@ -219,7 +219,7 @@ class Refusing:
         self.tried: list[float] = []
         self.accepted = [0.0]
 
-    def __call__(self) -> Solution:
+    def __call__(self, origin: Any = None) -> Solution:
         force = self.made.loading.values["force"]
         self.tried.append(force)
         if force - self.accepted[-1] > self.limit:
@@ -249,7 +249,7 @@ def test_a_part_that_would_go_beyond_the_end_is_halved_from_what_is_left(monkeyp
     refusing = Refusing(made, 2.5)
     real = refusing.__call__
 
-    def stricter_near_the_end() -> Solution:
+    def stricter_near_the_end(origin: Any = None) -> Solution:
         refusing.limit = 1.5 if refusing.accepted[-1] >= 6.0 else 2.5
         return real()
 
@@ -337,7 +337,7 @@ def test_after_an_exchange_of_the_cells_the_loads_are_tried_in_one_piece(monkeyp
     coupling: Any = stepper.coupling
     tried: list[tuple[str, float]] = []
 
-    def refuse_the_first(newton: GuardedNewton) -> Solution:
+    def refuse_the_first(newton: GuardedNewton, origin: Any = None) -> Solution:
         tried.append(("loads" if newton is coupling.newton else "cells", made.loading.values["force"]))
         if len(tried) == 1:
             raise SolveFailure("too much", 7, 7, Extension(0.9, 0.5, (0.0, 0.0, 0.0)))

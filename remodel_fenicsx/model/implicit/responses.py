@@ -185,9 +185,11 @@ def _principal(step: StepOfCells, strain: Strain, tensor: Array) -> _Principal:
     U[:, range(3), range(3)] = strain.stretches
     old = UnitCell(step.cells.dimensions, step.cells.axes @ strain.basis)
     carried = not step.driver.material and step.frame.carries_axes
+    # an error may not decide how cells jump; where they do not, axes that stay up to the noise would be the only jump
+    error = np.where(jumps_by_rank(step), step.noise, step.rounding)
     drive = Drive(
         U,
-        spectral.without_noise(tensor, carried_axes(U, old.axes) if carried else old.axes, step.noise),
+        spectral.without_noise(tensor, carried_axes(U, old.axes) if carried else old.axes, error),
         step.driver,
         step.frame,
         step.noise,
