@@ -15,7 +15,7 @@ from remodel_fenicsx.model import logarithm, tensor_law
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.chains import CHAINS
 from remodel_fenicsx.model.drivers import DRIVERS, rotated_back
-from remodel_fenicsx.model.energy import MATRICES, REPULSIONS, Repulsion, Tissue, whole_structure_tensor
+from remodel_fenicsx.model.energy import MATRICES, REPULSIONS, Tissue, whole_structure_tensor
 from remodel_fenicsx.model.implicit import condensed
 from remodel_fenicsx.model.implicit.condensed import CondensedPoints
 from remodel_fenicsx.model.implicit.responses import StepOfCells
@@ -94,14 +94,6 @@ class TensorKernels:
 def tensor_kernels(comm: MPI.Intracomm) -> TensorKernels | None:
     """None where numpy is asked for. Collective."""
     return None if in_numpy() else TensorKernels(comm)
-
-
-def with_kernels(tissue: Tissue, comm: MPI.Intracomm) -> Tissue:
-    """The tissue with its repulsion in C, where it is `log`."""
-    if tissue.chain is None or tissue.repulsion is not REPULSIONS["log"] or in_numpy():
-        return tissue
-    kernels = TensorKernels(comm)
-    return replace(tissue, repulsion=Repulsion(kernels.log_sum, kernels.log_derivatives))
 
 
 def condensed_points(kernels: TensorKernels | None, tissue: Tissue, step: StepOfCells) -> CondensedPoints:

@@ -216,6 +216,21 @@ def test_a_run_imports_only_what_it_needs(tmp_path: Path) -> None:
     assert "gmsh 4" in (tmp_path / "run" / "scene.toml").read_text()  # its version is known all the same
 
 
+def test_the_printed_law_imports_no_other_coupling() -> None:
+    """Nor what chooses steps, or goes to an equilibrium."""
+    program = (
+        "import sys\nfrom remodel_fenicsx import Simulation, preset_scene\n"
+        "Simulation(preset_scene('kuhl-holzapfel-2007', 'cube')).close()\n"
+        "print(*sorted(name for name in sys.modules if name.startswith('remodel_fenicsx.')))"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    imported = done.stdout.split()
+    assert "remodel_fenicsx.evolution.coupling" in imported
+    others = ("implicit", "condensed", "homeostasis", "step_control", "time_error", "kernels.tensor")
+    assert not [name for name in imported if any(other in name for other in others)]
+
+
 def test_no_form_is_made_in_the_middle_of_a_run(monkeypatch: pytest.MonkeyPatch) -> None:
     """What a step in parts needs is there before the first step."""
     simulation = Simulation(scene(), SELF)
