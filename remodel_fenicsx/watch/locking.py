@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.evolution.stepper import Step, Stepper
 from remodel_fenicsx.fem import jit
-from remodel_fenicsx.model.operators import cofactor
+from remodel_fenicsx.model.tensors import cofactor
 from remodel_fenicsx.state.memory import Occasions
 from remodel_fenicsx.state.parameters import at_points
 from remodel_fenicsx.watch.once import WarnsOnce

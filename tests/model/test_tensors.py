@@ -1,10 +1,10 @@
-"""Tensor operations on arrays."""
+"""Deformation gradients of many points at once."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from remodel_fenicsx.model.operators import cofactor
+from remodel_fenicsx.model.tensors import cofactor
 
 
 def test_the_cofactor_is_j_times_the_inverse_transposed() -> None:
