@@ -15,13 +15,12 @@ from remodel_fenicsx.evolution.remodeling import RemodelingPass
 from remodel_fenicsx.fem.assembly import over_ranks
 from remodel_fenicsx.fem.solver_methods import AUTO
 from remodel_fenicsx.kernels.tensor import condensed_points, tensor_kernels
-from remodel_fenicsx.model import spectral
 from remodel_fenicsx.model.cells import UnitCell, structure_tensor
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.model.implicit import condensed
 from remodel_fenicsx.model.implicit.responses import StepOfCells, jumps_by_rank
 from remodel_fenicsx.model.laws import relaxed
-from remodel_fenicsx.model.operators import determinant
+from remodel_fenicsx.model.tensors import determinant
 from remodel_fenicsx.settings import Solver
 from remodel_fenicsx.solver.equilibrium import Equilibrium, Look
 from remodel_fenicsx.solver.newton import GuardedNewton, Solution, SolveFailure
@@ -34,8 +33,8 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 BEFORE_HOLDING = 5
-"""Newton iterations after which cells that still jump stay as they are (by rank there are states without a solution),
-or after which states where cells are not found are refused (where none may be held)."""
+"""Newton iterations after which cells that still jump are held (by rank there are states without a solution), or after
+which states where cells are not found are refused (where none may be held)."""
 PASSES = 8  # with frozen cells, before a second try
 SETTLES = 0.5  # of the largest change of the unknowns over a pass: what the last may be
 JUMP = 0.02
@@ -58,13 +57,15 @@ class AnsweringCells:
     ----------
     stress, tangent
         P (3, 3) and dP/dF (9, 9), row by row: dolfinx functions that belong to the last `update`.
+    frozen
+        Cells of all points where none answers: those at the start of the step, or those of a pass.
     held
         Points whose cells answer no more in this solve.
-    frozen
-        Cells, and their A, of all points where none answers: those at the start of the step, or those of a pass.
-    holds
+    may_hold
         Whether points where the law jumps (`responses.jumps_by_rank`) may be held; otherwise a state with points that
         have no solution is refused.
+    accepted
+        The driving tensor of the last accepted state, from which the next solve starts.
     """
 
     def __init__(self, state: State, tissue: Tissue, remodeling: RemodelingPass):
@@ -72,12 +73,10 @@ class AnsweringCells:
         self.quadrature = state.cells.quadrature
         self.stress = self.quadrature.function("answering_stress", (3, 3))
         self.tangent = self.quadrature.function("answering_tangent", (9, 9))
-        self.frozen: tuple[UnitCell, Array] | None = None
-        self.holds = True
-        self.held: Flags = np.zeros(int(np.prod(self.quadrature.shape)), dtype=bool)
-        self._kernels = None
-        if remodeling.law.target is not None:
-            self._kernels = tensor_kernels(state.comm)
+        self.frozen: UnitCell | None = None
+        self.may_hold = True
+        self.held: Flags
+        self._kernels = tensor_kernels(state.comm) if remodeling.law.target is not None else None
         self._points: condensed.CondensedPoints
         self._jumps: Flags  # points where the law jumps
         self._found: condensed.LocalSolution
@@ -86,55 +85,39 @@ class AnsweringCells:
         self._start: Array
         self.accepted: Array
         self._iterations = 0
-        self._last_structure: Array | None = None
+        self._last_structure: Array
 
     # ------------------------------------------------------------ a step
     def begin(self, time: float, residual: float) -> None:
         """The present state is the start of a step to this time; it was accepted with these out-of-balance forces."""
-        settings, cells = self.remodeling.settings, self.state.cells
-        tissue = at_points(self.tissue, self.quadrature)
-        F, tensor = self.remodeling.driving_tensor()
-        old = UnitCell(*(values.copy() for values in cells.point_cells[:2]))
-        step = StepOfCells(
-            self.remodeling.law,
-            self.remodeling.driver,
-            self.remodeling.frame,
-            spectral.PAIRINGS[settings.pairing],
-            old,
-            structure_tensor(*old[:2]),
-            cells.initial_dimensions.reshape(-1, 3),
-            tissue.end_to_end_length,
-            settings.kappa,
-            self.state.time,
-            time,
-            *self.remodeling.noise(F, tensor, residual),
-        )
-        self._points = condensed_points(self._kernels, tissue, step)
-        self.accepted = self._points.kept(F, old, step.structure).driving_tensor
+        drive, cells = self.remodeling.drive(residual), self.state.cells.point_cells
+        old = UnitCell(cells.dimensions.copy(), cells.axes.copy())
+        step = StepOfCells(self.remodeling.law, drive, old, structure_tensor(*old[:2]), self.state.time, time)
+        self._points = condensed_points(self._kernels, at_points(self.tissue, self.quadrature), step)
+        self.accepted = self._points.with_cells(drive.deformation_gradient, old).driving_tensor
         self._jumps = jumps_by_rank(step)
         self.release()
 
     def set_time(self, time: float) -> None:
         """Another end of the step, which starts with the same cells."""
-        self._points = replace(self._points, step=replace(self._points.step, time_new=time))
+        self._points = replace(self._points, step=self._points.step._replace(time_new=time))
         self.release()
 
     def release(self) -> None:
         """All cells answer again, from the driving tensor of the last accepted state."""
-        self.held = np.zeros_like(self.held)
-        self._start, self._gradient, self._last_structure, self._iterations = self.accepted, None, None, 0
+        self.held = np.zeros_like(self._jumps)
+        self._start, self._gradient, self._iterations = self.accepted, None, 0
 
-    def freeze(self) -> None:
-        """No cells answer: those at the start of the step stay."""
-        self.frozen = self._points.step.cells, self._points.step.structure
+    def freeze(self, cells: UnitCell | None = None) -> None:
+        """No cells answer: these stay, or those at the start of the step."""
+        self.frozen, self._gradient = cells or self._points.step.cells, None
 
     def follow(self, factor: float) -> None:
         """Frozen cells make a share of a pass with the present stress: towards what it asks for at the step's end."""
         assert self.frozen is not None
         self.update()
-        F = self.state.deformation_gradient()
-        cells = relaxed(self.frozen[0], self._cells_of(self._points.passed(F, self._found)), factor)
-        self.frozen, self._gradient = (cells, structure_tensor(*cells[:2])), None
+        cells = self._points.unit_cells(self._points.passed(self._found))
+        self.freeze(relaxed(self.frozen, cells, factor))
 
     def accept(self) -> None:
         """The present state is a solved one."""
@@ -144,31 +127,16 @@ class AnsweringCells:
     @property
     def asked(self) -> UnitCell:
         """The cells of the last update."""
-        return self._cells_of(self._found)
+        return self._points.unit_cells(self._found)
 
-    def _cells_of(self, found: condensed.LocalSolution) -> UnitCell:
-        if self._points.step.law.dimensions is not None:
-            return found.cells
-        squared, axes = spectral.continued(found.structure, self._points.step.cells.axes)
-        return UnitCell(np.sqrt(np.maximum(squared, 0.0)), axes)
-
-    @property
-    def _may_hold(self) -> Flags:
-        return self._jumps if self.holds else np.zeros_like(self._jumps)
-
-    def may_hold(self) -> bool:
-        """Whether there are points, on any rank, whose cells may be held: the law jumps there."""
+    def jumps_somewhere(self) -> bool:
+        """Whether there are points, on any rank, where the law jumps."""
         return self._count(self._jumps) > 0
 
     def complete(self) -> bool:
-        """Whether the cells of the present unknowns may end a step: all belong to their stress, or the law may jump."""
+        """Whether the cells of the present unknowns may end a step: all belong to their stress, or may be held."""
         self.update()
-        return self._count(self._unanswered & ~self._may_hold) == 0
-
-    @property
-    def _unanswered(self) -> Flags:
-        points: Flags = self.held | ~self._found.converged
-        return points
+        return self._count(self._unanswered & ~self._holdable) == 0
 
     def held_points(self) -> int:
         """At how many points of all ranks the cells do not belong to the stress."""
@@ -177,6 +145,15 @@ class AnsweringCells:
     def held_share(self) -> float:
         """Their share of the body."""
         return self.quadrature.mean(self._unanswered.reshape(self.quadrature.shape).astype(np.float64))
+
+    @property
+    def _holdable(self) -> Flags:
+        return self._jumps & self.may_hold
+
+    @property
+    def _unanswered(self) -> Flags:
+        points: Flags = self.held | ~self._found.converged
+        return points
 
     def _count(self, points: Flags) -> int:
         owned = self.quadrature.owned(points.reshape(self.quadrature.shape))
@@ -187,46 +164,34 @@ class AnsweringCells:
         """Stress, and tangent on request, of the present unknowns."""
         F = self.state.deformation_gradient()
         if self._gradient is None or not np.array_equal(F, self._gradient):
-            self._solve(F)
+            self._found = self._solved(F)
             self._gradient, self._tangent_is_there = F, False
             stress = self._found.first_piola_kirchhoff.reshape(*self.quadrature.shape, 3, 3)
             self.quadrature.values(self.stress, (3, 3))[:] = stress
         if tangent and not self._tangent_is_there:
             self._hold_what_jumps()
             self._start = self._found.driving_tensor
-            kept = self.held if self.frozen is None else np.ones_like(self.held)
-            values = self._points.tangent(self._found, kept).reshape(*self.quadrature.shape, 9, 9)
+            held = self.held if self.frozen is None else np.ones_like(self.held)
+            values = self._points.tangent(self._found, held).reshape(*self.quadrature.shape, 9, 9)
             self.quadrature.values(self.tangent, (9, 9))[:] = values
             self._tangent_is_there = True
 
-    def _solve(self, F: Array) -> None:
-        with np.errstate(invalid="ignore"):
-            usable = determinant(F) > 0
-        F = np.where(usable[:, None, None], F, np.eye(3))
-        step = self._points.step
+    def _solved(self, F: Array) -> condensed.LocalSolution:
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            F = np.where((determinant(F) > 0)[:, None, None], F, np.eye(3))
             if self.frozen is not None:
-                self._found = self._points.kept(F, *self.frozen)
-                return
-            before = getattr(self, "_found", None)
-            found = self._points.solve(F, self._start, self.held)
-            if self.held.any():
-                assert before is not None
-                cells = before.cells
-                some = self._points.at(self.held)
-                held = UnitCell(cells.dimensions[self.held], cells.axes[self.held])
-                condensed.put(found, self.held, some.kept(F[self.held], held, step.structure[self.held]))
-        self._found = found
+                return self._points.with_cells(F, self.frozen)
+            before = self._found if self.held.any() else None
+            return self._points.solve(F, self._start, self.held, before)
 
     def _hold_what_jumps(self) -> None:
         """From an iteration on; only laws by rank jump, others fail and the step is made in parts."""
         self._iterations += 1
         structure = self._found.structure
         if self._iterations > BEFORE_HOLDING and self.frozen is None:
-            assert self._last_structure is not None
             change = np.linalg.norm(structure - self._last_structure, axis=(1, 2))
-            jumps = change > JUMP * self._points.step.end_to_end_length**2
-            self.held = self.held | (self._may_hold & (jumps | ~self._found.converged))
+            jumps = change > JUMP * self._points.step.drive.end_to_end_length**2
+            self.held = self.held | (self._holdable & (jumps | ~self._found.converged))
         self._last_structure = structure
 
     def squared_lengths(self) -> Array:
@@ -238,7 +203,7 @@ class AnsweringCells:
     @property
     def _refused(self) -> Flags:
         """Points without a solution, after so many iterations that none is expected, that may not be held."""
-        return ~(self._found.converged | self._may_hold) & (self._iterations > BEFORE_HOLDING)
+        return ~(self._found.converged | self._holdable) & (self._iterations > BEFORE_HOLDING)
 
     def unsolved(self, locking_length: Array) -> bool:
         """Whether the present unknowns are refused for points, on any rank, that have no solution with r < L."""
@@ -329,7 +294,7 @@ class AnsweringNewton(GuardedNewton):
         except SolveFailure as again:
             if again is not failure:
                 again.count(failure)
-            if self.answering.may_hold():
+            if self.answering.jumps_somewhere():
                 raise
             self.unknown.x.array[:], self.answering.accepted, self._patient = start, accepted, True
             log.info("solved once more, with shorter steps: %s", again.reason)
@@ -360,7 +325,8 @@ class AnsweringNewton(GuardedNewton):
                     solution = self._solved()
                 except SolveFailure as failure:  # too large a change of the cells: r >= L where they are longer
                     work.count(failure)
-                    values[:], answering.frozen, share = before, frozen, share / 2
+                    values[:], share = before, share / 2
+                    answering.freeze(frozen)
                     continue
                 work.count(solution)
                 way = over_ranks(self.equilibrium.comm, float(np.abs(values - before).max(initial=0.0)), MPI.MAX)

@@ -56,7 +56,7 @@ class Limit(Implicit):
     """A step over a time without end, in one piece or not at all; no point is held."""
 
     def _solve(self, time: float, loads: LoadValues, work: Work, answering: bool) -> None:
-        self.answering.holds = False
+        self.answering.may_hold = False
         self.state.loading.set(loads)
         work.add(self.newton.solve())
         work.substeps += 1

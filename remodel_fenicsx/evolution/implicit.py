@@ -116,10 +116,10 @@ class Implicit:
         """With all cells belonging to their stress; where that cannot be, not even in parts, some are held."""
         answers, unknown, old = self.answering, self.state.unknown.x.array, dict(self.state.loading.values)
         before, residual, most = unknown.copy(), work.residual, self.settings.maximum_halvings
-        if not answering or not answers.may_hold():
+        if not answering or not answers.jumps_somewhere():
             self._solve_or_part(time, loads, work, answering, most)
             return
-        answers.holds = False
+        answers.may_hold = False
         try:
             self._solve_or_part(time, loads, work, answering, min(STEP_HALVINGS, most))
         except StepFailure as failure:
@@ -127,10 +127,10 @@ class Implicit:
             unknown[:] = before
             self.state.loading.set(old)
             answers.begin(time, residual)
-            answers.holds = True
+            answers.may_hold = True
             self._solve_or_part(time, loads, work, answering, most)
         finally:
-            answers.holds = True
+            answers.may_hold = True
 
     def _solve_or_part(self, time: float, loads: LoadValues, work: Work, answering: bool, halvings: int) -> None:
         """In one piece, or in parts of time and loads."""

@@ -10,7 +10,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from remodel_fenicsx.fem.assembly import over_ranks
-from remodel_fenicsx.model import mandel
+from remodel_fenicsx.model import tensors
 from remodel_fenicsx.state.memory import Earlier, Numbers
 from remodel_fenicsx.state.state import State
 
@@ -141,7 +141,7 @@ class Responsive:
     def __init__(self, state: State):
         self.state, self.quadrature = state, state.cells.quadrature
         self._increments = Earlier(state, "responsive_increment", state.unknown.copy, ANSWERS)
-        components = (len(mandel.MANDEL),)
+        components = (len(tensors.MANDEL),)
         self._changes = Earlier(state, "responsive_change", lambda: self.quadrature.function("", components), ANSWERS)
         rates = {f"rate_{name}": 0.0 for name in state.loading.values}
         durations = {f"duration_{age}": 0.0 for age in range(ANSWERS)}  # the newest first
@@ -181,7 +181,7 @@ class Responsive:
         """Of the structure tensors since the last solved state, Mandel components after each other."""
         state = self.state
         change = state.cells.structure_tensor() - state.equilibrium_cells.structure_tensor()
-        return mandel.vectors(change.reshape(-1, 3, 3)).ravel()
+        return tensors.to_mandel(change.reshape(-1, 3, 3)).ravel()
 
     def _weights(self, step: LoadStep, asked: Array) -> Array:
         """Of the last increments, the newest first."""

@@ -8,16 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from remodel_fenicsx.evolution.stepper import Step, Stepper
-from remodel_fenicsx.model import mandel, spectral
+from remodel_fenicsx.model import spectral, tensors
 from remodel_fenicsx.model.cells import UnitCell, angle_between, structure_tensor
-from remodel_fenicsx.model.operators import largest_change_of_length
+from remodel_fenicsx.model.tensors import largest_change_of_length
 from remodel_fenicsx.state.memory import Earlier, Numbers
 
 Array = NDArray[np.float64]
 
 SLOWEST = 20.0  # times as slowly as the cells alone body and cells may forget
 LARGEST_LINEAR_CHANGE = 1.0  # change of a length: a linear answer says no more
-COMPONENTS = (len(mandel.MANDEL),)
+COMPONENTS = (len(tensors.MANDEL),)
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class TimeError:
         """Distance to the cells of a pass with the stress that belongs to such cells."""
         before, expected = structure_tensor(*row[:2]), better
         if self._last.known:
-            last = mandel.tensors(self._last.values[0].reshape(-1, *COMPONENTS))
+            last = tensors.from_mandel(self._last.values[0].reshape(-1, *COMPONENTS))
             squared, axes = spectral.continued(before + duration / self._numbers["duration"] * last, row.axes)
             expected = UnitCell(np.sqrt(np.maximum(squared, 0.0)), axes)
         known, angle = better, self._angle(row, better)
@@ -103,7 +103,7 @@ class TimeError:
         most, angle = SLOWEST * angle, self._angle(row, better)
         if angle > most:  # another state, to which this one does not tend
             better, angle = known, most
-        self._last.push(mandel.vectors(structure_tensor(*better[:2]) - before).ravel())
+        self._last.push(tensors.to_mandel(structure_tensor(*better[:2]) - before).ravel())
         return max(angle, strain)
 
     # ------------------------------------------------------------ errors that add up
@@ -122,7 +122,7 @@ class TimeError:
         """Rate at which errors fade: that at which the cells slow down while loads are held."""
         numbers, known = self._numbers, self._last.values
         before, fading, speed = numbers["speed"], numbers["fading"], 0.0
-        present = mandel.vectors(structure_tensor(*row[:2])).ravel()
+        present = tensors.to_mandel(structure_tensor(*row[:2])).ravel()
         if known:
             change = ((present - known[0]) ** 2).reshape(*self.quadrature.shape, -1).sum(axis=-1)
             speed = float(np.sqrt(self.quadrature.mean(change))) / duration

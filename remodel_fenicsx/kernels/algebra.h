@@ -30,7 +30,7 @@ static inline double norm(tensor t)
     return sqrt(sum);
 }
 
-/* logarithm.rotated: Q^T t Q, or Q t Q^T. */
+/* tensors.rotated: Q^T t Q, or Q t Q^T. */
 static inline void rotated(tensor t, tensor q, int back, tensor result)
 {
     tensor half;
@@ -54,7 +54,7 @@ static inline void strain_of(tensor F, tensor C)
     }
 }
 
-/* mandel.congruence. */
+/* tensors.congruence. */
 static void congruence(tensor q, matrix result)
 {
     MANDEL(r) MANDEL(s) {
@@ -131,7 +131,7 @@ static inline void rotate(tensor a, tensor v, int p, int q)
     }
 }
 
-/* logarithm.eigen: ascending values, vectors as columns. */
+/* tensors.eigen: ascending values, vectors as columns. */
 static void eigen(tensor t, double *values, tensor vectors)
 {
     tensor a;

@@ -4,14 +4,14 @@
 #include <float.h>
 #include "algebra.h"
 
-/* logarithm.first_divided_difference. */
+/* tensors.first_divided_difference. */
 static inline double first_difference(double a, double b)
 {
     const double x = (a - b) / (a + b), square = x * x;
     return 2 / (a + b) * (fabs(x) < CLOSE ? 1 + square / 3 + square * square / 5 : atanh(x) / x);
 }
 
-/* logarithm.second_divided_difference of ascending numbers, from f[a, b] and f[b, c]. */
+/* tensors.second_divided_difference. */
 static inline double second_difference(double a, double b, double c, double first, double last)
 {
     if (!(c - a < CLOSE * c)) return (last - first) / (c - a);
@@ -24,13 +24,13 @@ static inline double second_difference(double a, double b, double c, double firs
     return -(0.5 + p2 / 8 - p3 / 15 + p2 * p2 / 48 + p4 / 24) / (mean * mean);
 }
 
-/* logarithm.first_divided_differences. */
+/* tensors.first_divided_differences. */
 static void first_differences(const double *c, tensor result)
 {
     ALL(i) ALL(j) if (i <= j) result[i][j] = result[j][i] = i == j ? 1 / c[i] : first_difference(c[j], c[i]);
 }
 
-/* logarithm.second_derivative. */
+/* tensors.second_derivative. */
 static void second_derivative(const double *c, tensor first, tensor A, matrix result)
 {
     double f[3][3][3];

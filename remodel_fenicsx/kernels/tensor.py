@@ -11,13 +11,14 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from remodel_fenicsx.kernels.library import Library, in_numpy
-from remodel_fenicsx.model import logarithm, tensor_law
+from remodel_fenicsx.model import tensor_law, tensors
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.chains import CHAINS
 from remodel_fenicsx.model.drivers import DRIVERS, rotated_back
 from remodel_fenicsx.model.energy import MATRICES, REPULSIONS, Repulsion, Tissue, whole_structure_tensor
 from remodel_fenicsx.model.implicit import condensed
-from remodel_fenicsx.model.implicit.condensed import CondensedPoints
+from remodel_fenicsx.model.implicit.condensed import CondensedPoints, LocalSolution, named
+from remodel_fenicsx.model.implicit.network import at, put
 from remodel_fenicsx.model.implicit.responses import StepOfCells
 from remodel_fenicsx.model.laws import LAWS, Drive
 from remodel_fenicsx.model.tensor_law import Target
@@ -37,23 +38,10 @@ NUMBERS = {
     "ITERATIONS": condensed.LOCAL_ITERATIONS,
     "HALVINGS": condensed.LOCAL_HALVINGS,
     "TOLERANCE": condensed.TOLERANCE,
-    "CLOSE": logarithm.CLOSE_EIGENVALUES,
+    "CLOSE": tensors.CLOSE_EIGENVALUES,
     "COMPRESSION": tensor_law.COMPRESSION,
 }
 """What tensor.c takes from Python: the numbers of drivers, repulsions and parameters, and those that tune."""
-
-
-@dataclass(frozen=True)
-class CompiledSolution:
-    """As `condensed.Solution`, in the global basis; `rest`: what numpy has solved, and at which points."""
-
-    gradient: Array
-    driving_tensor: Array
-    structure: Array
-    first_piola_kirchhoff: Array
-    squared_lengths: Array
-    converged: Flags
-    rest: tuple[NDArray[np.intp], condensed.LocalSolution] | None = None
 
 
 class TensorKernels:
@@ -70,12 +58,12 @@ class TensorKernels:
 
     def target(self, drive: Drive) -> Target:
         """`laws.tensor_target`."""
-        F, tensors = drive.deformation_gradient, drive.tensor
+        F, given = drive.deformation_gradient, drive.tensor
         n, turned_back = len(F), not drive.driver.material
         if turned_back and drive.frame.tensor is not rotated_back:
-            turned_back, tensors = False, drive.frame.tensor(F, tensors)
+            turned_back, given = False, drive.frame.tensor(F, given)
         direction, share = np.empty((n, 3, 3)), np.empty(n)
-        self.call("target", n, F, tensors, turned_back, np.broadcast_to(drive.floor, n), direction, share)
+        self.call("target", n, F, given, turned_back, np.broadcast_to(drive.floor, n), direction, share)
         return Target(direction, share)
 
     def log_sum(self, F: Array, cells: Sequence[UnitCell], end_to_end_length: Any) -> Array:
@@ -108,11 +96,11 @@ def condensed_points(kernels: TensorKernels | None, tissue: Tissue, step: StepOf
     """Tissue and step of n points: in C, where that knows all of its parts."""
     known = (
         step.law is LAWS["tensor"]
-        and step.driver in (DRIVERS[name] for name in condensed.DRIVING_TENSORS)
+        and named(step.drive.driver, DRIVERS) in condensed.DRIVING_TENSORS
         and not step.is_spatial
         and tissue.chain is CHAINS["wormlike"]
         and tissue.matrix is MATRICES["neo-hookean"]
-        and tissue.repulsion in (REPULSIONS[name] for name in COMPILED_REPULSIONS)
+        and named(tissue.repulsion, REPULSIONS) in COMPILED_REPULSIONS
     )
     return CompiledPoints(tissue, step, kernels) if kernels is not None and known else CondensedPoints(tissue, step)
 
@@ -123,41 +111,32 @@ class CompiledPoints(CondensedPoints):
 
     kernels: TensorKernels
 
-    @property
-    def _given(self) -> tuple[Any, ...]:
-        """Cells at the start, parameters, and what else C takes of tissue and step."""
-        step, tissue = self.step, self.tissue
-        driver = next(i for i, name in enumerate(condensed.DRIVING_TENSORS) if step.driver is DRIVERS[name])
-        repulsion = next(i for i, name in enumerate(COMPILED_REPULSIONS) if tissue.repulsion is REPULSIONS[name])
+    def _call(self, name: str, F: Array, tensor: Array, *results: Array | Flags) -> None:
+        """A function in C with F, D, the cells at the start, parameters, and what else it takes of tissue and step."""
+        drive, tissue = self.step.drive, self.tissue
+        parts = (drive.driver, DRIVERS), (tissue.repulsion, REPULSIONS)
+        numbers = (NUMBERS[str(named(*part)).upper()] for part in parts)
         parameters = np.stack([getattr(tissue, name) for name in PARAMETERS])
-        rate = step.kappa * (step.time_new - step.time_old)
-        return step.structure, parameters, step.floor, step.rounding, rate, driver, repulsion
+        given = self.step.structure, parameters, drive.floor, drive.rounding, self.step.rate, *numbers
+        self.kernels.call(name, len(F), F, tensor, *given, *results)
 
-    def solve(self, F: Array, start: Array, left_out: Flags | None = None) -> Any:
-        """As `CondensedPoints.solve`."""
-        if left_out is not None and left_out.any():
-            return super().solve(F, start, left_out)
-        n = len(F)
-        tensor, structure, stress = np.empty((3, n, 3, 3))
-        squared, converged = np.empty(n), np.empty(n, np.bool_)
-        self.kernels.call("solve", n, F, start, *self._given, tensor, structure, stress, squared, converged)
-        found = CompiledSolution(F, tensor, structure, stress, squared, converged)
-        lost = np.flatnonzero(~found.converged)
-        return self._completed(found, lost, start[lost]) if lost.size else found
+    def solve(
+        self, F: Array, start: Array, held: Flags | None = None, before: LocalSolution | None = None
+    ) -> LocalSolution:
+        """As `CondensedPoints.solve`; no point is held, for the law jumps nowhere."""
+        tensor, structure, stress = np.empty((3, len(F), 3, 3))
+        squared, converged = np.empty(len(F)), np.empty(len(F), np.bool_)
+        self._call("solve", F, start, tensor, structure, stress, squared, converged)
+        found, lost = LocalSolution(F, tensor, structure, stress, squared, converged), np.flatnonzero(~converged)
+        if lost.size:
+            put(found, lost, self.at(lost).solve(F[lost], start[lost]))
+        return found
 
-    def _completed(self, found: CompiledSolution, lost: NDArray[np.intp], start: Array) -> CompiledSolution:
-        rest = self.at(lost).solve(found.gradient[lost], start)
-        for name in ("driving_tensor", "structure", "first_piola_kirchhoff", "squared_lengths", "converged"):
-            getattr(found, name)[lost] = getattr(rest, name)
-        return replace(found, rest=(lost, rest))
-
-    def tangent(self, found: Any, held: Flags) -> Array:
+    def tangent(self, found: LocalSolution, held: Flags) -> Array:
         """As `CondensedPoints.tangent`."""
-        if not isinstance(found, CompiledSolution):
-            return super().tangent(found, held)
-        n, result = len(found.gradient), np.empty((len(found.gradient), 3, 3, 3, 3))
-        self.kernels.call("tangent", n, found.gradient, found.driving_tensor, *self._given, result)
-        if found.rest is not None:
-            lost, rest = found.rest
-            result[lost] = self.at(lost).tangent(rest, held[lost])
+        frozen, result = held | ~found.converged, np.empty((len(found.gradient), 3, 3, 3, 3))
+        if not frozen.all():
+            self._call("tangent", found.gradient, found.driving_tensor, result)
+        if frozen.any():
+            result[frozen] = self.at(frozen).tangent(at(found, frozen), held[frozen])
         return result

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from remodel_fenicsx.model.energy import Stresses
-from remodel_fenicsx.model.logarithm import eigen
+from remodel_fenicsx.model.tensors import eigen
 
 Array = NDArray[np.float64]
 

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from remodel_fenicsx.model import logarithm, mandel
+from remodel_fenicsx.model import tensors
 from remodel_fenicsx.model.cells import UnitCell, structure_tensor
 from remodel_fenicsx.model.chains import CHAINS, Chain
 from remodel_fenicsx.model.operators import component, det, is_array, ln, sqrt, squared_norm
@@ -72,7 +72,7 @@ def neo_hookean_derivatives(squared: Any, lame_lambda: Any, lame_mu: Any, second
         return value, None
     entries = np.concatenate([inverse, np.zeros_like(inverse)], axis=1)
     dyad = np.reshape(lame_lambda, (-1, 1, 1)) / 2 * entries[:, :, None] * entries[:, None, :]
-    rows, columns = mandel.ROWS, mandel.COLUMNS
+    rows, columns = tensors.ROWS, tensors.COLUMNS
     dyad[:, range(6), range(6)] -= volumetric[:, None] * inverse[:, rows] * inverse[:, columns]
     return value, dyad
 
@@ -124,7 +124,7 @@ def length_sum(deformation_gradient: Any, cells: Sequence[UnitCell], end_to_end_
 def log_sum(deformation_gradient: Array, cells: Sequence[UnitCell], end_to_end_length: Any) -> Any:
     """M = A : ln C; arrays."""
     C = np.swapaxes(deformation_gradient, -1, -2) @ deformation_gradient
-    return (whole_structure_tensor(cells) * logarithm.logarithm(C)).sum(axis=(-1, -2))
+    return (whole_structure_tensor(cells) * tensors.logarithm(C)).sum(axis=(-1, -2))
 
 
 def whole_structure_tensor(cells: Sequence[UnitCell]) -> Array:
@@ -135,14 +135,14 @@ def whole_structure_tensor(cells: Sequence[UnitCell]) -> Array:
 
 def log_derivatives(C: Array, A: Array, second: bool = True) -> tuple[Array, Array | None]:
     """dM/dC (n, 3, 3) and d^2M/dC^2 as Mandel matrices (n, 6, 6) of M = A : ln C, the second on request."""
-    values, vectors = logarithm.eigen(C)
-    components = logarithm.rotated(A, vectors)
+    values, vectors = tensors.eigen(C)
+    components = tensors.rotated(A, vectors)
     back = np.swapaxes(vectors, -1, -2)
-    first = logarithm.rotated(logarithm.derivative(values, components), back)
+    first = tensors.rotated(tensors.first_divided_differences(values) * components, back)
     if not second:
         return first, None
-    rotation = mandel.congruence(vectors)
-    return first, rotation @ logarithm.second_derivative(values, components) @ np.swapaxes(rotation, 1, 2)
+    rotation = tensors.congruence(vectors)
+    return first, rotation @ tensors.second_derivative(values, components) @ np.swapaxes(rotation, 1, 2)
 
 
 @dataclass(frozen=True)

@@ -143,17 +143,7 @@ def ranked(function: RankedFunction, has_limit: bool = False, of_absolute_time: 
     """
 
     def update(cells: UnitCell, drive: Drive, time_old: float, time_new: float) -> UnitCell:
-        values, axes = principal_directions(drive, cells.axes, drive.pairing)
-        direction, active = drive.kernels.positive_direction(values, threshold=drive.threshold)
-        target = np.reshape(drive.end_to_end_length, (-1, 1)) * direction
-        dimensions = function(cells.dimensions, drive.initial_dimensions, target, drive.kappa, time_old, time_new)
-        axes = framed(drive, axes, None if drive.pairing is spectral.principal else dimensions)
-        if active.all():
-            return UnitCell(dimensions, axes)
-        return UnitCell(
-            np.where(active[:, None], dimensions, cells.dimensions),
-            np.where(active[:, None, None], axes, cells.axes),
-        )
+        return by_rank(function, cells, drive, time_old, time_new).cells
 
     return Law(
         update,
@@ -163,6 +153,41 @@ def ranked(function: RankedFunction, has_limit: bool = False, of_absolute_time: 
         keeps_symmetry=True,
         asks_kappa=True,
     )
+
+
+class Ranked(NamedTuple):
+    """What a law by rank makes of cells, and of what; arrays of n points.
+
+    Attributes
+    ----------
+    values, axes
+        Principal values (n, 3) and axes of the driving tensor, each where its dimension of the cell stands.
+    target, active
+        r0 e (n, 3), and whether any value is positive (n,): otherwise cells stay.
+    cells
+        The new ones.
+    """
+
+    values: Array
+    axes: Array
+    target: Array
+    active: NDArray[np.bool_]
+    cells: UnitCell
+
+
+def by_rank(function: RankedFunction, cells: UnitCell, drive: Drive, time_old: float, time_new: float) -> Ranked:
+    """Axes at the principal directions (eqs. 8 and 9), dimensions towards r0 e (eqs. 10 and 11)."""
+    values, axes = principal_directions(drive, cells.axes, drive.pairing)
+    direction, active = drive.kernels.positive_direction(values, threshold=drive.threshold)
+    target = np.reshape(drive.end_to_end_length, (-1, 1)) * direction
+    dimensions = function(cells.dimensions, drive.initial_dimensions, target, drive.kappa, time_old, time_new)
+    new = UnitCell(dimensions, framed(drive, axes, None if drive.pairing is spectral.principal else dimensions))
+    if not active.all():
+        new = UnitCell(
+            np.where(active[:, None], new.dimensions, cells.dimensions),
+            np.where(active[:, None, None], new.axes, cells.axes),
+        )
+    return Ranked(values, axes, target, active, new)
 
 
 def principal_directions(drive: Drive, previous: Array, pairing: spectral.Pairing) -> tuple[Array, Array]:

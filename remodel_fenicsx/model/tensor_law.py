@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from remodel_fenicsx.model import mandel
+from remodel_fenicsx.model import tensors
 
 Array = NDArray[np.float64]
 
@@ -125,18 +125,18 @@ def target_derivatives(tensor: Array, floor: Array | float) -> tuple[Array, Arra
     weights = tension**2 / some[:, None]
     by_values[:, range(3), range(3)] = 2 * tension / some[:, None]
     by_values[:, :3, :3] -= weights[:, :, None] * 2 * tension[:, None, :] / some[:, None, None]
-    for row, (i, j) in enumerate(mandel.PAIRS, start=3):
+    for row, (i, j) in enumerate(tensors.PAIRS, start=3):
         apart = np.maximum(np.abs(v[:, i] - v[:, j]), np.finfo(float).tiny)
         both = (v[:, i] > 0) & (v[:, j] > 0)
         one = np.maximum(tension[:, i], tension[:, j]) ** 2 / apart
         by_values[:, row, row] = np.where(both, v[:, i] + v[:, j], one) / some
-    to_axes = mandel.congruence(vectors)
+    to_axes = tensors.congruence(vectors)
     direction = to_axes @ (by_values / unit[:, None, None]) @ np.swapaxes(to_axes, 1, 2)
     against = COMPRESSION * negative + (np.asarray(floor) / unit) ** 2
     total = positive + against
     slope = 2 * (tension * against[:, None] - COMPRESSION * positive[:, None] * compression)
     slope /= (np.where(total > 0, total, 1.0) ** 2 * unit)[:, None]
-    share: Array = np.einsum("nab,nb->na", to_axes, mandel.on_diagonal(slope))
+    share: Array = np.einsum("nab,nb->na", to_axes, tensors.on_diagonal(slope))
     return direction, share
 
 

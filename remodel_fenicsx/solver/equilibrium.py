@@ -25,7 +25,7 @@ from remodel_fenicsx.fem.assembly import (
 )
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.energy import Tissue, squared_end_to_end_length
-from remodel_fenicsx.model.operators import passes_through_zero
+from remodel_fenicsx.model.tensors import passes_through_zero
 from remodel_fenicsx.solver.pointwise import Shares, pointwise_repulsion
 from remodel_fenicsx.state.parameters import Parameters, on_mesh
 from remodel_fenicsx.state.state import State

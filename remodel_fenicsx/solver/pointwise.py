@@ -13,7 +13,7 @@ from remodel_fenicsx.fem import assembly
 from remodel_fenicsx.kernels.tensor import with_kernels
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.energy import Stresses, Tissue, whole_structure_tensor
-from remodel_fenicsx.model.mandel import MANDEL
+from remodel_fenicsx.model.tensors import MANDEL
 from remodel_fenicsx.state.state import State
 
 Array = NDArray[np.float64]

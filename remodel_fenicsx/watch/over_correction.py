@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.evolution.stepper import Step, Stepper
 from remodel_fenicsx.fem.assembly import over_ranks
-from remodel_fenicsx.model import mandel
+from remodel_fenicsx.model import tensors
 from remodel_fenicsx.state.memory import Earlier
 from remodel_fenicsx.watch.once import WarnsOnce
 
@@ -148,11 +148,11 @@ class OverCorrection(WarnsOnce):
 
     def _structure(self) -> Array:
         """A at all points, six Mandel components after each other."""
-        return mandel.vectors(self.state.cells.structure_tensor().reshape(-1, 3, 3)).ravel()
+        return tensors.to_mandel(self.state.cells.structure_tensor().reshape(-1, 3, 3)).ravel()
 
     def _at_points(self, components: Any) -> Any:
         """What stands after each other by points, (elements, points, 6)."""
-        return components.reshape(*self.quadrature.shape, len(mandel.MANDEL))
+        return components.reshape(*self.quadrature.shape, len(tensors.MANDEL))
 
     def _rested(self, cells: list[Array]) -> bool:
         """Whether one of the passes has left most cells as they were: what goes on after that jumps."""

@@ -10,7 +10,7 @@ from remodel_fenicsx.evolution.stepper import Step, Watcher
 from remodel_fenicsx.kernels.points import CompiledPointKernels, PointKernels
 from remodel_fenicsx.model import energy, spectral
 from remodel_fenicsx.model.cells import UnitCell, structure_tensor
-from remodel_fenicsx.model.operators import passes_through_zero
+from remodel_fenicsx.model.tensors import passes_through_zero
 from remodel_fenicsx.scene import preset_scene
 from remodel_fenicsx.simulation import Simulation
 from tests.parts import tube

@@ -80,10 +80,10 @@ def test_solution_and_tangent(kernels: TensorKernels, name: str, driver: str) ->
     F = deformations(COUNT, rng) + 0.05 * rng.standard_normal((COUNT, 3, 3))
     F[-4:] = np.array([1.2, 1.2, 1.2, 1.2, 1.2, 0.8, 0.9, 1.3, 1.3, 0.9, 0.9, 0.9]).reshape(4, 3, 1) * np.eye(3)
     some = points("tensor", name, driver, "material", COUNT, "random", kappa=0.1)
-    twin, start = compiled_twin(kernels, some), some.kept(F, some.step.cells, some.step.structure).driving_tensor
+    twin, start = compiled_twin(kernels, some), some.with_cells(F, some.step.cells).driving_tensor
     assert (np.linalg.eigvalsh(start) < 0).any() or driver == "finger"
     expected, found = some.solve(F, start), twin.solve(F, start)
-    assert found.rest is None and expected.converged.all() and found.converged.all()
+    assert expected.converged.all() and found.converged.all()
     for quantity in ("driving_tensor", "structure", "first_piola_kirchhoff", "squared_lengths"):
         value = getattr(expected, quantity)
         np.testing.assert_allclose(getattr(found, quantity), value, atol=1e-10 * np.abs(value).max(), err_msg=quantity)
@@ -102,9 +102,14 @@ def test_what_the_kernel_does_not_solve_numpy_does(kernels: TensorKernels, monke
     F = np.swapaxes(R, 1, 2) @ ((1 + rng.uniform(-0.2, 0.3, (COUNT, 3)))[:, :, None] * R)
     F[0] = 3.0 * np.eye(3)
     some = points("tensor", "log", "cauchy", "material", COUNT, "random", kappa=2.5)
-    twin, start = compiled_twin(kernels, some), some.kept(F, some.step.cells, some.step.structure).driving_tensor
+    twin, start = compiled_twin(kernels, some), some.with_cells(F, some.step.cells).driving_tensor
+    asked: list[int] = []
+    solve = CondensedPoints.solve
+    monkeypatch.setattr(
+        CondensedPoints, "solve", lambda self, F, *given: asked.append(len(F)) or solve(self, F, *given)
+    )
     expected, found = some.solve(F, start), twin.solve(F, start)
-    assert found.rest is not None and 0 in found.rest[0]
+    assert asked[0] == COUNT and 0 < asked[1] < COUNT
     assert not expected.converged[0] and expected.converged[1:].all()
     np.testing.assert_array_equal(found.converged, expected.converged)
     solved = found.converged
@@ -112,6 +117,19 @@ def test_what_the_kernel_does_not_solve_numpy_does(kernels: TensorKernels, monke
     none = np.zeros(COUNT, dtype=bool)
     tangent = some.tangent(expected, none)[1:]
     np.testing.assert_allclose(twin.tangent(found, none)[1:], tangent, atol=1e-7 * np.abs(tangent).max())
+
+
+@pytest.mark.parametrize("share", [0.5, 1.0])
+def test_held_points_have_the_tangent_of_their_cells(kernels: TensorKernels, share: float) -> None:
+    """Some of the points, and all."""
+    rng = np.random.default_rng(12)
+    some, F = points("tensor", "log", "cauchy", "material", COUNT, "random"), deformations(COUNT, rng)
+    twin, held = compiled_twin(kernels, some), np.arange(COUNT) < share * COUNT
+    found = twin.solve(F, some.with_cells(F, some.step.cells).driving_tensor)
+    frozen = some.tangent(found, np.ones(COUNT, dtype=bool))
+    tangent = twin.tangent(found, held)
+    np.testing.assert_allclose(tangent[held], frozen[held], atol=1e-12 * np.abs(frozen).max())
+    assert held.all() or np.abs(tangent[~held] - frozen[~held]).max() > 1e-3
 
 
 def test_parts_that_the_kernel_does_not_know_are_numpys(kernels: TensorKernels) -> None:

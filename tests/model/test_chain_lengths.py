@@ -7,7 +7,6 @@ has no length of chains in it. r0 = 1, as in the paper, hides every wrong power 
 from __future__ import annotations
 
 import logging
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -151,15 +150,16 @@ def test_the_energy_has_no_length_in_it(repulsion: str) -> None:
 def in_unit(some: CondensedPoints, unit: float) -> CondensedPoints:
     """The same points with lengths of chains in another unit."""
     powers = {"network_modulus": 1 / unit, "contour_length": unit, "end_to_end_length": unit}
-    step = some.step
+    step, drive = some.step, some.step.drive
     return CondensedPoints(
         some.tissue.map(lambda name, value: powers.get(name, 1.0) * value),
-        replace(
-            step,
+        step._replace(
+            drive=drive._replace(
+                initial_dimensions=unit * drive.initial_dimensions,
+                end_to_end_length=unit * drive.end_to_end_length,
+            ),
             cells=UnitCell(unit * step.cells.dimensions, step.cells.axes),
             structure=unit**2 * step.structure,
-            initial_dimensions=unit * step.initial_dimensions,
-            end_to_end_length=unit * step.end_to_end_length,
         ),
     )
 

@@ -1,26 +1,43 @@
 """Stress of matrix and network on arrays, with its derivatives by strain and by cells: what a condensed tangent needs.
 
 Everything is in the eigenbasis of C, where C is diagonal. Symmetric tensors are Mandel vectors, derivatives 6 x 6
-matrices (`mandel`). Cells are given by six numbers y of their own: the structure tensor itself, or the three lengths
+matrices (`tensors`). Cells are given by six numbers y of their own: the structure tensor itself, or the three lengths
 and the three turns of an orthotropic cell.
 
     S = S_matrix + c (g(r) A - g(r0) G),    r^2 = A : C,    G = dM/dC
+
+Points are named tuples of arrays, one entry of each array a point: `at` takes some of them, `put` puts some into them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from remodel_fenicsx.model import logarithm, mandel
+from remodel_fenicsx.model import tensors
 from remodel_fenicsx.model.cells import UnitCell, structure_tensor
 from remodel_fenicsx.model.energy import Tissue
 
 Array = NDArray[np.float64]
+
+
+def at(points: Any, chosen: Any) -> Any:
+    """Some of the points, by mask or by number; what is no array is the same at all of them."""
+    if isinstance(points, tuple):
+        return type(points)(*(at(values, chosen) for values in points))  # type: ignore[call-arg]
+    return points[chosen] if isinstance(points, np.ndarray) else points
+
+
+def put(points: Any, chosen: Any, better: Any) -> None:
+    """Put some of the points into all of them."""
+    for values, others in zip(points, better, strict=True):
+        if isinstance(values, tuple):
+            put(values, chosen, others)
+        elif isinstance(values, np.ndarray):
+            values[chosen] = others
 
 
 class Strain(NamedTuple):
@@ -43,11 +60,7 @@ class Strain(NamedTuple):
     @classmethod
     def of(cls, gradient: Array) -> Strain:
         """From F."""
-        return cls(gradient, *logarithm.eigen(np.swapaxes(gradient, 1, 2) @ gradient))
-
-    def at(self, chosen: Any) -> Strain:
-        """Of some of the points."""
-        return Strain(self.gradient[chosen], self.squared[chosen], self.basis[chosen])
+        return cls(gradient, *tensors.eigen(np.swapaxes(gradient, 1, 2) @ gradient))
 
     @property
     def stretches(self) -> Array:
@@ -57,44 +70,61 @@ class Strain(NamedTuple):
     @property
     def rotation(self) -> Array:
         """R of F = R U in the eigenbasis."""
-        turned = logarithm.rotated(self.gradient, self.basis)
+        turned = tensors.rotated(self.gradient, self.basis)
         quotient: Array = turned / self.stretches[:, None, :]
         return quotient
 
-    def inside(self, tensors: Array) -> Array:
-        """Components of tensors (n, 3, 3) in the eigenbasis."""
-        return logarithm.rotated(tensors, self.basis)
-
-    def outside(self, tensors: Array) -> Array:
-        """Components in the global basis of tensors in the eigenbasis."""
-        return logarithm.rotated(tensors, np.swapaxes(self.basis, 1, 2))
-
-
-class LocalCells(Protocol):
-    """Cells of n points in the eigenbasis of C, with six numbers y of their own."""
+    @property
+    def by_gradient(self) -> Array:
+        """dC/dF, (n, 6, 9): dC = dF^T F + F^T dF in the eigenbasis, dF in the global one, row by row."""
+        carried, Q = self.gradient @ self.basis, self.basis
+        both = _dyads_of_columns(carried, Q, tensors.ROWS, tensors.COLUMNS)
+        both += _dyads_of_columns(carried, Q, tensors.COLUMNS, tensors.ROWS)
+        found: Array = tensors.FACTORS[:, None] * both
+        return found
 
     @property
-    def structure(self) -> Array:
-        """A, (n, 3, 3)."""
+    def turn_by_gradient(self) -> Array:
+        """dw/dF, (n, 3, 9), of turns dR = R W: w_ij = ((R^T dF)_ij - (R^T dF)_ji)/(u_i + u_j) in the eigenbasis."""
+        u, (i, j) = self.stretches, np.transpose(tensors.PAIRS)
+        axes = self.gradient @ self.basis / u[:, None, :]  # R Q
+        both = _dyads_of_columns(axes, self.basis, i, j) - _dyads_of_columns(axes, self.basis, j, i)
+        found: Array = both / (u[:, i] + u[:, j])[:, :, None]
+        return found
 
-    def structure_by_cells(self) -> Array:
-        """dA/dy, (n, 6, 6)."""
+    @property
+    def stretch_by_strain(self) -> Array:
+        """dU/dC, (n, 6, 6): 1/(u_i + u_j)."""
+        u = self.stretches
+        return tensors.diagonal(1 / (u[:, :, None] + u[:, None, :]))
+
+    def inside(self, components: Array) -> Array:
+        """Components of tensors (n, 3, 3) in the eigenbasis."""
+        return tensors.rotated(components, self.basis)
+
+    def outside(self, components: Array) -> Array:
+        """Components in the global basis of tensors in the eigenbasis."""
+        return tensors.rotated(components, np.swapaxes(self.basis, 1, 2))
 
 
-@dataclass(frozen=True)
-class StructureCells:
-    """Cells that are their structure tensor: y is A."""
+def _dyads_of_columns(left: Array, right: Array, i: Any, j: Any) -> Array:
+    """Column i of one matrix times column j of another, row by row, for numbers i and j: (n, len(i), 9)."""
+    dyads = left[:, :, None, i] * right[:, None, :, j]
+    return np.moveaxis(dyads.reshape(len(left), 9, len(i)), 2, 1)
+
+
+class StructureCells(NamedTuple):
+    """Cells of n points in the eigenbasis of C that are their structure tensor: y is A (n, 3, 3)."""
 
     structure: Array
 
     def structure_by_cells(self) -> Array:
-        """The identity."""
+        """dA/dy, (n, 6, 6): the identity."""
         return np.broadcast_to(np.eye(6), (len(self.structure), 6, 6))
 
 
-@dataclass(frozen=True)
-class OrthotropicCells:
-    """Cells with lengths and axes (rows): y is dl, and turns w_ij (`mandel.PAIRS`), dn_i = w n_j, dn_j = -w n_i."""
+class OrthotropicCells(NamedTuple):
+    """Cells with lengths and axes (rows): y is dl, and turns w_ij (`tensors.PAIRS`), dn_i = w n_j, dn_j = -w n_i."""
 
     cell: UnitCell
 
@@ -105,17 +135,20 @@ class OrthotropicCells:
 
     def to_axes(self) -> Array:
         """Matrix that takes components in the cell's axes to the eigenbasis of C."""
-        return mandel.congruence(np.swapaxes(self.cell.axes, 1, 2))
+        return tensors.congruence(np.swapaxes(self.cell.axes, 1, 2))
 
     def structure_by_cells(self) -> Array:
         """dA = 2 l dl n n, and (l_i^2 - l_j^2) across the axes."""
         lengths = self.cell.dimensions
         entries = np.zeros((len(lengths), 6))
         entries[:, :3] = 2 * lengths
-        for row, (i, j) in enumerate(mandel.PAIRS, start=3):
+        for row, (i, j) in enumerate(tensors.PAIRS, start=3):
             entries[:, row] = np.sqrt(2) * (lengths[:, i] ** 2 - lengths[:, j] ** 2)
         columns: Array = self.to_axes() * entries[:, None, :]
         return columns
+
+
+LocalCells = StructureCells | OrthotropicCells
 
 
 class Terms(NamedTuple):
@@ -129,11 +162,11 @@ class Terms(NamedTuple):
 def log_terms(strain: Strain, cells: LocalCells, r0: Array, derivatives: bool) -> Terms:
     """Of M = A : ln C."""
     values, A = strain.squared, cells.structure
-    quotients = logarithm.first_divided_differences(values)
+    quotients = tensors.first_divided_differences(values)
     if not derivatives:
         return Terms(quotients * A, None, None)
-    by_cells = quotients[:, mandel.ROWS, mandel.COLUMNS][:, :, None] * cells.structure_by_cells()
-    return Terms(quotients * A, by_cells, logarithm.second_derivative(values, A))
+    by_cells = quotients[:, tensors.ROWS, tensors.COLUMNS][:, :, None] * cells.structure_by_cells()
+    return Terms(quotients * A, by_cells, tensors.second_derivative(values, A))
 
 
 def length_terms(strain: Strain, cells: LocalCells, r0: Array, derivatives: bool) -> Terms:
@@ -142,13 +175,13 @@ def length_terms(strain: Strain, cells: LocalCells, r0: Array, derivatives: bool
     squared = np.einsum("nii,ni->n", A, strain.squared)[:, None, None]
     if not derivatives:
         return Terms(scale * A / squared, None, None)
-    a, by_cells = mandel.vectors(A), cells.structure_by_cells()
-    c = mandel.on_diagonal(strain.squared)
-    across = mandel.dyads(a, np.einsum("na,nab->nb", c, by_cells))
+    a, by_cells = tensors.to_mandel(A), cells.structure_by_cells()
+    c = tensors.on_diagonal(strain.squared)
+    across = tensors.dyads(a, np.einsum("na,nab->nb", c, by_cells))
     return Terms(
         scale * A / squared,
         scale * (by_cells / squared - across / squared**2),
-        -scale * mandel.dyads(a, a) / squared**2,
+        -scale * tensors.dyads(a, a) / squared**2,
     )
 
 
@@ -166,12 +199,12 @@ def axes_terms(strain: Strain, cells: LocalCells, r0: Array, derivatives: bool) 
     steepness = -entries / stretches
     for i in range(3):
         changes[:, i, i] = 2 * lengths[:, i] / stretches[:, i]
-    for column, (i, j) in enumerate(mandel.PAIRS, start=3):
+    for column, (i, j) in enumerate(tensors.PAIRS, start=3):
         changes[:, column, column] = np.sqrt(2) * (entries[:, i] - entries[:, j])
         changes[:, i, column] = 2 * steepness[:, i] * C[:, i, j]
         changes[:, j, column] = -2 * steepness[:, j] * C[:, i, j]
     to_axes = cells.to_axes()
-    along = to_axes * mandel.on_diagonal(steepness)[:, None, :]
+    along = to_axes * tensors.on_diagonal(steepness)[:, None, :]
     return Terms(value, to_axes @ changes, along @ np.swapaxes(to_axes, 1, 2))
 
 
@@ -218,13 +251,13 @@ def stress(tissue: Tissue, terms: Callable[..., Terms], strain: Strain, cells: L
     if not derivatives:
         return Stress(value, extension)
     assert repulsion.by_cells is not None and repulsion.by_strain is not None
-    a, by_cells = mandel.vectors(A), cells.structure_by_cells()
+    a, by_cells = tensors.to_mandel(A), cells.structure_by_cells()
     steep = c * slope / (2 * r)
-    along = np.einsum("na,nab->nb", mandel.on_diagonal(strain.squared), by_cells)
+    along = np.einsum("na,nab->nb", tensors.on_diagonal(strain.squared), by_cells)
     by_cells = (
-        mandel.dyads(steep[:, None] * a, along)
+        tensors.dyads(steep[:, None] * a, along)
         + (c * g)[:, None, None] * by_cells
         - g0[:, None, None] * repulsion.by_cells
     )
-    by_strain = by_strain + mandel.dyads(steep[:, None] * a, a) - g0[:, None, None] * repulsion.by_strain
+    by_strain = by_strain + tensors.dyads(steep[:, None] * a, a) - g0[:, None, None] * repulsion.by_strain
     return Stress(value, extension, by_cells, by_strain)

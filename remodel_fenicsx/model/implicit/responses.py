@@ -6,17 +6,16 @@ material space, or, for a spatial driver and the frame `spatial`, in space. The 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from remodel_fenicsx.model import mandel, spectral, tensor_law
+from remodel_fenicsx.model import spectral, tensor_law, tensors
 from remodel_fenicsx.model.cells import UnitCell
-from remodel_fenicsx.model.drivers import Driver, Frame, carried_axes
+from remodel_fenicsx.model.drivers import carried_axes
 from remodel_fenicsx.model.implicit.network import LocalCells, OrthotropicCells, Strain, StructureCells
-from remodel_fenicsx.model.laws import Drive, Law, framed, principal_directions
+from remodel_fenicsx.model.laws import Drive, Law, Ranked, by_rank
 
 Array = NDArray[np.float64]
 
@@ -25,72 +24,51 @@ AGREE = 1e-7
 SAME_LENGTH = 1e-9  # over r0: lengths of isotropic cells, but for rounding
 
 
-@dataclass(frozen=True)
-class StepOfCells:
+class StepOfCells(NamedTuple):
     """What points know of their cells in a step, in the global basis.
 
     Attributes
     ----------
-    law, driver, frame, pairing
-        Of the registries.
+    law
+        Of the registry.
+    drive
+        What acts, with the driver's parameters; its deformation and tensor are those at the start. Down to its
+        `rounding` the driving tensor is solved for: what is missing here is missing in the balance of forces.
     cells, structure
         At the start of the step: lengths (n, 3) and axes (n, 3, 3), and A (n, 3, 3).
-    initial_dimensions
-        l0, (n, 3).
-    end_to_end_length
-        r0, (n,).
-    kappa, time_old, time_new
+    time_old, time_new
         Of the step.
-    noise, rounding
-        Size up to which a principal value of the driving tensor may be an error, and that of its rounding alone. Down
-        to the latter it is solved for: what is missing here is missing in the balance of forces.
     """
 
     law: Law
-    driver: Driver
-    frame: Frame
-    pairing: spectral.Pairing
+    drive: Drive
     cells: UnitCell
     structure: Array
-    initial_dimensions: Array
-    end_to_end_length: Array
-    kappa: float
     time_old: float
     time_new: float
-    noise: float
-    rounding: float
-
-    @property
-    def floor(self) -> float:
-        """Of `tensor_law.target`."""
-        return float(tensor_law.floor_above(self.noise, self.rounding))
-
-    def at(self, chosen: Any) -> StepOfCells:
-        """Of some of the points."""
-        return replace(
-            self,
-            cells=UnitCell(self.cells.dimensions[chosen], self.cells.axes[chosen]),
-            structure=self.structure[chosen],
-            initial_dimensions=self.initial_dimensions[chosen],
-            end_to_end_length=self.end_to_end_length[chosen],
-        )
 
     @property
     def is_spatial(self) -> bool:
         """Whether X lives in space."""
-        return not self.driver.material and not self.frame.carries_axes
+        return not self.drive.driver.material and not self.drive.frame.carries_axes
+
+    @property
+    def carries_axes(self) -> bool:
+        """Whether the principal axes of X are pulled back to those of the cells."""
+        return not self.drive.driver.material and self.drive.frame.carries_axes
+
+    @property
+    def rate(self) -> float:
+        """kappa dt."""
+        return self.drive.kappa * (self.time_new - self.time_old)
 
 
 class Response(NamedTuple):
-    """Cells in the eigenbasis of C, and the derivatives of their numbers y by X and by U, (n, 6, 6).
-
-    `place`: for cells with axes, where each of them stands among the lengths and axes of the law, (n, 3).
-    """
+    """Cells in the eigenbasis of C, and the derivatives of their numbers y by X and by U, (n, 6, 6)."""
 
     cells: LocalCells
     by_tensor: Array | None = None
     by_stretch: Array | None = None
-    place: NDArray[np.intp] | None = None
 
 
 def response(step: StepOfCells, strain: Strain, tensor: Array, derivatives: bool) -> Response:
@@ -113,11 +91,17 @@ def jumps_by_rank(step: StepOfCells) -> NDArray[np.bool_]:
     """
     if step.law.dimensions is None:
         return np.zeros(len(step.structure), dtype=bool)
-    old, r0 = step.cells.dimensions, step.end_to_end_length[:, None]
-    alike = np.repeat(r0 / np.sqrt(3), 3, axis=1)
-    lengths = step.law.dimensions(old, step.initial_dimensions, alike, step.kappa, step.time_old, step.time_new)
-    apart: NDArray[np.bool_] = np.ptp(lengths, axis=1) > SAME_LENGTH * step.end_to_end_length
+    r0 = np.asarray(step.drive.end_to_end_length)
+    lengths = _lengths(step, np.repeat(r0[:, None] / np.sqrt(3), 3, axis=1))
+    apart: NDArray[np.bool_] = np.ptp(lengths, axis=1) > SAME_LENGTH * r0
     return apart
+
+
+def _lengths(step: StepOfCells, target: Any) -> Array:
+    """What a law by rank makes of the lengths; `target` may be complex."""
+    drive, law = step.drive, step.law.dimensions
+    assert law is not None
+    return law(step.cells.dimensions, drive.initial_dimensions, target, drive.kappa, step.time_old, step.time_new)
 
 
 # ---------------------------------------------------------------- the law for A
@@ -125,124 +109,98 @@ def jumps_by_rank(step: StepOfCells) -> NDArray[np.bool_]:
 
 def tensor_response(step: StepOfCells, strain: Strain, tensor: Array, derivatives: bool) -> Response:
     """A = A_old + w (r0^2 E - A_old), w = 1 - exp(-kappa s dt): `tensor_law` and its derivative."""
-    rate = step.kappa * (step.time_new - step.time_old)
-    towards = tensor_law.target(tensor, step.floor)
-    old = strain.inside(step.structure)
-    cells = StructureCells(tensor_law.follow(old, towards, step.end_to_end_length, rate))
+    r0 = np.asarray(step.drive.end_to_end_length)
+    towards, old = tensor_law.target(tensor, step.drive.floor), strain.inside(step.structure)
+    cells = StructureCells(tensor_law.follow(old, towards, r0, step.rate))
     if not derivatives:
         return Response(cells)
-    direction, share = tensor_law.target_derivatives(tensor, step.floor)
-    left = np.exp(-rate * towards.share)
-    squared = step.end_to_end_length**2
-    way = mandel.vectors(squared[:, None, None] * towards.direction - old)
-    by_tensor = (squared * -np.expm1(-rate * towards.share))[:, None, None] * direction
-    by_tensor += mandel.dyads((rate * left)[:, None] * way, share)
+    direction, share = tensor_law.target_derivatives(tensor, step.drive.floor)
+    squared, weight = r0**2, -np.expm1(-step.rate * towards.share)
+    by_tensor = (squared * weight)[:, None, None] * direction
+    by_share = step.rate * np.exp(-step.rate * towards.share)
+    way = tensors.to_mandel(squared[:, None, None] * towards.direction - old)
+    by_tensor += tensors.dyads(by_share[:, None] * way, share)
     return Response(cells, by_tensor)
 
 
 # ---------------------------------------------------------------- laws by rank
 
 
-class _Principal(NamedTuple):
-    """Principal values and axes (rows) of X with what the law makes of them, in the order of the frame."""
-
-    values: Array
-    axes: Array
-    direction: Array
-    slope: Array  # dl/d(target)
-    cell: UnitCell
-    active: NDArray[np.bool_]
-    place: NDArray[np.intp]
-
-
 def ranked_response(step: StepOfCells, strain: Strain, tensor: Array, derivatives: bool) -> Response:
-    """Lengths by rank along the framed principal axes of X (`laws.ranked`), and their derivatives."""
-    found = _principal(step, strain, tensor)
-    cells = OrthotropicCells(found.cell)
+    """Lengths by rank along the framed principal axes of X (`laws.by_rank`), and their derivatives."""
+    old = UnitCell(step.cells.dimensions, step.cells.axes @ strain.basis)
+    assert step.law.dimensions is not None
+    found = by_rank(step.law.dimensions, old, _drive(step, strain, tensor, old), step.time_old, step.time_new)
+    cells = OrthotropicCells(found.cells)
     if not derivatives:
-        return Response(cells, place=found.place)
-    e, active = found.direction, found.active
-    size = np.linalg.norm(np.where(e > 0, found.values, 0.0), axis=1)
-    steepness = found.slope * (step.end_to_end_length / np.where(active, size, 1.0))[:, None]
-    by_tensor: Array = np.zeros((len(e), 6, 6))
-    by_tensor[:, :3, :3] = steepness[:, :, None] * (np.eye(3) - e[:, :, None] * e[:, None, :]) * (e > 0)[:, None, :]
-    largest = np.abs(found.values).max(axis=1)
-    for row, (i, j) in enumerate(mandel.PAIRS, start=3):
-        gap = found.values[:, i] - found.values[:, j]
-        known = np.abs(gap) > np.maximum(AGREE * largest, step.noise)
-        by_tensor[:, row, row] = np.where(known, np.sqrt(0.5) / np.where(known, gap, 1.0), 0.0)
+        return Response(cells)
+    by_tensor: Array = np.zeros((len(tensor), 6, 6))
+    by_tensor[:, :3, :3] = _lengths_by_values(step, found)
+    by_tensor[:, range(3, 6), range(3, 6)] = _turns_by_tensor(step, found)
     by_stretch = None
-    if not step.driver.material and step.frame.carries_axes:
-        by_tensor, by_stretch = _pulled_back(found, strain, by_tensor)
-        by_stretch[~active] = 0.0
-    by_tensor[~active] = 0.0
-    by_tensor = by_tensor @ mandel.congruence(found.axes)  # X in its own axes from X as it is
-    return Response(cells, by_tensor, by_stretch, found.place)
+    if step.carries_axes:
+        by_stretch = np.zeros_like(by_tensor)
+        by_turns, by_stretch[:, 3:] = _pulled_back(step, found, strain)
+        by_tensor[:, 3:] = by_turns @ by_tensor[:, 3:]
+        by_stretch[~found.active] = 0.0
+    by_tensor[~found.active] = 0.0
+    by_tensor = by_tensor @ tensors.congruence(found.axes)  # X in its own axes from X as it is
+    return Response(cells, by_tensor, by_stretch)
 
 
-def _principal(step: StepOfCells, strain: Strain, tensor: Array) -> _Principal:
+def _drive(step: StepOfCells, strain: Strain, tensor: Array, old: UnitCell) -> Drive:
+    """What acts at a strain, with a driving tensor."""
     U = np.zeros_like(tensor)
     U[:, range(3), range(3)] = strain.stretches
-    old = UnitCell(step.cells.dimensions, step.cells.axes @ strain.basis)
-    carried = not step.driver.material and step.frame.carries_axes
+    axes = carried_axes(U, old.axes) if step.carries_axes else old.axes
     # an error may not decide how cells jump; where they do not, axes that stay up to the noise would be the only jump
-    error = np.where(jumps_by_rank(step), step.noise, step.rounding)
-    drive = Drive(
-        U,
-        spectral.without_noise(tensor, carried_axes(U, old.axes) if carried else old.axes, error),
-        step.driver,
-        step.frame,
-        step.noise,
-        step.initial_dimensions,
-        step.end_to_end_length,
-        step.kappa,
-        step.pairing,
-    )
-    values, axes = principal_directions(drive, old.axes, step.pairing)
-    direction, active = spectral.positive_direction(values, threshold=step.noise)
-    target, tiny = step.end_to_end_length[:, None] * direction, 1e-30
-    # elementwise in its arguments: the slope by a complex step
-    law: Any = step.law.dimensions
-    lengths = law(old.dimensions, step.initial_dimensions, target + 1j * tiny, step.kappa, step.time_old, step.time_new)
-    dimensions, slope = np.real(lengths), np.imag(lengths) / tiny
-    by_rank = step.pairing is spectral.principal
-    cell_axes = framed(drive, axes, None if by_rank else dimensions)
-    place = np.tile(np.arange(3), (len(values), 1))
-    if carried and not by_rank:
-        place = np.argsort(-dimensions, axis=1, kind="stable")
-    cell = UnitCell(
-        np.where(active[:, None], dimensions, old.dimensions),
-        np.where(active[:, None, None], cell_axes, old.axes),
-    )
-
-    def ordered(entries: Array) -> Array:
-        return np.take_along_axis(entries, place if entries.ndim == 2 else place[:, :, None], axis=1)
-
-    cell = UnitCell(ordered(cell.dimensions), ordered(cell.axes))
-    return _Principal(ordered(values), ordered(axes), ordered(direction), ordered(slope), cell, active, place)
+    error = np.where(jumps_by_rank(step), step.drive.threshold, step.drive.rounding)
+    steady = spectral.without_noise(tensor, axes, error)
+    return step.drive._replace(deformation_gradient=U, tensor=steady, kernels=spectral)
 
 
-def _pulled_back(found: _Principal, strain: Strain, turns: Array) -> tuple[Array, Array]:
-    """dy/dX in the axes of X and dy/dU, where n_1 is U^-1 m_1, n_2 U^-1 m_2 orthogonalised, n_3 what is left.
+def _lengths_by_values(step: StepOfCells, found: Ranked) -> Array:
+    """dl/d(principal values of X), (n, 3, 3): de = (1 - e e) dv+ / |v+|, and the law's slope by a complex step."""
+    tiny, r0 = 1e-30, np.reshape(step.drive.end_to_end_length, (-1, 1))
+    slope = np.imag(_lengths(step, found.target + 1j * tiny)) / tiny
+    e = found.target / r0
+    size = np.linalg.norm(np.where(e > 0, found.values, 0.0), axis=1)
+    steepness = slope * (r0 / np.where(found.active, size, 1.0)[:, None])
+    by_values: Array = steepness[:, :, None] * (np.eye(3) - e[:, :, None] * e[:, None, :]) * (e > 0)[:, None, :]
+    return by_values
 
-    `turns`: dy/dX in the axes of X where n = m.
+
+def _turns_by_tensor(step: StepOfCells, found: Ranked) -> Array:
+    """By what the axes of X turn in the planes of `PAIRS`, over the Mandel components of dX there: 1/(v_i - v_j)."""
+    i, j = np.transpose(tensors.PAIRS)
+    gap = found.values[:, i] - found.values[:, j]
+    unknown = AGREE * np.abs(found.values).max(axis=1)
+    known = np.abs(gap) > np.maximum(unknown, step.drive.threshold)[:, None]
+    return np.where(known, np.sqrt(0.5) / np.where(known, gap, 1.0), 0.0)
+
+
+def _pulled_back(step: StepOfCells, found: Ranked, strain: Strain) -> tuple[Array, Array]:
+    """Turns of the cells' axes n by those of the axes m of X, (n, 3, 3), and by the Mandel components of dU (n, 3, 6).
+
+    n are the rows m U^-1, orthonormalised in the frame's order (`drivers.material_frame`): m U^-1 = L n, L lower
+    triangular in that order. With dm = W m it follows that dn = V n, V_ij = (L^-1 W L - n dU U^-1 n^T)_ij where n_i
+    comes before n_j.
     """
-    m, n, inverse = found.axes, found.cell.axes, 1 / strain.stretches[:, None, :]
-    w = (n * inverse) @ np.swapaxes(m, 1, 2)  # n_a . U^-1 m_b
-    w = np.where(found.active[:, None, None], w, np.eye(3))  # axes that stay follow none of X
-    (r12, r02, r01), turned = (turns[:, 3], turns[:, 4], turns[:, 5]), turns.copy()
-    first, second, third = (w[:, i, i, None] for i in range(3))
-    turned[:, 5] = (w[:, 1, 1, None] * r01 + w[:, 1, 2, None] * r02) / first
-    turned[:, 4] = third * r02 / first
-    turned[:, 3] = (third * r12 - w[:, 0, 1, None] * turned[:, 4]) / second
-    stretched = np.zeros_like(turns)
-    carried, pulled = m * inverse, n * inverse  # U^-1 m_b, U^-1 n_a
+    m, n, u = found.axes, found.cells.axes, strain.stretches[:, None, :]
+    carried = n / u
+    L, inverse = m @ np.swapaxes(carried, 1, 2), (n * u) @ np.swapaxes(m, 1, 2)
+    i, j = (number[:, None] for number in np.transpose(tensors.PAIRS))
+    p, q = i.T, j.T
+    before: Any = True
+    if step.drive.pairing is not spectral.principal:  # as `laws.framed`
+        lengths = found.cells.dimensions
+        before = lengths[:, i] >= lengths[:, j]
 
-    def across(a: int, b: int) -> Array:
-        dyad = pulled[:, a, :, None] * carried[:, b, None, :]
-        return mandel.vectors((dyad + np.swapaxes(dyad, 1, 2)) / 2)
+    def by_turns(i: Any, j: Any) -> Array:
+        return inverse[:, i, p] * L[:, q, j] - inverse[:, i, q] * L[:, p, j]
 
-    stretched[:, 5] = -across(1, 0) / first
-    stretched[:, 4] = -across(2, 0) / first
-    stretched[:, 3] = (-across(2, 1) - w[:, 0, 1, None] * stretched[:, 4]) / second
-    return turned, stretched
+    def by_stretch(i: Any, j: Any) -> Array:
+        dyads = n[:, i[:, 0], :, None] * carried[:, j[:, 0], None, :]
+        return -tensors.to_mandel(dyads + np.swapaxes(dyads, 2, 3)) / 2
+
+    return np.where(before, by_turns(i, j), -by_turns(j, i)), np.where(before, by_stretch(i, j), -by_stretch(j, i))
