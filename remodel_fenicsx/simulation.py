@@ -14,19 +14,8 @@ from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.loading import Loading, LoadValues
 from remodel_fenicsx.body.reductions import AUTO, choice, explained
 from remodel_fenicsx.evolution.coupling import Coupling, Maker
-from remodel_fenicsx.evolution.homeostasis import (
-    COARSE,
-    LIMIT_ITERATIONS,
-    LONGEST,
-    TOLERANCE,
-    UNLOADING,
-    Homeostasis,
-    Limit,
-)
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
-from remodel_fenicsx.evolution.step_control import StepControl
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher, times
-from remodel_fenicsx.evolution.time_error import TimeError
 from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.fem.kinematics import KINEMATICS, FreeLength
 from remodel_fenicsx.fem.quadrature import Quadrature
@@ -114,12 +103,16 @@ class Simulation:
         counted = "negative_eigenvalues" in scene.output.columns
         self.stability = EquilibriumStability(self.stepper, scene.solver.unstable, every_step=counted)
         columns = list(scene.output.columns)
-        self.control: StepControl | None = None
+        self.control: Any = None  # `StepControl`
         if scene.time.tolerance is not None and not at_once:
+            from remodel_fenicsx.evolution.step_control import StepControl
+
             settings = scene.time.tolerance, scene.time.step, scene.stops()
             self.control = StepControl(self.stepper, *settings)
             columns += [TIME_ERROR] if TIME_ERROR not in columns else []
         elif TIME_ERROR in columns:
+            from remodel_fenicsx.evolution.time_error import TimeError
+
             self.stepper.judge = TimeError(self.stepper).measure
         self.observer = Observer(shape, self.stepper, columns_of(shape, columns, scene.loads))
         self.warnings: list[Watcher] = [
@@ -137,21 +130,26 @@ class Simulation:
 
     def _at_once(self, tissue: Tissue, solver: Solver) -> Maker:
         """The coupling that goes to the equilibrium, with the steps of a stepper of its own on the same state."""
+        from remodel_fenicsx.evolution import homeostasis
+        from remodel_fenicsx.evolution.step_control import StepControl
+
         scene, stops = self.scene, self.scene.stops()
         settings, tolerance = scene.remodeling, scene.time.tolerance
         if tolerance is None:
-            tolerance = UNLOADING if any(load.falls for load in scene.loads.values()) else TOLERANCE
+            falls = any(load.falls for load in scene.loads.values())
+            tolerance = homeostasis.UNLOADING if falls else homeostasis.TOLERANCE
         if scene.cells.initial == "random" and LAWS[settings.law].dimensions is not None:
             # cells that jump from rank to rank: no step is short enough, and passes swing
-            settings, tolerance = settings.model_copy(update={"coupling": "relaxed"}), COARSE
+            settings, tolerance = settings.model_copy(update={"coupling": "relaxed"}), homeostasis.COARSE
         way = Stepper(self.state, tissue, settings, solver, self.load_values)
-        way.coupling.longest = min(way.coupling.longest, LONGEST)
+        way.coupling.longest = min(way.coupling.longest, homeostasis.LONGEST)
         control = StepControl(way, tolerance, scene.time.step, stops)
-        until = scene.solver.model_copy(update={"maximum_iterations": LIMIT_ITERATIONS})
+        until = scene.solver.model_copy(update={"maximum_iterations": homeostasis.LIMIT_ITERATIONS})
 
         def make(state: State, tissue: Tissue, remodeling: RemodelingPass, solver: Solver) -> Coupling:
-            limit = Limit(state, tissue, remodeling, until) if scene.missing_for_implicit() is None else None
-            return Homeostasis(control, remodeling, max(stops[:-1], default=0.0), limit)
+            has_limit = scene.missing_for_implicit() is None
+            limit = homeostasis.Limit(state, tissue, remodeling, until) if has_limit else None
+            return homeostasis.Homeostasis(control, remodeling, max(stops[:-1], default=0.0), limit)
 
         return make
 

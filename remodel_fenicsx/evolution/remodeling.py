@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.assembly import over_ranks
-from remodel_fenicsx.kernels.tensor import tensor_kernels, with_kernels
+from remodel_fenicsx.kernels.library import with_kernels
 from remodel_fenicsx.model import spectral
 from remodel_fenicsx.model.cells import UnitCell, structure_tensor
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES, carried_axes
@@ -175,7 +175,11 @@ class RemodelingPass:
         """What the structure tensor tends to in the present state; of laws that have one."""
         drive, target = self.drive(residual), self.law.target
         assert target is not None
-        kernels = tensor_kernels(self.state.comm) if target is tensor_target else None
+        if target is not tensor_target:
+            return target(drive)
+        from remodel_fenicsx.kernels.tensor import tensor_kernels
+
+        kernels = tensor_kernels(self.state.comm)
         return target(drive) if kernels is None else kernels.target(drive)
 
     def without_tension(self, residual: float = 0.0) -> NDArray[np.bool_]:

@@ -45,6 +45,15 @@ static inline void rotated(tensor t, tensor q, int back, tensor result)
     }
 }
 
+/* A symmetric tensor from its principal values and, as columns, axes. */
+static inline void composed(const double *values, tensor vectors, tensor result)
+{
+    ALL(i) ALL(j) {
+        result[i][j] = 0;
+        ALL(k) result[i][j] += vectors[i][k] * values[k] * vectors[j][k];
+    }
+}
+
 /* C = F^T F. */
 static inline void strain_of(tensor F, tensor C)
 {

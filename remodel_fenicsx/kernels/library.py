@@ -6,6 +6,7 @@ import functools
 import logging
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -14,6 +15,7 @@ import numpy as np
 from mpi4py import MPI
 
 from remodel_fenicsx.fem import jit
+from remodel_fenicsx.model.energy import REPULSIONS, Repulsion, Tissue
 from remodel_fenicsx.system import environment
 from remodel_fenicsx.system.terminal import NOTICE
 
@@ -88,3 +90,13 @@ class Library:
                 return self._ffi.from_buffer("uint8_t[]", value)
             return self._ffi.from_buffer("double[]", np.ascontiguousarray(value, np.float64))
         return self._ffi.NULL if value is None else value
+
+
+def with_kernels(tissue: Tissue, comm: MPI.Intracomm) -> Tissue:
+    """The tissue with its repulsion in C, where it is `log`."""
+    if tissue.chain is None or tissue.repulsion is not REPULSIONS["log"] or in_numpy():
+        return tissue
+    from remodel_fenicsx.kernels.tensor import TensorKernels  # with the law `tensor`: most runs need neither
+
+    kernels = TensorKernels(comm)
+    return replace(tissue, repulsion=Repulsion(kernels.log_sum, kernels.log_derivatives))

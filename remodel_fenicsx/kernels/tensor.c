@@ -54,17 +54,13 @@ static void second_derivative(const double *c, tensor first, tensor A, matrix re
 void log_sum(int64_t n, const double *F, const double *A, double *result)
 {
     for (int64_t at = 0; at < n; ++at) {
-        tensor gradient, strain, basis;
+        tensor gradient, strain, basis, cells, inside;
         double c[3];
-        memcpy(gradient, F + 9 * at, sizeof(tensor));
+        memcpy(gradient, F + 9 * at, sizeof(tensor)), memcpy(cells, A + 9 * at, sizeof(tensor));
         strain_of(gradient, strain);
         eigen(strain, c, basis);
-        result[at] = 0;
-        ALL(k) {
-            double along = 0;
-            ALL(i) ALL(j) along += basis[i][k] * A[9 * at + 3 * i + j] * basis[j][k];
-            result[at] += log(c[k]) * along;
-        }
+        rotated(cells, basis, 0, inside);
+        result[at] = log(c[0]) * inside[0][0] + log(c[1]) * inside[1][1] + log(c[2]) * inside[2][2];
     }
 }
 
@@ -196,11 +192,8 @@ void target(int64_t n, const double *F, const double *tensors, int turned_back, 
         }
         eigen(D, values, vectors);
         share[at] = weights(values, floor[at], weight);
-        ALL(i) ALL(j) {
-            double sum = 0;
-            ALL(k) sum += vectors[i][k] * weight[k] * vectors[j][k];
-            direction[9 * at + 3 * i + j] = sum;
-        }
+        composed(weight, vectors, D);
+        memcpy(direction + 9 * at, D, sizeof(tensor));
     }
 }
 
@@ -211,11 +204,9 @@ static void cells(point *p, state *s)
     eigen(s->D, s->values, s->vectors);
     s->share = weights(s->values, p->floor, s->direction);
     const double weight = -expm1(-p->rate * s->share);
-    ALL(i) ALL(j) {
-        double direction = 0;
-        ALL(k) direction += s->vectors[i][k] * s->direction[k] * s->vectors[j][k];
-        s->A[i][j] = p->old[i][j] + weight * (squared * direction - p->old[i][j]);
-    }
+    tensor direction;
+    composed(s->direction, s->vectors, direction);
+    ALL(i) ALL(j) s->A[i][j] = p->old[i][j] + weight * (squared * direction[i][j] - p->old[i][j]);
 }
 
 /* responses.tensor_response with tensor_law.target_derivatives: dA/dD at a state that is there. */
@@ -255,7 +246,7 @@ static void cells_by_tensor(point *p, state *s, matrix result)
     }
 }
 
-/* condensed.TENSORS: what a stress makes of D, and the factors of its derivative by the stress. */
+/* condensed.DRIVING_TENSORS: what a stress makes of D, and the factors of its derivative by the stress. */
 static inline double by_stress(point *p, int i, int j)
 {
     return p->driver == CAUCHY ? p->u[i] * p->u[j] / p->J : p->driver == PK2;
@@ -288,7 +279,7 @@ static void drive_by_strain(point *p, tensor S, matrix result)
     }
 }
 
-/* condensed.CondensedPoints._at_tensor: all that D says. */
+/* condensed.CondensedPoints._trial: all that D says. */
 static void evaluate(point *p, state *s)
 {
     tensor D;
@@ -312,7 +303,7 @@ static void equation(point *p, state *s, matrix result, matrix answers, matrix d
     MANDEL(a) MANDEL(b) result[a][b] = (a == b) - by_stress(p, ROW[a], COLUMN[a]) * answers[a][b];
 }
 
-/* condensed.CondensedPoints._iterated: a step not longer than D, halved where it leads to r >= L. */
+/* condensed.CondensedPoints._better: a step not longer than D, halved where it leads to r >= L. */
 static void iterate(point *p, state *s)
 {
     matrix left, answers, direct;
@@ -364,36 +355,28 @@ void solve(int64_t n, const double *F, const double *start, const double *old, c
     }
 }
 
-/* tangents.of_deformation_gradient: dP/dF (9, 9) from S and dS/dC in the eigenbasis of C. */
+/* condensed._first_by_gradient: dP/dF (9, 9) = dC/dF^T dS/dC dC/dF / 2, and S, with both in the eigenbasis of C. */
 static void by_gradient(point *p, tensor S, matrix by_strain, double *result)
 {
-    double F[3][3], one[3][3][3][3], two[3][3][3][3];
+    double carried[3][3], strain[6][9], stress[6][9];   /* F Q, dC/dF, dS/dF */
+    tensor outside;
+    rotated(S, p->basis, 1, outside);
     ALL(i) ALL(j) {
-        F[i][j] = 0;
-        ALL(k) F[i][j] += p->F[i][k] * p->basis[k][j];
+        carried[i][j] = 0;
+        ALL(k) carried[i][j] += p->F[i][k] * p->basis[k][j];
     }
-    ALL(i) ALL(J) ALL(A) ALL(L) {
-        double sum = 0;
-        ALL(I) {
-            const int r = PLACE[I][J], c = PLACE[A][L];
-            sum += F[i][I] * 2 * by_strain[r][c] / (FACTOR[r] * FACTOR[c]);
+    MANDEL(a) ALL(k) ALL(L) {
+        const int i = ROW[a], j = COLUMN[a];
+        strain[a][3 * k + L] = FACTOR[a] * (carried[k][i] * p->basis[L][j] + carried[k][j] * p->basis[L][i]);
+    }
+    memset(stress, 0, sizeof(stress));
+    MANDEL(a) MANDEL(b) for (int c = 0; c < 9; ++c) stress[a][c] += by_strain[a][b] / 2 * strain[b][c];
+    for (int r = 0; r < 9; ++r)
+        for (int c = 0; c < 9; ++c) {
+            double sum = r / 3 == c / 3 ? outside[r % 3][c % 3] : 0;
+            MANDEL(a) sum += strain[a][r] * stress[a][c];
+            result[9 * r + c] = sum;
         }
-        one[i][J][A][L] = sum;
-    }
-    ALL(i) ALL(J) ALL(k) ALL(L) {
-        double sum = i == k ? S[J][L] : 0;
-        ALL(A) sum += F[k][A] * one[i][J][A][L];
-        two[i][J][k][L] = sum;
-    }
-    ALL(i) ALL(J) ALL(k) ALL(L) {
-        one[i][J][k][L] = 0;
-        ALL(M) one[i][J][k][L] += p->basis[J][M] * two[i][M][k][L];
-    }
-    ALL(i) ALL(J) ALL(k) ALL(L) {
-        double sum = 0;
-        ALL(M) sum += p->basis[L][M] * one[i][J][k][M];
-        result[9 * (3 * i + J) + 3 * k + L] = sum;
-    }
 }
 
 /* condensed.CondensedPoints.tangent at solved points. */

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from remodel_fenicsx.model import tensor_law, tensors
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.chains import CHAINS
 from remodel_fenicsx.model.drivers import DRIVERS, rotated_back
-from remodel_fenicsx.model.energy import MATRICES, REPULSIONS, Repulsion, Tissue, whole_structure_tensor
+from remodel_fenicsx.model.energy import MATRICES, REPULSIONS, Tissue, whole_structure_tensor
 from remodel_fenicsx.model.implicit import condensed
 from remodel_fenicsx.model.implicit.condensed import CondensedPoints, LocalSolution, named
 from remodel_fenicsx.model.implicit.network import at, put
@@ -82,14 +82,6 @@ class TensorKernels:
 def tensor_kernels(comm: MPI.Intracomm) -> TensorKernels | None:
     """None where numpy is asked for. Collective."""
     return None if in_numpy() else TensorKernels(comm)
-
-
-def with_kernels(tissue: Tissue, comm: MPI.Intracomm) -> Tissue:
-    """The tissue with its repulsion in C, where it is `log`."""
-    if tissue.chain is None or tissue.repulsion is not REPULSIONS["log"] or in_numpy():
-        return tissue
-    kernels = TensorKernels(comm)
-    return replace(tissue, repulsion=Repulsion(kernels.log_sum, kernels.log_derivatives))
 
 
 def condensed_points(kernels: TensorKernels | None, tissue: Tissue, step: StepOfCells) -> CondensedPoints:

@@ -229,6 +229,14 @@ def passes_through_zero(before: Any, after: Any) -> Any:
     return crossing
 
 
+def cofactor(tensors: Any) -> Any:
+    """J F^-T of arrays (..., 3, 3): each row is the cross product of the two others."""
+    (a, b, c), (d, e, f), (g, h, i) = np.moveaxis(tensors, (-2, -1), (0, 1)).copy()  # nine arrays without gaps
+    entries = [e * i - f * h, f * g - d * i, d * h - e * g, h * c - i * b, i * a - g * c, g * b - h * a,
+               b * f - c * e, c * d - a * f, a * e - b * d]  # fmt: skip
+    return np.stack(entries, axis=-1).reshape(np.shape(tensors))
+
+
 def largest_change_of_length(before: Any, after: Any) -> Any:
     """By what share the lengths at points change most between two deformation gradients (n, 3, 3), to first order.
 

@@ -23,7 +23,6 @@ from remodel_fenicsx.fem.solver_methods import METHODS
 from remodel_fenicsx.model.chains import CHAINS
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
 from remodel_fenicsx.model.energy import MATRICES, REPULSIONS, Matrix
-from remodel_fenicsx.model.implicit.condensed import refused
 from remodel_fenicsx.model.laws import LAWS
 from remodel_fenicsx.scene.plausibility import doubts, largest_stress
 from remodel_fenicsx.scene.presets import EXACT, PRESETS, PROFILES, default_method
@@ -170,6 +169,8 @@ class Scene(Table):
 
     def missing_for_implicit(self) -> str | None:
         """What the scene lacks for the coupling "implicit"; None where it lacks nothing."""
+        from remodel_fenicsx.model.implicit.condensed import refused  # six modules that most runs need not load
+
         material, remodeling = self.material, self.remodeling
         if self.mesh.formulation != "displacement":
             return "mesh.formulation = 'displacement': in the others the stress at a point depends on its whole element"

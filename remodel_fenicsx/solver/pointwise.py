@@ -10,7 +10,7 @@ import ufl
 from numpy.typing import NDArray
 
 from remodel_fenicsx.fem import assembly
-from remodel_fenicsx.kernels.tensor import with_kernels
+from remodel_fenicsx.kernels.library import with_kernels
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.energy import Stresses, Tissue, whole_structure_tensor
 from remodel_fenicsx.model.tensors import MANDEL

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.evolution.stepper import Step, Stepper
 from remodel_fenicsx.fem import jit
+from remodel_fenicsx.model.tensors import cofactor
 from remodel_fenicsx.state.memory import Occasions
 from remodel_fenicsx.state.parameters import at_points
 from remodel_fenicsx.watch.once import WarnsOnce
@@ -87,7 +88,9 @@ class LockingWarning(WarnsOnce):
 
     def missing(self) -> Missing:
         """Of the present state; zero where neither loads nor prescribed displacements deform the body."""
-        energy, volume, shape = self.energies()
+        return self._missing(*self.energies())
+
+    def _missing(self, energy: float, volume: float, shape: float) -> Missing:
         work, free_work = self.work(), self.work(free=True)
         driven = Missing(0.0, 0.0)
         if work > DRIVEN * energy > 0:
@@ -152,15 +155,17 @@ class LockingWarning(WarnsOnce):
 
     def solved(self, step: Step) -> None:
         """Look, until it was said."""
-        if self.homogeneous or self.said or not self._occasions.due() or not self._is_news():
+        if self.homogeneous or self.said or not self._occasions.due():
             return
-        missing = self.missing()
+        energies = self.energies()
+        if not self._are_news(*energies):
+            return
+        missing = self._missing(*energies)
         if sum(missing) > WARNED_SHARE:
             self.say(step, self.in_words(missing))
 
-    def _is_news(self) -> bool:
+    def _are_news(self, energy: float, *vain: float) -> bool:
         """Whether energies differ from those of the last look."""
-        energy, *vain = self.energies()
         known = self._numbers["energy"], self._numbers["vain"]
         news = any(abs(now - old) > NEWS * old for now, old in zip((energy, sum(vain)), known, strict=True))
         if news:
@@ -223,13 +228,12 @@ class VolumeResponse:
         return lacking
 
     def _stress(self) -> Array:
-        """P of the present unknowns, (elements, points, 3, 3)."""
+        """P of the present unknowns, (elements, points, 3, 3); cof F = J F^-T."""
         quadrature = self.quadrature
         states = quadrature.owned(self.stepper.coupling.equilibrium.states())
         changes = quadrature.beyond(0, np.log(states[..., 1])[..., None])[..., 0]
         F = states[..., 2:].reshape(*changes.shape, 3, 3)
-        inverse = np.swapaxes(np.linalg.inv(F), -1, -2)
-        stress: Array = (self.stiffness * changes)[..., None, None] * inverse
+        stress: Array = (self.stiffness * changes / states[..., 1])[..., None, None] * cofactor(F)
         return stress
 
     def _assemble(self, stress: Array, forces: Any) -> None:

@@ -22,6 +22,8 @@ from remodel_fenicsx.scene import scene_from_dict
 from remodel_fenicsx.settings import FIELDS_BY_NAME
 from remodel_fenicsx.solver.continuation import Blend, Work
 from remodel_fenicsx.solver.equilibrium import Equilibrium
+from remodel_fenicsx.watch.locking import LockingWarning
+from tests.parts import pulled_cube
 
 SELF = MPI.COMM_SELF
 
@@ -62,6 +64,15 @@ def test_a_state_is_evaluated_once(monkeypatch: pytest.MonkeyPatch) -> None:
     evaluations, parameters = Calls(monkeypatch, Quadrature, "evaluate"), Calls(monkeypatch, assembly, "point_values")
     iterations = sum(step.work.newton_iterations for step in march)
     assert evaluations.number <= iterations + 2 * 2 and parameters.number == 0
+    simulation.close()
+
+
+def test_energies_of_elements_are_summed_up_once_a_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They tell whether to look for elements that lock, and what such a look begins with."""
+    calls, looks = (Calls(monkeypatch, LockingWarning, name) for name in ("energies", "work"))
+    simulation = Simulation(pulled_cube(3.0), SELF)
+    assert len(list(simulation.steps())) == 3 == calls.number
+    assert looks.number
     simulation.close()
 
 
@@ -203,6 +214,21 @@ def test_a_run_imports_only_what_it_needs(tmp_path: Path) -> None:
     assert {"dolfinx", "petsc4py", "ufl"} < imported
     assert not imported & {"gmsh", "h5py", "rich", "pint", "scipy", "matplotlib", "pyvista", "pandas", "PIL"}
     assert "gmsh 4" in (tmp_path / "run" / "scene.toml").read_text()  # its version is known all the same
+
+
+def test_the_printed_law_imports_no_other_coupling() -> None:
+    """Nor what chooses steps, or goes to an equilibrium."""
+    program = (
+        "import sys\nfrom remodel_fenicsx import Simulation, preset_scene\n"
+        "Simulation(preset_scene('kuhl-holzapfel-2007', 'cube')).close()\n"
+        "print(*sorted(name for name in sys.modules if name.startswith('remodel_fenicsx.')))"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    imported = done.stdout.split()
+    assert "remodel_fenicsx.evolution.coupling" in imported
+    others = ("implicit", "condensed", "homeostasis", "step_control", "time_error", "kernels.tensor")
+    assert not [name for name in imported if any(other in name for other in others)]
 
 
 def test_no_form_is_made_in_the_middle_of_a_run(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -29,7 +29,7 @@ from remodel_fenicsx.body.columns import columns_of
 from remodel_fenicsx.paper import FIGURES, bodies, curves, rendering, runs
 from remodel_fenicsx.paper.runs import LOAD_CASES
 from remodel_fenicsx.results import vtkhdf
-from remodel_fenicsx.results.recording import Recording, RecordingError
+from remodel_fenicsx.results.recording import Recording, RecordingError, steps_recorded
 from remodel_fenicsx.scene.scene import Scene, scene_from_dict
 from remodel_fenicsx.studies import page
 from remodel_fenicsx.studies.page import FigureError
@@ -246,6 +246,7 @@ def test_a_stopped_command_ends_its_runs(number: int, tmp_path: Path) -> None:
     assert process.returncode == (4 if number == signal.SIGUSR1 else 143) and not is_alive(worker)
     said = "remodel-fenicsx: stopped; all that is recorded is kept, the same command goes on"
     assert rest.splitlines()[-1] == said and not (tmp_path / "figures").exists()
+    assert all(steps_recorded(history.parent) < 150 for history in (tmp_path / "runs").rglob("history.csv"))
 
 
 def children_of(number: int) -> list[int]:

@@ -14,7 +14,7 @@ from remodel_fenicsx.body import SHAPES
 from remodel_fenicsx.scene import Scene, scene_from_dict
 from remodel_fenicsx.system.terminal import NOTICE
 from remodel_fenicsx.watch.tissue import VolumeLoss
-from tests.conftest import Case
+from tests.conftest import Case, slowly
 
 SELF = MPI.COMM_SELF
 
@@ -105,8 +105,7 @@ def test_chains_that_point_out_of_the_wall_are_said(caplog: pytest.LogCaptureFix
     assert not SHAPES["cube"](shape="cube", side=1.0).radial_share(dimensions, axes, places).any()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("refinement", [1, 2])
+@pytest.mark.parametrize("refinement", [1, *slowly(2)])
 def test_a_front_within_the_inner_layer_is_said(refinement: int, caplog: pytest.LogCaptureFixture) -> None:
     """Chains turn from circumferential to axial at R = 1.2: in the first of 8 elements, or the second of 16."""
     ramp = [[0, 0], [25, 1]]
