@@ -119,6 +119,22 @@ def parser() -> argparse.ArgumentParser:
     text = "MB that the page may have (default: %(default)g): where it would be larger fewer times are shown"
     report.add_argument("--size", type=megabytes, default=20.0, metavar="MB", help=text)
     report.add_argument("--open", action="store_true", help="show it in a browser")
+    picture = command("picture", "Draw the body of the run in DIR: PNG, SVG or PDF.")
+    animate = command("animate", "Draw the body of the run in DIR as it moves: GIF or WebP, MP4 where ffmpeg is.")
+    for found, default in ((picture, "DIR/NAME-t150.png"), (animate, "DIR/NAME-t0-t150.gif")):
+        found.add_argument("folder", type=Path, metavar="DIR", help="folder of a run")
+        text = "show this many layers, from the inside of a tube, from the bottom of others (default: all)"
+        found.add_argument("--layers", type=int, metavar="K", help=text)
+        text = "leave out the half, or the quarter, that is in front"
+        found.add_argument("--cut", choices=("half", "quarter"), help=text)
+        text = "front, above, or where the eye is from the middle of the body: --view=X,Y,Z (default: front)"
+        found.add_argument("--view", default="front", metavar="VIEW", help=text)
+        text = f"a file that does not exist yet; its ending says the kind (default: {default}, numbered when taken)"
+        found.add_argument("-o", "--output", type=Path, metavar="FILE", help=text)
+    text = "times to show beside each other, the nearest recorded ones (default: the last)"
+    picture.add_argument("--time", type=float, nargs="+", metavar="T", help=text)
+    text = "recorded times to show, from 2 to 500 (default: %(default)s, or all where there are fewer)"
+    animate.add_argument("--frames", type=int, default=60, metavar="N", help=text)
     revolve = command("revolve", "Write the fields of a reduced run in DIR on the whole body: fields_body.vtkhdf.")
     revolve.add_argument("folder", type=Path, metavar="DIR", help="folder of a run")
     scene_command("validate", "Check a scene without running it.")
@@ -363,6 +379,34 @@ def _report(options: argparse.Namespace) -> int:
     return 0
 
 
+def _drawing(options: argparse.Namespace) -> int:
+    """A picture or an animation."""
+    _check(reason_undrawable())
+    if not interrupts.is_first_rank():  # the work of one process
+        return 0
+    from remodel_fenicsx.pictures.files import draw_animation, draw_picture
+    from remodel_fenicsx.pictures.sight import Viewing
+    from remodel_fenicsx.results.recording import RecordingError
+    from remodel_fenicsx.studies.page import FigureError
+
+    viewing = Viewing(options.layers, options.cut, options.view)
+    try:
+        if options.command == "picture":
+            written = draw_picture(options.folder, options.time, viewing, options.output)
+        else:
+            written = draw_animation(options.folder, options.frames, viewing, options.output)
+    except FigureError as refusal:
+        return _fail(str(refusal), refusal.exit_code)
+    except RecordingError as error:
+        return _fail(str(error), BAD_INPUT)
+    except ForeignFileError as error:
+        return _fail(f"{error.filename}: {error.strerror}", BAD_INPUT)
+    except OSError as error:
+        return _fail(f"cannot write the picture: {error}", BAD_ENVIRONMENT)
+    _say(str(written))
+    return 0
+
+
 def _revolve(options: argparse.Namespace) -> int:
     _check(reason_unusable())
     if not interrupts.is_first_rank():  # the work of one process
@@ -458,6 +502,8 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
     "trade": _trade,
     "status": _status,
     "report": _report,
+    "picture": _drawing,
+    "animate": _drawing,
     "revolve": _revolve,
     "validate": _validate,
     "new": _new,

@@ -13,8 +13,9 @@ from pathlib import Path
 import matplotlib
 from mpi4py import MPI
 
-from remodel_fenicsx.paper import bodies, curves, structures
+from remodel_fenicsx.paper import curves, structures
 from remodel_fenicsx.paper.runs import KAPPAS, LOAD_CASES, load_case_name, obtain, scenes
+from remodel_fenicsx.pictures import bodies
 from remodel_fenicsx.results.recording import Recording
 from remodel_fenicsx.studies.page import FORMATS, STYLE, FigureError, Page, check_folder
 from remodel_fenicsx.system.children import cores

@@ -7,8 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from remodel_fenicsx.model.chains import CHAINS
-from remodel_fenicsx.paper.bodies import Array, DrawnBody, Table, angle_scale, place
-from remodel_fenicsx.paper.rendering import render
+from remodel_fenicsx.pictures.bodies import Array, DrawnBody, Table, angle_scale, place
+from remodel_fenicsx.pictures.rendering import render
 from remodel_fenicsx.paper.runs import KAPPAS, first_cells, made_with
 from remodel_fenicsx.paper.structures import SOLVED, at, joined, layer_table, peeled, tube_picture, wall_table
 from remodel_fenicsx.results.recording import Recording

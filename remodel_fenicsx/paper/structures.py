@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from remodel_fenicsx.model.cells import initial_axes, radial_direction
-from remodel_fenicsx.paper.bodies import (
+from remodel_fenicsx.pictures.bodies import (
     ALL,
     Array,
     DrawnBody,
@@ -23,7 +23,7 @@ from remodel_fenicsx.paper.bodies import (
     radii,
     rank_of,
 )  # fmt: skip
-from remodel_fenicsx.paper.rendering import Picture, View, render
+from remodel_fenicsx.pictures.rendering import Picture, View, render
 from remodel_fenicsx.paper.runs import ELONGATION_COLUMN, LOAD_CASES, load_case_name, made_with
 from remodel_fenicsx.results.recording import Recording
 from remodel_fenicsx.studies.page import COLOURS, Page, panel_letters

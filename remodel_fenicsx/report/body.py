@@ -2,28 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.report.card import Array
 from remodel_fenicsx.report.packing import of_angles, of_places, of_vectors
 from remodel_fenicsx.results.chain_lines import AXIS_FIELDS
-from remodel_fenicsx.results.recording import HistoryColumns, Recording
-from remodel_fenicsx.results.turned import TurnedFields
+from remodel_fenicsx.results.recording import Recording
+from remodel_fenicsx.results.whole_body import WholeBody
 
 Numbers = NDArray[np.float64]
-Fields = tuple[Numbers | None, dict[str, Numbers]]
 
-CORNERS = {"interval": 2, "quadrilateral": 4, "tetrahedron": 4, "hexahedron": 8}
 CELL = ("cell_dimensions", *AXIS_FIELDS)
 NAMES = ("displacement", "deformation_gradient", "fibre_angle_deformed", "chain_extension", *CELL)
-MOST_LAYERS = 40  # of a mesh in layers; others are divided into FEW_LAYERS
-FEW_LAYERS = 8
 
 
 @dataclass(frozen=True)
@@ -74,24 +68,21 @@ class ShownBody:
         RecordingError
             If the fields are damaged.
         """
-        points, elements, fields = _whole_body(recording)
-        used, corners = np.unique(elements, return_inverse=True)
-        elements, points = corners.reshape(elements.shape), points[used]
-        layer, depth = _layers(recording.scene.geometry.depth(points[elements].mean(axis=1)))
+        whole = WholeBody(recording)
+        points, elements = whole.points, whole.elements
         volume = _volumes(points[elements])
         rows: dict[str, list[NDArray[np.float32]]] = {name: [] for name in ("position", "angle", "extension", "edges")}
         is_deformed = True
         for time in times:
-            displacement, found = fields(float(time))
+            displacement, found = whole.fields(float(time), NAMES)
             is_deformed = displacement is not None
-            moved = 0.0 if displacement is None else displacement[used]
+            moved = 0.0 if displacement is None else displacement
             rows["position"].append((points + moved).astype(np.float32))
             for name, values in _of_elements(found).items():
                 rows[name].append(values.astype(np.float32))
         series = {name: np.stack(values) if values else None for name, values in rows.items()}
-        reduced = KINEMATICS[recording.scene.model.kinematics].reduced
-        known: Any = {**series, "is_turned": reduced, "is_deformed": is_deformed}
-        return cls(times, points, elements, layer, depth, volume, **known)
+        known: Any = {**series, "is_turned": whole.is_turned, "is_deformed": is_deformed}
+        return cls(times, points, elements, whole.layer, whole.depth, volume, **known)
 
     def arrays(self) -> tuple[dict[str, Array], dict[str, Any]]:
         """The same in few bytes, and the numbers that lead back."""
@@ -120,33 +111,6 @@ class ShownBody:
         return 6 * len(self.points) + 11 * len(self.elements)
 
 
-def has_a_body(recording: Recording) -> bool:
-    """Whether a run recorded fields of a body that can be shown."""
-    scene = recording.scene
-    reduction = scene.geometry.reductions.get(scene.model.kinematics)
-    return bool(len(recording.times)) and (reduction is None or reduction.whole is not None)
-
-
-def _whole_body(recording: Recording) -> tuple[Numbers, NDArray[np.int64], Callable[[float], Fields]]:
-    """Points, corners, and a function of time: displacement of the points and fields of the elements."""
-    scene = recording.scene
-    name, shape = scene.model.kinematics, scene.geometry
-    points, elements = recording.points, recording.elements
-    corners = elements[:, : CORNERS[KINEMATICS[name].element(scene.mesh.element)]]
-
-    def recorded(time: float) -> Fields:
-        fields = recording.fields(time, NAMES)
-        return fields.pop("displacement", None), fields
-
-    if not KINEMATICS[name].reduced:
-        return points, corners, recorded
-    reduction = shape.reductions[name]
-    assert reduction.whole is not None
-    body, hexahedra = reduction.whole(shape, points, corners)
-    turned = TurnedFields(body, hexahedra, points, elements, reduction.turn)
-    return body, hexahedra, lambda time: turned(recording.fields(time, NAMES))
-
-
 def _of_elements(fields: dict[str, Numbers]) -> dict[str, Numbers]:
     """What is shown of the elements, by the names of `ShownBody`, as far as it was recorded."""
     names = {"angle": "fibre_angle_deformed", "extension": "chain_extension"}
@@ -157,19 +121,6 @@ def _of_elements(fields: dict[str, Numbers]) -> dict[str, Numbers]:
             axes = axes @ np.swapaxes(fields["deformation_gradient"].reshape(-1, 3, 3), 1, 2)
         found["edges"] = fields["cell_dimensions"][:, :, None] * axes
     return found
-
-
-def _layers(depth: Numbers) -> tuple[NDArray[np.int64], Numbers]:
-    """Number of each element's layer and the mean depth of each: those of the mesh, or equal parts of the way."""
-    ordered = np.sort(depth)
-    starts = np.concatenate([[True], np.diff(ordered) > 1e-6])
-    if starts.sum() <= MOST_LAYERS:
-        layer = np.searchsorted(ordered[starts], depth + 1e-7) - 1
-    else:
-        layer = np.minimum((FEW_LAYERS * np.clip(depth, 0.0, 1.0)).astype(np.int64), FEW_LAYERS - 1)
-        layer = np.unique(layer, return_inverse=True)[1].reshape(-1)  # none without an element
-    counts = np.bincount(layer)
-    return layer, np.bincount(layer, weights=depth) / counts
 
 
 def _volumes(corners: Numbers) -> Numbers:
@@ -184,26 +135,3 @@ def _volumes(corners: Numbers) -> Numbers:
         first, second, third = (corners[:, k] - corners[:, a] for k in (b, c, d))
         total += np.abs(np.einsum("mi,mi->m", np.cross(first, second), third))
     return total / total.sum()
-
-
-def kept_times(history: HistoryColumns, times: Numbers, most: int) -> Numbers:
-    """So many of the recorded times, the first and the last among them: spaced evenly, half in time, half in change.
-
-    Parameters
-    ----------
-    history
-        What changes: each column over its range.
-    times
-        That are recorded, (n,).
-    most
-        How many may be kept, at least 2.
-    """
-    if len(times) <= most:
-        return times
-    rows = np.stack([np.interp(times, history["time"], column) for column in history.values()])
-    rows = np.where(np.isfinite(rows), rows, 0.0)
-    change = np.abs(np.diff(rows, axis=1)) / np.maximum(np.ptp(rows, axis=1), np.finfo(float).tiny)[:, None]
-    share = [np.concatenate([[0.0], np.cumsum(part)]) for part in (np.diff(times), change.sum(axis=0))]
-    place = np.sum([part / (part[-1] or 1.0) for part in share], axis=0)
-    wanted = np.linspace(0.0, float(place[-1]), most)
-    return times[np.unique(np.abs(place[:, None] - wanted).argmin(axis=0))]

@@ -64,8 +64,3 @@ def table(rows: Iterable[tuple[str, str]]) -> str:
     """Names and values."""
     cells = "".join(f"<tr><th>{escape(name)}</th><td>{escape(value)}</td></tr>" for name, value in rows)
     return f"<table>{cells}</table>"
-
-
-def number(value: float) -> str:
-    """Three digits, as people write them."""
-    return f"{value:.3g}" if abs(value) < 1e5 and (abs(value) >= 1e-3 or value == 0) else f"{value:.2e}"

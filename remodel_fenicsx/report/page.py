@@ -12,12 +12,14 @@ from pathlib import Path
 from typing import Any
 
 from remodel_fenicsx._version import __version__
-from remodel_fenicsx.report.body import ShownBody, has_a_body, kept_times
+from remodel_fenicsx.report.body import ShownBody
 from remodel_fenicsx.report.card import Card
 from remodel_fenicsx.report.packing import packed
 from remodel_fenicsx.report.parts import ASSETS, ReportedRun, cards, data_of
 from remodel_fenicsx.report.story import Story
+from remodel_fenicsx.results.kept_times import kept_times
 from remodel_fenicsx.results.recording import Recording
+from remodel_fenicsx.results.whole_body import has_a_body
 from remodel_fenicsx.system.regular_files import read_regular, write_whole
 
 REPORT = "report.html"

@@ -16,7 +16,7 @@ from remodel_fenicsx._version import __version__
 from remodel_fenicsx.body.columns import Column, columns_of
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.report.body import ShownBody
-from remodel_fenicsx.report.card import Array, Card, folded, number, section, table
+from remodel_fenicsx.report.card import Array, Card, folded, section, table
 from remodel_fenicsx.report.story import Story
 from remodel_fenicsx.results.drawing import (
     AMBIENT,
@@ -26,8 +26,10 @@ from remodel_fenicsx.results.drawing import (
     CHAIN_REACH,
     CHAIN_ROOM,
     CHAIN_WIDTH,
+    VIEWS,
 )
 from remodel_fenicsx.results.recording import HISTORY, LARGEST_HISTORY, SCENE, Recording
+from remodel_fenicsx.results.words import unit_of, with_unit, words
 from remodel_fenicsx.system.regular_files import read_regular
 from remodel_fenicsx.system.terminal import duration
 
@@ -36,7 +38,6 @@ MOST_TILES = 8
 MOST_ROWS = 2000  # of a curve: a curve has fewer pixels
 LARGEST_DOWNLOAD = 20_000_000  # bytes of a history that still goes into the page
 LAST = ("min_jacobian", "newton_iterations", "linear_iterations", "substeps", "seconds", "processor_seconds")
-WORDS = {"max_chain_extension": "largest r/L", "min_jacobian": "smallest J", "seconds": "seconds a step"}
 
 
 @dataclass(frozen=True)
@@ -71,22 +72,10 @@ class ReportedRun:
 
     def unit(self, column: Column) -> str:
         """The column's unit where the scene says what it is, else nothing."""
-        scene = self.recording.scene
-        names = {"stress": scene.material.stress_unit, "length": scene.geometry.length_unit, "degrees": "°", "s": "s"}
-        return names.get(column.unit) or ""
+        return unit_of(self.recording.scene, column.unit)
 
 
 Part = Callable[[ReportedRun], Card | None]
-
-
-def words(name: str) -> str:
-    """A column's name as people read it."""
-    return WORDS.get(name) or name.replace("_", " ")
-
-
-def with_unit(value: float, unit: str) -> str:
-    """A number and its unit."""
-    return number(value) + (unit if unit == "°" else f" {unit}" if unit else "")
 
 
 # ---------------------------------------------------------------- top
@@ -130,6 +119,7 @@ def view(run: ReportedRun) -> Card | None:
     data = {
         **scales, "times": [float(time) for time in body.times], "layers": len(body.depth),
         "words": run.recording.scene.geometry.angle_in_words, "colours": ANGLE_COLOURS, "ambient": AMBIENT,
+        "views": VIEWS,
         "least_extension": 0.0 if body.extension is None else float(np.floor(20 * np.nanmin(body.extension)) / 20),
         "chain": {"colour": CHAIN_COLOUR, "reach": CHAIN_REACH, "room": CHAIN_ROOM, "width": CHAIN_WIDTH,
                   "lift": CHAIN_LIFT},

@@ -14,3 +14,4 @@ CHAIN_ROOM = 0.78  # how far a chain goes at most, over the way from the middle 
 CHAIN_WIDTH = 0.06  # over the shorter side
 CHAIN_LIFT = 0.2  # towards the eye, over the same: faces need not be plane
 AMBIENT = 0.8  # share of a colour that does not depend on where its face looks: it must mean the same everywhere
+VIEWS = {"front": (0.3, -1.0, 0.42), "above": (0.0, -0.02, 1.0)}  # where the eye is, from the middle of the body

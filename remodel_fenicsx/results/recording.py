@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from remodel_fenicsx.schema.times import same_time
-from remodel_fenicsx.system.regular_files import read_regular
+from remodel_fenicsx.system.regular_files import check_regular, read_regular
 
 if TYPE_CHECKING:
     import h5py
@@ -217,6 +217,7 @@ class Recording:
         if not path.exists():
             raise RecordingError(f"{self.path}: the run recorded no fields, there is no {FIELDS}")
         try:
+            check_regular(path)
             with h5py.File(path, "r") as file:
                 yield file["VTKHDF"]
         except (OSError, RuntimeError, KeyError, ValueError, IndexError, TypeError) as error:

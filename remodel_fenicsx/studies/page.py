@@ -9,6 +9,7 @@ import csv
 import io
 import tempfile
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -95,33 +96,11 @@ class Page:
         made_with = f"{made_with}; matplotlib {matplotlib.__version__}"
         if self.stamp:
             figure.text(0.004, 0.004, made_with, fontsize=4.5, color="0.55", ha="left", va="bottom")
-        made_by = f"{MARK} {__version__}"
-        common = {"Title": self.title, "Creator": made_by}
-        notes: dict[str, dict[str, Any]] = {
-            "png": {"Software": made_by, "Title": self.title, "Description": self.caption, "Source": made_with,
-                    "Comment": f"remodel-fenicsx figures {self.name}"},
-            "pdf": common | {"Subject": self.caption, "Keywords": made_with, "CreationDate": None},
-            "svg": common | {"Description": self.caption, "Source": made_with, "Date": None},
-        }  # fmt: skip
+        about = About(
+            f"{MARK} {__version__}", self.title, self.caption, made_with, f"remodel-fenicsx figures {self.name}"
+        )
         for ending in self.formats:
-            buffer = io.BytesIO()
-            how: dict[str, Any] = {"format": ending, "dpi": DOTS_PER_INCH[ending], "facecolor": "white"}
-            if ending != "png":
-                how["metadata"] = notes[ending]
-            figure.savefig(buffer, **how)
-            content = self._with_few_colours(buffer, notes["png"]) if ending == "png" else buffer.getvalue()
-            self._write(f"{self.name}.{ending}", content)
-
-    def _with_few_colours(self, drawn: io.BytesIO, notes: Mapping[str, str]) -> bytes:
-        """A PNG of 256 colours with these notes."""
-        texts = PngInfo()
-        for key, value in notes.items():
-            texts.add_text(key, value)
-        small, dpi = io.BytesIO(), DOTS_PER_INCH["png"]
-        with Image.open(drawn) as full:
-            picture = with_palette(full.convert("RGB"), self.colours)
-            picture.save(small, "png", pnginfo=texts, optimize=True, dpi=(dpi, dpi))
-        return small.getvalue()
+            self._write(f"{self.name}.{ending}", as_file(figure, ending, about, self.colours))
 
     def save_table(self, columns: Mapping[str, ArrayLike], notes: Sequence[str], part: str = "") -> None:
         """Write NAME.csv or NAME-PART.csv: notes as comments, then the columns, all of one length."""
@@ -141,6 +120,40 @@ class Page:
         self.folder.mkdir(parents=True, exist_ok=True)
         write_whole(path, content)
         self.written.append(path)
+
+
+@dataclass(frozen=True)
+class About:
+    """What stands in a picture's file: the caption says how it is read, the comment which command made it."""
+
+    made_by: str
+    title: str
+    caption: str
+    made_with: str
+    comment: str
+
+
+def as_file(figure: Figure, ending: str, about: About, colours: NDArray[np.float64]) -> bytes:
+    """A figure in one of `FORMATS`; a PNG has 256 colours, these (n, 3) in 0..1 as they are."""
+    common = {"Title": about.title, "Creator": about.made_by}
+    notes: dict[str, dict[str, Any]] = {
+        "png": {"Software": about.made_by, "Title": about.title, "Description": about.caption,
+                "Source": about.made_with, "Comment": about.comment},
+        "pdf": common | {"Subject": about.caption, "Keywords": about.made_with, "CreationDate": None},
+        "svg": common | {"Description": about.caption, "Source": about.made_with, "Date": None},
+    }  # fmt: skip
+    drawn, how = io.BytesIO(), {"format": ending, "dpi": DOTS_PER_INCH[ending], "facecolor": "white"}
+    if ending != "png":
+        figure.savefig(drawn, **how, metadata=notes[ending])  # type: ignore[arg-type]
+        return drawn.getvalue()
+    figure.savefig(drawn, **how)  # type: ignore[arg-type]
+    texts, small, dpi = PngInfo(), io.BytesIO(), DOTS_PER_INCH["png"]
+    for key, value in notes["png"].items():
+        texts.add_text(key, value)
+    with Image.open(drawn) as full:
+        picture = with_palette(full.convert("RGB"), colours)
+        picture.save(small, "png", pnginfo=texts, optimize=True, dpi=(dpi, dpi))
+    return small.getvalue()
 
 
 def panel_letters(*panels: Axes) -> None:
@@ -163,28 +176,46 @@ def _left_end(axes: Axes) -> float:
     return float(figure.transFigure.inverted().transform((place.x0, 0.0))[0])
 
 
-def with_palette(picture: Image.Image, colours: NDArray[np.float64]) -> Image.Image:
-    """A picture of 256 colours, a quarter as large: these (n, 3) in 0..1 as they are, the rest chosen for the picture.
+class Palette:
+    """256 colours, with which a picture is a quarter as large: some as they are, the rest chosen for a picture.
 
     Pillow alone takes neighbours on the scale for one colour, and looks for the nearest colour only roughly.
+
+    Parameters
+    ----------
+    picture
+        For which colours are chosen.
+    colours
+        Those that are kept, (n, 3) in 0..1.
     """
-    kept = np.rint(255 * colours).astype(np.uint8)
-    chosen = picture.quantize(256 - len(kept), method=Image.Quantize.MAXCOVERAGE, kmeans=2, dither=Image.Dither.NONE)
-    found = np.array(chosen.getpalette(), dtype=np.uint8).reshape(-1, 3)[: 256 - len(kept)]
-    palette = np.concatenate([kept, found])
-    numbers = np.asarray(picture) @ np.array([1 << 16, 1 << 8, 1])
-    seen = np.zeros(1 << 24, dtype=bool)
-    seen[numbers] = True
-    distinct = np.flatnonzero(seen)
-    nearest = np.concatenate([
-        np.abs(part[:, None] - palette.astype(int)).sum(axis=2).argmin(axis=1)
-        for part in np.array_split(distinct[:, None] >> [16, 8, 0] & 255, 1 + len(distinct) // 5000)
-    ])  # fmt: skip
-    table = np.zeros(1 << 24, dtype=np.uint8)
-    table[distinct] = nearest
-    result = Image.fromarray(table[numbers], mode="P")
-    result.putpalette(palette.tobytes())
-    return result
+
+    def __init__(self, picture: Image.Image, colours: NDArray[np.float64]):
+        kept = np.rint(255 * colours).astype(np.uint8)
+        how: dict[str, Any] = {"method": Image.Quantize.MAXCOVERAGE, "kmeans": 2, "dither": Image.Dither.NONE}
+        chosen = picture.quantize(256 - len(kept), **how).getpalette()
+        self.colours = np.concatenate([kept, np.array(chosen, dtype=np.uint8).reshape(-1, 3)[: 256 - len(kept)]])
+        self._known = np.zeros(1 << 24, dtype=bool)
+        self._nearest = np.zeros(1 << 24, dtype=np.uint8)  # of every colour that was met
+
+    def __call__(self, picture: Image.Image) -> Image.Image:
+        """A picture in these colours."""
+        numbers = np.asarray(picture) @ np.array([1 << 16, 1 << 8, 1])
+        seen = np.zeros(1 << 24, dtype=bool)
+        seen[numbers] = True
+        new = np.flatnonzero(seen & ~self._known)
+        self._nearest[new] = np.concatenate([
+            np.abs(part[:, None] - self.colours.astype(int)).sum(axis=2).argmin(axis=1)
+            for part in np.array_split(new[:, None] >> [16, 8, 0] & 255, 1 + len(new) // 5000)
+        ])  # fmt: skip
+        self._known |= seen
+        result = Image.fromarray(self._nearest[numbers], mode="P")
+        result.putpalette(self.colours.tobytes())
+        return result
+
+
+def with_palette(picture: Image.Image, colours: NDArray[np.float64]) -> Image.Image:
+    """A picture in the 256 colours that are chosen for it, these (n, 3) in 0..1 among them."""
+    return Palette(picture, colours)(picture)
 
 
 def _cell(value: Any) -> str:

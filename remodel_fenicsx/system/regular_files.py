@@ -13,6 +13,7 @@ from pathlib import Path
 
 NEVER_WAITING = os.O_NONBLOCK | os.O_CLOEXEC  # opening a pipe without a writer would wait
 
+NO_FILE = "is a pipe or a device, not a file"
 LINK = "is a link; nothing is written through one"
 
 
@@ -44,6 +45,12 @@ def read_regular(path: Path, most: int) -> bytes:
     if max(size, len(data)) > most:
         raise ForeignFileError(errno.EFBIG, f"is larger than {most / 1e6:g} MB", str(path))
     return data
+
+
+def check_regular(path: Path) -> None:
+    """Raise ForeignFileError if what stands there is no regular file, nor a link to one: opening it might wait."""
+    if path.exists() and not path.is_file():
+        raise ForeignFileError(errno.EINVAL, NO_FILE, str(path))
 
 
 def open_own(path: Path, flags: int) -> int:
@@ -131,10 +138,29 @@ def write_whole(path: Path, data: bytes) -> None:
         os.close(folder)
 
 
+def write_new(path: Path, data: bytes) -> None:
+    """Make a file that is not there; it is there whole or not at all, unless the process is killed.
+
+    Raises
+    ------
+    FileExistsError
+        If there is anything of this name, a link that leads nowhere too.
+    OSError
+        If it cannot be written.
+    """
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
+    try:
+        with open(descriptor, "wb") as file:
+            file.write(data)
+    except BaseException:
+        path.unlink()
+        raise
+
+
 def _check_regular(descriptor: int, path: Path) -> os.stat_result:
     found = os.fstat(descriptor)
     if stat.S_ISDIR(found.st_mode):
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     if not stat.S_ISREG(found.st_mode):
-        raise ForeignFileError(errno.EINVAL, "is a pipe or a device, not a file", str(path))
+        raise ForeignFileError(errno.EINVAL, NO_FILE, str(path))
     return found

@@ -20,7 +20,8 @@ ROOT = Path(__file__).parents[2]
 PACKAGE = "remodel_fenicsx"
 # what a room may import: itself, and those before it
 ROOMS = ("_lazy", "_version", "system", "schema", "model", "fem", "kernels", "settings", "body", "scene", "state",
-         "solver", "evolution", "watch", "results", "report", "simulation", "running", "studies", "paper", "cli",
+         "solver", "evolution", "watch", "results", "report", "simulation", "running", "studies", "pictures", "paper",
+         "cli",
          "parts", "extend")  # fmt: skip
 # imports that only the type checker follows: of what is there without dolfinx, to what is not
 TYPES_ONLY = {

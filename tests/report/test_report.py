@@ -22,10 +22,10 @@ import pytest
 from remodel_fenicsx import cli
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.report import REPORT, page, write_report
-from remodel_fenicsx.report.body import kept_times
 from remodel_fenicsx.report.packing import ANGLE_STEPS, NO_ANGLE, of_angles
 from remodel_fenicsx.report.story import Story
 from remodel_fenicsx.results.drawing import ANGLE_COLOURS
+from remodel_fenicsx.results.kept_times import kept_times
 from remodel_fenicsx.results.recording import HistoryColumns, Recording
 from remodel_fenicsx.results.vtkhdf import TransientGrid
 from remodel_fenicsx.scene.scene import preset_scene
@@ -180,8 +180,11 @@ def test_kept_times_follow_time_and_change() -> None:
     times = np.arange(101.0)
     still = HistoryColumns(time=times, force=np.where(times < 10, times, 10.0), nothing=np.full(101, np.nan))
     kept = kept_times(still, times, 21)
-    assert kept[0] == 0.0 and kept[-1] == 100.0 and len(kept) <= 21
+    assert kept[0] == 0.0 and kept[-1] == 100.0 and len(kept) == 21 and np.diff(kept).min() > 0
     assert (kept <= 10).sum() >= 7 and np.diff(kept).max() < 12
+    for most in (2, 50, 99, 100):
+        kept = kept_times(still, times, most)
+        assert len(kept) == most and np.diff(kept).min() > 0 and set(kept) <= set(times)
     np.testing.assert_array_equal(kept_times(still, times, 101), times)
 
 

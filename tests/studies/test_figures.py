@@ -26,8 +26,9 @@ from PIL import Image
 import remodel_fenicsx
 from remodel_fenicsx import cli
 from remodel_fenicsx.body.columns import columns_of
-from remodel_fenicsx.paper import FIGURES, bodies, curves, rendering, runs
+from remodel_fenicsx.paper import FIGURES, curves, runs
 from remodel_fenicsx.paper.runs import LOAD_CASES
+from remodel_fenicsx.pictures import bodies, rendering
 from remodel_fenicsx.results import vtkhdf
 from remodel_fenicsx.results.recording import Recording, RecordingError, steps_recorded
 from remodel_fenicsx.scene.scene import Scene, scene_from_dict

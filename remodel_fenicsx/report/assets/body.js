@@ -6,7 +6,6 @@ const FACES = {
 const SIGNS = [[1, 1, 1], [1, 1, -1], [1, -1, 1], [1, -1, -1]];  // the four chains of a cell: sums of its edges
 const GREY = [0.91, 0.92, 0.94], NOTHING_KNOWN = [0.6, 0.62, 0.65];
 const EDGE_LIFT = 0.02;  // of lines between elements towards the eye, over the smallest side of a face
-const FRONT = [0.3, -1, 0.42], ABOVE = [0, -0.02, 1];  // where the eye is
 const EXTENSION_COLOURS = ["#fff7d6", "#fbd98a", "#f5a754", "#e0662f", "#a8281e", "#4f0a16"];
 
 const rgb = (hex) => [1, 3, 5].map((at) => parseInt(hex.slice(at, at + 2), 16) / 255);
@@ -94,14 +93,16 @@ class Elements {
     return sides.reduce((a, b) => a + b) / sides.length;
   }
 
+  // Wedges on an axis are hexahedra with a side of no length.
   smallestSide(nodes) {
     const places = nodes.map((node) => this.reference(node));
-    return Math.min(...places.map((place, k) => Math.hypot(...add(places[(k + 1) % places.length], place, -1))));
+    const sides = places.map((place, k) => Math.hypot(...add(places[(k + 1) % places.length], place, -1)));
+    return Math.min(...sides.filter((side) => side > 0));
   }
 }
 
 // Ribbons of the chains of an element on one of its faces: they stay in it and clear of its edge, so that those of
-// neighbours do not read as one line. The rule is that of the figures (paper/bodies.py).
+// neighbours do not read as one line. The rule is that of the figures (pictures/bodies.py).
 function ribbonsOn(face, corners, inside, chains, rule) {
   const middle = mean(corners);
   let normal = corners.length === 4
@@ -163,7 +164,7 @@ class Stage {
     canvas.addEventListener("blur", () => { this.turning.enableZoom = false; });
     this.turning.addEventListener("change", () => this.draw());
     this.lift = 0;
-    this.look(FRONT);
+    this.look(data.views.front);
     new ResizeObserver(() => this.fit()).observe(canvas.parentElement);
   }
 
@@ -372,8 +373,8 @@ function connectBody(body, clock) {
     body.select();
     body.show();
   });
-  byId("front").addEventListener("click", () => stage.look(FRONT));
-  byId("above").addEventListener("click", () => stage.look(ABOVE));
+  byId("front").addEventListener("click", () => stage.look(data.views.front));
+  byId("above").addEventListener("click", () => stage.look(data.views.above));
   byId("picture").addEventListener("click", () => {
     stage.draw();
     stage.canvas.toBlob((blob) => save(`${PAGE.parts.head.name}-t${inDigits(clock.time)}.png`, blob));

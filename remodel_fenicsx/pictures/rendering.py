@@ -1,4 +1,4 @@
-"""Pictures of bodies in space, drawn in a child process: ``python3 -m remodel_fenicsx.paper.rendering JOB``.
+"""Pictures of bodies in space, drawn in a child process: ``python3 -m remodel_fenicsx.pictures.rendering JOB``.
 
 A VTK that knows only X (Debian 13's) kills its process where there is no display, so the child gets one of its own from
 xvfb-run; a VTK that can draw without (EGL) gets by without that program.
@@ -30,12 +30,12 @@ SAMPLES = 2  # pictures are drawn this much larger and made smaller: smooth edge
 
 @dataclass(frozen=True)
 class Patch:
-    """Quadrilaterals in space.
+    """Quadrilaterals or triangles in space.
 
     Attributes
     ----------
     corners
-        (m, 4, 3), counter-clockwise where they are seen from outside.
+        (m, 4 or 3, 3), counter-clockwise where they are seen from outside.
     colours
         One of each, (m, 3) in 0..1.
     edges
@@ -86,7 +86,9 @@ def render(pictures: list[Picture]) -> list[Pixels]:
             command = ["xvfb-run", "-a", "-s", "-screen 0 1280x1024x24", *command]
         paths = [str(Path(__file__).parents[2]), *filter(None, [os.environ.get("PYTHONPATH")])]
         environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths), "PYVISTA_OFF_SCREEN": "true"}
-        child = subprocess.run(command, env=environment, capture_output=True, text=True, stdin=subprocess.DEVNULL)
+        # in the folder of the job: Python looks for modules where it is started, and that may be anybody's folder
+        silent: Any = {"capture_output": True, "text": True, "stdin": subprocess.DEVNULL}
+        child = subprocess.run(command, env=environment, cwd=folder, **silent)
         result = job.with_suffix(".npz")
         if child.returncode != 0 or not result.exists():
             said = (child.stderr.strip().splitlines() or ["it said nothing"])[-1]
@@ -107,6 +109,36 @@ def main(job: str) -> None:
     np.savez(f"{job}.npz", **drawn)
 
 
+def add_patches(plotter: Any, patches: list[Patch], direction: Array, line_width: float = 1.0) -> None:
+    """Put patches into a PyVista plotter whose light is a headlight.
+
+    Parameters
+    ----------
+    plotter
+        A `pyvista.Plotter`.
+    patches
+        What is seen.
+    direction
+        Unit vector from the body towards the eye, (3,): what lies on a surface is moved that way.
+    line_width
+        Of the edges, in half pixels.
+    """
+    import pyvista
+
+    for patch in patches:
+        count, size = patch.corners.shape[:2]
+        if not count:
+            continue
+        faces = np.column_stack([np.full(count, size), np.arange(size * count).reshape(-1, size)]).ravel()
+        surface = pyvista.PolyData((patch.corners + patch.lies_on * direction).reshape(-1, 3), faces)
+        surface.cell_data["colour"] = np.rint(255 * patch.colours).astype(np.uint8)
+        plotter.add_mesh(
+            surface, scalars="colour", rgb=True, show_edges=patch.edges, edge_color="#777777",
+            line_width=line_width * 0.5, ambient=AMBIENT, diffuse=1 - AMBIENT, specular=0.0, smooth_shading=False,
+            show_scalar_bar=False, culling="back" if patch.lies_on else None,
+        )  # fmt: skip
+
+
 def _draw(picture: Picture) -> Pixels:
     import pyvista
 
@@ -115,18 +147,7 @@ def _draw(picture: Picture) -> Pixels:
     plotter.set_background("white")
     plotter.add_light(pyvista.Light(light_type="headlight", intensity=1.0))
     direction = np.array(picture.view.direction) / np.linalg.norm(picture.view.direction)
-    for patch in picture.patches:
-        count = len(patch.corners)
-        if not count:
-            continue
-        faces = np.column_stack([np.full(count, 4), np.arange(4 * count).reshape(-1, 4)]).ravel()
-        surface = pyvista.PolyData((patch.corners + patch.lies_on * direction).reshape(-1, 3), faces)
-        surface.cell_data["colour"] = np.rint(255 * patch.colours).astype(np.uint8)
-        plotter.add_mesh(
-            surface, scalars="colour", rgb=True, show_edges=patch.edges, edge_color="#777777", line_width=SAMPLES * 0.5,
-            ambient=AMBIENT, diffuse=1 - AMBIENT, specular=0.0, smooth_shading=False, show_scalar_bar=False,
-            culling="back" if patch.lies_on else None,
-        )  # fmt: skip
+    add_patches(plotter, picture.patches, direction, SAMPLES)
     view = picture.view
     camera = plotter.camera
     camera.focal_point = view.centre

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,8 +13,8 @@ from matplotlib.colors import BoundaryNorm, Colormap, ListedColormap
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from remodel_fenicsx.paper.rendering import Patch, Pixels
-from remodel_fenicsx.results.chain_lines import chain_lines
+from remodel_fenicsx.pictures.rendering import Patch, Pixels
+from remodel_fenicsx.results.chain_lines import AXIS_FIELDS, chain_lines
 from remodel_fenicsx.results.drawing import (
     AMBIENT,
     ANGLE_COLOURS,
@@ -25,19 +26,29 @@ from remodel_fenicsx.results.drawing import (
     LEVELS,
 )
 from remodel_fenicsx.results.recording import Recording
+from remodel_fenicsx.results.whole_body import WholeBody
 
 Array = NDArray[np.float64]
 Table = dict[str, NDArray[Any]]  # columns by name, all of one length
 Shown = NDArray[np.bool_] | slice  # which elements
 ALL = slice(None)
 
-# faces of VTK's hexahedron, by its local nodes
-_FACES = np.array([(0, 3, 2, 1), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7)])
+ANGLE = "fibre_angle_deformed"  # by which bodies are coloured
+OF_RIBBONS = ("deformation_gradient", "cell_dimensions", *AXIS_FIELDS)  # fields that chains are drawn of
+SHOWN_FIELDS = ("displacement", ANGLE, *OF_RIBBONS)
+NO_SIDE = 1e-4  # of the longest: such a side is one point of a wedge on an axis, to the digits of the fields
+NOTHING_KNOWN = (0.6, 0.62, 0.65)  # where chains have no angle
+
+# faces of VTK's hexahedron and tetrahedron, by their local nodes
+_FACES = {
+    8: np.array([(0, 3, 2, 1), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7)]),
+    4: np.array([(0, 2, 1), (0, 1, 3), (1, 2, 3), (2, 0, 3)]),
+}
 
 
 @dataclass(frozen=True)
 class DrawnBody:
-    """A body of hexahedra at one time.
+    """A body of hexahedra or tetrahedra at one time.
 
     Attributes
     ----------
@@ -45,7 +56,7 @@ class DrawnBody:
     points, displacement
         Reference coordinates and displacements of the nodes, (nodes, 3).
     elements
-        Nodes of the elements in VTK's order, (elements, 8).
+        Corners of the elements in VTK's order, (elements, 8 or 4).
     fields
         Means over the elements, by name (docs/commands.md): (elements,) or (elements, n).
     """
@@ -65,8 +76,29 @@ class DrawnBody:
         RecordingError
             If there is none.
         """
-        fields = run.fields(time)
-        return cls(time, run.points, run.elements, fields.pop("displacement"), fields)
+        return cls.at(WholeBody(run), time)
+
+    @classmethod
+    def at(cls, whole: WholeBody, time: float, names: Collection[str] | None = None) -> DrawnBody:
+        """The same of a body that is looked at several times; without displacements it is the reference body.
+
+        Parameters
+        ----------
+        whole
+            The body.
+        time
+            As recorded.
+        names
+            Fields that are read; default: all.
+
+        Raises
+        ------
+        RecordingError
+            If there are none at this time.
+        """
+        displacement, fields = whole.fields(time, names)
+        moved = np.zeros_like(whole.points) if displacement is None else displacement
+        return cls(time, whole.points, whole.elements, moved, fields)
 
     @property
     def centres(self) -> Array:
@@ -79,12 +111,12 @@ class DrawnBody:
         return self.points + self.displacement
 
     def exterior(self, shown: Shown = ALL) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Faces of the shown elements that no other shown element covers: nodes (m, 4), elements (m,)."""
-        elements = np.arange(len(self.elements))[shown]
-        faces = self.elements[elements][:, _FACES].reshape(-1, 4)
+        """Faces of the shown elements that no other shown element covers: nodes (m, 4 or 3), elements (m,)."""
+        elements, of_one = np.arange(len(self.elements))[shown], _FACES[self.elements.shape[1]]
+        faces = self.elements[elements][:, of_one].reshape(-1, of_one.shape[1])
         _, number, count = np.unique(np.sort(faces, axis=1), axis=0, return_inverse=True, return_counts=True)
         alone = count[np.ravel(number)] == 1
-        return faces[alone], np.repeat(elements, len(_FACES))[alone]
+        return faces[alone], np.repeat(elements, len(of_one))[alone]
 
 
 def rank_of(values: Array) -> NDArray[np.int64]:
@@ -113,9 +145,9 @@ def scale() -> tuple[Colormap, BoundaryNorm]:
 
 
 def coloured(angle: Array) -> Array:
-    """Colours (m, 3) of angles in degrees (m,)."""
+    """Colours (m, 3) of angles in degrees (m,); NaN is grey."""
     colours, steps = scale()
-    return colours(steps(angle))[:, :3]
+    return np.where(np.isnan(angle)[:, None], NOTHING_KNOWN, colours(steps(np.nan_to_num(angle)))[:, :3])
 
 
 def scale_colours() -> Array:
@@ -124,8 +156,8 @@ def scale_colours() -> Array:
     return np.concatenate([share * coloured(middle) for share in np.linspace(1.0, AMBIENT, 5)])
 
 
-def body(snapshot: DrawnBody, shown: Shown = ALL) -> list[Patch]:
-    """The surface of the shown elements in the deformed configuration, and chains where it looks away from the z axis.
+def body(snapshot: DrawnBody, shown: Shown = ALL, chains_everywhere: bool = False) -> list[Patch]:
+    """The surface of the shown elements in the deformed configuration, and chains on its faces.
 
     Parameters
     ----------
@@ -133,14 +165,22 @@ def body(snapshot: DrawnBody, shown: Shown = ALL) -> list[Patch]:
         The body.
     shown
         Which elements, (elements,).
+    chains_everywhere
+        On all faces, where cells were recorded; else on those that look away from the z axis.
     """
     faces, elements = snapshot.exterior(shown)
-    angle = snapshot.fields["fibre_angle_deformed"][elements]
-    centres, outward = snapshot.points[faces].mean(axis=1), _normals(snapshot.points[faces])
-    outward *= np.sign(np.sum(outward * (centres - snapshot.centres[elements]), axis=1))[:, None]
-    away = np.sum(outward[:, :2] * centres[:, :2], axis=1) > 0.5 * np.linalg.norm(centres[:, :2], axis=1)
-    surface = Patch(snapshot.deformed[faces], coloured(angle), edges=True)
-    return [surface, chains(snapshot, faces[away], elements[away])]
+    normal = _normals(snapshot.points[faces])
+    flat = np.any(normal, axis=1)  # wedges on an axis are hexahedra with a face of no area
+    faces, elements, normal = faces[flat], elements[flat], normal[flat]
+    surface = Patch(snapshot.deformed[faces], coloured(snapshot.fields[ANGLE][elements]), edges=True)
+    if not set(OF_RIBBONS) <= set(snapshot.fields):
+        return [surface]
+    if not chains_everywhere:
+        centres = snapshot.points[faces].mean(axis=1)
+        normal *= np.sign(np.sum(normal * (centres - snapshot.centres[elements]), axis=1))[:, None]
+        away = np.sum(normal[:, :2] * centres[:, :2], axis=1) > 0.5 * np.linalg.norm(centres[:, :2], axis=1)
+        faces, elements = faces[away], elements[away]
+    return [surface, chains(snapshot, faces, elements)]
 
 
 def chains(snapshot: DrawnBody, faces: NDArray[np.int64], elements: NDArray[np.int64]) -> Patch:
@@ -153,7 +193,7 @@ def chains(snapshot: DrawnBody, faces: NDArray[np.int64], elements: NDArray[np.i
     snapshot
         The body.
     faces
-        Nodes of the faces, (m, 4).
+        Nodes of the faces, (m, 4 or 3).
     elements
         The element of each, (m,).
     """
@@ -161,7 +201,8 @@ def chains(snapshot: DrawnBody, faces: NDArray[np.int64], elements: NDArray[np.i
     centres, middle = reference.mean(axis=1), deformed.mean(axis=1)
     axes = np.stack([fields[f"axis_{i + 1}"][elements] for i in range(3)], axis=1)
     gradient = fields["deformation_gradient"][elements].reshape(-1, 3, 3)
-    size = np.linalg.norm(reference - np.roll(reference, 1, axis=1), axis=2).min(axis=1)
+    sides = np.linalg.norm(reference - np.roll(reference, 1, axis=1), axis=2)
+    size = np.where(sides > 0, sides, np.inf).min(axis=1)  # of a wedge one side has no length
     ends, _ = chain_lines(np.zeros_like(centres), fields["cell_dimensions"][elements], axes, 1.0)
     half = CHAIN_REACH * size[:, None, None] * ends.reshape(-1, 8, 3)[:, ::2]  # (m, 4, 3): one half of each chain
     outward = _normals(deformed)
@@ -186,18 +227,23 @@ def _on_plane(vectors: Array, normal: Array) -> Array:
 
 
 def _room(arms: Array, corners: Array, normal: Array) -> Array:
-    """Factors (m, n) by which lines from -arm to +arm (m, n, 3) reach the edge of faces about 0, corners (m, 4, 3)."""
+    """Factors (m, n) by which lines from -arm to +arm (m, n, 3) reach the edge of faces about 0, corners (m, k, 3)."""
     edges = np.roll(corners, -1, axis=1) - corners
     across = np.cross(edges, normal[:, None])
     distance = np.abs(np.sum(across * corners, axis=2))
     towards = np.abs(np.einsum("mei,mki->mke", across, arms))
-    return (distance[:, None] / np.where(towards > 0, towards, np.finfo(float).tiny)).min(axis=2)
+    reach = distance[:, None] / np.where(towards > 0, towards, np.finfo(float).tiny)
+    length = np.linalg.norm(edges, axis=2)
+    is_side = length > NO_SIDE * length.max(axis=1, keepdims=True)
+    return np.where(is_side[:, None], reach, np.inf).min(axis=2)
 
 
 def _normals(corners: Array) -> Array:
-    """Unit normals of quadrilaterals (m, 4, 3)."""
-    normal = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
-    return normal / np.linalg.norm(normal, axis=1, keepdims=True)
+    """Unit normals of quadrilaterals (m, 4, 3) or triangles (m, 3, 3); 0 where they have no area."""
+    last = corners.shape[1] - 1
+    normal = np.cross(corners[:, 2] - corners[:, 0], corners[:, last] - corners[:, 1])
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    return normal / np.where(length > 0, length, 1.0)
 
 
 # ---------------------------------------------------------------- on the page

@@ -1,0 +1,102 @@
+"""The body of a run as it is shown: what is recorded, of reductions turned into the whole body. It needs no dolfinx."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+import numpy as np
+from numpy.typing import NDArray
+
+from remodel_fenicsx.fem.kinematics import KINEMATICS
+from remodel_fenicsx.results.recording import Recording
+from remodel_fenicsx.results.turned import TurnedFields
+
+Numbers = NDArray[np.float64]
+Fields = tuple[Numbers | None, dict[str, Numbers]]
+
+CORNERS = {"interval": 2, "quadrilateral": 4, "tetrahedron": 4, "hexahedron": 8}
+MOST_LAYERS = 40  # of a mesh in layers; others are divided into FEW_LAYERS
+FEW_LAYERS = 8
+
+
+class WholeBody:
+    """The body whose fields a run has recorded.
+
+    Parameters
+    ----------
+    recording
+        Of a run for which `has_a_body` is true.
+
+    Attributes
+    ----------
+    recording
+    points
+        Of the reference body, (n, 3): nodes that are corners.
+    elements
+        Corners in VTK's order, (m, 8 or 4).
+    layer, depth
+        Number of each element's layer, (m,); mean depth of each layer, from 0 to 1.
+    is_turned
+        Whether a reduction was solved.
+
+    Raises
+    ------
+    RecordingError, SceneError
+        If the folder is damaged.
+    """
+
+    def __init__(self, recording: Recording):
+        scene = recording.scene
+        shape, kinematics = scene.geometry, KINEMATICS[scene.model.kinematics]
+        self.recording, self.is_turned = recording, kinematics.reduced
+        points = recording.points
+        elements = recording.elements[:, : CORNERS[kinematics.element(scene.mesh.element)]]
+        self._turned: TurnedFields | None = None
+        if self.is_turned:
+            reduction = shape.reductions[scene.model.kinematics]
+            assert reduction.whole is not None
+            solved = points, recording.elements
+            points, elements = reduction.whole(shape, points, elements)
+            self._turned = TurnedFields(points, elements, *solved, reduction.turn)
+        self._used, corners = np.unique(elements, return_inverse=True)
+        self.points, self.elements = points[self._used], corners.reshape(elements.shape)
+        self.layer, self.depth = _layers(shape.depth(self.points[self.elements].mean(axis=1)))
+
+    def fields(self, time: float, names: Collection[str] | None = None) -> Fields:
+        """Displacement of the points, where it was recorded, and fields of the elements, at a recorded time.
+
+        Parameters
+        ----------
+        time
+            As recorded.
+        names
+            Read no others than these; turned tensors and displacements want `deformation_gradient`.
+
+        Raises
+        ------
+        RecordingError
+            If there are none, or the fields are damaged.
+        """
+        fields = self.recording.fields(time, names)
+        displacement, found = self._turned(fields) if self._turned else (fields.pop("displacement", None), fields)
+        return None if displacement is None else displacement[self._used], found
+
+
+def has_a_body(recording: Recording) -> bool:
+    """Whether a run recorded fields of a body that can be shown."""
+    scene = recording.scene
+    reduction = scene.geometry.reductions.get(scene.model.kinematics)
+    return bool(len(recording.times)) and (reduction is None or reduction.whole is not None)
+
+
+def _layers(depth: Numbers) -> tuple[NDArray[np.int64], Numbers]:
+    """Number of each element's layer and the mean depth of each: those of the mesh, or equal parts of the way."""
+    ordered = np.sort(depth)
+    starts = np.concatenate([[True], np.diff(ordered) > 1e-6])
+    if starts.sum() <= MOST_LAYERS:
+        layer = np.searchsorted(ordered[starts], depth + 1e-7) - 1
+    else:
+        layer = np.minimum((FEW_LAYERS * np.clip(depth, 0.0, 1.0)).astype(np.int64), FEW_LAYERS - 1)
+        layer = np.unique(layer, return_inverse=True)[1].reshape(-1)  # none without an element
+    counts = np.bincount(layer)
+    return layer, np.bincount(layer, weights=depth) / counts

@@ -1,0 +1,368 @@
+"""The commands `picture` and `animate`: what is on the pictures of real runs, pixel by pixel, and what is refused."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import stat
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from remodel_fenicsx import cli
+from remodel_fenicsx.pictures import files, rendering
+from remodel_fenicsx.pictures.bodies import coloured, scale_colours
+from remodel_fenicsx.results.drawing import ANGLE_COLOURS
+from remodel_fenicsx.results.recording import Recording
+from remodel_fenicsx.results.vtkhdf import TransientGrid
+from remodel_fenicsx.results.whole_body import WholeBody
+from tests.report.conftest import Recorded
+
+FROM_THE_FRONT = "--view=0,-1,0"  # faces that look there have the colours of the scale as they are
+Drawn = Callable[..., np.ndarray]
+
+
+@pytest.fixture
+def drawn(recorded: Recorded, tmp_path: Path) -> Drawn:
+    """drawn(name of a run, options) -> the picture in 0..255, (rows, columns, 3)."""
+
+    def draw(name: str, *options: str) -> np.ndarray:
+        path = tmp_path / f"{len(os.listdir(tmp_path))}.png"
+        assert cli.main(["picture", str(recorded(name)), *options, "-o", str(path)]) == 0
+        with Image.open(path) as picture:
+            return np.asarray(picture.convert("RGB"))
+
+    return draw
+
+
+def panel(picture: np.ndarray) -> np.ndarray:
+    """What lies between title and loads: the largest run of rows with something in them."""
+    filled = np.concatenate([[False], np.any(picture < 245, axis=(1, 2)), [False]])
+    starts, ends = np.flatnonzero(~filled[:-1] & filled[1:]), np.flatnonzero(filled[:-1] & ~filled[1:])
+    longest = int(np.argmax(ends - starts))
+    return picture[starts[longest] : ends[longest]]
+
+
+def outline(part: np.ndarray) -> tuple[int, int]:
+    """Rows and columns of what is not white."""
+    body = np.any(part < 245, axis=2)
+    rows, columns = np.flatnonzero(body.any(axis=1)), np.flatnonzero(body.any(axis=0))
+    return int(np.ptp(rows)) + 1, int(np.ptp(columns)) + 1
+
+
+def levels(part: np.ndarray, least: float = 0.004) -> set[int]:
+    """Which steps of the scale, unshaded, fill more than a share of it."""
+    scale = np.rint(255 * np.array([[int(text[i : i + 2], 16) / 255 for i in (1, 3, 5)] for text in ANGLE_COLOURS]))
+    return {k for k, colour in enumerate(scale) if np.all(part == colour, axis=2).mean() > least}
+
+
+def levels_of(angles: np.ndarray) -> set[int]:
+    """The steps of angles in degrees."""
+    return set(np.minimum(angles // 5, 17).astype(int))
+
+
+# ---------------------------------------------------------------- what is seen
+def test_the_cube_has_its_size_and_its_colour(recorded: Recorded, drawn: Drawn) -> None:
+    picture, run = drawn("cube", FROM_THE_FRONT), Recording(recorded("cube"))
+    fields = run.fields(run.times[-1])
+    size = np.ptp(run.points + fields["displacement"], axis=0)
+    body = panel(picture)
+    rows, columns = outline(body)
+    assert rows / columns == pytest.approx(size[2] / size[0], rel=0.02)
+    expected = np.rint(255 * coloured(fields["fibre_angle_deformed"])[0])
+    assert levels(body, 0.2) == levels_of(fields["fibre_angle_deformed"])
+    shares = np.all(body == expected, axis=2).sum() / (rows * columns)
+    chains = np.all(body < 70, axis=2).sum() / (rows * columns)
+    assert 0.03 < chains < 0.3 and shares > 0.95 - chains
+    # the bar at the left of the scale is a round length, and as long as it says
+    foot = picture[-picture.shape[0] // 4 :, : picture.shape[1] // 5]
+    longest = np.all(foot < 100, axis=2).sum(axis=1).max()
+    length = longest / rows * size[2]
+    assert min(abs(length / round_one - 1) for round_one in (0.1, 0.2, 0.5)) < 0.03
+
+
+def test_all_that_is_written_lies_outside_of_the_body(drawn: Drawn) -> None:
+    """Every letter below it ends before the edge of the sheet, and there is white between all parts."""
+    for name, options in (("artery", ()), ("tendon", ("--time", "0", "5"))):
+        picture = drawn(name, *options)
+        assert np.all(picture[:6] > 245) and np.all(picture[-6:] > 245)
+        assert np.all(picture[:, :4] > 245) and np.all(picture[:, -4:] > 245)
+        filled = np.any(picture < 245, axis=(1, 2))
+        assert np.count_nonzero(~filled[:-1] & filled[1:]) >= 6  # head, time, body, loads, scale, its label, notes
+    scale = picture[-picture.shape[0] // 4 :]
+    assert levels(scale, 0.0005) == set(range(18))
+
+
+def test_other_times_are_other_pictures_at_one_scale(recorded: Recorded, drawn: Drawn) -> None:
+    run = Recording(recorded("tendon"))
+    body = panel(drawn("tendon", "--time", "0", "5", FROM_THE_FRONT))
+    left, right = np.array_split(body, 2, axis=1)
+    heights = [np.ptp(run.points[:, 2] + run.fields(time)["displacement"][:, 2]) for time in (0.0, 5.0)]
+    assert outline(right)[0] / outline(left)[0] == pytest.approx(heights[1] / heights[0], rel=0.02)
+    angles = [Recording(recorded("tendon")).fields(time)["fibre_angle_deformed"].mean() for time in (0.0, 5.0)]
+    red = [np.mean(half[..., 0].astype(int) - half[..., 2] > 60) / np.mean(half < 245) for half in (left, right)]
+    assert angles[1] < angles[0] - 3 and red[1] > 1.2 * red[0]
+
+
+def test_a_cut_shows_the_inside_and_layers_are_taken_off(recorded: Recorded, drawn: Drawn) -> None:
+    """A tube of equal cells has one angle in each layer."""
+    whole = WholeBody(Recording(recorded("radial")))
+    _, fields = whole.fields(whole.recording.times[-1])
+    angle = np.array([fields["fibre_angle_deformed"][whole.layer == k].mean() for k in range(8)])
+    expected = levels_of(angle)
+    assert len(expected) >= 2 and levels_of(angle[:3]) < expected
+    middle = slice(200, -200)
+    outside = panel(drawn("radial", f"--view={np.sin(np.pi / 16)},{-np.cos(np.pi / 16)},0"))  # onto one of 16 sides
+    cut = panel(drawn("radial", FROM_THE_FRONT, "--cut", "half"))
+    peeled = panel(drawn("radial", FROM_THE_FRONT, "--cut", "half", "--layers", "3"))
+    assert levels(outside[middle]) == levels_of(angle[-1:])
+    assert levels(cut[middle], 0.02) == expected and levels(peeled[middle], 0.02) == levels_of(angle[:3])
+    # 3 of 8 layers from 1 to 3: to 1.75, and so much wider is the same length
+    assert np.divide(*outline(peeled)) / np.divide(*outline(cut)) == pytest.approx(3.0 / 1.75, rel=0.03)
+
+
+def test_a_quarter_is_less_than_a_half(drawn: Drawn) -> None:
+    half, quarter = (panel(drawn("radial", "--view", "above", "--cut", cut)) for cut in ("half", "quarter"))
+    rows, columns = outline(half)
+    assert rows / columns == pytest.approx(0.5, abs=0.05)
+    rows, columns = outline(quarter)
+    assert rows / columns == pytest.approx(1.0, abs=0.05)
+    start = np.flatnonzero(np.any(quarter < 245, axis=(0, 2)))[0]
+    corners = quarter[:, start : start + columns]
+    low, right = corners[rows // 2 + 20 :, : columns // 2 - 20], corners[rows // 2 + 20 :, columns // 2 + 20 :]
+    assert np.mean(np.any(low < 245, axis=2)) > 0.5 and np.mean(np.any(right < 245, axis=2)) < 0.01
+
+
+@pytest.mark.parametrize("name", ["radial", "axisymmetric", "sector"])
+def test_reductions_are_shown_as_whole_tubes(drawn: Drawn, name: str) -> None:
+    body = panel(drawn(name, "--view=0,0,1"))
+    filled = np.any(body < 245, axis=2)
+    rows, columns = np.nonzero(filled)
+    centre = np.array([(rows.min() + rows.max()) / 2, (columns.min() + columns.max()) / 2])
+    radius = np.ptp(columns) / 2
+    angles = np.linspace(0, 2 * np.pi, 36)
+    for share, is_wall in ((0.15, False), (0.7, True)):
+        at = np.rint(centre[:, None] + share * radius * np.stack([np.sin(angles), np.cos(angles)])).astype(int)
+        assert np.all(filled[at[0], at[1]] == is_wall), share
+
+
+def test_the_ends_of_a_tendon_of_wedges_are_there(drawn: Drawn) -> None:
+    body = panel(drawn("point", "--view=0,0,1"))
+    rows, columns = outline(body)
+    assert np.any(body < 245, axis=2).sum() / (rows * columns) == pytest.approx(np.pi / 4, abs=0.03)
+    assert 0.005 < np.all(body < 70, axis=2).mean() < 0.2  # their chains too
+
+
+@pytest.mark.parametrize(("name", "dark"), [("tetrahedra", True), ("quadratic", True), ("angles alone", False)])
+def test_other_elements_are_drawn_and_chains_where_they_were_recorded(drawn: Drawn, name: str, dark: bool) -> None:
+    body = panel(drawn(name))
+    rows, columns = outline(body)
+    assert 0.6 < np.any(body < 245, axis=2).sum() / (rows * columns) < 0.95  # a cube, seen obliquely
+    assert (np.all(body < 70, axis=2).mean() > 0.01) == dark
+
+
+def test_colours_are_those_of_the_scale_and_no_other(drawn: Drawn) -> None:
+    """But for chains, edges and their borders: shaded, as the palette keeps them."""
+    body = panel(drawn("artery"))
+    filled = body[np.any(body < 245, axis=2)].astype(int)
+    scale = np.rint(255 * scale_colours()).astype(int)
+    nearest = np.abs(filled[::37, None] - scale).sum(axis=2).min(axis=1)
+    assert np.mean(nearest < 20) > 0.85
+
+
+# ---------------------------------------------------------------- files
+def test_a_picture_says_what_it_is_and_where_it_comes_from(recorded: Recorded, tmp_path: Path) -> None:
+    folder = shutil.copytree(recorded("cube"), tmp_path / "run")
+    for number in range(2):
+        assert cli.main(["picture", str(folder), "--time", "4.2"]) == 0
+        name = f"cube-t4{'-2' if number else ''}.png"
+        with Image.open(folder / name) as picture:
+            assert picture.info["Title"] == "cube: angle of the collagen" and picture.mode == "P"
+            assert "dolfinx" in picture.info["Source"] and "four chains" in picture.info["Description"]
+        assert stat.S_IMODE((folder / name).stat().st_mode) & 0o044 == 0o044 & ~os.umask(os.umask(0o022))
+
+
+@pytest.mark.parametrize(("ending", "signs"), [("svg", (b"<image", b"<svg")), ("pdf", (b"%PDF", b"/Image"))])
+def test_letters_are_lines_where_the_kind_knows_lines(
+    recorded: Recorded, tmp_path: Path, ending: str, signs: tuple[bytes, ...]
+) -> None:
+    path = tmp_path / f"cube.{ending.upper()}"
+    assert cli.main(["picture", str(recorded("cube")), "-o", str(path)]) == 0
+    content = path.read_bytes()
+    assert all(sign in content for sign in signs)
+    assert ending == "pdf" or content.count(b"<image") == 1 and content.count(b"<path") > 30
+
+
+@pytest.mark.parametrize(("ending", "frames", "expected"), [("gif", 5, 5), ("webp", 4, 4), ("gif", 60, 11)])
+def test_an_animation_has_so_many_frames_that_differ(
+    recorded: Recorded, tmp_path: Path, ending: str, frames: int, expected: int
+) -> None:
+    path = tmp_path / f"film.{ending}"
+    assert cli.main(["animate", str(recorded("cube")), "--frames", str(frames), "-o", str(path)]) == 0
+    with Image.open(path) as film:
+        assert film.n_frames == expected  # type: ignore[attr-defined]
+        found, durations = [], []
+        for number in range(expected):
+            film.seek(number)
+            found.append(np.asarray(film.convert("RGB")).astype(int))
+            durations.append(film.info["duration" if ending == "gif" else "timestamp"])
+        assert ending == "webp" or durations == [80] * (expected - 1) + [1600]
+    height = found[0].shape[0]
+    bodies = [frame[height // 8 : int(0.7 * height)] for frame in found]
+    for earlier, later in zip(bodies[:-1], bodies[1:], strict=True):
+        assert np.mean(np.abs(later - earlier).max(axis=2) > 40) > 0.002
+    heights = [outline(body)[0] / outline(body)[1] for body in bodies]
+    assert heights[-1] > 1.2 * heights[0]  # it grows long and thin, in one view
+    clocks = [np.all(frame[int(0.8 * height) - 40 :] < 90, axis=2).sum() for frame in (found[0], found[-1])]
+    assert clocks[1] > clocks[0]
+
+
+def test_a_run_that_failed_is_drawn(drawn: Drawn) -> None:
+    assert np.any(panel(drawn("failed", "--layers", "1")) < 200)
+
+
+# ---------------------------------------------------------------- mp4
+def fake_ffmpeg(folder: Path, monkeypatch: pytest.MonkeyPatch, text: str) -> None:
+    program = folder / "bin" / "ffmpeg"
+    program.parent.mkdir()
+    program.write_text(f"#!/bin/sh\n{text}\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{program.parent}:{os.environ['PATH']}")
+
+
+def test_mp4_is_what_ffmpeg_makes_of_all_frames(
+    recorded: Recorded, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = tmp_path / "words"
+    fake_ffmpeg(tmp_path, monkeypatch, f'echo "$@" > {words}; cat > film.mp4')
+    film = tmp_path / "film.mp4"
+    assert cli.main(["animate", str(recorded("cube")), "--frames", "3", "-o", str(film)]) == 0
+    wide, tall = map(int, words.read_text().split("-s ")[1].split()[0].split("x"))
+    assert wide % 2 == tall % 2 == 0 and film.stat().st_size == 3 * wide * tall * (3 + 19)
+    pixels = np.frombuffer(film.read_bytes(), dtype=np.uint8).reshape(22, tall, wide, 3)
+    assert np.array_equal(pixels[2], pixels[-1]) and not np.array_equal(pixels[0], pixels[1])
+
+
+def test_mp4_without_ffmpeg_is_one_line(
+    recorded: Recorded, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    words = ["animate", str(recorded("cube")), "-o", str(tmp_path / "film.mp4")]
+    monkeypatch.setattr(files.shutil, "which", lambda name: None)
+    assert cli.main(words) == 5
+    assert capsys.readouterr().err == "remodel-fenicsx: mp4 wants ffmpeg; .webp needs nothing\n"
+    monkeypatch.undo()
+    fake_ffmpeg(tmp_path, monkeypatch, "cat > /dev/null; echo Unknown encoder >&2; exit 1")
+    assert cli.main([*words, "--frames", "2"]) == 5
+    said = "remodel-fenicsx: ffmpeg ended with 1: Unknown encoder; .webp needs nothing\n"
+    assert capsys.readouterr().err == said and not (tmp_path / "film.mp4").exists()
+
+
+# ---------------------------------------------------------------- what is refused
+@pytest.mark.parametrize(("name", "words", "said"), [
+    ("cube", ["picture", "DIR", "--time", "11"], "--time 11: allowed are times from 0 to 10"),
+    ("cube", ["picture", "DIR", "--time", "nan"], "--time nan: allowed are times from 0 to 10"),
+    ("cube", ["picture", "DIR", "--view", "behind"], "--view behind: allowed is front, above or --view=X,Y,Z"),
+    ("cube", ["picture", "DIR", "--view", "0,0,0"], "--view 0,0,0: allowed is "),
+    ("cube", ["picture", "DIR", "--view", "1,inf,0"], "--view 1,inf,0: allowed is "),
+    ("cube", ["picture", "DIR", "--view", "1,2"], "--view 1,2: allowed is "),
+    ("tendon", ["picture", "DIR", "--layers", "0"], "--layers 0: allowed is a whole number from 1 to 10, from the bot"),
+    ("artery", ["animate", "DIR", "--layers", "9"], "--layers 9: allowed is a whole number from 1 to 8, from the in"),
+    ("cube", ["picture", "DIR", "--cut", "half"], "--cut half: no element of this body lies whole in that part"),
+    ("cube", ["picture", "DIR", "-o", "x.jpg"], "-o x.jpg: allowed is a name that ends in .png, .svg, .pdf"),
+    ("cube", ["picture", "DIR", "-o", "x.gif"], "-o x.gif: allowed is a name that ends in .png, .svg, .pdf"),
+    ("cube", ["animate", "DIR", "-o", "x.png"], "-o x.png: allowed is a name that ends in .gif, .webp, .mp4"),
+    ("cube", ["animate", "DIR", "-o", "no/x.gif"], "-o no/x.gif: there is no folder no"),
+    ("cube", ["animate", "DIR", "--frames", "1"], "--frames 1: allowed is a whole number from 2 to 500"),
+    ("cube", ["animate", "DIR", "--frames", "501"], "--frames 501: allowed is a whole number from 2 to 500"),
+    ("cube", ["picture", "nowhere"], "nowhere: there is no such folder"),
+    ("cube", ["animate", "."], ".: is not the folder of a run, it has no scene.toml"),
+    ("without fields", ["picture", "DIR"], "DIR: the run recorded no fields of a body (output.fields)"),
+    ("without fields", ["animate", "DIR"], "DIR: the run recorded no fields of a body (output.fields)"),
+])  # fmt: skip
+def test_bad_input_is_one_line_and_writes_nothing(
+    recorded: Recorded, name: str, words: list[str], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture,
+) -> None:  # fmt: skip
+    folder = recorded(name)
+    before = sorted(os.listdir(folder))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(rendering.subprocess, "run", lambda *command, **how: pytest.fail("something was drawn"))
+    assert cli.main([str(folder) if word == "DIR" else word for word in words]) == 2
+    message = capsys.readouterr().err
+    assert message.startswith(f"remodel-fenicsx: {said.replace('DIR', str(folder))}") and message.count("\n") == 1
+    assert os.listdir() == [] and sorted(os.listdir(folder)) == before
+
+
+def test_a_run_of_one_time_does_not_move(recorded: Recorded, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """It is drawn, and not animated."""
+    run = Recording(recorded("cube"))
+    folder = shutil.copytree(recorded("without fields"), tmp_path / "run")
+    with TransientGrid(folder / "fields.vtkhdf", run.points, run.elements, 12) as grid:
+        fields = run.fields(run.times[-1])
+        grid.append(0.0, {"displacement": fields.pop("displacement")}, fields)
+    assert cli.main(["animate", str(folder)]) == 2
+    assert f"{folder}: fields of one time are recorded, and nothing moves" in capsys.readouterr().err
+    assert cli.main(["picture", str(folder)]) == 0 and (folder / "cube-t0.png").is_file()
+
+
+def test_what_cannot_be_drawn_is_exit_code_5(
+    recorded: Recorded, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    monkeypatch.setattr(rendering.sys, "executable", shutil.which("false"))
+    assert cli.main(["picture", str(recorded("cube")), "-o", str(tmp_path / "x.png")]) == 5
+    message = capsys.readouterr().err
+    assert message.startswith("remodel-fenicsx: no picture in space: ") and message.count("\n") == 1
+    assert os.listdir(tmp_path) == []
+
+
+# ---------------------------------------------------------------- what belongs to others
+@pytest.mark.parametrize("kind", ["file", "link", "broken link", "folder"])
+def test_nothing_is_overwritten(recorded: Recorded, kind: str, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """What the default name is taken by stays, and no link is followed."""
+    folder, victim = shutil.copytree(recorded("cube"), tmp_path / "run"), tmp_path / "victim"
+    mine = b"a year of work"
+    places = [folder / "cube-t10.png", tmp_path / "mine.png"]
+    for place in places:
+        if kind == "file":
+            place.write_bytes(mine)
+        elif kind == "folder":
+            place.mkdir()
+        else:
+            place.symlink_to(victim)
+    if kind == "link":
+        victim.write_bytes(mine)
+    assert cli.main(["picture", str(folder)]) == 0
+    assert capsys.readouterr().out == f"{folder / 'cube-t10-2.png'}\n"
+    assert cli.main(["picture", str(folder), "-o", str(places[1])]) == 2
+    assert f"-o {places[1]}: is there already; allowed is a new file\n" in capsys.readouterr().err
+    assert victim.exists() == (kind == "link") and (kind != "link" or victim.read_bytes() == mine)
+    assert all(place.is_dir() if kind == "folder" else place.is_symlink() == ("link" in kind) for place in places)
+    assert kind != "file" or all(place.read_bytes() == mine for place in places)
+
+
+def test_no_module_of_the_working_folder_runs(
+    recorded: Recorded, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    theirs = tmp_path / "theirs"
+    theirs.mkdir()
+    for name in ("pyvista", "numpy", "remodel_fenicsx"):
+        (theirs / f"{name}.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w')")
+    monkeypatch.chdir(theirs)
+    assert cli.main(["picture", str(recorded("cube")), "-o", str(tmp_path / "x.png")]) == 0
+    assert not (tmp_path / "ran").exists() and sorted(os.listdir(theirs)) == sorted(
+        ["numpy.py", "pyvista.py", "remodel_fenicsx.py"]
+    )
+
+
+def test_a_pipe_in_the_place_of_fields_is_refused(
+    recorded: Recorded, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    """Opening it would wait for ever."""
+    folder = shutil.copytree(recorded("cube"), tmp_path / "run")
+    (folder / "fields.vtkhdf").unlink()
+    os.mkfifo(folder / "fields.vtkhdf")
+    assert cli.main(["picture", str(folder)]) == 2
+    assert "is a pipe or a device, not a file" in capsys.readouterr().err
