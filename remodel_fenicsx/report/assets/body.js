@@ -6,6 +6,7 @@ const FACES = {
 const SIGNS = [[1, 1, 1], [1, 1, -1], [1, -1, 1], [1, -1, -1]];  // the four chains of a cell: sums of its edges
 const GREY = [0.91, 0.92, 0.94], NOTHING_KNOWN = [0.6, 0.62, 0.65];
 const EDGE_LIFT = 0.02;  // of lines between elements towards the eye, over the smallest side of a face
+const WORDS_OVER_THE_BODY = 62;  // pixels at the top and at the bottom that buttons and scale take
 const FRONT = [0.3, -1, 0.42], ABOVE = [0, -0.02, 1];  // where the eye is
 const EXTENSION_COLOURS = ["#fff7d6", "#fbd98a", "#f5a754", "#e0662f", "#a8281e", "#4f0a16"];
 
@@ -187,7 +188,8 @@ class Stage {
     this.camera.updateMatrixWorld();
     const inverse = this.camera.matrixWorldInverse.elements, half = add(this.box[1], this.box[0], -1);
     const extent = (row) => [0, 1, 2].reduce((sum, k) => sum + Math.abs(inverse[4 * k + row] * half[k]) / 2, 0);
-    const tall = Math.max(extent(1), (extent(0) * height) / width) * 1.16 || 1;
+    const free = Math.max(0.5 * height, height - 2 * WORDS_OVER_THE_BODY);
+    const tall = Math.max((extent(1) * height) / free, (1.08 * extent(0) * height) / width) || 1;
     Object.assign(this.camera, { top: tall, bottom: -tall, right: (tall * width) / height, left: (-tall * width) / height });
     this.camera.updateProjectionMatrix();
     this.renderer.setPixelRatio(Math.min(2, devicePixelRatio));
