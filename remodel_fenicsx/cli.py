@@ -10,6 +10,7 @@ import shlex
 import sys
 import time as clock
 import traceback
+import webbrowser
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
@@ -20,7 +21,7 @@ from remodel_fenicsx.scene.presets import PRESETS, PROFILES
 from remodel_fenicsx.scene.scene import Scene, SceneError, preset_scene, read_scene
 from remodel_fenicsx.schema.tables import printable
 from remodel_fenicsx.system import interrupts
-from remodel_fenicsx.system.arguments import positive, wall_time
+from remodel_fenicsx.system.arguments import megabytes, positive, wall_time
 from remodel_fenicsx.system.children import SERVE, serve
 from remodel_fenicsx.system.environment import kernels, reason_undrawable, reason_unusable, versions
 from remodel_fenicsx.system.regular_files import ForeignFileError
@@ -90,10 +91,12 @@ def parser() -> argparse.ArgumentParser:
     writes(run_command, "new or empty folder for the results (default: results/NAME)")
     text = "stop before this time is over, after a whole step, with exit code 4: 90s, 30min, 2h, 1.5d"
     run_command.add_argument("--max-wall-time", type=wall_time, metavar="TIME", help=text)
+    text = "leave no report.html at the end, as with output.report = false"
+    run_command.add_argument("--no-report", dest="report", action="store_false", help=text)
     stability = scene_command("stability", "Run a scene and say whether its passes damp small changes of the cells.")
     writes(stability, "new or empty folder (default: results/NAME-stability)")
     stability.add_argument("--times", type=positive, default=10, metavar="N", help="times to analyse (default: 10)")
-    stability.set_defaults(resume=None, max_wall_time=None)
+    stability.set_defaults(resume=None, max_wall_time=None, report=False)
     ensemble = scene_command("ensemble", "Run a scene of random cells with many seeds, and with isotropic cells.")
     ensemble.add_argument("--seeds", type=positive, default=32, metavar="N", help="how many (default: 32; at least 2)")
     trade = scene_command("trade", "Run a scene with a ladder of settings: what each costs, and how far off it is.")
@@ -107,6 +110,15 @@ def parser() -> argparse.ArgumentParser:
         found.add_argument("-q", "--quiet", action="store_true", help="no progress")
     status = command("status", "Say where the run in DIR is, how fast, and whether it is alive.")
     status.add_argument("folder", type=Path, metavar="DIR", help="folder of a run")
+    report = command(
+        "report", "Make the page of the run in DIR for a browser, also while it runs; it needs no network."
+    )
+    report.add_argument("folder", type=Path, metavar="DIR", help="folder of a run")
+    text = "a file that does not exist yet (default: DIR/report.html, which is made anew)"
+    report.add_argument("-o", "--output", type=Path, metavar="FILE", help=text)
+    text = "MB that the page may have (default: %(default)g): where it would be larger fewer times are shown"
+    report.add_argument("--size", type=megabytes, default=20.0, metavar="MB", help=text)
+    report.add_argument("--open", action="store_true", help="show it in a browser")
     revolve = command("revolve", "Write the fields of a reduced run in DIR on the whole body: fields_body.vtkhdf.")
     revolve.add_argument("folder", type=Path, metavar="DIR", help="folder of a run")
     scene_command("validate", "Check a scene without running it.")
@@ -189,7 +201,7 @@ def _fail(message: str, code: int) -> int:
 def _run(options: argparse.Namespace, task: Callable[..., Path] | None = None) -> int:
     deadline = None if options.max_wall_time is None else clock.monotonic() + options.max_wall_time
     scene = None if options.resume else read_scene(options.scene, options.set, options.profile)
-    wishes: Any = {"quiet": options.quiet, "deadline": deadline}
+    wishes: Any = {"quiet": options.quiet, "deadline": deadline, "report": options.report}
     if options.resume and (options.output or options.profile):
         return _fail(f"{'-o' if options.output else '--profile'}: a run goes on in its own folder, as it is", BAD_INPUT)
     _check(reason_unusable())
@@ -328,6 +340,29 @@ def _status(options: argparse.Namespace) -> int:
     return 0
 
 
+def _report(options: argparse.Namespace) -> int:
+    if not interrupts.is_first_rank():  # the work of one process
+        return 0
+    from remodel_fenicsx.report import ReportError, write_report
+    from remodel_fenicsx.results.recording import RecordingError
+
+    try:
+        written = write_report(options.folder, options.output, options.size)
+    except (RecordingError, ReportError) as error:
+        return _fail(str(error), BAD_INPUT)
+    except ForeignFileError as error:
+        return _fail(f"{error.filename}: {error.strerror}", BAD_INPUT)
+    except OSError as error:
+        return _fail(f"cannot write the report: {error}", BAD_ENVIRONMENT)
+    _say(str(written))
+    size = written.stat().st_size / 1e6
+    if size > options.size:
+        _complain(f"warning: it has {size:.3g} MB, more than --size {options.size:g}: two times of this body need that")
+    if options.open and not webbrowser.open(written.resolve().as_uri()):
+        _complain(f"warning: no browser is to be found from here; open {written} in yours")
+    return 0
+
+
 def _revolve(options: argparse.Namespace) -> int:
     _check(reason_unusable())
     if not interrupts.is_first_rank():  # the work of one process
@@ -422,6 +457,7 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
     "ensemble": _ensemble,
     "trade": _trade,
     "status": _status,
+    "report": _report,
     "revolve": _revolve,
     "validate": _validate,
     "new": _new,

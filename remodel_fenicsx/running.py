@@ -6,6 +6,7 @@ import logging
 import tomllib
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
+from functools import partial
 from pathlib import Path
 
 from mpi4py import MPI
@@ -39,7 +40,7 @@ from remodel_fenicsx.system.interrupts import (
     end_all_ranks_on_exception,
     stopping_at_once,
 )
-from remodel_fenicsx.system.terminal import Progress, hold_log, open_log
+from remodel_fenicsx.system.terminal import Progress, announce, hold_log, open_log
 
 log = logging.getLogger(__name__)
 
@@ -50,6 +51,7 @@ def run(
     comm: MPI.Intracomm = MPI.COMM_WORLD,
     quiet: bool = True,
     deadline: float | None = None,
+    report: bool = True,
 ) -> Path:
     """Run a scene and record it.
 
@@ -65,10 +67,13 @@ def run(
         No progress on the terminal.
     deadline
         `time.monotonic` before which it shall stop, between two steps; None: never.
+    report
+        Whether it leaves report.html at its end, if the scene does not say otherwise (`output.report`).
 
     Returns
     -------
-    The folder with history.csv, fields.vtkhdf, fields_chains.vtkhdf, scene.toml, run.log and the checkpoints.
+    The folder with history.csv, fields.vtkhdf, fields_chains.vtkhdf, scene.toml, run.log, report.html and the
+    checkpoints.
 
     Raises
     ------
@@ -91,7 +96,7 @@ def run(
             simulation = _built(scene, comm)
             place = place or chosen_folder(None, scene.name, comm)
         with _closing(simulation), locked(place, comm, new=True):
-            _record(simulation, place, stop, held, quiet, deadline)
+            _record(simulation, place, stop, held, quiet, deadline, report)
     return place
 
 
@@ -101,6 +106,7 @@ def resume(
     comm: MPI.Intracomm = MPI.COMM_WORLD,
     quiet: bool = True,
     deadline: float | None = None,
+    report: bool = True,
 ) -> Path:
     """Go on with a recorded run from its last checkpoint, or from t = 0 where it has none yet.
 
@@ -110,7 +116,7 @@ def resume(
         The run's.
     overrides
         "KEY=VALUE": keys that may change are time.end, output, solver, and loads after the checkpoint.
-    comm, quiet, deadline
+    comm, quiet, deadline, report
         As for `run`; the number of ranks may be another one.
 
     Returns
@@ -137,7 +143,7 @@ def resume(
                 with hold_log(comm.rank, quiet=quiet) as more:
                     restore_state(simulation.state, checkpoint)
                 held += more
-            _record(simulation, place, stop, held, quiet, deadline, resumes=True)
+            _record(simulation, place, stop, held, quiet, deadline, report, resumes=True)
     return place
 
 
@@ -203,6 +209,7 @@ def _record(
     held: list[logging.LogRecord],
     quiet: bool,
     deadline: float | None,
+    report: bool,
     resumes: bool = False,
 ) -> None:
     """March through time in the folder; `held` is what was logged before the run had one."""
@@ -212,6 +219,7 @@ def _record(
     )
     text = scene.to_toml(header)
     columns = [column.name for column in simulation.observer.columns]
+    wants_report = report and scene.output.report and comm.rank == 0
     after = LastStep(columns, state.number, state.time) if state.number else None
     if resumes:
         wanted = bool(scene.output.fields)
@@ -237,6 +245,7 @@ def _record(
         checkpoints = Checkpoints(place, state, text, scene.output.checkpoint, record.flush)
         pause = Pause(comm, place, lambda: stop.pause, deadline)
         watchers += [record, _Report(scene, progress), checkpoints, pause]
+        leave_report = partial(_leave_report, place) if wants_report else lambda: None
         simulation.stepper.stop_signal = lambda: stop.number
         try:
             for _ in simulation.steps(watchers):
@@ -248,12 +257,29 @@ def _record(
                 log.info(STOPPED + "%s", reason)
             if getattr(reason, "on_all_ranks", True):
                 checkpoints.write()
+            if not isinstance(reason, (Interrupted, Paused)):  # these shall end soon
+                leave_report()
             raise
         except Exception as defect:
             with suppress(OSError):  # the disk may be full
                 log.info(FAILED + "%s: %s", type(defect).__name__, defect)
             raise
         log.info("finished")
+        leave_report()
+
+
+def _leave_report(place: Path) -> None:
+    """The page of the run. Where it cannot be made the run is none the worse."""
+    from remodel_fenicsx.report import REPORT, write_report
+
+    try:
+        write_report(place)
+    except Exception as error:  # whatever it is: the results are there
+        words = f"no {REPORT}: {' '.join(str(error).split()) or type(error).__name__}"
+        try:
+            log.warning("%s", words)
+        except OSError:  # the disk is full
+            announce(f"WARNING: {words}")
 
 
 class _Report(Watcher):

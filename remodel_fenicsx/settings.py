@@ -659,6 +659,9 @@ class Output(Table):
         "step: multiples of time.step; with time.tolerance a step ends there.",
         json_schema_extra={"allowed": "a list of increasing times above 0"},
     )
+    report: bool = Field(
+        default=True, description="Leave a page of the run for a browser, report.html, at its end (docs/report.md)."
+    )
     checkpoint: int | None = Field(
         default=None,
         ge=0,

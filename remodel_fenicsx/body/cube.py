@@ -11,6 +11,7 @@ from remodel_fenicsx.body import gmsh_model as model
 from remodel_fenicsx.body.columns import Column
 from remodel_fenicsx.body.reductions import Reduction
 from remodel_fenicsx.body.shape import LoadKind, Shape, check_lengths, homogeneous_bar, uniaxial_columns
+from remodel_fenicsx.body.whole import box
 from remodel_fenicsx.schema.units import FORCE, LENGTH
 from remodel_fenicsx.settings import Mesh
 
@@ -36,7 +37,7 @@ class Cube(Shape):
     number_of_elements: ClassVar[int] = 1
     faces: ClassVar[tuple[str, ...]] = ("x0", "x1", "y0", "y1", "z0", "z1")
     reductions: ClassVar[dict[str, Reduction]] = {
-        "point": homogeneous_bar("z0", "z1", lambda shape: {"side": shape.side}),
+        "point": homogeneous_bar("z0", "z1", lambda shape: {"side": shape.side}, lambda shape: box(shape.side)),
     }
 
     shape: Literal["cube"] = Field(default="cube", description="Which body it is.")

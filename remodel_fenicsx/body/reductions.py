@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from remodel_fenicsx.body.buckling import expected_thrust
+from remodel_fenicsx.body.whole import Body, Corners
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.fem.solver_methods import AUTO
 from remodel_fenicsx.model.cells import cylindrical_axes, global_axes
@@ -46,12 +47,16 @@ class Reduction:
         Why it may be wrong.
     turn
         Q (n, 3, 3) for places X (n, 3) of the body: Q^T X lies in, or beside, the part that stands for it.
+    whole
+        Function of the shape and of the reduction's mesh: the whole body for reports (`body.whole`); None: they show
+        none.
     """
 
     build: Callable[[Any, Any], Any]
     elements: Callable[[Any], int]
     rules: tuple[Rule, ...]
     turn: Turn
+    whole: Callable[[Any, NDArray[np.float64], Corners], Body] | None = None
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from remodel_fenicsx.body.buckling import Strut
 from remodel_fenicsx.body.columns import Column
 from remodel_fenicsx.body.gmsh_model import length_fault
 from remodel_fenicsx.body.reductions import Reduction, homogeneous, known_loads, same_cells, symmetric_law, unturned
+from remodel_fenicsx.body.whole import Body
 from remodel_fenicsx.model.cells import angle_to_axis
 from remodel_fenicsx.schema.tables import Table, fault
 from remodel_fenicsx.schema.units import Dimension, LengthUnit
@@ -101,6 +102,10 @@ class Shape(Table):
         How the body may be held, by what `supports.ends` says: functions of shape and loading.
     ends_that_free_length
         Those of `ends` with which the body's length is an unknown.
+    depth_in_words
+        What `depth` goes through, where it is 0 and where it is 1.
+    angle_in_words
+        Where a fibre angle of 0 degrees and one of 90 point.
     defaults
         Defaults of other tables that this shape changes, under the keys of preset and scene.
     """
@@ -115,6 +120,8 @@ class Shape(Table):
     reductions: ClassVar[dict[str, Reduction]] = {}
     ends: ClassVar[dict[str, Callable[[Any, Loading], None]]] = {"free": lambda shape, loading: shape.hold(loading)}
     ends_that_free_length: ClassVar[tuple[str, ...]] = ()
+    depth_in_words: ClassVar[tuple[str, str, str]] = ("along the body", "bottom", "top")
+    angle_in_words: ClassVar[tuple[str, str]] = ("along the load", "across")
     defaults: ClassVar[dict[str, Any]] = {}
 
     shape: str = Field(description="Which body it is.")
@@ -235,7 +242,9 @@ def uniaxial_columns(top: str, length: str) -> tuple[Column, ...]:
     )
 
 
-def homogeneous_bar(bottom: str, top: str, dimensions: Callable[[Any], dict[str, float]]) -> Reduction:
+def homogeneous_bar(
+    bottom: str, top: str, dimensions: Callable[[Any], dict[str, float]], whole: Callable[[Any], Body]
+) -> Reduction:
     """The reduction "point" of a body between two faces across z, the same strain everywhere: one bar beside the axis.
 
     Parameters
@@ -244,6 +253,8 @@ def homogeneous_bar(bottom: str, top: str, dimensions: Callable[[Any], dict[str,
         Names of the faces.
     dimensions
         Function of the shape: the dimensions of its `Domain`.
+    whole
+        Function of the shape: the body for pictures.
     """
 
     def build(scene: Any, comm: Any = None) -> Domain:
@@ -254,4 +265,5 @@ def homogeneous_bar(bottom: str, top: str, dimensions: Callable[[Any], dict[str,
         ends = (length, 0.0, 0.0), (length, 0.0, length)
         return interval_domain(*ends, 1, scene.mesh.degree, faces, shape.name, dimensions(shape), comm)
 
-    return Reduction(build, lambda scene: 1, (same_cells, symmetric_law, homogeneous, known_loads("point")), unturned)
+    rules = (same_cells, symmetric_law, homogeneous, known_loads("point"))
+    return Reduction(build, lambda scene: 1, rules, unturned, lambda shape, points, corners: whole(shape))

@@ -14,6 +14,7 @@ from remodel_fenicsx.body.buckling import Strut
 from remodel_fenicsx.body.columns import Column
 from remodel_fenicsx.body.reductions import Reduction, unturned
 from remodel_fenicsx.body.shape import LoadKind, Shape, check_lengths, homogeneous_bar, uniaxial_columns
+from remodel_fenicsx.body.whole import cylinder
 from remodel_fenicsx.schema.units import AREA, FORCE, LENGTH
 from remodel_fenicsx.settings import Mesh
 
@@ -49,7 +50,10 @@ class Tendon(Shape):
     faces: ClassVar[tuple[str, ...]] = ("bottom", "top", "side")
     reductions: ClassVar[dict[str, Reduction]] = {
         "point": homogeneous_bar(
-            "bottom", "top", lambda shape: _dimensions(shape.length, shape.area, math.sqrt(shape.area / math.pi))
+            "bottom",
+            "top",
+            lambda shape: _dimensions(shape.length, shape.area, math.sqrt(shape.area / math.pi)),
+            lambda shape: cylinder(outer_radius(shape.area), shape.length),
         ),
     }
 

@@ -24,6 +24,7 @@ from remodel_fenicsx.body.reductions import (
     symmetric_planes,
 )
 from remodel_fenicsx.body.shape import Array, LoadKind, Shape, check_lengths
+from remodel_fenicsx.body.whole import Body, Corners, divided_along, extended, mirrored_twice, revolved
 from remodel_fenicsx.model.cells import pitch_angle, radial_share
 from remodel_fenicsx.schema.tables import fault, shown
 from remodel_fenicsx.schema.units import FORCE, LENGTH, STRESS
@@ -120,6 +121,12 @@ def _dimensions(shape: Any) -> dict[str, float]:
     return {name: float(getattr(shape, name)) for name in ("inner_radius", "outer_radius", "length")}
 
 
+def _in_layers(points: Array, elements: Corners) -> Body:
+    """Hexahedra of a quarter as long as the body, which pictures show in layers; all others as they are."""
+    as_long = np.isclose(np.ptp(points[elements, 2], axis=1), np.ptp(points[:, 2])).all()
+    return divided_along(points, elements) if as_long and elements.shape[1] == 8 else (points, elements)
+
+
 _EVERYWHERE = (same_cells, symmetric_law)
 REDUCTIONS = {
     "radial": Reduction(
@@ -127,18 +134,21 @@ REDUCTIONS = {
         lambda scene: PAPER[1] * scene.mesh.refinement,
         (*_EVERYWHERE, round_about_z, free_ends, known_loads("radial")),
         about_z,
+        lambda shape, points, lines: revolved(*extended(points, lines, shape.length)),
     ),
     "axisymmetric": Reduction(
         build_half_plane,
         lambda scene: PAPER[1] * PAPER[2] * scene.mesh.refinement**2,
         (*_EVERYWHERE, round_about_z, known_loads("axisymmetric")),
         about_z,
+        lambda shape, points, quadrilaterals: revolved(points, quadrilaterals),
     ),
     "sector": Reduction(
         build_quarter,
         lambda scene: PAPER[0] * PAPER[1] * scene.mesh.refinement**2 * layers(scene) // 4,
         (*_EVERYWHERE, symmetric_planes, known_loads("sector")),
         mirrored,
+        lambda shape, points, elements: mirrored_twice(*_in_layers(points, elements)),
     ),
 }
 """The cheapest first."""
@@ -262,6 +272,8 @@ class Tube(Shape):
         "closed": lambda shape, loading: shape.close(loading),
     }
     ends_that_free_length: ClassVar[tuple[str, ...]] = ("closed",)
+    depth_in_words: ClassVar[tuple[str, str, str]] = ("through the wall", "inside", "outside")
+    angle_in_words: ClassVar[tuple[str, str]] = ("around", "along")
     # with global axes a tube of isotropic cells would not stay round in the first step
     defaults: ClassVar[dict[str, Any]] = {"cells": {"axes": "cylindrical"}}
 

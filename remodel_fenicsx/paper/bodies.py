@@ -5,29 +5,31 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import BoundaryNorm, Colormap
+from matplotlib.colors import BoundaryNorm, Colormap, ListedColormap
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from remodel_fenicsx.paper.rendering import AMBIENT, Patch, Pixels
+from remodel_fenicsx.paper.rendering import Patch, Pixels
 from remodel_fenicsx.results.chain_lines import chain_lines
+from remodel_fenicsx.results.drawing import (
+    AMBIENT,
+    ANGLE_COLOURS,
+    CHAIN_COLOUR,
+    CHAIN_LIFT,
+    CHAIN_REACH,
+    CHAIN_ROOM,
+    CHAIN_WIDTH,
+    LEVELS,
+)
 from remodel_fenicsx.results.recording import Recording
 
 Array = NDArray[np.float64]
 Table = dict[str, NDArray[Any]]  # columns by name, all of one length
 Shown = NDArray[np.bool_] | slice  # which elements
 ALL = slice(None)
-
-LEVELS = 18  # steps of 5 degrees: a colour can be read off the scale
-CHAIN_COLOUR = (0.08, 0.08, 0.10)
-CHAIN_REACH = 0.39  # half a chain's length over the shorter side of its face, both undeformed
-CHAIN_ROOM = 0.78  # how far a chain goes at most, over the way from the middle to the edge of its face
-CHAIN_WIDTH = 0.06  # over the shorter side
-CHAIN_LIFT = 0.2  # towards the eye, over the same: faces need not be plane
 
 # faces of VTK's hexahedron, by its local nodes
 _FACES = np.array([(0, 3, 2, 1), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7)])
@@ -107,7 +109,7 @@ def layers(snapshot: DrawnBody) -> NDArray[np.int64]:
 
 def scale() -> tuple[Colormap, BoundaryNorm]:
     """Colours from red (0 degrees, aligned) over yellow to blue (90 degrees, orthogonal), in equal steps."""
-    return matplotlib.colormaps["RdYlBu"], BoundaryNorm(np.linspace(0.0, 90.0, LEVELS + 1), 256, clip=True)
+    return ListedColormap(ANGLE_COLOURS), BoundaryNorm(np.linspace(0.0, 90.0, LEVELS + 1), LEVELS, clip=True)
 
 
 def coloured(angle: Array) -> Array:

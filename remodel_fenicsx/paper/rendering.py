@@ -19,12 +19,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from remodel_fenicsx.results.drawing import AMBIENT
 from remodel_fenicsx.studies.page import FigureError
 
 Array = NDArray[np.float64]
 Pixels = NDArray[np.uint8]
 
-AMBIENT = 0.8  # share of a colour that does not depend on where its face looks: it must mean the same everywhere
 SAMPLES = 2  # pictures are drawn this much larger and made smaller: smooth edges with every VTK
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import os
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
@@ -175,10 +175,17 @@ class Recording:
                 raise ValueError("elements have nodes that are not there")
             return numbers
 
-    def fields(self, time: float) -> dict[str, Array]:
+    def fields(self, time: float, names: Collection[str] | None = None) -> dict[str, Array]:
         """The fields at a recorded time by name: at nodes, (nodes, ...), and means over elements, (elements, ...).
 
         `displacement` belongs to the nodes; docs/commands.md lists the others. Values have 7 digits.
+
+        Parameters
+        ----------
+        time
+            As recorded.
+        names
+            Read no others than these; those that were not recorded are not there.
 
         Raises
         ------
@@ -189,7 +196,8 @@ class Recording:
         found: dict[str, Array] = {}
         with self._fields_file() as root:
             for kind, unit in (("PointData", "NumberOfPoints"), ("CellData", "NumberOfCells")):
-                for name, values in root[kind].items():
+                for name in (name for name in root[kind] if names is None or name in names):
+                    values = root[kind][name]
                     start = int(root["Steps"][f"{kind}Offsets"][name][number])
                     found[name] = _block(values, start, int(root[unit][0]))
         return found

@@ -55,7 +55,7 @@ def status(folder: Path) -> list[str]:
         recording = Recording(folder)  # what is no run's folder is refused
     else:
         return [f"{folder}: starting, {holder or 'a process'} is at work"]
-    scene, history = recording.scene, _rows(recording, lives)
+    scene, history = recording.scene, rows_so_far(recording, lives)
     times = history["time"]
     end, time = scene.last_time, float(times[-1]) if len(times) else 0.0
     number = max(0, len(times) - 1)
@@ -145,7 +145,7 @@ def _state(folder: Path) -> tuple[str, str]:
     return ("failed", words) if words.startswith(FAILED) else ("stopped", "")
 
 
-def _rows(recording: Recording, lives: bool) -> HistoryColumns:
+def rows_so_far(recording: Recording, lives: bool) -> HistoryColumns:
     """The history; of a run that lives it may be read while a row is being written."""
     try:
         return recording.history

@@ -287,8 +287,8 @@ def _begin(worker: Worker, run: Run) -> None:
     check_no_link(run.folder)
     messages = run.beside(".txt")
     if (run.folder / SCENE).exists():
-        worker.begin(["run", "--resume", str(run.folder), "-q"], messages)
+        worker.begin(["run", "--resume", str(run.folder), "-q", "--no-report"], messages)
         return
     scene = run.beside(".toml")
     write_whole(scene, run.scene.to_toml().encode())
-    worker.begin(["run", str(scene), "-o", str(run.folder), "-q"], messages)
+    worker.begin(["run", str(scene), "-o", str(run.folder), "-q", "--no-report"], messages)

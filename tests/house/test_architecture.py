@@ -20,8 +20,8 @@ ROOT = Path(__file__).parents[2]
 PACKAGE = "remodel_fenicsx"
 # what a room may import: itself, and those before it
 ROOMS = ("_lazy", "_version", "system", "schema", "model", "fem", "kernels", "settings", "body", "scene", "state",
-         "solver", "evolution", "watch", "results", "simulation", "running", "studies", "paper", "cli", "parts",
-         "extend")  # fmt: skip
+         "solver", "evolution", "watch", "results", "report", "simulation", "running", "studies", "paper", "cli",
+         "parts", "extend")  # fmt: skip
 # imports that only the type checker follows: of what is there without dolfinx, to what is not
 TYPES_ONLY = {
     "__init__": {"results.recording", "running", "scene", "simulation"},
@@ -211,6 +211,7 @@ def test_a_room_does_without(inside: str, never: set[str]) -> None:
     (f"{PACKAGE}.extend", "dolfinx basix mpi4py petsc4py gmsh ufl pint h5py"),
     (f"{PACKAGE}.model.laws", "dolfinx basix mpi4py petsc4py gmsh ufl pydantic"),
     (f"{PACKAGE}.results.recording", "dolfinx basix mpi4py petsc4py gmsh ufl pint pydantic"),
+    (f"{PACKAGE}.report", "dolfinx basix mpi4py petsc4py gmsh ufl pint matplotlib"),
 ])  # fmt: skip
 def test_importing_costs_no_more_than_it_must(module: str, never: str) -> None:
     program = f"import sys, {module}; print(*(name for name in {never.split()} if name in sys.modules))"

@@ -113,7 +113,7 @@ BAD_SCENES = [
         TUBE,
         {"output.pictures!": True},
         "output.'pictures!' = true: unknown key; allowed are output.fields, output.columns, output.every, "
-        "output.times, output.checkpoint",
+        "output.times, output.report, output.checkpoint",
     ),
     (TUBE, {"time.x\ny": 1}, "time.'x\\ny' = 1: unknown key; allowed are time.end, time.step, time.tolerance"),
     # material

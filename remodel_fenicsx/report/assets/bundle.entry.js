@@ -1,0 +1,9 @@
+// What of other people's code the report uses; docs/make_bundle.py makes report.bundle.js and report.bundle.css of it.
+export {
+  AmbientLight, BufferAttribute, BufferGeometry, ColorManagement, DirectionalLight, DoubleSide, LinearSRGBColorSpace,
+  LineBasicMaterial, LineSegments, Mesh, MeshBasicMaterial, MeshLambertMaterial, OrthographicCamera, Scene,
+  WebGLRenderer,
+} from "three";
+export { OrbitControls } from "three/addons/controls/OrbitControls.js";
+export { default as uPlot } from "uplot";
+import "uplot/dist/uPlot.min.css";

@@ -1,0 +1,139 @@
+"""The page as one file: template, cards, data, scripts; nothing in it asks for anything from outside."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import math
+import os
+from html import escape
+from pathlib import Path
+from typing import Any
+
+from remodel_fenicsx._version import __version__
+from remodel_fenicsx.report.body import ShownBody, has_a_body, kept_times
+from remodel_fenicsx.report.card import Card
+from remodel_fenicsx.report.packing import packed
+from remodel_fenicsx.report.parts import ASSETS, ReportedRun, cards, data_of
+from remodel_fenicsx.report.story import Story
+from remodel_fenicsx.results.recording import Recording
+from remodel_fenicsx.system.regular_files import read_regular, write_whole
+
+REPORT = "report.html"
+PAGE_SIZE = 20.0  # MB that a page has at most, if it need not be larger for two times
+SCRIPTS = ("data.js", "body.js", "angles.js", "curves.js", "page.js")
+STYLES = ("report.bundle.css", "page.css")
+GENERATOR_TAG = b'name="generator" content="remodel_fenicsx'  # what bears it may be made anew
+LARGEST_PAGE = 10**9  # bytes
+FEWEST_TIMES = 2
+BEST_RATIO = 0.15  # of deflated to plain bytes of fields: none was smaller, so that no time is left out too early
+TRIES = 4
+
+
+class ReportError(ValueError):
+    """No report for a reason that its one line names."""
+
+
+def write_report(folder: str | os.PathLike[str], path: Path | None = None, size: float = PAGE_SIZE) -> Path:
+    """Make the report of a run, finished or not, from its folder.
+
+    Parameters
+    ----------
+    folder
+        Of a run; it may still be under way.
+    path
+        Where the page goes; a report.html in the run's folder is replaced, any other file must be new.
+    size
+        MB (10^6 bytes) that it may have: fewer times are kept where all would be more, never fewer elements.
+
+    Returns
+    -------
+    The file.
+
+    Raises
+    ------
+    RecordingError, SceneError
+        If it is no folder of a run, or damaged.
+    ReportError
+        If the file is there already, or a report.html that this command has not made.
+    OSError
+        If it cannot be read or written.
+    """
+    recording = Recording(folder)
+    if path is not None and (path.exists() or path.is_symlink()):
+        raise ReportError(f"-o {path}: is there already; allowed is a new file")
+    path = path or recording.path / REPORT
+    if path.exists() and GENERATOR_TAG not in read_regular(path, LARGEST_PAGE)[:4096]:
+        raise ReportError(f"{path}: is no report of this command and is not overwritten; choose another file with -o")
+    page = page_of(recording, size)
+    write_whole(path, page.encode("utf-8"))
+    return path
+
+
+def page_of(recording: Recording, size: float = PAGE_SIZE) -> str:
+    """The page as text; parameters and errors as of `write_report`."""
+    story = Story.of(recording)
+    if not has_a_body(recording):
+        return _page(cards(ReportedRun(recording, story, None)))
+    most = _times_at_most(recording, size)
+    for _ in range(TRIES):
+        body = ShownBody.of(recording, kept_times(story.history, recording.times, most))
+        found = cards(ReportedRun(recording, story, body))
+        page = _page(found)
+        if len(page) <= 1e6 * size or len(body.times) <= FEWEST_TIMES:
+            break
+        rest = len(_page([card for card in found if card.name != "view"]))
+        share = max(0.0, 1e6 * size - rest) / (len(page) - rest)
+        most = max(FEWEST_TIMES, min(len(body.times) - 1, math.floor(0.97 * share * len(body.times))))
+    return page
+
+
+def _times_at_most(recording: Recording, size: float) -> int:
+    """More times than this do not fit, however small they become."""
+    count = 6 * len(recording.points) + 11 * len(recording.elements)
+    return max(FEWEST_TIMES, int(1e6 * size / (4 / 3 * BEST_RATIO * count)))
+
+
+def _page(found: list[Card]) -> str:
+    data, arrays = data_of(found)
+    block, table = packed(arrays)
+    script = "{\n" + "\n".join(_asset(name) for name in SCRIPTS) + "\n}\n"
+    style = "\n".join(_asset(name) for name in STYLES)
+    bundle = _asset("report.bundle.js")
+    parts = {
+        "POLICY": policy([bundle, script], style),
+        "GENERATOR": f"remodel_fenicsx {__version__}",
+        "TITLE": escape(str(data["head"]["name"])),
+        "STYLE": style,
+        "CARDS": "\n".join(card.html for card in found),
+        "DATA": as_json({"parts": data, "arrays": table}),
+        "ARRAYS": block,
+        "BUNDLE": bundle,
+        "SCRIPT": script,
+    }
+    pieces = _asset("template.html").split("@")  # what is put in is not looked at again
+    return "".join(parts[piece] if index % 2 else piece for index, piece in enumerate(pieces))
+
+
+def policy(scripts: list[str], style: str) -> str:
+    """What the browser allows the page: its own scripts and style, known by their hashes, and nothing from anywhere."""
+    allowed = " ".join(_hash(text) for text in scripts)
+    return (
+        f"default-src 'none'; script-src {allowed}; style-src {_hash(style)}; img-src data: blob:; "
+        "connect-src 'none'; base-uri 'none'; form-action 'none'"
+    )
+
+
+def _hash(text: str) -> str:
+    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode('utf-8')).digest()).decode('ascii')}'"
+
+
+def as_json(values: Any) -> str:
+    """JSON that no reader of HTML takes for an end of its script."""
+    text = json.dumps(values, separators=(",", ":"), allow_nan=False)
+    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+
+
+def _asset(name: str) -> str:
+    return (ASSETS / name).read_text(encoding="utf-8")
