@@ -44,7 +44,8 @@ def made(seed: int) -> tuple[Values, Values]:
     scene["time"] = _time(random, scene)
     scene["loads"] = _loads(random, scene, stiffness)
     scene["solver"] = _solver(random, scene)
-    scene["output"] = {"fields": True, "every": 1_000_000, "checkpoint": random.choice((0, 3))}
+    output = {"fields": True, "every": 1_000_000, "checkpoint": random.choice((0, 3)), "report": seed % 4 == 0}
+    scene["output"] = output
     if random.random() < 0.2:
         scene["output"]["columns"] = ["pass_residual", "held_points"]
     _rarely(Random(f"more of {seed}"), scene, stiffness)

@@ -25,7 +25,7 @@ Numbers = NDArray[np.float64]
 
 CUTS = ("half", "quarter")
 CUT_IN_WORDS = {"half": "the half in front cut off", "quarter": "the quarter in front cut off"}
-MARGIN = 1.05  # of what is seen over the body's size
+VIEW_MARGIN = 1.05  # of what is seen over the body's size
 ASPECT = (0.28, 2.2)  # least and largest width over height of a view
 
 
@@ -166,7 +166,7 @@ class Sight:
         pixels = round(dots * height * aspect), round(dots * height)
         x, y, z = ((low + high) / 2) @ axes
         up = axes[1] if abs(axes[2, 2]) >= 0.9999 else np.array([0.0, 0.0, 1.0])
-        return View(tuple(axes[2]), (x, y, z), MARGIN * max(tall, wide / aspect), pixels, tuple(up))
+        return View(tuple(axes[2]), (x, y, z), VIEW_MARGIN * max(tall, wide / aspect), pixels, tuple(up))
 
     def images(self, snapshots: Sequence[DrawnBody], view: View) -> list[Pixels]:
         """What is seen at these times, each (rows, columns, 3).

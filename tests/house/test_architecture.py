@@ -212,6 +212,7 @@ def test_a_room_does_without(inside: str, never: set[str]) -> None:
     (f"{PACKAGE}.extend", "dolfinx basix mpi4py petsc4py gmsh ufl pint h5py"),
     (f"{PACKAGE}.model.laws", "dolfinx basix mpi4py petsc4py gmsh ufl pydantic"),
     (f"{PACKAGE}.results.recording", "dolfinx basix mpi4py petsc4py gmsh ufl pint pydantic"),
+    (f"{PACKAGE}.report", "dolfinx basix mpi4py petsc4py gmsh ufl pint matplotlib"),
 ])  # fmt: skip
 def test_importing_costs_no_more_than_it_must(module: str, never: str) -> None:
     program = f"import sys, {module}; print(*(name for name in {never.split()} if name in sys.modules))"

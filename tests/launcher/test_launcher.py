@@ -599,6 +599,21 @@ def test_older_roots_are_pruned_unless_in_use(rooted):
     assert used not in rooted.roots() and len(rooted.roots()) == 2
 
 
+def test_a_browser_comes_with_an_environment_of_its_own(rooted):
+    """It takes no room from those without one, and a command in it knows nothing of the wish."""
+    browser = {"WITH_FENICSX_ADD": "browser"}
+    rooted.run("true")
+    inside = rooted.run("sh", "-c", "echo ${WITH_FENICSX_ADD-none}", environment=browser)
+    assert (inside.returncode, inside.stdout) == (0, "none\n")
+    first, second = (next(word for word in words if word.startswith("--include=")) for words in rooted.builds())
+    assert second == f"{first},chromium-headless-shell"
+    original = rooted.packages.read_text()
+    for number in range(2):
+        rooted.packages.write_text(f"{original}package-{number}\n")
+        rooted.run("true")
+    assert sorted(name.split("-")[0] for name in rooted.roots()) == ["trixie", "trixie", "trixie+browser"]
+
+
 # ---------------------------------------------------------------- what cannot work says so in one line
 @pytest.mark.parametrize(
     "environment, words",

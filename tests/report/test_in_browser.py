@@ -182,6 +182,18 @@ def test_a_choice_changes_the_picture_and_back(browser: Browser, recorded: Recor
     np.testing.assert_array_equal(body(browser), before)
 
 
+def test_faces_go_round_their_corners(browser: Browser, recorded: Recorded) -> None:
+    """The cube from above is a rectangle of one colour, with no line across."""
+    browser.open(recorded("cube") / REPORT)
+    browser.choose("#shown", "shape")
+    browser.click("#above")
+    pixels = body(browser)
+    rows, columns = np.nonzero((pixels < 250).any(axis=2))
+    down, across = (slice(*np.quantile([x.min(), x.max()], [0.15, 0.85]).astype(int)) for x in (rows, columns))
+    inside = pixels[down, across]  # without a little of the front
+    assert min(inside.shape[:2]) > 150 and len(np.unique(inside.reshape(-1, 3), axis=0)) == 1
+
+
 def test_chains_are_drawn(browser: Browser, recorded: Recorded) -> None:
     """Black on the surface, by the rule of the figures."""
     browser.open(recorded("artery") / REPORT)

@@ -134,6 +134,8 @@ def test_reductions_are_shown_as_whole_bodies(recorded: Recorded, name: str) -> 
     assert radii.min() == pytest.approx(history["inner_radius"][-1], rel=1e-3)
     assert radii.max() == pytest.approx(history["outer_radius"][-1], rel=1e-3)
     assert len(found.arrays["view.elements"]) == 1536
+    sides = end[found.arrays["view.elements"]].mean(axis=1)[:, :2] > 0
+    np.testing.assert_array_equal(np.bincount(2 * sides[:, 0] + sides[:, 1]), [384] * 4)
     # the same angle all around: the turned chains of a layer make it with their own tangents
     edges = found.view["edge_step"] * found.arrays["view.edges"][-1].reshape(-1, 3, 3)
     centres = end[found.arrays["view.elements"]].mean(axis=1)
@@ -283,6 +285,8 @@ def test_text_of_others_is_text(folder: Path) -> None:
         log.write(f"2026-01-02 03:04:06,000 WARNING {HOSTILE}\n2026-01-02 03:04:06,000 INFO failed: {HOSTILE}\n")
     with (folder / "scene.toml").open("a") as scene:
         scene.write(f"# {HOSTILE} <!--\n")
+    history = (folder / "history.csv").read_text()
+    (folder / "history.csv").write_text(history.replace("odd", HOSTILE).replace("1,\n", "1,7\n"))
     text = write_report(folder).read_text()
     assert "<img" not in text and "<!--" not in text and text.count(html.escape(HOSTILE)) >= 4
     assert text.count("</script>") == 4
@@ -312,6 +316,7 @@ def test_the_policy_names_what_is_in_the_page(folder: Path) -> None:
 # ---------------------------------------------------------------- the command, and the end of a run
 def test_only_its_own_page_is_made_anew(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["report", str(folder)]) == 0 and cli.main(["report", str(folder)]) == 0
+    assert cli.main(["report", str(folder), "-o", str(folder / REPORT)]) == 2
     (folder / REPORT).write_text("mine")
     assert cli.main(["report", str(folder)]) == 2
     assert cli.main(["report", str(folder), "-o", str(folder / REPORT)]) == 2

@@ -6,6 +6,7 @@ const FACES = {
 const SIGNS = [[1, 1, 1], [1, 1, -1], [1, -1, 1], [1, -1, -1]];  // the four chains of a cell: sums of its edges
 const GREY = [0.91, 0.92, 0.94], NOTHING_KNOWN = [0.6, 0.62, 0.65];
 const EDGE_LIFT = 0.02;  // of lines between elements towards the eye, over the smallest side of a face
+const WORDS_OVER_THE_BODY = 62;  // pixels at the top and at the bottom that buttons and scale take
 const EXTENSION_COLOURS = ["#fff7d6", "#fbd98a", "#f5a754", "#e0662f", "#a8281e", "#4f0a16"];
 
 const rgb = (hex) => [1, 3, 5].map((at) => parseInt(hex.slice(at, at + 2), 16) / 255);
@@ -13,6 +14,7 @@ const add = (a, b, s = 1) => [a[0] + s * b[0], a[1] + s * b[1], a[2] + s * b[2]]
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 const times = (a, s) => [a[0] * s, a[1] * s, a[2] * s];
+const vectorAt = (values, k) => [values[3 * k], values[3 * k + 1], values[3 * k + 2]];
 const mean = (places) => times(places.reduce((a, b) => add(a, b)), 1 / places.length);
 
 // What does not depend on how it is looked at: elements, their neighbours, places at a time.
@@ -25,15 +27,30 @@ class Elements {
     this.faces = FACES[this.corners];
     this.neighbours = this.findNeighbours();
     this.place = new Float32Array(3 * this.nodes);
-    this.centres = Float32Array.from({ length: 3 * this.count }, (_, k) => this.referenceCentre(Math.floor(k / 3))[k % 3]);
+    this.centres = this.findCentres();
     this.box = this.findBox();
   }
 
   node(e, corner) { return this.arrays.elements[e * this.corners + corner]; }
-  reference(node) { return Array.from(this.arrays.reference.subarray(3 * node, 3 * node + 3)); }
-  referenceCentre(e) { return mean(Array.from({ length: this.corners }, (_, k) => this.reference(this.node(e, k)))); }
-  at(node) { return [this.place[3 * node], this.place[3 * node + 1], this.place[3 * node + 2]]; }
-  centre(e) { return mean(Array.from({ length: this.corners }, (_, k) => this.at(this.node(e, k)))); }
+  reference(node) { return vectorAt(this.arrays.reference, node); }
+  at(node) { return vectorAt(this.place, node); }
+  centre(e) {
+    const sum = [0, 0, 0];
+    for (let k = 0; k < this.corners; k++) {
+      for (let i = 0; i < 3; i++) sum[i] += this.place[3 * this.node(e, k) + i] / this.corners;
+    }
+    return sum;
+  }
+
+  // In the reference body, three numbers an element.
+  findCentres() {
+    const found = new Float32Array(3 * this.count);
+    for (let k = 0; k < this.arrays.elements.length; k++) {
+      const e = Math.floor(k / this.corners), node = this.arrays.elements[k];
+      for (let i = 0; i < 3; i++) found[3 * e + i] += this.arrays.reference[3 * node + i] / this.corners;
+    }
+    return found;
+  }
 
   // The element on the other side of each face; -1 where there is none. Three nodes tell a face.
   findNeighbours() {
@@ -188,7 +205,8 @@ class Stage {
     this.camera.updateMatrixWorld();
     const inverse = this.camera.matrixWorldInverse.elements, half = add(this.box[1], this.box[0], -1);
     const extent = (row) => [0, 1, 2].reduce((sum, k) => sum + Math.abs(inverse[4 * k + row] * half[k]) / 2, 0);
-    const tall = Math.max(extent(1), (extent(0) * height) / width) * 1.16 || 1;
+    const free = Math.max(0.5 * height, height - 2 * WORDS_OVER_THE_BODY);
+    const tall = Math.max((extent(1) * height) / free, (1.08 * extent(0) * height) / width) || 1;
     Object.assign(this.camera, { top: tall, bottom: -tall, right: (tall * width) / height, left: (-tall * width) / height });
     this.camera.updateProjectionMatrix();
     this.renderer.setPixelRatio(Math.min(2, devicePixelRatio));

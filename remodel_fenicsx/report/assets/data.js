@@ -6,17 +6,21 @@ const TYPES = {
 };
 const PARTS = {};  // by the name of a card: function(data of the card, arrays of all by card and name, clock)
 
+// Rows that are stored as differences to the row before, modulo the range of the type.
+function sumUp(values, row) {
+  for (let i = row; i < values.length; i++) values[i] += values[i - row];
+}
+
 async function unpacked() {
-  const text = document.getElementById("page-arrays").textContent;
-  const deflated = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
+  const text = atob(document.getElementById("page-arrays").textContent), deflated = new Uint8Array(text.length);
+  for (let i = 0; i < text.length; i++) deflated[i] = text.charCodeAt(i);
   const stream = new Blob([deflated]).stream().pipeThrough(new DecompressionStream("gzip"));
   const block = await new Response(stream).arrayBuffer();
   const arrays = {};
   for (const [path, entry] of Object.entries(PAGE.arrays)) {
     const dot = path.indexOf("."), card = path.slice(0, dot), length = entry.shape.reduce((a, b) => a * b, 1);
     const values = new TYPES[entry.type](block, entry.start, length);
-    const row = entry.differences ? length / entry.shape[0] : length;
-    for (let i = row; i < length; i++) values[i] += values[i - row];  // modulo the range of the type
+    if (entry.differences) sumUp(values, length / entry.shape[0]);
     (arrays[card] ??= {})[path.slice(dot + 1)] = values;
   }
   return arrays;
