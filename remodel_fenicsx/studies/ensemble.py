@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from remodel_fenicsx.body.columns import columns_of
 from remodel_fenicsx.scene.scene import Scene, SceneError
 from remodel_fenicsx.schema.times import same_time
-from remodel_fenicsx.studies.page import COLOURS, STYLE, Page
+from remodel_fenicsx.results.words import unit_of, words
+from remodel_fenicsx.studies.page import COLOURS, STYLE, Page, add_head
 from remodel_fenicsx.studies.runs import FEWEST_RUNS, Run, TooFewRuns, run_all, write_study
 from remodel_fenicsx.system.children import cores
 from remodel_fenicsx.system.environment import versions
@@ -253,22 +254,30 @@ def draw(found: Ensemble, folder: Path, scene: Scene) -> None:
     page.save_table(table, [title, made_with])
     varying = [name for name, values in found.columns.items() if np.nanmax(np.ptp(values, axis=0)) > 0]
     shown = sorted(varying, key=lambda name: name not in _own_columns(scene))[:PANELS]
+    columns = columns_of(scene.geometry, scene.output.columns, scene.loads)
+    units = {column.name: unit_of(scene, column.unit) for column in columns}
     with rc_context(STYLE):
         rows = -(-len(shown) // 2)
         figure = Figure(figsize=(7.2, 2.2 * rows + 0.4), layout="constrained")
         grid = figure.subplots(rows, 2, squeeze=False).ravel()
         for axes, name in zip(grid, shown, strict=False):
             mean, deviation = table[f"{name}_mean"], table[f"{name}_deviation"]
-            axes.fill_between(found.time, table[f"{name}_least"], table[f"{name}_most"], color=COLOURS[0], alpha=0.15)
-            if found.knows_deviations:
-                axes.fill_between(found.time, mean - deviation, mean + deviation, color=COLOURS[0], alpha=0.35)
+            band: dict[str, Any] = {"color": COLOURS[0], "linewidth": 0}
             axes.plot(found.time, mean, color=COLOURS[0], label="random cells, mean over the seeds")
+            if found.knows_deviations:
+                label = "mean and one standard deviation"
+                axes.fill_between(found.time, mean - deviation, mean + deviation, alpha=0.35, label=label, **band)
+            least, most = table[f"{name}_least"], table[f"{name}_most"]
+            axes.fill_between(found.time, least, most, alpha=0.15, label="least to most of all seeds", **band)
             if name in found.isotropic and name not in found.extremes:
                 axes.plot(found.time, found.isotropic[name], "--", color=COLOURS[1], label="isotropic cells")
-            axes.set(xlabel="time", ylabel=name, xlim=(0, found.time[-1]))
+            unit = units.get(name)
+            axes.set(xlabel="time", ylabel=words(name) + (f", {unit}" if unit else ""), xlim=(0, found.time[-1]))
         for axes in grid[len(shown) :]:
             axes.set_axis_off()
-        figure.legend(*grid[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
+        known = {label: line for axes in grid for line, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+        figure.legend(list(known.values()), list(known), loc="outside lower center", ncols=2)
+        add_head(figure, title, verdict(found, float(found.time[-1])))
         page.save_figure(figure, made_with)
 
 

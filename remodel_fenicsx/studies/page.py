@@ -8,6 +8,7 @@ from __future__ import annotations
 import csv
 import io
 import tempfile
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -154,6 +155,26 @@ def as_file(figure: Figure, ending: str, about: About, colours: NDArray[np.float
         picture = with_palette(full.convert("RGB"), colours)
         picture.save(small, "png", pnginfo=texts, optimize=True, dpi=(dpi, dpi))
     return small.getvalue()
+
+
+HEAD_LINE, VERDICT_LINE, VERDICT_LETTER = 0.24, 0.155, 0.0585  # inches: lines of title and verdict, mean letter
+TICK_LABEL = 0.14  # half of one at the end of an axis: which labels there are is settled after the layout
+
+
+def add_head(figure: Figure, title: str, verdict: str) -> None:
+    """Write title and verdict over a figure of constrained layout, which becomes that much taller."""
+    wide, tall = figure.get_size_inches()
+    lines = textwrap.wrap(verdict, int((wide - 0.16) / VERDICT_LETTER))
+    taken = 0.1 + HEAD_LINE + VERDICT_LINE * len(lines)
+    whole = tall + taken
+    figure.set_size_inches(wide, whole)
+    engine: Any = figure.get_layout_engine()
+    engine.set(rect=(0.0, 0.0, 1.0, tall / whole), w_pad=TICK_LABEL)
+    common: dict[str, Any] = {"ha": "left", "va": "baseline", "parse_math": False}
+    figure.text(0.08 / wide, 1 - 0.2 / whole, title, fontsize=10, fontweight="bold", **common)
+    for number, line in enumerate(lines, start=1):
+        place = 1 - (HEAD_LINE + VERDICT_LINE * number - 0.02) / whole
+        figure.text(0.08 / wide, place, line, fontsize=8, color="0.25", **common)
 
 
 def panel_letters(*panels: Axes) -> None:

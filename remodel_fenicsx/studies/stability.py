@@ -18,7 +18,7 @@ from remodel_fenicsx.model.laws import LAWS
 from remodel_fenicsx.results.run_folder import RunFolder, chosen_folder
 from remodel_fenicsx.scene import Scene, SceneError
 from remodel_fenicsx.simulation import Simulation
-from remodel_fenicsx.studies.page import COLOURS, STYLE, Page
+from remodel_fenicsx.studies.page import COLOURS, STYLE, Page, add_head
 from remodel_fenicsx.system.environment import versions
 from remodel_fenicsx.system.interrupts import PAUSE, StopRequest, end_all_ranks_on_exception
 from remodel_fenicsx.system.terminal import Progress, hold_log, open_log
@@ -190,9 +190,7 @@ def draw(table: Table, folder: Path, scene: Scene, share: float) -> None:
         figure = Figure(figsize=(5.2, 3.4), layout="constrained")
         FigureCanvasAgg(figure)
         axes = figure.add_subplot()
-        axes.axhspan(-1, 1, color=COLOURS[2], alpha=0.12, linewidth=0)
-        axes.annotate("stable", (0.99, -1), xycoords=("axes fraction", "data"), xytext=(0, 3), ha="right", va="bottom",
-                      textcoords="offset points", color=COLOURS[2])  # fmt: skip
+        axes.axhspan(-1, 1, color=COLOURS[2], alpha=0.12, linewidth=0, label="stable: from −1 to 1")
         axes.plot(table["time"], table["factor"], "o-", markersize=4, color=COLOURS[1], label="whole pass")
         if share != 1.0:
             label = f"the share {share:g} of it that is made"
@@ -206,7 +204,8 @@ def draw(table: Table, folder: Path, scene: Scene, share: float) -> None:
         axes.set_ylim(1.3 * lowest, 1.2)
         axes.set_xlim(left=0)
         axes.set_xlabel("time")
-        axes.set_ylabel("factor of a pass, most negative")
-        axes.set_title(title)
+        axes.set_ylabel("factor of one pass on the\nworst small change of the cells")
         figure.legend(loc="outside lower center", ncols=2)
+        unseen = unseen_by(scene)
+        add_head(figure, title, verdict(table) + (f" But {unseen}." if unseen else ""))
         page.save_figure(figure, made_with)

@@ -1,0 +1,109 @@
+"""The pictures of studies: title, verdict, units; nothing lies on anything else, or beyond the edge."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from remodel_fenicsx.scene.scene import Scene, preset_scene
+from remodel_fenicsx.studies import ensemble, stability, trade
+from remodel_fenicsx.studies.estimates import estimated
+from remodel_fenicsx.studies.ladder import ladder
+from remodel_fenicsx.studies.page import Page
+from tests.studies.test_trade import artery, made_up
+
+
+def an_ensemble(seeds: int) -> tuple[ensemble.Ensemble, Scene]:
+    scene = preset_scene("kuhl-holzapfel-2007", "tube").with_values({"geometry.length_unit": "mm"})
+    time, rng = np.arange(0.0, 151.0), np.random.default_rng(1)
+    names = ("inner_radius", "outer_radius", "fibre_angle_inner", "fibre_angle_outer", "max_chain_extension")
+    columns = {name: 1 + rng.normal(0, 0.1, (seeds, 1)) * time for name in names}
+    isotropic = {name: 1 + 0.01 * time for name in names}
+    return ensemble.Ensemble(time, columns, isotropic, {}, frozenset({"max_chain_extension"})), scene
+
+
+def an_analysis(factor: float) -> stability.Table:
+    count = 10
+    table = {name: [1.0] * count for name in ("time", "factor", "factor_of_coupling", "growing_factor", "stable_share")}
+    return table | {
+        "time": list(np.linspace(15.0, 150.0, count)),
+        "factor": list(np.linspace(0.0, factor, count)),
+        "factor_of_coupling": list(np.linspace(0.0, 0.5 + factor / 2, count)),
+    }
+
+
+def the_ensemble(folder: Path, seeds: int) -> str:
+    found, scene = an_ensemble(seeds)
+    ensemble.draw(found, folder, scene)
+    return ensemble.verdict(found, 150.0)
+
+
+def the_analysis(folder: Path, factor: float) -> str:
+    scene = preset_scene("kuhl-holzapfel-2007", "tube").with_values(
+        {"cells.initial": "isotropic", "model.kinematics": "radial"}
+    )
+    stability.draw(an_analysis(factor), folder, scene, 0.5)
+    return stability.verdict(an_analysis(factor))
+
+
+def the_trade(folder: Path, noise: float) -> str:
+    rows, notes = estimated([made_up(setting, noise=noise) for setting in ladder(artery())])
+    trade.write(trade.Trade(rows, notes, [], {}), folder, artery())
+    return trade.verdict(rows)
+
+
+@pytest.mark.parametrize(("study", "value", "labels"), [
+    (the_ensemble, 8, {"inner radius, mm", "fibre angle inner, °", "largest r/L", "time"}),
+    (the_ensemble, 3, {"outer radius, mm"}),
+    (the_analysis, -0.5, {"factor of one pass on the\nworst small change of the cells"}),
+    (the_analysis, -300.0, {"time"}),
+    (the_trade, 0.0, {"seconds of the processor", "error of the fibre angle, degrees"}),
+    (the_trade, 0.3, {"seconds of the processor"}),
+])  # fmt: skip
+def test_a_picture_says_its_answer_and_every_word_can_be_read(
+    study: Callable[[Path, float], str], value: float, labels: set[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found: list[tuple[Page, Figure]] = []
+    save = Page.save_figure
+
+    def saved(page: Page, figure: Figure, made_with: str) -> None:
+        save(page, figure, made_with)
+        figure.draw_without_rendering()  # in its own dots an inch
+        found.append((page, figure))
+
+    monkeypatch.setattr(Page, "save_figure", saved)
+    verdict = study(tmp_path, value)
+    ((page, figure),) = found
+    words = [text.get_text() for text in figure.texts]
+    assert words[0] == page.title and " ".join(words[1:]).startswith(verdict)
+    said = {text for axes in figure.axes for text in (axes.get_xlabel(), axes.get_ylabel())}
+    assert labels <= said and not any("_" in text for text in said)
+    boxes = [text.get_window_extent() for text in figure.texts]
+    boxes += [legend.get_window_extent() for legend in figure.legends]
+    boxes += [box for axes in figure.axes if axes.axison and (box := axes.get_tightbbox()) is not None]
+    assert len(figure.legends) >= 1 and all(not axes.get_legend() for axes in figure.axes)
+    for number, box in enumerate(boxes):
+        assert figure.bbox.x0 <= box.x0 and box.x1 <= figure.bbox.x1, number
+        assert figure.bbox.y0 <= box.y0 and box.y1 <= figure.bbox.y1, number
+        assert not any(box.padded(-1).overlaps(other) for other in boxes[:number]), number
+
+
+def test_the_verdict_on_settings_is_that_of_trusted_ones() -> None:
+    rows, _ = estimated([made_up(setting) for setting in ladder(artery())])
+    good = [row for row in rows if row.angle_error <= 1.0 and not row.doubt]
+    cheapest = min(good, key=lambda row: (row.result.seconds, row.angle_error))
+    assert cheapest.on_front
+    said = f"{cheapest.result.seconds:.2g} s of the processor for an error of {cheapest.angle_error:.2g} degrees."
+    assert trade.verdict(rows).startswith("The cheapest setting within 1 degree is ")
+    assert trade.verdict(rows).endswith(said)
+    others = [dataclasses.replace(row, doubt="noise") if row is cheapest else row for row in rows]
+    assert not trade.verdict(others).endswith(said)
+    coarse = [row for row in rows if row.angle_error > 1.0]
+    assert trade.verdict(coarse).startswith("No setting is known to be within 1 degree; the closest is ")
+    doubted = [dataclasses.replace(row, doubt="noise") for row in rows]
+    assert trade.verdict(doubted) == f"Not known: all {len(rows)} errors are doubted; trade.csv says why."
