@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from tests.conftest import mpirun, slowly
 from tests.forks import forked
+from tests.session import pytest_collection
 
 PROJECT = Path(__file__).resolve().parents[2]
 RANK = "import os, sys, time; from mpi4py import MPI; open(f'{sys.argv[1]}/{os.getpid()}', 'w'); MPI.COMM_WORLD.recv()"
@@ -149,3 +152,21 @@ def test_the_launchers_key_changes_with_its_files(monkeypatch: pytest.MonkeyPatc
         with (tmp_path / name).open("a") as file:
             file.write("\n")
         assert plugin.launcher_key() != last, name
+
+
+def test_a_file_that_is_skipped_as_a_whole_does_not_end_the_session(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As the tests in a browser are, where there is none: each worker imports all files before it collects them."""
+    worker = {"workerid": "gw0", "workercount": 1}
+    config = SimpleNamespace(workerinput=worker, args_source=pytest.Config.ArgsSource.TESTPATHS)
+    asked: list[str] = []
+
+    def imported(name: str) -> None:
+        asked.append(name)
+        pytest.skip("there is none", allow_module_level=True)
+
+    monkeypatch.setattr(importlib, "import_module", imported)
+    try:
+        pytest_collection(SimpleNamespace(config=config))  # type: ignore[arg-type]
+    except pytest.skip.Exception:
+        pytest.fail("the first file that is skipped ends the worker")
+    assert asked == sorted(asked) and __name__ in asked
