@@ -497,7 +497,7 @@ def test_runs_that_go_on_say_what_one_run_says(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr(over_correction, "RESTED_SHARE", 1.0)
     monkeypatch.setattr(OverCorrection, "_advice", lambda watcher, factor: "nothing")
     monkeypatch.setattr(LockingWarning, "stiffness_ratio", lambda watcher: 1e9)
-    monkeypatch.setattr(LockingWarning, "missing", lambda watcher: Missing(1.0, 0.0))
+    monkeypatch.setattr(LockingWarning, "_missing", lambda watcher, *energies: Missing(1.0, 0.0))
     monkeypatch.setattr(equilibrium_stability, "ITERATIONS_BETWEEN_LOOKS", 9)
     counts: list[int] = []
     count = EquilibriumStability._count
