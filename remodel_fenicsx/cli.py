@@ -10,7 +10,6 @@ import shlex
 import sys
 import time as clock
 import traceback
-import webbrowser
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
@@ -24,7 +23,7 @@ from remodel_fenicsx.system import interrupts
 from remodel_fenicsx.system.arguments import megabytes, positive, wall_time
 from remodel_fenicsx.system.children import SERVE, serve
 from remodel_fenicsx.system.environment import kernels, reason_undrawable, reason_unusable, versions
-from remodel_fenicsx.system.regular_files import ForeignFileError
+from remodel_fenicsx.system.regular_files import ForeignFileError, write_new
 
 BAD_INPUT, SOLVE_FAILED, STOPPED, BAD_ENVIRONMENT = 2, 3, interrupts.PAUSED, 5
 STUDY_STOPPED = "stopped; all that is recorded is kept, the same command goes on"
@@ -374,8 +373,11 @@ def _report(options: argparse.Namespace) -> int:
     size = written.stat().st_size / 1e6
     if size > options.size:
         _complain(f"warning: it has {size:.3g} MB, more than --size {options.size:g}: two times of this body need that")
-    if options.open and not webbrowser.open(written.resolve().as_uri()):
-        _complain(f"warning: no browser is to be found from here; open {written} in yours")
+    if options.open:
+        import webbrowser  # slow to import, and seldom asked for
+
+        if not webbrowser.open(written.resolve().as_uri()):
+            _complain(f"warning: no browser is to be found from here; open {written} in yours")
     return 0
 
 
@@ -453,8 +455,7 @@ def _schema(options: argparse.Namespace) -> int:
     if not interrupts.is_first_rank():  # the work of one process
         return 0
     try:
-        with open(options.output, "x", encoding="utf-8") as file:
-            file.write(text + "\n")
+        write_new(options.output, f"{text}\n".encode())
     except FileExistsError:
         return _fail(f"-o {options.output}: exists; allowed is a file that does not", BAD_INPUT)
     except OSError as error:

@@ -21,11 +21,11 @@ from remodel_fenicsx.pictures.bodies import (
     layers,
     place,
     radii,
-    rank_of,
 )  # fmt: skip
 from remodel_fenicsx.pictures.rendering import Picture, View, render
 from remodel_fenicsx.paper.runs import ELONGATION_COLUMN, LOAD_CASES, load_case_name, made_with
 from remodel_fenicsx.results.recording import Recording
+from remodel_fenicsx.results.whole_body import rank_of
 from remodel_fenicsx.studies.page import COLOURS, Page, panel_letters
 
 TENDON_TIMES = (1.0, 12.0, 25.0, 50.0, 150.0)

@@ -26,7 +26,7 @@ from remodel_fenicsx.results.drawing import (
     LEVELS,
 )
 from remodel_fenicsx.results.recording import Recording
-from remodel_fenicsx.results.whole_body import WholeBody
+from remodel_fenicsx.results.whole_body import WholeBody, rank_of
 
 Array = NDArray[np.float64]
 Table = dict[str, NDArray[Any]]  # columns by name, all of one length
@@ -117,13 +117,6 @@ class DrawnBody:
         _, number, count = np.unique(np.sort(faces, axis=1), axis=0, return_inverse=True, return_counts=True)
         alone = count[np.ravel(number)] == 1
         return faces[alone], np.repeat(elements, len(of_one))[alone]
-
-
-def rank_of(values: Array) -> NDArray[np.int64]:
-    """Number of each value among the distinct ones, ascending, from 0: layers, rows or columns of a regular mesh."""
-    ordered = np.sort(values)
-    starts = np.concatenate([[True], np.diff(ordered) > 1e-6 * (ordered[-1] - ordered[0])])
-    return np.searchsorted(ordered[starts], values + 1e-7 * (ordered[-1] - ordered[0])) - 1
 
 
 def radii(points: Array, elements: NDArray[np.int64]) -> Array:

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from remodel_fenicsx.report.card import Array
 from remodel_fenicsx.report.packing import of_angles, of_places, of_vectors
 from remodel_fenicsx.results.chain_lines import AXIS_FIELDS
-from remodel_fenicsx.results.recording import Recording
 from remodel_fenicsx.results.whole_body import WholeBody
 
 Numbers = NDArray[np.float64]
@@ -26,41 +25,31 @@ class ShownBody:
 
     Attributes
     ----------
+    whole
+        The body, (n) points and (m) elements.
     times
         That are shown, (t,).
-    points
-        Of the reference body, (n, 3): nodes that are corners.
-    elements
-        Corners in VTK's order, (m, 8 or 4).
-    layer, depth
-        Number of each element's layer, (m,); mean depth of each layer, from 0 to 1.
     volume
         Of each element in the reference body, as a share of all, (m,).
     position
         Of the points, (t, n, 3).
     angle, extension, edges
         Deformed fibre angle in degrees (t, m), largest r/L (t, m), l_I F n_I (t, m, 3, 3); None if not recorded.
-    is_turned
-        Whether a reduction was solved.
     is_deformed
         Whether displacements were recorded.
     """
 
+    whole: WholeBody
     times: Numbers
-    points: Numbers
-    elements: NDArray[np.int64]
-    layer: NDArray[np.int64]
-    depth: Numbers
     volume: Numbers
     position: NDArray[np.float32]
     angle: NDArray[np.float32] | None
     extension: NDArray[np.float32] | None
     edges: NDArray[np.float32] | None
-    is_turned: bool
     is_deformed: bool
 
     @classmethod
-    def of(cls, recording: Recording, times: Numbers) -> ShownBody:
+    def of(cls, whole: WholeBody, times: Numbers) -> ShownBody:
         """What a run has recorded at these times.
 
         Raises
@@ -68,31 +57,28 @@ class ShownBody:
         RecordingError
             If the fields are damaged.
         """
-        whole = WholeBody(recording)
-        points, elements = whole.points, whole.elements
-        volume = _volumes(points[elements])
         rows: dict[str, list[NDArray[np.float32]]] = {name: [] for name in ("position", "angle", "extension", "edges")}
         is_deformed = True
         for time in times:
             displacement, found = whole.fields(float(time), NAMES)
             is_deformed = displacement is not None
             moved = 0.0 if displacement is None else displacement
-            rows["position"].append((points + moved).astype(np.float32))
+            rows["position"].append((whole.points + moved).astype(np.float32))
             for name, values in _of_elements(found).items():
                 rows[name].append(values.astype(np.float32))
-        series = {name: np.stack(values) if values else None for name, values in rows.items()}
-        known: Any = {**series, "is_turned": whole.is_turned, "is_deformed": is_deformed}
-        return cls(times, points, elements, whole.layer, whole.depth, volume, **known)
+        series: Any = {name: np.stack(values) if values else None for name, values in rows.items()}
+        volume = _volumes(whole.points[whole.elements])
+        return cls(whole, times, volume, **series, is_deformed=is_deformed)
 
     def arrays(self) -> tuple[dict[str, Array], dict[str, Any]]:
         """The same in few bytes, and the numbers that lead back."""
         position, origin, step = of_places(self.position)
-        size = np.uint16 if len(self.points) <= 65536 else np.uint32
+        size = np.uint16 if len(self.whole.points) <= 65536 else np.uint32
         arrays = {
-            "elements": Array(self.elements.astype(size)),
-            "layer": Array(self.layer.astype(np.uint8)),
+            "elements": Array(self.whole.elements.astype(size)),
+            "layer": Array(self.whole.layer.astype(np.uint8)),
             "volume": Array(self.volume.astype(np.float32)),
-            "reference": Array(self.points.astype(np.float32)),
+            "reference": Array(self.whole.points.astype(np.float32)),
             "position": Array(position, differences=True),
         }
         scales: dict[str, Any] = {"origin": origin, "position_step": step}
@@ -104,11 +90,6 @@ class ShownBody:
             edges, scales["edge_step"] = of_vectors(self.edges)
             arrays["edges"] = Array(edges.reshape(*edges.shape[:2], 9), differences=True)
         return arrays, scales
-
-    @property
-    def bytes_of_a_time(self) -> int:
-        """Before anything is deflated."""
-        return 6 * len(self.points) + 11 * len(self.elements)
 
 
 def _of_elements(fields: dict[str, Numbers]) -> dict[str, Numbers]:

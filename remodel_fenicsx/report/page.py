@@ -19,8 +19,8 @@ from remodel_fenicsx.report.parts import ASSETS, ReportedRun, cards, data_of
 from remodel_fenicsx.report.story import Story
 from remodel_fenicsx.results.kept_times import kept_times
 from remodel_fenicsx.results.recording import Recording
-from remodel_fenicsx.results.whole_body import has_a_body
-from remodel_fenicsx.system.regular_files import read_regular, write_whole
+from remodel_fenicsx.results.whole_body import WholeBody, has_a_body
+from remodel_fenicsx.system.regular_files import read_regular, write_new, write_whole
 
 REPORT = "report.html"
 PAGE_SIZE = 20.0  # MB that a page has at most, if it need not be larger for two times
@@ -63,13 +63,16 @@ def write_report(folder: str | os.PathLike[str], path: Path | None = None, size:
         If it cannot be read or written.
     """
     recording = Recording(folder)
-    if path is not None and (path.exists() or path.is_symlink()):
-        raise ReportError(f"-o {path}: is there already; allowed is a new file")
-    path = path or recording.path / REPORT
+    if path is not None:
+        try:
+            write_new(path, page_of(recording, size).encode("utf-8"))
+        except FileExistsError as error:
+            raise ReportError(f"-o {path}: is there already; allowed is a new file") from error
+        return path
+    path = recording.path / REPORT
     if path.exists() and GENERATOR_TAG not in read_regular(path, LARGEST_PAGE)[:4096]:
         raise ReportError(f"{path}: is no report of this command and is not overwritten; choose another file with -o")
-    page = page_of(recording, size)
-    write_whole(path, page.encode("utf-8"))
+    write_whole(path, page_of(recording, size).encode("utf-8"))
     return path
 
 
@@ -78,9 +81,9 @@ def page_of(recording: Recording, size: float = PAGE_SIZE) -> str:
     story = Story.of(recording)
     if not has_a_body(recording):
         return _page(cards(ReportedRun(recording, story, None)))
-    most = _times_at_most(recording, size)
+    whole, most = WholeBody(recording), _times_at_most(recording, size)
     for _ in range(TRIES):
-        body = ShownBody.of(recording, kept_times(story.history, recording.times, most))
+        body = ShownBody.of(whole, kept_times(story.history, recording.times, most))
         found = cards(ReportedRun(recording, story, body))
         page = _page(found)
         if len(page) <= 1e6 * size or len(body.times) <= FEWEST_TIMES:

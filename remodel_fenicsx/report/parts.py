@@ -117,7 +117,7 @@ def view(run: ReportedRun) -> Card | None:
         return Card("no_view", section("The body", f'<p class="note">{text}</p>', "whole"))
     arrays, scales = body.arrays()
     data = {
-        **scales, "times": [float(time) for time in body.times], "layers": len(body.depth),
+        **scales, "times": [float(time) for time in body.times], "layers": len(body.whole.depth),
         "words": run.recording.scene.geometry.angle_in_words, "colours": ANGLE_COLOURS, "ambient": AMBIENT,
         "views": VIEWS,
         "least_extension": 0.0 if body.extension is None else float(np.floor(20 * np.nanmin(body.extension)) / 20),
@@ -125,7 +125,7 @@ def view(run: ReportedRun) -> Card | None:
                   "lift": CHAIN_LIFT},
     }  # fmt: skip
     html = (ASSETS / "view.html").read_text(encoding="utf-8")
-    html = html.replace("@OPTIONS@", _ways_to_show(arrays)).replace("@LAST_LAYER@", str(len(body.depth) - 1))
+    html = html.replace("@OPTIONS@", _ways_to_show(arrays)).replace("@LAST_LAYER@", str(len(body.whole.depth) - 1))
     html = html.replace("@NOTES@", "".join(f'<p class="note">{escape(note)}</p>' for note in _notes(run, body)))
     return Card("view", html, data, arrays)
 
@@ -144,7 +144,7 @@ def _ways_to_show(arrays: Mapping[str, Array]) -> str:
 def _notes(run: ReportedRun, body: ShownBody) -> list[str]:
     """What is to be known of the view."""
     found = []
-    if body.is_turned:
+    if body.whole.is_turned:
         found.append(f"Solved with the kinematics {run.recording.scene.model.kinematics!r}, shown as the whole body.")
     if not body.is_deformed:
         found.append("Displacements were not recorded: this is the reference body.")
@@ -163,9 +163,9 @@ def angles(run: ReportedRun) -> Card | None:
     legend = '<p class="note">Red: now, mean and 10 to 90 % of the volume. Grey: other times.</p>'
     profile = section(f"Collagen angle {through}, deformed", f'<div id="profile"></div>{legend}', "narrow")
     rose = section("Where the collagen points, by volume", '<div id="rose"></div>', "narrow")
-    data = {"depth": body.depth.tolist(), "through": f"{through} (0 {start}, 1 {end})", "along": along,
+    data = {"depth": body.whole.depth.tolist(), "through": f"{through} (0 {start}, 1 {end})", "along": along,
             "across": across, "colours": ANGLE_COLOURS}  # fmt: skip
-    return Card("angles", f'<div class="stack">{profile if len(body.depth) > 1 else ""}{rose}</div>', data)
+    return Card("angles", f'<div class="stack">{profile if len(body.whole.depth) > 1 else ""}{rose}</div>', data)
 
 
 # ---------------------------------------------------------------- curves

@@ -91,12 +91,17 @@ def has_a_body(recording: Recording) -> bool:
 
 def _layers(depth: Numbers) -> tuple[NDArray[np.int64], Numbers]:
     """Number of each element's layer and the mean depth of each: those of the mesh, or equal parts of the way."""
-    ordered = np.sort(depth)
-    starts = np.concatenate([[True], np.diff(ordered) > 1e-6])
-    if starts.sum() <= MOST_LAYERS:
-        layer = np.searchsorted(ordered[starts], depth + 1e-7) - 1
-    else:
+    layer = rank_of(depth)
+    if layer.max() >= MOST_LAYERS:
         layer = np.minimum((FEW_LAYERS * np.clip(depth, 0.0, 1.0)).astype(np.int64), FEW_LAYERS - 1)
         layer = np.unique(layer, return_inverse=True)[1].reshape(-1)  # none without an element
     counts = np.bincount(layer)
     return layer, np.bincount(layer, weights=depth) / counts
+
+
+def rank_of(values: Numbers) -> NDArray[np.int64]:
+    """Number of each value among the distinct ones, ascending, from 0: layers, rows or columns of a regular mesh."""
+    ordered = np.sort(values)
+    size = np.ptp(ordered) or 1.0  # of one layer there is no range
+    starts = np.concatenate([[True], np.diff(ordered) > 1e-6 * size])
+    return np.searchsorted(ordered[starts], values + 1e-7 * size) - 1
