@@ -312,6 +312,51 @@ def test_made_once_from_the_list(rooted):
     assert "trixie" in arguments
 
 
+RUN_OF_A_DEMO = r"""#!/bin/bash
+printf '%s\n' "$*" >> "$RECORD/demos"
+echo $$ > "$RECORD/demo-process"
+case ${STUB_DEMO:-} in fail) echo "no compiler" >&2; exit 3 ;; hang) exec sleep 300 ;; esac
+"""
+
+
+@pytest.fixture
+def with_demos(rooted):
+    """A clone with two demos, and a stand-in for the command that runs them."""
+    (rooted.folder / "demos").mkdir()
+    for name in ("one", "two"):
+        (rooted.folder / "demos" / f"{name}.toml").touch()
+    script(rooted.folder / "bin" / "remodel-fenicsx", RUN_OF_A_DEMO)
+    return rooted
+
+
+def test_a_new_environment_compiles_what_the_demos_need(with_demos):
+    assert with_demos.run("echo", "done").stdout == "done\n"
+    assert with_demos.run("true").stderr == ""
+    first, second = (with_demos.record / "demos").read_text().splitlines()
+    assert first.startswith(f"run {with_demos.folder}/demos/one.toml --set time.end=1 ") and "two.toml" in second
+    folder = Path(first.split(" -o ")[1]).parent
+    assert not folder.exists() and not folder.is_relative_to(with_demos.folder)
+
+
+def test_demos_that_do_not_compile_are_one_line_each(with_demos):
+    found = with_demos.run("echo", "done", environment={"STUB_DEMO": "fail"})
+    assert (found.returncode, found.stdout) == (0, "done\n")
+    lines = [line for line in found.stderr.splitlines() if "could not compile" in line]
+    assert [line.endswith("its runs will: no compiler") for line in lines] == [True, True]
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_no_compilation_outlives_the_launcher(with_demos, number):
+    process = with_demos.start("true", environment={"STUB_DEMO": "hang"}, stderr=subprocess.DEVNULL)
+    wait_for((with_demos.record / "demo-process").exists, "the run of a demo")
+    wait_for((with_demos.record / "demo-process").read_text, "its number")
+    demo = Path("/proc") / (with_demos.record / "demo-process").read_text().strip()
+    os.kill(process.pid, number)
+    process.wait(timeout=LONG)
+    wait_for(lambda: not demo.exists(), "the end of the demo")
+    assert len((with_demos.record / "demos").read_text().splitlines()) == 1
+
+
 def test_key_is_the_list_and_the_release(rooted):
     rooted.run("true")
     rooted.packages.write_text(rooted.packages.read_text() + "# a comment changes nothing\n\n")
