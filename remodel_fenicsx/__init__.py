@@ -20,7 +20,8 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from remodel_fenicsx.results.recording import Recording, RecordingError
+    from remodel_fenicsx.recording import Recording
+    from remodel_fenicsx.results.recording import RecordingError
     from remodel_fenicsx.running import run
     from remodel_fenicsx.scene import Scene, SceneError, preset_scene, read_scene
     from remodel_fenicsx.simulation import Simulation
@@ -29,7 +30,8 @@ if TYPE_CHECKING:
 __getattr__ = on_demand(
     __name__,
     {
-        **dict.fromkeys(("Recording", "RecordingError"), "results.recording"),
+        "Recording": "recording",
+        "RecordingError": "results.recording",
         "run": "running",
         **dict.fromkeys(("Scene", "SceneError", "preset_scene", "read_scene"), "scene"),
         "Simulation": "simulation",

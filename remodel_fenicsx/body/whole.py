@@ -31,7 +31,7 @@ def revolved(points: Array, quadrilaterals: Corners) -> Body:
     found = np.stack([np.outer(np.cos(angles), radii).ravel(), np.outer(np.sin(angles), radii).ravel(), z], axis=1)
     start = np.arange(ROUND)[:, None, None] * len(points)
     here, next_one = start + quadrilaterals, np.roll(start, -1, axis=0) + quadrilaterals
-    return found, np.concatenate([here, next_one], axis=-1).reshape(-1, 8)
+    return found, _oriented(found, np.concatenate([here, next_one], axis=-1).reshape(-1, 8))
 
 
 def mirrored_twice(points: Array, elements: Corners) -> Body:
@@ -41,7 +41,23 @@ def mirrored_twice(points: Array, elements: Corners) -> Body:
     places = np.rint(copies / (1e-7 * np.abs(points).max())).astype(np.int64)
     _, first, number = np.unique(places, axis=0, return_index=True, return_inverse=True)
     every = (np.arange(4)[:, None, None] * len(points) + elements).reshape(-1, elements.shape[1])
-    return copies[first], np.ravel(number)[every]
+    return copies[first], _oriented(copies[first], np.ravel(number)[every])
+
+
+# corners of one side and of the side across from it, for each of three directions, and the order of the mirror image
+_SIDES = {
+    8: (((0, 3, 4, 7), (1, 2, 5, 6)), ((0, 1, 4, 5), (2, 3, 6, 7)), ((0, 1, 2, 3), (4, 5, 6, 7))),
+    4: (((0,), (1,)), ((0,), (2,)), ((0,), (3,))),
+}
+_MIRRORED = {8: (0, 3, 2, 1, 4, 7, 6, 5), 4: (0, 2, 1, 3)}
+
+
+def _oriented(points: Array, elements: Corners) -> Corners:
+    """The same hexahedra or tetrahedra, all of positive volume as VTK has them."""
+    size = elements.shape[1]
+    along = [points[elements[:, b]].mean(axis=1) - points[elements[:, a]].mean(axis=1) for a, b in _SIDES[size]]
+    is_mirrored = np.linalg.det(np.stack(along, axis=1)) < 0
+    return np.where(is_mirrored[:, None], elements[:, _MIRRORED[size]], elements)
 
 
 def divided_along(points: Array, hexahedra: Corners) -> Body:

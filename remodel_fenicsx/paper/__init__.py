@@ -16,7 +16,7 @@ from mpi4py import MPI
 from remodel_fenicsx.paper import curves, structures
 from remodel_fenicsx.paper.runs import KAPPAS, LOAD_CASES, load_case_name, obtain, scenes
 from remodel_fenicsx.pictures import bodies
-from remodel_fenicsx.results.recording import Recording
+from remodel_fenicsx.results.recording import RecordedRun
 from remodel_fenicsx.studies.page import FORMATS, STYLE, FigureError, Page, check_folder
 from remodel_fenicsx.system.children import cores
 from remodel_fenicsx.system.terminal import Line
@@ -50,7 +50,7 @@ class FigureSpec:
     title: str
     caption: str
     runs: tuple[str, ...]
-    draw: Callable[[dict[str, Recording], Page], None]
+    draw: Callable[[dict[str, RecordedRun], Page], None]
 
 
 FIGURES: dict[str, FigureSpec] = {
@@ -177,7 +177,7 @@ def draw(
     known = scenes()
     needed = dict.fromkeys(run for name in chosen for run in FIGURES[name].runs)
     recorded = obtain([known[run] for run in needed], runs, jobs or cores())
-    recordings = {name: Recording(path) for name, path in recorded.items()}
+    recordings = {name: RecordedRun(path) for name, path in recorded.items()}
     progress, written = Line("figures"), []
     for number, name in enumerate(chosen, start=1):
         progress.show(f"drawing {name} ({number}/{len(chosen)})", at_once=True)

@@ -11,7 +11,7 @@ from remodel_fenicsx.pictures.bodies import Array, DrawnBody, Table, angle_scale
 from remodel_fenicsx.pictures.rendering import render
 from remodel_fenicsx.paper.runs import KAPPAS, first_cells, made_with
 from remodel_fenicsx.paper.structures import SOLVED, at, joined, layer_table, peeled, tube_picture, wall_table
-from remodel_fenicsx.results.recording import Recording
+from remodel_fenicsx.results.recording import RecordedRun
 from remodel_fenicsx.studies.page import COLOURS, Page, panel_letters
 
 PERSISTENCE_LENGTHS = (0.1, 0.4, 0.8)  # Remark 1
@@ -24,7 +24,7 @@ DRIVER_LABELS = {
 PLACES = {"inner": ":", "middle": "--", "outer": "-"}
 
 
-def draw_chain_force(runs: dict[str, Recording], page: Page) -> None:
+def draw_chain_force(runs: dict[str, RecordedRun], page: Page) -> None:
     """Fig. 1: the force of a single chain."""
     extension = np.linspace(0.0, 0.95, 191)
     force = {A: CHAINS["wormlike"].force(extension, 1.0, A) for A in PERSISTENCE_LENGTHS}
@@ -50,7 +50,7 @@ def closed_form_angle(time: Array, kappa: float) -> Array:
     return np.degrees(np.arctan(np.sqrt(2) * (1 - s) / (1 - s + np.sqrt(3) * s)))
 
 
-def draw_alignment(runs: dict[str, Recording], page: Page) -> None:
+def draw_alignment(runs: dict[str, RecordedRun], page: Page) -> None:
     """Fig. 5: how fast the chains of a cube align, for several kappa; circles are the closed form."""
     figure = Figure(figsize=(4.8, 3.3))
     axes = figure.add_axes((0.12, 0.15, 0.84, 0.81))
@@ -77,7 +77,7 @@ def draw_alignment(runs: dict[str, Recording], page: Page) -> None:
 # ---------------------------------------------------------------- through the wall
 
 
-def draw_drivers(runs: dict[str, Recording], page: Page, other: str) -> None:
+def draw_drivers(runs: dict[str, RecordedRun], page: Page, other: str) -> None:
     """Figs. 10 and 11: angle over radius (left), peeled tubes (right), for the Cauchy stress and another driver."""
     pair = {"cauchy": runs["artery"], other: runs[f"artery-{other}"]}
     ends = {driver: DrawnBody.of(run, run.scene.time.end) for driver, run in pair.items()}
@@ -111,7 +111,7 @@ def _draw_profiles(axes: Axes, tables: dict[str, Table]) -> None:
     axes.set_yticks(range(0, 91, 15))
 
 
-def _save_drivers(pair: dict[str, Recording], ends: dict[str, DrawnBody], page: Page) -> None:
+def _save_drivers(pair: dict[str, RecordedRun], ends: dict[str, DrawnBody], page: Page) -> None:
     """Layers, histories and every element that is drawn, of both drivers."""
     made = made_with(pair["cauchy"])
     layers: Table = {}
@@ -131,7 +131,7 @@ def _save_drivers(pair: dict[str, Recording], ends: dict[str, DrawnBody], page: 
     page.save_table(joined(elements), [made, f"the elements that are drawn; {SOLVED}"], "elements")
 
 
-def draw_rate(runs: dict[str, Recording], page: Page) -> None:
+def draw_rate(runs: dict[str, RecordedRun], page: Page) -> None:
     """Erratum 7: eqs. (10) and (11) on the same artery."""
     pair = {"eq. (11), explicit": runs["artery"], "eq. (10), rate": runs["artery-rate"]}
     figure = Figure(figsize=(7.8, 3.6))
@@ -158,7 +158,7 @@ def draw_rate(runs: dict[str, Recording], page: Page) -> None:
     page.save_table(columns, [made, "rows of the two histories, reference angles in degrees"], "history")
 
 
-def _draw_rate_histories(axes: Axes, pair: dict[str, Recording]) -> None:
+def _draw_rate_histories(axes: Axes, pair: dict[str, RecordedRun]) -> None:
     """Angle over time at three places of the wall; a colour for each law, dashes for each place."""
     for (label, run), colour in zip(pair.items(), COLOURS, strict=False):
         for name, dashes in PLACES.items():
@@ -176,7 +176,7 @@ def _draw_rate_histories(axes: Axes, pair: dict[str, Recording]) -> None:
 # ---------------------------------------------------------------- Remark 6
 
 
-def draw_energy(runs: dict[str, Recording], page: Page) -> None:
+def draw_energy(runs: dict[str, RecordedRun], page: Page) -> None:
     """Remark 6: stored energy and power of remodeling over time for cube, tendon and artery."""
     demos = {"cube": runs["cube-0.025"], "tendon": runs["tendon"], "artery": runs["artery"]}
     figure = Figure(figsize=(8.2, 4.2))
@@ -204,7 +204,7 @@ def draw_energy(runs: dict[str, Recording], page: Page) -> None:
     page.save_table(joined(tables), notes)
 
 
-def _draw_energy(above: Axes, below: Axes, run: Recording) -> None:
+def _draw_energy(above: Axes, below: Axes, run: RecordedRun) -> None:
     """Stored energy above; below the power of remodeling, a pass's over the whole of its step."""
     time = run.history["time"]
     above.plot(time, run.history["stored_energy"], color=COLOURS[0])

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from remodel_fenicsx._version import __version__
 from remodel_fenicsx.body.reductions import AUTO, choice
-from remodel_fenicsx.results.recording import Recording, RecordingError
+from remodel_fenicsx.results.recording import RecordedRun, RecordingError
 from remodel_fenicsx.results.run_lock import is_vacant
 from remodel_fenicsx.scene.scene import Scene, SceneError, preset_scene
 from remodel_fenicsx.studies.page import FigureError
@@ -116,7 +116,7 @@ def _is_whole(run: Run) -> bool:
     if not run.folder.exists() or is_vacant(run.folder):
         return False
     try:
-        _ = Recording(run.folder).history
+        _ = RecordedRun(run.folder).history
         return run.is_complete()
     except (SceneError, RecordingError, OSError) as error:
         announce(f"figures: run again: {run.folder}: {' '.join(str(error).split())}")
@@ -127,13 +127,13 @@ def _is_whole(run: Run) -> bool:
 # ---------------------------------------------------------------- what they were made with
 
 
-def first_cells(run: Recording) -> str:
+def first_cells(run: RecordedRun) -> str:
     """How the cells of a run were at first, in words."""
     cells = run.scene.cells
     return f"random cells of seed {cells.seed}" if cells.initial == "random" else f"{cells.initial} cells"
 
 
-def made_with(run: Recording, cells: str | None = None) -> str:
+def made_with(run: RecordedRun, cells: str | None = None) -> str:
     """Package, library and scene of a run, in a line; `cells` says more than `first_cells` of this run alone."""
     scene, versions = run.scene, run.versions
     libraries = ", ".join(f"{name} {versions.get(name, '?')}" for name in ("remodel_fenicsx", "dolfinx"))

@@ -24,7 +24,7 @@ from remodel_fenicsx.pictures.bodies import (
 )  # fmt: skip
 from remodel_fenicsx.pictures.rendering import Picture, View, render
 from remodel_fenicsx.paper.runs import ELONGATION_COLUMN, LOAD_CASES, load_case_name, made_with
-from remodel_fenicsx.results.recording import Recording
+from remodel_fenicsx.results.recording import RecordedRun
 from remodel_fenicsx.results.whole_body import rank_of
 from remodel_fenicsx.studies.page import COLOURS, Page, panel_letters
 
@@ -90,7 +90,7 @@ def tube_picture(snapshot: DrawnBody, shown: Shown, height: float, pixels: tuple
 # ---------------------------------------------------------------- the tendon
 
 
-def draw_tendon(runs: dict[str, Recording], page: Page) -> None:
+def draw_tendon(runs: dict[str, RecordedRun], page: Page) -> None:
     """Fig. 6: stretch over time, and snapshots coloured by the angle to the load axis."""
     run = runs["tendon"]
     snapshots = [DrawnBody.of(run, time) for time in TENDON_TIMES]
@@ -151,7 +151,7 @@ def snapshot_summary(snapshots: Sequence[DrawnBody]) -> Table:
 # ---------------------------------------------------------------- the artery
 
 
-def draw_artery(runs: dict[str, Recording], page: Page) -> None:
+def draw_artery(runs: dict[str, RecordedRun], page: Page) -> None:
     """Fig. 7: five snapshots of the artery."""
     run = runs["artery"]
     snapshots = [DrawnBody.of(run, time) for time in ARTERY_TIMES]
@@ -230,7 +230,7 @@ def local_shear(snapshot: DrawnBody) -> Array:
     return local[:, ~np.eye(3, dtype=bool)]
 
 
-def draw_layers(runs: dict[str, Recording], page: Page) -> None:
+def draw_layers(runs: dict[str, RecordedRun], page: Page) -> None:
     """Fig. 8: the end of Fig. 7, three layers of its wall apart."""
     run = runs["artery"]
     snapshot = DrawnBody.of(run, run.scene.time.end)
@@ -260,7 +260,7 @@ def peeled(snapshot: DrawnBody) -> NDArray[np.bool_]:
     return row < row.max() + 1 - layers(snapshot)
 
 
-def draw_load_cases(runs: dict[str, Recording], page: Page) -> None:
+def draw_load_cases(runs: dict[str, RecordedRun], page: Page) -> None:
     """Fig. 9: the ends of five load cases, the layers virtually peeled off."""
     cases = [runs[load_case_name(*case)] for case in LOAD_CASES]
     snapshots = [DrawnBody.of(run, run.scene.time.end) for run in cases]

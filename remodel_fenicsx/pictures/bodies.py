@@ -25,7 +25,7 @@ from remodel_fenicsx.results.drawing import (
     CHAIN_WIDTH,
     LEVELS,
 )
-from remodel_fenicsx.results.recording import Recording
+from remodel_fenicsx.results.recording import RecordedRun
 from remodel_fenicsx.results.whole_body import WholeBody, rank_of
 
 Array = NDArray[np.float64]
@@ -68,7 +68,7 @@ class DrawnBody:
     fields: dict[str, Array]
 
     @classmethod
-    def of(cls, run: Recording, time: float) -> DrawnBody:
+    def of(cls, run: RecordedRun, time: float) -> DrawnBody:
         """The solved state of a run at a recorded time.
 
         Raises
@@ -161,10 +161,7 @@ def body(snapshot: DrawnBody, shown: Shown = ALL, chains_everywhere: bool = Fals
     chains_everywhere
         On all faces, where cells were recorded; else on those that look away from the z axis.
     """
-    faces, elements = snapshot.exterior(shown)
-    normal = _normals(snapshot.points[faces])
-    flat = np.any(normal, axis=1)  # wedges on an axis are hexahedra with a face of no area
-    faces, elements, normal = faces[flat], elements[flat], normal[flat]
+    faces, elements, normal = outer_faces(snapshot, shown)
     surface = Patch(snapshot.deformed[faces], coloured(snapshot.fields[ANGLE][elements]), edges=True)
     if not set(OF_RIBBONS) <= set(snapshot.fields):
         return [surface]
@@ -174,6 +171,14 @@ def body(snapshot: DrawnBody, shown: Shown = ALL, chains_everywhere: bool = Fals
         away = np.sum(normal[:, :2] * centres[:, :2], axis=1) > 0.5 * np.linalg.norm(centres[:, :2], axis=1)
         faces, elements = faces[away], elements[away]
     return [surface, chains(snapshot, faces, elements)]
+
+
+def outer_faces(snapshot: DrawnBody, shown: Shown = ALL) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
+    """Faces that are seen: nodes (m, 4 or 3), elements (m,), unit normals in the reference body (m, 3)."""
+    faces, elements = snapshot.exterior(shown)
+    normal = _normals(snapshot.points[faces])
+    has_area = np.any(normal, axis=1)  # wedges on an axis are hexahedra with a face of no area
+    return faces[has_area], elements[has_area], normal[has_area]
 
 
 def chains(snapshot: DrawnBody, faces: NDArray[np.int64], elements: NDArray[np.int64]) -> Patch:

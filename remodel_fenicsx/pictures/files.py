@@ -23,7 +23,7 @@ from remodel_fenicsx.pictures.rendering import Pixels
 from remodel_fenicsx.pictures.sheet import ONE, SEVERAL, Sheet
 from remodel_fenicsx.pictures.sight import Sight, Viewing
 from remodel_fenicsx.results.kept_times import kept_times
-from remodel_fenicsx.results.recording import Recording
+from remodel_fenicsx.results.recording import RecordedRun
 from remodel_fenicsx.studies.page import DOTS_PER_INCH, STYLE, About, FigureError, Palette, as_file
 from remodel_fenicsx.system.regular_files import write_new
 
@@ -66,7 +66,7 @@ def draw_picture(
         If the file cannot be written.
     """
     _check_new(path, PICTURES)
-    sight = Sight(Recording(folder), viewing or Viewing())
+    sight = Sight(RecordedRun(folder), viewing or Viewing())
     shown = sight.times(times)
     if len(shown) > MOST_PANELS:
         raise FigureError(f"--time: {len(shown)} times; allowed are {MOST_PANELS} in a picture (animate shows more)", 2)
@@ -112,7 +112,7 @@ def draw_animation(
         raise FigureError(f"--frames {frames}: allowed is a whole number from {FEWEST_FRAMES} to {MOST_FRAMES}", 2)
     ending = path.suffix.lower() if path else ".gif"
     encode = _encoder(ending)
-    sight = Sight(Recording(folder), viewing or Viewing())
+    sight = Sight(RecordedRun(folder), viewing or Viewing())
     if len(sight.recording.times) < FEWEST_FRAMES:
         raise FigureError(f"{sight.recording.path}: fields of one time are recorded, and nothing moves", 2)
     times = [float(time) for time in kept_times(sight.history, sight.recording.times, frames)]

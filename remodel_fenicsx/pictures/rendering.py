@@ -109,7 +109,7 @@ def main(job: str) -> None:
     np.savez(f"{job}.npz", **drawn)
 
 
-def add_patches(plotter: Any, patches: list[Patch], direction: Array, line_width: float = 1.0) -> None:
+def add_patches(plotter: Any, patches: list[Patch], direction: Array | None, line_width: float = 1.0) -> None:
     """Put patches into a PyVista plotter whose light is a headlight.
 
     Parameters
@@ -119,7 +119,8 @@ def add_patches(plotter: Any, patches: list[Patch], direction: Array, line_width
     patches
         What is seen.
     direction
-        Unit vector from the body towards the eye, (3,): what lies on a surface is moved that way.
+        Unit vector from the body towards the eye, (3,): what lies on a surface is moved that way. None: it is moved
+        along its own normal, for a body that will be turned.
     line_width
         Of the edges, in half pixels.
     """
@@ -130,13 +131,21 @@ def add_patches(plotter: Any, patches: list[Patch], direction: Array, line_width
         if not count:
             continue
         faces = np.column_stack([np.full(count, size), np.arange(size * count).reshape(-1, size)]).ravel()
-        surface = pyvista.PolyData((patch.corners + patch.lies_on * direction).reshape(-1, 3), faces)
+        lift = patch.lies_on * (_normal(patch.corners) if direction is None else direction)
+        surface = pyvista.PolyData((patch.corners + lift).reshape(-1, 3), faces)
         surface.cell_data["colour"] = np.rint(255 * patch.colours).astype(np.uint8)
         plotter.add_mesh(
             surface, scalars="colour", rgb=True, show_edges=patch.edges, edge_color="#777777",
             line_width=line_width * 0.5, ambient=AMBIENT, diffuse=1 - AMBIENT, specular=0.0, smooth_shading=False,
             show_scalar_bar=False, culling="back" if patch.lies_on else None,
         )  # fmt: skip
+
+
+def _normal(corners: Array) -> Array:
+    """Unit normals of faces (m, n, 3), as (m, 1, 3)."""
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 1])
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    return (normal / np.where(length > 0, length, 1.0))[:, None]
 
 
 def _draw(picture: Picture) -> Pixels:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from remodel_fenicsx.pictures.bodies import ANGLE, OF_RIBBONS, SHOWN_FIELDS, DrawnBody, body
 from remodel_fenicsx.pictures.rendering import Picture, Pixels, View, render
 from remodel_fenicsx.results.drawing import VIEWS
-from remodel_fenicsx.results.recording import HistoryColumns, Recording
+from remodel_fenicsx.results.recording import HistoryColumns, RecordedRun
 from remodel_fenicsx.results.run_lock import writer
 from remodel_fenicsx.results.status import rows_so_far
 from remodel_fenicsx.results.whole_body import WholeBody, has_a_body
@@ -69,6 +69,34 @@ class Viewing:
         return x, y, z
 
 
+def shown_elements(whole: WholeBody, viewing: Viewing) -> NDArray[np.bool_]:
+    """Which elements are neither peeled nor cut off, (elements,).
+
+    Raises
+    ------
+    FigureError
+        If there are no such layers, or nothing to cut off, with exit code 2.
+    """
+    layers, count = viewing.layers, len(whole.depth)
+    if layers is not None and not 1 <= layers <= count:
+        start = whole.recording.scene.geometry.depth_in_words[1]
+        raise FigureError(f"--layers {layers}: allowed is a whole number from 1 to {count}, from the {start}", 2)
+    return (whole.layer < (layers or count)) & ~_cut_off(whole, viewing.cut)
+
+
+def _cut_off(whole: WholeBody, cut: str | None) -> NDArray[np.bool_]:
+    centres = whole.points[whole.elements].mean(axis=1)
+    middle = (whole.points.min(axis=0) + whole.points.max(axis=0)) / 2
+    slack = 1e-6 * np.ptp(whole.points)  # an element on the border stays
+    is_front, is_right = centres[:, 1] < middle[1] - slack, centres[:, 0] > middle[0] + slack
+    found = {None: np.zeros(len(centres), dtype=bool), "half": is_front, "quarter": is_front & is_right}
+    if cut not in found:
+        raise FigureError(f"--cut {cut}: allowed are {', '.join(CUTS)}", 2)
+    if cut is not None and not found[cut].any():
+        raise FigureError(f"--cut {cut}: no element of this body lies whole in that part of it", 2)
+    return found[cut]
+
+
 class Sight:
     """A run's body and what of it is seen.
 
@@ -92,7 +120,7 @@ class Sight:
         If the folder is damaged.
     """
 
-    def __init__(self, recording: Recording, viewing: Viewing):
+    def __init__(self, recording: RecordedRun, viewing: Viewing):
         self.recording, self.viewing, self.direction = recording, viewing, viewing.direction
         if not has_a_body(recording):
             raise FigureError(f"{recording.path}: the run recorded no fields of a body (output.fields)", 2)
@@ -102,29 +130,12 @@ class Sight:
             raise FigureError(f"{recording.path}: the run recorded no {ANGLE} (output.fields), which colours show", 2)
         self.has_chains = set(OF_RIBBONS) <= recorded
         self.is_deformed = self.whole.is_turned <= ("deformation_gradient" in recorded) and "displacement" in recorded
-        self.shown = self._in_layers() & ~self._cut_off()
+        self.shown = shown_elements(self.whole, viewing)
 
     @cached_property
     def history(self) -> HistoryColumns:
         """Of the run, which may still be under way."""
         return rows_so_far(self.recording, writer(self.recording.path)[1])
-
-    def _in_layers(self) -> NDArray[np.bool_]:
-        layers, count = self.viewing.layers, len(self.whole.depth)
-        if layers is not None and not 1 <= layers <= count:
-            start = self.recording.scene.geometry.depth_in_words[1]
-            raise FigureError(f"--layers {layers}: allowed is a whole number from 1 to {count}, from the {start}", 2)
-        return self.whole.layer < (layers or count)
-
-    def _cut_off(self) -> NDArray[np.bool_]:
-        centres = self.whole.points[self.whole.elements].mean(axis=1)
-        middle = (self.whole.points.min(axis=0) + self.whole.points.max(axis=0)) / 2
-        slack = 1e-6 * np.ptp(self.whole.points)  # an element on the border stays
-        is_front, is_right = centres[:, 1] < middle[1] - slack, centres[:, 0] > middle[0] + slack
-        found = {None: np.zeros(len(centres), dtype=bool), "half": is_front, "quarter": is_front & is_right}
-        if self.viewing.cut is not None and not found[self.viewing.cut].any():
-            raise FigureError(f"--cut {self.viewing.cut}: no element of this body lies whole in that part of it", 2)
-        return found[self.viewing.cut]
 
     def times(self, wanted: Sequence[float] | None) -> list[float]:
         """The recorded times nearest to these, each once; the last one where none are wanted.

@@ -18,7 +18,7 @@ from remodel_fenicsx.report.packing import packed
 from remodel_fenicsx.report.parts import ASSETS, ReportedRun, cards, data_of
 from remodel_fenicsx.report.story import Story
 from remodel_fenicsx.results.kept_times import kept_times
-from remodel_fenicsx.results.recording import Recording
+from remodel_fenicsx.results.recording import RecordedRun
 from remodel_fenicsx.results.whole_body import WholeBody, has_a_body
 from remodel_fenicsx.system.regular_files import read_regular, write_new, write_whole
 
@@ -62,7 +62,7 @@ def write_report(folder: str | os.PathLike[str], path: Path | None = None, size:
     OSError
         If it cannot be read or written.
     """
-    recording = Recording(folder)
+    recording = RecordedRun(folder)
     if path is not None:
         try:
             write_new(path, page_of(recording, size).encode("utf-8"))
@@ -76,7 +76,7 @@ def write_report(folder: str | os.PathLike[str], path: Path | None = None, size:
     return path
 
 
-def page_of(recording: Recording, size: float = PAGE_SIZE) -> str:
+def page_of(recording: RecordedRun, size: float = PAGE_SIZE) -> str:
     """The page as text; parameters and errors as of `write_report`."""
     story = Story.of(recording)
     if not has_a_body(recording):
@@ -94,7 +94,7 @@ def page_of(recording: Recording, size: float = PAGE_SIZE) -> str:
     return page
 
 
-def _times_at_most(recording: Recording, size: float) -> int:
+def _times_at_most(recording: RecordedRun, size: float) -> int:
     """More times than this do not fit, however small they become."""
     count = 6 * len(recording.points) + 11 * len(recording.elements)
     return max(FEWEST_TIMES, int(1e6 * size / (4 / 3 * BEST_RATIO * count)))

@@ -28,7 +28,7 @@ from remodel_fenicsx.results.drawing import (
     CHAIN_WIDTH,
     VIEWS,
 )
-from remodel_fenicsx.results.recording import HISTORY, LARGEST_HISTORY, SCENE, Recording
+from remodel_fenicsx.results.recording import HISTORY, LARGEST_HISTORY, SCENE, RecordedRun
 from remodel_fenicsx.results.words import unit_of, with_unit, words
 from remodel_fenicsx.system.regular_files import read_regular
 from remodel_fenicsx.system.terminal import duration
@@ -54,7 +54,7 @@ class ReportedRun:
         The body at the times that are kept; None without fields.
     """
 
-    recording: Recording
+    recording: RecordedRun
     story: Story
     body: ShownBody | None
 

@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from remodel_fenicsx.results.recording import LARGEST_HISTORY, LOG, HistoryColumns, Recording
+from remodel_fenicsx.results.recording import LARGEST_HISTORY, LOG, HistoryColumns, RecordedRun
 from remodel_fenicsx.results.run_lock import writer
 from remodel_fenicsx.results.status import FAILED, STOPPED, how_it_ended, rows_so_far
 from remodel_fenicsx.schema.times import same_time
@@ -67,7 +67,7 @@ class Story:
     warnings: list[Warned]
 
     @classmethod
-    def of(cls, recording: Recording) -> Story:
+    def of(cls, recording: RecordedRun) -> Story:
         """The story of a run's folder.
 
         Raises
@@ -116,7 +116,7 @@ def _warnings(lines: list[tuple[str, str, str]]) -> list[Warned]:
     return list(found.values())
 
 
-def _state(recording: Recording, history: HistoryColumns, lives: bool) -> tuple[str, str]:
+def _state(recording: RecordedRun, history: HistoryColumns, lives: bool) -> tuple[str, str]:
     """A word, and why or where."""
     scene, times = recording.scene, history["time"]
     if len(times) and same_time(float(times[-1]), scene.last_time):

@@ -50,10 +50,10 @@ class HistoryColumns(dict[str, Array]):
         return pandas.DataFrame(dict(self))
 
 
-class Recording:
+class RecordedRun:
     """The folder of a run, finished or under way.
 
-    Everything is read when it is first asked for, and once: a new `Recording` sees what has been added since.
+    Everything is read when it is first asked for, and once: a new object sees what has been added since.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ class Recording:
                 raise RecordingError(f"{self.path}: is not the folder of a run, it has no {name}")
 
     def __repr__(self) -> str:
-        return f"Recording({str(self.path)!r})"
+        return f"{type(self).__name__}({str(self.path)!r})"
 
     # ------------------------------------------------------------ scene
     @cached_property

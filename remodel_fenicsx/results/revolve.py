@@ -10,7 +10,7 @@ from mpi4py import MPI
 from remodel_fenicsx.body.reductions import Turn
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.results.chain_lines import OF_CHAINS, append_chains
-from remodel_fenicsx.results.recording import Recording, RecordingError
+from remodel_fenicsx.results.recording import RecordedRun, RecordingError
 from remodel_fenicsx.results.turned import TurnedFields
 from remodel_fenicsx.results.vtkhdf import TransientGrid, vtk_cells
 
@@ -36,7 +36,7 @@ def revolve(folder: Path | str) -> list[Path]:
     RecordingError
         If it is no run of a reduced kinematics with fields, or the files are there already.
     """
-    recording = Recording(folder)
+    recording = RecordedRun(folder)
     name = recording.scene.model.kinematics
     if name not in KINEMATICS or not KINEMATICS[name].reduced:
         raise RecordingError(f"{recording.path}: its kinematics are {name!r}: the fields are those of the body already")
@@ -63,7 +63,7 @@ def revolve(folder: Path | str) -> list[Path]:
 class _Image(TurnedFields):
     """The body's mesh, and the fields on it."""
 
-    def __init__(self, recording: Recording, turn: Turn):
+    def __init__(self, recording: RecordedRun, turn: Turn):
         scene = recording.scene
         domain = scene.geometry.build(scene.mesh, MPI.COMM_SELF)
         points, elements = domain.gather_mesh()

@@ -20,7 +20,7 @@ from remodel_fenicsx.results.recording import (
     LOG,
     STUDY,
     HistoryColumns,
-    Recording,
+    RecordedRun,
     RecordingError,
     read_history,
 )
@@ -52,7 +52,7 @@ def status(folder: Path) -> list[str]:
         return _of_study(folder)
     holder, lives = writer(folder)
     if not lives or (folder / HISTORY).exists():
-        recording = Recording(folder)  # what is no run's folder is refused
+        recording = RecordedRun(folder)  # what is no run's folder is refused
     else:
         return [f"{folder}: starting, {holder or 'a process'} is at work"]
     scene, history = recording.scene, rows_so_far(recording, lives)
@@ -137,7 +137,7 @@ def _state(folder: Path) -> tuple[str, str]:
     if writer(folder)[1]:
         return "running", ""
     with suppress(RecordingError):
-        recording = Recording(folder)
+        recording = RecordedRun(folder)
         times = recording.history["time"]
         if len(times) and same_time(float(times[-1]), recording.scene.last_time):
             return "finished", ""
@@ -145,7 +145,7 @@ def _state(folder: Path) -> tuple[str, str]:
     return ("failed", words) if words.startswith(FAILED) else ("stopped", "")
 
 
-def rows_so_far(recording: Recording, lives: bool) -> HistoryColumns:
+def rows_so_far(recording: RecordedRun, lives: bool) -> HistoryColumns:
     """The history; of a run that lives it may be read while a row is being written."""
     try:
         return recording.history

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from remodel_fenicsx.fem.kinematics import KINEMATICS
-from remodel_fenicsx.results.recording import Recording
+from remodel_fenicsx.results.recording import RecordedRun
 from remodel_fenicsx.results.turned import TurnedFields
 
 Numbers = NDArray[np.float64]
@@ -45,7 +45,7 @@ class WholeBody:
         If the folder is damaged.
     """
 
-    def __init__(self, recording: Recording):
+    def __init__(self, recording: RecordedRun):
         scene = recording.scene
         shape, kinematics = scene.geometry, KINEMATICS[scene.model.kinematics]
         self.recording, self.is_turned = recording, kinematics.reduced
@@ -82,7 +82,7 @@ class WholeBody:
         return None if displacement is None else displacement[self._used], found
 
 
-def has_a_body(recording: Recording) -> bool:
+def has_a_body(recording: RecordedRun) -> bool:
     """Whether a run recorded fields of a body that can be shown."""
     scene = recording.scene
     reduction = scene.geometry.reductions.get(scene.model.kinematics)

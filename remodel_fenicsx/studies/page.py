@@ -50,7 +50,7 @@ STYLE: dict[str, Any] = {
 COLOURS = ("#1b4f9c", "#d1495b", "#2a9d6f", "#e09f3e", "#6c4f9c")  # apart in lightness too
 
 
-class FigureError(Exception):
+class FigureError(ValueError):
     """No figure for a reason that its one line names; `exit_code` is the command's."""
 
     def __init__(self, message: str, exit_code: int):

@@ -22,7 +22,7 @@ from remodel_fenicsx.results.recording import (
     SCENE,
     STUDY,
     HistoryColumns,
-    Recording,
+    RecordedRun,
     RecordingError,
     read_history,
     steps_recorded,
@@ -99,7 +99,7 @@ class Run:
         """
         if not (self.folder / SCENE).exists() or not (self.folder / HISTORY).exists():
             return False
-        recording = Recording(self.folder)
+        recording = RecordedRun(self.folder)
         if recording.scene != self.scene:
             raise SceneError(f"{self.folder}: holds a run of another scene; choose another folder with -o")
         try:

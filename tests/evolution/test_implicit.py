@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.evolution.implicit import Implicit
 from remodel_fenicsx.model.cells import UnitCell, structure_tensor
-from remodel_fenicsx.results.recording import Recording
+from remodel_fenicsx import Recording
 from remodel_fenicsx.running import resume
 from remodel_fenicsx.running import run as record
 from remodel_fenicsx.scene.scene import scene_from_dict

@@ -11,7 +11,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from remodel_fenicsx.body import Cube, LoadKind
-from remodel_fenicsx.results.recording import Recording
+from remodel_fenicsx import Recording
 from remodel_fenicsx.running import resume
 from remodel_fenicsx.running import run as record
 from remodel_fenicsx.scene.scene import SceneError, scene_from_dict

@@ -16,7 +16,7 @@ from remodel_fenicsx import cli
 from remodel_fenicsx.pictures import files, rendering
 from remodel_fenicsx.pictures.bodies import coloured, scale_colours
 from remodel_fenicsx.results.drawing import ANGLE_COLOURS
-from remodel_fenicsx.results.recording import Recording
+from remodel_fenicsx import Recording
 from remodel_fenicsx.results.vtkhdf import TransientGrid
 from remodel_fenicsx.results.whole_body import WholeBody
 from tests.report.conftest import Recorded

@@ -26,7 +26,8 @@ from remodel_fenicsx.report.packing import ANGLE_STEPS, NO_ANGLE, of_angles
 from remodel_fenicsx.report.story import Story
 from remodel_fenicsx.results.drawing import ANGLE_COLOURS
 from remodel_fenicsx.results.kept_times import kept_times
-from remodel_fenicsx.results.recording import HistoryColumns, Recording
+from remodel_fenicsx import Recording
+from remodel_fenicsx.results.recording import HistoryColumns
 from remodel_fenicsx.results.vtkhdf import TransientGrid
 from remodel_fenicsx.scene.scene import preset_scene
 from tests.forks import forked

@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 
 from remodel_fenicsx.results import run_folder
-from remodel_fenicsx.results.recording import Recording, RecordingError, read_history
+from remodel_fenicsx import Recording
+from remodel_fenicsx.results.recording import RecordingError, read_history
 from remodel_fenicsx.results.vtkhdf import TransientGrid
 from remodel_fenicsx.scene.scene import Scene, SceneError, scene_from_dict
 

@@ -30,7 +30,8 @@ from remodel_fenicsx.paper import FIGURES, curves, runs
 from remodel_fenicsx.paper.runs import LOAD_CASES
 from remodel_fenicsx.pictures import bodies, rendering
 from remodel_fenicsx.results import vtkhdf
-from remodel_fenicsx.results.recording import Recording, RecordingError, steps_recorded
+from remodel_fenicsx import Recording
+from remodel_fenicsx.results.recording import RecordingError, steps_recorded
 from remodel_fenicsx.scene.scene import Scene, scene_from_dict
 from remodel_fenicsx.studies import page
 from remodel_fenicsx.studies.page import FigureError

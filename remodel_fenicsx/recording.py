@@ -1,0 +1,186 @@
+"""A recorded run in scripts and notebooks: what it recorded, its page, its body in PyVista, its pictures."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from remodel_fenicsx.results.recording import RecordedRun, RecordingError
+
+if TYPE_CHECKING:
+    import pyvista
+
+NOTEBOOK_SIZE = 5.0  # MB that a page has at most in a notebook, which is saved with all of them
+FRAME_STYLE = "width: 100%; height: 48em; border: 1px solid #888"
+
+
+class Recording(RecordedRun):
+    """The folder of a run, finished or under way. In a notebook it shows its report.
+
+    Everything is read when it is first asked for, and once: a new `Recording` sees what has been added since.
+
+    Parameters
+    ----------
+    folder
+        What `remodel-fenicsx run -o` was given.
+
+    Attributes
+    ----------
+    path : Path
+        The folder.
+
+    Raises
+    ------
+    RecordingError
+        If it is no folder of a run.
+
+    Examples
+    --------
+    >>> recording = Recording("results/artery")
+    >>> recording.history["inner_radius"][-1]
+    >>> recording.plot(layers=2).show()
+    """
+
+    def _repr_html_(self) -> str:
+        from remodel_fenicsx.report.page import page_of
+
+        page = escape(page_of(self, NOTEBOOK_SIZE))
+        sandbox = "allow-scripts allow-downloads"  # no origin of its own: it reaches nothing of the notebook
+        return f'<iframe srcdoc="{page}" sandbox="{sandbox}" style="{FRAME_STYLE}" title="report of a run"></iframe>'
+
+    def report(self, path: Path | None = None, size: float = 20.0) -> Path:
+        """Make the page of the run for a browser, as `remodel-fenicsx report` does.
+
+        Parameters
+        ----------
+        path
+            A new file; default: report.html in the folder, which is made anew.
+        size
+            MB (10^6 bytes) that it may have: where it would be larger fewer times are shown.
+
+        Returns
+        -------
+        The file.
+
+        Raises
+        ------
+        ReportError
+            If the file is there already, or a report.html that this package has not made; a ValueError.
+        RecordingError, SceneError
+            If the folder is damaged.
+        OSError
+            If it cannot be written.
+        """
+        from remodel_fenicsx.report.page import write_report
+
+        return write_report(self.path, path, size)
+
+    def grid(self, time: float | None = None) -> pyvista.UnstructuredGrid:
+        """The whole body at a recorded time for PyVista; of a reduction it is turned into the body.
+
+        Parameters
+        ----------
+        time
+            As recorded; default: the last.
+
+        Returns
+        -------
+        The reference body. Its points have `displacement`, (n, 3), where that was recorded:
+        `grid.warp_by_vector("displacement")` is the deformed body. Its elements have all other fields, and `layer`.
+
+        Raises
+        ------
+        RecordingError
+            If no fields of a body are recorded at this time, or they are damaged.
+        ImportError
+            If there is no PyVista.
+        """
+        from remodel_fenicsx.pictures.plots import grid
+
+        return grid(self, self._time(time))
+
+    def plot(
+        self, time: float | None = None, name: str = "fibre_angle_deformed", *, layers: int | None = None,
+        cut: str | None = None, chains: bool = True, plotter: pyvista.Plotter | None = None, **options: Any,
+    ) -> pyvista.Plotter:  # fmt: skip
+        """Put the deformed body at a recorded time into a plotter of PyVista: `recording.plot().show()`.
+
+        Parameters
+        ----------
+        time
+            As recorded; default: the last.
+        name
+            The field that colours the elements; of vectors and tensors PyVista shows the magnitude. Fibre angles have
+            the colours of the report and of the paper's figures.
+        layers
+            Show so many, from the inside of a tube, from the bottom of others; default: all.
+        cut
+            "half" or "quarter": leave out what is in front.
+        chains
+            Whether the four chains of each element are drawn on the faces that are seen, where cells were recorded.
+        plotter
+            To put it into; default: a new one.
+        options
+            For `pyvista.Plotter.add_mesh`, which draws the body.
+
+        Returns
+        -------
+        The plotter, not shown yet.
+
+        Raises
+        ------
+        RecordingError
+            If the field, or any, was not recorded at this time.
+        FigureError
+            If there are no such layers, or nothing is left by the cut; a ValueError.
+        ImportError
+            If there is no PyVista.
+        """
+        from remodel_fenicsx.pictures.plots import plot
+        from remodel_fenicsx.pictures.sight import Viewing
+
+        return plot(self, self._time(time), name, Viewing(layers, cut), chains, plotter, options)
+
+    def screenshot(
+        self, path: str | os.PathLike[str] | None = None, times: Sequence[float] | None = None, *,
+        layers: int | None = None, cut: str | None = None, view: str = "front",
+    ) -> Path:  # fmt: skip
+        """Draw the body into a file, as `remodel-fenicsx picture` does: it needs no display.
+
+        Parameters
+        ----------
+        path
+            A new file: .png, .svg or .pdf; default: NAME-tTIME.png in the folder, numbered when taken.
+        times
+            To show beside each other; the nearest recorded ones are taken. Default: the last.
+        layers, cut
+            As of `plot`.
+        view
+            "front", "above" or "X,Y,Z": where the eye is, from the middle of the body.
+
+        Returns
+        -------
+        The file.
+
+        Raises
+        ------
+        FigureError
+            One line: what is not allowed, or that nothing can be drawn here; a ValueError.
+        RecordingError, SceneError
+            If the folder is damaged.
+        OSError
+            If the file cannot be written.
+        """
+        from remodel_fenicsx.pictures.files import draw_picture
+        from remodel_fenicsx.pictures.sight import Viewing
+
+        return draw_picture(self.path, times, Viewing(layers, cut, view), None if path is None else Path(path))
+
+    def _time(self, time: float | None) -> float:
+        """A time with fields: this one or the last."""
+        if not len(self.times):
+            raise RecordingError(f"{self.path}: the run recorded no fields (output.fields)")
+        return float(self.times[-1]) if time is None else time
