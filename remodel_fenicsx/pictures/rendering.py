@@ -86,6 +86,7 @@ def render(pictures: list[Picture]) -> list[Pixels]:
             command = ["xvfb-run", "-a", "-s", "-screen 0 1280x1024x24", *command]
         paths = [str(Path(__file__).parents[2]), *filter(None, [os.environ.get("PYTHONPATH")])]
         environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths), "PYVISTA_OFF_SCREEN": "true"}
+        environment["MPLBACKEND"] = "agg"  # a notebook's own is one that only its kernel may know
         # in the folder of the job: Python looks for modules where it is started, and that may be anybody's folder
         silent: Any = {"capture_output": True, "text": True, "stdin": subprocess.DEVNULL}
         child = subprocess.run(command, env=environment, cwd=folder, **silent)

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.colors import to_rgb
 
 from remodel_fenicsx import Recording, RecordingError
 from remodel_fenicsx.results.drawing import ANGLE_COLOURS
@@ -106,8 +107,6 @@ def test_a_plot_has_the_colours_and_the_chains_of_all_pictures(recorded: Recorde
     assert 0.05 < len(body) / without[..., 0].size < 0.95
     # every colour is one of the scale, as bright as its face is lit
     hue = body / np.linalg.norm(body, axis=1, keepdims=True)
-    from matplotlib.colors import to_rgb
-
     scale = np.array([to_rgb(colour) for colour in ANGLE_COLOURS])
     scale /= np.linalg.norm(scale, axis=1, keepdims=True)
     distance = np.linalg.norm(hue[:, None] - scale[None], axis=2).min(axis=1)
@@ -150,7 +149,10 @@ def test_without_fields_there_is_no_body(recorded: Recorded) -> None:
     assert "<iframe" in recording._repr_html_()
 
 
-def test_a_screenshot_is_the_picture_of_the_command(recorded: Recorded, tmp_path: Path) -> None:
+def test_a_screenshot_is_the_picture_of_the_command(
+    recorded: Recorded, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MPLBACKEND", "module://matplotlib_inline.backend_inline")  # as in a kernel of Jupyter
     path = Recording(recorded("cube")).screenshot(tmp_path / "cube.png", [0.0, 10.0], view="above")
     assert path.read_bytes().startswith(b"\x89PNG")
     with pytest.raises(ValueError, match="exists|already|not exist"):
