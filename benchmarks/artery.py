@@ -120,7 +120,7 @@ def main() -> None:
     )
     print(f"{scene.name}: {scene.time.number_of_steps} steps, {iterations} Newton iterations, {total:.1f} s")
     for name, seconds in sorted(parts.items(), key=lambda pair: -pair[1]):
-        print(f"{name:30} {seconds:7.2f} s {100 * seconds / total:5.1f} %")
+        print(f"{name:30} {seconds:8.3f} s {100 * seconds / total:5.1f} %")
 
 
 if __name__ == "__main__":

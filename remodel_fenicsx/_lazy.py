@@ -1,8 +1,9 @@
-"""Names of a module that are imported when they are first asked for: a leaf."""
+"""Names that are imported when they are first asked for: a leaf."""
 
 from __future__ import annotations
 
 import importlib
+import pkgutil
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -24,3 +25,9 @@ def on_demand(module: str, places: Mapping[str, str]) -> Callable[[str], Any]:
         return getattr(importlib.import_module(f"remodel_fenicsx.{places[name]}"), name)
 
     return imported
+
+
+def resolved(maker: Callable[..., Any] | str) -> Callable[..., Any]:
+    """A class or function that a registry names: itself, or what its dotted name stands for."""
+    found: Callable[..., Any] = pkgutil.resolve_name(maker) if isinstance(maker, str) else maker
+    return found

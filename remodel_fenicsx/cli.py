@@ -487,12 +487,12 @@ def _figures(options: argparse.Namespace) -> int:
 def _info(options: argparse.Namespace) -> int:
     _check(reason_unusable())
     from remodel_fenicsx.fem.jit import has_simd_logarithm
-    from remodel_fenicsx.fem.solver_methods import METHODS
+    from remodel_fenicsx.fem.solver_methods import SOLVER_METHODS
 
     for name, version in versions().items():
         _say(f"{name:16} {version}")
     _say(f"{'logarithms':16} {'of several points at once' if has_simd_logarithm() else 'point by point'}")
-    _say(f"{'solver methods':16} {', '.join(METHODS)}")
+    _say(f"{'solver methods':16} {', '.join(SOLVER_METHODS)}")
     return 0
 
 

@@ -18,7 +18,7 @@ from remodel_fenicsx.body.reductions import Reduction
 from remodel_fenicsx.body.shape import uniaxial_columns
 from remodel_fenicsx.fem.formulations import FORMULATIONS, Formulation, Selective
 from remodel_fenicsx.fem.kinematics import KINEMATICS, FullKinematics, Kinematics
-from remodel_fenicsx.fem.solver_methods import METHODS
+from remodel_fenicsx.fem.solver_methods import SOLVER_METHODS, SolverMethod
 from remodel_fenicsx.model.cells import AXES, UnitCell, angle_to_axis
 from remodel_fenicsx.model.chains import CHAINS, Chain
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES, Driver, Frame
@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     from remodel_fenicsx.evolution.coupling import Coupling, Staggered
     from remodel_fenicsx.fem.jit import form
     from remodel_fenicsx.results.columns import Measurement
-    from remodel_fenicsx.solver.linear import LINEAR_METHODS, EveryTangent
+    from remodel_fenicsx.solver.linear import EveryTangent
 
 __all__ = [
     "AREA",
@@ -81,11 +81,9 @@ __all__ = [
     "LAWS",
     "LENGTH",
     "LENGTH_UNIT",
-    "LINEAR_METHODS",
     "Law",
     "LoadKind",
     "MATRICES",
-    "METHODS",
     "Matrix",
     "Measurement",
     "NUMBER_DENSITY",
@@ -94,10 +92,12 @@ __all__ = [
     "Reduction",
     "Repulsion",
     "SHAPES",
+    "SOLVER_METHODS",
     "STRESS",
     "STRESS_UNIT",
     "Selective",
     "Shape",
+    "SolverMethod",
     "Staggered",
     "Stresses",
     "TEMPERATURE",
@@ -117,7 +117,7 @@ __getattr__ = on_demand(
     __name__,
     {
         **dict.fromkeys(("Coupling", "Staggered"), "evolution.coupling"),
-        **dict.fromkeys(("EveryTangent", "LINEAR_METHODS"), "solver.linear"),
+        "EveryTangent": "solver.linear",
         "Measurement": "results.columns",
         "form": "fem.jit",
     },

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import pkgutil
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -19,17 +18,17 @@ from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, model_validator
 from pydantic.config import JsonDict
 
+from remodel_fenicsx._lazy import resolved
 from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.fem.solver_methods import (
     AUTO,
     LARGE,
     LARGE_ON_RANKS,
-    MEANINGS,
-    METHODS,
     REMOVED,
     SMALL_BODY,
     SMALL_REDUCTION,
+    SOLVER_METHODS,
     fault_of_option,
 )
 from remodel_fenicsx.model.cells import AXES
@@ -306,10 +305,7 @@ class CouplingKind:
     @property
     def make(self) -> Callable[..., Any]:
         """Makes the coupling of a state, a tissue, a remodeling pass and settings of the solver."""
-        found: Callable[..., Any] = (
-            pkgutil.resolve_name(self.coupling) if isinstance(self.coupling, str) else self.coupling
-        )
-        return found
+        return resolved(self.coupling)
 
 
 COUPLINGS = {
@@ -565,12 +561,12 @@ def _petsc_options(value: Any) -> Any:
 class Solver(Table):
     """Solution of the nonlinear problem of each step."""
 
-    method: Annotated[str, OneOf(METHODS, (AUTO,), REMOVED)] = Field(
+    method: Annotated[str, OneOf(SOLVER_METHODS, (AUTO,), REMOVED)] = Field(
         default=AUTO,
         description=f"'auto': 'direct' up to {SMALL_BODY} unknowns ({SMALL_REDUCTION} of a reduction), then 'lagged', "
         f"above {LARGE} 'iterative'; "
         f"on more ranks 'direct' up to {LARGE_ON_RANKS}, then 'iterative'; "
-        + "; ".join(f"{name!r}: {meaning}" for name, meaning in MEANINGS.items())
+        + "; ".join(f"{name!r}: {method.meaning}" for name, method in SOLVER_METHODS.items())
         + " (docs/speed.md).",
     )
     predictor: Literal["none", "autoregressive", "with-tolerance"] = Field(

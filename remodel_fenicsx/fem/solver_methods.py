@@ -1,68 +1,100 @@
-"""Solver methods by name: PETSc options of each. A leaf without PETSc, so that scenes can be checked anywhere."""
+"""Solver methods by name. A leaf without PETSc, so that scenes can be checked anywhere."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Any
+
+from remodel_fenicsx._lazy import resolved
 
 AUTO = "auto"
 LAGGED = "lagged"  # whose factor may be of an earlier tangent (`solver.linear`)
 
-# MUMPS: robust for indefinite tangents too, one factorisation pattern for all steps
-METHODS: dict[str, dict[str, Any]] = {
-    "direct": {
-        "snes_type": "newtonls",
-        "snes_linesearch_type": "basic",
-        "ksp_type": "preonly",
-        "pc_type": "lu",
-        "pc_factor_mat_solver_type": "mumps",
-        "mat_mumps_icntl_33": 1,  # the determinant, whose sign tells of unstable equilibria; costs nothing
-    },
-    LAGGED: {"snes_type": "newtonls", "snes_linesearch_type": "basic", "ksp_type": "preonly"},
+
+@dataclass(frozen=True)
+class SolverMethod:
+    """How the nonlinear problem of a step is solved.
+
+    Attributes
+    ----------
+    options
+        Of PETSc, names without the leading '-'.
+    meaning
+        What it does, for docs/scene.md, which lists those of the package.
+    linear
+        The class that solves the linear systems where options do not say it all, an `EveryTangent`, or its dotted name:
+        scenes are read without PETSc, which it needs.
+    on_several_ranks
+        Options that replace those of the same name there.
+    """
+
+    options: Mapping[str, Any]
+    meaning: str = ""
+    linear: Callable[..., Any] | str = "remodel_fenicsx.solver.linear.EveryTangent"
+    on_several_ranks: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def make_linear(self) -> Callable[..., Any]:
+        """Makes the solver of the linear systems of an equilibrium, a SNES, a tangent and options."""
+        return resolved(self.linear)
+
+
+NEWTON = {"snes_type": "newtonls", "snes_linesearch_type": "basic"}
+SOLVER_METHODS = {
+    # MUMPS: robust for indefinite tangents too, one factorisation pattern for all steps. On several ranks it adds up in
+    # the order in which messages come: its last digits differ from run to run. So one rank has the whole matrix and
+    # factorises it, which for the sizes that are factorised at all costs little
+    "direct": SolverMethod(
+        NEWTON
+        | {
+            "ksp_type": "preonly",
+            "pc_type": "lu",
+            "pc_factor_mat_solver_type": "mumps",
+            "mat_mumps_icntl_33": 1,  # the determinant, whose sign tells of unstable equilibria; costs nothing
+        },
+        "Newton's method, each system factorised by MUMPS; runs on so many ranks are the same to the last digit",
+        on_several_ranks={
+            "pc_type": "telescope",
+            "telescope_ksp_type": "preonly",
+            "telescope_pc_type": "lu",
+            "telescope_pc_factor_mat_solver_type": "mumps",
+        },
+    ),
+    LAGGED: SolverMethod(
+        NEWTON | {"ksp_type": "preonly"},
+        "few tangents are factorised, and quasi-Newton steps (L-BFGS) make up for it",
+        linear="remodel_fenicsx.solver.linear.Lagged",
+    ),
     # GMRES, because tangents of random cells are not always definite; levels cost as much as 20 of its iterations, and
     # those of an older tangent serve as well
-    "iterative": {
-        "snes_type": "newtonls",
-        "snes_linesearch_type": "basic",
-        "snes_lag_preconditioner": 20,
-        "snes_lag_preconditioner_persists": True,
-        "ksp_type": "gmres",
-        "ksp_gmres_restart": 100,
-        "ksp_rtol": 1e-3,
-        "ksp_max_it": 300,
-        "pc_type": "gamg",
-        "pc_gamg_threshold": 0.01,
-        "pc_gamg_reuse_interpolation": True,
-        "mg_levels_ksp_type": "chebyshev",
-        "mg_levels_pc_type": "sor",
-    },
+    "iterative": SolverMethod(
+        NEWTON
+        | {
+            "snes_lag_preconditioner": 20,
+            "snes_lag_preconditioner_persists": True,
+            "ksp_type": "gmres",
+            "ksp_gmres_restart": 100,
+            "ksp_rtol": 1e-3,
+            "ksp_max_it": 300,
+            "pc_type": "gamg",
+            "pc_gamg_threshold": 0.01,
+            "pc_gamg_reuse_interpolation": True,
+            "mg_levels_ksp_type": "chebyshev",
+            "mg_levels_pc_type": "sor",
+        },
+        "Newton's method with GMRES and algebraic multigrid (GAMG), whose levels are kept for some iterations",
+        linear="remodel_fenicsx.solver.linear.Multigrid",
+    ),
 }
-
-MEANINGS = {
-    "direct": "Newton's method, each system factorised by MUMPS; runs on so many ranks are the same "
-    "to the last digit",
-    LAGGED: "few tangents are factorised, and quasi-Newton steps (L-BFGS) make up for it",
-    "iterative": "Newton's method with GMRES and algebraic multigrid (GAMG), whose levels are kept for some iterations",
-}
-"""In words, for docs/scene.md; those of one's own need none."""
 
 REMOVED = {"exact": "was removed; take 'lagged', or 'direct' for a new tangent in every iteration"}
 """Methods of earlier versions, and what to take in their place."""
 
-# MUMPS on several ranks adds up in the order in which messages come: its last digits differ from run to run. So one
-# rank has the whole matrix and factorises it, which for the sizes that are factorised at all costs little
-ON_SEVERAL_RANKS: dict[str, dict[str, Any]] = {
-    "direct": {
-        "pc_type": "telescope",
-        "telescope_ksp_type": "preonly",
-        "telescope_pc_type": "lu",
-        "telescope_pc_factor_mat_solver_type": "mumps",
-    },
-}
-
 # Factors that are kept, by what is known of the tangent, the best first; each but the last may be refused
 DEFINITE, SYMMETRIC, GENERAL = "positive definite", "symmetric", "general"
-FACTOR_OPTIONS: dict[str, dict[str, Any]] = {
+FACTOR_OPTIONS: dict[str, Mapping[str, Any]] = {
     DEFINITE: {
         "pc_type": "cholesky",
         "pc_factor_mat_solver_type": "cholmod",
@@ -75,7 +107,7 @@ FACTOR_OPTIONS: dict[str, dict[str, Any]] = {
         "mat_mumps_icntl_7": 3,  # SCOTCH, as fast as any; PORD ends the process for some small matrices
         "mat_mumps_icntl_33": 1,
     },
-    GENERAL: METHODS["direct"],
+    GENERAL: SOLVER_METHODS["direct"].options,
 }
 
 # Unknowns up to which PETSc's own LU of every tangent is the fastest on one rank. A reduction has narrow bands: above
@@ -102,7 +134,7 @@ def chosen(method: str, unknowns: int, ranks: int, reduced: bool, multigrid: boo
 
 def method_options(method: str, ranks: int, small: bool = False) -> dict[str, Any]:
     """PETSc options of a method on so many ranks; `small`: for a problem that `is_small`, on one rank."""
-    options = dict(METHODS[method])
+    options = dict(SOLVER_METHODS[method].options)
     if small and ranks == 1 and options.get("pc_factor_mat_solver_type") == "mumps":
         options |= {"pc_factor_mat_solver_type": "petsc", "mat_mumps_icntl_33": False}
     return _on_ranks(options, method, ranks)
@@ -116,7 +148,7 @@ def factor_options(kind: str, ranks: int) -> dict[str, Any]:
 
 def _on_ranks(options: dict[str, Any], method: str, ranks: int) -> dict[str, Any]:
     if ranks > 1:
-        options |= ON_SEVERAL_RANKS.get(method, {})
+        options |= SOLVER_METHODS[method].on_several_ranks
         if options.get("pc_type") == "telescope":
             options["pc_telescope_reduction_factor"] = ranks
     return options

@@ -19,7 +19,7 @@ from remodel_fenicsx.body import SHAPES, Shape
 from remodel_fenicsx.body.columns import columns_of, columns_of_region, columns_on_request
 from remodel_fenicsx.body.reductions import AUTO, objections
 from remodel_fenicsx.fem.formulations import FORMULATIONS
-from remodel_fenicsx.fem.solver_methods import METHODS
+from remodel_fenicsx.fem.solver_methods import SOLVER_METHODS
 from remodel_fenicsx.model.chains import CHAINS
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
 from remodel_fenicsx.model.energy import MATRICES, REPULSIONS, Matrix
@@ -272,7 +272,7 @@ class Scene(Table):
             rule = "must be 0 where the length is an unknown, with loads.axial_force or closed ends"
             raise fault(rule, "loads.elongation.value", load.value)
         if self.has_free_length and self.solver.method == "iterative":
-            names = ", ".join(repr(name) for name in (AUTO, *METHODS) if name != "iterative")
+            names = ", ".join(repr(name) for name in (AUTO, *SOLVER_METHODS) if name != "iterative")
             rule = f"allowed where the length is an unknown, with loads.axial_force or closed ends, are {names}"
             raise fault(rule, "solver.method", self.solver.method)
 

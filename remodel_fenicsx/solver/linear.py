@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from remodel_fenicsx.fem.petsc_options import ProblemOptions
-from remodel_fenicsx.fem.solver_methods import DEFINITE, GENERAL, LAGGED, SYMMETRIC, factor_options
+from remodel_fenicsx.fem.solver_methods import DEFINITE, GENERAL, SYMMETRIC, factor_options
 from remodel_fenicsx.solver.equilibrium import Equilibrium
 from remodel_fenicsx.solver.quasi_newton import Secants
 
@@ -250,8 +250,3 @@ class Lagged(EveryTangent):
     def close(self) -> None:
         self.factor.close()
         self.secants.forget()
-
-
-LinearMethod = Callable[[Equilibrium, Any, Any, ProblemOptions], EveryTangent]
-LINEAR_METHODS: dict[str, LinearMethod] = {LAGGED: Lagged, "iterative": Multigrid}
-"""Methods (`fem.solver_methods.METHODS`) that want more than PETSc's options."""

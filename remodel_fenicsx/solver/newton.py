@@ -15,12 +15,12 @@ from petsc4py import PETSc
 
 from remodel_fenicsx.fem.assembly import over_ranks
 from remodel_fenicsx.fem.petsc_options import ProblemOptions
-from remodel_fenicsx.fem.solver_methods import AUTO, LAGGED, chosen, is_small, method_options
+from remodel_fenicsx.fem.solver_methods import AUTO, LAGGED, SOLVER_METHODS, chosen, is_small, method_options
 from remodel_fenicsx.settings import Solver
 from remodel_fenicsx.solver.convergence import PRESCRIBED_ROUNDING, Convergence
 from remodel_fenicsx.solver.equilibrium import Equilibrium, Extension, Look
 from remodel_fenicsx.solver.limits import Limits, reserved
-from remodel_fenicsx.solver.linear import LINEAR_METHODS, EveryTangent
+from remodel_fenicsx.solver.linear import EveryTangent
 from remodel_fenicsx.system.interrupts import Interrupted
 
 log = logging.getLogger(__name__)
@@ -202,7 +202,8 @@ class GuardedNewton:
         self._most_iterations = snes.getTolerances()[3]  # the user's PETSc option may have changed it
         snes.setConvergenceTest(self._converged)
         self._snes: Any = snes
-        self._linear = LINEAR_METHODS.get(self.method, EveryTangent)(equilibrium, snes, self._matrix, self._options)
+        make_linear = SOLVER_METHODS[self.method].make_linear
+        self._linear: EveryTangent = make_linear(equilibrium, snes, self._matrix, self._options)
 
     def close(self) -> None:
         """Free PETSc's objects and take the options out of its database; calling it again does nothing."""

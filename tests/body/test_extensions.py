@@ -34,10 +34,10 @@ from remodel_fenicsx.extend import (
     LENGTH,
     LENGTH_UNIT,
     MATRICES,
-    METHODS,
     PAIRINGS,
     REPULSIONS,
     SHAPES,
+    SOLVER_METHODS,
     STRESS_UNIT,
     Chain,
     Column,
@@ -45,6 +45,7 @@ from remodel_fenicsx.extend import (
     Dimension,
     Drive,
     Driver,
+    EveryTangent,
     Frame,
     FullKinematics,
     Law,
@@ -53,6 +54,7 @@ from remodel_fenicsx.extend import (
     Repulsion,
     Selective,
     Shape,
+    SolverMethod,
     Staggered,
     UnitCell,
     angle_to_axis,
@@ -472,12 +474,22 @@ def test_a_formulation(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_solver_method(monkeypatch: pytest.MonkeyPatch) -> None:
-    method = {"snes_type": "newtonls", "snes_linesearch_type": "basic", "ksp_type": "gmres", "pc_type": "jacobi"}
-    monkeypatch.setitem(METHODS, "krylov", {**method, "ksp_rtol": 1e-12})
+    """Its options reach PETSc, and its class solves the systems."""
+    made = []
+
+    class Watched(EveryTangent):
+        def renew(self) -> None:
+            super().renew()
+            made.append(self)
+
+    options = {"snes_type": "newtonls", "snes_linesearch_type": "basic", "ksp_type": "gmres", "pc_type": "jacobi"}
+    method = SolverMethod({**options, "ksp_rtol": 1e-12}, "for this test", Watched)
+    monkeypatch.setitem(SOLVER_METHODS, "krylov", method)
     expected, found = (rows_of(whole().with_values({"solver.method": name})) for name in ("direct", "krylov"))
     np.testing.assert_allclose(column(found, "mean_stretch"), column(expected, "mean_stretch"), rtol=1e-9)
     assert column(expected, "linear_iterations") == column(expected, "newton_iterations")
     assert sum(column(found, "linear_iterations")) > 2 * sum(column(found, "newton_iterations"))
+    assert len(made) == sum(column(found, "newton_iterations"))
 
 
 # ---------------------------------------------------------------- scenes

@@ -11,9 +11,15 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from remodel_fenicsx import Simulation
-from remodel_fenicsx.fem.solver_methods import LARGE, LARGE_ON_RANKS, METHODS, SMALL_BODY, SMALL_REDUCTION, chosen
+from remodel_fenicsx.fem.solver_methods import (
+    LARGE,
+    LARGE_ON_RANKS,
+    SMALL_BODY,
+    SMALL_REDUCTION,
+    SOLVER_METHODS,
+    chosen,
+)
 from remodel_fenicsx.scene import SceneError, preset_scene
-from remodel_fenicsx.solver import linear
 from remodel_fenicsx.solver.limits import Limits
 from remodel_fenicsx.solver.linear import KeptFactor, Lagged
 from remodel_fenicsx.solver.quasi_newton import Secants
@@ -54,7 +60,7 @@ def test_auto_goes_by_the_size(small: int, reduced: bool) -> None:
         (LARGE + 1, 1, "iterative"), (LARGE_ON_RANKS, 2, "direct"), (LARGE_ON_RANKS + 1, 2, "iterative"),
     ):  # fmt: skip
         assert chosen("auto", unknowns, ranks, reduced) == method
-        assert all(chosen(name, unknowns, ranks, reduced) == name for name in METHODS)
+        assert all(chosen(name, unknowns, ranks, reduced) == name for name in SOLVER_METHODS)
     assert chosen("auto", LARGE + 1, 1, reduced, multigrid=False) == "lagged"
     assert chosen("auto", LARGE_ON_RANKS + 1, 2, reduced, multigrid=False) == "direct"
 
@@ -203,7 +209,7 @@ def test_an_indefinite_tangent_is_solved_by_every_method(caplog: pytest.LogCaptu
     """The paper's artery begins with one, by the stress of random cells. CHOLMOD cannot take it."""
     caplog.set_level(logging.INFO)
     scene, rows, said = preset_scene("kuhl-holzapfel-2007", "tube"), {}, {}
-    for method in METHODS:
+    for method in SOLVER_METHODS:
         domain = tube(divisions=(12, 4, 8), comm=SELF)
         simulation = Simulation(scene.with_values({"time.end": 1.0, "solver.method": method}), SELF, domain)
         rows[method] = [step.row for step in simulation.steps()]
@@ -311,7 +317,3 @@ def test_what_the_bound_spares_is_admissible(monkeypatch: pytest.MonkeyPatch) ->
     assert extension.admissible and extension.max_chain_extension < 0.95
     assert not spare(newton.limits, size)  # it counts what has been travelled already
     simulation.close()
-
-
-def test_the_registry_names_no_method_without_options() -> None:
-    assert set(linear.LINEAR_METHODS) < set(METHODS)
