@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
@@ -75,6 +76,8 @@ class UnitCells(CellField):
         Elements of the whole mesh.
     settings
         Initial dimensions, axes, seed, r0.
+    regions
+        Settings of initial dimensions and r0 that hold elsewhere, each with the mask of its local elements (elements,).
 
     Attributes
     ----------
@@ -88,9 +91,12 @@ class UnitCells(CellField):
         element_number: NDArray[np.int64],
         number_of_elements: int,
         settings: Cells,
+        regions: Sequence[tuple[NDArray[np.bool_], Cells]] = (),
     ):
         super().__init__(quadrature, "cell")
         self.settings = settings
-        self.dimension_values[:] = settings.dimensions(number_of_elements)[element_number][:, None, :]
+        everywhere = np.ones(len(element_number), dtype=bool)
+        for chosen, cells in ((everywhere, settings), *regions):
+            self.dimension_values[chosen] = cells.dimensions(number_of_elements)[element_number[chosen]][:, None, :]
         self.axis_values[:] = initial_axes(settings.axes, quadrature.coordinates)
         self.initial_dimensions: Array = self.dimension_values.copy()
