@@ -86,7 +86,9 @@ class Simulation:
             kinematics = FreeLength(kinematics, shape)
         self.unknown = kinematics.unknown(mesh, scene.mesh.degree)
         self.quadrature = Quadrature(mesh, scene.mesh.degree, kinematics.weight(mesh))
-        self.cells = UnitCells(self.quadrature, domain.element_number, domain.number_of_elements, scene.cells)
+        local_axes = shape.local_axes(domain, self.quadrature)
+        numbers = domain.element_number, domain.number_of_elements
+        self.cells = UnitCells(self.quadrature, *numbers, scene.cells, local_axes)
         self.loading = Loading(domain, self.unknown, kinematics)
         shape.support(self.loading, scene.supports.ends)
         formulation = FORMULATIONS[scene.mesh.formulation]
@@ -120,7 +122,7 @@ class Simulation:
             BucklingWarning(self.stepper, shape.strut(scene.supports.ends)),
             VolumeLoss(self.stepper),
             RadialChains(self.stepper, shape.radial_share),
-            FrontsInLayers(self.stepper, shape, domain),
+            FrontsInLayers(self.stepper, shape),
         ]
         if self.stepper.remodeling.law.remodels and not at_once:
             over_correction = OverCorrection(self.stepper)

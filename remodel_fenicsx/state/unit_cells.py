@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.kernels.points import PointKernels, point_kernels
-from remodel_fenicsx.model.cells import UnitCell, initial_axes
+from remodel_fenicsx.model.cells import UnitCell
+from remodel_fenicsx.model.local_axes import AXES, LocalAxes
 from remodel_fenicsx.settings import Cells
 
 Array = NDArray[np.float64]
@@ -75,9 +76,13 @@ class UnitCells(CellField):
         Elements of the whole mesh.
     settings
         Initial dimensions, axes, seed, r0.
+    local_axes
+        Of the body at the points (`Shape.local_axes`).
 
     Attributes
     ----------
+    local_axes
+        As given.
     initial_dimensions
         l0_I by rank (not by direction), shape (cells, points, 3), in link lengths.
     """
@@ -88,9 +93,14 @@ class UnitCells(CellField):
         element_number: NDArray[np.int64],
         number_of_elements: int,
         settings: Cells,
+        local_axes: LocalAxes,
     ):
         super().__init__(quadrature, "cell")
-        self.settings = settings
+        self.settings, self.local_axes = settings, local_axes
         self.dimension_values[:] = settings.dimensions(number_of_elements)[element_number][:, None, :]
-        self.axis_values[:] = initial_axes(settings.axes, quadrature.coordinates)
+        self.axis_values[:] = self.initial_axes()
         self.initial_dimensions: Array = self.dimension_values.copy()
+
+    def initial_axes(self) -> Array:
+        """n_I before the first pass, rows, (cells, points, 3, 3)."""
+        return AXES[self.settings.axes](self.local_axes)
