@@ -87,8 +87,7 @@ class Simulation:
         self.unknown = kinematics.unknown(mesh, scene.mesh.degree)
         self.quadrature = Quadrature(mesh, scene.mesh.degree, kinematics.weight(mesh))
         local_axes = shape.local_axes(domain, self.quadrature)
-        numbers = domain.element_number, domain.number_of_elements
-        self.cells = UnitCells(self.quadrature, *numbers, scene.cells, local_axes)
+        self.cells = UnitCells(self.quadrature, domain, scene.cells, local_axes)
         self.loading = Loading(domain, self.unknown, kinematics)
         shape.support(self.loading, scene.supports.ends)
         formulation = FORMULATIONS[scene.mesh.formulation]
@@ -206,7 +205,7 @@ def build(scene: Scene, comm: MPI.Intracomm) -> Domain:
     if KINEMATICS[scene.model.kinematics].reduced:
         domain: Domain = scene.geometry.reductions[scene.model.kinematics].build(scene, comm)
         return domain
-    return scene.geometry.build(scene.mesh, comm)
+    return scene.geometry.build_with(scene.regions, scene.mesh, comm)
 
 
 def checked_domain(domain: Domain, scene: Scene) -> Domain:
@@ -226,6 +225,9 @@ def checked_domain(domain: Domain, scene: Scene) -> Domain:
         raise SceneError(f"mesh.element = {scene.mesh.element!r}: the mesh has elements of type {kind!r}")
     if degree != scene.mesh.degree:
         raise SceneError(f"mesh.degree = {scene.mesh.degree}: the mesh has degree {degree}")
+    for name in scene.regions:
+        if name not in domain.regions:
+            raise SceneError(f"regions.{name}: the mesh has no such region; it has {', '.join(domain.regions)}")
     needed = () if KINEMATICS[scene.model.kinematics].reduced else shape.faces
     missing = [face for face in needed if face not in domain.faces]
     if missing:

@@ -171,7 +171,7 @@ def body(domain: Domain, cells: Cells, degree: int = 1) -> Body:
     displacement = FullKinematics().unknown(domain.mesh, degree)
     quadrature = Quadrature(domain.mesh, degree)
     local_axes = shape_of(domain).local_axes(domain, quadrature)
-    unit_cells = UnitCells(quadrature, domain.element_number, domain.number_of_elements, cells, local_axes)
+    unit_cells = UnitCells(quadrature, domain, cells, local_axes)
     return Body(domain, displacement, quadrature, unit_cells, Loading(domain, displacement))
 
 

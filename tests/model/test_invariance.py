@@ -173,9 +173,8 @@ class Points:
         self.displacement = FullKinematics().unknown(mesh, 1)
         self.space = self.displacement.function_space
         self.quadrature = Quadrature(mesh, 1)
-        numbers = self.domain.element_number, self.domain.number_of_elements
         local_axes = Cube().local_axes(self.domain, self.quadrature)
-        self.cells = UnitCells(self.quadrature, *numbers, Cells(initial="random", seed=2), local_axes)
+        self.cells = UnitCells(self.quadrature, self.domain, Cells(initial="random", seed=2), local_axes)
         self.state = State(self.displacement, FullKinematics(), self.cells, Loading(self.domain, self.displacement))
         self.passes: dict[tuple[str, str, str], RemodelingPass] = {}
 
