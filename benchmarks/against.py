@@ -1,13 +1,14 @@
 #!/usr/bin/env python3
-"""Two states of this project on one scene, in pairs: processor time, and how far their results are apart.
+"""Two states of this project, or two settings of one, in pairs: processor time, and how far results are apart.
 
     ./with-fenicsx benchmarks/against.py COMMIT [--scene demos/artery.toml] [--steps N] [--pairs 3] [--core 0]
         [--set KEY=VALUE]... [--set-here KEY=VALUE]... [--set-there KEY=VALUE]...
 
-COMMIT is a commit of this project, or a folder with a checkout of it. Each state takes its own file SCENE, all --set,
-and its own --set-here or --set-there (keys that were not there, or had other names then). Both run as a user runs
-them, recorded, on one core; they take turns, and what a run of one step costs is taken off: imports, the mesh, the
-forms from the cache. The ratio is what counts: it hardly depends on the machine, nor on what else runs there.
+COMMIT is a commit of this project, or a folder with a checkout of it (`.`: this one, with other settings). Each state
+takes its own file SCENE, all --set, and its own --set-here or --set-there (keys that were not there, or had other names
+then). Both run as a user runs them, recorded, on one core; they take turns, and what a run of one step costs is taken
+off: imports, the mesh, the forms from the cache. The ratio is what counts: it hardly depends on the machine, nor on
+what else runs there.
 """
 
 from __future__ import annotations

@@ -1,15 +1,15 @@
 #!/usr/bin/env python3
 """Error against time of the processor for every setting of the artery, one factor at a time, and the front of all.
 
-    ./with-fenicsx benchmarks/work_precision.py [--folder DIR] [--budget SECONDS] [--only PART...] [--jobs N] [--report]
+    ./with-fenicsx benchmarks/work_precision.py [--folder DIR] [--budget SECONDS] [--only PART...] [--report]
 
 Parts: `artery`, the settings of `remodel-fenicsx trade` and the profiles on the paper's artery with isotropic cells,
 for the printed coupling, the implicit one and the consistent variant, against the one-dimensional solver of
 tests/reference with steps of 1/8 and 1/16 (1/2 and 1/4 for the law tensor), extrapolated; `end`, chosen steps against
 equal ones there, in turns; `paper`, the paper's own mesh there, at its points too; `whole`, the whole tube in three
 dimensions, up to 20 minutes a run; `hold`, chosen steps against equal ones to t = 1000; `tendon`, the paper's with
-random cells; `seeds`, 32 of it. Two hours of one core, most of it the whole tube and the seeds. Then makes
-docs/speed_and_accuracy.md and its pictures; --report makes them from what is there. What is recorded is used again.
+random cells. An hour or more of one core, most of it the whole tube. Then makes docs/speed_and_accuracy.md and its
+picture; --only makes no page, --report makes it from what is there. What is recorded is used again.
 """
 
 from __future__ import annotations
@@ -25,25 +25,23 @@ from matplotlib.figure import Figure
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from benchmarks.precision import end, hold, places, spread, tendon, whole
+from benchmarks.precision import chosen, places, tendon, whole
 from remodel_fenicsx.body.columns import PROFILE, profile_weights
 from remodel_fenicsx.scene.presets import PROFILES
-from remodel_fenicsx.scene.scene import Scene, preset_scene, read_scene
+from remodel_fenicsx.scene.scene import Scene, preset_scene
 from remodel_fenicsx.schema.times import same_time
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.studies.page import COLOURS, STYLE, Page
 from remodel_fenicsx.studies import ladder as rungs
 from remodel_fenicsx.studies.estimates import pareto, typical
-from remodel_fenicsx.system.children import cores
 from remodel_fenicsx.system.environment import versions
 from tests.reference.radial import solve_radial
 
 DOCS = Path(__file__).parents[1] / "docs"
 PAGE, PICTURE = DOCS / "speed_and_accuracy.md", "speed_and_accuracy"
-TENDON, SEEDS = Path(__file__).parents[1] / "demos" / "tendon.toml", "tendon-seeds"
-PARTS = ("artery", "end", "paper", "whole", "hold", "tendon", "seeds")
+PARTS = ("artery", "end", "paper", "whole", "hold", "tendon")
 COARSE = (8.0, 4.0)  # tolerances, degrees
-TIMES = [5.0, 25.0, 45.0, 65.0, 85.0, 105.0, 125.0, 145.0, 150.0]
+TIMES = chosen.TO_THE_END
 REFERENCE = {"explicit": (150, 1 / 8, 1 / 16), "tensor": (60, 1 / 2, 1 / 4)}  # elements and steps, by law
 Array = NDArray[np.float64]
 
@@ -138,14 +136,13 @@ def _reference(law: str, step: float, elements: int) -> tuple[Array, Array]:
     return angles, np.stack([history.inner_radii[rows], history.outer_radii[rows]], axis=1)
 
 
-def run(folder: Path, parts: Sequence[str], budget: float, jobs: int) -> None:
-    """What is asked for and not kept yet; but for the seeds in this process."""
+def run(folder: Path, parts: Sequence[str], budget: float) -> None:
+    """What is asked for and not kept yet."""
     if "artery" in parts:
         run_artery(folder, budget, paper=False)
-    if "end" in parts:
-        end.run(folder, measured, TIMES)
-    if "hold" in parts:
-        hold.run(folder, measured)
+    for part in ("end", "hold"):
+        if part in parts:
+            chosen.run(folder, measured, part)
     if "paper" in parts:
         places.run(scene(METHODS["printed"]), folder)
         run_artery(folder, 0.0, paper=True)
@@ -155,8 +152,6 @@ def run(folder: Path, parts: Sequence[str], budget: float, jobs: int) -> None:
                 run_one(folder, name, setting)
     if "tendon" in parts:
         tendon.run(folder, measured)
-    if "seeds" in parts:
-        spread.run(read_scene(TENDON), folder / SEEDS, jobs)
 
 
 def run_artery(folder: Path, budget: float, paper: bool) -> None:
@@ -227,15 +222,13 @@ def report(folder: Path) -> None:
     rows = [_row(p, id(p) in best) for p in found]
     made = ", ".join(f"{name} {version}" for name, version in versions().items() if name != "BLAS")
     text = (Path(__file__).with_name("work_precision.template.md")).read_text(encoding="utf-8")
-    found_seeds = spread.recorded(read_scene(TENDON), folder / SEEDS)
-    parts = {"rows": "\n".join(rows), "whole": whole_rows(found), "hold": hold.rows(folder), "end": end.rows(folder),
-             "tendon": tendon.rows(folder), "made": made, "paper": paper_words(found), "places": places.words(folder),
-             "seeds": spread.rows(found_seeds), "number": str(found_seeds.seeds)}  # fmt: skip
+    parts = {"rows": "\n".join(rows), "whole": whole_rows(found), "hold": chosen.hold_rows(folder),
+             "end": chosen.end_rows(folder), "tendon": tendon.rows(folder), "made": made,
+             "paper": paper_words(found), "places": places.words(folder)}  # fmt: skip
     for name, words in parts.items():
         text = text.replace(f"{{{name}}}", words)
     PAGE.write_text(text, encoding="utf-8")
     _draw(found, made)
-    spread.draw(found_seeds, DOCS / "figures", made)
 
 
 def _row(p: Point, is_best: bool) -> str:
@@ -302,14 +295,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--folder", type=Path, default=Path("results/work-precision"))
     parser.add_argument("--budget", type=float, default=5.0, help="longest expected run, seconds")
-    parser.add_argument("--only", nargs="+", choices=PARTS, default=PARTS, help="parts to run; default: all")
-    parser.add_argument("--jobs", type=int, default=cores(), help="seeds at a time")
+    parser.add_argument(
+        "--only", nargs="+", choices=PARTS, default=PARTS, help="parts to run, without the page; default: all"
+    )
     parser.add_argument("--report", action="store_true", help="make the page from what is there")
     options = parser.parse_args()
     options.folder.mkdir(parents=True, exist_ok=True)
     if not options.report:
-        run(options.folder, options.only, options.budget, options.jobs)
-    report(options.folder)
+        run(options.folder, options.only, options.budget)
+    if options.report or options.only is PARTS:  # the page needs all parts
+        report(options.folder)
 
 
 if __name__ == "__main__":

@@ -14,12 +14,15 @@ from pathlib import Path
 
 from remodel_fenicsx.body.gmsh_model import gmsh_model
 from remodel_fenicsx.body.tendon import draw_tendon
-from remodel_fenicsx.body.tube import PAPER, draw_tube
+from remodel_fenicsx.body.layers import Wall
+from remodel_fenicsx.body.tube import draw_tube
+
+WALL = Wall.of(1.0, 3.0, 8, {})
 
 # file -> what is in it, as in the paper: Figs. 6 and 7
 MESHES = {
     "tendon.msh": lambda: draw_tendon(length=10.0, area=10.0),
-    "artery.msh": lambda: draw_tube(1.0, 3.0, 8.0, PAPER, "hexahedron", 1),
+    "artery.msh": lambda: draw_tube(WALL, 8.0, (16, 12), "hexahedron", 1),
 }
 
 

@@ -39,7 +39,7 @@ from remodel_fenicsx.model.laws import LAWS
 from remodel_fenicsx.model.spectral import PAIRINGS
 from remodel_fenicsx.schema.tables import OneOf, Table, fault, is_number, quoted, shown
 from remodel_fenicsx.schema.times import is_multiple, same_time
-from remodel_fenicsx.schema.units import FORCE, NUMBER_DENSITY, STRESS, TEMPERATURE
+from remodel_fenicsx.schema.units import FORCE, LENGTH, NUMBER_DENSITY, STRESS, TEMPERATURE
 
 STRESS_UNITS = {"Pa": 1.0, "kPa": 1.0e3, "MPa": 1.0e6}  # in Pa
 INITIAL_CELLS = ("random", "isotropic", "aligned")
@@ -78,6 +78,22 @@ class Mesh(Table):
             rule = f"allowed for elements {self.element!r} of degree {self.degree} is {', '.join(map(repr, able))}"
             raise fault(rule, "formulation", self.formulation)
         return self
+
+
+class Region(Table):
+    """A named part of the body with properties of its own, `[regions.media]` say. What it does not say is as elsewhere.
+
+    Regions of a tube are layers of its wall, in the order of their outer radii; together they are the wall. Elements
+    through the wall are shared out so that none lies in two layers. NAME is a letter, then letters, digits and `_`.
+    """
+
+    outer_radius: Annotated[float | None, LENGTH] = Field(
+        default=None,
+        gt=0,
+        description="Of shape 'tube': where the layer ends, in the scene's unit of length; it begins where the one "
+        "inside of it ends. The outermost may leave it out.",
+        json_schema_extra={"allowed": "a finite number greater than 0"},
+    )
 
 
 class Model(Table):

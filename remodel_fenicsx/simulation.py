@@ -204,7 +204,7 @@ def build(scene: Scene, comm: MPI.Intracomm) -> Domain:
     if KINEMATICS[scene.model.kinematics].reduced:
         domain: Domain = scene.geometry.reductions[scene.model.kinematics].build(scene, comm)
         return domain
-    return scene.geometry.build(scene.mesh, comm)
+    return scene.geometry.build_with(scene.regions, scene.mesh, comm)
 
 
 def checked_domain(domain: Domain, scene: Scene) -> Domain:
@@ -224,6 +224,9 @@ def checked_domain(domain: Domain, scene: Scene) -> Domain:
         raise SceneError(f"mesh.element = {scene.mesh.element!r}: the mesh has elements of type {kind!r}")
     if degree != scene.mesh.degree:
         raise SceneError(f"mesh.degree = {scene.mesh.degree}: the mesh has degree {degree}")
+    for name in scene.regions:
+        if name not in domain.regions:
+            raise SceneError(f"regions.{name}: the mesh has no such region; it has {', '.join(domain.regions)}")
     needed = () if KINEMATICS[scene.model.kinematics].reduced else shape.faces
     missing = [face for face in needed if face not in domain.faces]
     if missing:

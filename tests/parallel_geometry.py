@@ -9,7 +9,11 @@ import numpy as np
 from mpi4py import MPI
 
 from remodel_fenicsx.body import GeometryError, domain
+from remodel_fenicsx.settings import Mesh, Region
 from tests import parts
+
+LAYERED = parts.Tube(inner_radius=1.0, outer_radius=3.0, length=8.0)
+LAYERS = {"media": Region(outer_radius=1.4), "adventitia": Region()}
 
 
 def digest(domain):
@@ -17,7 +21,7 @@ def digest(domain):
     points, cells = domain.gather_mesh()
     table = np.random.default_rng(1).random((max(domain.number_of_elements, domain.number_of_nodes), 3))
     values = domain.gather_elements(table[domain.element_number]), domain.gather_nodes(table[domain.node_number])
-    pieces = [points, cells, *values]
+    pieces = [points, cells, *values, domain.gather_elements(domain.element_region)]
     facets = domain.mesh.topology.index_map(2)
     sizes = [
         domain.comm.allreduce(int(np.sum(domain.facet_tags.find(tag) < facets.size_local)))
@@ -37,6 +41,7 @@ def digests(comm):
         "tendon of tetrahedra": digest(parts.tendon(element="tetrahedron", comm=comm)),
         "tube": digest(parts.tube(comm=comm)),
         "tube of degree 2": digest(parts.tube(degree=2, divisions=(16, 3, 2), comm=comm)),
+        "tube of two layers": digest(LAYERED.build_with(LAYERS, Mesh(), comm)),
     }
 
 

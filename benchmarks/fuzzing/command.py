@@ -1,15 +1,10 @@
-"""The command `benchmarks/fuzz.py`: which seeds are to run, on which cores, and what becomes of the results."""
+"""The command `benchmarks/fuzz.py`: which seeds are to run, and what becomes of the results."""
 
 from __future__ import annotations
 
-import argparse
 import hashlib
-import json
-import os
 import sys
-import threading
 from collections import Counter
-from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import asdict, replace
 from pathlib import Path
 from random import Random
@@ -23,54 +18,42 @@ from benchmarks.fuzzing.scenes import Values, cost, made
 from benchmarks.stability_map.cases import Case, Finding, Run
 from benchmarks.stability_map.judging import BAD_INPUT, NO_END, SOLVE_FAILED, Verdict, judged
 from benchmarks.stability_map.report import read_records
-from benchmarks.stability_map.running import PROJECT, Record, Runner, source_of
-
-RESULTS = PROJECT / "results" / "fuzz"
+from benchmarks.stability_map.running import PROJECT, Record, Runner, file_of, measure, mine, parser_of, source_of
 
 
 def main(description: str | None, arguments: list[str] | None = None) -> int:
     """Run what is missing, print what has come of it; 1 if a scene is wrong."""
-    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(description, 15, "fuzz")
     parser.add_argument("--seed", type=int, default=1, metavar="FIRST", help="the first seed (1)")
     parser.add_argument("--count", type=int, default=300, metavar="N", help="how many seeds (300)")
     parser.add_argument("--only", type=int, metavar="SEED", help="this one, with its scene, whatever is there of it")
-    parser.add_argument("--again", action="store_true", help="run also what is there")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, metavar="N", help="at a time (all cores)")
-    parser.add_argument("--limit", type=float, default=15, metavar="SECONDS", help="of processor time for a run (15)")
-    parser.add_argument("--results", type=Path, default=RESULTS, metavar="DIR", help="folder of the results")
     options = parser.parse_args(arguments)
     if options.only is not None:
         return _one(options.only, options.limit)
-    source, seeds = f"{source_of(PROJECT)} by {judges()}", range(options.seed, options.seed + options.count)
-    file = options.results / f"{source.partition('+')[0]}.jsonl"
+    source, seeds = f"{source_of()} by {judges()}", range(options.seed, options.seed + options.count)
+    file = file_of(options, source)
     there = {} if options.again else {r["seed"]: r for r in read_records(file) if r["source"] == source}
     done = {seed: there[seed] for seed in seeds if seed in there}
     # the cheap ones first: what is stopped has seen as many as it could
     missing = sorted((seed for seed in seeds if seed not in done), key=lambda seed: cost(made(seed)[0]))
     print(f"{source}: {len(seeds)} scenes, {len(missing)} to run; {file}", file=sys.stderr)
-    file.parent.mkdir(parents=True, exist_ok=True)
-    kept = options.results / "runs" / source.partition(" ")[0]  # a run is judged again without being run again
-    mine = threading.local()  # a thread waits for a process of its own, that runs the scenes
-
-    def evaluate(seed: int) -> Record:
-        if not hasattr(mine, "runner"):
-            mine.runner = Runner(PROJECT, options.limit, kept)
-        return evaluated(seed, mine.runner)
-
-    with file.open("a", encoding="utf-8") as out, ThreadPoolExecutor(options.jobs) as pool:
-        for future in as_completed([pool.submit(evaluate, seed) for seed in missing]):
-            record = future.result() | {"source": source}
-            done[record["seed"]] = record
-            out.write(json.dumps(record) + "\n")
-            out.flush()
-            print(said(record), file=sys.stderr, flush=True)
-    print(summary([done[seed] for seed in seeds]))
+    done |= measure(missing, evaluate, said, source, options)
+    print(summary([done[seed] for seed in seeds if seed in done]))
     return int(any(record["outcome"] == "wrong" for record in done.values()))
+
+
+def evaluate(seed: int) -> Record:
+    """A seed, in a process of the pool."""
+    runner, source = mine()
+    return evaluated(seed, runner) | {"source": source}
 
 
 def judges() -> str:
     """Hash of what makes the scenes and judges them: with other scenes a seed is another one."""
-    files = [*sorted(Path(__file__).parent.glob("*.py")), PROJECT / "tests" / "reference" / "radial.py"]
+    files = [
+        path for room in ("fuzzing", "stability_map") for path in sorted(Path(__file__).parents[1].glob(f"{room}/*.py"))
+    ]
+    files.append(PROJECT / "tests" / "reference" / "radial.py")
     return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:10]
 
 
@@ -142,7 +125,7 @@ def _one(seed: int, limit: float) -> int:
         for key, value in values.items() if scene.get(table, {}).get(key) != value
     }  # fmt: skip
     print("\n".join(f"#     {key} = {value}" for key, value in changed.items()))
-    runner = Runner(PROJECT, limit)
+    runner = Runner(limit)
     try:
         record = evaluated(seed, runner)
     finally:

@@ -6,11 +6,10 @@ import math
 from random import Random
 from typing import Any
 
+from benchmarks.stability_map.march import BOLTZMANN, STRESS_UNITS
 from tests.reference.radial import secant_stiffness
 
 Values = dict[str, Any]
-BOLTZMANN = 1.381e-23
-STRESS_UNITS = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6}
 COARSE = (8, 4, 2)  # elements of a tube around, through the wall and along, where it is meshed in full
 RAY = (16, 8, 1)  # one layer: a half-plane that the radius is held against
 COUNTS = {"tendon": {"AROUND": 8, "CORE": 2, "RINGS": 1, "ALONG": 2}}

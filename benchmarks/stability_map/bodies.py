@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 
 from benchmarks.stability_map.cases import MU, Case, Check, Finding, Place, Run, Values, named, table, with_values
-from benchmarks.stability_map.homogeneous import CUBE, DRIVERS, FRAMES, RAMP, element, has_frame, step_times
+from benchmarks.stability_map.homogeneous import CUBE, DRIVERS, FRAMES, RAMP, element, has_frame
 from benchmarks.stability_map.judging import SAME_MESH
-from benchmarks.stability_map.tube_march import load_at, march
+from benchmarks.stability_map.march import load_at, step_times
+from benchmarks.stability_map.tube_march import march_of
 from tests.reference.radial import RadialMaterial, Tube
 
 SOFT = {"chain_density": 2.0e21, "contour_length": 1.594, "persistence_length": 1.365}
@@ -50,7 +51,7 @@ def ring(around: int, through: int) -> dict[str, Any]:
 # ---------------------------------------------------------------- the tube in one dimension
 def check_tube(case: Case, run: Run) -> Finding:
     """Inner and outer radius by step, and the fibre angle of the outermost elements, where it is no steep function."""
-    expected, known = march(case.scene, step_times(case.scene), 60), case.options.get("unstable")
+    expected, known = march_of(case.scene, step_times(case.scene), 60), case.options.get("unstable")
     rows, whole = min(len(run.column("time")), len(expected.times)), not expected.ended
     if not rows:
         return Finding(np.inf if run.code == 0 else 0.0, "no row to compare", known, whole)

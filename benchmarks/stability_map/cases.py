@@ -18,7 +18,7 @@ Values = dict[str, Any]
 class Run:
     """What came out of a scene, as a user sees it (`runner.run_request`)."""
 
-    code: int | None
+    code: int
     said: str = ""
     seconds: float = 0.0
     warnings: list[str] = field(default_factory=list)

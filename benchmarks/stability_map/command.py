@@ -3,61 +3,51 @@
 from __future__ import annotations
 
 import argparse
-import json
-import multiprocessing
-import os
 import sys
-import time as clock
 from collections import Counter
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 
 from benchmarks.stability_map import report
 from benchmarks.stability_map.cases import FAMILIES, Case, all_cases
-from benchmarks.stability_map.running import PROJECT, Record, digest, evaluate, set_up, source_of
+from benchmarks.stability_map.running import Record, digest, evaluate, file_of, measure, parser_of, source_of
 
 
 def main(description: str | None, arguments: list[str] | None = None) -> int:
     """Run what is missing, print the table; 1 if a case is wrong."""
-    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(description, 120, "stability")
     parser.add_argument("--family", action="append", default=[], metavar="NAME", help="only cases of this family")
     parser.add_argument("--only", action="append", default=[], metavar="TEXT", help="only cases whose key contains it")
     parser.add_argument("--reduced", action="store_true", help="only the cases of the test")
-    parser.add_argument("--again", action="store_true", help="run also what has been measured")
     parser.add_argument("--judge", action="store_true", help="only what has been measured with any reference before")
     parser.add_argument("--list", action="store_true", help="print the cases, run nothing")
-    parser.add_argument(
-        "--jobs", type=int, default=os.cpu_count() or 1, metavar="N", help="cases at a time (all cores)"
-    )
-    parser.add_argument(
-        "--limit", type=float, default=120, metavar="SECONDS", help="of processor time for one scene (120)"
-    )
-    parser.add_argument("--checkout", type=Path, default=PROJECT, metavar="PATH", help="of another version")
-    parser.add_argument("--results", type=Path, default=PROJECT / "results" / "stability", help="folder of the results")
     parser.add_argument("--report", action="store_true", help="write docs/stability.md and its picture, run nothing")
     options = parser.parse_args(arguments)
     if options.report:
-        return report.write(options.results, all_cases(), source_of(PROJECT), digest)
+        return report.write(options.results, all_cases(), source_of(), digest)
     cases = chosen(options, parser)
     if options.list:
         print("\n".join(f"{case.key}\n    {case.command}" for case in cases.values()))
         return 0
-    checkout = options.checkout.resolve()
-    source = source_of(checkout)
-    file = options.results / f"{source.partition('+')[0]}.jsonl"
+    source = source_of()
+    file = file_of(options, source)
     done = {} if options.again else measured(file, source, cases, options.limit)
     if options.judge:
         known = {record["key"] for record in report.read_records(file) if record["source"] == source}
         cases = {key: case for key, case in cases.items() if key in known}
     missing = spread([key for key in cases if key not in done], cases)
     print(f"{source}: {len(cases)} cases, {len(missing)} to run with {options.jobs} processes; {file}", file=sys.stderr)
-    done |= run(missing, checkout, source, file, options)
+    done |= measure(missing, evaluate, said, source, options)
     records = [done[key] for key in cases if key in done]
     print(report.table(records))
     for record in records:
         if record["outcome"] in ("wrong", "unchecked") or options.only:
             print(f"{record['outcome']}: {record['key']}: {record['words']}\n    {cases[record['key']].command}")
     return int(any(record["outcome"] == "wrong" for record in records))
+
+
+def said(record: Record) -> str:
+    """A line on a case."""
+    return f"{record['outcome']:9} {record['total']:6.1f} s  {record['key']}"
 
 
 def chosen(options: argparse.Namespace, parser: argparse.ArgumentParser) -> dict[str, Case]:
@@ -92,36 +82,3 @@ def spread(keys: list[str], cases: dict[str, Case]) -> list[str]:
         seen[cases[key].family] += 1
         order[key] = (not cases[key].reduced, seen[cases[key].family])
     return sorted(keys, key=order.__getitem__)
-
-
-def run(keys: list[str], checkout: Path, source: str, file: Path, options: argparse.Namespace) -> dict[str, Record]:
-    """Run cases; each result is on disk as soon as it is there."""
-    found: dict[str, Record] = {}
-    if not keys:
-        return found
-    file.parent.mkdir(parents=True, exist_ok=True)
-    start, counts = clock.monotonic(), Counter[str]()
-    with (
-        file.open("a", encoding="utf-8") as out,
-        ProcessPoolExecutor(
-            options.jobs,
-            multiprocessing.get_context("spawn"),
-            set_up,
-            (str(checkout), options.limit, source, "" if options.again else str(file.parent / "runs")),
-        ) as pool,
-    ):
-        waiting = {pool.submit(evaluate, key): key for key in keys}
-        try:
-            for number, future in enumerate(as_completed(waiting), start=1):
-                record = found[waiting[future]] = future.result()
-                out.write(json.dumps(record) + "\n")
-                out.flush()
-                counts[record["outcome"]] += 1
-                left = (clock.monotonic() - start) / number * (len(keys) - number)
-                words = f"{record['outcome']:9} {record['total']:6.1f} s  {record['key']}"
-                line = f"[{number}/{len(keys)}, {left / 60:.0f} min left] {words}"
-                print(line, file=sys.stderr, flush=True)
-        except KeyboardInterrupt:
-            pool.shutdown(wait=False, cancel_futures=True)
-            print("stopped; what has been measured is kept, the same command goes on", file=sys.stderr)
-    return found

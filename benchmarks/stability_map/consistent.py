@@ -17,12 +17,9 @@ from benchmarks.stability_map.homogeneous import (
     compared,
     cube_case,
     element,
-    initial,
-    material,
-    nominal_stress,
-    step_times,
     triaxial,
 )
+from benchmarks.stability_map.march import initial, material, nominal_stress, step_times
 from benchmarks.stability_map.point import Array, NoEquilibrium, Path, advance
 from benchmarks.stability_map.prescribed import FINER, REFERENCE, REVERSED, compared_with_limit, gradients
 from tests.reference.radial import RadialMaterial, cauchy_stress, driving_values, secant_stiffness
@@ -67,7 +64,7 @@ class Target:
 def diagonal_path(
     m: RadialMaterial, forces: Array, times: Array, dimensions: Array, driver: str, scheme: str, kappa: float
 ) -> Path:
-    """As `point.diagonal_path`, for the law `tensor`. Coaxial, the repulsion `log` is the paper's."""
+    """As `march.march` of a bar, for the law `tensor`, typed once more. Coaxial, the repulsion `log` is the paper's."""
     squares, stretches, load, path = dimensions**2, np.ones(3), np.zeros(3), Path()
     old, last, before, r0, start = squares, None, None, m.end_to_end_length, 0.0
     for time, new_load in zip(times, forces, strict=True):

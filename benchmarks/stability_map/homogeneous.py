@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
 import numpy as np
 
 from benchmarks.stability_map.cases import Case, Check, Finding, Place, Run, Values, named, table, with_values
-from benchmarks.stability_map.point import Path, diagonal_path
+from benchmarks.stability_map.march import Bar, march, material, slowed
+from benchmarks.stability_map.point import Path
 from benchmarks.stability_map.solid import smallest_eigenvalue
-from tests.reference.radial import RadialMaterial
 
 CUBE: dict[str, Any] = {
     "geometry": {"shape": "cube", "side": 1.0},
@@ -42,66 +41,11 @@ REFERENCE = "material point"
 
 
 # ---------------------------------------------------------------- the reference of a scene
-def material(scene: dict[str, Any]) -> RadialMaterial:
-    """The reference's parameters from the scene's."""
-    m = scene["material"]
-    modulus = 1.381e-23 * m["temperature"] * m["chain_density"] / (4 * m["persistence_length"])
-    length = m["contour_length"] if m["chain_density"] else 1e9  # where there are no chains, none locks
-    return RadialMaterial(m["lame_lambda"], m["lame_mu"], modulus, length, scene["cells"]["end_to_end_length"])
-
-
-def factor(ramp: Sequence[Sequence[float]], time: np.ndarray) -> np.ndarray:
-    """Piecewise linear, held at both ends."""
-    times, factors = np.array(ramp, dtype=float).T
-    return np.interp(time, times, factors)
-
-
-def step_times(scene: dict[str, Any]) -> np.ndarray:
-    """Times of the steps."""
-    step, end = scene["time"]["step"], scene["time"]["end"]
-    return step * np.arange(1, round(end / step) + 1)
-
-
-def nominal_stress(scene: dict[str, Any], times: np.ndarray) -> np.ndarray:
-    """Dead stresses along x, y, z by step."""
-    geometry, found = scene["geometry"], np.zeros((len(times), 3))
-    thickness = geometry["side"] / geometry.get("aspect", 1.0)
-    for name, load in scene["loads"].items():
-        axis = "xyz".index(name[-1]) if name != "force" else 2
-        area = geometry["side"] ** 2 if axis == 0 else geometry["side"] * thickness
-        found[:, axis] += load["value"] * factor(load["ramp"], times) / area
-    return found
-
-
-def initial(scene: dict[str, Any]) -> np.ndarray:
-    """l_I at t = 0."""
-    cells = scene["cells"]
-    if isinstance(cells["initial"], str):
-        along = cells.get("aligned_axis", 3)
-        pattern = {"isotropic": np.full(3, 3**-0.5), "aligned": np.eye(3)[along - 1]}[cells["initial"]]
-        return np.asarray(cells["end_to_end_length"] * pattern)
-    return np.array(cells["initial"], dtype=float)
-
-
-def slowed(scene: dict[str, Any]) -> bool:
-    """Whether the relaxed pass meets a law with a memory: then its own scheme is no reference, the law is."""
-    return scene["remodeling"]["coupling"] == "relaxed" and scene["remodeling"]["law"] in ("rate", "relaxation")
-
-
 def path_of(scene: dict[str, Any]) -> Path:
     """What the reference does."""
-    r, times = scene["remodeling"], step_times(scene)
-    relaxed = r["coupling"] == "relaxed" and not slowed(scene)
-    return diagonal_path(
-        material(scene),
-        nominal_stress(scene, times),
-        times,
-        initial(scene),
-        r["driver"],
-        r["law"],
-        r["kappa"],
-        r.get("relaxation_factor", 0.5) if relaxed else 1.0,
-    )
+    rows, ended = march(scene, Bar(scene))
+    times, stretches, squares = (list(values) for values in zip(*rows, strict=True)) if rows else ([], [], [])
+    return Path(times, stretches, [by_point[0] for by_point in squares], ended)
 
 
 def check_point(case: Case, run: Run) -> Finding:

@@ -9,14 +9,8 @@ import numpy as np
 
 from benchmarks.stability_map import consistent
 from benchmarks.stability_map.cases import Case, Finding, Place, Run, Values, table
-from benchmarks.stability_map.homogeneous import (
-    CUBE,
-    cube_case,
-    initial,
-    material,
-    nominal_stress,
-    step_times,
-)
+from benchmarks.stability_map.homogeneous import CUBE, cube_case
+from benchmarks.stability_map.march import initial, material, nominal_stress, step_times
 from benchmarks.stability_map.point import Array, advance
 
 POINT: dict[str, Any] = {"model.kinematics": "point"}

@@ -54,8 +54,6 @@ class Verdict:
 
 def judged(case: Case, run: Run) -> Verdict:
     """The verdict on a run."""
-    if run.code is None:
-        return Verdict("not there", run.said)
     if run.code == NO_END:
         return Verdict("unchecked", run.said)
     if run.code not in (0, BAD_INPUT, SOLVE_FAILED):

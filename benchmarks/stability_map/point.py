@@ -14,12 +14,8 @@ import numpy.typing as npt
 
 from tests.reference.radial import (
     RadialMaterial,
-    cauchy_stress,
-    driving_values,
     first_piola_kirchhoff,
-    remodel,
     secant_stiffness,
-    stress_noise,
 )
 
 Array = npt.NDArray[Any]
@@ -46,60 +42,6 @@ class Path:
 
 
 # ---------------------------------------------------------------- axes along x, y, z for ever
-def diagonal_path(
-    material: RadialMaterial,
-    forces: Array,
-    times: Array,
-    dimensions: Array,
-    driver: str = "cauchy",
-    law: str = "explicit",
-    kappa: float = 0.025,
-    share: float = 1.0,
-) -> Path:
-    """A cube under dead forces along x, y, z, staggered as the paper does it, all axes along x, y, z.
-
-    Parameters
-    ----------
-    forces
-        Nominal stresses by step, (steps, 3).
-    dimensions
-        l_I at t = 0; rank I lies along axis I.
-    share
-        Of a pass's change of A that is made.
-    """
-    squares: Array = dimensions[None] ** 2
-    ranked, ranks, start = dimensions[None].copy(), np.array([[0, 1, 2]]), dimensions[None].copy()
-    stretches, old, path, before = np.ones(3), squares, Path(), 0.0
-    load = np.zeros(3)
-    for time, new_load in zip(times, forces, strict=True):
-        try:
-            stretches = advance(stretches, (old, load), (squares, new_load), material)
-        except NoEquilibrium as error:
-            path.ended = f"no equilibrium at t = {time:g}: {error}"
-            return path
-        old, load = squares, new_load
-        path.times.append(float(time))
-        path.stretches.append(stretches)
-        path.squares.append(squares[0])
-        stress = cauchy_stress(stretches[None], squares, material)
-        noise = 0.0 if driver == "finger" else stress_noise(stretches[None], squares, material)
-        values = driving_values(driver, stretches[None], stress)
-        step = float(time) - before
-        ranked, ranks = remodel(
-            ranked, values, ranks, start, law, kappa, float(time), step, material.end_to_end_length, noise
-        )
-        asked = np.empty_like(ranked)
-        np.put_along_axis(asked, ranks, ranked, axis=1)
-        squares = old + share * (asked**2 - old)
-        if share < 1.0:  # rank is the order of A's eigenvalues; where they agree the pass's ranks stay
-            by_rank = np.take_along_axis(squares, ranks, axis=1)
-            order = np.argsort(-np.round(by_rank, 12), axis=1, kind="stable")
-            ranks = np.take_along_axis(ranks, order, axis=1)
-            ranked = np.sqrt(np.take_along_axis(squares, ranks, axis=1))
-        before = float(time)
-    return path
-
-
 def advance(stretches: Array, old: tuple[Array, Array], new: tuple[Array, Array], material: RadialMaterial) -> Array:
     """Stretches in equilibrium with new squares and load, in parts where one Newton solve fails."""
     found = equilibrium(stretches, *new, material)

@@ -14,12 +14,9 @@ from benchmarks.stability_map.homogeneous import (
     FRAMES,
     RAMP,
     case_of_shape,
-    factor,
     has_frame,
-    initial,
-    material,
-    step_times,
 )
+from benchmarks.stability_map.march import factor, initial, material, step_times
 from benchmarks.stability_map.point import prescribed_path
 
 FINER = 16  # steps of the reference in one of the scene's

@@ -9,7 +9,8 @@ import numpy as np
 
 from benchmarks.stability_map.bodies import OUTER_ANGLE_TOLERANCE, RADIUS_TOLERANCE, TUBE, check_inner_displacement
 from benchmarks.stability_map.cases import MU, Case, Check, Finding, Place, Run, Values, named, table, with_values
-from benchmarks.stability_map.tube_march import March, load_at, march, pressure_curve, tube_of
+from benchmarks.stability_map.march import load_at, tube_of
+from benchmarks.stability_map.tube_march import March, march_of, pressure_curve
 
 RAY: dict[str, Any] = with_values(
     TUBE, {"geometry.length": 8.0, "model.kinematics": "radial", "loads": {}, "time": {"end": 8.0, "step": 1.0}}
@@ -41,7 +42,7 @@ def marched(scene: dict[str, Any]) -> March:
     """The reference with the scene's steps, or finer ones where the scene's cells are not a step behind."""
     step, end = scene["time"]["step"], scene["time"]["end"]
     finer = 1 if scene["remodeling"]["coupling"] == "staggered" else 8
-    return march(scene, step / finer * np.arange(1, round(end / step) * finer + 1))
+    return march_of(scene, step / finer * np.arange(1, round(end / step) * finer + 1))
 
 
 def check_march(case: Case, run: Run) -> Finding:
@@ -157,7 +158,7 @@ def check_equilibrium(case: Case, run: Run) -> Finding:
     """Radii, angles at both faces and the mean of A along the axis, as a march in small steps leaves them."""
     scene, rows = case.scene, run.column("time")
     ramped = max(load["ramp"][-1][0] for load in scene["loads"].values())
-    expected = march(scene, growing_steps(float(ramped)), 24)
+    expected = march_of(scene, growing_steps(float(ramped)), 24)
     if expected.ended:
         return Finding(np.nan, f"the reference ends at {expected.ended}")
     if not len(rows) or run.code != 0:

@@ -1,8 +1,6 @@
-"""Runs scenes through a checkout's own command line, many in one process, and returns what a user would see.
+"""Runs scenes through the command line, many in one process, and returns what a user would see.
 
-    python3 runner.py       reads one request a line (JSON), answers with one line each; PYTHONPATH names the checkout
-
-It imports nothing of this checkout but the bodies and loads of `extensions`, which another version may not know.
+python3 runner.py       reads one request a line (JSON), answers with one line each
 """
 
 from __future__ import annotations
@@ -26,24 +24,7 @@ import h5py
 import numpy as np
 import tomlkit
 
-MESH_MODULES = ("remodel_fenicsx.body", "remodel_fenicsx.geometry")  # of this version, of 0.1.0
-UNKNOWN = re.compile(r"unknown key|allowed (is|are)\b|has no such")  # another version's words for what it does not have
 WANTED_FIELDS = ("deformation_gradient", "cauchy_stress", "cell_dimensions", "axis_1", "axis_2", "axis_3")
-
-
-# keys of this version that 0.1.0 calls otherwise
-EARLIER = {("mesh", "element"): ("mesh", "cell"), ("loads", "elongation"): ("loads", "stretch")}
-
-
-def in_words_of(version: str, scene: dict[str, Any]) -> dict[str, Any]:
-    """The scene with the keys that a version knows it by."""
-    if not version.startswith("0.1."):
-        return scene
-    copy = {name: dict(value) if isinstance(value, dict) else value for name, value in scene.items()}
-    for (table, key), (_, earlier) in EARLIER.items():
-        if key in copy.get(table, {}):
-            copy[table][earlier] = copy[table].pop(key)
-    return copy
 
 
 def run_request(request: dict[str, Any]) -> dict[str, Any]:
@@ -53,26 +34,21 @@ def run_request(request: dict[str, Any]) -> dict[str, Any]:
     ----------
     request
         `scene`: nested tables; `counts`: {module: {constant: value}}, numbers of elements that scenes cannot ask for;
-        `extended`: whether it needs the loads and bodies of `extensions`; `other`: whether this is another checkout.
+        `extended`: whether it needs the loads and bodies of `extensions`.
         Ways to run it that must change nothing: `ranks`; `stop`, a time at which it ends and is resumed; `recorded`:
         the scene.toml that it leaves is what is run.
 
     Returns
     -------
-    `code`: exit code, or None where this version cannot express the scene; `said`: standard error; `warnings`: lines
+    `code`: exit code; `said`: standard error; `warnings`: lines
     of run.log; `history`: columns; `fields`: of the last recorded time; `seconds`.
     """
     if request.get("extended"):
-        try:
-            importlib.import_module("benchmarks.stability_map.extensions").register()
-        except ImportError as error:
-            return {"code": None, "said": f"{error}"}
-    start, version = clock.perf_counter(), importlib.import_module("remodel_fenicsx").__version__
+        importlib.import_module("benchmarks.stability_map.extensions").register()
+    start = clock.perf_counter()
     with tempfile.TemporaryDirectory(prefix="remodel-fenicsx-stability-") as folder:
         scene, results = Path(folder) / "scene.toml", Path(folder) / "run"
-        tables = in_words_of(version, request["scene"])
-        if not request.get("other"):  # without it scenes without a preset take the cheapest kinematics
-            tables = {"model": {"kinematics": "full"}, **tables}
+        tables = {"model": {"kinematics": "full"}, **request["scene"]}  # without it they take the cheapest kinematics
         scene.write_text(tomlkit.dumps(tables), encoding="utf-8")
         said, command = io.StringIO(), ["run", str(scene), "-o", str(results), "-q"]
         with element_counts(request.get("counts", {})), contextlib.redirect_stderr(said):
@@ -89,8 +65,6 @@ def run_request(request: dict[str, Any]) -> dict[str, Any]:
                 if code == 0 and request.get("recorded"):
                     again = Path(folder) / "again"
                     code, results = commanded(["run", str(results / "scene.toml"), "-o", str(again), "-q"], said), again
-        if code == 2 and UNKNOWN.search(said.getvalue()) and request.get("other"):
-            code = None
         found = {"code": code, "said": said.getvalue()[-2000:], "seconds": clock.perf_counter() - start}
         return {**found, **read_results(results)}
 
@@ -139,12 +113,10 @@ def element_counts(counts: dict[str, dict[str, Any]]) -> Any:
     """Numbers of elements other than the paper's, where meshes are made."""
     before = []
     for name, constants in counts.items():
-        for room in MESH_MODULES:
-            with contextlib.suppress(ImportError):
-                module = importlib.import_module(f"{room}.{name}")
-                for key, value in constants.items():
-                    before.append((module, key, getattr(module, key)))
-                    setattr(module, key, tuple(value) if isinstance(value, list) else value)
+        module = importlib.import_module(f"remodel_fenicsx.body.{name}")
+        for key, value in constants.items():
+            before.append((module, key, getattr(module, key)))
+            setattr(module, key, tuple(value) if isinstance(value, list) else value)
     try:
         yield
     finally:

@@ -1,16 +1,20 @@
-"""Cases to records: each process that judges owns one that runs scenes with the package of a checkout."""
+"""Cases to records, of the map and of random scenes: each process that judges owns one that runs scenes."""
 
 from __future__ import annotations
 
+import argparse
 import gzip
 import hashlib
 import json
+import multiprocessing
 import os
 import select
 import subprocess
 import sys
 import tempfile
 import time as clock
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict
 from functools import lru_cache
 from pathlib import Path
@@ -20,6 +24,7 @@ import numpy as np
 
 from benchmarks.stability_map.cases import Case, Run, all_cases
 from benchmarks.stability_map.judging import CRASHED, NO_END, judged
+from remodel_fenicsx._version import __version__
 
 PROJECT = Path(__file__).resolve().parents[2]
 RUNNER = Path(__file__).with_name("runner.py")
@@ -28,20 +33,18 @@ ENDED = (0, 1, 2, 3)  # a run that was killed, or went on for too long, may end 
 
 
 class Runner:
-    """A process that runs scenes with the package of a checkout.
+    """A process that runs scenes.
 
     Parameters
     ----------
-    checkout
-        Folder with `remodel_fenicsx`.
     store
         Folder that keeps what came out of a scene, so that a new reference runs nothing again.
     limit
         Seconds of processor time that one scene may take; then the process is ended and another one started.
     """
 
-    def __init__(self, checkout: Path, limit: float, store: Path | None = None):
-        self.checkout, self.limit, self.store = checkout, limit, store
+    def __init__(self, limit: float, store: Path | None = None):
+        self.limit, self.store = limit, store
         self._process: subprocess.Popen[str] | None = None
 
     def run(self, request: dict[str, Any]) -> Run:
@@ -53,7 +56,7 @@ class Runner:
         if kept.exists():
             return Run(**json.loads(gzip.decompress(kept.read_bytes())))
         run = self._run(request)
-        if run.code in (None, *ENDED):
+        if run.code in ENDED:
             self.store.mkdir(parents=True, exist_ok=True)
             part = kept.with_suffix(f".{os.getpid()}")
             part.write_bytes(gzip.compress(json.dumps(asdict(run)).encode()))
@@ -65,7 +68,7 @@ class Runner:
         process = self._process = self._process or self._started()
         assert process.stdin is not None and process.stdout is not None
         try:
-            process.stdin.write(json.dumps({**request, "other": self.checkout != PROJECT}, default=plain) + "\n")
+            process.stdin.write(json.dumps(request, default=plain) + "\n")
             process.stdin.flush()
             end = processor_seconds(process.pid) + self.limit
             while not (ready := select.select([process.stdout], [], [], 0.5)[0]):
@@ -81,8 +84,7 @@ class Runner:
         return Run(**json.loads(line))
 
     def _started(self) -> subprocess.Popen[str]:
-        paths = os.pathsep.join(map(str, dict.fromkeys([self.checkout, PROJECT])))
-        environment = {**os.environ, "PYTHONPATH": paths, "OMP_NUM_THREADS": "1"}
+        environment = {**os.environ, "PYTHONPATH": str(PROJECT), "OMP_NUM_THREADS": "1"}
         log = tempfile.TemporaryFile("w")
         return subprocess.Popen(
             [sys.executable, str(RUNNER)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, text=True,
@@ -142,29 +144,78 @@ def references() -> str:
     return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()
 
 
-def source_of(checkout: Path) -> str:
-    """Version and hash of a checkout's package."""
-    package, key = checkout / "remodel_fenicsx", hashlib.sha256()
+def source_of() -> str:
+    """Version and hash of the package."""
+    package, key = PROJECT / "remodel_fenicsx", hashlib.sha256()
     for path in sorted(package.rglob("*.py")):
         key.update(f"{path.relative_to(package)}\n".encode() + path.read_bytes())
-    places = (package / "_version.py", package / "__init__.py")  # the latter in earlier versions
-    text = next(place for place in places if place.exists()).read_text(encoding="utf-8")
-    version = text.partition('__version__ = "')[2].partition('"')[0]
-    return f"{version}+{key.hexdigest()[:10]}"
+    return f"{__version__}+{key.hexdigest()[:10]}"
 
 
-# ---------------------------------------------------------------- in a pool
+# ---------------------------------------------------------------- many of them
 _mine: dict[str, Any] = {}
 
 
-def set_up(checkout: str, limit: float, source: str, store: str) -> None:
-    """Of a process of the pool."""
-    os.environ["OMP_NUM_THREADS"] = "1"
-    _mine.update(
-        runner=Runner(Path(checkout), limit, Path(store) / source if store else None), source=source, cases=all_cases()
+def parser_of(description: str | None, limit: float, results: str) -> argparse.ArgumentParser:
+    """The options that both commands have; seconds and the name of the results' folder are their defaults."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--again", action="store_true", help="run also what has been measured")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, metavar="N", help="at a time (all cores)")
+    parser.add_argument(
+        "--limit", type=float, default=limit, metavar="SECONDS", help=f"of processor time for one scene ({limit:g})"
     )
+    parser.add_argument("--results", type=Path, default=PROJECT / "results" / results, help="folder of the results")
+    return parser
+
+
+def measure(
+    keys: Sequence[Any], evaluate: Callable[[Any], Record], said: Callable[[Record], str], source: str,
+    options: argparse.Namespace,
+) -> dict[Any, Record]:  # fmt: skip
+    """Run and judge, in processes; each record is a line of the file of the version as soon as it is there."""
+    found: dict[Any, Record] = {}
+    if not keys:
+        return found
+    options.results.mkdir(parents=True, exist_ok=True)
+    start, store = clock.monotonic(), None if options.again else options.results / "runs" / source.partition(" ")[0]
+    with (
+        file_of(options, source).open("a", encoding="utf-8") as out,
+        ProcessPoolExecutor(
+            options.jobs, multiprocessing.get_context("spawn"), _set_up, (options.limit, source, store)
+        ) as pool,
+    ):  # fmt: skip
+        waiting = {pool.submit(evaluate, key): key for key in keys}
+        try:
+            for number, future in enumerate(as_completed(waiting), start=1):
+                record = found[waiting[future]] = future.result()
+                out.write(json.dumps(record) + "\n")
+                out.flush()
+                left = (clock.monotonic() - start) / number * (len(keys) - number)
+                print(f"[{number}/{len(keys)}, {left / 60:.0f} min left] {said(record)}", file=sys.stderr, flush=True)
+        except KeyboardInterrupt:
+            pool.shutdown(wait=False, cancel_futures=True)
+            print("stopped; what has been measured is kept, the same command goes on", file=sys.stderr)
+    return found
+
+
+def file_of(options: argparse.Namespace, source: str) -> Path:
+    """Of the results of a version."""
+    return Path(options.results / f"{source.partition('+')[0]}.jsonl")
+
+
+def _set_up(limit: float, source: str, store: Path | None) -> None:
+    os.environ["OMP_NUM_THREADS"] = "1"
+    _mine.update(runner=Runner(limit, store), source=source)
+
+
+def mine() -> tuple[Runner, str]:
+    """Of a process of the pool: what runs scenes there, and the source that its records name."""
+    return _mine["runner"], _mine["source"]
 
 
 def evaluate(key: str) -> Record:
     """A case by its key, in a process of the pool."""
-    return evaluated(_mine["cases"][key], _mine["runner"], _mine["source"])
+    return evaluated(_cases()[key], *mine())
+
+
+_cases = lru_cache(all_cases)

@@ -12,19 +12,8 @@ from typing import Any
 import numpy as np
 from scipy.optimize import root
 
-from benchmarks.stability_map.homogeneous import factor, initial, material
-from tests.reference.radial import (
-    AXIAL,
-    CIRCUMFERENTIAL,
-    RADIAL,
-    Array,
-    Tube,
-    cauchy_stress,
-    driving_values,
-    first_piola_kirchhoff,
-    remodel,
-    stress_noise,
-)
+from benchmarks.stability_map.march import Wall, initial, march, tube_of
+from tests.reference.radial import AXIAL, CIRCUMFERENTIAL, Array, Tube, first_piola_kirchhoff
 
 
 @dataclass
@@ -50,49 +39,12 @@ class March:
         return float(np.average(angle[layer], weights=self.tube.areas[layer]))
 
 
-def tube_of(scene: dict[str, Any], elements: int = 40) -> Tube:
-    """The scene's wall."""
-    geometry = scene["geometry"]
-    return Tube(geometry["inner_radius"], geometry["outer_radius"], elements, material(scene))
-
-
-def load_at(scene: dict[str, Any], name: str, time: float) -> float:
-    """A load that may not be there."""
-    load = scene["loads"].get(name)
-    return 0.0 if load is None else float(load["value"] * factor(load["ramp"], np.array([time]))[0])
-
-
-def march(scene: dict[str, Any], times: Sequence[float], elements: int = 40) -> March:
+def march_of(scene: dict[str, Any], times: Sequence[float], elements: int = 40) -> March:
     """Staggered as the paper does it, through the scene's loads at these times, held at the prescribed elongation."""
-    tube, r = tube_of(scene, elements), scene["remodeling"]
-    m, found = tube.material, March(tube)
-    start = np.tile(initial(scene), (len(tube.points), 1))
-    ranked, ranks = start.copy(), np.tile([CIRCUMFERENTIAL, AXIAL, RADIAL], (len(start), 1))
-    radii, squares, before = tube.nodes.copy(), start**2, 0.0
-    state: tuple[Array, float, float] = (squares, 0.0, 1.0)
-    for time in times:
-        new = (squares, load_at(scene, "pressure", time), 1 + load_at(scene, "elongation", time))
-        try:
-            radii = tube.advance(radii, state, new)
-        except (RuntimeError, ValueError, np.linalg.LinAlgError) as error:
-            found.ended = f"t = {time:g}: {error}"
-            return found
-        state = new
-        found.times.append(float(time))
-        found.inner.append(float(radii[0]))
-        found.outer.append(float(radii[-1]))
-        found.squares.append(squares)
-        stretches = tube.stretches(radii, new[2])
-        stress = cauchy_stress(stretches, squares, m)
-        noise = 0.0 if r["driver"] == "finger" else stress_noise(stretches, squares, m)
-        ranked, ranks = remodel(
-            ranked, driving_values(r["driver"], stretches, stress), ranks, start, r["law"], r["kappa"], float(time),
-            float(time) - before, m.end_to_end_length, noise,
-        )  # fmt: skip
-        by_direction = np.empty_like(ranked)
-        np.put_along_axis(by_direction, ranks, ranked, axis=1)
-        squares, before = by_direction**2, float(time)
-    return found
+    wall = Wall(scene, elements)
+    rows, ended = march(scene, wall, times, "staggered")
+    inner, outer = ([float(row.unknown[end]) for row in rows] for end in (0, -1))
+    return March(wall.tube, [row.time for row in rows], inner, outer, [row.squares for row in rows], ended)
 
 
 # ---------------------------------------------------------------- how far a pressure can be raised

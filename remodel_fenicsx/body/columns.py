@@ -78,6 +78,14 @@ _PROFILE_COLUMNS = tuple(
 )
 
 
+# ---------------------------------------------------------------- of regions
+
+
+def columns_of_region(name: str) -> tuple[str, str]:
+    """Names of the columns that a region has."""
+    return f"fibre_angle_{name}", f"max_chain_extension_{name}"
+
+
 # ---------------------------------------------------------------- which a history has
 FIRST_COLUMN = Column("time", "time", "time of the scene", lambda m: m.step.time)
 COLUMNS: dict[str, Column] = {

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import basix.ufl
@@ -18,7 +18,7 @@ import numpy.typing as npt
 import ufl
 from mpi4py import MPI
 
-from remodel_fenicsx.body.gmsh_model import GeometryError, gmsh_model, named_faces
+from remodel_fenicsx.body.gmsh_model import GeometryError, NamedGroups, gmsh_model, named_groups
 from remodel_fenicsx.fem import compat
 from remodel_fenicsx.fem.assembly import over_ranks
 
@@ -28,7 +28,7 @@ Marker = Callable[[Array], npt.NDArray[np.bool_]]
 
 @dataclass(frozen=True, eq=False)
 class Domain:
-    """A meshed body with named faces.
+    """A meshed body with named faces and regions.
 
     Elements and nodes have the numbers under which rank 0 gave them to dolfinx (0, 1, ... in the order of the
     input). They do not depend on the number of ranks: what belongs to an element or a node for good is drawn and
@@ -46,6 +46,13 @@ class Domain:
         Name of the shape (`body.SHAPES`).
     dimensions
         The shape's dimensions by name, in the scene's unit of length. Tendon: also `radius`, that of the outer nodes.
+    regions
+        Name of a region -> its number in `element_region`, on every rank; a body of one piece has one. A shape gives
+        them as named volumes of what it draws with Gmsh (`build_domain`), or here (`layers.Wall.marked`). Every
+        element is in one; a scene's `[regions.NAME]` names some or all of them.
+    element_region
+        Number of each local element's region, owned ones first, then ghosts, (local elements,) int32; default: the
+        one region.
     element_number
         Number of each local element, owned ones first, then ghosts, (local elements,) int64.
     node_number
@@ -59,6 +66,8 @@ class Domain:
     faces: dict[str, int]
     shape: str
     dimensions: dict[str, float]
+    regions: dict[str, int] = field(default_factory=lambda: {"body": 1})
+    element_region: npt.NDArray[np.int32] = None  # type: ignore[assignment]  # then made below
     element_number: npt.NDArray[np.int64] = field(init=False)
     node_number: npt.NDArray[np.int64] = field(init=False)
     number_of_elements: int = field(init=False)
@@ -73,6 +82,9 @@ class Domain:
         settle(self, "node_number", np.asarray(geometry.input_global_indices, dtype=np.int64))
         settle(self, "number_of_elements", int(topology.index_map(topology.dim).size_global))
         settle(self, "number_of_nodes", int(geometry.index_map().size_global))
+        if self.element_region is None:
+            (only,) = self.regions.values()
+            settle(self, "element_region", np.full(len(self.element_number), only, dtype=np.int32))
 
     @property
     def comm(self) -> MPI.Intracomm:
@@ -224,7 +236,7 @@ def build_domain(
     Parameters
     ----------
     draw
-        Draws and meshes the body in the current Gmsh model, with physical groups for the volume and the faces.
+        Draws and meshes the body in the current Gmsh model, with physical groups for the volumes and the faces.
     shape, dimensions
         As in `Domain`.
     comm
@@ -239,35 +251,39 @@ def build_domain(
     # with several threads Scotch parts the same mesh differently from run to run
     os.environ.setdefault("SCOTCH_PTHREAD_NUMBER", "1")
     if comm.rank != 0:
-        verdict, faces = comm.bcast(None, root=0)
+        verdict, groups = comm.bcast(None, root=0)
         if verdict:
             raise GeometryError(verdict)
-        return _domain_from_gmsh(None, comm, faces, shape, dimensions)
+        return _domain_from_gmsh(None, comm, groups, shape, dimensions)
     # the verdict goes out exactly once, whether Gmsh is missing, fails or is interrupted: nobody waits for ever
     told = False
     try:
         with gmsh_model(shape) as gmsh:
             draw()
-            faces = named_faces()
+            groups = named_groups()
             told = True
-            comm.bcast(("", faces), root=0)
-            return _domain_from_gmsh(gmsh.model, comm, faces, shape, dimensions)
+            comm.bcast(("", groups), root=0)
+            return _domain_from_gmsh(gmsh.model, comm, groups, shape, dimensions)
     except BaseException as error:
         if told:
             raise
         verdict = f"Gmsh could not mesh the {shape}: {str(error) or type(error).__name__}"
-        comm.bcast((verdict, {}), root=0)
+        comm.bcast((verdict, None), root=0)
         if not isinstance(error, Exception):  # Ctrl-C on rank 0 stays what it is there
             raise
         raise GeometryError(verdict) from error
 
 
 def _domain_from_gmsh(
-    model: Any, comm: MPI.Intracomm, faces: dict[str, int], shape: str, dimensions: dict[str, float]
+    model: Any, comm: MPI.Intracomm, groups: NamedGroups, shape: str, dimensions: dict[str, float]
 ) -> Domain:
-    mesh, facet_tags = compat.mesh_from_gmsh(model, comm)
+    mesh, cell_tags, facet_tags = compat.mesh_from_gmsh(model, comm)
     symbolic = SymbolicMesh(mesh.ufl_domain().ufl_coordinate_element())
-    return Domain(type(mesh)(mesh._cpp_object, symbolic), facet_tags, faces, shape, dimensions)
+    region = np.zeros(len(mesh.topology.original_cell_index), dtype=np.int32)
+    region[cell_tags.indices] = cell_tags.values
+    drawn = type(mesh)(mesh._cpp_object, symbolic), facet_tags, groups.faces, shape, dimensions, groups.regions
+    domain = Domain(*drawn, region)
+    return replace(domain, element_region=domain.scatter_elements(domain.gather_elements(region)))  # ghosts too
 
 
 # ---------------------------------------------------------------- structured, without Gmsh
@@ -276,21 +292,21 @@ def _domain_from_gmsh(
 def interval_domain(
     start: tuple[float, float, float],
     end: tuple[float, float, float],
-    elements: int,
+    shares: Array,
     degree: int,
     faces: Mapping[str, Marker],
     shape: str,
     dimensions: dict[str, float],
     comm: MPI.Intracomm | None = None,
 ) -> Domain:
-    """Equal elements on a straight line. Collective.
+    """Elements on a straight line. Collective.
 
     Parameters
     ----------
     start, end
         Of the line.
-    elements, degree
-        Number of elements, and degree of their geometry.
+    shares, degree
+        Where on it the nodes are, from 0 to 1, and degree of the elements' geometry.
     faces
         Name of a face of the body -> function of coordinates (3, n) that is true on its place on the line.
     shape, dimensions
@@ -298,25 +314,36 @@ def interval_domain(
     comm
         Ranks that share the mesh; default: all.
     """
-    share = np.linspace(0.0, 1.0, degree * elements + 1)[:, None]
-    points = (1.0 - share) * np.array(start) + share * np.array(end)
+    points = (1.0 - shares[:, None]) * np.array(start) + shares[:, None] * np.array(end)
+    elements = (len(shares) - 1) // degree
     return _domain_from_lattice("interval", degree, points, _lines(elements, degree), faces, shape, dimensions, comm)
 
 
 def half_plane_domain(
-    radii: tuple[float, float],
+    radii: Array,
     length: float,
-    elements: tuple[int, int],
+    layers: int,
     degree: int,
     faces: Mapping[str, Marker],
     shape: str,
     dimensions: dict[str, float],
     comm: MPI.Intracomm | None = None,
 ) -> Domain:
-    """Equal quadrilaterals on a rectangle of the half-plane y = 0, x > 0; elements along x and z. Collective."""
-    across, along = (degree * number + 1 for number in elements)
-    x, z = np.linspace(*radii, across), np.linspace(0.0, length, along)
-    points = np.stack([np.tile(x, along), np.zeros(across * along), np.repeat(z, across)], axis=1)
+    """Quadrilaterals on a rectangle of the half-plane y = 0, x > 0. Collective.
+
+    Parameters
+    ----------
+    radii
+        Where on the x axis the nodes are.
+    length, layers
+        Height along z, and number of equal layers of elements.
+    degree, faces, shape, dimensions, comm
+        As of `interval_domain`.
+    """
+    across, along = len(radii), degree * layers + 1
+    z = np.linspace(0.0, length, along)
+    points = np.stack([np.tile(radii, along), np.zeros(across * along), np.repeat(z, across)], axis=1)
+    elements = (across - 1) // degree, layers
     first, second = (_lines(number, degree, in_order=True) for number in elements)
     # dolfinx's order on a quadrilateral of any degree: corners, then edges and inside, from the two lines
     nodes = second[:, None, :, None] * across + first[None, :, None, :]

@@ -61,23 +61,48 @@ def gmsh_model(name: str) -> Iterator[Any]:
             gmsh.finalize()
 
 
-def named_faces() -> dict[str, int]:
-    """Names and numbers of the faces of the current model, once it is sure that dolfinx can take the model.
+class NamedGroups(NamedTuple):
+    """Names and numbers of the physical groups of a model: its faces, and its regions, which share out its volumes."""
+
+    faces: dict[str, int]
+    regions: dict[str, int]
+
+
+def named_groups() -> NamedGroups:
+    """Those of the current model, once it is sure that dolfinx can take the model. One without a name has its number.
 
     dolfinx looks at these things on rank 0 only, where a failure would leave the other ranks waiting.
 
     Raises
     ------
     GeometryError
-        If there is not exactly one named volume with exactly one type of element, or no face.
+        If there is no named volume or face, more than one type of element, or a volume that is in no named one or in
+        several; if two groups have one name.
     """
     import gmsh
 
-    volumes, faces = gmsh.model.getPhysicalGroups(3), gmsh.model.getPhysicalGroups(2)
+    found = NamedGroups(_groups(2), _groups(3))
     kinds = gmsh.model.mesh.getElements(3)[0]
-    if len(volumes) != 1 or len(kinds) != 1 or not faces:
-        raise GeometryError(f"{len(volumes)} named volumes, {len(kinds)} types of elements, {len(faces)} named faces")
-    return {gmsh.model.getPhysicalName(2, tag): tag for _, tag in faces}
+    if not found.regions or len(kinds) != 1 or not found.faces:
+        counts = f"{len(found.regions)} named volumes, {len(kinds)} types of elements, {len(found.faces)} named faces"
+        raise GeometryError(counts)
+    for _, volume in gmsh.model.getEntities(3):
+        groups = gmsh.model.getPhysicalGroupsForEntity(3, volume)
+        if len(groups) != 1 and len(gmsh.model.mesh.getElements(3, volume)[0]):
+            names = " and ".join(repr(name) for name, tag in found.regions.items() if tag in groups) or "no named one"
+            raise GeometryError(f"volume {volume} is in {names}; each must be in one named volume")
+    return found
+
+
+def _groups(dimension: int) -> dict[str, int]:
+    import gmsh
+
+    tags = [tag for _, tag in gmsh.model.getPhysicalGroups(dimension)]
+    names = [gmsh.model.getPhysicalName(dimension, tag) or str(tag) for tag in tags]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise GeometryError(f"two named {'faces' if dimension == 2 else 'volumes'} {twice!r}")
+    return dict(zip(names, tags, strict=True))
 
 
 # ---------------------------------------------------------------- what the shapes are made of

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -19,7 +19,7 @@ from remodel_fenicsx.body.whole import Body
 from remodel_fenicsx.model.cells import angle_to_axis
 from remodel_fenicsx.schema.tables import Table, fault
 from remodel_fenicsx.schema.units import Dimension, LengthUnit
-from remodel_fenicsx.settings import Mesh
+from remodel_fenicsx.settings import Mesh, Region
 
 if TYPE_CHECKING:  # shapes are part of every scene: they are read without dolfinx
     from mpi4py import MPI
@@ -108,6 +108,8 @@ class Shape(Table):
         Where a fibre angle of 0 degrees and one of 90 point.
     defaults
         Defaults of other tables that this shape changes, under the keys of preset and scene.
+    has_regions
+        Whether a scene may give the body `[regions.NAME]`, named parts with tissue of their own.
     """
 
     loads: ClassVar[dict[str, LoadKind]]
@@ -123,6 +125,7 @@ class Shape(Table):
     depth_in_words: ClassVar[tuple[str, str, str]] = ("along the body", "bottom", "top")
     angle_in_words: ClassVar[tuple[str, str]] = ("along the load", "across")
     defaults: ClassVar[dict[str, Any]] = {}
+    has_regions: ClassVar[bool] = False
 
     shape: str = Field(description="Which body it is.")
     length_unit: LengthUnit = None
@@ -171,6 +174,16 @@ class Shape(Table):
         body.gmsh_model.GeometryError
             On all ranks, if Gmsh fails.
         """
+
+    def build_with(self, regions: Mapping[str, Region], mesh: Mesh, comm: MPI.Intracomm | None = None) -> Domain:
+        """Mesh the body with the regions of a scene, the names of `Domain.regions` among them. Collective.
+
+        Here they come with the mesh (`build`), or there are none; a shape whose regions the scene draws overrides it.
+        """
+        return self.build(mesh, comm)
+
+    def check_regions(self, regions: Mapping[str, Region], mesh: Mesh) -> None:
+        """Refuse what the regions of a scene ask of the body and it cannot have: raise a `fault` that names the key."""
 
     @abstractmethod
     def hold(self, loading: Loading) -> None:
@@ -263,7 +276,9 @@ def homogeneous_bar(
         shape, length = scene.geometry, scene.geometry.axial_length
         faces = {bottom: lambda x: np.isclose(x[2], 0.0), top: lambda x: np.isclose(x[2], length)}
         ends = (length, 0.0, 0.0), (length, 0.0, length)
-        return interval_domain(*ends, 1, scene.mesh.degree, faces, shape.name, dimensions(shape), comm)
+        degree: int = scene.mesh.degree
+        shares = np.linspace(0.0, 1.0, degree + 1, dtype=np.float64)
+        return interval_domain(*ends, shares, degree, faces, shape.name, dimensions(shape), comm)
 
     rules = (same_cells, symmetric_law, homogeneous, known_loads("point"))
     return Reduction(build, lambda scene: 1, rules, unturned, lambda shape, points, corners: whole(shape))

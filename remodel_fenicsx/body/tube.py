@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -12,6 +13,7 @@ from pydantic import Field, model_validator
 from remodel_fenicsx.body import gmsh_model as model
 from remodel_fenicsx.body.buckling import Strut
 from remodel_fenicsx.body.columns import Column
+from remodel_fenicsx.body.layers import Wall, check_layers
 from remodel_fenicsx.body.reductions import (
     Reduction,
     about_z,
@@ -28,7 +30,7 @@ from remodel_fenicsx.body.whole import Body, Corners, divided_along, extended, m
 from remodel_fenicsx.model.cells import pitch_angle, radial_share
 from remodel_fenicsx.schema.tables import fault, shown
 from remodel_fenicsx.schema.units import FORCE, LENGTH, STRESS
-from remodel_fenicsx.settings import Mesh
+from remodel_fenicsx.settings import Mesh, Region
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -47,8 +49,8 @@ def build_ray(scene: Any, comm: Any = None) -> Domain:
 
     shape, faces = scene.geometry, _faces(scene.geometry, "inner", "outer")
     ends = (shape.inner_radius, 0.0, 0.0), (shape.outer_radius, 0.0, 0.0)
-    elements = PAPER[1] * scene.mesh.refinement
-    return interval_domain(*ends, elements, scene.mesh.degree, faces, shape.name, _dimensions(shape), comm)
+    wall, degree = _wall(shape, _counts(scene.mesh)[1], scene.regions), scene.mesh.degree
+    return wall.marked(interval_domain(*ends, wall.shares(degree), degree, faces, shape.name, _dimensions(shape), comm))
 
 
 def build_half_plane(scene: Any, comm: Any = None) -> Domain:
@@ -56,10 +58,10 @@ def build_half_plane(scene: Any, comm: Any = None) -> Domain:
     from remodel_fenicsx.body.domain import half_plane_domain
 
     shape, faces = scene.geometry, _faces(scene.geometry, "bottom", "top", "inner", "outer")
-    elements = PAPER[1] * scene.mesh.refinement, PAPER[2] * scene.mesh.refinement
-    radii = shape.inner_radius, shape.outer_radius
-    return half_plane_domain(
-        radii, shape.length, elements, scene.mesh.degree, faces, shape.name, _dimensions(shape), comm
+    _, through, along = _counts(scene.mesh)
+    wall, degree = _wall(shape, through, scene.regions), scene.mesh.degree
+    return wall.marked(
+        half_plane_domain(wall.nodes(degree), shape.length, along, degree, faces, shape.name, _dimensions(shape), comm)
     )
 
 
@@ -68,12 +70,13 @@ def build_quarter(scene: Any, comm: Any = None) -> Domain:
     from remodel_fenicsx.body.domain import build_domain
 
     shape, mesh = scene.geometry, scene.mesh
-    counts = (*_counts(mesh)[:2], layers(scene))
+    around, through, _ = _counts(mesh)
+    wall = _wall(shape, through, scene.regions)
 
     def draw() -> None:
-        draw_quarter(shape.inner_radius, shape.outer_radius, shape.length, counts, mesh.element, mesh.degree)
+        draw_quarter(wall, shape.length, (around, layers(scene)), mesh.element, mesh.degree)
 
-    return build_domain(draw, shape.name, _dimensions(shape), comm)
+    return wall.marked(build_domain(draw, shape.name, _dimensions(shape), comm))
 
 
 def layers(scene: Any) -> int:
@@ -81,23 +84,28 @@ def layers(scene: Any) -> int:
     return 1 if free_ends(scene) is None else PAPER[2] * scene.mesh.refinement
 
 
-def draw_quarter(
-    inner_radius: float, outer_radius: float, length: float, counts: tuple[int, int, int], element: str, degree: int
-) -> None:
-    """Draw and mesh a quarter in the current Gmsh model; counts are those of the whole tube around."""
-    number, through, along = counts
+def draw_quarter(wall: Wall, length: float, counts: tuple[int, int], element: str, degree: int) -> None:
+    """Draw and mesh a quarter in the current Gmsh model; elements of the whole tube around, and along."""
+    number, along = counts
     quarter = number // 4
-    inner = model.points(model.circle(inner_radius, number)[: quarter + 1])
-    outer = model.points(model.circle(outer_radius, number)[: quarter + 1])
+    faces = wall.radii[0], wall.radii[-1]
+    inner, outer = (model.points(model.circle(radius, number)[: quarter + 1]) for radius in faces)
     inner_line, outer_line = (
         [curve for pair in zip(arc[:-1], arc[1:], strict=True) for curve in model.line(*pair)] for arc in (inner, outer)
     )
-    first, last = (model.line(inner[k], outer[k], through) for k in (0, quarter))
+    first, last = (_spoke(wall, number, k, inner[k], outer[k]) for k in (0, quarter))
     edges = [first, outer_line, model.reverse(last), model.reverse(inner_line)]
     section = model.block(edges, [inner[0], outer[0], outer[quarter], inner[quarter]], element)
     sides = {"inner": inner_line, "outer": outer_line, "plane_y": first, "plane_x": last}
     model.extrude([section], length, along, element, sides)
     model.raise_degree(degree, np.ones_like)
+
+
+def _spoke(wall: Wall, number: int, corner: int, start: model.Point, stop: model.Point) -> list[int]:
+    """Chain of curves through the wall between the corners of the same number on its two faces."""
+    inside = [model.points(model.circle(radius, number)[[corner]])[0] for radius in wall.radii[1:-1]]
+    pairs = itertools.pairwise([start, *inside, stop])
+    return [curve for pair, count in zip(pairs, wall.counts, strict=True) for curve in model.line(*pair, count)]
 
 
 def _faces(shape: Any, *names: str) -> dict[str, Any]:
@@ -115,6 +123,10 @@ def _counts(mesh: Mesh) -> tuple[int, int, int]:
     """Elements of the whole tube around, through the wall and along."""
     around, through, along = (mesh.refinement * count for count in PAPER)
     return around, through, along
+
+
+def _wall(shape: Any, elements: int, regions: Mapping[str, Region]) -> Wall:
+    return Wall.of(shape.inner_radius, shape.outer_radius, elements, regions)
 
 
 def _dimensions(shape: Any) -> dict[str, float]:
@@ -274,6 +286,7 @@ class Tube(Shape):
     ends_that_free_length: ClassVar[tuple[str, ...]] = ("closed",)
     depth_in_words: ClassVar[tuple[str, str, str]] = ("through the wall", "inside", "outside")
     angle_in_words: ClassVar[tuple[str, str]] = ("around", "along")
+    has_regions: ClassVar[bool] = True
     # with global axes a tube of isotropic cells would not stay round in the first step
     defaults: ClassVar[dict[str, Any]] = {"cells": {"axes": "cylindrical"}}
 
@@ -294,6 +307,14 @@ class Tube(Shape):
     def build(self, mesh: Mesh, comm: MPI.Intracomm | None = None) -> Domain:
         """The paper's 16 elements around, 8 through the wall and 12 along, times the refinement."""
         return whole_tube(self, _counts(mesh), mesh.element, mesh.degree, comm)
+
+    def build_with(self, regions: Mapping[str, Region], mesh: Mesh, comm: MPI.Intracomm | None = None) -> Domain:
+        """The same with the scene's layers: as many elements, equally thick in each layer, none in two."""
+        return whole_tube(self, _counts(mesh), mesh.element, mesh.degree, comm, regions)
+
+    def check_regions(self, regions: Mapping[str, Region], mesh: Mesh) -> None:
+        """Regions are layers of the wall, from the lumen outwards by their outer radii."""
+        check_layers(self.inner_radius, self.outer_radius, _counts(mesh)[1], regions)
 
     def hold(self, loading: Loading) -> None:
         """u_z = 0 at the bottom, the rigid motions held at three of its nodes."""
@@ -358,32 +379,37 @@ class Tube(Shape):
 
 
 def whole_tube(
-    shape: Tube, counts: tuple[int, int, int], element: str, degree: int, comm: MPI.Intracomm | None = None
+    shape: Tube,
+    counts: tuple[int, int, int],
+    element: str,
+    degree: int,
+    comm: MPI.Intracomm | None = None,
+    regions: Mapping[str, Region] | None = None,
 ) -> Domain:
     """The mesh of a tube with so many elements around (a multiple of 4), through the wall and along. Collective.
 
-    The nodes lie exactly on the radii, equally spaced through the wall; some are on the positive and negative x and y
+    The nodes lie exactly on the radii, equally spaced through each layer; some are on the positive and negative x and y
     axes. Elements of degree 1 have plane faces: their inner and outer faces are regular prisms inside the cylinders.
     """
     from remodel_fenicsx.body.domain import build_domain
 
+    around, through, along = counts
+    wall = _wall(shape, through, regions or {})
+
     def draw() -> None:
-        draw_tube(shape.inner_radius, shape.outer_radius, shape.length, counts, element, degree)
+        draw_tube(wall, shape.length, (around, along), element, degree)
 
-    return build_domain(draw, shape.name, _dimensions(shape), comm)
+    return wall.marked(build_domain(draw, shape.name, _dimensions(shape), comm))
 
 
-def draw_tube(
-    inner_radius: float, outer_radius: float, length: float, counts: tuple[int, int, int], element: str, degree: int
-) -> None:
-    """Draw and mesh the tube in the current Gmsh model: four quarters, swept along z."""
-    number, through, along = counts
+def draw_tube(wall: Wall, length: float, counts: tuple[int, int], element: str, degree: int) -> None:
+    """Draw and mesh the tube in the current Gmsh model: four quarters, swept along z; elements around and along."""
+    number, along = counts
     quarter = number // 4
-    inner = model.points(model.circle(inner_radius, number))
-    outer = model.points(model.circle(outer_radius, number))
+    inner, outer = (model.points(model.circle(radius, number)) for radius in (wall.radii[0], wall.radii[-1]))
     inner_lines, outer_lines = model.polygon(inner), model.polygon(outer)
     corners = range(0, number, quarter)
-    spokes = [model.line(inner[k], outer[k], through) for k in corners]
+    spokes = [_spoke(wall, number, k, inner[k], outer[k]) for k in corners]
     section = []
     for i, k in enumerate(corners):
         j, m = (i + 1) % 4, (k + quarter) % number

@@ -7,15 +7,18 @@ from typing import Any
 from mpi4py import MPI
 
 
-def mesh_from_gmsh(model: Any, comm: MPI.Intracomm) -> tuple[Any, Any]:
-    """The dolfinx mesh and its facet tags of the Gmsh model that rank 0 holds (`model` is not looked at elsewhere)."""
+def mesh_from_gmsh(model: Any, comm: MPI.Intracomm) -> tuple[Any, Any, Any]:
+    """The dolfinx mesh, its cell tags and its facet tags of the Gmsh model that rank 0 holds.
+
+    Tags are the numbers of physical groups; `model` is not looked at on other ranks.
+    """
     try:
         from dolfinx.io import gmsh as reader  # type: ignore[attr-defined]  # 0.10 and later
     except ImportError:
         from dolfinx.io import gmshio as reader  # type: ignore[attr-defined,no-redef]  # 0.9
     # 0.9 returns (mesh, cell tags, facet tags), later versions a longer named tuple that starts with the same three
-    mesh, _, facet_tags = reader.model_to_mesh(model, comm, 0, gdim=3)[:3]
-    return mesh, facet_tags
+    mesh, cell_tags, facet_tags = reader.model_to_mesh(model, comm, 0, gdim=3)[:3]
+    return mesh, cell_tags, facet_tags
 
 
 def geometry_dofmap(mesh: Any) -> Any:

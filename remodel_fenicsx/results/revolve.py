@@ -65,7 +65,7 @@ class _Image(TurnedFields):
 
     def __init__(self, recording: RecordedRun, turn: Turn):
         scene = recording.scene
-        domain = scene.geometry.build(scene.mesh, MPI.COMM_SELF)
+        domain = scene.geometry.build_with(scene.regions, scene.mesh, MPI.COMM_SELF)
         points, elements = domain.gather_mesh()
         assert points is not None and elements is not None
         super().__init__(points, elements, recording.points, recording.elements, turn)

@@ -49,12 +49,14 @@ def _field(field: FieldInfo, by_pydantic: Schema) -> Schema:
     """Of a key: a table, or the values that it takes."""
     if is_table(field.annotation):
         return _table(field.annotation)  # type: ignore[arg-type]
-    schema = {name: entry for name, entry in by_pydantic.items() if name not in ("title", "allowed")}
+    if get_origin(field.annotation) is dict and is_table(kind := get_args(field.annotation)[1]):
+        return {"type": "object", "additionalProperties": _table(kind)}
+    schema = _without_null({name: entry for name, entry in by_pydantic.items() if name not in ("title", "allowed")})
     if listed := choices(field):
         schema["enum"] = listed
     if dimension := dimension_of(field):
         schema = _with_unit(schema, dimension)
-    return _without_null(schema)
+    return schema
 
 
 def _with_unit(schema: Schema, dimension: Dimension) -> Schema:
@@ -96,6 +98,7 @@ def _of_shape(shape: type[Shape]) -> Schema:
         "loads": {"type": "object", "properties": loads, "additionalProperties": False},
         "supports": {"properties": {"ends": {"enum": list(shape.ends)}}},
         "cells": {"properties": {"axes": {"enum": list(shape.axis_kinds)}}},
+        "regions": {} if shape.has_regions else {"maxProperties": 0},
     }
     chosen = {"properties": {"geometry": {"properties": {"shape": {"const": name}}}}}
     without_preset = {"if": {"not": {"required": ["preset"]}}, "then": {"properties": {"geometry": _required(shape)}}}

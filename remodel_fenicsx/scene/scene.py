@@ -16,7 +16,7 @@ from typing import Annotated, Any, ClassVar
 from pydantic import BaseModel, BeforeValidator, Field, ModelWrapValidatorHandler, SerializeAsAny, model_validator
 
 from remodel_fenicsx.body import SHAPES, Shape
-from remodel_fenicsx.body.columns import columns_of, columns_on_request
+from remodel_fenicsx.body.columns import columns_of, columns_of_region, columns_on_request
 from remodel_fenicsx.body.reductions import AUTO, objections
 from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.fem.solver_methods import SOLVER_METHODS
@@ -37,6 +37,7 @@ from remodel_fenicsx.settings import (
     Mesh,
     Model,
     Output,
+    Region,
     Remodeling,
     Solver,
     Supports,
@@ -95,6 +96,7 @@ class Scene(Table):
     material: Material = Material()
     cells: Cells = Cells()
     supports: Supports = Supports()
+    regions: dict[str, Region] = {}
     loads: dict[str, Load] = {}
     remodeling: Remodeling = Remodeling()
     time: Time
@@ -158,6 +160,7 @@ class Scene(Table):
             largest = math.floor((LARGEST_MESH / geometry.number_of_elements) ** (1 / 3))
             rule = f"must be at most {largest} for a {geometry.name}: more makes over {LARGEST_MESH:g} elements"
             raise fault(rule, "mesh.refinement", self.mesh.refinement)
+        self._check_regions()
         for name, load in self.loads.items():
             self._check_load(name, load)
         self._check_output_times()
@@ -205,6 +208,19 @@ class Scene(Table):
             return float(self.time.end)
         ramps = [load.ramp[-1][0] for load in self.loads.values()]
         return max(ramps, default=0.0) + FORGOTTEN_AFTER / self.remodeling.kappa
+
+    def _check_regions(self) -> None:
+        shape, columns = self.geometry, {column.name for column in columns_of(self.geometry)}
+        for name in self.regions:
+            key = f"regions.{quoted(name)}"
+            if not shape.has_regions:
+                able = ", ".join(repr(other) for other, kind in SHAPES.items() if kind.has_regions)
+                raise fault(f"a {shape.name} has no regions; shapes with regions: {able}", key, None)
+            if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,39}", name):
+                raise fault("a region's name is a letter, then letters, digits and _, at most 40 in all", key, None)
+            if taken := columns.intersection(columns_of_region(name)):
+                raise fault(f"the column {min(taken)!r} has another meaning; choose another name", key, None)
+        shape.check_regions(self.regions, self.mesh)
 
     def _check_load(self, name: str, load: Load) -> None:
         step, key = self.time.step, f"loads.{name}"
@@ -341,6 +357,10 @@ def _in_own_units(values: Mapping[str, Any], shape: type[Shape]) -> dict[str, An
             raise fault(allowed(field), key, units[key])
     result: dict[str, Any] = in_units(values, Scene, units)
     result["geometry"] = in_units(result["geometry"], shape, units, "geometry")
+    if isinstance(regions := result.get("regions"), Mapping):
+        result["regions"] = {
+            name: in_units(entry, Region, units, f"regions.{quoted(str(name))}") for name, entry in regions.items()
+        }
     if isinstance(loads := result.get("loads"), Mapping):
         result["loads"] = {
             name: in_units(entry, Load, units, f"loads.{name}", {"value": shape.loads[name].dimension})

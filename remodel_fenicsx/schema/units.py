@@ -113,7 +113,7 @@ def in_units(
         value, path = values.get(name), f"{key}.{name}" if key else name
         if is_table(field.annotation) and name in values:
             result[name] = in_units(value, field.annotation, units, path)  # type: ignore[arg-type]
-        elif field.annotation is float and isinstance(value, str):
+        elif float in (field.annotation, *get_args(field.annotation)) and isinstance(value, str):
             dimension = dimension_of(field) if dimensions is None else dimensions.get(name)
             result[name] = _number(value, field, dimension, units, path)
     return result

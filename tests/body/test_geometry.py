@@ -271,7 +271,9 @@ def test_a_tube_with_divisions_of_its_own(element, degree, refinement):
 @pytest.mark.parametrize("kind", ["drawn", "points"])
 def test_ufls_side_of_a_mesh_is_ufls_own_but_for_the_number_of_its_cells(kind):
     """The same forms, so that kernels have the same names; one cell, however often it is asked for."""
-    line, faces = ((1.0, 0.0, 0.0), (2.0, 0.0, 0.0), 3, 2), {"inner": lambda x: np.isclose(x[0], 1.0)}
+    line, faces = ((1.0, 0.0, 0.0), (2.0, 0.0, 0.0), np.linspace(0.0, 1.0, 7), 2), {
+        "inner": lambda x: np.isclose(x[0], 1.0)
+    }
     domain = domain_of("tube") if kind == "drawn" else interval_domain(*line, faces, "tube", {}, MPI.COMM_SELF)
     ours = domain.mesh.ufl_domain()
     theirs = ufl.Mesh(ours.ufl_coordinate_element())

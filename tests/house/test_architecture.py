@@ -28,6 +28,7 @@ TYPES_ONLY = {
     "__init__": {"recording", "results.recording", "running", "scene", "simulation"},
     "body.columns": {"body.shape"},
     "body.cube": {"body.domain", "body.loading"},
+    "body.layers": {"body.domain"},
     "body.shape": {"body.domain", "body.loading"},
     "body.tendon": {"body.domain", "body.loading"},
     "body.tube": {"body.domain", "body.loading"},

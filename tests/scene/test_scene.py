@@ -947,8 +947,8 @@ def test_the_reference_page_is_the_one_that_the_code_makes():
 
 def test_every_key_is_described():
     page = scene_reference()
-    tables = {"geometry", "mesh", "model", "material", "cells", "supports", "loads", "remodeling", "time", "solver",
-              "output"}  # fmt: skip
+    tables = {"geometry", "mesh", "model", "material", "cells", "supports", "regions", "loads", "remodeling", "time",
+              "solver", "output"}  # fmt: skip
     for key, _, table in sections(Scene):
         for name, field in table.model_fields.items():
             if not key and name in tables:

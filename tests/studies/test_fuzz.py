@@ -14,7 +14,8 @@ from benchmarks.fuzzing import references, relations
 from benchmarks.fuzzing.command import evaluated, said, verdict_on
 from benchmarks.fuzzing.scenes import made
 from benchmarks.stability_map.cases import Run
-from benchmarks.stability_map.running import PROJECT, Runner
+from benchmarks.stability_map.march import factor
+from benchmarks.stability_map.running import Runner
 from remodel_fenicsx.scene import scene_from_dict
 
 ALL = range(1, 301)
@@ -30,7 +31,7 @@ HELD = ("right", "refused", "unstable", "warned")
 @pytest.fixture(scope="module")
 def runner() -> Iterator[Runner]:
     """The package of this checkout."""
-    made_runner = Runner(PROJECT, limit=60)
+    made_runner = Runner(limit=60)
     yield made_runner
     made_runner.close()
 
@@ -109,7 +110,7 @@ def test_no_row_may_do_this(fault: str) -> None:
     scene, _ = made(CUBE)
     load, times = scene["loads"]["force"], np.linspace(0.0, scene["time"]["end"], 5)
     rows = {
-        "time": times, "force": load["value"] * references.factor(load["ramp"], times), "min_jacobian": np.ones(5),
+        "time": times, "force": load["value"] * factor(load["ramp"], times), "min_jacobian": np.ones(5),
         "max_chain_extension": np.full(5, 0.5), "stored_energy": np.zeros(5),
     }  # fmt: skip
     r0 = scene["cells"]["end_to_end_length"]

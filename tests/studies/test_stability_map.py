@@ -14,10 +14,11 @@ import pytest
 from benchmarks.stability_map import report
 from benchmarks.stability_map.cases import Case, Finding, Run, all_cases
 from benchmarks.stability_map.command import main, measured
-from benchmarks.stability_map.homogeneous import CUBE, material, path_of
+from benchmarks.stability_map.homogeneous import CUBE, path_of
 from benchmarks.stability_map.judging import judged
+from benchmarks.stability_map.march import material
 from benchmarks.stability_map.point import prescribed_path
-from benchmarks.stability_map.running import PROJECT, Runner, digest, evaluated, source_of
+from benchmarks.stability_map.running import Runner, digest, evaluated, source_of
 from benchmarks.stability_map.solid import smallest_eigenvalue
 
 CASES = all_cases()
@@ -36,7 +37,7 @@ QUICK = (
 @pytest.fixture(scope="module")
 def runner() -> Iterator[Runner]:
     """The package of this checkout."""
-    made = Runner(PROJECT, limit=60)
+    made = Runner(limit=60)
     yield made
     made.close()
 
@@ -93,7 +94,6 @@ def test_outcomes() -> None:
     assert verdict(Finding(0.5, unstable=True), warnings=saddle).outcome == "unstable"
     assert verdict(Finding(0.5, unstable=False), warnings=saddle).false_alarm
     assert verdict(Finding(np.nan)).outcome == "unchecked"
-    assert verdict(Finding(0.0), code=None).outcome == "not there"
     assert verdict(Finding(0.0), code=1).outcome == "wrong" and verdict(Finding(0.0), code=-1).outcome == "wrong"
     assert verdict(Finding(0.0), code=-2).outcome == "unchecked"
     assert verdict(Finding(np.inf), code=2, said="cells.seed = -1: must be").cause_named
@@ -143,7 +143,7 @@ def test_results_are_kept_and_belong_to_package_and_case(tmp_path: Path) -> None
 
 def test_the_command_lists_and_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """What is there is not run again: nothing is started here."""
-    key, source = QUICK[0], source_of(PROJECT)
+    key, source = QUICK[0], source_of()
     assert main("", ["--list", "--only", key]) == 0
     command = "remodel-fenicsx run demos/cube.toml --set remodeling.frame=spatial --set loads.force.value=10.0"
     assert f"{key}\n    ./with-fenicsx {command}" in capsys.readouterr().out

@@ -1,0 +1,254 @@
+"""Bodies of one dimension through time, their axes fixed: references of the map and of random scenes.
+
+Typed from docs/theory.md on top of `point` and tests/reference/radial.py, which share no code with the package. A cube
+or bar is one point, a tube is divided along its radius; cells are three squares l_d^2 by direction.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from benchmarks.stability_map.point import Array, NoEquilibrium, advance
+from tests.reference.radial import (
+    RadialMaterial,
+    Tube,
+    cauchy_stress,
+    driving_values,
+    remodel,
+    stress_noise,
+)
+
+Scene = dict[str, Any]
+BOLTZMANN = 1.381e-23
+STRESS_UNITS = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6}
+COUNTS = 0.01  # a target with a smaller share is none to go on from
+COMPRESSION = 0.1
+SETTLED, PASSES = 1e-10, 300  # of an implicit step by repeated passes: change of the squares over r0^2; how many
+
+
+# ---------------------------------------------------------------- what a scene asks for
+def material(scene: Scene) -> RadialMaterial:
+    """The reference's parameters, stresses in the scene's unit."""
+    m = scene["material"]
+    modulus = BOLTZMANN * m["temperature"] * m["chain_density"] / (4 * m["persistence_length"])
+    modulus *= m.get("energy_factor", 1) / STRESS_UNITS[m.get("stress_unit", "Pa")]
+    length = m["contour_length"] if m["chain_density"] else 1e9  # where there are no chains, none locks
+    return RadialMaterial(m["lame_lambda"], m["lame_mu"], modulus, length, scene["cells"]["end_to_end_length"])
+
+
+def factor(ramp: Sequence[Sequence[float]], time: Array) -> Array:
+    """Piecewise linear, held at both ends."""
+    times, factors = np.array(ramp, dtype=float).T
+    return np.interp(time, times, factors)
+
+
+def load_at(scene: Scene, name: str, time: float) -> float:
+    """A load that may not be there."""
+    load = scene["loads"].get(name)
+    return 0.0 if load is None else float(load["value"] * factor(load["ramp"], np.array([time]))[0])
+
+
+def step_times(scene: Scene) -> Array:
+    """Times of the steps."""
+    step, end = scene["time"]["step"], scene["time"]["end"]
+    return step * np.arange(1, round(end / step) + 1)
+
+
+def nominal_stress(scene: Scene, times: Array) -> Array:
+    """Dead stresses along x, y, z by step, (steps, 3)."""
+    geometry, found = scene["geometry"], np.zeros((len(times), 3))
+    side = geometry.get("side", 1.0)
+    for name, load in scene["loads"].items():
+        axis = "xyz".index(name[-1]) if name != "force" else 2
+        area = side**2 if axis == 0 else side * (side / geometry.get("aspect", 1.0))
+        found[:, axis] += load["value"] * factor(load["ramp"], times) / geometry.get("area", area)
+    return found
+
+
+def initial(scene: Scene) -> Array:
+    """l_I at t = 0."""
+    cells = scene["cells"]
+    if isinstance(cells["initial"], str):
+        along = cells.get("aligned_axis", 3)
+        pattern = {"isotropic": np.full(3, 3**-0.5), "aligned": np.eye(3)[along - 1]}[cells["initial"]]
+        return np.asarray(cells["end_to_end_length"] * pattern)
+    return np.array(cells["initial"], dtype=float)
+
+
+def slowed(scene: Scene) -> bool:
+    """Whether the relaxed pass meets a law with a memory: then its own scheme is no reference, the law is."""
+    return scene["remodeling"]["coupling"] == "relaxed" and scene["remodeling"]["law"] in ("rate", "relaxation")
+
+
+# ---------------------------------------------------------------- bodies
+class Bar:
+    """A cube or bar: one point under dead forces; its unknown are the stretches."""
+
+    points, start, unloaded = 1, np.ones(3), np.zeros(3)
+
+    def __init__(self, scene: Scene):
+        self.scene, self.material = scene, material(scene)
+
+    def loads(self, time: float) -> Array:
+        """Nominal stresses (3)."""
+        return nominal_stress(self.scene, np.array([time]))[0]
+
+    def solve(self, unknown: Array, old: tuple[Array, Any], new: tuple[Array, Any]) -> Array:
+        """Equilibrium with other squares and loads."""
+        return advance(unknown, old, new, self.material)
+
+    def stretches(self, unknown: Array, loads: Any) -> Array:
+        """(1, 3)"""
+        return unknown[None]
+
+
+class Wall:
+    """A tube with free ends and a given length; its unknown are the radii of the nodes."""
+
+    unloaded = (0.0, 1.0)
+
+    def __init__(self, scene: Scene, elements: int = 40):
+        self.scene, self.tube = scene, tube_of(scene, elements)
+        self.start, self.points = self.tube.nodes.copy(), len(self.tube.points)
+
+    def loads(self, time: float) -> tuple[float, float]:
+        """Pressure and axial stretch."""
+        return load_at(self.scene, "pressure", time), 1 + load_at(self.scene, "elongation", time)
+
+    def solve(self, unknown: Array, old: tuple[Array, Any], new: tuple[Array, Any]) -> Array:
+        """Equilibrium with other squares and loads."""
+        try:
+            return self.tube.advance(unknown, (old[0], *old[1]), (new[0], *new[1]))
+        except (RuntimeError, ValueError, np.linalg.LinAlgError) as error:
+            raise NoEquilibrium(str(error)) from error
+
+    def stretches(self, unknown: Array, loads: tuple[float, float]) -> Array:
+        """(points, 3)"""
+        return self.tube.stretches(unknown, loads[1])
+
+
+def tube_of(scene: Scene, elements: int = 40) -> Tube:
+    """The scene's wall."""
+    geometry = scene["geometry"]
+    return Tube(geometry["inner_radius"], geometry["outer_radius"], elements, material(scene))
+
+
+# ---------------------------------------------------------------- through time
+class Row(NamedTuple):
+    """A solved state: unknown of the body, squares (points, 3) of its cells."""
+
+    time: float
+    unknown: Array
+    squares: Array
+
+
+class Pass:
+    """The evolution laws at points with axes that stay: from squares (points, 3) to squares."""
+
+    def __init__(self, scene: Scene, points: int, coupling: str):
+        self.r, self.material = scene["remodeling"], material(scene)
+        self.r0, self.law = self.material.end_to_end_length, self.r["law"]
+        self.start = np.tile(initial(scene), (points, 1))
+        self.ranked, self.ranks = self.start.copy(), np.tile([0, 1, 2], (points, 1))
+        relaxed = coupling == "relaxed" and not slowed(scene)
+        self.share = self.r.get("relaxation_factor", 0.5) if relaxed else 1.0
+        self.targets: list[tuple[float, Array]] = []  # time and sE of solved states, the last one first
+        self.begun = np.zeros(points, bool)  # points whose last target stands alone
+
+    def values(self, stretches: Array, squares: Array) -> tuple[Array, float]:
+        """Of the driver by direction, and what of them is rounding."""
+        driver = self.r["driver"]
+        noise = 0.0 if driver == "finger" else stress_noise(stretches, squares, self.material)
+        return driving_values(driver, stretches, cauchy_stress(stretches, squares, self.material)), noise
+
+    def target(self, stretches: Array, squares: Array) -> Array:
+        """sE of the law `tensor`."""
+        values, noise = self.values(stretches, squares)
+        tension, compression = np.maximum(values, 0) ** 2, np.minimum(values, 0) ** 2
+        total = tension.sum(axis=1) + COMPRESSION**2 * compression.sum(axis=1) + (100 * noise) ** 2
+        return np.asarray(tension / total[:, None])
+
+    def followed(self, squares: Array, target: Array, rate: float) -> Array:
+        """dA/dt = kappa (r0^2 sE - s A) with sE kept."""
+        share = np.clip(target.sum(axis=1, keepdims=True), 0.0, 1.0)
+        direction = target / np.where(share > 0, target.sum(axis=1, keepdims=True), 1.0)
+        return np.where(share > 0, squares + (self.r0**2 * direction - squares) * -np.expm1(-rate * share), squares)
+
+    def after(self, stretches: Array, squares: Array, old: Array, time: float, step: float) -> tuple[Array, Any]:
+        """Squares that a pass makes of `old` under the stress of a state, and what to keep if it is the last one."""
+        if self.law == "tensor":
+            asked = self.followed(old, self.target(stretches, squares), self.r["kappa"] * step)
+            return old + self.share * (asked - old), (self.ranked, self.ranks)
+        values, noise = self.values(stretches, squares)
+        ranked, ranks = remodel(
+            self.ranked, values, self.ranks, self.start, self.law, self.r["kappa"], time, step, self.r0, noise
+        )
+        asked = np.empty_like(ranked)
+        np.put_along_axis(asked, ranks, ranked, axis=1)
+        new = old + self.share * (asked**2 - old)
+        if self.share < 1.0:  # rank is the order of A's eigenvalues; where they agree the pass's ranks stay
+            by_rank = np.take_along_axis(new, ranks, axis=1)
+            order = np.argsort(-np.round(by_rank / self.r0**2, 12), axis=1, kind="stable")
+            ranks = np.take_along_axis(ranks, order, axis=1)
+            ranked = np.sqrt(np.take_along_axis(new, ranks, axis=1))
+        return new, (ranked, ranks)
+
+    def ahead(self, time: float) -> Array:
+        """sE in the middle of the step to `time`, along the line through two states."""
+        (last, now), *earlier = self.targets
+        if not earlier:
+            return now
+        slope = (time - last) / 2 / (last - earlier[0][0])
+        return now + np.where(self.begun[:, None], 0.0, slope * (now - earlier[0][1]))
+
+
+def march(
+    scene: Scene, body: Bar | Wall, times: Iterable[float] | None = None, coupling: str = ""
+) -> tuple[list[Row], str]:
+    """The rows, and why there are no more; times and coupling are the scene's where none are given."""
+    coupling = coupling or scene["remodeling"]["coupling"]
+    cells = Pass(scene, body.points, coupling)
+    unknown, squares, rows, before = body.start, cells.start**2, [], 0.0
+    solved, loads = squares, body.unloaded  # of the last state: the way to the next one begins there
+    for time in map(float, step_times(scene) if times is None else times):
+        new: Any = body.loads(time)
+        step, start = time - before, squares
+        if coupling == "extrapolated" and cells.targets:
+            expected = cells.ahead(time)
+            squares = cells.followed(start, expected, cells.r["kappa"] * step)
+            if np.any(squares < 0):
+                return rows, "unknown: an extrapolated target makes A indefinite"
+        try:
+            unknown = body.solve(unknown, (solved, loads), (squares, new))
+            for number in range(PASSES if coupling == "implicit" else 0):
+                other, kept = cells.after(body.stretches(unknown, new), squares, start, time, step)
+                change = np.abs(other - squares).max() / cells.r0**2
+                unknown, squares = body.solve(unknown, (squares, new), (other, new)), other
+                if change < SETTLED:
+                    cells.ranked, cells.ranks = kept
+                    break
+                if number == PASSES - 1:
+                    return rows, "unknown: repeated passes do not settle"
+            if coupling == "extrapolated":
+                found = cells.target(body.stretches(unknown, new), squares)
+                had = cells.targets[0][1] if cells.targets else np.zeros_like(found)
+                cells.begun = (had.sum(axis=1) < COUNTS) & (found.sum(axis=1) >= COUNTS)
+                if cells.begun.any():
+                    mixed = np.where(cells.begun[:, None], found, expected if cells.targets else 0.0)
+                    other = cells.followed(start, mixed, cells.r["kappa"] * step)
+                    unknown, squares = body.solve(unknown, (squares, new), (other, new)), other
+                    found = cells.target(body.stretches(unknown, new), squares)
+                cells.targets = [(time, found), *cells.targets[:1]]
+        except NoEquilibrium as error:
+            return rows, f"no equilibrium at t = {time:g}: {error}"
+        rows.append(Row(time, unknown, squares))
+        solved = squares
+        if coupling in ("staggered", "relaxed"):
+            squares, (cells.ranked, cells.ranks) = cells.after(
+                body.stretches(unknown, new), squares, squares, time, step
+            )
+        loads, before = new, time
+    return rows, ""
