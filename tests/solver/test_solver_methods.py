@@ -56,7 +56,8 @@ def assert_same(found: list[dict[str, float]], expected: list[dict[str, float]])
 @pytest.mark.parametrize(("small", "reduced"), [(SMALL_BODY, False), (SMALL_REDUCTION, True)])
 def test_auto_goes_by_the_size(small: int, reduced: bool) -> None:
     for unknowns, ranks, method in (
-        (small, 1, "direct"), (small + 1, 1, "lagged"), (small, 2, "direct"), (small + 1, 2, "lagged"), (LARGE, 1, "lagged"),
+        (small, 1, "direct"), (small + 1, 1, "lagged"), (small, 2, "direct"), (small + 1, 2, "lagged"),
+        (LARGE, 1, "lagged"),
         (LARGE + 1, 1, "iterative"), (LARGE_ON_RANKS, 2, "lagged"), (LARGE_ON_RANKS + 1, 2, "iterative"),
     ):  # fmt: skip
         assert chosen("auto", unknowns, ranks, reduced) == method
