@@ -321,7 +321,7 @@ COUPLINGS = {
     "extrapolated": CouplingKind(
         "remodel first, towards the stress of the middle of the step, extrapolated from the two steps before; then "
         "solve: of second order, for the law 'tensor'",
-        "remodel_fenicsx.evolution.coupling:Extrapolated",
+        "remodel_fenicsx.evolution.extrapolated:Extrapolated",
         needs_a_target=True,
     ),
     "implicit": CouplingKind(
