@@ -27,7 +27,6 @@ from remodel_fenicsx.settings import Solver
 from remodel_fenicsx.state.state import State
 from remodel_fenicsx.state.unit_cells import UnitCells
 from remodel_fenicsx.system.interrupts import take_back_signals
-from remodel_fenicsx.watch.buckling import BucklingWarning
 from remodel_fenicsx.watch.equilibrium_stability import EquilibriumStability
 from remodel_fenicsx.watch.locking import LockingWarning
 from remodel_fenicsx.watch.over_correction import OverCorrection, RestedCells
@@ -118,11 +117,15 @@ class Simulation:
         self.observer = Observer(shape, self.stepper, columns_of(shape, columns, scene.loads))
         self.warnings: list[Watcher] = [
             LockingWarning(self.stepper, formulation.locks),
-            BucklingWarning(self.stepper, shape.strut(scene.supports.ends)),
             VolumeLoss(self.stepper),
             RadialChains(self.stepper, shape.radial_share),
             FrontsInLayers(self.stepper, shape),
         ]
+        strut = shape.strut(scene.supports.ends) if kinematics.reduced else None
+        if strut is not None:  # a whole body buckles by itself
+            from remodel_fenicsx.watch.buckling import BucklingWarning
+
+            self.warnings.insert(1, BucklingWarning(self.stepper, strut))
         if self.stepper.remodeling.law.remodels and not at_once:
             over_correction = OverCorrection(self.stepper)
             self.warnings.insert(0, over_correction)

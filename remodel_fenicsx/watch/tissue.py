@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from remodel_fenicsx.body.shape import Shape
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
 from remodel_fenicsx.fem.compat import geometry_dofmap
-from remodel_fenicsx.system.terminal import NOTICE
+from remodel_fenicsx.system import NOTICE
 from remodel_fenicsx.watch.once import WarnsOnce
 
 Array = NDArray[np.float64]
