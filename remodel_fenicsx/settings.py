@@ -32,7 +32,7 @@ from remodel_fenicsx.fem.solver_methods import (
     SOLVER_METHODS,
     fault_of_option,
 )
-from remodel_fenicsx.model.cells import AXES
+from remodel_fenicsx.model.local_axes import AXES
 from remodel_fenicsx.model.chains import BOLTZMANN_CONSTANT, CHAINS
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
 from remodel_fenicsx.model.energy import MATRICES, REPULSIONS, Tissue
@@ -307,7 +307,7 @@ COUPLINGS = {
     "extrapolated": CouplingKind(
         "remodel first, towards the stress of the middle of the step, extrapolated from the two steps before; then "
         "solve: of second order, for the law 'tensor'",
-        "remodel_fenicsx.evolution.coupling:Extrapolated",
+        "remodel_fenicsx.evolution.extrapolated:Extrapolated",
         needs_a_target=True,
     ),
     "implicit": CouplingKind(
@@ -633,8 +633,7 @@ class Solver(Table):
     method: Annotated[str, OneOf(SOLVER_METHODS, (AUTO,), REMOVED)] = Field(
         default=AUTO,
         description=f"'auto': 'direct' up to {SMALL_BODY} unknowns ({SMALL_REDUCTION} of a reduction), then 'lagged', "
-        f"above {LARGE} 'iterative'; "
-        f"on more ranks 'direct' up to {LARGE_ON_RANKS}, then 'iterative'; "
+        f"above {LARGE} (on several ranks {LARGE_ON_RANKS}) 'iterative'; "
         + "; ".join(f"{name!r}: {method.meaning}" for name, method in SOLVER_METHODS.items())
         + " (docs/speed.md).",
     )

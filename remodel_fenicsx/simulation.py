@@ -28,7 +28,6 @@ from remodel_fenicsx.state.parameters import by_region
 from remodel_fenicsx.state.state import State
 from remodel_fenicsx.state.unit_cells import UnitCells
 from remodel_fenicsx.system.interrupts import take_back_signals
-from remodel_fenicsx.watch.buckling import BucklingWarning
 from remodel_fenicsx.watch.equilibrium_stability import EquilibriumStability
 from remodel_fenicsx.watch.locking import LockingWarning
 from remodel_fenicsx.watch.over_correction import OverCorrection, RestedCells
@@ -87,9 +86,9 @@ class Simulation:
             kinematics = FreeLength(kinematics, shape)
         self.unknown = kinematics.unknown(mesh, scene.mesh.degree)
         self.quadrature = Quadrature(mesh, scene.mesh.degree, kinematics.weight(mesh))
-        numbers, properties = (domain.element_number, domain.number_of_elements), scene.properties()
-        own = [(domain.element_region == domain.regions[name], properties[name].cells) for name in scene.regions]
-        self.cells = UnitCells(self.quadrature, *numbers, scene.cells, own)
+        properties, local_axes = scene.properties(), shape.local_axes(domain, self.quadrature)
+        own = {name: properties[name].cells for name in scene.regions}
+        self.cells = UnitCells(self.quadrature, domain, scene.cells, local_axes, own)
         self.loading = Loading(domain, self.unknown, kinematics)
         shape.support(self.loading, scene.supports.ends)
         formulation = FORMULATIONS[scene.mesh.formulation]
@@ -120,11 +119,15 @@ class Simulation:
         self.observer = Observer(shape, self.stepper, columns_of(shape, columns, scene.loads))
         self.warnings: list[Watcher] = [
             LockingWarning(self.stepper, formulation.locks),
-            BucklingWarning(self.stepper, shape.strut(scene.supports.ends)),
             VolumeLoss(self.stepper),
             RadialChains(self.stepper, shape.radial_share),
-            FrontsInLayers(self.stepper, shape, domain),
+            FrontsInLayers(self.stepper, shape),
         ]
+        strut = shape.strut(scene.supports.ends) if kinematics.reduced else None
+        if strut is not None:  # a whole body buckles by itself
+            from remodel_fenicsx.watch.buckling import BucklingWarning
+
+            self.warnings.insert(1, BucklingWarning(self.stepper, strut))
         if self.stepper.remodeling.law.remodels and not at_once:
             over_correction = OverCorrection(self.stepper)
             self.warnings.insert(0, over_correction)

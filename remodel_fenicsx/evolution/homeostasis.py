@@ -24,7 +24,7 @@ from remodel_fenicsx.solver.continuation import Work
 from remodel_fenicsx.solver.equilibrium import Equilibrium
 from remodel_fenicsx.solver.newton import GuardedNewton, SolveFailure
 from remodel_fenicsx.state.state import Snapshot
-from remodel_fenicsx.system.terminal import NOTICE
+from remodel_fenicsx.system import NOTICE
 
 log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
