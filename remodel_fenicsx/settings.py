@@ -31,7 +31,7 @@ from remodel_fenicsx.fem.solver_methods import (
     SOLVER_METHODS,
     fault_of_option,
 )
-from remodel_fenicsx.model.cells import AXES
+from remodel_fenicsx.model.local_axes import AXES
 from remodel_fenicsx.model.chains import BOLTZMANN_CONSTANT, CHAINS
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
 from remodel_fenicsx.model.energy import MATRICES, REPULSIONS, Tissue

@@ -85,7 +85,8 @@ class Simulation:
             kinematics = FreeLength(kinematics, shape)
         self.unknown = kinematics.unknown(mesh, scene.mesh.degree)
         self.quadrature = Quadrature(mesh, scene.mesh.degree, kinematics.weight(mesh))
-        self.cells = UnitCells(self.quadrature, domain.element_number, domain.number_of_elements, scene.cells)
+        local_axes = shape.local_axes(domain, self.quadrature)
+        self.cells = UnitCells(self.quadrature, domain, scene.cells, local_axes)
         self.loading = Loading(domain, self.unknown, kinematics)
         shape.support(self.loading, scene.supports.ends)
         formulation = FORMULATIONS[scene.mesh.formulation]
@@ -118,7 +119,7 @@ class Simulation:
             LockingWarning(self.stepper, formulation.locks),
             VolumeLoss(self.stepper),
             RadialChains(self.stepper, shape.radial_share),
-            FrontsInLayers(self.stepper, shape, domain),
+            FrontsInLayers(self.stepper, shape),
         ]
         strut = shape.strut(scene.supports.ends) if kinematics.reduced else None
         if strut is not None:  # a whole body buckles by itself

@@ -61,8 +61,8 @@ def _profile_value(number: int, measurement: Any) -> float:
 
 
 def _profile(measurement: Any) -> Array:
-    quadrature, shape = measurement.quadrature, measurement.observer.shape
-    hats = measurement.tool("hats", lambda: profile_weights(shape.depth(quadrature.coordinates)))
+    quadrature, local_axes = measurement.quadrature, measurement.state.cells.local_axes
+    hats = measurement.tool("hats", lambda: profile_weights(local_axes.depth))
     return np.array([quadrature.mean_of_known(measurement.fibre_angle, hats[..., k]) for k in range(PROFILE_PLACES)])
 
 

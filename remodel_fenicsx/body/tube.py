@@ -27,7 +27,7 @@ from remodel_fenicsx.body.reductions import (
 )
 from remodel_fenicsx.body.shape import Array, LoadKind, Shape, check_lengths
 from remodel_fenicsx.body.whole import Body, Corners, divided_along, extended, mirrored_twice, revolved
-from remodel_fenicsx.model.cells import pitch_angle, radial_share
+from remodel_fenicsx.model.cells import cylindrical_axes, pitch_angle, radial_share
 from remodel_fenicsx.schema.tables import fault, shown
 from remodel_fenicsx.schema.units import FORCE, LENGTH, STRESS
 from remodel_fenicsx.settings import Mesh, Region
@@ -369,13 +369,21 @@ class Tube(Shape):
         depth: Array = np.clip((radii - self.inner_radius) / (self.outer_radius - self.inner_radius), 0.0, 1.0)
         return depth
 
-    def fibre_angle(self, dimensions: Array, axes: Array, coordinates: Array) -> Array:
-        """Angle in degrees of the chain direction in the wall, from circumferential (0) to axial (90); NaN across."""
-        return pitch_angle(dimensions, axes, coordinates)
+    def axes_at(self, coordinates: Array) -> Array:
+        """About the z axis."""
+        return cylindrical_axes(coordinates)
 
-    def radial_share(self, dimensions: Array, axes: Array, coordinates: Array) -> Array:
+    def station(self, coordinates: Array) -> Array:
+        """Along z."""
+        return np.asarray(coordinates[..., 2] / self.length, dtype=np.float64)
+
+    def fibre_angle(self, dimensions: Array, axes: Array, local: Array) -> Array:
+        """Angle in degrees of the chain direction in the wall, from circumferential (0) to axial (90); NaN across."""
+        return pitch_angle(dimensions, axes, local)
+
+    def radial_share(self, dimensions: Array, axes: Array, local: Array) -> Array:
         """A_rr / tr A."""
-        return radial_share(dimensions, axes, coordinates)
+        return radial_share(dimensions, axes, local)
 
 
 def whole_tube(

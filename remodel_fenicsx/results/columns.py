@@ -110,13 +110,13 @@ class Measurement:
     def fibre_angle(self) -> Array:
         """Reference fibre angle at all points (elements, points), degrees; NaN where there is none."""
         cells = self.state.cells
-        return self.observer.shape.fibre_angle(cells.dimension_values, cells.axis_values, self.quadrature.coordinates)
+        return self.observer.shape.fibre_angle(cells.dimension_values, cells.axis_values, cells.local_axes.axes)
 
     @cached_property
     def radial_share(self) -> Array:
         """Of the chains at all points (elements, points)."""
         cells = self.state.cells
-        return self.observer.shape.radial_share(cells.dimension_values, cells.axis_values, self.quadrature.coordinates)
+        return self.observer.shape.radial_share(cells.dimension_values, cells.axis_values, cells.local_axes.axes)
 
     @cached_property
     def axial_stretch(self) -> Array:

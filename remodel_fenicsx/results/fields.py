@@ -59,9 +59,7 @@ class ElementFields:
         if self._stresses is not None:
             tensors.append(self._stresses.ufl.cauchy)
         entries = [t[i, j] for t in tensors for i in range(3) for j in range(3)]
-        displacement = state.kinematics.displacement(state.unknown)
-        expressions = ufl.as_vector([*entries, *(displacement[i] for i in range(3))])
-        self._state = jit.expression(expressions, self.quadrature.points)
+        self._state = jit.expression(ufl.as_vector(entries), self.quadrature.points)
 
     def __call__(self) -> dict[str, Array]:
         """By name, one row per local element.
@@ -73,9 +71,10 @@ class ElementFields:
         """
         if self._stresses is not None:
             self._stresses.refresh()
-        values = self.quadrature.evaluate(self._state, (12 if self._stresses is None else 21,))
+        values = self.quadrature.evaluate(self._state, (9 if self._stresses is None else 18,))
         F = values[..., :9].reshape(*values.shape[:2], 3, 3)
-        dimensions, axes = self.state.cells.dimension_values, self.state.cells.axis_values
+        cells = self.state.cells
+        dimensions, axes = cells.dimension_values, cells.axis_values
         mean, fibre_angle, wanted = self.quadrature.element_mean, self.shape.fibre_angle, set(self.names)
         mean_of_known = self.quadrature.element_mean_of_known
         found: dict[str, Array] = {}
@@ -87,12 +86,11 @@ class ElementFields:
             found["cell_dimensions"], mean_axes = self.mean_cells()
             found |= {name: mean_axes[:, i] for i, name in enumerate(AXIS_FIELDS)}
         if "fibre_angle" in wanted:
-            found["fibre_angle"] = mean_of_known(fibre_angle(dimensions, axes, self.quadrature.coordinates))
+            found["fibre_angle"] = mean_of_known(fibre_angle(dimensions, axes, cells.local_axes.axes))
         if "fibre_angle_deformed" in wanted:
-            position, deformed_axes = self.quadrature.coordinates + values[..., -3:], axes @ np.swapaxes(F, -1, -2)
-            found["fibre_angle_deformed"] = mean_of_known(fibre_angle(dimensions, deformed_axes, position))
+            deformed_axes, local = axes @ np.swapaxes(F, -1, -2), cells.local_axes.deformed(F)
+            found["fibre_angle_deformed"] = mean_of_known(fibre_angle(dimensions, deformed_axes, local))
         if "chain_extension" in wanted:
-            cells = self.state.cells
             squared = cells.kernels.squared_length(F.reshape(-1, 3, 3), cells.point_cells).reshape(F.shape[:2])
             found["chain_extension"] = np.max(np.sqrt(squared) / self._locking_length(), axis=1)
         return {name: found[name] for name in OF_ELEMENTS if name in wanted}
