@@ -112,6 +112,8 @@ class Shape(Table):
         Defaults of other tables that this shape changes, under the keys of preset and scene.
     has_regions
         Whether a scene may give the body `[regions.NAME]`, named parts with tissue of their own.
+    is_filled_by_regions
+        Whether the regions of a scene, where it has some, are all of the body.
     """
 
     loads: ClassVar[dict[str, LoadKind]]
@@ -128,6 +130,7 @@ class Shape(Table):
     angle_in_words: ClassVar[tuple[str, str]] = ("along the load", "across")
     defaults: ClassVar[dict[str, Any]] = {}
     has_regions: ClassVar[bool] = False
+    is_filled_by_regions: ClassVar[bool] = False
 
     shape: str = Field(description="Which body it is.")
     length_unit: LengthUnit = None
@@ -205,6 +208,10 @@ class Shape(Table):
 
     def check_regions(self, regions: Mapping[str, Region], mesh: Mesh) -> None:
         """Refuse what the regions of a scene ask of the body and it cannot have: raise a `fault` that names the key."""
+
+    def section_shares(self, regions: Mapping[str, Region]) -> dict[str, float]:
+        """Share of every section across z that is in a region, by its name; "" is what is beside them."""
+        return {"": 1.0}
 
     @abstractmethod
     def hold(self, loading: Loading) -> None:

@@ -287,6 +287,7 @@ class Tube(Shape):
     depth_in_words: ClassVar[tuple[str, str, str]] = ("through the wall", "inside", "outside")
     angle_in_words: ClassVar[tuple[str, str]] = ("around", "along")
     has_regions: ClassVar[bool] = True
+    is_filled_by_regions: ClassVar[bool] = True
     # with global axes a tube of isotropic cells would not stay round in the first step
     defaults: ClassVar[dict[str, Any]] = {"cells": {"axes": "cylindrical"}}
 
@@ -315,6 +316,12 @@ class Tube(Shape):
     def check_regions(self, regions: Mapping[str, Region], mesh: Mesh) -> None:
         """Regions are layers of the wall, from the lumen outwards by their outer radii."""
         check_layers(self.inner_radius, self.outer_radius, _counts(mesh)[1], regions)
+
+    def section_shares(self, regions: Mapping[str, Region]) -> dict[str, float]:
+        """Of the wall."""
+        wall = _wall(self, max(1, len(regions)), regions)
+        areas = np.diff(np.square(wall.radii)) * math.pi / self.section_area
+        return dict(zip(wall.names if regions else [""], map(float, areas), strict=True))
 
     def hold(self, loading: Loading) -> None:
         """u_z = 0 at the bottom, the rigid motions held at three of its nodes."""

@@ -102,7 +102,7 @@ class Extrapolated(Staggered):
 
     def _mean(self, target: Target, duration: float) -> Target:
         """What counts of the targets at the start and at the end of the step."""
-        return self._known(0).towards(target, weight_of_the_end(self.remodeling.settings.kappa * duration))
+        return self._known(0).towards(target, weight_of_the_end(self.remodeling.kappa * duration))
 
     def _extrapolated(self, time: float) -> Target:
         times = self._values.reshape(-1, 2, 11)[:, :, 10]

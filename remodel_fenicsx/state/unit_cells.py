@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import cached_property
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,6 +79,8 @@ class UnitCells(CellField):
         Initial dimensions, axes, seed, r0.
     local_axes
         Of the body at the points (`Shape.local_axes`).
+    regions
+        Initial dimensions and r0 of regions where they are others, by name.
 
     Attributes
     ----------
@@ -92,10 +96,15 @@ class UnitCells(CellField):
         domain: Domain,
         settings: Cells,
         local_axes: LocalAxes,
+        regions: Mapping[str, Cells] = MappingProxyType({}),
     ):
         super().__init__(quadrature, "cell")
         self.settings, self.local_axes = settings, local_axes
         self.dimension_values[:] = settings.dimensions(domain.number_of_elements)[domain.element_number][:, None, :]
+        for name, cells in regions.items():
+            chosen = domain.element_region == domain.regions[name]
+            drawn = cells.dimensions(domain.number_of_elements)
+            self.dimension_values[chosen] = drawn[domain.element_number[chosen]][:, None, :]
         self.axis_values[:] = self.initial_axes()
         self.initial_dimensions: Array = self.dimension_values.copy()
 

@@ -91,7 +91,7 @@ def members_of(scene: Scene, folder: Path, seeds: int) -> list[Run]:
     SceneError
         If the scene has no random cells.
     """
-    if scene.cells.initial != "random":
+    if not scene.has_random_cells:
         raise SceneError(f"cells.initial = {scene.cells.initial!r}: an ensemble is one of 'random' cells")
     if scene.time.tolerance is not None and not scene.time.is_equilibrium:
         raise SceneError(f"time.tolerance = {scene.time.tolerance:g}: each seed would have other steps; leave it out")
