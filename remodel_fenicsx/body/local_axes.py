@@ -25,7 +25,7 @@ LEAST_TANGENT = 0.1  # share of the axial field that lies in the wall: below, it
 # of the volume: 13 forks, coarse and fine, with one element through the wall or two, had 0.03 % at most, in the crotch;
 # with half of the outer face named inner it was 0.7 % (a thick wall, fine) to 43 % (one element)
 MOST_UNDEFINED = 0.01
-AT_ONCE = 2_000_000  # distances that are compared at a time
+AT_ONCE = 1_000_000  # distances that are compared at a time
 
 
 class UndefinedAxes(ValueError):

@@ -13,7 +13,7 @@ from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.assembly import assemble_matrix, create_matrix
 
 TOLERANCE = 1e-12  # relative, of the linear solve: what comes of it has ten digits on any number of ranks
-MOST_ITERATIONS = 20_000  # lines of a thousand elements need some thousands
+ITERATION_LIMIT = 20_000  # lines of a thousand elements need some thousands
 
 
 class SolveStopped(ArithmeticError):
@@ -61,7 +61,7 @@ def solve_positive(bilinear: Any, linear: Any, unknown: Any, conditions: Sequenc
     solver.setOperators(matrix)
     solver.setType("cg")
     solver.getPC().setType("jacobi")
-    solver.setTolerances(rtol=TOLERANCE, max_it=MOST_ITERATIONS)
+    solver.setTolerances(rtol=TOLERANCE, max_it=ITERATION_LIMIT)
     solver.solve(load, change)
     reason, iterations = solver.getConvergedReason(), solver.getIterationNumber()
     start.axpy(1.0, change)
