@@ -137,6 +137,9 @@ def parser() -> argparse.ArgumentParser:
     revolve = command("revolve", "Write the fields of a reduced run in DIR on the whole body: fields_body.vtkhdf.")
     revolve.add_argument("folder", type=Path, metavar="DIR", help="folder of a run")
     scene_command("validate", "Check a scene without running it.")
+    axes = scene_command("axes", "Write the local axes of a scene's body, before any solve, as a VTU file.")
+    text = "a file that does not exist yet (default: NAME-axes.vtu)"
+    axes.add_argument("-o", "--output", type=Path, metavar="FILE", help=text)
     new = command("new", "Print a scene of a preset.")
     new.add_argument("preset", metavar="PRESET", help=", ".join(PRESETS))
     new.add_argument("--shape", default="tube", help="cube, tendon or tube (default: tube)")
@@ -439,6 +442,28 @@ def _validate(options: argparse.Namespace) -> int:
     return 0
 
 
+def _axes(options: argparse.Namespace) -> int:
+    scene = read_scene(options.scene, options.set, options.profile)
+    _check(reason_unusable())
+    from remodel_fenicsx.body import GeometryError
+    from remodel_fenicsx.studies.preview import write_axes
+
+    path = options.output or Path(f"{scene.name}-axes.vtu")
+    try:
+        with interrupts.StopRequest(), interrupts.stopping_at_once():
+            words = write_axes(scene, path)
+    except (SceneError, GeometryError) as error:
+        return _fail(" ".join(str(error).split()), BAD_INPUT)
+    except interrupts.Interrupted as interruption:
+        return _fail(f"stopped by {interruption}", interruption.exit_code)
+    except FileExistsError:
+        return _end_all(f"-o {path}: exists; allowed is a file that does not", BAD_INPUT)
+    except OSError as error:
+        return _end_all(f"-o {path}: cannot be written: {error.strerror}", BAD_ENVIRONMENT)
+    _say(f"{words}\nlocal axes in {path}")
+    return 0
+
+
 def _new(options: argparse.Namespace) -> int:
     scene: Scene = preset_scene(options.preset, options.shape)
     _say(scene.to_toml(f"a scene of the preset {options.preset}").rstrip("\n"))
@@ -507,6 +532,7 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
     "animate": _drawing,
     "revolve": _revolve,
     "validate": _validate,
+    "axes": _axes,
     "new": _new,
     "schema": _schema,
     "figures": _figures,

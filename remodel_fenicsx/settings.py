@@ -215,8 +215,9 @@ class Cells(Table):
     )
     axes: Annotated[str, OneOf(AXES)] = Field(
         default="global",
-        description="Cell axes n_I before the first pass: 'global' (x, y, z) or 'cylindrical' (circumferential, axial, "
-        "radial, about the z axis). Where neither scene nor preset says it: a tube starts with 'cylindrical'.",
+        description="Cell axes n_I before the first pass: 'global' (x, y, z), 'cylindrical' (circumferential, axial, "
+        "radial, about the z axis) or 'local' (the same found on a mesh, docs/own_body.md). Where neither scene nor "
+        "preset says it: a tube starts with 'cylindrical'.",
     )
     aligned_axis: Annotated[int, OneOf((1, 2, 3))] = Field(
         default=3,
@@ -684,7 +685,10 @@ FIELDS_BY_NAME = (
     "displacement", "deformation_gradient", "cauchy_stress", "cell_dimensions", "axis_1", "axis_2", "axis_3",
     "fibre_angle", "fibre_angle_deformed", "chain_extension", "chains",
 )  # fmt: skip
-"""What `output.fields` may name (`results.fields`); "chains" are the lines of fields_chains.vtkhdf."""
+"""What `output.fields = true` stands for (`results.fields`); "chains" are the lines of fields_chains.vtkhdf."""
+
+CONSTANT_FIELDS = ("axis_c", "axis_a", "axis_r", "depth", "station")
+"""What `output.fields` may name beside: local axes of the elements, their depth and station, which do not change."""
 
 
 def _fields(value: Any) -> Any:
@@ -693,8 +697,9 @@ def _fields(value: Any) -> Any:
     if not isinstance(value, (list, tuple)) or not all(isinstance(name, str) for name in value):
         raise fault("must be true, false or a list of names of fields")
     for name in value:
-        if name not in FIELDS_BY_NAME:
-            raise fault(f"no such field; allowed are {', '.join(map(repr, FIELDS_BY_NAME))}", value=name)
+        if name not in (*FIELDS_BY_NAME, *CONSTANT_FIELDS):
+            allowed = ", ".join(map(repr, (*FIELDS_BY_NAME, *CONSTANT_FIELDS)))
+            raise fault(f"no such field; allowed are {allowed}", value=name)
     return tuple(value)
 
 
@@ -722,7 +727,7 @@ class Output(Table):
         "for the chain lines. What no name asks for is not computed.",
         json_schema_extra={
             "allowed": "true, false or a list of names of fields",
-            "anyOf": [{"type": "boolean"}, {"type": "array", "items": {"enum": [*FIELDS_BY_NAME]}}],
+            "anyOf": [{"type": "boolean"}, {"type": "array", "items": {"enum": [*FIELDS_BY_NAME, *CONSTANT_FIELDS]}}],
         },
     )
     columns: Annotated[tuple[str, ...], BeforeValidator(_columns)] = Field(

@@ -19,9 +19,10 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from remodel_fenicsx.body.domain import Domain, SymbolicMesh, build_domain
-from remodel_fenicsx.body.local_axes import FoundAxes, found_axes
+from remodel_fenicsx.body.local_axes import found_axes
 from remodel_fenicsx.fem.compat import geometry_dofmap
 from remodel_fenicsx.fem.quadrature import Quadrature
+from remodel_fenicsx.model.local_axes import LocalAxes
 
 Array = NDArray[np.float64]
 FACES = ("inner", "outer", "inlet", "outlet")
@@ -187,7 +188,7 @@ def fork(half_angle: float, size: float, radius: float = 1.0, wall: float = 0.4,
     return build_domain(draw, "fork", {"size": length}, MPI.COMM_SELF)
 
 
-def found(domain: Domain, degree: int = 1, **ends: Any) -> tuple[FoundAxes, Quadrature]:
+def found(domain: Domain, degree: int = 1, **ends: Any) -> tuple[LocalAxes, Quadrature]:
     """Local axes of a mesh, and the points."""
     quadrature = Quadrature(domain.mesh, degree)
     return found_axes(domain, quadrature, **ends), quadrature
@@ -206,10 +207,9 @@ def gathered_bend(comm: Any) -> dict[str, Array] | None:
     """Everything that is found of a bend with legs, by element of the input; on rank 0."""
     domain = ring(LEGS.place, (8, 2, 12), "tetrahedron", comm)
     made, _ = found(domain)
-    local = made.local_axes
-    values = {"axes": local.axes, "depth": local.depth, "station": local.station, "thickness": made.thickness}
+    values = {name: getattr(made, name) for name in ("axes", "depth", "station", "thickness")}
     whole = {name: domain.gather_elements(array) for name, array in values.items()}
-    whole["nodal_depth"] = domain.gather_nodes(local.nodal_depth)
+    whole["nodal_depth"] = domain.gather_nodes(made.nodal_depth)
     return whole if comm.rank == 0 else None
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -32,31 +31,9 @@ class UndefinedAxes(ValueError):
     """More of the body than a few points has no local axes."""
 
 
-@dataclass(frozen=True, eq=False)
-class FoundAxes:
-    """Local axes of a body that were found on its mesh.
-
-    Attributes
-    ----------
-    local_axes
-        At the points.
-    thickness
-        Of the wall at the points, (elements, points).
-    undefined
-        Where the axes are those of the nearest point that has some, (elements, points).
-    undefined_share
-        Of the volume.
-    """
-
-    local_axes: LocalAxes
-    thickness: Array
-    undefined: NDArray[np.bool_]
-    undefined_share: float
-
-
 def found_axes(
     domain: Domain, quadrature: Quadrature, inlets: Sequence[str] = ("inlet",), outlets: Sequence[str] = ("outlet",)
-) -> FoundAxes:
+) -> LocalAxes:
     """Local axes of a mesh with faces "inner" and "outer", and ends. Collective.
 
     Raises
@@ -80,8 +57,8 @@ def found_axes(
     _fill(axes, known, quadrature)
     depth, station = (_share(values[..., k], values[..., k + 1]) for k in (6, 8))
     nodal = _share(*(_at_nodes(length) for length in (fields.from_inner, fields.from_outer)))
-    local_axes = LocalAxes(quadrature.coordinates, lambda: axes, lambda: depth, lambda: station, lambda: nodal)
-    return FoundAxes(local_axes, values[..., 6] + values[..., 7], ~known, share)
+    makers = (lambda: axes), (lambda: depth), (lambda: station), (lambda: nodal)
+    return LocalAxes(quadrature.coordinates, *makers, values[..., 6] + values[..., 7], ~known)
 
 
 def _axes(radial: Array, axial: Array) -> tuple[Array, NDArray[np.bool_]]:

@@ -108,6 +108,8 @@ class Shape(Table):
         What `depth` goes through, where it is 0 and where it is 1.
     angle_in_words
         Where a fibre angle of 0 degrees and one of 90 point.
+    constant_fields
+        Of `settings.CONSTANT_FIELDS`, those that `output.fields = true` stands for too.
     defaults
         Defaults of other tables that this shape changes, under the keys of preset and scene.
     has_regions
@@ -128,6 +130,7 @@ class Shape(Table):
     ends_that_free_length: ClassVar[tuple[str, ...]] = ()
     depth_in_words: ClassVar[tuple[str, str, str]] = ("along the body", "bottom", "top")
     angle_in_words: ClassVar[tuple[str, str]] = ("along the load", "across")
+    constant_fields: ClassVar[tuple[str, ...]] = ()
     defaults: ClassVar[dict[str, Any]] = {}
     has_regions: ClassVar[bool] = False
     is_filled_by_regions: ClassVar[bool] = False

@@ -23,6 +23,8 @@ class LocalAxes:
         Reference places of the points, (..., 3).
     axes, depth, station, nodal_depth
         Functions that make the attributes of these names; nothing is made that nobody asks for.
+    thickness, undefined
+        The attributes of these names, of axes that were found on a mesh (`body.local_axes`).
 
     Attributes
     ----------
@@ -36,10 +38,23 @@ class LocalAxes:
         Share of the length along the body, (...,).
     nodal_depth
         Depth of the local geometry nodes, ghosts included, (nodes,).
+    thickness
+        Of the wall at the points, (...,); None where the shape's keys say it.
+    undefined
+        Where the axes are those of the nearest point that has some, (...,); None where all have their own.
     """
 
-    def __init__(self, coordinates: Array, axes: Maker, depth: Maker, station: Maker, nodal_depth: Maker):
-        self.coordinates = coordinates
+    def __init__(
+        self,
+        coordinates: Array,
+        axes: Maker,
+        depth: Maker,
+        station: Maker,
+        nodal_depth: Maker,
+        thickness: Array | None = None,
+        undefined: NDArray[np.bool_] | None = None,
+    ):
+        self.coordinates, self.thickness, self.undefined = coordinates, thickness, undefined
         self._axes, self._depth, self._station, self._nodal_depth = axes, depth, station, nodal_depth
 
     @cached_property
@@ -83,5 +98,6 @@ def _unit(vectors: Array) -> Array:
 AXES: dict[str, Callable[[LocalAxes], Array]] = {
     "global": lambda points: global_axes(points.coordinates),
     "cylindrical": lambda points: cylindrical_axes(points.coordinates),
+    "local": lambda points: points.axes,
 }
 """Axes of the cells before the first pass by name: functions of a `LocalAxes`."""

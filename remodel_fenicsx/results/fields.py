@@ -14,11 +14,13 @@ from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.shape import Shape
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
 from remodel_fenicsx.fem import compat, jit
+from remodel_fenicsx.fem.quadrature import Quadrature
+from remodel_fenicsx.model.local_axes import LocalAxes
 from remodel_fenicsx.results.chain_lines import AXIS_FIELDS, OF_CHAINS, append_chains
 from remodel_fenicsx.results.recording import CHAIN_LINES, FIELDS
 from remodel_fenicsx.results.vtkhdf import TransientGrid, vtk_cells
 from remodel_fenicsx.schema.times import SAME_TIME, same_time
-from remodel_fenicsx.settings import FIELDS_BY_NAME
+from remodel_fenicsx.settings import CONSTANT_FIELDS, FIELDS_BY_NAME
 from remodel_fenicsx.solver.pointwise import PointStresses
 from remodel_fenicsx.state.state import State
 
@@ -28,11 +30,19 @@ log = logging.getLogger(__name__)
 OF_ELEMENTS = tuple(name for name in FIELDS_BY_NAME if name not in ("displacement", "chains"))
 
 
-def field_names(asked: bool | Sequence[str]) -> tuple[str, ...]:
+def field_names(asked: bool | Sequence[str], shape: Shape) -> tuple[str, ...]:
     """The fields that a scene's `output.fields` asks for."""
     if isinstance(asked, bool):
-        return FIELDS_BY_NAME if asked else ()
+        return (*FIELDS_BY_NAME, *shape.constant_fields) if asked else ()
     return tuple(asked)
+
+
+def local_fields(local_axes: LocalAxes, quadrature: Quadrature) -> dict[str, Array]:
+    """CONSTANT_FIELDS of the local elements, by name: unit vectors (elements, 3), depth and station (elements,)."""
+    axes = quadrature.element_mean(local_axes.axes)
+    axes /= np.linalg.norm(axes, axis=-1, keepdims=True)
+    numbers = (quadrature.element_mean(values) for values in (local_axes.depth, local_axes.station))
+    return dict(zip(CONSTANT_FIELDS, (*np.moveaxis(axes, 1, 0), *numbers), strict=True))
 
 
 class ElementFields:
@@ -124,7 +134,7 @@ class Fields(Watcher):
     after
         Where a run goes on: time of the last step that was done. Fields of later ones are dropped.
     names
-        Of `settings.FIELDS_BY_NAME`, what is written; the lines only with "chains".
+        Of `settings.FIELDS_BY_NAME` and CONSTANT_FIELDS, what is written; the lines only with "chains".
     times
         Further times that are written.
 
@@ -154,7 +164,11 @@ class Fields(Watcher):
         needed = {*self.names, *(OF_CHAINS if "chains" in self.names else ())}
         self._element_fields = ElementFields(shape, stepper, [name for name in OF_ELEMENTS if name in needed])
         self._displacement = NodalGather(domain, self.state)
-        quadrature = self.state.cells.quadrature
+        quadrature, local_axes = self.state.cells.quadrature, self.state.cells.local_axes
+        constant = local_fields(local_axes, quadrature) if {*CONSTANT_FIELDS} & {*self.names} else {}
+        self._constant = {
+            name: domain.gather_elements(values) for name, values in constant.items() if name in self.names
+        }
         points, elements = domain.gather_mesh()
         self._grid: TransientGrid | None = None
         self._chains: TransientGrid | None = None
@@ -195,7 +209,9 @@ class Fields(Watcher):
             return
         fields = {name: values for name, values in gathered.items() if values is not None}
         at_nodes = {"displacement": displacement} if "displacement" in self.names else {}
-        self._grid.append(time, at_nodes, {name: fields[name] for name in fields if name in self.names})
+        changing = {name: fields[name] for name in fields if name in self.names}
+        constant = {name: values for name, values in self._constant.items() if values is not None}
+        self._grid.append(time, at_nodes, changing, constant=constant)
         if "chains" in self.names:
             grid, middle = self._chains or self._grid.path.with_name(CHAIN_LINES), displacement[self._elements].mean(
                 axis=1

@@ -34,8 +34,8 @@ BODIES = {
 def error(body: KnownBody, counts: tuple[int, int, int], kind: str, number: int) -> tuple[float, float]:
     """Root of the mean square and largest error of c (0) or a (1), degrees."""
     made, quadrature = found(ring(body.place, counts, kind))
-    off = apart(made.local_axes.axes[..., number, :], body.directions(quadrature.coordinates)[number])
-    assert made.undefined_share == 0.0
+    off = apart(made.axes[..., number, :], body.directions(quadrature.coordinates)[number])
+    assert made.undefined is not None and not made.undefined.any()
     return float(np.sqrt(quadrature.mean(off**2))), float(off.max())
 
 
@@ -68,11 +68,12 @@ def test_depth_station_and_thickness_of_the_papers_wall(kind: str, most: float) 
     body, counts = BODIES["straight"]
     domain = ring(body.place, counts, kind)
     made, quadrature = found(domain)
-    x, local = quadrature.coordinates, made.local_axes
+    x, local = quadrature.coordinates, made
     assert body.depth is not None
     off = local.depth - body.depth(x)
     assert np.sqrt(quadrature.mean(off**2)) <= most
     np.testing.assert_allclose(local.station, x[..., 2] / 8.0, atol=1e-3)
+    assert made.thickness is not None
     np.testing.assert_allclose(made.thickness, 2.0, rtol=0.03)
     nodes = domain.mesh.geometry.x
     np.testing.assert_allclose(local.nodal_depth, body.depth(nodes), atol=1.5 * most)
@@ -84,7 +85,7 @@ def test_station_is_a_share_of_the_length_of_a_bend() -> None:
     """Of its middle line: constant in the sections of a torus."""
     made, quadrature = found(ring(TORUS.place, (16, 4, 12), "hexahedron"))
     turn = np.arctan2(quadrature.coordinates[..., 2], quadrature.coordinates[..., 0] + 6.0)
-    np.testing.assert_allclose(made.local_axes.station, turn / (np.pi / 3), atol=0.004)
+    np.testing.assert_allclose(made.station, turn / (np.pi / 3), atol=0.004)
 
 
 @pytest.mark.parametrize("kind, rms", [("hexahedron", 0.01), ("tetrahedron", 0.6)])
@@ -92,11 +93,11 @@ def test_curved_elements_of_degree_two(kind: str, rms: float) -> None:
     domain = parts.tube(element=kind, degree=2, divisions=(16, 2, 2), length=2.0, comm=MPI.COMM_SELF)
     made, quadrature = found(domain, 2, inlets=["bottom"], outlets=["top"])
     x, (body, _) = quadrature.coordinates, BODIES["straight"]
-    off = apart(made.local_axes.axes[..., 0, :], body.directions(x)[0])
+    off = apart(made.axes[..., 0, :], body.directions(x)[0])
     assert np.sqrt(quadrature.mean(off**2)) < rms
     assert body.depth is not None
-    np.testing.assert_allclose(made.local_axes.depth, body.depth(x), atol=0.005)
-    np.testing.assert_allclose(made.local_axes.nodal_depth, body.depth(domain.mesh.geometry.x), atol=0.005)
+    np.testing.assert_allclose(made.depth, body.depth(x), atol=0.005)
+    np.testing.assert_allclose(made.nodal_depth, body.depth(domain.mesh.geometry.x), atol=0.005)
 
 
 def test_axes_are_a_right_handed_frame_and_a_turned_body_has_turned_ones() -> None:
@@ -106,12 +107,13 @@ def test_axes_are_a_right_handed_frame_and_a_turned_body_has_turned_ones() -> No
     first, _ = found(ring(body.place, counts, "tetrahedron"))
     moved = ring(lambda *shares: 1000.0 * body.place(*shares) @ turn.T + shift, counts, "tetrahedron")
     second, _ = found(moved)
-    axes = first.local_axes.axes
+    axes = first.axes
     np.testing.assert_allclose(axes @ np.swapaxes(axes, -1, -2), np.broadcast_to(np.eye(3), axes.shape), atol=1e-12)
     np.testing.assert_allclose(np.cross(axes[..., 0, :], axes[..., 1, :]), axes[..., 2, :], atol=1e-12)
-    np.testing.assert_allclose(second.local_axes.axes, axes @ turn.T, atol=1e-6)
-    np.testing.assert_allclose(second.local_axes.depth, first.local_axes.depth, atol=1e-6)
-    np.testing.assert_allclose(second.local_axes.station, first.local_axes.station, atol=1e-6)
+    np.testing.assert_allclose(second.axes, axes @ turn.T, atol=1e-6)
+    np.testing.assert_allclose(second.depth, first.depth, atol=1e-6)
+    np.testing.assert_allclose(second.station, first.station, atol=1e-6)
+    assert first.thickness is not None and second.thickness is not None
     np.testing.assert_allclose(second.thickness, 1000.0 * first.thickness, rtol=1e-6)
 
 
@@ -133,9 +135,10 @@ def test_two_ranks_give_the_same(tmp_path: Path) -> None:
 def test_a_fork_has_the_directions_of_its_branches_and_few_points_without() -> None:
     """Three points in the crotch have none of their own; they get those of the nearest point that has some."""
     made, quadrature = found(fork(35.0, size=0.35), inlets=["inlet"], outlets=["left", "right"])
-    assert made.undefined.any() and made.undefined_share < 0.1 * MOST_UNDEFINED
-    x, axes = quadrature.coordinates, made.local_axes.axes
-    assert np.isfinite(axes).all() and np.isfinite(made.local_axes.depth).all()
+    assert made.undefined is not None and made.undefined.any()
+    assert quadrature.mean(made.undefined.astype(float)) < 0.1 * MOST_UNDEFINED
+    x, axes = quadrature.coordinates, made.axes
+    assert np.isfinite(axes).all() and np.isfinite(made.depth).all()
     for angle, sign in ((0.0, -1.0), (-35.0, 1.0), (35.0, 1.0)):
         way = np.array([np.sin(np.radians(angle)), 0.0, np.cos(np.radians(angle))])
         along = sign * (x @ way)

@@ -163,7 +163,7 @@ def test_stress_that_nobody_writes_is_not_compiled(monkeypatch: pytest.MonkeyPat
         fields = ElementFields(simulation.scene.geometry, simulation.stepper, names)
         assert set(fields()) == set(names)
         sizes[names] = fields._state.ufl_expression.ufl_shape
-    assert list(sizes.values()) == [(21,), (12,)]
+    assert list(sizes.values()) == [(18,), (9,)]
     simulation.close()
 
 

@@ -163,7 +163,7 @@ BAD_SCENES = [
     (CUBE, {"cells.seed": 1.5}, "cells.seed = 1.5: must be a whole number at least 0"),
     (CUBE, {"cells.seed": True}, "cells.seed = true: must be a whole number at least 0"),
     (CUBE, {"cells.axes": "cylindrical"}, "cells.axes = 'cylindrical': allowed for shape 'cube' is 'global'"),
-    (CUBE, {"cells.axes": "polar"}, "cells.axes = 'polar': allowed are 'global', 'cylindrical'"),
+    (CUBE, {"cells.axes": "polar"}, "cells.axes = 'polar': allowed are 'global', 'cylindrical', 'local'"),
     (
         CUBE,
         {"cells.initial": "raindrop"},
