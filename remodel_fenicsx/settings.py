@@ -682,9 +682,10 @@ class Solver(Table):
 
 FIELDS_BY_NAME = (
     "displacement", "deformation_gradient", "cauchy_stress", "cell_dimensions", "axis_1", "axis_2", "axis_3",
-    "fibre_angle", "fibre_angle_deformed", "chain_extension", "chains",
+    "fibre_angle", "fibre_angle_deformed", "chain_extension", "region", "chains",
 )  # fmt: skip
 """What `output.fields` may name (`results.fields`); "chains" are the lines of fields_chains.vtkhdf."""
+REGION = "region"  # the field of bodies with regions
 
 
 def _fields(value: Any) -> Any:
