@@ -683,12 +683,12 @@ class Solver(Table):
 
 FIELDS_BY_NAME = (
     "displacement", "deformation_gradient", "cauchy_stress", "cell_dimensions", "axis_1", "axis_2", "axis_3",
-    "fibre_angle", "fibre_angle_deformed", "chain_extension", "chains",
+    "fibre_angle", "fibre_angle_deformed", "chain_extension", "region", "chains",
 )  # fmt: skip
-"""What `output.fields = true` stands for (`results.fields`); "chains" are the lines of fields_chains.vtkhdf."""
-
+"""What `output.fields` may name (`results.fields`); "chains" are the lines of fields_chains.vtkhdf."""
+REGION = "region"  # the field of bodies with regions
 CONSTANT_FIELDS = ("axis_c", "axis_a", "axis_r", "depth", "station")
-"""What `output.fields` may name beside: local axes of the elements, their depth and station, which do not change."""
+"""What it may name beside: local axes of the elements, their depth and station, which do not change."""
 
 
 def _fields(value: Any) -> Any:

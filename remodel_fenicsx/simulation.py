@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from remodel_fenicsx.body.columns import columns_of
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.loading import Loading, LoadValues
 from remodel_fenicsx.body.reductions import AUTO, choice, explained
@@ -104,19 +103,19 @@ class Simulation:
         self.tissue = self.stepper.tissue
         counted = "negative_eigenvalues" in scene.output.columns
         self.stability = EquilibriumStability(self.stepper, scene.solver.unstable, every_step=counted)
-        columns = list(scene.output.columns)
+        more: list[str] = []
         self.control: Any = None  # `StepControl`
         if scene.time.tolerance is not None and not at_once:
             from remodel_fenicsx.evolution.step_control import StepControl
 
             settings = scene.time.tolerance, scene.time.step, scene.stops()
             self.control = StepControl(self.stepper, *settings)
-            columns += [TIME_ERROR] if TIME_ERROR not in columns else []
-        elif TIME_ERROR in columns:
+            more += [TIME_ERROR] if TIME_ERROR not in scene.output.columns else []
+        elif TIME_ERROR in scene.output.columns:
             from remodel_fenicsx.evolution.time_error import TimeError
 
             self.stepper.judge = TimeError(self.stepper).measure
-        self.observer = Observer(shape, self.stepper, columns_of(shape, columns, scene.loads))
+        self.observer = Observer(shape, self.stepper, scene.columns(more))
         self.warnings: list[Watcher] = [
             LockingWarning(self.stepper, formulation.locks),
             VolumeLoss(self.stepper),

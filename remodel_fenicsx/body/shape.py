@@ -216,6 +216,10 @@ class Shape(Table):
         """Share of every section across z that is in a region, by its name; "" is what is beside them."""
         return {"": 1.0}
 
+    def region_depths(self, regions: Mapping[str, Region]) -> dict[str, tuple[float, float]]:
+        """Where regions that lie one behind the other begin and end in `depth`; empty where they do not."""
+        return {}
+
     @abstractmethod
     def hold(self, loading: Loading) -> None:
         """Hold the body as it is held without loads, its ends free."""

@@ -323,6 +323,12 @@ class Tube(Shape):
         areas = np.diff(np.square(wall.radii)) * math.pi / self.section_area
         return dict(zip(wall.names if regions else [""], map(float, areas), strict=True))
 
+    def region_depths(self, regions: Mapping[str, Region]) -> dict[str, tuple[float, float]]:
+        """Of the layers, from the inside outwards."""
+        wall = _wall(self, max(1, len(regions)), regions)
+        places = [(radius - wall.radii[0]) / (wall.radii[-1] - wall.radii[0]) for radius in wall.radii]
+        return dict(zip(wall.names, itertools.pairwise(places), strict=True)) if regions else {}
+
     def hold(self, loading: Loading) -> None:
         """u_z = 0 at the bottom, the rigid motions held at three of its nodes."""
         loading.hold_face("bottom", 2)

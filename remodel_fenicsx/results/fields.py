@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +20,7 @@ from remodel_fenicsx.results.chain_lines import AXIS_FIELDS, OF_CHAINS, append_c
 from remodel_fenicsx.results.recording import CHAIN_LINES, FIELDS
 from remodel_fenicsx.results.vtkhdf import TransientGrid, vtk_cells
 from remodel_fenicsx.schema.times import SAME_TIME, same_time
-from remodel_fenicsx.settings import CONSTANT_FIELDS, FIELDS_BY_NAME
+from remodel_fenicsx.settings import CONSTANT_FIELDS, FIELDS_BY_NAME, REGION
 from remodel_fenicsx.solver.pointwise import PointStresses
 from remodel_fenicsx.state.state import State
 
@@ -30,10 +30,15 @@ log = logging.getLogger(__name__)
 OF_ELEMENTS = tuple(name for name in FIELDS_BY_NAME if name not in ("displacement", "chains"))
 
 
-def field_names(asked: bool | Sequence[str], shape: Shape) -> tuple[str, ...]:
-    """The fields that a scene's `output.fields` asks for."""
+def field_names(
+    asked: bool | Sequence[str], regions: Collection[str] = (), constant: Sequence[str] = ()
+) -> tuple[str, ...]:
+    """The fields that a scene's `output.fields` asks for; all but that of regions where it has none.
+
+    `constant` are those that its shape has beside (`Shape.constant_fields`).
+    """
     if isinstance(asked, bool):
-        return (*FIELDS_BY_NAME, *shape.constant_fields) if asked else ()
+        return (*(name for name in FIELDS_BY_NAME if regions or name != REGION), *constant) if asked else ()
     return tuple(asked)
 
 
@@ -77,7 +82,7 @@ class ElementFields:
         `deformation_gradient` and `cauchy_stress` (9, row by row); `cell_dimensions` (3) and `axis_1..3`: the cell
         whose structure tensor is the element's mean, longest first; `fibre_angle` and `fibre_angle_deformed` (degrees,
         to the load axis, or in a tube from circumferential to axial; NaN where no chain has one); `chain_extension`
-        (largest r/L in the element; 0 where no chain locks).
+        (largest r/L in the element; 0 where no chain locks); `region` (its number, `Domain.regions`).
         """
         if self._stresses is not None:
             self._stresses.refresh()
@@ -103,6 +108,8 @@ class ElementFields:
         if "chain_extension" in wanted:
             squared = cells.kernels.squared_length(F.reshape(-1, 3, 3), cells.point_cells).reshape(F.shape[:2])
             found["chain_extension"] = np.max(np.sqrt(squared) / self._locking_length(), axis=1)
+        if REGION in wanted:
+            found[REGION] = self.state.loading.domain.element_region.astype(np.float64)
         return {name: found[name] for name in OF_ELEMENTS if name in wanted}
 
     def mean_cells(self) -> tuple[Array, Array]:
@@ -155,7 +162,7 @@ class Fields(Watcher):
         stepper: Stepper,
         every: int = 1,
         after: float | None = None,
-        names: Sequence[str] = FIELDS_BY_NAME,
+        names: Sequence[str] = field_names(True),
         times: Sequence[float] = (),
     ):
         self.times = tuple(times)

@@ -16,7 +16,7 @@ from typing import Annotated, Any, ClassVar
 from pydantic import BaseModel, BeforeValidator, Field, ModelWrapValidatorHandler, SerializeAsAny, model_validator
 
 from remodel_fenicsx.body import SHAPES, Shape
-from remodel_fenicsx.body.columns import columns_of, columns_of_region, columns_on_request
+from remodel_fenicsx.body.columns import Column, columns_of, columns_of_region, columns_on_request
 from remodel_fenicsx.body.reductions import AUTO, objections
 from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.fem.solver_methods import SOLVER_METHODS
@@ -30,6 +30,7 @@ from remodel_fenicsx.schema.tables import SceneError, Table, VariantOf, allowed,
 from remodel_fenicsx.schema.toml import merged, parse_override, put, read_toml, toml_text
 from remodel_fenicsx.schema.units import FORCE, LENGTH_UNIT, LENGTH_UNITS, STRESS_UNIT, in_units
 from remodel_fenicsx.settings import (
+    REGION,
     STRESS_UNITS,
     Cells,
     Load,
@@ -162,6 +163,8 @@ class Scene(Table):
         for name, load in self.loads.items():
             self._check_load(name, load)
         self._check_output_times()
+        if REGION in _listed(self.output.fields) and not self.regions:
+            raise fault("the scene has no regions", "output.fields", REGION)
         self._check_columns()
         self._check_length()
         if self.model.kinematics != AUTO and (reasons := objections(self, self.model.kinematics)):
@@ -197,7 +200,7 @@ class Scene(Table):
             return f"remodeling.law = {law!r} has no limit that the way there does not decide; those with one: {laws}"
         for name, properties in self.properties().items():
             if properties.kappa == 0:
-                return f"{_in_region(name)}remodeling.kappa = 0: the cells never change"
+                return f"{in_region(name)}remodeling.kappa = 0: the cells never change"
         return None if self.material.chain_density else "needs chains: material.chain_density above 0"
 
     @property
@@ -212,6 +215,7 @@ class Scene(Table):
 
     def _check_regions(self) -> None:
         shape, columns = self.geometry, {column.name for column in columns_of(self.geometry)}
+        columns |= set(columns_on_request(shape))
         for name in self.regions:
             key = f"regions.{quoted(name)}"
             if not shape.has_regions:
@@ -219,11 +223,11 @@ class Scene(Table):
                 raise fault(f"a {shape.name} has no regions; shapes with regions: {able}", key, None)
             if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,39}", name):
                 raise fault("a region's name is a letter, then letters, digits and _, at most 40 in all", key, None)
-            if taken := columns.intersection(columns_of_region(name)):
+            if taken := columns.intersection(column.name for column in columns_of_region(name)):
                 raise fault(f"the column {min(taken)!r} has another meaning; choose another name", key, None)
         shape.check_regions(self.regions, self.mesh)
         for name, properties in self.properties().items():
-            self._check_properties(_in_region(name), properties)
+            self._check_properties(in_region(name), properties)
 
     def _check_properties(self, region: str, properties: Properties) -> None:
         """What the keys of a region say together with those of the whole body."""
@@ -274,11 +278,16 @@ class Scene(Table):
                 raise fault(rule, f"output.times[{index}]", time)
 
     def _check_columns(self) -> None:
-        known = dict.fromkeys([*columns_on_request(self.geometry), *(c.name for c in columns_of(self.geometry))])
+        always = columns_of(self.geometry, regions=self.regions)
+        known = dict.fromkeys([*columns_on_request(self.geometry), *(column.name for column in always)])
         for name in self.output.columns:
             if name not in known:
                 rule = f"no such column on request; allowed for shape {self.geometry.name!r} are "
                 raise fault(rule + ", ".join(map(repr, known)), "output.columns", name)
+
+    def columns(self, more: Iterable[str] = ()) -> tuple[Column, ...]:
+        """Of its history, in the order of the file; with `more` of those on request."""
+        return columns_of(self.geometry, [*self.output.columns, *more], self.loads, self.regions)
 
     def stops(self) -> list[float]:
         """Times at which a step ends, however long steps are: corners of ramps, output.times and the end."""
@@ -365,7 +374,11 @@ def _in_present_format(values: Mapping[str, Any]) -> dict[str, Any]:
     return {**values, "format": FORMAT}
 
 
-def _in_region(name: str) -> str:
+def _listed(fields: Any) -> tuple[str, ...]:
+    return () if isinstance(fields, bool) else tuple(fields)
+
+
+def in_region(name: str) -> str:
     """Of a dotted key in a region, or in the whole body: what stands before."""
     return f"regions.{name}." if name else ""
 
