@@ -98,7 +98,8 @@ def test_chosen_steps_hold_the_error_of_both_regions() -> None:
 
 def test_no_step_is_longer_than_the_fastest_region_allows() -> None:
     """kappa dt of an explicit rule, wherever it is largest."""
-    made = Simulation(scene(0.4, SECOND, "tensor", "extrapolated", **{"time.tolerance": 20.0}), MPI.COMM_SELF)
+    held = {"time.tolerance": 40.0, "time.end": 30.0}
+    made = Simulation(scene(0.4, SECOND, "tensor", "extrapolated", **held), MPI.COMM_SELF)
     lengths = np.diff([0.0, *(step.time for step in made.steps())])
     longest = made.stepper.coupling.longest / 0.4
     made.close()
