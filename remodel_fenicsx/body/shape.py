@@ -210,7 +210,14 @@ class Shape(Table):
         return self.build(mesh, comm)
 
     def check_regions(self, regions: Mapping[str, Region], mesh: Mesh) -> None:
-        """Refuse what the regions of a scene ask of the body and it cannot have: raise a `fault` that names the key."""
+        """Refuse what the regions of a scene ask of the body and it cannot have: raise a `fault` that names the key.
+
+        Here they come with the mesh: no radius says where they end.
+        """
+        for name, region in regions.items():
+            if region.outer_radius is not None:
+                rule = f"the regions of a {self.name} come with its mesh; only layers of a tube have an outer radius"
+                raise fault(rule, f"regions.{name}.outer_radius", region.outer_radius)
 
     def section_shares(self, regions: Mapping[str, Region]) -> dict[str, float]:
         """Share of every section across z that is in a region, by its name; "" is what is beside them."""

@@ -45,9 +45,9 @@ def scene(regions: Any = LAYERS, law: str = "explicit", **changes: Any) -> Scene
 
 
 @lru_cache
-def reference(law: str) -> RadialHistory:
+def reference(law: str, step: float = 1.0, elements: int = 200) -> RadialHistory:
     """The same typed from the paper's equations, with parameters by point; the interface lies between two elements."""
-    points = Tube(1.0, 3.0, 200, RadialMaterial()).points
+    points = Tube(1.0, 3.0, elements, RadialMaterial()).points
     inside = points[:, None] < INTERFACE
 
     def modulus(density: float, temperature: float = 310.0, persistence: float = 1.365) -> float:
@@ -58,9 +58,10 @@ def reference(law: str) -> RadialHistory:
         np.where(inside, modulus(1.5e21), modulus(4e21, 320.0, 1.2)), np.where(inside, 1.7, 1.594),
         np.where(inside, 1.0, R0),
     )  # fmt: skip
+    initial = np.where(inside, 1 / np.sqrt(3), np.array(LENGTHS))
     return solve_radial(
-        pressure=LOADS[law][0], stretch=LOADS[law][1], end=END, law=law, kappa=np.where(inside, 0.06, 0.02),
-        ramp_time=8.0, elements=200, material=material, initial=np.where(inside, 1 / np.sqrt(3), np.array(LENGTHS)),
+        pressure=LOADS[law][0], stretch=LOADS[law][1], ramp_time=8.0, end=END, step=step, law=law,
+        kappa=np.where(inside, 0.06, 0.02), elements=elements, material=material, initial=initial,
     )  # fmt: skip
 
 
@@ -82,6 +83,23 @@ def test_two_layers_on_one_radius_are_those_of_the_reference(law: str) -> None:
     radius, media, adventitia = held_against(law, Simulation(scene(law=law, **{"mesh.refinement": 4}), SELF))
     print(law, radius, media, adventitia)
     assert radius < 3e-4 and media < 0.1 and adventitia < 0.1
+
+
+@pytest.mark.parametrize("coupling, step, error", [("extrapolated", 0.5, 0.03), ("implicit", 0.25, 0.15)])
+def test_couplings_come_to_the_limit_of_short_steps(coupling: str, step: float, error: float) -> None:
+    """Their cells belong to their stress; those of the reference lag by a step, and are extrapolated to none."""
+    known = []
+    for short in (0.1, 0.05):
+        exact = reference("tensor", short, 40)
+        known.append([exact.mean_fibre_angle(1.0, INTERFACE, -2), exact.mean_fibre_angle(INTERFACE, 3.0, -2)])
+    limit = 2 * np.array(known[1]) - np.array(known[0])
+    changes = {"remodeling.coupling": coupling, "time.step": step, "material.repulsion": "log", "mesh.refinement": 2}
+    simulation = Simulation(scene(law="tensor", **changes), SELF)
+    row = list(simulation.steps())[-1].row
+    simulation.close()
+    found = [row["fibre_angle_media"], row["fibre_angle_adventitia"]]
+    np.testing.assert_allclose(found, limit, rtol=0, atol=error)
+    assert np.abs(limit - known[1]).min() > 0.02  # more than the errors that are left
 
 
 def test_two_layers_in_three_dimensions_are_those_of_the_reference() -> None:
