@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from typing import Any
 
@@ -14,10 +15,13 @@ from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.assembly import of_all_ranks
 from remodel_fenicsx.fem.compat import geometry_dofmap
+from remodel_fenicsx.fem.positive import SolveStopped
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.model.local_axes import LocalAxes
+from remodel_fenicsx.schema.tables import SceneError
 
 Array = NDArray[np.float64]
+log = logging.getLogger(__name__)
 
 LEAST_RADIAL = 0.2  # length of the mean of unit gradients: below, they point all ways
 LEAST_TANGENT = 0.1  # share of the axial field that lies in the wall: below, it runs through the wall
@@ -27,7 +31,7 @@ MOST_UNDEFINED = 0.01
 AT_ONCE = 1_000_000  # distances that are compared at a time
 
 
-class UndefinedAxes(ValueError):
+class UndefinedAxes(SceneError):
     """More of the body than a few points has no local axes."""
 
 
@@ -39,22 +43,30 @@ def found_axes(
     Raises
     ------
     UndefinedAxes
-        If more than MOST_UNDEFINED of the volume has none; one line that names a place.
-    SolveStopped
-        If a linear solve does not converge.
+        If a face is missing, if more than MOST_UNDEFINED of the volume has none, or if a linear solve stops; one line.
     """
-    fields = axis_fields(domain, quadrature, inlets, outlets)
+    missing = [face for face in ("inner", "outer", *inlets, *outlets) if face not in domain.faces]
+    if missing:
+        raise UndefinedAxes(f"geometry.faces: the local axes of a wall need a face {', '.join(map(repr, missing))}")
+    try:
+        fields = axis_fields(domain, quadrature, inlets, outlets)
+    except SolveStopped as stopped:
+        raise UndefinedAxes(f"geometry.faces: the local axes were not found: {stopped}") from stopped
     lengths = (fields.from_inner, fields.from_outer, fields.from_inlet, fields.from_outlet)
     values = _at_points([*fields.radial, *fields.axial, *lengths], quadrature)
     axes, known = _axes(values[..., :3], values[..., 3:6])
     share = quadrature.mean((~known).astype(np.float64))
-    if share > MOST_UNDEFINED:
+    if share > 0:
         x, y, z = _first_place(quadrature, ~known)
-        raise UndefinedAxes(
-            f"the local axes are undefined in {100 * share:.2g} % of the wall, first at ({x:.4g}, {y:.4g}, {z:.4g}); "
-            f"allowed is {100 * MOST_UNDEFINED:g} %: does an outer face lie across the wall from an inner one there?"
-        )
-    _fill(axes, known, quadrature)
+        words = f"undefined in {100 * share:.2g} % of the wall, first at ({x:.4g}, {y:.4g}, {z:.4g})"
+        if share > MOST_UNDEFINED:
+            raise UndefinedAxes(
+                f"geometry.faces: the local axes are {words}; allowed is {100 * MOST_UNDEFINED:g} %: does an outer "
+                "face lie across the wall from an inner one there?"
+            )
+        if domain.comm.rank == 0:
+            log.info("the local axes are %s; they are taken from the nearest point that has some", words)
+        _fill(axes, known, quadrature)
     depth, station = (_share(values[..., k], values[..., k + 1]) for k in (6, 8))
     nodal = _share(*(_at_nodes(length) for length in (fields.from_inner, fields.from_outer)))
     makers = (lambda: axes), (lambda: depth), (lambda: station), (lambda: nodal)
@@ -105,8 +117,6 @@ def _fill(axes: Array, known: NDArray[np.bool_], quadrature: Quadrature) -> None
     """Give points without axes those of the nearest one that has some. Collective."""
     comm, wanted = quadrature.mesh.comm, quadrature.coordinates[~known]
     asked = of_all_ranks(comm, wanted)
-    if not sum(map(len, asked)):
-        return
     good = quadrature.owned(known)
     places, candidates = quadrature.owned(quadrature.coordinates)[good], quadrature.owned(axes)[good]
     answers = []

@@ -32,6 +32,7 @@ TYPES_ONLY = {
     "body.shape": {"body.domain", "body.loading", "fem.quadrature"},
     "body.tendon": {"body.domain", "body.loading"},
     "body.tube": {"body.domain", "body.loading"},
+    "body.walled": {"body.domain", "fem.quadrature"},
     "extend": {"evolution.coupling", "solver.linear", "fem.jit", "results.columns"},
     "results.recording": {"scene.scene"},
 }
