@@ -1,4 +1,4 @@
-"""Bodies with a wall between an inner and an outer face, and ends: their local axes are found on their mesh."""
+"""Bodies with a wall between an inner and an outer face: what is measured in it, and its local axes on any mesh."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from remodel_fenicsx.fem.quadrature import Quadrature
 
 NODES_AT_A_DEPTH = 1e-3  # layers of nodes of a regular mesh have their depth to 1e-4
-_ANGLE = (
+ANGLE_IN = (
     "mean of the reference angle, from circumferential (0) to axial (90 degrees), over the chains that do not point "
     "out of the wall, in the elements"
 )
@@ -56,16 +56,8 @@ def _middle_angle(m: Any) -> float:
 
 
 class Walled(Shape):
-    """What the wall of a body decides: its local axes, and what is measured in them.
+    """A body with a wall: angles are those in it."""
 
-    Faces "inner" and "outer" lie across the wall from each other, "inlet" and "outlet" across the body.
-    """
-
-    columns: ClassVar[tuple[Column, ...]] = (
-        Column("fibre_angle_inner", "degrees", f"{_ANGLE} with a facet on the inner face", _angle_at("inner")),
-        Column("fibre_angle_middle", "degrees", f"{_ANGLE} half-way through the wall", _middle_angle),
-        Column("fibre_angle_outer", "degrees", f"{_ANGLE} with a facet on the outer face", _angle_at("outer")),
-    )
     columns_on_request: ClassVar[tuple[Column, ...]] = (
         Column(
             "radial_share",
@@ -79,10 +71,31 @@ class Walled(Shape):
         "fibre_angle_middle": 0.5,
         "fibre_angle_outer": 1.0,
     }
-    axis_kinds: ClassVar[tuple[str, ...]] = ("local", "global")
-    constant_fields: ClassVar[tuple[str, ...]] = CONSTANT_FIELDS
     depth_in_words: ClassVar[tuple[str, str, str]] = ("through the wall", "inside", "outside")
     angle_in_words: ClassVar[tuple[str, str]] = ("around", "along")
+
+    def fibre_angle(self, dimensions: Array, axes: Array, local: Array) -> Array:
+        """Angle in degrees of the chain direction in the wall, from circumferential (0) to axial (90); NaN across."""
+        return pitch_angle(dimensions, axes, local)
+
+    def radial_share(self, dimensions: Array, axes: Array, local: Array) -> Array:
+        """A_rr / tr A."""
+        return radial_share(dimensions, axes, local)
+
+
+class WalledMesh(Walled):
+    """A body with a wall whose local axes are found on its mesh.
+
+    Faces "inner" and "outer" lie across the wall from each other, "inlet" and "outlet" across the body.
+    """
+
+    columns: ClassVar[tuple[Column, ...]] = (
+        Column("fibre_angle_inner", "degrees", f"{ANGLE_IN} with a facet on the inner face", _angle_at("inner")),
+        Column("fibre_angle_middle", "degrees", f"{ANGLE_IN} half-way through the wall", _middle_angle),
+        Column("fibre_angle_outer", "degrees", f"{ANGLE_IN} with a facet on the outer face", _angle_at("outer")),
+    )
+    axis_kinds: ClassVar[tuple[str, ...]] = ("local", "global")
+    constant_fields: ClassVar[tuple[str, ...]] = CONSTANT_FIELDS
     defaults: ClassVar[dict[str, Any]] = {"cells": {"axes": "local"}}
 
     def local_axes(self, domain: Domain, quadrature: Quadrature) -> LocalAxes:
@@ -100,11 +113,3 @@ class Walled(Shape):
     def depth(self, coordinates: Array) -> Array:
         """No function of the place: where it was not recorded all is one layer."""
         return np.zeros(coordinates.shape[:-1])
-
-    def fibre_angle(self, dimensions: Array, axes: Array, local: Array) -> Array:
-        """Angle in degrees of the chain direction in the wall, from circumferential (0) to axial (90); NaN across."""
-        return pitch_angle(dimensions, axes, local)
-
-    def radial_share(self, dimensions: Array, axes: Array, local: Array) -> Array:
-        """A_rr / tr A."""
-        return radial_share(dimensions, axes, local)

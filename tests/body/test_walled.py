@@ -16,7 +16,7 @@ from remodel_fenicsx import Recording, Scene, SceneError, run
 from remodel_fenicsx.body import SHAPES, LoadKind, Tube
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.tube import whole_tube
-from remodel_fenicsx.body.walled import Walled
+from remodel_fenicsx.body.walled import WalledMesh
 from remodel_fenicsx.results.whole_body import WholeBody
 from remodel_fenicsx.settings import CONSTANT_FIELDS
 from remodel_fenicsx.simulation import Simulation
@@ -27,7 +27,7 @@ COUNTS = (16, 8, 4)
 RENAMED = {"bottom": "inlet", "top": "outlet", "inner": "inner", "outer": "outer"}
 
 
-class WalledTube(Walled):
+class WalledTube(WalledMesh):
     """The paper's tube, two long, that says nothing of its axes."""
 
     loads: ClassVar[dict[str, LoadKind]] = {name: Tube.loads[name] for name in ("pressure", "elongation")}
