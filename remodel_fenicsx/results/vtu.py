@@ -6,6 +6,7 @@ import base64
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
@@ -17,7 +18,12 @@ _TYPES = {"f": ("Float64", np.float64), "i": ("Int64", np.int64), "u": ("UInt8",
 
 
 def write_vtu(
-    path: Path, points: ArrayLike, cells: NDArray[np.int64], cell_type: int, cell_data: Mapping[str, ArrayLike]
+    path: Path,
+    points: ArrayLike,
+    cells: NDArray[np.int64],
+    cell_type: int,
+    cell_data: Mapping[str, ArrayLike],
+    point_data: Mapping[str, ArrayLike] = MappingProxyType({}),
 ) -> None:
     """Write a new file.
 
@@ -31,8 +37,8 @@ def write_vtu(
         Node numbers of each cell in VTK's order, (cells, nodes).
     cell_type
         VTK's number, one for all cells.
-    cell_data
-        Arrays by name: scalars (cells,), vectors (cells, 3), tensors (cells, 9).
+    cell_data, point_data
+        Arrays by name: scalars (n,), vectors (n, 3), tensors (n, 9).
 
     Raises
     ------
@@ -51,6 +57,7 @@ def write_vtu(
         f'<UnstructuredGrid><Piece NumberOfPoints="{len(places)}" NumberOfCells="{len(cells)}">',
         *("<Points>", _array("Points", places), "</Points>"),
         *("<Cells>", *(_array(name, values) for name, values in topology.items()), "</Cells>"),
+        *("<PointData>", *(_array(name, values) for name, values in point_data.items()), "</PointData>"),
         *("<CellData>", *(_array(name, values) for name, values in cell_data.items()), "</CellData>"),
         "</Piece></UnstructuredGrid></VTKFile>",
     ]
