@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import tomllib
 from collections.abc import Iterator, Sequence
@@ -30,7 +31,7 @@ from remodel_fenicsx.results.run_folder import (
 )
 from remodel_fenicsx.results.status import BEGUN, FAILED, STOPPED
 from remodel_fenicsx.scene import Scene, SceneError, read_scene, scene_from_dict
-from remodel_fenicsx.scene.scene import check_continuation
+from remodel_fenicsx.scene.scene import check_continuation, in_region
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.system.environment import versions
@@ -41,6 +42,7 @@ from remodel_fenicsx.system.interrupts import (
     end_all_ranks_on_exception,
     stopping_at_once,
 )
+from remodel_fenicsx.system.regular_files import read_regular, write_whole
 from remodel_fenicsx.system.terminal import Progress, announce, hold_log, open_log
 
 log = logging.getLogger(__name__)
@@ -218,6 +220,7 @@ def _record(
     header = "as run: all values, also those of preset and defaults\n" + "\n".join(
         f"{name} {version}" for name, version in versions().items()
     )
+    scene, files = agreed(comm, lambda: _with_files_kept(scene) if comm.rank == 0 else (scene, {}))
     text = scene.to_toml(header)
     columns = [column.name for column in simulation.observer.columns]
     wants_report = report and scene.output.report and comm.rank == 0
@@ -228,6 +231,9 @@ def _record(
         if after is None and comm.rank == 0:
             forget_steps(place)
     with ExitStack() as stack:
+        if not resumes:  # before the scene that names them
+            for name, data in files.items():
+                write_whole(place / name, data)
         record = stack.enter_context(agreed(comm, lambda: RunFolder(place, text, comm.rank, after)))
         stack.enter_context(open_log(place / LOG, comm.rank, quiet=quiet, held=held))
         steps = scene.time.number_of_steps if simulation.control else state.number + len(simulation.remaining())
@@ -270,6 +276,20 @@ def _record(
             raise
         log.info("finished")
         leave_report()
+
+
+def _with_files_kept(scene: Scene) -> tuple[Scene, dict[str, bytes]]:
+    """The scene with the names that its files have in the folder of the run and their SHA-256, and these files."""
+    from remodel_fenicsx.body.fibre_file import LARGEST_FIBRES
+
+    changes, files = {}, {}
+    for region, cells in scene.measured_cells.items():
+        path = Path(cells.fibres or "")
+        name = f"fibres{'_' if region else ''}{region}{path.suffix.lower()}"
+        files[name] = read_regular(path, LARGEST_FIBRES)
+        changes[f"{in_region(region)}cells.fibres"] = name
+        changes[f"{in_region(region)}cells.fibres_sha256"] = hashlib.sha256(files[name]).hexdigest()
+    return scene.with_values(changes) if changes else scene, files
 
 
 def _leave_report(place: Path) -> None:

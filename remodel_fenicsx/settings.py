@@ -43,7 +43,8 @@ from remodel_fenicsx.schema.times import is_multiple, same_time
 from remodel_fenicsx.schema.units import FORCE, LENGTH, NUMBER_DENSITY, STRESS, TEMPERATURE
 
 STRESS_UNITS = {"Pa": 1.0, "kPa": 1.0e3, "MPa": 1.0e6}  # in Pa
-INITIAL_CELLS = ("random", "isotropic", "aligned")
+MEASURED_CELLS = "fibres"  # those of cells.fibres
+INITIAL_CELLS = ("random", "isotropic", "aligned", MEASURED_CELLS)
 MOST_STEPS = 1_000_000
 NOT_NEGATIVE: JsonDict = {"type": "number", "minimum": 0}
 
@@ -204,14 +205,28 @@ class Cells(Table):
         default="random",
         description="Cell dimensions l_I at t = 0, with |l| = end_to_end_length: 'random' (one draw per element, "
         "uniform on the positive octant of the sphere), 'isotropic' (three equal ones), 'aligned' (all of it along "
-        "aligned_axis), or [l1, l2, l3] in link lengths.",
+        "aligned_axis), 'fibres' (those of the file cells.fibres, which says it by itself), or [l1, l2, l3] in link "
+        "lengths.",
         json_schema_extra={
-            "allowed": "'random', 'isotropic', 'aligned' or three lengths [l1, l2, l3]",
+            "allowed": "'random', 'isotropic', 'aligned', 'fibres' or three lengths [l1, l2, l3]",
             "anyOf": [
                 {"enum": [*INITIAL_CELLS]},
                 {"type": "array", "items": NOT_NEGATIVE, "minItems": 3, "maxItems": 3},
             ],
         },
+    )
+    fibres: str | None = Field(
+        default=None,
+        min_length=1,
+        description="File of measured fibres (.vtu, .xdmf or .csv, relative to the scene): axes and dimensions of the "
+        "cells at t = 0 (docs/own_body.md, Fibres in and out). It is copied into the folder of the run.",
+        json_schema_extra={"allowed": "the name of a file .vtu, .xdmf or .csv"},
+    )
+    fibres_sha256: str | None = Field(
+        default=None,
+        pattern="^[0-9a-f]{64}$",
+        description="SHA-256 of that file: a scene as run has it, and another file is refused.",
+        json_schema_extra={"allowed": "64 hexadecimal digits"},
     )
     axes: Annotated[str, OneOf(AXES)] = Field(
         default="global",
@@ -430,6 +445,8 @@ class RegionCells(Table):
     """Keys of `[cells]` that are others in the region; axes and seed are one for the whole body."""
 
     initial: str | tuple[float, float, float] | None = _as_in(Cells, "initial", "cells")
+    fibres: str | None = _as_in(Cells, "fibres", "cells")
+    fibres_sha256: str | None = _as_in(Cells, "fibres_sha256", "cells")
     aligned_axis: int | None = _as_in(Cells, "aligned_axis", "cells")
     end_to_end_length: float | None = _as_in(Cells, "end_to_end_length", "cells")
 

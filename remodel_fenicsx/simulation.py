@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,8 +22,10 @@ from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.model.laws import LAWS
 from remodel_fenicsx.results.columns import Observer
+from remodel_fenicsx.results.run_folder import agreed
 from remodel_fenicsx.scene import Scene, SceneError
-from remodel_fenicsx.settings import Properties, Solver
+from remodel_fenicsx.scene.scene import in_region
+from remodel_fenicsx.settings import Cells, Properties, Solver
 from remodel_fenicsx.state.parameters import by_region
 from remodel_fenicsx.state.state import State
 from remodel_fenicsx.state.unit_cells import UnitCells
@@ -87,7 +90,8 @@ class Simulation:
         self.quadrature = Quadrature(mesh, scene.mesh.degree, kinematics.weight(mesh))
         properties, local_axes = scene.properties(), shape.local_axes(domain, self.quadrature)
         own = {name: properties[name].cells for name in scene.regions}
-        self.cells = UnitCells(self.quadrature, domain, scene.cells, local_axes, own)
+        fibres = measured_fibres(scene, domain)
+        self.cells = UnitCells(self.quadrature, domain, scene.cells, local_axes, own, fibres)
         self.loading = Loading(domain, self.unknown, kinematics)
         shape.support(self.loading, scene.supports.ends)
         formulation = FORMULATIONS[scene.mesh.formulation]
@@ -194,6 +198,53 @@ class Simulation:
         """Free PETSc's objects and options."""
         self.stability.close()
         self.stepper.close()
+
+
+def measured_fibres(scene: Scene, domain: Domain) -> dict[str, dict[str, Any]]:
+    """Measured fibres by region and name, a row for each element of the mesh, on all ranks. Collective.
+
+    Parameters
+    ----------
+    scene, domain
+        What asks for them, and the mesh.
+
+    Raises
+    ------
+    SceneError
+        If a file cannot be read, is another one than in the run so far, or does not reach an element.
+    """
+    if not scene.measured_cells:
+        return {}
+    points, elements = domain.gather_mesh()
+    regions = domain.gather_elements(domain.element_region)
+
+    def read() -> dict[str, dict[str, Any]] | None:
+        if points is None or elements is None or regions is None:
+            return None
+        found = {}
+        for name, cells in scene.measured_cells.items():
+            chosen = regions == domain.regions[name] if name else np.ones(len(regions), dtype=np.bool_)
+            found[name] = _fibres_of(cells, name, points[elements], chosen)
+        return found
+
+    return domain.comm.bcast(agreed(domain.comm, read)) or {}
+
+
+def _fibres_of(cells: Cells, region: str, corners: Any, chosen: Any) -> dict[str, Any]:
+    from remodel_fenicsx.body.fibre_file import FibreFileError, read_fibre_file  # few scenes have one
+
+    key = f"{in_region(region)}cells.fibres"
+    try:
+        file = read_fibre_file(Path(str(cells.fibres)))
+        if cells.fibres_sha256 not in (None, file.sha256):
+            raise FibreFileError(f"has changed since the run: its SHA-256 was {str(cells.fibres_sha256)[:12]}...")
+        rows, farthest = file.rows_of(corners, chosen)
+    except FibreFileError as error:
+        raise SceneError(f"{key} = {cells.fibres!r}: {error}") from error
+    count, names = len(next(iter(file.measured.values()))), ", ".join(file.measured)
+    way = "by number" if farthest is None else f"the nearest ones, {farthest:.3g} away at most"
+    log.info("%s: %s of %d rows, %s; SHA-256 %s", key, names, count, way, file.sha256)
+    return {name: values[rows] for name, values in file.measured.items()}
 
 
 def parameters_of(properties: Mapping[str, Properties], domain: Domain) -> tuple[Tissue, Any]:

@@ -191,6 +191,8 @@ def mirrored(places: NDArray[np.float64]) -> NDArray[np.float64]:
 # ---------------------------------------------------------------- rules
 def same_cells(scene: Any) -> str | None:
     """Random cells are other ones in every element."""
+    if scene.measured_cells:
+        return "cells.fibres gives other cells to each element"
     number = scene.geometry.number_of_elements * scene.mesh.refinement**3
     if not scene.has_random_cells or (number == 1 and scene.mesh.element == "hexahedron"):
         return None

@@ -32,6 +32,7 @@ from remodel_fenicsx.schema.units import FORCE, LENGTH_UNIT, LENGTH_UNITS, STRES
 from remodel_fenicsx.settings import (
     REGION,
     STRESS_UNITS,
+    MEASURED_CELLS,
     Cells,
     Load,
     Material,
@@ -111,7 +112,7 @@ class Scene(Table):
         """The scene's keys over those of profile, preset and shape; numbers in place of values with units."""
         if not isinstance(values, dict):
             return handler(values)
-        own = _in_present_format(_plain(values))
+        own = _with_measured_cells(_in_present_format(_plain(values)))
         preset, profile = own.get("preset"), own.get("profile")
         if preset is not None:
             _check_name("preset", preset, PRESETS)
@@ -237,6 +238,8 @@ class Scene(Table):
             raise fault(rule, f"{region}cells.end_to_end_length", cells.end_to_end_length)
         if (length := cells.fault_of_length()) is not None:
             raise fault(length, f"{region}cells.initial", cells.initial)
+        if cells.initial == MEASURED_CELLS and cells.fibres is None:
+            raise fault("needs cells.fibres, the name of a file", f"{region}cells.initial", cells.initial)
         if bool(material.chain_density) != bool(self.material.chain_density):
             rule = "is 0 in all of the body or nowhere (material.chain_density): without chains nothing locks"
             raise fault(rule, f"{region}material.chain_density", material.chain_density)
@@ -254,6 +257,12 @@ class Scene(Table):
     def has_random_cells(self) -> bool:
         """Whether cells are drawn anywhere."""
         return any(properties.cells.initial == "random" for properties in self.properties().values())
+
+    @property
+    def measured_cells(self) -> dict[str, Cells]:
+        """Cells that a file gives, by region, "" for what holds beside them."""
+        found = {name: properties.cells for name, properties in self.properties().items()}
+        return {name: cells for name, cells in found.items() if cells.initial == MEASURED_CELLS}
 
     def _check_load(self, name: str, load: Load) -> None:
         step, key = self.time.step, f"loads.{name}"
@@ -372,6 +381,46 @@ def _in_present_format(values: Mapping[str, Any]) -> dict[str, Any]:
         rule = f"written by a newer version of remodel_fenicsx; this one reads formats up to {FORMAT}"
         raise fault(rule, "format", written)
     return {**values, "format": FORMAT}
+
+
+def _with_measured_cells(values: dict[str, Any]) -> dict[str, Any]:
+    """cells.initial = 'fibres' wherever a file of fibres is given, in the whole body and in regions."""
+    regions = values.get("regions")
+    tables = {"": values, **{in_region(quoted(str(name))): table for name, table in _items(regions)}}
+    found = {}
+    for key, table in tables.items():
+        cells = table.get("cells") if isinstance(table, Mapping) else None
+        if not isinstance(table, Mapping) or not isinstance(cells, Mapping) or cells.get("fibres") is None:
+            continue
+        if cells.get("initial", MEASURED_CELLS) != MEASURED_CELLS:
+            rule = f"{key}cells.initial = {shown(cells['initial'])} is there too; one of them gives the cells"
+            raise fault(rule, f"{key}cells.fibres", cells["fibres"])
+        found[key] = {**table, "cells": {**cells, "initial": MEASURED_CELLS}}
+    values = found.get("", values)
+    if regions is None or not found:
+        return values
+    own = {name: found.get(in_region(quoted(str(name))), table) for name, table in _items(regions)}
+    return {**values, "regions": own if isinstance(regions, Mapping) else regions}
+
+
+def _items(table: Any) -> list[tuple[Any, Any]]:
+    return list(table.items()) if isinstance(table, Mapping) else []
+
+
+def _beside(values: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """The keys of a file in this folder, with the places of the files that they name."""
+
+    def placed(table: Any) -> Any:
+        cells: Any = table.get("cells") if isinstance(table, Mapping) else None
+        file = cells.get("fibres") if isinstance(cells, Mapping) else None
+        return (
+            {**table, "cells": {**cells, "fibres": str(folder.absolute() / file)}} if isinstance(file, str) else table
+        )
+
+    values = placed(values)
+    if isinstance(regions := values.get("regions"), Mapping):
+        values = {**values, "regions": {name: placed(table) for name, table in regions.items()}}
+    return values
 
 
 def _listed(fields: Any) -> tuple[str, ...]:
@@ -500,7 +549,7 @@ def read_scene(path: str | os.PathLike[str], overrides: Iterable[str] = (), prof
         put(values, key, value)
     name = re.sub(r"\.toml$", "", Path(path).name, flags=re.IGNORECASE)  # what follows another dot is part of it
     values.setdefault("name", re.sub(r"^[^\w]+|[^\w+-]+$|[^\w .+-]", "", name)[:100].rstrip(" .") or "scene")
-    scene = scene_from_dict(values)
+    scene = scene_from_dict(_beside(values, Path(path).parent))
     if profile is None or not PROFILES[profile].takes_exact_coupling or not scene.has_exact_coupling:
         return scene
     asked = any(parse_override(override)[0] == "remodeling.coupling" for override in overrides)
@@ -548,7 +597,7 @@ def _physics(table: Mapping[str, Any], key: str = "") -> Iterator[tuple[str, Any
     """(dotted key, value) of all values that must stay."""
     for name, value in table.items():
         path = f"{key}.{name}" if key else name
-        if path in FREE:
+        if path in FREE or path.endswith("cells.fibres"):  # the SHA-256 beside it must stay
             continue
         if isinstance(value, Mapping):
             yield from _physics(value, path)

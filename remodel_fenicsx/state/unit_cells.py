@@ -13,8 +13,9 @@ from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.kernels.points import PointKernels, point_kernels
 from remodel_fenicsx.model.cells import UnitCell
+from remodel_fenicsx.model.fibres import cells_of, structure_tensors
 from remodel_fenicsx.model.local_axes import AXES, LocalAxes
-from remodel_fenicsx.settings import Cells
+from remodel_fenicsx.settings import MEASURED_CELLS, Cells
 
 Array = NDArray[np.float64]
 
@@ -81,6 +82,9 @@ class UnitCells(CellField):
         Of the body at the points (`Shape.local_axes`).
     regions
         Initial dimensions and r0 of regions where they are others, by name.
+    fibres
+        Measured fibres of all elements, (number_of_elements, columns) by name of `model.fibres.MEASURED`, by region;
+        "" is the whole body.
 
     Attributes
     ----------
@@ -97,16 +101,28 @@ class UnitCells(CellField):
         settings: Cells,
         local_axes: LocalAxes,
         regions: Mapping[str, Cells] = MappingProxyType({}),
+        fibres: Mapping[str, Mapping[str, Array]] = MappingProxyType({}),
     ):
         super().__init__(quadrature, "cell")
         self.settings, self.local_axes = settings, local_axes
-        self.dimension_values[:] = settings.dimensions(domain.number_of_elements)[domain.element_number][:, None, :]
-        for name, cells in regions.items():
-            chosen = domain.element_region == domain.regions[name]
-            drawn = cells.dimensions(domain.number_of_elements)
-            self.dimension_values[chosen] = drawn[domain.element_number[chosen]][:, None, :]
-        self.axis_values[:] = self.initial_axes()
+        self.axis_values[:] = axes = self.initial_axes()
+        everywhere = np.ones(len(domain.element_number), dtype=np.bool_)
+        for name, cells in {"": settings, **regions}.items():
+            chosen = domain.element_region == domain.regions[name] if name else everywhere
+            if name in fibres:
+                measured = {key: values[domain.element_number[chosen]] for key, values in fibres[name].items()}
+                self._take(measured, chosen, axes[chosen], cells.end_to_end_length)
+            elif cells.initial != MEASURED_CELLS:
+                drawn = cells.dimensions(domain.number_of_elements)
+                self.dimension_values[chosen] = drawn[domain.element_number[chosen]][:, None, :]
+                self.axis_values[chosen] = axes[chosen]
         self.initial_dimensions: Array = self.dimension_values.copy()
+
+    def _take(self, measured: Mapping[str, Array], chosen: NDArray[np.bool_], axes: Array, length: float) -> None:
+        """Cells of measured fibres in the chosen elements; `axes` where these leave some open."""
+        at_points = {name: values[:, None, :] for name, values in measured.items()}
+        tensors = np.broadcast_to(structure_tensors(at_points, self.local_axes.axes[chosen]), axes.shape)
+        self.dimension_values[chosen], self.axis_values[chosen] = cells_of(tensors, length, axes)
 
     def initial_axes(self) -> Array:
         """n_I before the first pass, rows, (cells, points, 3, 3)."""

@@ -167,12 +167,13 @@ BAD_SCENES = [
     (
         CUBE,
         {"cells.initial": "raindrop"},
-        "cells.initial = 'raindrop': allowed are 'random', 'isotropic', 'aligned' or three lengths [l1, l2, l3]",
+        "cells.initial = 'raindrop': allowed are 'random', 'isotropic', 'aligned', 'fibres' or three lengths "
+        "[l1, l2, l3]",
     ),
     (
         CUBE,
         {"cells.initial": 1.0},
-        "cells.initial = 1.0: allowed are 'random', 'isotropic', 'aligned' or three lengths [l1, l2, l3]",
+        "cells.initial = 1.0: allowed are 'random', 'isotropic', 'aligned', 'fibres' or three lengths [l1, l2, l3]",
     ),
     (
         CUBE,

@@ -1,0 +1,187 @@
+"""Files of measured fibres: VTU and XDMF by meshio, CSV. They are data: nothing in them is run or followed."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from remodel_fenicsx.model.fibres import MEASURED, SOURCES, fault_of_fibres
+from remodel_fenicsx.system.regular_files import read_regular
+
+Array = NDArray[np.float64]
+
+LARGEST_FIBRES = 2 * 10**9  # bytes; a structure tensor and a mesh of ten million hexahedra as VTU
+ENDINGS = (".vtu", ".xdmf", ".csv")
+SAME_PLACE = 1e-4  # of an element: files may have 7 digits; a neighbour is a whole one away
+SYMMETRIC_COMPONENTS = ("xx", "yy", "zz", "xy", "yz", "xz")
+ALL_COMPONENTS = tuple(f"{i}{j}" for i in "xyz" for j in "xyz")
+
+
+class FibreFileError(ValueError):
+    """What is wrong with a file of fibres; one line."""
+
+
+@dataclass(frozen=True)
+class FibreFile:
+    """What a file of fibres holds.
+
+    Attributes
+    ----------
+    measured
+        By name of `model.fibres.MEASURED`, (rows, columns).
+    places
+        Middles of the file's elements, or its points, (rows, 3); None: rows are elements of the run's mesh.
+    sha256
+        Of the file, in hexadecimal digits.
+    """
+
+    measured: dict[str, Array]
+    places: Array | None
+    sha256: str
+
+    def rows_of(self, corners: Array, chosen: NDArray[np.bool_]) -> tuple[NDArray[np.int64], float | None]:
+        """The row for each element of a mesh, and how far the farthest is away; None where rows are elements.
+
+        Parameters
+        ----------
+        corners
+            Nodes of the elements, (elements, nodes of one, 3). What is farther from the middle of an element than the
+            element is wide says nothing about it.
+        chosen
+            Elements that need a row, (elements,); others get row 0.
+
+        Raises
+        ------
+        FibreFileError
+            If there is none.
+        """
+        count, centres = len(next(iter(self.measured.values()))), corners.mean(axis=1)
+        sizes = 2 * np.linalg.norm(corners - centres[:, None], axis=2).max(axis=1)
+        if count == len(centres):
+            if self.places is None or (np.abs(self.places - centres) < SAME_PLACE * sizes[:, None]).all():
+                return np.arange(count), None
+        if self.places is None:
+            raise FibreFileError(f"has {count} rows without places (x, y, z), the mesh has {len(centres)} elements")
+        rows = np.zeros(len(centres), dtype=np.int64)
+        rows[chosen] = _nearest(centres[chosen], self.places)
+        far = np.linalg.norm(self.places[rows[chosen]] - centres[chosen], axis=1)
+        if (far > sizes[chosen]).any():
+            worst = (far / sizes[chosen]).argmax()
+            place, size = ", ".join(f"{x:.4g}" for x in centres[chosen][worst]), sizes[chosen][worst]
+            rule = f"nothing is measured within one element ({size:.3g}) of ({place}); "
+            raise FibreFileError(rule + f"the nearest is {far[worst]:.3g} away")
+        return rows, float(far.max())
+
+
+def _nearest(places: Array, candidates: Array) -> NDArray[np.int64]:
+    """Number of the nearest candidate; a million distances at a time."""
+    step = max(1, 10**6 // len(candidates))
+    parts = [
+        np.linalg.norm(places[start : start + step, None] - candidates, axis=-1).argmin(axis=1)
+        for start in range(0, len(places), step)
+    ]
+    return np.concatenate(parts)
+
+
+def read_fibre_file(path: Path) -> FibreFile:
+    """Read measured fibres.
+
+    Raises
+    ------
+    FibreFileError
+        If the file is not there, is of another kind or damaged, or holds no fibres.
+    """
+    ending = path.suffix.lower()
+    if ending not in ENDINGS:
+        raise FibreFileError(f"allowed are files {', '.join(ENDINGS)}")
+    try:
+        data = read_regular(path, LARGEST_FIBRES)
+    except OSError as error:
+        raise FibreFileError(f"cannot be read: {error.strerror or error}") from error
+    measured, places = _of_csv(data) if ending == ".csv" else _of_mesh(path, data, ending)
+    if (found := fault_of_fibres(measured)) is not None:
+        raise FibreFileError(found)
+    if places is not None and not np.isfinite(places).all():
+        raise FibreFileError("has places that are not finite")
+    return FibreFile(measured, places, hashlib.sha256(data).hexdigest())
+
+
+def _of_csv(data: bytes) -> tuple[dict[str, Array], Array | None]:
+    """Columns by name: structure_tensor_xx ..., fibre_x ..., fibre_2_x ..., weight, angle; element, or x, y, z."""
+    try:
+        names, *rows = csv.reader(data.decode().splitlines())
+        table = np.array([[float(word) for word in row] for row in rows if row])
+    except (ValueError, csv.Error) as error:
+        raise FibreFileError(f"is no table of numbers with names of columns above: {error}") from error
+    if table.ndim != 2 or table.shape[1] != len(names):
+        raise FibreFileError("is no table: rows with as many numbers as names of columns, one row at least")
+    columns = dict(zip((name.strip() for name in names), table.T, strict=True))
+
+    def together(name: str, *components: str) -> Array | None:
+        keys = [f"{name}_{c}" if name else c for c in components]
+        return np.stack([columns[key] for key in keys], axis=1) if set(keys) <= set(columns) else None
+
+    found = {"structure_tensor": together("structure_tensor", *ALL_COMPONENTS)}
+    if found["structure_tensor"] is None:
+        found["structure_tensor"] = together("structure_tensor", *SYMMETRIC_COMPONENTS)
+    found |= {name: together(name, *"xyz") for name in ("fibre", "fibre_2")}
+    found |= {name: together("", name) for name in ("angle", "weight")}
+    measured = {name: values for name, values in found.items() if values is not None}
+    if not set(measured) & set(SOURCES):
+        raise FibreFileError(f"has columns {', '.join(columns)}; {_NEEDED} with _xx ... or _x, _y, _z")
+    if "element" not in columns:
+        return measured, together("", *"xyz")
+    order = np.argsort(columns["element"])
+    if not np.array_equal(columns["element"][order], np.arange(1, len(order) + 1)):
+        raise FibreFileError(f"the column element must have the numbers 1 to {len(order)}, each once")
+    places = together("", *"xyz")
+    return {name: values[order] for name, values in measured.items()}, None if places is None else places[order]
+
+
+_NEEDED = f"needed is one of {', '.join(SOURCES)}"
+
+
+def _of_mesh(path: Path, data: bytes, ending: str) -> tuple[dict[str, Array], Array]:
+    """Arrays of the solid elements, or else of the points."""
+    if ending == ".xdmf" and re.search(rb"Format\s*=\s*[\"'](?!XML)|<!|xi:include", data):
+        raise FibreFileError(
+            "its numbers stand in another file; allowed is an XDMF file that holds them (Format='XML')"
+        )
+    if b"<!ENTITY" in data[:10000]:
+        raise FibreFileError("has entities; allowed is plain XML")
+    try:
+        from meshio import vtu, xdmf
+    except ImportError as error:
+        raise FibreFileError("VTU and XDMF are read by meshio, which is not installed; CSV needs none") from error
+    try:
+        mesh = (vtu if ending == ".vtu" else xdmf).read(str(path))
+        solid = [n for n, block in enumerate(mesh.cells) if block.type.startswith(("tetra", "hexa", "wedge"))]
+        of_cells = {
+            name: np.concatenate([_columns(blocks[n]) for n in solid])
+            for name, blocks in mesh.cell_data.items()
+            if name in MEASURED and solid
+        }
+        of_points = {name: _columns(values) for name, values in mesh.point_data.items() if name in MEASURED}
+        points = np.asarray(mesh.points, dtype=np.float64)
+        points = np.pad(points, [(0, 0), (0, 3 - points.shape[1])])
+        centres = [points[mesh.cells[n].data].mean(axis=1) for n in solid]
+    except (Exception, SystemExit) as error:  # meshio raises whatever happens on the way
+        raise FibreFileError(f"cannot be read: {' '.join(str(error).split()) or type(error).__name__}") from error
+    if set(of_cells) & set(SOURCES):
+        return of_cells, np.concatenate(centres)
+    if set(of_points) & set(SOURCES):
+        return of_points, points
+    known = ", ".join([*mesh.cell_data, *mesh.point_data]) or "none"
+    raise FibreFileError(f"has arrays {known}; {_NEEDED}")
+
+
+def _columns(values: Array) -> Array:
+    """As (rows, columns)."""
+    rows = np.asarray(values, dtype=np.float64)
+    return rows.reshape(len(rows), -1)

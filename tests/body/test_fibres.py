@@ -1,0 +1,270 @@
+"""Measured fibres as cells at t = 0: what is exported comes back; other meshes, ranks, resuming, and bad files."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import meshio
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from remodel_fenicsx import Scene, SceneError, Simulation, cli, read_scene, run
+from remodel_fenicsx.body import tube
+from remodel_fenicsx.model.cells import structure_tensor
+from remodel_fenicsx.model.fibres import cells_of, structure_tensors
+from remodel_fenicsx.running import resume
+from tests.results.test_export import TUBE
+
+SELF = MPI.COMM_SELF
+R0 = 0.9
+
+
+@pytest.fixture(scope="module", autouse=True)
+def coarse() -> Any:
+    """Tubes of 32 elements, eight around."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tube, "PAPER", (8, 4, 1))
+        yield
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """The last state of a run in a file of a format."""
+    folder = run(Scene(**TUBE), tmp_path_factory.mktemp("out") / "run")
+
+    def file(kind: str) -> Path:
+        path = folder / f"fibres.{kind}"
+        assert path.exists() or cli.main(["export", str(folder), "--format", kind]) == 0
+        return path
+
+    return file
+
+
+def scene(file: Path | str, **cells: Any) -> Scene:
+    """The tube with the cells of a file."""
+    return Scene(
+        **TUBE | {"cells": {"fibres": str(file), "end_to_end_length": R0, **cells}, "solver": {"method": "direct"}}
+    )
+
+
+def tensors_of(one: Scene) -> np.ndarray:
+    """A at the points of each element, by the number of the element."""
+    simulation = Simulation(one, SELF)
+    tensors = simulation.cells.structure_tensor()
+    found = np.empty_like(tensors)
+    found[simulation.domain.element_number] = tensors
+    simulation.close()
+    return found
+
+
+def rows_of(path: Path) -> list[dict[str, str]]:
+    """Of a table."""
+    return list(csv.DictReader(path.read_text().splitlines()))
+
+
+def table(path: Path, rows: list[dict[str, Any]]) -> Path:
+    """A file of rows."""
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
+    return path
+
+
+def expected(path: Path) -> np.ndarray:
+    """A of a table, scaled to the trace r0^2."""
+    names = [f"structure_tensor_{i}{j}" for i in "xyz" for j in "xyz"]
+    tensors = np.array([[float(row[name]) for name in names] for row in rows_of(path)]).reshape(-1, 1, 3, 3)
+    return R0**2 * tensors / np.trace(tensors, axis1=2, axis2=3)[..., None, None]
+
+
+# ---------------------------------------------------------------- files that were exported
+
+
+@pytest.mark.parametrize("kind", ["vtu", "csv", "xdmf"])
+def test_what_is_exported_comes_back(kind: str, exported: Callable[[str], Path], tmp_path: Path) -> None:
+    """A to 1e-12, at every point of an element, by number; dimensions with the longest first."""
+    if kind == "xdmf":
+        path = tmp_path / "fibres.xdmf"
+        meshio.xdmf.write(path, meshio.read(exported("vtu")), data_format="XML")
+    else:
+        path = exported(kind)
+    found = tensors_of(scene(path))
+    wanted = np.broadcast_to(expected(exported("csv")), found.shape)
+    np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-12 if kind != "xdmf" else 1e-6)
+    assert np.ptp(found, axis=0).max() > 0.1, "elements differ"
+
+
+def test_rows_belong_to_numbers_or_else_to_places(exported: Callable[[str], Path], tmp_path: Path) -> None:
+    """Shuffled rows; six numbers in place of nine; places a little beside those of the elements."""
+    rows = rows_of(exported("csv"))
+    wanted = tensors_of(scene(exported("csv")))
+    order = np.random.default_rng(2).permutation(len(rows))
+    np.testing.assert_allclose(
+        tensors_of(scene(table(tmp_path / "a.csv", [rows[i] for i in order]))), wanted, atol=1e-14
+    )
+    six = [{f"structure_tensor_{c}": row[f"structure_tensor_{c}"] for c in ("xx", "yy", "zz", "xy", "yz", "xz")}
+           | {c: float(row[c]) + 0.05 for c in "xyz"} for row in rows]  # fmt: skip
+    shuffled = [six[i] for i in order] + [six[0] | {"x": 100.0, "structure_tensor_xx": 50.0}]
+    for number, found in enumerate((shuffled[:-1], shuffled)):  # as many as elements, and one more
+        path = table(tmp_path / f"b{number}.csv", found)
+        np.testing.assert_allclose(tensors_of(scene(path)), wanted, atol=1e-12)
+
+
+def test_values_of_points_go_to_the_nearest_elements(exported: Callable[[str], Path], tmp_path: Path) -> None:
+    mesh = meshio.read(exported("vtu"))
+    direction = mesh.points * [0.0, 0.0, 1.0] + [1.0, 0.0, 0.0]
+    meshio.Mesh(mesh.points, mesh.cells, {"fibre": direction}).write(tmp_path / "points.vtu")
+    found = tensors_of(scene(tmp_path / "points.vtu"))
+    for element, corners in enumerate(mesh.cells[0].data):
+        candidates = [np.outer(d, d) / (d @ d) for d in direction[corners]]
+        assert min(np.abs(R0**2 * candidate - found[element]).max() for candidate in candidates) < 1e-12
+
+
+# ---------------------------------------------------------------- what is measured, in closed form
+
+
+def local(angle: float) -> np.ndarray:
+    """Axes c, a, r turned about z."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[-s, c, 0.0], [0.0, 0.0, 1.0], [c, s, 0.0]])
+
+
+def test_angles_are_measured_from_circumferential_towards_axial() -> None:
+    axes = np.stack([local(0.3), local(2.0)])[:, None]
+    found = structure_tensors({"angle": np.array([[[90.0]], [[30.0]]])}, axes)
+    np.testing.assert_allclose(found[0, 0], np.diag([0.0, 0.0, 1.0]), atol=1e-15)
+    direction = np.sqrt(0.75) * axes[1, 0, 0] + 0.5 * axes[1, 0, 1]
+    np.testing.assert_allclose(found[1, 0], np.outer(direction, direction), atol=1e-15)
+
+
+def test_weights_share_out_two_fibres_or_leave_the_rest_to_all_directions() -> None:
+    one, two = np.array([[2.0, 0.0, 0.0]]), np.array([[0.0, 0.0, -0.1]])
+    axes = np.eye(3)[None]
+    np.testing.assert_allclose(structure_tensors({"fibre": one, "fibre_2": two}, axes)[0], np.diag([0.5, 0, 0.5]))
+    weighed = structure_tensors({"fibre": one, "fibre_2": two, "weight": np.array([[0.8]])}, axes)
+    np.testing.assert_allclose(weighed[0], np.diag([0.8, 0, 0.2]), atol=1e-15)
+    # the generalised structure tensor kappa I + (1 - 3 kappa) f f of Gasser, Ogden & Holzapfel 2006, kappa = 0.1
+    dispersed = structure_tensors({"fibre": one, "weight": np.array([[0.7]])}, axes)
+    np.testing.assert_allclose(dispersed[0], 0.1 * np.eye(3) + 0.7 * np.diag([1.0, 0, 0]), atol=1e-15)
+
+
+def test_cells_have_the_tensor_with_the_longest_side_first() -> None:
+    axes = np.stack([local(0.3), np.eye(3)])
+    tensors = structure_tensor(np.sqrt([[0.2, 0.7, 0.1], [1 / 3, 1 / 3, 1 / 3]]), axes)
+    lengths, found = cells_of(tensors, 2.0, axes)
+    np.testing.assert_allclose(lengths[0], 2.0 * np.sqrt([0.7, 0.2, 0.1]), rtol=1e-12)
+    np.testing.assert_allclose(structure_tensor(lengths, found), 4.0 * tensors, atol=1e-12)
+    np.testing.assert_allclose(found[1], axes[1], atol=1e-12)  # no direction is its own: those of before
+
+
+# ---------------------------------------------------------------- runs
+
+
+def test_a_run_keeps_the_file_and_goes_on_with_it(exported: Callable[[str], Path], tmp_path: Path) -> None:
+    """Stopped, moved to another folder, without the file that it began with; another file is refused."""
+    (tmp_path / "in").mkdir()
+    shutil.copy(exported("vtu"), tmp_path / "in" / "measured.vtu")
+    (tmp_path / "in" / "scene.toml").write_text(scene("measured.vtu").to_toml())
+    one = read_scene(tmp_path / "in" / "scene.toml")
+    whole = run(one, tmp_path / "whole")
+    half = run(one.with_values({"time.end": 1.0}), tmp_path / "half")
+    digest = hashlib.sha256((tmp_path / "in" / "measured.vtu").read_bytes()).hexdigest()
+    said = f"cells.fibres: structure_tensor of 32 rows, by number; SHA-256 {digest}"
+    assert said in (half / "run.log").read_text()
+    shutil.rmtree(tmp_path / "in")
+    half = Path(shutil.move(half, tmp_path / "moved"))
+    kept = half / "fibres.vtu"
+    assert (read_scene(half / "scene.toml").cells.fibres, read_scene(half / "scene.toml").cells.fibres_sha256) == (
+        str(kept), digest)  # fmt: skip
+    data = kept.read_bytes()
+    kept.write_bytes(data.replace(b"axis_3", b"axis_4"))
+    with pytest.raises(SceneError, match=r"^cells.fibres = .*fibres.vtu': has changed since the run: its SHA-256 was "):
+        resume(half, ["time.end=2.0"])
+    kept.write_bytes(data)
+    resume(half, ["time.end=2.0"])
+    mine, others = half / "scene.toml", whole / "scene.toml"
+    assert mine.read_text().replace("end = 2.0", "") == others.read_text().replace("end = 2.0", "")
+    again, once = (
+        np.loadtxt(folder / "history.csv", delimiter=",", skiprows=1, usecols=range(5)) for folder in (half, whole)
+    )
+    np.testing.assert_array_equal(again, once)
+
+
+def test_one_and_two_ranks_have_the_same(exported: Callable[[str], Path], case: Any) -> None:
+    values = TUBE | {"cells": {"fibres": str(exported("csv"))}, "solver": {"method": "direct"}}
+    one, two = (case(values, ranks=ranks, divisions=[8, 4, 1]) for ranks in (1, 2))
+    assert set(one) == set(two)
+    for name in {"inner_radius", "fibre_angle_inner", "fibre_angle_middle", "fibre_angle_outer"}:
+        np.testing.assert_allclose(two[name], one[name], rtol=0, atol=1e-9, err_msg=name)
+
+
+def test_a_region_has_a_file_of_its_own(tmp_path: Path) -> None:
+    rows = [{"element": n, "angle": 30.0} for n in range(1, 33)]
+    path = table(tmp_path / "angle.csv", rows)
+    regions = {"media": {"outer_radius": 2.0, "cells": {"fibres": str(path)}}, "adventitia": {}}
+    simulation = Simulation(Scene(**TUBE | {"cells": {"initial": "isotropic"}, "regions": regions}), SELF)
+    inside = simulation.domain.element_region == simulation.domain.regions["media"]
+    lengths, axes = simulation.cells.dimension_values, simulation.cells.axis_values
+    np.testing.assert_allclose(lengths[inside] - [1.0, 0.0, 0.0], 0.0, atol=1e-7)
+    np.testing.assert_allclose(np.abs(axes[inside][..., 0, 2]), 0.5, atol=1e-12)
+    np.testing.assert_allclose(lengths[~inside], np.sqrt(1 / 3), atol=1e-12)
+    simulation.close()
+
+
+# ---------------------------------------------------------------- what is refused
+
+HEAD = "element,fibre_x,fibre_y,fibre_z\n"
+BAD = {
+    "a.txt": ("", r"allowed are files .vtu, .xdmf, .csv"),
+    "nothing.csv": (None, r"cannot be read: No such file"),
+    "empty.csv": ("", r"is no table of numbers"),
+    "words.csv": ("angle\nsteep\n", r"is no table of numbers with names of columns above"),
+    "short.csv": ("angle\n" + "1\n" * 31, r"has 31 rows without places \(x, y, z\), the mesh has 32 elements"),
+    "unknown.csv": ("x,y,z,direction\n0,0,0,1\n", r"has columns x, y, z, direction; needed is one of structure_tensor"),
+    "nan.csv": ("angle\n" + "1\n" * 4 + "nan\n" + "1\n" * 27, r"angle of row 5 is not finite"),
+    "zero.csv": (HEAD + "\n".join(f"{n},0,0,{n - 9}" for n in range(1, 33)), r"fibre of row 9 is the zero vector"),
+    "weight.csv": ("angle,weight\n" + "1,0.5\n" * 31 + "1,1.5\n", r"weight of row 32 is not from 0 to 1"),
+    "numbers.csv": ("element,angle\n" + "1,1\n" * 32, r"element must have the numbers 1 to 32, each once"),
+    "both.csv": ("angle,fibre_x,fibre_y,fibre_z\n" + "1,1,1,1\n" * 32, r"has fibre and angle of structure_tensor"),
+    "far.csv": ("x,y,z,angle\n0,0,9,1\n", r"nothing is measured within one element \([\d.]+\) of \("),
+    "damaged.vtu": ("<VTKFile", r"cannot be read: "),
+    "negative.csv": (
+        ",".join(f"structure_tensor_{c}" for c in ("xx", "yy", "zz", "xy", "yz", "xz")) + "\n" + "1,1,-1,0,0,0\n" * 32,
+        r"structure_tensor of row 1 has eigenvalues -1, 1, 1; none may be below 0",
+    ),
+    "outside.xdmf": ('<Xdmf><DataItem Format="HDF">/etc/x.h5:/a</DataItem></Xdmf>', r"numbers stand in another file"),
+    "entity.vtu": ('<!DOCTYPE a [<!ENTITY b "c">]><VTKFile/>', r"has entities"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_a_bad_file_is_said_in_one_line(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text, said = BAD[name]
+    if text is not None:
+        (tmp_path / name).write_text(text)
+    with pytest.raises(SceneError, match=rf"^cells.fibres = '.*{name}': .*{said}") as error:
+        Simulation(scene(tmp_path / name), SELF)
+    assert "\n" not in str(error.value)
+
+
+def test_two_sources_and_reductions_are_refused() -> None:
+    with pytest.raises(SceneError, match="cells.fibres = 'a.csv': cells.initial = 'isotropic' is there too; one of"):
+        scene("a.csv", initial="isotropic")
+    with pytest.raises(SceneError, match="cells.initial = 'fibres': needs cells.fibres, the name of a file"):
+        Scene(**TUBE | {"cells": {"initial": "fibres"}})
+    with pytest.raises(SceneError, match="model.kinematics = 'radial': cells.fibres gives other cells to each element"):
+        Scene(**TUBE | {"cells": {"fibres": "a.csv"}, "model": {"kinematics": "radial"}})
+    regions = {"media": {"cells": {"fibres": "a.csv", "initial": "isotropic"}}}
+    with pytest.raises(SceneError, match="regions.media.cells.fibres = 'a.csv': regions.media.cells.initial = 'isotr"):
+        Scene(**TUBE | {"regions": regions})
+    preset = Scene(preset="kuhl-holzapfel-2007", geometry={"shape": "tube"}, cells={"fibres": "a.csv"})
+    assert preset.cells.initial == "fibres", "the preset's random cells lie under it"
