@@ -56,6 +56,9 @@ def test_all_scenes(seed: int, runner: Runner) -> None:
 
 
 # ---------------------------------------------------------------- the scenes
+OF_FILES = {"cells.fibres", "cells.fibres_sha256"}  # a seed makes a scene and no files beside it
+
+
 def test_scenes_are_valid_and_draw_every_key() -> None:
     """What the package has as keys, some scene sets; a seed makes the same scene each time."""
     drawn: set[str] = set()
@@ -69,7 +72,7 @@ def test_scenes_are_valid_and_draw_every_key() -> None:
     for name in keys - {"geometry", "loads"}:
         table = getattr(valid, name)
         keys = keys | {f"{name}.{key}" for key in getattr(type(table), "model_fields", ())}
-    assert keys <= drawn, f"benchmarks/fuzzing/scenes.py draws no {sorted(keys - drawn)}"
+    assert keys - OF_FILES <= drawn, f"benchmarks/fuzzing/scenes.py draws no {sorted(keys - OF_FILES - drawn)}"
 
 
 # ---------------------------------------------------------------- right and wrong
