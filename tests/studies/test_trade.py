@@ -266,7 +266,7 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     assert len(before) == 4  # the three, and 'implicit'
     assert cli.main(["trade", str(path), "-o", str(out), "-q"]) == 0
     assert {file: file.stat().st_mtime_ns for file in out.glob("*/history.csv")} == before
-    assert cli.main(["trade", str(path), "-o", str(tmp_path / "none"), "--budget", "0.001s"]) == 4
+    assert cli.main(["trade", str(path), "-o", str(tmp_path / "none"), "--budget", "0.001s", "-q"]) == 4
     said = capsys.readouterr().err
     assert said.startswith("remodel-fenicsx: 0 of 4 settings reached the end within the budget of 0.001 s, at least 2")
     assert re.search(r"is kept, a larger budget goes on; the cheapest 2 need about \S+ s for their steps", said)
