@@ -144,14 +144,8 @@ def cost(number: int) -> Iterator[dict[str, Any]]:
 
 # ---------------------------------------------------------------- the page
 def numbers(name: str) -> Columns:
-    """A table as columns, numbers where they are."""
-    found = {}
-    for column, values in read_table(DOCS / "figures" / f"{name}.csv").items():
-        try:
-            found[column] = np.array(values, dtype=float)
-        except ValueError:
-            found[column] = np.array(values)
-    return found
+    """A table of the page."""
+    return read_table(DOCS / "figures" / f"{name}.csv")
 
 
 def draw(table: Columns) -> Figure:

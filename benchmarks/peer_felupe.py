@@ -1,25 +1,32 @@
 """The artery of `benchmarks/peers.py` in FElupe, as one of its users would write it: run by that command, not by hand.
 
-    python3 peer_felupe.py PROBLEM.npz STEPS TOLERANCE RESULT.npz
+    python3 peer_felupe.py PROBLEM.npz STEPS TOLERANCE RESULT.npz tensortrax|jax
 
 PROBLEM has the mesh, the cells before the first pass, the numbers of the material and of the loads. W is differentiated
-by tensortrax; the follower pressure, Newton's method and SciPy's sparse solver are FElupe's. The pass is eqs. (8) to
-(11) of the paper, typed here. It imports nothing of this project.
+by tensortrax, and SciPy solves the linear systems; or by jax (compiled, double precision), and MKL's Pardiso solves
+them. The follower pressure and Newton's method are FElupe's. The pass is eqs. (8) to (11) of the paper, typed here. It
+imports nothing of this project.
 """
 
 from __future__ import annotations
 
+import importlib
 import sys
 import warnings
+from functools import partial
 from typing import Any
 
 import felupe
 import numpy as np
-import tensortrax.math as tm
-from felupe.constitution.tensortrax import Hyperelastic
+
+# What differentiates W, its functions of tensors, and what solves the linear systems
+PARTS = {
+    "tensortrax": ("felupe.constitution.tensortrax", "tensortrax.math", "scipy.sparse.linalg"),
+    "jax": ("felupe.constitution.jax", "jax.numpy", "pypardiso"),
+}
 
 
-def energy(C: Any, cells: Any, mu: float, lmbda: float, modulus: float, contour: float, initial: float) -> Any:
+def energy(tm: Any, C: Any, cells: Any, mu: float, lmbda: float, modulus: float, contour: float, initial: float) -> Any:
     """W of eqs. (4) and (6) per reference volume, of the energy factor 1; `cells`: three lengths, then three axes."""
     squared, repulsion = 0.0, 0.0
     for i in range(3):
@@ -52,13 +59,16 @@ def remodeled(cells: Any, first: Any, cauchy: Any, grown: float, initial: float)
 class Tube:
     """The body, its supports and what changes from step to step."""
 
-    def __init__(self, given: Any):
-        self.given = given
+    def __init__(self, given: Any, parts: str):
+        constitution, math, systems = (importlib.import_module(name) for name in PARTS[parts])
+        self.given, self.solve = given, systems.spsolve
         mesh = felupe.Mesh(given["points"], given["elements"], "hexahedron")
         region = felupe.RegionHexahedron(mesh)
         self.field = felupe.FieldContainer([felupe.Field(region, dim=3)])
         names = ("mu", "lmbda", "modulus", "contour", "initial")
-        material = Hyperelastic(energy, nstatevars=12, **{name: float(given[name]) for name in names})
+        material = constitution.Hyperelastic(
+            partial(energy, math), nstatevars=12, **{name: float(given[name]) for name in names}
+        )
         self.cells = self.cells_before(region)
         self.first = self.cells[:3].copy()
         self.solid = felupe.SolidBody(material, self.field, statevars=self.cells)
@@ -89,8 +99,9 @@ class Tube:
         free = np.setdiff1d(np.arange(self.field[0].values.size), prescribed)
         items = [self.solid, self.pressure]
         solved = felupe.newtonraphson(
-            items=items, dof0=prescribed, dof1=free, ext0=values, tol=tolerance, maxiter=30, verbose=0
-        )
+            items=items, dof0=prescribed, dof1=free, ext0=values, tol=tolerance, maxiter=30, verbose=0,
+            solver=self.solve,
+        )  # fmt: skip
         self.field = solved.x
         grown = -np.expm1(-float(given["kappa"]) * time)
         cauchy = self.solid.evaluate.cauchy_stress(self.field)
@@ -109,10 +120,12 @@ def held_and_drawn(points: Any, given: Any) -> tuple[Any, Any]:
     return np.concatenate(held), 3 * np.flatnonzero(np.isclose(z, float(given["length"]))) + 2
 
 
-def main(problem: str, steps: str, tolerance: str, result: str) -> None:
+def main(problem: str, steps: str, tolerance: str, result: str, parts: str) -> None:
     """Run, write the displacement and the number of iterations."""
+    if parts == "jax":
+        importlib.import_module("jax").config.update("jax_enable_x64", True)
     warnings.simplefilter("error", RuntimeWarning)  # a chain at its full length: no number may come of it
-    tube, iterations = Tube(np.load(problem)), 0
+    tube, iterations = Tube(np.load(problem), parts), 0
     for number in range(1, int(steps) + 1):
         iterations += tube.step(float(number), float(tolerance))
     np.savez(result, displacement=tube.field[0].values, iterations=iterations)

@@ -3,7 +3,9 @@
 
     pip install --no-deps --target peers felupe==11.3.0 tensortrax==0.29.0     # once, with any pip: pure Python
     ./with-fenicsx benchmarks/peers.py peers [--steps 40] [--pairs 1] [--core 0] [--tolerance 1e-10]
-        [--set KEY=VALUE]...
+        [--parts tensortrax|jax] [--set KEY=VALUE]...
+
+`--parts jax` needs jax and pypardiso (which needs mkl) in the folder too; PYPARDISO_MKL_RT names libmkl_rt.so there.
 
 FElupe is a finite element library of Python for hyperelastic bodies; numpy and SciPy are the environment's for both.
 Ours is run as a user runs it (solver.method auto, predictor autoregressive, all fields recorded) and its record gives
@@ -52,7 +54,8 @@ def own(steps: int, folder: Path, options: argparse.Namespace) -> float:
 def other(steps: int, problem: Path, result: Path, options: argparse.Namespace) -> float:
     """Processor seconds of a run of FElupe."""
     script = PROJECT / "benchmarks" / "peer_felupe.py"
-    command = [sys.executable, str(script), str(problem), str(steps), str(options.tolerance), str(result)]
+    command = [sys.executable, str(script), str(problem), str(steps), str(options.tolerance)]
+    command += [str(result), options.parts]
     return processor_seconds(command, options.core, [options.packages.resolve()])
 
 
@@ -83,6 +86,7 @@ def main() -> None:
     """Measure in turns, compare, print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("packages", type=Path, help="folder with felupe and tensortrax")
+    parser.add_argument("--parts", choices=("tensortrax", "jax"), default="tensortrax", help="jax: with Pardiso")
     parser.add_argument("--steps", type=int, default=40)
     parser.add_argument("--pairs", type=int, default=1)
     parser.add_argument("--core", type=int, default=0)
@@ -107,7 +111,7 @@ def main() -> None:
             iterations = int(np.sum(recording.history["newton_iterations"]))
             difference = np.abs(ours - theirs).max()
             print(
-                f"{options.steps} steps: here {seconds:.1f} s, {iterations} iterations; FElupe "
+                f"{options.steps} steps: here {seconds:.1f} s, {iterations} iterations; FElupe, {options.parts} "
                 f"{seconds_of_other:.1f} s, {int(found['iterations'])} iterations; ratio "
                 f"{seconds_of_other / seconds:.1f}; radii here {ours}, "
                 f"there {theirs}; u differs by up to {np.abs(displacement - found['displacement']).max():.1e}",

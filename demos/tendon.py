@@ -41,7 +41,7 @@ tissue = parts.Material(lame_lambda=27.293, lame_mu=3.103, chain_density=2.0e21,
                         persistence_length=1.365, temperature=310.0).tissue(end_to_end_length=1.0)  # fmt: skip
 quadrature = parts.Quadrature(domain.mesh, element_degree=1)
 start = parts.Cells(initial="random", axes="global", seed=1, end_to_end_length=1.0)
-cells = parts.UnitCells(quadrature, domain.element_number, domain.number_of_elements, start)
+cells = parts.UnitCells(quadrature, domain, start, body.local_axes(domain, quadrature))
 
 # %% [markdown]
 # ## Supports and loads

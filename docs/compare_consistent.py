@@ -149,14 +149,9 @@ def _label(panels: Sequence[Axes]) -> None:
 
 
 # ---------------------------------------------------------------- the numbers on the page
-def numbers(path: Path) -> Columns:
-    """Columns of a table."""
-    return {name: np.array(values, dtype=float) for name, values in read_table(path).items()}
-
-
 def page_values(folder: Path) -> dict[str, str]:
     """What the page shows of the tables."""
-    table, layers, tendon = (numbers(folder / f"{name}.csv") for name in ("consistent", "consistent-layers", "fig6"))
+    table, layers, tendon = (read_table(folder / f"{name}.csv") for name in ("consistent", "consistent-layers", "fig6"))
     at_12, peak = table["time"] == 12.0, tendon["time"] == 12.0
     found = {"consistent_table": layer_table(layers), "caption_consistent": CAPTION[1]}
     found["paper_peak"] = f"{100 * tendon['mean_stretch'][peak].item():.0f}"
@@ -210,7 +205,7 @@ def main() -> None:
         source = ["docs/compare_consistent.py"]
         Page(KEPT, "consistent", *CAPTION).save_table(table | history, source)
         Page(KEPT, "consistent").save_table(layers, source, "layers")
-    tables = (numbers(KEPT / f"{name}.csv") for name in ("consistent", "consistent-layers", "fig6"))
+    tables = (read_table(KEPT / f"{name}.csv") for name in ("consistent", "consistent-layers", "fig6"))
     with matplotlib.rc_context(STYLE):
         Page(KEPT, "consistent", *CAPTION).save_figure(draw(*tables), "docs/compare_consistent.py")
     (DOCS / "verification.md").write_text(page(), encoding="utf-8")

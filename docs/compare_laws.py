@@ -150,9 +150,8 @@ def run(names: Sequence[str], folder: Path) -> None:
 def kept_runs(folder: Path) -> dict[tuple[str, str], Columns]:
     """Columns of each run in the table, by case and law."""
     table = read_table(folder / "laws.csv")
-    case, law = np.array(table["case"]), np.array(table["law"])
-    numbers = {name: np.array(table[name], dtype=float) for name in COLUMNS}
-    return {(one, other): {name: values[(case == one) & (law == other)] for name, values in numbers.items()}
+    case, law = table["case"], table["law"]
+    return {(one, other): {name: table[name][(case == one) & (law == other)] for name in COLUMNS}
             for one in CASES for other in LAWS}  # fmt: skip
 
 

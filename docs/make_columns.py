@@ -18,7 +18,7 @@ def _rows() -> Iterator[str]:
     """Columns of all shapes before those of some; the same one of several shapes on one row."""
     shapes: dict[tuple[str, str, str], list[str]] = {}
     for shape, kind in SHAPES.items():
-        for column in columns_of(kind, loads=()):
+        for column in columns_of(kind, loads=(), regions=["NAME"] if kind.has_regions else []):
             shapes.setdefault(_key(column), []).append(shape)
     for (name, unit, meaning), having in sorted(shapes.items(), key=lambda item: len(item[1]) != len(SHAPES)):
         of = "all" if len(having) == len(SHAPES) else ", ".join(having)

@@ -157,7 +157,9 @@ def _columns() -> Iterator[str]:
     by_shape: dict[str, dict[str, list[str]]] = {"": {}, " on request": {}}
     for shape, kind in extend.SHAPES.items():
         freed = [load.column_name(name) for name, load in kind.loads.items() if load.frees_length]
-        by_shape[""][shape] = [column.name for column in columns_of(kind, loads=())]
+        by_shape[""][shape] = [
+            column.name for column in columns_of(kind, loads=(), regions=["NAME"] if kind.has_regions else [])
+        ]
         by_shape[" on request"][shape] = [*freed, *columns_on_request(kind)]
     for when, columns in by_shape.items():
         common = [name for name in columns["cube"] if all(name in names for names in columns.values())]

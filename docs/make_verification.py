@@ -49,17 +49,6 @@ REFERENCE_CAPTION = (
 Columns = dict[str, np.ndarray]
 
 
-def numbers_of(path: Path) -> Columns:
-    """Columns of a table; those of words stay words."""
-    found = {}
-    for name, values in read_table(path).items():
-        try:
-            found[name] = np.array(values, dtype=float)
-        except ValueError:
-            found[name] = np.array(values)
-    return found
-
-
 # ---------------------------------------------------------------- the independent reference
 
 
@@ -104,7 +93,7 @@ def _draw_reference(page: Page, curves: dict[str, tuple[np.ndarray, np.ndarray]]
 
 def layer_angles(folder: Path) -> Columns:
     """Layer means of the runs at t = 150 by driver or law."""
-    second, strain, rate = (numbers_of(folder / f"{name}.csv") for name in ("fig10", "fig11", "rate"))
+    second, strain, rate = (read_table(folder / f"{name}.csv") for name in ("fig10", "fig11", "rate"))
     return {
         "cauchy": second["fibre_angle_cauchy"],
         "pk2": second["fibre_angle_pk2"],
@@ -125,7 +114,7 @@ def all_numbers(folder: Path) -> dict[str, str]:
 
 
 def _cube(folder: Path) -> dict[str, str]:
-    table = numbers_of(folder / "fig5.csv")
+    table = read_table(folder / "fig5.csv")
     kappas = ("0.01", "0.025", "0.05", "0.1")
     error = max(np.abs(table[f"angle_kappa_{k}"] - table[f"exact_kappa_{k}"]).max() for k in kappas)
     ends = {f"cube_end_{k.replace('.', '')}": f"{table[f'angle_kappa_{k}'][-1]:.1f}" for k in kappas}
@@ -134,7 +123,7 @@ def _cube(folder: Path) -> dict[str, str]:
 
 
 def _tendon(folder: Path) -> dict[str, str]:
-    table, seen = numbers_of(folder / "fig6.csv"), numbers_of(folder / "fig6-snapshots.csv")
+    table, seen = read_table(folder / "fig6.csv"), read_table(folder / "fig6-snapshots.csv")
     row = table["time"] == 12.0
 
     def value(name: str, time: float) -> float:
@@ -154,16 +143,16 @@ def _tendon(folder: Path) -> dict[str, str]:
         "tendon_deformed_mean_12": f"{value('mean_fibre_angle_deformed', 12.0):.0f}",
         "tendon_angle_end": f"{value('mean_fibre_angle', 150.0):.1f}",
         "tendon_l1": f"{value('min_l_1', 150.0):.4f}",
-        "tendon_stiff_end": f"{100 * numbers_of(folder / 'stiff-tendon.csv')['mean_stretch'].item():.0f}",
+        "tendon_stiff_end": f"{100 * read_table(folder / 'stiff-tendon.csv')['mean_stretch'].item():.0f}",
         "left_of_start": f"{100 * np.exp(-0.025 * 149):.1f}",
     }
 
 
 def _artery(folder: Path) -> dict[str, str]:
-    history, seen = numbers_of(folder / "fig7-history.csv"), numbers_of(folder / "fig7.csv")
+    history, seen = read_table(folder / "fig7-history.csv"), read_table(folder / "fig7.csv")
     outer, inner, time = history["outer_radius"], history["inner_radius"], history["time"]
     peak, at_24 = int(outer.argmax()), int(np.argmin(np.abs(time - 24.0)))
-    layers = numbers_of(folder / "fig8.csv")
+    layers = read_table(folder / "fig8.csv")
     return {
         "artery_peak": f"{outer[peak]:.3f}",
         "artery_peak_time": f"{time[peak]:g}",
@@ -187,7 +176,7 @@ def _artery(folder: Path) -> dict[str, str]:
 
 
 def _cases(folder: Path) -> dict[str, str]:
-    table = numbers_of(folder / "fig9.csv")
+    table = read_table(folder / "fig9.csv")
 
     def angles(stretch: float, pressure: float, name: str = "fibre_angle") -> np.ndarray:
         chosen = np.isclose(table["stretch"], stretch) & np.isclose(table["pressure"], pressure)
@@ -195,9 +184,9 @@ def _cases(folder: Path) -> dict[str, str]:
 
     stretched, pressed = angles(0.1, 0.0), angles(0.0, 4.8)
     most, least = (angles(*case, f"fibre_angle_{name}") for case, name in (((0.0, 4.8), "most"), ((0.1, 0.0), "least")))
-    reference = numbers_of(folder / "radial-reference.csv")["case_0_4.8"]
-    stopped = numbers_of(folder / "stopped-points.csv")
-    coarse, fine = numbers_of(folder / "pressure-meshes.csv")["fibre_angle_4"]
+    reference = read_table(folder / "radial-reference.csv")["case_0_4.8"]
+    stopped = read_table(folder / "stopped-points.csv")
+    coarse, fine = read_table(folder / "pressure-meshes.csv")["fibre_angle_4"]
     first = stopped["radius"] < EDGES[1]
     return {
         "stretch_least": f"{stretched.min():.1f}",
@@ -223,12 +212,12 @@ def _cases(folder: Path) -> dict[str, str]:
 
 def _drivers(folder: Path) -> dict[str, str]:
     angles = layer_angles(folder)
-    second, strain = numbers_of(folder / "fig10.csv"), numbers_of(folder / "fig11.csv")
-    reference = numbers_of(folder / "radial-reference.csv")
+    second, strain = read_table(folder / "fig10.csv"), read_table(folder / "fig11.csv")
+    reference = read_table(folder / "radial-reference.csv")
     drivers = ("cauchy", "pk2", "finger")
-    radii = numbers_of(folder / "radial-reference-radii.csv")
+    radii = read_table(folder / "radial-reference-radii.csv")
     exact = {face: radii[f"{face}_radius"][radii["name"] == "finger"].item() for face in ("inner", "outer")}
-    drifted = numbers_of(folder / "fig11-history.csv")
+    drifted = read_table(folder / "fig11-history.csv")
     inner, outer = (drifted[f"{face}_radius_finger"][-1] for face in ("inner", "outer"))
     found = {f"variation_{name}": f"{np.ptp(angles[name]):.1f}" for name in drivers}
     found |= {f"reference_variation_{name}": f"{np.ptp(reference[name]):.1f}" for name in drivers}
@@ -259,7 +248,7 @@ def _drivers(folder: Path) -> dict[str, str]:
 
 
 def _energy(folder: Path) -> dict[str, str]:
-    table = numbers_of(folder / "energy.csv")
+    table = read_table(folder / "energy.csv")
     found = {}
     for demo in ("cube", "tendon", "artery"):
         chosen = table["demo"] == demo
@@ -276,7 +265,7 @@ def _energy(folder: Path) -> dict[str, str]:
             held = (time >= 12.0) & (time < time[-1])  # the passes between the solved states of t = 12 and of the end
             found["tendon_supplied"] = f"{-power[held].sum() * (time[1] - time[0]):.0f}"
             found["tendon_drop"] = f"{energy[time == 12.0].item() - energy[-1]:.0f}"
-    curve = numbers_of(folder / "fig6.csv")
+    curve = read_table(folder / "fig6.csv")
     shorter = curve["mean_stretch"][curve["time"] == 12.0].item() - curve["mean_stretch"][-1]
     return found | {"tendon_work": f"{curve['force'][-1] * 10.0 * shorter:.0f}"}  # the tendon is 10 long
 
@@ -292,7 +281,7 @@ def markdown(header: list[str], rows: list[list[str]]) -> str:
 
 def layer_table(folder: Path) -> str:
     """Runs against the reference, layer by layer."""
-    runs, reference = layer_angles(folder), numbers_of(folder / "radial-reference.csv")
+    runs, reference = layer_angles(folder), read_table(folder / "radial-reference.csv")
     header = ["layer", "R"]
     for label in ("σ, eq. (11)", "S, eq. (11)", "b, eq. (11)", "σ, eq. (10)"):
         header += [label, "reference"]
@@ -307,7 +296,7 @@ def layer_table(folder: Path) -> str:
 
 def case_table(folder: Path) -> str:
     """Fig. 9, layer by layer, against the reference."""
-    table, reference = numbers_of(folder / "fig9.csv"), numbers_of(folder / "radial-reference.csv")
+    table, reference = read_table(folder / "fig9.csv"), read_table(folder / "radial-reference.csv")
     header, columns = ["layer"], []
     for stretch, pressure in CASES:
         chosen = np.isclose(table["stretch"], stretch / 100) & np.isclose(table["pressure"], pressure)
@@ -338,7 +327,7 @@ def degrees(value: float) -> str:
 
 def rows_of(path: Path) -> list[dict[str, Any]]:
     """Rows of a table, numbers where they are."""
-    columns = numbers_of(path)
+    columns = read_table(path)
     return [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
 
 

@@ -136,7 +136,17 @@ def parser() -> argparse.ArgumentParser:
     animate.add_argument("--frames", type=int, default=60, metavar="N", help=text)
     revolve = command("revolve", "Write the fields of a reduced run in DIR on the whole body: fields_body.vtkhdf.")
     revolve.add_argument("folder", type=Path, metavar="DIR", help="folder of a run")
+    fibres = command("export", "Write the cells of the run in DIR for other programs: a structure tensor an element.")
+    fibres.add_argument("folder", type=Path, metavar="DIR", help="folder of a run")
+    text = "vtu (ParaView, meshio), febio (.feb), abaqus (.inp, CalculiX too) or csv"
+    fibres.add_argument("--format", required=True, choices=("vtu", "febio", "abaqus", "csv"), help=text)
+    text = "a file that does not exist yet (default: fibres in DIR, with the format's ending)"
+    fibres.add_argument("-o", "--output", type=Path, metavar="FILE", help=text)
+    fibres.add_argument("--time", type=float, metavar="T", help="a recorded time (default: the last)")
     scene_command("validate", "Check a scene without running it.")
+    axes = scene_command("axes", "Write the local axes of a scene's body, before any solve, as a VTU file.")
+    text = "a file that does not exist yet (default: NAME-axes.vtu)"
+    axes.add_argument("-o", "--output", type=Path, metavar="FILE", help=text)
     new = command("new", "Print a scene of a preset.")
     new.add_argument("preset", metavar="PRESET", help=", ".join(PRESETS))
     new.add_argument("--shape", default="tube", help="cube, tendon or tube (default: tube)")
@@ -426,6 +436,22 @@ def _revolve(options: argparse.Namespace) -> int:
     return 0
 
 
+def _export(options: argparse.Namespace) -> int:
+    if not interrupts.is_first_rank():  # the work of one process
+        return 0
+    from remodel_fenicsx.results.export import export
+    from remodel_fenicsx.results.recording import RecordingError
+
+    try:
+        written = export(options.folder, options.format, options.output, options.time)
+    except RecordingError as error:
+        return _fail(str(error), BAD_INPUT)
+    except OSError as error:
+        return _fail(f"cannot write the fibres: {error}", BAD_ENVIRONMENT)
+    _say(str(written))
+    return 0
+
+
 def _validate(options: argparse.Namespace) -> int:
     scene = read_scene(options.scene, options.set, options.profile)
     _say(f"{options.scene}: a valid scene ({scene.geometry.name}, {scene.time.in_words()})")
@@ -436,6 +462,28 @@ def _validate(options: argparse.Namespace) -> int:
     if _rank() == 0:
         for warning in scene.warnings():
             _complain(f"warning: {warning}")
+    return 0
+
+
+def _axes(options: argparse.Namespace) -> int:
+    scene = read_scene(options.scene, options.set, options.profile)
+    _check(reason_unusable())
+    from remodel_fenicsx.body import GeometryError
+    from remodel_fenicsx.studies.preview import write_axes
+
+    path = options.output or Path(f"{scene.name}-axes.vtu")
+    try:
+        with interrupts.StopRequest(), interrupts.stopping_at_once():
+            words = write_axes(scene, path)
+    except (SceneError, GeometryError) as error:
+        return _fail(" ".join(str(error).split()), BAD_INPUT)
+    except interrupts.Interrupted as interruption:
+        return _fail(f"stopped by {interruption}", interruption.exit_code)
+    except FileExistsError:
+        return _end_all(f"-o {path}: exists; allowed is a file that does not", BAD_INPUT)
+    except OSError as error:
+        return _end_all(f"-o {path}: cannot be written: {error.strerror}", BAD_ENVIRONMENT)
+    _say(f"{words}\nlocal axes in {path}")
     return 0
 
 
@@ -506,7 +554,9 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
     "picture": _drawing,
     "animate": _drawing,
     "revolve": _revolve,
+    "export": _export,
     "validate": _validate,
+    "axes": _axes,
     "new": _new,
     "schema": _schema,
     "figures": _figures,

@@ -19,7 +19,7 @@ from remodel_fenicsx.body.shape import uniaxial_columns
 from remodel_fenicsx.fem.formulations import FORMULATIONS, Formulation, Selective
 from remodel_fenicsx.fem.kinematics import KINEMATICS, FullKinematics, Kinematics
 from remodel_fenicsx.fem.solver_methods import SOLVER_METHODS, SolverMethod
-from remodel_fenicsx.model.cells import AXES, UnitCell, angle_to_axis
+from remodel_fenicsx.model.cells import UnitCell, angle_to_axis
 from remodel_fenicsx.model.chains import CHAINS, Chain
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES, Driver, Frame
 from remodel_fenicsx.model.energy import (
@@ -33,6 +33,7 @@ from remodel_fenicsx.model.energy import (
     squared_end_to_end_length,
 )
 from remodel_fenicsx.model.laws import LAWS, Drive, Law, ranked
+from remodel_fenicsx.model.local_axes import AXES, LocalAxes
 from remodel_fenicsx.model.spectral import PAIRINGS, principal
 from remodel_fenicsx.schema.tables import markdown_reference
 from remodel_fenicsx.schema.units import (
@@ -83,6 +84,7 @@ __all__ = [
     "LENGTH_UNIT",
     "Law",
     "LoadKind",
+    "LocalAxes",
     "MATRICES",
     "Matrix",
     "Measurement",

@@ -13,6 +13,7 @@ from mpi4py import MPI
 
 from remodel_fenicsx.evolution.pause import Pause
 from remodel_fenicsx.evolution.stepper import Step, Watcher
+from remodel_fenicsx.fem.solver_methods import LARGE_ON_RANKS
 from remodel_fenicsx.results.checkpoint import Checkpoints, restore_state
 from remodel_fenicsx.results.checkpoint_file import Checkpoint, CheckpointError, read_checkpoint
 from remodel_fenicsx.results.fields import Fields, field_names
@@ -234,11 +235,14 @@ def _record(
         progress = stack.enter_context(Progress(steps, scene.name, rank, done=done))
         log.info(BEGUN + "%s on %d ranks, results in %s", scene.name, comm.size, place)
         log.info("%s", scene.summary())
+        unknowns = simulation.unknown.x.petsc_vec.getSize()
+        if comm.size > 1 and unknowns <= LARGE_ON_RANKS:
+            log.info("%d unknowns: one rank is faster than %d (docs/speed.md, Ranks)", unknowns, comm.size)
         for warning in scene.warnings():
             log.warning("%s", warning)
         watchers: list[Watcher] = []
         if scene.output.fields:
-            names = field_names(scene.output.fields)
+            names = field_names(scene.output.fields, scene.regions, scene.geometry.constant_fields)
             parts = place, scene.geometry, simulation.stepper, scene.output.every, after and after.time, names
             times = scene.output.times
             watchers.append(stack.enter_context(agreed(comm, lambda: Fields(*parts, times))))

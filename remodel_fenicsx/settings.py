@@ -6,12 +6,13 @@ docs/theory.md has the equations as implemented. A `Scene` (`scene.scene`) is ma
 
 from __future__ import annotations
 
+import copy
 import itertools
 import math
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,13 +32,13 @@ from remodel_fenicsx.fem.solver_methods import (
     SOLVER_METHODS,
     fault_of_option,
 )
-from remodel_fenicsx.model.cells import AXES
+from remodel_fenicsx.model.local_axes import AXES
 from remodel_fenicsx.model.chains import BOLTZMANN_CONSTANT, CHAINS
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
 from remodel_fenicsx.model.energy import MATRICES, REPULSIONS, Tissue
 from remodel_fenicsx.model.laws import LAWS
 from remodel_fenicsx.model.spectral import PAIRINGS
-from remodel_fenicsx.schema.tables import OneOf, Table, fault, is_number, quoted, shown
+from remodel_fenicsx.schema.tables import OneOf, Table, allowed, fault, is_number, quoted, shown
 from remodel_fenicsx.schema.times import is_multiple, same_time
 from remodel_fenicsx.schema.units import FORCE, FOUNDATION, LENGTH, NUMBER_DENSITY, STRESS, TEMPERATURE
 
@@ -78,22 +79,6 @@ class Mesh(Table):
             rule = f"allowed for elements {self.element!r} of degree {self.degree} is {', '.join(map(repr, able))}"
             raise fault(rule, "formulation", self.formulation)
         return self
-
-
-class Region(Table):
-    """A named part of the body with properties of its own, `[regions.media]` say. What it does not say is as elsewhere.
-
-    Regions of a tube are layers of its wall, in the order of their outer radii; together they are the wall. Elements
-    through the wall are shared out so that none lies in two layers. NAME is a letter, then letters, digits and `_`.
-    """
-
-    outer_radius: Annotated[float | None, LENGTH] = Field(
-        default=None,
-        gt=0,
-        description="Of shape 'tube': where the layer ends, in the scene's unit of length; it begins where the one "
-        "inside of it ends. The outermost may leave it out.",
-        json_schema_extra={"allowed": "a finite number greater than 0"},
-    )
 
 
 class Model(Table):
@@ -275,8 +260,9 @@ class Cells(Table):
     )
     axes: Annotated[str, OneOf(AXES)] = Field(
         default="global",
-        description="Cell axes n_I before the first pass: 'global' (x, y, z) or 'cylindrical' (circumferential, axial, "
-        "radial, about the z axis). Where neither scene nor preset says it: a tube starts with 'cylindrical'.",
+        description="Cell axes n_I before the first pass: 'global' (x, y, z), 'cylindrical' (circumferential, axial, "
+        "radial, about the z axis) or 'local' (the same found on a mesh, docs/own_body.md). Where neither scene nor "
+        "preset says it: a tube starts with 'cylindrical'.",
     )
     aligned_axis: Annotated[int, OneOf((1, 2, 3))] = Field(
         default=3,
@@ -297,16 +283,17 @@ class Cells(Table):
 
     @model_validator(mode="after")
     def _length_of_the_chain(self) -> Cells:
-        if not isinstance(self.initial, str):
-            length = math.hypot(*self.initial)
-            if abs(length - self.end_to_end_length) > 1e-6 * self.end_to_end_length:
-                raise fault(
-                    f"the root of the sum of squares is {length:.7g}, it must be "
-                    f"cells.end_to_end_length = {shown(self.end_to_end_length)}",
-                    "initial",
-                    self.initial,
-                )
+        if (rule := self.fault_of_length()) is not None:
+            raise fault(rule, "initial", self.initial)
         return self
+
+    def fault_of_length(self) -> str | None:
+        """What keeps three lengths from being those of a chain; None if nothing does."""
+        length = self.end_to_end_length if isinstance(self.initial, str) else math.hypot(*self.initial)
+        if abs(length - self.end_to_end_length) <= 1e-6 * self.end_to_end_length:
+            return None
+        r0 = shown(self.end_to_end_length)
+        return f"the root of the sum of squares is {length:.7g}, it must be cells.end_to_end_length = {r0}"
 
     def dimensions(self, number_of_elements: int) -> NDArray[np.float64]:
         """l_I at t = 0 of every element of the mesh file, shape (number_of_elements, 3), in link lengths.
@@ -366,7 +353,7 @@ COUPLINGS = {
     "extrapolated": CouplingKind(
         "remodel first, towards the stress of the middle of the step, extrapolated from the two steps before; then "
         "solve: of second order, for the law 'tensor'",
-        "remodel_fenicsx.evolution.coupling:Extrapolated",
+        "remodel_fenicsx.evolution.extrapolated:Extrapolated",
         needs_a_target=True,
     ),
     "implicit": CouplingKind(
@@ -445,6 +432,89 @@ class Remodeling(Table):
                 f"needs a remodeling.law with a target that can be extrapolated: {laws}", "coupling", self.coupling
             )
         return self
+
+
+# ---------------------------------------------------------------- regions
+
+
+class Properties(NamedTuple):
+    """What holds in a region, or in the body beside its regions."""
+
+    material: Material
+    cells: Cells
+    kappa: float
+
+    @property
+    def tissue(self) -> Tissue:
+        """The tissue of these parameters."""
+        return self.material.tissue(self.cells.end_to_end_length)
+
+
+def _as_in(table: type[Table], name: str, key: str) -> Any:
+    """A key of another table that may be left out: the value of that table holds then."""
+    field = copy.copy(table.model_fields[name])
+    rule = re.sub(r"^(must be|allowed is|allowed are) ", "", allowed(field))
+    extra = field.json_schema_extra if isinstance(field.json_schema_extra, dict) else {}
+    field.json_schema_extra = extra | {"allowed": rule}
+    field.default, field.description = None, f"As `{key}.{name}`, in the region; where it is left out that holds."
+    return field
+
+
+class RegionMaterial(Table):
+    """Numbers of `[material]` that are others in the region; all else of it is one for the whole body."""
+
+    lame_lambda: float | None = _as_in(Material, "lame_lambda", "material")
+    lame_mu: float | None = _as_in(Material, "lame_mu", "material")
+    chain_density: float | None = _as_in(Material, "chain_density", "material")
+    contour_length: float | None = _as_in(Material, "contour_length", "material")
+    persistence_length: float | None = _as_in(Material, "persistence_length", "material")
+    temperature: float | None = _as_in(Material, "temperature", "material")
+
+
+class RegionCells(Table):
+    """Keys of `[cells]` that are others in the region; axes and seed are one for the whole body."""
+
+    initial: str | tuple[float, float, float] | None = _as_in(Cells, "initial", "cells")
+    aligned_axis: int | None = _as_in(Cells, "aligned_axis", "cells")
+    end_to_end_length: float | None = _as_in(Cells, "end_to_end_length", "cells")
+
+
+class RegionRemodeling(Table):
+    """Keys of `[remodeling]` that are others in the region; the law is one for the whole body."""
+
+    kappa: float | None = _as_in(Remodeling, "kappa", "remodeling")
+
+
+class Region(Table):
+    """A named part of the body with properties of its own, `[regions.media]` say. What it does not say is as elsewhere.
+
+    Regions of a tube are layers of its wall, in the order of their outer radii; together they are the wall. Elements
+    through the wall are shared out so that none lies in two layers. NAME is a letter, then letters, digits and `_`.
+    Keys of other tables stand after the region: `material.chain_density = 4e21` in `[regions.media]`.
+    """
+
+    outer_radius: Annotated[float | None, LENGTH] = Field(
+        default=None,
+        gt=0,
+        description="Of shape 'tube': where the layer ends, in the scene's unit of length; it begins where the one "
+        "inside of it ends. The outermost may leave it out.",
+        json_schema_extra={"allowed": "a finite number greater than 0"},
+    )
+    material: RegionMaterial = RegionMaterial()
+    cells: RegionCells = RegionCells()
+    remodeling: RegionRemodeling = RegionRemodeling()
+
+    def over(self, others: Properties) -> Properties:
+        """What holds in the region, its own keys over these."""
+        return Properties(
+            others.material.model_copy(update=_set(self.material)),
+            others.cells.model_copy(update=_set(self.cells)),
+            others.kappa if self.remodeling.kappa is None else self.remodeling.kappa,
+        )
+
+
+def _set(table: Table) -> dict[str, Any]:
+    return {name: value for name, value in table if value is not None}
 
 
 # ---------------------------------------------------------------- loads and time
@@ -609,8 +679,7 @@ class Solver(Table):
     method: Annotated[str, OneOf(SOLVER_METHODS, (AUTO,), REMOVED)] = Field(
         default=AUTO,
         description=f"'auto': 'direct' up to {SMALL_BODY} unknowns ({SMALL_REDUCTION} of a reduction), then 'lagged', "
-        f"above {LARGE} 'iterative'; "
-        f"on more ranks 'direct' up to {LARGE_ON_RANKS}, then 'iterative'; "
+        f"above {LARGE} (on several ranks {LARGE_ON_RANKS}) 'iterative'; "
         + "; ".join(f"{name!r}: {method.meaning}" for name, method in SOLVER_METHODS.items())
         + " (docs/speed.md).",
     )
@@ -659,9 +728,12 @@ class Solver(Table):
 
 FIELDS_BY_NAME = (
     "displacement", "deformation_gradient", "cauchy_stress", "cell_dimensions", "axis_1", "axis_2", "axis_3",
-    "fibre_angle", "fibre_angle_deformed", "chain_extension", "chains",
+    "fibre_angle", "fibre_angle_deformed", "chain_extension", "region", "chains",
 )  # fmt: skip
 """What `output.fields` may name (`results.fields`); "chains" are the lines of fields_chains.vtkhdf."""
+REGION = "region"  # the field of bodies with regions
+CONSTANT_FIELDS = ("axis_c", "axis_a", "axis_r", "depth", "station")
+"""What it may name beside: local axes of the elements, their depth and station, which do not change."""
 
 
 def _fields(value: Any) -> Any:
@@ -670,8 +742,9 @@ def _fields(value: Any) -> Any:
     if not isinstance(value, (list, tuple)) or not all(isinstance(name, str) for name in value):
         raise fault("must be true, false or a list of names of fields")
     for name in value:
-        if name not in FIELDS_BY_NAME:
-            raise fault(f"no such field; allowed are {', '.join(map(repr, FIELDS_BY_NAME))}", value=name)
+        if name not in (*FIELDS_BY_NAME, *CONSTANT_FIELDS):
+            allowed = ", ".join(map(repr, (*FIELDS_BY_NAME, *CONSTANT_FIELDS)))
+            raise fault(f"no such field; allowed are {allowed}", value=name)
     return tuple(value)
 
 
@@ -699,7 +772,7 @@ class Output(Table):
         "for the chain lines. What no name asks for is not computed.",
         json_schema_extra={
             "allowed": "true, false or a list of names of fields",
-            "anyOf": [{"type": "boolean"}, {"type": "array", "items": {"enum": [*FIELDS_BY_NAME]}}],
+            "anyOf": [{"type": "boolean"}, {"type": "array", "items": {"enum": [*FIELDS_BY_NAME, *CONSTANT_FIELDS]}}],
         },
     )
     columns: Annotated[tuple[str, ...], BeforeValidator(_columns)] = Field(

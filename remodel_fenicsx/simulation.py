@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from mpi4py import MPI
 
-from remodel_fenicsx.body.columns import columns_of
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.loading import Loading, LoadValues
 from remodel_fenicsx.body.reductions import AUTO, choice, explained
@@ -23,11 +22,11 @@ from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.model.laws import LAWS
 from remodel_fenicsx.results.columns import Observer
 from remodel_fenicsx.scene import Scene, SceneError
-from remodel_fenicsx.settings import Solver
+from remodel_fenicsx.settings import Properties, Solver
+from remodel_fenicsx.state.parameters import by_region
 from remodel_fenicsx.state.state import State
 from remodel_fenicsx.state.unit_cells import UnitCells
 from remodel_fenicsx.system.interrupts import take_back_signals
-from remodel_fenicsx.watch.buckling import BucklingWarning
 from remodel_fenicsx.watch.equilibrium_stability import EquilibriumStability
 from remodel_fenicsx.watch.locking import LockingWarning
 from remodel_fenicsx.watch.over_correction import OverCorrection, RestedCells
@@ -86,49 +85,55 @@ class Simulation:
             kinematics = FreeLength(kinematics, shape)
         self.unknown = kinematics.unknown(mesh, scene.mesh.degree)
         self.quadrature = Quadrature(mesh, scene.mesh.degree, kinematics.weight(mesh))
-        self.cells = UnitCells(self.quadrature, domain.element_number, domain.number_of_elements, scene.cells)
+        properties, local_axes = scene.properties(), shape.local_axes(domain, self.quadrature)
+        own = {name: properties[name].cells for name in scene.regions}
+        self.cells = UnitCells(self.quadrature, domain, scene.cells, local_axes, own)
         self.loading = Loading(domain, self.unknown, kinematics)
         shape.support(self.loading, scene.supports.ends)
         formulation = FORMULATIONS[scene.mesh.formulation]
         self.state = State(self.unknown, kinematics, self.cells, self.loading, formulation)
-        tissue = scene.material.tissue(scene.cells.end_to_end_length)
+        tissue, kappa = parameters_of(properties, domain)
         at_once = scene.time.is_equilibrium
         predictor: str = scene.solver.predictor
         if (at_once or scene.time.tolerance is not None) and predictor != "none":
             predictor = "responsive"  # steps have all lengths
         solver = scene.solver.model_copy(update={"predictor": predictor})
         parts = self.state, tissue, scene.remodeling, solver, self.load_values
-        self.stepper = Stepper(*parts, self._at_once(tissue, solver) if at_once else None)
+        self.stepper = Stepper(*parts, self._at_once(tissue, solver, kappa) if at_once else None, kappa)
         self.tissue = self.stepper.tissue
         counted = "negative_eigenvalues" in scene.output.columns
         self.stability = EquilibriumStability(self.stepper, scene.solver.unstable, every_step=counted)
-        columns = list(scene.output.columns)
+        more: list[str] = []
         self.control: Any = None  # `StepControl`
         if scene.time.tolerance is not None and not at_once:
             from remodel_fenicsx.evolution.step_control import StepControl
 
             settings = scene.time.tolerance, scene.time.step, scene.stops()
             self.control = StepControl(self.stepper, *settings)
-            columns += [TIME_ERROR] if TIME_ERROR not in columns else []
-        elif TIME_ERROR in columns:
+            more += [TIME_ERROR] if TIME_ERROR not in scene.output.columns else []
+        elif TIME_ERROR in scene.output.columns:
             from remodel_fenicsx.evolution.time_error import TimeError
 
             self.stepper.judge = TimeError(self.stepper).measure
-        self.observer = Observer(shape, self.stepper, columns_of(shape, columns, scene.loads))
+        self.observer = Observer(shape, self.stepper, scene.columns(more))
         self.warnings: list[Watcher] = [
             LockingWarning(self.stepper, formulation.locks),
-            BucklingWarning(self.stepper, shape.strut(scene.supports.ends)),
             VolumeLoss(self.stepper),
             RadialChains(self.stepper, shape.radial_share),
-            FrontsInLayers(self.stepper, shape, domain),
+            FrontsInLayers(self.stepper, shape),
         ]
+        strut = shape.strut(scene.supports.ends) if kinematics.reduced else None
+        if strut is not None:  # a whole body buckles by itself
+            from remodel_fenicsx.watch.buckling import BucklingWarning
+
+            self.warnings.insert(1, BucklingWarning(self.stepper, strut))
         if self.stepper.remodeling.law.remodels and not at_once:
             over_correction = OverCorrection(self.stepper)
             self.warnings.insert(0, over_correction)
             if self.stepper.remodeling.law.of_absolute_time:
                 self.warnings.append(RestedCells(self.stepper, over_correction))
 
-    def _at_once(self, tissue: Tissue, solver: Solver) -> Maker:
+    def _at_once(self, tissue: Tissue, solver: Solver, kappa: Any) -> Maker:
         """The coupling that goes to the equilibrium, with the steps of a stepper of its own on the same state."""
         from remodel_fenicsx.evolution import homeostasis
         from remodel_fenicsx.evolution.step_control import StepControl
@@ -138,10 +143,10 @@ class Simulation:
         if tolerance is None:
             falls = any(load.falls for load in scene.loads.values())
             tolerance = homeostasis.UNLOADING if falls else homeostasis.TOLERANCE
-        if scene.cells.initial == "random" and LAWS[settings.law].dimensions is not None:
+        if scene.has_random_cells and LAWS[settings.law].dimensions is not None:
             # cells that jump from rank to rank: no step is short enough, and passes swing
             settings, tolerance = settings.model_copy(update={"coupling": "relaxed"}), homeostasis.COARSE
-        way = Stepper(self.state, tissue, settings, solver, self.load_values)
+        way = Stepper(self.state, tissue, settings, solver, self.load_values, kappa=kappa)
         way.coupling.longest = min(way.coupling.longest, homeostasis.LONGEST)
         control = StepControl(way, tolerance, scene.time.step, stops)
         until = scene.solver.model_copy(update={"maximum_iterations": homeostasis.LIMIT_ITERATIONS})
@@ -191,6 +196,19 @@ class Simulation:
         self.stepper.close()
 
 
+def parameters_of(properties: Mapping[str, Properties], domain: Domain) -> tuple[Tissue, Any]:
+    """Tissue and kappa of a scene's regions: numbers where these agree, DG0 Functions where they differ.
+
+    The parameters of a tissue are all of one kind, so that there are two kernels, not one for every choice of them.
+    """
+    tissues = {name: one.tissue for name, one in properties.items()}
+    kappas = {name: one.kappa for name, one in properties.items()}
+    tissue, kappa = next(iter(tissues.values())), next(iter(kappas.values()))
+    if any(other != tissue for other in tissues.values()):
+        tissue = tissue.map(lambda key, _: by_region(domain, {name: getattr(t, key) for name, t in tissues.items()}))
+    return tissue, kappa if len(set(kappas.values())) == 1 else by_region(domain, kappas)
+
+
 def with_kinematics(scene: Scene, domain: Domain | None = None) -> Scene:
     """The scene with the kinematics that it is run with, where it leaves the choice. A mesh of one's own is full."""
     if scene.model.kinematics != AUTO:
@@ -227,6 +245,8 @@ def checked_domain(domain: Domain, scene: Scene) -> Domain:
     for name in scene.regions:
         if name not in domain.regions:
             raise SceneError(f"regions.{name}: the mesh has no such region; it has {', '.join(domain.regions)}")
+    if scene.regions and shape.is_filled_by_regions and (others := set(domain.regions) - set(scene.regions)):
+        raise SceneError(f"regions.{min(others)}: missing; it is a region of the mesh")
     needed = () if KINEMATICS[scene.model.kinematics].reduced else shape.faces
     missing = [face for face in needed if face not in domain.faces]
     if missing:

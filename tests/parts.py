@@ -145,10 +145,8 @@ class Body:
 
     def supported(self) -> Body:
         """The same, held and loaded as its shape is in a scene."""
-        dimensions = {k: v for k, v in self.domain.dimensions.items() if k != "radius"}
-        shape: Shape = SHAPES[self.domain.shape](shape=self.domain.shape, **dimensions)
         self.loading = Loading(self.domain, self.displacement)
-        shape.support(self.loading)
+        shape_of(self.domain).support(self.loading)
         return self
 
     def set_displacement(self, values: np.ndarray) -> None:
@@ -161,11 +159,19 @@ class Body:
         return self.displacement.function_space.tabulate_dof_coordinates()
 
 
+def shape_of(domain: Domain) -> Shape:
+    """The shape whose mesh it is."""
+    dimensions = {name: value for name, value in domain.dimensions.items() if name != "radius"}
+    made: Shape = SHAPES[domain.shape](shape=domain.shape, **dimensions)
+    return made
+
+
 def body(domain: Domain, cells: Cells, degree: int = 1) -> Body:
     """Cells, quadrature and displacement of a mesh."""
     displacement = FullKinematics().unknown(domain.mesh, degree)
     quadrature = Quadrature(domain.mesh, degree)
-    unit_cells = UnitCells(quadrature, domain.element_number, domain.number_of_elements, cells)
+    local_axes = shape_of(domain).local_axes(domain, quadrature)
+    unit_cells = UnitCells(quadrature, domain, cells, local_axes)
     return Body(domain, displacement, quadrature, unit_cells, Loading(domain, displacement))
 
 

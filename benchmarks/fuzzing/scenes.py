@@ -239,3 +239,6 @@ def _rarely(random: Random, scene: Values, stiffness: float) -> None:
     if random.random() < 0.1:
         scene |= {"name": f"scene {random.randrange(100)}", "format": 2}
         scene["material"] |= {"matrix": "neo-hookean", "chain": "wormlike"}
+    if scene["geometry"]["shape"] == "tube" and random.random() < 0.1:  # two layers of one tissue
+        middle = (scene["geometry"]["inner_radius"] + scene["geometry"]["outer_radius"]) / 2
+        scene["regions"] = {"inside": {"outer_radius": middle}, "outside": {}}

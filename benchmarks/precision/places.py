@@ -24,7 +24,7 @@ def run(scene: Scene, folder: Path) -> None:
     for _ in simulation.steps():
         pass
     coordinates, cells = simulation.quadrature.coordinates, simulation.cells
-    angles = scene.geometry.fibre_angle(cells.dimension_values, cells.axis_values, coordinates).ravel()
+    angles = scene.geometry.fibre_angle(cells.dimension_values, cells.axis_values, cells.local_axes.axes).ravel()
     radii = np.hypot(coordinates[..., 0], coordinates[..., 1]).ravel()
     simulation.close()
     exact = solve_radial(end=scene.time.end, step=scene.time.step)

@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from remodel_fenicsx.model.energy import Tissue
+
 Array = NDArray[np.float64]
 NEAR_LOCKING = 0.9  # r/L that chains of the inner face are thought to reach
 WALL_POINTS = 100  # through the wall
@@ -52,20 +54,18 @@ def expected_thrust(scene: Any) -> float:
     """Largest thrust on the way over Euler's load, as far as the scene's numbers tell; 0 where nothing pushes.
 
     The wall is taken as an incompressible neo-Hookean one of the tissue's small-strain modulus, a closed form, with
-    Lame's term for a compressible one beside it. Where a force is given, that and the lumen are all there is.
+    Lame's term for a compressible one beside it. Where a force is given, that and the lumen are all there is. Of
+    several regions it has the mean over the section.
     """
     shape = scene.geometry
     strut = shape.strut(scene.supports.ends)
     if strut is None or strut.radii is None:
         return 0.0
     inner, outer = strut.radii
-    tissue = scene.material.tissue(scene.cells.end_to_end_length)
-    lame, shear, longest = tissue.lame_lambda, tissue.lame_mu, math.inf
-    ratio, modulus = lame / (2 * (lame + shear)), shear * (3 * lame + 2 * shear) / (lame + shear)
-    if tissue.chain is not None:
-        modulus += tissue.repulsion_modulus * tissue.end_to_end_length**2  # isotropic cells pulled along one axis
-    if tissue.locking_length is not None:
-        longest = NEAR_LOCKING * tissue.locking_length / tissue.end_to_end_length
+    shares, properties = shape.section_shares(scene.regions), scene.properties()
+    parts = [(share, _stiffness(properties[name].tissue)) for name, share in shares.items()]
+    ratio, modulus = (sum(share * part[k] for share, part in parts) for k in (0, 1))
+    longest = min(part[2] for _, part in parts)
 
     def thrust(time: float) -> float:
         loads = {name: load.value * load.factor(time) for name, load in scene.loads.items()}
@@ -79,6 +79,17 @@ def expected_thrust(scene: Any) -> float:
     corners = {float(time) for load in scene.loads.values() for time, _ in load.ramp}
     largest = max((thrust(time) for time in corners), default=0.0)
     return max(0.0, largest) / strut.euler_load(modulus * math.pi / 4 * (outer**4 - inner**4), strut.length)
+
+
+def _stiffness(tissue: Tissue) -> tuple[float, float, float]:
+    """Poisson's ratio of the matrix, Young's modulus of matrix and network, and the stretch near which chains lock."""
+    lame, shear, longest = tissue.lame_lambda, tissue.lame_mu, math.inf
+    ratio, modulus = lame / (2 * (lame + shear)), shear * (3 * lame + 2 * shear) / (lame + shear)
+    if tissue.chain is not None:
+        modulus += tissue.repulsion_modulus * tissue.end_to_end_length**2  # isotropic cells pulled along one axis
+    if tissue.locking_length is not None:
+        longest = NEAR_LOCKING * tissue.locking_length / tissue.end_to_end_length
+    return ratio, modulus, longest
 
 
 def inflated(pressure: float, inner: float, outer: float, stretch: float, longest: float) -> tuple[float, float]:

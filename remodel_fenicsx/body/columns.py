@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Sequence
+from collections.abc import Callable, Container, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -61,8 +61,8 @@ def _profile_value(number: int, measurement: Any) -> float:
 
 
 def _profile(measurement: Any) -> Array:
-    quadrature, shape = measurement.quadrature, measurement.observer.shape
-    hats = measurement.tool("hats", lambda: profile_weights(shape.depth(quadrature.coordinates)))
+    quadrature, local_axes = measurement.quadrature, measurement.state.cells.local_axes
+    hats = measurement.tool("hats", lambda: profile_weights(local_axes.depth))
     return np.array([quadrature.mean_of_known(measurement.fibre_angle, hats[..., k]) for k in range(PROFILE_PLACES)])
 
 
@@ -81,9 +81,23 @@ _PROFILE_COLUMNS = tuple(
 # ---------------------------------------------------------------- of regions
 
 
-def columns_of_region(name: str) -> tuple[str, str]:
-    """Names of the columns that a region has."""
-    return f"fibre_angle_{name}", f"max_chain_extension_{name}"
+def columns_of_region(name: str) -> tuple[Column, Column]:
+    """What a history says of each region of a scene."""
+    return (
+        Column(
+            f"fibre_angle_{name}",
+            "degrees",
+            f"mean of the reference fibre angle over the region `{name}`, over the chains that have one",
+            lambda m: float(m.quadrature.mean_of_known(m.fibre_angle, m.elements_of_region(name))),
+        ),
+        Column(
+            f"max_chain_extension_{name}",
+            "",
+            f"largest r/L in the region `{name}` (0 where no chain locks)",
+            lambda m: float(m.quadrature.maximum(m.chain_extension * m.elements_of_region(name)[:, None])),
+            extreme=True,
+        ),
+    )
 
 
 # ---------------------------------------------------------------- which a history has
@@ -169,7 +183,10 @@ COLUMNS_ON_REQUEST: dict[str, Column] = {
 
 
 def columns_of(
-    shape: Shape | type[Shape], requested: Sequence[str] = (), loads: Container[str] | None = None
+    shape: Shape | type[Shape],
+    requested: Sequence[str] = (),
+    loads: Container[str] | None = None,
+    regions: Iterable[str] = (),
 ) -> tuple[Column, ...]:
     """The columns of a shape's history, in the order of the file, those on request last.
 
@@ -184,6 +201,8 @@ def columns_of(
     loads
         Names of the loads that there are; default: all of the shape's. The column of a load that frees the length of
         the body is on request where it is not among them.
+    regions
+        Names of the scene's regions.
 
     Raises
     ------
@@ -196,7 +215,8 @@ def columns_of(
         if not kind.frees_length or loads is None or name in loads or kind.column_name(name) in requested
     )
     always = (FIRST_COLUMN, *of_loads)
-    others = (*shape.columns, *COLUMNS.values())
+    of_regions = [column for name in regions for column in columns_of_region(name)]
+    others = (*shape.columns, *of_regions, *COLUMNS.values())
     chosen = [column for column in others if column.name in requested]
     known = {column.name for column in (*always, *others)}
     on_request = columns_on_request(shape)

@@ -192,7 +192,7 @@ def mirrored(places: NDArray[np.float64]) -> NDArray[np.float64]:
 def same_cells(scene: Any) -> str | None:
     """Random cells are other ones in every element."""
     number = scene.geometry.number_of_elements * scene.mesh.refinement**3
-    if scene.cells.initial != "random" or (number == 1 and scene.mesh.element == "hexahedron"):
+    if not scene.has_random_cells or (number == 1 and scene.mesh.element == "hexahedron"):
         return None
     return f"cells.initial = 'random' draws other cells for each of {number} elements"
 
@@ -205,8 +205,8 @@ def symmetric_law(scene: Any) -> str | None:
 
 def round_about_z(scene: Any) -> str | None:
     """Cells that are the same in every half-plane through the z axis."""
-    axes, (first, second, _) = scene.cells.axes, _dimensions(scene)
-    if axes == "cylindrical" or (axes == "global" and first == second == 0):
+    axes = scene.cells.axes
+    if axes == "cylindrical" or (axes == "global" and all(a == b == 0 for a, b, _ in _dimensions(scene))):
         return None
     return f"cells.axes = {axes!r} makes another tube along x than along the diagonal"
 
@@ -219,12 +219,15 @@ def symmetric_planes(scene: Any) -> str | None:
 
 def homogeneous(scene: Any) -> str | None:
     """Cells that are the same everywhere, and stay so."""
-    axes, (first, second, third) = scene.cells.axes, _dimensions(scene)
+    axes, lengths = scene.cells.axes, _dimensions(scene)
+    if len(lengths) > 1:
+        return "regions may make cells, and stress, that are not the same everywhere"
     if axes == "global":
         return None
     if axes != "cylindrical":
         return f"cells.axes = {axes!r} may make cells that are not the same everywhere"
     # passes give dimensions to ranks: with l1 = l3 != l2 the cells would differ after the first one
+    ((first, second, third),) = lengths
     stays = first == third and (second == first or not LAWS[scene.remodeling.law].remodels)
     return None if stays else "cells.axes = 'cylindrical' makes cells, and stress, that are not the same everywhere"
 
@@ -246,7 +249,6 @@ def known_loads(name: str) -> Rule:
     return rule
 
 
-def _dimensions(scene: Any) -> tuple[float, float, float]:
-    """l1, l2, l3 of the first cell at the start."""
-    first, second, third = np.asarray(scene.cells.dimensions(1)[0], dtype=float)
-    return float(first), float(second), float(third)
+def _dimensions(scene: Any) -> list[tuple[float, ...]]:
+    """l1, l2, l3 of the first cell at the start, of each region."""
+    return [tuple(map(float, properties.cells.dimensions(1)[0])) for properties in scene.properties().values()]

@@ -17,6 +17,7 @@ from remodel_fenicsx.body.gmsh_model import length_fault
 from remodel_fenicsx.body.reductions import Reduction, homogeneous, known_loads, same_cells, symmetric_law, unturned
 from remodel_fenicsx.body.whole import Body
 from remodel_fenicsx.model.cells import angle_to_axis
+from remodel_fenicsx.model.local_axes import LocalAxes
 from remodel_fenicsx.schema.tables import Table, fault
 from remodel_fenicsx.schema.units import Dimension, LengthUnit
 from remodel_fenicsx.settings import Mesh, Region
@@ -26,6 +27,7 @@ if TYPE_CHECKING:  # shapes are part of every scene: they are read without dolfi
 
     from remodel_fenicsx.body.domain import Domain
     from remodel_fenicsx.body.loading import Loading
+    from remodel_fenicsx.fem.quadrature import Quadrature
 
 Array = NDArray[np.float64]
 
@@ -90,7 +92,7 @@ class Shape(Table):
     angle_layers
         Columns of the fibre angle that are means over one layer of elements, each with the layer's `depth`.
     axis_kinds
-        What `cells.axes` may be (`model.cells.AXES`).
+        What `cells.axes` may be (`model.local_axes.AXES`).
     number_of_elements
         Hexahedra of the mesh with refinement 1.
     faces
@@ -106,10 +108,14 @@ class Shape(Table):
         What `depth` goes through, where it is 0 and where it is 1.
     angle_in_words
         Where a fibre angle of 0 degrees and one of 90 point.
+    constant_fields
+        Of `settings.CONSTANT_FIELDS`, those that `output.fields = true` stands for too.
     defaults
         Defaults of other tables that this shape changes, under the keys of preset and scene.
     has_regions
         Whether a scene may give the body `[regions.NAME]`, named parts with tissue of their own.
+    is_filled_by_regions
+        Whether the regions of a scene, where it has some, are all of the body.
     """
 
     loads: ClassVar[dict[str, LoadKind]]
@@ -124,8 +130,10 @@ class Shape(Table):
     ends_that_free_length: ClassVar[tuple[str, ...]] = ()
     depth_in_words: ClassVar[tuple[str, str, str]] = ("along the body", "bottom", "top")
     angle_in_words: ClassVar[tuple[str, str]] = ("along the load", "across")
+    constant_fields: ClassVar[tuple[str, ...]] = ()
     defaults: ClassVar[dict[str, Any]] = {}
     has_regions: ClassVar[bool] = False
+    is_filled_by_regions: ClassVar[bool] = False
 
     shape: str = Field(description="Which body it is.")
     length_unit: LengthUnit = None
@@ -154,9 +162,28 @@ class Shape(Table):
         """What of the body buckles under thrust, held as `supports.ends` says; None if nothing bends it."""
         return None
 
+    def axes_at(self, coordinates: Array) -> Array:
+        """Local axes at places (..., 3), rows circumferential, axial, radial: here y, z, x, axial along the load."""
+        return np.broadcast_to(np.roll(np.eye(3), -1, axis=0), (*coordinates.shape[:-1], 3, 3))
+
     def depth(self, coordinates: Array) -> Array:
         """How far places (..., 3) are through the body, from 0 to 1: here along z."""
         return np.asarray(coordinates[..., 2] / self.axial_length, dtype=np.float64)
+
+    def station(self, coordinates: Array) -> Array:
+        """How far places (..., 3) are along the body, from 0 to 1: here along z."""
+        return np.asarray(coordinates[..., 2] / self.axial_length, dtype=np.float64)
+
+    def local_axes(self, domain: Domain, quadrature: Quadrature) -> LocalAxes:
+        """Axes, depth and station at the points of a mesh of the body: here functions of the place."""
+        places = quadrature.coordinates
+        return LocalAxes(
+            places,
+            lambda: self.axes_at(places),
+            lambda: self.depth(places),
+            lambda: self.station(places),
+            lambda: self.depth(domain.mesh.geometry.x),
+        )
 
     @property
     def name(self) -> str:
@@ -183,7 +210,22 @@ class Shape(Table):
         return self.build(mesh, comm)
 
     def check_regions(self, regions: Mapping[str, Region], mesh: Mesh) -> None:
-        """Refuse what the regions of a scene ask of the body and it cannot have: raise a `fault` that names the key."""
+        """Refuse what the regions of a scene ask of the body and it cannot have: raise a `fault` that names the key.
+
+        Here they come with the mesh: no radius says where they end.
+        """
+        for name, region in regions.items():
+            if region.outer_radius is not None:
+                rule = f"the regions of a {self.name} come with its mesh; only layers of a tube have an outer radius"
+                raise fault(rule, f"regions.{name}.outer_radius", region.outer_radius)
+
+    def section_shares(self, regions: Mapping[str, Region]) -> dict[str, float]:
+        """Share of every section across z that is in a region, by its name; "" is what is beside them."""
+        return {"": 1.0}
+
+    def region_depths(self, regions: Mapping[str, Region]) -> dict[str, tuple[float, float]]:
+        """Where regions that lie one behind the other begin and end in `depth`; empty where they do not."""
+        return {}
 
     @abstractmethod
     def hold(self, loading: Loading) -> None:
@@ -209,14 +251,14 @@ class Shape(Table):
             else:
                 kind.add(self, loading, name)
 
-    def fibre_angle(self, dimensions: Array, axes: Array, coordinates: Array) -> Array:
+    def fibre_angle(self, dimensions: Array, axes: Array, local: Array) -> Array:
         """Angle of the chain direction in degrees; here to the load axis z.
 
         Parameters
         ----------
-        dimensions, axes, coordinates
-            l_I (..., 3), axes as rows (..., 3, 3) and places (..., 3), all in the reference or all in the deformed
-            configuration.
+        dimensions, axes, local
+            l_I (..., 3), axes of the cells and local axes of the body as rows (..., 3, 3), all in the reference or all
+            in the deformed configuration.
 
         Returns
         -------
@@ -224,7 +266,7 @@ class Shape(Table):
         """
         return angle_to_axis(dimensions, axes, np.array([0.0, 0.0, 1.0]))
 
-    def radial_share(self, dimensions: Array, axes: Array, coordinates: Array) -> Array:
+    def radial_share(self, dimensions: Array, axes: Array, local: Array) -> Array:
         """Share of the chains, by their squared length, that `fibre_angle` does not see; parameters as there."""
         return np.zeros(dimensions.shape[:-1])
 

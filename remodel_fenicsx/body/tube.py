@@ -25,9 +25,10 @@ from remodel_fenicsx.body.reductions import (
     symmetric_law,
     symmetric_planes,
 )
-from remodel_fenicsx.body.shape import Array, LoadKind, Shape, check_lengths
+from remodel_fenicsx.body.shape import Array, LoadKind, check_lengths
+from remodel_fenicsx.body.walled import ANGLE_IN, Walled
 from remodel_fenicsx.body.whole import Body, Corners, divided_along, extended, mirrored_twice, revolved
-from remodel_fenicsx.model.cells import pitch_angle, radial_share
+from remodel_fenicsx.model.cells import cylindrical_axes
 from remodel_fenicsx.schema.tables import fault, shown
 from remodel_fenicsx.schema.units import FORCE, LENGTH, STRESS
 from remodel_fenicsx.settings import Mesh, Region
@@ -187,9 +188,6 @@ def _layer_angle(share: float) -> Callable[[Any], float]:
     return value
 
 
-_LAYERS = {"fibre_angle_inner": 0.0, "fibre_angle_middle": 0.5, "fibre_angle_outer": 1.0}
-
-
 def _add_pressure(loading: Loading, name: str) -> None:
     (loading.add_cavity_pressure if loading.has_caps else loading.add_follower_pressure)(name, "inner")
 
@@ -208,13 +206,7 @@ def _reduced_axial_force(m: Any) -> float:
     return float(m.end_force("inner").reduced(m.state.loading.values["pressure"]))
 
 
-_ANGLE = (
-    "mean of the reference angle, from circumferential (0) to axial (90 degrees), over the chains that do not point "
-    "out of the wall, in the elements that touch"
-)
-
-
-class Tube(Shape):
+class Tube(Walled):
     """A thick-walled tube about z under inner pressure and axial elongation: the artery of the paper's Fig. 7.
 
     Its ends stay in their planes; they are free to move radially, clamped, or closed by caps (`supports.ends`). Inner
@@ -255,11 +247,10 @@ class Tube(Shape):
         Column(
             "outer_radius", "length", "mean distance from the axis over the deformed outer face", _mean_radius("outer")
         ),
-        Column("fibre_angle_inner", "degrees", f"{_ANGLE} R_i", _layer_angle(_LAYERS["fibre_angle_inner"])),
-        Column("fibre_angle_middle", "degrees", f"{_ANGLE} (R_i + R_o)/2", _layer_angle(_LAYERS["fibre_angle_middle"])),
-        Column("fibre_angle_outer", "degrees", f"{_ANGLE} R_o", _layer_angle(_LAYERS["fibre_angle_outer"])),
+        Column("fibre_angle_inner", "degrees", f"{ANGLE_IN} that touch R_i", _layer_angle(0.0)),
+        Column("fibre_angle_middle", "degrees", f"{ANGLE_IN} that touch (R_i + R_o)/2", _layer_angle(0.5)),
+        Column("fibre_angle_outer", "degrees", f"{ANGLE_IN} that touch R_o", _layer_angle(1.0)),
     )
-    angle_layers: ClassVar[dict[str, float]] = _LAYERS
     columns_on_request: ClassVar[tuple[Column, ...]] = (
         Column(
             "reduced_axial_force",
@@ -267,12 +258,7 @@ class Tube(Shape):
             "`axial_force` less the pressure times the lumen's area at that end, p pi r_i^2: what a machine measures",
             _reduced_axial_force,
         ),
-        Column(
-            "radial_share",
-            "",
-            "volume mean of A_rr / tr A: 0 where all chains lie in the wall, 1 where they point out of it",
-            lambda m: m.quadrature.mean(m.radial_share),
-        ),
+        *Walled.columns_on_request,
     )
     axis_kinds: ClassVar[tuple[str, ...]] = ("global", "cylindrical")
     number_of_elements: ClassVar[int] = 1536
@@ -284,9 +270,8 @@ class Tube(Shape):
         "closed": lambda shape, loading: shape.close(loading),
     }
     ends_that_free_length: ClassVar[tuple[str, ...]] = ("closed",)
-    depth_in_words: ClassVar[tuple[str, str, str]] = ("through the wall", "inside", "outside")
-    angle_in_words: ClassVar[tuple[str, str]] = ("around", "along")
     has_regions: ClassVar[bool] = True
+    is_filled_by_regions: ClassVar[bool] = True
     # with global axes a tube of isotropic cells would not stay round in the first step
     defaults: ClassVar[dict[str, Any]] = {"cells": {"axes": "cylindrical"}}
 
@@ -315,6 +300,18 @@ class Tube(Shape):
     def check_regions(self, regions: Mapping[str, Region], mesh: Mesh) -> None:
         """Regions are layers of the wall, from the lumen outwards by their outer radii."""
         check_layers(self.inner_radius, self.outer_radius, _counts(mesh)[1], regions)
+
+    def section_shares(self, regions: Mapping[str, Region]) -> dict[str, float]:
+        """Of the wall."""
+        wall = _wall(self, max(1, len(regions)), regions)
+        areas = np.diff(np.square(wall.radii)) * math.pi / self.section_area
+        return dict(zip(wall.names if regions else [""], map(float, areas), strict=True))
+
+    def region_depths(self, regions: Mapping[str, Region]) -> dict[str, tuple[float, float]]:
+        """Of the layers, from the inside outwards."""
+        wall = _wall(self, max(1, len(regions)), regions)
+        places = [(radius - wall.radii[0]) / (wall.radii[-1] - wall.radii[0]) for radius in wall.radii]
+        return dict(zip(wall.names, itertools.pairwise(places), strict=True)) if regions else {}
 
     def hold(self, loading: Loading) -> None:
         """u_z = 0 at the bottom, the rigid motions held at three of its nodes."""
@@ -369,13 +366,13 @@ class Tube(Shape):
         depth: Array = np.clip((radii - self.inner_radius) / (self.outer_radius - self.inner_radius), 0.0, 1.0)
         return depth
 
-    def fibre_angle(self, dimensions: Array, axes: Array, coordinates: Array) -> Array:
-        """Angle in degrees of the chain direction in the wall, from circumferential (0) to axial (90); NaN across."""
-        return pitch_angle(dimensions, axes, coordinates)
+    def axes_at(self, coordinates: Array) -> Array:
+        """About the z axis."""
+        return cylindrical_axes(coordinates)
 
-    def radial_share(self, dimensions: Array, axes: Array, coordinates: Array) -> Array:
-        """A_rr / tr A."""
-        return radial_share(dimensions, axes, coordinates)
+    def station(self, coordinates: Array) -> Array:
+        """Along z."""
+        return np.asarray(coordinates[..., 2] / self.length, dtype=np.float64)
 
 
 def whole_tube(

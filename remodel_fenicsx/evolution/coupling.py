@@ -15,7 +15,6 @@ from remodel_fenicsx.evolution.predictor import PREDICTORS, LoadStep
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.energy import Tissue
-from remodel_fenicsx.model.tensor_law import Target, weight_of_the_end
 from remodel_fenicsx.settings import Solver
 from remodel_fenicsx.solver.continuation import Blend, Change, Work
 from remodel_fenicsx.solver.equilibrium import Equilibrium
@@ -24,11 +23,7 @@ from remodel_fenicsx.state.memory import Numbers
 from remodel_fenicsx.state.state import State
 
 Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 log = logging.getLogger(__name__)
-
-NEVER = -1.0  # time of a target that there has not been
-COUNTS = 0.01  # share of a target from which on it is one: what is less moves the cells less than a step is off
 
 
 class Coupling(Protocol):
@@ -228,112 +223,6 @@ class Relaxed(Staggered):
     def __init__(self, state: State, tissue: Tissue, remodeling: RemodelingPass, settings: Solver):
         super().__init__(state, tissue, remodeling, settings)
         self.share = remodeling.settings.relaxation_factor
-
-
-class Extrapolated(Staggered):
-    """Remodel, then solve: sE + h/2 d(sE)/dt from the targets of the last two states, h the step (docs/theory.md).
-
-    Cells, stress and row belong together at the end of a step. A point that has had no target yet, or none for a while,
-    begins with the one at the end of its first step under tension: the step is solved, those points remodel over it,
-    and it is solved again. Before the first step that are all points. For laws with a `target`.
-    """
-
-    order, accumulates, longest = 2, True, 0.5
-
-    def __init__(self, state: State, tissue: Tissue, remodeling: RemodelingPass, settings: Solver):
-        super().__init__(state, tissue, remodeling, settings)
-        self._targets = state.cells.quadrature.function("targets", (2, 11))  # the last first: E, s, its time
-        self._values[..., 10] = NEVER
-        state.remember(self._targets)
-        self._power = 0.0
-        self._start: UnitCell  # the cells at the start of the step
-        self._found: Target  # of the solved state
-        self._begins: Flags  # points whose first step with a target this is
-        self._better: UnitCell | None = None
-
-    @property
-    def better(self) -> UnitCell | None:
-        """The cells that the targets at both ends give together; where a point begins, the target of its end."""
-        return self._better
-
-    @property
-    def _values(self) -> Array:
-        return self.state.cells.quadrature.values(self._targets, (2, 11))
-
-    def _known(self, age: int) -> Target:
-        """The last target (0) or the one before (1) of all points in one row; zero where there was none."""
-        values = self._values.reshape(-1, 2, 11)[:, age]
-        return Target(values[:, :9].reshape(-1, 3, 3), values[:, 9])
-
-    def solve(self, time: float, loads: LoadValues) -> Work:
-        """New cells, and equilibrium at `time` with them.
-
-        Raises
-        ------
-        StepFailure
-            If no admissible equilibrium is found.
-        """
-        cells = self.state.cells
-        self._start = UnitCell(*(values.copy() for values in cells.point_cells[:2]))
-        expected = self._extrapolated(time)
-        self._follow(expected, time)
-        work = super().solve(time, loads)
-        self._found = self.remodeling.target(self._residual)
-        self._begins = (self._known(0).share < COUNTS) & (self._found.share >= COUNTS)
-        if not self._anywhere(self._begins):
-            return work
-        shape = cells.quadrature.shape
-        cells.set(self._start.dimensions.reshape(*shape, 3), self._start.axes.reshape(*shape, 3, 3))
-        self._follow(expected.where(self._begins, self._found), time)
-        again = super().solve(time, loads)
-        self._found = self.remodeling.target(self._residual)
-        again.substeps += work.substeps - 1
-        again.count(work)
-        return again
-
-    def remodel(self, time: float) -> float:
-        """Remember the target of the solved state; the cells are those of the row."""
-        target, values = self._found, self._values
-        if self.compares:
-            duration = time - self.state.time
-            mean = self._mean(target, duration).where(self._begins, target)
-            self._better = self.remodeling.followed(mean, duration, self._start)
-        values[:, :, 1] = values[:, :, 0]
-        values[:, :, 1, 10][self._begins.reshape(values.shape[:2])] = NEVER  # its step had the target of its end
-        values[:, :, 0, :9] = target.direction.reshape(*values.shape[:2], 9)
-        values[:, :, 0, 9] = target.share.reshape(values.shape[:2])
-        values[:, :, 0, 10] = time
-        return self._power
-
-    def _mean(self, target: Target, duration: float) -> Target:
-        """What counts of the targets at the start and at the end of the step."""
-        return self._known(0).towards(target, weight_of_the_end(self.remodeling.settings.kappa * duration))
-
-    def _extrapolated(self, time: float) -> Target:
-        times = self._values.reshape(-1, 2, 11)[:, :, 10]
-        back, known = np.zeros(len(times)), times[:, 1] != NEVER
-        back[known] = (time - times[known, 0]) / 2 / (times[known, 0] - times[known, 1])
-        return self._known(0).towards(self._known(1), -back)
-
-    def _follow(self, target: Target, time: float) -> None:
-        """Cells after the step; where an extrapolated target would make A indefinite, the last target itself counts."""
-        duration = time - self.state.time
-        self._power = 0.0
-        if not self._anywhere(target.share != 0.0):
-            return
-        asked = self.remodeling.followed(target, duration)
-        lost = ~np.isfinite(asked.dimensions).all(axis=-1)
-        if lost.any():
-            asked = self.remodeling.followed(target.where(lost, self._known(0)), duration)
-        points = self._anywhere(lost)
-        if points and self.state.comm.rank == 0:
-            log.info("time %g: %d points follow the last stress, not the extrapolated one", time, points)
-        self._power = self.remodeling.replace(asked, self.state.deformation_gradient(), duration)
-
-    def _anywhere(self, points: Flags) -> int:
-        """How many there are on all ranks."""
-        quadrature = self.state.cells.quadrature
-        return int(self.state.comm.allreduce(int(quadrature.owned(points.reshape(quadrature.shape)).sum())))
 
 
 Maker = Callable[[State, Tissue, RemodelingPass, Solver], Coupling]

@@ -24,7 +24,7 @@ from remodel_fenicsx.solver.continuation import Work
 from remodel_fenicsx.solver.equilibrium import Equilibrium
 from remodel_fenicsx.solver.newton import GuardedNewton, SolveFailure
 from remodel_fenicsx.state.state import Snapshot
-from remodel_fenicsx.system.terminal import NOTICE
+from remodel_fenicsx.system import NOTICE
 
 log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
@@ -141,7 +141,7 @@ class Homeostasis:
             ahead, solved = state.snapshot(), state.equilibrium_cells
             self._held = self._held or ahead
             state.cells.set(solved.dimension_values, solved.axis_values)  # those that the stress belongs to
-            if self._is_over(time, loads, self.remodeling.settings.kappa * (state.time - held), work):
+            if self._is_over(time, loads, self.remodeling.slowest * (state.time - held), work):
                 return
             state.restore(ahead)
 
@@ -154,7 +154,7 @@ class Homeostasis:
             self.near, self.tries = AGAIN * rest, self.tries - 1
             if self._arrived(self.limit, time, loads, towards, work):
                 return True
-        soon = self.state.time + 1 / self.remodeling.settings.kappa
+        soon = self.state.time + 1 / self.remodeling.slowest
         if self._largest(self._change_by_a_pass(soon, work.residual)) <= REST:
             return True
         if waiting > LONGEST_HOLD:

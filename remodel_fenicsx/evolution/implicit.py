@@ -67,7 +67,7 @@ class Implicit:
         from_start = self._from_start(time, work.residual if self.state.number == 0 else self.state.numbers[RESIDUAL])
         self._solve(time, loads, work, answering=True)
         if from_start is not None:
-            weight = weight_of_the_end(self.remodeling.settings.kappa * (time - self.state.time))
+            weight = weight_of_the_end(self.remodeling.kappa * (time - self.state.time))
             self._better = relaxed(from_start, self.answering.asked, weight)
         work.substeps -= int(self.state.number == 0)
         self.state.numbers[RESIDUAL] = work.residual

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from numbers import Real
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,7 +12,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from remodel_fenicsx.fem import jit
-from remodel_fenicsx.fem.assembly import over_ranks
+from remodel_fenicsx.fem.assembly import coefficient, over_ranks, point_values
 from remodel_fenicsx.kernels.library import with_kernels
 from remodel_fenicsx.model import spectral
 from remodel_fenicsx.model.cells import UnitCell, structure_tensor
@@ -64,15 +65,25 @@ class RemodelingPass:
         Parameters of matrix and chains.
     settings
         Driver, law, frame, pairing, kappa and rotation time.
+    kappa
+        In place of that of the settings: a number, a Constant or a DG0 Function as it is now.
+
+    Attributes
+    ----------
+    kappa
+        Speed of remodeling: a number, or of all points in one row (n,).
+    slowest, fastest
+        The smallest one above 0 and the largest one in the body; 0 where all are.
     """
 
-    def __init__(self, state: State, tissue: Tissue, settings: Remodeling):
+    def __init__(self, state: State, tissue: Tissue, settings: Remodeling, kappa: Any = None):
         self.state, self.settings = state, settings
         self.quadrature = state.cells.quadrature
         self.tissue = with_kernels(on_mesh(tissue, self.quadrature.mesh), state.comm)
         self.parameters = Parameters(self.tissue, self.quadrature)
         self.driver, self.law, self.frame = DRIVERS[settings.driver], LAWS[settings.law], FRAMES[settings.frame]
-        if settings.kappa == 0.0 and self.law.asks_kappa:  # cells that never move need no pass
+        self._set_kappa(settings.kappa if kappa is None else kappa)
+        if self.fastest == 0.0 and self.law.asks_kappa:  # cells that never move need no pass
             self.law = LAWS["none"]
         if not self.law.remodels:
             return
@@ -86,6 +97,16 @@ class RemodelingPass:
         # one stacked expression: the deformation gradient comes at no cost with the driver
         stacked = ufl.as_vector([t[i, j] for t in (F, tensor) for i in range(3) for j in range(3)])
         self._expression = jit.expression(stacked, self.quadrature.points)
+
+    def _set_kappa(self, kappa: Any) -> None:
+        self.kappa: Any = kappa
+        self.slowest = self.fastest = kappa
+        if isinstance(kappa, Real):
+            return
+        at_points = point_values(coefficient(self.quadrature.mesh, "kappa", kappa), self.quadrature)
+        self.fastest = self.quadrature.maximum(at_points)
+        slowest = self.quadrature.minimum(np.where(at_points > 0.0, at_points, np.inf))
+        self.slowest, self.kappa = slowest if np.isfinite(slowest) else 0.0, at_points.reshape(-1)
 
     def driving_tensor(self) -> tuple[Array, Array]:
         """F and the symmetric driving tensor at all points, each (elements * points, 3, 3)."""
@@ -105,7 +126,7 @@ class RemodelingPass:
             noise,
             self.state.cells.initial_dimensions.reshape(-1, 3),
             self.parameters.at_points().end_to_end_length,
-            self.settings.kappa,
+            self.kappa,
             spectral.PAIRINGS[self.settings.pairing],
             self.settings.rotation_time,
             self.kernels,
@@ -194,7 +215,7 @@ class RemodelingPass:
         """Cells of all points in one row, the present or others, after a time with this target. Changes nothing."""
         assert self.law.follow is not None
         r0 = self.parameters.at_points().end_to_end_length
-        return self.law.follow(cells or self.state.cells.point_cells, target, r0, self.settings.kappa * duration)
+        return self.law.follow(cells or self.state.cells.point_cells, target, r0, self.kappa * duration)
 
     @property
     def asked(self) -> UnitCell | None:

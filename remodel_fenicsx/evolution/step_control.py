@@ -139,7 +139,7 @@ class StepControl:
         self._remember_refused(duration)
         self._count(step, error, duration)
         wanted = max(numbers["usual"] if numbers["goes_on"] else wanted, shortest)
-        kappa = self.stepper.remodeling.settings.kappa
+        kappa = self.stepper.remodeling.fastest
         numbers["wanted"] = min(wanted, self.stepper.coupling.longest / kappa if kappa else wanted)
         numbers["before"], numbers["effective"] = max(error, TELLING_ERROR), self._effective(duration)
 
@@ -171,7 +171,7 @@ class StepControl:
         before = max([0.0, *(stop for stop in self.stops if stop < after)])
         if not remodeling.law.remodels:
             return after - before
-        return min(after - before, 1 / settings.kappa if remodeling.law.asks_kappa else settings.rotation_time)
+        return min(after - before, 1 / remodeling.fastest if remodeling.law.asks_kappa else settings.rotation_time)
 
     def _shortest(self) -> float:
         """Length below which no step is cut for its error."""

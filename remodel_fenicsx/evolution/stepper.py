@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from decimal import Decimal
+from typing import Any
 
 from remodel_fenicsx.body.loading import LoadValues
 from remodel_fenicsx.evolution.coupling import Coupling, Maker
@@ -104,6 +105,8 @@ class Stepper:
         Function of time: magnitudes of all loads.
     coupling
         Makes a coupling in place of the one that `remodeling` names.
+    kappa
+        Of `RemodelingPass`.
     """
 
     def __init__(
@@ -114,10 +117,11 @@ class Stepper:
         solver: Solver,
         load_values: Callable[[float], LoadValues],
         coupling: Maker | None = None,
+        kappa: Any = None,
     ):
         self.state, self.load_values = state, load_values
         self.tissue = on_mesh(tissue, state.cells.quadrature.mesh)
-        self.remodeling = RemodelingPass(state, self.tissue, remodeling)
+        self.remodeling = RemodelingPass(state, self.tissue, remodeling, kappa)
         # cells that never change are coupled to nothing
         name = remodeling.coupling if self.remodeling.law.remodels else "staggered"
         make = coupling or COUPLINGS[name].make

@@ -63,7 +63,7 @@ class TimeError:
 
     def __init__(self, stepper: Stepper):
         self.stepper, self.state = stepper, stepper.state
-        self.quadrature, self.kappa = stepper.state.cells.quadrature, stepper.remodeling.settings.kappa
+        self.quadrature, self.kappa = stepper.state.cells.quadrature, stepper.remodeling.slowest
         stepper.coupling.compares = True
         initial = {"row": 0.0, "speed": 0.0, "duration": 0.0, "fading": self.kappa, "answer": 1.0}
         self._numbers = Numbers(stepper.state, "time_error", initial)

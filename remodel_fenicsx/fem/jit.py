@@ -34,7 +34,7 @@ from ufl.corealg.multifunction import MultiFunction
 from ufl.domain import extract_unique_domain
 
 from remodel_fenicsx.system.interrupts import PAUSE, SIGNALS, Interrupted, blocked, stopping_at_once
-from remodel_fenicsx.system.terminal import NOTICE
+from remodel_fenicsx.system import NOTICE
 
 log = logging.getLogger(__name__)
 

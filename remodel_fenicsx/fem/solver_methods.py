@@ -115,7 +115,7 @@ FACTOR_OPTIONS: dict[str, Mapping[str, Any]] = {
 # unknowns, 0.6 of it at 380, 0.4 at 650 and 0.25 at 1,500 (cubes and tubes of random cells, 40 steps).
 SMALL_REDUCTION, SMALL_BODY = 2000, 200
 LARGE = 100_000  # unknowns from which on even a few factors cost more than multigrid, in time and in memory
-LARGE_ON_RANKS = 20_000  # the same on several ranks, where every tangent is factorised, on one of them
+LARGE_ON_RANKS = 20_000  # the same on several ranks, where one of them keeps the factor for all
 
 
 def is_small(unknowns: int, reduced: bool) -> bool:
@@ -129,7 +129,7 @@ def chosen(method: str, unknowns: int, ranks: int, reduced: bool, multigrid: boo
         return method
     if multigrid and unknowns > (LARGE if ranks == 1 else LARGE_ON_RANKS):
         return "iterative"
-    return "direct" if ranks > 1 or is_small(unknowns, reduced) else LAGGED
+    return "direct" if is_small(unknowns, reduced) else LAGGED
 
 
 def method_options(method: str, ranks: int, small: bool = False) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from mpi4py import MPI
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.model.energy import REPULSIONS, Repulsion, Tissue
 from remodel_fenicsx.system import environment
-from remodel_fenicsx.system.terminal import NOTICE
+from remodel_fenicsx.system import NOTICE
 
 log = logging.getLogger(__name__)
 

@@ -100,7 +100,7 @@ typedef struct {
 } state;
 
 static void prepare(point *p, int64_t n, int64_t at, const double *F, const double *old, const double *parameters,
-                    double floor, double solved, double rate, int driver, int repulsion)
+                    double floor, double solved, const double *rate, int driver, int repulsion)
 {
     tensor C, global;
     memcpy(p->F, F + 9 * at, sizeof(tensor)), memcpy(global, old + 9 * at, sizeof(tensor));
@@ -110,7 +110,7 @@ static void prepare(point *p, int64_t n, int64_t at, const double *F, const doub
     ALL(i) p->u[i] = sqrt(p->c[i]);
     p->J = p->u[0] * p->u[1] * p->u[2];
     for (int k = 0; k < PARAMETERS; ++k) p->parameter[k] = parameters[k * n + at];
-    p->floor = floor, p->solved = solved, p->rate = rate, p->driver = driver, p->repulsion = repulsion;
+    p->floor = floor, p->solved = solved, p->rate = rate[at], p->driver = driver, p->repulsion = repulsion;
 }
 
 /* chains.wormlike_stiffness, and its slope by r. */
@@ -327,7 +327,7 @@ static void iterate(point *p, state *s)
 
 /* condensed.CondensedPoints.solve, from start; all results in the global basis. */
 void solve(int64_t n, const double *F, const double *start, const double *old, const double *parameters,
-           double floor, double solved, double rate, int driver, int repulsion, double *tensors, double *structure,
+           double floor, double solved, const double *rate, int driver, int repulsion, double *tensors, double *structure,
            double *stresses, double *squared, uint8_t *converged)
 {
     for (int64_t at = 0; at < n; ++at) {
@@ -381,7 +381,7 @@ static void by_gradient(point *p, tensor S, matrix by_strain, double *result)
 
 /* condensed.CondensedPoints.tangent at solved points. */
 void tangent(int64_t n, const double *F, const double *tensors, const double *old, const double *parameters,
-             double floor, double solved, double rate, int driver, int repulsion, double *result)
+             double floor, double solved, const double *rate, int driver, int repulsion, double *result)
 {
     for (int64_t at = 0; at < n; ++at) {
         point p;

@@ -109,7 +109,8 @@ class CompiledPoints(CondensedPoints):
         parts = (drive.driver, DRIVERS), (tissue.repulsion, REPULSIONS)
         numbers = (NUMBERS[str(named(*part)).upper()] for part in parts)
         parameters = np.stack([getattr(tissue, name) for name in PARAMETERS])
-        given = self.step.structure, parameters, drive.floor, drive.rounding, self.step.rate, *numbers
+        rate = np.broadcast_to(self.step.rate, len(F))
+        given = self.step.structure, parameters, drive.floor, drive.rounding, rate, *numbers
         self.kernels.call(name, len(F), F, tensor, *given, *results)
 
     def solve(

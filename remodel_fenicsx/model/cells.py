@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -59,15 +58,6 @@ def cylindrical_axes(coordinates: Array) -> Array:
     return axes
 
 
-AXES: dict[str, Callable[[Array], Array]] = {"global": global_axes, "cylindrical": cylindrical_axes}
-"""Axes of the cells before the first pass by name: functions of the reference coordinates."""
-
-
-def initial_axes(kind: str, coordinates: Array) -> Array:
-    """n_I before the first pass (`AXES`), rows, shape (..., 3, 3), at reference coordinates (..., 3)."""
-    return AXES[kind](coordinates)
-
-
 def radial_direction(coordinates: Array) -> Array:
     """Unit vector away from the z axis at coordinates (..., 3)."""
     radius = np.sqrt(coordinates[..., 0] ** 2 + coordinates[..., 1] ** 2)[..., None]
@@ -89,35 +79,31 @@ def angle_to_axis(dimensions: Array, axes: Array, direction: Array) -> Array:
 IN_THE_WALL = 1e-6  # of tr A: of less a rounded A has no direction, and a chain there has none that a picture shows
 
 
-def pitch_angle(dimensions: Array, axes: Array, coordinates: Array) -> Array:
-    """Angle in degrees of the chain direction in the wall of a tube about z, from circumferential (0) to axial (90).
+def pitch_angle(dimensions: Array, axes: Array, local: Array) -> Array:
+    """Angle in degrees of the chain direction in the wall, from circumferential (0) to axial (90).
 
-    atan sqrt(A_zz / A_tt) with the structure tensor A and t the circumferential direction; NaN where chains point out
-    of the wall, A_zz + A_tt < IN_THE_WALL tr A.
+    atan sqrt(A_aa / A_cc) with the structure tensor A and local axes c, a, r as rows (..., 3, 3); NaN where chains
+    point out of the wall, A_aa + A_cc < IN_THE_WALL tr A.
     """
-    circumferential, axial, radial = _wall_components(dimensions, axes, coordinates)
+    circumferential, axial, radial = _local_components(dimensions, axes, local)
     inside = circumferential**2 + axial**2
     angle: Array = np.degrees(np.arctan2(axial, circumferential))
     return np.where(inside < IN_THE_WALL * (inside + radial**2), np.nan, angle)
 
 
-def radial_share(dimensions: Array, axes: Array, coordinates: Array) -> Array:
-    """A_rr / tr A about the z axis, from 0 (chains in the wall) to 1 (chains across it); 0 where there are none."""
-    circumferential, axial, radial = _wall_components(dimensions, axes, coordinates)
+def radial_share(dimensions: Array, axes: Array, local: Array) -> Array:
+    """A_rr / tr A with local axes as rows, from 0 (chains in the wall) to 1 (across it); 0 where there are none."""
+    circumferential, axial, radial = _local_components(dimensions, axes, local)
     trace = circumferential**2 + axial**2 + radial**2
     return np.divide(radial**2, trace, out=np.zeros_like(trace), where=trace > 0)
 
 
-def _wall_components(dimensions: Array, axes: Array, coordinates: Array) -> tuple[Array, Array, Array]:
-    """Roots of A_tt, A_zz and A_rr."""
-    radius = np.sqrt(coordinates[..., 0] ** 2 + coordinates[..., 1] ** 2)
-    cosine, sine = coordinates[..., 0, None] / radius[..., None], coordinates[..., 1, None] / radius[..., None]
+def _local_components(dimensions: Array, axes: Array, local: Array) -> list[Array]:
+    """Roots of A_cc, A_aa and A_rr."""
     x, y, z = (axes[..., i] for i in range(3))
-    return (
-        _norm(dimensions * (y * cosine - x * sine)),
-        _norm(dimensions * z),
-        _norm(dimensions * (x * cosine + y * sine)),
-    )
+    # by columns: sums of three products, each rounded by itself, are the same numbers with every BLAS
+    along = (local[..., k, :, None] for k in range(3))
+    return [_norm(dimensions * (x * d[..., 0, :] + y * d[..., 1, :] + z * d[..., 2, :])) for d in along]
 
 
 def angle_between(first: UnitCell, second: UnitCell) -> Array:

@@ -40,12 +40,6 @@ def wormlike_stiffness(end_to_end_length: Any, contour_length: Any) -> Any:
     return (1 + (2 - x) / (4 * (1 - x) ** 2)) / contour_length
 
 
-def wormlike_force(end_to_end_length: Any, contour_length: Any, persistence_length: Any, k_theta: Any = 1.0) -> Any:
-    """Force that holds the ends of one chain apart (eq. 2): k theta / (4 A_p) (4 x + 1/(1-x)^2 - 1), x = r/L."""
-    x = end_to_end_length / contour_length
-    return k_theta / (4 * persistence_length) * (4 * x + 1 / (1 - x) ** 2 - 1)
-
-
 @dataclass(frozen=True)
 class Chain:
     """A chain law.
@@ -65,7 +59,7 @@ class Chain:
     locks: bool = True
 
     def force(self, end_to_end_length: Any, contour_length: Any, persistence_length: Any, k_theta: Any = 1.0) -> Any:
-        """Force that holds the ends of one chain apart: k theta / A_p times the derivative of its energy."""
+        """Force that holds the ends of one chain apart: k theta / A_p times the derivative of its energy (eq. 2)."""
         return k_theta / persistence_length * self.stiffness(end_to_end_length, contour_length) * end_to_end_length
 
 

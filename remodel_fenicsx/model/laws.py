@@ -40,7 +40,7 @@ class Drive(NamedTuple):
     end_to_end_length
         r0, in link lengths; (n,) or a number.
     kappa
-        Speed of remodeling, in 1/time.
+        Speed of remodeling, in 1/time; (n,) or a number.
     pairing
         Of `spectral.PAIRINGS`: principal values and axes, in the order in which they belong to the cell's dimensions.
     rotation_time
@@ -58,11 +58,16 @@ class Drive(NamedTuple):
     threshold: Array | float
     initial_dimensions: Array
     end_to_end_length: Array | float
-    kappa: float
+    kappa: Array | float
     pairing: spectral.Pairing = spectral.principal
     rotation_time: float = 40.0
     kernels: Any = spectral
     rounding: Array | float = 0.0
+
+    @property
+    def kappas(self) -> Array | float:
+        """kappa beside arrays (n, 3)."""
+        return np.reshape(self.kappa, (-1, 1)) if np.ndim(self.kappa) else self.kappa
 
     @property
     def floor(self) -> Array | float:
@@ -71,21 +76,21 @@ class Drive(NamedTuple):
         return floor
 
 
-def relaxed(old: UnitCell, new: UnitCell, factor: float) -> UnitCell:
+def relaxed(old: UnitCell, new: UnitCell, factor: Array | float) -> UnitCell:
     """The cells that a pass has reached with a share of its change: A = A_old + factor (A_new - A_old).
 
     A = sum_I l_I^2 n_I (x) n_I; the dimensions are the roots of its eigenvalues, the axes its eigenvectors, in the
-    order of the new axes that they continue. Where eigenvalues agree, the new axes decide. Arrays of n points; a factor
-    of 1 gives the new cells as they are.
+    order of the new axes that they continue. Where eigenvalues agree, the new axes decide. Arrays of n points; the
+    factor is (n,) or a number, which at 1 gives the new cells as they are.
     """
-    if factor == 1.0:
+    if np.ndim(factor) == 0 and factor == 1.0:
         return new
     before, after = structure_tensor(*old[:2]), structure_tensor(*new[:2])
-    squared, axes = spectral.continued(before + factor * (after - before), new.axes)
+    squared, axes = spectral.continued(before + np.reshape(factor, (-1, 1, 1)) * (after - before), new.axes)
     return UnitCell(np.sqrt(np.maximum(squared, 0.0)), axes)
 
 
-RankedFunction = Callable[[Array, Array, Array, float, float, float], Array]
+RankedFunction = Callable[[Array, Array, Array, Any, float, float], Array]
 
 
 @dataclass(frozen=True)
@@ -105,7 +110,7 @@ class Law:
         that make a share of each are slower.
     target, follow
         Of laws whose cells tend to a tensor: ``target(drive)`` and ``follow(cells, target, r0, kappa dt)``, of which
-        `update` is made. A scheme of second order needs them apart.
+        `update` is made; r0 and kappa dt are (n,) or numbers. A scheme of second order needs them apart.
     dimensions
         Of laws towards a target by rank (`ranked`): the function of which `update` is made. The coupling "implicit"
         asks for its slope.
@@ -122,7 +127,7 @@ class Law:
     remodels: bool = True
     of_absolute_time: bool = False
     target: Callable[[Drive], tensor_law.Target] | None = None
-    follow: Callable[[UnitCell, tensor_law.Target, Array | float, float], UnitCell] | None = None
+    follow: Callable[[UnitCell, tensor_law.Target, Array | float, Array | float], UnitCell] | None = None
     dimensions: RankedFunction | None = None
     share: Callable[[UnitCell, UnitCell, float], UnitCell] = relaxed
     keeps_symmetry: bool = False
@@ -136,8 +141,8 @@ def ranked(function: RankedFunction, has_limit: bool = False, of_absolute_time: 
     ----------
     function
         ``function(l, l0, target, kappa, time_old, time_new) -> l_new`` with l and l0 (n, 3) by rank (column 0: largest
-        principal value; with the pairing "continuous" by axis instead), target = r0 e, e = lambda^+ / |lambda^+|.
-        Points without a positive value keep their cells.
+        principal value; with the pairing "continuous" by axis instead), target = r0 e, e = lambda^+ / |lambda^+|,
+        kappa a number, or (n, 1) where regions differ. Points without a positive value, or kappa, keep their cells.
     has_limit, of_absolute_time
         As in `Law`.
     """
@@ -180,7 +185,9 @@ def by_rank(function: RankedFunction, cells: UnitCell, drive: Drive, time_old: f
     values, axes = principal_directions(drive, cells.axes, drive.pairing)
     direction, active = drive.kernels.positive_direction(values, threshold=drive.threshold)
     target = np.reshape(drive.end_to_end_length, (-1, 1)) * direction
-    dimensions = function(cells.dimensions, drive.initial_dimensions, target, drive.kappa, time_old, time_new)
+    if np.ndim(drive.kappa):
+        active = active & (np.asarray(drive.kappa) > 0.0)
+    dimensions = function(cells.dimensions, drive.initial_dimensions, target, drive.kappas, time_old, time_new)
     new = UnitCell(dimensions, framed(drive, axes, None if drive.pairing is spectral.principal else dimensions))
     if not active.all():
         new = UnitCell(
@@ -214,17 +221,17 @@ def framed(drive: Drive, axes: Array, dimensions: Array | None = None) -> Array:
     return np.take_along_axis(framed, np.argsort(order, axis=1), axis=1)
 
 
-def explicit(l: Array, l0: Array, target: Array, kappa: float, time_old: float, time_new: float) -> Array:
+def explicit(l: Array, l0: Array, target: Array, kappa: Any, time_old: float, time_new: float) -> Array:
     """Eq. (11): l = l0 + (r0 e - l0)(1 - exp(-kappa t)), a function of the absolute time and the present target."""
     return l0 - (target - l0) * np.expm1(-kappa * time_new)
 
 
-def rate(l: Array, l0: Array, target: Array, kappa: float, time_old: float, time_new: float) -> Array:
+def rate(l: Array, l0: Array, target: Array, kappa: Any, time_old: float, time_new: float) -> Array:
     """Eq. (10): dl/dt = kappa (r0 e - l0) exp(-kappa t), integrated exactly over the step with e frozen."""
     return l - (target - l0) * np.exp(-kappa * time_old) * np.expm1(-kappa * (time_new - time_old))
 
 
-def relaxation(l: Array, l0: Array, target: Array, kappa: float, time_old: float, time_new: float) -> Array:
+def relaxation(l: Array, l0: Array, target: Array, kappa: Any, time_old: float, time_new: float) -> Array:
     """Autonomous form dl/dt = kappa (r0 e - l), integrated exactly over the step with e frozen."""
     return l - (target - l) * np.expm1(-kappa * (time_new - time_old))
 
@@ -312,7 +319,7 @@ def tensor_target(drive: Drive) -> tensor_law.Target:
 
 
 def follow_tensor(
-    cells: UnitCell, target: tensor_law.Target, end_to_end_length: Array | float, rate: float
+    cells: UnitCell, target: tensor_law.Target, end_to_end_length: Array | float, rate: Array | float
 ) -> UnitCell:
     """Cells whose structure tensor is `tensor_law.follow`; where its eigenvalues agree, the axes stay.
 

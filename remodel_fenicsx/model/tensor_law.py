@@ -97,15 +97,16 @@ def target(tensor: Array, floor: Array | float) -> Target:
     return Target(direction, tension / np.where(total > 0, total, 1.0))
 
 
-def weight_of_the_end(rate: float) -> float:
-    """Weight of the target at the end of a step in the one that acts, if targets change linearly over it.
+def weight_of_the_end(rate: Array | float) -> Array:
+    """Weight of the target at the end of a step in the one that acts, if targets change linearly over it; rate (n,).
 
     A forgets: A(h) = (1 - w) A(0) + w (E_0 + weight (E_1 - E_0)), w = 1 - exp(-z), weight = 1/w - 1/z, z = kappa h:
     one half for short steps, one for long ones.
     """
-    if rate < 1e-3:
-        return 0.5 + rate / 12
-    return float(-1.0 / np.expm1(-rate) - 1.0 / rate)
+    z = np.asarray(rate, dtype=np.float64)
+    short = z < 1e-3
+    long = np.where(short, 1.0, z)
+    return np.where(short, 0.5 + z / 12, -1.0 / np.expm1(-long) - 1.0 / long)
 
 
 def target_derivatives(tensor: Array, floor: Array | float) -> tuple[Array, Array]:
@@ -140,7 +141,7 @@ def target_derivatives(tensor: Array, floor: Array | float) -> tuple[Array, Arra
     return direction, share
 
 
-def follow(structure: Array, towards: Target, end_to_end_length: Array | float, rate: float) -> Array:
+def follow(structure: Array, towards: Target, end_to_end_length: Array | float, rate: Array | float) -> Array:
     """A after a time in which the target does not change: exact.
 
     Parameters
@@ -152,7 +153,7 @@ def follow(structure: Array, towards: Target, end_to_end_length: Array | float, 
     end_to_end_length
         r0, (n,) or a number.
     rate
-        kappa times the time.
+        kappa times the time, (n,) or a number.
     """
     squared = np.reshape(np.asarray(end_to_end_length, dtype=np.float64) ** 2, (-1, 1, 1))
     weight = -np.expm1(-rate * towards.share)[:, None, None]

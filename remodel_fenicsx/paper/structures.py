@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from remodel_fenicsx.model.cells import initial_axes, radial_direction
+from remodel_fenicsx.model.cells import cylindrical_axes, radial_direction
 from remodel_fenicsx.pictures.bodies import (
     ALL,
     Array,
@@ -224,7 +224,7 @@ def layer_table(snapshot: DrawnBody) -> Table:
 
 def local_shear(snapshot: DrawnBody) -> Array:
     """The six off-diagonal components of F in circumferential, axial and radial direction, (elements, 6)."""
-    directions = initial_axes("cylindrical", snapshot.centres)
+    directions = cylindrical_axes(snapshot.centres)
     gradient = snapshot.fields["deformation_gradient"].reshape(-1, 3, 3)
     local = directions @ gradient @ np.swapaxes(directions, 1, 2)
     return local[:, ~np.eye(3, dtype=bool)]

@@ -55,9 +55,9 @@ def section(title: str, content: str, width: str = "half", note: str = "") -> st
     return f'<section class="card {width}">{heading}{content}</section>'
 
 
-def folded(title: str, content: str, width: str = "half") -> str:
+def folded(title: str, content: str) -> str:
     """The same, closed until somebody opens it."""
-    return f'<details class="card {width}"><summary>{escape(title)}</summary>{content}</details>'
+    return f'<details class="card half"><summary>{escape(title)}</summary>{content}</details>'
 
 
 def table(rows: Iterable[tuple[str, str]]) -> str:

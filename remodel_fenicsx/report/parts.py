@@ -7,13 +7,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from html import escape
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from remodel_fenicsx._version import __version__
-from remodel_fenicsx.body.columns import Column, columns_of
+from remodel_fenicsx.body.columns import Column, columns_of_region
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.report.body import ShownBody
 from remodel_fenicsx.report.card import Array, Card, folded, section, table
@@ -30,6 +31,8 @@ from remodel_fenicsx.results.drawing import (
 )
 from remodel_fenicsx.results.recording import HISTORY, LARGEST_HISTORY, SCENE, RecordedRun
 from remodel_fenicsx.results.words import unit_of, with_unit, words
+from remodel_fenicsx.scene.scene import Scene
+from remodel_fenicsx.settings import Properties
 from remodel_fenicsx.system.regular_files import read_regular
 from remodel_fenicsx.system.terminal import duration
 
@@ -62,8 +65,11 @@ class ReportedRun:
     def columns(self) -> list[Column]:
         """Of the history, those of the shape first; none without a number."""
         scene, history = self.recording.scene, self.story.history
-        known = {column.name: column for column in columns_of(scene.geometry, scene.output.columns, scene.loads)}
-        own = {column.name for column in scene.geometry.columns}
+        known = {column.name: column for column in scene.columns()}
+        own = {
+            column.name
+            for column in (*scene.geometry.columns, *chain.from_iterable(map(columns_of_region, scene.regions)))
+        }
         names = [name for name in history if name != "time" and np.isfinite(history[name]).any()]
         if "substeps" in names and np.nanmax(history["substeps"]) <= 1:
             names.remove("substeps")
@@ -155,7 +161,7 @@ def _notes(run: ReportedRun, body: ShownBody) -> list[str]:
 
 def angles(run: ReportedRun) -> Card | None:
     """The fibre angle through the body, and where the collagen points."""
-    body, shape = run.body, run.recording.scene.geometry
+    body, shape, regions = run.body, run.recording.scene.geometry, run.recording.scene.regions
     if body is None or body.angle is None:
         return None
     through, start, end = shape.depth_in_words
@@ -164,7 +170,9 @@ def angles(run: ReportedRun) -> Card | None:
     profile = section(f"Collagen angle {through}, deformed", f'<div id="profile"></div>{legend}', "narrow")
     rose = section("Where the collagen points, by volume", '<div id="rose"></div>', "narrow")
     data = {"depth": body.whole.depth.tolist(), "through": f"{through} (0 {start}, 1 {end})", "along": along,
-            "across": across, "colours": ANGLE_COLOURS}  # fmt: skip
+            "across": across, "colours": ANGLE_COLOURS,
+            "regions": [{"name": words(name), "from": start, "to": end}
+                        for name, (start, end) in shape.region_depths(regions).items()]}  # fmt: skip
     return Card("angles", f'<div class="stack">{profile if len(body.whole.depth) > 1 else ""}{rose}</div>', data)
 
 
@@ -222,9 +230,8 @@ def facts(run: ReportedRun) -> Card:
     )
     count = f", {len(run.recording.elements):,} in number" if run.body else ""
     name = KINEMATICS[scene.model.kinematics].element(mesh.element)
-    cells = (
-        f"{scene.cells.initial}, seed {scene.cells.seed}" if scene.cells.initial == "random" else scene.cells.initial
-    )
+    seed = f", seed {scene.cells.seed}" if scene.has_random_cells else ""
+    cells, kappa = _by_region(scene, _cells), _by_region(scene, lambda properties: f"{properties.kappa:g}")
     loads = "; ".join(f"{words(name)} {load.value:g}" for name, load in scene.loads.items())
     seconds = story.history.get("seconds", np.zeros(0))
     solving = f"; {duration(float(np.nansum(seconds)))} of solving" if len(seconds) else ""
@@ -234,14 +241,26 @@ def facts(run: ReportedRun) -> Card:
         ("Mesh", f"{name} elements{count}, degree {mesh.degree}, refinement {mesh.refinement}, {mesh.formulation}"),
         ("Kinematics", f"{scene.model.kinematics}: {KINEMATICS[scene.model.kinematics].meaning}"),
         ("Supports", f"ends {scene.supports.ends}"),
-        ("Cells", f"{cells}, axes {scene.cells.axes}, r0 = {scene.cells.end_to_end_length:g}"),
+        ("Cells", f"{cells}{seed}, axes {scene.cells.axes}"),
         ("Loads", loads or "none"),
         ("Material", scene.summary()),
         ("Remodeling", f"law {remodeling.law}, driver {remodeling.driver}, frame {remodeling.frame}, "
-                       f"coupling {remodeling.coupling}, kappa {remodeling.kappa:g}"),
+                       f"coupling {remodeling.coupling}, kappa {kappa}"),
         ("Time", f"{max(0, len(story.history['time']) - 1)} of {scene.time.in_words()}{solving}{ranks}"),
     ]  # fmt: skip
     return Card("facts", section("What was run", table(rows)))
+
+
+def _by_region(scene: Scene, in_words: Callable[[Properties], str]) -> str:
+    """What holds in the body, or in each region by its name where they differ."""
+    found = {name: in_words(properties) for name, properties in scene.properties().items()}
+    if len(set(found.values())) == 1:
+        return next(iter(found.values()))
+    return "; ".join(f"{name or 'elsewhere'}: {text}" for name, text in found.items())
+
+
+def _cells(properties: Properties) -> str:
+    return f"{properties.cells.initial}, r0 = {properties.cells.end_to_end_length:g}"
 
 
 def warnings(run: ReportedRun) -> Card:

@@ -110,13 +110,24 @@ class Measurement:
     def fibre_angle(self) -> Array:
         """Reference fibre angle at all points (elements, points), degrees; NaN where there is none."""
         cells = self.state.cells
-        return self.observer.shape.fibre_angle(cells.dimension_values, cells.axis_values, self.quadrature.coordinates)
+        return self.observer.shape.fibre_angle(cells.dimension_values, cells.axis_values, cells.local_axes.axes)
 
     @cached_property
     def radial_share(self) -> Array:
         """Of the chains at all points (elements, points)."""
         cells = self.state.cells
-        return self.observer.shape.radial_share(cells.dimension_values, cells.axis_values, self.quadrature.coordinates)
+        return self.observer.shape.radial_share(cells.dimension_values, cells.axis_values, cells.local_axes.axes)
+
+    @cached_property
+    def chain_extension(self) -> Array:
+        """r/L at all points (elements, points); 0 where no chain locks."""
+        cells, F = self.state.cells, self.state.deformation_gradient()
+        length = self.equilibrium.parameters.locking_length()
+        return np.asarray(np.sqrt(cells.kernels.squared_length(F, cells.point_cells)).reshape(length.shape) / length)
+
+    def elements_of_region(self, name: str) -> NDArray[np.bool_]:
+        """Mask of the local elements of a region, (elements,)."""
+        return np.asarray(self.domain.element_region == self.domain.regions[name])
 
     @cached_property
     def axial_stretch(self) -> Array:

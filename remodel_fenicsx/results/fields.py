@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,11 +14,13 @@ from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.shape import Shape
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
 from remodel_fenicsx.fem import compat, jit
+from remodel_fenicsx.fem.quadrature import Quadrature
+from remodel_fenicsx.model.local_axes import LocalAxes
 from remodel_fenicsx.results.chain_lines import AXIS_FIELDS, OF_CHAINS, append_chains
 from remodel_fenicsx.results.recording import CHAIN_LINES, FIELDS
 from remodel_fenicsx.results.vtkhdf import TransientGrid, vtk_cells
 from remodel_fenicsx.schema.times import SAME_TIME, same_time
-from remodel_fenicsx.settings import FIELDS_BY_NAME
+from remodel_fenicsx.settings import CONSTANT_FIELDS, FIELDS_BY_NAME, REGION
 from remodel_fenicsx.solver.pointwise import PointStresses
 from remodel_fenicsx.state.state import State
 
@@ -28,11 +30,24 @@ log = logging.getLogger(__name__)
 OF_ELEMENTS = tuple(name for name in FIELDS_BY_NAME if name not in ("displacement", "chains"))
 
 
-def field_names(asked: bool | Sequence[str]) -> tuple[str, ...]:
-    """The fields that a scene's `output.fields` asks for."""
+def field_names(
+    asked: bool | Sequence[str], regions: Collection[str] = (), constant: Sequence[str] = ()
+) -> tuple[str, ...]:
+    """The fields that a scene's `output.fields` asks for; all but that of regions where it has none.
+
+    `constant` are those that its shape has beside (`Shape.constant_fields`).
+    """
     if isinstance(asked, bool):
-        return FIELDS_BY_NAME if asked else ()
+        return (*(name for name in FIELDS_BY_NAME if regions or name != REGION), *constant) if asked else ()
     return tuple(asked)
+
+
+def local_fields(local_axes: LocalAxes, quadrature: Quadrature) -> dict[str, Array]:
+    """CONSTANT_FIELDS of the local elements, by name: unit vectors (elements, 3), depth and station (elements,)."""
+    axes = quadrature.element_mean(local_axes.axes)
+    axes /= np.linalg.norm(axes, axis=-1, keepdims=True)
+    numbers = (quadrature.element_mean(values) for values in (local_axes.depth, local_axes.station))
+    return dict(zip(CONSTANT_FIELDS, (*np.moveaxis(axes, 1, 0), *numbers), strict=True))
 
 
 class ElementFields:
@@ -59,9 +74,7 @@ class ElementFields:
         if self._stresses is not None:
             tensors.append(self._stresses.ufl.cauchy)
         entries = [t[i, j] for t in tensors for i in range(3) for j in range(3)]
-        displacement = state.kinematics.displacement(state.unknown)
-        expressions = ufl.as_vector([*entries, *(displacement[i] for i in range(3))])
-        self._state = jit.expression(expressions, self.quadrature.points)
+        self._state = jit.expression(ufl.as_vector(entries), self.quadrature.points)
 
     def __call__(self) -> dict[str, Array]:
         """By name, one row per local element.
@@ -69,13 +82,14 @@ class ElementFields:
         `deformation_gradient` and `cauchy_stress` (9, row by row); `cell_dimensions` (3) and `axis_1..3`: the cell
         whose structure tensor is the element's mean, longest first; `fibre_angle` and `fibre_angle_deformed` (degrees,
         to the load axis, or in a tube from circumferential to axial; NaN where no chain has one); `chain_extension`
-        (largest r/L in the element; 0 where no chain locks).
+        (largest r/L in the element; 0 where no chain locks); `region` (its number, `Domain.regions`).
         """
         if self._stresses is not None:
             self._stresses.refresh()
-        values = self.quadrature.evaluate(self._state, (12 if self._stresses is None else 21,))
+        values = self.quadrature.evaluate(self._state, (9 if self._stresses is None else 18,))
         F = values[..., :9].reshape(*values.shape[:2], 3, 3)
-        dimensions, axes = self.state.cells.dimension_values, self.state.cells.axis_values
+        cells = self.state.cells
+        dimensions, axes = cells.dimension_values, cells.axis_values
         mean, fibre_angle, wanted = self.quadrature.element_mean, self.shape.fibre_angle, set(self.names)
         mean_of_known = self.quadrature.element_mean_of_known
         found: dict[str, Array] = {}
@@ -87,14 +101,15 @@ class ElementFields:
             found["cell_dimensions"], mean_axes = self.mean_cells()
             found |= {name: mean_axes[:, i] for i, name in enumerate(AXIS_FIELDS)}
         if "fibre_angle" in wanted:
-            found["fibre_angle"] = mean_of_known(fibre_angle(dimensions, axes, self.quadrature.coordinates))
+            found["fibre_angle"] = mean_of_known(fibre_angle(dimensions, axes, cells.local_axes.axes))
         if "fibre_angle_deformed" in wanted:
-            position, deformed_axes = self.quadrature.coordinates + values[..., -3:], axes @ np.swapaxes(F, -1, -2)
-            found["fibre_angle_deformed"] = mean_of_known(fibre_angle(dimensions, deformed_axes, position))
+            deformed_axes, local = axes @ np.swapaxes(F, -1, -2), cells.local_axes.deformed(F)
+            found["fibre_angle_deformed"] = mean_of_known(fibre_angle(dimensions, deformed_axes, local))
         if "chain_extension" in wanted:
-            cells = self.state.cells
             squared = cells.kernels.squared_length(F.reshape(-1, 3, 3), cells.point_cells).reshape(F.shape[:2])
             found["chain_extension"] = np.max(np.sqrt(squared) / self._locking_length(), axis=1)
+        if REGION in wanted:
+            found[REGION] = self.state.loading.domain.element_region.astype(np.float64)
         return {name: found[name] for name in OF_ELEMENTS if name in wanted}
 
     def mean_cells(self) -> tuple[Array, Array]:
@@ -126,7 +141,7 @@ class Fields(Watcher):
     after
         Where a run goes on: time of the last step that was done. Fields of later ones are dropped.
     names
-        Of `settings.FIELDS_BY_NAME`, what is written; the lines only with "chains".
+        Of `settings.FIELDS_BY_NAME` and CONSTANT_FIELDS, what is written; the lines only with "chains".
     times
         Further times that are written.
 
@@ -147,7 +162,7 @@ class Fields(Watcher):
         stepper: Stepper,
         every: int = 1,
         after: float | None = None,
-        names: Sequence[str] = FIELDS_BY_NAME,
+        names: Sequence[str] = field_names(True),
         times: Sequence[float] = (),
     ):
         self.times = tuple(times)
@@ -156,7 +171,11 @@ class Fields(Watcher):
         needed = {*self.names, *(OF_CHAINS if "chains" in self.names else ())}
         self._element_fields = ElementFields(shape, stepper, [name for name in OF_ELEMENTS if name in needed])
         self._displacement = NodalGather(domain, self.state)
-        quadrature = self.state.cells.quadrature
+        quadrature, local_axes = self.state.cells.quadrature, self.state.cells.local_axes
+        constant = local_fields(local_axes, quadrature) if {*CONSTANT_FIELDS} & {*self.names} else {}
+        self._constant = {
+            name: domain.gather_elements(values) for name, values in constant.items() if name in self.names
+        }
         points, elements = domain.gather_mesh()
         self._grid: TransientGrid | None = None
         self._chains: TransientGrid | None = None
@@ -197,7 +216,9 @@ class Fields(Watcher):
             return
         fields = {name: values for name, values in gathered.items() if values is not None}
         at_nodes = {"displacement": displacement} if "displacement" in self.names else {}
-        self._grid.append(time, at_nodes, {name: fields[name] for name in fields if name in self.names})
+        changing = {name: fields[name] for name in fields if name in self.names}
+        constant = {name: values for name, values in self._constant.items() if values is not None}
+        self._grid.append(time, at_nodes, changing, constant=constant)
         if "chains" in self.names:
             grid, middle = self._chains or self._grid.path.with_name(CHAIN_LINES), displacement[self._elements].mean(
                 axis=1

@@ -10,6 +10,7 @@ from remodel_fenicsx.results.chain_lines import AXIS_FIELDS
 
 Array = NDArray[np.float64]
 
+DIRECTION_FIELDS = ("axis_c", "axis_a", "axis_r")
 TENSOR_FIELDS = ("deformation_gradient", "cauchy_stress")
 AT_ONCE = 1_000_000  # distances that are compared at a time
 
@@ -48,7 +49,7 @@ class TurnedFields:
     def __call__(self, fields: dict[str, Array]) -> tuple[Array | None, dict[str, Array]]:
         """Displacement of the body's nodes, where it was recorded, and fields of its elements."""
         found = {name: values[self.sources] for name, values in fields.items() if name != "displacement"}
-        for name in set(found) & set(AXIS_FIELDS):
+        for name in set(found) & {*AXIS_FIELDS, *DIRECTION_FIELDS}:
             found[name] = np.einsum("nij,nj->ni", self.element_turns, found[name])
         for name in set(found) & set(TENSOR_FIELDS):
             tensors = found[name].reshape(-1, 3, 3)

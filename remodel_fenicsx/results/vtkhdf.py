@@ -139,6 +139,7 @@ class TransientGrid:
         point_data: Fields | None = None,
         cell_data: Fields | None = None,
         points: ArrayLike | None = None,
+        constant: Fields | None = None,
     ) -> None:
         """Add one step and bring it to the disk.
 
@@ -151,6 +152,8 @@ class TransientGrid:
             are stored with 7 digits: 150 steps of the artery's 1,536 cells take 34 MB.
         points
             Coordinates from this step on, shape (points, 3), if they move.
+        constant
+            Cell data that are the same at every step, and stand in the file once.
 
         Raises
         ------
@@ -165,6 +168,10 @@ class TransientGrid:
                     block = np.asarray(values)
                     self._rows_of_field(kind, name, block).write(step, block)
                     self._rows(f"Steps/{kind}Offsets/{name}").write(step, step * len(block))
+            for name, values in (constant or {}).items():
+                if name not in self._root["CellData"]:
+                    self._rows_of_field("CellData", name, np.asarray(values)).write(0, np.asarray(values))
+                self._rows(f"Steps/CellDataOffsets/{name}").write(step, 0)
             if points is not None:
                 self._rows("Points").write(self._point_blocks, np.asarray(points))
                 self._point_blocks += 1
@@ -376,5 +383,7 @@ def _check_steps(root: h5py.Group) -> None:
     for kind, unit in (("PointData", "NumberOfPoints"), ("CellData", "NumberOfCells")):
         size = int(root[unit][0])
         for name, offsets in steps[f"{kind}Offsets"].items():
-            if (offsets[:number] != size * np.arange(number)).any() or len(root[kind][name]) < size * number:
+            places = offsets[:number]
+            at_every_step, once = (places == size * np.arange(number)).all(), not places.any()  # constant ones
+            if not (at_every_step or once) or len(root[kind][name]) < places[-1:].sum() + size * bool(number):
                 raise ValueError(f"the values of {name} are not where they belong")

@@ -7,6 +7,7 @@ from collections.abc import Collection
 import numpy as np
 from numpy.typing import NDArray
 
+from remodel_fenicsx.body.shape import Shape
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.results.recording import RecordedRun
 from remodel_fenicsx.results.turned import TurnedFields
@@ -60,7 +61,13 @@ class WholeBody:
             self._turned = TurnedFields(points, elements, *solved, reduction.turn)
         self._used, corners = np.unique(elements, return_inverse=True)
         self.points, self.elements = points[self._used], corners.reshape(elements.shape)
-        self.layer, self.depth = _layers(shape.depth(self.points[self.elements].mean(axis=1)))
+        self.layer, self.depth = _layers(self._depths(shape))
+
+    def _depths(self, shape: Shape) -> Numbers:
+        """Of the elements, (m,): as recorded, or by their places."""
+        recording = self.recording
+        known = {} if self.is_turned else recording.fields(float(recording.times[0]), {"depth"})
+        return known["depth"] if "depth" in known else shape.depth(self.points[self.elements].mean(axis=1))
 
     def fields(self, time: float, names: Collection[str] | None = None) -> Fields:
         """Displacement of the points, where it was recorded, and fields of the elements, at a recorded time.

@@ -16,7 +16,7 @@ from typing import Annotated, Any, ClassVar
 from pydantic import BaseModel, BeforeValidator, Field, ModelWrapValidatorHandler, SerializeAsAny, model_validator
 
 from remodel_fenicsx.body import SHAPES, Shape
-from remodel_fenicsx.body.columns import columns_of, columns_of_region, columns_on_request
+from remodel_fenicsx.body.columns import Column, columns_of, columns_of_region, columns_on_request
 from remodel_fenicsx.body.reductions import AUTO, objections
 from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.fem.solver_methods import SOLVER_METHODS
@@ -30,6 +30,7 @@ from remodel_fenicsx.schema.tables import SceneError, Table, VariantOf, allowed,
 from remodel_fenicsx.schema.toml import merged, parse_override, put, read_toml, toml_text
 from remodel_fenicsx.schema.units import FORCE, LENGTH_UNIT, LENGTH_UNITS, STRESS_UNIT, in_units
 from remodel_fenicsx.settings import (
+    REGION,
     STRESS_UNITS,
     Cells,
     Load,
@@ -37,6 +38,7 @@ from remodel_fenicsx.settings import (
     Mesh,
     Model,
     Output,
+    Properties,
     Region,
     Remodeling,
     Solver,
@@ -136,9 +138,7 @@ class Scene(Table):
     @model_validator(mode="after")
     def _tables_fit_together(self) -> Scene:
         cells, material, geometry = self.cells, self.material, self.geometry
-        if CHAINS[material.chain].locks and cells.end_to_end_length >= material.contour_length:
-            rule = f"must be smaller than material.contour_length = {shown(material.contour_length)}"
-            raise fault(rule, "cells.end_to_end_length", cells.end_to_end_length)
+        self._check_regions()
         ends = self.supports.ends
         for key, name, names in (
             ("cells.axes", cells.axes, geometry.axis_kinds),
@@ -160,10 +160,11 @@ class Scene(Table):
             largest = math.floor((LARGEST_MESH / geometry.number_of_elements) ** (1 / 3))
             rule = f"must be at most {largest} for a {geometry.name}: more makes over {LARGEST_MESH:g} elements"
             raise fault(rule, "mesh.refinement", self.mesh.refinement)
-        self._check_regions()
         for name, load in self.loads.items():
             self._check_load(name, load)
         self._check_output_times()
+        if REGION in _listed(self.output.fields) and not self.regions:
+            raise fault("the scene has no regions", "output.fields", REGION)
         self._check_columns()
         self._check_length()
         if self.model.kinematics != AUTO and (reasons := objections(self, self.model.kinematics)):
@@ -189,7 +190,7 @@ class Scene(Table):
         So it is where the cells depend on the time and the tension that they have then alone. From random cells some
         points have no such state and are held (docs/couplings.md).
         """
-        depends_on_now = LAWS[self.remodeling.law].of_absolute_time and self.cells.initial != "random"
+        depends_on_now = LAWS[self.remodeling.law].of_absolute_time and not self.has_random_cells
         return depends_on_now and self.missing_for_implicit() is None
 
     def _missing_for_equilibrium(self) -> str | None:
@@ -197,8 +198,9 @@ class Scene(Table):
         law, laws = self.remodeling.law, ", ".join(repr(name) for name, law in LAWS.items() if law.has_limit)
         if not LAWS[law].has_limit:
             return f"remodeling.law = {law!r} has no limit that the way there does not decide; those with one: {laws}"
-        if self.remodeling.kappa == 0:
-            return "remodeling.kappa = 0: the cells never change"
+        for name, properties in self.properties().items():
+            if properties.kappa == 0:
+                return f"{in_region(name)}remodeling.kappa = 0: the cells never change"
         return None if self.material.chain_density else "needs chains: material.chain_density above 0"
 
     @property
@@ -207,10 +209,13 @@ class Scene(Table):
         if not self.time.is_equilibrium:
             return float(self.time.end)
         ramps = [load.ramp[-1][0] for load in self.loads.values()]
-        return max(ramps, default=0.0) + FORGOTTEN_AFTER / self.remodeling.kappa
+        return max(ramps, default=0.0) + FORGOTTEN_AFTER / min(
+            properties.kappa for properties in self.properties().values()
+        )
 
     def _check_regions(self) -> None:
         shape, columns = self.geometry, {column.name for column in columns_of(self.geometry)}
+        columns |= set(columns_on_request(shape))
         for name in self.regions:
             key = f"regions.{quoted(name)}"
             if not shape.has_regions:
@@ -218,9 +223,37 @@ class Scene(Table):
                 raise fault(f"a {shape.name} has no regions; shapes with regions: {able}", key, None)
             if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,39}", name):
                 raise fault("a region's name is a letter, then letters, digits and _, at most 40 in all", key, None)
-            if taken := columns.intersection(columns_of_region(name)):
+            if taken := columns.intersection(column.name for column in columns_of_region(name)):
                 raise fault(f"the column {min(taken)!r} has another meaning; choose another name", key, None)
         shape.check_regions(self.regions, self.mesh)
+        for name, properties in self.properties().items():
+            self._check_properties(in_region(name), properties)
+
+    def _check_properties(self, region: str, properties: Properties) -> None:
+        """What the keys of a region say together with those of the whole body."""
+        material, cells = properties.material, properties.cells
+        if CHAINS[material.chain].locks and cells.end_to_end_length >= material.contour_length:
+            rule = f"must be smaller than {region}material.contour_length = {shown(material.contour_length)}"
+            raise fault(rule, f"{region}cells.end_to_end_length", cells.end_to_end_length)
+        if (length := cells.fault_of_length()) is not None:
+            raise fault(length, f"{region}cells.initial", cells.initial)
+        if bool(material.chain_density) != bool(self.material.chain_density):
+            rule = "is 0 in all of the body or nowhere (material.chain_density): without chains nothing locks"
+            raise fault(rule, f"{region}material.chain_density", material.chain_density)
+        law = LAWS[self.remodeling.law]
+        if properties.kappa != self.remodeling.kappa and law.remodels and not law.asks_kappa:
+            raise fault(f"the law {self.remodeling.law!r} has no kappa", f"{region}remodeling.kappa", properties.kappa)
+
+    def properties(self) -> dict[str, Properties]:
+        """What holds in each region by its name, and under "" what holds beside them, where there may be anything."""
+        body = Properties(self.material, self.cells, self.remodeling.kappa)
+        found = {name: region.over(body) for name, region in self.regions.items()}
+        return found if found and self.geometry.is_filled_by_regions else {"": body} | found
+
+    @property
+    def has_random_cells(self) -> bool:
+        """Whether cells are drawn anywhere."""
+        return any(properties.cells.initial == "random" for properties in self.properties().values())
 
     def _check_load(self, name: str, load: Load) -> None:
         step, key = self.time.step, f"loads.{name}"
@@ -245,11 +278,16 @@ class Scene(Table):
                 raise fault(rule, f"output.times[{index}]", time)
 
     def _check_columns(self) -> None:
-        known = dict.fromkeys([*columns_on_request(self.geometry), *(c.name for c in columns_of(self.geometry))])
+        always = columns_of(self.geometry, regions=self.regions)
+        known = dict.fromkeys([*columns_on_request(self.geometry), *(column.name for column in always)])
         for name in self.output.columns:
             if name not in known:
                 rule = f"no such column on request; allowed for shape {self.geometry.name!r} are "
                 raise fault(rule + ", ".join(map(repr, known)), "output.columns", name)
+
+    def columns(self, more: Iterable[str] = ()) -> tuple[Column, ...]:
+        """Of its history, in the order of the file; with `more` of those on request."""
+        return columns_of(self.geometry, [*self.output.columns, *more], self.loads, self.regions)
 
     def stops(self) -> list[float]:
         """Times at which a step ends, however long steps are: corners of ramps, output.times and the end."""
@@ -284,12 +322,17 @@ class Scene(Table):
             if stress is not None:
                 is_force = self.geometry.loads[name].dimension == FORCE
                 loads[f"largest {name}{' over its area' if is_force else ''}"] = stress
-        return self.material.summary(loads)
+        found = self.properties()
+        parts = [_words(name) + properties.material.summary(loads) for name, properties in found.items()]
+        return "; ".join(parts)
 
     def warnings(self) -> list[str]:
         """What is allowed but hardly meant, each on one line."""
-        parts = self.material, self.geometry, self.loads, self.cells.end_to_end_length, self.last_time
-        return doubts(*parts) + self.remodeling.warnings()
+        found: dict[str, None] = {}
+        for name, (material, cells, _) in self.properties().items():
+            lines = doubts(material, self.geometry, self.loads, cells.end_to_end_length, self.last_time)
+            found |= dict.fromkeys(line if line.startswith("geometry.") else _words(name) + line for line in lines)
+        return [*found, *self.remodeling.warnings()]
 
     def with_values(self, changes: Mapping[str, Any]) -> Scene:
         """A validated copy with other values by dotted key: ``scene.with_values({"loads.pressure.value": 2.4})``.
@@ -329,6 +372,19 @@ def _in_present_format(values: Mapping[str, Any]) -> dict[str, Any]:
         rule = f"written by a newer version of remodel_fenicsx; this one reads formats up to {FORMAT}"
         raise fault(rule, "format", written)
     return {**values, "format": FORMAT}
+
+
+def _listed(fields: Any) -> tuple[str, ...]:
+    return () if isinstance(fields, bool) else tuple(fields)
+
+
+def in_region(name: str) -> str:
+    """Of a dotted key in a region, or in the whole body: what stands before."""
+    return f"regions.{name}." if name else ""
+
+
+def _words(region: str) -> str:
+    return f"{region}: " if region else ""
 
 
 def _check_name(key: str, name: Any, names: Iterable[str]) -> None:
@@ -384,7 +440,8 @@ def _plain(value: Any, every_value: bool = False) -> Any:
     if isinstance(value, BaseModel):
         kind = {"shape": value.name} if isinstance(value, Shape) else {}
         names = [name for name in type(value).model_fields if every_value or name in value.model_fields_set]
-        return kind | {name: _plain(getattr(value, name), every_value) for name in names}
+        found = {name: _plain(getattr(value, name), every_value) for name in names}
+        return kind | {name: entry for name, entry in found.items() if entry is not None}
     if isinstance(value, Mapping):
         return {name: _plain(entry, every_value) for name, entry in value.items()}
     return value

@@ -134,7 +134,8 @@ def _fill(container: Any, table: BaseModel | Mapping[str, Any]) -> None:
             of_tables = isinstance(value, dict) and any(isinstance(entry, BaseModel) for entry in value.values())
             inner = tomlkit.table(is_super_table=of_tables)
             _fill(inner, value)
-            container.add(name, inner)
+            if len(inner) or not fields:  # an empty table says nothing, but a name does
+                container.add(name, inner)
         elif value is not None:
             for line in textwrap.wrap((name in fields and fields[name].description) or "", COMMENT_WIDTH):
                 container.add(tomlkit.comment(line))

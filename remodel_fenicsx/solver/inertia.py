@@ -11,7 +11,6 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
-from remodel_fenicsx.model.cells import initial_axes
 from remodel_fenicsx.solver.equilibrium import Equilibrium
 
 Array = NDArray[np.float64]
@@ -211,7 +210,7 @@ def of_the_unloaded_body(inertia: Inertia) -> tuple[int, float]:
     try:
         state.unknown.x.array[:] = 0.0
         state.loading.set(dict.fromkeys(state.loading.values, 0.0))
-        cells.set(cells.initial_dimensions, initial_axes(cells.settings.axes, cells.quadrature.coordinates))
+        cells.set(cells.initial_dimensions, cells.initial_axes())
         state.settle_cells()
         return inertia.negative_eigenvalues(), inertia.lowest().eigenvalue
     finally:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
+import dolfinx.fem
 import numpy as np
 from numpy.typing import NDArray
 
+from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.fem import assembly
 from remodel_fenicsx.fem.assembly import Remembered
 from remodel_fenicsx.fem.quadrature import Quadrature
@@ -45,6 +48,15 @@ def stress_rounding(numbers: Tissue, max_chain_extension: float) -> float:
     if numbers.locking_length is not None:
         length = max(length, max_chain_extension * numbers.locking_length)
     return float(np.finfo(np.float64).eps * numbers.stiffness(length))
+
+
+def by_region(domain: Domain, values: Mapping[str, float]) -> Any:
+    """A DG0 Function with the value of each region of a domain by its name; "" is for those that have none."""
+    found = dolfinx.fem.Function(dolfinx.fem.functionspace(domain.mesh, ("DG", 0)))
+    places = found.function_space.dofmap.list.reshape(-1)
+    for name, number in domain.regions.items():
+        found.x.array[places[domain.element_region == number]] = values[name if name in values else ""]
+    return found
 
 
 class Parameters:

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import cached_property
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
 
+from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.kernels.points import PointKernels, point_kernels
-from remodel_fenicsx.model.cells import UnitCell, initial_axes
+from remodel_fenicsx.model.cells import UnitCell
+from remodel_fenicsx.model.local_axes import AXES, LocalAxes
 from remodel_fenicsx.settings import Cells
 
 Array = NDArray[np.float64]
@@ -68,16 +72,20 @@ class UnitCells(CellField):
     ----------
     quadrature
         The points.
-    element_number
-        Number of each local element (ghosts included) in the mesh file's order, shape (elements,): the seed's index,
-        so that random cells do not depend on the number of ranks.
-    number_of_elements
-        Elements of the whole mesh.
+    domain
+        With the numbers of its elements in the mesh file's order, which are the seed's index: random cells do not
+        depend on the number of ranks.
     settings
         Initial dimensions, axes, seed, r0.
+    local_axes
+        Of the body at the points (`Shape.local_axes`).
+    regions
+        Initial dimensions and r0 of regions where they are others, by name.
 
     Attributes
     ----------
+    local_axes
+        As given.
     initial_dimensions
         l0_I by rank (not by direction), shape (cells, points, 3), in link lengths.
     """
@@ -85,12 +93,21 @@ class UnitCells(CellField):
     def __init__(
         self,
         quadrature: Quadrature,
-        element_number: NDArray[np.int64],
-        number_of_elements: int,
+        domain: Domain,
         settings: Cells,
+        local_axes: LocalAxes,
+        regions: Mapping[str, Cells] = MappingProxyType({}),
     ):
         super().__init__(quadrature, "cell")
-        self.settings = settings
-        self.dimension_values[:] = settings.dimensions(number_of_elements)[element_number][:, None, :]
-        self.axis_values[:] = initial_axes(settings.axes, quadrature.coordinates)
+        self.settings, self.local_axes = settings, local_axes
+        self.dimension_values[:] = settings.dimensions(domain.number_of_elements)[domain.element_number][:, None, :]
+        for name, cells in regions.items():
+            chosen = domain.element_region == domain.regions[name]
+            drawn = cells.dimensions(domain.number_of_elements)
+            self.dimension_values[chosen] = drawn[domain.element_number[chosen]][:, None, :]
+        self.axis_values[:] = self.initial_axes()
         self.initial_dimensions: Array = self.dimension_values.copy()
+
+    def initial_axes(self) -> Array:
+        """n_I before the first pass, rows, (cells, points, 3, 3)."""
+        return AXES[self.settings.axes](self.local_axes)

@@ -12,8 +12,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from remodel_fenicsx.body.columns import columns_of
-from remodel_fenicsx.scene.scene import Scene, SceneError
+from remodel_fenicsx.scene.scene import Scene, SceneError, in_region
 from remodel_fenicsx.schema.times import same_time
 from remodel_fenicsx.results.words import unit_of, words
 from remodel_fenicsx.studies.page import COLOURS, STYLE, Page, add_head
@@ -91,13 +90,14 @@ def members_of(scene: Scene, folder: Path, seeds: int) -> list[Run]:
     SceneError
         If the scene has no random cells.
     """
-    if scene.cells.initial != "random":
+    if not scene.has_random_cells:
         raise SceneError(f"cells.initial = {scene.cells.initial!r}: an ensemble is one of 'random' cells")
     if scene.time.tolerance is not None and not scene.time.is_equilibrium:
         raise SceneError(f"time.tolerance = {scene.time.tolerance:g}: each seed would have other steps; leave it out")
     numbers = range(scene.cells.seed, scene.cells.seed + seeds)
     every: dict[str, dict[str, Any]] = {f"seed-{number}": {"cells.seed": number} for number in numbers}
-    every[ISOTROPIC] = {"cells.initial": ISOTROPIC}
+    random = [name for name, properties in scene.properties().items() if properties.cells.initial == "random"]
+    every[ISOTROPIC] = {f"{in_region(name)}cells.initial": ISOTROPIC for name in random}
     return [
         Run(name, scene.with_values({"output.fields": False, "name": name, **change}), folder / name)
         for name, change in every.items()
@@ -164,7 +164,7 @@ def gathered(members: list[Run], failed: dict[str, str]) -> Ensemble:
         name: np.stack([history[name] for history in histories.values()]) for name in first if name not in NOT_COMPARED
     }
     scene = members[0].scene
-    extremes = frozenset(column.name for column in columns_of(scene.geometry, scene.output.columns) if column.extreme)
+    extremes = frozenset(column.name for column in scene.columns() if column.extreme)
     same = {name: isotropic[name] for name in columns if name in isotropic}
     return Ensemble(first["time"], columns, same, failed, extremes)
 
@@ -254,7 +254,7 @@ def draw(found: Ensemble, folder: Path, scene: Scene) -> None:
     page.save_table(table, [title, made_with])
     varying = [name for name, values in found.columns.items() if np.nanmax(np.ptp(values, axis=0)) > 0]
     shown = sorted(varying, key=lambda name: name not in _own_columns(scene))[:PANELS]
-    columns = columns_of(scene.geometry, scene.output.columns, scene.loads)
+    columns = scene.columns()
     units = {column.name: unit_of(scene, column.unit) for column in columns}
     with rc_context(STYLE):
         rows = -(-len(shown) // 2)

@@ -107,7 +107,7 @@ def ladder(scene: Scene) -> list[Setting]:
     own = choice(scene).name
     base = scene.with_values({"model.kinematics": _cheapest(scene), "time.tolerance": None})
     step, mesh = base.time.step, (base.mesh.refinement, base.mesh.degree)
-    random, seed = scene.cells.initial == "random", scene.cells.seed
+    random, seed = scene.has_random_cells, scene.cells.seed
     several = tuple(range(seed, seed + SEEDS)) if random else (seed,)
     found: dict[str, Setting] = {}
 

@@ -272,8 +272,15 @@ def _check_ours(path: Path) -> None:
         raise FigureError(message, 2)
 
 
-def read_table(path: Path) -> dict[str, list[str]]:
-    """Columns of a table that `Page.save_table` wrote, as text."""
+def read_table(path: Path) -> dict[str, NDArray[Any]]:
+    """Columns of a table that `Page.save_table` wrote: numbers, or text where one of them is none."""
     with path.open(newline="", encoding="utf-8") as file:
         rows = list(csv.reader(line for line in file if not line.startswith("#")))
-    return {name: [row[index] for row in rows[1:]] for index, name in enumerate(rows[0])}
+    return {name: _as_numbers([row[index] for row in rows[1:]]) for index, name in enumerate(rows[0])}
+
+
+def _as_numbers(values: list[str]) -> NDArray[Any]:
+    try:
+        return np.array(values, dtype=float)
+    except ValueError:
+        return np.array(values)

@@ -16,7 +16,6 @@ from pathlib import Path
 
 import numpy as np
 
-from remodel_fenicsx.body.columns import columns_of
 from remodel_fenicsx.results.recording import (
     HISTORY,
     SCENE,
@@ -120,7 +119,7 @@ class Run:
     def _has_all_rows(self, history: HistoryColumns) -> bool:
         """Whether a history, perhaps somebody else's, has columns and rows of a run that has reached its end."""
         scene, times = self.scene, history["time"]
-        names = [column.name for column in columns_of(scene.geometry, scene.output.columns, scene.loads)]
+        names = [column.name for column in scene.columns()]
         is_fixed = scene.time.tolerance is None and not scene.time.is_equilibrium
         rows = scene.time.number_of_steps + 1 if is_fixed else len(times)
         return set(names) <= set(history) and len(times) == rows and bool((np.diff(times) > 0).all())

@@ -14,15 +14,12 @@ from io import TextIOWrapper
 from pathlib import Path
 from typing import Any, cast
 
+from remodel_fenicsx.system import NOTICE
 from remodel_fenicsx.system.regular_files import open_own
 
 LOGGER = "remodel_fenicsx"
 LOG_FORMAT = "%(asctime)s %(levelname)s %(message)s"
 LINE_EVERY = 10.0  # seconds, of lines that stay
-
-# for the log, and for the terminal unless it is to be quiet: a wait with its reason. No warning: all is well
-NOTICE = (logging.INFO + logging.WARNING) // 2
-logging.addLevelName(NOTICE, "NOTICE")
 
 
 class Progress:

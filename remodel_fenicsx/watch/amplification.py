@@ -29,6 +29,7 @@ STEP = 1e-5  # of the differences, over tr A
 DISTINCT = 1e-3  # difference of two squared lengths over tr A below which a turn in their plane is no change of A
 SHEAR_PLANES = ((0, 1), (0, 2), (1, 2))
 LARGEST_BASIS, RESTARTS = 40, 20  # of the Krylov space
+FACTOR_ERROR = 5e-3  # absolute: enough to tell on which side of -1 or 1 a factor is
 ENDS = {"reversing": SLEPc.EPS.Which.SMALLEST_REAL, "growing": SLEPc.EPS.Which.LARGEST_REAL}
 SHARE_NAMES = ("turn_12", "turn_13", "turn_23", "lengths")
 
@@ -168,13 +169,13 @@ class LinearPass:
         self.state.cells.set(cells.dimensions.reshape(*shape, 3), cells.axes.reshape(*shape, 3, 3))
 
     # ------------------------------------------------------------ its eigenvalues
-    def modes(self, end: str = "reversing", number: int = 1, tolerance: float = 5e-3) -> list[PassMode]:
-        """The modes with the most negative factors ("reversing") or the largest ("growing"), the extreme one first.
+    def extreme(self, end: str) -> PassMode:
+        """The mode with the most negative factor ("reversing") or with the largest ("growing").
 
         Raises
         ------
         NotFound
-            If SLEPc has not found the first one.
+            If SLEPc has not found it.
         """
         rows = 6 * self.owned
         total = self.equilibrium.comm.allreduce(rows, MPI.SUM)
@@ -184,23 +185,21 @@ class LinearPass:
         solver.setOperators(operator)
         solver.setProblemType(SLEPc.EPS.ProblemType.NHEP)
         solver.setWhichEigenpairs(ENDS[end])
-        solver.setDimensions(number, min(LARGEST_BASIS, total))
-        solver.setTolerances(tolerance, RESTARTS)
+        solver.setDimensions(1, min(LARGEST_BASIS, total))
+        solver.setTolerances(FACTOR_ERROR, RESTARTS)
         solver.setConvergenceTest(SLEPc.EPS.Conv.ABS)
         start = operator.createVecRight()
         start.array[:] = np.random.default_rng(1).standard_normal(rows)
         solver.setInitialSpace(start)
         solver.solve()
-        found = min(number, solver.getConverged())
-        if not found:
-            raise NotFound(f"no eigenvalue of the pass to {tolerance:g} after {solver.getIterationNumber()} restarts")
-        modes = []
-        for index in range(found):
-            value = solver.getEigenpair(index, start)
-            modes.append(self._mode(float(np.real(value)), self.tensors(start.array_r)))
+        if not solver.getConverged():
+            raise NotFound(
+                f"no eigenvalue of the pass to {FACTOR_ERROR:g} after {solver.getIterationNumber()} restarts"
+            )
+        found = self._mode(float(np.real(solver.getEigenpair(0, start))), self.tensors(start.array_r))
         for thing in (solver, operator, start):
             thing.destroy()
-        return modes
+        return found
 
     def _mode(self, factor: float, change: Array) -> PassMode:
         comm, volumes = self.equilibrium.comm, self._weights**2
@@ -285,7 +284,7 @@ class AmplificationWatcher(Watcher):
 
     def _first_mode(self, linear: LinearPass, end: str, step: Step) -> PassMode | None:
         try:
-            return linear.modes(end)[0]
+            return linear.extreme(end)
         except NotFound as reason:
             if linear.equilibrium.comm.rank == 0:
                 log.warning("time %g, %s modes: %s", step.time, end, reason)

@@ -38,17 +38,17 @@ class BucklingWarning(WarnsOnce):
     stepper
         Whose states are looked at.
     strut
-        What of the body buckles; None for one that does not.
+        What of the body buckles.
     """
 
-    def __init__(self, stepper: Stepper, strut: Strut | None):
+    def __init__(self, stepper: Stepper, strut: Strut):
         super().__init__(stepper, "buckling")
-        self.strut = strut if self.state.kinematics.reduced else None
+        self.strut = strut
         self._occasions = Occasions(self.state, "buckling")
 
     def solved(self, step: Step) -> None:
         """Look, until it was said."""
-        if self.strut is not None and not self.said and self._occasions.due() and (found := self.in_words()):
+        if not self.said and self._occasions.due() and (found := self.in_words()):
             self.say(step, found)
 
     def in_words(self) -> str:
@@ -73,13 +73,12 @@ class BucklingWarning(WarnsOnce):
         """Of the wall and of what fills the cavity, along z."""
         stress = self._derivatives([(ALONG,)])[0]
         force = self._integral(stress) / self._length()
-        if self.strut is None or self.strut.radii is None:
+        if self.strut.radii is None:
             return -force
         return self.state.loading.values["pressure"] * np.pi * self._radii()[0] ** 2 - force
 
     def euler_load(self) -> float:
         """Of the present body."""
-        assert self.strut is not None
         H = self._moduli()
         across = H[:2, :2]
         coupling = H[:2, ALONG].T[..., None]
@@ -91,7 +90,7 @@ class BucklingWarning(WarnsOnce):
 
     def suction_share(self) -> float:
         """Pressure below zero over that at which the wall turns oval, a ring in plane strain."""
-        if self.strut is None or self.strut.radii is None or self.state.loading.values["pressure"] >= 0:
+        if self.strut.radii is None or self.state.loading.values["pressure"] >= 0:
             return 0.0
         (inner, outer), H = self._radii(), self._moduli()
         modulus = H[AROUND, AROUND] - H[AROUND, ACROSS] ** 2 / H[ACROSS, ACROSS]
@@ -105,13 +104,12 @@ class BucklingWarning(WarnsOnce):
         return self.stepper.coupling.equilibrium.look().states[:, 2:].reshape(-1, 3, 3)
 
     def _length(self) -> float:
-        assert self.strut is not None
         stretch = self._integral(self._gradients()[:, 2, 2]) / self._integral(np.ones(len(self._places)))
         return self.strut.length * stretch
 
     def _radii(self) -> tuple[float, float]:
         """Of the cavity's wall, inside and outside: means over the nodes there."""
-        assert self.strut is not None and self.strut.radii is not None
+        assert self.strut.radii is not None
         kinematics, unknown = self.state.kinematics, self.state.unknown
         nodes = kinematics.nodal_space(unknown).tabulate_dof_coordinates()
         deformed = np.linalg.norm((nodes + kinematics.nodal_displacement(unknown))[:, :2], axis=1)
@@ -175,7 +173,6 @@ class BucklingWarning(WarnsOnce):
 
     @cached_property
     def _directions(self) -> Array:
-        assert self.strut is not None
         return self.strut.directions(self._places)
 
     @cached_property

@@ -185,10 +185,9 @@ class OverCorrection(WarnsOnce):
 
         now, last = _difference(cells, times), _difference(cells[1:], times[1:])
         moved, moved_last, place = _difference(body, times), _difference(body[1:], times[1:]), body[0]
+        r0 = self.stepper.remodeling.parameters.largest().end_to_end_length
         return Swing(
-            np.sqrt(of_cells(now, now) / self.quadrature.volume)
-            / GAIN
-            / self.state.cells.settings.end_to_end_length**2,
+            np.sqrt(of_cells(now, now) / self.quadrature.volume) / GAIN / r0**2,
             _ratio(of_cells(now, last), of_cells(last, last)),
             np.sqrt(_ratio(of_body(moved, moved), of_body(place, place))) / GAIN,
             _ratio(of_body(moved, moved_last), of_body(moved_last, moved_last)),
@@ -274,8 +273,8 @@ class RestedCells(WarnsOnce):
         """Warn."""
         if self.said:
             return
-        squares = self._squares
-        change = np.sqrt(self.quadrature.mean(squares)) / self.state.cells.settings.end_to_end_length**2
+        squares, r0 = self._squares, self.stepper.remodeling.parameters.largest().end_to_end_length
+        change = np.sqrt(self.quadrature.mean(squares)) / r0**2
         if change < RESUMED_CHANGE:
             return
         share, place = self.quadrature.mean((squares > 0).astype(float)), self.quadrature.place_of_largest(squares)

@@ -8,11 +8,10 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.shape import Shape
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
 from remodel_fenicsx.fem.compat import geometry_dofmap
-from remodel_fenicsx.system.terminal import NOTICE
+from remodel_fenicsx.system import NOTICE
 from remodel_fenicsx.watch.once import WarnsOnce
 
 Array = NDArray[np.float64]
@@ -80,7 +79,7 @@ class RadialChains(WarnsOnce):
     stepper
         Whose solved states are looked at.
     radial_share
-        Of dimensions, axes and places, as `Shape.radial_share`.
+        Of dimensions, axes and local axes, as `Shape.radial_share`.
     """
 
     def __init__(self, stepper: Stepper, radial_share: Callable[[Array, Array, Array], Array]):
@@ -91,7 +90,7 @@ class RadialChains(WarnsOnce):
         """Measure, until it was said."""
         if not self.said:
             cells = self.state.cells
-            share = self.radial_share(cells.dimension_values, cells.axis_values, self.quadrature.coordinates)
+            share = self.radial_share(cells.dimension_values, cells.axis_values, cells.local_axes.axes)
             self._numbers["share"] = self.quadrature.mean(share)
 
     def committed(self, step: Step) -> None:
@@ -115,14 +114,14 @@ class FrontsInLayers(Watcher):
     ----------
     stepper
         Whose last state is looked at.
-    shape, domain
+    shape
         With the layers (`Shape.angle_layers`) and the angles.
     """
 
-    def __init__(self, stepper: Stepper, shape: Shape, domain: Domain):
+    def __init__(self, stepper: Stepper, shape: Shape):
         self.state, self.shape, self._found = stepper.state, shape, list[tuple[str, float, float]]()
-        nodes = domain.mesh.geometry.x[geometry_dofmap(domain.mesh)]
-        depths = shape.depth(nodes) if shape.angle_layers else np.zeros(nodes.shape[:-1])
+        nodes = geometry_dofmap(self.state.cells.quadrature.mesh)
+        depths = self.state.cells.local_axes.nodal_depth[nodes] if shape.angle_layers else np.zeros(nodes.shape)
         self._layers = {
             name: (depths.min(axis=1) <= share + 1e-6) & (depths.max(axis=1) >= share - 1e-6)
             for name, share in shape.angle_layers.items()
@@ -134,7 +133,7 @@ class FrontsInLayers(Watcher):
         if not step.is_last:
             return
         cells, quadrature = self.state.cells, self.state.cells.quadrature
-        angles = self.shape.fibre_angle(cells.dimension_values, cells.axis_values, quadrature.coordinates)
+        angles = self.shape.fibre_angle(cells.dimension_values, cells.axis_values, cells.local_axes.axes)
         known = ~np.isnan(angles)
         least = np.where(known, angles, np.inf).min(axis=1)
         most = np.where(known, angles, -np.inf).max(axis=1)

@@ -50,6 +50,7 @@ from remodel_fenicsx.extend import (
     FullKinematics,
     Law,
     LoadKind,
+    LocalAxes,
     Measurement,
     Repulsion,
     Selective,
@@ -271,9 +272,9 @@ def test_a_pairing(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_initial_axes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Cells along an axis that leans by 30 degrees from the load."""
 
-    def leaning(coordinates: np.ndarray) -> np.ndarray:
+    def leaning(points: LocalAxes) -> np.ndarray:
         c, s = np.cos(np.pi / 6), 0.5
-        return np.broadcast_to([[c, 0.0, -s], [0.0, 1.0, 0.0], [s, 0.0, c]], (*coordinates.shape[:-1], 3, 3))
+        return np.broadcast_to([[c, 0.0, -s], [0.0, 1.0, 0.0], [s, 0.0, c]], (*points.coordinates.shape[:-1], 3, 3))
 
     monkeypatch.setitem(AXES, "leaning", leaning)
     with pytest.raises(SceneError, match="^cells.axes = 'leaning': allowed for shape 'cube' is 'global'$"):
@@ -377,7 +378,7 @@ class Bar(Shape):
         for component, face in enumerate(("x0", "y0", "z0")):
             loading.hold_face(face, component)
 
-    def fibre_angle(self, dimensions: Any, axes: Any, coordinates: Any) -> Any:
+    def fibre_angle(self, dimensions: Any, axes: Any, local: Any) -> Any:
         """To x, across the load."""
         return angle_to_axis(dimensions, axes, np.array([1.0, 0.0, 0.0]))
 

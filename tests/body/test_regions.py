@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 from mpi4py import MPI
+from pydantic_core import PydanticCustomError
 
 from remodel_fenicsx import Scene, SceneError
-from remodel_fenicsx.body import Tube
+from remodel_fenicsx.body import SHAPES, Tube
 from remodel_fenicsx.body.domain import Domain, build_domain
 from remodel_fenicsx.body.gmsh_model import GeometryError
 from remodel_fenicsx.body.layers import shared_out
@@ -105,6 +106,16 @@ def test_bad_regions_are_refused_in_one_line(regions: dict[str, Any], line: str)
 def test_a_body_without_regions_refuses_them_by_name() -> None:
     with pytest.raises(SceneError, match="^regions.core: a cube has no regions; shapes with regions: 'tube'$"):
         Scene(geometry={"shape": "cube"}, regions={"core": {}}, time={"end": 1.0})
+
+
+def test_an_outer_radius_where_no_layer_is_is_refused() -> None:
+    """Also by shapes of scripts that have regions and say no more about them."""
+    cube = SHAPES["cube"](side=1.0)
+    cube.check_regions({"core": Region()}, Mesh())
+    with pytest.raises(
+        PydanticCustomError, match="the regions of a cube come with its mesh; only layers of a tube have"
+    ):
+        cube.check_regions({"core": Region(outer_radius=1.0)}, Mesh())
 
 
 def test_radii_of_layers_take_units_and_are_read_back(tmp_path: Any) -> None:

@@ -13,7 +13,8 @@ import warnings
 import pytest
 
 from remodel_fenicsx.system import terminal
-from remodel_fenicsx.system.terminal import NOTICE, Progress, hold_log, open_log
+from remodel_fenicsx.system import NOTICE
+from remodel_fenicsx.system.terminal import Progress, hold_log, open_log
 
 SCRIPT = """
 import sys, time, logging

@@ -55,8 +55,8 @@ class Angles(Watcher):
 
     def committed(self, step: Step) -> None:
         simulation = self.simulation
-        cells, places = simulation.state.equilibrium_cells, simulation.quadrature.coordinates
-        angles = simulation.scene.geometry.fibre_angle(cells.dimension_values, cells.axis_values, places)
+        cells, local = simulation.state.equilibrium_cells, simulation.cells.local_axes.axes
+        angles = simulation.scene.geometry.fibre_angle(cells.dimension_values, cells.axis_values, local)
         self.by_time[step.time] = angles.copy()
         self.cells[step.time] = UnitCell(*(values.copy() for values in cells.point_cells[:2]))
 

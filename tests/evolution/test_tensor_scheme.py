@@ -210,7 +210,7 @@ def test_isotropic_cells_keep_the_tube_symmetric() -> None:
         simulation = short_tube(12.0, cells="isotropic", driver=driver)
         _, _, rows = run(simulation)
         angle = simulation.scene.geometry.fibre_angle(
-            simulation.cells.dimension_values, simulation.cells.axis_values, simulation.quadrature.coordinates
+            simulation.cells.dimension_values, simulation.cells.axis_values, simulation.cells.local_axes.axes
         )
         layers = np.round(np.linalg.norm(simulation.quadrature.coordinates[..., :2], axis=-1), 6)
         scatter = max(np.ptp(angle[layers == radius]) for radius in np.unique(layers))

@@ -29,9 +29,10 @@ TYPES_ONLY = {
     "body.columns": {"body.shape"},
     "body.cube": {"body.domain", "body.loading"},
     "body.layers": {"body.domain"},
-    "body.shape": {"body.domain", "body.loading"},
+    "body.shape": {"body.domain", "body.loading", "fem.quadrature"},
     "body.tendon": {"body.domain", "body.loading"},
     "body.tube": {"body.domain", "body.loading"},
+    "body.walled": {"body.domain", "fem.quadrature"},
     "extend": {"evolution.coupling", "solver.linear", "fem.jit", "results.columns"},
     "results.recording": {"scene.scene"},
 }

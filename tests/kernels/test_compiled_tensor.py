@@ -79,7 +79,8 @@ def test_solution_and_tangent(kernels: TensorKernels, name: str, driver: str) ->
     rng = np.random.default_rng(11)
     F = deformations(COUNT, rng) + 0.05 * rng.standard_normal((COUNT, 3, 3))
     F[-4:] = np.array([1.2, 1.2, 1.2, 1.2, 1.2, 0.8, 0.9, 1.3, 1.3, 0.9, 0.9, 0.9]).reshape(4, 3, 1) * np.eye(3)
-    some = points("tensor", name, driver, "material", COUNT, "random", kappa=0.1)
+    kappa = np.linspace(0.02, 0.2, COUNT)  # of points in several regions
+    some = points("tensor", name, driver, "material", COUNT, "random", kappa=kappa)
     twin, start = compiled_twin(kernels, some), some.with_cells(F, some.step.cells).driving_tensor
     assert (np.linalg.eigvalsh(start) < 0).any() or driver == "finger"
     expected, found = some.solve(F, start), twin.solve(F, start)

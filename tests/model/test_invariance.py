@@ -17,6 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mpi4py import MPI
 
+from remodel_fenicsx.body import Cube
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.loading import Loading
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
@@ -172,9 +173,8 @@ class Points:
         self.displacement = FullKinematics().unknown(mesh, 1)
         self.space = self.displacement.function_space
         self.quadrature = Quadrature(mesh, 1)
-        self.cells = UnitCells(
-            self.quadrature, self.domain.element_number, self.domain.number_of_elements, Cells(initial="random", seed=2)
-        )
+        local_axes = Cube().local_axes(self.domain, self.quadrature)
+        self.cells = UnitCells(self.quadrature, self.domain, Cells(initial="random", seed=2), local_axes)
         self.state = State(self.displacement, FullKinematics(), self.cells, Loading(self.domain, self.displacement))
         self.passes: dict[tuple[str, str, str], RemodelingPass] = {}
 

@@ -37,13 +37,13 @@ SLOPES = np.stack([4 * POINTS - 3, 4 - 8 * POINTS, 4 * POINTS - 1], axis=1)
 
 @dataclass(frozen=True)
 class RadialMaterial:
-    """Parameters of the paper's artery; stresses in Pa, lengths of the chain in link lengths."""
+    """Parameters of the paper's artery, of layers (points, 1); stresses in Pa, lengths of the chain in link lengths."""
 
-    lame_lambda: float = 27.293
-    lame_mu: float = 3.103
-    network_modulus: float = 1.381e-23 * 310.0 * 2.0e21 / (4 * 1.365)
-    contour_length: float = 1.594
-    end_to_end_length: float = 1.0
+    lame_lambda: Any = 27.293
+    lame_mu: Any = 3.103
+    network_modulus: Any = 1.381e-23 * 310.0 * 2.0e21 / (4 * 1.365)
+    contour_length: Any = 1.594
+    end_to_end_length: Any = 1.0
 
 
 @dataclass(frozen=True)
@@ -162,7 +162,7 @@ class Tube:
     def admissible(self, stretches: Array, squares: Array) -> bool:
         """Whether every point has J > 0 and r < L."""
         chain = np.sqrt(np.sum(squares * stretches**2, axis=1))
-        return bool(np.all(stretches > 0) and np.all(chain < self.material.contour_length))
+        return bool(np.all(stretches > 0) and np.all(chain < np.ravel(self.material.contour_length)))
 
     def residual(self, radii: Array, squares: Array, pressure: float, axial: float) -> Array:
         """Return internal minus external forces at the nodes, per radian and unit length of the axis."""
@@ -250,9 +250,9 @@ def driving_values(driver: str, stretches: Array, cauchy: Array) -> Array:
 def stress_noise(stretches: Array, squares: Array, material: RadialMaterial) -> float:
     """Return the size up to which a stress may be the solver's error: strains are accepted to 1e-11."""
     m = material
-    r = np.sqrt(np.sum(squares * stretches**2, axis=1))
+    r = np.sqrt(np.sum(squares * stretches**2, axis=1, keepdims=True))
     network = m.network_modulus * secant_stiffness(r, m.contour_length) * r**2 / (1 - r / m.contour_length)
-    return 1e-11 * float(m.lame_lambda + 2 * m.lame_mu + np.max(network))
+    return 1e-11 * float(np.max(m.lame_lambda + 2 * m.lame_mu) + np.max(network))
 
 
 def sorted_directions(values: Array, previous: Array, tolerance: float = 1e-8, noise: float = 0.0) -> Array:
@@ -267,7 +267,7 @@ def sorted_directions(values: Array, previous: Array, tolerance: float = 1e-8, n
     return ranks
 
 
-def updated(law: str, old: Array, start: Array, target: Array, kappa: float, time: float, step: float) -> Array:
+def updated(law: str, old: Array, start: Array, target: Array, kappa: Any, time: float, step: float) -> Array:
     """Return the dimensions by rank at `time` (eq. 11, eq. 10 integrated over the step, or the autonomous form)."""
     if law == "explicit":
         return start + (target - start) * (1 - np.exp(-kappa * time))
@@ -286,10 +286,10 @@ def remodel(
     ranks: Array,
     start: Array,
     law: str,
-    kappa: float,
+    kappa: Any,
     time: float,
     step: float,
-    r0: float,
+    r0: Any,
     noise: float = 0.0,
 ) -> tuple[Array, Array]:
     """Return the dimensions by rank and the direction of each rank after one remodeling pass."""
@@ -309,7 +309,7 @@ def remodel(
     return np.where(active, new, ranked), new_ranks
 
 
-def structure(squares: Array, values: Array, rate: float, r0: float) -> Array:
+def structure(squares: Array, values: Array, rate: Any, r0: Any) -> Array:
     """Return the squares by direction after a step of dA/dt = kappa s (r0^2 E - A), A diagonal; rate: kappa times step.
 
     E = (d+)^2 / |d+|^2 with the driver's eigenvalues d, and s = |d+|^2 / (|d+|^2 + |d-|^2 / 100): no ranks.
@@ -329,13 +329,14 @@ def solve_radial(
     step: float = 1.0,
     driver: str = "cauchy",
     law: str = "explicit",
-    kappa: float = 0.025,
+    kappa: Any = 0.025,
     inner_radius: float = 1.0,
     outer_radius: float = 3.0,
     elements: int = 200,
     material: RadialMaterial = RadialMaterial(),
+    initial: Array | None = None,
 ) -> RadialHistory:
-    """Remodel the tube with initially isotropic cells; staggered in time as the paper does it.
+    """Remodel the tube; staggered in time as the paper does it.
 
     Each step to t: set pressure and stretch of t; solve with the cells of t - step; the stress and the time t then give
     the cells of t. A rank keeps its dimension when it changes its direction.
@@ -347,8 +348,12 @@ def solve_radial(
     driver : "cauchy" | "pk2" | "finger"
     law : "explicit" (eq. 11) | "rate" (eq. 10) | "relaxation" | "tensor" (of the consistent variant, whose repulsion
         is the paper's where cells and stretches have the same axes, as here) | "none"
+    kappa
+        A number, or (points, 1).
     elements
         Quadratic elements through the wall.
+    initial
+        Cell dimensions at t = 0 by direction, (points, 3); default: isotropic cells.
 
     Raises
     ------
@@ -358,7 +363,7 @@ def solve_radial(
     tube = Tube(inner_radius, outer_radius, elements, material)
     count = len(tube.points)
     number_of_steps = round(end / step)
-    start = np.full((count, 3), material.end_to_end_length / np.sqrt(3))
+    start = np.full((count, 3), material.end_to_end_length / np.sqrt(3)) if initial is None else initial
     ranked: Array = start.copy()
     ranks: Array = np.tile(np.array([CIRCUMFERENTIAL, AXIAL, RADIAL]), (count, 1))
     radii = tube.nodes.copy()

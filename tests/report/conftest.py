@@ -26,6 +26,7 @@ RUNS = {
     "quadratic": ("cube", "time.end=2 | mesh.degree=2"),
     "radial": ("artery", "time.end=3 | cells.initial=isotropic | model.kinematics=radial"),
     "axisymmetric": ("artery", "time.end=3 | cells.initial=isotropic | model.kinematics=axisymmetric"),
+    "layers": ("layers", "time.end=3"),
     "sector": ("artery", "time.end=3 | cells.initial=isotropic | model.kinematics=sector"),
     "point": ("tendon", "time.end=3 | cells.initial=isotropic | model.kinematics=point"),
     "without fields": ("cube", "time.end=3 | output.fields=false"),

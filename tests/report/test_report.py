@@ -105,6 +105,28 @@ def worst_direction(first: np.ndarray, second: np.ndarray) -> float:
     return float(np.degrees(np.arccos(np.clip(np.sum(first * second, axis=1) / lengths, -1, 1))).max())
 
 
+def test_regions_are_shown_by_name(recorded: Recorded) -> None:
+    """A curve for each beside those of the body, where each lies in the profile, and what differs in words."""
+    found = Decoded.of(recorded("layers"))
+    regions = found.data["parts"]["angles"]["regions"]
+    assert regions == [{"name": "media", "from": 0.0, "to": 0.5}, {"name": "adventitia", "from": 0.5, "to": 1.0}]
+    curves = {
+        curve["title"]: [one["name"] for one in curve["series"]] for curve in found.data["parts"]["curves"]["curves"]
+    }
+    angles = [
+        "fibre angle inner",
+        "fibre angle middle",
+        "fibre angle outer",
+        "fibre angle media",
+        "fibre angle adventitia",
+    ]
+    assert curves["Fibre angle"] == angles
+    assert {"max chain extension media", "max chain extension adventitia"} <= set(sum(curves.values(), []))
+    for words in ("kappa media: 0.05; adventitia: 0.025", "media: isotropic, r0 = 1; adventitia: (0.5, 0.85, 0.165"):
+        assert words in found.text
+    assert Decoded.of(recorded("artery")).data["parts"]["angles"]["regions"] == []
+
+
 def test_volumes_and_layers_are_those_of_the_body(recorded: Recorded) -> None:
     for name, layers in (("artery", 8), ("tendon", 10), ("cube", 1)):
         found = Decoded.of(recorded(name))

@@ -56,9 +56,7 @@ def test_fields_and_row_belong_to_the_cells_before_the_pass(tmp_path: Path) -> N
     for time, angle in rows.items():
         assert fields[time] == pytest.approx(angle, rel=1e-6)  # fields have seven digits
     cells = simulation.cells
-    now = simulation.scene.geometry.fibre_angle(
-        cells.dimension_values, cells.axis_values, simulation.quadrature.coordinates
-    )
+    now = simulation.scene.geometry.fibre_angle(cells.dimension_values, cells.axis_values, cells.local_axes.axes)
     assert now.max() < rows[3.0] - 0.5
 
 

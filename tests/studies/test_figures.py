@@ -326,13 +326,8 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def numbers(path: Path) -> dict[str, np.ndarray]:
-    """Columns of a figure's table."""
-    return {name: np.array(values, dtype=float) for name, values in page.read_table(path).items()}
-
-
 def test_fig1_is_eq_2(drawn: Path) -> None:
-    table = numbers(drawn / "fig1.csv")
+    table = page.read_table(drawn / "fig1.csv")
     x = table["extension"]
     assert len(x) > 100 and x[0] == 0 and 0.9 < x[-1] < 1
     for A in (0.1, 0.4, 0.8):
@@ -340,7 +335,7 @@ def test_fig1_is_eq_2(drawn: Path) -> None:
 
 
 def test_fig5_is_the_closed_form_of_the_cells_before_the_pass(drawn: Path) -> None:
-    table = numbers(drawn / "fig5.csv")
+    table = page.read_table(drawn / "fig5.csv")
     np.testing.assert_array_equal(table["time"][table["time"] > 0], np.arange(1.0, 101.0))
     for kappa in (0.01, 0.025, 0.05, 0.1):
         s = 1 - np.exp(-kappa * np.maximum(table["time"] - 1.0, 0.0))
@@ -637,23 +632,23 @@ def test_every_figure_has_a_picture_and_its_data(everything: Path) -> None:
 
 @pytest.mark.slow
 def test_the_figures_show_what_the_design_says(everything: Path) -> None:
-    tendon = numbers(everything / "fig6.csv")
+    tendon = page.read_table(everything / "fig6.csv")
     assert 1.735 <= tendon["mean_stretch"][tendon["time"] == 12.0].item() <= 1.750
     assert 1.4244 <= tendon["mean_stretch"][-1] <= 1.4250
-    radial = numbers(everything / "fig7.csv")["mean_l_radial"]
+    radial = page.read_table(everything / "fig7.csv")["mean_l_radial"]
     assert 0.49 < radial[0] < 0.53 and 0.02 < radial[-1] < 0.035
-    layers = numbers(everything / "fig8.csv")
+    layers = page.read_table(everything / "fig8.csv")
     target = [1.1, 4.2, 14.0, 36.9, 60.2, 66.7, 70.3, 72.7]
     np.testing.assert_allclose(layers["fibre_angle"], target, rtol=0, atol=1.5)
-    cases = numbers(everything / "fig9.csv")
+    cases = page.read_table(everything / "fig9.csv")
     stretched, pressed = (cases["pressure"] == 0.0, cases["stretch"] == 0.0)
     assert np.all(cases["fibre_angle"][stretched] > 89.0)
     assert np.all(cases["fibre_angle"][pressed][:4] < 1.5) and np.all(cases["fibre_angle"][pressed] < 13.0)
-    second, strain = numbers(everything / "fig10.csv"), numbers(everything / "fig11.csv")
+    second, strain = page.read_table(everything / "fig10.csv"), page.read_table(everything / "fig11.csv")
     variation = {name: np.ptp(table[f"fibre_angle_{name}"]) for name, table in
                  (("cauchy", second), ("pk2", second), ("finger", strain))}  # fmt: skip
     assert variation["finger"] < 25 < 60 < variation["pk2"] < variation["cauchy"] < variation["pk2"] + 6
-    rate = numbers(everything / "rate.csv")
+    rate = page.read_table(everything / "rate.csv")
     assert 15 < rate["fibre_angle_explicit"][-1] - rate["fibre_angle_rate"][-1] < 25
 
 

@@ -12,7 +12,7 @@ from mpi4py import MPI
 from remodel_fenicsx import Simulation
 from remodel_fenicsx.body import SHAPES
 from remodel_fenicsx.scene import Scene, scene_from_dict
-from remodel_fenicsx.system.terminal import NOTICE
+from remodel_fenicsx.system import NOTICE
 from remodel_fenicsx.watch.tissue import VolumeLoss
 from tests.conftest import Case, slowly
 

@@ -58,8 +58,8 @@ class StepOfCells(NamedTuple):
         return not self.drive.driver.material and self.drive.frame.carries_axes
 
     @property
-    def rate(self) -> float:
-        """kappa dt."""
+    def rate(self) -> Array | float:
+        """kappa dt, (n,) or a number."""
         return self.drive.kappa * (self.time_new - self.time_old)
 
 
@@ -94,14 +94,14 @@ def jumps_by_rank(step: StepOfCells) -> NDArray[np.bool_]:
     r0 = np.asarray(step.drive.end_to_end_length)
     lengths = _lengths(step, np.repeat(r0[:, None] / np.sqrt(3), 3, axis=1))
     apart: NDArray[np.bool_] = np.ptp(lengths, axis=1) > SAME_LENGTH * r0
-    return apart
+    return apart & (np.asarray(step.drive.kappa) > 0.0)
 
 
 def _lengths(step: StepOfCells, target: Any) -> Array:
     """What a law by rank makes of the lengths; `target` may be complex."""
     drive, law = step.drive, step.law.dimensions
     assert law is not None
-    return law(step.cells.dimensions, drive.initial_dimensions, target, drive.kappa, step.time_old, step.time_new)
+    return law(step.cells.dimensions, drive.initial_dimensions, target, drive.kappas, step.time_old, step.time_new)
 
 
 # ---------------------------------------------------------------- the law for A

@@ -54,6 +54,14 @@ function profileDrawing(data, clock, others, profileAt) {
     drawing.append(element("line", { x1: 34, x2: 260, y1: y(degrees), y2: y(degrees), stroke: "var(--line)" }));
     drawing.append(element("text", { x: 28, y: y(degrees) + 4, "text-anchor": "end" }, `${degrees}°`));
   }
+  for (const region of data.regions) {  // the name of each, and where the next one begins
+    const middle = x((region.from + region.to) / 2);
+    drawing.append(element("text", { x: middle, y: 10, "text-anchor": "middle", class: "region" }, region.name));
+    if (region.to < 1) {
+      const at = { x1: x(region.to), x2: x(region.to), y1: y(90), y2: y(0) };
+      drawing.append(element("line", { ...at, stroke: "var(--soft)", "stroke-dasharray": "4 3", class: "region" }));
+    }
+  }
   const known = (profile) => profile.map((layer, k) => ({ ...layer, depth: data.depth[k] }))
     .filter((layer) => Number.isFinite(layer.mean));
   const path = (points) => points.map(([a, b], k) => `${k ? "L" : "M"}${a.toFixed(1)} ${b.toFixed(1)}`).join("");

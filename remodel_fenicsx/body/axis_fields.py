@@ -1,0 +1,224 @@
+"""Directions and lengths in any body with an inner and an outer face, an inlet and outlets, by a few linear solves.
+
+1. phi is harmonic, 0 on the inner and 1 on the outer face. Its unit gradients, projected onto continuous vectors, give
+   the radial direction: raw gradients are those of plane facets, which lean by up to half of their angle.
+2. The axial direction is the smoothest field of vectors that are normal to the ends and square to the radial one.
+3. Lengths along r from the inner and the outer face give depth and thickness (Yezzi & Prince 2003); lengths along a
+   from the ends give the station.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import basix
+import dolfinx.fem
+import dolfinx.la
+import numpy as np
+import ufl
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from remodel_fenicsx.body.domain import Domain
+from remodel_fenicsx.fem.assembly import over_ranks
+from remodel_fenicsx.fem.compat import geometry_dofmap
+from remodel_fenicsx.fem.kinematics import lagrange
+from remodel_fenicsx.fem.positive import solve_positive
+from remodel_fenicsx.fem.quadrature import Quadrature
+
+Array = NDArray[np.float64]
+Facets = NDArray[np.int32]
+
+# of 1/thickness: an element with all its nodes on one face has no gradient of phi, and 0/0 would be everywhere
+LEAST_SLOPE = 1e-6
+# weight of (a . r)^2 against |grad a|^2 times the squared thickness: 10 and 1000 differ by 0.2 degrees rms in a bend
+SQUARE_TO_RADIAL = 10.0
+TINY = 1e-12  # of a squared length of about one: no direction is divided by zero
+
+
+@dataclass(frozen=True, eq=False)
+class AxisFields:
+    """Continuous functions on the mesh, of its degree.
+
+    Attributes
+    ----------
+    radial, axial
+        Vectors, near unit length where they are defined, not square to each other to the last digit.
+    from_inner, from_outer
+        Lengths along the radial direction from these faces.
+    from_inlet, from_outlet
+        Lengths along the axial direction from the ends.
+    """
+
+    radial: Any
+    axial: Any
+    from_inner: Any
+    from_outer: Any
+    from_inlet: Any
+    from_outlet: Any
+
+
+def axis_fields(
+    domain: Domain, quadrature: Quadrature, inlets: Sequence[str] = ("inlet",), outlets: Sequence[str] = ("outlet",)
+) -> AxisFields:
+    """Find them. Collective.
+
+    Parameters
+    ----------
+    domain
+        With faces "inner" and "outer".
+    quadrature
+        On its mesh, with the degree of its elements.
+    inlets, outlets
+        Names of the faces across the body. Chains that run from inlets to outlets go up the axial direction.
+
+    Raises
+    ------
+    SolveStopped
+        If a linear solve does not converge.
+    """
+    mesh, degree = domain.mesh, quadrature.element_degree
+    inner, outer, starts, ends = (facets_of(domain, names) for names in (["inner"], ["outer"], inlets, outlets))
+    thickness = 2 * quadrature.volume / (area(mesh, inner) + area(mesh, outer))
+    dx = ufl.Measure("dx", domain=mesh, metadata={"quadrature_degree": 2 * degree})
+    radial = _radial(mesh, degree, dx, inner, outer, thickness)
+    axial = _axial(radial, dx, starts, ends, thickness)
+    return AxisFields(
+        radial,
+        axial,
+        _length(radial, dx, inner, 1.0),
+        _length(radial, dx, outer, -1.0),
+        _potential(axial, dx, starts, 1.0),
+        _potential(axial, dx, ends, -1.0),
+    )
+
+
+def _radial(mesh: Any, degree: int, dx: Any, inner: Facets, outer: Facets, thickness: float) -> Any:
+    """Projected unit gradients of the harmonic function."""
+    phi, found = lagrange(mesh, degree, ()), lagrange(mesh, degree, (3,))
+    solve_positive(_stiffness(phi, dx), None, phi, [_held(phi, inner, 0.0), _held(phi, outer, 1.0)])
+    slope, least = ufl.grad(phi), dolfinx.fem.Constant(mesh, np.float64(LEAST_SLOPE / thickness))
+    direction = slope / ufl.sqrt(ufl.inner(slope, slope) + least**2)
+    trial, test = _arguments(found)
+    solve_positive(ufl.inner(trial, test) * dx, ufl.inner(direction, test) * dx, found)
+    return found
+
+
+def _axial(radial: Any, dx: Any, starts: Facets, ends: Facets, thickness: float) -> Any:
+    """The smoothest field: least integral of |grad a|^2 + k (a . r)^2 / thickness^2 with the ends' normals."""
+    mesh, found = radial.function_space.mesh, dolfinx.fem.Function(radial.function_space)
+    weight, normal = dolfinx.fem.Constant(mesh, np.float64(SQUARE_TO_RADIAL / thickness**2)), _unit(radial)
+    trial, test = _arguments(found)
+    across = weight * ufl.inner(trial, normal) * ufl.inner(test, normal)
+    bilinear = (ufl.inner(ufl.grad(trial), ufl.grad(test)) + across) * dx
+    solve_positive(bilinear, None, found, [_normal_to_ends(found, starts, ends)])
+    return found
+
+
+def _length(direction: Any, dx: Any, facets: Facets, sign: float) -> Any:
+    """Length along a direction from facets: least integral of (d . grad - sign)^2, which is 0 on the facets."""
+    found, along = _scalar(direction), _unit(direction)
+    trial, test = _arguments(found)
+    bilinear = ufl.inner(along, ufl.grad(trial)) * ufl.inner(along, ufl.grad(test)) * dx
+    solve_positive(bilinear, _flux(direction, test, dx, sign), found, [_held(found, facets, 0.0)])
+    return found
+
+
+def _potential(direction: Any, dx: Any, facets: Facets, sign: float) -> Any:
+    """The function, 0 on facets, whose gradient is nearest to a direction: a length of a bent body, of its middle.
+
+    Lengths along single lines, as through the wall, would differ over the section of a bend.
+    """
+    found = _scalar(direction)
+    _, test = _arguments(found)
+    solve_positive(_stiffness(found, dx), _flux(direction, test, dx, sign), found, [_held(found, facets, 0.0)])
+    return found
+
+
+def _scalar(vector: Any) -> Any:
+    space = vector.function_space
+    return lagrange(space.mesh, space.ufl_element().degree, ())
+
+
+def _stiffness(function: Any, dx: Any) -> Any:
+    trial, test = _arguments(function)
+    return ufl.inner(ufl.grad(trial), ufl.grad(test)) * dx
+
+
+def _flux(direction: Any, test: Any, dx: Any, sign: float) -> Any:
+    factor = dolfinx.fem.Constant(direction.function_space.mesh, np.float64(sign))
+    return factor * ufl.inner(_unit(direction), ufl.grad(test)) * dx
+
+
+def _arguments(function: Any) -> tuple[Any, Any]:
+    return ufl.TrialFunction(function.function_space), ufl.TestFunction(function.function_space)
+
+
+def _unit(vector: Any) -> Any:
+    return vector / ufl.sqrt(ufl.inner(vector, vector) + TINY)
+
+
+def _held(function: Any, facets: Facets, value: float) -> Any:
+    space = function.function_space
+    dofs = dolfinx.fem.locate_dofs_topological(space, space.mesh.topology.dim - 1, facets)
+    held = dolfinx.fem.Constant(space.mesh, np.float64(value))
+    return dolfinx.fem.dirichletbc(held, dofs, space)
+
+
+def _normal_to_ends(function: Any, starts: Facets, ends: Facets) -> Any:
+    """Inward normals on the inlets, outward ones on the outlets: at nodes the mean over the facets by their area."""
+    space, sums = function.function_space, dolfinx.fem.Function(function.function_space)
+    values, layout = sums.x.array.reshape(-1, 3), space.dofmap.dof_layout
+    for facets, sign in ((starts, -1.0), (ends, 1.0)):
+        cells, local = cells_of(space.mesh, facets)
+        for cell, number, vector in zip(cells, local, outward_areas(space.mesh, facets), strict=True):
+            values[space.dofmap.cell_dofs(cell)[layout.entity_closure_dofs(2, number)]] += sign * vector
+    sums.x.scatter_reverse(dolfinx.la.InsertMode.add)
+    sums.x.scatter_forward()
+    sizes = np.linalg.norm(values, axis=1)
+    dofs = np.flatnonzero(sizes).astype(np.int32)
+    values[dofs] /= sizes[dofs, None]
+    return dolfinx.fem.dirichletbc(sums, dofs)
+
+
+# ---------------------------------------------------------------- facets
+def facets_of(domain: Domain, names: Sequence[str]) -> Facets:
+    """Local facets of named faces, ascending, (n,)."""
+    found: Facets = np.unique(np.concatenate([domain.facet_tags.find(domain.faces[name]) for name in names]))
+    return found.astype(np.int32)
+
+
+def cells_of(mesh: Any, facets: Facets) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The element behind each facet of the boundary, and the facet's number in it."""
+    topology = mesh.topology
+    for pair in ((2, 3), (3, 2), (2, 0)):
+        topology.create_connectivity(*pair)
+    to_cells, to_facets = topology.connectivity(2, 3), topology.connectivity(3, 2)
+    cells = np.array([to_cells.links(facet)[0] for facet in facets], dtype=np.int64)
+    local = [np.flatnonzero(to_facets.links(cell) == facet)[0] for cell, facet in zip(cells, facets, strict=True)]
+    return cells, np.array(local, dtype=np.int64)
+
+
+def outward_areas(mesh: Any, facets: Facets) -> Array:
+    """Area times outward normal of the facets between their corners, (n, 3); zero for those that another rank owns."""
+    cells, local = cells_of(mesh, facets)
+    corners_of = np.array(basix.topology(basix.CellType[mesh.topology.cell_name()])[2])
+    nodes = geometry_dofmap(mesh)[cells]
+    corners = mesh.geometry.x[np.take_along_axis(nodes, corners_of[local], axis=1)]
+    if corners.shape[1] == 3:
+        vectors = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
+    else:  # the diagonals of a quadrilateral, in dolfinx's order of its corners
+        vectors = np.cross(corners[:, 3] - corners[:, 0], corners[:, 2] - corners[:, 1]) / 2
+    middles = mesh.geometry.x[nodes].mean(axis=1)
+    outwards = np.sign(np.sum(vectors * (corners.mean(axis=1) - middles), axis=1))
+    owned = facets < mesh.topology.index_map(2).size_local
+    areas: Array = vectors * (outwards * owned)[:, None]
+    return areas
+
+
+def area(mesh: Any, facets: Facets) -> float:
+    """Of facets, between their corners, over all ranks. Collective."""
+    local = float(np.linalg.norm(outward_areas(mesh, facets), axis=1).sum())
+    return float(over_ranks(mesh.comm, local, MPI.SUM))

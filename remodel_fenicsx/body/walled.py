@@ -1,0 +1,115 @@
+"""Bodies with a wall between an inner and an outer face: what is measured in it, and its local axes on any mesh."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from remodel_fenicsx.body.columns import Column
+from remodel_fenicsx.body.shape import Array, Shape
+from remodel_fenicsx.model.cells import pitch_angle, radial_share
+from remodel_fenicsx.model.local_axes import LocalAxes
+from remodel_fenicsx.settings import CONSTANT_FIELDS
+
+if TYPE_CHECKING:
+    from remodel_fenicsx.body.domain import Domain
+    from remodel_fenicsx.fem.quadrature import Quadrature
+
+NODES_AT_A_DEPTH = 1e-3  # layers of nodes of a regular mesh have their depth to 1e-4
+ANGLE_IN = (
+    "mean of the reference angle, from circumferential (0) to axial (90 degrees), over the chains that do not point "
+    "out of the wall, in the elements"
+)
+
+
+def _angle_at(face: str) -> Callable[[Any], float]:
+    """Mean angle over the elements that have a facet on a face."""
+
+    def elements(m: Any) -> NDArray[np.bool_]:
+        from remodel_fenicsx.body.axis_fields import cells_of, facets_of
+
+        found = np.zeros(m.quadrature.shape[0], dtype=np.bool_)
+        found[cells_of(m.domain.mesh, facets_of(m.domain, [face]))[0]] = True
+        return found
+
+    def value(m: Any) -> float:
+        chosen = m.tool(("elements at", face), lambda: elements(m))
+        return float(m.quadrature.mean_of_known(m.fibre_angle, chosen))
+
+    return value
+
+
+def _middle_angle(m: Any) -> float:
+    """Mean angle over the elements that are half-way through the wall; there are some in every mesh."""
+
+    def elements() -> NDArray[np.bool_]:
+        from remodel_fenicsx.fem.compat import geometry_dofmap
+
+        depths = m.state.cells.local_axes.nodal_depth[geometry_dofmap(m.domain.mesh)]
+        low, high = depths.min(axis=1) - NODES_AT_A_DEPTH, depths.max(axis=1) + NODES_AT_A_DEPTH
+        return np.asarray((low <= 0.5) & (high >= 0.5), dtype=np.bool_)
+
+    return float(m.quadrature.mean_of_known(m.fibre_angle, m.tool("middle elements", elements)))
+
+
+class Walled(Shape):
+    """A body with a wall: angles are those in it."""
+
+    columns_on_request: ClassVar[tuple[Column, ...]] = (
+        Column(
+            "radial_share",
+            "",
+            "volume mean of A_rr / tr A: 0 where all chains lie in the wall, 1 where they point out of it",
+            lambda m: m.quadrature.mean(m.radial_share),
+        ),
+    )
+    angle_layers: ClassVar[dict[str, float]] = {
+        "fibre_angle_inner": 0.0,
+        "fibre_angle_middle": 0.5,
+        "fibre_angle_outer": 1.0,
+    }
+    depth_in_words: ClassVar[tuple[str, str, str]] = ("through the wall", "inside", "outside")
+    angle_in_words: ClassVar[tuple[str, str]] = ("around", "along")
+
+    def fibre_angle(self, dimensions: Array, axes: Array, local: Array) -> Array:
+        """Angle in degrees of the chain direction in the wall, from circumferential (0) to axial (90); NaN across."""
+        return pitch_angle(dimensions, axes, local)
+
+    def radial_share(self, dimensions: Array, axes: Array, local: Array) -> Array:
+        """A_rr / tr A."""
+        return radial_share(dimensions, axes, local)
+
+
+class WalledMesh(Walled):
+    """A body with a wall whose local axes are found on its mesh.
+
+    Faces "inner" and "outer" lie across the wall from each other, "inlet" and "outlet" across the body.
+    """
+
+    columns: ClassVar[tuple[Column, ...]] = (
+        Column("fibre_angle_inner", "degrees", f"{ANGLE_IN} with a facet on the inner face", _angle_at("inner")),
+        Column("fibre_angle_middle", "degrees", f"{ANGLE_IN} half-way through the wall", _middle_angle),
+        Column("fibre_angle_outer", "degrees", f"{ANGLE_IN} with a facet on the outer face", _angle_at("outer")),
+    )
+    axis_kinds: ClassVar[tuple[str, ...]] = ("local", "global")
+    constant_fields: ClassVar[tuple[str, ...]] = CONSTANT_FIELDS
+    defaults: ClassVar[dict[str, Any]] = {"cells": {"axes": "local"}}
+
+    def local_axes(self, domain: Domain, quadrature: Quadrature) -> LocalAxes:
+        """Found on the mesh by a few linear solves. Collective.
+
+        Raises
+        ------
+        SceneError
+            If the wall has none.
+        """
+        from remodel_fenicsx.body.local_axes import found_axes
+
+        return found_axes(domain, quadrature)
+
+    def depth(self, coordinates: Array) -> Array:
+        """No function of the place: where it was not recorded all is one layer."""
+        return np.zeros(coordinates.shape[:-1])

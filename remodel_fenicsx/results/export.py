@@ -1,0 +1,237 @@
+"""The cells of a recorded run as fibres of other programs: one structure tensor for each element. It needs no dolfinx.
+
+Elements and nodes have the numbers of the run's mesh file, counted from 1 in text. What is written where:
+
+- febio: https://help.febio.org, User Manual 4, sections Mesh and MeshData; read by FEBioMeshDataSection4.cpp. Axis 1 is
+  a, axis 2 lies in the plane of a and d; the cell dimensions are three data maps of the elements.
+- abaqus: Keywords Reference Guide, *DISTRIBUTION TABLE, *DISTRIBUTION and *ORIENTATION, which CalculiX reads too
+  (https://www.openaircraft.com/ccx-doc/ccx/node256.html). Neither has a place for the dimensions, which stand in
+  comments: `** cell_dimensions, element, l1, l2, l3`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from remodel_fenicsx.fem.kinematics import KINEMATICS
+from remodel_fenicsx.model.cells import structure_tensor
+from remodel_fenicsx.results.chain_lines import AXIS_FIELDS
+from remodel_fenicsx.results.recording import RecordedRun, RecordingError
+from remodel_fenicsx.results.vtu import write_vtu
+from remodel_fenicsx.system.regular_files import write_new
+
+Array = NDArray[np.float64]
+
+TENSOR_COMPONENTS = tuple(f"{i}{j}" for i in "xyz" for j in "xyz")  # of a tensor, row by row
+
+
+@dataclass(frozen=True)
+class ElementNames:
+    """What other programs call an element, and how many of its nodes, in VTK's order, FEBio and Abaqus take."""
+
+    vtk: int
+    febio: str
+    abaqus: str
+    nodes: int
+
+
+# by number of nodes. Other programs count the nodes within faces and volume of quadratic hexahedra in other orders, and
+# CalculiX has no such element: theirs is that of 20 nodes
+ELEMENTS = {
+    4: ElementNames(10, "tet4", "C3D4", 4),
+    8: ElementNames(12, "hex8", "C3D8", 8),
+    10: ElementNames(24, "tet10", "C3D10", 10),
+    27: ElementNames(29, "hex20", "C3D20", 20),
+}
+
+
+@dataclass(frozen=True)
+class Fibres:
+    """The mean cells of the elements of a body.
+
+    Attributes
+    ----------
+    points
+        Reference coordinates of the nodes, (nodes, 3).
+    elements
+        Numbers of their nodes in VTK's order, from 0, (elements, nodes of one).
+    dimensions, axes
+        l_I in link lengths, longest first, (elements, 3), and n_I as rows, (elements, 3, 3): of the mean structure
+        tensor.
+    displacement
+        Of the nodes, (nodes, 3); None where it was not recorded.
+    """
+
+    points: Array
+    elements: NDArray[np.int64]
+    dimensions: Array
+    axes: Array
+    displacement: Array | None
+
+    @property
+    def tensors(self) -> Array:
+        """A, (elements, 3, 3), in squared link lengths."""
+        return structure_tensor(self.dimensions, self.axes)
+
+    @property
+    def names(self) -> ElementNames:
+        """Of the elements."""
+        return ELEMENTS[self.elements.shape[1]]
+
+
+def export(folder: Path | str, kind: str, path: Path | None = None, time: float | None = None) -> Path:
+    """Write the mean structure tensor of each element with its axes and dimensions into a new file.
+
+    Parameters
+    ----------
+    folder
+        Of a run; it may still be under way.
+    kind
+        A key of `FIBRE_FORMATS`.
+    path
+        A file that does not exist; None: `fibres` in the folder, with the format's ending.
+    time
+        A recorded one; None: the last.
+
+    Returns
+    -------
+    The file.
+
+    Raises
+    ------
+    RecordingError
+        If it is no run of a whole body with its cells, or the file is there already.
+    OSError
+        If it cannot be written.
+    """
+    ending, write = FIBRE_FORMATS[kind]
+    fibres = recorded_fibres(RecordedRun(folder), time)
+    path = Path(folder) / f"fibres{ending}" if path is None else path
+    try:
+        write(path, fibres)
+    except FileExistsError as error:
+        raise RecordingError(f"{path}: is there already; nothing is overwritten") from error
+    return path
+
+
+def recorded_fibres(recording: RecordedRun, time: float | None = None) -> Fibres:
+    """The cells of a run at a recorded time, the last one where None is given.
+
+    Raises
+    ------
+    RecordingError
+        If it is a reduction, or cells or this time were not recorded.
+    """
+    kinematics = recording.scene.model.kinematics
+    if KINEMATICS[kinematics].reduced:
+        remedy = "revolve writes the fields of the whole body, model.kinematics = 'full' runs it"
+        raise RecordingError(f"{recording.path}: its kinematics are {kinematics!r}, a part of the body; {remedy}")
+    if not len(recording.times):
+        raise RecordingError(f"{recording.path}: the run recorded no fields")
+    time = float(recording.times[-1]) if time is None else time
+    needed = ("cell_dimensions", *AXIS_FIELDS)
+    fields = recording.fields(time, (*needed, "displacement"))
+    missing = [name for name in needed if name not in fields]
+    if missing:
+        raise RecordingError(f"{recording.path}: output.fields was without {', '.join(missing)}")
+    axes = np.stack([fields[name] for name in AXIS_FIELDS], axis=1)
+    displacement = fields.get("displacement")
+    return Fibres(recording.points, recording.elements, fields["cell_dimensions"], axes, displacement)
+
+
+# ---------------------------------------------------------------- formats
+def _vtu(path: Path, fibres: Fibres) -> None:
+    of_elements = {"structure_tensor": fibres.tensors.reshape(-1, 9), "cell_dimensions": fibres.dimensions}
+    of_elements |= {name: fibres.axes[:, i] for i, name in enumerate(AXIS_FIELDS)}
+    of_nodes = {} if fibres.displacement is None else {"displacement": fibres.displacement}
+    write_vtu(path, fibres.points, fibres.elements, fibres.names.vtk, of_elements, of_nodes)
+
+
+def _csv(path: Path, fibres: Fibres) -> None:
+    names = [
+        "element",
+        *"xyz",
+        *(f"structure_tensor_{c}" for c in TENSOR_COMPONENTS),
+        *(f"cell_dimension_{i}" for i in (1, 2, 3)),
+    ]
+    names += [f"{name}_{c}" for name in AXIS_FIELDS for c in "xyz"]
+    centres = fibres.points[fibres.elements].mean(axis=1)
+    count = len(centres)
+    columns = [centres, fibres.tensors.reshape(count, 9), fibres.dimensions, fibres.axes.reshape(count, 9)]
+    _write(path, [",".join(names), *_rows("{number},{values}", np.hstack(columns))])
+
+
+def _febio(path: Path, fibres: Fibres) -> None:
+    nodes, elements = _used(fibres)
+    axes = fibres.axes[:, :2].reshape(-1, 6)
+    lines = ['<?xml version="1.0" encoding="UTF-8"?>', '<febio_spec version="4.0">', "<Mesh>", '<Nodes name="nodes">']
+    lines += _rows('<node id="{number}">{values}</node>', fibres.points[nodes], nodes + 1)
+    lines += ["</Nodes>", f'<Elements type="{fibres.names.febio}" name="body">']
+    lines += _rows('<elem id="{number}">{values}</elem>', elements + 1)
+    lines += ["</Elements>", "</Mesh>", "<MeshData>", '<ElementData type="mat_axis" elem_set="body">']
+    for number, (a, d) in enumerate(zip(_joined(axes[:, :3]), _joined(axes[:, 3:]), strict=True), start=1):
+        lines.append(f'<elem lid="{number}"><a>{a}</a><d>{d}</d></elem>')
+    lines.append("</ElementData>")
+    for i in range(3):
+        lines.append(f'<ElementData name="cell_dimension_{i + 1}" data_type="scalar" elem_set="body">')
+        lines += _rows('<elem lid="{number}">{values}</elem>', fibres.dimensions[:, i : i + 1])
+        lines.append("</ElementData>")
+    _write(path, [*lines, "</MeshData>", "</febio_spec>"])
+
+
+def _abaqus(path: Path, fibres: Fibres) -> None:
+    nodes, elements = _used(fibres)
+    lines = [
+        "** mean cells of a run of remodel_fenicsx: local directions 1, 2 and 3 are the axes, longest first",
+        "*NODE",
+    ]
+    lines += _rows("{number},{values}", fibres.points[nodes], nodes + 1)
+    lines.append(f"*ELEMENT, TYPE={fibres.names.abaqus}, ELSET=BODY")
+    for row in _rows("{number},{values}", elements + 1):
+        words = row.split(",")  # sixteen in a line at most
+        lines += [",".join(words)] if len(words) <= 16 else [",".join(words[:16]) + ",", ",".join(words[16:])]
+    lines += ["*DISTRIBUTION TABLE, NAME=CELL_AXES_TABLE", "COORD3D, COORD3D"]
+    lines += ["*DISTRIBUTION, NAME=CELL_AXES, LOCATION=ELEMENT, TABLE=CELL_AXES_TABLE", ",1.,0.,0.,0.,1.,0."]
+    lines += _rows("{number},{values}", fibres.axes[:, :2].reshape(-1, 6))
+    lines += [
+        "*ORIENTATION, NAME=CELLS, DEFINITION=COORDINATES",
+        "CELL_AXES",
+        "** cell_dimensions, element, l1, l2, l3",
+    ]
+    _write(path, [*lines, *_rows("** cell_dimensions,{number},{values}", fibres.dimensions)])
+
+
+# format: ending of its files, and what writes one
+FIBRE_FORMATS: dict[str, tuple[str, Callable[[Path, Fibres], None]]] = {
+    "vtu": (".vtu", _vtu),
+    "febio": (".feb", _febio),
+    "abaqus": (".inp", _abaqus),
+    "csv": (".csv", _csv),
+}
+
+
+def _used(fibres: Fibres) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Nodes that the elements of other programs have, ascending, and those elements."""
+    elements = fibres.elements[:, : fibres.names.nodes]
+    return np.unique(elements), elements
+
+
+def _rows(pattern: str, values: NDArray[Any], numbers: Iterable[int] | None = None) -> list[str]:
+    """A line for each row of values (n, columns)."""
+    numbers = range(1, len(values) + 1) if numbers is None else numbers
+    return [pattern.format(number=n, values=row) for n, row in zip(numbers, _joined(values), strict=True)]
+
+
+def _joined(values: NDArray[Any]) -> list[str]:
+    """Each row as numbers with commas between; they are read back to the last bit."""
+    return [",".join(map(repr, row.tolist())) for row in values]
+
+
+def _write(path: Path, lines: Sequence[str]) -> None:
+    write_new(path, ("\n".join(lines) + "\n").encode("ascii"))

@@ -1,0 +1,140 @@
+"""Two regions of kappa k1 and k2 are, point by point, bodies of k1 and of k2: every law with every coupling.
+
+A network of next to no stiffness: the deformation is that of the matrix alone, whatever the cells do.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from remodel_fenicsx import Scene, SceneError
+from remodel_fenicsx.model.cells import structure_tensor
+from remodel_fenicsx.model.laws import LAWS
+from remodel_fenicsx.settings import COUPLINGS
+from remodel_fenicsx.simulation import Simulation
+
+PAIRS = [
+    (law, coupling)
+    for law, kind in LAWS.items()
+    for coupling, coupled in COUPLINGS.items()
+    if kind.asks_kappa and (kind.target is not None or not coupled.needs_a_target)
+]
+FIRST, SECOND = 0.08, 0.02
+RAMP = [[0.0, 0.0], [2.0, 1.0], [5.0, 0.5]]
+
+
+def scene(first: float, second: float, law: str, coupling: str, **changes: Any) -> Scene:
+    """A tube of two layers on one radius; loads that turn the cells, and fall."""
+    made = Scene(
+        geometry={"shape": "tube", "inner_radius": 1.0, "outer_radius": 3.0, "length": 1.0},
+        regions={"media": {"outer_radius": 1.9, "remodeling": {"kappa": first}},
+                 "adventitia": {"remodeling": {"kappa": second}}},
+        material={"chain_density": 1e10}, cells={"initial": [0.5, 0.7, 0.26**0.5]}, model={"kinematics": "radial"},
+        loads={"pressure": {"value": 1.0, "ramp": RAMP}, "elongation": {"value": 0.1, "ramp": RAMP}},
+        remodeling={"law": law, "coupling": coupling}, time={"end": 5.0}, output={"columns": ["time_error"]},
+    )  # fmt: skip
+    return made.with_values(changes)
+
+
+@lru_cache
+def solved(*arguments: Any, changes: tuple[tuple[str, Any], ...] = ()) -> tuple[np.ndarray, np.ndarray, Simulation]:
+    """A at all points of the last row, (elements, points, 3, 3); which elements are of the media; the simulation."""
+    simulation = Simulation(scene(*arguments, **dict(changes)), MPI.COMM_SELF)
+    for _ in simulation.steps():
+        pass
+    simulation.close()
+    domain = simulation.domain
+    cells = simulation.state.equilibrium_cells
+    return cells.structure_tensor(), domain.element_region == domain.regions["media"], simulation
+
+
+def one_better(simulation: Simulation) -> np.ndarray:
+    """A of the cells with which the last row is compared; zero of a law without errors in time."""
+    better, shape = simulation.stepper.coupling.better, simulation.quadrature.shape
+    return np.zeros((*shape, 3, 3)) if better is None else structure_tensor(*better[:2]).reshape(*shape, 3, 3)
+
+
+@pytest.mark.parametrize("law, coupling", PAIRS)
+def test_each_region_has_its_own_kappa(law: str, coupling: str) -> None:
+    both, media, simulation = solved(FIRST, SECOND, law, coupling)
+    alone = [solved(kappa, kappa, law, coupling) for kappa in (FIRST, SECOND)]
+    first, second = (found[0] for found in alone)
+    np.testing.assert_allclose(both[media], first[media], rtol=0, atol=1e-8)
+    np.testing.assert_allclose(both[~media], second[~media], rtol=0, atol=1e-8)
+    better, better_first, better_second = (one_better(one) for one in (simulation, *(found[2] for found in alone)))
+    np.testing.assert_allclose(better[media], better_first[media], rtol=0, atol=1e-8)
+    np.testing.assert_allclose(better[~media], better_second[~media], rtol=0, atol=1e-8)
+    assert np.abs(first - second)[media].max() > 0.03 and np.abs(first - second)[~media].max() > 0.03
+
+
+@pytest.mark.parametrize("law, coupling", PAIRS)
+def test_cells_without_kappa_stay(law: str, coupling: str) -> None:
+    """As where nothing remodels, axes included; the others remodel."""
+    both, media, simulation = solved(FIRST, 0.0, law, coupling)
+    np.testing.assert_allclose(both[media], solved(FIRST, FIRST, law, coupling)[0][media], rtol=0, atol=1e-8)
+    assert simulation.stepper.remodeling.slowest == simulation.stepper.remodeling.fastest == FIRST
+    lengths = simulation.state.cells.dimension_values
+    np.testing.assert_allclose(np.sort(lengths[~media]), np.broadcast_to([0.5, 0.26**0.5, 0.7], lengths[~media].shape),
+                               rtol=0, atol=1e-12)  # fmt: skip
+    start = Simulation(scene(FIRST, 0.0, law, coupling), MPI.COMM_SELF)
+    np.testing.assert_allclose(both[~media], start.cells.structure_tensor()[~media], rtol=0, atol=1e-12)
+    start.close()
+
+
+def test_chosen_steps_hold_the_error_of_both_regions() -> None:
+    """With a tolerance: both layers together are as near to short steps as it asks."""
+    both, _, simulation = solved(0.4, SECOND, "tensor", "extrapolated", changes=(("time.tolerance", 0.5),))
+    fine, _, _ = solved(0.4, SECOND, "tensor", "extrapolated", changes=(("time.step", 0.05),))
+    remodeling = simulation.stepper.remodeling
+    assert (remodeling.fastest, remodeling.slowest) == (0.4, SECOND)
+    difference = np.sqrt(np.mean(np.sum((both - fine) ** 2, axis=(-1, -2))))
+    assert np.degrees(difference) < 0.5 and simulation.state.number < 100
+
+
+def test_no_step_is_longer_than_the_fastest_region_allows() -> None:
+    """kappa dt of an explicit rule, wherever it is largest."""
+    held = {"time.tolerance": 40.0, "time.end": 30.0}
+    made = Simulation(scene(0.4, SECOND, "tensor", "extrapolated", **held), MPI.COMM_SELF)
+    lengths = np.diff([0.0, *(step.time for step in made.steps())])
+    longest = made.stepper.coupling.longest / 0.4
+    made.close()
+    assert 0.5 * longest < lengths.max() <= longest * (1 + 1e-9)
+
+
+def test_the_equilibrium_waits_for_the_slowest_region() -> None:
+    """At once from two kappas, or from one: the same rest, which depends on no kappa."""
+    changes = (("time.end", "equilibrium"), ("output.columns", []), ("cells.initial", "isotropic"))
+    changes += tuple((f"loads.{load}.ramp", [[0.0, 0.0], [2.0, 1.0]]) for load in ("pressure", "elongation"))
+    both, _, simulation = solved(FIRST, FIRST / 50, "tensor", "staggered", changes=_hashable(changes))
+    same, _, _ = solved(FIRST, FIRST, "tensor", "staggered", changes=_hashable(changes))
+    np.testing.assert_allclose(both, same, rtol=0, atol=2e-3)
+    assert simulation.scene.last_time == pytest.approx(2.0 + 1000.0 / (FIRST / 50))
+
+
+def _hashable(changes: Any) -> tuple[tuple[str, Any], ...]:
+    return tuple((key, tuple(map(tuple, value)) if isinstance(value, list) else value) for key, value in changes)
+
+
+@pytest.mark.parametrize("changes, line", [
+    ({"remodeling.law": "rotation"}, "regions.media.remodeling.kappa = 0.08: the law 'rotation' has no kappa"),
+    ({"time.end": "equilibrium", "regions.adventitia.remodeling.kappa": 0.0},
+     "time.end = 'equilibrium': regions.adventitia.remodeling.kappa = 0: the cells never change"),
+    ({"regions.media.remodeling.kappa": -1.0},
+     "regions.media.remodeling.kappa = -1.0: must be a finite number at least 0"),
+    ({"regions.media.remodeling.law": "rate"}, "regions.media.remodeling.law = 'rate': unknown key; did you mean "
+     "remodeling.law?"),
+])  # fmt: skip
+def test_what_kappa_by_region_cannot_be_is_refused(changes: dict[str, Any], line: str) -> None:
+    with pytest.raises(SceneError) as refusal:
+        scene(FIRST, SECOND, "tensor", "staggered", **changes)
+    assert str(refusal.value) == line
+
+
+def test_a_body_whose_law_never_changes_cells_takes_any_kappa() -> None:
+    before, _, simulation = solved(FIRST, SECOND, "none", "staggered")
+    assert not simulation.stepper.remodeling.law.remodels and np.ptp(before, axis=0).max() < 1e-12

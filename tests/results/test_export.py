@@ -1,0 +1,275 @@
+"""The cells of a run in files of other programs, read back by parsers that are written from their manuals."""
+
+from __future__ import annotations
+
+import csv
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import meshio
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from remodel_fenicsx import Recording, Scene, cli, run
+from remodel_fenicsx.body import tube
+from remodel_fenicsx.results.vtkhdf import TransientGrid, vtk_cells
+
+RAMP = [[0.0, 0.0], [3.0, 1.0]]
+TUBE: dict[str, Any] = {
+    "geometry": {"shape": "tube", "inner_radius": 1.0, "outer_radius": 3.0, "length": 1.0},
+    "cells": {"initial": "random"},
+    "loads": {"pressure": {"value": 2.4, "ramp": RAMP}, "elongation": {"value": 0.1, "ramp": RAMP}},
+    "time": {"end": 2.0}, "model": {"kinematics": "full"},
+}  # fmt: skip
+MESHES = {
+    "hexahedra": {},
+    "tetrahedra": {"element": "tetrahedron"},
+    "quadratic hexahedra": {"degree": 2},
+    "quadratic tetrahedra": {"element": "tetrahedron", "degree": 2},
+}
+# nodes of an element that lie between two of its corners: Abaqus, C3D20 and C3D10; FEBio counts like it
+BETWEEN = {
+    20: [(1, 2), (2, 3), (3, 4), (4, 1), (5, 6), (6, 7), (7, 8), (8, 5), (1, 5), (2, 6), (3, 7), (4, 8)],
+    10: [(1, 2), (2, 3), (3, 1), (1, 4), (2, 4), (3, 4)],
+}
+
+
+def exported(folder: Path, kind: str, *words: str) -> Path:
+    """The file that the command writes."""
+    path = folder / f"out-{kind}"
+    assert cli.main(["export", str(folder), "--format", kind, "-o", str(path), *words]) == 0
+    return path
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of two steps."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tube, "PAPER", (8, 4, 1))
+        return run(Scene(**TUBE), tmp_path_factory.mktemp("export") / "run")
+
+
+@pytest.fixture(params=MESHES)
+def start(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """What a run on a mesh leaves, without the run: cells and displacements by chance."""
+    monkeypatch.setattr(tube, "PAPER", (8, 4, 1))
+    scene = Scene(**TUBE | {"mesh": MESHES[request.param]})
+    (tmp_path / "scene.toml").write_text(scene.to_toml("as run"))
+    (tmp_path / "history.csv").write_text("time\n")
+    domain = scene.geometry.build_with(scene.regions, scene.mesh, MPI.COMM_SELF)
+    points, elements = domain.gather_mesh()
+    cell_type, cells = vtk_cells(domain.mesh.topology.cell_name(), domain.mesh.geometry.cmap.degree, elements)
+    draw = np.random.default_rng(1).standard_normal
+    axes = np.linalg.qr(draw((len(cells), 3, 3)))[0]
+    values = dict(zip(CELLS, [np.abs(draw((len(cells), 3))), *np.moveaxis(axes, 1, 0)], strict=True))
+    with TransientGrid(tmp_path / "fields.vtkhdf", points, cells, cell_type) as grid:
+        grid.append(0.0, {"displacement": draw(points.shape)}, values)
+    return tmp_path
+
+
+CELLS = ("cell_dimensions", "axis_1", "axis_2", "axis_3")
+
+
+def recorded_tensors(recording: Recording, time: float) -> np.ndarray:
+    """A of each element, term by term."""
+    fields = recording.fields(time)
+    axes = [fields[f"axis_{i + 1}"] for i in range(3)]
+    return sum(
+        fields["cell_dimensions"][:, i, None, None] ** 2 * axes[i][:, :, None] * axes[i][:, None, :] for i in range(3)
+    )
+
+
+def from_axes(a: np.ndarray, d: np.ndarray, dimensions: np.ndarray) -> np.ndarray:
+    """A of two vectors in the plane of axes 1 and 2 and three dimensions: 3 = a x d, 2 = 3 x 1, all of unit length."""
+    third = np.cross(a, d)
+    axes = np.stack([a, np.cross(third, a), third], axis=1)
+    axes /= np.linalg.norm(axes, axis=2, keepdims=True)
+    return np.einsum("ni,nij,nik->njk", dimensions**2, axes, axes)
+
+
+class Solid:
+    """What a parser found: nodes by number, elements with their numbers of nodes, a and d and dimensions of each."""
+
+    def __init__(self) -> None:
+        self.nodes: dict[int, list[float]] = {}
+        self.elements: dict[int, list[int]] = {}
+        self.a: dict[int, list[float]] = {}
+        self.d: dict[int, list[float]] = {}
+        self.dimensions: dict[int, list[float]] = {}
+        self.kind = ""
+
+    def tensors(self) -> np.ndarray:
+        """A of the elements by their number, which begins with 1."""
+        order = range(1, len(self.elements) + 1)
+        return from_axes(*(np.array([values[n] for n in order]) for values in (self.a, self.d, self.dimensions)))
+
+    def places(self) -> np.ndarray:
+        """Of the nodes of each element."""
+        return np.array([[self.nodes[n] for n in self.elements[e]] for e in range(1, len(self.elements) + 1)])
+
+
+def read_febio(path: Path) -> Solid:
+    """FEBio User Manual 4, Mesh and MeshData: lid counts the elements of the set, which the part gives its name."""
+    root = ElementTree.parse(path).getroot()
+    assert (root.tag, root.attrib["version"], [part.tag for part in root]) == (
+        "febio_spec",
+        "4.0",
+        ["Mesh", "MeshData"],
+    )
+    solid, (nodes, elements) = Solid(), root[0]
+    assert (nodes.tag, elements.tag) == ("Nodes", "Elements")
+    solid.nodes = {int(node.attrib["id"]): numbers(node.text) for node in nodes if node.tag == "node"}
+    solid.elements = {int(e.attrib["id"]): [int(n) for n in (e.text or "").split(",")] for e in elements}
+    solid.kind, part = elements.attrib["type"], list(solid.elements)
+    for data in root[1]:
+        assert (data.tag, data.attrib["elem_set"]) == ("ElementData", elements.attrib["name"])
+        for one in data:
+            element = part[int(one.attrib["lid"]) - 1]
+            if data.attrib.get("type") == "mat_axis":
+                found = {axis.tag: numbers(axis.text) for axis in one}
+                solid.a[element], solid.d[element] = found["a"], found["d"]
+            else:
+                assert data.attrib["data_type"] == "scalar"
+                solid.dimensions.setdefault(element, []).append(float(one.text or ""))
+    return solid
+
+
+def numbers(text: str | None) -> list[float]:
+    """With commas between."""
+    return [float(word) for word in (text or "").split(",")]
+
+
+def read_abaqus(path: Path) -> Solid:
+    """Abaqus Keywords Reference Guide: keyword lines, data lines, ** comments; after a comma a data line goes on."""
+    solid, orientations, tables = Solid(), {}, {}
+    distributions: dict[str, dict[int | None, list[float]]] = {}
+    for keyword, options, lines in keyword_blocks(path.read_text()):
+        if keyword == "NODE":
+            solid.nodes = {int(line[0]): [float(x) for x in line[1:]] for line in lines}
+        elif keyword == "ELEMENT":
+            solid.kind = options["TYPE"]
+            solid.elements = {int(line[0]): [int(n) for n in line[1:]] for line in lines}
+        elif keyword == "DISTRIBUTION TABLE":
+            tables[options["NAME"]] = lines
+        elif keyword == "DISTRIBUTION":
+            assert options["LOCATION"] == "ELEMENT" and tables[options["TABLE"]] == [["COORD3D", "COORD3D"]]
+            assert lines[0][0] == "", "the first line is the default"
+            values = {int(line[0]) if line[0] else None: [float(x) for x in line[1:]] for line in lines}
+            distributions[options["NAME"]] = values
+        elif keyword == "ORIENTATION":
+            assert options["DEFINITION"] == "COORDINATES"
+            orientations[options["NAME"]] = lines[0][0]
+        else:
+            raise AssertionError(f"keyword *{keyword}")
+    ((name,),) = [list(orientations.values())]
+    for element in solid.elements:
+        solid.a[element], solid.d[element] = distributions[name][element][:3], distributions[name][element][3:]
+    for line in path.read_text().splitlines():
+        if line.startswith("** cell_dimensions,") and line.split(",")[1].strip().isdigit():
+            _, element, *lengths = line.split(",")
+            solid.dimensions[int(element)] = [float(length) for length in lengths]
+    return solid
+
+
+def keyword_blocks(text: str) -> Iterator[tuple[str, dict[str, str], list[list[str]]]]:
+    """Keyword, its parameters and its data lines."""
+    head: tuple[str, dict[str, str], list[list[str]]] | None = None
+    goes_on = False
+    for line in text.splitlines():
+        assert len(line) <= 256 and line.isascii()
+        if line.startswith("**"):
+            continue
+        words = [word.strip() for word in line.split(",")]
+        if line.startswith("*"):
+            if head is not None:
+                yield head
+            assert not goes_on
+            head = words[0][1:].upper(), dict(word.upper().split("=") for word in words[1:]), []
+            continue
+        assert head is not None and len(words) <= 16 + (words[-1] == "")
+        ends_in_comma = words[-1] == ""
+        words = words[:-1] if ends_in_comma else words
+        if goes_on:
+            head[2][-1].extend(words)
+        else:
+            head[2].append(words)
+        goes_on = ends_in_comma
+    assert head is not None and not goes_on
+    yield head
+
+
+@pytest.mark.parametrize(("kind", "reader"), [("febio", read_febio), ("abaqus", read_abaqus)])
+def test_other_programs_get_the_structure_tensor_of_each_element(kind: str, reader: Any, recorded: Path) -> None:
+    recording = Recording(recorded)
+    for time in (0.0, 2.0):
+        path = recorded / f"{kind}-{time}"
+        assert cli.main(["export", str(recorded), "--format", kind, "-o", str(path), "--time", str(time)]) == 0
+        found = reader(path).tensors()
+        np.testing.assert_allclose(found, recorded_tensors(recording, time), rtol=0, atol=1e-6)
+    assert np.abs(recorded_tensors(recording, 0.0) - recorded_tensors(recording, 2.0)).max() > 0.01
+    np.testing.assert_allclose(reader(exported(recorded, kind)).tensors(), found, rtol=0, atol=0)  # the last one
+
+
+@pytest.mark.parametrize(("kind", "reader"), [("febio", read_febio), ("abaqus", read_abaqus)])
+def test_elements_are_those_of_the_mesh_and_have_their_nodes_in_order(kind: str, reader: Any, start: Path) -> None:
+    """Corners turn around so that the volume is positive; nodes of edges lie between the corners that manuals name."""
+    recording, solid = Recording(start), reader(exported(start, kind))
+    places, corners = solid.places(), 8 if solid.kind in ("hex8", "hex20", "C3D8", "C3D20") else 4
+    assert int("".join(filter(str.isdigit, solid.kind[3:]))) == places.shape[1]
+    assert set(solid.nodes) == {node for nodes in solid.elements.values() for node in nodes}
+    np.testing.assert_array_equal(
+        places.mean(axis=1).round(9), recording.points[recording.elements[:, : places.shape[1]]].mean(axis=1).round(9)
+    )
+    last = places[:, 4 if corners == 8 else 3]
+    sides = [places[:, 1], places[:, 3 if corners == 8 else 2], last]
+    assert (np.linalg.det(np.stack([side - places[:, 0] for side in sides], axis=1)) > 0).all()
+    for node, (i, j) in enumerate(BETWEEN.get(places.shape[1], []), start=corners):
+        ends = places[:, i - 1], places[:, j - 1]
+        chord = np.linalg.norm(ends[1] - ends[0], axis=1)
+        assert (np.linalg.norm(places[:, node] - (ends[0] + ends[1]) / 2, axis=1) < 0.25 * chord).all(), (node, i, j)
+
+
+def test_vtu_and_csv_hold_the_same(start: Path) -> None:
+    """To the last digit, with centroids and, in VTU, the displacement."""
+    recording = Recording(start)
+    tensors = recorded_tensors(recording, 0.0)
+    mesh = meshio.read(exported(start, "vtu"), file_format="vtu")
+    (elements,) = mesh.cells
+    np.testing.assert_array_equal(mesh.points, recording.points)
+    np.testing.assert_array_equal(elements.data, recording.elements)
+    np.testing.assert_array_equal(mesh.point_data["displacement"], recording.fields(0.0)["displacement"])
+    np.testing.assert_allclose(mesh.cell_data["structure_tensor"][0].reshape(-1, 3, 3), tensors, rtol=0, atol=1e-15)
+    for name in CELLS:
+        np.testing.assert_array_equal(mesh.cell_data[name][0], recording.fields(0.0)[name])
+    rows = list(csv.DictReader(exported(start, "csv").read_text().splitlines()))
+    assert [int(row["element"]) for row in rows] == [*range(1, len(tensors) + 1)]
+    found = [[float(row[f"structure_tensor_{i}{j}"]) for i in "xyz" for j in "xyz"] for row in rows]
+    np.testing.assert_allclose(np.reshape(found, (-1, 3, 3)), tensors, rtol=0, atol=1e-15)
+    middle = [[float(row[i]) for i in "xyz"] for row in rows]
+    np.testing.assert_allclose(middle, recording.points[recording.elements].mean(axis=1), atol=1e-12)
+
+
+def test_what_cannot_be_exported_is_said_in_a_line(
+    recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def refused(*words: str, folder: Path = recorded) -> str:
+        assert cli.main(["export", str(folder), "--format", "csv", "-o", str(tmp_path / "new.csv"), *words]) == 2
+        assert not (tmp_path / "new.csv").exists()
+        said = capsys.readouterr().err
+        assert said.count("\n") == 1
+        return said
+
+    assert "no fields at time 1.5; recorded are 0, 1, 2" in refused("--time", "1.5")
+    (tmp_path / "old.csv").write_text("dear")
+    assert "old.csv: is there already; nothing is overwritten" in refused("-o", str(tmp_path / "old.csv"))
+    assert (tmp_path / "old.csv").read_text() == "dear"
+    assert "there is no such folder" in refused(folder=tmp_path / "nowhere")
+    point = {"geometry": {"shape": "cube"}, "model": {"kinematics": "point"}, "time": {"end": 1.0}}
+    folder = run(Scene(preset="kuhl-holzapfel-2007", **point), tmp_path / "point")
+    assert "its kinematics are 'point', a part of the body; revolve writes" in refused(folder=folder)
+    point |= {"model": {"kinematics": "full"}, "output": {"fields": ["displacement"]}}
+    folder = run(Scene(preset="kuhl-holzapfel-2007", **point), tmp_path / "no cells")
+    assert "output.fields was without cell_dimensions, axis_1, axis_2, axis_3" in refused(folder=folder)
