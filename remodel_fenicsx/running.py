@@ -218,7 +218,8 @@ def _record(
     header = "as run: all values, also those of preset and defaults\n" + "\n".join(
         f"{name} {version}" for name, version in versions().items()
     )
-    text = scene.to_toml(header)
+    changes, files = scene.geometry.kept_files()
+    text = (scene.with_values(changes) if changes else scene).to_toml(header)
     columns = [column.name for column in simulation.observer.columns]
     wants_report = report and scene.output.report and comm.rank == 0
     after = LastStep(columns, state.number, state.time) if state.number else None
@@ -228,7 +229,9 @@ def _record(
         if after is None and comm.rank == 0:
             forget_steps(place)
     with ExitStack() as stack:
-        record = stack.enter_context(agreed(comm, lambda: RunFolder(place, text, comm.rank, after)))
+        record = stack.enter_context(
+            agreed(comm, lambda: RunFolder(place, text, comm.rank, after, {} if resumes else files))
+        )
         stack.enter_context(open_log(place / LOG, comm.rank, quiet=quiet, held=held))
         steps = scene.time.number_of_steps if simulation.control else state.number + len(simulation.remaining())
         rank, done = -1 if quiet else comm.rank, scene.time.progress(state.number, state.time)

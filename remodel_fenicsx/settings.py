@@ -45,6 +45,7 @@ from remodel_fenicsx.schema.units import FORCE, FOUNDATION, LENGTH, NUMBER_DENSI
 STRESS_UNITS = {"Pa": 1.0, "kPa": 1.0e3, "MPa": 1.0e6}  # in Pa
 INITIAL_CELLS = ("random", "isotropic", "aligned")
 MOST_STEPS = 1_000_000
+LARGEST_MESH = 10_000_000  # hexahedra; Gmsh, which is serial, needs about 10 GB for them
 NOT_NEGATIVE: JsonDict = {"type": "number", "minimum": 0}
 
 

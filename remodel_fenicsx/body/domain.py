@@ -343,7 +343,7 @@ def share_mesh(
     mesh: Any = dolfinx.mesh.create_mesh(comm, cells=cells, x=points, e=symbolic)
     tags = _tags_of_facets(mesh, *comm.bcast(tagged))
     domain = Domain(mesh, tags, faces, shape, dimensions, regions, np.empty(0, dtype=np.int32))
-    values = arrays and arrays.cell_values.astype(np.int32)
+    values = None if arrays is None else arrays.cell_values.astype(np.int32)
     return replace(domain, element_region=domain.scatter_elements(values))
 
 
@@ -361,9 +361,11 @@ def _tags_of_facets(mesh: Any, corners: npt.NDArray[np.int64], values: npt.NDArr
     local = np.argmax(of_cell[cells] == facets[:, None], axis=1) if len(cells) else cells
     corners_of = np.array(basix.topology(basix.CellType[mesh.topology.cell_name()])[dimension - 1])
     nodes = np.take_along_axis(compat.geometry_dofmap(mesh)[cells], corners_of[local], axis=1)
-    wanted = dict(zip(map(tuple, corners.tolist()), values.tolist(), strict=True))
+    listed: Any = corners.tolist()
+    wanted = dict(zip(map(tuple, listed), values.astype(int), strict=True))
     own = np.sort(np.asarray(geometry.input_global_indices, dtype=np.int64)[nodes], axis=1)
-    found = np.array([wanted.get(tuple(row), 0) for row in own.tolist()], dtype=np.int32)
+    rows: Any = own.tolist()
+    found = np.array([wanted.get(tuple(row), 0) for row in rows], dtype=np.int32)
     order = np.argsort(facets)
     order = order[found[order] > 0]
     return dolfinx.mesh.meshtags(mesh, dimension - 1, facets[order].astype(np.int32), found[order])

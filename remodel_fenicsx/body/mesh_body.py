@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-import hashlib
 import logging
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
+from pydantic.config import JsonDict
 
 from remodel_fenicsx.body import mesh_file
 from remodel_fenicsx.body.columns import Column
 from remodel_fenicsx.body.gmsh_model import LARGEST_LENGTH, SMALLEST_LENGTH
 from remodel_fenicsx.body.mesh_file import MeshFile, MeshFileError
-from remodel_fenicsx.body.shape import LoadKind, Shape
+from remodel_fenicsx.body.shape import LoadKind
+from remodel_fenicsx.body.walled import WalledMesh
 from remodel_fenicsx.schema.tables import SceneError, fault, shown
 from remodel_fenicsx.schema.units import LENGTH_UNITS, STRESS
 from remodel_fenicsx.settings import Mesh, Support
@@ -32,8 +33,8 @@ log = logging.getLogger(__name__)
 
 ROLES = ("inner", "outer", "inlet", "outlet")
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}
-PARALLEL = 1e-3  # radians between the normals of two ends that are parallel: what a mesh in single precision has
 Names = tuple[str | int, ...]
+_ENTRY: JsonDict = {"type": ["string", "integer"]}
 
 
 def _faces(value: Any) -> Any:
@@ -43,7 +44,7 @@ def _faces(value: Any) -> Any:
     found = {}
     for name, entry in value.items():
         entries = entry if isinstance(entry, (list, tuple)) else [entry]
-        if not all(isinstance(one, (str, int)) and not isinstance(one, bool) for one in entries):
+        if not entries or not all(isinstance(one, (str, int)) and not isinstance(one, bool) for one in entries):
             raise fault("must be a name or a number of a face in the file, or a list of them", str(name), entry)
         found[str(name)] = tuple(entries)
     return found
@@ -55,14 +56,7 @@ def _file(value: Any) -> Any:
     return value
 
 
-def _lumen_volume(m: Any) -> float:
-    """-1/3 integral of x . cof(F) N over the inner face, and flat caps on its rims."""
-    from remodel_fenicsx.body.mesh_lumen import LumenVolume
-
-    return float(m.tool("lumen volume", lambda: LumenVolume(m.domain, m.state))())
-
-
-class MeshBody(Shape):
+class MeshBody(WalledMesh):
     """A body of one's own from a file by Gmsh, a vessel with an inner and an outer face and ends.
 
     The file is data: it is read as text of format 2.2 or 4.1, and never run. Its elements are tetrahedra or hexahedra,
@@ -86,12 +80,16 @@ class MeshBody(Shape):
     }
     columns: ClassVar[tuple[Column, ...]] = (
         Column(
-            "lumen_volume", "length^3", "volume between the deformed inner face and flat caps on its rims", _lumen_volume
+            "lumen_volume",
+            "length^3",
+            "volume inside the deformed inner face, with flat caps on its rims",
+            lambda m: m.lumen_volume(),
         ),
+        *WalledMesh.columns,
     )
+    face_names: ClassVar[tuple[str, ...]] = ROLES
     has_regions: ClassVar[bool] = True
-    faces_hold: ClassVar[bool] = True
-    # random cells as elsewhere; the element and its degree are the file's
+    holds_faces: ClassVar[bool] = True
 
     shape: Literal["mesh"] = Field(default="mesh", description="Which body it is.")
     file: Annotated[str, BeforeValidator(_file)] = Field(
@@ -103,12 +101,14 @@ class MeshBody(Shape):
         description="Unit of the file's numbers, where it is another one than `length_unit`.",
         json_schema_extra={"allowed": "one of " + ", ".join(map(repr, LENGTH_UNITS))},
     )
-    faces: Annotated[dict[str, tuple[str | int, ...]], BeforeValidator(_faces)] = Field(  # type: ignore[assignment]
+    faces: Annotated[dict[str, tuple[str | int, ...]], BeforeValidator(_faces)] = Field(
         default={},
         description="Name of a face -> name or number of a named face of the file, or a list. `inner`, `outer`, "
-        "`inlet`, `outlet` are needed where the file's own names are others; a body without an end says `[]`. Others "
-        "are for supports and loads.",
-        json_schema_extra={"allowed": "a table of names, numbers or lists of them"},
+        "`inlet`, `outlet` are needed where the file's own names are others. Further ones are for supports.",
+        json_schema_extra={
+            "allowed": "a table of names, numbers or lists of them",
+            "additionalProperties": {"anyOf": [_ENTRY, {"type": "array", "items": _ENTRY, "minItems": 1}]},
+        },
     )
     open_boundary: bool = Field(
         default=False, description="Whether a part of the boundary may be in no face; otherwise it is taken for a hole."
@@ -142,8 +142,8 @@ class MeshBody(Shape):
         try:
             found = mesh_file.read_mesh_file(Path(_file(file)))
         except MeshFileError as error:
-            raise fault(str(error), "geometry.file", file) from None
-        return {"mesh": {"element": found.kind, "degree": found.degree}}
+            raise fault(str(error), "geometry.file", Path(file).name) from None
+        return cls.defaults | {"mesh": {"element": found.kind, "degree": found.degree}}
 
     def kept_files(self) -> tuple[dict[str, Any], dict[str, bytes]]:
         """The file under its own name beside the scene as run, which has its SHA-256."""
@@ -156,22 +156,19 @@ class MeshBody(Shape):
         """Of the file."""
         return len(self._read().cells)
 
-    def check_size(self, mesh: Mesh, largest: int) -> None:
-        """The file is as large as it is."""
+    def check_size(self, mesh: Mesh) -> None:
+        """The file has what it has; nothing refines it."""
+        if mesh.refinement != 1:
+            raise fault("the mesh of a file is taken as it is: 1", "mesh.refinement", mesh.refinement)
 
     # ------------------------------------------------------------ mesh
     def build(self, mesh: Mesh, comm: MPI.Intracomm | None = None) -> Domain:
         """The file's own mesh."""
-        from mpi4py import MPI as mpi
+        from mpi4py import MPI
 
         from remodel_fenicsx.body.mesh_domain import shared
 
-        comm = comm or mpi.COMM_WORLD
-        dimensions: dict[str, float] = {}
-        domain = shared(self.checked, dimensions, comm)
-        box = np.array([part.centre for part in domain.parts])
-        dimensions["extent"] = float(np.ptp(box, axis=0).max())
-        return domain
+        return shared(self.checked, comm or MPI.COMM_WORLD)
 
     def checked(self) -> tuple[MeshFile, Boundary, dict[str, int]]:
         """The file, its boundary, and its regions' numbers by name; on rank 0.
@@ -214,7 +211,7 @@ class MeshBody(Shape):
         return file
 
     def _fault(self, rule: str) -> SceneError:
-        return SceneError(f"geometry.file = {shown(self.file)}: {rule}")
+        return SceneError(f"geometry.file = {shown(Path(self.file).name)}: {rule}")
 
     def _asked(self, face: str) -> Any:
         """As the scene says it, or by default."""
@@ -223,32 +220,28 @@ class MeshBody(Shape):
 
     def _groups(self, file: MeshFile) -> dict[str, tuple[int, ...]]:
         """Numbers of the file's groups by name of the face, further named faces of the file under their own."""
-        names, there = file.names[2], sorted(set(file.facet_groups.tolist()) - {0})
+        from remodel_fenicsx.body.mesh_faces import groups_inside
+
+        names, there = file.names[2], sorted(set(mesh_file.distinct(file.facet_groups)) - {0})
         listed = ", ".join([*map(repr, names), *(str(number) for number in there if number not in names.values())])
         groups: dict[str, tuple[int, ...]] = {}
         for face in dict.fromkeys([*ROLES, *self.faces]):
             numbers = []
             for entry in self.faces.get(face, (face,)):
                 number = names.get(entry) if isinstance(entry, str) else entry
-                if number not in there:
+                if number is None or number not in there:
                     rule = f"the file has no such face; it has {listed or 'none'}"
                     raise SceneError(f"geometry.faces.{face} = {shown(entry)}: {rule}")
                 numbers.append(int(number))
             if numbers:
                 groups[face] = tuple(numbers)
         taken = {number for numbers in groups.values() for number in numbers}
-        bare = self._facets_inside(file)
-        others = {n: (k,) for n, k in names.items() if k in there and k not in taken and n not in groups}
-        return groups | {name: numbers for name, numbers in others.items() if numbers[0] not in bare}
-
-    def _facets_inside(self, file: MeshFile) -> set[int]:
-        """Numbers of named faces that are between regions, of no use here."""
-        from remodel_fenicsx.body.mesh_faces import groups_inside
-
-        return groups_inside(file)
+        others = {name: (number,) for name, number in names.items() if number in there and number not in taken}
+        between = groups_inside(file) if others else set()
+        return groups | {n: numbers for n, numbers in others.items() if n not in groups and numbers[0] not in between}
 
     def _regions(self, file: MeshFile) -> dict[str, int]:
-        numbers = dict.fromkeys(file.cell_groups.tolist())
+        numbers = mesh_file.distinct(file.cell_groups)
         if 0 in numbers and len(numbers) > 1:
             lost = file.cell_numbers[file.cell_groups == 0]
             raise self._fault(f"{len(lost)} elements are in no named volume, the first is {lost[0]}; the others are")
@@ -258,50 +251,43 @@ class MeshBody(Shape):
     def _say(self, file: MeshFile, boundary: Boundary) -> None:
         from remodel_fenicsx.body.mesh_faces import through_the_wall
 
-        unit = f" {self.length_unit}" if self.length_unit else ""
-        counts = f"{len(file.cells)} {file.kind[:-2] + 'ra'} of degree {file.degree}, {len(file.points)} nodes"
+        counts = f"{len(file.cells)} {file.kind[:-3]}ra of degree {file.degree}, {len(file.points)} nodes"
         log.info("%s: %s, SHA-256 %s", Path(self.file).name, counts, file.sha256)
-        thickness = 2 * boundary.volume / (boundary.area("inner") + boundary.area("outer"))
-        log.info("mean thickness of the wall %.4g%s, with plane faces of the elements", thickness, unit)
         if through_the_wall(boundary):
-            log.warning("the wall is one element thick in places: bending and the fibre angle through it are lost there")
+            log.warning(
+                "the wall is one element thick in places: bending and the fibre angle through it are lost there"
+            )
 
     # ------------------------------------------------------------ supports
     def hold(self, loading: Loading) -> None:
-        """Ends guided."""
-        self.hold_faces(loading, {}, 1.0)
+        """By its faces alone (`hold_faces`)."""
 
-    def hold_faces(self, loading: Loading, supports: Mapping[str, Support], modulus: float) -> None:
-        """Hold the faces as a scene says, inlet and outlet guided where it does not.
-
-        Parameters
-        ----------
-        loading
-            Of the body.
-        supports
-            By name of the face.
-        modulus
-            lambda + 2 mu of the matrix, in the scene's unit of stress.
+    def hold_faces(
+        self, loading: Loading, supports: Mapping[str, Support], modulus: float, loads: Collection[str] = ()
+    ) -> None:
+        """Hold them as a scene says, inlet and outlet guided where it does not. Collective.
 
         Raises
         ------
         SceneError
-            If there is no such face, if a rigid motion is left, or ends that slide could not be pulled apart.
+            On all ranks: if there is no such face, if the body can move as a whole, or if ends that slide can not be
+            pulled apart.
         """
-        from remodel_fenicsx.body.mesh_supports import GUIDE, add_support
+        from remodel_fenicsx.body.mesh_supports import GUIDE, add_support, check_supports
 
         domain: Any = loading.domain
         for name in supports:
             if name not in domain.faces:
-                rule = f"the body has no such face; it has {', '.join(domain.faces)}"
-                raise SceneError(f"supports.{name}: {rule}")
-        ends = {name: Support() for name in ("inlet", "outlet") if name in domain.faces}
-        thickness = 2 * domain.volume / (domain.area("inner") + domain.area("outer"))
+                raise SceneError(f"supports.{name}: the body has no such face; it has {', '.join(domain.faces)}")
+        chosen = {name: Support() for name in ("inlet", "outlet") if name in domain.faces} | dict(supports)
+        check_supports(domain, chosen, "elongation" in loads)
         length = domain.length()
-        if domain.comm.rank == 0 and length:
-            log.info("length of the body from inlet to outlet %.6g%s", length, f" {self.length_unit or ''}".rstrip())
-        for name, support in {**ends, **supports}.items():
+        unit = f" {self.length_unit}" if self.length_unit else ""
+        if domain.comm.rank == 0:
+            words = f"mean thickness of the wall {domain.thickness:.6g}{unit}, with plane faces"
+            log.info("%s%s", words, f"; length from inlet to outlet {length:.6g}{unit}" if length else "")
+        for name, support in chosen.items():
             moves = ("elongation", length) if name == "outlet" else None
-            add_support(loading, name, support, GUIDE * modulus / thickness, moves)
+            add_support(loading, name, support, GUIDE * modulus / domain.thickness, moves)
         if "elongation" not in loading.values:
             loading.leave_out("elongation")

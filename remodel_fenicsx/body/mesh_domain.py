@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
 
+import dolfinx.fem
 import numpy as np
+import ufl
 from mpi4py import MPI
+from numpy.typing import NDArray
+
+from remodel_fenicsx.body.axis_fields import cells_of, facets_of
 
 from remodel_fenicsx.body.domain import Domain, MeshArrays, share_mesh
 from remodel_fenicsx.body.mesh_faces import Boundary, Face, node_order, rims
 from remodel_fenicsx.body.mesh_file import Array, Integers, MeshFile
-from remodel_fenicsx.fem.harmonic import harmonic, integral_of_slope
+from remodel_fenicsx.fem import jit
+from remodel_fenicsx.fem.assembly import over_ranks
+from remodel_fenicsx.fem.kinematics import lagrange
+from remodel_fenicsx.fem.positive import solve_positive
 from remodel_fenicsx.schema.tables import SceneError
-
-log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,19 +40,31 @@ class MeshDomain(Domain):
     """
 
     parts: tuple[Face, ...] = ()
-    part_of_element: dict[str, Integers] | None = None
+    part_of_element: Mapping[str, Integers] = field(default_factory=dict)
     rims: tuple[Integers, ...] = ()
     volume: float = 0.0
 
-    def of_part(self, face: str, values: Callable[[Face], Array]) -> Array:
-        """A vector of each part of a face at the local elements that touch it, zero at the others, (elements, 3)."""
-        table = np.array([values(part) for part in self.parts] + [np.zeros(3)])
-        assert self.part_of_element is not None
+    def of_parts(self, face: str, name: str) -> Array:
+        """`normal` or `centre` of each part of a face at the local elements beside it, 0 at others; (elements, 3)."""
+        table = np.array([*(getattr(part, name) for part in self.parts), np.zeros(3)])
         return np.asarray(table[self.part_of_element[face]])
+
+    def facets_of_parts(self, face: str) -> Iterator[tuple[Face, NDArray[np.int32]]]:
+        """The parts of a face with their local facets."""
+        facets = facets_of(self, [face])
+        cells, _ = cells_of(self.mesh, facets)
+        for number, part in enumerate(self.parts):
+            if part.name == face:
+                yield part, facets[self.part_of_element[face][cells] == number]
 
     def area(self, face: str) -> float:
         """Of a named face, with plane facets."""
         return sum(part.area for part in self.parts if part.name == face)
+
+    @property
+    def thickness(self) -> float:
+        """Mean thickness of the wall: twice the volume over the areas of its two faces."""
+        return 2 * self.volume / (self.area("inner") + self.area("outer"))
 
     def length(self) -> float:
         """Of the body from inlet to outlet: volume over the integral of |grad psi|, psi harmonic from 0 to 1.
@@ -56,28 +72,31 @@ class MeshDomain(Domain):
         In a bend psi goes with the angle: the mean of |grad psi| is that at the distance at which the mean of 1/R is,
         the line of the sections' centres. Collective; 0 for a body without one of the two.
         """
-        held = [(self.facets(face), value) for face, value in (("inlet", 0.0), ("outlet", 1.0))]
-        if not all(self.comm.allreduce(len(facets)) for facets, _ in held):
+        if not {"inlet", "outlet"} <= set(self.faces):
             return 0.0
-        field = harmonic(self.mesh, int(self.mesh.geometry.cmap.degree), held)
-        return self.volume / integral_of_slope(field)
+        mesh, degree = self.mesh, int(self.mesh.geometry.cmap.degree)
+        psi = lagrange(mesh, degree, ())
+        space, dx = psi.function_space, ufl.Measure("dx", domain=mesh, metadata={"quadrature_degree": 2 * degree})
+        conditions = []
+        for value, face in enumerate(("inlet", "outlet")):
+            dofs = dolfinx.fem.locate_dofs_topological(space, 2, facets_of(self, [face]))
+            held = dolfinx.fem.Constant(mesh, np.float64(value))
+            conditions.append(dolfinx.fem.dirichletbc(held, dofs, space))
+        trial, test = ufl.TrialFunction(space), ufl.TestFunction(space)
+        solve_positive(ufl.inner(ufl.grad(trial), ufl.grad(test)) * dx, None, psi, conditions)
+        slope, one = ufl.sqrt(ufl.inner(ufl.grad(psi), ufl.grad(psi))), dolfinx.fem.Constant(mesh, np.float64(1.0))
+        parts = [float(np.real(dolfinx.fem.assemble_scalar(jit.form(value * dx)))) for value in (one, slope)]
+        volume, total = over_ranks(self.comm, np.array(parts), MPI.SUM)
+        return float(volume / total)
 
-    def facets(self, face: str) -> Any:
-        """Local facets of a named face; none where the body has no such face."""
-        return self.facet_tags.find(self.faces[face]) if face in self.faces else np.empty(0, dtype=np.int32)
 
-
-def shared(
-    read: Callable[[], tuple[MeshFile, Boundary, dict[str, int]]], dimensions: dict[str, float], comm: MPI.Intracomm
-) -> MeshDomain:
+def shared(read: Callable[[], tuple[MeshFile, Boundary, dict[str, int]]], comm: MPI.Intracomm) -> MeshDomain:
     """What rank 0 reads, on all ranks. Collective.
 
     Parameters
     ----------
     read
         Called on rank 0: the file with its points in the scene's unit, its boundary, and numbers of regions by name.
-    dimensions
-        As in `Domain`.
     comm
         Ranks that share it.
 
@@ -99,7 +118,8 @@ def shared(
     if verdict:
         raise SceneError(verdict)
     arrays = None if found is None else _arrays(*found)
-    domain = share_mesh(arrays, "mesh", dimensions, comm)
+    extent = comm.bcast(arrays and float(np.ptp(arrays.points, axis=0).max()))
+    domain = share_mesh(arrays, "mesh", {"extent": extent}, comm)
     boundary = None if found is None else found[1]
     parts, volume = comm.bcast(boundary and (tuple(boundary.faces), boundary.volume))
     touched = {}

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import basix
 import numpy as np
 from numpy.typing import NDArray
 
-from remodel_fenicsx.body.mesh_file import Array, Integers, MeshFile, MeshFileError
+from remodel_fenicsx.body.mesh_file import Array, Integers, MeshFile, MeshFileError, as_rows, distinct
 
 # corners of the facets of an element and of the edges around a facet, in Gmsh's order; the normals point outwards
 FACETS = {
@@ -46,12 +47,16 @@ class Face:
         Of the face.
     facets
         Rows of `Boundary.facets`.
+    places, normals
+        Middles of the facets, and their unit normals outwards, (facets, 3).
     area, normal, centre
         Of its plane facets: their area, and the mean of their outward normals (3,) and of their places (3,).
     """
 
     name: str
     facets: Integers
+    places: Array
+    normals: Array
     area: float
     normal: Array
     centre: Array
@@ -109,13 +114,12 @@ def boundary_of(file: MeshFile, groups: Groups, open_boundary: bool) -> Boundary
     places = file.points[facets]
     normals = _area_vectors(places)
     owner = np.full(len(facets), "", dtype=object)
-    index = {tuple(sorted(corners)): row for row, corners in enumerate(facets.tolist())}
-    inside = {tuple(corners) for corners in np.sort(twice, axis=1).tolist()}
+    index = {corners: row for row, corners in enumerate(as_rows(np.sort(facets, axis=1)))}
+    inside = set(as_rows(np.sort(twice, axis=1)))
     for name, numbers in groups.items():
         chosen = np.isin(file.facet_groups, numbers)
-        for corners in file.facets[chosen].tolist():
-            row = index.get(key := tuple(sorted(corners)))
-            where = "at " + _place(file.points[corners].mean(axis=0))
+        for key in as_rows(np.sort(file.facets[chosen], axis=1)):
+            row, where = index.get(key), "at " + _place(file.points[list(key)].mean(axis=0))
             if row is None:
                 words = "inside the body" if key in inside else "that are no facets of its elements"
                 raise FaceError(name, f"has facets {words}, the first {where}")
@@ -131,21 +135,24 @@ def boundary_of(file: MeshFile, groups: Groups, open_boundary: bool) -> Boundary
     for name in groups:
         rows = np.flatnonzero(owner == name)
         label = components(facets[rows], len(file.points))
-        for one in dict.fromkeys(label.tolist()):
+        for one in distinct(label):
             part = rows[label == one]
-            size = np.linalg.norm(normals[part], axis=1)
-            mean = normals[part].sum(axis=0)
-            centre = size @ places[part].mean(axis=1) / size.sum()
-            faces.append(Face(name, part, float(size.sum()), mean / max(np.linalg.norm(mean), 1e-300), centre))
+            size, mean, middles = (
+                np.linalg.norm(normals[part], axis=1),
+                normals[part].sum(axis=0),
+                places[part].mean(axis=1),
+            )
+            normal, centre = mean / max(float(np.linalg.norm(mean)), 1e-300), size @ middles / size.sum()
+            units = normals[part] / size[:, None]
+            faces.append(Face(name, part, middles, units, float(size.sum()), normal, centre))
     volume = float(np.einsum("fi,fi->", places.mean(axis=1), normals) / 3)
     return Boundary(facets, cell, faces, volume)
 
 
 def groups_inside(file: MeshFile) -> set[int]:
     """Numbers of the named faces with facets that are not on the boundary: between regions, say."""
-    outside = {tuple(corners) for corners in np.sort(_facets(file)[0], axis=1).tolist()}
-    rows = np.sort(file.facets, axis=1).tolist()
-    return {int(n) for n, corners in zip(file.facet_groups, rows, strict=True) if tuple(corners) not in outside}
+    outside, rows = set(as_rows(np.sort(_facets(file)[0], axis=1))), as_rows(np.sort(file.facets, axis=1))
+    return {int(n) for n, corners in zip(file.facet_groups, rows, strict=True) if corners not in outside}
 
 
 def through_the_wall(boundary: Boundary) -> bool:
@@ -164,8 +171,7 @@ def rims(file: MeshFile, boundary: Boundary, face: str) -> list[Integers]:
     """
     rows = np.concatenate([np.empty(0, dtype=np.int64), *(part.facets for part in boundary.parts(face))])
     edges: dict[tuple[int, int], int] = {}
-    for row in rows.tolist():
-        corners = boundary.facets[row].tolist()
+    for row, corners in zip(distinct(rows), as_rows(boundary.facets[rows]), strict=True):
         for start, end in zip(corners, [*corners[1:], corners[0]], strict=True):
             if edges.pop((end, start), None) is None:
                 edges[start, end] = row
@@ -176,7 +182,7 @@ def rims(file: MeshFile, boundary: Boundary, face: str) -> list[Integers]:
     if file.degree == 2:
         middles = [_middle(file, int(boundary.cell[row]), pair) for pair, row in edges.items()]
         pairs = np.column_stack([pairs, middles])
-    return [pairs[label == one] for one in dict.fromkeys(label.tolist())]
+    return [pairs[label == one] for one in distinct(label)]
 
 
 def area_vector(points: Array, rim: Integers) -> Array:
@@ -217,8 +223,8 @@ def _facets(file: MeshFile) -> tuple[Integers, Integers, Integers]:
         np.sort(facets, axis=1), axis=0, return_index=True, return_inverse=True, return_counts=True
     )
     if (count > 2).any():
-        cell = int(first[count > 2][0]) // len(local)
-        raise MeshFileError(f"element {file.cell_numbers[cell]} shares a facet with two others")
+        bad = int(first[count > 2][0]) // len(local)
+        raise MeshFileError(f"element {file.cell_numbers[bad]} shares a facet with two others")
     one = np.flatnonzero(count[inverse.reshape(-1)] == 1)
     facets_one, cell = facets[one], one // len(local)
     flipped = _orientation(file)[cell] < 0  # elements may be numbered as in a mirror
@@ -236,7 +242,7 @@ def _check_elements(file: MeshFile) -> None:
     extent = np.ptp(file.points, axis=0).max()
     if extent == 0:
         raise MeshFileError("all nodes are at one place")
-    bodies = len(set(components(file.corners, len(file.points)).tolist()))
+    bodies = len(distinct(components(file.corners, len(file.points))))
     if bodies > 1:
         raise MeshFileError(f"{bodies} bodies that have no node in common; allowed is one (in Gmsh: BooleanFragments)")
     determinants = jacobian_determinants(file)
@@ -256,7 +262,8 @@ def jacobian_determinants(file: MeshFile) -> Array:
     kind = basix.CellType[file.kind]
     points, _ = basix.make_quadrature(kind, 2 * file.degree)
     element = basix.create_element(basix.ElementFamily.P, kind, file.degree, basix.LagrangeVariant.gll_warped)
-    slopes = element.tabulate(1, points)[1:, :, :, 0]  # (3, points, nodes)
+    table: Any = element.tabulate(1, np.asarray(points))
+    slopes = table[1:, :, :, 0]  # (3, points, nodes)
     nodes = file.points[file.cells[:, node_order(file)]]
     return np.asarray(np.linalg.det(np.einsum("dpn,cni->cpdi", slopes, nodes)))
 
@@ -282,7 +289,7 @@ def _area_vectors(places: Array) -> Array:
 
 
 def _middle(file: MeshFile, cell: int, pair: tuple[int, int]) -> int:
-    nodes = file.cells[cell].tolist()
+    (nodes,) = as_rows(file.cells[[cell]])
     local = tuple(sorted(nodes.index(node) for node in pair))
     return int(nodes[MIDDLES[file.kind][local[0], local[1]]])
 

@@ -42,6 +42,18 @@ READ = (b"MeshFormat", b"PhysicalNames", b"Entities", b"Nodes", b"Elements")
 ALLOWED_ELEMENTS = "tetrahedra of 4 or 10 nodes, hexahedra of 8 or 27"
 
 
+def as_rows(table: Integers) -> list[tuple[int, ...]]:
+    """Rows of a table as tuples."""
+    listed: Any = table.tolist()
+    return [tuple(row) for row in listed]
+
+
+def distinct(values: Integers) -> list[int]:
+    """Different ones of a list of numbers, in its order."""
+    listed: Any = values.tolist()
+    return list(dict.fromkeys(listed))
+
+
 class MeshFileError(ValueError):
     """What is wrong with a mesh file: one line, with its line in the file where there is one."""
 
@@ -98,7 +110,7 @@ def read_mesh_file(path: Path) -> MeshFile:
         found = path.stat()
         return _read(path, found.st_mtime_ns, found.st_size)
     except FileNotFoundError:
-        raise MeshFileError("no such file") from None
+        raise MeshFileError(f"no such file: {path}") from None
     except IsADirectoryError:
         raise MeshFileError("is a folder; a mesh is a file by Gmsh (.msh)") from None
     except OSError as error:
@@ -207,8 +219,8 @@ def _sections(data: bytes) -> dict[bytes, _Section]:
         raise MeshFileError("line 2: the file ends within $MeshFormat")
     version = lines[1].split()
     if len(version) != 3 or version[0] not in VERSIONS:
-        found = f"format {version[0].decode('ascii', 'replace')[:20]}" if version else "no number of a format"
-        raise MeshFileError(f"line 2: {found}; allowed are 2.2 and 4.1")
+        written = f"format {version[0].decode('ascii', 'replace')[:20]}" if version else "no number of a format"
+        raise MeshFileError(f"line 2: {written}; allowed are 2.2 and 4.1")
     if version[1] != b"0":
         raise MeshFileError("line 2: a binary file; allowed is text (in Gmsh: Mesh.Binary = 0)")
     found: dict[bytes, _Section] = {}
@@ -298,7 +310,7 @@ def _read_41(sections: dict[bytes, _Section]) -> tuple[Integers, Array, list[_Bl
         else:
             elements.at += count
     elements.end()
-    return np.concatenate(numbers or [[]]).astype(np.int64), np.concatenate([np.empty((0, 3)), *points]), blocks
+    return np.concatenate([np.empty(0, dtype=np.int64), *numbers]), np.concatenate([np.empty((0, 3)), *points]), blocks
 
 
 def _entities(section: _Section | None) -> dict[tuple[int, int], list[int]]:

@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import logging
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from remodel_fenicsx.body.mesh_faces import Boundary
+from remodel_fenicsx.body.mesh_faces import Face
 from remodel_fenicsx.body.mesh_file import Array
+from remodel_fenicsx.schema.tables import SceneError
 from remodel_fenicsx.settings import Support
 
 if TYPE_CHECKING:
     from remodel_fenicsx.body.loading import Loading
     from remodel_fenicsx.body.mesh_domain import MeshDomain
 
-GUIDE = 1000.0  # default stiffness over (lambda + 2 mu) / thickness: radii of the paper's tube within 2e-5 of exact ones
+log = logging.getLogger(__name__)
+
+GUIDE = (
+    1000.0  # default stiffness over (lambda + 2 mu) / thickness: radii of the paper's tube within 2e-5 of exact ones
+)
+PARALLEL = 1e-3  # radians between normals: what a mesh in single precision has
+LEAST_TANGENTIAL = 0.5  # measured with ends held: 0 has one or two negative eigenvalues, 0.3 and 1 have none
 STILL = 1e-8  # smallest eigenvalue over the largest below which nothing holds a rigid motion
 
 
@@ -35,7 +43,7 @@ def add_support(
     moves
         Name of the load by which the face moves along its normal, and the way at 1; None: it stays.
     """
-    _KINDS[support.kind](loading, face, support, support.stiffness or stiffness, moves)
+    _HOLD[support.kind](loading, face, support, support.stiffness or stiffness, moves)
 
 
 def _guided(loading: Loading, face: str, support: Support, stiffness: float, moves: tuple[str, float] | None) -> None:
@@ -74,14 +82,16 @@ def _elastic(loading: Loading, face: str, support: Support, stiffness: float, mo
 
 def _held(loading: Loading, face: str, support: Support, stiffness: float, moves: tuple[str, float] | None) -> None:
     """u = d N."""
-    loading.prescribe_displacement(face, _of_parts(loading, face, "normal"), moves)
+    domain: MeshDomain = loading.domain  # type: ignore[assignment]
+    for part, facets in domain.facets_of_parts(face):
+        loading.hold_facets(facets, *((moves[0], moves[1] * part.normal) if moves else ()))
 
 
 def _free(loading: Loading, face: str, support: Support, stiffness: float, moves: tuple[str, float] | None) -> None:
     """Nothing."""
 
 
-_KINDS: dict[str, Callable[[Loading, str, Support, float, tuple[str, float] | None], None]] = {
+_HOLD: dict[str, Callable[[Loading, str, Support, float, tuple[str, float] | None], None]] = {
     "guided": _guided,
     "sliding": _sliding,
     "held": _held,
@@ -103,7 +113,7 @@ def _of_parts(loading: Loading, face: str, name: str) -> Any:
     domain: MeshDomain = loading.domain  # type: ignore[assignment]
     element = basix.ufl.element("DG", domain.mesh.topology.cell_name(), 0, shape=(3,))
     field: Any = dolfinx.fem.Function(dolfinx.fem.functionspace(domain.mesh, element))
-    values = domain.of_part(face, lambda part: getattr(part, name))
+    values = domain.of_parts(face, name)
     field.x.array.reshape(-1, 3)[np.asarray(field.function_space.dofmap.list).reshape(-1)] = values
     return field
 
@@ -111,46 +121,69 @@ def _of_parts(loading: Loading, face: str, name: str) -> Any:
 # ---------------------------------------------------------------- rigid motions
 
 
-def free_motions(boundary: Boundary, places: Array, supports: Mapping[str, Support]) -> list[str]:
-    """Rigid motions of the body that no support holds, in words.
+def check_supports(domain: MeshDomain, supports: Mapping[str, Support], elongated: bool) -> None:
+    """Refuse supports that leave the body free to move as a whole, or, where it is elongated, to evade that.
+
+    Raises
+    ------
+    SceneError
+        One line that names the motions.
+    """
+    free = free_motions(domain.parts, supports)
+    if free:
+        kinds = ", ".join(f"{name} {support.kind!r}" for name, support in supports.items()) or "none"
+        raise SceneError(f"supports ({kinds}): they leave the body free to {' and to '.join(free)}")
+    sliding = [part for part in domain.parts if supports.get(part.name, Support(kind="free")).kind == "sliding"]
+    if elongated and len(sliding) == 2 and np.linalg.norm(np.cross(sliding[0].normal, sliding[1].normal)) > PARALLEL:
+        raise SceneError(
+            "loads.elongation: both ends slide and are not parallel: the elongation would only shift the body, which "
+            "the pressure on its ends holds; allowed with an end that is 'guided' or 'held'"
+        )
+    for name, support in supports.items():
+        if support.kind == "elastic" and support.tangential < LEAST_TANGENTIAL and domain.comm.rank == 0:
+            log.warning(
+                "supports.%s.tangential = %g: springs that hold a wall hardly across their direction push it sideways "
+                "once it has grown, and it twists; from %g on none has",
+                name, support.tangential, LEAST_TANGENTIAL,
+            )  # fmt: skip
+
+
+def free_motions(parts: Sequence[Face], supports: Mapping[str, Support]) -> list[str]:
+    """Rigid motions of the body that no support holds, in words: of the 6 x 6 matrix of the supports over them.
 
     Parameters
     ----------
-    boundary, places
-        Of the body, and its nodes.
+    parts
+        Of the faces of the body.
     supports
         By name of the face.
     """
-    middle = places.mean(axis=0)
-    size = float(np.linalg.norm(places - middle, axis=1).max())
+    everywhere = np.concatenate([part.places for part in parts])
+    middle = everywhere.mean(axis=0)
+    size = float(np.linalg.norm(everywhere - middle, axis=1).max())
     matrix = np.zeros((6, 6))
-    for part in boundary.faces:
+    for part in parts:
         support = supports.get(part.name)
-        if support is None or support.kind == "free":
-            continue
-        corners = places[boundary.facets[part.facets]]
-        at = corners.mean(axis=1)
-        motions = _motions((at - middle) / size)
-        held = _held_directions(support, part.normal, at - part.centre, corners)
-        matrix += np.einsum("fki,fij,flj->kl", motions, held, motions) / len(at)
+        if support is not None and support.kind != "free":
+            motions = _motions((part.places - middle) / size)
+            matrix += np.einsum("fki,fij,flj->kl", motions, _held_directions(support, part), motions) / len(motions)
     values, vectors = np.linalg.eigh(matrix)
     still = vectors[:, values <= STILL * max(float(values[-1]), 1e-300)]
     return [_in_words(motion, middle, size) for motion in _plain(still).T]
 
 
 def _motions(places: Array) -> Array:
-    """Displacements of the six unit motions at places (facets, 3): three along, three about the axes, (facets, 6, 3)."""
+    """Displacements (facets, 6, 3) of the unit motions along and about the axes at places (facets, 3)."""
     turns = np.cross(np.eye(3)[None], places[:, None])
     return np.concatenate([np.broadcast_to(np.eye(3), turns.shape), turns], axis=1)
 
 
-def _held_directions(support: Support, normal: Array, from_centre: Array, corners: Array) -> Array:
-    """What a support holds at facets, as projections (facets, 3, 3)."""
-    along = np.broadcast_to(np.outer(normal, normal), (len(from_centre), 3, 3))
-    around = np.cross(normal, from_centre)
+def _held_directions(support: Support, part: Face) -> Array:
+    """What a support holds at the facets of a part, as projections (facets, 3, 3)."""
+    along = np.broadcast_to(np.outer(part.normal, part.normal), (len(part.places), 3, 3))
+    around = np.cross(part.normal, part.places - part.centre)
     around /= np.maximum(np.linalg.norm(around, axis=1, keepdims=True), 1e-300)
-    own = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    own /= np.linalg.norm(own, axis=1, keepdims=True)
+    own = part.normals
     share, springs = support.tangential, np.einsum("fi,fj->fij", own, own)
     return {
         "guided": along + np.einsum("fi,fj->fij", around, around),
