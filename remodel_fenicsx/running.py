@@ -42,7 +42,7 @@ from remodel_fenicsx.system.interrupts import (
     end_all_ranks_on_exception,
     stopping_at_once,
 )
-from remodel_fenicsx.system.regular_files import read_regular, write_whole
+from remodel_fenicsx.system.regular_files import read_regular
 from remodel_fenicsx.system.terminal import Progress, announce, hold_log, open_log
 
 log = logging.getLogger(__name__)
@@ -231,10 +231,9 @@ def _record(
         if after is None and comm.rank == 0:
             forget_steps(place)
     with ExitStack() as stack:
-        if not resumes:  # before the scene that names them
-            for name, data in files.items():
-                write_whole(place / name, data)
-        record = stack.enter_context(agreed(comm, lambda: RunFolder(place, text, comm.rank, after)))
+        record = stack.enter_context(
+            agreed(comm, lambda: RunFolder(place, text, comm.rank, after, {} if resumes else files))
+        )
         stack.enter_context(open_log(place / LOG, comm.rank, quiet=quiet, held=held))
         steps = scene.time.number_of_steps if simulation.control else state.number + len(simulation.remaining())
         rank, done = -1 if quiet else comm.rank, scene.time.progress(state.number, state.time)
@@ -282,7 +281,7 @@ def _with_files_kept(scene: Scene) -> tuple[Scene, dict[str, bytes]]:
     """The scene with the names that its files have in the folder of the run and their SHA-256, and these files."""
     from remodel_fenicsx.body.fibre_file import LARGEST_FIBRES
 
-    changes, files = {}, {}
+    changes, files = scene.geometry.kept_files()
     for region, cells in scene.measured_cells.items():
         path = Path(cells.fibres or "")
         name = f"fibres{'_' if region else ''}{region}{path.suffix.lower()}"

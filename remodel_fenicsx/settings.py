@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 from pydantic.config import JsonDict
 
 from remodel_fenicsx._lazy import resolved
@@ -40,12 +40,13 @@ from remodel_fenicsx.model.laws import LAWS
 from remodel_fenicsx.model.spectral import PAIRINGS
 from remodel_fenicsx.schema.tables import OneOf, Table, allowed, fault, is_number, quoted, shown
 from remodel_fenicsx.schema.times import is_multiple, same_time
-from remodel_fenicsx.schema.units import FORCE, LENGTH, NUMBER_DENSITY, STRESS, TEMPERATURE
+from remodel_fenicsx.schema.units import FORCE, FOUNDATION, LENGTH, NUMBER_DENSITY, STRESS, TEMPERATURE
 
 STRESS_UNITS = {"Pa": 1.0, "kPa": 1.0e3, "MPa": 1.0e6}  # in Pa
 MEASURED_CELLS = "fibres"  # those of cells.fibres
 INITIAL_CELLS = ("random", "isotropic", "aligned", MEASURED_CELLS)
 MOST_STEPS = 1_000_000
+LARGEST_MESH = 10_000_000  # hexahedra; Gmsh, which is serial, needs about 10 GB for them
 NOT_NEGATIVE: JsonDict = {"type": "number", "minimum": 0}
 
 
@@ -93,8 +94,48 @@ class Model(Table):
     )
 
 
+class Support(Table):
+    """How a face of an own body (shape `'mesh'`) is held, `[supports.inlet]` say.
+
+    NAME is a face of `geometry.faces`, or one that the file names. N is the face's mean outward normal in the
+    reference, of each of its parts; c goes around the middle of the part. Where a scene says nothing, inlet and outlet
+    are guided, all other faces free.
+    """
+
+    kind: Literal["guided", "sliding", "held", "elastic", "free"] = Field(
+        default="guided",
+        description="'guided': the face stays in its plane and around its middle, its circumference may grow; "
+        "'sliding': it stays in its plane; 'held': it does not move, but along N as loads.elongation says; 'elastic': "
+        "on springs of fixed direction, as in what surrounds the body; 'free'.",
+    )
+    stiffness: Annotated[float | None, FOUNDATION] = Field(
+        default=None,
+        gt=0,
+        description="Force per area and displacement, in stress_unit over the scene's unit of length. 'elastic' needs "
+        "it; for 'guided' and 'sliding' the default is 1000 (lame_lambda + 2 lame_mu) over the wall's thickness: it "
+        "moves a plane by a thousandth of what the wall's own compression does.",
+        json_schema_extra={"allowed": "a finite number greater than 0"},
+    )
+    tangential: float = Field(
+        default=1.0,
+        ge=0,
+        le=1,
+        description="Of 'elastic': stiffness across N over that along N. Below 0.5 a wall that has grown may twist.",
+    )
+
+    @model_validator(mode="after")
+    def _springs_have_a_stiffness(self) -> Support:
+        if self.kind == "elastic" and self.stiffness is None:
+            raise fault("missing; a support of kind 'elastic' needs it, as in '10 kPa/mm'", "stiffness", None)
+        return self
+
+
 class Supports(Table):
-    """How the body is held."""
+    """How the body is held. An own body (shape `'mesh'`) has a table for each of its faces that is held."""
+
+    further = Support
+    model_config = ConfigDict(extra="allow")
+    __pydantic_extra__: dict[str, Support] = Field(init=False)
 
     ends: str = Field(
         default="free",
@@ -102,6 +143,11 @@ class Supports(Table):
         "or 'closed': free, with caps on which the pressure acts, and the length an unknown.",
         json_schema_extra={"allowed": "'free', for a tube also 'clamped' and 'closed'"},
     )
+
+    @property
+    def faces(self) -> dict[str, Support]:
+        """Supports by name of the face."""
+        return dict(self.__pydantic_extra__ or {})
 
 
 # ---------------------------------------------------------------- tissue and cells

@@ -94,6 +94,9 @@ class Simulation:
         self.cells = UnitCells(self.quadrature, domain, scene.cells, local_axes, own, fibres)
         self.loading = Loading(domain, self.unknown, kinematics)
         shape.support(self.loading, scene.supports.ends)
+        matrices = [one.material for one in properties.values()]
+        modulus = max(material.lame_lambda + 2 * material.lame_mu for material in matrices)
+        shape.hold_faces(self.loading, scene.supports.faces, modulus, scene.loads)
         formulation = FORMULATIONS[scene.mesh.formulation]
         self.state = State(self.unknown, kinematics, self.cells, self.loading, formulation)
         tissue, kappa = parameters_of(properties, domain)
@@ -298,7 +301,7 @@ def checked_domain(domain: Domain, scene: Scene) -> Domain:
             raise SceneError(f"regions.{name}: the mesh has no such region; it has {', '.join(domain.regions)}")
     if scene.regions and shape.is_filled_by_regions and (others := set(domain.regions) - set(scene.regions)):
         raise SceneError(f"regions.{min(others)}: missing; it is a region of the mesh")
-    needed = () if KINEMATICS[scene.model.kinematics].reduced else shape.faces
+    needed = () if KINEMATICS[scene.model.kinematics].reduced else shape.face_names
     missing = [face for face in needed if face not in domain.faces]
     if missing:
         raise SceneError(f"geometry.shape = {shape.name!r}: the mesh has no face {', '.join(missing)}")

@@ -37,7 +37,7 @@ def place(m: Any, point: tuple[float, float, float], component: int) -> float:
 class Prism(Shape):
     """A quadrilateral in the plane, extruded along z; faces x0, x1, y0, y1 and z0, z1."""
 
-    faces: ClassVar[tuple[str, ...]] = ("x0", "x1", "y0", "y1", "z0", "z1")
+    face_names: ClassVar[tuple[str, ...]] = ("x0", "x1", "y0", "y1", "z0", "z1")
     corners: ClassVar[tuple[tuple[float, float], ...]]
     thickness: ClassVar[float]
     divisions: ClassVar[tuple[int, int, int]]

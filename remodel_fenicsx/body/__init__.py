@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from remodel_fenicsx.body.cube import Cube
 from remodel_fenicsx.body.gmsh_model import GeometryError
+from remodel_fenicsx.body.mesh_body import MeshBody
 from remodel_fenicsx.body.shape import LoadKind, Shape
 from remodel_fenicsx.body.tendon import Tendon
 from remodel_fenicsx.body.tube import Tube
@@ -13,10 +14,11 @@ __all__ = [
     "Cube",
     "GeometryError",
     "LoadKind",
+    "MeshBody",
     "Shape",
     "Tendon",
     "Tube",
 ]
 
-SHAPES: dict[str, type[Shape]] = {"cube": Cube, "tendon": Tendon, "tube": Tube}
+SHAPES: dict[str, type[Shape]] = {"cube": Cube, "tendon": Tendon, "tube": Tube, "mesh": MeshBody}
 """The shapes that a scene may name; a script adds its own."""

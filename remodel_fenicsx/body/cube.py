@@ -35,7 +35,7 @@ class Cube(Shape):
     }
     columns: ClassVar[tuple[Column, ...]] = uniaxial_columns("z1", "side")
     number_of_elements: ClassVar[int] = 1
-    faces: ClassVar[tuple[str, ...]] = ("x0", "x1", "y0", "y1", "z0", "z1")
+    face_names: ClassVar[tuple[str, ...]] = ("x0", "x1", "y0", "y1", "z0", "z1")
     reductions: ClassVar[dict[str, Reduction]] = {
         "point": homogeneous_bar("z0", "z1", lambda shape: {"side": shape.side}, lambda shape: box(shape.side)),
     }

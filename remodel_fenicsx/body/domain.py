@@ -286,6 +286,91 @@ def _domain_from_gmsh(
     return replace(domain, element_region=domain.scatter_elements(domain.gather_elements(region)))  # ghosts too
 
 
+# ---------------------------------------------------------------- from arrays
+
+
+@dataclass(frozen=True, eq=False)
+class MeshArrays:
+    """A mesh on rank 0.
+
+    Attributes
+    ----------
+    kind, degree
+        Of the elements.
+    points, cells
+        (nodes, 3), and their rows in dolfinx's order, (elements, nodes of one).
+    facets, facet_values
+        Corners in any order, (facets, corners), and the value of each in `Domain.facet_tags`.
+    cell_values
+        Value of each element in `Domain.element_region`.
+    faces, regions
+        As in `Domain`.
+    """
+
+    kind: str
+    degree: int
+    points: Array
+    cells: npt.NDArray[np.int64]
+    facets: npt.NDArray[np.int64]
+    facet_values: npt.NDArray[np.int64]
+    cell_values: npt.NDArray[np.int64]
+    faces: dict[str, int]
+    regions: dict[str, int]
+
+
+def share_mesh(
+    arrays: MeshArrays | None, shape: str, dimensions: dict[str, float], comm: MPI.Intracomm | None = None
+) -> Domain:
+    """Share a mesh that rank 0 holds; elsewhere `arrays` is not looked at. Collective.
+
+    Parameters
+    ----------
+    arrays
+        The mesh.
+    shape, dimensions
+        As in `Domain`.
+    comm
+        Ranks that share the mesh; default: all.
+    """
+    comm = comm or MPI.COMM_WORLD
+    os.environ.setdefault("SCOTCH_PTHREAD_NUMBER", "1")  # as above
+    told = arrays and (arrays.kind, arrays.degree, arrays.cells.shape[1], arrays.faces, arrays.regions)
+    tagged = arrays and (np.sort(arrays.facets, axis=1), arrays.facet_values)
+    kind, degree, nodes, faces, regions = comm.bcast(told)
+    symbolic = SymbolicMesh(basix.ufl.element("Lagrange", kind, degree, shape=(3,)))
+    cells = np.empty((0, nodes), dtype=np.int64) if arrays is None else arrays.cells
+    points = np.empty((0, 3)) if arrays is None else arrays.points
+    mesh: Any = dolfinx.mesh.create_mesh(comm, cells=cells, x=points, e=symbolic)
+    tags = _tags_of_facets(mesh, *comm.bcast(tagged))
+    domain = Domain(mesh, tags, faces, shape, dimensions, regions, np.empty(0, dtype=np.int32))
+    values = None if arrays is None else arrays.cell_values.astype(np.int32)
+    return replace(domain, element_region=domain.scatter_elements(values))
+
+
+def _tags_of_facets(mesh: Any, corners: npt.NDArray[np.int64], values: npt.NDArray[np.int64]) -> Any:
+    """Tags of the facets of the boundary with these corners, as rank 0 numbered them, each row ascending."""
+    topology, geometry = mesh.topology, mesh.geometry
+    dimension = topology.dim
+    topology.create_connectivity(dimension - 1, dimension)
+    topology.create_connectivity(dimension, dimension - 1)
+    facets = dolfinx.mesh.exterior_facet_indices(topology)
+    to_cells = topology.connectivity(dimension - 1, dimension)
+    to_facets = topology.connectivity(dimension, dimension - 1)
+    cells = to_cells.array[to_cells.offsets[facets]]
+    of_cell = to_facets.array.reshape(-1, len(to_facets.links(0)) if len(cells) else 1)
+    local = np.argmax(of_cell[cells] == facets[:, None], axis=1) if len(cells) else cells
+    corners_of = np.array(basix.topology(basix.CellType[mesh.topology.cell_name()])[dimension - 1])
+    nodes = np.take_along_axis(compat.geometry_dofmap(mesh)[cells], corners_of[local], axis=1)
+    listed: Any = corners.tolist()
+    wanted = dict(zip(map(tuple, listed), values.astype(int), strict=True))
+    own = np.sort(np.asarray(geometry.input_global_indices, dtype=np.int64)[nodes], axis=1)
+    rows: Any = own.tolist()
+    found = np.array([wanted.get(tuple(row), 0) for row in rows], dtype=np.int32)
+    order = np.argsort(facets)
+    order = order[found[order] > 0]
+    return dolfinx.mesh.meshtags(mesh, dimension - 1, facets[order].astype(np.int32), found[order])
+
+
 # ---------------------------------------------------------------- structured, without Gmsh
 
 

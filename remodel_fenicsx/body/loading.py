@@ -48,7 +48,7 @@ class Loading:
         self.weight = self.kinematics.weight(domain.mesh)
         self.boundary_conditions: list[Any] = []
         self.values: LoadValues = {}
-        self._magnitudes: dict[str, list[tuple[Any, float]]] = {}
+        self._magnitudes: dict[str, list[tuple[Any, Any]]] = {}  # constant, and its value at magnitude 1
         self._terms: list[Callable[[Any, Any], Any]] = []
         self._potentials: list[Callable[[Any], Any]] = []
         self.has_caps = False
@@ -56,7 +56,7 @@ class Loading:
     # ------------------------------------------------------------ supports
     def hold_face(self, face: str, component: int) -> None:
         """u_component = 0 on a named face."""
-        self._prescribe_face(face, component, self._constant(0.0))
+        self._prescribe_face(face, component, self.constant(0.0))
 
     def hold_node(self, point: tuple[float, float, float], component: int) -> None:
         """u_component = 0 at the mesh node at `point`, where the body could move as a whole.
@@ -81,7 +81,25 @@ class Loading:
         if found != 1:
             raise ValueError(f"{found} mesh nodes at {point}: a support needs exactly one")
         # on the sub-space's own dofs alone the value is a Constant, as for faces
-        self.boundary_conditions.append(dolfinx.fem.dirichletbc(self._constant(0.0), dofs[0], subspace))
+        self.boundary_conditions.append(dolfinx.fem.dirichletbc(self.constant(0.0), dofs[0], subspace))
+
+    def hold_facets(self, facets: Any, name: str | None = None, way: Any = None) -> None:
+        """u = magnitude times `way` on local facets, of the full displacement.
+
+        Parameters
+        ----------
+        facets
+            Their local numbers.
+        name
+            Of the load whose magnitude it is; None: u = 0.
+        way
+            Displacement at magnitude 1, (3,).
+        """
+        value = dolfinx.fem.Constant(self.domain.mesh, np.zeros(3, dtype=PETSc.ScalarType))
+        dofs = dolfinx.fem.locate_dofs_topological(self.space, self.domain.mesh.topology.dim - 1, facets)
+        self.boundary_conditions.append(dolfinx.fem.dirichletbc(value, dofs, self.space))
+        if name is not None:
+            self._take(name, value, way)
 
     # ------------------------------------------------------------ loads
     def add_dead_force(self, name: str, face: str, component: int) -> None:
@@ -153,7 +171,7 @@ class Loading:
 
     def magnitude(self, name: str, scale: float = 1.0) -> Any:
         """A Constant that is the named load's present magnitude times `scale`: what a term is made of."""
-        constant = self._constant(0.0)
+        constant = self.constant(0.0)
         self._take(name, constant, scale)
         return constant
 
@@ -203,10 +221,11 @@ class Loading:
         return float(np.real(self.domain.mesh.comm.allreduce(local, MPI.SUM)))
 
     # ------------------------------------------------------------ inside
-    def _constant(self, value: float) -> Any:
+    def constant(self, value: float) -> Any:
+        """A number as an argument of kernels, so that another one compiles nothing."""
         return dolfinx.fem.Constant(self.domain.mesh, PETSc.ScalarType(value))
 
-    def _take(self, name: str, constant: Any, scale: float) -> None:
+    def _take(self, name: str, constant: Any, scale: Any) -> None:
         """From now on the constant is the named load's magnitude times `scale`."""
         self._magnitudes.setdefault(name, []).append((constant, scale))
         self.values[name] = 0.0

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -20,7 +22,7 @@ from remodel_fenicsx.model.cells import angle_to_axis
 from remodel_fenicsx.model.local_axes import LocalAxes
 from remodel_fenicsx.schema.tables import Table, fault
 from remodel_fenicsx.schema.units import Dimension, LengthUnit
-from remodel_fenicsx.settings import Mesh, Region
+from remodel_fenicsx.settings import LARGEST_MESH, Mesh, Region, Support
 
 if TYPE_CHECKING:  # shapes are part of every scene: they are read without dolfinx
     from mpi4py import MPI
@@ -95,7 +97,7 @@ class Shape(Table):
         What `cells.axes` may be (`model.local_axes.AXES`).
     number_of_elements
         Hexahedra of the mesh with refinement 1.
-    faces
+    face_names
         Names of the faces that supports, loads and columns refer to.
     reductions
         What is cheaper than the displacement in three dimensions and exact for some scenes, by name of the kinematics,
@@ -112,6 +114,8 @@ class Shape(Table):
         Of `settings.CONSTANT_FIELDS`, those that `output.fields = true` stands for too.
     defaults
         Defaults of other tables that this shape changes, under the keys of preset and scene.
+    holds_faces
+        Whether `[supports.NAME]` says how each face is held (`hold_faces`).
     has_regions
         Whether a scene may give the body `[regions.NAME]`, named parts with tissue of their own.
     is_filled_by_regions
@@ -124,7 +128,7 @@ class Shape(Table):
     angle_layers: ClassVar[dict[str, float]] = {}
     axis_kinds: ClassVar[tuple[str, ...]] = ("global",)
     number_of_elements: ClassVar[int]
-    faces: ClassVar[tuple[str, ...]] = ()
+    face_names: ClassVar[tuple[str, ...]] = ()
     reductions: ClassVar[dict[str, Reduction]] = {}
     ends: ClassVar[dict[str, Callable[[Any, Loading], None]]] = {"free": lambda shape, loading: shape.hold(loading)}
     ends_that_free_length: ClassVar[tuple[str, ...]] = ()
@@ -132,6 +136,7 @@ class Shape(Table):
     angle_in_words: ClassVar[tuple[str, str]] = ("along the load", "across")
     constant_fields: ClassVar[tuple[str, ...]] = ()
     defaults: ClassVar[dict[str, Any]] = {}
+    holds_faces: ClassVar[bool] = False
     has_regions: ClassVar[bool] = False
     is_filled_by_regions: ClassVar[bool] = False
 
@@ -250,6 +255,45 @@ class Shape(Table):
                 loading.leave_out(name)
             else:
                 kind.add(self, loading, name)
+
+    def hold_faces(
+        self, loading: Loading, supports: Mapping[str, Support], modulus: float, loads: Collection[str] = ()
+    ) -> None:
+        """Hold faces as `[supports.NAME]` says, where the shape `holds_faces`.
+
+        Parameters
+        ----------
+        loading
+            Of the body, with all its loads.
+        supports
+            By name of the face.
+        modulus
+            lambda + 2 mu of the stiffest matrix in the body, in the scene's unit of stress.
+        loads
+            Names of those that the scene has.
+        """
+
+    @classmethod
+    def defaults_of(cls, own: Mapping[str, Any]) -> dict[str, Any]:
+        """`defaults` for a scene with these keys, as they were read."""
+        return cls.defaults
+
+    @classmethod
+    def with_files_from(cls, geometry: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+        """The keys of `[geometry]` as they were read from a scene in a folder, with the places of files."""
+        return dict(geometry)
+
+    def kept_files(self) -> tuple[dict[str, Any], dict[str, bytes]]:
+        """Values that a scene as run has in place of its own, by dotted key, and files beside it by name."""
+        return {}, {}
+
+    def check_size(self, mesh: Mesh) -> None:
+        """Refuse a mesh that is too large: raise a `fault` that names the key."""
+        number = self.number_of_elements
+        if number * mesh.refinement**3 > LARGEST_MESH:
+            largest = math.floor((LARGEST_MESH / number) ** (1 / 3))
+            rule = f"must be at most {largest} for a {self.name}: more makes over {LARGEST_MESH:g} elements"
+            raise fault(rule, "mesh.refinement", mesh.refinement)
 
     def fibre_angle(self, dimensions: Array, axes: Array, local: Array) -> Array:
         """Angle of the chain direction in degrees; here to the load axis z.

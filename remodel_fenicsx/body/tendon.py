@@ -47,7 +47,7 @@ class Tendon(Shape):
     columns: ClassVar[tuple[Column, ...]] = uniaxial_columns("top", "length")
     axis_kinds: ClassVar[tuple[str, ...]] = ("global", "cylindrical")
     number_of_elements: ClassVar[int] = 480
-    faces: ClassVar[tuple[str, ...]] = ("bottom", "top", "side")
+    face_names: ClassVar[tuple[str, ...]] = ("bottom", "top", "side")
     reductions: ClassVar[dict[str, Reduction]] = {
         "point": homogeneous_bar(
             "bottom",

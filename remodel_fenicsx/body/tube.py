@@ -262,7 +262,7 @@ class Tube(Walled):
     )
     axis_kinds: ClassVar[tuple[str, ...]] = ("global", "cylindrical")
     number_of_elements: ClassVar[int] = 1536
-    faces: ClassVar[tuple[str, ...]] = ("bottom", "top", "inner", "outer")
+    face_names: ClassVar[tuple[str, ...]] = ("bottom", "top", "inner", "outer")
     reductions: ClassVar[dict[str, Reduction]] = REDUCTIONS
     ends: ClassVar[dict[str, Callable[[Any, Loading], None]]] = {
         "free": lambda shape, loading: shape.hold(loading),

@@ -15,10 +15,13 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.body.columns import Column, columns_of
 from remodel_fenicsx.body.domain import Domain
+from remodel_fenicsx.body.mesh_faces import cap_volume
 from remodel_fenicsx.body.shape import Shape
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
 from remodel_fenicsx.fem import compat, jit
+from remodel_fenicsx.fem.assembly import over_ranks
 from remodel_fenicsx.fem.quadrature import Quadrature
+from remodel_fenicsx.results.fields import NodalGather
 from remodel_fenicsx.solver.equilibrium import Equilibrium
 
 Array = NDArray[np.float64]
@@ -147,6 +150,10 @@ class Measurement:
         found: EndForce = self.tool_of_step(("end force", face), measure)
         return found
 
+    def lumen_volume(self) -> float:
+        """Of an own body (`MeshDomain`): volume inside the deformed inner face, with flat caps on its rims."""
+        return float(self.tool("lumen volume", lambda: _LumenVolume(self.observer))())
+
     def largest(self, values: Array) -> float:
         """Largest of one value per local element, over all ranks."""
         local = float(np.max(self.quadrature.owned(values), initial=-np.inf))
@@ -204,6 +211,26 @@ class _FaceMean:
     def _integral(self, nodal_values: Array | float) -> float:
         self.field.x.array.reshape(-1, self._size)[:, 0] = nodal_values
         return float(np.real(dolfinx.fem.assemble_scalar(self._form)))
+
+
+class _LumenVolume:
+    """-1/3 integral of x . cof(F) N over the inner face, and the cones over flat caps on its rims."""
+
+    def __init__(self, observer: Observer):
+        domain, state = observer.domain, observer.state
+        self._rims, self._comm = domain.rims, domain.comm  # type: ignore[attr-defined]
+        self._nodes, self._displacement = domain.gather_nodes(domain.mesh.geometry.x), NodalGather(domain, state)
+        place = ufl.SpatialCoordinate(domain.mesh) + state.kinematics.displacement(state.unknown)
+        normal = ufl.cofac(state.kinematics.deformation_gradient(state.unknown)) * ufl.FacetNormal(domain.mesh)
+        self._form = jit.form(-ufl.inner(place, normal) / 3 * state.loading.measure_alone("inner"))
+
+    def __call__(self) -> float:
+        """Of the present displacement. Collective."""
+        volume = float(np.real(dolfinx.fem.assemble_scalar(self._form)))
+        displacement = self._displacement()
+        if displacement is not None and self._nodes is not None:
+            volume += sum(cap_volume(self._nodes + displacement, rim) for rim in self._rims)
+        return float(over_ranks(self._comm, volume, MPI.SUM))
 
 
 class EndForce(NamedTuple):

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import itertools
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
+from types import MappingProxyType
 from typing import TypeVar, cast
 
 from mpi4py import MPI
@@ -174,6 +175,8 @@ class RunFolder(Watcher):
         Rank in the communicator: all but rank 0 write nothing.
     after
         Where a run goes on: the history is cut there.
+    files
+        Contents of further files by name, which the scene needs.
 
     Raises
     ------
@@ -185,7 +188,14 @@ class RunFolder(Watcher):
         If the history does not hold the steps that were done; nothing has changed then.
     """
 
-    def __init__(self, folder: Path, scene_text: str, rank: int = 0, after: LastStep | None = None):
+    def __init__(
+        self,
+        folder: Path,
+        scene_text: str,
+        rank: int = 0,
+        after: LastStep | None = None,
+        files: Mapping[str, bytes] = MappingProxyType({}),
+    ):
         self.folder = Path(folder)
         self.history: History | None = None
         self._last_row = -1  # number of its step
@@ -193,6 +203,8 @@ class RunFolder(Watcher):
             self.folder.mkdir(parents=True, exist_ok=True)
             if after is not None:  # what is refused leaves the scene as it is
                 self.history = History(self.folder / HISTORY, after)
+            for name, data in files.items():
+                write_whole(self.folder / name, data)
             write_whole(self.folder / SCENE, scene_text.encode("utf-8"))
             self.history = self.history or History(self.folder / HISTORY)
 

@@ -15,9 +15,9 @@ from pydantic.fields import FieldInfo
 from remodel_fenicsx.body import SHAPES, Shape
 from remodel_fenicsx.scene.presets import PRESETS, PROFILES
 from remodel_fenicsx.scene.scene import FORMAT, Scene
-from remodel_fenicsx.schema.tables import choices, is_table
+from remodel_fenicsx.schema.tables import choices, free_names, is_table
 from remodel_fenicsx.schema.units import QUANTITY, Dimension, dimension_of
-from remodel_fenicsx.settings import Load
+from remodel_fenicsx.settings import Load, Supports
 
 Schema = dict[str, Any]
 
@@ -42,7 +42,9 @@ def _table(table: type[BaseModel]) -> Schema:
     by_pydantic = table.model_json_schema()["properties"]
     properties = {name: _field(field, by_pydantic[name]) for name, field in table.model_fields.items()}
     meaning = {"description": inspect.cleandoc(table.__doc__)} if table.__doc__ else {}
-    return {"type": "object", **meaning, "properties": properties, "additionalProperties": False}
+    further = free_names(table)
+    others = _table(further) if further is not None else False
+    return {"type": "object", **meaning, "properties": properties, "additionalProperties": others}
 
 
 def _field(field: FieldInfo, by_pydantic: Schema) -> Schema:
@@ -96,7 +98,8 @@ def _of_shape(shape: type[Shape]) -> Schema:
     tables = {
         "geometry": geometry,
         "loads": {"type": "object", "properties": loads, "additionalProperties": False},
-        "supports": {"properties": {"ends": {"enum": list(shape.ends)}}},
+        "supports": {"properties": {"ends": {"enum": list(shape.ends)}}}
+        | ({} if shape.holds_faces else {"propertyNames": {"enum": list(Supports.model_fields)}}),
         "cells": {"properties": {"axes": {"enum": list(shape.axis_kinds)}}},
         "regions": {} if shape.has_regions else {"maxProperties": 0},
     }

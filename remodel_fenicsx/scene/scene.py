@@ -6,7 +6,6 @@ keys (`scene.reference`).
 
 from __future__ import annotations
 
-import math
 import os
 import re
 from collections.abc import Iterable, Iterator, Mapping
@@ -54,7 +53,6 @@ RENAMED = {"mesh.cell": "mesh.element", "loads.stretch": "loads.elongation", "so
 FORGOTTEN_AFTER = (
     1000.0  # times 1/kappa after which nothing is left of a start, of cells under a hundredth of a tension too
 )
-LARGEST_MESH = 10_000_000  # hexahedra; Gmsh, which is serial, needs about 10 GB for them
 
 
 # ---------------------------------------------------------------- the scene
@@ -118,7 +116,7 @@ class Scene(Table):
             _check_name("preset", preset, PRESETS)
         shape = _known_shape(own.get("geometry", {}))
         _check_load_names(shape, own.get("loads"))
-        base = SHAPES[shape].defaults
+        base = SHAPES[shape].defaults_of(own)
         if preset is None:
             base = merged(base, default_method(own))
         else:
@@ -147,6 +145,9 @@ class Scene(Table):
         ):
             if name not in names:
                 raise fault(f"allowed for shape {geometry.name!r} is {', '.join(map(repr, names))}", key, name)
+        for name in self.supports.faces:
+            if not geometry.holds_faces:
+                raise fault(f"a {geometry.name} is held by supports.ends", f"supports.{quoted(name)}", None)
         formulation = self.mesh.formulation
         if FORMULATIONS[formulation].takes_parts and not isinstance(MATRICES[material.matrix], Matrix):
             rule = f"needs the volumetric part of material.matrix = {material.matrix!r}: an energy made as a Matrix"
@@ -156,11 +157,7 @@ class Scene(Table):
             raise fault(f"needs {missing}", "remodeling.coupling", "implicit")
         if self.time.is_equilibrium and (missing := self._missing_for_equilibrium()) is not None:
             raise fault(missing, "time.end", self.time.end)
-        elements = geometry.number_of_elements * self.mesh.refinement**3
-        if elements > LARGEST_MESH:
-            largest = math.floor((LARGEST_MESH / geometry.number_of_elements) ** (1 / 3))
-            rule = f"must be at most {largest} for a {geometry.name}: more makes over {LARGEST_MESH:g} elements"
-            raise fault(rule, "mesh.refinement", self.mesh.refinement)
+        geometry.check_size(self.mesh)
         for name, load in self.loads.items():
             self._check_load(name, load)
         self._check_output_times()
@@ -418,6 +415,9 @@ def _beside(values: dict[str, Any], folder: Path) -> dict[str, Any]:
         )
 
     values = placed(values)
+    geometry = values.get("geometry")
+    if isinstance(geometry, Mapping) and isinstance(kind := geometry.get("shape"), str) and kind in SHAPES:
+        values = {**values, "geometry": SHAPES[kind].with_files_from(geometry, folder)}
     if isinstance(regions := values.get("regions"), Mapping):
         values = {**values, "regions": {name: placed(table) for name, table in regions.items()}}
     return values
@@ -489,6 +489,7 @@ def _plain(value: Any, every_value: bool = False) -> Any:
     if isinstance(value, BaseModel):
         kind = {"shape": value.name} if isinstance(value, Shape) else {}
         names = [name for name in type(value).model_fields if every_value or name in value.model_fields_set]
+        names += value.model_extra or ()
         found = {name: _plain(getattr(value, name), every_value) for name in names}
         return kind | {name: entry for name, entry in found.items() if entry is not None}
     if isinstance(value, Mapping):
@@ -559,7 +560,8 @@ def read_scene(path: str | os.PathLike[str], overrides: Iterable[str] = (), prof
 # ---------------------------------------------------------------- where a run goes on
 
 # what decides no number of the steps done, or only how they were solved
-FREE = ("format", "name", "preset", "profile", "output", "solver", "loads", "time.end")
+# (of a file only its contents, geometry.sha256, count)
+FREE = ("format", "name", "preset", "profile", "output", "solver", "loads", "time.end", "geometry.file")
 SAME_LOAD = 1e-12  # relative difference of two loads that are the same
 
 

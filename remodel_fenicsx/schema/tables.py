@@ -35,9 +35,12 @@ class Table(BaseModel):
     ----------
     renamed
         Of the outermost table: dotted keys of earlier versions, each with the one that has taken its place.
+    further
+        Class of tables that may be there under any name beside the fields; None: there are none.
     """
 
     renamed: ClassVar[Mapping[str, str]] = {}
+    further: ClassVar[type[BaseModel] | None] = None
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
@@ -221,8 +224,11 @@ def locate(table: type[BaseModel], location: tuple[int | str, ...]) -> tuple[str
         item = items.pop(0)
         key = _joined(key, f"[{item}]" if isinstance(item, int) else quoted(item))
         if is_table(annotation):
+            further = free_names(annotation)
             owner, field = annotation, annotation.model_fields.get(str(item))
             annotation = None if field is None else field.annotation
+            if field is None and further is not None:
+                annotation, owner, field = further, further, FieldInfo.from_annotation(further)
             if field is not None and items and (variant := variant_of_field(field)):
                 annotation = variant.registry[str(items.pop(0))]
         elif get_origin(annotation) is dict:
@@ -291,6 +297,11 @@ def is_table(annotation: Any) -> bool:
     return isinstance(annotation, type) and issubclass(annotation, BaseModel)
 
 
+def free_names(table: Any) -> type[BaseModel] | None:
+    """The class of the tables that a table may have under any name beside its fields, or None."""
+    return getattr(table, "further", None)
+
+
 def variant_of_field(field: FieldInfo) -> VariantOf | None:
     """The registry behind a field that has several kinds of tables, or None."""
     return next((entry for entry in field.metadata if isinstance(entry, VariantOf)), None)
@@ -326,6 +337,8 @@ def allowed(field: FieldInfo) -> str:
 def sections(table: type[BaseModel], key: str = "", variant: str = "") -> Iterator[tuple[str, str, type[BaseModel]]]:
     """(dotted key, variant, class) of a table and of all tables in it; NAME stands for a free name."""
     yield key, variant, table
+    if (kind := free_names(table)) is not None:
+        yield from sections(kind, _joined(key, "NAME"))
     for name, field in table.model_fields.items():
         path = _joined(key, name)
         if several := variant_of_field(field):

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 from pydantic import BaseModel, Field
 from pydantic.fields import FieldInfo
 
-from remodel_fenicsx.schema.tables import allowed, fault, is_table, sections, shown
+from remodel_fenicsx.schema.tables import allowed, fault, free_names, is_table, quoted, sections, shown
 
 if TYPE_CHECKING:  # it takes half a second to start, and most scenes have no units
     import pint
@@ -69,6 +69,7 @@ LENGTH = Dimension("length", "5 mm", ((LENGTH_UNIT, 1),))
 AREA = Dimension("area", "10 mm^2", ((LENGTH_UNIT, 2),))
 FORCE = Dimension("force", "300 mN", ((STRESS_UNIT, 1), (LENGTH_UNIT, 2)))
 TEMPERATURE = Dimension("temperature", "37 degC", (("K", 1),))
+FOUNDATION = Dimension("stress per length", "10 kPa/mm", ((STRESS_UNIT, 1), (LENGTH_UNIT, -1)))
 NUMBER_DENSITY = Dimension("number per volume", "2e21 / m^3", (("m", -3),))
 
 
@@ -109,6 +110,10 @@ def in_units(
     if not isinstance(values, Mapping):
         return values
     result = dict(values)
+    kind = free_names(table)
+    if kind is not None:
+        further = [name for name in values if name not in table.model_fields]
+        result |= {name: in_units(values[name], kind, units, f"{key}.{quoted(str(name))}") for name in further}
     for name, field in table.model_fields.items():
         value, path = values.get(name), f"{key}.{name}" if key else name
         if is_table(field.annotation) and name in values:

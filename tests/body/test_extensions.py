@@ -339,7 +339,7 @@ class Bar(Shape):
         Column("width", "length", "mean of the deformed side", lambda m: m.face_mean("x1", m.position[:, 0])),
     )
     number_of_elements: ClassVar[int] = 4
-    faces: ClassVar[tuple[str, ...]] = ("x0", "x1", "y0", "y1", "z0", "z1")
+    face_names: ClassVar[tuple[str, ...]] = ("x0", "x1", "y0", "y1", "z0", "z1")
 
     shape: Literal["bar"] = Field(default="bar", description="Which body it is.")
     width: Annotated[float, LENGTH] = Field(default=1.0, gt=0, description="Length along x.")
@@ -371,7 +371,7 @@ class Bar(Shape):
         order = np.argsort(np.concatenate(facets))
         tags = dolfinx.mesh.meshtags(box, 2, np.concatenate(facets)[order], np.concatenate(values)[order])
         dimensions = {"width": self.width, "depth": self.depth, "length": self.length}
-        return Domain(box, tags, {name: tag for tag, name in enumerate(self.faces, start=1)}, "bar", dimensions)
+        return Domain(box, tags, {name: tag for tag, name in enumerate(self.face_names, start=1)}, "bar", dimensions)
 
     def hold(self, loading: Any) -> None:
         """Three planes of symmetry."""
@@ -410,7 +410,9 @@ def test_a_shape_that_does_not_mesh_what_the_scene_asks_for_is_refused(monkeypat
     curved = Scene(geometry={"shape": "bar"}, mesh={"degree": 2}, time={"end": 1.0})
     with pytest.raises(SceneError, match="^mesh.degree = 2: the mesh has degree 1$"):
         Simulation(curved, MPI.COMM_SELF)
-    with pytest.raises(SceneError, match="^geometry.shape = 'rod': allowed are 'cube', 'tendon', 'tube', 'bar'$"):
+    with pytest.raises(
+        SceneError, match="^geometry.shape = 'rod': allowed are 'cube', 'tendon', 'tube', 'mesh', 'bar'$"
+    ):
         Scene(geometry={"shape": "rod"}, time={"end": 1.0})
 
 

@@ -104,7 +104,7 @@ def test_bad_regions_are_refused_in_one_line(regions: dict[str, Any], line: str)
 
 
 def test_a_body_without_regions_refuses_them_by_name() -> None:
-    with pytest.raises(SceneError, match="^regions.core: a cube has no regions; shapes with regions: 'tube'$"):
+    with pytest.raises(SceneError, match="^regions.core: a cube has no regions; shapes with regions: 'tube', 'mesh'$"):
         Scene(geometry={"shape": "cube"}, regions={"core": {}}, time={"end": 1.0})
 
 

@@ -32,7 +32,7 @@ class WalledTube(WalledMesh):
 
     loads: ClassVar[dict[str, LoadKind]] = {name: Tube.loads[name] for name in ("pressure", "elongation")}
     number_of_elements: ClassVar[int] = 512
-    faces: ClassVar[tuple[str, ...]] = ("inner", "outer", "inlet", "outlet")
+    face_names: ClassVar[tuple[str, ...]] = ("inner", "outer", "inlet", "outlet")
 
     shape: Literal["walled"] = Field(default="walled", description="Which body it is.")
     length: float = Field(default=2.0, description="Along z.")

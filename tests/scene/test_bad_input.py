@@ -402,7 +402,7 @@ def body() -> tuple[Scene, Domain]:
 
 
 @bad("meshes", 60, "another shape, element or size; faces missing, tags on no facet; nodes NaN or infinite",
-     kind=st.sampled_from(["shape", "face", "tag", "size", "node", "element"]), face=st.sampled_from(Tube.faces),
+     kind=st.sampled_from(["shape", "face", "tag", "size", "node", "element"]), face=st.sampled_from(Tube.face_names),
      number=st.integers(5, 10**6), size=DIMENSIONS, value=st.sampled_from(ODD_NUMBERS),
      node=st.integers(0, 40))  # fmt: skip
 def test_a_mesh_of_another_kind(

@@ -65,16 +65,20 @@ BAD_SCENES = [
         "geometry.inner_radius = 5.0: must be smaller than geometry.outer_radius = 3.0",
     ),
     (TUBE, {"geometry.length": 0.0}, "geometry.length = 0.0: must be a finite number greater than 0"),
-    (TUBE, {"geometry.shape": "sphere"}, "geometry.shape = 'sphere': allowed are 'cube', 'tendon', 'tube'"),
-    (TUBE, {"geometry.shape": 1}, "geometry.shape = 1: allowed are 'cube', 'tendon', 'tube'"),
+    (TUBE, {"geometry.shape": "sphere"}, "geometry.shape = 'sphere': allowed are 'cube', 'tendon', 'tube', 'mesh'"),
+    (TUBE, {"geometry.shape": 1}, "geometry.shape = 1: allowed are 'cube', 'tendon', 'tube', 'mesh'"),
     (
         CUBE,
         {"geometry": {"shape": "tube", "inner_radius": 1.0, "outer_radius": 2.0}},
         "geometry.length: missing; must be a finite number greater than 0",
     ),
-    ({"time": {"end": 1.0}}, {}, "geometry.shape: missing; allowed are 'cube', 'tendon', 'tube'"),
-    ({"time": {"end": 1.0}}, {"preset": PAPER}, "geometry.shape: missing; allowed are 'cube', 'tendon', 'tube'"),
-    (CUBE, {"geometry": {"side": 1.0}}, "geometry.shape: missing; allowed are 'cube', 'tendon', 'tube'"),
+    ({"time": {"end": 1.0}}, {}, "geometry.shape: missing; allowed are 'cube', 'tendon', 'tube', 'mesh'"),
+    (
+        {"time": {"end": 1.0}},
+        {"preset": PAPER},
+        "geometry.shape: missing; allowed are 'cube', 'tendon', 'tube', 'mesh'",
+    ),
+    (CUBE, {"geometry": {"side": 1.0}}, "geometry.shape: missing; allowed are 'cube', 'tendon', 'tube', 'mesh'"),
     (CUBE, {"geometry": 3}, "geometry = 3: must be a table"),
     (
         CUBE,
@@ -82,17 +86,17 @@ BAD_SCENES = [
         "geometry.radius = 3.0: unknown key; allowed are geometry.shape, geometry.length_unit, geometry.side",
     ),
     # without a shape nothing else is judged: preset, loads and units depend on it
-    (CUBE, {"preset": PAPER, "geometry": {}}, "geometry.shape: missing; allowed are 'cube', 'tendon', 'tube'"),
-    ({}, {}, "geometry.shape: missing; allowed are 'cube', 'tendon', 'tube'"),
+    (CUBE, {"preset": PAPER, "geometry": {}}, "geometry.shape: missing; allowed are 'cube', 'tendon', 'tube', 'mesh'"),
+    ({}, {}, "geometry.shape: missing; allowed are 'cube', 'tendon', 'tube', 'mesh'"),
     (
         {"preset": PAPER, "geometry": {"shape": "heart"}},
         {},
-        "geometry.shape = 'heart': allowed are 'cube', 'tendon', 'tube'",
+        "geometry.shape = 'heart': allowed are 'cube', 'tendon', 'tube', 'mesh'",
     ),
     (
         {"preset": PAPER, "geometry": {"shape": "heart"}, "loads": {"pressure": {"value": "100 mmHg"}}},
         {},
-        "geometry.shape = 'heart': allowed are 'cube', 'tendon', 'tube'",
+        "geometry.shape = 'heart': allowed are 'cube', 'tendon', 'tube', 'mesh'",
     ),
     ({"preset": PAPER, "geometry": 3}, {}, "geometry = 3: must be a table"),
     # unknown keys
@@ -768,7 +772,7 @@ def test_a_preset_by_name():
         SceneError, match=r"^preset = 'none': allowed are 'kuhl-holzapfel-2007', 'consistent', 'sun-2002'$"
     ):
         preset_scene("none", "tube")
-    with pytest.raises(SceneError, match=r"^geometry\.shape = 'heart': allowed are 'cube', 'tendon', 'tube'$"):
+    with pytest.raises(SceneError, match=r"^geometry\.shape = 'heart': allowed are 'cube', 'tendon', 'tube', 'mesh'$"):
         preset_scene(PAPER, "heart")
 
 

@@ -1,0 +1,293 @@
+"""A body of one's own: the mesh of a file, with named faces."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Collection, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import BeforeValidator, Field, model_validator
+from pydantic.config import JsonDict
+
+from remodel_fenicsx.body import mesh_file
+from remodel_fenicsx.body.columns import Column
+from remodel_fenicsx.body.gmsh_model import LARGEST_LENGTH, SMALLEST_LENGTH
+from remodel_fenicsx.body.mesh_file import MeshFile, MeshFileError
+from remodel_fenicsx.body.shape import LoadKind
+from remodel_fenicsx.body.walled import WalledMesh
+from remodel_fenicsx.schema.tables import SceneError, fault, shown
+from remodel_fenicsx.schema.units import LENGTH_UNITS, STRESS
+from remodel_fenicsx.settings import Mesh, Support
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
+
+    from remodel_fenicsx.body.domain import Domain
+    from remodel_fenicsx.body.loading import Loading
+    from remodel_fenicsx.body.mesh_faces import Boundary
+
+log = logging.getLogger(__name__)
+
+ROLES = ("inner", "outer", "inlet", "outlet")
+METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}
+Names = tuple[str | int, ...]
+_ENTRY: JsonDict = {"type": ["string", "integer"]}
+
+
+def _faces(value: Any) -> Any:
+    """Names or numbers, one or a list, as tuples."""
+    if not isinstance(value, Mapping):
+        raise fault("must be a table: inner, outer, inlet, outlet = names or numbers of the file's faces")
+    found = {}
+    for name, entry in value.items():
+        entries = entry if isinstance(entry, (list, tuple)) else [entry]
+        if not entries or not all(isinstance(one, (str, int)) and not isinstance(one, bool) for one in entries):
+            raise fault("must be a name or a number of a face in the file, or a list of them", str(name), entry)
+        found[str(name)] = tuple(entries)
+    return found
+
+
+def _file(value: Any) -> Any:
+    if not isinstance(value, str) or "\x00" in value or Path(value).suffix.lower() != ".msh":
+        raise fault("must be the path of a mesh by Gmsh (.msh), relative to the scene's folder")
+    return value
+
+
+class MeshBody(WalledMesh):
+    """A body of one's own from a file by Gmsh, a vessel with an inner and an outer face and ends.
+
+    The file is data: it is read as text of format 2.2 or 4.1, and never run. Its elements are tetrahedra or hexahedra,
+    all of one kind. A run keeps a copy of the file.
+    """
+
+    loads: ClassVar[dict[str, LoadKind]] = {
+        "pressure": LoadKind(
+            lambda shape, loading, name: loading.add_follower_pressure(name, "inner"),
+            "pressure on the deformed inner face",
+            STRESS,
+        ),
+        "elongation": LoadKind(
+            lambda shape, loading, name: None,  # a part of the supports (`support`)
+            "engineering strain of the length, prescribed: the outlet moves by so much of the length of the body along "
+            "its own normal",
+            column="axial_elongation",
+            above=-1.0,
+            doubtful=(1.0, "an elongation is an engineering strain: a stretch of 1.1 is an elongation of 0.1"),
+        ),
+    }
+    columns: ClassVar[tuple[Column, ...]] = (
+        Column(
+            "lumen_volume",
+            "length^3",
+            "volume inside the deformed inner face, with flat caps on its rims",
+            lambda m: m.lumen_volume(),
+        ),
+        *WalledMesh.columns,
+    )
+    face_names: ClassVar[tuple[str, ...]] = ROLES
+    has_regions: ClassVar[bool] = True
+    holds_faces: ClassVar[bool] = True
+
+    shape: Literal["mesh"] = Field(default="mesh", description="Which body it is.")
+    file: Annotated[str, BeforeValidator(_file)] = Field(
+        description="The mesh, a file by Gmsh (`.msh`, format 2.2 or 4.1, text), relative to the scene's folder.",
+        json_schema_extra={"allowed": "the path of a file by Gmsh (.msh)"},
+    )
+    file_unit: Literal["m", "cm", "mm", "um"] | None = Field(
+        default=None,
+        description="Unit of the file's numbers, where it is another one than `length_unit`.",
+        json_schema_extra={"allowed": "one of " + ", ".join(map(repr, LENGTH_UNITS))},
+    )
+    faces: Annotated[dict[str, tuple[str | int, ...]], BeforeValidator(_faces)] = Field(
+        default={},
+        description="Name of a face -> name or number of a named face of the file, or a list. `inner`, `outer`, "
+        "`inlet`, `outlet` are needed where the file's own names are others. Further ones are for supports.",
+        json_schema_extra={
+            "allowed": "a table of names, numbers or lists of them",
+            "additionalProperties": {"anyOf": [_ENTRY, {"type": "array", "items": _ENTRY, "minItems": 1}]},
+        },
+    )
+    open_boundary: bool = Field(
+        default=False, description="Whether a part of the boundary may be in no face; otherwise it is taken for a hole."
+    )
+    sha256: str | None = Field(
+        default=None,
+        pattern="^[0-9a-f]{64}$",
+        description="SHA-256 of the file: a scene as run has it, and another file is refused.",
+        json_schema_extra={"allowed": "64 hexadecimal digits"},
+    )
+
+    @model_validator(mode="after")
+    def _units_are_both_there(self) -> MeshBody:
+        if self.file_unit is not None and self.length_unit is None:
+            raise fault("needs geometry.length_unit, the unit of the scene", "file_unit", self.file_unit)
+        return self
+
+    @classmethod
+    def with_files_from(cls, geometry: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+        """The keys as they were read, with the place of the file."""
+        file = geometry.get("file")
+        return {**geometry, **({"file": str(folder.absolute() / file)} if isinstance(file, str) else {})}
+
+    @classmethod
+    def defaults_of(cls, own: Mapping[str, Any]) -> dict[str, Any]:
+        """Element and degree of the file, where the scene does not say them."""
+        mesh, file = own.get("mesh", {}), own["geometry"].get("file")
+        said = isinstance(mesh, Mapping) and "element" in mesh and "degree" in mesh
+        if said or not isinstance(file, str):
+            return cls.defaults
+        try:
+            found = mesh_file.read_mesh_file(Path(_file(file)))
+        except MeshFileError as error:
+            raise fault(str(error), "geometry.file", Path(file).name) from None
+        return cls.defaults | {"mesh": {"element": found.kind, "degree": found.degree}}
+
+    def kept_files(self) -> tuple[dict[str, Any], dict[str, bytes]]:
+        """The file under its own name beside the scene as run, which has its SHA-256."""
+        file = self._read()
+        name = Path(self.file).name
+        return {"geometry.file": name, "geometry.sha256": file.sha256}, {name: file.data}
+
+    @property
+    def number_of_elements(self) -> int:  # type: ignore[override]
+        """Of the file."""
+        return len(self._read().cells)
+
+    def check_size(self, mesh: Mesh) -> None:
+        """The file has what it has; nothing refines it."""
+        if mesh.refinement != 1:
+            raise fault("the mesh of a file is taken as it is: 1", "mesh.refinement", mesh.refinement)
+
+    # ------------------------------------------------------------ mesh
+    def build(self, mesh: Mesh, comm: MPI.Intracomm | None = None) -> Domain:
+        """The file's own mesh."""
+        from mpi4py import MPI
+
+        from remodel_fenicsx.body.mesh_domain import shared
+
+        return shared(self.checked, comm or MPI.COMM_WORLD)
+
+    def checked(self) -> tuple[MeshFile, Boundary, dict[str, int]]:
+        """The file, its boundary, and its regions' numbers by name; on rank 0.
+
+        Raises
+        ------
+        SceneError
+            If the file is no mesh of one body with these faces; one line.
+        """
+        from remodel_fenicsx.body.mesh_faces import FaceError, boundary_of
+
+        file = self._read()
+        scale = METRES[self.file_unit] / METRES[self.length_unit] if self.file_unit and self.length_unit else 1.0
+        file = replace(file, points=scale * file.points)
+        extent = float(np.ptp(file.points, axis=0).max())
+        if not SMALLEST_LENGTH <= extent <= LARGEST_LENGTH:
+            limits = f"allowed are {SMALLEST_LENGTH:g} to {LARGEST_LENGTH:g} (geometry.file_unit, geometry.length_unit)"
+            raise self._fault(f"the body is {extent:g} long in the scene's unit; {limits}")
+        groups = self._groups(file)
+        try:
+            boundary = boundary_of(file, groups, self.open_boundary)
+        except FaceError as error:
+            raise SceneError(f"geometry.faces.{error.face} = {shown(self._asked(error.face))}: {error}") from None
+        except MeshFileError as error:
+            raise self._fault(str(error)) from None
+        inner, outer = boundary.area("inner"), boundary.area("outer")
+        if inner > outer:
+            words = f"its area is {inner:.4g}, that of outer {outer:.4g}: are inner and outer swapped?"
+            raise SceneError(f"geometry.faces.inner = {shown(self._asked('inner'))}: {words}")
+        self._say(file, boundary)
+        return file, boundary, self._regions(file)
+
+    def _read(self) -> MeshFile:
+        try:
+            file = mesh_file.read_mesh_file(Path(self.file))
+        except MeshFileError as error:
+            raise self._fault(str(error)) from None
+        if self.sha256 not in (None, file.sha256):
+            raise self._fault(f"has changed since the run: its SHA-256 was {str(self.sha256)[:12]}...")
+        return file
+
+    def _fault(self, rule: str) -> SceneError:
+        return SceneError(f"geometry.file = {shown(Path(self.file).name)}: {rule}")
+
+    def _asked(self, face: str) -> Any:
+        """As the scene says it, or by default."""
+        entry: Names = self.faces.get(face, (face,))
+        return entry[0] if len(entry) == 1 else list(entry)
+
+    def _groups(self, file: MeshFile) -> dict[str, tuple[int, ...]]:
+        """Numbers of the file's groups by name of the face, further named faces of the file under their own."""
+        from remodel_fenicsx.body.mesh_faces import groups_inside
+
+        names, there = file.names[2], sorted(set(mesh_file.distinct(file.facet_groups)) - {0})
+        listed = ", ".join([*map(repr, names), *(str(number) for number in there if number not in names.values())])
+        groups: dict[str, tuple[int, ...]] = {}
+        for face in dict.fromkeys([*ROLES, *self.faces]):
+            numbers = []
+            for entry in self.faces.get(face, (face,)):
+                number = names.get(entry) if isinstance(entry, str) else entry
+                if number is None or number not in there:
+                    rule = f"the file has no such face; it has {listed or 'none'}"
+                    raise SceneError(f"geometry.faces.{face} = {shown(entry)}: {rule}")
+                numbers.append(int(number))
+            if numbers:
+                groups[face] = tuple(numbers)
+        taken = {number for numbers in groups.values() for number in numbers}
+        others = {name: (number,) for name, number in names.items() if number in there and number not in taken}
+        between = groups_inside(file) if others else set()
+        return groups | {n: numbers for n, numbers in others.items() if n not in groups and numbers[0] not in between}
+
+    def _regions(self, file: MeshFile) -> dict[str, int]:
+        numbers = mesh_file.distinct(file.cell_groups)
+        if 0 in numbers and len(numbers) > 1:
+            lost = file.cell_numbers[file.cell_groups == 0]
+            raise self._fault(f"{len(lost)} elements are in no named volume, the first is {lost[0]}; the others are")
+        names = {number: name for name, number in file.names[3].items()}
+        return {names.get(number, str(number) if number else "body"): number for number in numbers}
+
+    def _say(self, file: MeshFile, boundary: Boundary) -> None:
+        from remodel_fenicsx.body.mesh_faces import through_the_wall
+
+        counts = f"{len(file.cells)} {file.kind[:-3]}ra of degree {file.degree}, {len(file.points)} nodes"
+        log.info("%s: %s, SHA-256 %s", Path(self.file).name, counts, file.sha256)
+        if through_the_wall(boundary):
+            log.warning(
+                "the wall is one element thick in places: bending and the fibre angle through it are lost there"
+            )
+
+    # ------------------------------------------------------------ supports
+    def hold(self, loading: Loading) -> None:
+        """By its faces alone (`hold_faces`)."""
+
+    def hold_faces(
+        self, loading: Loading, supports: Mapping[str, Support], modulus: float, loads: Collection[str] = ()
+    ) -> None:
+        """Hold them as a scene says, inlet and outlet guided where it does not. Collective.
+
+        Raises
+        ------
+        SceneError
+            On all ranks: if there is no such face, if the body can move as a whole, or if ends that slide can not be
+            pulled apart.
+        """
+        from remodel_fenicsx.body.mesh_supports import GUIDE, add_support, check_supports
+
+        domain: Any = loading.domain
+        for name in supports:
+            if name not in domain.faces:
+                raise SceneError(f"supports.{name}: the body has no such face; it has {', '.join(domain.faces)}")
+        chosen = {name: Support() for name in ("inlet", "outlet") if name in domain.faces} | dict(supports)
+        check_supports(domain, chosen, "elongation" in loads)
+        length = domain.length()
+        unit = f" {self.length_unit}" if self.length_unit else ""
+        if domain.comm.rank == 0:
+            words = f"mean thickness of the wall {domain.thickness:.6g}{unit}, with plane faces"
+            log.info("%s%s", words, f"; length from inlet to outlet {length:.6g}{unit}" if length else "")
+        for name, support in chosen.items():
+            moves = ("elongation", length) if name == "outlet" else None
+            add_support(loading, name, support, GUIDE * modulus / domain.thickness, moves)
+        if "elongation" not in loading.values:
+            loading.leave_out("elongation")

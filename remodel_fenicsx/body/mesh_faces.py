@@ -1,0 +1,298 @@
+"""Faces of a mesh of one's own: which facets they have, their normals and rims, and whether they bound one body."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import basix
+import numpy as np
+from numpy.typing import NDArray
+
+from remodel_fenicsx.body.mesh_file import Array, Integers, MeshFile, MeshFileError, as_rows, distinct
+
+# corners of the facets of an element and of the edges around a facet, in Gmsh's order; the normals point outwards
+FACETS = {
+    "tetrahedron": ((0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)),
+    "hexahedron": ((0, 3, 2, 1), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7)),
+}
+# Gmsh's number of the node in the middle of each edge of an element, by its corners
+MIDDLES = {
+    "tetrahedron": {(0, 1): 4, (1, 2): 5, (0, 2): 6, (0, 3): 7, (2, 3): 8, (1, 3): 9},
+    "hexahedron": {
+        (0, 1): 8, (0, 3): 9, (0, 4): 10, (1, 2): 11, (1, 5): 12, (2, 3): 13,
+        (2, 6): 14, (3, 7): 15, (4, 5): 16, (4, 7): 17, (5, 6): 18, (6, 7): 19,
+    },
+}  # fmt: skip
+FLAT = 1e-12  # of the mean |det J| of the elements: below it one has no volume
+Groups = Mapping[str, Sequence[int]]
+
+
+class FaceError(MeshFileError):
+    """A fault of one face, under its name."""
+
+    def __init__(self, face: str, rule: str):
+        super().__init__(rule)
+        self.face = face
+
+
+@dataclass(frozen=True, eq=False)
+class Face:
+    """A connected part of a named face.
+
+    Attributes
+    ----------
+    name
+        Of the face.
+    facets
+        Rows of `Boundary.facets`.
+    places, normals
+        Middles of the facets, and their unit normals outwards, (facets, 3).
+    area, normal, centre
+        Of its plane facets: their area, and the mean of their outward normals (3,) and of their places (3,).
+    """
+
+    name: str
+    facets: Integers
+    places: Array
+    normals: Array
+    area: float
+    normal: Array
+    centre: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Boundary:
+    """What bounds a body.
+
+    Attributes
+    ----------
+    facets
+        Corners, normals outwards, (facets, 3 or 4).
+    faces
+        The connected parts of its named faces.
+    cell
+        Element behind each facet, (facets,).
+    volume
+        Of the body, with plane faces.
+    """
+
+    facets: Integers
+    cell: Integers
+    faces: list[Face]
+    volume: float
+
+    def parts(self, name: str) -> list[Face]:
+        """The connected parts of a named face."""
+        return [face for face in self.faces if face.name == name]
+
+    def area(self, name: str) -> float:
+        """Of a named face."""
+        return sum(face.area for face in self.parts(name))
+
+
+def boundary_of(file: MeshFile, groups: Groups, open_boundary: bool) -> Boundary:
+    """Find the named faces on the boundary of the one body that a file holds.
+
+    Parameters
+    ----------
+    file
+        As it was read.
+    groups
+        Name of a face -> numbers of the groups of the file that it is made of.
+    open_boundary
+        Whether a part of the boundary may have no name.
+
+    Raises
+    ------
+    MeshFileError
+        One line.
+    """
+    _check_elements(file)
+    facets, cell, twice = _facets(file)
+    places = file.points[facets]
+    normals = _area_vectors(places)
+    owner = np.full(len(facets), "", dtype=object)
+    index = {corners: row for row, corners in enumerate(as_rows(np.sort(facets, axis=1)))}
+    inside = set(as_rows(np.sort(twice, axis=1)))
+    for name, numbers in groups.items():
+        chosen = np.isin(file.facet_groups, numbers)
+        for key in as_rows(np.sort(file.facets[chosen], axis=1)):
+            row, where = index.get(key), "at " + _place(file.points[list(key)].mean(axis=0))
+            if row is None:
+                words = "inside the body" if key in inside else "that are no facets of its elements"
+                raise FaceError(name, f"has facets {words}, the first {where}")
+            if owner[row] not in ("", name):
+                raise FaceError(name, f"shares facets with the face {owner[row]!r}, the first {where}")
+            owner[row] = name
+    bare = owner == ""
+    if bare.any() and not open_boundary:
+        where, share = _place(places[bare][0].mean(axis=0)), bare.sum()
+        rule = f"{share} of {len(bare)} facets of the boundary are in no face of geometry.faces, the first at {where}"
+        raise MeshFileError(rule + "; if that is meant: geometry.open_boundary = true")
+    faces = []
+    for name in groups:
+        rows = np.flatnonzero(owner == name)
+        label = components(facets[rows], len(file.points))
+        for one in distinct(label):
+            part = rows[label == one]
+            size, mean, middles = (
+                np.linalg.norm(normals[part], axis=1),
+                normals[part].sum(axis=0),
+                places[part].mean(axis=1),
+            )
+            normal, centre = mean / max(float(np.linalg.norm(mean)), 1e-300), size @ middles / size.sum()
+            units = normals[part] / size[:, None]
+            faces.append(Face(name, part, middles, units, float(size.sum()), normal, centre))
+    volume = float(np.einsum("fi,fi->", places.mean(axis=1), normals) / 3)
+    return Boundary(facets, cell, faces, volume)
+
+
+def groups_inside(file: MeshFile) -> set[int]:
+    """Numbers of the named faces with facets that are not on the boundary: between regions, say."""
+    outside, rows = set(as_rows(np.sort(_facets(file)[0], axis=1))), as_rows(np.sort(file.facets, axis=1))
+    return {int(n) for n, corners in zip(file.facet_groups, rows, strict=True) if corners not in outside}
+
+
+def through_the_wall(boundary: Boundary) -> bool:
+    """Whether an element has facets on the inner and on the outer face."""
+    inner, outer = (
+        boundary.cell[np.concatenate([np.empty(0, np.int64), *(part.facets for part in boundary.parts(name))])]
+        for name in ("inner", "outer")
+    )
+    return bool(np.isin(inner, outer).any())
+
+
+def rims(file: MeshFile, boundary: Boundary, face: str) -> list[Integers]:
+    """The closed lines in which a face ends, each as nodes of its edges, (edges, 2 or 3: start, end, middle).
+
+    They run so that the normal of a flat cap on one points out of what the face encloses.
+    """
+    rows = np.concatenate([np.empty(0, dtype=np.int64), *(part.facets for part in boundary.parts(face))])
+    edges: dict[tuple[int, int], int] = {}
+    for row, corners in zip(distinct(rows), as_rows(boundary.facets[rows]), strict=True):
+        for start, end in zip(corners, [*corners[1:], corners[0]], strict=True):
+            if edges.pop((end, start), None) is None:
+                edges[start, end] = row
+    if not edges:
+        return []
+    pairs = np.array(list(edges), dtype=np.int64)
+    label = components(pairs, len(file.points))
+    if file.degree == 2:
+        middles = [_middle(file, int(boundary.cell[row]), pair) for pair, row in edges.items()]
+        pairs = np.column_stack([pairs, middles])
+    return [pairs[label == one] for one in distinct(label)]
+
+
+def area_vector(points: Array, rim: Integers) -> Array:
+    """Integral of x cross dx / 2 along a closed line of straight or parabolic edges: area times normal of a cap."""
+    a, b = points[rim[:, 0]], points[rim[:, 1]]
+    if rim.shape[1] == 2:
+        return np.asarray(np.cross(a, b).sum(axis=0) / 2)
+    m = points[rim[:, 2]]
+    return np.asarray((4 * (np.cross(a, m) + np.cross(m, b)) - np.cross(a, b)).sum(axis=0) / 6)
+
+
+def cap_volume(points: Array, rim: Integers) -> float:
+    """Of the cone between the origin and a flat cap on a closed line."""
+    return float(points[rim[:, 0]].mean(axis=0) @ area_vector(points, rim) / 3)
+
+
+def components(rows: Integers, nodes: int) -> Integers:
+    """Number of the connected part of each row, which share nodes; (rows,)."""
+    label = np.arange(nodes)
+    while True:
+        least = label[rows].min(axis=1)
+        new = label.copy()
+        np.minimum.at(new, rows, least[:, None])
+        new = new[new]  # what a label has been joined to: so many rounds as the logarithm of the way
+        if np.array_equal(new, label):
+            return np.asarray(label[rows[:, 0]])
+        label = new
+
+
+# ---------------------------------------------------------------- inside
+
+
+def _facets(file: MeshFile) -> tuple[Integers, Integers, Integers]:
+    """Facets of the boundary with normals outwards, the elements behind them, and the facets between two elements."""
+    local = np.array(FACETS[file.kind])
+    facets = file.corners[:, local].reshape(-1, local.shape[1])
+    _, first, inverse, count = np.unique(
+        np.sort(facets, axis=1), axis=0, return_index=True, return_inverse=True, return_counts=True
+    )
+    if (count > 2).any():
+        bad = int(first[count > 2][0]) // len(local)
+        raise MeshFileError(f"element {file.cell_numbers[bad]} shares a facet with two others")
+    one = np.flatnonzero(count[inverse.reshape(-1)] == 1)
+    facets_one, cell = facets[one], one // len(local)
+    flipped = _orientation(file)[cell] < 0  # elements may be numbered as in a mirror
+    facets_one[flipped] = facets_one[flipped][:, ::-1]
+    return facets_one, cell, facets[first[count == 2]]
+
+
+def _check_elements(file: MeshFile) -> None:
+    """One body of elements that have a volume, none twice."""
+    ordered = np.sort(file.corners, axis=1)
+    _, first, count = np.unique(ordered, axis=0, return_index=True, return_counts=True)
+    if (count > 1).any():
+        rule = "is there twice: in two named volumes?"
+        raise MeshFileError(f"element {file.cell_numbers[first[count > 1][0]]} {rule}")
+    extent = np.ptp(file.points, axis=0).max()
+    if extent == 0:
+        raise MeshFileError("all nodes are at one place")
+    bodies = len(distinct(components(file.corners, len(file.points))))
+    if bodies > 1:
+        raise MeshFileError(f"{bodies} bodies that have no node in common; allowed is one (in Gmsh: BooleanFragments)")
+    determinants = jacobian_determinants(file)
+    turned = determinants * np.sign(determinants.mean(axis=1, keepdims=True))
+    bad = np.flatnonzero(turned.min(axis=1) <= FLAT * np.abs(determinants).mean())
+    if len(bad):
+        cell = int(bad[0])
+        where = _place(file.points[file.corners[cell]].mean(axis=0))
+        raise MeshFileError(
+            f"element {file.cell_numbers[cell]} at {where} is twisted or flat: its volume is not above zero "
+            f"everywhere in it ({len(bad)} such element{'s' if len(bad) > 1 else ''})"
+        )
+
+
+def jacobian_determinants(file: MeshFile) -> Array:
+    """det J at the quadrature points of each element, (elements, points)."""
+    kind = basix.CellType[file.kind]
+    points, _ = basix.make_quadrature(kind, 2 * file.degree)
+    element = basix.create_element(basix.ElementFamily.P, kind, file.degree, basix.LagrangeVariant.gll_warped)
+    table: Any = element.tabulate(1, np.asarray(points))
+    slopes = table[1:, :, :, 0]  # (3, points, nodes)
+    nodes = file.points[file.cells[:, node_order(file)]]
+    return np.asarray(np.linalg.det(np.einsum("dpn,cni->cpdi", slopes, nodes)))
+
+
+def node_order(file: MeshFile) -> NDArray[np.int64]:
+    """dolfinx's order of an element's nodes, as places in Gmsh's."""
+    import dolfinx.cpp
+    import dolfinx.mesh
+
+    kind = getattr(dolfinx.mesh.CellType, file.kind)
+    return np.asarray(dolfinx.cpp.io.perm_gmsh(kind, file.cells.shape[1]), dtype=np.int64)
+
+
+def _orientation(file: MeshFile) -> Array:
+    return np.asarray(np.sign(jacobian_determinants(file).mean(axis=1)))
+
+
+def _area_vectors(places: Array) -> Array:
+    """Area times normal of facets at (facets, 3 or 4, 3): half the cross product of two edges, or of the diagonals."""
+    if places.shape[1] == 3:
+        return np.asarray(np.cross(places[:, 1] - places[:, 0], places[:, 2] - places[:, 0]) / 2)
+    return np.asarray(np.cross(places[:, 2] - places[:, 0], places[:, 3] - places[:, 1]) / 2)
+
+
+def _middle(file: MeshFile, cell: int, pair: tuple[int, int]) -> int:
+    (nodes,) = as_rows(file.cells[[cell]])
+    local = tuple(sorted(nodes.index(node) for node in pair))
+    return int(nodes[MIDDLES[file.kind][local[0], local[1]]])
+
+
+def _place(point: Array) -> str:
+    return "(" + ", ".join(f"{x:.4g}" for x in point) + ")"

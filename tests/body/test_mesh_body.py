@@ -1,0 +1,242 @@
+"""A body of one's own from a mesh file: a tube as a file is the tube; supports; rigid motions."""
+
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from remodel_fenicsx import SceneError
+from remodel_fenicsx.body import Tube
+from remodel_fenicsx.body.mesh_supports import free_motions
+from remodel_fenicsx.body.tube import whole_tube
+from remodel_fenicsx.results.fields import NodalGather
+from remodel_fenicsx.scene import scene_from_dict
+from remodel_fenicsx.settings import Support
+from remodel_fenicsx.simulation import Simulation
+from tests.mesh_files import COUNTS, LENGTH, RADII, write_tube
+
+LOADS = {name: {"value": value, "ramp": [[0, 0], [2, 1]]} for name, value in (("pressure", 2.0), ("elongation", 0.1))}
+TURN = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])
+SHIFT = np.array([10.0, -3.0, 7.0])
+FREE = {"kind": "free"}
+
+
+def scene_of(file: Path, **tables: Any) -> Any:
+    """Of a mesh file, pressed and stretched."""
+    values = {
+        "geometry": {"shape": "mesh", "file": str(file)},
+        "cells": {"initial": "isotropic"},
+        "remodeling": {"law": "rate"},
+        "loads": LOADS,
+        "time": {"end": 2.0, "step": 1.0},
+        "solver": {"method": "direct"},
+    }
+    return scene_from_dict(values | tables)
+
+
+def solved(scene: Any, domain: Any = None) -> tuple[dict[str, float], Any, Any]:
+    """The last row, displacement of the nodes and their places, in the order of the file."""
+    simulation = Simulation(scene, MPI.COMM_SELF, domain)
+    row = [dict(step.row) for step in simulation.steps()][-1]
+    displacement = NodalGather(simulation.domain, simulation.state)()
+    places = simulation.domain.gather_nodes(simulation.domain.mesh.geometry.x)
+    simulation.close()
+    return row, displacement, places
+
+
+@pytest.fixture(scope="module")
+def tube(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_tube(tmp_path_factory.mktemp("mesh") / "tube.msh")
+
+
+@pytest.fixture(scope="module")
+def of_the_file(tube: Path) -> tuple[dict[str, float], Any, Any]:
+    return solved(scene_of(tube))
+
+
+def test_a_tube_as_a_file_is_the_tube(of_the_file: Any) -> None:
+    shape = {"shape": "tube", "inner_radius": RADII[0], "outer_radius": RADII[1], "length": LENGTH}
+    scene = scene_of(Path("none.msh"), geometry=shape, model={"kinematics": "full"})
+    made = whole_tube(Tube(inner_radius=RADII[0], outer_radius=RADII[1], length=LENGTH), COUNTS, "hexahedron", 1)
+    row, displacement, places = solved(scene, made)
+    own, own_displacement, own_places = of_the_file
+    order, other = np.lexsort(np.round(places, 6).T), np.lexsort(np.round(own_places, 6).T)
+    np.testing.assert_allclose(own_places[other], places[order], atol=1e-9)
+    # ends are guided by springs, not exactly
+    radii, own_radii = (
+        np.hypot(*(x + u)[:, :2].T)
+        for x, u in ((places[order], displacement[order]), (own_places[other], own_displacement[other]))
+    )
+    np.testing.assert_allclose(own_radii, radii, rtol=1e-4)
+    np.testing.assert_allclose(own_displacement[other], displacement[order], atol=2e-4)
+    for place in ("inner", "middle", "outer"):
+        assert own[f"fibre_angle_{place}"] == pytest.approx(row[f"fibre_angle_{place}"], abs=0.05)
+    assert own["stored_energy"] == pytest.approx(row["stored_energy"], rel=1e-4)
+    inner = np.isclose(np.hypot(*own_places[:, :2].T), RADII[0])
+    radius = np.hypot(*(own_places + own_displacement)[inner, :2].T).mean()
+    octagon = 4 * np.sin(np.pi / 4) * radius**2
+    assert own["lumen_volume"] == pytest.approx(octagon * 1.1 * LENGTH, rel=1e-3)
+    assert radius > 1.05 * RADII[0]
+
+
+def test_a_turned_and_shifted_file_has_the_same_rows(tmp_path: Path, of_the_file: Any) -> None:
+    row, displacement, _ = solved(scene_of(write_tube(tmp_path / "turned.msh", turn=TURN, shift=SHIFT)))
+    own, own_displacement, _ = of_the_file
+    np.testing.assert_allclose(displacement, own_displacement @ TURN.T, atol=1e-6)
+    for name in ("lumen_volume", "fibre_angle_inner", "stored_energy", "max_chain_extension"):
+        assert row[name] == pytest.approx(own[name], rel=1e-6)
+
+
+def test_the_file_of_another_unit(tmp_path: Path, of_the_file: Any) -> None:
+    file = write_tube(tmp_path / "metres.msh", turn=1e-3 * np.eye(3))
+    geometry = {"shape": "mesh", "file": str(file), "file_unit": "m", "length_unit": "mm"}
+    row, _, _ = solved(scene_of(file, geometry=geometry))
+    assert row["lumen_volume"] == pytest.approx(of_the_file[0]["lumen_volume"], rel=1e-8)
+
+
+@pytest.mark.parametrize(("element", "degree"), [("tetrahedron", 1), ("hexahedron", 2), ("tetrahedron", 2)])
+@pytest.mark.parametrize("version", [2.2, 4.1])
+def test_element_and_degree_are_those_of_the_file(tmp_path: Path, element: str, degree: int, version: float) -> None:
+    scene = scene_of(write_tube(tmp_path / "tube.msh", element, degree, version))
+    assert (scene.mesh.element, scene.mesh.degree) == (element, degree)
+    domain = scene.geometry.build(scene.mesh, MPI.COMM_SELF)
+    assert domain.length() == pytest.approx(LENGTH, rel=1e-3)
+    assert domain.mesh.geometry.cmap.degree == degree
+    assert {part.name: round(part.area, 3) for part in domain.parts} == {
+        "inner": 18.369, "outer": 36.738, "inlet": 8.485, "outlet": 8.485
+    }  # fmt: skip
+
+
+def test_held_ends_move_as_they_are_told(tube: Path) -> None:
+    supports = {"inlet": {"kind": "held"}, "outlet": {"kind": "held"}}
+    _, displacement, places = solved(scene_of(tube, supports=supports, time={"end": 1.0, "step": 1.0}))
+    np.testing.assert_allclose(displacement[places[:, 2] < 1e-9], 0.0, atol=1e-12)
+    np.testing.assert_allclose(
+        displacement[places[:, 2] > LENGTH - 1e-9], np.tile([0, 0, 0.05 * LENGTH], (24, 1)), atol=1e-12
+    )
+
+
+def test_springs_around_a_body_push_back(tube: Path, of_the_file: Any) -> None:
+    supports = {"outer": {"kind": "elastic", "stiffness": 5.0}}
+    row, _, _ = solved(scene_of(tube, supports=supports))
+    start = 8 / 2 * np.sin(np.pi / 4) * LENGTH
+    assert start < row["lumen_volume"] < of_the_file[0]["lumen_volume"]
+
+
+# ---------------------------------------------------------------- rigid motions
+
+
+SLIDING = {"kind": "sliding"}
+SPRINGS = {"kind": "elastic", "stiffness": 1.0}
+X, Y, Z = "(1, 0, 0)", "(0, 1, 0)", "(0, 0, 1)"
+
+
+@pytest.mark.parametrize(
+    ("supports", "free"),
+    [
+        ({}, []),
+        ({"inlet": FREE}, []),
+        (
+            {"inlet": FREE, "outlet": FREE},
+            [f"{way} {axis}" for way in ("move along", "turn about") for axis in (X, Y, Z)],
+        ),
+        (
+            {"inlet": SLIDING, "outlet": SLIDING},
+            [f"move along {X}", f"move along {Y}", f"turn about {Z} through (0, 0,"],
+        ),
+        ({"inlet": SLIDING, "outlet": FREE, "outer": SPRINGS}, []),
+        (
+            {"inlet": FREE, "outlet": FREE, "outer": SPRINGS | {"tangential": 0.0}},
+            [f"move along {Z}", f"turn about {Z}"],
+        ),
+    ],
+)
+def test_every_free_rigid_motion_is_named(tube: Path, supports: Any, free: list[str]) -> None:
+    scene = scene_of(tube)
+    parts = scene.geometry.build(scene.mesh, MPI.COMM_SELF).parts
+    chosen = {"inlet": Support(), "outlet": Support()} | {name: Support(**one) for name, one in supports.items()}
+    found = free_motions(parts, chosen)
+    assert len(found) == len(free)
+    for words in free:
+        assert any(one.startswith(words) for one in found), found
+
+
+def test_a_body_that_can_move_is_refused(tube: Path) -> None:
+    with pytest.raises(
+        SceneError, match=r"supports \(inlet 'free', outlet 'sliding'\): they leave the body free to move"
+    ):
+        Simulation(scene_of(tube, supports={"inlet": FREE, "outlet": {"kind": "sliding"}}))
+
+
+@pytest.mark.parametrize(
+    ("tables", "words"),
+    [
+        ({"supports": {"lid": FREE}}, "supports.lid: the body has no such face; it has inner, outer, inlet, outlet"),
+        ({"supports": {"outer": {"kind": "elastic"}}}, "supports.outer.stiffness: missing"),
+        ({"supports": {"inlet": {"kind": "fixed"}}}, "supports.inlet.kind = 'fixed': allowed are 'guided'"),
+        ({"mesh": {"refinement": 2}}, "mesh.refinement = 2: the mesh of a file is taken as it is: 1"),
+    ],
+)
+def test_supports_and_meshes_that_cannot_be(tube: Path, tables: Any, words: str) -> None:
+    with pytest.raises(SceneError) as error:
+        Simulation(scene_of(tube, **tables))
+    assert str(error.value).startswith(words)
+
+
+def test_other_shapes_are_held_by_their_ends() -> None:
+    with pytest.raises(SceneError, match="supports.inlet: a cube is held by supports.ends"):
+        scene_from_dict({"geometry": {"shape": "cube"}, "supports": {"inlet": FREE}, "time": {"end": 1.0, "step": 1.0}})
+
+
+# ---------------------------------------------------------------- runs
+
+RUN = """
+[geometry]
+shape = "mesh"
+file = "mesh/tube.msh"
+[loads.pressure]
+value = 2.0
+ramp = [[0.0, 0.0], [2.0, 1.0]]
+[time]
+end = 4.0
+step = 1.0
+[solver]
+method = "direct"
+"""
+
+
+def _command(*arguments: str, ranks: int = 1) -> subprocess.CompletedProcess[str]:
+    launcher = ["mpirun", "-n", str(ranks)] if ranks > 1 else []
+    words = [*launcher, "python3", "-m", "remodel_fenicsx", *arguments]
+    return subprocess.run(words, capture_output=True, text=True, check=False)
+
+
+def _history(folder: Path) -> Any:
+    table = np.genfromtxt(folder / "history.csv", delimiter=",", names=True)
+    names = [name for name in table.dtype.names if "iterations" not in name and name != "seconds"]
+    return np.array([table[name] for name in names])
+
+
+def test_a_run_goes_on_with_its_copy_on_other_ranks(tmp_path: Path) -> None:
+    (tmp_path / "mesh").mkdir()
+    file = write_tube(tmp_path / "mesh" / "tube.msh")
+    scene = tmp_path / "vessel.toml"
+    scene.write_text(RUN)
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    assert _command("run", str(scene), "-o", str(whole), "--no-report").returncode == 0
+    first = _command("run", str(scene), "-o", str(parts), "--set", "time.end=2", "--no-report", ranks=2)
+    assert first.returncode == 0, first.stderr
+    copy = parts / "tube.msh"
+    assert copy.read_bytes() == file.read_bytes()
+    file.unlink()  # the run has its own
+    assert _command("run", "--resume", str(parts), "--set", "time.end=4", "--no-report").returncode == 0
+    np.testing.assert_allclose(_history(parts), _history(whole), rtol=1e-8, atol=1e-10)
+    copy.write_text(copy.read_text() + "\n")
+    refused = _command("run", "--resume", str(parts), "--set", "time.end=5")
+    assert refused.returncode == 2
+    assert "tube.msh': has changed since the run" in refused.stderr

@@ -1,0 +1,54 @@
+"""Mesh files of tubes, as a user of Gmsh writes them, and what goes wrong with such files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from remodel_fenicsx.body.gmsh_model import gmsh_model
+from remodel_fenicsx.body.layers import Wall
+from remodel_fenicsx.body.tube import draw_tube
+
+NAMES = {"bottom": "inlet", "top": "outlet", "inner": "inner", "outer": "outer"}
+COUNTS = (8, 2, 3)
+RADII, LENGTH = (1.0, 2.0), 3.0
+
+
+def write_tube(
+    path: Path,
+    element: str = "hexahedron",
+    degree: int = 1,
+    version: float = 4.1,
+    turn: Any = None,
+    shift: Any = (0.0, 0.0, 0.0),
+    renamed: dict[str, str] = NAMES,
+    counts: tuple[int, int, int] = COUNTS,
+) -> Path:
+    """A tube about z as a file with named faces, perhaps turned and shifted."""
+    around, through, along = counts
+    wall = Wall.of(*RADII, through, {})
+    with gmsh_model("tube") as gmsh:
+        draw_tube(wall, LENGTH, (around, along), element, degree)
+        for dimension, tag in gmsh.model.getPhysicalGroups(2):
+            name = gmsh.model.getPhysicalName(dimension, tag)
+            gmsh.model.removePhysicalName(name)
+            gmsh.model.setPhysicalName(dimension, tag, renamed.get(name, name))
+        if turn is not None:
+            tags, places, _ = gmsh.model.mesh.getNodes()
+            for tag, place in zip(tags, places.reshape(-1, 3) @ np.asarray(turn).T + shift, strict=True):
+                gmsh.model.mesh.setNode(tag, place, [])
+        gmsh.option.setNumber("Mesh.MshFileVersion", version)
+        gmsh.option.setNumber("Mesh.Binary", 0)
+        gmsh.write(str(path))
+    return path
+
+
+def edited(source: Path, target: Path, section: str, edit: Any) -> Path:
+    """A copy of a file in which the lines of a section went through a function."""
+    lines = source.read_text().splitlines()
+    first, last = lines.index(f"${section}") + 1, lines.index(f"$End{section}")
+    lines[first:last] = edit(lines[first:last])
+    target.write_text("\n".join(lines) + "\n")
+    return target
