@@ -244,6 +244,19 @@ def _initial_cells(value: Any) -> Any:
     return value
 
 
+class Natural(Table):
+    """The configuration in which the tissue is free of stress, where it is not the mesh's (docs/natural.md)."""
+
+    opening_angle: float = Field(
+        default=0.0,
+        ge=0,
+        le=180,
+        description="Of a tube: angle of the sector that is missing when a cut ring has opened, in degrees, 360 less "
+        "that of the sector. Fung's opening angle, between the lines from the middle of the inner arc to its ends, is "
+        "half of it. 0: the mesh is free of stress.",
+    )
+
+
 class Cells(Table):
     """The orthotropic unit cells of the collagen network before the first remodeling pass."""
 

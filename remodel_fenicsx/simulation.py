@@ -17,10 +17,12 @@ from remodel_fenicsx.evolution.coupling import Coupling, Maker
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher, times
 from remodel_fenicsx.fem.formulations import FORMULATIONS
-from remodel_fenicsx.fem.kinematics import KINEMATICS, FreeLength
+from remodel_fenicsx.fem.kinematics import KINEMATICS, FreeLength, NaturalConfiguration
 from remodel_fenicsx.fem.quadrature import Quadrature
+from remodel_fenicsx.model.cells import cylindrical_axes
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.model.laws import LAWS
+from remodel_fenicsx.model.local_axes import LocalAxes
 from remodel_fenicsx.results.columns import Observer
 from remodel_fenicsx.results.run_folder import agreed
 from remodel_fenicsx.scene import Scene, SceneError
@@ -90,6 +92,8 @@ class Simulation:
         self.quadrature = Quadrature(mesh, scene.mesh.degree, kinematics.weight(mesh))
         properties, local_axes = scene.properties(), shape.local_axes(domain, self.quadrature)
         own = {name: properties[name].cells for name in scene.regions}
+        if scene.natural.opening_angle:
+            kinematics = opened(kinematics, scene, self.quadrature, local_axes)
         fibres = measured_fibres(scene, domain)
         self.cells = UnitCells(self.quadrature, domain, scene.cells, local_axes, own, fibres)
         self.loading = Loading(domain, self.unknown, kinematics)
@@ -201,6 +205,29 @@ class Simulation:
         """Free PETSc's objects and options."""
         self.stability.close()
         self.stepper.close()
+
+
+def opened(kinematics: Any, scene: Scene, quadrature: Quadrature, local_axes: LocalAxes) -> NaturalConfiguration:
+    """The kinematics of a tube whose tissue is free of stress in an open sector.
+
+    Raises
+    ------
+    SceneError
+        If no such sector closes to the tube.
+    """
+    from remodel_fenicsx.model.closing import closing
+
+    tube: Any = scene.geometry  # a shape that `closes_from_a_sector`
+    angle = scene.natural.opening_angle
+    try:
+        found = closing(scene.properties()[""].tissue, (tube.inner_radius, tube.outer_radius), angle)
+    except ArithmeticError as error:
+        raise SceneError(f"natural.opening_angle = {angle:g}: must be smaller: {error}") from error
+    places = local_axes.coordinates
+    gradient = found.gradient(np.linalg.norm(places[..., :2], axis=-1), cylindrical_axes(places))
+    natural = quadrature.function("natural_gradient", (3, 3))
+    quadrature.values(natural, (3, 3))[:] = gradient.reshape(*quadrature.shape, 3, 3)
+    return NaturalConfiguration(kinematics, natural)
 
 
 def measured_fibres(scene: Scene, domain: Domain) -> dict[str, dict[str, Any]]:

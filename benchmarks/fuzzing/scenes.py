@@ -242,3 +242,15 @@ def _rarely(random: Random, scene: Values, stiffness: float) -> None:
     if scene["geometry"]["shape"] == "tube" and random.random() < 0.1:  # two layers of one tissue
         middle = (scene["geometry"]["inner_radius"] + scene["geometry"]["outer_radius"]) / 2
         scene["regions"] = {"inside": {"outer_radius": middle}, "outside": {}}
+    if _closes_from_a_sector(scene) and random.random() < 0.3:
+        scene["natural"] = {"opening_angle": rounded(random.uniform(0, 120))}
+
+
+def _closes_from_a_sector(scene: Values) -> bool:
+    """Whether an opening angle goes with all else."""
+    uniform = scene["cells"]["initial"] == "isotropic" and scene["cells"]["axes"] == "cylindrical"
+    marched = scene["remodeling"]["coupling"] == "staggered" and "tolerance" not in scene["time"]
+    plain = scene["mesh"]["formulation"] == "displacement" and "regions" not in scene and "profile" not in scene
+    return (
+        scene["geometry"]["shape"] == "tube" and uniform and marched and plain and scene["time"]["end"] != "equilibrium"
+    )

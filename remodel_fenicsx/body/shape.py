@@ -120,6 +120,8 @@ class Shape(Table):
         Whether a scene may give the body `[regions.NAME]`, named parts with tissue of their own.
     is_filled_by_regions
         Whether the regions of a scene, where it has some, are all of the body.
+    closes_from_a_sector
+        Whether a scene may give the body `natural.opening_angle`: it has `inner_radius` and `outer_radius`.
     """
 
     loads: ClassVar[dict[str, LoadKind]]
@@ -138,6 +140,7 @@ class Shape(Table):
     defaults: ClassVar[dict[str, Any]] = {}
     holds_faces: ClassVar[bool] = False
     has_regions: ClassVar[bool] = False
+    closes_from_a_sector: ClassVar[bool] = False
     is_filled_by_regions: ClassVar[bool] = False
 
     shape: str = Field(description="Which body it is.")

@@ -271,6 +271,7 @@ class Tube(Walled):
     }
     ends_that_free_length: ClassVar[tuple[str, ...]] = ("closed",)
     has_regions: ClassVar[bool] = True
+    closes_from_a_sector: ClassVar[bool] = True
     is_filled_by_regions: ClassVar[bool] = True
     # with global axes a tube of isotropic cells would not stay round in the first step
     defaults: ClassVar[dict[str, Any]] = {"cells": {"axes": "cylindrical"}}

@@ -162,7 +162,7 @@ class AnsweringCells:
     # ------------------------------------------------------------ values
     def update(self, tangent: bool = False) -> None:
         """Stress, and tangent on request, of the present unknowns."""
-        F = self.state.deformation_gradient()
+        F = self.state.elastic_gradient()
         if self._gradient is None or not np.array_equal(F, self._gradient):
             self._found = self._solved(F)
             self._gradient, self._tangent_is_there = F, False
@@ -228,7 +228,11 @@ class AnsweringEquilibrium(Equilibrium):
 
     def internal_and_tangents(self, F: Any, test: Any, trial: Any) -> tuple[list[Any], list[Any]]:
         """Virtual work of P, and with it dP/dF."""
-        u, weight, dx = self.state.unknown, self.state.kinematics.weight(self.quadrature.mesh), self.quadrature.dx
+        u, weight, dx = (
+            self.state.unknown,
+            self.state.kinematics.stress_free_weight(self.quadrature.mesh),
+            self.quadrature.dx,
+        )
         variation, increment = (ufl.derivative(F, u, function) for function in (test, trial))
         row, column = (ufl.as_vector([F_[i, j] for i in range(3) for j in range(3)]) for F_ in (variation, increment))
         internal = ufl.inner(self.answering.stress, variation) * weight * dx

@@ -123,7 +123,7 @@ class Extrapolated(Staggered):
         points = self._anywhere(lost)
         if points and self.state.comm.rank == 0:
             log.info("time %g: %d points follow the last stress, not the extrapolated one", time, points)
-        self._power = self.remodeling.replace(asked, self.state.deformation_gradient(), duration)
+        self._power = self.remodeling.replace(asked, self.state.elastic_gradient(), duration)
 
     def _anywhere(self, points: Flags) -> int:
         """How many there are on all ranks."""

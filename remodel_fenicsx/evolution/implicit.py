@@ -59,7 +59,7 @@ class Implicit:
         StepFailure
             If none is found.
         """
-        work, start = Work(), self.state.deformation_gradient()
+        work, start = Work(), self.state.elastic_gradient()
         self.answering.begin(time, self.state.numbers[RESIDUAL])
         if self.state.number == 0:
             self._solve(time, loads, work, answering=False)

@@ -91,10 +91,10 @@ class RemodelingPass:
         self.kernels = state.cells.kernels
         self._numbers = Numbers(state, "noise", {"said": 0})
         self._smallest_area = self.quadrature.minimum(self.quadrature.smallest_areas)
-        F = state.kinematics.deformation_gradient(state.unknown)
+        F = state.kinematics.elastic_gradient(state.unknown)
         self._stresses = PointStresses(state, self.tissue)
         tensor = self.driver.tensor(F, self._stresses.ufl)
-        # one stacked expression: the deformation gradient comes at no cost with the driver
+        # one stacked expression: F_e comes at no cost with the driver
         stacked = ufl.as_vector([t[i, j] for t in (F, tensor) for i in range(3) for j in range(3)])
         self._expression = jit.expression(stacked, self.quadrature.points)
 
@@ -246,7 +246,7 @@ class RemodelingPass:
         )
         updated = self.law.share(self._change[0], asked, factor)
         increment = self._energy_increment(F, self._change[0], updated)
-        power: float = 0.0 - self.quadrature.integral(increment.reshape(shape)) / duration
+        power: float = 0.0 - self.quadrature.integral(self.state.per_mesh_volume(increment)) / duration
         cells.set(updated.dimensions.reshape(*shape, 3), updated.axes.reshape(*shape, 3, 3))
         return power
 

@@ -157,10 +157,10 @@ class TimeError:
     def _strain(self, step: Step, cells: UnitCell) -> tuple[float, bool]:
         """Give the body other cells, and let it answer: the largest change of a length, and whether that is a state."""
         state, shape = self.state, self.quadrature.shape
-        before = state.deformation_gradient()
+        before = state.elastic_gradient()
         state.cells.set(cells.dimensions.reshape(*shape, 3), cells.axes.reshape(*shape, 3, 3))
         equilibrium, newton = self.stepper.coupling.equilibrium, self.stepper.coupling.newton
         state.unknown.x.array[:] += newton.answer(equilibrium, step.work.tangents)
-        after, admissible = state.deformation_gradient(), equilibrium.extension().admissible
+        after, admissible = state.elastic_gradient(), equilibrium.extension().admissible
         changes = np.minimum(largest_change_of_length(before, after), LARGEST_LINEAR_CHANGE).reshape(shape)
         return float(np.degrees(self.quadrature.maximum(changes))), admissible

@@ -119,7 +119,7 @@ class _PartsApart(Dilatation):
         self.dx = ufl.Measure("dx", domain=quadrature.mesh, metadata={"quadrature_degree": degree})
         kind = basix.CellType[quadrature.element_kind]
         points = np.asarray(basix.make_quadrature(kind, degree)[0], dtype=np.float64)
-        jacobian = ufl.det(kinematics.deformation_gradient(unknown))
+        jacobian = ufl.det(kinematics.elastic_gradient(unknown))
         self._expression = jit.expression(jacobian, points, "J where the formulation takes it")
         polynomials = basix.create_element(basix.ElementFamily.P, kind, degree // 2, discontinuous=True)
         there, here = (np.asarray(polynomials.tabulate(0, p))[0, :, :, 0] for p in (points, quadrature.points))

@@ -68,6 +68,18 @@ class Kinematics(ABC):
     def deformation_gradient(self, unknown: Any) -> Any:
         """F, UFL, always of shape (3, 3)."""
 
+    def elastic(self, deformation_gradient: Any) -> Any:
+        """F_e, UFL, of an F: F itself where the mesh is free of stress."""
+        return deformation_gradient
+
+    def elastic_gradient(self, unknown: Any) -> Any:
+        """F_e, UFL: what the tissue feels."""
+        return self.elastic(self.deformation_gradient(unknown))
+
+    def stress_free_weight(self, mesh: Any) -> Any:
+        """Volume of the tissue, free of stress, per unit of mesh."""
+        return self.weight(mesh)
+
     def weight(self, mesh: Any) -> Any:
         """Volume of the body per unit of mesh, a number or UFL; one where the mesh is the body."""
         return 1
@@ -315,6 +327,47 @@ KINEMATICS: dict[str, Kinematics] = {
 """Kinematics by the name that a scene gives them."""
 
 
+# ---------------------------------------------------------------- tissue that is free of stress elsewhere
+
+
+class NaturalConfiguration:
+    """A body whose tissue is free of stress in another configuration, from which G leads to the mesh: F_e = F G.
+
+    Loads, caps and columns of shape ask for F and `weight`; what the tissue feels is F_e, per volume dV / det G.
+
+    Parameters
+    ----------
+    kinematics
+        On a mesh; what is not said here it answers itself.
+    gradient
+        G at the quadrature points, a dolfinx function.
+    """
+
+    def __init__(self, kinematics: Any, gradient: Any):
+        self.field, self.gradient = kinematics, gradient
+
+    def __getattr__(self, name: str) -> Any:
+        if name == "field":  # while it is copied it has none
+            raise AttributeError(name)
+        return getattr(self.field, name)
+
+    def elastic(self, deformation_gradient: Any) -> Any:
+        """F G."""
+        import ufl
+
+        return ufl.dot(deformation_gradient, self.gradient)
+
+    def elastic_gradient(self, unknown: Any) -> Any:
+        """F_e = F G."""
+        return self.elastic(self.field.deformation_gradient(unknown))
+
+    def stress_free_weight(self, mesh: Any) -> Any:
+        """The mesh's weight over det G."""
+        import ufl
+
+        return self.field.weight(mesh) / ufl.det(self.gradient)
+
+
 # ---------------------------------------------------------------- the length as an unknown
 
 
@@ -381,6 +434,10 @@ class FreeLength:
         return self.field.deformation_gradient(u) + ufl.as_tensor(
             [[stretch if i == j == 2 else 0.0 for j in range(3)] for i in range(3)]
         )
+
+    def elastic_gradient(self, unknown: Any) -> Any:
+        """Of the field and the length together."""
+        return self.field.elastic(self.deformation_gradient(unknown))
 
     def subspace(self, space: Any, component: int) -> Any:
         """The field's."""

@@ -124,7 +124,7 @@ class Measurement:
     @cached_property
     def chain_extension(self) -> Array:
         """r/L at all points (elements, points); 0 where no chain locks."""
-        cells, F = self.state.cells, self.state.deformation_gradient()
+        cells, F = self.state.cells, self.state.elastic_gradient()
         length = self.equilibrium.parameters.locking_length()
         return np.asarray(np.sqrt(cells.kernels.squared_length(F, cells.point_cells)).reshape(length.shape) / length)
 
@@ -273,17 +273,18 @@ class _EndForceForms:
         state, mesh = equilibrium.state, equilibrium.quadrature.mesh
         self._pointwise, self._comm = equilibrium.pointwise, equilibrium.comm
         weight, F = state.kinematics.weight(mesh), state.kinematics.deformation_gradient(state.unknown)
+        tissue, elastic = state.kinematics.stress_free_weight(mesh), state.kinematics.elastic
         # a function where a number would do: UFL differentiates by functions only, and some kinematics prescribe F_zz
         element = basix.ufl.element("DG", mesh.topology.cell_name(), 0)
         change: Any = dolfinx.fem.Function(dolfinx.fem.functionspace(mesh, element))
         one, size = (dolfinx.fem.Constant(mesh, np.float64(value)) for value in (1.0, length))
         along = ufl.as_tensor([[1.0 / size if i == j == 2 else 0.0 for j in range(3)] for i in range(3)])
         longer = F + change * along
-        energies = state.dilatation.energies(equilibrium.tissue, longer, [state.cells.ufl_cell], weight)
+        energies = state.dilatation.energies(equilibrium.tissue, elastic(longer), [state.cells.ufl_cell], tissue)
         internal = [ufl.derivative(energy, change, one) for energy in energies]
         if self._pointwise is not None:
-            work = ufl.inner(ufl.dot(F, self._pointwise.stress), along)
-            internal[0] += work * weight * equilibrium.quadrature.dx
+            work = ufl.inner(ufl.dot(elastic(F), self._pointwise.stress), elastic(along))
+            internal[0] += work * tissue * equilibrium.quadrature.dx
         place, normal = ufl.SpatialCoordinate(mesh), ufl.FacetNormal(mesh)
         surface = state.loading.surface_measure(face)
         inward = ufl.dot(ufl.cofac(F), normal)[2] * place[2] / size

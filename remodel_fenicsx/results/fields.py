@@ -88,6 +88,7 @@ class ElementFields:
             self._stresses.refresh()
         values = self.quadrature.evaluate(self._state, (9 if self._stresses is None else 18,))
         F = values[..., :9].reshape(*values.shape[:2], 3, 3)
+        elastic = self.state.elastic(F)
         cells = self.state.cells
         dimensions, axes = cells.dimension_values, cells.axis_values
         mean, fibre_angle, wanted = self.quadrature.element_mean, self.shape.fibre_angle, set(self.names)
@@ -103,10 +104,10 @@ class ElementFields:
         if "fibre_angle" in wanted:
             found["fibre_angle"] = mean_of_known(fibre_angle(dimensions, axes, cells.local_axes.axes))
         if "fibre_angle_deformed" in wanted:
-            deformed_axes, local = axes @ np.swapaxes(F, -1, -2), cells.local_axes.deformed(F)
+            deformed_axes, local = axes @ np.swapaxes(elastic, -1, -2), cells.local_axes.deformed(F)
             found["fibre_angle_deformed"] = mean_of_known(fibre_angle(dimensions, deformed_axes, local))
         if "chain_extension" in wanted:
-            squared = cells.kernels.squared_length(F.reshape(-1, 3, 3), cells.point_cells).reshape(F.shape[:2])
+            squared = cells.kernels.squared_length(elastic.reshape(-1, 3, 3), cells.point_cells).reshape(F.shape[:2])
             found["chain_extension"] = np.max(np.sqrt(squared) / self._locking_length(), axis=1)
         if REGION in wanted:
             found[REGION] = self.state.loading.domain.element_region.astype(np.float64)

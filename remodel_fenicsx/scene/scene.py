@@ -37,6 +37,7 @@ from remodel_fenicsx.settings import (
     Material,
     Mesh,
     Model,
+    Natural,
     Output,
     Properties,
     Region,
@@ -97,6 +98,7 @@ class Scene(Table):
     material: Material = Material()
     cells: Cells = Cells()
     supports: Supports = Supports()
+    natural: Natural = Natural()
     regions: dict[str, Region] = {}
     loads: dict[str, Load] = {}
     remodeling: Remodeling = Remodeling()
@@ -165,6 +167,7 @@ class Scene(Table):
             raise fault("the scene has no regions", "output.fields", REGION)
         self._check_columns()
         self._check_length()
+        self._check_natural()
         if self.model.kinematics != AUTO and (reasons := objections(self, self.model.kinematics)):
             raise fault("; ".join(reasons), "model.kinematics", self.model.kinematics)
         return self
@@ -308,6 +311,25 @@ class Scene(Table):
         return self.supports.ends in self.geometry.ends_that_free_length or any(
             kinds[name].frees_length for name in self.loads
         )
+
+    def _check_natural(self) -> None:
+        """What goes with an opening angle; all else is refused by name."""
+        angle = self.natural.opening_angle
+        if angle == 0.0:
+            return
+        able = ", ".join(repr(name) for name, kind in SHAPES.items() if kind.closes_from_a_sector)
+        for has, key, needed in (
+            (self.geometry.closes_from_a_sector, "geometry.shape", able),
+            (not self.regions, "regions", "none: the closing knows one tissue"),
+            (self.cells.initial == "isotropic", "cells.initial", "'isotropic'"),
+            (self.cells.axes == "cylindrical", "cells.axes", "'cylindrical'"),
+            (self.mesh.formulation == "displacement", "mesh.formulation", "'displacement'"),
+            (self.remodeling.coupling == "staggered", "remodeling.coupling", "'staggered'"),
+            (not self.time.is_equilibrium, "time.end", "a time"),
+            (self.time.tolerance is None, "time.tolerance", "none: steps of one length"),
+        ):
+            if not has:
+                raise fault(f"must be 0 unless {key} is {needed}", "natural.opening_angle", angle)
 
     def _check_length(self) -> None:
         """A length is prescribed or unknown."""

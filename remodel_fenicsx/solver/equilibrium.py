@@ -104,8 +104,8 @@ class Equilibrium:
         self.stop_signal: Callable[[], int] = lambda: 0
         u, shares, loading = state.unknown, shares or [state.cells.ufl_cell], state.loading
         test, trial = ufl.TestFunction(u.function_space), ufl.TrialFunction(u.function_space)
-        F = state.kinematics.deformation_gradient(u)
-        self.energies = state.dilatation.energies(self.tissue, F, shares, state.kinematics.weight(mesh))
+        F = state.kinematics.elastic_gradient(u)
+        self.energies = state.dilatation.energies(self.tissue, F, shares, state.kinematics.stress_free_weight(mesh))
         external = loading.external_residual(test)
         self.pointwise = pointwise_repulsion(state, self.tissue, point_shares)
         internal, tangents = self.internal_and_tangents(F, test, trial)
@@ -128,7 +128,7 @@ class Equilibrium:
         internal = [ufl.derivative(energy, u, test) for energy in self.energies]
         tangents = [second_derivative(energy, u, test, trial) for energy in self.energies]
         if self.pointwise is not None:
-            weight, dx = self.state.kinematics.weight(self.quadrature.mesh), self.quadrature.dx
+            weight, dx = self.state.kinematics.stress_free_weight(self.quadrature.mesh), self.quadrature.dx
             internal[0] += self.pointwise.residual(u, F, test) * weight * dx
             tangents[0] += self.pointwise.tangent(u, F, test, trial) * weight * dx
         return internal, tangents

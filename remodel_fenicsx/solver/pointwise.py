@@ -55,7 +55,7 @@ class PointwiseRepulsion:
         """Stress, and stiffness on request, of the present unknowns and cells: what is there already stays."""
         derivatives = self.tissue.repulsion.derivatives
         assert derivatives is not None
-        F, A, modulus = self.state.deformation_gradient(), self._structure_tensor(), self._modulus()
+        F, A, modulus = self.state.elastic_gradient(), self._structure_tensor(), self._modulus()
         asked = [F, A, modulus]
         known = bool(self._known) and all(map(np.array_equal, asked, self._known))
         if known and (self._stiffness_is_known or not stiffness):
@@ -79,10 +79,10 @@ class PointwiseRepulsion:
 
     def energy(self) -> float:
         """Its part of the stored energy, over all ranks."""
-        F = self.state.deformation_gradient()
+        F = self.state.elastic_gradient()
         r0 = assembly.point_values(self.tissue.end_to_end_length, self.quadrature).reshape(-1)
         values = -self._modulus() / 2 * self.tissue.repulsion.sum(F, self.shares(), r0)
-        return self.quadrature.integral(values.reshape(self.quadrature.shape))
+        return self.quadrature.integral(self.state.per_mesh_volume(values))
 
     def residual(self, u: Any, F: Any, test: Any) -> Any:
         """Its virtual work per reference volume, UFL."""
@@ -121,7 +121,7 @@ class PointStresses:
 
     def __init__(self, state: State, tissue: Tissue):
         self._dilatation, self._repulsion = state.dilatation, pointwise_repulsion(state, tissue)
-        F = state.kinematics.deformation_gradient(state.unknown)
+        F = state.kinematics.elastic_gradient(state.unknown)
         self.ufl: Stresses = state.dilatation.stresses(tissue, F, [state.cells.ufl_cell])
         if self._repulsion is not None:
             self.ufl = self.ufl.plus(F, self._repulsion.stress)

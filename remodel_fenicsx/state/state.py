@@ -70,6 +70,7 @@ class State:
         self.unknown, self.kinematics, self.cells, self.loading = unknown, kinematics, cells, loading
         self.dilatation = formulation.on(kinematics, unknown, cells.quadrature)
         F = kinematics.deformation_gradient(unknown)
+        self._natural = getattr(kinematics, "gradient", None)  # G, of a body that is free of stress elsewhere
         self._deformation_gradient = jit.expression(F, cells.quadrature.points)
         self.equilibrium_cells = CellField(cells.quadrature, "equilibrium_cell")
         self.settle_cells()
@@ -98,6 +99,27 @@ class State:
     def deformation_gradient(self) -> NDArray[np.float64]:
         """F of the present unknowns at all points of this rank in one row, ghosts included, (n, 3, 3)."""
         return self.cells.quadrature.evaluate(self._deformation_gradient, (3, 3)).reshape(-1, 3, 3)
+
+    def elastic(self, deformation_gradient: NDArray[np.float64]) -> NDArray[np.float64]:
+        """F_e of F at all points, (elements, points, 3, 3): F itself where the mesh is free of stress."""
+        if self._natural is None:
+            return deformation_gradient
+        found: NDArray[np.float64] = deformation_gradient @ self.cells.quadrature.values(self._natural, (3, 3))
+        return found
+
+    def elastic_gradient(self) -> NDArray[np.float64]:
+        """F_e of the present unknowns at all points in one row, as `deformation_gradient`."""
+        F = self.deformation_gradient()
+        return self.elastic(F.reshape(*self.cells.quadrature.shape, 3, 3)).reshape(-1, 3, 3)
+
+    def per_mesh_volume(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Values per volume of tissue that is free of stress, as values per volume of the mesh, (elements, points)."""
+        quadrature = self.cells.quadrature
+        values = values.reshape(quadrature.shape)
+        if self._natural is None:
+            return values
+        shares: NDArray[np.float64] = values / np.linalg.det(quadrature.values(self._natural, (3, 3)))
+        return shares
 
     def functions(self) -> dict[str, Any]:
         """Every dolfinx function of the state by its name."""

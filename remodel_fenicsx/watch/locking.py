@@ -253,8 +253,8 @@ class VolumeResponse:
         state, quadrature = self.state, self.quadrature
         function = quadrature.function("stress_in_vain", (3, 3))
         test = ufl.TestFunction(state.unknown.function_space)
-        variation = ufl.derivative(state.kinematics.deformation_gradient(state.unknown), state.unknown, test)
-        weight = state.kinematics.weight(quadrature.mesh)
+        variation = ufl.derivative(state.kinematics.elastic_gradient(state.unknown), state.unknown, test)
+        weight = state.kinematics.stress_free_weight(quadrature.mesh)
         return function, jit.form(ufl.inner(function, variation) * weight * quadrature.dx)
 
     def _derivative(self, direction: Any) -> Any:
