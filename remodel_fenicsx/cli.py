@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
+import math
 import os
 import shlex
 import sys
@@ -20,7 +21,7 @@ from remodel_fenicsx.scene.presets import PRESETS, PROFILES
 from remodel_fenicsx.scene.scene import Scene, SceneError, preset_scene, read_scene
 from remodel_fenicsx.schema.tables import printable
 from remodel_fenicsx.system import interrupts
-from remodel_fenicsx.system.arguments import megabytes, positive, wall_time
+from remodel_fenicsx.system.arguments import MOST_RUNS, megabytes, positive, wall_time
 from remodel_fenicsx.system.children import SERVE, serve
 from remodel_fenicsx.system.environment import kernels, reason_undrawable, reason_unusable, versions
 from remodel_fenicsx.system.regular_files import ForeignFileError, write_new
@@ -101,11 +102,17 @@ def parser() -> argparse.ArgumentParser:
     trade = scene_command("trade", "Run a scene with a ladder of settings: what each costs, and how far off it is.")
     text = "wall time for the runs: 90s, 10min, 2h (default: 10min); cheap settings first"
     trade.add_argument("--budget", type=wall_time, default=600.0, metavar="TIME", help=text)
-    for study, name in ((ensemble, "ensemble"), (trade, "trade")):
+    sweep = scene_command("sweep", "Run a scene with other numbers: how its end depends on them.")
+    text = "KEY=a:b:n (n numbers from a to b) or KEY=a,b,...; of several all combinations are run"
+    sweep.add_argument("axes", nargs="+", metavar="KEY=a:b:n", help=text)
+    text = "N points of a Latin hypercube in place of all combinations; then each key is KEY=a:b"
+    sweep.add_argument("--samples", type=positive, metavar="N", help=text)
+    sweep.add_argument("--seed", type=int, default=1, metavar="N", help="of the Latin hypercube (default: 1)")
+    for study, name in ((ensemble, "ensemble"), (trade, "trade"), (sweep, "sweep")):
         text = "finished runs of the same scene that it holds are used, others go on"
         writes(study, f"folder (default: results/NAME-{name}); {text}")
         study.add_argument("--jobs", type=positive, metavar="N", help="runs at a time (default: as many as cores)")
-    for found in (run_command, stability, ensemble, trade):
+    for found in (run_command, stability, ensemble, trade, sweep):
         found.add_argument("-q", "--quiet", action="store_true", help="no progress")
     status = command("status", "Say where the run in DIR is, how fast, and whether it is alive.")
     status.add_argument("folder", type=Path, metavar="DIR", help="folder of a run")
@@ -338,6 +345,26 @@ def _trade(options: argparse.Namespace) -> int:
     return _study(options, task)
 
 
+def _sweep(options: argparse.Namespace) -> int:
+    def task(scene: Scene) -> tuple[Path, str, dict[str, str]]:
+        from remodel_fenicsx.studies import sweep as study
+
+        axes: dict[str, Any] = {}
+        for text in options.axes:
+            key, numbers = study.read_axis(text, options.samples)
+            if key in axes:
+                raise SceneError(f"sweep {key}: is there twice")
+            axes[key] = numbers
+        if math.prod(map(len, axes.values())) > MOST_RUNS:
+            raise SceneError(f"sweep: {math.prod(map(len, axes.values()))} runs; allowed are at most {MOST_RUNS}")
+        sampled = options.samples is not None
+        points = study.latin_hypercube(axes, options.samples, options.seed) if sampled else study.grid(axes)
+        folder, found = study.sweep(scene, points, options.output, options.jobs, options.quiet)
+        return folder, study.in_words(found, scene), found.failed
+
+    return _study(options, task)
+
+
 def _end_all(message: str, code: int) -> int:
     """End the run on all ranks: an error on one of them leaves the others waiting for ever."""
     from mpi4py import MPI
@@ -549,6 +576,7 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
     "stability": _stability,
     "ensemble": _ensemble,
     "trade": _trade,
+    "sweep": _sweep,
     "status": _status,
     "report": _report,
     "picture": _drawing,

@@ -1,0 +1,105 @@
+"""Runs over numbers of a scene: closed form of the end, nothing done twice, bad input in one line."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from remodel_fenicsx import cli, preset_scene
+from remodel_fenicsx.results.status import status
+from remodel_fenicsx.studies.sweep import latin_hypercube, read_axis
+from tests.conftest import forked_children
+
+PAPER = "kuhl-holzapfel-2007"
+
+
+@pytest.fixture
+def cube(tmp_path: Path) -> Path:
+    """A homogeneous cube whose angle at the end has a closed form."""
+    changes = {"model.kinematics": "point", "time.end": 20.0, "time.step": 1.0}
+    path = tmp_path / "cube.toml"
+    path.write_text(preset_scene(PAPER, "cube").with_values(changes).to_toml())
+    return path
+
+
+def rows(folder: Path) -> list[dict[str, str]]:
+    with (folder / "sweep.csv").open() as file:
+        return list(csv.DictReader(line for line in file if not line.startswith("#")))
+
+
+def test_the_ends_follow_the_closed_form(cube: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The angle of the printed scheme after 19 steps, for three kappas; a finer sweep runs what is new."""
+    out = tmp_path / "out"
+    with forked_children():
+        words = ["sweep", str(cube), "remodeling.kappa=0.05:0.15:3", "-o", str(out), "-q"]
+        assert cli.main(words) == 0
+        said = capsys.readouterr().out
+        assert "remodeling.kappa 0.15" in said and f"results in {out}" in said
+        table = rows(out)
+        assert [float(row["remodeling.kappa"]) for row in table] == [0.05, 0.1, 0.15]
+        for row in table:
+            s = 1 - np.exp(-float(row["remodeling.kappa"]) * 19.0)
+            expected = np.degrees(np.arctan(np.sqrt(2) * (1 - s) / (1 - s + np.sqrt(3) * s)))
+            assert float(row["mean_fibre_angle"]) == pytest.approx(expected, abs=1e-5)
+        before = {path: path.stat().st_mtime_ns for path in out.glob("*/history.csv")}
+        assert cli.main([*words[:2], "remodeling.kappa=0.05:0.15:5", *words[3:]]) == 0
+    assert {path: path.stat().st_mtime_ns for path in before} == before
+    assert len(rows(out)) == 5 and len(list(out.glob("*/history.csv"))) == 5
+    assert (out / "sweep.png").stat().st_size > 10_000
+    assert status(out)[0] == f"{out}: sweep of cube, 5 runs: 5 finished"
+
+
+def test_a_run_that_fails_is_nan_and_named(cube: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Its folder's name is taken by a file."""
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "remodeling.kappa-0.1_loads.force.value-4").write_text("a file of the user's")
+    with forked_children():
+        words = ["remodeling.kappa=0.05,0.1", "loads.force.value=4:8:2", "-o", str(out), "-q"]
+        assert cli.main(["sweep", str(cube), *words]) == 3
+    assert "remodeling.kappa-0.1_loads.force.value-4 has failed: " in capsys.readouterr().err
+    angles = {(row["remodeling.kappa"], row["loads.force.value"]): row["mean_fibre_angle"] for row in rows(out)}
+    assert sorted(angles) == [("0.05", "4"), ("0.05", "8"), ("0.1", "4"), ("0.1", "8")]
+    assert [key for key, angle in angles.items() if not np.isfinite(float(angle or "nan"))] == [("0.1", "4")]
+
+
+def test_each_part_of_each_range_has_one_point() -> None:
+    """And another seed has others."""
+    ranges = {"a.b": (2.0, 6.0), "a.c": (-1.0, 1.0)}
+    points = latin_hypercube(ranges, 8)
+    for key, (low, high) in ranges.items():
+        parts = [int((float(point[key]) - low) / (high - low) * 8) for point in points]
+        assert sorted(parts) == list(range(8))
+    assert points == latin_hypercube(ranges, 8) != latin_hypercube(ranges, 8, seed=2)
+
+
+def test_whole_numbers_stay_whole() -> None:
+    assert read_axis("mesh.refinement=1:3:3") == ("mesh.refinement", [1, 2, 3])
+    assert read_axis("remodeling.kappa=0.1:0.3:3") == ("remodeling.kappa", [0.1, 0.2, 0.3])
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["remodeling.kappa"], "sweep 'remodeling.kappa': must be KEY=a:b:n"),
+        (["remodeling.kappa=1:2"], "sweep 'remodeling.kappa=1:2': must be KEY=a:b:n"),
+        (["remodeling.kappa=1:2:1"], "n is a whole number from 2 to 10000"),
+        (["remodeling.kappa=nan,1"], "sweep 'remodeling.kappa=nan,1': must be KEY=a:b:n"),
+        (["remodeling.kappa=1,1"], "a number is there twice"),
+        (["remodeling.kappa=1"], "sweep: 1 runs; allowed are 2 to 10000"),
+        (["remodeling.kapa=1,2"], "remodeling.kapa"),
+        (["remodeling.kappa=-1,2"], "remodeling.kappa = -1"),
+        (["remodeling.kappa=1,2", "remodeling.kappa=3,4"], "sweep remodeling.kappa: is there twice"),
+        (["remodeling.kappa=1:2:3", "--samples", "4"], "must be KEY=a:b with --samples"),
+        (["remodeling.kappa=1:2:9999", "time.end=1:2:9999"], "runs; allowed are at most 10000"),
+    ],
+)
+def test_bad_input_is_one_line(cube: Path, words: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Exit code 2, before any run."""
+    assert cli.main(["sweep", str(cube), *words, "-o", str(cube.parent / "out"), "-q"]) == 2
+    errors = capsys.readouterr().err
+    assert said in errors and errors.count("\n") == 1
+    assert not (cube.parent / "out").exists()
