@@ -106,13 +106,19 @@ def parser() -> argparse.ArgumentParser:
     text = "KEY=a:b:n (n numbers from a to b) or KEY=a,b,...; of several all combinations are run"
     sweep.add_argument("axes", nargs="+", metavar="KEY=a:b:n", help=text)
     text = "N points of a Latin hypercube in place of all combinations; then each key is KEY=a:b"
-    sweep.add_argument("--samples", type=positive, metavar="N", help=text)
+    sweep.add_argument("--latin", type=positive, metavar="N", help=text)
     sweep.add_argument("--seed", type=int, default=1, metavar="N", help="of the Latin hypercube (default: 1)")
     for study, name in ((ensemble, "ensemble"), (trade, "trade"), (sweep, "sweep")):
         text = "finished runs of the same scene that it holds are used, others go on"
         writes(study, f"folder (default: results/NAME-{name}); {text}")
         study.add_argument("--jobs", type=positive, metavar="N", help="runs at a time (default: as many as cores)")
-    for found in (run_command, stability, ensemble, trade, sweep):
+    fitting = scene_command("fit", "Fit numbers of a scene to measurements, with 95 % bands.")
+    text = "the unknowns, and tables of measurements (TOML), see docs/fit.md"
+    fitting.add_argument("data", type=Path, metavar="DATA", help=text)
+    writes(fitting, "new or empty folder (default: results/NAME-fit)")
+    text = "the given one, and others within a factor of two (default: 3)"
+    fitting.add_argument("--starts", type=positive, default=3, metavar="N", help=text)
+    for found in (run_command, stability, ensemble, trade, sweep, fitting):
         found.add_argument("-q", "--quiet", action="store_true", help="no progress")
     status = command("status", "Say where the run in DIR is, how fast, and whether it is alive.")
     status.add_argument("folder", type=Path, metavar="DIR", help="folder of a run")
@@ -351,18 +357,42 @@ def _sweep(options: argparse.Namespace) -> int:
 
         axes: dict[str, Any] = {}
         for text in options.axes:
-            key, numbers = study.read_axis(text, options.samples)
+            key, numbers = study.read_axis(text, options.latin)
             if key in axes:
                 raise SceneError(f"sweep {key}: is there twice")
             axes[key] = numbers
         if math.prod(map(len, axes.values())) > MOST_RUNS:
             raise SceneError(f"sweep: {math.prod(map(len, axes.values()))} runs; allowed are at most {MOST_RUNS}")
-        sampled = options.samples is not None
-        points = study.latin_hypercube(axes, options.samples, options.seed) if sampled else study.grid(axes)
+        sampled = options.latin is not None
+        points = study.latin_hypercube(axes, options.latin, options.seed) if sampled else study.grid(axes)
         folder, found = study.sweep(scene, points, options.output, options.jobs, options.quiet)
         return folder, study.in_words(found, scene), found.failed
 
     return _study(options, task)
+
+
+def _fit(options: argparse.Namespace) -> int:
+    def task(scene: Scene) -> tuple[Path, str, dict[str, str]]:
+        from remodel_fenicsx.results.run_folder import FolderTaken
+        from remodel_fenicsx.solver.continuation import StepFailure
+        from remodel_fenicsx.studies import fit as study
+
+        try:
+            folder, found = study.fit(scene, options.data, options.output, options.starts, options.quiet)
+        except FolderTaken as error:
+            raise SceneError(" ".join(str(error).split())) from error
+        except StepFailure as failure:
+            raise _NoStart(f"at the start of the fit {failure}. {failure.refusal}; choose other starts") from failure
+        return folder, study.in_words(found), {}
+
+    try:
+        return _study(options, task)
+    except _NoStart as failure:
+        return _fail(str(failure), SOLVE_FAILED)
+
+
+class _NoStart(Exception):  # noqa: N818
+    """A fit starts where the scene has no equilibrium."""
 
 
 def _end_all(message: str, code: int) -> int:
@@ -577,6 +607,7 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
     "ensemble": _ensemble,
     "trade": _trade,
     "sweep": _sweep,
+    "fit": _fit,
     "status": _status,
     "report": _report,
     "picture": _drawing,

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 from pydantic import BaseModel, Field
 from pydantic.fields import FieldInfo
+from pydantic_core import PydanticCustomError
 
 from remodel_fenicsx.schema.tables import allowed, fault, free_names, is_table, quoted, sections, shown
 
@@ -138,6 +139,29 @@ def keys_with_units(table: type[BaseModel]) -> Iterator[tuple[str, Dimension]]:
             if dimension is not None and path not in seen:
                 seen.add(path)
                 yield path, dimension
+
+
+def factor_to_scene(unit: str, dimension: Dimension, units: Mapping[str, str | None]) -> float:
+    """How many of the scene's units one of another unit is.
+
+    Parameters
+    ----------
+    unit
+        As "mmHg".
+    dimension
+        What it must measure.
+    units
+        The scene's unit by the key that chooses it; None where none is chosen.
+
+    Raises
+    ------
+    ValueError
+        If it is no unit of that dimension, or the scene has no unit to go to.
+    """
+    try:
+        return float(_number(f"1 {unit}", FieldInfo(annotation=float), dimension, units, "units"))
+    except PydanticCustomError as error:
+        raise ValueError(error.message()) from error
 
 
 def _number(

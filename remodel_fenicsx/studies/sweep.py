@@ -28,12 +28,12 @@ from remodel_fenicsx.system.environment import versions
 Array = NDArray[np.float64]
 Number = int | float
 
-NAME = "sweep"
+SWEEP = "sweep"
 NOT_SHOWN = ("time", "seconds", "newton_iterations", "linear_iterations", "substeps")
 PANEL_COLUMNS, PANEL_KEYS = 5, 3  # of the picture: what fits on a page
 MOST_LINES = 6  # in a panel; where there are more combinations of the other keys, points are drawn
 RULE = "must be KEY=a:b:n (n numbers from a to b) or KEY=a,b,..., as in natural.opening_angle=0:160:5"
-RANGE_RULE = "must be KEY=a:b with --samples, as in loads.pressure.value=2:6"
+RANGE_RULE = "must be KEY=a:b with --latin, as in loads.pressure.value=2:6"
 
 
 @dataclass(frozen=True)
@@ -170,7 +170,7 @@ def sweep(
     points
         Numbers by dotted key, for each run: `grid` or `latin_hypercube` make them.
     folder
-        Default: results/NAME-sweep. What is recorded there is not run again; runs that have stopped go on.
+        Default: results/SWEEP-sweep. What is recorded there is not run again; runs that have stopped go on.
     jobs
         Runs at a time; default: the number of cores.
     quiet
@@ -191,10 +191,10 @@ def sweep(
     OSError
         If a file cannot be written.
     """
-    place = Path(folder or Path("results") / f"{scene.name}-{NAME}")
+    place = Path(folder or Path("results") / f"{scene.name}-{SWEEP}")
     members = members_of(scene, points, place)
-    checked = partial(write_study, place, NAME, scene.name, members)
-    failed = run_all(members, jobs or cores(), f"{scene.name} {NAME}", quiet, checked=checked)
+    checked = partial(write_study, place, SWEEP, scene.name, members)
+    failed = run_all(members, jobs or cores(), f"{scene.name} {SWEEP}", quiet, checked=checked)
     found = gathered(members, points, failed)
     draw(found, place, scene)
     return place, found
@@ -261,7 +261,9 @@ def _at(found: Sweep, run: int) -> str:
 def draw(found: Sweep, folder: Path, scene: Scene) -> None:
     """Write sweep.csv and sweep.png."""
     title = f"{scene.name}: the last row of {len(found.names)} runs"
-    page = Page(folder, NAME, title, "Each point is the end of one run; lines join runs whose other numbers are equal.")
+    page = Page(
+        folder, SWEEP, title, "Each point is the end of one run; lines join runs whose other numbers are equal."
+    )
     made_with = ", ".join(f"{name} {version}" for name, version in versions().items() if name != "BLAS")
     page.save_table({**found.values, **found.columns}, [title, made_with])
     columns, keys = shown_columns(found, scene), list(found.values)[:PANEL_KEYS]

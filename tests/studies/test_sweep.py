@@ -93,7 +93,7 @@ def test_whole_numbers_stay_whole() -> None:
         (["remodeling.kapa=1,2"], "remodeling.kapa"),
         (["remodeling.kappa=-1,2"], "remodeling.kappa = -1"),
         (["remodeling.kappa=1,2", "remodeling.kappa=3,4"], "sweep remodeling.kappa: is there twice"),
-        (["remodeling.kappa=1:2:3", "--samples", "4"], "must be KEY=a:b with --samples"),
+        (["remodeling.kappa=1:2:3", "--latin", "4"], "must be KEY=a:b with --latin"),
         (["remodeling.kappa=1:2:9999", "time.end=1:2:9999"], "runs; allowed are at most 10000"),
     ],
 )

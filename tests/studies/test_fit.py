@@ -1,0 +1,189 @@
+"""Numbers of a scene from measurements: recovered from own rows, blind directions named, bad data refused."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from remodel_fenicsx import Scene, SceneError, Simulation, cli, preset_scene, read_scene
+from remodel_fenicsx.settings import STRESS_UNITS
+from remodel_fenicsx.studies.fit import Problem, fit
+from remodel_fenicsx.studies.measured import read_measurements
+
+TRUTH = {"material.lame_mu": 3.0, "material.chain_density": 2e21, "remodeling.kappa": 0.05}
+PRESSURES = [0.2, 0.4, 0.6, 0.8, 1.0, 1.2]
+
+PER_MMHG = STRESS_UNITS[preset_scene("kuhl-holzapfel-2007", "tube").material.stress_unit] / 133.322387415
+
+
+def tube(**changes: Any) -> Scene:
+    """A thin tube of isotropic cells on one radius, with the true numbers."""
+    values = {
+        "cells.initial": "isotropic", "model.kinematics": "radial", "geometry.outer_radius": 1.3, "mesh.degree": 2,
+        "loads.pressure.value": 1.2, "remodeling.law": "tensor", "time.end": 40.0, "geometry.length_unit": "mm",
+    }  # fmt: skip
+    return preset_scene("kuhl-holzapfel-2007", "tube").with_values(values | TRUTH | changes)
+
+
+def rows(scene: Scene) -> list[dict[str, float]]:
+    """Of the steps after t = 0."""
+    simulation = Simulation(scene, MPI.COMM_SELF)
+    try:
+        return [step.row for step in simulation.steps() if step.time > 0]
+    finally:
+        simulation.close()
+
+
+def inflated() -> list[dict[str, float]]:
+    """Virgin tissue under rising pressure at once with the whole elongation."""
+    ramp = [[0.0, 0.0], *([number + 1.0, p / 1.2] for number, p in enumerate(PRESSURES))]
+    changes = {"remodeling.law": "none", "time.end": 6.0, "loads.pressure.ramp": ramp}
+    return rows(tube(**changes, **{"loads.elongation.ramp": [[0.0, 0.0], [1.0, 1.0]]}))
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Scene, tables of the model's own rows, and what is to be fitted, from starts that are off by a third."""
+    (tmp_path / "scene.toml").write_text(tube().to_toml())
+    with (tmp_path / "virgin.csv").open("w") as file:
+        out = csv.writer(file)
+        out.writerow(["pressure", "outer_radius"])
+        out.writerows([p * PER_MMHG, row["outer_radius"]] for p, row in zip(PRESSURES, inflated(), strict=True))
+    with (tmp_path / "history.csv").open("w") as file:
+        out = csv.writer(file)
+        out.writerow(["time", "fibre_angle_outer", "inner_radius"])
+        kept = [row for row in rows(tube()) if row["time"] in (10.0, 20.0, 30.0, 40.0)]
+        out.writerows([row["time"], row["fibre_angle_outer"], row["inner_radius"]] for row in kept)
+    (tmp_path / "data.toml").write_text(DATA)
+    return tmp_path
+
+
+DATA = """
+[unknowns]
+"material.lame_mu" = { start = 4.0 }
+"material.chain_density" = { start = 1.5e21, lower = 1e20, upper = 1e23 }
+"remodeling.kappa" = { start = 0.035 }
+
+[[measured]]
+file = "virgin.csv"
+units = { pressure = "mmHg" }
+sd = { outer_radius = 0.01 }
+
+[[measured]]
+file = "history.csv"
+state = "history"
+sd = { fibre_angle_outer = 2.0, inner_radius = 0.01 }
+"""
+
+
+def test_the_numbers_that_made_the_data_are_found(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """From each start; the tables, the picture and a scene that runs are there."""
+    out = folder / "out"
+    words = ["fit", str(folder / "scene.toml"), str(folder / "data.toml"), "-o", str(out), "--starts", "2", "-q"]
+    assert cli.main(words) == 0
+    said = capsys.readouterr().out
+    assert "2 of 2 starts end in this minimum" in said
+    with (out / "fit.csv").open() as file:
+        table = list(csv.DictReader(line for line in file if not line.startswith("#")))
+    assert [row["key"] for row in table] == list(TRUTH)
+    for row in table:
+        assert float(row["value"]) == pytest.approx(TRUTH[row["key"]], rel=1e-3)
+        assert float(row["lower"]) < float(row["value"]) < float(row["upper"])
+    fitted = read_scene(out / "scene.toml")
+    assert fitted.material.lame_mu == pytest.approx(3.0, rel=1e-3) and fitted.time.end == 40.0
+    assert (out / "fit.png").stat().st_size > 10_000
+    assert cli.main(words) == 2 and "out" in capsys.readouterr().err  # nothing of the user's is written over
+
+
+def test_bands_have_the_width_of_the_noise(folder: Path) -> None:
+    """Twice the standard deviations, twice the logarithmic bands; they cover the truth of noisy data."""
+    path, scene = folder / "data.toml", read_scene(folder / "scene.toml")
+    one = fit(scene, path, folder / "one", starts=1)[1]
+    path.write_text(DATA.replace("= 0.01", "= 0.02").replace("= 2.0,", "= 4.0,"))
+    two = fit(scene, path, folder / "two", starts=1)[1]
+    np.testing.assert_allclose(np.log(two.upper / two.lower), 2 * np.log(one.upper / one.lower), rtol=1e-2)
+
+
+def test_a_passive_test_of_remodeled_tissue(folder: Path) -> None:
+    """Cells of t = 40 that stay: at the loads of the run's own end it has the radii of the run's own next row."""
+    end = tube(**{"time.end": 41.0})
+    expected = rows(end)[-1]
+    (folder / "after.csv").write_text("pressure,outer_radius,inner_radius\n0.6,1.4,1.2\n1.2,1.4,1.2\n")
+    (folder / "after.toml").write_text(
+        """
+[unknowns]
+"material.lame_mu" = { start = 3.0 }
+
+[[measured]]
+file = "after.csv"
+state = "after"
+time = 40.0
+sd = { outer_radius = 0.01, inner_radius = 0.01 }
+"""
+    )
+    problem = Problem(end, *read_measurements(folder / "after.toml", end))
+    found = problem.models(np.log([3.0]))[0]
+    assert found["outer_radius"][-1] == pytest.approx(expected["outer_radius"], rel=1e-8)
+    assert found["inner_radius"][-1] == pytest.approx(expected["inner_radius"], rel=1e-8)
+    virgin = inflated()[-1]
+    assert abs(found["inner_radius"][-1] - virgin["inner_radius"]) > 1e-3  # and not those of virgin tissue
+
+
+def test_what_the_data_cannot_tell_apart_is_named(folder: Path) -> None:
+    """Only n / A_p is in the energy; without a force all moduli go with the scale of the pressure."""
+    scene = read_scene(folder / "scene.toml")
+    virgin = '[[measured]]\nfile = "virgin.csv"\nsd = { outer_radius = 0.01 }\nunits = { pressure = "mmHg" }\n'
+    path = folder / "blind.toml"
+    path.write_text(
+        '[unknowns]\n"material.chain_density" = { start = 1e21 }\n"material.persistence_length" = { start = 1.82 }\n'
+        + virgin
+    )
+    with pytest.raises(SceneError, match=r"tell apart material.chain_density \(.0.71\), material.persistence_length"):
+        fit(scene, path, folder / "blind")
+    moduli = "".join(f'"material.{name}" = {{ start = {getattr(scene.material, name)} }}\n' for name in MODULI)
+    path.write_text(f'[unknowns]\n{moduli}{virgin}scale = {{ pressure = "unknown" }}\n')
+    with pytest.raises(SceneError, match=r"tell apart .*lame_mu.*chain_density.*scale.pressure"):
+        fit(scene, path, folder / "blind")
+    assert not (folder / "blind").exists()
+
+
+MODULI = ("lame_lambda", "lame_mu", "chain_density")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ('"mmHg"', '"mm"', "measured 1.units.pressure = 'mm': "),
+        ('"mmHg"', '"nonsense"', "'nonsense' is no unit of stress"),
+        ("virgin.csv", "none.csv", "measured 1.file = 'none.csv': "),
+        ("virgin.csv", "bad.csv", "measured 1.file = 'bad.csv': row 2, outer_radius: 'nan' is no number"),
+        ("virgin.csv", "short.csv", "measured 1.file = 'short.csv': row 1 has 1 numbers, not 2"),
+        ("virgin.csv", "other.csv", "'diameter' is no load of the scene and no column; allowed are "),
+        ("sd = { outer_radius = 0.01 }", "sd = {}", "measured 1.sd: has no outer_radius"),
+        ("sd = { outer_radius = 0.01 }", "sd = { outer_radius = -1 }", "measured 1.sd.outer_radius = -1: must be a "),
+        ("sd = { outer_radius = 0.01 }", "sd = { radius = 1.0 }", "measured 1.sd.radius: the file has no such column"),
+        ("lower = 1e20", "lower = 2e21", "must lie between lower 2e+21 and upper 1e+23"),
+        ("material.lame_mu", "material.lame", "material.lame"),
+        ('state = "history"', 'state = "past"', "measured 2.state = 'past': must be one of 'virgin'"),
+        ('state = "history"', 'state = "after"', "measured 2.time: goes with state = 'after'"),
+        ("start = 4.0", "start = 4.0, prior = 3.0", "prior and prior_sd (of the logarithm) go together"),
+        ("[unknowns]", "[unknown]", "'unknown': no such key; allowed are unknowns, measured"),
+    ],
+)
+def test_bad_data_is_one_line(folder: Path, old: str, new: str, said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Exit code 2, before any solve, and nothing is written."""
+    (folder / "bad.csv").write_text("pressure,outer_radius\n1,1.3\n2,nan\n")
+    (folder / "short.csv").write_text("pressure,outer_radius\n1\n")
+    (folder / "other.csv").write_text("pressure,diameter\n1,1.3\n2,1.4\n")
+    assert old in DATA
+    (folder / "data.toml").write_text(DATA.replace(old, new, 1))
+    words = ["fit", str(folder / "scene.toml"), str(folder / "data.toml"), "-o", str(folder / "out"), "-q"]
+    assert cli.main(words) == 2
+    errors = capsys.readouterr().err
+    assert said in errors and errors.count("\n") == 1, errors
+    assert not (folder / "out").exists()
