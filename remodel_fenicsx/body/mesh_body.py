@@ -229,6 +229,8 @@ class MeshBody(WalledMesh):
             numbers = []
             for entry in self.faces.get(face, (face,)):
                 number = names.get(entry) if isinstance(entry, str) else entry
+                if isinstance(entry, str) and number is not None and number not in there:
+                    raise SceneError(f"geometry.faces.{face} = {shown(entry)}: this face of the file has no elements")
                 if number is None or number not in there:
                     rule = f"the file has no such face; it has {listed or 'none'}"
                     raise SceneError(f"geometry.faces.{face} = {shown(entry)}: {rule}")
