@@ -15,7 +15,7 @@ WALL_TOLERANCE, POLYGON_TOLERANCE = 0.08, 0.2
 
 
 def known(scene: Values) -> bool:
-    """Whether the reference can do it: axes that stay, the repulsions that agree then, equal steps, paired by rank."""
+    """Whether the reference can do it: axes that stay, no residual stress, repulsions that agree, equal steps, sorted."""
     r, g, time = scene["remodeling"], scene["geometry"]["shape"], scene["time"]
     lags = r["coupling"] == "relaxed" and r["law"] in ("rate", "relaxation")  # slower than its law says
     # across a bar two values agree: which of them has which rank matters where the old cells tell x from y, and stay
@@ -23,7 +23,7 @@ def known(scene: Values) -> bool:
     return (
         r["law"] != "rotation" and not lags and (r["pairing"] == "sorted" or r["law"] in ("tensor", "none"))
         and "tolerance" not in time and time["end"] != "equilibrium" and scene["material"]["repulsion"] != "length"
-        and scene["cells"]["initial"] != "random"
+        and scene["cells"]["initial"] != "random" and "natural" not in scene
         and scene["cells"]["axes"] == ("cylindrical" if g == "tube" else "global")
         and (g != "tube" or scene["supports"]["ends"] == "free" and "axial_force" not in scene["loads"])
     )  # fmt: skip

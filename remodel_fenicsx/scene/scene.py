@@ -324,9 +324,6 @@ class Scene(Table):
             (self.cells.initial == "isotropic", "cells.initial", "'isotropic'"),
             (self.cells.axes == "cylindrical", "cells.axes", "'cylindrical'"),
             (self.mesh.formulation == "displacement", "mesh.formulation", "'displacement'"),
-            (self.remodeling.coupling == "staggered", "remodeling.coupling", "'staggered'"),
-            (not self.time.is_equilibrium, "time.end", "a time"),
-            (self.time.tolerance is None, "time.tolerance", "none: steps of one length"),
         ):
             if not has:
                 raise fault(f"must be 0 unless {key} is {needed}", "natural.opening_angle", angle)
