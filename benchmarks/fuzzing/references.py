@@ -15,7 +15,7 @@ WALL_TOLERANCE, POLYGON_TOLERANCE = 0.08, 0.2
 
 
 def known(scene: Values) -> bool:
-    """Whether the reference can do it: axes that stay, no residual stress, repulsions that agree, equal steps, sorted."""
+    """Whether the reference can do it: axes that stay, no residual stress, equal steps, sorted values."""
     r, g, time = scene["remodeling"], scene["geometry"]["shape"], scene["time"]
     lags = r["coupling"] == "relaxed" and r["law"] in ("rate", "relaxation")  # slower than its law says
     # across a bar two values agree: which of them has which rank matters where the old cells tell x from y, and stay
