@@ -173,6 +173,20 @@ class Material(Table):
         gt=0,
         description="Persistence length A_p of a chain, its bending stiffness over k theta, in link lengths.",
     )
+    initial_stiffness: Annotated[float | None, STRESS] = Field(
+        default=None,
+        gt=0,
+        description="In place of chain_density: slope of the network's nominal stress over the stretch along aligned "
+        "chains at stretch 1, c r0^2 (d(g r)/dr + g) at r0, in stress_unit. A scene as run has chain_density.",
+        json_schema_extra={"allowed": "a finite number greater than 0"},
+    )
+    locking_stretch: float | None = Field(
+        default=None,
+        gt=1,
+        description="In place of contour_length: stretch L / r0 along aligned chains at which they lock. A scene as "
+        "run has contour_length.",
+        json_schema_extra={"allowed": "a finite number greater than 1"},
+    )
     temperature: Annotated[float, TEMPERATURE] = Field(
         default=310.0, gt=0, description="Absolute temperature theta, in K."
     )
@@ -436,6 +450,13 @@ class Remodeling(Table):
     kappa: float = Field(
         default=0.025, ge=0, description="Speed of remodeling kappa, in 1/time; a difference fades like exp(-kappa t)."
     )
+    half_life: float | None = Field(
+        default=None,
+        gt=0,
+        description="In place of kappa: time after which half of a difference is left, ln 2 / kappa. A scene as run "
+        "has kappa.",
+        json_schema_extra={"allowed": "a finite number greater than 0"},
+    )
     rotation_time: float = Field(
         default=40.0,
         gt=0,
@@ -497,6 +518,8 @@ class RegionMaterial(Table):
     chain_density: float | None = _as_in(Material, "chain_density", "material")
     contour_length: float | None = _as_in(Material, "contour_length", "material")
     persistence_length: float | None = _as_in(Material, "persistence_length", "material")
+    initial_stiffness: float | None = _as_in(Material, "initial_stiffness", "material")
+    locking_stretch: float | None = _as_in(Material, "locking_stretch", "material")
     temperature: float | None = _as_in(Material, "temperature", "material")
 
 
@@ -514,6 +537,7 @@ class RegionRemodeling(Table):
     """Keys of `[remodeling]` that are others in the region; the law is one for the whole body."""
 
     kappa: float | None = _as_in(Remodeling, "kappa", "remodeling")
+    half_life: float | None = _as_in(Remodeling, "half_life", "remodeling")
 
 
 class Region(Table):

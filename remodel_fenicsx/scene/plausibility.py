@@ -29,14 +29,14 @@ def doubts(
     end
         Last time.
     """
-    network = initial_stiffness(material, end_to_end_length)
+    network = chain_stress(material, end_to_end_length)
     found = [*_of_material(material, network), *_of_lengths(geometry)]
     for name, load in loads.items():
         found += _of_load(name, load.largest(end), material, geometry, network)
     return found
 
 
-def initial_stiffness(material: Material, end_to_end_length: float) -> float:
+def chain_stress(material: Material, end_to_end_length: float) -> float:
     """c g(r0) r0^2, in stress_unit: whatever the unit of chain lengths; 0 without chains."""
     tissue = material.tissue(end_to_end_length)
     return float(tissue.repulsion_modulus * end_to_end_length**2) if tissue.chain is not None else 0.0

@@ -97,8 +97,8 @@ _PAPER = {
 }
 
 # Lengths in nm. r0 is the root mean square end-to-end length of the free chain,
-# sqrt(2 A_p L (1 - A_p/L (1 - e^(-L/A_p)))), and the density makes c g(r0) r0^2, the initial stiffness of
-# the network, that of the paper's tendon and artery.
+# sqrt(2 A_p L (1 - A_p/L (1 - e^(-L/A_p)))), and the density makes c g(r0) r0^2, the stress of the chains
+# at rest, that of the paper's tendon and artery.
 _MEASURED_COLLAGEN = {"chain_density": 9.0e20, "contour_length": 309.0, "persistence_length": 14.5}
 _FREE_CHAIN = 92.4
 

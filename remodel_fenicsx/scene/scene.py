@@ -23,6 +23,7 @@ from remodel_fenicsx.model.chains import CHAINS
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
 from remodel_fenicsx.model.energy import MATRICES, REPULSIONS, Matrix
 from remodel_fenicsx.model.laws import LAWS
+from remodel_fenicsx.scene.experiments import check_exclusive, with_own_numbers, without_replaced
 from remodel_fenicsx.scene.plausibility import doubts, largest_stress
 from remodel_fenicsx.scene.presets import EXACT, PRESETS, PROFILES, default_method
 from remodel_fenicsx.schema.tables import SceneError, Table, VariantOf, allowed, fault, quoted, shown
@@ -113,6 +114,7 @@ class Scene(Table):
         if not isinstance(values, dict):
             return handler(values)
         own = _with_measured_cells(_in_present_format(_plain(values)))
+        check_exclusive(own)
         preset, profile = own.get("preset"), own.get("profile")
         if preset is not None:
             _check_name("preset", preset, PRESETS)
@@ -129,7 +131,7 @@ class Scene(Table):
         if profile is not None:
             _check_name("profile", profile, PROFILES)
             base = merged(base, PROFILES[profile].tables())
-        values = _in_own_units(merged(base, own), SHAPES[shape])
+        values = with_own_numbers(_in_own_units(merged(base, own), SHAPES[shape]))
         scene = handler(values)
         if profile is not None and PROFILES[profile].takes_exact_coupling and scene.has_exact_coupling:
             if "coupling" not in own.get("remodeling", {}):
@@ -372,6 +374,7 @@ class Scene(Table):
         values = _plain({name: getattr(self, name) for name in type(self).model_fields}, every_value=True)
         for key, value in changes.items():
             put(values, key, value)
+        without_replaced(values, changes)
         return type(self)(**values)
 
     def to_toml(self, header: str = "") -> str:

@@ -687,11 +687,11 @@ def test_collagen_as_measured():
     assert built.cells.end_to_end_length == pytest.approx(free_chain, abs=0.05)
     paper = preset_scene("kuhl-holzapfel-2007", "tendon")
 
-    def initial_stiffness(scene):
+    def chain_stress(scene):
         material, r0 = scene.material, scene.cells.end_to_end_length
         return material.network_modulus * wormlike_stiffness(r0, material.contour_length) * r0**2
 
-    assert initial_stiffness(built) == pytest.approx(initial_stiffness(paper), rel=0.01)
+    assert chain_stress(built) == pytest.approx(chain_stress(paper), rel=0.01)
 
 
 def test_the_presets_keys_lie_under_the_scenes():
