@@ -310,7 +310,7 @@ class _Report(Watcher):
 
     def __init__(self, scene: Scene, progress: Progress):
         self.progress, self.time = progress, scene.time
-        self.loads = [kind.column or name for name, kind in scene.geometry.loads.items()]
+        self.loads = [kind.column or name for name, kind in scene.load_kinds.items()]
 
     def committed(self, step: Step) -> None:
         """Say it."""

@@ -594,6 +594,8 @@ def _ramp(value: Any) -> tuple[tuple[float, float], ...]:
 class Load(Table):
     """A load by name: `force` of cube and tendon, `pressure` and `elongation` of a tube; zero if it is not listed.
 
+    An own body (shape `'mesh'`) may have further ones under names of your choice, each on one of its faces.
+
     `force` is the total dead force along z on the top; `pressure` acts on the deformed inner face; `elongation` is the
     prescribed engineering strain of the length (0.1: 10 % longer). A tube with `axial_force` in place of `elongation`
     has a length that is an unknown.
@@ -609,6 +611,25 @@ class Load(Table):
         "time.tolerance they are hit.",
         json_schema_extra={"allowed": "a list of pairs [time, factor] with increasing times"},
     )
+
+    kind: Literal["pressure"] | None = Field(
+        default=None,
+        description="Of a further load of an own body: 'pressure', against the deformed face's outward normal.",
+        json_schema_extra={"allowed": "'pressure'"},
+    )
+    face: str | None = Field(
+        default=None,
+        min_length=1,
+        description="The face that a further load of an own body acts on.",
+        json_schema_extra={"allowed": "the name of a face"},
+    )
+
+    @model_validator(mode="after")
+    def _kind_and_face(self) -> Load:
+        for given, missing in (("kind", "face"), ("face", "kind")):
+            if getattr(self, given) is not None and getattr(self, missing) is None:
+                raise fault(f"missing; {given} = {shown(getattr(self, given))} needs it", missing, None)
+        return self
 
     def factor(self, time: float) -> float:
         """Factor on the value at a time: piecewise linear, held before the first and after the last pair."""
@@ -626,6 +647,15 @@ class Load(Table):
         """The value of largest magnitude from time 0 to `end`, with its sign."""
         times = [end, *(time for time, _ in self.ramp if time < end)]
         return max((self.value * self.factor(time) for time in times), key=abs)
+
+
+def faces_of(loads: Mapping[str, Any]) -> dict[str, str]:
+    """Of the further loads among a scene's by name, tables as they were read or as they are."""
+    found = {
+        name: load.get("face") if isinstance(load, Mapping) else getattr(load, "face", None)
+        for name, load in loads.items()
+    }
+    return {name: face for name, face in found.items() if isinstance(face, str)}
 
 
 EQUILIBRIUM = "equilibrium"

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Iterable, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from remodel_fenicsx.settings import faces_of
 
 if TYPE_CHECKING:  # a shape has columns
     from remodel_fenicsx.body.shape import Shape
@@ -199,8 +201,8 @@ def columns_of(
     requested
         Names that a scene's `output.columns` gives.
     loads
-        Names of the loads that there are; default: all of the shape's. The column of a load that frees the length of
-        the body is on request where it is not among them.
+        The loads that there are by name, or their names; default: all of the shape's. The column of one that frees the
+        length of the body is on request where it is not among them.
     regions
         Names of the scene's regions.
 
@@ -209,9 +211,10 @@ def columns_of(
     KeyError
         If a column that is requested does not exist.
     """
+    kinds = shape.loads_on(faces_of(loads) if isinstance(loads, Mapping) else {})
     of_loads = (
         kind.make_column(name)
-        for name, kind in shape.loads.items()
+        for name, kind in kinds.items()
         if not kind.frees_length or loads is None or name in loads or kind.column_name(name) in requested
     )
     always = (FIRST_COLUMN, *of_loads)

@@ -20,7 +20,7 @@ from remodel_fenicsx.body.shape import LoadKind
 from remodel_fenicsx.body.walled import WalledMesh
 from remodel_fenicsx.schema.tables import SceneError, fault, shown
 from remodel_fenicsx.schema.units import LENGTH_UNITS, STRESS
-from remodel_fenicsx.settings import Mesh, Support
+from remodel_fenicsx.settings import Load, Mesh, Support, faces_of
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+HELD_ACROSS = ("guided", "sliding", "held")  # kinds of support that leave a face no motion along its normal
 ROLES = ("inner", "outer", "inlet", "outlet")
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}
 Names = tuple[str | int, ...]
@@ -264,16 +265,28 @@ class MeshBody(WalledMesh):
     def hold(self, loading: Loading) -> None:
         """By its faces alone (`hold_faces`)."""
 
+    @classmethod
+    def loads_on(cls, faces: Mapping[str, str]) -> dict[str, LoadKind]:
+        """Pressures on faces beside its own loads; `hold_faces` adds them."""
+        return cls.loads | {
+            name: LoadKind(lambda shape, loading, name: None, f"pressure on the deformed face {face}", STRESS)
+            for name, face in faces.items()
+        }
+
+    def fills(self, regions: Collection[str]) -> bool:
+        """Whether they are all volumes of the file."""
+        return bool(regions) and set(self._regions(self._read())) <= set(regions)
+
     def hold_faces(
-        self, loading: Loading, supports: Mapping[str, Support], modulus: float, loads: Collection[str] = ()
+        self, loading: Loading, supports: Mapping[str, Support], modulus: float, loads: Mapping[str, Load]
     ) -> None:
-        """Hold them as a scene says, inlet and outlet guided where it does not. Collective.
+        """Hold them as a scene says, inlet and outlet guided where it does not; add pressures on them. Collective.
 
         Raises
         ------
         SceneError
-            On all ranks: if there is no such face, if the body can move as a whole, or if ends that slide can not be
-            pulled apart.
+            On all ranks: if there is no such face, if the body can move as a whole, if ends that slide can not be
+            pulled apart, or if a support takes all of a pressure.
         """
         from remodel_fenicsx.body.mesh_supports import GUIDE, add_support, check_supports
 
@@ -293,3 +306,12 @@ class MeshBody(WalledMesh):
             add_support(loading, name, support, GUIDE * modulus / domain.thickness, moves)
         if "elongation" not in loading.values:
             loading.leave_out("elongation")
+        for name, face in faces_of(loads).items():
+            key, kind = f"loads.{name}.face = {shown(face)}", chosen.get(face, Support(kind="free")).kind
+            if face not in domain.faces:
+                raise SceneError(f"{key}: the body has no such face; it has {', '.join(domain.faces)}")
+            if kind in HELD_ACROSS:
+                raise SceneError(
+                    f"{key}: its support ({kind!r}) takes all of the pressure; allowed are faces that move"
+                )
+            loading.add_follower_pressure(name, face)

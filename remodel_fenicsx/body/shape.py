@@ -22,7 +22,7 @@ from remodel_fenicsx.model.cells import angle_to_axis
 from remodel_fenicsx.model.local_axes import LocalAxes
 from remodel_fenicsx.schema.tables import Table, fault
 from remodel_fenicsx.schema.units import Dimension, LengthUnit
-from remodel_fenicsx.settings import LARGEST_MESH, Mesh, Region, Support
+from remodel_fenicsx.settings import LARGEST_MESH, Load, Mesh, Region, Support
 
 if TYPE_CHECKING:  # shapes are part of every scene: they are read without dolfinx
     from mpi4py import MPI
@@ -259,8 +259,23 @@ class Shape(Table):
             else:
                 kind.add(self, loading, name)
 
+    def fills(self, regions: Collection[str]) -> bool:
+        """Whether these regions of a scene, by name, are all of the body."""
+        return self.is_filled_by_regions and bool(regions)
+
+    @classmethod
+    def loads_on(cls, faces: Mapping[str, str]) -> dict[str, LoadKind]:
+        """All loads by name: its own, and those that a scene puts on faces, where the shape `holds_faces`.
+
+        Parameters
+        ----------
+        faces
+            Of the scene's further loads by name (`faces_of`).
+        """
+        return cls.loads
+
     def hold_faces(
-        self, loading: Loading, supports: Mapping[str, Support], modulus: float, loads: Collection[str] = ()
+        self, loading: Loading, supports: Mapping[str, Support], modulus: float, loads: Mapping[str, Load]
     ) -> None:
         """Hold faces as `[supports.NAME]` says, where the shape `holds_faces`.
 

@@ -194,7 +194,7 @@ class Sight:
         scene, found = self.recording.scene, []
         row = np.flatnonzero([same_time(recorded, time) for recorded in self.history["time"]])
         for name in scene.loads:
-            column = scene.geometry.loads[name].make_column(name)
+            column = scene.load_kinds[name].make_column(name)
             if len(row) and column.name in self.history:
                 value = with_unit(float(self.history[column.name][row[0]]), unit_of(scene, column.unit))
                 found.append(f"{words(column.name)} {value}")

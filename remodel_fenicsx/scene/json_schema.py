@@ -16,7 +16,7 @@ from remodel_fenicsx.body import SHAPES, Shape
 from remodel_fenicsx.scene.presets import PRESETS, PROFILES
 from remodel_fenicsx.scene.scene import FORMAT, Scene
 from remodel_fenicsx.schema.tables import choices, free_names, is_table
-from remodel_fenicsx.schema.units import QUANTITY, Dimension, dimension_of
+from remodel_fenicsx.schema.units import QUANTITY, STRESS, Dimension, dimension_of
 from remodel_fenicsx.settings import Load, Supports
 
 Schema = dict[str, Any]
@@ -97,7 +97,7 @@ def _of_shape(shape: type[Shape]) -> Schema:
     loads = {load: _load(kind.meaning, kind.dimension) for load, kind in shape.loads.items()}
     tables = {
         "geometry": geometry,
-        "loads": {"type": "object", "properties": loads, "additionalProperties": False},
+        "loads": {"type": "object", "properties": loads, "additionalProperties": _load_on_face(shape)},
         "supports": {"properties": {"ends": {"enum": list(shape.ends)}}}
         | ({} if shape.holds_faces else {"propertyNames": {"enum": list(Supports.model_fields)}}),
         "cells": {"properties": {"axes": {"enum": list(shape.axis_kinds)}}},
@@ -110,9 +110,19 @@ def _of_shape(shape: type[Shape]) -> Schema:
 
 def _load(meaning: str, dimension: Dimension | None) -> Schema:
     table = _table(Load)
-    value = table["properties"]["value"]
-    table["properties"]["value"] = _with_unit(value, dimension) if dimension else value
-    return table | {"description": meaning}
+    keys = {name: entry for name, entry in table["properties"].items() if name not in ("kind", "face")}
+    if dimension:
+        keys["value"] = _with_unit(keys["value"], dimension)
+    return table | {"properties": keys, "description": meaning}
+
+
+def _load_on_face(shape: type[Shape]) -> Schema | bool:
+    """A further load of an own body, where the shape has such."""
+    if not shape.holds_faces:
+        return False
+    table = _table(Load)
+    keys = table["properties"] | {"value": _with_unit(table["properties"]["value"], STRESS)}
+    return table | {"properties": keys, "required": ["kind", "face", "value", "ramp"]}
 
 
 def _required(table: type[BaseModel]) -> Schema:

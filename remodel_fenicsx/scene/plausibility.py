@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 
-from remodel_fenicsx.body import Shape
+from remodel_fenicsx.body import LoadKind, Shape
 from remodel_fenicsx.schema.units import FORCE, STRESS
-from remodel_fenicsx.settings import STRESS_UNITS, Load, Material
+from remodel_fenicsx.settings import STRESS_UNITS, Load, Material, faces_of
 
 # Decades in which a ratio may lie. Units differ by a thousand and more, choices seldom by a hundred.
 NETWORK = (-2, 2)  # initial stiffness of the network over that of the matrix; the paper's bodies: 1.1 and 1.5
@@ -30,9 +30,9 @@ def doubts(
         Last time.
     """
     network = chain_stress(material, end_to_end_length)
-    found = [*_of_material(material, network), *_of_lengths(geometry)]
+    found, kinds = [*_of_material(material, network), *_of_lengths(geometry)], geometry.loads_on(faces_of(loads))
     for name, load in loads.items():
-        found += _of_load(name, load.largest(end), material, geometry, network)
+        found += _of_load(name, kinds[name], load.largest(end), material, geometry, network)
     return found
 
 
@@ -42,12 +42,11 @@ def chain_stress(material: Material, end_to_end_length: float) -> float:
     return float(tissue.repulsion_modulus * end_to_end_length**2) if tissue.chain is not None else 0.0
 
 
-def largest_stress(name: str, value: float, geometry: Shape) -> float | None:
+def largest_stress(kind: LoadKind, value: float, geometry: Shape) -> float | None:
     """Of a load: a stress itself, or a force over its area; None of an elongation."""
-    dimension = geometry.loads[name].dimension
-    if dimension == FORCE:
+    if kind.dimension == FORCE:
         return value / geometry.loaded_area
-    return value if dimension == STRESS else None
+    return value if kind.dimension == STRESS else None
 
 
 def _of_material(material: Material, network: float) -> Iterator[str]:
@@ -73,11 +72,13 @@ def _of_lengths(geometry: Shape) -> Iterator[str]:
             yield f"geometry.{key} = {value:g}: {words} is {ratio:.3g}; {unit}"
 
 
-def _of_load(name: str, value: float, material: Material, geometry: Shape, network: float) -> Iterator[str]:
-    kind, key = geometry.loads[name], f"loads.{name}.value"
+def _of_load(
+    name: str, kind: LoadKind, value: float, material: Material, geometry: Shape, network: float
+) -> Iterator[str]:
+    key = f"loads.{name}.value"
     if kind.doubtful is not None and abs(value) >= kind.doubtful[0]:
         yield f"{key}: {value:g} at its largest; {kind.doubtful[1]}"
-    stress = largest_stress(name, value, geometry)
+    stress = largest_stress(kind, value, geometry)
     if not stress:
         return
     ratio = abs(stress) / (material.lame_mu + network)

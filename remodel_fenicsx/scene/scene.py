@@ -15,6 +15,7 @@ from typing import Annotated, Any, ClassVar
 from pydantic import BaseModel, BeforeValidator, Field, ModelWrapValidatorHandler, SerializeAsAny, model_validator
 
 from remodel_fenicsx.body import SHAPES, Shape
+from remodel_fenicsx.body.shape import LoadKind
 from remodel_fenicsx.body.columns import Column, columns_of, columns_of_region, columns_on_request
 from remodel_fenicsx.body.reductions import AUTO, objections
 from remodel_fenicsx.fem.formulations import FORMULATIONS
@@ -46,9 +47,11 @@ from remodel_fenicsx.settings import (
     Solver,
     Supports,
     Time,
+    faces_of,
     nearest_multiples,
 )
 
+NAME = r"[A-Za-z][A-Za-z0-9_]{0,39}"  # of a region or a further load: part of the name of a column
 FORMAT = 2  # of recorded scenes: raised where a reader of the one before would not understand them
 RENAMED = {"mesh.cell": "mesh.element", "loads.stretch": "loads.elongation", "solver.profile": "solver.method"}
 """Dotted key of an earlier format -> the key that has taken its place, for the error."""
@@ -224,7 +227,7 @@ class Scene(Table):
             if not shape.has_regions:
                 able = ", ".join(repr(other) for other, kind in SHAPES.items() if kind.has_regions)
                 raise fault(f"a {shape.name} has no regions; shapes with regions: {able}", key, None)
-            if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,39}", name):
+            if not re.fullmatch(NAME, name):
                 raise fault("a region's name is a letter, then letters, digits and _, at most 40 in all", key, None)
             if taken := columns.intersection(column.name for column in columns_of_region(name)):
                 raise fault(f"the column {min(taken)!r} has another meaning; choose another name", key, None)
@@ -271,7 +274,7 @@ class Scene(Table):
         for index, (time, factor) in enumerate(load.ramp):
             if not self.time.is_equilibrium and time <= self.time.end and not self.time.is_hit(time):
                 raise fault(nearest_multiples(time, step, "time.step"), f"{key}.ramp[{index}][0]", time)
-            value, above = load.value * factor, self.geometry.loads[name].above
+            value, above = load.value * factor, self.load_kinds[name].above
             if value <= above:
                 rule = (
                     f"must be greater than {above:g} at every time; with the factor {shown(factor)} it is {value:.6g}"
@@ -307,9 +310,14 @@ class Scene(Table):
         return sorted({*times, *self.output.times, end})
 
     @property
+    def load_kinds(self) -> dict[str, LoadKind]:
+        """All loads that it can have, by name."""
+        return self.geometry.loads_on(faces_of(self.loads))
+
+    @property
     def has_free_length(self) -> bool:
         """Whether the body's length is an unknown."""
-        kinds = self.geometry.loads
+        kinds = self.load_kinds
         return self.supports.ends in self.geometry.ends_that_free_length or any(
             kinds[name].frees_length for name in self.loads
         )
@@ -345,9 +353,9 @@ class Scene(Table):
         """Stiffness of network and matrix and the largest loads, in one unit and on one line."""
         loads = {}
         for name, load in self.loads.items():
-            stress = largest_stress(name, load.largest(self.last_time), self.geometry)
+            stress = largest_stress(self.load_kinds[name], load.largest(self.last_time), self.geometry)
             if stress is not None:
-                is_force = self.geometry.loads[name].dimension == FORCE
+                is_force = self.load_kinds[name].dimension == FORCE
                 loads[f"largest {name}{' over its area' if is_force else ''}"] = stress
         found = self.properties()
         parts = [_words(name) + properties.material.summary(loads) for name, properties in found.items()]
@@ -356,7 +364,10 @@ class Scene(Table):
     def warnings(self) -> list[str]:
         """What is allowed but hardly meant, each on one line."""
         found: dict[str, None] = {}
-        for name, (material, cells, _) in self.properties().items():
+        properties = self.properties()
+        if self.geometry.fills(self.regions):
+            properties.pop("", None)  # it holds nowhere
+        for name, (material, cells, _) in properties.items():
             lines = doubts(material, self.geometry, self.loads, cells.end_to_end_length, self.last_time)
             found |= dict.fromkeys(line if line.startswith("geometry.") else _words(name) + line for line in lines)
         return [*found, *self.remodeling.warnings()]
@@ -489,8 +500,9 @@ def _in_own_units(values: Mapping[str, Any], shape: type[Shape]) -> dict[str, An
             name: in_units(entry, Region, units, f"regions.{quoted(str(name))}") for name, entry in regions.items()
         }
     if isinstance(loads := result.get("loads"), Mapping):
+        kinds = shape.loads_on(faces_of(loads))
         result["loads"] = {
-            name: in_units(entry, Load, units, f"loads.{name}", {"value": shape.loads[name].dimension})
+            name: in_units(entry, Load, units, f"loads.{name}", {"value": kinds[name].dimension})
             for name, entry in loads.items()
         }
     return result
@@ -498,12 +510,27 @@ def _in_own_units(values: Mapping[str, Any], shape: type[Shape]) -> dict[str, An
 
 def _check_load_names(shape: str, loads: Any) -> None:
     """A load that the shape does not have, before anything is said about what is missing in it."""
-    names = SHAPES[shape].loads
+    kind = SHAPES[shape]
+    names = kind.loads
     for name, load in loads.items() if isinstance(loads, Mapping) else ():
-        if name not in names:
+        if kind.holds_faces and isinstance(load, Mapping) and ("kind" in load or "face" in load):
+            _check_load_on_face(kind, str(name), load)
+        elif name not in names:
             key, listed = f"loads.{quoted(str(name))}", ", ".join(f"loads.{known}" for known in names)
             rule = f"is now {RENAMED[key]}" if key in RENAMED else f"a {shape} has no such load; allowed: {listed}"
             raise fault(rule, key, load)
+
+
+def _check_load_on_face(shape: type[Shape], name: str, load: Mapping[str, Any]) -> None:
+    key = f"loads.{quoted(name)}"
+    if not isinstance(load.get("face"), str):
+        raise fault("missing; a load of this kind needs the name of a face", f"{key}.face", load.get("face"))
+    if name in shape.loads:
+        raise fault(
+            f"{shape.loads[name].meaning}; a load on another face has another name", f"{key}.face", load["face"]
+        )
+    if not re.fullmatch(NAME, name) or name in {column.name for column in columns_of(shape)}:
+        raise fault("a letter, then letters, digits and _, at most 40 in all, and the name of no column", key, None)
 
 
 def _plain(value: Any, every_value: bool = False) -> Any:
@@ -603,8 +630,10 @@ def check_continuation(old: Scene, new: Scene, time: float) -> None:
         if before.get(key) != now.get(key):
             was = shown(before[key]) if key in before else "not there"
             raise SceneError(f"{key} = {shown(now.get(key))}: was {was}; {rule}")
-    for name in new.geometry.loads:
+    for name in {**old.load_kinds, **new.load_kinds}:
         first, second = old.loads.get(name), new.loads.get(name)
+        if first and second and first.face != second.face:
+            raise SceneError(f"loads.{name}.face = {shown(second.face)}: was {shown(first.face)}; {rule}")
         for moment in sorted({0.0, time, *_ramp_times(first), *_ramp_times(second)}):
             old_value, value = (0.0 if one is None else one.value * one.factor(moment) for one in (first, second))
             if moment <= time and abs(old_value - value) > SAME_LOAD * max(abs(old_value), abs(value)):

@@ -333,7 +333,7 @@ def _draw(found: Fit, tables: Sequence[Measured], folder: Path) -> None:
     correlations.save_table({"key": keys, **dict(zip(keys, found.correlations, strict=True))}, [title, made_with])
     panels = [(number, name) for number, one in enumerate(tables) for name in one.sd]
     units = {column.name: unit_of(found.scene, column.unit) for column in found.scene.columns()}
-    kinds = found.scene.geometry.loads
+    kinds = found.scene.load_kinds
     units |= {name: unit_of(found.scene, kind.dimension.name) for name, kind in kinds.items() if kind.dimension}
     scales = {u.key: value for u, value in zip(found.unknowns, found.values, strict=True)}
     with rc_context(STYLE):

@@ -179,7 +179,7 @@ def _pairs(table: Mapping[str, Any], key: str, place: str, columns: Mapping[str,
 
 def _factor(name: str, unit: Any, scene: Scene, place: str) -> float:
     kinds = {column.name: column.unit for column in _all_columns(scene)}
-    kinds |= {load: kind.dimension.name for load, kind in scene.geometry.loads.items() if kind.dimension}
+    kinds |= {load: kind.dimension.name for load, kind in scene.load_kinds.items() if kind.dimension}
     dimension = DIMENSIONS.get(kinds.get(name, ""))
     if dimension is None:
         raise SceneError(f"{place} = {shown(unit)}: {name} takes no unit")

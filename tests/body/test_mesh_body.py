@@ -240,3 +240,54 @@ def test_a_run_goes_on_with_its_copy_on_other_ranks(tmp_path: Path) -> None:
     refused = _command("run", "--resume", str(parts), "--set", "time.end=5")
     assert refused.returncode == 2
     assert "tube.msh': has changed since the run" in refused.stderr
+
+
+# ---------------------------------------------------------------- pressures on other faces
+
+
+def _outside(face: str = "outer", **more: Any) -> dict[str, Any]:
+    return {"kind": "pressure", "face": face, "value": 2.0, "ramp": [[0, 0], [2, 1]]} | more
+
+
+def test_equal_pressures_inside_and_outside_compress_alike_everywhere(tube: Path) -> None:
+    """In plane strain all of it is s times as wide: (mu (s^2 - 1) + 2 lambda ln s)/s^2 = -p, on plane facets too."""
+    stiff = {"kind": "guided", "stiffness": 1e8}
+    pressure = {"value": 2.0, "ramp": [[0, 0], [2, 1]]}
+    scene = scene_of(
+        tube,
+        material={"chain_density": 0.0},
+        remodeling={"law": "none"},
+        loads={"pressure": pressure, "tissue": _outside()},
+        supports={"inlet": stiff, "outlet": stiff},
+    )
+    row, displacement, places = solved(scene)
+    mu, lame_lambda, s = scene.material.lame_mu, scene.material.lame_lambda, 1.0
+    for _ in range(50):  # Newton's method
+        balance = mu * (s**2 - 1) + 2 * lame_lambda * np.log(s) + 2.0 * s**2
+        s -= balance / (2 * mu * s + 2 * lame_lambda / s + 4.0 * s)
+    assert s < 0.98 and row["tissue"] == 2.0
+    assert np.abs(displacement[:, :2] - (s - 1) * places[:, :2]).max() < 1e-5
+
+
+@pytest.mark.parametrize(
+    ("loads", "words"),
+    [
+        ({"tissue": _outside("lumen")}, "loads.tissue.face = 'lumen': the body has no such face"),
+        ({"tissue": _outside("inlet")}, r"loads.tissue.face = 'inlet': its support \('guided'\) takes all"),
+        ({"pressure": _outside()}, "loads.pressure.face = 'outer': pressure on the deformed inner face"),
+        ({"tissue": {"kind": "pressure", "value": 1.0, "ramp": [[0, 0]]}}, "loads.tissue.face: missing"),
+        ({"tissue": {"face": "outer", "value": 1.0, "ramp": [[0, 0]]}}, "loads.tissue.kind: missing"),
+        ({"fibre_angle_outer": _outside()}, "loads.fibre_angle_outer: a letter, then"),
+        ({"tissue": _outside(kind="traction")}, "loads.tissue.kind = 'traction'"),
+    ],
+)
+def test_loads_on_faces_that_cannot_be_are_refused(tube: Path, loads: dict[str, Any], words: str) -> None:
+    """One line that names the key."""
+    with pytest.raises(SceneError, match=words):
+        Simulation(scene_of(tube, loads=loads), MPI.COMM_SELF)
+
+
+def test_other_shapes_have_no_loads_on_faces() -> None:
+    values = {"preset": "consistent", "geometry": {"shape": "tube"}, "loads": {"tissue": _outside()}}
+    with pytest.raises(SceneError, match="loads.tissue.*no such load"):
+        scene_from_dict(values)
