@@ -15,7 +15,9 @@ from pydantic.config import JsonDict
 from remodel_fenicsx.body import mesh_file
 from remodel_fenicsx.body.columns import Column
 from remodel_fenicsx.body.gmsh_model import LARGEST_LENGTH, SMALLEST_LENGTH
+from remodel_fenicsx.body.exchange_file import ENDINGS
 from remodel_fenicsx.body.mesh_file import MeshFile, MeshFileError
+from remodel_fenicsx.body.mesh_reader import TAGS, read_mesh
 from remodel_fenicsx.body.shape import LoadKind
 from remodel_fenicsx.body.walled import WalledMesh
 from remodel_fenicsx.schema.tables import SceneError, fault, shown
@@ -33,6 +35,7 @@ log = logging.getLogger(__name__)
 
 HELD_ACROSS = ("guided", "sliding", "held")  # kinds of support that leave a face no motion along its normal
 ROLES = ("inner", "outer", "inlet", "outlet")
+MESH_ENDINGS = (".msh", *ENDINGS)
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}
 Names = tuple[str | int, ...]
 _ENTRY: JsonDict = {"type": ["string", "integer"]}
@@ -41,26 +44,30 @@ _ENTRY: JsonDict = {"type": ["string", "integer"]}
 def _faces(value: Any) -> Any:
     """Names or numbers, one or a list, as tuples."""
     if not isinstance(value, Mapping):
-        raise fault("must be a table: inner, outer, inlet, outlet = names or numbers of the file's faces")
+        raise fault("must be a table: names or numbers of the file's faces or volumes, as in inner = 3")
     found = {}
     for name, entry in value.items():
         entries = entry if isinstance(entry, (list, tuple)) else [entry]
         if not entries or not all(isinstance(one, (str, int)) and not isinstance(one, bool) for one in entries):
-            raise fault("must be a name or a number of a face in the file, or a list of them", str(name), entry)
+            raise fault("must be a name or a number in the file, or a list of them", str(name), entry)
         found[str(name)] = tuple(entries)
     return found
 
 
 def _file(value: Any) -> Any:
-    if not isinstance(value, str) or "\x00" in value or Path(value).suffix.lower() != ".msh":
-        raise fault("must be the path of a mesh by Gmsh (.msh), relative to the scene's folder")
+    if not isinstance(value, str) or "\x00" in value or Path(value).suffix.lower() not in MESH_ENDINGS:
+        raise fault(f"must be the path of a mesh ({', '.join(MESH_ENDINGS)}), relative to the scene's folder")
     return value
 
 
-class MeshBody(WalledMesh):
-    """A body of one's own from a file by Gmsh, a vessel with an inner and an outer face and ends.
+def _text(value: Any) -> str | None:
+    return value if isinstance(value, str) else None
 
-    The file is data: it is read as text of format 2.2 or 4.1, and never run. Its elements are tetrahedra or hexahedra,
+
+class MeshBody(WalledMesh):
+    """A body of one's own from a mesh file, a vessel with an inner and an outer face and ends.
+
+    The file is data: it is read, and never run. Its elements are tetrahedra or hexahedra,
     all of one kind. A run keeps a copy of the file.
     """
 
@@ -94,8 +101,16 @@ class MeshBody(WalledMesh):
 
     shape: Literal["mesh"] = Field(default="mesh", description="Which body it is.")
     file: Annotated[str, BeforeValidator(_file)] = Field(
-        description="The mesh, a file by Gmsh (`.msh`, format 2.2 or 4.1, text), relative to the scene's folder.",
-        json_schema_extra={"allowed": "the path of a file by Gmsh (.msh)"},
+        description="The mesh, a file by Gmsh (`.msh`, format 2.2 or 4.1, text) or one that meshio reads (`.vtu`, "
+        "`.vtk`, `.xdmf`), relative to the scene's folder.",
+        json_schema_extra={"allowed": "the path of a file .msh, .vtu, .vtk or .xdmf"},
+    )
+    tags: str | None = Field(
+        default=None,
+        min_length=1,
+        description="Of a file that is not by Gmsh: the array of whole numbers that tells the faces and volumes apart. "
+        "Default: the first of " + ", ".join(f"`{name}`" for name in TAGS) + " that is there.",
+        json_schema_extra={"allowed": "the name of an array"},
     )
     file_unit: Literal["m", "cm", "mm", "um"] | None = Field(
         default=None,
@@ -106,6 +121,14 @@ class MeshBody(WalledMesh):
         default={},
         description="Name of a face -> name or number of a named face of the file, or a list. `inner`, `outer`, "
         "`inlet`, `outlet` are needed where the file's own names are others. Further ones are for supports.",
+        json_schema_extra={
+            "allowed": "a table of names, numbers or lists of them",
+            "additionalProperties": {"anyOf": [_ENTRY, {"type": "array", "items": _ENTRY, "minItems": 1}]},
+        },
+    )
+    regions: Annotated[dict[str, tuple[str | int, ...]], BeforeValidator(_faces)] = Field(
+        default={},
+        description="Name of a region -> name or number of a volume of the file, or a list. Default: the file's names.",
         json_schema_extra={
             "allowed": "a table of names, numbers or lists of them",
             "additionalProperties": {"anyOf": [_ENTRY, {"type": "array", "items": _ENTRY, "minItems": 1}]},
@@ -141,7 +164,7 @@ class MeshBody(WalledMesh):
         if said or not isinstance(file, str):
             return cls.defaults
         try:
-            found = mesh_file.read_mesh_file(Path(_file(file)))
+            found = read_mesh(Path(_file(file)), _text(own["geometry"].get("tags")))
         except MeshFileError as error:
             raise fault(str(error), "geometry.file", Path(file).name) from None
         return cls.defaults | {"mesh": {"element": found.kind, "degree": found.degree}}
@@ -181,7 +204,7 @@ class MeshBody(WalledMesh):
         """
         from remodel_fenicsx.body.mesh_faces import FaceError, boundary_of
 
-        file = self._read()
+        file = self._with_regions(self._read())
         scale = METRES[self.file_unit] / METRES[self.length_unit] if self.file_unit and self.length_unit else 1.0
         file = replace(file, points=scale * file.points)
         extent = float(np.ptp(file.points, axis=0).max())
@@ -204,7 +227,7 @@ class MeshBody(WalledMesh):
 
     def _read(self) -> MeshFile:
         try:
-            file = mesh_file.read_mesh_file(Path(self.file))
+            file = read_mesh(Path(self.file), self.tags)
         except MeshFileError as error:
             raise self._fault(str(error)) from None
         if self.sha256 not in (None, file.sha256):
@@ -249,7 +272,27 @@ class MeshBody(WalledMesh):
             lost = file.cell_numbers[file.cell_groups == 0]
             raise self._fault(f"{len(lost)} elements are in no named volume, the first is {lost[0]}; the others are")
         names = {number: name for name, number in file.names[3].items()}
+        names |= {self._volumes(file, name, entries[:1])[0]: name for name, entries in self.regions.items()}
         return {names.get(number, str(number) if number else "body"): number for number in numbers}
+
+    def _with_regions(self, file: MeshFile) -> MeshFile:
+        """Volumes of one region under one number."""
+        groups = file.cell_groups.copy()
+        for name, entries in self.regions.items():
+            numbers = self._volumes(file, name, entries)
+            groups[np.isin(groups, numbers)] = numbers[0]
+        return replace(file, cell_groups=groups)
+
+    def _volumes(self, file: MeshFile, region: str, entries: Names) -> list[int]:
+        """Numbers of the volumes that a region has in the file."""
+        there, names = set(mesh_file.distinct(file.cell_groups)) - {0}, file.names[3]
+        numbers = [names.get(entry, 0) if isinstance(entry, str) else entry for entry in entries]
+        for entry, number in zip(entries, numbers, strict=True):
+            if number not in there:
+                listed = [*map(repr, names), *(str(other) for other in sorted(there - set(names.values())))]
+                rule = f"the file has no such volume; it has {', '.join(listed) or 'none'}"
+                raise SceneError(f"geometry.regions.{region} = {shown(entry)}: {rule}")
+        return [int(number) for number in numbers]
 
     def _say(self, file: MeshFile, boundary: Boundary) -> None:
         from remodel_fenicsx.body.mesh_faces import through_the_wall
@@ -275,7 +318,7 @@ class MeshBody(WalledMesh):
 
     def fills(self, regions: Collection[str]) -> bool:
         """Whether they are all volumes of the file."""
-        return bool(regions) and set(self._regions(self._read())) <= set(regions)
+        return bool(regions) and set(self._regions(self._with_regions(self._read()))) <= set(regions)
 
     def hold_faces(
         self, loading: Loading, supports: Mapping[str, Support], modulus: float, loads: Mapping[str, Load]

@@ -106,13 +106,28 @@ def read_mesh_file(path: Path) -> MeshFile:
     MeshFileError
         If it is not there, is no such file, or is damaged: one line, which names the line of the file.
     """
+    changed, size = found_file(path)
     try:
+        return _read(path, changed, size)
+    except OSError as error:
+        raise MeshFileError(f"cannot be read: {error.strerror or error}") from None
+
+
+def found_file(path: Path) -> tuple[int, int]:
+    """When it changed last, in ns, and its size in bytes.
+
+    Raises
+    ------
+    MeshFileError
+        If there is no such file.
+    """
+    try:
+        if path.is_dir():
+            raise MeshFileError("is a folder; a mesh is a file")
         found = path.stat()
-        return _read(path, found.st_mtime_ns, found.st_size)
+        return found.st_mtime_ns, found.st_size
     except FileNotFoundError:
         raise MeshFileError(f"no such file: {path}") from None
-    except IsADirectoryError:
-        raise MeshFileError("is a folder; a mesh is a file by Gmsh (.msh)") from None
     except OSError as error:
         raise MeshFileError(f"cannot be read: {error.strerror or error}") from None
 
@@ -123,7 +138,7 @@ def _read(path: Path, _changed: int, _size: int) -> MeshFile:
     sections = _sections(data)
     groups = _physical_names(sections.get(b"PhysicalNames"))
     numbers, points, elements = (_read_22 if sections[b"MeshFormat"].version == b"2.2" else _read_41)(sections)
-    return _assembled(numbers, points, elements, groups, data)
+    return assembled(numbers, points, elements, groups, data)
 
 
 # ---------------------------------------------------------------- lines
@@ -274,8 +289,8 @@ def _physical_names(section: _Section | None) -> dict[int, dict[str, int]]:
 
 
 @dataclass(frozen=True)
-class _Block:
-    """Elements of one type: their lines, numbers, groups (one row per group), nodes as numbered in the file."""
+class Block:
+    """Elements of one type: lines (0: none), numbers, groups (one row per group), nodes as numbered in the file."""
 
     type: int
     dimension: int
@@ -285,7 +300,7 @@ class _Block:
     nodes: Integers
 
 
-def _read_41(sections: dict[bytes, _Section]) -> tuple[Integers, Array, list[_Block]]:
+def _read_41(sections: dict[bytes, _Section]) -> tuple[Integers, Array, list[Block]]:
     groups_of = _entities(sections.get(b"Entities"))
     nodes = sections[b"Nodes"]
     numbers, points = [], []
@@ -306,7 +321,7 @@ def _read_41(sections: dict[bytes, _Section]) -> tuple[Integers, Array, list[_Bl
             groups = groups_of.get((dimension, entity), [])
             for group in groups or [0]:
                 parts = np.arange(first, first + count) + 1, rows[:, 0], np.full(count, group), rows[:, 1:columns]
-                blocks.append(_Block(kind, dimension, *parts))
+                blocks.append(Block(kind, dimension, *parts))
         else:
             elements.at += count
     elements.end()
@@ -336,7 +351,7 @@ def _entities(section: _Section | None) -> dict[tuple[int, int], list[int]]:
     return found
 
 
-def _read_22(sections: dict[bytes, _Section]) -> tuple[Integers, Array, list[_Block]]:
+def _read_22(sections: dict[bytes, _Section]) -> tuple[Integers, Array, list[Block]]:
     nodes, elements = sections[b"Nodes"], sections[b"Elements"]
     table = nodes.table(nodes.count(1, 0, "nodes"), np.float64, 4, "number and place of a node")
     nodes.end()
@@ -356,7 +371,7 @@ def _read_22(sections: dict[bytes, _Section]) -> tuple[Integers, Array, list[_Bl
     elements.end()
     tables = {kind: np.array(found, dtype=np.int64) for kind, found in rows.items()}
     blocks = [
-        _Block(kind, 3 if kind in VOLUMES else 2, found[:, 0], found[:, 1], found[:, 2], found[:, 3:])
+        Block(kind, 3 if kind in VOLUMES else 2, found[:, 0], found[:, 1], found[:, 2], found[:, 3:])
         for kind, found in tables.items()
     ]
     return table[:, 0].astype(np.int64), table[:, 1:4], blocks
@@ -375,9 +390,27 @@ def _nodes_of(kind: int, section: _Section, ahead: int = 0) -> int:
 # ---------------------------------------------------------------- what both lead to
 
 
-def _assembled(
-    numbers: Integers, points: Array, blocks: list[_Block], names: dict[int, dict[str, int]], data: bytes
+def assembled(
+    numbers: Integers, points: Array, blocks: list[Block], names: dict[int, dict[str, int]], data: bytes
 ) -> MeshFile:
+    """What a file of any kind holds.
+
+    Parameters
+    ----------
+    numbers, points
+        Of the nodes, (nodes,) and (nodes, 3).
+    blocks
+        Elements by type.
+    names
+        Of faces (2) and volumes (3): name -> number.
+    data
+        The file itself.
+
+    Raises
+    ------
+    MeshFileError
+        If they are no mesh; one line.
+    """
     order = np.argsort(numbers, kind="stable")
     ordered = numbers[order]
     if len(ordered) > 1 and (np.diff(ordered) == 0).any():
@@ -386,14 +419,15 @@ def _assembled(
     if bad.any():
         raise MeshFileError(f"node {numbers[bad][0]} is at {tuple(points[bad][0].tolist())}: its place must be finite")
 
-    def rows_of(block: _Block, columns: int | None = None) -> Integers:
+    def rows_of(block: Block, columns: int | None = None) -> Integers:
         nodes = block.nodes[:, :columns]
         place = np.searchsorted(ordered, nodes).clip(max=max(len(ordered) - 1, 0))
         lost = ordered[place] != nodes if len(ordered) else np.ones_like(nodes, dtype=bool)
         if lost.any():
             row, column = np.argwhere(lost)[0]
             rule = f"element {block.numbers[row]} has the node {nodes[row, column]}, which is not in $Nodes"
-            raise MeshFileError(f"line {block.lines[row]}: {rule}")
+            line = f"line {block.lines[row]}: " if block.lines[row] else ""
+            raise MeshFileError(line + rule)
         return order[place]
 
     solid = [block for block in blocks if block.dimension == 3 and len(block.numbers)]

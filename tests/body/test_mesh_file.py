@@ -233,7 +233,7 @@ def test_a_wall_of_one_element_is_warned_of(tmp_path: Path, caplog: pytest.LogCa
     ("file", "words"),
     [
         ("missing.msh", "no such file"),
-        ("../scene.toml", "must be the path of a mesh by Gmsh (.msh)"),
+        ("../scene.toml", "must be the path of a mesh (.msh, "),
         ("folder.msh", "is a folder"),
     ],
 )

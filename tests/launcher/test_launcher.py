@@ -755,7 +755,19 @@ def test_no_namespaces(clone, way):
     ],
 )
 def test_native_version(clone, tmp_path, version, suite, usable):
-    for name in ("dolfinx", "mpi4py", "petsc4py", "gmsh", "pydantic", "pint", "tomlkit", "h5py", "rich"):
+    for name in (
+        "dolfinx",
+        "mpi4py",
+        "petsc4py",
+        "gmsh",
+        "pydantic",
+        "pint",
+        "tomlkit",
+        "h5py",
+        "rich",
+        "scipy",
+        "meshio",
+    ):
         script(tmp_path / "site" / name / "__init__.py", "raise SystemExit('the launcher must not import this')")
     script(
         tmp_path / "site" / f"fenics_dolfinx-{version}.dist-info" / "METADATA",

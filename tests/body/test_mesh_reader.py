@@ -1,0 +1,150 @@
+"""Own bodies from files of other programs: the same mesh as Gmsh's own file, and what is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import meshio
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from remodel_fenicsx import SceneError
+from remodel_fenicsx.body import mesh_file
+from remodel_fenicsx.body.mesh_faces import jacobian_determinants
+from remodel_fenicsx.body.mesh_file import MeshFileError
+from remodel_fenicsx.body.mesh_reader import read_mesh
+from remodel_fenicsx.scene import scene_from_dict
+from remodel_fenicsx.simulation import Simulation
+from tests.mesh_files import write_tube
+
+LOADS = {"pressure": {"value": 2.0, "ramp": [[0, 0], [2, 1]]}}
+
+
+def converted(source: Path, ending: str, **arrays: Any) -> Path:
+    """By meshio, as a user would."""
+    mesh = meshio.read(source)
+    mesh.cell_sets = {}
+    mesh.cell_data |= arrays
+    target = source.with_suffix(ending)
+    more = {"data_format": "XML"} if ending == ".xdmf" else {}
+    meshio.write(target, mesh, **more)
+    return target
+
+
+def numbers_of(source: Path) -> dict[str, int]:
+    return {name: int(number) for name, (number, dimension) in meshio.read(source).field_data.items() if dimension == 2}
+
+
+def sorted_rows(table: Any) -> Any:
+    return table[np.lexsort(table.T)]
+
+
+@pytest.mark.parametrize(
+    ("ending", "element", "degree"),
+    [
+        (".vtu", "hexahedron", 1),
+        (".vtu", "tetrahedron", 2),
+        (".vtu", "hexahedron", 2),
+        (".vtk", "tetrahedron", 1),
+        (".xdmf", "hexahedron", 1),
+        (".xdmf", "tetrahedron", 1),
+    ],
+)
+def test_the_mesh_is_that_of_gmsh(tmp_path: Path, ending: str, element: str, degree: int) -> None:
+    """The same elements, nodes in the same order, the same facets under the same numbers."""
+    source = write_tube(tmp_path / "tube.msh", element, degree)
+    one, other = read_mesh(source), read_mesh(converted(source, ending))
+    assert (other.kind, other.degree) == (element, degree)
+    places = [sorted_rows(file.points[file.cells].reshape(len(file.cells), -1)) for file in (one, other)]
+    assert np.abs(places[0] - places[1]).max() < 1e-12
+    assert jacobian_determinants(other).min() > 0 or jacobian_determinants(other).max() < 0
+    for number in mesh_file.distinct(one.facet_groups):
+        sides = [file.points[file.facets[file.facet_groups == number]].mean(axis=1) for file in (one, other)]
+        assert np.abs(sorted_rows(sides[0].round(9)) - sorted_rows(sides[1].round(9))).max() < 1e-8
+
+
+def scene_of(file: Path, **geometry: Any) -> Any:
+    return scene_from_dict(
+        {
+            "geometry": {"shape": "mesh", "file": str(file)} | geometry,
+            "cells": {"initial": "isotropic"},
+            "loads": LOADS,
+            "time": {"end": 2.0, "step": 1.0},
+            "solver": {"method": "direct"},
+        }
+    )
+
+
+def last_row(scene: Any) -> dict[str, float]:
+    simulation = Simulation(scene, MPI.COMM_SELF)
+    try:
+        return [dict(step.row) for step in simulation.steps()][-1]
+    finally:
+        simulation.close()
+
+
+def test_a_run_of_it_is_that_of_gmsh_s_file(tmp_path: Path) -> None:
+    """With numbers in place of names, and two numbers that are one region."""
+    source = write_tube(tmp_path / "tube.msh")
+    mesh = meshio.read(source)
+    groups = [
+        np.where(np.arange(len(a)) % 2, a, a + 70) if "hexa" in block.type else a
+        for block, a in zip(mesh.cells, mesh.cell_data["gmsh:physical"], strict=True)
+    ]
+    file = converted(source, ".vtu", parts=groups)
+    volumes = sorted({int(n) for block, a in zip(mesh.cells, groups, strict=True) if "hexa" in block.type for n in a})
+    scene = scene_of(file, faces=numbers_of(source), tags="parts", regions={"wall": volumes})
+    expected, found = last_row(scene_of(source)), last_row(scene)
+    assert len(volumes) == 2
+    for name in ("lumen_volume", "fibre_angle_inner", "stored_energy"):
+        assert found[name] == pytest.approx(expected[name], rel=1e-10), name
+    assert scene.geometry.kept_files()[1].keys() == {"tube.vtu"}
+
+
+def test_what_is_wrong_is_said_in_one_line(tmp_path: Path) -> None:
+    source = write_tube(tmp_path / "tube.msh")
+    file, names = converted(source, ".vtu"), numbers_of(source)
+    with pytest.raises(SceneError, match=r"geometry.faces.inner = 'inner': the file has no such face; it has \d"):
+        scene_of(file).geometry.checked()
+    with pytest.raises(SceneError, match="geometry.regions.media = 99: the file has no such volume; it has"):
+        scene_of(file, faces=names, regions={"media": 99}).geometry.checked()
+    with pytest.raises(SceneError, match="has no array 'parts' with the numbers of faces"):
+        scene_of(file, faces=names, tags="parts")
+    with pytest.raises(MeshFileError, match="no such file"):
+        read_mesh(tmp_path / "other.vtu")
+    half = tmp_path / "half.vtu"
+    half.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    with pytest.raises(MeshFileError, match="cannot be read"):
+        read_mesh(half)
+
+
+@pytest.mark.parametrize(
+    ("cells", "tags", "words"),
+    [
+        ([("wedge", [[0, 1, 2, 4, 5, 6]])], [[1]], "elements of type 'wedge'"),
+        ([("hexahedron", [range(8)])], [[0.5]], "no whole number for each element"),
+        ([("hexahedron", [range(8)])], [[np.nan]], "no whole number for each element"),
+        ([("quad", [range(4)])], [[1]], "no elements of a volume"),
+    ],
+)
+def test_other_meshes_are_refused(tmp_path: Path, cells: Any, tags: Any, words: str) -> None:
+    places = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1.0]])
+    arrays = {"medit:ref": [np.array(values) for values in tags]}
+    mesh = meshio.Mesh(
+        places, [(kind, np.array([list(row) for row in rows])) for kind, rows in cells], cell_data=arrays
+    )
+    mesh.write(tmp_path / "one.vtu")
+    with pytest.raises(MeshFileError, match=words):
+        read_mesh(tmp_path / "one.vtu")
+
+
+def test_numbers_in_another_file_are_refused(tmp_path: Path) -> None:
+    """Its SHA-256 would say nothing, and it would lead out of the folder."""
+    source = write_tube(tmp_path / "tube.msh")
+    mesh = meshio.read(source)
+    mesh.cell_sets = {}
+    meshio.write(tmp_path / "tube.xdmf", mesh, data_format="HDF")
+    with pytest.raises(MeshFileError, match="its numbers stand in another file"):
+        read_mesh(tmp_path / "tube.xdmf")
