@@ -243,7 +243,7 @@ def _record(
         unknowns = simulation.unknown.x.petsc_vec.getSize()
         if comm.size > 1 and unknowns <= LARGE_ON_RANKS:
             log.info("%d unknowns: one rank is faster than %d (docs/speed.md, Ranks)", unknowns, comm.size)
-        for warning in scene.warnings():
+        for warning in simulation.scene.warnings():  # the one whose files have places
             log.warning("%s", warning)
         watchers: list[Watcher] = []
         if scene.output.fields:
