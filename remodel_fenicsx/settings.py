@@ -457,6 +457,19 @@ class Remodeling(Table):
         "has kappa.",
         json_schema_extra={"allowed": "a finite number greater than 0"},
     )
+    threshold: Annotated[float, STRESS] = Field(
+        default=0.0,
+        ge=0,
+        description="Lazy zone: principal stress s0 up to which a point sleeps; kappa acts with a share of "
+        "max(0, 1 - s0/s), s the largest one. For the law 'tensor' and drivers that are stresses (docs/laws.md).",
+    )
+    exponent: float = Field(
+        default=2.0,
+        gt=0,
+        le=16,
+        description="n of the target (D+)^n over its trace: 2 is the paper's, 1 that of netting analysis. For the law "
+        "'tensor' (docs/laws.md).",
+    )
     rotation_time: float = Field(
         default=40.0,
         gt=0,
@@ -473,6 +486,22 @@ class Remodeling(Table):
             f"remodeling.coupling = {self.coupling!r} makes a share of {share:g} of each pass, and the law "
             f"{self.law!r} does not make up for the rest: cells remodel at about {share:g} times the speed"
         ]
+
+    @property
+    def has_set_point(self) -> bool:
+        """Whether exponent or threshold is another than the paper's."""
+        return self.exponent != 2.0 or self.threshold != 0.0
+
+    @model_validator(mode="after")
+    def _set_points_have_their_law(self) -> Remodeling:
+        for key, plain in (("exponent", 2), ("threshold", 0)):
+            value = getattr(self, key)
+            if value != plain and LAWS[self.law] is not LAWS["tensor"]:
+                raise fault(f"must be {plain} unless remodeling.law is 'tensor'", key, value)
+        if self.threshold and not DRIVERS[self.driver].is_stress:
+            drivers = ", ".join(repr(name) for name, driver in DRIVERS.items() if driver.is_stress)
+            raise fault(f"must be 0 unless remodeling.driver is a stress: {drivers}", "threshold", self.threshold)
+        return self
 
     @model_validator(mode="after")
     def _coupling_fits_the_law(self) -> Remodeling:

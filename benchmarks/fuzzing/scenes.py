@@ -244,6 +244,18 @@ def _rarely(random: Random, scene: Values, stiffness: float) -> None:
         scene["regions"] = {"inside": {"outer_radius": middle}, "outside": {}}
     if _closes_from_a_sector(scene) and random.random() < 0.3:
         scene["natural"] = {"opening_angle": rounded(random.uniform(0, 120))}
+    _set_points(random, scene, stiffness)
+
+
+def _set_points(random: Random, scene: Values, stiffness: float) -> None:
+    """Exponent and threshold of the law that has them."""
+    remodeling = scene["remodeling"]
+    if remodeling["law"] != "tensor" or remodeling["coupling"] == "implicit" or scene["time"]["end"] == "equilibrium":
+        return
+    if random.random() < 0.15:
+        remodeling["exponent"] = random.choice((1.0, 3.0))
+    if remodeling["driver"] != "finger" and random.random() < 0.15:
+        remodeling["threshold"] = rounded(stiffness * random.uniform(0.01, 0.2))
 
 
 def _closes_from_a_sector(scene: Values) -> bool:

@@ -172,6 +172,12 @@ COLUMNS_ON_REQUEST: dict[str, Column] = {
             lambda m: m.step.work.held_points,
         ),
         Column(
+            "asleep_share",
+            "",
+            "share of the volume in which no principal value of the driving tensor is above remodeling.threshold",
+            lambda m: m.observer.stepper.remodeling.asleep_share(),
+        ),
+        Column(
             "processor_seconds",
             "s",
             "time of the first rank's processor in the step: on a machine that others use it says more than `seconds`",

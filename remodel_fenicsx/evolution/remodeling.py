@@ -131,6 +131,8 @@ class RemodelingPass:
             self.settings.rotation_time,
             self.kernels,
             rounding,
+            self.settings.exponent,
+            self.settings.threshold,
         )
 
     def _steady_axes(self, F: Array) -> Array:
@@ -196,7 +198,7 @@ class RemodelingPass:
         """What the structure tensor tends to in the present state; of laws that have one."""
         drive, target = self.drive(residual), self.law.target
         assert target is not None
-        if target is not tensor_target:
+        if target is not tensor_target or self.settings.has_set_point:  # C knows the paper's alone
             return target(drive)
         from remodel_fenicsx.kernels.tensor import tensor_kernels
 
@@ -210,6 +212,12 @@ class RemodelingPass:
             return np.asarray(self.target(residual).share < AWAKE)
         values = np.linalg.eigvalsh(drive.tensor)
         return ~spectral.positive_direction(values, threshold=drive.threshold)[1]
+
+    def asleep_share(self) -> float:
+        """Share of the body's volume in which no principal value is above `remodeling.threshold`."""
+        _, tensor = self.driving_tensor()
+        asleep = np.linalg.eigvalsh(tensor)[:, -1] <= self.settings.threshold
+        return float(self.quadrature.mean(asleep.reshape(self.quadrature.shape).astype(float)))
 
     def followed(self, target: Target, duration: float, cells: UnitCell | None = None) -> UnitCell:
         """Cells of all points in one row, the present or others, after a time with this target. Changes nothing."""

@@ -49,6 +49,8 @@ class Drive(NamedTuple):
         Whose `principal` and `positive_direction` are called: those of `spectral`, or of C (`kernels.points`).
     rounding
         The part of the threshold that is the rounding of a stress.
+    exponent, least_tension
+        Of `tensor_law.target` and `tensor_law.awake`.
     """
 
     deformation_gradient: Array
@@ -63,6 +65,8 @@ class Drive(NamedTuple):
     rotation_time: float = 40.0
     kernels: Any = spectral
     rounding: Array | float = 0.0
+    exponent: float = 2.0
+    least_tension: float = 0.0
 
     @property
     def kappas(self) -> Array | float:
@@ -311,11 +315,14 @@ def keep(cells: UnitCell, drive: Drive, time_old: float, time_new: float) -> Uni
 
 
 def tensor_target(drive: Drive) -> tensor_law.Target:
-    """What the structure tensor tends to (`tensor_law.target`)."""
+    """What the structure tensor tends to (`tensor_law.target`, `tensor_law.awake`)."""
     tensor = drive.tensor
     if not drive.driver.material:
         tensor = drive.frame.tensor(drive.deformation_gradient, tensor)
-    return tensor_law.target(tensor, drive.floor)
+    found = tensor_law.target(tensor, drive.floor, drive.exponent)
+    if not drive.least_tension:
+        return found
+    return found._replace(share=found.share * tensor_law.awake(drive.tensor, drive.least_tension))
 
 
 def follow_tensor(

@@ -1,6 +1,6 @@
 """The consistent evolution law: one symmetric tensor A per point, without ranks and without axes (docs/theory.md).
 
-    dA/dt = kappa s (r0^2 E - A),    E = N / tr N,  N = (D+)^2
+    dA/dt = kappa s (r0^2 E - A),    E = N / tr N,  N = (D+)^n,  n = 2
 
 D is the driving tensor in material space, D+ its positive part, s a switch that is one under tension and vanishes with
 it. For the driver `finger` D is C. E has trace one, so tr A stays r0^2. Pure functions on arrays (n, 3, 3).
@@ -75,7 +75,7 @@ class Target(NamedTuple):
         )
 
 
-def target(tensor: Array, floor: Array | float) -> Target:
+def target(tensor: Array, floor: Array | float, exponent: float = 2.0) -> Target:
     """E and s of driving tensors in material space.
 
     Parameters
@@ -84,6 +84,8 @@ def target(tensor: Array, floor: Array | float) -> Target:
         D, symmetric, (n, 3, 3), any unit.
     floor
         Tension below which next to nothing remodels (`floor_above`), in the same unit; (n,) or a number.
+    exponent
+        n of N = (D+)^n: 2 is eq. (9), l_I = r0 e_I; 1 is netting analysis, tan^2 a = s_2/s_1.
     """
     values, vectors = np.linalg.eigh(tensor)
     largest = np.abs(values).max(axis=1)
@@ -92,9 +94,29 @@ def target(tensor: Array, floor: Array | float) -> Target:
     positive = np.maximum(values, 0.0) ** 2
     tension, compression = positive.sum(axis=1), (np.minimum(values, 0.0) ** 2).sum(axis=1)
     weights = positive / np.where(tension > 0, tension, 1.0)[:, None]
+    if exponent != 2.0:
+        top = np.where(tension > 0, weights.max(axis=1), 1.0)[:, None]
+        powers = (weights / top) ** (exponent / 2)
+        weights = powers / np.where(tension > 0, powers.sum(axis=1), 1.0)[:, None]
     direction = (vectors * weights[:, None, :]) @ np.swapaxes(vectors, 1, 2)
     total = tension + COMPRESSION * compression + (np.asarray(floor) / unit) ** 2
     return Target(direction, tension / np.where(total > 0, total, 1.0))
+
+
+def awake(tensor: Array, least_tension: float) -> Array:
+    """Share of kappa that acts: max(0, 1 - s0/s) with the largest principal value s; (n,).
+
+    The lazy zone of bone's adaptation (Huiskes et al. 1987), and Hypothesis I of the paper, "within a range".
+
+    Parameters
+    ----------
+    tensor
+        The driving tensor, (n, 3, 3).
+    least_tension
+        s0, in the same unit.
+    """
+    largest = np.linalg.eigvalsh(tensor)[:, -1]
+    return np.where(largest > least_tension, 1 - least_tension / np.where(largest > 0, largest, 1.0), 0.0)
 
 
 def weight_of_the_end(rate: Array | float) -> Array:

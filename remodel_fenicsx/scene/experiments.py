@@ -105,7 +105,8 @@ def check_exclusive(own: Values) -> None:
     SceneError
         One line that names both keys.
     """
-    for place, part in _parts(own):
+    for name, part in _parts(own):
+        place = _place(name)
         for table, key, replaces, *_ in EXPERIMENTS:
             value = _of(part, table, key)
             if value is not None and _of(part, table, replaces) is not None:
@@ -125,13 +126,13 @@ def with_own_numbers(values: Values) -> dict[str, Any]:
         Of a whole scene, without units.
     """
     found = {**values}
-    for place, part in _parts(values):
+    for name, part in _parts(values):
         for experiment in EXPERIMENTS:
             part = _with_own_number(experiment, part, found)
-        if not place:
+        if name is None:
             found = {**found, **part}
-        elif part is not _at(found, place):
-            found["regions"] = {**found["regions"], _name(place): part}
+        else:
+            found["regions"] = {**found["regions"], name: part}
     return found
 
 
@@ -146,27 +147,25 @@ def without_replaced(values: dict[str, Any], changed: Iterable[str]) -> None:
         Dotted keys that have been set.
     """
     changed = set(changed)
-    for place, part in _parts(values):
+    for name, part in _parts(values):
+        place = _place(name)
         for table, key, replaces, *_ in EXPERIMENTS:
             if f"{place}{table}.{key}" in changed and f"{place}{table}.{replaces}" not in changed:
                 part[table].pop(replaces, None)
 
 
-def _parts(values: Values) -> Iterator[tuple[str, Any]]:
-    """What is said of the whole body and of each region, under the dotted key before its tables."""
-    yield "", values
+def _parts(values: Values) -> Iterator[tuple[Any, Any]]:
+    """What is said of the whole body, under None, and of each region by its name."""
+    yield None, values
     regions = values.get("regions")
     for name, region in regions.items() if isinstance(regions, Mapping) else ():
         if isinstance(region, Mapping):
-            yield f"regions.{quoted(str(name))}.", region
+            yield name, region
 
 
-def _name(place: str) -> str:
-    return place.removeprefix("regions.").removesuffix(".").strip('"')
-
-
-def _at(values: Values, place: str) -> Any:
-    return values["regions"][_name(place)]
+def _place(name: Any) -> str:
+    """What stands before the keys of its tables."""
+    return "" if name is None else f"regions.{quoted(str(name))}."
 
 
 def _of(part: Values, table: str, key: str) -> Any:

@@ -186,6 +186,8 @@ class Scene(Table):
             return "mesh.formulation = 'displacement': in the others the stress at a point depends on its whole element"
         if not material.chain_density:
             return "chains: material.chain_density above 0"
+        if remodeling.has_set_point:
+            return "remodeling.exponent = 2 and remodeling.threshold = 0: their targets have no derivatives here"
         parts = LAWS[remodeling.law], DRIVERS[remodeling.driver], FRAMES[remodeling.frame]
         return refused(*parts, MATRICES[material.matrix], REPULSIONS[material.repulsion])
 
@@ -204,6 +206,10 @@ class Scene(Table):
         law, laws = self.remodeling.law, ", ".join(repr(name) for name, law in LAWS.items() if law.has_limit)
         if not LAWS[law].has_limit:
             return f"remodeling.law = {law!r} has no limit that the way there does not decide; those with one: {laws}"
+        if self.remodeling.threshold:
+            return "remodeling.threshold is above 0: where cells fall asleep depends on the way; march to a late time"
+        if self.remodeling.has_set_point:
+            return "remodeling.exponent is not 2: the equilibrium is found by derivatives that this target has not here"
         for name, properties in self.properties().items():
             if properties.kappa == 0:
                 return f"{in_region(name)}remodeling.kappa = 0: the cells never change"

@@ -1,0 +1,103 @@
+"""remodeling.exponent and remodeling.threshold: closed forms, and what has none of them is refused by name."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from remodel_fenicsx import SceneError, Simulation
+from remodel_fenicsx.model import tensor_law
+from remodel_fenicsx.scene import scene_from_dict
+
+
+def last_row(values: dict[str, Any]) -> dict[str, float]:
+    simulation = Simulation(scene_from_dict(values))
+    try:
+        return [dict(step.row) for step in simulation.steps()][-1]
+    finally:
+        simulation.close()
+
+
+@pytest.mark.parametrize(("exponent", "angle"), [(1.0, 35.26), (2.0, 26.57), (4.0, 14.04)])
+def test_fibres_of_a_thin_closed_tube(exponent: float, angle: float) -> None:
+    """Its hoop stress is twice the axial one: tan^2 a = 2^-n; n = 1 is netting analysis."""
+    values = {
+        "preset": "consistent",
+        "geometry": {"shape": "tube", "inner_radius": 100.0, "outer_radius": 100.5, "length": 10.0},
+        "model": {"kinematics": "radial"},
+        "cells": {"initial": "isotropic"},
+        "supports": {"ends": "closed"},
+        "remodeling": {"exponent": exponent, "kappa": 0.1},
+        "loads": {
+            "pressure": {"value": 0.005, "ramp": [[0.0, 0.0], [10.0, 1.0]]},
+            "elongation": {"value": 0.0, "ramp": [[0.0, 0.0]]},
+        },
+        "time": {"end": 300.0, "step": 5.0},
+        "output": {"fields": False},
+    }
+    assert last_row(values)["fibre_angle_middle"] == pytest.approx(angle, abs=0.25)
+
+
+def stiff_cube(**remodeling: Any) -> dict[str, Any]:
+    """Under a stress of 10, which hardly deforms it."""
+    return {
+        "geometry": {"shape": "cube", "side": 1.0},
+        "model": {"kinematics": "point"},
+        "material": {"lame_mu": 1e6, "lame_lambda": 1e6},
+        "cells": {"initial": "isotropic"},
+        "loads": {"force": {"value": 10.0, "ramp": [[0.0, 1.0]]}},
+        "remodeling": {"law": "tensor", "coupling": "staggered", "kappa": 0.02} | remodeling,
+        "time": {"end": 20.0, "step": 1.0},
+        "output": {"fields": False, "columns": ["asleep_share", "mean_fibre_angle"]},
+    }
+
+
+@pytest.mark.parametrize("coupling", ["staggered", "extrapolated"])
+def test_the_lazy_zone_slows_and_stops(coupling: str) -> None:
+    """A threshold of half the stress is half of kappa; one above it leaves the cells alone."""
+    slow = last_row(stiff_cube(threshold=5.0, coupling=coupling))
+    half = last_row(stiff_cube(kappa=0.01, coupling=coupling))
+    asleep = last_row(stiff_cube(threshold=10.5, coupling=coupling))
+    assert slow["mean_fibre_angle"] == pytest.approx(half["mean_fibre_angle"], abs=2e-3)
+    start = np.degrees(np.arccos(1 / np.sqrt(3)))
+    assert slow["mean_fibre_angle"] < start - 3 and asleep["mean_fibre_angle"] == pytest.approx(start, abs=1e-9)
+    assert (slow["asleep_share"], asleep["asleep_share"]) == (0.0, 1.0)
+
+
+def test_the_target_of_any_exponent() -> None:
+    """Its principal values are powers of those of the driving tensor, in any basis; the trace is one."""
+    random = np.random.default_rng(3)
+    axes = np.linalg.qr(random.standard_normal((3, 3)))[0]
+    values = np.array([4.0, 1.0, -2.0])
+    tensor = (axes * values) @ axes.T
+    for exponent in (0.5, 1.0, 3.0):
+        powers = np.maximum(values, 0) ** exponent
+        expected = (axes * (powers / powers.sum())) @ axes.T
+        found = tensor_law.target(tensor[None], 0.0, exponent)
+        assert np.abs(found.direction[0] - expected).max() < 1e-12
+        assert found.share == pytest.approx(tensor_law.target(tensor[None], 0.0).share)
+    zero = tensor_law.target(-np.eye(3)[None], 0.0, 1.0)
+    assert not zero.direction.any() and np.isfinite(zero.share).all()
+
+
+@pytest.mark.parametrize(
+    ("remodeling", "words"),
+    [
+        ({"law": "explicit", "coupling": "staggered", "exponent": 1.0}, "remodeling.exponent = 1"),
+        ({"law": "rate", "coupling": "staggered", "threshold": 1.0}, "remodeling.threshold = 1"),
+        ({"driver": "finger", "threshold": 1.0}, "remodeling.threshold = 1"),
+        ({"coupling": "implicit", "exponent": 1.0}, "remodeling.coupling = 'implicit': needs remodeling.exponent = 2"),
+    ],
+)
+def test_what_has_no_set_point_is_refused(remodeling: dict[str, Any], words: str) -> None:
+    with pytest.raises(SceneError, match=words):
+        scene_from_dict(stiff_cube() | {"remodeling": {"law": "tensor"} | remodeling})
+
+
+@pytest.mark.parametrize(("key", "reason"), [("threshold", "is above 0: where cells"), ("exponent", "is not 2")])
+def test_no_equilibrium_is_computed_with_them(key: str, reason: str) -> None:
+    values = stiff_cube(**{key: 1.0}) | {"time": {"end": "equilibrium"}}
+    with pytest.raises(SceneError, match=f"time.end = 'equilibrium': remodeling.{key} {reason}"):
+        scene_from_dict(values)
