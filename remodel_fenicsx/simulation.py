@@ -227,7 +227,7 @@ def opened(kinematics: Any, scene: Scene, quadrature: Quadrature, local_axes: Lo
     gradient = found.gradient(np.linalg.norm(places[..., :2], axis=-1), cylindrical_axes(places))
     natural = quadrature.function("natural_gradient", (3, 3))
     quadrature.values(natural, (3, 3))[:] = gradient.reshape(*quadrature.shape, 3, 3)
-    return NaturalConfiguration(kinematics, natural)
+    return NaturalConfiguration(kinematics, natural, found)
 
 
 def measured_fibres(scene: Scene, domain: Domain) -> dict[str, dict[str, Any]]:

@@ -116,6 +116,8 @@ class Shape(Table):
         Defaults of other tables that this shape changes, under the keys of preset and scene.
     holds_faces
         Whether `[supports.NAME]` says how each face is held (`hold_faces`).
+    columns_of_one_tissue
+        Names of columns that a body with regions has not.
     has_regions
         Whether a scene may give the body `[regions.NAME]`, named parts with tissue of their own.
     is_filled_by_regions
@@ -139,6 +141,7 @@ class Shape(Table):
     constant_fields: ClassVar[tuple[str, ...]] = ()
     defaults: ClassVar[dict[str, Any]] = {}
     holds_faces: ClassVar[bool] = False
+    columns_of_one_tissue: ClassVar[tuple[str, ...]] = ()
     has_regions: ClassVar[bool] = False
     closes_from_a_sector: ClassVar[bool] = False
     is_filled_by_regions: ClassVar[bool] = False

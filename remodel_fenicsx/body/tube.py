@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import logging
 import math
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
@@ -28,7 +29,7 @@ from remodel_fenicsx.body.reductions import (
 from remodel_fenicsx.body.shape import Array, LoadKind, check_lengths
 from remodel_fenicsx.body.walled import ANGLE_IN, Walled
 from remodel_fenicsx.body.whole import Body, Corners, divided_along, extended, mirrored_twice, revolved
-from remodel_fenicsx.model.cells import cylindrical_axes
+from remodel_fenicsx.model.cells import cylindrical_axes, structure_tensor
 from remodel_fenicsx.schema.tables import fault, shown
 from remodel_fenicsx.schema.units import FORCE, LENGTH, STRESS
 from remodel_fenicsx.settings import Mesh, Region
@@ -39,6 +40,9 @@ if TYPE_CHECKING:
     from remodel_fenicsx.body.domain import Domain
     from remodel_fenicsx.body.loading import Loading
 
+log = logging.getLogger(__name__)
+
+LAYERS_OF_A_CUT = 64  # in which the cells are averaged: a radial mesh of up to as many points loses nothing
 PAPER = (16, 8, 12)  # the paper's elements around, through the wall, and along
 
 # ---------------------------------------------------------------- what stands for all of a tube
@@ -206,6 +210,30 @@ def _reduced_axial_force(m: Any) -> float:
     return float(m.end_force("inner").reduced(m.state.loading.values["pressure"]))
 
 
+def _opening_angle(m: Any) -> float:
+    """Of the tube without loads, cut along its length, with its cells as they are; collective."""
+    from remodel_fenicsx.model.cutting import cut, means_through
+
+    cells, shape, comm = m.state.cells, m.observer.shape, m.state.comm
+    local = cells.local_axes
+    axes = local.axes.reshape(-1, 3, 3)
+    structure = structure_tensor(*cells.point_cells[:2])
+    squared = np.einsum("nia,nab,nib->ni", axes, structure, axes)  # around, along and across the wall
+    radius = np.linalg.norm(local.coordinates.reshape(-1, 3)[:, :2], axis=1)
+    parts = comm.allgather((radius, squared, m.quadrature.volumes.reshape(-1)))
+    radius, squared, volumes = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    known = means_through(radius, squared, volumes, LAYERS_OF_A_CUT)
+    try:
+        tissue = m.observer.stepper.remodeling.parameters.largest()  # one tissue: numbers
+        return float(
+            cut(tissue, (shape.inner_radius, shape.outer_radius), m.state.kinematics.closing, *known).opening_angle
+        )
+    except ArithmeticError as error:
+        if comm.rank == 0:
+            log.warning("time %g: no opening_angle: %s", m.step.time, error)
+        return float("nan")
+
+
 class Tube(Walled):
     """A thick-walled tube about z under inner pressure and axial elongation: the artery of the paper's Fig. 7.
 
@@ -258,6 +286,12 @@ class Tube(Walled):
             "`axial_force` less the pressure times the lumen's area at that end, p pi r_i^2: what a machine measures",
             _reduced_axial_force,
         ),
+        Column(
+            "opening_angle",
+            "degrees",
+            "angle of the sector that is missing when the unloaded tube is cut along its length, cells as they are",
+            _opening_angle,
+        ),
         *Walled.columns_on_request,
     )
     axis_kinds: ClassVar[tuple[str, ...]] = ("global", "cylindrical")
@@ -270,6 +304,7 @@ class Tube(Walled):
         "closed": lambda shape, loading: shape.close(loading),
     }
     ends_that_free_length: ClassVar[tuple[str, ...]] = ("closed",)
+    columns_of_one_tissue: ClassVar[tuple[str, ...]] = ("opening_angle",)
     has_regions: ClassVar[bool] = True
     closes_from_a_sector: ClassVar[bool] = True
     is_filled_by_regions: ClassVar[bool] = True

@@ -35,6 +35,8 @@ class Kinematics(ABC):
         Whether the strain is the same everywhere: then no mesh changes what is found.
     suits_multigrid
         Whether algebraic multigrid solves for these unknowns.
+    closing
+        Of which sector a tube is made (`model.closing.Closing`), where it has residual stress.
     cost
         Of a step for each quadrature point, in that of one of a hexahedron, as measured on the artery.
     """
@@ -47,6 +49,7 @@ class Kinematics(ABC):
     homogeneous: ClassVar[bool] = False
     suits_multigrid: ClassVar[bool] = True
     cost: ClassVar[float] = 1.0
+    closing: Any = None
 
     def element(self, kind: str) -> str:
         """Kind of the mesh's elements where the scene asks for elements of the body of this kind."""
@@ -341,10 +344,12 @@ class NaturalConfiguration:
         On a mesh; what is not said here it answers itself.
     gradient
         G at the quadrature points, a dolfinx function.
+    closing
+        Where it is from.
     """
 
-    def __init__(self, kinematics: Any, gradient: Any):
-        self.field, self.gradient = kinematics, gradient
+    def __init__(self, kinematics: Any, gradient: Any, closing: Any = None):
+        self.field, self.gradient, self.closing = kinematics, gradient, closing
 
     def __getattr__(self, name: str) -> Any:
         if name == "field":  # while it is copied it has none

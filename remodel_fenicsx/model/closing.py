@@ -10,6 +10,8 @@ equilibrium without pressure and without axial force.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -49,11 +51,11 @@ class Closing(NamedTuple):
 
     def natural_radius(self, radius: Array) -> Array:
         """R at r, both (...,)."""
-        return np.asarray(chebyshev.chebval(_between(radius, self.radii), self.coefficients), dtype=np.float64)
+        return np.asarray(chebyshev.chebval(between(radius, self.radii), self.coefficients), dtype=np.float64)
 
     def stretches(self, radius: Array) -> Array:
         """Circumferential, axial and radial stretch of G at r (...,): (..., 3), as the rows of cylindrical axes."""
-        slope = chebyshev.chebval(_between(radius, self.radii), chebyshev.chebder(self.coefficients))
+        slope = chebyshev.chebval(between(radius, self.radii), chebyshev.chebder(self.coefficients))
         inner, outer = self.radii
         radial = (outer - inner) / 2 / slope
         hoop = self.circumferential * radius / self.natural_radius(radius)
@@ -88,24 +90,38 @@ def closing(tissue: Tissue, radii: tuple[float, float], opening_angle: float) ->
     values = np.append(radius, 1.0)  # R at the places, and g_z
     for k in np.linspace(1.0, whole, 1 + int(np.ceil((whole - 1.0) / LARGEST_TURN)))[1:]:
         values[:-1] *= np.mean(values[:-1] + (k - 1.0) * radius * 0.5) / np.mean(values[:-1])
-        values = _solved(tissue, radii, places, float(k), values)
+        scale: Array = np.append(np.full(len(places), radii[1]), 1.0)
+        stiffness = tissue.lame_lambda + 2 * tissue.lame_mu
+        values = solved(partial(_residual, tissue, radii, places, float(k)), values, scale, stiffness)
     coefficients: Array = np.asarray(chebyshev.chebfit(places, values[:-1], DEGREE), dtype=np.float64)
     return Closing(radii, coefficients, whole, float(values[-1]))
 
 
-def _between(radius: Array, radii: tuple[float, float]) -> Array:
+def between(radius: Array, radii: tuple[float, float]) -> Array:
     return np.asarray(2 * (radius - radii[0]) / (radii[1] - radii[0]) - 1, dtype=np.float64)
 
 
-def _solved(tissue: Tissue, radii: tuple[float, float], places: Array, k: float, values: Array) -> Array:
-    """Newton with differences, halved where a step leaves what has an energy."""
-    stiffness = tissue.lame_lambda + 2 * tissue.lame_mu
-    scale = np.append(np.full(len(places), radii[1]), 1.0)
+def solved(function: Callable[[Array], Array], values: Array, scale: Array, stiffness: float) -> Array:
+    """Newton with differences, halved where a step leaves what has an energy.
+
+    Parameters
+    ----------
+    function
+        Stresses that shall vanish, of the values.
+    values, scale
+        A start, and sizes of the values.
+    stiffness
+        Of which the stresses are shares.
+
+    Raises
+    ------
+    ArithmeticError
+        If no solution is found.
+    """
 
     def residual(trial: Array) -> Array:
         with np.errstate(all="ignore"):
-            found: Array = _residual(tissue, radii, places, k, trial) / stiffness
-        return found
+            return np.asarray(function(trial) / stiffness, dtype=np.float64)
 
     present = residual(values)
     for _ in range(ITERATIONS):
@@ -122,7 +138,7 @@ def _solved(tissue: Tissue, radii: tuple[float, float], places: Array, k: float,
             if np.isfinite(trial).all() and np.linalg.norm(trial) < np.linalg.norm(present) * 10:
                 break
         values, present = values - share * step, trial
-    raise ArithmeticError(f"no sector with k = {k:.3g} closes to the ring")
+    raise ArithmeticError(f"no equilibrium of ring and sector; out of balance by {np.abs(present).max():.2g}")
 
 
 def _residual(tissue: Tissue, radii: tuple[float, float], places: Array, k: float, values: Array) -> Array:
@@ -139,10 +155,20 @@ def _residual(tissue: Tissue, radii: tuple[float, float], places: Array, k: floa
     return np.concatenate([balance[1:-1], faces, [chebyshev.chebval(1.0, force) / (radii[0] + radii[1])]])
 
 
-def principal_stresses(tissue: Tissue, stretches: Array) -> Array:
-    """Principal Cauchy stresses (..., 3) of a tissue with isotropic cells along stretches (..., 3)."""
+def principal_stresses(tissue: Tissue, stretches: Array, dimensions: Array | None = None) -> Array:
+    """Principal Cauchy stresses (..., 3) along stretches (..., 3), which are the axes of the cells.
+
+    Parameters
+    ----------
+    tissue
+        Its parameters are numbers.
+    stretches
+        F_e.
+    dimensions
+        l_I along them (..., 3), in link lengths; default: isotropic cells.
+    """
     shape = stretches.shape[:-1]
-    length = np.full((*shape, 3), tissue.end_to_end_length / np.sqrt(3.0))
+    length = np.full((*shape, 3), tissue.end_to_end_length / np.sqrt(3.0)) if dimensions is None else dimensions
     cell = UnitCell(length, np.broadcast_to(np.eye(3), (*shape, 3, 3)))
 
     def energy(index: int, change: float) -> Array:

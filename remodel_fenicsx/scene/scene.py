@@ -301,6 +301,8 @@ class Scene(Table):
         always = columns_of(self.geometry, regions=self.regions)
         known = dict.fromkeys([*columns_on_request(self.geometry), *(column.name for column in always)])
         for name in self.output.columns:
+            if self.regions and name in self.geometry.columns_of_one_tissue:
+                raise fault(f"{name!r} is for one tissue; the scene has regions", "output.columns", name)
             if name not in known:
                 rule = f"no such column on request; allowed for shape {self.geometry.name!r} are "
                 raise fault(rule + ", ".join(map(repr, known)), "output.columns", name)

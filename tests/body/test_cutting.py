@@ -1,0 +1,93 @@
+"""The column opening_angle: what is closed from a sector opens to it; remodeling alone leaves no residual stress."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+import numpy as np
+import pytest
+
+from remodel_fenicsx import Scene, SceneError, Simulation, preset_scene
+from remodel_fenicsx.model.closing import closing
+from remodel_fenicsx.model.cutting import cut
+
+
+def scene(preset: str = "consistent", kinematics: str = "radial", **changes: Any) -> Scene:
+    """An artery of isotropic cells whose opening angle is asked for."""
+    values = {"cells.initial": "isotropic", "model.kinematics": kinematics, "mesh.degree": 2}
+    values |= {"output.columns": ["opening_angle"], "output.fields": False, "loads.pressure.ramp": [[0, 0], [5, 1]]}
+    values |= {"loads.elongation.ramp": [[0, 0], [5, 1]], "time.end": 20.0}
+    return preset_scene(preset, "tube").with_values(values | changes)
+
+
+def angles(of: Scene) -> list[float]:
+    simulation = Simulation(of)
+    try:
+        return [float(step.row["opening_angle"]) for step in simulation.steps()]
+    finally:
+        simulation.close()
+
+
+@pytest.mark.parametrize("opening_angle", [60.0, 160.0])
+def test_what_was_closed_opens_again(opening_angle: float) -> None:
+    """Angle, radii and length of the sector, from another start than the solution."""
+    of = scene(**{"natural.opening_angle": opening_angle})
+    tissue, radii = of.properties()[""].tissue, (1.0, 3.0)
+    closed = closing(tissue, radii, opening_angle)
+    radius = np.linspace(*radii, 40)
+    isotropic = np.full((40, 3), tissue.end_to_end_length**2 / 3)
+    near = closed._replace(circumferential=closed.circumferential)
+    found = cut(tissue, radii, near, radius, isotropic)
+    sector = closed.natural_radius(np.array(radii))
+    assert found.opening_angle == pytest.approx(opening_angle, abs=1e-6)
+    assert found.radii == pytest.approx(tuple(sector), abs=1e-6)
+    assert found.axial == pytest.approx(1 / closed.axial, abs=1e-8)
+
+
+def test_tensor_and_log_leave_the_angle_as_it_was() -> None:
+    """F_e = 1 is free of stress for every structure tensor: a cut of the remodeled tube opens by what was given."""
+    for opening_angle in (0.0, 120.0):
+        found = angles(scene(**{"natural.opening_angle": opening_angle, "time.end": 40.0, "time.step": 1.0}))
+        assert found == pytest.approx([opening_angle] * len(found), abs=1e-5)
+
+
+def test_the_paper_s_law_makes_hardly_any_residual_stress() -> None:
+    """On the way |l| is below r0, which is stress; it fades."""
+    found = angles(scene("kuhl-holzapfel-2007", **{"time.end": 200.0, "time.step": 5.0}))
+    assert 1.0 < max(map(abs, found)) < 4.0 and 1e-3 < abs(found[-1]) < 0.3
+
+
+def test_a_stiffer_inside_changes_the_cut() -> None:
+    """Cells that were turned by force: the sector is in balance with the cells that are given."""
+    tissue, radii = scene().properties()[""].tissue, (1.0, 3.0)
+    closed = closing(tissue, radii, 120.0)
+    radius = np.linspace(*radii, 40)
+    share = np.linspace(0.9, 0.05, 40)
+    cells = tissue.end_to_end_length**2 * np.stack([share, 0.9 - share + 0.05, np.full(40, 0.05)], axis=1)
+    axes_repulsion = preset_scene("kuhl-holzapfel-2007", "tube").properties()[""].tissue
+    assert cut(tissue, radii, closed, radius, cells).opening_angle == pytest.approx(120.0, abs=1e-5)
+    assert cut(axes_repulsion, radii, closed, radius, 0.9 * cells).opening_angle != pytest.approx(120.0, abs=0.05)
+
+
+def test_kinematics_agree() -> None:
+    """On a ring of elements as on one radius: the mean of the cells through the wall decides."""
+    few = {"natural.opening_angle": 90.0, "time.end": 6.0, "time.step": 2.0, "loads.pressure.ramp": [[0, 0], [6, 1]]}
+    few |= {"loads.elongation.ramp": [[0, 0], [6, 1]]}
+    ends = [angles(scene("kuhl-holzapfel-2007", name, **few))[-1] for name in ("radial", "axisymmetric")]
+    assert ends[0] == pytest.approx(ends[1], abs=1e-3) and 89 < ends[0] < 91
+
+
+def test_no_equilibrium_of_the_cut_is_said(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    def fails(*parts: Any) -> None:
+        raise ArithmeticError("out of balance by 0.1")
+
+    monkeypatch.setattr("remodel_fenicsx.model.cutting.cut", fails)
+    with caplog.at_level(logging.WARNING):
+        assert np.isnan(angles(scene(**{"time.end": 5.0})))[0]
+    assert "no opening_angle: out of balance by 0.1" in caplog.text
+
+
+def test_layers_have_no_cut() -> None:
+    with pytest.raises(SceneError, match="'opening_angle' is for one tissue; the scene has regions"):
+        scene(**{"regions": {"inside": {"outer_radius": 2.0}, "outside": {}}})
