@@ -220,7 +220,7 @@ def _record(
     header = "as run: all values, also those of preset and defaults\n" + "\n".join(
         f"{name} {version}" for name, version in versions().items()
     )
-    scene, files = agreed(comm, lambda: _with_files_kept(scene) if comm.rank == 0 else (scene, {}))
+    scene, files = agreed(comm, lambda: with_files_kept(scene) if comm.rank == 0 else (scene, {}))
     text = scene.to_toml(header)
     columns = [column.name for column in simulation.observer.columns]
     wants_report = report and scene.output.report and comm.rank == 0
@@ -277,7 +277,7 @@ def _record(
         leave_report()
 
 
-def _with_files_kept(scene: Scene) -> tuple[Scene, dict[str, bytes]]:
+def with_files_kept(scene: Scene) -> tuple[Scene, dict[str, bytes]]:
     """The scene with the names that its files have in the folder of the run and their SHA-256, and these files."""
     from remodel_fenicsx.body.fibre_file import LARGEST_FIBRES
 

@@ -98,6 +98,7 @@ class MeshBody(WalledMesh):
     face_names: ClassVar[tuple[str, ...]] = ROLES
     has_regions: ClassVar[bool] = True
     holds_faces: ClassVar[bool] = True
+    refines: ClassVar[bool] = False
 
     shape: Literal["mesh"] = Field(default="mesh", description="Which body it is.")
     file: Annotated[str, BeforeValidator(_file)] = Field(

@@ -118,6 +118,8 @@ class Shape(Table):
         Whether `[supports.NAME]` says how each face is held (`hold_faces`).
     columns_of_one_tissue
         Names of columns that a body with regions has not.
+    refines
+        Whether `[mesh]` decides on its elements.
     has_regions
         Whether a scene may give the body `[regions.NAME]`, named parts with tissue of their own.
     is_filled_by_regions
@@ -142,6 +144,7 @@ class Shape(Table):
     defaults: ClassVar[dict[str, Any]] = {}
     holds_faces: ClassVar[bool] = False
     columns_of_one_tissue: ClassVar[tuple[str, ...]] = ()
+    refines: ClassVar[bool] = True
     has_regions: ClassVar[bool] = False
     closes_from_a_sector: ClassVar[bool] = False
     is_filled_by_regions: ClassVar[bool] = False

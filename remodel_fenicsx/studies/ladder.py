@@ -111,9 +111,15 @@ def ladder(scene: Scene) -> list[Setting]:
     several = tuple(range(seed, seed + SEEDS)) if random else (seed,)
     found: dict[str, Setting] = {}
 
+    def known(values: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Without those of a mesh that means nothing, or is given."""
+        homogeneous = KINEMATICS[values.get("model.kinematics", base.model.kinematics)].homogeneous
+        if scene.geometry.refines and not homogeneous:
+            return values
+        return {key: value for key, value in values.items() if not key.startswith("mesh.")}
+
     def add(factor: str, seeds: tuple[int, ...], values: Mapping[str, Any], profile: str = "") -> Setting | None:
-        if KINEMATICS[values.get("model.kinematics", base.model.kinematics)].homogeneous:
-            values = {key: value for key, value in values.items() if not key.startswith("mesh.")}
+        values = known(values)
         try:
             changed = base.with_values(values)
         except SceneError as error:  # a step of which a corner is no multiple, an element that a formulation has not
@@ -130,7 +136,7 @@ def ladder(scene: Scene) -> list[Setting]:
     remodels = LAWS[scene.remodeling.law].remodels
     for name, profile in PROFILES.items() if remodels else ():
         values = profile.values | {"model.kinematics": base.model.kinematics}
-        exact = base.with_values(values).has_exact_coupling and profile.takes_exact_coupling
+        exact = base.with_values(known(values)).has_exact_coupling and profile.takes_exact_coupling
         add(BOTH, several, values | ({COUPLING: EXACT} if exact else {}), name)
     for factor in [*STEPS, *(0.5**k for k in range(1, FINER_STEPS + 1))]:
         add(TIME, (seed,), {"time.step": factor * step})
@@ -179,7 +185,10 @@ def compared_lengths(scene: Scene) -> tuple[str, list[str]]:
     """What the lengths of a body are called, and its columns of them: radii, or the stretch of what has none."""
     columns = scene.geometry.columns
     radii = [column.name for column in columns if column.unit == "length"]
-    return ("radii", radii) if radii else ("stretch", [column.name for column in columns if column.name == STRETCH])
+    if radii:
+        return "radii", radii
+    stretch = [column.name for column in columns if column.name == STRETCH]
+    return ("stretch", stretch) if stretch else ("volume", [c.name for c in columns if c.unit == "length^3"])
 
 
 def as_run(setting: Setting, seed: int, times: list[float]) -> Scene:

@@ -99,7 +99,7 @@ class Run:
         if not (self.folder / SCENE).exists() or not (self.folder / HISTORY).exists():
             return False
         recording = RecordedRun(self.folder)
-        if recording.scene != self.scene:
+        if not _same(recording.scene, self.scene):
             raise SceneError(f"{self.folder}: holds a run of another scene; choose another folder with -o")
         try:
             history = recording.history
@@ -127,6 +127,19 @@ class Run:
     def history(self) -> HistoryColumns:
         """What it has recorded."""
         return read_history(self.folder)
+
+
+def _same(recorded: Scene, wanted: Scene) -> bool:
+    """Whether they are one scene: with the kinematics that "auto" took, and its files by SHA-256, wherever they are."""
+    if recorded == wanted:
+        return True
+    from remodel_fenicsx.running import with_files_kept
+    from remodel_fenicsx.simulation import with_kinematics
+
+    try:
+        return with_files_kept(recorded)[0] == with_files_kept(with_kinematics(wanted))[0]
+    except OSError:  # a file of fibres that is not there any more
+        return False
 
 
 def write_study(folder: Path, name: str, scene: str, runs: Sequence[Run]) -> None:

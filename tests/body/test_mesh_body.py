@@ -18,6 +18,7 @@ from remodel_fenicsx.results.fields import NodalGather
 from remodel_fenicsx.scene import scene_from_dict
 from remodel_fenicsx.settings import Support
 from remodel_fenicsx.simulation import Simulation
+from remodel_fenicsx.studies.ladder import ladder
 from tests.mesh_files import COUNTS, LENGTH, RADII, write_tube
 
 LOADS = {name: {"value": value, "ramp": [[0, 0], [2, 1]]} for name, value in (("pressure", 2.0), ("elongation", 0.1))}
@@ -291,3 +292,10 @@ def test_other_shapes_have_no_loads_on_faces() -> None:
     values = {"preset": "consistent", "geometry": {"shape": "tube"}, "loads": {"tissue": _outside()}}
     with pytest.raises(SceneError, match="loads.tissue.*no such load"):
         scene_from_dict(values)
+
+
+def test_the_ladder_of_an_own_body_varies_steps_alone(tube: Path) -> None:
+    """Its mesh is given: no rung asks for another, and no two are the same."""
+    rungs = ladder(scene_of(tube, time={"end": 4.0, "step": 1.0}))
+    assert {rung.mesh for rung in rungs} == {("full", 1, 1)}
+    assert len({rung.steps_in_words + str(rung.way) for rung in rungs}) == len(rungs) > 3
