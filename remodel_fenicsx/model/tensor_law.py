@@ -106,7 +106,7 @@ def target(tensor: Array, floor: Array | float, exponent: float = 2.0) -> Target
 def awake(tensor: Array, least_tension: float) -> Array:
     """Share of kappa that acts: max(0, 1 - s0/s) with the largest principal value s; (n,).
 
-    The lazy zone of bone's adaptation (Huiskes et al. 1987), and Hypothesis I of the paper, "within a range".
+    A lazy zone, as in models of the adaptation of bone; Hypothesis I of the paper says "within a range".
 
     Parameters
     ----------
