@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Collection, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
@@ -22,7 +23,7 @@ from remodel_fenicsx.body.shape import LoadKind
 from remodel_fenicsx.body.walled import WalledMesh
 from remodel_fenicsx.schema.tables import SceneError, fault, shown
 from remodel_fenicsx.schema.units import LENGTH_UNITS, STRESS
-from remodel_fenicsx.settings import Load, Mesh, Support, faces_of
+from remodel_fenicsx.settings import LARGEST_MESH, Load, Mesh, Support, faces_of
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -182,21 +183,21 @@ class MeshBody(WalledMesh):
         return len(self._read().cells)
 
     def check_size(self, mesh: Mesh) -> None:
-        """The file has what it has; nothing refines it."""
-        if mesh.refinement != 1:
-            raise fault("the mesh of a file is taken as it is: 1", "mesh.refinement", mesh.refinement)
+        """Edges are halved, as often as asked for."""
+        if mesh.refinement & (mesh.refinement - 1):
+            raise fault("must be a power of 2: the elements of a file are halved", "mesh.refinement", mesh.refinement)
 
     # ------------------------------------------------------------ mesh
     def build(self, mesh: Mesh, comm: MPI.Intracomm | None = None) -> Domain:
-        """The file's own mesh."""
+        """The file's own mesh, split where the scene says so."""
         from mpi4py import MPI
 
         from remodel_fenicsx.body.mesh_domain import shared
 
-        return shared(self.checked, comm or MPI.COMM_WORLD)
+        return shared(partial(self.checked, mesh), comm or MPI.COMM_WORLD)
 
-    def checked(self) -> tuple[MeshFile, Boundary, dict[str, int]]:
-        """The file, its boundary, and its regions' numbers by name; on rank 0.
+    def checked(self, mesh: Mesh | None = None) -> tuple[MeshFile, Boundary, dict[str, int]]:
+        """The mesh, its boundary, and its regions' numbers by name; on rank 0.
 
         Raises
         ------
@@ -224,7 +225,25 @@ class MeshBody(WalledMesh):
             words = f"its area is {inner:.4g}, that of outer {outer:.4g}: are inner and outer swapped?"
             raise SceneError(f"geometry.faces.inner = {shown(self._asked('inner'))}: {words}")
         self._say(file, boundary)
+        if mesh is not None and (mesh.refinement, mesh.degree) != (1, file.degree):
+            file, boundary = self._refined(file, mesh)
         return file, boundary, self._regions(file)
+
+    def _refined(self, file: MeshFile, mesh: Mesh) -> tuple[MeshFile, Boundary]:
+        """With smaller elements, or those of degree 2."""
+        from remodel_fenicsx.body.mesh_faces import boundary_of
+        from remodel_fenicsx.body.mesh_refinement import refined
+
+        if (number := len(file.cells) * mesh.refinement**3) > LARGEST_MESH:
+            raise SceneError(f"mesh.refinement = {mesh.refinement}: {number} elements; at most {LARGEST_MESH} are made")
+        try:
+            file = refined(file, mesh.refinement, mesh.degree)
+        except MeshFileError as error:
+            asked = f"mesh.refinement = {mesh.refinement}, mesh.degree = {mesh.degree}"
+            raise SceneError(f"{asked}: {Path(self.file).name} {error}") from None
+        words = "the body stays that of the file's plane faces"
+        log.info("split into %d elements of degree %d; %s", len(file.cells), file.degree, words)
+        return file, boundary_of(file, self._groups(file), self.open_boundary)
 
     def _read(self) -> MeshFile:
         try:

@@ -180,7 +180,7 @@ def test_a_body_that_can_move_is_refused(tube: Path) -> None:
         ({"supports": {"lid": FREE}}, "supports.lid: the body has no such face; it has inner, outer, inlet, outlet"),
         ({"supports": {"outer": {"kind": "elastic"}}}, "supports.outer.stiffness: missing"),
         ({"supports": {"inlet": {"kind": "fixed"}}}, "supports.inlet.kind = 'fixed': allowed are 'guided'"),
-        ({"mesh": {"refinement": 2}}, "mesh.refinement = 2: the mesh of a file is taken as it is: 1"),
+        ({"mesh": {"refinement": 3}}, "mesh.refinement = 3: must be a power of 2"),
     ],
 )
 def test_supports_and_meshes_that_cannot_be(tube: Path, tables: Any, words: str) -> None:

@@ -12,9 +12,10 @@ from mpi4py import MPI
 
 from remodel_fenicsx import SceneError
 from remodel_fenicsx.body import mesh_file
-from remodel_fenicsx.body.mesh_faces import jacobian_determinants
+from remodel_fenicsx.body.mesh_faces import boundary_of, jacobian_determinants
 from remodel_fenicsx.body.mesh_file import MeshFileError
 from remodel_fenicsx.body.mesh_reader import read_mesh
+from remodel_fenicsx.body.mesh_refinement import refined
 from remodel_fenicsx.scene import scene_from_dict
 from remodel_fenicsx.simulation import Simulation
 from tests.mesh_files import write_tube
@@ -148,3 +149,39 @@ def test_numbers_in_another_file_are_refused(tmp_path: Path) -> None:
     meshio.write(tmp_path / "tube.xdmf", mesh, data_format="HDF")
     with pytest.raises(MeshFileError, match="its numbers stand in another file"):
         read_mesh(tmp_path / "tube.xdmf")
+
+
+# ---------------------------------------------------------------- smaller elements
+
+
+@pytest.mark.parametrize("element", ["hexahedron", "tetrahedron"])
+@pytest.mark.parametrize(("refinement", "degree"), [(2, 1), (1, 2), (2, 2), (4, 1)])
+def test_refined_it_is_the_same_body(tmp_path: Path, element: str, refinement: int, degree: int) -> None:
+    """As many elements as halves make; volume and faces as before."""
+    source = read_mesh(write_tube(tmp_path / "tube.msh", element))
+    found = refined(source, refinement, degree)
+    assert (found.kind, found.degree, len(found.cells)) == (element, degree, len(source.cells) * refinement**3)
+    assert found.sha256 == source.sha256 and found.names == source.names
+    groups = {name: (number,) for name, number in source.names[2].items()}
+    one, other = boundary_of(source, groups, False), boundary_of(found, groups, False)
+    assert other.volume == pytest.approx(one.volume, rel=1e-12)
+    for name in groups:
+        assert other.area(name) == pytest.approx(one.area(name), rel=1e-12)
+        assert len(other.faces) == len(one.faces)
+    assert mesh_file.distinct(found.cell_groups) == mesh_file.distinct(source.cell_groups)
+
+
+def test_a_refined_run_is_nearer_to_a_finer_file(tmp_path: Path) -> None:
+    """Through the scene; what is no power of 2, or of degree 2 already, is refused by name."""
+    source = write_tube(tmp_path / "tube.msh")
+    rows = [
+        last_row(scene_of(source).with_values(changes))
+        for changes in ({}, {"mesh.refinement": 2}, {"mesh.refinement": 2, "mesh.degree": 2})
+    ]
+    volumes = [row["lumen_volume"] for row in rows]
+    assert abs(volumes[1] - volumes[2]) < 0.6 * abs(volumes[0] - volumes[2])
+    with pytest.raises(SceneError, match="mesh.refinement = 3: must be a power of 2"):
+        scene_of(source).with_values({"mesh.refinement": 3})
+    curved = write_tube(tmp_path / "curved.msh", degree=2)
+    with pytest.raises(SceneError, match="mesh.refinement = 2, mesh.degree = 2: curved.msh has elements of degree 2"):
+        last_row(scene_of(curved).with_values({"mesh.refinement": 2}))
