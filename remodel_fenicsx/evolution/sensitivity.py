@@ -24,7 +24,7 @@ from remodel_fenicsx.evolution.remodeling import RemodelingPass
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.model import tensor_law
 from remodel_fenicsx.model.cells import UnitCell
-from remodel_fenicsx.model.energy import Tissue
+from remodel_fenicsx.model.energy import Stresses, Tissue
 from remodel_fenicsx.model.laws import Drive, Law, RankedFunction
 from remodel_fenicsx.model.tensor_law import Target
 from remodel_fenicsx.settings import Remodeling, Solver
@@ -167,9 +167,10 @@ class LinearisedEquilibrium:
         terms = [ufl.derivative(tensor, u, way), along_constants(tensor, ways)]
         if tissue.chain is not None:
             terms.append(ufl.derivative(tensor, state.cells.dimensions, self._change_of_dimensions))
-        if pointwise is not None:
-            change = _sum([ufl.derivative(F, u, way), along_constants(F, ways)])
-            terms.append(ufl.derivative(tensor, pointwise.stress, self._whole_change_of_stress(F, change)))
+        if pointwise is not None and remodeling.driver.is_stress:  # linear in the stress
+            change = self._whole_change_of_stress(F, _sum([ufl.derivative(F, u, way), along_constants(F, ways)]))
+            nothing = ufl.zero(3, 3)
+            terms.append(remodeling.driver.tensor(F, Stresses(nothing, nothing, nothing).plus(F, change)))
         total = _sum(terms)
         return ufl.as_vector([total[i, i] for i in range(3)])
 
