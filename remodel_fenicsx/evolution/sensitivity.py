@@ -1,4 +1,4 @@
-"""Couplings that carry the derivatives of each solved step by numbers of the scene along, of bodies in which nothing turns.
+"""Couplings that carry along derivatives of each step by numbers of the scene, of bodies in which nothing turns.
 
 With the unknowns u, the lengths of the cells l and numbers theta: K du = -(R_theta dtheta + R_l dl) in each solved
 state, then dl of the pass. R_theta is the derivative of the forms by their Constants; it is exact.
@@ -67,6 +67,11 @@ def refused(settings: Remodeling, law: Law, coupling: str) -> str | None:
     if coupling not in COUPLINGS_WITH_DERIVATIVES:
         return f"remodeling.coupling = {coupling!r} has no derivative"
     return None
+
+
+def axes_lie_along(axes: Array) -> bool:
+    """Whether all axes of cells, rows (n, 3, 3), lie along the coordinates: else F, however diagonal, turns them."""
+    return bool(np.allclose(np.sort(np.abs(axes), axis=2), [0.0, 0.0, 1.0], rtol=0, atol=1e-12))
 
 
 # ---------------------------------------------------------------- a solved state
