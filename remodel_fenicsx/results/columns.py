@@ -116,6 +116,21 @@ class Measurement:
         return self.observer.shape.fibre_angle(cells.dimension_values, cells.axis_values, cells.local_axes.axes)
 
     @cached_property
+    def fibre_angle_unloaded(self) -> Array:
+        """Of the cells in the unloaded body, at all points (elements, points), degrees."""
+        cells = self.state.cells
+        axes = self.state.elastic_axes(cells.axis_values)
+        return self.observer.shape.fibre_angle(cells.dimension_values, axes, cells.local_axes.axes)
+
+    @cached_property
+    def fibre_angle_deformed(self) -> Array:
+        """Of the cells in the deformed body, at all points (elements, points), degrees."""
+        cells = self.state.cells
+        F = self.state.deformation_gradient().reshape(*self.quadrature.shape, 3, 3)
+        axes = self.state.elastic_axes(cells.axis_values, F)
+        return self.observer.shape.fibre_angle(cells.dimension_values, axes, cells.local_axes.deformed(F))
+
+    @cached_property
     def radial_share(self) -> Array:
         """Of the chains at all points (elements, points)."""
         cells = self.state.cells

@@ -114,16 +114,20 @@ def test_two_layers_in_three_dimensions_are_those_of_the_reference() -> None:
     assert radius < 3e-3 and media < 0.2 and adventitia < 0.2
 
 
-def write_layers(path: Path) -> Path:
+def write_layers(path: Path, radii: tuple[float, ...] = (1.0, INTERFACE, 3.0), turn: Any = None) -> Path:
     """The same tube as a mesh file by the script of a demo, whose numbers are set and whose bend is left out."""
     script: Any = runpy.run_path(str(Path(__file__).parents[2] / "demos" / "bent_vessel" / "mesh.py"))
-    numbers = {"RADII": (1.0, INTERFACE, 3.0), "LENGTH": 0.5, "AROUND": 32, "THROUGH": 4, "ALONG": 1}
+    numbers = {"RADII": radii, "LENGTH": 0.5, "AROUND": 32, "THROUGH": 4, "ALONG": 1}
     script["straight"].__globals__.update(numbers)
     with gmsh_model("layers") as gmsh:
         script["straight"]()
         script["name_parts"]()
         gmsh.model.mesh.generate(3)
         gmsh.model.mesh.setOrder(2)
+        if turn is not None:
+            tags, places, _ = gmsh.model.mesh.getNodes()
+            for tag, place in zip(tags, places.reshape(-1, 3) @ np.asarray(turn).T, strict=True):
+                gmsh.model.mesh.setNode(tag, place, [])
         gmsh.option.setNumber("Mesh.MshFileVersion", 4.1)
         gmsh.write(str(path))
     return path
