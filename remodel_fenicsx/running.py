@@ -247,7 +247,7 @@ def _record(
             log.warning("%s", warning)
         watchers: list[Watcher] = []
         if scene.output.fields:
-            names = field_names(scene.output.fields, scene.regions, scene.geometry.constant_fields)
+            names = field_names(scene.output.fields, scene.lacking_fields, scene.geometry.constant_fields)
             parts = place, scene.geometry, simulation.stepper, scene.output.every, after and after.time, names
             times = scene.output.times
             watchers.append(stack.enter_context(agreed(comm, lambda: Fields(*parts, times))))

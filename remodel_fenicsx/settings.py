@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import BeforeValidator, ConfigDict, Field, create_model, model_validator
 from pydantic.config import JsonDict
 
 from remodel_fenicsx._lazy import resolved
@@ -258,6 +258,76 @@ def _initial_cells(value: Any) -> Any:
     return value
 
 
+def _entries(value: Any) -> Any:
+    """A list of tables as a tuple; anything else is a fault."""
+    if not isinstance(value, (list, tuple)):
+        raise fault("must be a list of tables, each [[natural.layers]]")
+    return tuple(value)
+
+
+POSITIVE: JsonDict = {"allowed": "a finite number greater than 0"}
+
+
+class Prestretch(Table):
+    """How far a part of the wall was stretched before it was joined to the rest, along its local axes.
+
+    What is not said follows from the volume, which stays: two others are alike.
+    """
+
+    circumferential: float | None = Field(default=None, gt=0, description="Stretch around.", json_schema_extra=POSITIVE)
+    axial: float | None = Field(default=None, gt=0, description="Stretch along.", json_schema_extra=POSITIVE)
+    radial: float | None = Field(default=None, gt=0, description="Stretch across the wall.", json_schema_extra=POSITIVE)
+
+    @model_validator(mode="after")
+    def _says_one(self) -> Prestretch:
+        if not _set(self):
+            raise fault("needs one of " + ", ".join(type(self).model_fields))
+        return self
+
+    @property
+    def stretches(self) -> tuple[float, float, float]:
+        """Around, along and across."""
+        given = [self.circumferential, self.axial, self.radial]
+        known = [value for value in given if value is not None]
+        other = float(np.prod(known)) ** (-1 / (3 - len(known))) if len(known) < 3 else 1.0
+        around, along, across = (other if value is None else value for value in given)
+        return around, along, across
+
+
+_share: Any = {  # `from` is a word of Python
+    "from": (
+        float,
+        Field(default=0.0, ge=0, lt=1, description="Where it begins, from the inside (0) to the outside (1)."),
+    ),
+    "to": (float, Field(default=1.0, gt=0, le=1, description="Where it ends.")),
+}
+_Share: Any = create_model("_Share", __base__=Table, **_share)
+
+
+class NaturalLayer(_Share):  # type: ignore[misc]
+    """A part of the wall that was stretched before it was joined to the rest (docs/natural.md)."""
+
+    region: str | None = Field(
+        default=None, min_length=1, description="A region, in place of `from` and `to`.",
+        json_schema_extra={"allowed": "the name of a region"},
+    )  # fmt: skip
+    prestretch: Prestretch = Field(description="From its natural state to the unloaded body.")
+
+    @model_validator(mode="after")
+    def _is_somewhere(self) -> NaturalLayer:
+        low, high = self.share
+        if not low < high:
+            raise fault(f"must be smaller than to = {shown(high)}", "from", low)
+        if self.region is not None and self.share != (0.0, 1.0):
+            raise fault("the layer has a region: from and to say nothing more", "region", self.region)
+        return self
+
+    @property
+    def share(self) -> tuple[float, float]:
+        """Of the wall: where it begins and ends."""
+        return getattr(self, "from"), self.to
+
+
 class Natural(Table):
     """The configuration in which the tissue is free of stress, where it is not the mesh's (docs/natural.md)."""
 
@@ -269,6 +339,31 @@ class Natural(Table):
         "that of the sector. Fung's opening angle, between the lines from the middle of the inner arc to its ends, is "
         "half of it. 0: the mesh is free of stress.",
     )
+    layers: Annotated[tuple[NaturalLayer, ...], BeforeValidator(_entries)] = Field(
+        default=(),
+        description="Parts of the wall with a prestretch, a table `[[natural.layers]]` each; a tube and its layers "
+        "close so that it is in equilibrium without loads, an own body moves when it is let go.",
+        json_schema_extra={"allowed": "a list of tables"},
+    )
+
+    @property
+    def is_of_the_mesh(self) -> bool:
+        """Whether the mesh is free of stress."""
+        return self.opening_angle == 0.0 and not self.layers
+
+    @model_validator(mode="after")
+    def _layers_lie_apart(self) -> Natural:
+        for index, layer in enumerate(self.layers):
+            for other in self.layers[:index]:
+                same = layer.region is not None and layer.region == other.region
+                if (layer.region is None) != (other.region is None):
+                    raise fault("some layers have a region and some a share of the wall: allowed is one of both",
+                                f"layers[{index}].region", layer.region)  # fmt: skip
+                apart = layer.share[0] >= other.share[1] or layer.share[1] <= other.share[0]
+                if same or (layer.region is None and not apart):
+                    place = layer.region if same else list(layer.share)
+                    raise fault("lies in another layer", f"layers[{index}]", place)
+        return self
 
 
 class Cells(Table):
@@ -842,10 +937,11 @@ class Solver(Table):
 
 FIELDS_BY_NAME = (
     "displacement", "deformation_gradient", "cauchy_stress", "cell_dimensions", "axis_1", "axis_2", "axis_3",
-    "fibre_angle", "fibre_angle_deformed", "chain_extension", "region", "chains",
+    "fibre_angle", "fibre_angle_unloaded", "fibre_angle_deformed", "chain_extension", "region", "chains",
 )  # fmt: skip
 """What `output.fields` may name (`results.fields`); "chains" are the lines of fields_chains.vtkhdf."""
 REGION = "region"  # the field of bodies with regions
+UNLOADED = "fibre_angle_unloaded"  # the field of bodies whose tissue is free of stress in another configuration
 CONSTANT_FIELDS = ("axis_c", "axis_a", "axis_r", "depth", "station")
 """What it may name beside: local axes of the elements, their depth and station, which do not change."""
 

@@ -19,7 +19,6 @@ from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher, times
 from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.fem.kinematics import KINEMATICS, FreeLength, NaturalConfiguration
 from remodel_fenicsx.fem.quadrature import Quadrature
-from remodel_fenicsx.model.cells import cylindrical_axes
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.model.laws import LAWS
 from remodel_fenicsx.model.local_axes import LocalAxes
@@ -100,8 +99,8 @@ class Simulation:
         self.quadrature = Quadrature(mesh, scene.mesh.degree, kinematics.weight(mesh))
         properties, local_axes = scene.properties(), shape.local_axes(domain, self.quadrature)
         own = {name: properties[name].cells for name in scene.regions}
-        if scene.natural.opening_angle:
-            kinematics = opened(kinematics, scene, self.quadrature, local_axes)
+        if not scene.natural.is_of_the_mesh:
+            kinematics = from_natural(kinematics, scene, self.quadrature, domain, local_axes)
         fibres = measured_fibres(scene, domain)
         self.cells = UnitCells(self.quadrature, domain, scene.cells, local_axes, own, fibres)
         self.loading = Loading(domain, self.unknown, kinematics)
@@ -215,27 +214,38 @@ class Simulation:
         self.stepper.close()
 
 
-def opened(kinematics: Any, scene: Scene, quadrature: Quadrature, local_axes: LocalAxes) -> NaturalConfiguration:
-    """The kinematics of a tube whose tissue is free of stress in an open sector.
+def from_natural(
+    kinematics: Any, scene: Scene, quadrature: Quadrature, domain: Domain, local_axes: LocalAxes
+) -> NaturalConfiguration:
+    """The kinematics of a body whose tissue is free of stress in another configuration than the mesh's.
 
     Raises
     ------
     SceneError
-        If no such sector closes to the tube.
+        If nothing closes to the tube, or a layer has a region that the body has not.
     """
+    from remodel_fenicsx.body.natural import gradient, prestretch
     from remodel_fenicsx.model.closing import closing
 
-    tube: Any = scene.geometry  # a shape that `closes_from_a_sector`
-    angle = scene.natural.opening_angle
-    try:
-        found = closing(scene.properties()[""].tissue, (tube.inner_radius, tube.outer_radius), angle)
-    except ArithmeticError as error:
-        raise SceneError(f"natural.opening_angle = {angle:g}: must be smaller: {error}") from error
-    places = local_axes.coordinates
-    gradient = found.gradient(np.linalg.norm(places[..., :2], axis=-1), cylindrical_axes(places))
-    natural = quadrature.function("natural_gradient", (3, 3))
-    quadrature.values(natural, (3, 3))[:] = gradient.reshape(*quadrature.shape, 3, 3)
-    return NaturalConfiguration(kinematics, natural, found)
+    natural, shape, found = scene.natural, scene.geometry, None
+    for index, layer in enumerate(natural.layers):
+        if layer.region is not None and layer.region not in domain.regions:
+            known = ", ".join(map(repr, domain.regions))
+            raise SceneError(f"natural.layers[{index}].region = {layer.region!r}: no such region; there are {known}")
+    if shape.closes_from_a_sector:
+        tissues = {name: properties.tissue for name, properties in scene.properties().items()}
+        try:
+            found = closing(shape.layers_of_tissue(natural, scene.regions, tissues), natural.opening_angle)
+        except ArithmeticError as error:
+            asked = f"natural.opening_angle = {natural.opening_angle:g}"
+            raise SceneError(f"{asked}: must be smaller, or natural.layers nearer to 1: {error}") from error
+        stretches = found.stretches(np.linalg.norm(local_axes.coordinates[..., :2], axis=-1))
+    else:
+        stretches = prestretch(natural, local_axes, domain)
+    function = quadrature.function("natural_gradient", (3, 3))
+    values = gradient(stretches, local_axes.axes)
+    quadrature.values(function, (3, 3))[:] = values.reshape(*quadrature.shape, 3, 3)
+    return NaturalConfiguration(kinematics, function, found)
 
 
 def measured_fibres(scene: Scene, domain: Domain) -> dict[str, dict[str, Any]]:

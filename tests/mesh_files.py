@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -25,19 +26,23 @@ def write_tube(
     shift: Any = (0.0, 0.0, 0.0),
     renamed: dict[str, str] = NAMES,
     counts: tuple[int, int, int] = COUNTS,
+    length: float = LENGTH,
+    moved: Callable[[Any], Any] | None = None,
 ) -> Path:
-    """A tube about z as a file with named faces, perhaps turned and shifted."""
+    """A tube about z as a file with named faces, perhaps turned and shifted, or its places (n, 3) moved at will."""
     around, through, along = counts
     wall = Wall.of(*RADII, through, {})
     with gmsh_model("tube") as gmsh:
-        draw_tube(wall, LENGTH, (around, along), element, degree)
+        draw_tube(wall, length, (around, along), element, degree)
         for dimension, tag in gmsh.model.getPhysicalGroups(2):
             name = gmsh.model.getPhysicalName(dimension, tag)
             gmsh.model.removePhysicalName(name)
             gmsh.model.setPhysicalName(dimension, tag, renamed.get(name, name))
         if turn is not None:
+            moved = lambda places: places @ np.asarray(turn).T + shift  # noqa: E731
+        if moved is not None:
             tags, places, _ = gmsh.model.mesh.getNodes()
-            for tag, place in zip(tags, places.reshape(-1, 3) @ np.asarray(turn).T + shift, strict=True):
+            for tag, place in zip(tags, moved(places.reshape(-1, 3)), strict=True):
                 gmsh.model.mesh.setNode(tag, place, [])
         gmsh.option.setNumber("Mesh.MshFileVersion", version)
         gmsh.option.setNumber("Mesh.Binary", 0)

@@ -244,6 +244,9 @@ def _rarely(random: Random, scene: Values, stiffness: float) -> None:
         scene["regions"] = {"inside": {"outer_radius": middle}, "outside": {}}
     if _closes_from_a_sector(scene) and random.random() < 0.3:
         scene["natural"] = {"opening_angle": rounded(random.uniform(0, 120))}
+        if random.random() < 0.4:
+            along = {"axial": rounded(random.uniform(0.95, 1.1))}
+            scene["natural"]["layers"] = [{"from": rounded(random.uniform(0.2, 0.8)), "prestretch": along}]
     _set_points(random, scene, stiffness)
 
 

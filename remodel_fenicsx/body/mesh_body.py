@@ -96,6 +96,15 @@ class MeshBody(WalledMesh):
         ),
         *WalledMesh.columns,
     )
+    columns_on_request: ClassVar[tuple[Column, ...]] = (
+        Column(
+            "outer_area",
+            "length^2",
+            "area of the deformed outer face",
+            lambda m: m.face_area("outer", deformed=True),
+        ),
+        *WalledMesh.columns_on_request,
+    )
     face_names: ClassVar[tuple[str, ...]] = ROLES
     has_regions: ClassVar[bool] = True
     holds_faces: ClassVar[bool] = True

@@ -19,10 +19,11 @@ from remodel_fenicsx.body.gmsh_model import length_fault
 from remodel_fenicsx.body.reductions import Reduction, homogeneous, known_loads, same_cells, symmetric_law, unturned
 from remodel_fenicsx.body.whole import Body
 from remodel_fenicsx.model.cells import angle_to_axis
+from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.model.local_axes import LocalAxes
 from remodel_fenicsx.schema.tables import Table, fault
 from remodel_fenicsx.schema.units import Dimension, LengthUnit
-from remodel_fenicsx.settings import LARGEST_MESH, Load, Mesh, Region, Support
+from remodel_fenicsx.settings import LARGEST_MESH, Load, Mesh, Natural, Region, Support
 
 if TYPE_CHECKING:  # shapes are part of every scene: they are read without dolfinx
     from mpi4py import MPI
@@ -125,7 +126,9 @@ class Shape(Table):
     is_filled_by_regions
         Whether the regions of a scene, where it has some, are all of the body.
     closes_from_a_sector
-        Whether a scene may give the body `natural.opening_angle`: it has `inner_radius` and `outer_radius`.
+        Whether a scene may give the body `natural.opening_angle`; `layers_of_tissue` says of which layers it closes.
+    has_a_wall
+        Whether a scene may give it `natural.layers`.
     """
 
     loads: ClassVar[dict[str, LoadKind]]
@@ -147,6 +150,7 @@ class Shape(Table):
     refines: ClassVar[bool] = True
     has_regions: ClassVar[bool] = False
     closes_from_a_sector: ClassVar[bool] = False
+    has_a_wall: ClassVar[bool] = False
     is_filled_by_regions: ClassVar[bool] = False
 
     shape: str = Field(description="Which body it is.")
@@ -198,6 +202,10 @@ class Shape(Table):
             lambda: self.station(places),
             lambda: self.depth(domain.mesh.geometry.x),
         )
+
+    def layers_of_tissue(self, natural: Natural, regions: Mapping[str, Region], tissues: Mapping[str, Tissue]) -> Any:
+        """Of a body that closes from a sector: its layers (`model.closing.Layer`), from the lumen outwards."""
+        raise NotImplementedError(f"a {self.name} does not close")
 
     @property
     def name(self) -> str:

@@ -27,12 +27,13 @@ from remodel_fenicsx.body.reductions import (
     symmetric_planes,
 )
 from remodel_fenicsx.body.shape import Array, LoadKind, check_lengths
-from remodel_fenicsx.body.walled import ANGLE_IN, Walled
+from remodel_fenicsx.body.walled import AngleOf, Walled, angle_columns, angle_columns_on_request
 from remodel_fenicsx.body.whole import Body, Corners, divided_along, extended, mirrored_twice, revolved
 from remodel_fenicsx.model.cells import cylindrical_axes, structure_tensor
+from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.schema.tables import fault, shown
 from remodel_fenicsx.schema.units import FORCE, LENGTH, STRESS
-from remodel_fenicsx.settings import Mesh, Region
+from remodel_fenicsx.settings import Mesh, Natural, Region
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -181,15 +182,22 @@ def _mean_radius(face: str) -> Callable[[Any], float]:
     return value
 
 
-def _layer_angle(share: float) -> Callable[[Any], float]:
+def _layer_angle(share: float) -> AngleOf:
     """Mean angle over the elements that touch R_i + share (R_o - R_i)."""
 
-    def value(m: Any) -> float:
+    def value(m: Any, angle: Array) -> float:
         inner, outer = (m.domain.dimensions[f"{side}_radius"] for side in ("inner", "outer"))
         radius = (1.0 - share) * inner + share * outer
-        return float(m.quadrature.mean_of_known(m.fibre_angle, m.elements_touching_radius(radius)))
+        return float(m.quadrature.mean_of_known(angle, m.elements_touching_radius(radius)))
 
     return value
+
+
+MEANS = {
+    "inner": ("that touch R_i", _layer_angle(0.0)),
+    "middle": ("that touch (R_i + R_o)/2", _layer_angle(0.5)),
+    "outer": ("that touch R_o", _layer_angle(1.0)),
+}
 
 
 def _add_pressure(loading: Loading, name: str) -> None:
@@ -212,6 +220,7 @@ def _reduced_axial_force(m: Any) -> float:
 
 def _opening_angle(m: Any) -> float:
     """Of the tube without loads, cut along its length, with its cells as they are; collective."""
+    from remodel_fenicsx.model.closing import Layer
     from remodel_fenicsx.model.cutting import cut, means_through
 
     cells, shape, comm = m.state.cells, m.observer.shape, m.state.comm
@@ -223,11 +232,11 @@ def _opening_angle(m: Any) -> float:
     parts = comm.allgather((radius, squared, m.quadrature.volumes.reshape(-1)))
     radius, squared, volumes = (np.concatenate(columns) for columns in zip(*parts, strict=True))
     known = means_through(radius, squared, volumes, LAYERS_OF_A_CUT)
+    tissue = m.observer.stepper.remodeling.parameters.largest()  # one tissue: numbers
+    closed = m.state.kinematics.closing
+    layers = (Layer((shape.inner_radius, shape.outer_radius), tissue),) if closed is None else closed.layers
     try:
-        tissue = m.observer.stepper.remodeling.parameters.largest()  # one tissue: numbers
-        return float(
-            cut(tissue, (shape.inner_radius, shape.outer_radius), m.state.kinematics.closing, *known).opening_angle
-        )
+        return float(cut(layers, closed, *known).opening_angle)
     except ArithmeticError as error:
         if comm.rank == 0:
             log.warning("time %g: no opening_angle: %s", m.step.time, error)
@@ -275,9 +284,7 @@ class Tube(Walled):
         Column(
             "outer_radius", "length", "mean distance from the axis over the deformed outer face", _mean_radius("outer")
         ),
-        Column("fibre_angle_inner", "degrees", f"{ANGLE_IN} that touch R_i", _layer_angle(0.0)),
-        Column("fibre_angle_middle", "degrees", f"{ANGLE_IN} that touch (R_i + R_o)/2", _layer_angle(0.5)),
-        Column("fibre_angle_outer", "degrees", f"{ANGLE_IN} that touch R_o", _layer_angle(1.0)),
+        *angle_columns(MEANS),
     )
     columns_on_request: ClassVar[tuple[Column, ...]] = (
         Column(
@@ -292,6 +299,7 @@ class Tube(Walled):
             "angle of the sector that is missing when the unloaded tube is cut along its length, cells as they are",
             _opening_angle,
         ),
+        *angle_columns_on_request(MEANS),
         *Walled.columns_on_request,
     )
     axis_kinds: ClassVar[tuple[str, ...]] = ("global", "cylindrical")
@@ -315,6 +323,12 @@ class Tube(Walled):
     inner_radius: Annotated[float, LENGTH] = Field(gt=0, description="Inner radius R_i, in the scene's unit of length.")
     outer_radius: Annotated[float, LENGTH] = Field(gt=0, description="Outer radius R_o, in the scene's unit of length.")
     length: Annotated[float, LENGTH] = Field(gt=0, description="Length along z, in the scene's unit of length.")
+
+    def layers_of_tissue(self, natural: Natural, regions: Mapping[str, Region], tissues: Mapping[str, Tissue]) -> Any:
+        """Where tissue or prestretch change."""
+        from remodel_fenicsx.body.natural import tube_layers
+
+        return tube_layers(_wall(self, max(1, len(regions)), regions), natural, tissues)
 
     @model_validator(mode="after")
     def _has_a_wall(self) -> Tube:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from remodel_fenicsx.body.domain import Domain
     from remodel_fenicsx.fem.quadrature import Quadrature
 
+AngleOf = Callable[[Any, Array], float]  # of a measurement and angles at its points
 NODES_AT_A_DEPTH = 1e-3  # layers of nodes of a regular mesh have their depth to 1e-4
 ANGLE_IN = (
     "mean of the reference angle, from circumferential (0) to axial (90 degrees), over the chains that do not point "
@@ -25,7 +27,14 @@ ANGLE_IN = (
 )
 
 
-def _angle_at(face: str) -> Callable[[Any], float]:
+CONFIGURATIONS = {
+    "unloaded": "the same of the cells in the unloaded body, where the tissue is free of stress in another one",
+    "deformed": "the same of the cells in the deformed body, in local axes that move with it",
+}
+"""Configurations, beside that of the cells, whose angles may be asked for, each with its words."""
+
+
+def _angle_at(face: str) -> AngleOf:
     """Mean angle over the elements that have a facet on a face."""
 
     def elements(m: Any) -> NDArray[np.bool_]:
@@ -35,14 +44,14 @@ def _angle_at(face: str) -> Callable[[Any], float]:
         found[cells_of(m.domain.mesh, facets_of(m.domain, [face]))[0]] = True
         return found
 
-    def value(m: Any) -> float:
+    def value(m: Any, angle: Array) -> float:
         chosen = m.tool(("elements at", face), lambda: elements(m))
-        return float(m.quadrature.mean_of_known(m.fibre_angle, chosen))
+        return float(m.quadrature.mean_of_known(angle, chosen))
 
     return value
 
 
-def _middle_angle(m: Any) -> float:
+def _middle_angle(m: Any, angle: Array) -> float:
     """Mean angle over the elements that are half-way through the wall; there are some in every mesh."""
 
     def elements() -> NDArray[np.bool_]:
@@ -52,7 +61,34 @@ def _middle_angle(m: Any) -> float:
         low, high = depths.min(axis=1) - NODES_AT_A_DEPTH, depths.max(axis=1) + NODES_AT_A_DEPTH
         return np.asarray((low <= 0.5) & (high >= 0.5), dtype=np.bool_)
 
-    return float(m.quadrature.mean_of_known(m.fibre_angle, m.tool("middle elements", elements)))
+    return float(m.quadrature.mean_of_known(angle, m.tool("middle elements", elements)))
+
+
+def angle_columns(means: Mapping[str, tuple[str, AngleOf]]) -> tuple[Column, ...]:
+    """Of the cells' own configuration.
+
+    Parameters
+    ----------
+    means
+        By where, "inner" say: which elements they are, in words, and the mean over them.
+    """
+    return tuple(
+        Column(f"fibre_angle_{where}", "degrees", f"{ANGLE_IN} {words}", partial(_of, mean, "fibre_angle"))
+        for where, (words, mean) in means.items()
+    )
+
+
+def angle_columns_on_request(means: Mapping[str, tuple[str, AngleOf]]) -> tuple[Column, ...]:
+    """Of the other configurations."""
+    return tuple(
+        Column(f"fibre_angle_{name}_{where}", "degrees", meaning, partial(_of, mean, f"fibre_angle_{name}"))
+        for name, meaning in CONFIGURATIONS.items()
+        for where, (_, mean) in means.items()
+    )
+
+
+def _of(mean: AngleOf, name: str, m: Any) -> float:
+    return mean(m, getattr(m, name))
 
 
 class Walled(Shape):
@@ -71,6 +107,7 @@ class Walled(Shape):
         "fibre_angle_middle": 0.5,
         "fibre_angle_outer": 1.0,
     }
+    has_a_wall: ClassVar[bool] = True
     depth_in_words: ClassVar[tuple[str, str, str]] = ("through the wall", "inside", "outside")
     angle_in_words: ClassVar[tuple[str, str]] = ("around", "along")
 
@@ -83,16 +120,23 @@ class Walled(Shape):
         return radial_share(dimensions, axes, local)
 
 
+MEANS_ON_A_MESH: dict[str, tuple[str, AngleOf]] = {
+    "inner": ("with a facet on the inner face", _angle_at("inner")),
+    "middle": ("half-way through the wall", _middle_angle),
+    "outer": ("with a facet on the outer face", _angle_at("outer")),
+}
+
+
 class WalledMesh(Walled):
     """A body with a wall whose local axes are found on its mesh.
 
     Faces "inner" and "outer" lie across the wall from each other, "inlet" and "outlet" across the body.
     """
 
-    columns: ClassVar[tuple[Column, ...]] = (
-        Column("fibre_angle_inner", "degrees", f"{ANGLE_IN} with a facet on the inner face", _angle_at("inner")),
-        Column("fibre_angle_middle", "degrees", f"{ANGLE_IN} half-way through the wall", _middle_angle),
-        Column("fibre_angle_outer", "degrees", f"{ANGLE_IN} with a facet on the outer face", _angle_at("outer")),
+    columns: ClassVar[tuple[Column, ...]] = angle_columns(MEANS_ON_A_MESH)
+    columns_on_request: ClassVar[tuple[Column, ...]] = (
+        *angle_columns_on_request(MEANS_ON_A_MESH),
+        *Walled.columns_on_request,
     )
     axis_kinds: ClassVar[tuple[str, ...]] = ("local", "global")
     constant_fields: ClassVar[tuple[str, ...]] = CONSTANT_FIELDS

@@ -1,25 +1,25 @@
-"""The natural configuration of a tube with an opening angle: the sector that closes to a known ring without loads.
+"""The natural configuration of a tube: what closes and joins to a known ring, with or without loads.
 
-A ring that is cut opens to a sector. With k = 360/(360 - opening angle) the way back is, in cylindrical axes,
+A ring that is cut opens to a sector, and its layers may be stretched before they are joined. In cylindrical axes
 
-    G = diag(dr/dR, k r/R, g_z),
+    G = diag(k r/R, g_z, dr/dR) P,    k = 360/(360 - opening angle),
 
-where R(r) is the sector's radius of what lies at r in the closed ring. R and g_z are such that the ring is in
-equilibrium without pressure and without axial force.
+where R(r) is the sector's radius of what lies at r in the ring, and P the prestretch of the layer. R and g_z are such
+that the ring is in equilibrium: as the unloaded tube without pressure and without axial force.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.energy import Tissue
+from remodel_fenicsx.model.panels import Panels
 
 Array = NDArray[np.float64]
 DEGREE = 24  # of R(r): the paper's artery at 160 degrees changes by less than 1e-8 from 16 to 32
@@ -29,55 +29,98 @@ LARGEST_TURN = (
 ITERATIONS = 30
 CLOSED = 1e-9  # of the residual over lambda + 2 mu; the differences of the energy are good to about 1e-11
 STRETCH_DIFFERENCE = 1e-3  # of a stretch in the five-point rule: its error is of fourth order
+UNSTRETCHED = (1.0, 1.0, 1.0)
 
 
-class Closing(NamedTuple):
-    """A sector that closes to a ring.
+class Layer(NamedTuple):
+    """A layer of a ring.
 
     Attributes
     ----------
     radii
-        r_i and r_o of the ring.
-    coefficients
-        Of R(r), in Chebyshev polynomials of the ring's radius between -1 and 1.
+        Where it begins and ends in the ring.
+    tissue
+        Its parameters are numbers.
+    prestretch
+        Circumferential, axial and radial: from its natural state to what is joined.
+    """
+
+    radii: tuple[float, float]
+    tissue: Tissue
+    prestretch: tuple[float, float, float] = UNSTRETCHED
+
+
+class Loads(NamedTuple):
+    """What acts on the ring.
+
+    Attributes
+    ----------
+    pressure
+        On its inner face.
+    force
+        Of the wall along the axis; None where the axial stretch is prescribed.
+    axial
+        The axial stretch, where it is prescribed.
+    """
+
+    pressure: float = 0.0
+    force: float | None = 0.0
+    axial: float = 1.0
+
+
+class Closing(NamedTuple):
+    """What closes to a ring.
+
+    Attributes
+    ----------
+    layers
+        Of the ring, from the lumen outwards.
+    panels
+        One for each layer.
+    radius
+        R at the panels' points.
     circumferential, axial
         k and g_z.
     """
 
-    radii: tuple[float, float]
-    coefficients: Array
+    layers: tuple[Layer, ...]
+    panels: Panels
+    radius: Array
     circumferential: float
     axial: float
 
     def natural_radius(self, radius: Array) -> Array:
         """R at r, both (...,)."""
-        return np.asarray(chebyshev.chebval(between(radius, self.radii), self.coefficients), dtype=np.float64)
+        return self.panels.at(radius, self.radius)
 
     def stretches(self, radius: Array) -> Array:
         """Circumferential, axial and radial stretch of G at r (...,): (..., 3), as the rows of cylindrical axes."""
-        slope = chebyshev.chebval(between(radius, self.radii), chebyshev.chebder(self.coefficients))
-        inner, outer = self.radii
-        radial = (outer - inner) / 2 / slope
-        hoop = self.circumferential * radius / self.natural_radius(radius)
-        return np.stack([hoop, np.full_like(radius, self.axial), radial], axis=-1)
+        slope = self.panels.at(radius, self.panels.derivative(self.radius))
+        prestretch = np.array([layer.prestretch for layer in self.layers])[self.panels.of(radius)]
+        return self._joined(radius, self.natural_radius(radius), slope) * prestretch
 
-    def gradient(self, radius: Array, axes: Array) -> Array:
-        """G (..., 3, 3) at r (...,), with the cylindrical axes there as rows (..., 3, 3)."""
-        found: Array = np.swapaxes(axes, -1, -2) @ (self.stretches(radius)[..., None] * axes)
-        return found
+    def at_panels(self) -> Array:
+        """The same at the panels' own points, (panels, points, 3)."""
+        prestretch = np.array([layer.prestretch for layer in self.layers])[:, None]
+        return self._joined(self.panels.places, self.radius, self.panels.derivative(self.radius)) * prestretch
+
+    def _joined(self, radius: Array, natural: Array, slope: Array) -> Array:
+        """G without the prestretch."""
+        hoop = self.circumferential * radius / natural
+        return np.stack([hoop, np.full_like(radius, self.axial), 1.0 / slope], axis=-1)
 
 
-def closing(tissue: Tissue, radii: tuple[float, float], opening_angle: float) -> Closing:
-    """The sector of a tissue with isotropic cells that closes to a ring of these radii.
+def closing(layers: Sequence[Layer], opening_angle: float, loads: Loads = Loads()) -> Closing:
+    """What closes to a ring in equilibrium: of a tissue with isotropic cells.
 
     Parameters
     ----------
-    tissue
-        Its parameters are numbers.
-    radii
-        r_i and r_o of the closed ring.
+    layers
+        Of the ring, from the lumen outwards.
     opening_angle
         Angle of the sector that is missing, in degrees (Fung's opening angle is half of it).
+    loads
+        Of the ring; default: none, the unloaded tube.
 
     Raises
     ------
@@ -85,20 +128,17 @@ def closing(tissue: Tissue, radii: tuple[float, float], opening_angle: float) ->
         If no equilibrium is found.
     """
     whole = 360.0 / (360.0 - opening_angle)
-    places = np.cos(np.pi * np.arange(DEGREE, -1, -1) / DEGREE)
-    radius = radii[0] + (radii[1] - radii[0]) * (places + 1) / 2
-    values = np.append(radius, 1.0)  # R at the places, and g_z
-    for k in np.linspace(1.0, whole, 1 + int(np.ceil((whole - 1.0) / LARGEST_TURN)))[1:]:
-        values[:-1] *= np.mean(values[:-1] + (k - 1.0) * radius * 0.5) / np.mean(values[:-1])
-        scale: Array = np.append(np.full(len(places), radii[1]), 1.0)
-        stiffness = tissue.lame_lambda + 2 * tissue.lame_mu
-        values = solved(partial(_residual, tissue, radii, places, float(k)), values, scale, stiffness)
-    coefficients: Array = np.asarray(chebyshev.chebfit(places, values[:-1], DEGREE), dtype=np.float64)
-    return Closing(radii, coefficients, whole, float(values[-1]))
-
-
-def between(radius: Array, radii: tuple[float, float]) -> Array:
-    return np.asarray(2 * (radius - radii[0]) / (radii[1] - radii[0]) - 1, dtype=np.float64)
+    panels = Panels([layers[0].radii[0], *(layer.radii[1] for layer in layers)], DEGREE)
+    ring = panels.places
+    values = np.append(ring, loads.axial)  # R at the points, and g_z
+    stiffness = max(layer.tissue.lame_lambda + 2 * layer.tissue.lame_mu for layer in layers)
+    scale: Array = np.append(np.full(ring.size, panels.edges[-1]), 1.0)
+    turns = np.linspace(1.0, whole, 1 + max(1, int(np.ceil((whole - 1.0) / LARGEST_TURN))))[1:]
+    for k in turns:
+        values[:-1] *= np.mean(values[:-1] + (k - 1.0) * ring.ravel() * 0.5) / np.mean(values[:-1])
+        residual = partial(_residual, tuple(layers), panels, float(k), loads)
+        values = solved(residual, values, scale, stiffness)
+    return Closing(tuple(layers), panels, values[:-1].reshape(ring.shape), whole, float(values[-1]))
 
 
 def solved(function: Callable[[Array], Array], values: Array, scale: Array, stiffness: float) -> Array:
@@ -141,18 +181,23 @@ def solved(function: Callable[[Array], Array], values: Array, scale: Array, stif
     raise ArithmeticError(f"no equilibrium of ring and sector; out of balance by {np.abs(present).max():.2g}")
 
 
-def _residual(tissue: Tissue, radii: tuple[float, float], places: Array, k: float, values: Array) -> Array:
-    """Radial balance inside, radial stress on both faces, axial force."""
-    half = (radii[1] - radii[0]) / 2
-    radius = radii[0] + half * (places + 1)
-    coefficients: Array = np.asarray(chebyshev.chebfit(places, values[:-1], DEGREE), dtype=np.float64)
-    shape = Closing(radii, coefficients, k, float(values[-1]))
-    hoop, axial, radial = np.moveaxis(principal_stresses(tissue, shape.stretches(radius)), -1, 0)
-    fitted = chebyshev.chebfit(places, radial, DEGREE)
-    balance = chebyshev.chebval(places, chebyshev.chebder(fitted)) + (radial - hoop) * half / radius
-    force = chebyshev.chebint(chebyshev.chebfit(places, axial * radius, DEGREE), lbnd=-1)
-    faces = radial[[0, -1]]
-    return np.concatenate([balance[1:-1], faces, [chebyshev.chebval(1.0, force) / (radii[0] + radii[1])]])
+def _residual(layers: tuple[Layer, ...], panels: Panels, k: float, loads: Loads, values: Array) -> Array:
+    """Radial balance in the layers, what goes from one to the next, radial stress on both faces, axial force."""
+    ring, radius = panels.places, values[:-1].reshape(panels.places.shape)
+    stretches = Closing(layers, panels, radius, k, float(values[-1])).at_panels()
+    stresses = [principal_stresses(layer.tissue, stretches[n]) for n, layer in enumerate(layers)]
+    hoop, axial, radial = np.moveaxis(np.array(stresses), -1, 0)
+    balance = (panels.derivative(radial) + (radial - hoop) / ring)[:, 1:-1] * (panels.edges[-1] - panels.edges[0]) / 2
+    faces = [radial[0, 0] + loads.pressure, radial[-1, -1]]
+    moduli = np.array([layer.tissue.lame_lambda + 2 * layer.tissue.lame_mu for layer in layers])
+    between = panels.jumps(radius) / ring[0, 0] * moduli.max()
+    edges = panels.edges
+    area = np.pi * (edges[-1] ** 2 - edges[0] ** 2)
+    if loads.force is None:
+        along = (float(values[-1]) - loads.axial) * moduli.max()
+    else:
+        along = (2 * np.pi * panels.integral(axial * ring) - loads.force) / area
+    return np.concatenate([balance.ravel(), faces, panels.jumps(radial), between, [along]])
 
 
 def principal_stresses(tissue: Tissue, stretches: Array, dimensions: Array | None = None) -> Array:

@@ -2,22 +2,23 @@
 
 The mesh's ring of radii R becomes a sector of radii rho(R), in cylindrical axes
 
-    F = diag(drho/dR, k rho/R, e),    F_e = F G,
+    F = diag(k rho/R, e, drho/dR),    F_e = F G,
 
 without pressure, axial force and bending moment; its opening angle is 360 (1 - k). The cells stay.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
-from remodel_fenicsx.model.closing import Closing, principal_stresses, solved
+from remodel_fenicsx.model.closing import Closing, Layer, principal_stresses, solved
 from remodel_fenicsx.model.energy import Tissue
+from remodel_fenicsx.model.panels import Panels
 
 Array = NDArray[np.float64]
 CUT_DEGREE = 32  # of rho(R): angles of remodeled walls, whose cells have a front, change by less than 0.1 degrees to 48
@@ -42,28 +43,23 @@ class Cut(NamedTuple):
 
 
 class _Wall(NamedTuple):
-    """What is known of the ring: tissue, radii of the mesh, Chebyshev places, G and l_I there, (places, 3)."""
+    """What is known of the ring: its layers' tissues, points, and G and l_I there, (panels, points, 3)."""
 
-    tissue: Tissue
-    radii: tuple[float, float]
-    places: Array
+    tissues: tuple[Tissue, ...]
+    panels: Panels
     natural: Array
     dimensions: Array
 
 
-def cut(
-    tissue: Tissue, radii: tuple[float, float], closed: Closing | None, radius: Array, squared_dimensions: Array
-) -> Cut:
+def cut(layers: Sequence[Layer], closed: Closing | None, radius: Array, squared_dimensions: Array) -> Cut:
     """Cut an unloaded tube.
 
     Parameters
     ----------
-    tissue
-        Its parameters are numbers.
-    radii
+    layers
         Of the ring that is the mesh.
     closed
-        Of which sector it is made; None: the mesh is free of stress before any remodeling.
+        Of what it was closed; None: the mesh is free of stress before any remodeling.
     radius, squared_dimensions
         Places through the wall (n,), increasing, and l_I^2 there around, along and across it, (n, 3).
 
@@ -72,37 +68,41 @@ def cut(
     ArithmeticError
         If no equilibrium is found.
     """
-    places = np.cos(np.pi * np.arange(CUT_DEGREE, -1, -1) / CUT_DEGREE)
-    at = radii[0] + (radii[1] - radii[0]) * (places + 1) / 2
-    squared = np.stack([np.interp(at, radius, column) for column in squared_dimensions.T], axis=-1)
-    natural = np.ones((len(at), 3)) if closed is None else closed.stretches(at)
-    wall = _Wall(tissue, radii, places, natural, np.sqrt(np.maximum(squared, 0.0)))
-    start = (at, 1.0, 1.0)
-    if closed is not None:  # what opens, were the cells as they were
-        start = (closed.natural_radius(at), 1 / closed.axial, 1 / closed.circumferential)
-    values: Array = np.concatenate([start[0], start[1:]])
-    scale: Array = np.concatenate([np.full(len(at), radii[1]), [1.0, 1.0]])
-    found = solved(partial(_residual, wall), values, scale, tissue.lame_lambda + 2 * tissue.lame_mu)
+    panels = Panels([layers[0].radii[0], *(layer.radii[1] for layer in layers)], CUT_DEGREE)
+    squared = np.empty((*panels.places.shape, 3))
+    panel = panels.of(radius)
+    for number, at in enumerate(panels.places):  # what lies in a layer says nothing of the next
+        here = panel == number
+        rows = radius[here], squared_dimensions[here]
+        squared[number] = np.stack([np.interp(at, rows[0], column) for column in rows[1].T], axis=-1)
+    natural, start = np.ones_like(squared), (panels.places.copy(), 1.0, 1.0)
+    if closed is not None:
+        fine = closed._replace(panels=panels, radius=closed.panels.onto(panels, closed.radius))
+        natural = fine.at_panels()
+        start = (fine.radius, 1 / closed.axial, 1 / closed.circumferential)  # what opens, were the cells as they were
+    tissues = tuple(layer.tissue for layer in layers)
+    wall = _Wall(tissues, panels, natural, np.sqrt(np.maximum(squared, 0.0)))
+    values: Array = np.concatenate([start[0].ravel(), start[1:]])
+    scale: Array = np.concatenate([np.full(panels.places.size, panels.edges[-1]), [1.0, 1.0]])
+    stiffness = max(tissue.lame_lambda + 2 * tissue.lame_mu for tissue in tissues)
+    found = solved(partial(_residual, wall, stiffness), values, scale, stiffness)
     return Cut(360.0 * (1.0 - float(found[-1])), (float(found[0]), float(found[-3])), float(found[-2]))
 
 
-def _residual(wall: _Wall, values: Array) -> Array:
-    """Radial balance inside, radial stress on both faces, axial force and bending moment; all as stresses."""
-    rho, axial, k = values[:-2], values[-2], values[-1]
-    places, half = wall.places, (wall.radii[1] - wall.radii[0]) / 2
-    radius = wall.radii[0] + half * (places + 1)
-    slope = chebyshev.chebval(places, chebyshev.chebder(chebyshev.chebfit(places, rho, CUT_DEGREE))) / half
-    stretches = np.stack([k * rho / radius, np.full_like(rho, axial), slope], axis=-1)
-    stresses = principal_stresses(wall.tissue, stretches * wall.natural, wall.dimensions)
-    hoop, along, radial = np.moveaxis(stresses, -1, 0)
-    change = chebyshev.chebval(places, chebyshev.chebder(chebyshev.chebfit(places, radial, CUT_DEGREE)))
-    balance = change + (radial - hoop) * slope * half / rho
-
-    def over_the_wall(density: Array) -> float:
-        integral = chebyshev.chebint(chebyshev.chebfit(places, density * rho * slope, CUT_DEGREE), lbnd=-1)
-        return float(chebyshev.chebval(1.0, integral)) / (rho[0] + rho[-1])
-
-    return np.concatenate([balance[1:-1], radial[[0, -1]], [over_the_wall(along), over_the_wall(hoop)]])
+def _residual(wall: _Wall, stiffness: float, values: Array) -> Array:
+    """Radial balance in the layers, what goes on between them, both faces, axial force and bending moment: stresses."""
+    panels, axial, k = wall.panels, values[-2], values[-1]
+    ring, half = panels.places, (panels.edges[-1] - panels.edges[0]) / 2
+    rho = values[:-2].reshape(ring.shape)
+    slope = panels.derivative(rho)
+    stretches = np.stack([k * rho / ring, np.full_like(rho, axial), slope], axis=-1) * wall.natural
+    stresses = [principal_stresses(t, stretches[n], wall.dimensions[n]) for n, t in enumerate(wall.tissues)]
+    hoop, along, radial = np.moveaxis(np.array(stresses), -1, 0)
+    balance = (panels.derivative(radial) + (radial - hoop) * slope / rho)[:, 1:-1] * half
+    between = panels.jumps(rho) / ring[0, 0] * stiffness
+    means = [panels.integral(density * rho * slope) / half / (rho[0, 0] + rho[-1, -1]) for density in (along, hoop)]
+    faces = [radial[0, 0], radial[-1, -1]]
+    return np.concatenate([balance.ravel(), faces, panels.jumps(radial), between, means])
 
 
 def means_through(radius: Array, values: Array, weights: Array, number: int) -> tuple[Array, Array]:

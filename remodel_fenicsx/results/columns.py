@@ -116,6 +116,21 @@ class Measurement:
         return self.observer.shape.fibre_angle(cells.dimension_values, cells.axis_values, cells.local_axes.axes)
 
     @cached_property
+    def fibre_angle_unloaded(self) -> Array:
+        """Of the cells in the unloaded body, at all points (elements, points), degrees."""
+        cells = self.state.cells
+        axes = self.state.elastic_axes(cells.axis_values)
+        return self.observer.shape.fibre_angle(cells.dimension_values, axes, cells.local_axes.axes)
+
+    @cached_property
+    def fibre_angle_deformed(self) -> Array:
+        """Of the cells in the deformed body, at all points (elements, points), degrees."""
+        cells = self.state.cells
+        F = self.state.deformation_gradient().reshape(*self.quadrature.shape, 3, 3)
+        axes = self.state.elastic_axes(cells.axis_values, F)
+        return self.observer.shape.fibre_angle(cells.dimension_values, axes, cells.local_axes.deformed(F))
+
+    @cached_property
     def radial_share(self) -> Array:
         """Of the chains at all points (elements, points)."""
         cells = self.state.cells
@@ -140,8 +155,15 @@ class Measurement:
 
     def face_mean(self, face: str, nodal_values: Array, deformed: bool = False) -> float:
         """Mean of nodal values (nodes,) over a named face, by its reference or its deformed area."""
-        mean = self.tool((face, deformed), lambda: _FaceMean(self.observer, face, deformed))
-        return float(mean(nodal_values))
+        return self._face(face, deformed).mean(nodal_values)
+
+    def face_area(self, face: str, deformed: bool = False) -> float:
+        """Reference or deformed area of a named face."""
+        return self._face(face, deformed).area()
+
+    def _face(self, face: str, deformed: bool) -> _FaceIntegral:
+        found: _FaceIntegral = self.tool((face, deformed), lambda: _FaceIntegral(self.observer, face, deformed))
+        return found
 
     def end_force(self, face: str) -> EndForce:
         """Of a tube whose inner face has this name, at the end z = length."""
@@ -186,8 +208,8 @@ class Measurement:
         return self._of_step[key]
 
 
-class _FaceMean:
-    """Mean over a face of a nodal field, over the reference or the deformed area."""
+class _FaceIntegral:
+    """Integrals over a face of a nodal field, over the reference or the deformed area."""
 
     def __init__(self, observer: Observer, face: str, deformed: bool):
         domain, state = observer.domain, observer.state
@@ -202,11 +224,16 @@ class _FaceMean:
         self._form = jit.form(value * weight * state.loading.measure_alone(face))
         self._comm = domain.comm
 
-    def __call__(self, nodal_values: Array) -> float:
+    def mean(self, nodal_values: Array) -> float:
+        """Of nodal values (nodes,). Collective."""
         weighted, area = self._comm.allreduce(
             np.array([self._integral(values) for values in (nodal_values, 1.0)]), MPI.SUM
         )
         return float(weighted / area)
+
+    def area(self) -> float:
+        """Of the face. Collective."""
+        return float(self._comm.allreduce(self._integral(1.0), MPI.SUM))
 
     def _integral(self, nodal_values: Array | float) -> float:
         self.field.x.array.reshape(-1, self._size)[:, 0] = nodal_values

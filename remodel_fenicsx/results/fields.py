@@ -20,7 +20,7 @@ from remodel_fenicsx.results.chain_lines import AXIS_FIELDS, OF_CHAINS, append_c
 from remodel_fenicsx.results.recording import CHAIN_LINES, FIELDS
 from remodel_fenicsx.results.vtkhdf import TransientGrid, vtk_cells
 from remodel_fenicsx.schema.times import SAME_TIME, same_time
-from remodel_fenicsx.settings import CONSTANT_FIELDS, FIELDS_BY_NAME, REGION
+from remodel_fenicsx.settings import CONSTANT_FIELDS, FIELDS_BY_NAME, REGION, UNLOADED
 from remodel_fenicsx.solver.pointwise import PointStresses
 from remodel_fenicsx.state.state import State
 
@@ -31,14 +31,14 @@ OF_ELEMENTS = tuple(name for name in FIELDS_BY_NAME if name not in ("displacemen
 
 
 def field_names(
-    asked: bool | Sequence[str], regions: Collection[str] = (), constant: Sequence[str] = ()
+    asked: bool | Sequence[str], lacking: Collection[str] = (REGION, UNLOADED), constant: Sequence[str] = ()
 ) -> tuple[str, ...]:
-    """The fields that a scene's `output.fields` asks for; all but that of regions where it has none.
+    """The fields that a scene's `output.fields` asks for; where it says all, without those that it lacks.
 
     `constant` are those that its shape has beside (`Shape.constant_fields`).
     """
     if isinstance(asked, bool):
-        return (*(name for name in FIELDS_BY_NAME if regions or name != REGION), *constant) if asked else ()
+        return (*(name for name in FIELDS_BY_NAME if name not in lacking), *constant) if asked else ()
     return tuple(asked)
 
 
@@ -80,9 +80,10 @@ class ElementFields:
         """By name, one row per local element.
 
         `deformation_gradient` and `cauchy_stress` (9, row by row); `cell_dimensions` (3) and `axis_1..3`: the cell
-        whose structure tensor is the element's mean, longest first; `fibre_angle` and `fibre_angle_deformed` (degrees,
-        to the load axis, or in a tube from circumferential to axial; NaN where no chain has one); `chain_extension`
-        (largest r/L in the element; 0 where no chain locks); `region` (its number, `Domain.regions`).
+        whose structure tensor is the element's mean, longest first; `fibre_angle`, `fibre_angle_unloaded` and
+        `fibre_angle_deformed` (degrees, to the load axis, or in a tube from circumferential to axial; NaN where no
+        chain has one); `chain_extension` (largest r/L in the element; 0 where no chain locks); `region` (its number,
+        `Domain.regions`).
         """
         if self._stresses is not None:
             self._stresses.refresh()
@@ -103,8 +104,11 @@ class ElementFields:
             found |= {name: mean_axes[:, i] for i, name in enumerate(AXIS_FIELDS)}
         if "fibre_angle" in wanted:
             found["fibre_angle"] = mean_of_known(fibre_angle(dimensions, axes, cells.local_axes.axes))
+        if UNLOADED in wanted:
+            unloaded_axes = self.state.elastic_axes(axes)
+            found[UNLOADED] = mean_of_known(fibre_angle(dimensions, unloaded_axes, cells.local_axes.axes))
         if "fibre_angle_deformed" in wanted:
-            deformed_axes, local = axes @ np.swapaxes(elastic, -1, -2), cells.local_axes.deformed(F)
+            deformed_axes, local = self.state.elastic_axes(axes, F), cells.local_axes.deformed(F)
             found["fibre_angle_deformed"] = mean_of_known(fibre_angle(dimensions, deformed_axes, local))
         if "chain_extension" in wanted:
             squared = cells.kernels.squared_length(elastic.reshape(-1, 3, 3), cells.point_cells).reshape(F.shape[:2])

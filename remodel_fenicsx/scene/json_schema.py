@@ -15,7 +15,7 @@ from pydantic.fields import FieldInfo
 from remodel_fenicsx.body import SHAPES, Shape
 from remodel_fenicsx.scene.presets import PRESETS, PROFILES
 from remodel_fenicsx.scene.scene import FORMAT, Scene
-from remodel_fenicsx.schema.tables import choices, free_names, is_table
+from remodel_fenicsx.schema.tables import choices, free_names, is_table, listed_tables
 from remodel_fenicsx.schema.units import QUANTITY, STRESS, Dimension, dimension_of
 from remodel_fenicsx.settings import Load, Supports
 
@@ -53,6 +53,8 @@ def _field(field: FieldInfo, by_pydantic: Schema) -> Schema:
         return _table(field.annotation)  # type: ignore[arg-type]
     if get_origin(field.annotation) is dict and is_table(kind := get_args(field.annotation)[1]):
         return {"type": "object", "additionalProperties": _table(kind)}
+    if (listed_kind := listed_tables(field.annotation)) is not None:
+        return {"type": "array", "description": field.description or "", "items": _table(listed_kind)}
     schema = _without_null({name: entry for name, entry in by_pydantic.items() if name not in ("title", "allowed")})
     if listed := choices(field):
         schema["enum"] = listed

@@ -32,6 +32,7 @@ from remodel_fenicsx.schema.toml import merged, parse_override, put, read_toml, 
 from remodel_fenicsx.schema.units import FORCE, LENGTH_UNIT, LENGTH_UNITS, STRESS_UNIT, in_units
 from remodel_fenicsx.settings import (
     REGION,
+    UNLOADED,
     STRESS_UNITS,
     MEASURED_CELLS,
     Cells,
@@ -168,8 +169,9 @@ class Scene(Table):
         for name, load in self.loads.items():
             self._check_load(name, load)
         self._check_output_times()
-        if REGION in _listed(self.output.fields) and not self.regions:
-            raise fault("the scene has no regions", "output.fields", REGION)
+        for field, reason in self.lacking_fields.items():
+            if field in _listed(self.output.fields):
+                raise fault(reason, "output.fields", field)
         self._check_columns()
         self._check_length()
         self._check_natural()
@@ -323,6 +325,13 @@ class Scene(Table):
         return self.geometry.loads_on(faces_of(self.loads))
 
     @property
+    def lacking_fields(self) -> dict[str, str]:
+        """Fields that the body has not, each with the reason."""
+        found = {} if self.regions else {REGION: "the scene has no regions"}
+        same = "the mesh is free of stress ([natural]): 'fibre_angle' is that of the unloaded body"
+        return found | ({UNLOADED: same} if self.natural.is_of_the_mesh else {})
+
+    @property
     def has_free_length(self) -> bool:
         """Whether the body's length is an unknown."""
         kinds = self.load_kinds
@@ -332,19 +341,26 @@ class Scene(Table):
 
     def _check_natural(self) -> None:
         """What goes with an opening angle; all else is refused by name."""
-        angle = self.natural.opening_angle
-        if angle == 0.0:
+        natural, shape = self.natural, self.geometry
+        if natural.is_of_the_mesh:
             return
-        able = ", ".join(repr(name) for name, kind in SHAPES.items() if kind.closes_from_a_sector)
-        for has, key, needed in (
-            (self.geometry.closes_from_a_sector, "geometry.shape", able),
-            (not self.regions, "regions", "none: the closing knows one tissue"),
-            (self.cells.initial == "isotropic", "cells.initial", "'isotropic'"),
-            (self.cells.axes == "cylindrical", "cells.axes", "'cylindrical'"),
-            (self.mesh.formulation == "displacement", "mesh.formulation", "'displacement'"),
-        ):
-            if not has:
-                raise fault(f"must be 0 unless {key} is {needed}", "natural.opening_angle", angle)
+        asked, value, none = "natural.opening_angle", natural.opening_angle, "0"
+        able = [name for name, kind in SHAPES.items() if kind.closes_from_a_sector]
+        if not natural.opening_angle:
+            asked, value, none = "natural.layers", len(natural.layers), "none"
+            able = [name for name, kind in SHAPES.items() if kind.has_a_wall]
+        needs: list[tuple[str, Any, list[str]]] = [
+            ("geometry.shape", shape.name, able),
+            ("mesh.formulation", self.mesh.formulation, ["displacement"]),
+        ]
+        if shape.closes_from_a_sector:  # the closing knows isotropic cells
+            needs.append(("cells.axes", self.cells.axes, ["cylindrical"]))
+            for name, properties in self.properties().items():
+                needs.append((f"{in_region(name)}cells.initial", properties.cells.initial, ["isotropic"]))
+        for key, has, possible in needs:
+            if has not in possible:
+                rule = f"must be {none} unless {key} is {' or '.join(map(repr, possible))}"
+                raise fault(rule, asked, value)
 
     def _check_length(self) -> None:
         """A length is prescribed or unknown."""

@@ -231,6 +231,8 @@ def locate(table: type[BaseModel], location: tuple[int | str, ...]) -> tuple[str
                 annotation, owner, field = further, further, FieldInfo.from_annotation(further)
             if field is not None and items and (variant := variant_of_field(field)):
                 annotation = variant.registry[str(items.pop(0))]
+        elif (listed := listed_tables(annotation)) is not None:
+            annotation, owner, field = listed, listed, FieldInfo.from_annotation(listed)
         elif get_origin(annotation) is dict:
             annotation = get_args(annotation)[1]
             if is_table(annotation):
@@ -297,6 +299,12 @@ def is_table(annotation: Any) -> bool:
     return isinstance(annotation, type) and issubclass(annotation, BaseModel)
 
 
+def listed_tables(annotation: Any) -> type[BaseModel] | None:
+    """The class of the tables in a list of tables, or None."""
+    entries = get_args(annotation) if get_origin(annotation) is tuple else ()
+    return entries[0] if entries and is_table(entries[0]) else None
+
+
 def free_names(table: Any) -> type[BaseModel] | None:
     """The class of the tables that a table may have under any name beside its fields, or None."""
     return getattr(table, "further", None)
@@ -346,6 +354,8 @@ def sections(table: type[BaseModel], key: str = "", variant: str = "") -> Iterat
                 yield from sections(inner, path, tag)
         elif is_table(field.annotation):
             yield from sections(field.annotation, path)  # type: ignore[arg-type]
+        elif (listed := listed_tables(field.annotation)) is not None:
+            yield from sections(listed, f"{path}[]")
         elif get_origin(field.annotation) is dict and is_table(get_args(field.annotation)[1]):
             yield from sections(get_args(field.annotation)[1], f"{path}.NAME")
 
@@ -359,7 +369,8 @@ def markdown_reference(table: type[BaseModel]) -> str:
 
 
 def _section(key: str, variant: str, table: type[BaseModel]) -> str:
-    title = f"## `[{key}]`" + (f" of shape `{variant!r}`" if variant else "") if key else "## Top of the file"
+    name = f"[[{key[:-2]}]]" if key.endswith("[]") else f"[{key}]"
+    title = f"## `{name}`" + (f" of shape `{variant!r}`" if variant else "") if key else "## Top of the file"
     rows = [
         " | ".join([f"| `{name}`", _default(field), _cell(allowed(field)), _cell(field.description) + " |"])
         for name, field in table.model_fields.items()

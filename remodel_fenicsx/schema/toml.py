@@ -129,14 +129,26 @@ def toml_text(table: BaseModel, header: str = "") -> str:
 def _fill(container: Any, table: BaseModel | Mapping[str, Any]) -> None:
     fields = type(table).model_fields if isinstance(table, BaseModel) else {}
     # TOML wants a table's own values before the tables in it
-    for name, value in sorted(dict(table).items(), key=lambda item: isinstance(item[1], (BaseModel, dict))):
-        if isinstance(value, (BaseModel, dict)):
+    for name, value in sorted(dict(table).items(), key=lambda item: _is_of_tables(item[1])):
+        if isinstance(value, tuple) and _is_of_tables(value):
+            several = tomlkit.aot()
+            for entry in value:
+                inner = tomlkit.table()
+                _fill(inner, entry)
+                several.append(inner)
+            container.add(name, several)
+        elif isinstance(value, (BaseModel, dict)):
             of_tables = isinstance(value, dict) and any(isinstance(entry, BaseModel) for entry in value.values())
             inner = tomlkit.table(is_super_table=of_tables)
             _fill(inner, value)
             if len(inner) or not fields:  # an empty table says nothing, but a name does
                 container.add(name, inner)
-        elif value is not None:
+        elif value is not None and value != ():
             for line in textwrap.wrap((name in fields and fields[name].description) or "", COMMENT_WIDTH):
                 container.add(tomlkit.comment(line))
             container.add(name, value)
+
+
+def _is_of_tables(value: Any) -> bool:
+    """Whether it is a table or a list of tables."""
+    return isinstance(value, (BaseModel, dict)) or (isinstance(value, tuple) and isinstance((*value, 0)[0], BaseModel))

@@ -107,6 +107,19 @@ class State:
         found: NDArray[np.float64] = deformation_gradient @ self.cells.quadrature.values(self._natural, (3, 3))
         return found
 
+    def elastic_axes(
+        self, axes: NDArray[np.float64], deformation_gradient: NDArray[np.float64] | None = None
+    ) -> NDArray[np.float64]:
+        """Where F_e carries axes, rows (elements, points, 3, 3); without an F where G does, to the unloaded body."""
+        if deformation_gradient is None:
+            if self._natural is None:
+                return axes
+            gradient = self.cells.quadrature.values(self._natural, (3, 3))
+        else:
+            gradient = self.elastic(deformation_gradient)
+        found: NDArray[np.float64] = axes @ np.swapaxes(gradient, -1, -2)
+        return found
+
     def elastic_gradient(self) -> NDArray[np.float64]:
         """F_e of the present unknowns at all points in one row, as `deformation_gradient`."""
         F = self.deformation_gradient()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from remodel_fenicsx import Scene, SceneError, Simulation, preset_scene
-from remodel_fenicsx.model.closing import closing
+from remodel_fenicsx.model.closing import Layer, closing
 from remodel_fenicsx.model.cutting import cut
 
 
@@ -34,11 +34,11 @@ def test_what_was_closed_opens_again(opening_angle: float) -> None:
     """Angle, radii and length of the sector, from another start than the solution."""
     of = scene(**{"natural.opening_angle": opening_angle})
     tissue, radii = of.properties()[""].tissue, (1.0, 3.0)
-    closed = closing(tissue, radii, opening_angle)
+    closed = closing([Layer(radii, tissue)], opening_angle)
     radius = np.linspace(*radii, 40)
     isotropic = np.full((40, 3), tissue.end_to_end_length**2 / 3)
     near = closed._replace(circumferential=closed.circumferential)
-    found = cut(tissue, radii, near, radius, isotropic)
+    found = cut(closed.layers, near, radius, isotropic)
     sector = closed.natural_radius(np.array(radii))
     assert found.opening_angle == pytest.approx(opening_angle, abs=1e-6)
     assert found.radii == pytest.approx(tuple(sector), abs=1e-6)
@@ -61,13 +61,15 @@ def test_the_paper_s_law_makes_hardly_any_residual_stress() -> None:
 def test_a_stiffer_inside_changes_the_cut() -> None:
     """Cells that were turned by force: the sector is in balance with the cells that are given."""
     tissue, radii = scene().properties()[""].tissue, (1.0, 3.0)
-    closed = closing(tissue, radii, 120.0)
+    closed = closing([Layer(radii, tissue)], 120.0)
     radius = np.linspace(*radii, 40)
     share = np.linspace(0.9, 0.05, 40)
     cells = tissue.end_to_end_length**2 * np.stack([share, 0.9 - share + 0.05, np.full(40, 0.05)], axis=1)
     axes_repulsion = preset_scene("kuhl-holzapfel-2007", "tube").properties()[""].tissue
-    assert cut(tissue, radii, closed, radius, cells).opening_angle == pytest.approx(120.0, abs=1e-5)
-    assert cut(axes_repulsion, radii, closed, radius, 0.9 * cells).opening_angle != pytest.approx(120.0, abs=0.05)
+    assert cut(closed.layers, closed, radius, cells).opening_angle == pytest.approx(120.0, abs=1e-5)
+    assert cut([Layer(radii, axes_repulsion)], closed, radius, 0.9 * cells).opening_angle != pytest.approx(
+        120.0, abs=0.05
+    )
 
 
 def test_kinematics_agree() -> None:

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from remodel_fenicsx import Scene, SceneError, Simulation, preset_scene
-from remodel_fenicsx.model.closing import closing
+from remodel_fenicsx.model.closing import Closing, Layer, closing
+from remodel_fenicsx.results.columns import Measurement
 from remodel_fenicsx.studies.page import read_table
 
 RADII = (1.0, 1.3)
@@ -61,7 +62,7 @@ def test_the_sector_of_a_neo_hookean_tube_tends_to_the_incompressible_one() -> N
     tissue = preset_scene("kuhl-holzapfel-2007", "tube").properties()[""].tissue
     expected, errors = incompressible_radius(160.0), []
     for ratio in (100.0, 1000.0):
-        found = closing(replace(tissue, chain=None, lame_lambda=ratio, lame_mu=1.0), RADII, 160.0)
+        found = closing([Layer(RADII, replace(tissue, chain=None, lame_lambda=ratio, lame_mu=1.0))], 160.0)
         errors.append(abs(float(found.natural_radius(np.array(1.0))) - expected))
     assert errors[0] < 1e-3
     assert errors[1] < 0.2 * errors[0]
@@ -177,3 +178,66 @@ def test_the_figure_shows_what_the_page_says() -> None:
     spread = {angle: np.ptp(np.log(found[f"loaded_{angle}"])) for angle in (0, 60, 120, 160)}
     assert spread[120] < 0.4 < min(spread[0], spread[60], spread[160])
     assert not found["unloaded_0"].any() and found["unloaded_120"][0] < -3 < 1.5 < found["unloaded_120"][-1]
+
+
+# ---------------------------------------------------------------- layers that were stretched before they were joined
+
+
+def layers(*parts: tuple[Any, dict[str, float]]) -> list[dict[str, Any]]:
+    """`natural.layers` of (region or where it begins, prestretch)."""
+    return [
+        {**({"region": where} if isinstance(where, str) else {"from": where}), "prestretch": prestretch}
+        for where, prestretch in parts
+    ]
+
+
+def test_a_tube_of_stretched_layers_keeps_its_shape_without_loads() -> None:
+    """Radii, and no axial force; the stretched layer is pulled along, the other pressed."""
+    changes: dict[str, Any] = {"loads.pressure.value": 0.0, "loads.elongation.value": 0.0, "time.end": 1.0}
+    changes |= {"natural.layers": layers((0.5, {"axial": 1.1})), "output.columns": ["reduced_axial_force"]}
+    changes |= {"mesh.refinement": 2}
+    simulation = Simulation(scene("radial", **changes))
+    try:
+        row = next(iter(simulation.steps())).row
+        axial = simulation.stepper.remodeling.drive().tensor[:, 2, 2]
+        radius = simulation.cells.local_axes.coordinates[..., 0].ravel()
+        assert row["inner_radius"] == pytest.approx(1.0, abs=1e-6)
+        assert row["outer_radius"] == pytest.approx(3.0, abs=1e-6)
+        assert abs(row["reduced_axial_force"]) < 1e-3
+        assert axial[radius > 2].min() > 0.3 > -0.3 > axial[radius < 2].max()
+    finally:
+        simulation.close()
+
+
+def ends_of_layers(axial: float) -> tuple[float, float]:
+    """Angles where the inner two thirds of a thin wall end and where its outer third begins, t = 150."""
+    changes = {"natural.opening_angle": 0.0, "natural.layers": layers((2 / 3, {"axial": axial})), "time.end": 150.0}
+    thin = {"geometry.outer_radius": 1.3, "loads.pressure.value": 1.2, "mesh.refinement": 3}
+    simulation = Simulation(
+        scene("radial", **changes, **thin, **{"remodeling.law": "tensor", "material.repulsion": "log"})
+    )
+    last = list(simulation.steps())[-1]
+    angle = Measurement(simulation.observer, last).fibre_angle.ravel()
+    radius = simulation.cells.local_axes.coordinates[..., 0].ravel()
+    simulation.close()
+    order = np.argsort(radius)
+    inside = radius[order] < 1.2
+    return float(angle[order][inside][-1]), float(angle[order][~inside][0])
+
+
+def test_stretched_layers_make_a_step_of_the_angle(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The outer third prestretched by 5, 10 and 20 %; an independent solver does not let the layers come to rest.
+
+    Where they do, the step begins at smaller angles.
+    """
+    rested = [ends_of_layers(axial) for axial in (1.05, 1.1, 1.2)]
+
+    def held(of: Any, angle: float) -> Closing:
+        alone = closing([layer._replace(prestretch=(1.0, 1.0, 1.0)) for layer in of], angle)
+        return alone._replace(layers=tuple(of))
+
+    monkeypatch.setattr("remodel_fenicsx.model.closing.closing", held)
+    for axial, here, known in zip((1.05, 1.1, 1.2), rested, ((19, 36), (18, 56), (18, 76)), strict=True):
+        found = ends_of_layers(axial)
+        assert found == pytest.approx(known, abs=0.6)
+        assert here[0] < found[0] - 2 and here[1] < found[1] - 3 and here[1] - here[0] > 10

@@ -31,6 +31,7 @@ TYPES_ONLY = {
     "body.layers": {"body.domain"},
     "body.mesh_body": {"body.domain", "body.loading", "body.mesh_faces"},
     "body.mesh_supports": {"body.loading", "body.mesh_domain"},
+    "body.natural": {"body.domain"},
     "body.shape": {"body.domain", "body.loading", "fem.quadrature"},
     "body.tendon": {"body.domain", "body.loading"},
     "body.tube": {"body.domain", "body.loading"},

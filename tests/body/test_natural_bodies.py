@@ -1,0 +1,135 @@
+"""F_e = F G in three dimensions: quarters, whole tubes and bodies from a file, and runs that go on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from remodel_fenicsx import Simulation, cli
+from remodel_fenicsx.body.tube import whole_tube
+from remodel_fenicsx.model.closing import Layer, closing
+from remodel_fenicsx.scene import scene_from_dict
+from tests.body.test_layers import write_layers
+from tests.body.test_natural import layers, scene
+
+SELF = MPI.COMM_SELF
+TURN = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])
+MEDIA, ADVENTITIA = {"circumferential": 1.05, "axial": 0.95}, {"axial": 1.1}
+
+
+def test_a_quarter_and_the_whole_tube_agree_with_one_radius() -> None:
+    """As they do without G: within the facets of their elements."""
+    few = {"time.end": 6.0, "loads.pressure.ramp": [[0, 0], [5, 1]], "loads.elongation.ramp": [[0, 0], [5, 1]]}
+    ends = {}
+    for kinematics in ("radial", "sector", "full"):
+        of = scene(kinematics, **few)
+        domain = whole_tube(of.geometry, (16, 8, 1), "hexahedron", 2, SELF) if kinematics == "full" else None
+        simulation = Simulation(of, SELF, domain)
+        ends[kinematics] = [step.row for step in simulation.steps()][-1]
+        simulation.close()
+    for kinematics in ("sector", "full"):
+        for column, error in (("inner_radius", 2e-3), ("outer_radius", 1e-3), ("fibre_angle_outer", 0.1)):
+            assert ends[kinematics][column] == pytest.approx(ends["radial"][column], abs=error), (kinematics, column)
+
+
+def own_body(file: Path, elongation: float, **tables: Any) -> Any:
+    """Two layers of a file with a prestretch each, let go and elongated."""
+    ramp = [[0.0, 0.0], [1.0, 1.0]]
+    values: dict[str, Any] = {
+        "geometry": {"shape": "mesh", "file": str(file)},
+        "cells": {"initial": "isotropic"},
+        "natural": {"layers": layers(("media", MEDIA), ("adventitia", ADVENTITIA))},
+        "loads": {"elongation": {"value": elongation, "ramp": ramp}},
+        "remodeling": {"law": "none"},
+        "output": {"fields": False, "columns": ["outer_area"]},
+        "time": {"end": 1.0, "step": 1.0},
+        "solver": {"method": "direct"},
+    }
+    return scene_from_dict(values | tables)
+
+
+def last_row(of: Any) -> dict[str, float]:
+    simulation = Simulation(of, SELF)
+    row = [dict(step.row) for step in simulation.steps()][-1]
+    simulation.close()
+    return row
+
+
+def test_layers_of_a_file_come_to_rest_as_the_closing_of_a_ring_says(tmp_path: Path) -> None:
+    """The ring to which two stretched layers close, from elements and from one radius; the same for a turned body."""
+    ring = (1.0, 1.5, 3.0)
+    tissue = own_body(write_layers(tmp_path / "any.msh"), 0.0).properties()[""].tissue
+    stretches = [part["prestretch"] for part in layers((0.0, MEDIA), (0.5, ADVENTITIA))]
+    of = scene("radial", **{"natural.layers": layers((0.0, MEDIA))}).natural.layers[0]
+    both = [type(of.prestretch)(**stretch).stretches for stretch in stretches]
+    parts = [Layer((a, b), tissue, s) for a, b, s in zip(ring, ring[1:], both, strict=False)]
+    closed = closing(parts, 0.0)
+    free = tuple(float(radius) for radius in closed.natural_radius(np.array(ring)))
+    assert max(abs(np.array(free) - ring)) > 0.01 and abs(closed.axial - 1) > 0.01
+    file = write_layers(tmp_path / "layers.msh", free)
+    row = last_row(own_body(file, closed.axial - 1.0))
+    length = 0.5 * closed.axial
+    assert np.sqrt(row["lumen_volume"] / np.pi / length) == pytest.approx(ring[0], abs=1e-3)
+    assert row["outer_area"] / (2 * np.pi * length) == pytest.approx(ring[-1], abs=1e-3)
+    turned = last_row(own_body(write_layers(tmp_path / "turned.msh", free, TURN), closed.axial - 1.0))
+    for column in ("lumen_volume", "outer_area", "stored_energy"):
+        assert turned[column] == pytest.approx(row[column], rel=1e-6), column
+
+
+def test_a_prestretch_that_is_given_back_leaves_no_stress(tmp_path: Path) -> None:
+    """The same everywhere: shortened by as much, the body finds its natural state, F_e = 1 up to a rotation."""
+    whole = {"natural": {"layers": [{"prestretch": {"axial": 1.1}}]}}
+    file = write_layers(tmp_path / "layers.msh")
+    row = last_row(own_body(file, 1 / 1.1 - 1.0, **whole))
+    held = last_row(own_body(file, 0.0, **whole))
+    assert abs(row["stored_energy"] - last_row(own_body(file, 0.0, natural={}))["stored_energy"]) < 1e-4
+    assert held["stored_energy"] > 0.1
+    assert np.sqrt(row["lumen_volume"] / (np.pi * 0.5 / 1.1)) == pytest.approx(np.sqrt(1.1), abs=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        ({"layers": [{"prestretch": {}}]}, "natural.layers[0].prestretch = {}: needs one of circumferential, axial"),
+        ({"layers": [{"region": "intima", "prestretch": {"axial": 1.1}}]}, "no such region; there are 'media'"),
+        ({"layers": [{"from": 0.5, "to": 0.4, "prestretch": {"axial": 1.1}}]}, "must be smaller than to = 0.4"),
+        ({"layers": {"prestretch": {"axial": 1.1}}}, "must be a list of tables"),
+        (
+            {"layers": [{"prestretch": {"axial": 1.1}}, {"from": 0.5, "prestretch": {"axial": 1.2}}]},
+            "natural.layers[1] = [0.5, 1.0]: lies in another layer",
+        ),
+        ({"opening_angle": 90.0}, "natural.opening_angle = 90.0: must be 0 unless geometry.shape is 'tube'"),
+        ({"layers": [{"prestretch": {"axial": -1.0}}]}, "prestretch.axial = -1.0: must be a finite number greater"),
+        ({"layers": [{"prestretch": {"axial": 1.1}, "depth": 1}]}, "natural.layers[0].depth = 1: unknown key"),
+    ],
+)
+def test_bad_layers_get_one_line(table: dict[str, Any], words: str, tmp_path: Path) -> None:
+    file = write_layers(tmp_path / "layers.msh")
+    with pytest.raises(ValueError) as refused:
+        Simulation(own_body(file, 0.0, natural=table), SELF)
+    assert words in str(refused.value) and "\n" not in str(refused.value)
+
+
+def test_a_run_with_residual_stress_goes_on(tmp_path: Path) -> None:
+    """Two steps and two more are four, to the last digit; its scene as run has the layers, and all three angles."""
+    names = [f"fibre_angle_{of}outer" for of in ("", "unloaded_", "deformed_")]
+    text = scene(
+        "radial", **{"natural.layers": layers((0.5, {"axial": 1.1})), "output.columns": names}
+    ).to_toml()  # fmt: skip
+    (tmp_path / "scene.toml").write_text(text)
+    command = ["run", str(tmp_path / "scene.toml"), "-q", "--set", "output.fields=['fibre_angle_unloaded']"]
+    assert cli.main([*command, "-o", str(tmp_path / "all"), "--set", "time.end=4"]) == 0
+    assert cli.main([*command, "-o", str(tmp_path / "run"), "--set", "time.end=2"]) == 0
+    assert "[[natural.layers]]" in (tmp_path / "run" / "scene.toml").read_text()
+    assert cli.main(["run", "--resume", str(tmp_path / "run"), "--set", "time.end=4", "-q"]) == 0
+    tables = [(tmp_path / name / "history.csv").read_text().splitlines() for name in ("run", "all")]
+    heads = tables[0][0].split(",")
+    rows = [dict(zip(heads, table[-1].split(","), strict=True)) for table in tables]
+    for name in (*names, "time", "pressure"):
+        assert rows[0][name] == rows[1][name]
+    angles = [float(rows[0][name]) for name in names]
+    assert np.ptp(angles) > 1.0 and len({round(angle, 3) for angle in angles}) == 3
