@@ -115,9 +115,9 @@ class LinearisedEquilibrium:
         self.equilibrium, self.state, self.names = equilibrium, equilibrium.state, names
         state, quadrature, tissue = self.state, equilibrium.quadrature, equilibrium.tissue
         mesh, u, cells = quadrature.mesh, state.unknown, state.cells
-        self._numbers = {name: dolfinx.fem.Constant(mesh, 0.0) for name in names}
+        self._numbers = {name: dolfinx.fem.Constant(mesh, np.float64(0.0)) for name in names}
         self._loads = [
-            (name, dolfinx.fem.Constant(mesh, 0.0), constant, scale)
+            (name, dolfinx.fem.Constant(mesh, np.float64(0.0)), constant, scale)
             for name in state.loading.values
             for constant, scale in state.loading.constants(name)
             if constant.ufl_shape == ()
@@ -214,7 +214,9 @@ class LinearisedEquilibrium:
                 found[k] = quadrature.evaluate(self._driver, (3,))
         return found.reshape(len(dimensions), -1, 3)
 
-    def _set(self, directions: Directions, loads: Mapping[str, Array], k: int, dimensions: Array, stresses: Any) -> None:
+    def _set(
+        self, directions: Directions, loads: Mapping[str, Array], k: int, dimensions: Array, stresses: Any
+    ) -> None:
         """All directions are those of the unknown number k."""
         for name, way in self._numbers.items():
             way.value = directions.tissue[name][k]
@@ -435,8 +437,9 @@ class ExtrapolatedDerivatives(Extrapolated, StaggeredDerivatives):
         """With dl of the cells: from their start towards the extrapolated target, or towards one of this step."""
         changes = self._of_extrapolated(time)
         if self._solved:
-            changes = Changes(*(np.where(chosen, *pair) for chosen, *pair in zip(
-                (self._begins[:, None], self._begins), self._of_found(), changes, strict=True)))  # fmt: skip
+            found, begins = self._of_found(), self._begins
+            direction = np.where(begins[:, None], found.direction, changes.direction)
+            changes = Changes(direction, np.where(begins, found.share, changes.share))
         self._solved = True
         self._put(self._of_start)
         super()._follow(target, time)
@@ -450,9 +453,7 @@ class ExtrapolatedDerivatives(Extrapolated, StaggeredDerivatives):
     def _of_extrapolated(self, time: float) -> Changes:
         """As `Target.towards` has it: sE changes linearly, and s is its trace."""
         back = self._back(time)[:, None]
-        last, before = (
-            known.share[:, None] * diagonal(known.direction) for known in (self._known(0), self._known(1))
-        )
+        last, before = (known.share[:, None] * diagonal(known.direction) for known in (self._known(0), self._known(1)))
         both, (of_last, of_before) = last - back * (before - last), self._of_targets
         of_both, share = of_last - back * (of_before - of_last), both.sum(axis=1)
         of_share, some = of_both.sum(axis=2), share > 0.0

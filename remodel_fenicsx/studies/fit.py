@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib import rc_context
@@ -163,7 +163,7 @@ class Problem:
                 off = models[number].columns[name] - measured if models else np.full(table.rows, UNSOLVED * sd)
                 parts.append(off / sd)
                 by_scale = np.array([u.key == SCALE + name for u in self.unknowns], dtype=np.float64)
-                ways = np.zeros((table.rows, len(x)))
+                ways: Array = np.zeros((table.rows, len(x)))
                 if models and derivatives:
                     ways = models[number].changes[name].T - measured[:, None] * by_scale
                 slopes_.append(ways / sd)

@@ -21,7 +21,7 @@ from remodel_fenicsx.studies.measured import Measured
 
 Array = NDArray[np.float64]
 
-PARAMETERS = ("lame_lambda", "lame_mu", "network_modulus", "contour_length")  # of a tissue: those with derivatives
+OF_TISSUE = ("lame_lambda", "lame_mu", "network_modulus", "contour_length")  # of a tissue: those with derivatives
 NUMBERS_CHANGE = 1e-4  # of logarithms, for closed formulas: with four points the error is 1e-16, that of rounding 1e-12
 STATE_CHANGE = 1e-5  # of logarithms, for columns of a state: central differences err by 1e-10
 
@@ -39,9 +39,9 @@ class Slopes(NamedTuple):
         Which unknowns change these numbers and nothing else, (k,).
     """
 
-    tissue: dict[str, Array]
-    loads: dict[str, Array]
-    scales: dict[str, Array]
+    tissue: Mapping[str, Array]
+    loads: Mapping[str, Array]
+    scales: Mapping[str, Array]
     kappa: Array
     exact: NDArray[np.bool_]
 
@@ -89,7 +89,7 @@ def slopes(at: Callable[[Array], Scene], logarithms: Array, scales: Mapping[str,
     """
     count, base = len(logarithms), at(logarithms)
     is_scale = {number for number, _ in scales.values()}
-    tissue = {name: np.zeros(count) for name in PARAMETERS}
+    tissue = {name: np.zeros(count) for name in OF_TISSUE}
     loads = {name: np.zeros(count) for name in base.loads}
     kappa, exact = np.zeros(count), np.ones(count, dtype=np.bool_)
     for k in range(count):
@@ -115,8 +115,7 @@ def _slope(values: list[float]) -> float:
 def _apart_from_numbers(scene: Scene) -> Any:
     """What of a scene has no derivative."""
     values = scene.model_dump()
-    tissue = scene.properties()[""].tissue
-    rest = replace(tissue, **dict.fromkeys(PARAMETERS, 0.0))
+    rest = scene.properties()[""].tissue.map(lambda name, value: 0.0 if name in OF_TISSUE else value)
     values.pop("material")
     values["remodeling"].pop("kappa")
     for load in values["loads"].values():
@@ -283,7 +282,7 @@ class RowChanges(Watcher):
     def solved(self, step: Step) -> None:
         """Measure the state a little ahead and behind in each direction."""
         count = len(self.directions.kappa)
-        row = {column.name: np.zeros(count) for column in self.columns}
+        row: dict[str, Array] = {column.name: np.zeros(count) for column in self.columns}
         if self.wanted(step.time):
             for k in range(count):
                 ahead, behind = (self._measured(step, k, way) for way in (STATE_CHANGE, -STATE_CHANGE))
