@@ -6,7 +6,7 @@ import base64
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -46,7 +46,8 @@ START_SPREAD = np.log(2.0)  # of further starts, to both sides
 SAME_MINIMUM = 1e-2  # relative difference of the sums of squares
 ENOUGH = 1e-6  # relative change of the sum of squares, or of the unknowns, at which a fit ends: noise is far above it
 CORRELATED = 0.9  # of two unknowns, from which on their profiles are made
-PROFILE_STEP, PROFILE_REACH = 0.5, 4.0  # standard deviations of the straight line
+PROFILE_STEP, PROFILE_REACH = 1.0, 4.0  # standard deviations of the straight line
+ROUGHLY = 1e-4  # as ENOUGH, of a profile's fits: they start where a straight line has their end
 NORMAL_95 = 1.959963984540054  # standard deviations on each side, normal distribution
 
 
@@ -126,7 +127,7 @@ class Fit:
     evaluations: list[int]
     modelled: list[dict[str, Array]]
     scene: Scene
-    profiles: dict[str, Profile]
+    profiles: dict[str, Profile] = field(default_factory=dict)
 
 
 # ---------------------------------------------------------------- least squares
@@ -286,7 +287,12 @@ def _trial() -> Iterator[None]:
 
 
 def fit(
-    scene: Scene, data: Path | str, folder: Path | str | None = None, starts: int = 3, quiet: bool = True
+    scene: Scene,
+    data: Path | str,
+    folder: Path | str | None = None,
+    starts: int = 3,
+    quiet: bool = True,
+    profiles: bool = True,
 ) -> tuple[Path, Fit]:
     """Fit numbers of a scene to measurements.
 
@@ -302,6 +308,8 @@ def fit(
         How many: the given one, and others at random within a factor of two.
     quiet
         No progress.
+    profiles
+        Whether unknowns that go together have profiles.
 
     Returns
     -------
@@ -338,7 +346,9 @@ def fit(
                     line.show(f"start {number + 1} of {starts}, misfit {misfit:.4g}")
 
             found.append(minimised(problem, start, said))
-        result = result_of(problem, found, lambda key: None if quiet else line.show(f"profile of {key}"))
+        result = result_of(problem, found)
+        if profiles:
+            result = with_profiles(problem, result, lambda key: quiet or line.show(f"profile of {key}"))
     finally:
         line.end()
     write_whole(place / "scene.toml", result.scene.to_toml(f"fitted to {Path(data).name}").encode())
@@ -361,7 +371,11 @@ def _place(folder: Path | str | None, name: str, mark: str) -> Path:
 
 
 def minimised(
-    problem: Problem, start: Array, said: Callable[[float], object] = lambda misfit: None, held: int | None = None
+    problem: Problem,
+    start: Array,
+    said: Callable[[float], object] = lambda misfit: None,
+    held: int | None = None,
+    enough: float = ENOUGH,
 ) -> Any:
     """SciPy's least squares from a start, logarithms; `said` gets each misfit.
 
@@ -369,6 +383,8 @@ def minimised(
     ----------
     held
         Number of an unknown that stays at its start.
+    enough
+        Relative change of the sum of squares, or of the unknowns, at which it ends.
 
     Returns
     -------
@@ -391,7 +407,13 @@ def minimised(
 
     inside = np.clip(start[free], bounds[0] + 1e-6, bounds[1] - 1e-6)
     return least_squares(
-        residuals, inside, lambda x: problem.jacobian(whole(x))[:, free], bounds, x_scale="jac", xtol=ENOUGH, ftol=ENOUGH
+        residuals,
+        inside,
+        lambda x: problem.jacobian(whole(x))[:, free],
+        bounds,
+        x_scale="jac",
+        xtol=enough,
+        ftol=enough,
     )
 
 
@@ -413,7 +435,7 @@ def profile(problem: Problem, best: Array, covariance: Array, number: int) -> Pr
             if not np.log(unknown.lower) < x[number] < np.log(unknown.upper):
                 break
             if len(x) > 1:
-                x[np.arange(len(x)) != number] = minimised(problem, x, held=number).x
+                x[np.arange(len(x)) != number] = minimised(problem, x, held=number, enough=ROUGHLY).x
             point = float(x[number]), float(np.sum(problem.residuals(x) ** 2)) - least
             points.append(point)
             if point[1] > NORMAL_95**2:  # the root is nearly a straight line
@@ -426,8 +448,8 @@ def profile(problem: Problem, best: Array, covariance: Array, number: int) -> Pr
     return Profile(np.exp(values), increases, *ends)
 
 
-def result_of(problem: Problem, found: Sequence[Any], said: Callable[[str], object] = lambda key: None) -> Fit:
-    """The best of several minima, with bands; `said` gets the key of each unknown whose profile is made.
+def result_of(problem: Problem, found: Sequence[Any]) -> Fit:
+    """The best of several minima, with bands.
 
     Raises
     ------
@@ -440,10 +462,6 @@ def result_of(problem: Problem, found: Sequence[Any], said: Callable[[str], obje
     covariance = np.linalg.inv(jacobian.T @ jacobian)
     deviations = np.sqrt(np.diag(covariance))
     correlations, off = covariance / np.outer(deviations, deviations), problem.residuals(logarithms)
-    profiles = {}
-    for number in np.flatnonzero((np.abs(correlations) > CORRELATED).sum(axis=0) > 1):
-        said(problem.unknowns[number].key)
-        profiles[problem.unknowns[number].key] = profile(problem, logarithms, covariance, int(number))
     return Fit(
         problem.unknowns,
         np.exp(logarithms),
@@ -455,8 +473,17 @@ def result_of(problem: Problem, found: Sequence[Any], said: Callable[[str], obje
         [int(one.nfev) for one in found],
         [modelled.columns for modelled in problem.models(logarithms)],
         problem.scene_of(logarithms),
-        profiles,
     )
+
+
+def with_profiles(problem: Problem, found: Fit, said: Callable[[str], object] = lambda key: None) -> Fit:
+    """The fit with profiles of what goes together; `said` gets the key of each unknown whose profile is made."""
+    deviations, profiles = np.log(found.upper / found.lower) / (2 * NORMAL_95), {}
+    covariance = found.correlations * np.outer(deviations, deviations)
+    for number in np.flatnonzero((np.abs(found.correlations) > CORRELATED).sum(axis=0) > 1):
+        said(found.unknowns[number].key)
+        profiles[found.unknowns[number].key] = profile(problem, np.log(found.values), covariance, int(number))
+    return replace(found, profiles=profiles)
 
 
 # ---------------------------------------------------------------- words and picture
@@ -511,7 +538,9 @@ def _draw(found: Fit, tables: Sequence[Measured], folder: Path) -> None:
         table[f"profile_{end}"] = np.array([getattr(found.profiles.get(key), end, np.nan) for key in keys])
     page.save_table({"key": keys, **table, "start": [u.start for u in found.unknowns]}, [title, made_with])
     if found.profiles:
-        rows_of = [(k, v, i) for k, one in found.profiles.items() for v, i in zip(one.values, one.increases, strict=True)]
+        rows_of = [
+            (k, v, i) for k, one in found.profiles.items() for v, i in zip(one.values, one.increases, strict=True)
+        ]
         columns = dict(zip(("key", "value", "increase"), zip(*rows_of, strict=True), strict=True))
         Page(folder, "profiles", title, "").save_table(columns, [title, made_with])
     correlations = Page(folder, "correlations", title, "")

@@ -86,7 +86,7 @@ class Journal:
         self.known: dict[Point, Evaluation] = {}
         for line in lines[1:]:
             point, off, ways = (np.array(line[name], dtype=np.float64) for name in ("at", "residuals", "jacobian"))
-            self.known[tuple(point.tolist())] = Evaluation(off, ways)
+            self.known[tuple(map(float, point))] = Evaluation(off, ways)
         # without a line that was cut off
         text = "".join(json.dumps(line) + "\n" for line in (lines or [{"fit": mark}]))
         self._path.write_text(text, encoding="utf-8")

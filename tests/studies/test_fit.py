@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import re
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +20,7 @@ from remodel_fenicsx.settings import STRESS_UNITS
 from remodel_fenicsx.studies.fit import Problem, fit, minimised
 from remodel_fenicsx.studies.measured import read_measurements
 
+ROOT = Path(__file__).parents[2]
 TRUTH = {"material.lame_mu": 3.0, "material.chain_density": 2e21, "remodeling.kappa": 0.05}
 PRESSURES = [0.2, 0.4, 0.6, 0.8, 1.0, 1.2]
 
@@ -87,7 +90,7 @@ sd = { fibre_angle_outer = 2.0, inner_radius = 0.01 }
 def test_the_numbers_that_made_the_data_are_found(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """From each start; the tables, the picture and a scene that runs are there."""
     out = folder / "out"
-    words = ["fit", str(folder / "scene.toml"), str(folder / "data.toml"), "-o", str(out), "--starts", "2", "-q"]
+    words = ["fit", str(folder / "scene.toml"), str(folder / "data.toml"), "-o", str(out), "--starts", "2", "-q", "--no-profiles"]
     assert cli.main(words) == 0
     said = capsys.readouterr().out
     assert "2 of 2 starts end in this minimum" in said
@@ -122,22 +125,22 @@ def test_a_fit_goes_on_where_it_was_killed(folder: Path, monkeypatch: pytest.Mon
         return evaluated(self, x, derivatives)
 
     monkeypatch.setattr(Problem, "_evaluated", counted)
-    fit(scene, folder / "data.toml", folder / "whole", starts=1)
+    fit(scene, folder / "data.toml", folder / "whole", starts=1, profiles=False)
     whole = len(made)
     made.clear()
     allowed[0] = whole - 2
     with pytest.raises(KeyboardInterrupt):
-        fit(scene, folder / "data.toml", folder / "cut", starts=1)
+        fit(scene, folder / "data.toml", folder / "cut", starts=1, profiles=False)
     journal = folder / "cut" / "evaluations.jsonl"
     journal.write_text(journal.read_text() + '{"at": [1.0, ')
     allowed[0] = 10**6
-    fit(scene, folder / "data.toml", folder / "cut", starts=1)
+    fit(scene, folder / "data.toml", folder / "cut", starts=1, profiles=False)
     assert len(made) <= whole + 1  # the start alone is asked before the folder is
     assert (folder / "cut" / "fit.csv").read_text() == (folder / "whole" / "fit.csv").read_text()
 
 
 def test_profiles_of_what_goes_together(folder: Path) -> None:
-    """Of an inflation alone, stiffness and locking of the chains; the sum of squares rises by 3.84 at the band's ends."""
+    """Stiffness and locking of the chains, of an inflation: at the band's ends the sum of squares is 3.84 higher."""
     (folder / "data.toml").write_text(PAIR)
     _, found = fit(read_scene(folder / "scene.toml"), folder / "data.toml", folder / "out", starts=1)
     assert set(found.profiles) == {"material.chain_density", "material.contour_length"}
@@ -260,9 +263,9 @@ def test_what_is_not_exact_is_said(folder: Path, caplog: pytest.LogCaptureFixtur
 def test_bands_have_the_width_of_the_noise(folder: Path) -> None:
     """Twice the standard deviations, twice the logarithmic bands; they cover the truth of noisy data."""
     path, scene = folder / "data.toml", read_scene(folder / "scene.toml")
-    one = fit(scene, path, folder / "one", starts=1)[1]
+    one = fit(scene, path, folder / "one", starts=1, profiles=False)[1]
     path.write_text(DATA.replace("= 0.01", "= 0.02").replace("= 2.0,", "= 4.0,"))
-    two = fit(scene, path, folder / "two", starts=1)[1]
+    two = fit(scene, path, folder / "two", starts=1, profiles=False)[1]
     np.testing.assert_allclose(np.log(two.upper / two.lower), 2 * np.log(one.upper / one.lower), rtol=1e-2)
 
 
@@ -344,3 +347,26 @@ def test_bad_data_is_one_line(folder: Path, old: str, new: str, said: str, capsy
     errors = capsys.readouterr().err
     assert said in errors and errors.count("\n") == 1, errors
     assert not (folder / "out").exists()
+
+
+def test_the_page_leads_from_a_curve_to_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """docs/fit.md: its files and commands as they stand, the last run in a short form; the numbers are the page's."""
+    monkeypatch.chdir(tmp_path)
+    page = (ROOT / "docs" / "fit.md").read_text(encoding="utf-8")
+    page = page[page.index("## A pressure-radius curve") : page.index("## The two files")]
+    for name, text in re.findall(r"^```(?:csv|toml)\n# (\S+)\n(.*?)^```", page, re.MULTILINE | re.DOTALL):
+        Path(name).write_text(text)
+    (block,) = re.findall(r"^```sh\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    for line in block.splitlines():
+        words = shlex.split(line.removeprefix("./with-fenicsx remodel-fenicsx "))
+        more = {"run": ["-q", "--set", "time.end=12"], "fit": ["-q", "--starts", "1"]}.get(words[0], [])
+        assert cli.main(words + more) == 0, line
+    with Path("fitted/fit.csv").open() as file:
+        table = {row["key"]: row for row in csv.DictReader(line for line in file if not line.startswith("#"))}
+    said = re.findall(r"^\| `(\w+)` \| ([\d.]+).* \| ([\d.]+) to ([\d.]+) \|$", page, re.MULTILINE)
+    assert len(said) == 3
+    for key, value, low, high in said:
+        found = table[f"material.{key}"]
+        for name, number in (("value", value), ("profile_lower", low), ("profile_upper", high)):
+            assert float(found[name]) == pytest.approx(float(number), rel=1e-2), key
+    assert len(table) == 3 and Path("vessel/history.csv").exists()
