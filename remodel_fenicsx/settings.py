@@ -328,6 +328,9 @@ class NaturalLayer(_Share):  # type: ignore[misc]
         return getattr(self, "from"), self.to
 
 
+AS_GIVEN: Literal["as-given"] = "as-given"
+
+
 class Natural(Table):
     """The configuration in which the tissue is free of stress, where it is not the mesh's (docs/natural.md)."""
 
@@ -344,6 +347,13 @@ class Natural(Table):
         description="Parts of the wall with a prestretch, a table `[[natural.layers]]` each; a tube and its layers "
         "close so that it is in equilibrium without loads, an own body moves when it is let go.",
         json_schema_extra={"allowed": "a list of tables"},
+    )
+
+    cells: Literal["as-given", "equilibrium"] = Field(
+        default=AS_GIVEN,
+        description="Of a tube that is the loaded one (geometry.is): cells of the loaded tube, 'as-given' by [cells], "
+        "or 'equilibrium': those that remodeling comes to under these loads, as in a scan of a vessel. The run begins "
+        "with [cells] and comes to the given tube at its end, time.end = 'equilibrium'.",
     )
 
     @property

@@ -77,6 +77,10 @@ class Simulation:
                 f"not a Scene: {scene!r}; read_scene(PATH) makes one of a file, preset_scene one of a preset"
             )
         take_back_signals()
+        if scene.geometry.is_loaded:
+            raise SceneError(
+                "geometry.is = 'loaded': a simulation is of the unloaded body; remodel_fenicsx.unloaded(scene) finds it"
+            )
         if scene.model.kinematics == AUTO and domain is None and comm.rank == 0:
             for line in explained(scene):
                 log.info("%s", line)

@@ -315,6 +315,8 @@ class Tube(Walled):
     columns_of_one_tissue: ClassVar[tuple[str, ...]] = ("opening_angle",)
     has_regions: ClassVar[bool] = True
     closes_from_a_sector: ClassVar[bool] = True
+    unloads: ClassVar[bool] = True
+    unloads_by_numbers: ClassVar[bool] = True
     is_filled_by_regions: ClassVar[bool] = True
     # with global axes a tube of isotropic cells would not stay round in the first step
     defaults: ClassVar[dict[str, Any]] = {"cells": {"axes": "cylindrical"}}
