@@ -79,7 +79,7 @@ class Simulation:
         take_back_signals()
         if scene.geometry.is_loaded:
             raise SceneError(
-                "geometry.is = 'loaded': a simulation is of the unloaded body; remodel_fenicsx.unloaded(scene) finds it"
+                "geometry.is = 'loaded': this takes the unloaded body; remodel-fenicsx unload SCENE writes its scene"
             )
         if scene.model.kinematics == AUTO and domain is None and comm.rank == 0:
             for line in explained(scene):

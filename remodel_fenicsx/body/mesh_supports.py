@@ -52,9 +52,10 @@ def _guided(loading: Loading, face: str, support: Support, stiffness: float, mov
 
     normal, centre = _of_parts(loading, face, "normal"), _of_parts(loading, face, "centre")
     around = ufl.cross(normal, ufl.SpatialCoordinate(loading.domain.mesh) - centre)
-    unit = around / ufl.sqrt(ufl.inner(around, around) + 1e-24 * loading.domain.size**2)
+    # a Constant: a number in the kernel would be another kernel for each mesh
+    squared = ufl.inner(around, around) + loading.constant(1e-24 * loading.domain.size**2)
     way = loading.magnitude(*moves) if moves else 0.0
-    _add(loading, face, stiffness, lambda u: (ufl.inner(u, normal) - way) ** 2 + ufl.inner(u, unit) ** 2)
+    _add(loading, face, stiffness, lambda u: (ufl.inner(u, normal) - way) ** 2 + ufl.inner(u, around) ** 2 / squared)
 
 
 def _sliding(loading: Loading, face: str, support: Support, stiffness: float, moves: tuple[str, float] | None) -> None:

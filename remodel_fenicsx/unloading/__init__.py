@@ -57,6 +57,6 @@ def unloaded(scene: Scene, comm: MPI.Intracomm = MPI.COMM_WORLD, folder: Path | 
     if scene.geometry.unloads_by_numbers:
         return unloaded_tube(scene, comm)
     if folder is None:
-        way = "remodel-fenicsx unload SCENE -o FOLDER writes the scene of the unloaded body, take that"
+        way = "a folder is needed for the unloaded mesh"
         raise SceneError(f"geometry.is = 'loaded': {way}")
     return unloaded_mesh(scene, comm, folder)

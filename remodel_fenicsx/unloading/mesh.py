@@ -42,9 +42,9 @@ from remodel_fenicsx.unloading.failure import in_shares
 log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 
-UNLOADED = "unloaded.msh"
-CLOSE = 1e-10  # of the body's extent: the last change of a place
-MOST = 20  # Newton iterations for one share of the loads
+UNLOADED_MESH = "unloaded.msh"
+LEAST_MOVE = 1e-10  # of the body's extent: the last change of a place
+MOST_MOVES = 20  # Newton iterations for one share of the loads
 LEAST_STEP = 1 / 64  # of a Newton step that keeps elements whole and chains shorter than their contour length
 
 
@@ -61,7 +61,7 @@ def unloaded_mesh(scene: Scene, comm: MPI.Intracomm, folder: Path) -> Scene:
     shape: Any = scene.geometry
     file, regions = agreed(comm, lambda: _read(scene) if comm.rank == 0 else None) or (None, None)
     given: Array = comm.bcast(None if file is None else file.points)
-    path = folder / UNLOADED
+    path = folder / UNLOADED_MESH
     changes: dict[str, Any] = {"geometry.is": "unloaded", "geometry.file": str(path), "mesh.refinement": 1}
     changes |= {"geometry.file_unit": None, "geometry.tags": None, "geometry.sha256": None}
     if shape.regions:
@@ -77,7 +77,7 @@ def unloaded_mesh(scene: Scene, comm: MPI.Intracomm, folder: Path) -> Scene:
     def find(share: float, start: Array) -> Array:
         nonlocal iterations
         places, step, length = start, np.zeros_like(start), 1.0
-        for _ in range(MOST):
+        for _ in range(MOST_MOVES):
             iterations += 1
             write(places)
             with _quietly(), _built(scene.with_values(changes), comm) as simulation:
@@ -95,12 +95,12 @@ def unloaded_mesh(scene: Scene, comm: MPI.Intracomm, folder: Path) -> Scene:
                     raise ArithmeticError("elements would turn inside out")
             step = found
             places = places + length * step
-            if size <= CLOSE * float(np.ptp(given, axis=0).max()):
+            if size <= LEAST_MOVE * float(np.ptp(given, axis=0).max()):
                 return places
-        raise ArithmeticError(f"places still move by {size:.2g} after {MOST} iterations")
+        raise ArithmeticError(f"places still move by {size:.2g} after {MOST_MOVES} iterations")
 
     write(in_shares(find, given))
-    log.info("unloaded: %s, found in %d Newton iterations", UNLOADED, iterations)
+    log.info("unloaded: %s, found in %d Newton iterations", UNLOADED_MESH, iterations)
     return scene.with_values(changes)
 
 

@@ -23,8 +23,8 @@ from remodel_fenicsx.unloading.failure import in_shares
 log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 
-CLOSE = 1e-9  # of the largest length: how far the loaded numbers may be from those of the scene
-MOST = 30  # runs for one share of the loads
+LOADED_AGAIN = 1e-9  # of the largest length: how far the loaded numbers may be from those of the scene
+MOST_LOADINGS = 30  # runs for one share of the loads
 REMEMBERED = 5  # differences of earlier runs from which the next is guessed (Anderson 1965)
 LOAD_STEPS = 10  # of a run to the end of the ramps
 
@@ -65,17 +65,17 @@ def _found(scene: Scene, comm: MPI.Intracomm, given: Array, share: float, start:
     """
     target, targets, errors = given.copy(), [], []
     length = start[-1]
-    for number in range(1, MOST + 1):
+    for number in range(1, MOST_LOADINGS + 1):
         numbers = _inverse(scene, target, share, given[-1] / length)
         found = _loaded(scene, comm, numbers, share)
         length = numbers[-1] * given[-1] / found[-1]
         error = given - found
-        if np.abs(error).max() <= CLOSE * given.max():
+        if np.abs(error).max() <= LOADED_AGAIN * given.max():
             return numbers, number
         targets.append(target)
         errors.append(error)
         target = _extrapolated(targets[-REMEMBERED:], errors[-REMEMBERED:])
-    raise ArithmeticError(f"off by {np.abs(error).max():.2g} after {MOST} runs")
+    raise ArithmeticError(f"off by {np.abs(error).max():.2g} after {MOST_LOADINGS} runs")
 
 
 def _extrapolated(targets: list[Array], errors: list[Array]) -> Array:
