@@ -175,6 +175,10 @@ class Loading:
         self._take(name, constant, scale)
         return constant
 
+    def constants(self, name: str) -> list[tuple[Any, Any]]:
+        """The Constants of a load, each with its value at magnitude 1."""
+        return list(self._magnitudes[name])
+
     def leave_out(self, name: str) -> None:
         """A load that these kinematics lack and no scene asks for: it has a magnitude, zero, and does nothing."""
         self._magnitudes.setdefault(name, [])
