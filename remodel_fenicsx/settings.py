@@ -95,7 +95,7 @@ class Model(Table):
 
 
 class Support(Table):
-    """How a face of an own body (shape `'mesh'`) is held, `[supports.inlet]` say.
+    """How a face of an own body (shape `'mesh'`) is held, `[supports.inlet]` say; a tube has `[supports.outer]`.
 
     NAME is a face of `geometry.faces`, or one that the file names. N is the face's mean outward normal in the
     reference, of each of its parts; c goes around the middle of the part. Where a scene says nothing, inlet and outlet
@@ -120,7 +120,8 @@ class Support(Table):
         default=1.0,
         ge=0,
         le=1,
-        description="Of 'elastic': stiffness across N over that along N. Below 0.5 a wall that has grown may twist.",
+        description="Of 'elastic': stiffness across N over that along N. Below 0.5 a wall that has grown may twist. "
+        "With 0 a tube may be solved on one radius, which cannot twist.",
     )
 
     @model_validator(mode="after")
@@ -131,7 +132,9 @@ class Support(Table):
 
 
 class Supports(Table):
-    """How the body is held. An own body (shape `'mesh'`) has a table for each of its faces that is held."""
+    """How the body is held. An own body (shape `'mesh'`) has a table for each of its faces that is held, a tube one
+    for what surrounds it, `[supports.outer]`.
+    """
 
     further = Support
     model_config = ConfigDict(extra="allow")

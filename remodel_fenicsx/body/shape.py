@@ -130,6 +130,8 @@ class Shape(_Is):  # type: ignore[misc]
         Defaults of other tables that this shape changes, under the keys of preset and scene.
     holds_faces
         Whether `[supports.NAME]` says how each face is held (`hold_faces`).
+    surrounded_faces
+        Faces of other bodies that `[supports.NAME]` may put on springs, as in what surrounds the body.
     columns_of_one_tissue
         Names of columns that a body with regions has not.
     refines
@@ -163,6 +165,7 @@ class Shape(_Is):  # type: ignore[misc]
     constant_fields: ClassVar[tuple[str, ...]] = ()
     defaults: ClassVar[dict[str, Any]] = {}
     holds_faces: ClassVar[bool] = False
+    surrounded_faces: ClassVar[tuple[str, ...]] = ()
     columns_of_one_tissue: ClassVar[tuple[str, ...]] = ()
     refines: ClassVar[bool] = True
     has_regions: ClassVar[bool] = False

@@ -153,9 +153,15 @@ class Scene(Table):
         ):
             if name not in names:
                 raise fault(f"allowed for shape {geometry.name!r} is {', '.join(map(repr, names))}", key, name)
-        for name in self.supports.faces:
-            if not geometry.holds_faces:
-                raise fault(f"a {geometry.name} is held by supports.ends", f"supports.{quoted(name)}", None)
+        for name, support in self.supports.faces.items():
+            if not geometry.holds_faces and name not in geometry.surrounded_faces:
+                springs = " or ".join(f"supports.{face} of kind 'elastic'" for face in geometry.surrounded_faces)
+                rule = f"a {geometry.name} is held by supports.ends" + (
+                    f"; allowed beside is {springs}" if springs else ""
+                )
+                raise fault(rule, f"supports.{quoted(name)}", None)
+            if not geometry.holds_faces and support.kind != "elastic":
+                raise fault("allowed here is 'elastic'", f"supports.{quoted(name)}.kind", support.kind)
         formulation = self.mesh.formulation
         if FORMULATIONS[formulation].takes_parts and not isinstance(MATRICES[material.matrix], Matrix):
             rule = f"needs the volumetric part of material.matrix = {material.matrix!r}: an energy made as a Matrix"
