@@ -85,6 +85,10 @@ class Simulation:
                 f"not a Scene: {scene!r}; read_scene(PATH) makes one of a file, preset_scene one of a preset"
             )
         take_back_signals()
+        if scene.geometry.is_loaded:
+            raise SceneError(
+                "geometry.is = 'loaded': this takes the unloaded body; remodel-fenicsx unload SCENE writes its scene"
+            )
         if scene.model.kinematics == AUTO and domain is None and comm.rank == 0:
             for line in explained(scene):
                 log.info("%s", line)

@@ -202,7 +202,13 @@ class Loading:
         """Minus the virtual work of the external forces, a UFL form; None without loads on faces or volumes."""
         virtual = self.kinematics.displacement(test)
         terms = [term(self.unknown, virtual) for term in self._terms]
-        terms += [ufl.derivative(potential(self.unknown), self.unknown, test) for potential in self._potentials]
+        potentials = self.residual_of_potentials(test)
+        terms += [] if potentials is None else [potentials]
+        return sum(terms[1:], terms[0]) if terms else None
+
+    def residual_of_potentials(self, test: Any) -> Any:
+        """The part of it that has a potential: springs, of own bodies; None where there is none."""
+        terms = [ufl.derivative(potential(self.unknown), self.unknown, test) for potential in self._potentials]
         return sum(terms[1:], terms[0]) if terms else None
 
     def set(self, values: Mapping[str, float]) -> None:
