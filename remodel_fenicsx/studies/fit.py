@@ -72,7 +72,7 @@ TOGETHER: list[tuple[set[str], str]] = [
 
 
 @dataclass(frozen=True)
-class Profile:
+class LikelihoodProfile:
     """Smallest sums of squares with one unknown held.
 
     Attributes
@@ -127,7 +127,7 @@ class Fit:
     evaluations: list[int]
     modelled: list[dict[str, Array]]
     scene: Scene
-    profiles: dict[str, Profile] = field(default_factory=dict)
+    profiles: dict[str, LikelihoodProfile] = field(default_factory=dict)
 
 
 # ---------------------------------------------------------------- least squares
@@ -335,6 +335,11 @@ def fit(
     problem.models(first)  # what has no equilibrium here says so
     problem.check_tells_apart(problem.jacobian(first, central=True))
     problem.keep(Journal(place, mark))
+
+    def announced(key: str) -> None:
+        if not quiet:
+            line.show(f"profile of {key}")
+
     random = np.random.default_rng(1)
     found = []
     try:
@@ -348,7 +353,7 @@ def fit(
             found.append(minimised(problem, start, said))
         result = result_of(problem, found)
         if profiles:
-            result = with_profiles(problem, result, lambda key: quiet or line.show(f"profile of {key}"))
+            result = with_profiles(problem, result, announced)
     finally:
         line.end()
     write_whole(place / "scene.toml", result.scene.to_toml(f"fitted to {Path(data).name}").encode())
@@ -417,7 +422,7 @@ def minimised(
     )
 
 
-def profile(problem: Problem, best: Array, covariance: Array, number: int) -> Profile:
+def profile(problem: Problem, best: Array, covariance: Array, number: int) -> LikelihoodProfile:
     """Of an unknown, from the minimum outwards until the band ends: the others are fitted again at each value.
 
     Parameters
@@ -445,7 +450,7 @@ def profile(problem: Problem, best: Array, covariance: Array, number: int) -> Pr
             last = point
         ends.append(end)
     values, increases = np.array(sorted(points)).T
-    return Profile(np.exp(values), increases, *ends)
+    return LikelihoodProfile(np.exp(values), increases, *ends)
 
 
 def result_of(problem: Problem, found: Sequence[Any]) -> Fit:

@@ -90,7 +90,17 @@ sd = { fibre_angle_outer = 2.0, inner_radius = 0.01 }
 def test_the_numbers_that_made_the_data_are_found(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """From each start; the tables, the picture and a scene that runs are there."""
     out = folder / "out"
-    words = ["fit", str(folder / "scene.toml"), str(folder / "data.toml"), "-o", str(out), "--starts", "2", "-q", "--no-profiles"]
+    words = [
+        "fit",
+        str(folder / "scene.toml"),
+        str(folder / "data.toml"),
+        "-o",
+        str(out),
+        "--starts",
+        "2",
+        "-q",
+        "--no-likelihood-profiles",
+    ]
     assert cli.main(words) == 0
     said = capsys.readouterr().out
     assert "2 of 2 starts end in this minimum" in said
