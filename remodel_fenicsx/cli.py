@@ -117,7 +117,9 @@ def parser() -> argparse.ArgumentParser:
     fitting.add_argument("data", type=Path, metavar="DATA", help=text)
     writes(fitting, "new or empty folder, or that of the same fit, which goes on (default: results/NAME-fit)")
     text = "the given one, and others within a factor of two (default: 3)"
-    fitting.add_argument("--no-likelihood-profiles", dest="profiles", action="store_false", help="of unknowns that go together")
+    fitting.add_argument(
+        "--no-likelihood-profiles", dest="profiles", action="store_false", help="of unknowns that go together"
+    )
     fitting.add_argument("--starts", type=positive, default=3, metavar="N", help=text)
     for found in (run_command, stability, ensemble, trade, sweep, fitting):
         found.add_argument("-q", "--quiet", action="store_true", help="no progress")

@@ -52,7 +52,7 @@ NORMAL_95 = 1.959963984540054  # standard deviations on each side, normal distri
 
 
 _MODULI = ("lame_lambda", "lame_mu", "chain_density", "initial_stiffness", "persistence_length", "temperature")
-TOGETHER: list[tuple[set[str], str]] = [
+KNOWN_GROUPS: list[tuple[set[str], str]] = [
     (
         {f"material.{key}" for key in ("chain_density", "persistence_length", "temperature", "energy_factor")},
         "only their product c = omega k theta n / (4 A_p) is in the energy",
@@ -271,7 +271,7 @@ class Problem:
 
 def _reason(keys: Sequence[str]) -> str:
     """Why unknowns go together, where it is known."""
-    return next((f" ({words})" for group, words in TOGETHER if set(keys) <= group and len(set(keys)) > 1), "")
+    return next((f" ({words})" for group, words in KNOWN_GROUPS if set(keys) <= group and len(set(keys)) > 1), "")
 
 
 @contextmanager
