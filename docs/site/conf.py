@@ -9,12 +9,12 @@ extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphin
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3
 napoleon_google_docstring = False
+napoleon_use_ivar = True
 autodoc_typehints = "none"
 autodoc_member_order = "bysource"
 suppress_warnings = ["misc.highlighting_failure"]  # shells' prompts and shortened TOML in examples
 html_theme = "pydata_sphinx_theme"
 html_title = "remodel_fenicsx"
-html_static_path = ["static"]
 html_copy_source = html_show_sourcelink = False
 html_theme_options = {"show_toc_level": 2, "header_links_before_dropdown": 6, "secondary_sidebar_items": ["page-toc"]}
 # KaTeX in the site's own folder: formulas need no network
@@ -22,5 +22,8 @@ mathjax_path = "katex/katex.min.js"
 html_css_files = ["katex/katex.min.css"]
 html_js_files = [
     ("katex/contrib/auto-render.min.js", {"defer": "defer"}),
-    (None, {"body": "addEventListener('load', () => window.renderMathInElement && renderMathInElement(document.body))"}),
+    (
+        None,
+        {"body": "addEventListener('load', () => window.renderMathInElement && renderMathInElement(document.body))"},
+    ),
 ]
