@@ -17,6 +17,7 @@ __all__ = [
     "preset_scene",
     "read_scene",
     "run",
+    "unloaded",
 ]
 
 if TYPE_CHECKING:
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from remodel_fenicsx.running import run
     from remodel_fenicsx.scene import Scene, SceneError, preset_scene, read_scene
     from remodel_fenicsx.simulation import Simulation
+    from remodel_fenicsx.unloading import unloaded
 
 # scenes and recordings need no dolfinx
 __getattr__ = on_demand(
@@ -35,5 +37,6 @@ __getattr__ = on_demand(
         "run": "running",
         **dict.fromkeys(("Scene", "SceneError", "preset_scene", "read_scene"), "scene"),
         "Simulation": "simulation",
+        "unloaded": "unloading",
     },
 )

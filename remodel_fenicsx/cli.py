@@ -160,6 +160,9 @@ def parser() -> argparse.ArgumentParser:
     axes = scene_command("axes", "Write the local axes of a scene's body, before any solve, as a VTU file.")
     text = "a file that does not exist yet (default: NAME-axes.vtu)"
     axes.add_argument("-o", "--output", type=Path, metavar="FILE", help=text)
+    unload = scene_command("unload", "Find the unloaded body of a scene whose geometry is the loaded one.")
+    text = "folder for its scene and mesh, which does not exist yet (default: NAME-unloaded)"
+    unload.add_argument("-o", "--output", type=Path, metavar="FOLDER", help=text)
     new = command("new", "Print a scene of a preset.")
     new.add_argument("preset", metavar="PRESET", help=", ".join(PRESETS))
     new.add_argument("--shape", default="tube", help="cube, tendon or tube (default: tube)")
@@ -250,6 +253,7 @@ def _run(options: argparse.Namespace, task: Callable[..., Path] | None = None) -
     from remodel_fenicsx.results.run_folder import FolderTaken
     from remodel_fenicsx.running import resume, run
     from remodel_fenicsx.solver.continuation import StepFailure
+    from remodel_fenicsx.unloading import NoUnloadedShape
 
     try:
         if scene is None:
@@ -260,6 +264,8 @@ def _run(options: argparse.Namespace, task: Callable[..., Path] | None = None) -
             folder = run(scene, options.output, **wishes)
     except (FolderTaken, SceneError, GeometryError, CheckpointError, RecordingError) as error:
         return _fail(" ".join(str(error).split()), BAD_INPUT)
+    except NoUnloadedShape as failure:
+        return _fail(str(failure), SOLVE_FAILED)
     except StepFailure as failure:
         way = "" if task is not None else ", and run --resume goes on from there"
         return _fail(f"{failure}. {failure.refusal}; every finished step is kept{way}", SOLVE_FAILED)
@@ -544,6 +550,33 @@ def _axes(options: argparse.Namespace) -> int:
     return 0
 
 
+def _unload(options: argparse.Namespace) -> int:
+    scene = read_scene(options.scene, options.set, options.profile)
+    if not scene.geometry.is_loaded:
+        return _fail("geometry.is = 'unloaded': nothing to find; allowed is 'loaded'", BAD_INPUT)
+    _check(reason_unusable())
+    from remodel_fenicsx.body import GeometryError
+    from remodel_fenicsx.studies.unloaded_folder import write_unloaded
+    from remodel_fenicsx.unloading import NoUnloadedShape
+
+    place = options.output or Path(f"{scene.name}-unloaded")
+    try:
+        with interrupts.StopRequest(), interrupts.stopping_at_once():
+            words = write_unloaded(scene, place)
+    except (SceneError, GeometryError) as error:
+        return _fail(" ".join(str(error).split()), BAD_INPUT)
+    except NoUnloadedShape as failure:
+        return _fail(str(failure), SOLVE_FAILED)
+    except interrupts.Interrupted as interruption:
+        return _fail(f"stopped by {interruption}", interruption.exit_code)
+    except FileExistsError:
+        return _end_all(f"-o {place}: exists; allowed is a folder that does not", BAD_INPUT)
+    except OSError as error:
+        return _end_all(f"-o {place}: cannot be written: {error.strerror}", BAD_ENVIRONMENT)
+    _say(f"{words}\nscene of the unloaded body in {place / 'scene.toml'}")
+    return 0
+
+
 def _new(options: argparse.Namespace) -> int:
     scene: Scene = preset_scene(options.preset, options.shape)
     _say(scene.to_toml(f"a scene of the preset {options.preset}").rstrip("\n"))
@@ -616,6 +649,7 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
     "export": _export,
     "validate": _validate,
     "axes": _axes,
+    "unload": _unload,
     "new": _new,
     "schema": _schema,
     "figures": _figures,

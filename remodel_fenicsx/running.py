@@ -44,6 +44,7 @@ from remodel_fenicsx.system.interrupts import (
 )
 from remodel_fenicsx.system.regular_files import read_regular
 from remodel_fenicsx.system.terminal import Progress, announce, hold_log, open_log
+from remodel_fenicsx.unloading import as_unloaded
 
 log = logging.getLogger(__name__)
 
@@ -94,8 +95,9 @@ def run(
     end_all_ranks_on_exception()
     # what the scene asks for is built before anything is written
     place = None if folder is None else chosen_folder(folder, scene.name, comm)
-    with StopRequest() as stop:
+    with StopRequest() as stop, ExitStack() as body:
         with hold_log(comm.rank, quiet=quiet) as held:
+            scene = body.enter_context(as_unloaded(scene, comm))
             simulation = _built(scene, comm)
             place = place or chosen_folder(None, scene.name, comm)
         with _closing(simulation), locked(place, comm, new=True):

@@ -95,7 +95,7 @@ class Model(Table):
 
 
 class Support(Table):
-    """How a face of an own body (shape `'mesh'`) is held, `[supports.inlet]` say.
+    """How a face of an own body (shape `'mesh'`) is held, `[supports.inlet]` say; a tube has `[supports.outer]`.
 
     NAME is a face of `geometry.faces`, or one that the file names. N is the face's mean outward normal in the
     reference, of each of its parts; c goes around the middle of the part. Where a scene says nothing, inlet and outlet
@@ -120,7 +120,8 @@ class Support(Table):
         default=1.0,
         ge=0,
         le=1,
-        description="Of 'elastic': stiffness across N over that along N. Below 0.5 a wall that has grown may twist.",
+        description="Of 'elastic': stiffness across N over that along N. Below 0.5 a wall that has grown may twist. "
+        "With 0 a tube may be solved on one radius, which cannot twist.",
     )
 
     @model_validator(mode="after")
@@ -131,7 +132,9 @@ class Support(Table):
 
 
 class Supports(Table):
-    """How the body is held. An own body (shape `'mesh'`) has a table for each of its faces that is held."""
+    """How the body is held. An own body (shape `'mesh'`) has a table for each of its faces that is held, a tube one
+    for what surrounds it, `[supports.outer]`.
+    """
 
     further = Support
     model_config = ConfigDict(extra="allow")
@@ -328,6 +331,9 @@ class NaturalLayer(_Share):  # type: ignore[misc]
         return getattr(self, "from"), self.to
 
 
+AS_GIVEN: Literal["as-given"] = "as-given"
+
+
 class Natural(Table):
     """The configuration in which the tissue is free of stress, where it is not the mesh's (docs/natural.md)."""
 
@@ -344,6 +350,13 @@ class Natural(Table):
         description="Parts of the wall with a prestretch, a table `[[natural.layers]]` each; a tube and its layers "
         "close so that it is in equilibrium without loads, an own body moves when it is let go.",
         json_schema_extra={"allowed": "a list of tables"},
+    )
+
+    cells: Literal["as-given", "equilibrium"] = Field(
+        default=AS_GIVEN,
+        description="Of a tube that is the loaded one (geometry.is): cells of the loaded tube, 'as-given' by [cells], "
+        "or 'equilibrium': those that remodeling comes to under these loads, as in a scan of a vessel. The run begins "
+        "with [cells] and comes to the given tube at its end, time.end = 'equilibrium'.",
     )
 
     @property

@@ -52,6 +52,8 @@ class Simulation:
         MPI communicator of the mesh.
     domain
         A mesh of the scene's body to take in place of the one that the scene asks for.
+    coupling
+        Makes a coupling in place of the one that the scene names.
 
     Attributes
     ----------
@@ -71,12 +73,22 @@ class Simulation:
         If `scene` is none.
     """
 
-    def __init__(self, scene: Scene, comm: MPI.Intracomm = MPI.COMM_WORLD, domain: Domain | None = None):
+    def __init__(
+        self,
+        scene: Scene,
+        comm: MPI.Intracomm = MPI.COMM_WORLD,
+        domain: Domain | None = None,
+        coupling: Maker | None = None,
+    ):
         if not isinstance(scene, Scene):
             raise TypeError(
                 f"not a Scene: {scene!r}; read_scene(PATH) makes one of a file, preset_scene one of a preset"
             )
         take_back_signals()
+        if scene.geometry.is_loaded:
+            raise SceneError(
+                "geometry.is = 'loaded': this takes the unloaded body; remodel-fenicsx unload SCENE writes its scene"
+            )
         if scene.model.kinematics == AUTO and domain is None and comm.rank == 0:
             for line in explained(scene):
                 log.info("%s", line)
@@ -109,7 +121,7 @@ class Simulation:
             predictor = "responsive"  # steps have all lengths
         solver = scene.solver.model_copy(update={"predictor": predictor})
         parts = self.state, tissue, scene.remodeling, solver, self.load_values
-        self.stepper = Stepper(*parts, self._at_once(tissue, solver, kappa) if at_once else None, kappa)
+        self.stepper = Stepper(*parts, self._at_once(tissue, solver, kappa) if at_once else coupling, kappa)
         self.tissue = self.stepper.tissue
         counted = "negative_eigenvalues" in scene.output.columns
         self.stability = EquilibriumStability(self.stepper, scene.solver.unstable, every_step=counted)

@@ -175,6 +175,10 @@ class Loading:
         self._take(name, constant, scale)
         return constant
 
+    def constants(self, name: str) -> list[tuple[Any, Any]]:
+        """The Constants of a load, each with its value at magnitude 1."""
+        return list(self._magnitudes[name])
+
     def leave_out(self, name: str) -> None:
         """A load that these kinematics lack and no scene asks for: it has a magnitude, zero, and does nothing."""
         self._magnitudes.setdefault(name, [])
@@ -198,7 +202,13 @@ class Loading:
         """Minus the virtual work of the external forces, a UFL form; None without loads on faces or volumes."""
         virtual = self.kinematics.displacement(test)
         terms = [term(self.unknown, virtual) for term in self._terms]
-        terms += [ufl.derivative(potential(self.unknown), self.unknown, test) for potential in self._potentials]
+        potentials = self.residual_of_potentials(test)
+        terms += [] if potentials is None else [potentials]
+        return sum(terms[1:], terms[0]) if terms else None
+
+    def residual_of_potentials(self, test: Any) -> Any:
+        """The part of it that has a potential: springs, of own bodies; None where there is none."""
+        terms = [ufl.derivative(potential(self.unknown), self.unknown, test) for potential in self._potentials]
         return sum(terms[1:], terms[0]) if terms else None
 
     def set(self, values: Mapping[str, float]) -> None:

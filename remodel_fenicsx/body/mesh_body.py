@@ -109,6 +109,7 @@ class MeshBody(WalledMesh):
     has_regions: ClassVar[bool] = True
     holds_faces: ClassVar[bool] = True
     refines: ClassVar[bool] = False
+    unloads: ClassVar[bool] = True
 
     shape: Literal["mesh"] = Field(default="mesh", description="Which body it is.")
     file: Annotated[str, BeforeValidator(_file)] = Field(

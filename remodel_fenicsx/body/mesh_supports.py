@@ -52,9 +52,10 @@ def _guided(loading: Loading, face: str, support: Support, stiffness: float, mov
 
     normal, centre = _of_parts(loading, face, "normal"), _of_parts(loading, face, "centre")
     around = ufl.cross(normal, ufl.SpatialCoordinate(loading.domain.mesh) - centre)
-    unit = around / ufl.sqrt(ufl.inner(around, around) + 1e-24 * loading.domain.size**2)
+    # a Constant: a number in the kernel would be another kernel for each mesh
+    squared = ufl.inner(around, around) + loading.constant(1e-24 * loading.domain.size**2)
     way = loading.magnitude(*moves) if moves else 0.0
-    _add(loading, face, stiffness, lambda u: (ufl.inner(u, normal) - way) ** 2 + ufl.inner(u, unit) ** 2)
+    _add(loading, face, stiffness, lambda u: (ufl.inner(u, normal) - way) ** 2 + ufl.inner(u, around) ** 2 / squared)
 
 
 def _sliding(loading: Loading, face: str, support: Support, stiffness: float, moves: tuple[str, float] | None) -> None:
@@ -102,7 +103,7 @@ _HOLD: dict[str, Callable[[Loading, str, Support, float, tuple[str, float] | Non
 
 def _add(loading: Loading, face: str, stiffness: float, density: Callable[[Any], Any]) -> None:
     half, measure = loading.constant(stiffness / 2), loading.surface_measure(face)
-    loading.add_potential(lambda u: half * density(loading.kinematics.displacement(u)) * measure)
+    loading.add_potential(lambda u: half * density(loading.kinematics.displacement(u)) * loading.weight * measure)
 
 
 def _of_parts(loading: Loading, face: str, name: str) -> Any:
@@ -140,12 +141,17 @@ def check_supports(domain: MeshDomain, supports: Mapping[str, Support], elongate
             "the pressure on its ends holds; allowed with an end that is 'guided' or 'held'"
         )
     for name, support in supports.items():
-        if support.kind == "elastic" and support.tangential < LEAST_TANGENTIAL and domain.comm.rank == 0:
-            log.warning(
-                "supports.%s.tangential = %g: springs that hold a wall hardly across their direction push it sideways "
-                "once it has grown, and it twists; from %g on none has",
-                name, support.tangential, LEAST_TANGENTIAL,
-            )  # fmt: skip
+        warn_of_twist(name, support, domain.comm)
+
+
+def warn_of_twist(name: str, support: Support, comm: Any) -> None:
+    """Say so where springs may turn a body about its axis."""
+    if support.kind == "elastic" and support.tangential < LEAST_TANGENTIAL and comm.rank == 0:
+        log.warning(
+            "supports.%s.tangential = %g: springs that hold a wall hardly across their direction push it sideways "
+            "once it has grown, and it twists; from %g on none has",
+            name, support.tangential, LEAST_TANGENTIAL,
+        )  # fmt: skip
 
 
 def free_motions(parts: Sequence[Face], supports: Mapping[str, Support]) -> list[str]:

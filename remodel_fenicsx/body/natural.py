@@ -48,7 +48,7 @@ def tube_layers(wall: Wall, natural: Natural, tissues: Mapping[str, Tissue]) -> 
             for layer in natural.layers
             if (layer.share[0] <= share < layer.share[1] if layer.region is None else layer.region == region)
         ]
-        found.append(Layer((low, high), tissues.get(region, tissues[""]), (*of_layer, UNSTRETCHED)[0]))
+        found.append(Layer((low, high), tissues[region if region in tissues else ""], (*of_layer, UNSTRETCHED)[0]))
     return found
 
 

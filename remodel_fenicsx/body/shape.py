@@ -7,11 +7,11 @@ from abc import abstractmethod
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, create_model
 
 from remodel_fenicsx.body.buckling import Strut
 from remodel_fenicsx.body.columns import Column
@@ -81,7 +81,20 @@ class LoadKind:
         return Column(self.column_name(name), unit, self.meaning, self.value or (lambda m: float(m.step.loads[name])))
 
 
-class Shape(Table):
+_is: Any = {  # a word of Python
+    "is": (
+        Literal["unloaded", "loaded"],
+        Field(
+            default="unloaded",
+            description="What the geometry is: the body without loads, or, of a tube and a body of one's own, the one "
+            "under the loads of the end of their ramps. The unloaded one is found then (docs/natural.md).",
+        ),
+    )
+}
+_Is: Any = create_model("_Is", __base__=Table, **_is)
+
+
+class Shape(_Is):  # type: ignore[misc]
     """A body of a scene. Its fields are the keys of `[geometry]`; `shape: Literal["name"] = "name"` is one of them.
 
     Attributes
@@ -117,6 +130,8 @@ class Shape(Table):
         Defaults of other tables that this shape changes, under the keys of preset and scene.
     holds_faces
         Whether `[supports.NAME]` says how each face is held (`hold_faces`).
+    surrounded_faces
+        Faces of other bodies that `[supports.NAME]` may put on springs, as in what surrounds the body.
     columns_of_one_tissue
         Names of columns that a body with regions has not.
     refines
@@ -129,6 +144,10 @@ class Shape(Table):
         Whether a scene may give the body `natural.opening_angle`; `layers_of_tissue` says of which layers it closes.
     has_a_wall
         Whether a scene may give it `natural.layers`.
+    unloads
+        Whether a scene may give its loaded shape, `geometry.is = "loaded"`.
+    unloads_by_numbers
+        Whether a few numbers are all of the unloaded shape.
     """
 
     loads: ClassVar[dict[str, LoadKind]]
@@ -146,15 +165,23 @@ class Shape(Table):
     constant_fields: ClassVar[tuple[str, ...]] = ()
     defaults: ClassVar[dict[str, Any]] = {}
     holds_faces: ClassVar[bool] = False
+    surrounded_faces: ClassVar[tuple[str, ...]] = ()
     columns_of_one_tissue: ClassVar[tuple[str, ...]] = ()
     refines: ClassVar[bool] = True
     has_regions: ClassVar[bool] = False
     closes_from_a_sector: ClassVar[bool] = False
     has_a_wall: ClassVar[bool] = False
+    unloads: ClassVar[bool] = False
+    unloads_by_numbers: ClassVar[bool] = False
     is_filled_by_regions: ClassVar[bool] = False
 
     shape: str = Field(description="Which body it is.")
     length_unit: LengthUnit = None
+
+    @property
+    def is_loaded(self) -> bool:
+        """Whether the geometry is that under the loads."""
+        return bool(getattr(self, "is") == "loaded")
 
     @property
     def loaded_area(self) -> float:

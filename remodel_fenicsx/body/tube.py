@@ -33,7 +33,7 @@ from remodel_fenicsx.model.cells import cylindrical_axes, structure_tensor
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.schema.tables import fault, shown
 from remodel_fenicsx.schema.units import FORCE, LENGTH, STRESS
-from remodel_fenicsx.settings import Mesh, Natural, Region
+from remodel_fenicsx.settings import Load, Mesh, Natural, Region, Support
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -145,12 +145,20 @@ def _in_layers(points: Array, elements: Corners) -> Body:
     return divided_along(points, elements) if as_long and elements.shape[1] == 8 else (points, elements)
 
 
+def springs_across(scene: Any) -> str | None:
+    """Springs along the wall pull its sections out of their planes."""
+    for face, support in scene.supports.faces.items():
+        if support.tangential:
+            return f"supports.{face}.tangential is above 0: sections do not stay plane"
+    return None
+
+
 _EVERYWHERE = (same_cells, symmetric_law)
 REDUCTIONS = {
     "radial": Reduction(
         build_ray,
         lambda scene: PAPER[1] * scene.mesh.refinement,
-        (*_EVERYWHERE, round_about_z, free_ends, known_loads("radial")),
+        (*_EVERYWHERE, round_about_z, free_ends, springs_across, known_loads("radial")),
         about_z,
         lambda shape, points, lines: revolved(*extended(points, lines, shape.length)),
     ),
@@ -164,7 +172,7 @@ REDUCTIONS = {
     "sector": Reduction(
         build_quarter,
         lambda scene: PAPER[0] * PAPER[1] * scene.mesh.refinement**2 * layers(scene) // 4,
-        (*_EVERYWHERE, symmetric_planes, known_loads("sector")),
+        (*_EVERYWHERE, symmetric_planes, springs_across, known_loads("sector")),
         mirrored,
         lambda shape, points, elements: mirrored_twice(*_in_layers(points, elements)),
     ),
@@ -311,10 +319,13 @@ class Tube(Walled):
         "clamped": lambda shape, loading: shape.clamp(loading),
         "closed": lambda shape, loading: shape.close(loading),
     }
+    surrounded_faces: ClassVar[tuple[str, ...]] = ("outer",)
     ends_that_free_length: ClassVar[tuple[str, ...]] = ("closed",)
     columns_of_one_tissue: ClassVar[tuple[str, ...]] = ("opening_angle",)
     has_regions: ClassVar[bool] = True
     closes_from_a_sector: ClassVar[bool] = True
+    unloads: ClassVar[bool] = True
+    unloads_by_numbers: ClassVar[bool] = True
     is_filled_by_regions: ClassVar[bool] = True
     # with global axes a tube of isotropic cells would not stay round in the first step
     defaults: ClassVar[dict[str, Any]] = {"cells": {"axes": "cylindrical"}}
@@ -323,6 +334,17 @@ class Tube(Walled):
     inner_radius: Annotated[float, LENGTH] = Field(gt=0, description="Inner radius R_i, in the scene's unit of length.")
     outer_radius: Annotated[float, LENGTH] = Field(gt=0, description="Outer radius R_o, in the scene's unit of length.")
     length: Annotated[float, LENGTH] = Field(gt=0, description="Length along z, in the scene's unit of length.")
+
+    def hold_faces(
+        self, loading: Loading, supports: Mapping[str, Support], modulus: float, loads: Mapping[str, Load]
+    ) -> None:
+        """Springs of what surrounds it."""
+        from remodel_fenicsx.body.mesh_supports import add_support, warn_of_twist
+
+        for face, support in supports.items():
+            add_support(loading, face, support, modulus, None)
+            if loading.kinematics.moves_rigidly:
+                warn_of_twist(face, support, loading.domain.comm)
 
     def layers_of_tissue(self, natural: Natural, regions: Mapping[str, Region], tissues: Mapping[str, Tissue]) -> Any:
         """Where tissue or prestretch change."""

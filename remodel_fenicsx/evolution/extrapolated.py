@@ -105,10 +105,14 @@ class Extrapolated(Staggered):
         return self._known(0).towards(target, weight_of_the_end(self.remodeling.kappa * duration))
 
     def _extrapolated(self, time: float) -> Target:
+        return self._known(0).towards(self._known(1), -self._back(time))
+
+    def _back(self, time: float) -> Array:
+        """Minus the weight of the target before in the extrapolated one, (n,)."""
         times = self._values.reshape(-1, 2, 11)[:, :, 10]
         back, known = np.zeros(len(times)), times[:, 1] != NEVER
         back[known] = (time - times[known, 0]) / 2 / (times[known, 0] - times[known, 1])
-        return self._known(0).towards(self._known(1), -back)
+        return back
 
     def _follow(self, target: Target, time: float) -> None:
         """Cells after the step; where an extrapolated target would make A indefinite, the last target itself counts."""

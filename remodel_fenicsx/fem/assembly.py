@@ -181,7 +181,7 @@ def _same(one: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
 # ---------------------------------------------------------------- the tangent of an energy
 
 
-def second_derivative(energy: Any, unknown: Any, test: Any, trial: Any) -> Any:
+def second_derivative(energy: Any, unknown: Any, test: Any, trial: Any, other: Any = None) -> Any:
     """Derivative of an energy by its unknowns, twice; its kernel takes a third of the time.
 
     An energy W(I_1, I_2, ...) of scalar invariants of F has sum_m W_m D(d I_m) + sum_mn W_mn d I_m D I_n. Left to
@@ -194,23 +194,28 @@ def second_derivative(energy: Any, unknown: Any, test: Any, trial: Any) -> Any:
         UFL form without arguments.
     unknown, test, trial
         What it is differentiated by, and the directions.
+    other
+        What it is differentiated by the second time, if that is not the unknown: a function on which the invariants
+        depend, and nothing else does.
     """
-    return map_integrands(lambda density: _of_density(density, unknown, test, trial), energy)
+    other = unknown if other is None else other
+    return map_integrands(lambda density: _of_density(density, unknown, test, trial, other), energy)
 
 
-def _of_density(density: Any, unknown: Any, test: Any, trial: Any) -> Any:
+def _of_density(density: Any, unknown: Any, test: Any, trial: Any, other: Any) -> Any:
     found = invariants(density, unknown)
     if not found:
-        return ufl.derivative(ufl.derivative(density, unknown, test), unknown, trial)
+        return ufl.derivative(ufl.derivative(density, unknown, test), other, trial)
     by_number = [(ufl.variable(invariant), invariant) for invariant in found]
     function = ufl.replace(density, {invariant: number for number, invariant in by_number})
-    changes = [[ufl.derivative(invariant, unknown, way) for invariant in found] for way in (test, trial)]
+    ways = ((unknown, test), (other, trial))
+    changes = [[ufl.derivative(invariant, by, way) for invariant in found] for by, way in ways]
     total = ufl.as_ufl(0)
     for (number, _), change in zip(by_number, changes[0], strict=True):
         slope = ufl.diff(function, number)
-        total += slope * ufl.derivative(change, unknown, trial)
-        for (other, _), other_change in zip(by_number, changes[1], strict=True):
-            total += ufl.diff(slope, other) * (change * other_change)
+        total += slope * ufl.derivative(change, other, trial)
+        for (partner, _), its_change in zip(by_number, changes[1], strict=True):
+            total += ufl.diff(slope, partner) * (change * its_change)
     return total
 
 

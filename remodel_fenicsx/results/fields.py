@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Collection, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import ufl
@@ -258,12 +259,18 @@ class NodalGather:
 
     def __init__(self, domain: Domain, state: State):
         self.domain, self.state = domain, state
-        dofs = state.kinematics.nodal_space(state.unknown).dofmap.list.reshape(-1)
-        nodes = compat.geometry_dofmap(domain.mesh).reshape(-1)
-        # the element and the geometry have the same degree: node k of an element is dof k of that element
-        self._dof_of_node = np.zeros(len(domain.node_number), dtype=np.int64)
-        self._dof_of_node[nodes] = dofs
+        self._dof_of_node = dof_of_node(domain, state.kinematics.nodal_space(state.unknown))
 
     def __call__(self) -> Array | None:
         values = self.state.kinematics.nodal_displacement(self.state.unknown)[self._dof_of_node]
         return self.domain.gather_nodes(values)
+
+
+def dof_of_node(domain: Domain, space: Any) -> NDArray[np.int64]:
+    """Number of the (blocked) degree of freedom at each local geometry node, (nodes,)."""
+    dofs = space.dofmap.list.reshape(-1)
+    nodes = compat.geometry_dofmap(domain.mesh).reshape(-1)
+    # the element and the geometry have the same degree: node k of an element is dof k of that element
+    found = np.zeros(len(domain.node_number), dtype=np.int64)
+    found[nodes] = dofs
+    return found

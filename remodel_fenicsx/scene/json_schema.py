@@ -101,7 +101,7 @@ def _of_shape(shape: type[Shape]) -> Schema:
         "geometry": geometry,
         "loads": {"type": "object", "properties": loads, "additionalProperties": _load_on_face(shape)},
         "supports": {"properties": {"ends": {"enum": list(shape.ends)}}}
-        | ({} if shape.holds_faces else {"propertyNames": {"enum": list(Supports.model_fields)}}),
+        | ({} if shape.holds_faces else {"propertyNames": {"enum": [*Supports.model_fields, *shape.surrounded_faces]}}),
         "cells": {"properties": {"axes": {"enum": list(shape.axis_kinds)}}},
         "regions": {} if shape.has_regions else {"maxProperties": 0},
     }

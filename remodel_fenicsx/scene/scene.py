@@ -153,9 +153,15 @@ class Scene(Table):
         ):
             if name not in names:
                 raise fault(f"allowed for shape {geometry.name!r} is {', '.join(map(repr, names))}", key, name)
-        for name in self.supports.faces:
-            if not geometry.holds_faces:
-                raise fault(f"a {geometry.name} is held by supports.ends", f"supports.{quoted(name)}", None)
+        for name, support in self.supports.faces.items():
+            if not geometry.holds_faces and name not in geometry.surrounded_faces:
+                springs = " or ".join(f"supports.{face} of kind 'elastic'" for face in geometry.surrounded_faces)
+                rule = f"a {geometry.name} is held by supports.ends" + (
+                    f"; allowed beside is {springs}" if springs else ""
+                )
+                raise fault(rule, f"supports.{quoted(name)}", None)
+            if not geometry.holds_faces and support.kind != "elastic":
+                raise fault("allowed here is 'elastic'", f"supports.{quoted(name)}.kind", support.kind)
         formulation = self.mesh.formulation
         if FORMULATIONS[formulation].takes_parts and not isinstance(MATRICES[material.matrix], Matrix):
             rule = f"needs the volumetric part of material.matrix = {material.matrix!r}: an energy made as a Matrix"
@@ -175,6 +181,7 @@ class Scene(Table):
         self._check_columns()
         self._check_length()
         self._check_natural()
+        self._check_loaded_shape()
         if self.model.kinematics != AUTO and (reasons := objections(self, self.model.kinematics)):
             raise fault("; ".join(reasons), "model.kinematics", self.model.kinematics)
         return self
@@ -361,6 +368,28 @@ class Scene(Table):
             if has not in possible:
                 rule = f"must be {none} unless {key} is {' or '.join(map(repr, possible))}"
                 raise fault(rule, asked, value)
+
+    def _check_loaded_shape(self) -> None:
+        """Whose unloaded shape can be found."""
+        shape, cells = self.geometry, self.natural.cells
+        if cells == "equilibrium":
+            if not (shape.is_loaded and shape.unloads_by_numbers):
+                able = " or ".join(repr(name) for name, kind in SHAPES.items() if kind.unloads_by_numbers)
+                raise fault(f"needs geometry.is = 'loaded' of the shape {able}", "natural.cells", cells)
+            if not self.time.is_equilibrium:
+                raise fault("needs time.end = 'equilibrium'", "natural.cells", cells)
+        if not shape.is_loaded:
+            return
+        if not shape.unloads:
+            able = ", ".join(repr(name) for name, kind in SHAPES.items() if kind.unloads)
+            raise fault(f"allowed for the shapes {able}", "geometry.is", "loaded")
+        if self.supports.ends == "clamped":
+            raise fault("a tube with clamped ends has no one radius under loads", "geometry.is", "loaded")
+        if self.measured_cells:
+            key = f"{in_region(next(iter(self.measured_cells)))}cells.fibres"
+            raise fault(
+                f"rows of {key} are found again by their places, which unloading moves", "geometry.is", "loaded"
+            )
 
     def _check_length(self) -> None:
         """A length is prescribed or unknown."""

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib import rc_context
@@ -17,17 +18,19 @@ from numpy.typing import NDArray
 from remodel_fenicsx.results.run_folder import chosen_folder
 from remodel_fenicsx.results.words import unit_of, words
 from remodel_fenicsx.scene.scene import Scene, SceneError
-from remodel_fenicsx.simulation import Simulation, with_kinematics
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.studies.measured import Measured, Unknown, read_measurements
+from remodel_fenicsx.studies.modelled import Modelled, Slopes, model_of, rotated_cells, slopes, without_derivatives
 from remodel_fenicsx.studies.page import COLOURS, STYLE, Page, add_head
 from remodel_fenicsx.system.environment import versions
 from remodel_fenicsx.system.regular_files import write_whole
 from remodel_fenicsx.system.terminal import Line
 
 Array = NDArray[np.float64]
+log = logging.getLogger(__name__)
 
 FIT = "fit"
+SCALE = "scale."  # what keys of factors on columns begin with
 LOGARITHM_CHANGE = 1e-3  # of a logarithm: central differences err by 1e-6, the solves' tolerance of 1e-10 by 1e-7
 BLIND = 1e-5  # smallest singular value over the largest, below which the data say nothing: what differences err by
 NAMED = 0.1  # share of a blind direction from which on an unknown is named
@@ -73,112 +76,118 @@ class Fit:
     scene: Scene
 
 
-# ---------------------------------------------------------------- the model of a table
-def model_of(scene: Scene, table: Measured, scales: Mapping[str, float]) -> dict[str, Array]:
-    """What a scene says where a table has measurements, by column.
-
-    Raises
-    ------
-    StepFailure
-        If a state has no equilibrium.
-    """
-    wanted = {column.name for column in scene.columns()}
-    scene = scene.with_values({"output.columns": [*scene.output.columns, *(n for n in table.sd if n not in wanted)]})
-    if table.state == "history":
-        end = float(scene.time.step * np.ceil(table.columns["time"].max() / scene.time.step - 1e-9))
-        history, _ = _rows(scene.with_values({"time.end": max(end, scene.time.step)}), table)
-        return {name: np.interp(table.columns["time"], history["time"], history[name]) for name in table.sd}
-    cells = None
-    if table.state == "after":
-        scene = with_kinematics(scene)
-        _, cells = _rows(scene.with_values({"time.end": table.time}), table)
-    history, _ = _rows(_passive(scene, table, scales), table, cells)
-    return {name: history[name][history["time"] > 0] for name in table.sd}
-
-
-def _passive(scene: Scene, table: Measured, scales: Mapping[str, float]) -> Scene:
-    """Cells that stay, and a step for each row; loads that the table has not keep their last value."""
-    changes: dict[str, Any] = {"remodeling.law": "none", "remodeling.coupling": "staggered", "output.times": []}
-    changes |= {"time.step": 1.0, "time.end": float(table.rows), "time.tolerance": None}
-    for name, load in scene.loads.items():
-        values: Array = np.full(table.rows, load.value * load.factor(scene.last_time))
-        if name in table.loads:
-            values = scales.get(name, 1.0) * table.columns[name]
-        largest = float(values[np.abs(values).argmax()]) or 1.0
-        ramp = [[0.0, 0.0], *([number + 1.0, float(value / largest)] for number, value in enumerate(values))]
-        changes |= {f"loads.{name}.value": largest, f"loads.{name}.ramp": ramp}
-    return scene.with_values(changes)
-
-
-def _rows(scene: Scene, table: Measured, cells: tuple[Array, Array] | None = None) -> tuple[dict[str, Array], Any]:
-    """Measured columns of a run over its time, and the cells at its end."""
-    simulation = Simulation(scene, MPI.COMM_SELF)
-    try:
-        if cells is not None:
-            simulation.cells.set(*cells)
-            simulation.state.settle_cells()
-        rows = [step.row for step in simulation.steps()]
-        kept = simulation.cells.dimension_values.copy(), simulation.cells.axis_values.copy()
-    finally:
-        simulation.close()
-    return {name: np.array([row[name] for row in rows]) for name in ("time", *table.sd)}, kept
-
-
 # ---------------------------------------------------------------- least squares
+class Evaluation(NamedTuple):
+    """Residuals (n,) at a point, and their derivatives (n, k): NaN in columns that the model does not give."""
+
+    residuals: Array
+    jacobian: Array
+
+
 class Problem:
-    """Residuals over their standard deviations as a function of the logarithms of the unknowns."""
+    """Residuals over their standard deviations as a function of the logarithms of the unknowns.
+
+    Attributes
+    ----------
+    exact
+        Which unknowns have derivatives of the model, (k,); those of the others are differences of runs.
+    reason
+        Why there are others.
+    """
 
     def __init__(self, scene: Scene, unknowns: Sequence[Unknown], tables: Sequence[Measured]):
         self.scene, self.unknowns, self.tables = scene, list(unknowns), list(tables)
-        self._known = cache(self._residuals)
+        self._known: dict[tuple[float, ...], Evaluation] = {}
+        first = np.log([unknown.start for unknown in unknowns])
+        words = [reason for table in tables if (reason := without_derivatives(scene, table)) is not None]
+        if not words and rotated_cells(scene):
+            words = [f"cells.axes = {scene.cells.axes!r}"]
+        self.exact: NDArray[np.bool_] = np.zeros(len(first), dtype=np.bool_) if words else self._slopes(first).exact
+        self.reason = words[0] if words else "the model has no derivative by them"
+
+    def how(self) -> str:
+        """Which derivatives are exact, in words."""
+        keys = [unknown.key for unknown in self.unknowns]
+        exact = [key for key, known in zip(keys, self.exact, strict=True) if known]
+        others = [key for key in keys if key not in exact]
+        parts = [f"exact by {', '.join(exact)}"] if exact else []
+        parts += [f"by differences of runs for {', '.join(others)} ({self.reason})"] if others else []
+        return f"derivatives: {'; '.join(parts)}"
 
     def scene_of(self, logarithms: Array) -> Scene:
         """The scene with these numbers."""
         found = {u.key: float(np.exp(x)) for u, x in zip(self.unknowns, logarithms, strict=True)}
-        return self.scene.with_values({key: value for key, value in found.items() if not key.startswith("scale.")})
+        return self.scene.with_values({key: value for key, value in found.items() if not key.startswith(SCALE)})
 
     def scales_of(self, logarithms: Array) -> dict[str, float]:
         """Factors on columns, by name."""
         pairs = zip(self.unknowns, logarithms, strict=True)
-        return {u.key.removeprefix("scale."): float(np.exp(x)) for u, x in pairs if u.key.startswith("scale.")}
+        return {u.key.removeprefix(SCALE): float(np.exp(x)) for u, x in pairs if u.key.startswith(SCALE)}
 
-    def models(self, logarithms: Array) -> list[dict[str, Array]]:
-        """What the model says of each table."""
+    def _slopes(self, logarithms: Array) -> Slopes:
+        names = {u.key.removeprefix(SCALE): k for k, u in enumerate(self.unknowns) if u.key.startswith(SCALE)}
+        scales = {name: (k, float(np.exp(logarithms[k]))) for name, k in names.items()}
+        return slopes(self.scene_of, logarithms, scales)
+
+    def models(self, logarithms: Array, derivatives: bool = False) -> list[Modelled]:
+        """What the model says of each table, with derivatives on request.
+
+        Raises
+        ------
+        StepFailure
+            If a state has no equilibrium.
+        """
         scene, scales = self.scene_of(logarithms), self.scales_of(logarithms)
-        return [model_of(scene, table, scales) for table in self.tables]
+        ways = self._slopes(logarithms) if derivatives else None
+        return [model_of(scene, table, scales, ways) for table in self.tables]
 
     def residuals(self, logarithms: Array) -> Array:
         """Model less measurement over standard deviation, table by table; then the priors."""
-        return self._known(tuple(map(float, logarithms)))
+        return self.at(logarithms).residuals
 
-    def _residuals(self, logarithms: tuple[float, ...]) -> Array:
-        x = np.array(logarithms)
-        scales, parts = self.scales_of(x), []
-        models: list[dict[str, Array]] | None = None
-        try:
-            models = self.models(x)
-        except StepFailure:
-            models = None
+    def at(self, logarithms: Array, derivatives: bool = True) -> Evaluation:
+        """Residuals, and those derivatives that are exact, where they are asked for."""
+        key = tuple(map(float, logarithms))
+        if key not in self._known or (derivatives and self.exact.any() and np.isnan(self._known[key].jacobian).all()):
+            self._known[key] = self._evaluated(np.array(logarithms), derivatives and bool(self.exact.any()))
+        return self._known[key]
+
+    def _evaluated(self, x: Array, derivatives: bool) -> Evaluation:
+        scales, parts, slopes_ = self.scales_of(x), [], []
+        models: list[Modelled] | None = None
+        with suppress(StepFailure):
+            models = self.models(x, derivatives)
         for number, table in enumerate(self.tables):
             for name, sd in table.sd.items():
                 measured = scales.get(name, 1.0) * table.columns[name]
-                off = models[number][name] - measured if models else np.full(table.rows, UNSOLVED * sd)
+                off = models[number].columns[name] - measured if models else np.full(table.rows, UNSOLVED * sd)
                 parts.append(off / sd)
-        for unknown, value in zip(self.unknowns, x, strict=True):
+                by_scale = np.array([u.key == SCALE + name for u in self.unknowns], dtype=np.float64)
+                ways: Array = np.zeros((table.rows, len(x)))
+                if models and derivatives:
+                    ways = models[number].changes[name].T - measured[:, None] * by_scale
+                slopes_.append(ways / sd)
+        for number, (unknown, value) in enumerate(zip(self.unknowns, x, strict=True)):
             if unknown.prior is not None and unknown.prior_sd is not None:
                 parts.append(np.array([(value - np.log(unknown.prior)) / unknown.prior_sd]))
-        return np.concatenate(parts)
+                slopes_.append(np.eye(len(x))[[number]] / unknown.prior_sd)
+        known = self.exact if derivatives else np.zeros_like(self.exact)
+        return Evaluation(np.concatenate(parts), np.where(known, np.concatenate(slopes_), np.nan))
 
     def jacobian(self, logarithms: Array, central: bool = False) -> Array:
-        """Derivatives by differences, (residuals, unknowns)."""
-        present, columns = self.residuals(logarithms), []
-        for change in LOGARITHM_CHANGE * np.eye(len(logarithms)):
+        """Derivatives, (residuals, unknowns): of the model where it has them, else by differences of runs."""
+        present, found = self.at(logarithms)
+        found = found.copy()
+        for k, change in enumerate(LOGARITHM_CHANGE * np.eye(len(logarithms))):
+            if self.exact[k]:
+                continue
             if central:
-                ahead, behind = self.residuals(logarithms + change), self.residuals(logarithms - change)
-                columns.append((ahead - behind) / (2 * LOGARITHM_CHANGE))
+                ahead, behind = (self.at(logarithms + way, False).residuals for way in (change, -change))
+                found[:, k] = (ahead - behind) / (2 * LOGARITHM_CHANGE)
             else:
-                columns.append((self.residuals(logarithms + 0.1 * change) - present) / (0.1 * LOGARITHM_CHANGE))
-        return np.stack(columns, axis=1)
+                ahead = self.at(logarithms + 0.1 * change, False).residuals
+                found[:, k] = (ahead - present) / (0.1 * LOGARITHM_CHANGE)
+        return found
 
     def check_tells_apart(self, jacobian: Array) -> None:
         """Refuse unknowns of which the data say nothing.
@@ -239,6 +248,7 @@ def fit(
     problem, line = Problem(scene, unknowns, tables), Line(f"{scene.name} {FIT}")
     first = np.log([unknown.start for unknown in unknowns])
     bounds = np.log([u.lower for u in unknowns]), np.log([u.upper for u in unknowns])
+    log.info("%s", problem.how())
     problem.models(first)  # what has no equilibrium here says so
     problem.check_tells_apart(problem.jacobian(first, central=True))
     random = np.random.default_rng(1)
@@ -282,7 +292,7 @@ def _result(problem: Problem, logarithms: Array, minima: list[float], evaluation
         float(np.sqrt(np.mean(off**2))),
         minima,
         evaluations,
-        problem.models(logarithms),
+        [modelled.columns for modelled in problem.models(logarithms)],
         problem.scene_of(logarithms),
     )
 

@@ -180,6 +180,27 @@ def test_the_figure_shows_what_the_page_says() -> None:
     assert not found["unloaded_0"].any() and found["unloaded_120"][0] < -3 < 1.5 < found["unloaded_120"][-1]
 
 
+def test_a_rotation_of_the_natural_state_changes_nothing() -> None:
+    """F_e = F G Q with isotropic cells: the same energy of the loaded tube for every rotation Q.
+
+    With the repulsion `log`: that of the paper knows the cells' axes, however long they are.
+    """
+    changes = {"remodeling.law": "none", "time.end": 25.0, "material.repulsion": "log"}
+    simulation = Simulation(scene("radial", **changes))
+    try:
+        list(simulation.steps())
+        equilibrium, function = simulation.stepper.coupling.equilibrium, simulation.state.kinematics.gradient
+        before = equilibrium.stored_energy()
+        values = simulation.quadrature.values(function, (3, 3))
+        turn = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])
+        values[:] = values @ turn
+        assert equilibrium.stored_energy() == pytest.approx(before, rel=1e-12)
+        values[:] = values * np.array([1.1, 1.0, 1.0])
+        assert equilibrium.stored_energy() != pytest.approx(before, rel=1e-3)
+    finally:
+        simulation.close()
+
+
 # ---------------------------------------------------------------- layers that were stretched before they were joined
 
 

@@ -20,12 +20,12 @@ ROOT = Path(__file__).parents[2]
 PACKAGE = "remodel_fenicsx"
 # what a room may import: itself, and those before it
 ROOMS = ("_lazy", "_version", "system", "schema", "model", "fem", "kernels", "settings", "body", "scene", "state",
-         "solver", "evolution", "watch", "results", "report", "simulation", "running", "studies", "pictures",
-         "recording", "paper", "cli",
+         "solver", "evolution", "watch", "results", "report", "simulation", "unloading", "running", "studies",
+         "pictures", "recording", "paper", "cli",
          "parts", "extend")  # fmt: skip
 # imports that only the type checker follows: of what is there without dolfinx, to what is not
 TYPES_ONLY = {
-    "__init__": {"recording", "results.recording", "running", "scene", "simulation"},
+    "__init__": {"recording", "results.recording", "running", "scene", "simulation", "unloading"},
     "body.columns": {"body.shape"},
     "body.cube": {"body.domain", "body.loading"},
     "body.layers": {"body.domain"},

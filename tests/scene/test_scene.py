@@ -83,7 +83,8 @@ BAD_SCENES = [
     (
         CUBE,
         {"geometry.radius": 3.0},
-        "geometry.radius = 3.0: unknown key; allowed are geometry.shape, geometry.length_unit, geometry.side",
+        "geometry.radius = 3.0: unknown key; allowed are "
+        "geometry.is, geometry.shape, geometry.length_unit, geometry.side",
     ),
     # without a shape nothing else is judged: preset, loads and units depend on it
     (CUBE, {"preset": PAPER, "geometry": {}}, "geometry.shape: missing; allowed are 'cube', 'tendon', 'tube', 'mesh'"),

@@ -100,6 +100,80 @@ def test_the_numbers_that_made_the_data_are_found(folder: Path, capsys: pytest.C
     assert cli.main(words) == 2 and "out" in capsys.readouterr().err  # nothing of the user's is written over
 
 
+EVERY = """
+[unknowns]
+"material.lame_lambda" = { start = 10.0 }
+"material.lame_mu" = { start = 3.0, prior = 3.0, prior_sd = 0.5 }
+"material.chain_density" = { start = 2e21 }
+"material.locking_stretch" = { start = 2.0 }
+"remodeling.half_life" = { start = 14.0 }
+"loads.pressure.value" = { start = 1.2 }
+
+[[measured]]
+file = "virgin.csv"
+sd = { outer_radius = 0.01 }
+units = { pressure = "mmHg" }
+scale = { pressure = "unknown" }
+
+[[measured]]
+file = "history.csv"
+state = "history"
+sd = { fibre_angle_outer = 2.0, inner_radius = 0.01 }
+
+[[measured]]
+file = "after.csv"
+state = "after"
+time = 10.0
+sd = { inner_radius = 0.01, reduced_axial_force = 0.1 }
+"""
+
+MODELS = (
+    {},
+    {"remodeling.law": "explicit"},
+    {"remodeling.coupling": "extrapolated", "material.repulsion": "log"},
+)
+
+
+@pytest.mark.parametrize("changes", MODELS, ids=["tensor", "explicit", "extrapolated"])
+def test_derivatives_are_exact(folder: Path, changes: dict[str, Any]) -> None:
+    """Taylor remainders fall by four where the step is halved; central differences of runs are the same numbers."""
+    (folder / "after.csv").write_text("pressure,inner_radius,reduced_axial_force\n0.6,1.2,0.5\n1.2,1.3,0.1\n")
+    (folder / "every.toml").write_text(EVERY)
+    scene = tube(**changes, **{"solver.relative_tolerance": 1e-13, "time.end": 40.0})
+    problem = Problem(scene, *read_measurements(folder / "every.toml", scene))
+    assert problem.exact.all(), problem.how()
+    x = np.log([unknown.start for unknown in problem.unknowns])
+    found, way = problem.jacobian(x), np.random.default_rng(2).normal(size=len(x)) / 3
+    present = problem.residuals(x)
+    remainders = []
+    for size in (0.04, 0.02, 0.01, 0.005):
+        change = problem.at(x + size * way, False).residuals - present
+        remainders.append(np.linalg.norm(change - size * found @ way))
+    ratios = np.divide(remainders[:-1], remainders[1:])
+    assert np.abs(ratios[1:] - 4.0).max() < 0.1, ratios
+    for k in range(len(x)):
+        step = 1e-4 * np.eye(len(x))[k]
+        ends = [problem.at(x + side * step, False).residuals for side in (1, -1)]
+        differences = (ends[0] - ends[1]) / 2e-4
+        np.testing.assert_allclose(found[:, k], differences, atol=2e-6 * np.abs(differences).max())
+
+
+def test_what_is_not_exact_is_said(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Numbers of the cells and of the body go by differences, and so does a model without derivatives."""
+    (folder / "data.toml").write_text(
+        DATA.replace('"material.lame_mu" = { start = 4.0 }', '"geometry.inner_radius" = { start = 1.01 }')
+    )
+    scene = read_scene(folder / "scene.toml")
+    problem = Problem(scene, *read_measurements(folder / "data.toml", scene))
+    assert problem.how() == (
+        "derivatives: exact by material.chain_density, remodeling.kappa; by differences of runs for "
+        "geometry.inner_radius (the model has no derivative by them)"
+    )
+    full = scene.with_values({"remodeling.exponent": 1.0})
+    problem = Problem(full, *read_measurements(folder / "data.toml", full))
+    assert not problem.exact.any() and "threshold and remodeling.exponent have no derivative" in problem.how()
+
+
 def test_bands_have_the_width_of_the_noise(folder: Path) -> None:
     """Twice the standard deviations, twice the logarithmic bands; they cover the truth of noisy data."""
     path, scene = folder / "data.toml", read_scene(folder / "scene.toml")
@@ -127,7 +201,7 @@ sd = { outer_radius = 0.01, inner_radius = 0.01 }
 """
     )
     problem = Problem(end, *read_measurements(folder / "after.toml", end))
-    found = problem.models(np.log([3.0]))[0]
+    found = problem.models(np.log([3.0]))[0].columns
     assert found["outer_radius"][-1] == pytest.approx(expected["outer_radius"], rel=1e-8)
     assert found["inner_radius"][-1] == pytest.approx(expected["inner_radius"], rel=1e-8)
     virgin = inflated()[-1]

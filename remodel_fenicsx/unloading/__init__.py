@@ -1,0 +1,62 @@
+"""A scene whose geometry is the loaded one, as a scene of the unloaded body that its loads bring there."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from mpi4py import MPI
+
+from remodel_fenicsx.scene import Scene, SceneError
+from remodel_fenicsx.unloading.failure import NoUnloadedShape
+from remodel_fenicsx.unloading.mesh import unloaded_mesh
+from remodel_fenicsx.unloading.tube import unloaded_tube
+
+__all__ = ["NoUnloadedShape", "as_unloaded", "unloaded"]
+
+
+@contextmanager
+def as_unloaded(scene: Scene, comm: MPI.Intracomm) -> Iterator[Scene]:
+    """The scene itself, or that of its unloaded body, whose mesh is there as long as this context. Collective.
+
+    Raises
+    ------
+    SceneError, NoUnloadedShape
+        As `unloaded`.
+    """
+    if not scene.geometry.is_loaded:
+        yield scene
+        return
+    with TemporaryDirectory() as folder:
+        yield unloaded(scene, comm, Path(comm.bcast(folder)))
+
+
+def unloaded(scene: Scene, comm: MPI.Intracomm = MPI.COMM_WORLD, folder: Path | None = None) -> Scene:
+    """The scene of the body that the loads, at the end of their ramps, bring to the geometry of this one. Collective.
+
+    Parameters
+    ----------
+    scene
+        With `geometry.is = "loaded"`; another is given back.
+    comm
+        MPI communicator.
+    folder
+        Where the mesh of an own body is written, on rank 0.
+
+    Raises
+    ------
+    SceneError
+        If the body has no numbers or nodes to be found, or an own body no folder.
+    NoUnloadedShape
+        If none is found.
+    """
+    if not scene.geometry.is_loaded:
+        return scene
+    if scene.geometry.unloads_by_numbers:
+        return unloaded_tube(scene, comm)
+    if folder is None:
+        way = "a folder is needed for the unloaded mesh"
+        raise SceneError(f"geometry.is = 'loaded': {way}")
+    return unloaded_mesh(scene, comm, folder)

@@ -1,0 +1,184 @@
+"""A geometry that is the loaded one: what is unloaded and loaded again is as given."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from remodel_fenicsx import Scene, SceneError, Simulation, cli, read_scene, unloaded
+from remodel_fenicsx.body.mesh_reader import read_mesh
+from remodel_fenicsx.results.fields import NodalGather
+from remodel_fenicsx.unloading import NoUnloadedShape
+from tests.body.test_natural import scene
+from tests.mesh_files import write_tube
+
+SELF = MPI.COMM_SELF
+LOADED = {"geometry.is": "loaded", "geometry.inner_radius": 1.4, "geometry.outer_radius": 3.05, "geometry.length": 2.2}
+VIRGIN = {"remodeling.law": "none", "time.end": 25.0, "natural.opening_angle": 0.0}
+
+
+def end_of(of: Scene) -> dict[str, float]:
+    simulation = Simulation(of, SELF)
+    row = [dict(step.row) for step in simulation.steps()][-1]
+    simulation.close()
+    return row
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"loads.pressure.value": 1.2},
+        {"loads.pressure.value": 4.8},
+        {"loads.pressure.value": 2.4, "natural.opening_angle": 120.0},
+        {"loads.pressure.value": 2.4, "supports.ends": "closed", "loads.elongation.value": 0.0},
+        {"regions": {"inside": {"outer_radius": 2.0, "material": {"lame_mu": 2.0}}, "outside": {}}},
+        {"model.kinematics": "axisymmetric"},
+        {"model.kinematics": "sector", "mesh.degree": 1},
+    ],
+    ids=["1.2", "4.8", "opened", "closed", "regions", "axisymmetric", "sector"],
+)
+def test_a_tube_comes_back_to_its_loaded_radii_and_length(
+    changes: dict[str, Any], caplog: pytest.LogCaptureFixture
+) -> None:
+    """To the tolerance of the solver, in at most fifteen runs."""
+    of = scene("radial", **(LOADED | VIRGIN | changes))
+    caplog.set_level("INFO")
+    found = unloaded(of, SELF)
+    runs = int(caplog.records[-1].getMessage().split("(")[1].split()[0])
+    assert runs <= 15
+    simulation = Simulation(found, SELF)
+    row = [step.row for step in simulation.steps()][-1]
+    places = simulation.domain.gather_nodes(simulation.domain.mesh.geometry.x)
+    moved = places + NodalGather(simulation.domain, simulation.state)()  # type: ignore[operator]
+    simulation.close()
+    radii = np.hypot(moved[:, 0], moved[:, 1])
+    assert radii.min() == pytest.approx(1.4, abs=1e-7)
+    assert radii.max() == pytest.approx(3.05, abs=1e-7)
+    shape: Any = found.geometry
+    assert shape.length * (1 + row["axial_elongation"]) == pytest.approx(2.2, abs=1e-8)
+    assert shape.inner_radius < 1.3 and getattr(shape, "is") == "unloaded"
+
+
+def test_the_scan_of_a_tube_that_has_remodeled() -> None:
+    """`natural.cells = "equilibrium"`: its unloaded radii by an independent solver, and back to the given ones."""
+    changes = {"natural.opening_angle": 0.0, "natural.cells": "equilibrium", "time.end": "equilibrium"}
+    changes |= {"remodeling.law": "tensor", "remodeling.coupling": "extrapolated", "material.repulsion": "log"}
+    found = unloaded(scene("radial", **(LOADED | {"geometry.length": 2.0} | changes)), SELF)
+    shape: Any = found.geometry
+    assert shape.inner_radius == pytest.approx(0.99114, abs=2e-4)
+    assert shape.outer_radius == pytest.approx(2.99557, abs=1e-4)
+    row = end_of(found)
+    assert row["inner_radius"] == pytest.approx(1.4, abs=1e-6)
+    assert row["outer_radius"] == pytest.approx(3.05, abs=1e-6)
+
+
+# ---------------------------------------------------------------- bodies from a file
+RAMP = [[0.0, 0.0], [5.0, 1.0]]
+
+
+def own_scene(folder: Path, pressure: float = 2.4, **tables: Any) -> Path:
+    """A tube from a file that is the loaded one."""
+    file = write_tube(folder / "loaded.msh", counts=(8, 2, 4))
+    text = f"""
+[geometry]
+shape = "mesh"
+file = "{file.name}"
+is = "loaded"
+[cells]
+initial = "isotropic"
+[loads.pressure]
+value = {pressure}
+ramp = [[0.0, 0.0], [5.0, 1.0]]
+[loads.elongation]
+value = 0.1
+ramp = [[0.0, 0.0], [5.0, 1.0]]
+[remodeling]
+law = "none"
+[time]
+end = 5.0
+step = 1.0
+[output]
+fields = false
+[solver]
+method = "direct"
+"""
+    path = folder / "scene.toml"
+    path.write_text(text)
+    return path
+
+
+def nodes_of(of: Scene) -> np.ndarray:
+    """At the end of a run."""
+    simulation = Simulation(of, SELF)
+    list(simulation.steps())
+    places = simulation.domain.gather_nodes(simulation.domain.mesh.geometry.x)
+    moved: np.ndarray = places + NodalGather(simulation.domain, simulation.state)()  # type: ignore[operator]
+    simulation.close()
+    return moved
+
+
+def test_every_node_of_an_own_body_comes_back(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """By the command; to 1e-9, in at most ten iterations; a run from the loaded scene has the same mesh."""
+    of = own_scene(tmp_path)
+    assert cli.main(["unload", str(of), "-o", str(tmp_path / "found")]) == 0
+    assert "nodes, moved by 0.4005" in capsys.readouterr().out
+    found = read_scene(tmp_path / "found" / "scene.toml")
+    given = read_mesh(tmp_path / "loaded.msh").points
+    np.testing.assert_allclose(nodes_of(found), given, rtol=0, atol=1e-9)
+    assert cli.main(["unload", str(of), "-o", str(tmp_path / "found")]) == 2
+    assert cli.main(["run", str(of), "-o", str(tmp_path / "run"), "-q"]) == 0
+    same = [read_mesh(tmp_path / name / "unloaded.msh").points for name in ("found", "run")]
+    np.testing.assert_allclose(*same, rtol=0, atol=1e-11)
+    log = (tmp_path / "run" / "run.log").read_text()
+    assert int(log.split("found in ")[1].split()[0]) <= 10
+    assert cli.main(["run", "--resume", str(tmp_path / "run"), "--set", "time.end=6", "-q"]) == 0
+    loads = (tmp_path / "run" / "history.csv").read_text().splitlines()
+    assert len(loads) == 8
+
+
+def test_two_ranks_find_the_same(tmp_path: Path) -> None:
+    of = own_scene(tmp_path)
+    for ranks in (1, 2):
+        line = ["mpirun", "-n", str(ranks), sys.executable, "-m", "remodel_fenicsx", "run", str(of), "-q"]
+        subprocess.run([*line, "-o", str(tmp_path / str(ranks))], check=True, timeout=200, capture_output=True)
+    found = [read_mesh(tmp_path / name / "unloaded.msh").points for name in ("1", "2")]
+    np.testing.assert_allclose(*found, rtol=0, atol=1e-9)
+
+
+def test_what_has_no_unloaded_shape_says_at_which_share(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Exit code 3, and nothing is left behind; from Python an exception."""
+    thin = LOADED | VIRGIN | {"geometry.inner_radius": 3.0, "loads.pressure.value": 30.0}
+    with pytest.raises(NoUnloadedShape, match=r"no unloaded shape at \d+ % of the loads, there is one at \d+ %"):
+        unloaded(scene("radial", **thin), SELF)
+    of = own_scene(tmp_path, pressure=500.0)
+    assert cli.main(["run", str(of), "-o", str(tmp_path / "run"), "-q"]) == 3
+    assert "no unloaded shape at" in capsys.readouterr().err and not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"supports.ends": "clamped"}, "geometry.is = 'loaded': a tube with clamped ends"),
+        ({"natural.cells": "equilibrium"}, "natural.cells = 'equilibrium': needs time.end = 'equilibrium'"),
+        (
+            {"geometry.is": "unloaded", "natural.cells": "equilibrium"},
+            "needs geometry.is = 'loaded' of the shape 'tube'",
+        ),
+        ({"geometry.is": "pressed"}, "geometry.is = 'pressed': allowed are 'unloaded', 'loaded'"),
+    ],
+)
+def test_what_cannot_be_loaded_is_refused(changes: dict[str, Any], words: str) -> None:
+    with pytest.raises(SceneError) as refused:
+        scene("radial" if "supports.ends" not in changes else "auto", **(LOADED | VIRGIN | changes))
+    assert words in str(refused.value)
+
+
+def test_a_simulation_asks_for_the_unloaded_body() -> None:
+    with pytest.raises(SceneError, match="remodel-fenicsx unload SCENE writes its scene"):
+        Simulation(scene("radial", **(LOADED | VIRGIN)), SELF)

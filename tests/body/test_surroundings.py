@@ -1,0 +1,91 @@
+"""Springs on the outer face of a tube: what surrounds a vessel."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from remodel_fenicsx import Scene, SceneError, Simulation
+from remodel_fenicsx.body.reductions import choice
+from remodel_fenicsx.body.tube import whole_tube
+from tests.body.test_natural import scene
+
+SELF = MPI.COMM_SELF
+
+
+def surrounded(stiffness: float, kinematics: str = "radial", tangential: float = 0.0, **changes: Any) -> Scene:
+    springs = {"kind": "elastic", "stiffness": stiffness, "tangential": tangential}
+    values: dict[str, Any] = {"natural.opening_angle": 0.0}
+    values |= {"supports": {"outer": springs}} if stiffness else {}
+    return scene(kinematics, **(values | changes))
+
+
+def end_of(of: Scene, domain: Any = None) -> dict[str, float]:
+    simulation = Simulation(of, SELF, domain)
+    row = [dict(step.row) for step in simulation.steps()][-1]
+    simulation.close()
+    return row
+
+
+def test_a_stiffer_surrounding_turns_the_outside_further() -> None:
+    """The paper's artery at its equilibrium, of an independent solver: outer eighth of the wall, and inner radius."""
+    law = {"remodeling.law": "tensor", "remodeling.coupling": "extrapolated", "material.repulsion": "log"}
+    law |= {"time.end": "equilibrium", "mesh.refinement": 2, "output.columns": []}
+    for stiffness, angle, radius in ((0.0, 75.2, 1.413), (0.5, 75.8, None), (2.0, 77.2, 1.409)):
+        simulation = Simulation(surrounded(stiffness, **law), SELF)
+        row = [step.row for step in simulation.steps()][-1]
+        cells = simulation.cells
+        found = simulation.observer.shape.fibre_angle(
+            cells.dimension_values, cells.axis_values, cells.local_axes.axes
+        )  # fmt: skip
+        outside = cells.local_axes.coordinates[..., 0] > 2.75
+        mean = float(np.average(found[outside], weights=simulation.quadrature.volumes[outside]))
+        simulation.close()
+        assert mean == pytest.approx(angle, abs=0.3)
+        if radius is not None:
+            assert row["inner_radius"] == pytest.approx(radius, abs=1.5e-3)
+
+
+def test_kinematics_agree_on_springs() -> None:
+    """Of fixed direction, square to the face: on one radius, a half-plane, a quarter and the whole tube."""
+    few = {"time.end": 6.0, "loads.pressure.ramp": [[0, 0], [5, 1]], "loads.elongation.ramp": [[0, 0], [5, 1]]}
+    ends = {name: end_of(surrounded(2.0, name, **few)) for name in ("radial", "axisymmetric", "sector")}
+    without = end_of(surrounded(0.0, "radial", **few))
+    assert without["outer_radius"] - ends["radial"]["outer_radius"] > 0.02
+    for name in ("axisymmetric", "sector"):
+        for column in ("inner_radius", "outer_radius"):
+            assert ends[name][column] == pytest.approx(ends["radial"][column], abs=2e-3), (name, column)
+
+
+def test_springs_along_the_wall_need_what_shows_them() -> None:
+    """Sections do not stay plane: the half-plane and the whole tube agree, one radius is refused, with its reason."""
+    few = {"time.end": 2.0, "loads.pressure.ramp": [[0, 0], [2, 1]], "loads.elongation.ramp": [[0, 0], [2, 1]]}
+    few |= {"time.step": 1.0}
+    assert choice(surrounded(2.0, "auto", 1.0)).name == "axisymmetric"
+    assert choice(surrounded(2.0, "auto", 0.0)).name == "radial"
+    with pytest.raises(SceneError, match="supports.outer.tangential is above 0: sections do not stay plane"):
+        surrounded(2.0, "radial", 1.0)
+    half = end_of(surrounded(2.0, "axisymmetric", 1.0, **few))
+    whole = surrounded(2.0, "full", 1.0, **few)
+    full = end_of(whole, whole_tube(whole.geometry, (16, 4, 6), "hexahedron", 2, SELF))
+    across = end_of(surrounded(2.0, "axisymmetric", 0.0, **few))
+    assert abs(half["stored_energy"] / across["stored_energy"] - 1) > 1e-3
+    assert full["stored_energy"] == pytest.approx(half["stored_energy"], rel=3e-3)
+    assert full["outer_radius"] == pytest.approx(half["outer_radius"], abs=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        ({"inner": {"kind": "elastic", "stiffness": 1.0}}, "allowed beside is supports.outer of kind 'elastic'"),
+        ({"outer": {"kind": "held"}}, "supports.outer.kind = 'held': allowed here is 'elastic'"),
+        ({"outer": {"kind": "elastic"}}, "supports.outer.stiffness: missing; a support of kind 'elastic' needs it"),
+    ],
+)
+def test_other_supports_of_a_tube_are_refused(table: dict[str, Any], words: str) -> None:
+    with pytest.raises(SceneError) as refused:
+        scene("radial", **{"natural.opening_angle": 0.0, "supports": table})
+    assert words in str(refused.value)
