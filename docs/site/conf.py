@@ -21,7 +21,7 @@ html_theme_options = {"show_toc_level": 2, "header_links_before_dropdown": 6, "s
 mathjax_path = "katex/katex.min.js"
 html_css_files = ["katex/katex.min.css"]
 html_js_files = [
-    ("katex/contrib/auto-render.min.js", {"defer": "defer"}),
+    ("katex/contrib/auto-render.js", {"defer": "defer"}),
     (
         None,
         {"body": "addEventListener('load', () => window.renderMathInElement && renderMathInElement(document.body))"},

@@ -150,7 +150,7 @@ class Quadrature:
 
     @cached_property
     def gradients(self) -> NDArray[np.float64]:
-        """G with ``|grad u| <= G max |u_node|`` in each element, (elements,): the sizes of the slopes of its functions."""
+        """G with ``|grad u| <= G max |u_node|`` in each element, (elements,): the slopes of its functions."""
         element = basix.create_element(
             basix.ElementFamily.P,
             basix.CellType[self.element_kind],
