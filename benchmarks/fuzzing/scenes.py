@@ -248,7 +248,7 @@ def _rarely(random: Random, scene: Values, stiffness: float) -> None:
             along = {"axial": rounded(random.uniform(0.95, 1.1))}
             scene["natural"]["layers"] = [{"from": rounded(random.uniform(0.2, 0.8)), "prestretch": along}]
     _set_points(random, scene, stiffness)
-    if _closes_from_a_sector(scene) and scene["supports"]["ends"] != "clamped" and random.random() < 0.1:
+    if _closes_from_a_sector(scene) and scene["supports"]["ends"] != "clamped" and random.random() < 0.05:
         scene["geometry"]["is"] = "loaded"
         if scene["time"]["end"] == "equilibrium":
             scene.setdefault("natural", {})["cells"] = "equilibrium"

@@ -110,11 +110,11 @@ class Quadrature:
         return dolfinx.fem.Function(self._spaces[value_shape], name=name)
 
     def values(self, function: Any, value_shape: tuple[int, ...]) -> NDArray[np.float64]:
-        """The function's own memory as an array (elements, points, *value_shape)."""
+        """The function's own memory as an array ``(elements, points, *value_shape)``."""
         return function.x.array.reshape(*self.shape, *value_shape)
 
     def evaluate(self, expression: Any, value_shape: tuple[int, ...]) -> NDArray[np.float64]:
-        """Values (elements, points, *value_shape) of a compiled expression at the points."""
+        """Values ``(elements, points, *value_shape)`` of a compiled expression at the points."""
         return expression.eval(self.mesh, self.elements).reshape(*self.shape, *value_shape)
 
     def owned(self, values: NDArray[Any]) -> NDArray[Any]:
@@ -150,7 +150,7 @@ class Quadrature:
 
     @cached_property
     def gradients(self) -> NDArray[np.float64]:
-        """G with |grad u| <= G max |u_node| in each element, (elements,): the sizes of the slopes of its functions."""
+        """G with ``|grad u| <= G max |u_node|`` in each element, (elements,): the slopes of its functions."""
         element = basix.create_element(
             basix.ElementFamily.P,
             basix.CellType[self.element_kind],

@@ -145,7 +145,7 @@ def ranked(function: RankedFunction, has_limit: bool = False, of_absolute_time: 
     ----------
     function
         ``function(l, l0, target, kappa, time_old, time_new) -> l_new`` with l and l0 (n, 3) by rank (column 0: largest
-        principal value; with the pairing "continuous" by axis instead), target = r0 e, e = lambda^+ / |lambda^+|,
+        principal value; with the pairing "continuous" by axis instead), target = r0 e, ``e = lambda^+ / |lambda^+|``,
         kappa a number, or (n, 1) where regions differ. Points without a positive value, or kappa, keep their cells.
     has_limit, of_absolute_time
         As in `Law`.

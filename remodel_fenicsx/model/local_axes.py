@@ -80,8 +80,8 @@ class LocalAxes:
     def deformed(self, deformation_gradient: Array) -> Array:
         """The axes in the deformed body: rows c', a', r', (..., 3, 3), with F (..., 3, 3).
 
-        c' = F c / |F c| follows a material line. r' = F^-T r / |F^-T r| stays normal to a material surface, and is
-        taken as F c x F a, which needs no inverse. a' = r' x c' lies in that surface, square to c'.
+        ``c' = F c / |F c|`` follows a material line. ``r' = F^-T r / |F^-T r|`` stays normal to a material surface,
+        and is taken as F c x F a, which needs no inverse. a' = r' x c' lies in that surface, square to c'.
         """
         circumferential, axial = (
             np.einsum("...ij,...j->...i", deformation_gradient, self.axes[..., k, :]) for k in (0, 1)

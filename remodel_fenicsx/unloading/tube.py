@@ -121,6 +121,7 @@ def _loaded(scene: Scene, comm: MPI.Intracomm, numbers: Array, share: float) -> 
         changes |= {"remodeling.exponent": 2.0, "time.end": end, "time.step": end / LOAD_STEPS, "time.tolerance": None}
     else:
         changes |= {"time.end": EQUILIBRIUM}
+    changes |= {"solver.relative_tolerance": min(scene.solver.relative_tolerance, LOADED_AGAIN / 10)}
     for name, load in scene.loads.items():
         changes |= {f"loads.{name}.value": load.value * load.factor(end) * share}
         changes |= {f"loads.{name}.ramp": [[0.0, 0.0], [end, 1.0]]}

@@ -1,0 +1,29 @@
+"""What Sphinx is told; docs/build calls it."""
+
+from remodel_fenicsx import __version__
+
+project = "remodel_fenicsx"
+author = "The remodel_fenicsx developers"
+release = version = __version__
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.mathjax"]
+myst_enable_extensions = ["dollarmath"]
+myst_heading_anchors = 3
+napoleon_google_docstring = False
+napoleon_use_ivar = True
+autodoc_typehints = "none"
+autodoc_member_order = "bysource"
+suppress_warnings = ["misc.highlighting_failure"]  # shells' prompts and shortened TOML in examples
+html_theme = "pydata_sphinx_theme"
+html_title = "remodel_fenicsx"
+html_copy_source = html_show_sourcelink = False
+html_theme_options = {"show_toc_level": 2, "header_links_before_dropdown": 6, "secondary_sidebar_items": ["page-toc"]}
+# KaTeX in the site's own folder: formulas need no network
+mathjax_path = "katex/katex.min.js"
+html_css_files = ["katex/katex.min.css"]
+html_js_files = [
+    ("katex/contrib/auto-render.js", {"defer": "defer"}),
+    (
+        None,
+        {"body": "addEventListener('load', () => window.renderMathInElement && renderMathInElement(document.body))"},
+    ),
+]

@@ -1,0 +1,87 @@
+"""The site of the documentation: built without a warning, and its own search finds what people look for."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+pytest.importorskip("sphinx", reason="no Sphinx: pip install '.[docs]'")
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Its folder."""
+    folder = tmp_path_factory.mktemp("site")
+    done = subprocess.run(
+        [sys.executable, ROOT / "docs" / "build", "-o", folder], capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return folder
+
+
+def found(site: Path, words: str) -> set[str]:
+    """The pages with all the words, by the index and the stemmer that the site's search has."""
+    from sphinx.search.en import SearchEnglish
+
+    stem = SearchEnglish({}).stem
+    text = (site / "searchindex.js").read_text(encoding="utf-8")
+    index = json.loads(text.removeprefix("Search.setIndex(").removesuffix(")"))
+    pages = []
+    for word in words.lower().split():
+        entries = [index[kind].get(stem(word), []) for kind in ("terms", "titleterms")]
+        numbers = [number for entry in entries for number in (entry if isinstance(entry, list) else [entry])]
+        pages.append({index["docnames"][number] for number in numbers})
+    return set.intersection(*pages)
+
+
+@pytest.mark.parametrize(
+    "words, page",
+    [("residual stress", "natural"), ("mmHg", "scene"), ("resume", "commands"), ("STL", "my_own_vessel")],
+)
+def test_the_search_finds(site: Path, words: str, page: str) -> None:
+    assert page in found(site, words)
+
+
+def test_no_page_finds_nonsense(site: Path) -> None:
+    assert not found(site, "gobbledygook")
+
+
+def test_the_site_needs_no_network(site: Path) -> None:
+    """Scripts, styles and pictures of each page are files of the site."""
+    asks = re.compile(r'<(?:script|img|link rel="stylesheet")[^>]*? (?:src|href)="([^"#]+)"')
+    for page in site.glob("*.html"):
+        links = asks.findall(page.read_text(encoding="utf-8"))
+        assert len(links) > 5, page.name
+        for link in links:
+            assert (site / link.partition("?")[0]).exists(), (page.name, link)
+
+
+def test_every_public_class_and_function_has_its_place(site: Path) -> None:
+    import remodel_fenicsx
+    from remodel_fenicsx import extend, parts
+
+    text = "".join((site / f"{name}.html").read_text(encoding="utf-8") for name in ("api", "api_parts", "api_extend"))
+    places = {name.rpartition(".")[2] for name in re.findall(r'id="(remodel_fenicsx[\w.]*)"', text)}
+    public = {name for module in (remodel_fenicsx, parts, extend) for name in module.__all__}
+    callables = {name for name in public if name[0] != "_" and not name.replace("_", "").isupper()}
+    assert callables - {"neo_hookean"} <= places, callables - places
+
+
+def test_a_wrong_link_is_an_error(tmp_path: Path) -> None:
+    """Of a copy in which a page links to nothing."""
+    import runpy
+
+    build = runpy.run_path(str(ROOT / "docs" / "build"))
+    assert build["staged"]("see docs/fit.md and `docs/fit.md`") == "see [](fit.md) and `docs/fit.md`"
+    (tmp_path / "conf.py").write_text('extensions = ["myst_parser"]\n')
+    (tmp_path / "index.md").write_text("# Title\n\n" + build["staged"]("see docs/nothing.md\n"))
+    code = "import sys; from sphinx.cmd.build import main; sys.exit(main(sys.argv[1:]))"
+    done = subprocess.run([sys.executable, "-c", code, "-q", "-W", str(tmp_path), str(tmp_path / "out")],
+                          capture_output=True, text=True, timeout=100)  # fmt: skip
+    assert done.returncode != 0 and "nothing.md" in done.stderr
