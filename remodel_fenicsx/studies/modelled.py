@@ -301,7 +301,9 @@ class RowChanges(Watcher):
             for name, value in before.items():
                 getattr(tissue, name).value = value + way * self.directions.tissue[name][k]
             try:
-                at = Measurement(self.simulation.observer, replace(step, loads=dict(state.loading.values)))
+                extension = coupling.equilibrium.extension()
+                moved = replace(step, loads=dict(state.loading.values), extension=extension)
+                at = Measurement(self.simulation.observer, moved)
                 return {column.name: column.value(at) for column in self.columns}
             finally:
                 for name, value in before.items():
