@@ -115,8 +115,11 @@ def parser() -> argparse.ArgumentParser:
     fitting = scene_command("fit", "Fit numbers of a scene to measurements, with 95 % bands.")
     text = "the unknowns, and tables of measurements (TOML), see docs/fit.md"
     fitting.add_argument("data", type=Path, metavar="DATA", help=text)
-    writes(fitting, "new or empty folder (default: results/NAME-fit)")
+    writes(fitting, "new or empty folder, or that of the same fit, which goes on (default: results/NAME-fit)")
     text = "the given one, and others within a factor of two (default: 3)"
+    fitting.add_argument(
+        "--no-likelihood-profiles", dest="profiles", action="store_false", help="of unknowns that go together"
+    )
     fitting.add_argument("--starts", type=positive, default=3, metavar="N", help=text)
     for found in (run_command, stability, ensemble, trade, sweep, fitting):
         found.add_argument("-q", "--quiet", action="store_true", help="no progress")
@@ -384,7 +387,9 @@ def _fit(options: argparse.Namespace) -> int:
         from remodel_fenicsx.studies import fit as study
 
         try:
-            folder, found = study.fit(scene, options.data, options.output, options.starts, options.quiet)
+            folder, found = study.fit(
+                scene, options.data, options.output, options.starts, options.quiet, options.profiles
+            )
         except FolderTaken as error:
             raise SceneError(" ".join(str(error).split())) from error
         except StepFailure as failure:

@@ -80,15 +80,15 @@ def page_of(recording: RecordedRun, size: float = PAGE_SIZE) -> str:
     """The page as text; parameters and errors as of `write_report`."""
     story = Story.of(recording)
     if not has_a_body(recording):
-        return _page(cards(ReportedRun(recording, story, None)))
+        return page_with(cards(ReportedRun(recording, story, None)))
     whole, most = WholeBody(recording), _times_at_most(recording, size)
     for _ in range(TRIES):
         body = ShownBody.of(whole, kept_times(story.history, recording.times, most))
         found = cards(ReportedRun(recording, story, body))
-        page = _page(found)
+        page = page_with(found)
         if len(page) <= 1e6 * size or len(body.times) <= FEWEST_TIMES:
             break
-        rest = len(_page([card for card in found if card.name != "view"]))
+        rest = len(page_with([card for card in found if card.name != "view"]))
         share = max(0.0, 1e6 * size - rest) / (len(page) - rest)
         most = max(FEWEST_TIMES, min(len(body.times) - 1, math.floor(0.97 * share * len(body.times))))
     return page
@@ -100,7 +100,8 @@ def _times_at_most(recording: RecordedRun, size: float) -> int:
     return max(FEWEST_TIMES, int(1e6 * size / (4 / 3 * BEST_RATIO * count)))
 
 
-def _page(found: list[Card]) -> str:
+def page_with(found: list[Card]) -> str:
+    """A page with these cards, the first one the head, whose data have the page's `name`."""
     data, arrays = data_of(found)
     block, table = packed(arrays)
     script = "{\n" + "\n".join(_asset(name) for name in SCRIPTS) + "\n}\n"

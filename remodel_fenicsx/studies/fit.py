@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import base64
 import logging
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field, replace
+from html import escape
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 from matplotlib import rc_context
@@ -15,15 +17,19 @@ from matplotlib.figure import Figure
 from mpi4py import MPI
 from numpy.typing import NDArray
 
+from remodel_fenicsx.report.card import Card, folded, section
+from remodel_fenicsx.report.card import table as card_table
+from remodel_fenicsx.report.page import page_with
 from remodel_fenicsx.results.run_folder import chosen_folder
 from remodel_fenicsx.results.words import unit_of, words
 from remodel_fenicsx.scene.scene import Scene, SceneError
 from remodel_fenicsx.solver.continuation import StepFailure
+from remodel_fenicsx.studies.journal import Evaluation, Journal, Point, fingerprint, fingerprint_in
 from remodel_fenicsx.studies.measured import Measured, Unknown, read_measurements
 from remodel_fenicsx.studies.modelled import Modelled, Slopes, model_of, rotated_cells, slopes, without_derivatives
 from remodel_fenicsx.studies.page import COLOURS, STYLE, Page, add_head
 from remodel_fenicsx.system.environment import versions
-from remodel_fenicsx.system.regular_files import write_whole
+from remodel_fenicsx.system.regular_files import ForeignFileError, write_whole
 from remodel_fenicsx.system.terminal import Line
 
 Array = NDArray[np.float64]
@@ -33,11 +39,56 @@ FIT = "fit"
 SCALE = "scale."  # what keys of factors on columns begin with
 LOGARITHM_CHANGE = 1e-3  # of a logarithm: central differences err by 1e-6, the solves' tolerance of 1e-10 by 1e-7
 BLIND = 1e-5  # smallest singular value over the largest, below which the data say nothing: what differences err by
+BLIND_EXACT = 1e-8  # the same where all derivatives are exact: columns are differentiated with errors of 1e-10
 NAMED = 0.1  # share of a blind direction from which on an unknown is named
 UNSOLVED = 1e3  # standard deviations, of all rows of a state that has no equilibrium
 START_SPREAD = np.log(2.0)  # of further starts, to both sides
 SAME_MINIMUM = 1e-2  # relative difference of the sums of squares
+ENOUGH = 1e-6  # relative change of the sum of squares, or of the unknowns, at which a fit ends: noise is far above it
+CORRELATED = 0.9  # of two unknowns, from which on their profiles are made
+PROFILE_STEP, PROFILE_REACH = 1.0, 4.0  # standard deviations of the straight line
+ROUGHLY = 1e-4  # as ENOUGH, of a profile's fits: they start where a straight line has their end
 NORMAL_95 = 1.959963984540054  # standard deviations on each side, normal distribution
+
+
+_MODULI = ("lame_lambda", "lame_mu", "chain_density", "initial_stiffness", "persistence_length", "temperature")
+KNOWN_GROUPS: list[tuple[set[str], str]] = [
+    (
+        {f"material.{key}" for key in ("chain_density", "persistence_length", "temperature", "energy_factor")},
+        "only their product c = omega k theta n / (4 A_p) is in the energy",
+    ),
+    (
+        {"material.chain_density", "material.initial_stiffness", "material.persistence_length"},
+        "both are the stiffness of the network",
+    ),
+    ({"material.contour_length", "material.locking_stretch"}, "both are the length at which a chain locks"),
+    ({"remodeling.kappa", "remodeling.half_life"}, "the half-life is ln 2 / kappa"),
+    (
+        {"remodeling.threshold", "loads.pressure.value", "scale.pressure"} | {f"material.{key}" for key in _MODULI},
+        "without a measured force, all stresses may be multiplied by one factor",
+    ),
+]
+"""Unknowns that go together, and why; the first group that has all of them counts."""
+
+
+@dataclass(frozen=True)
+class LikelihoodProfile:
+    """Smallest sums of squares with one unknown held.
+
+    Attributes
+    ----------
+    values
+        Of the unknown, ascending, (n,).
+    increases
+        Of the sum of squares above the minimum, (n,).
+    lower, upper
+        Where the increase is that of a 95 % band, 3.84; NaN where it is not reached in `PROFILE_REACH`.
+    """
+
+    values: Array
+    increases: Array
+    lower: float
+    upper: float
 
 
 @dataclass(frozen=True)
@@ -62,6 +113,8 @@ class Fit:
         Columns of each table at the fit.
     scene
         With the fitted numbers.
+    profiles
+        By key of each unknown whose correlation with another one is above `CORRELATED`.
     """
 
     unknowns: list[Unknown]
@@ -74,16 +127,10 @@ class Fit:
     evaluations: list[int]
     modelled: list[dict[str, Array]]
     scene: Scene
+    profiles: dict[str, LikelihoodProfile] = field(default_factory=dict)
 
 
 # ---------------------------------------------------------------- least squares
-class Evaluation(NamedTuple):
-    """Residuals (n,) at a point, and their derivatives (n, k): NaN in columns that the model does not give."""
-
-    residuals: Array
-    jacobian: Array
-
-
 class Problem:
     """Residuals over their standard deviations as a function of the logarithms of the unknowns.
 
@@ -97,13 +144,21 @@ class Problem:
 
     def __init__(self, scene: Scene, unknowns: Sequence[Unknown], tables: Sequence[Measured]):
         self.scene, self.unknowns, self.tables = scene, list(unknowns), list(tables)
-        self._known: dict[tuple[float, ...], Evaluation] = {}
+        self._known: dict[Point, Evaluation] = {}
+        self._journal: Journal | None = None
         first = np.log([unknown.start for unknown in unknowns])
         words = [reason for table in tables if (reason := without_derivatives(scene, table)) is not None]
         if not words and rotated_cells(scene):
             words = [f"cells.axes = {scene.cells.axes!r}"]
         self.exact: NDArray[np.bool_] = np.zeros(len(first), dtype=np.bool_) if words else self._slopes(first).exact
         self.reason = words[0] if words else "the model has no derivative by them"
+
+    def keep(self, journal: Journal) -> None:
+        """From now on each evaluation is in the journal, and what that has is not evaluated again."""
+        for point in self._known.keys() - journal.known.keys():
+            journal.add(point, self._known[point])
+        self._known |= journal.known
+        self._journal = journal
 
     def how(self) -> str:
         """Which derivatives are exact, in words."""
@@ -149,7 +204,10 @@ class Problem:
         """Residuals, and those derivatives that are exact, where they are asked for."""
         key = tuple(map(float, logarithms))
         if key not in self._known or (derivatives and self.exact.any() and np.isnan(self._known[key].jacobian).all()):
-            self._known[key] = self._evaluated(np.array(logarithms), derivatives and bool(self.exact.any()))
+            with _trial():
+                self._known[key] = self._evaluated(np.array(logarithms), derivatives and bool(self.exact.any()))
+            if self._journal is not None:
+                self._journal.add(key, self._known[key])
         return self._known[key]
 
     def _evaluated(self, x: Array, derivatives: bool) -> Evaluation:
@@ -198,18 +256,43 @@ class Problem:
             One line that names them.
         """
         _, singular, directions = np.linalg.svd(jacobian, full_matrices=False)
-        if singular[-1] > BLIND * singular[0]:
+        if singular[-1] > (BLIND_EXACT if self.exact.all() else BLIND) * singular[0]:
             return
         blind = directions[-1] * np.sign(directions[-1][np.abs(directions[-1]).argmax()])
-        named = [f"{u.key} ({part:+.2f})" for u, part in zip(self.unknowns, blind, strict=True) if abs(part) > NAMED]
+        pairs = [(u.key, part) for u, part in zip(self.unknowns, blind, strict=True) if abs(part) > NAMED]
+        keys, named = [key for key, _ in pairs], [f"{key} ({part:+.2f})" for key, part in pairs]
+        if len(named) == 1:
+            raise SceneError(f"unknowns: {keys[0]} changes nothing that is measured; fix it or give it a prior")
         raise SceneError(
             f"unknowns: the data cannot tell apart {', '.join(named)}: changed together by these powers of a factor "
-            "they give the same measurements; fix one of them or give it a prior"
+            f"they give the same measurements{_reason(keys)}; fix one of them or give it a prior"
         )
 
 
+def _reason(keys: Sequence[str]) -> str:
+    """Why unknowns go together, where it is known."""
+    return next((f" ({words})" for group, words in KNOWN_GROUPS if set(keys) <= group and len(set(keys)) > 1), "")
+
+
+@contextmanager
+def _trial() -> Iterator[None]:
+    """Runs with numbers that nobody will keep: what they warn of is not said. The fitted numbers are run once more."""
+    package = logging.getLogger("remodel_fenicsx")
+    before = package.level
+    package.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        package.setLevel(before)
+
+
 def fit(
-    scene: Scene, data: Path | str, folder: Path | str | None = None, starts: int = 3, quiet: bool = True
+    scene: Scene,
+    data: Path | str,
+    folder: Path | str | None = None,
+    starts: int = 3,
+    quiet: bool = True,
+    profiles: bool = True,
 ) -> tuple[Path, Fit]:
     """Fit numbers of a scene to measurements.
 
@@ -220,15 +303,17 @@ def fit(
     data
         A TOML file with `[unknowns]` and `[[measured]]` (docs/fit.md).
     folder
-        New or empty; default: results/FIT-fit, numbered when taken.
+        New or empty, or that of the same fit, which goes on; default: results/NAME-fit, numbered when taken.
     starts
         How many: the given one, and others at random within a factor of two.
     quiet
         No progress.
+    profiles
+        Whether unknowns that go together have profiles.
 
     Returns
     -------
-    The folder with fit.csv, correlations.csv, scene.toml and fit.png; and what they hold.
+    The folder with fit.csv, correlations.csv, scene.toml, fit.png and fit.html; and what they hold.
 
     Raises
     ------
@@ -241,60 +326,169 @@ def fit(
     OSError
         If a file cannot be written.
     """
-    from scipy.optimize import least_squares
-
     unknowns, tables = read_measurements(Path(data), scene)
-    place = chosen_folder(folder, f"{scene.name}-{FIT}", MPI.COMM_SELF)
+    mark = fingerprint(scene, unknowns, tables)
+    place = _place(folder, f"{scene.name}-{FIT}", mark)
     problem, line = Problem(scene, unknowns, tables), Line(f"{scene.name} {FIT}")
     first = np.log([unknown.start for unknown in unknowns])
-    bounds = np.log([u.lower for u in unknowns]), np.log([u.upper for u in unknowns])
     log.info("%s", problem.how())
     problem.models(first)  # what has no equilibrium here says so
     problem.check_tells_apart(problem.jacobian(first, central=True))
+    problem.keep(Journal(place, mark))
+
+    def announced(key: str) -> None:
+        if not quiet:
+            line.show(f"profile of {key}")
+
     random = np.random.default_rng(1)
     found = []
     try:
         for number in range(starts):
             start = first + (random.uniform(-START_SPREAD, START_SPREAD, len(first)) if number else 0.0)
-            inside = np.clip(start, bounds[0] + 1e-6, bounds[1] - 1e-6)
 
-            def residuals(x: Array, number: int = number) -> Array:
-                off = problem.residuals(x)
+            def said(misfit: float, number: int = number) -> None:
                 if not quiet:
-                    line.show(f"start {number + 1} of {starts}, misfit {np.sqrt(np.mean(off**2)):.4g}")
-                return off
+                    line.show(f"start {number + 1} of {starts}, misfit {misfit:.4g}")
 
-            found.append(
-                least_squares(residuals, inside, jac=problem.jacobian, bounds=bounds, x_scale="jac", xtol=1e-8)
-            )
+            found.append(minimised(problem, start, said))
+        result = result_of(problem, found)
+        if profiles:
+            result = with_profiles(problem, result, announced)
     finally:
         line.end()
-    best = min(found, key=lambda one: float(one.cost))
-    result = _result(problem, best.x, [2 * float(one.cost) for one in found], [int(one.nfev) for one in found])
-    place.mkdir(parents=True, exist_ok=True)
     write_whole(place / "scene.toml", result.scene.to_toml(f"fitted to {Path(data).name}").encode())
     _draw(result, tables, place)
     return place, result
 
 
-def _result(problem: Problem, logarithms: Array, minima: list[float], evaluations: list[int]) -> Fit:
+def _place(folder: Path | str | None, name: str, mark: str) -> Path:
+    """The folder of the same fit, or a new one."""
+    wanted = Path(folder or Path("results") / name)
+    try:
+        there = fingerprint_in(wanted)
+    except (ForeignFileError, OSError) as error:
+        raise SceneError(f"-o {wanted}: {error}") from error
+    if there == mark:
+        return wanted
+    if there is not None and folder is not None:
+        raise SceneError(f"-o {wanted}: holds a fit of another scene, data or version; choose another folder")
+    return chosen_folder(folder, name, MPI.COMM_SELF)
+
+
+def minimised(
+    problem: Problem,
+    start: Array,
+    said: Callable[[float], object] = lambda misfit: None,
+    held: int | None = None,
+    enough: float = ENOUGH,
+) -> Any:
+    """SciPy's least squares from a start, logarithms; `said` gets each misfit.
+
+    Parameters
+    ----------
+    held
+        Number of an unknown that stays at its start.
+    enough
+        Relative change of the sum of squares, or of the unknowns, at which it ends.
+
+    Returns
+    -------
+    SciPy's result; its `x` are the unknowns that are not held.
+    """
+    from scipy.optimize import least_squares
+
+    free = np.array([number != held for number in range(len(start))])
+    bounds = [np.log([getattr(u, end) for u in problem.unknowns])[free] for end in ("lower", "upper")]
+
+    def whole(x: Array) -> Array:
+        found = start.copy()
+        found[free] = x
+        return found
+
+    def residuals(x: Array) -> Array:
+        off = problem.residuals(whole(x))
+        said(float(np.sqrt(np.mean(off**2))))
+        return off
+
+    inside = np.clip(start[free], bounds[0] + 1e-6, bounds[1] - 1e-6)
+    return least_squares(
+        residuals,
+        inside,
+        lambda x: problem.jacobian(whole(x))[:, free],
+        bounds,
+        x_scale="jac",
+        xtol=enough,
+        ftol=enough,
+    )
+
+
+def profile(problem: Problem, best: Array, covariance: Array, number: int) -> LikelihoodProfile:
+    """Of an unknown, from the minimum outwards until the band ends: the others are fitted again at each value.
+
+    Parameters
+    ----------
+    best, covariance
+        Of the logarithms, at the minimum.
+    """
+    least, deviation = float(np.sum(problem.residuals(best) ** 2)), float(np.sqrt(covariance[number, number]))
+    unknown, points, ends = problem.unknowns[number], [(float(best[number]), 0.0)], []
+    for side in (-1.0, 1.0):
+        x, last, end = best.copy(), (float(best[number]), 0.0), float("nan")
+        way = side * PROFILE_STEP * deviation * covariance[:, number] / covariance[number, number]
+        for _ in range(round(PROFILE_REACH / PROFILE_STEP)):
+            x = x + way
+            if not np.log(unknown.lower) < x[number] < np.log(unknown.upper):
+                break
+            if len(x) > 1:
+                x[np.arange(len(x)) != number] = minimised(problem, x, held=number, enough=ROUGHLY).x
+            point = float(x[number]), float(np.sum(problem.residuals(x) ** 2)) - least
+            points.append(point)
+            if point[1] > NORMAL_95**2:  # the root is nearly a straight line
+                roots = [float(np.sqrt(max(increase, 0.0))) for _, increase in (last, point)]
+                end = float(np.exp(np.interp(NORMAL_95, roots, [last[0], point[0]])))
+                break
+            last = point
+        ends.append(end)
+    values, increases = np.array(sorted(points)).T
+    return LikelihoodProfile(np.exp(values), increases, *ends)
+
+
+def result_of(problem: Problem, found: Sequence[Any]) -> Fit:
+    """The best of several minima, with bands.
+
+    Raises
+    ------
+    SceneError
+        If the data cannot tell the unknowns apart there.
+    """
+    logarithms: Array = min(found, key=lambda one: float(one.cost)).x
     jacobian = problem.jacobian(logarithms, central=True)
     problem.check_tells_apart(jacobian)
     covariance = np.linalg.inv(jacobian.T @ jacobian)
     deviations = np.sqrt(np.diag(covariance))
-    off = problem.residuals(logarithms)
+    correlations, off = covariance / np.outer(deviations, deviations), problem.residuals(logarithms)
     return Fit(
         problem.unknowns,
         np.exp(logarithms),
         np.exp(logarithms - NORMAL_95 * deviations),
         np.exp(logarithms + NORMAL_95 * deviations),
-        covariance / np.outer(deviations, deviations),
+        correlations,
         float(np.sqrt(np.mean(off**2))),
-        minima,
-        evaluations,
+        [2 * float(one.cost) for one in found],
+        [int(one.nfev) for one in found],
         [modelled.columns for modelled in problem.models(logarithms)],
         problem.scene_of(logarithms),
     )
+
+
+def with_profiles(problem: Problem, found: Fit, said: Callable[[str], object] = lambda key: None) -> Fit:
+    """The fit with profiles of what goes together; `said` gets the key of each unknown whose profile is made."""
+    deviations, profiles = np.log(found.upper / found.lower) / (2 * NORMAL_95), {}
+    covariance = found.correlations * np.outer(deviations, deviations)
+    for number in np.flatnonzero((np.abs(found.correlations) > CORRELATED).sum(axis=0) > 1):
+        said(found.unknowns[number].key)
+        profiles[found.unknowns[number].key] = profile(problem, np.log(found.values), covariance, int(number))
+    return replace(found, profiles=profiles)
 
 
 # ---------------------------------------------------------------- words and picture
@@ -305,7 +499,14 @@ def in_words(found: Fit) -> str:
     for number, u in enumerate(found.unknowns):
         row = (found.values[number], found.lower[number], found.upper[number], u.start)
         lines.append(f"{u.key:{width}} {' '.join(f'{value:12.5g}' for value in row)}")
+    lines += [
+        f"profile of {key}: 95 % from {_end(one.lower)} to {_end(one.upper)}" for key, one in found.profiles.items()
+    ]
     return "\n".join([*lines, verdict(found)])
+
+
+def _end(value: float) -> str:
+    return "beyond what was tried" if np.isnan(value) else f"{value:.5g}"
 
 
 def verdict(found: Fit) -> str:
@@ -314,11 +515,11 @@ def verdict(found: Fit) -> str:
     same = sum(one - least <= SAME_MINIMUM * max(least, 1.0) for one in found.minima)
     text = f"The model is off by {found.misfit:.2g} standard deviations (root mean square); "
     text += f"{same} of {len(found.minima)} starts end in this minimum."
-    pairs = np.argwhere(np.triu(np.abs(found.correlations) > 0.9, 1))
+    pairs = np.argwhere(np.triu(np.abs(found.correlations) > CORRELATED, 1))
     keys = [unknown.key for unknown in found.unknowns]
     together = [f"{keys[i]} and {keys[j]} ({found.correlations[i, j]:+.2f})" for i, j in pairs]
     if together:
-        text += f" Correlated above 0.9, so that bands are those of a straight line at best: {', '.join(together)}."
+        text += f" Correlated above {CORRELATED:g}, so that profiles count, not bands: {', '.join(together)}."
     edges = [
         u.key
         for u, v in zip(found.unknowns, found.values, strict=True)
@@ -338,7 +539,15 @@ def _draw(found: Fit, tables: Sequence[Measured], folder: Path) -> None:
     made_with = ", ".join(f"{name} {version}" for name, version in versions().items() if name != "BLAS")
     keys = [unknown.key for unknown in found.unknowns]
     table = {"value": found.values, "lower": found.lower, "upper": found.upper}
+    for end in ("lower", "upper"):
+        table[f"profile_{end}"] = np.array([getattr(found.profiles.get(key), end, np.nan) for key in keys])
     page.save_table({"key": keys, **table, "start": [u.start for u in found.unknowns]}, [title, made_with])
+    if found.profiles:
+        rows_of = [
+            (k, v, i) for k, one in found.profiles.items() for v, i in zip(one.values, one.increases, strict=True)
+        ]
+        columns = dict(zip(("key", "value", "increase"), zip(*rows_of, strict=True), strict=True))
+        Page(folder, "profiles", title, "").save_table(columns, [title, made_with])
     correlations = Page(folder, "correlations", title, "")
     correlations.save_table({"key": keys, **dict(zip(keys, found.correlations, strict=True))}, [title, made_with])
     panels = [(number, name) for number, one in enumerate(tables) for name in one.sd]
@@ -364,3 +573,31 @@ def _draw(found: Fit, tables: Sequence[Measured], folder: Path) -> None:
             axes.set_axis_off()
         add_head(figure, title, verdict(found))
         page.save_figure(figure, made_with)
+    picture = base64.b64encode((folder / f"{FIT}.png").read_bytes()).decode("ascii")
+    write_whole(folder / f"{FIT}.html", _web_page(found, title, picture, made_with).encode())
+
+
+def _web_page(found: Fit, title: str, picture: str, made_with: str) -> str:
+    """All that a fit has found, as a page like a run's report."""
+    head = f'<header class="whole"><h1>{escape(title)}</h1><p class="reason">{escape(verdict(found))}</p></header>'
+    image = f'<img alt="measured and fitted" width="100%" src="data:image/png;base64,{picture}">'
+    numbers = []
+    for number, u in enumerate(found.unknowns):
+        one = found.profiles.get(u.key)
+        more = f"; profile {_end(one.lower)} to {_end(one.upper)}" if one else ""
+        band = f"{found.values[number]:.5g} (95 %: {found.lower[number]:.5g} to {found.upper[number]:.5g}{more})"
+        numbers.append((u.key, band))
+    pairs = [
+        (f"{a.key}, {b.key}", f"{found.correlations[i, j]:+.2f}")
+        for i, a in enumerate(found.unknowns)
+        for j, b in enumerate(found.unknowns[:i])
+    ]
+    cards = [
+        Card("head", head, {"name": title}),
+        Card("picture", section("Measured and fitted", image, "whole", "points with one standard deviation; lines")),
+        Card("numbers", section("Fitted numbers", card_table(numbers))),
+        Card("pairs", section("Correlations of the logarithms", card_table(pairs))),
+        Card("scene", folded("The scene with these numbers", f"<pre>{escape(found.scene.to_toml())}</pre>")),
+        Card("made", folded("Made with", f"<p>{escape(made_with)}</p>")),
+    ]
+    return page_with(cards)

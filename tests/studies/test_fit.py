@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import re
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +12,15 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
+from benchmarks.recovery import MOST, fitted, noisy, tables
+from benchmarks.recovery import TRUTH as RECOVERED
+from benchmarks.recovery import tube as tube_of_the_benchmark
 from remodel_fenicsx import Scene, SceneError, Simulation, cli, preset_scene, read_scene
 from remodel_fenicsx.settings import STRESS_UNITS
-from remodel_fenicsx.studies.fit import Problem, fit
+from remodel_fenicsx.studies.fit import Problem, fit, minimised
 from remodel_fenicsx.studies.measured import read_measurements
 
+ROOT = Path(__file__).parents[2]
 TRUTH = {"material.lame_mu": 3.0, "material.chain_density": 2e21, "remodeling.kappa": 0.05}
 PRESSURES = [0.2, 0.4, 0.6, 0.8, 1.0, 1.2]
 
@@ -84,7 +90,17 @@ sd = { fibre_angle_outer = 2.0, inner_radius = 0.01 }
 def test_the_numbers_that_made_the_data_are_found(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """From each start; the tables, the picture and a scene that runs are there."""
     out = folder / "out"
-    words = ["fit", str(folder / "scene.toml"), str(folder / "data.toml"), "-o", str(out), "--starts", "2", "-q"]
+    words = [
+        "fit",
+        str(folder / "scene.toml"),
+        str(folder / "data.toml"),
+        "-o",
+        str(out),
+        "--starts",
+        "2",
+        "-q",
+        "--no-likelihood-profiles",
+    ]
     assert cli.main(words) == 0
     said = capsys.readouterr().out
     assert "2 of 2 starts end in this minimum" in said
@@ -97,7 +113,87 @@ def test_the_numbers_that_made_the_data_are_found(folder: Path, capsys: pytest.C
     fitted = read_scene(out / "scene.toml")
     assert fitted.material.lame_mu == pytest.approx(3.0, rel=1e-3) and fitted.time.end == 40.0
     assert (out / "fit.png").stat().st_size > 10_000
-    assert cli.main(words) == 2 and "out" in capsys.readouterr().err  # nothing of the user's is written over
+    page = (out / "fit.html").read_text()
+    assert "material.lame_mu" in page and "data:image/png" in page and "<script" in page
+    (folder / "data.toml").write_text(DATA.replace("outer_radius = 0.01", "outer_radius = 0.02"))
+    assert cli.main(words) == 2 and "holds a fit of another scene, data or version" in capsys.readouterr().err
+    (folder / "own").mkdir()
+    (folder / "own" / "notes.txt").write_text("mine")
+    assert cli.main([*words[:4], str(folder / "own"), "-q"]) == 2  # nothing of the user's is written over
+
+
+def test_a_fit_goes_on_where_it_was_killed(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With the same evaluations, each made once, and the same numbers; a line that was cut off is made again."""
+    scene, evaluated = read_scene(folder / "scene.toml"), Problem._evaluated
+    made: list[int] = []
+    allowed = [10**6]
+
+    def counted(self: Problem, x: Any, derivatives: bool) -> Any:
+        if len(made) >= allowed[0]:
+            raise KeyboardInterrupt
+        made.append(1)
+        return evaluated(self, x, derivatives)
+
+    monkeypatch.setattr(Problem, "_evaluated", counted)
+    fit(scene, folder / "data.toml", folder / "whole", starts=1, profiles=False)
+    whole = len(made)
+    made.clear()
+    allowed[0] = whole - 2
+    with pytest.raises(KeyboardInterrupt):
+        fit(scene, folder / "data.toml", folder / "cut", starts=1, profiles=False)
+    journal = folder / "cut" / "evaluations.jsonl"
+    journal.write_text(journal.read_text() + '{"at": [1.0, ')
+    allowed[0] = 10**6
+    fit(scene, folder / "data.toml", folder / "cut", starts=1, profiles=False)
+    assert len(made) <= whole + 1  # the start alone is asked before the folder is
+    assert (folder / "cut" / "fit.csv").read_text() == (folder / "whole" / "fit.csv").read_text()
+
+
+def test_profiles_of_what_goes_together(folder: Path) -> None:
+    """Stiffness and locking of the chains, of an inflation: at the band's ends the sum of squares is 3.84 higher."""
+    (folder / "data.toml").write_text(PAIR)
+    _, found = fit(read_scene(folder / "scene.toml"), folder / "data.toml", folder / "out", starts=1)
+    assert set(found.profiles) == {"material.chain_density", "material.contour_length"}
+    one = found.profiles["material.contour_length"]
+    assert one.increases.min() == 0.0 and one.lower < found.values[1] < one.upper
+    problem = Problem(read_scene(folder / "scene.toml"), *read_measurements(folder / "data.toml", found.scene))
+    held = np.log([found.values[0], one.upper])
+    again = minimised(problem, held, held=1)
+    least = float(np.sum(problem.residuals(np.log(found.values)) ** 2))
+    assert 2 * again.cost - least == pytest.approx(3.84, rel=0.1)
+    assert (folder / "out" / "profiles.csv").exists()
+
+
+PAIR = """
+[unknowns]
+"material.chain_density" = { start = 2e21 }
+"material.contour_length" = { start = 2.125 }
+
+[[measured]]
+file = "virgin.csv"
+units = { pressure = "mmHg" }
+sd = { outer_radius = 0.01 }
+"""
+
+
+def test_what_changes_nothing_is_named(folder: Path) -> None:
+    """A rate of remodeling in a test of virgin tissue."""
+    text = PAIR.replace('"material.contour_length" = { start = 2.125 }', '"remodeling.kappa" = { start = 0.05 }')
+    (folder / "data.toml").write_text(text)
+    with pytest.raises(SceneError, match="remodeling.kappa changes nothing that is measured; fix it"):
+        fit(read_scene(folder / "scene.toml"), folder / "data.toml", folder / "out")
+
+
+def test_six_numbers_are_recovered() -> None:
+    """A part of benchmarks/recovery.py: one minimum from two starts, the truth within three standard deviations."""
+    scene, random = tube_of_the_benchmark(), np.random.default_rng(1)
+    data = noisy(tables(scene), random)
+    assert sum(one.rows * len(one.sd) for one in data) == 46
+    ends = [fitted(scene, data, factors)[0] for factors in (np.ones(6), np.array([2, 0.5, 2, 0.9, 0.5, 2]))]
+    assert ends[0].minima[0] == pytest.approx(ends[1].minima[0], rel=1e-4)
+    assert max(one.evaluations[0] for one in ends) <= MOST["evaluations"]
+    width = np.log(ends[0].upper / ends[0].lower) / 2
+    assert np.all(np.abs(np.log(ends[0].values / list(RECOVERED.values()))) < 1.6 * width)
 
 
 EVERY = """
@@ -177,9 +273,9 @@ def test_what_is_not_exact_is_said(folder: Path, caplog: pytest.LogCaptureFixtur
 def test_bands_have_the_width_of_the_noise(folder: Path) -> None:
     """Twice the standard deviations, twice the logarithmic bands; they cover the truth of noisy data."""
     path, scene = folder / "data.toml", read_scene(folder / "scene.toml")
-    one = fit(scene, path, folder / "one", starts=1)[1]
+    one = fit(scene, path, folder / "one", starts=1, profiles=False)[1]
     path.write_text(DATA.replace("= 0.01", "= 0.02").replace("= 2.0,", "= 4.0,"))
-    two = fit(scene, path, folder / "two", starts=1)[1]
+    two = fit(scene, path, folder / "two", starts=1, profiles=False)[1]
     np.testing.assert_allclose(np.log(two.upper / two.lower), 2 * np.log(one.upper / one.lower), rtol=1e-2)
 
 
@@ -261,3 +357,26 @@ def test_bad_data_is_one_line(folder: Path, old: str, new: str, said: str, capsy
     errors = capsys.readouterr().err
     assert said in errors and errors.count("\n") == 1, errors
     assert not (folder / "out").exists()
+
+
+def test_the_page_leads_from_a_curve_to_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """docs/fit.md: its files and commands as they stand, the last run in a short form; the numbers are the page's."""
+    monkeypatch.chdir(tmp_path)
+    page = (ROOT / "docs" / "fit.md").read_text(encoding="utf-8")
+    page = page[page.index("## A pressure-radius curve") : page.index("## The two files")]
+    for name, text in re.findall(r"^```(?:csv|toml)\n# (\S+)\n(.*?)^```", page, re.MULTILINE | re.DOTALL):
+        Path(name).write_text(text)
+    (block,) = re.findall(r"^```sh\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    for line in block.splitlines():
+        words = shlex.split(line.removeprefix("./with-fenicsx remodel-fenicsx "))
+        more = {"run": ["-q", "--set", "time.end=12"], "fit": ["-q", "--starts", "1"]}.get(words[0], [])
+        assert cli.main(words + more) == 0, line
+    with Path("fitted/fit.csv").open() as file:
+        table = {row["key"]: row for row in csv.DictReader(line for line in file if not line.startswith("#"))}
+    said = re.findall(r"^\| `(\w+)` \| ([\d.]+).* \| ([\d.]+) to ([\d.]+) \|$", page, re.MULTILINE)
+    assert len(said) == 3
+    for key, value, low, high in said:
+        found = table[f"material.{key}"]
+        for name, number in (("value", value), ("profile_lower", low), ("profile_upper", high)):
+            assert float(found[name]) == pytest.approx(float(number), rel=1e-2), key
+    assert len(table) == 3 and Path("vessel/history.csv").exists()
