@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import subprocess
@@ -20,7 +21,9 @@ ROOT = Path(__file__).parents[2]
 def test_citation_and_image_say_the_version() -> None:
     assert f"\nversion: {__version__}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
     labels = dict(re.findall(r'org\.opencontainers\.image\.(\w+)="([^"]*)"', (ROOT / "Dockerfile").read_text()))
-    assert labels["version"] == __version__ and labels["licenses"] == "MIT" and labels["title"] and labels["description"]
+    assert (
+        labels["version"] == __version__ and labels["licenses"] == "MIT" and labels["title"] and labels["description"]
+    )
 
 
 def test_the_package_is_built_and_installed_beside_a_dolfinx(tmp_path: Path) -> None:
@@ -31,12 +34,14 @@ def test_the_package_is_built_and_installed_beside_a_dolfinx(tmp_path: Path) -> 
     source.mkdir()
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source)
-    shutil.copytree(
-        ROOT / "remodel_fenicsx", source / "remodel_fenicsx", ignore=shutil.ignore_patterns("__pycache__")
-    )
+    shutil.copytree(ROOT / "remodel_fenicsx", source / "remodel_fenicsx", ignore=shutil.ignore_patterns("__pycache__"))
+
+    alone = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
 
     def call(*words: str | Path) -> str:
-        done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=200, env={"PATH": "/usr/bin"})
+        done = subprocess.run(
+            words, cwd=tmp_path, capture_output=True, text=True, timeout=200, env={"PATH": "/usr/bin"}
+        )
         assert done.returncode == 0, done.stdout[-1000:] + done.stderr[-1000:]
         return done.stdout
 
