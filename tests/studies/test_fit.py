@@ -364,7 +364,7 @@ def test_the_page_leads_from_a_curve_to_numbers(tmp_path: Path, monkeypatch: pyt
     monkeypatch.chdir(tmp_path)
     page = (ROOT / "docs" / "fit.md").read_text(encoding="utf-8")
     page = page[page.index("## A pressure-radius curve") : page.index("## The two files")]
-    for name, text in re.findall(r"^```(?:csv|toml)\n# (\S+)\n(.*?)^```", page, re.MULTILINE | re.DOTALL):
+    for name, text in re.findall(r"^```(?:text|toml)\n# (\S+)\n(.*?)^```", page, re.MULTILINE | re.DOTALL):
         Path(name).write_text(text)
     (block,) = re.findall(r"^```sh\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
     for line in block.splitlines():
