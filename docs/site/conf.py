@@ -1,5 +1,9 @@
 """What Sphinx is told; docs/build calls it."""
 
+from typing import Any
+
+from pygments.lexers.special import TextLexer
+
 from remodel_fenicsx import __version__
 
 project = "remodel_fenicsx"
@@ -27,3 +31,8 @@ html_js_files = [
         {"body": "addEventListener('load', () => window.renderMathInElement && renderMathInElement(document.body))"},
     ),
 ]
+
+
+def setup(app: Any) -> None:
+    """Tables in pages: Pygments knows no CSV."""
+    app.add_lexer("csv", TextLexer)
