@@ -1,0 +1,108 @@
+"""The style of all pages: lines and paragraphs that can be read, words spelled right, no riddles."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PAGES = {
+    str(page.relative_to(ROOT)): page
+    for folder in (ROOT, ROOT / "docs")
+    for page in sorted(folder.glob("*.md"))
+    if ".template" not in page.name
+}
+LINE, PARAGRAPH = 100, 80  # characters, words
+# pages that are not rewritten yet, by how many of each they have: numbers that may only fall
+LONG_LINES: dict[str, int] = {
+    "CHANGELOG.md": 260,
+    "docs/couplings.md": 10,
+    "docs/laws.md": 24,
+    "docs/natural.md": 10,
+    "docs/own_body.md": 16,
+    "docs/scene.md": 36,
+    "docs/speed_and_accuracy.md": 27,
+    "docs/stability.md": 204,
+    "docs/verification.md": 112,
+}
+LONG_PARAGRAPHS: dict[str, int] = {
+    "CHANGELOG.md": 12,
+    "README.md": 1,
+    "docs/architecture.md": 1,
+    "docs/commands.md": 11,
+    "docs/couplings.md": 2,
+    "docs/environment.md": 5,
+    "docs/fit.md": 4,
+    "docs/kinematics.md": 3,
+    "docs/laws.md": 6,
+    "docs/natural.md": 6,
+    "docs/own_body.md": 9,
+    "docs/reliability.md": 4,
+    "docs/scene.md": 1,
+    "docs/speed.md": 8,
+    "docs/speed_and_accuracy.md": 6,
+    "docs/stability.md": 2,
+    "docs/theory.md": 42,
+    "docs/verification.md": 9,
+}
+DECODED = (  # what a native reader had to decode
+    "by what its passes multiply a small change",
+    "waits for nobody",
+    "let expect the solution",
+    "one that is finished is lengthened",
+    "with another one the stress at a point belongs to its element",
+)
+
+
+def prose(text: str) -> str:
+    """Without code, tables, formulas of their own and links, which cannot be broken."""
+    text = re.sub(r"^ *```.*?^ *```$", "", text, flags=re.MULTILINE | re.DOTALL)
+    return "\n".join(
+        "" if re.match(r" *\||    |.*\$\$|<!--|!\[", line) and not re.match(r" *(?:[-*]|\d+\.) ", line) else line
+        for line in text.splitlines()
+    )
+
+
+def long_lines(text: str) -> list[int]:
+    """Their numbers of characters."""
+    return [len(line) for line in prose(text).splitlines() if len(line) > LINE and " " in line[:LINE].strip()]
+
+
+def long_paragraphs(text: str) -> list[int]:
+    """Their numbers of words; an item of a list is a paragraph."""
+    parts = re.split(r"\n\s*\n|\n(?=\s*(?:[-*]|\d+\.) )", prose(text))
+    return [len(part.split()) for part in parts if len(part.split()) > PARAGRAPH]
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_lines_and_paragraphs_are_short(name: str) -> None:
+    text = PAGES[name].read_text(encoding="utf-8")
+    assert len(long_lines(text)) <= LONG_LINES.get(name, 0), long_lines(text)
+    assert len(long_paragraphs(text)) <= LONG_PARAGRAPHS.get(name, 0), long_paragraphs(text)
+
+
+def test_what_is_long_is_found() -> None:
+    assert long_lines("a " * 60) == [120] and not long_lines("| " + "a " * 60) and not long_lines("a " * 40)
+    assert long_paragraphs("a\n" * 81) == [81] and not long_paragraphs("a\n" * 70 + "\n" + "a\n" * 70)
+
+
+def test_sentences_that_were_decoded_once_are_gone() -> None:
+    for name, page in PAGES.items():
+        text = " ".join(page.read_text(encoding="utf-8").split())
+        if name != "CHANGELOG.md":
+            assert not [words for words in DECODED if words in text], name
+
+
+def test_words_are_spelled_right(tmp_path: Path) -> None:
+    if shutil.which("codespell") is None:
+        pytest.skip("no codespell")
+    ignored = ["--ignore-words-list", "mater,fro,larg,mke"]
+    files = [*map(str, PAGES.values()), str(ROOT / "remodel_fenicsx")]
+    done = subprocess.run(["codespell", "--skip", "*.js,*.pyc,*.svg", *ignored, *files], capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout[-3000:]
+    (tmp_path / "page.md").write_text("A wrong word: teh.\n")
+    assert subprocess.run(["codespell", str(tmp_path / "page.md")], capture_output=True).returncode != 0
