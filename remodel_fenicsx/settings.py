@@ -516,6 +516,19 @@ COUPLINGS = {
 """Couplings by the name that a scene gives them."""
 
 
+TURNOVER_COUPLINGS = ("staggered", "extrapolated")  # the others ask for derivatives of the turnover, or share passes
+
+
+class Turnover(Table):
+    """How collagen is removed and deposited (docs/turnover.md)."""
+
+    time: float = Field(default=40.0, gt=0, description="T, time in which collagen is turned over.")
+    deposition_stretch: float = Field(
+        default=1.1, gt=1, description="Stretch lambda_h over r0 under which chains are deposited."
+    )
+    gain: float = Field(default=1.0, ge=0, description="k: how fast the content follows the chains' tension; 0: never.")
+
+
 class Remodeling(Table):
     """How the cells follow the load: driving tensor, evolution law, frame and speed."""
 
@@ -585,6 +598,12 @@ class Remodeling(Table):
         "exp(-t / rotation_time).",
     )
 
+    turnover: Turnover | None = Field(
+        default=None,
+        description="Collagen is removed in time and deposited under a stretch; without it the amount stays. For the "
+        "law 'tensor' (docs/turnover.md).",
+    )
+
     def warnings(self) -> list[str]:
         """A line on a law that a share of each pass makes slower."""
         law, share = LAWS[self.law], self.relaxation_factor
@@ -609,6 +628,17 @@ class Remodeling(Table):
         if self.threshold and not DRIVERS[self.driver].is_stress:
             drivers = ", ".join(repr(name) for name, driver in DRIVERS.items() if driver.is_stress)
             raise fault(f"must be 0 unless remodeling.driver is a stress: {drivers}", "threshold", self.threshold)
+        return self
+
+    @model_validator(mode="after")
+    def _turnover_fits(self) -> Remodeling:
+        if self.turnover is None:
+            return self
+        if LAWS[self.law] is not LAWS["tensor"]:
+            raise fault("needs remodeling.law = 'tensor'", "turnover", None)
+        if self.coupling not in TURNOVER_COUPLINGS:
+            allowed_ones = ", ".join(map(repr, TURNOVER_COUPLINGS))
+            raise fault(f"with remodeling.turnover must be one of: {allowed_ones}", "coupling", self.coupling)
         return self
 
     @model_validator(mode="after")

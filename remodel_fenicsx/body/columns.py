@@ -141,6 +141,11 @@ COLUMNS: dict[str, Column] = {
 }
 """Columns of every shape by name, after `time` and those of the shape; a script adds its own."""
 
+def _turned_over(name: str, m: Any) -> float:
+    turnover = m.observer.stepper.turnover
+    return 1.0 if turnover is None else float(turnover.mean(name))
+
+
 COLUMNS_ON_REQUEST: dict[str, Column] = {
     column.name: column
     for column in (
@@ -176,6 +181,15 @@ COLUMNS_ON_REQUEST: dict[str, Column] = {
             "",
             "share of the volume in which no principal value of the driving tensor is above remodeling.threshold",
             lambda m: m.observer.stepper.remodeling.asleep_share(),
+        ),
+        *(
+            Column(
+                name,
+                "",
+                f"{what} of the collagen over that at the start, volume mean; with remodeling.turnover",
+                partial(_turned_over, name),
+            )
+            for name, what in (("content", "amount"), ("natural_length", "natural length"))
         ),
         Column(
             "processor_seconds",

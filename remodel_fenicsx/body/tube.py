@@ -30,7 +30,7 @@ from remodel_fenicsx.body.shape import Array, LoadKind, check_lengths
 from remodel_fenicsx.body.walled import AngleOf, Walled, angle_columns, angle_columns_on_request
 from remodel_fenicsx.body.whole import Body, Corners, divided_along, extended, mirrored_twice, revolved
 from remodel_fenicsx.model.cells import cylindrical_axes, structure_tensor
-from remodel_fenicsx.model.energy import Tissue
+from remodel_fenicsx.model.energy import TURNED_OVER, Tissue
 from remodel_fenicsx.schema.tables import fault, shown
 from remodel_fenicsx.schema.units import FORCE, LENGTH, STRESS
 from remodel_fenicsx.settings import Load, Mesh, Natural, Region, Support
@@ -237,6 +237,9 @@ def _opening_angle(m: Any) -> float:
     structure = structure_tensor(*cells.point_cells[:2])
     squared = np.einsum("nia,nab,nib->ni", axes, structure, axes)  # around, along and across the wall
     radius = np.linalg.norm(local.coordinates.reshape(-1, 3)[:, :2], axis=1)
+    points = m.observer.stepper.remodeling.parameters.at_points()
+    turned = [getattr(points, name) for name in TURNED_OVER]
+    squared = np.column_stack([squared, *(values for values in turned if values is not None)])
     parts = comm.allgather((radius, squared, m.quadrature.volumes.reshape(-1)))
     radius, squared, volumes = (np.concatenate(columns) for columns in zip(*parts, strict=True))
     known = means_through(radius, squared, volumes, LAYERS_OF_A_CUT)

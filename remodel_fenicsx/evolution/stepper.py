@@ -13,6 +13,7 @@ from typing import Any
 from remodel_fenicsx.body.loading import LoadValues
 from remodel_fenicsx.evolution.coupling import Coupling, Maker
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
+from remodel_fenicsx.evolution.turnover import TurnoverPass
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.settings import COUPLINGS, Remodeling, Solver
 from remodel_fenicsx.solver.continuation import Work
@@ -126,6 +127,9 @@ class Stepper:
         name = remodeling.coupling if self.remodeling.law.remodels else "staggered"
         make = coupling or COUPLINGS[name].make
         self.coupling: Coupling = make(state, self.tissue, self.remodeling, solver)
+        self.turnover: TurnoverPass | None = None
+        if remodeling.turnover is not None:
+            self.turnover = TurnoverPass(state, self.tissue, remodeling.turnover)
         self._closed = False
         # asked on each rank in every solve: the signal (SIGINT, SIGTERM) that should end it, or 0
         self.stop_signal: Callable[[], int] = lambda: 0
@@ -186,6 +190,8 @@ class Stepper:
                 for watcher in watchers:
                     watcher.solved(step)
                 step.remodeling_power = self.coupling.remodel(time)
+                if self.turnover is not None:
+                    self.turnover.apply(time - state.time)
                 step.seconds = clock.perf_counter() - start
                 step.processor_seconds = clock.process_time() - processor_start
                 if rejected is not None:

@@ -10,6 +10,7 @@ without pressure, axial force and bending moment; its opening angle is 360 (1 - 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -17,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from remodel_fenicsx.model.closing import Closing, Layer, principal_stresses, solved
-from remodel_fenicsx.model.energy import Tissue
+from remodel_fenicsx.model.energy import TURNED_OVER, Tissue
 from remodel_fenicsx.model.panels import Panels
 
 Array = NDArray[np.float64]
@@ -61,7 +62,8 @@ def cut(layers: Sequence[Layer], closed: Closing | None, radius: Array, squared_
     closed
         Of what it was closed; None: the mesh is free of stress before any remodeling.
     radius, squared_dimensions
-        Places through the wall (n,), increasing, and l_I^2 there around, along and across it, (n, 3).
+        Places through the wall (n,), increasing, and l_I^2 there around, along and across it, (n, 3); with
+        turnover also content and natural length, (n, 5).
 
     Raises
     ------
@@ -69,18 +71,22 @@ def cut(layers: Sequence[Layer], closed: Closing | None, radius: Array, squared_
         If no equilibrium is found.
     """
     panels = Panels([layers[0].radii[0], *(layer.radii[1] for layer in layers)], CUT_DEGREE)
-    squared = np.empty((*panels.places.shape, 3))
+    squared = np.empty((*panels.places.shape, squared_dimensions.shape[1]))
     panel = panels.of(radius)
     for number, at in enumerate(panels.places):  # what lies in a layer says nothing of the next
         here = panel == number
         rows = radius[here], squared_dimensions[here]
         squared[number] = np.stack([np.interp(at, rows[0], column) for column in rows[1].T], axis=-1)
+    squared, turned = squared[..., :3], np.moveaxis(squared[..., 3:], -1, 0)
     natural, start = np.ones_like(squared), (panels.places.copy(), 1.0, 1.0)
     if closed is not None:
         fine = closed._replace(panels=panels, radius=closed.panels.onto(panels, closed.radius))
         natural = fine.at_panels()
         start = (fine.radius, 1 / closed.axial, 1 / closed.circumferential)  # what opens, were the cells as they were
-    tissues = tuple(layer.tissue for layer in layers)
+    tissues = tuple(
+        replace(layer.tissue, **{name: values[n] for name, values in zip(TURNED_OVER, turned, strict=False)})  # none without turnover
+        for n, layer in enumerate(layers)
+    )
     wall = _Wall(tissues, panels, natural, np.sqrt(np.maximum(squared, 0.0)))
     values: Array = np.concatenate([start[0].ravel(), start[1:]])
     scale: Array = np.concatenate([np.full(panels.places.size, panels.edges[-1]), [1.0, 1.0]])

@@ -189,6 +189,9 @@ class Stresses(NamedTuple):
         return Stresses(first + P, second + S, cauchy + ufl.dot(P, F.T) / ufl.det(F))
 
 
+TURNED_OVER = ("content", "natural_length")  # what turnover changes at every point
+
+
 @dataclass(frozen=True)
 class Tissue:
     """Matrix and collagen network: the constitutive parameters and what follows from them.
@@ -212,6 +215,9 @@ class Tissue:
         Energy of the matrix (`MATRICES`).
     repulsion
         Form of the repulsive energy (`REPULSIONS`).
+    content, natural_length
+        m, density of the chains, and rho, their natural length, each over those at the start (`model.turnover`):
+        W_net = m c (w(r/rho) - g(r0) M / 2). None where they stay 1.
     """
 
     lame_lambda: Any
@@ -222,11 +228,24 @@ class Tissue:
     chain: Chain | None = CHAINS["wormlike"]
     matrix: Term = neo_hookean
     repulsion: Repulsion = REPULSIONS["axes"]
+    content: Any = None
+    natural_length: Any = None
 
     @property
     def locking_length(self) -> Any:
-        """Length at which a chain locks, in link lengths; None where nothing locks."""
-        return self.contour_length if self.chain is not None and self.chain.locks else None
+        """Length at which a chain locks, rho L, in link lengths; None where nothing locks."""
+        if self.chain is None or not self.chain.locks:
+            return None
+        return self.contour_length if self.natural_length is None else self.natural_length * self.contour_length
+
+    @property
+    def present_modulus(self) -> Any:
+        """m c: the network's modulus with the chains that there are."""
+        return self.network_modulus if self.content is None else self.content * self.network_modulus
+
+    def relative(self, length: Any) -> Any:
+        """r/rho."""
+        return length if self.natural_length is None else length / self.natural_length
 
     def stiffness(self, end_to_end_length: Any) -> Any:
         """A stress per strain of matrix and network, where chains have a length r; times eps the rounding of a stress.
@@ -237,14 +256,15 @@ class Tissue:
         matrix = self.lame_lambda + 2 * self.lame_mu
         if self.chain is None:
             return matrix
-        r, r0, L, g = end_to_end_length, self.end_to_end_length, self.contour_length, self.chain.stiffness
+        r, r0, L, g = self.relative(end_to_end_length), self.end_to_end_length, self.contour_length, self.chain.stiffness
         h = 1e-6 * r * (1 - r / L if self.chain.locks else 1)
         slope = ((r + h) * g(r + h, L) - (r - h) * g(r - h, L)) / (2 * h)
-        return matrix + self.network_modulus * (r**2 * slope + g(r0, L) * r0**2)
+        return matrix + self.present_modulus * (r**2 * slope + g(r0, L) * r0**2)
 
     def map(self, function: Callable[[str, Any], Any]) -> Tissue:
         """The same tissue with function(name, value) for every parameter."""
         names = ("lame_lambda", "lame_mu", "network_modulus", "contour_length", "end_to_end_length")
+        names += tuple(name for name in TURNED_OVER if getattr(self, name) is not None)
         return replace(self, **{name: function(name, getattr(self, name)) for name in names})
 
     def strain_energy(self, deformation_gradient: Any, cells: Sequence[UnitCell]) -> Any:
@@ -284,18 +304,18 @@ class Tissue:
         if self.chain is None:
             return energy
         length = sqrt(squared_end_to_end_length(deformation_gradient, cells))
-        chains = self.chain.energy(length, self.contour_length)
+        chains = self.chain.energy(self.relative(length), self.contour_length)
         if not is_array(deformation_gradient) and self.repulsion.derivatives is not None:
-            return energy + self.network_modulus * chains
+            return energy + self.present_modulus * chains
         stiffness = self.chain.stiffness(self.end_to_end_length, self.contour_length)
         repulsion = -stiffness / 2 * self.repulsion.sum(deformation_gradient, cells, self.end_to_end_length)
-        return energy + self.network_modulus * (chains + repulsion)
+        return energy + self.present_modulus * (chains + repulsion)
 
     @property
     def repulsion_modulus(self) -> Any:
-        """c g(r0): W_rep = -c g(r0) M / 2."""
+        """m c g(r0): W_rep = -m c g(r0) M / 2."""
         assert self.chain is not None
-        return self.network_modulus * self.chain.stiffness(self.end_to_end_length, self.contour_length)
+        return self.present_modulus * self.chain.stiffness(self.end_to_end_length, self.contour_length)
 
     def stresses(self, deformation_gradient: Any, cells: Sequence[UnitCell]) -> Stresses:
         """P = dW/dF, S = F^-1 P and sigma = P F^T / J (eqs. 6 and 7 with erratum 5), by differentiation of W; UFL."""
@@ -332,9 +352,11 @@ class Tissue:
     def increment(self, squared: Any, squared_change: Any, repulsion_change: Any) -> Any:
         """The same from the old r^2, its change and that of M: for those who have them already; arrays."""
         assert self.chain is not None
-        stiffness = self.chain.stiffness(sqrt(squared), self.contour_length)
+        stiffness = self.chain.stiffness(self.relative(sqrt(squared)), self.contour_length)
+        if self.natural_length is not None:
+            stiffness = stiffness / self.natural_length**2
         initial = self.chain.stiffness(self.end_to_end_length, self.contour_length)
-        return self.network_modulus / 2 * (stiffness * squared_change - initial * repulsion_change)
+        return self.present_modulus / 2 * (stiffness * squared_change - initial * repulsion_change)
 
 
 def _stresses(F: Any, first: Any) -> Stresses:

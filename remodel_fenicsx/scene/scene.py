@@ -195,6 +195,8 @@ class Scene(Table):
             return "mesh.formulation = 'displacement': in the others the stress at a point depends on its whole element"
         if not material.chain_density:
             return "chains: material.chain_density above 0"
+        if remodeling.turnover is not None:
+            return "no remodeling.turnover: it has no derivatives here"
         if remodeling.has_set_point:
             return "remodeling.exponent = 2 and remodeling.threshold = 0: their targets have no derivatives here"
         parts = LAWS[remodeling.law], DRIVERS[remodeling.driver], FRAMES[remodeling.frame]
@@ -215,6 +217,8 @@ class Scene(Table):
         law, laws = self.remodeling.law, ", ".join(repr(name) for name, law in LAWS.items() if law.has_limit)
         if not LAWS[law].has_limit:
             return f"remodeling.law = {law!r} has no limit that the way there does not decide; those with one: {laws}"
+        if self.remodeling.turnover is not None:
+            return "remodeling.turnover has no equilibrium that is found at once; march to a late time"
         if self.remodeling.threshold:
             return "remodeling.threshold is above 0: where cells fall asleep depends on the way; march to a late time"
         if self.remodeling.has_set_point:
@@ -263,9 +267,24 @@ class Scene(Table):
         if bool(material.chain_density) != bool(self.material.chain_density):
             rule = "is 0 in all of the body or nowhere (material.chain_density): without chains nothing locks"
             raise fault(rule, f"{region}material.chain_density", material.chain_density)
+        self._check_turnover(region, properties)
         law = LAWS[self.remodeling.law]
         if properties.kappa != self.remodeling.kappa and law.remodels and not law.asks_kappa:
             raise fault(f"the law {self.remodeling.law!r} has no kappa", f"{region}remodeling.kappa", properties.kappa)
+
+    def _check_turnover(self, region: str, properties: Properties) -> None:
+        turnover, material, r0 = self.remodeling.turnover, properties.material, properties.cells.end_to_end_length
+        if turnover is None:
+            return
+        if not material.chain_density:
+            raise fault("needs chains: material.chain_density above 0", "remodeling.turnover", None)
+        if self.time.tolerance is not None:
+            rule = "must be left out with remodeling.turnover, whose error is not estimated: give time.step alone"
+            raise fault(rule, "time.tolerance", self.time.tolerance)
+        longest = material.contour_length / r0
+        if CHAINS[material.chain].locks and turnover.deposition_stretch >= longest:
+            rule = f"must be smaller than {region}contour_length / end_to_end_length = {shown(longest)}"
+            raise fault(rule, "remodeling.turnover.deposition_stretch", turnover.deposition_stretch)
 
     def properties(self) -> dict[str, Properties]:
         """What holds in each region by its name, and under "" what holds beside them, where there may be anything."""

@@ -13,7 +13,7 @@ from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.fem import assembly
 from remodel_fenicsx.fem.assembly import Remembered
 from remodel_fenicsx.fem.quadrature import Quadrature
-from remodel_fenicsx.model.energy import Tissue
+from remodel_fenicsx.model.energy import TURNED_OVER, Tissue
 
 Array = NDArray[np.float64]
 
@@ -26,7 +26,7 @@ def on_mesh(tissue: Tissue, mesh: Any) -> Tissue:
     TypeError, ValueError
         If a parameter is neither a number, nor a Constant, nor a DG0 Function of the mesh.
     """
-    return tissue.map(lambda name, value: assembly.coefficient(mesh, name, value))
+    return tissue.map(lambda name, value: value if name in TURNED_OVER else assembly.coefficient(mesh, name, value))
 
 
 def at_points(tissue: Tissue, quadrature: Quadrature) -> Tissue:

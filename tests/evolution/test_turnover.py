@@ -1,0 +1,136 @@
+"""remodeling.turnover: an unstressed wall makes its own residual stress; rates, refusals, and the law without it."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from remodel_fenicsx import SceneError, Simulation
+from remodel_fenicsx.body.tube import _opening_angle
+from remodel_fenicsx.model.chains import CHAINS
+from remodel_fenicsx.model.energy import Tissue
+from remodel_fenicsx.model.turnover import rates
+from remodel_fenicsx.scene import scene_from_dict
+
+COLUMNS = ["content", "natural_length"]
+ANGLES = ["fibre_angle_inner", "fibre_angle_middle", "fibre_angle_outer"]
+
+
+def wall(end: float, step: float, turnover: dict[str, float] | None, columns: list[str], **changes: Any) -> Any:
+    """A tube of 1 to 1.3 under a pressure of 1.2 and an elongation of 10 %."""
+    ramp = [[0.0, 0.0], [24.0, 1.0]]
+    remodeling = {"turnover": turnover} if turnover else {}
+    return {
+        "preset": "consistent",
+        "geometry": {"shape": "tube", "inner_radius": 1.0, "outer_radius": 1.3, "length": 2.0},
+        "model": {"kinematics": "radial"},
+        "mesh": {"refinement": 2, "degree": 2},
+        "cells": {"initial": "isotropic"},
+        "remodeling": remodeling | changes,
+        "loads": {"pressure": {"value": 1.2, "ramp": ramp}, "elongation": {"value": 0.1, "ramp": ramp}},
+        "time": {"end": end, "step": step},
+        "output": {"fields": False, "columns": [*ANGLES, "outer_radius", "stored_energy", *columns]},
+    }
+
+
+def opening_angle(simulation: Simulation) -> float:
+    """Of a cut of the present state; the column would cut in every row."""
+    state, observer = simulation.state, simulation.observer
+    m = SimpleNamespace(state=state, observer=observer, quadrature=simulation.quadrature, step=SimpleNamespace(time=0))
+    return _opening_angle(m)
+
+
+def simulated(values: dict[str, Any]) -> tuple[list[dict[str, float]], dict[str, np.ndarray]]:
+    """All rows, and content and natural length at the points in the order of their radii."""
+    simulation = Simulation(scene_from_dict(values))
+    try:
+        rows = [dict(step.row) for step in simulation.steps()]
+        turnover, order = simulation.stepper.turnover, np.argsort(simulation.quadrature.coordinates[..., 0].ravel())
+        known = {} if turnover is None else {name: turnover._values(name).ravel()[order] for name in COLUMNS}
+        if turnover is not None:
+            known["opening_angle"] = opening_angle(simulation)
+        return rows, known
+    finally:
+        simulation.close()
+
+
+def test_an_unstressed_wall_comes_to_rest_with_an_opening_angle_of_its_own() -> None:
+    """Figures of an independent program on one radius."""
+    values = wall(1440.0, 4.0, {"time": 40.0, "deposition_stretch": 1.1, "gain": 1.0}, COLUMNS)
+    rows, known = simulated(values)
+    last = rows[-1]
+    assert [last[name] for name in ANGLES] == pytest.approx([6.7, 10.3, 14.5], abs=1.0)
+    assert known["opening_angle"] == pytest.approx(115.4, abs=3.0)
+    for name, expected in (("content", (3.9, 2.9, 2.2)), ("natural_length", (1.43, 1.31, 1.22))):
+        assert known[name][[0, len(known[name]) // 2, -1]] == pytest.approx(expected, rel=0.03)
+
+
+def test_without_turnover_it_is_the_law_tensor() -> None:
+    """Gain 0 and a huge time."""
+    for coupling in ("staggered", "extrapolated"):
+        never = {"time": 1e12, "deposition_stretch": 1.1, "gain": 0.0}
+        plain, turned = (simulated(wall(40.0, 4.0, t, COLUMNS, coupling=coupling))[0][-1] for t in (None, never))
+        assert turned == pytest.approx(plain, rel=1e-9, abs=1e-9, nan_ok=True)
+
+
+def test_rates_against_their_equation() -> None:
+    """At the stretch of deposition nothing changes; beyond it m and rho grow, and no faster than 1/T and its double."""
+    chain, r0, contour, time = CHAINS["wormlike"], 1.0, 1.594, 40.0
+    tissue = Tissue(1.0, 1.0, 1.0, contour, r0, content=np.ones(3), natural_length=np.array([1.0, 1.3, 1.3]))
+    stretches = np.array([1.1, 1.15, 0.9])
+    found = rates(tissue, stretches * tissue.natural_length, time, 1.1, 1.0)
+    tension = stretches * chain.stiffness(stretches, contour) / (1.1 * chain.stiffness(1.1, contour))
+    assert found.content == pytest.approx(np.clip(tension - 1, -1, 1) / time, abs=1e-15)
+    growth = (1 / time + np.maximum(found.content, 0)) * (stretches / 1.1 - 1)
+    assert found.natural_length == pytest.approx(growth, abs=1e-15)
+    assert found.content[1] > 0 > found.content[2]
+
+
+def test_energy_and_its_increment() -> None:
+    """W_net = m c (w(r/rho) - g(r0) M / 2), and its first-order change with the cells by differences."""
+    from remodel_fenicsx.model.cells import UnitCell
+
+    plain = Tissue(10.0, 3.0, 2.0, 1.594, 1.0)
+    turned = Tissue(10.0, 3.0, 2.0, 1.594, 1.0, content=2.5, natural_length=1.2)
+    F, axes = np.diag([1.15, 1.02, 0.9])[None], np.eye(3)[None]
+    cell = UnitCell(np.array([[0.7, 0.6, 0.4]]), axes)
+    r = np.sqrt(((np.diagonal(F[0]) * cell.dimensions[0]) ** 2).sum())
+    chain = CHAINS["wormlike"]
+    matrix = plain.matrix(F, 10.0, 3.0)
+    network = plain.strain_energy(F, [cell]) - matrix - 2.0 * chain.energy(r, 1.594)
+    expected = matrix + 2.5 * (2.0 * chain.energy(r / 1.2, 1.594) + network)
+    assert turned.strain_energy(F, [cell]) == pytest.approx(expected, rel=1e-12)
+    h, way = 1e-6, np.array([[0.3, -0.2, 0.1]])
+    ends = [UnitCell(cell.dimensions + sign * h * way, axes) for sign in (-1, 1)]
+    slope = (turned.strain_energy(F, [ends[1]]) - turned.strain_energy(F, [ends[0]])) / (2 * h)
+    assert turned.energy_increment(F, cell, ends[1]) / h == pytest.approx(slope, rel=1e-4)
+
+
+def test_a_growth_that_does_not_rest_is_said(caplog: pytest.LogCaptureFixture) -> None:
+    """With a small gain the wall dilates on and on."""
+    values = wall(320.0, 4.0, {"time": 4.0, "deposition_stretch": 1.1, "gain": 0.1}, COLUMNS)
+    simulated(values)
+    assert sum("mechanobiological instability" in record.message for record in caplog.records) == 1
+
+
+@pytest.mark.parametrize(
+    ("remodeling", "time", "words"),
+    [
+        ({"law": "explicit", "coupling": "staggered"}, {}, "remodeling.turnover: needs remodeling.law = 'tensor'"),
+        ({"coupling": "implicit"}, {}, "remodeling.coupling = 'implicit'"),
+        ({"coupling": "relaxed"}, {}, "remodeling.coupling = 'relaxed'"),
+        ({"turnover": {"deposition_stretch": 1.6}}, {}, "deposition_stretch = 1.6: must be smaller than"),
+        ({"turnover": {"gain": -1.0}}, {}, "remodeling.turnover.gain = -1"),
+        ({}, {"tolerance": 0.1}, "time.tolerance = 0.1: must be left out"),
+        ({}, {"end": "equilibrium"}, "remodeling.turnover has no equilibrium"),
+    ],
+)
+def test_what_has_no_turnover_is_refused(remodeling: dict[str, Any], time: dict[str, Any], words: str) -> None:
+    values = wall(40.0, 4.0, {"gain": 1.0}, COLUMNS)
+    values["remodeling"] |= remodeling
+    values["time"] |= time
+    with pytest.raises(SceneError, match=words):
+        scene_from_dict(values)
