@@ -520,13 +520,32 @@ TURNOVER_COUPLINGS = ("staggered", "extrapolated")  # the others ask for derivat
 
 
 class Turnover(Table):
-    """How collagen is removed and deposited (docs/turnover.md)."""
+    """How collagen is removed and deposited under a stretch (docs/turnover.md); without `time` none is.
 
-    time: float = Field(default=40.0, gt=0, description="T, time in which collagen is turned over.")
+    For the law `tensor`, with the couplings `staggered` and `extrapolated`.
+    """
+
+    time: float | None = Field(
+        default=None,
+        gt=0,
+        description="T, time in which collagen is turned over. Without it nothing is.",
+        json_schema_extra={"allowed": "a finite number greater than 0"},
+    )
     deposition_stretch: float = Field(
-        default=1.1, gt=1, description="Stretch lambda_h over r0 under which chains are deposited."
+        default=1.1, gt=1, description="lambda_h, stretch of chains over r0 under which they are deposited."
     )
     gain: float = Field(default=1.0, ge=0, description="k: how fast the content follows the chains' tension; 0: never.")
+
+    @property
+    def is_on(self) -> bool:
+        """Whether there is any."""
+        return self.time is not None
+
+    @model_validator(mode="after")
+    def _says_its_time(self) -> Turnover:
+        if self.time is None and (self.deposition_stretch, self.gain) != (1.1, 1.0):
+            raise fault("missing; turnover needs its time", "time", None)
+        return self
 
 
 class Remodeling(Table):
@@ -598,11 +617,7 @@ class Remodeling(Table):
         "exp(-t / rotation_time).",
     )
 
-    turnover: Turnover | None = Field(
-        default=None,
-        description="Collagen is removed in time and deposited under a stretch; without it the amount stays. For the "
-        "law 'tensor' (docs/turnover.md).",
-    )
+    turnover: Turnover = Turnover()
 
     def warnings(self) -> list[str]:
         """A line on a law that a share of each pass makes slower."""
@@ -632,7 +647,7 @@ class Remodeling(Table):
 
     @model_validator(mode="after")
     def _turnover_fits(self) -> Remodeling:
-        if self.turnover is None:
+        if not self.turnover.is_on:
             return self
         if LAWS[self.law] is not LAWS["tensor"]:
             raise fault("needs remodeling.law = 'tensor'", "turnover", None)

@@ -116,7 +116,7 @@ class Simulation:
         formulation = FORMULATIONS[scene.mesh.formulation]
         self.state = State(self.unknown, kinematics, self.cells, self.loading, formulation)
         tissue, kappa = parameters_of(properties, domain)
-        if scene.remodeling.turnover is not None:
+        if scene.remodeling.turnover.is_on:
             tissue = turned_over(tissue, self.state)
         at_once = scene.time.is_equilibrium
         predictor: str = scene.solver.predictor

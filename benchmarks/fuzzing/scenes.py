@@ -248,6 +248,12 @@ def _rarely(random: Random, scene: Values, stiffness: float) -> None:
             along = {"axial": rounded(random.uniform(0.95, 1.1))}
             scene["natural"]["layers"] = [{"from": rounded(random.uniform(0.2, 0.8)), "prestretch": along}]
     _set_points(random, scene, stiffness)
+    plain = "tolerance" not in scene["time"] and "profile" not in scene and scene["time"]["end"] != "equilibrium"
+    turns = scene["remodeling"]["law"] == "tensor" and scene["remodeling"]["coupling"] in ("staggered", "extrapolated")
+    locked = scene["material"]["contour_length"] <= 1.3 * scene["cells"]["end_to_end_length"]
+    if turns and plain and not locked and scene["material"]["chain_density"] and random.random() < 0.2:
+        numbers = {"time": rounded(random.uniform(20, 80)), "deposition_stretch": rounded(random.uniform(1.02, 1.2))}
+        scene["remodeling"]["turnover"] = numbers | {"gain": rounded(random.uniform(0.5, 2))}
     if _closes_from_a_sector(scene) and scene["supports"]["ends"] != "clamped" and random.random() < 0.05:
         scene["geometry"]["is"] = "loaded"
         if scene["time"]["end"] == "equilibrium":

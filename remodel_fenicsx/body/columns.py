@@ -141,9 +141,9 @@ COLUMNS: dict[str, Column] = {
 }
 """Columns of every shape by name, after `time` and those of the shape; a script adds its own."""
 
+
 def _turned_over(name: str, m: Any) -> float:
-    turnover = m.observer.stepper.turnover
-    return 1.0 if turnover is None else float(turnover.mean(name))
+    return float(m.observer.stepper.turnover.mean(name))
 
 
 COLUMNS_ON_REQUEST: dict[str, Column] = {

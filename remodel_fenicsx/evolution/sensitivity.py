@@ -60,7 +60,7 @@ def refused(settings: Remodeling, law: Law, coupling: str) -> str | None:
     """Why a run has no derivatives here, in words; None where it has them."""
     if not law.remodels:
         return None
-    if settings.turnover is not None:
+    if settings.turnover.is_on:
         return "remodeling.turnover has no derivative"
     if settings.has_set_point:
         return "remodeling.threshold and remodeling.exponent have no derivative"

@@ -128,7 +128,7 @@ class Stepper:
         make = coupling or COUPLINGS[name].make
         self.coupling: Coupling = make(state, self.tissue, self.remodeling, solver)
         self.turnover: TurnoverPass | None = None
-        if remodeling.turnover is not None:
+        if remodeling.turnover.is_on:
             self.turnover = TurnoverPass(state, self.tissue, remodeling.turnover)
         self._closed = False
         # asked on each rank in every solve: the signal (SIGINT, SIGTERM) that should end it, or 0

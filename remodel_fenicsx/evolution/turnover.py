@@ -18,8 +18,8 @@ from remodel_fenicsx.state.state import State
 log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 
-FASTEST = 0.5  # largest |change of ln rho| in a step: the prototype's; it does not act at rest
-UNSTABLE = 10.0  # factor of content or natural length from which on growth is hardly meant
+LARGEST_TURNOVER = 0.5  # largest |change of ln rho| in a step: the prototype's; it does not act at rest
+BEYOND_REST = 10.0  # factor of content or natural length from which on growth is hardly meant
 
 
 def turned_over(tissue: Tissue, state: State) -> Tissue:
@@ -54,9 +54,11 @@ class TurnoverPass:
         """A step with the rates of the solved state: m and rho change by exp(rate * duration)."""
         cells = self.state.equilibrium_cells
         squared = cells.kernels.squared_length(self.state.elastic_gradient(), cells.point_cells)
-        given = self.settings.time, self.settings.deposition_stretch, self.settings.gain
+        given = self.settings.time or np.inf, self.settings.deposition_stretch, self.settings.gain
         found = rates(self._parameters.at_points(), np.sqrt(squared), *given)
-        changes = found.content * duration, np.clip(found.natural_length * duration, -FASTEST, FASTEST)
+        changes = found.content * duration, np.clip(
+            found.natural_length * duration, -LARGEST_TURNOVER, LARGEST_TURNOVER
+        )
         for name, change in zip(TURNED_OVER, changes, strict=True):
             getattr(self.tissue, name).x.array[:] *= np.exp(change)
         self._warn(duration)
@@ -75,7 +77,7 @@ class TurnoverPass:
         for name in TURNED_OVER:
             factor = np.exp(np.abs(np.log(self._values(name))))
             largest = self.quadrature.maximum(factor)
-            if largest <= UNSTABLE:
+            if largest <= BEYOND_REST:
                 continue
             self._numbers["said"] = 1
             place = ", ".join(f"{c:.3f}" for c in self.quadrature.place_of_largest(factor))
@@ -85,7 +87,7 @@ class TurnoverPass:
                     "that does not rest (mechanobiological instability, docs/turnover.md); a larger "
                     "remodeling.turnover.gain or a thicker wall comes to rest",
                     name.replace("_", " "),
-                    UNSTABLE,
+                    BEYOND_REST,
                     place,
                     self.state.time,
                 )

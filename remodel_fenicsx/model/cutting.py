@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,11 +83,11 @@ def cut(layers: Sequence[Layer], closed: Closing | None, radius: Array, squared_
         fine = closed._replace(panels=panels, radius=closed.panels.onto(panels, closed.radius))
         natural = fine.at_panels()
         start = (fine.radius, 1 / closed.axial, 1 / closed.circumferential)  # what opens, were the cells as they were
-    tissues = tuple(
-        replace(layer.tissue, **{name: values[n] for name, values in zip(TURNED_OVER, turned, strict=False)})  # none without turnover
-        for n, layer in enumerate(layers)
-    )
-    wall = _Wall(tissues, panels, natural, np.sqrt(np.maximum(squared, 0.0)))
+    tissues = []
+    for number, layer in enumerate(layers):
+        changes: dict[str, Any] = dict(zip(TURNED_OVER, turned[:, number], strict=False))  # none without turnover
+        tissues.append(replace(layer.tissue, **changes))
+    wall = _Wall(tuple(tissues), panels, natural, np.sqrt(np.maximum(squared, 0.0)))
     values: Array = np.concatenate([start[0].ravel(), start[1:]])
     scale: Array = np.concatenate([np.full(panels.places.size, panels.edges[-1]), [1.0, 1.0]])
     stiffness = max(tissue.lame_lambda + 2 * tissue.lame_mu for tissue in tissues)

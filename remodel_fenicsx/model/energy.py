@@ -256,14 +256,15 @@ class Tissue:
         matrix = self.lame_lambda + 2 * self.lame_mu
         if self.chain is None:
             return matrix
-        r, r0, L, g = self.relative(end_to_end_length), self.end_to_end_length, self.contour_length, self.chain.stiffness
+        r, r0 = self.relative(end_to_end_length), self.end_to_end_length
+        L, g = self.contour_length, self.chain.stiffness
         h = 1e-6 * r * (1 - r / L if self.chain.locks else 1)
         slope = ((r + h) * g(r + h, L) - (r - h) * g(r - h, L)) / (2 * h)
         return matrix + self.present_modulus * (r**2 * slope + g(r0, L) * r0**2)
 
     def map(self, function: Callable[[str, Any], Any]) -> Tissue:
         """The same tissue with function(name, value) for every parameter."""
-        names = ("lame_lambda", "lame_mu", "network_modulus", "contour_length", "end_to_end_length")
+        names: tuple[str, ...] = ("lame_lambda", "lame_mu", "network_modulus", "contour_length", "end_to_end_length")
         names += tuple(name for name in TURNED_OVER if getattr(self, name) is not None)
         return replace(self, **{name: function(name, getattr(self, name)) for name in names})
 

@@ -22,7 +22,7 @@ from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.fem.solver_methods import SOLVER_METHODS
 from remodel_fenicsx.model.chains import CHAINS
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
-from remodel_fenicsx.model.energy import MATRICES, REPULSIONS, Matrix
+from remodel_fenicsx.model.energy import MATRICES, REPULSIONS, TURNED_OVER, Matrix
 from remodel_fenicsx.model.laws import LAWS
 from remodel_fenicsx.scene.experiments import check_exclusive, with_own_numbers, without_replaced
 from remodel_fenicsx.scene.plausibility import doubts, largest_stress
@@ -195,7 +195,7 @@ class Scene(Table):
             return "mesh.formulation = 'displacement': in the others the stress at a point depends on its whole element"
         if not material.chain_density:
             return "chains: material.chain_density above 0"
-        if remodeling.turnover is not None:
+        if remodeling.turnover.is_on:
             return "no remodeling.turnover: it has no derivatives here"
         if remodeling.has_set_point:
             return "remodeling.exponent = 2 and remodeling.threshold = 0: their targets have no derivatives here"
@@ -217,7 +217,7 @@ class Scene(Table):
         law, laws = self.remodeling.law, ", ".join(repr(name) for name, law in LAWS.items() if law.has_limit)
         if not LAWS[law].has_limit:
             return f"remodeling.law = {law!r} has no limit that the way there does not decide; those with one: {laws}"
-        if self.remodeling.turnover is not None:
+        if self.remodeling.turnover.is_on:
             return "remodeling.turnover has no equilibrium that is found at once; march to a late time"
         if self.remodeling.threshold:
             return "remodeling.threshold is above 0: where cells fall asleep depends on the way; march to a late time"
@@ -274,7 +274,7 @@ class Scene(Table):
 
     def _check_turnover(self, region: str, properties: Properties) -> None:
         turnover, material, r0 = self.remodeling.turnover, properties.material, properties.cells.end_to_end_length
-        if turnover is None:
+        if not turnover.is_on:
             return
         if not material.chain_density:
             raise fault("needs chains: material.chain_density above 0", "remodeling.turnover", None)
@@ -331,6 +331,8 @@ class Scene(Table):
         for name in self.output.columns:
             if self.regions and name in self.geometry.columns_of_one_tissue:
                 raise fault(f"{name!r} is for one tissue; the scene has regions", "output.columns", name)
+            if name in TURNED_OVER and not self.remodeling.turnover.is_on:
+                raise fault(f"{name!r} changes with remodeling.turnover alone", "output.columns", name)
             if name not in known:
                 rule = f"no such column on request; allowed for shape {self.geometry.name!r} are "
                 raise fault(rule + ", ".join(map(repr, known)), "output.columns", name)

@@ -118,7 +118,7 @@ def _loaded(scene: Scene, comm: MPI.Intracomm, numbers: Array, share: float) -> 
     changes: dict[str, Any] = {"output.columns": [], "output.times": [], "output.fields": False}
     if scene.natural.cells == AS_GIVEN:
         changes |= {"remodeling.law": "none", "remodeling.coupling": "staggered", "remodeling.threshold": 0.0}
-        changes |= {"remodeling.turnover": None}
+        changes |= {"remodeling.turnover": {}}
         changes |= {"remodeling.exponent": 2.0, "time.end": end, "time.step": end / LOAD_STEPS, "time.tolerance": None}
     else:
         changes |= {"time.end": EQUILIBRIUM}

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from remodel_fenicsx import SceneError, Simulation
+from remodel_fenicsx import SceneError, Simulation, cli
 from remodel_fenicsx.body.tube import _opening_angle
 from remodel_fenicsx.model.chains import CHAINS
 from remodel_fenicsx.model.energy import Tissue
@@ -72,7 +73,7 @@ def test_without_turnover_it_is_the_law_tensor() -> None:
     """Gain 0 and a huge time."""
     for coupling in ("staggered", "extrapolated"):
         never = {"time": 1e12, "deposition_stretch": 1.1, "gain": 0.0}
-        plain, turned = (simulated(wall(40.0, 4.0, t, COLUMNS, coupling=coupling))[0][-1] for t in (None, never))
+        plain, turned = (simulated(wall(40.0, 4.0, t, [], coupling=coupling))[0][-1] for t in (None, never))
         assert turned == pytest.approx(plain, rel=1e-9, abs=1e-9, nan_ok=True)
 
 
@@ -111,9 +112,43 @@ def test_energy_and_its_increment() -> None:
 
 def test_a_growth_that_does_not_rest_is_said(caplog: pytest.LogCaptureFixture) -> None:
     """With a small gain the wall dilates on and on."""
-    values = wall(320.0, 4.0, {"time": 4.0, "deposition_stretch": 1.1, "gain": 0.1}, COLUMNS)
-    simulated(values)
+    turnover = {"time": 40.0, "deposition_stretch": 1.1, "gain": 0.2}
+    rows, _ = simulated(wall(720.0, 4.0, turnover, COLUMNS))
+    assert rows[-1]["outer_radius"] > 5.0
     assert sum("mechanobiological instability" in record.message for record in caplog.records) == 1
+
+
+def test_kinematics_agree() -> None:
+    """One radius and a half-plane, while it grows."""
+    turnover = {"time": 40.0, "deposition_stretch": 1.1, "gain": 1.0}
+    ends = []
+    for kinematics in ("radial", "axisymmetric"):
+        values = wall(120.0, 8.0, turnover, COLUMNS) | {"model": {"kinematics": kinematics}}
+        ends.append(simulated(values)[0][-1])
+    for name in (*COLUMNS, "outer_radius"):
+        assert ends[1][name] == pytest.approx(ends[0][name], rel=2e-3), name
+        assert ends[0][name] > 1.05
+
+
+def test_a_run_goes_on_with_its_content(tmp_path: Path) -> None:
+    """Two parts are the whole, to the last digit."""
+    values = wall(80.0, 4.0, {"time": 40.0, "gain": 1.0}, COLUMNS)
+    (tmp_path / "scene.toml").write_text(scene_from_dict(values).to_toml())
+    command = ["run", str(tmp_path / "scene.toml"), "-q", "--set", "output.report=false"]
+    assert cli.main([*command, "-o", str(tmp_path / "all")]) == 0
+    assert cli.main([*command, "-o", str(tmp_path / "run"), "--set", "time.end=40"]) == 0
+    assert cli.main(["run", "--resume", str(tmp_path / "run"), "--set", "time.end=80", "-q"]) == 0
+    tables = [(tmp_path / name / "history.csv").read_text().splitlines() for name in ("run", "all")]
+    places = [tables[0][0].split(",").index(name) for name in (*COLUMNS, *ANGLES, "outer_radius")]
+    last = [[table[-1].split(",")[place] for place in places] for table in tables]
+    assert last[0] == last[1] and float(last[0][0]) > 1.1
+
+
+def test_its_columns_and_numbers_need_it() -> None:
+    with pytest.raises(SceneError, match="'content' changes with remodeling.turnover alone"):
+        scene_from_dict(wall(40.0, 4.0, None, COLUMNS))
+    with pytest.raises(SceneError, match="remodeling.turnover.time: missing"):
+        scene_from_dict(wall(40.0, 4.0, {"gain": 2.0}, []))
 
 
 @pytest.mark.parametrize(
@@ -124,13 +159,15 @@ def test_a_growth_that_does_not_rest_is_said(caplog: pytest.LogCaptureFixture) -
         ({"coupling": "relaxed"}, {}, "remodeling.coupling = 'relaxed'"),
         ({"turnover": {"deposition_stretch": 1.6}}, {}, "deposition_stretch = 1.6: must be smaller than"),
         ({"turnover": {"gain": -1.0}}, {}, "remodeling.turnover.gain = -1"),
+        ({"turnover": {"pace": 1.0}}, {}, "remodeling.turnover.pace = 1.0: unknown key"),
         ({}, {"tolerance": 0.1}, "time.tolerance = 0.1: must be left out"),
         ({}, {"end": "equilibrium"}, "remodeling.turnover has no equilibrium"),
     ],
 )
 def test_what_has_no_turnover_is_refused(remodeling: dict[str, Any], time: dict[str, Any], words: str) -> None:
-    values = wall(40.0, 4.0, {"gain": 1.0}, COLUMNS)
-    values["remodeling"] |= remodeling
+    values = wall(40.0, 4.0, {"time": 40.0, "gain": 1.0}, COLUMNS)
+    turnover = values["remodeling"]["turnover"] | remodeling.pop("turnover", {})
+    values["remodeling"] |= {**remodeling, "turnover": turnover}
     values["time"] |= time
     with pytest.raises(SceneError, match=words):
         scene_from_dict(values)
