@@ -69,6 +69,21 @@ def test_an_unstressed_wall_comes_to_rest_with_an_opening_angle_of_its_own() -> 
         assert known[name][[0, len(known[name]) // 2, -1]] == pytest.approx(expected, rel=0.03)
 
 
+@pytest.mark.parametrize(
+    ("end", "stretch", "tube", "angle"),
+    [(1440.0, 1.15, (1.3, 1.2), 82.0), (2400.0, 1.1, (3.0, 4.8), 92.7)],
+    ids=["stretch", "paper's wall"],
+)
+def test_other_walls_open_as_an_independent_solver_says(
+    end: float, stretch: float, tube: tuple[float, float], angle: float
+) -> None:
+    """Another stretch of deposition; the paper's wall under its pressure."""
+    values = wall(end, 4.0, {"time": 40.0, "deposition_stretch": stretch, "gain": 1.0}, [])
+    values["geometry"]["outer_radius"], values["loads"]["pressure"]["value"] = tube
+    _, known = simulated(values)
+    assert known["opening_angle"] == pytest.approx(angle, abs=1.0)
+
+
 def test_without_turnover_it_is_the_law_tensor() -> None:
     """Gain 0 and a huge time."""
     for coupling in ("staggered", "extrapolated"):
