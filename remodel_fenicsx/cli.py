@@ -536,23 +536,10 @@ def _validate(options: argparse.Namespace) -> int:
 def _axes(options: argparse.Namespace) -> int:
     scene = read_scene(options.scene, options.set, options.profile)
     _check(reason_unusable())
-    from remodel_fenicsx.body import GeometryError
     from remodel_fenicsx.studies.preview import write_axes
 
     path = options.output or Path(f"{scene.name}-axes.vtu")
-    try:
-        with interrupts.StopRequest(), interrupts.stopping_at_once():
-            words = write_axes(scene, path)
-    except (SceneError, GeometryError) as error:
-        return _fail(" ".join(str(error).split()), BAD_INPUT)
-    except interrupts.Interrupted as interruption:
-        return _fail(f"stopped by {interruption}", interruption.exit_code)
-    except FileExistsError:
-        return _end_all(f"-o {path}: exists; allowed is a file that does not", BAD_INPUT)
-    except OSError as error:
-        return _end_all(f"-o {path}: cannot be written: {error.strerror}", BAD_ENVIRONMENT)
-    _say(f"{words}\nlocal axes in {path}")
-    return 0
+    return _written(lambda: write_axes(scene, path), path, "file", f"local axes in {path}")
 
 
 def _unload(options: argparse.Namespace) -> int:
@@ -560,25 +547,33 @@ def _unload(options: argparse.Namespace) -> int:
     if not scene.geometry.is_loaded:
         return _fail("geometry.is = 'unloaded': nothing to find; allowed is 'loaded'", BAD_INPUT)
     _check(reason_unusable())
-    from remodel_fenicsx.body import GeometryError
     from remodel_fenicsx.studies.unloaded_folder import write_unloaded
     from remodel_fenicsx.unloading import NoUnloadedShape
 
     place = options.output or Path(f"{scene.name}-unloaded")
+    said = f"scene of the unloaded body in {place / 'scene.toml'}"
     try:
-        with interrupts.StopRequest(), interrupts.stopping_at_once():
-            words = write_unloaded(scene, place)
-    except (SceneError, GeometryError) as error:
-        return _fail(" ".join(str(error).split()), BAD_INPUT)
+        return _written(lambda: write_unloaded(scene, place), place, "folder", said)
     except NoUnloadedShape as failure:
         return _fail(str(failure), SOLVE_FAILED)
+
+
+def _written(write: Callable[[], str], place: Path, kind: str, said: str) -> int:
+    """Say what write() found and where it is, or why there is nothing; `place` must be new, a `kind`."""
+    from remodel_fenicsx.body import GeometryError
+
+    try:
+        with interrupts.StopRequest(), interrupts.stopping_at_once():
+            words = write()
+    except (SceneError, GeometryError) as error:
+        return _fail(" ".join(str(error).split()), BAD_INPUT)
     except interrupts.Interrupted as interruption:
         return _fail(f"stopped by {interruption}", interruption.exit_code)
     except FileExistsError:
-        return _end_all(f"-o {place}: exists; allowed is a folder that does not", BAD_INPUT)
+        return _end_all(f"-o {place}: exists; allowed is a {kind} that does not", BAD_INPUT)
     except OSError as error:
         return _end_all(f"-o {place}: cannot be written: {error.strerror}", BAD_ENVIRONMENT)
-    _say(f"{words}\nscene of the unloaded body in {place / 'scene.toml'}")
+    _say(f"{words}\n{said}")
     return 0
 
 

@@ -16,7 +16,6 @@ from remodel_fenicsx.body.reductions import AUTO, choice, explained
 from remodel_fenicsx.evolution.coupling import Coupling, Maker
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher, times
-from remodel_fenicsx.evolution.turnover import turned_over
 from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.fem.kinematics import KINEMATICS, FreeLength, NaturalConfiguration
 from remodel_fenicsx.fem.quadrature import Quadrature
@@ -117,6 +116,8 @@ class Simulation:
         self.state = State(self.unknown, kinematics, self.cells, self.loading, formulation)
         tissue, kappa = parameters_of(properties, domain)
         if scene.remodeling.turnover.is_on:
+            from remodel_fenicsx.evolution.turnover import turned_over
+
             tissue = turned_over(tissue, self.state)
         at_once = scene.time.is_equilibrium
         predictor: str = scene.solver.predictor

@@ -13,7 +13,6 @@ from typing import Any
 from remodel_fenicsx.body.loading import LoadValues
 from remodel_fenicsx.evolution.coupling import Coupling, Maker
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
-from remodel_fenicsx.evolution.turnover import TurnoverPass
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.settings import COUPLINGS, Remodeling, Solver
 from remodel_fenicsx.solver.continuation import Work
@@ -127,8 +126,10 @@ class Stepper:
         name = remodeling.coupling if self.remodeling.law.remodels else "staggered"
         make = coupling or COUPLINGS[name].make
         self.coupling: Coupling = make(state, self.tissue, self.remodeling, solver)
-        self.turnover: TurnoverPass | None = None
+        self.turnover: Any = None  # `TurnoverPass`
         if remodeling.turnover.is_on:
+            from remodel_fenicsx.evolution.turnover import TurnoverPass
+
             self.turnover = TurnoverPass(state, self.tissue, remodeling.turnover)
         self._closed = False
         # asked on each rank in every solve: the signal (SIGINT, SIGTERM) that should end it, or 0

@@ -61,7 +61,7 @@ class TurnoverPass:
         )
         for name, change in zip(TURNED_OVER, changes, strict=True):
             getattr(self.tissue, name).x.array[:] *= np.exp(change)
-        self._warn(duration)
+        self._warn()
 
     def mean(self, name: str) -> float:
         """Volume mean of `content` or `natural_length`."""
@@ -71,7 +71,7 @@ class TurnoverPass:
         values: Array = self.quadrature.values(getattr(self.tissue, name), ())
         return values
 
-    def _warn(self, duration: float) -> None:
+    def _warn(self) -> None:
         if self._numbers["said"]:
             return
         for name in TURNED_OVER:

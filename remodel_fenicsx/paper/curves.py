@@ -209,7 +209,7 @@ def _draw_energy(above: Axes, below: Axes, run: RecordedRun) -> None:
     time = run.history["time"]
     above.plot(time, run.history["stored_energy"], color=COLOURS[0])
     _draw_power(below, time, run.history["remodeling_power"][1:])  # no pass comes before t = 0
-    ramp_end = max(load.ramp[-1][0] for load in run.scene.loads.values())
+    ramp_end = run.scene.end_of_ramps
     for axes in (above, below):
         axes.axvline(ramp_end, color="0.6", lw=0.8, ls=":")
         axes.set_xlim(0, run.scene.time.end)

@@ -229,14 +229,16 @@ class Scene(Table):
         return None if self.material.chain_density else "needs chains: material.chain_density above 0"
 
     @property
+    def end_of_ramps(self) -> float:
+        """The time from which on no load changes; 0 without loads."""
+        return max((load.ramp[-1][0] for load in self.loads.values()), default=0.0)
+
+    @property
     def last_time(self) -> float:
         """The time of the last row: where the equilibrium is asked for, one at which nothing is left of the start."""
         if not self.time.is_equilibrium:
             return float(self.time.end)
-        ramps = [load.ramp[-1][0] for load in self.loads.values()]
-        return max(ramps, default=0.0) + FORGOTTEN_AFTER / min(
-            properties.kappa for properties in self.properties().values()
-        )
+        return self.end_of_ramps + FORGOTTEN_AFTER / min(properties.kappa for properties in self.properties().values())
 
     def _check_regions(self) -> None:
         shape, columns = self.geometry, {column.name for column in columns_of(self.geometry)}

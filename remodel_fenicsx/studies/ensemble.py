@@ -235,11 +235,10 @@ def verdict(found: Ensemble, time: float) -> str:
 
 def chosen_times(scene: Scene) -> list[float]:
     """The end of the last ramp, and the end."""
-    ramps = [load.ramp[-1][0] for load in scene.loads.values()]
     step, end = scene.time.step, scene.last_time
     if scene.time.is_equilibrium:
         return [end]
-    last = step * round(max(ramps, default=end) / step)
+    last = step * round(scene.end_of_ramps / step)
     return [last, end] if step <= last < end else [end]
 
 

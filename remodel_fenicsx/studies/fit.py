@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import base64
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from html import escape
 from pathlib import Path
@@ -30,7 +30,7 @@ from remodel_fenicsx.studies.modelled import Modelled, Slopes, model_of, rotated
 from remodel_fenicsx.studies.page import COLOURS, STYLE, Page, add_head
 from remodel_fenicsx.system.environment import versions
 from remodel_fenicsx.system.regular_files import ForeignFileError, write_whole
-from remodel_fenicsx.system.terminal import Line
+from remodel_fenicsx.system.terminal import Line, unsaid
 
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
@@ -204,7 +204,7 @@ class Problem:
         """Residuals, and those derivatives that are exact, where they are asked for."""
         key = tuple(map(float, logarithms))
         if key not in self._known or (derivatives and self.exact.any() and np.isnan(self._known[key].jacobian).all()):
-            with _trial():
+            with unsaid():
                 self._known[key] = self._evaluated(np.array(logarithms), derivatives and bool(self.exact.any()))
             if self._journal is not None:
                 self._journal.add(key, self._known[key])
@@ -272,18 +272,6 @@ class Problem:
 def _reason(keys: Sequence[str]) -> str:
     """Why unknowns go together, where it is known."""
     return next((f" ({words})" for group, words in KNOWN_GROUPS if set(keys) <= group and len(set(keys)) > 1), "")
-
-
-@contextmanager
-def _trial() -> Iterator[None]:
-    """Runs with numbers that nobody will keep: what they warn of is not said. The fitted numbers are run once more."""
-    package = logging.getLogger("remodel_fenicsx")
-    before = package.level
-    package.setLevel(logging.ERROR)
-    try:
-        yield
-    finally:
-        package.setLevel(before)
 
 
 def fit(

@@ -269,3 +269,15 @@ def duration(seconds: float) -> str:
     if whole < 3600:
         return f"{whole // 60}:{whole % 60:02d} min"
     return f"{whole // 3600}:{whole % 3600 // 60:02d} h"
+
+
+@contextmanager
+def unsaid() -> Iterator[None]:
+    """Runs on the way, which nobody will keep: what they warn of is not said. The one that is kept says it."""
+    package = logging.getLogger(LOGGER)
+    before = package.level
+    package.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        package.setLevel(before)

@@ -11,8 +11,6 @@ from mpi4py import MPI
 
 from remodel_fenicsx.scene import Scene, SceneError
 from remodel_fenicsx.unloading.failure import NoUnloadedShape
-from remodel_fenicsx.unloading.mesh import unloaded_mesh
-from remodel_fenicsx.unloading.tube import unloaded_tube
 
 __all__ = ["NoUnloadedShape", "as_unloaded", "unloaded"]
 
@@ -55,8 +53,11 @@ def unloaded(scene: Scene, comm: MPI.Intracomm = MPI.COMM_WORLD, folder: Path | 
     if not scene.geometry.is_loaded:
         return scene
     if scene.geometry.unloads_by_numbers:
+        from remodel_fenicsx.unloading.tube import unloaded_tube
+
         return unloaded_tube(scene, comm)
     if folder is None:
-        way = "a folder is needed for the unloaded mesh"
-        raise SceneError(f"geometry.is = 'loaded': {way}")
+        raise SceneError("geometry.is = 'loaded': a folder is needed for the unloaded mesh")
+    from remodel_fenicsx.unloading.mesh import unloaded_mesh
+
     return unloaded_mesh(scene, comm, folder)

@@ -12,8 +12,7 @@ derived by w at w = 0. A pressure stays as it is, for the loaded face does not m
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -37,6 +36,7 @@ from remodel_fenicsx.results.run_folder import agreed
 from remodel_fenicsx.scene import Scene
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.solver.pointwise import mandel_vector
+from remodel_fenicsx.system.terminal import unsaid
 from remodel_fenicsx.unloading.failure import in_shares
 
 log = logging.getLogger(__name__)
@@ -80,7 +80,7 @@ def unloaded_mesh(scene: Scene, comm: MPI.Intracomm, folder: Path) -> Scene:
         for _ in range(MOST_MOVES):
             iterations += 1
             write(places)
-            with _quietly(), _built(scene.with_values(changes), comm) as simulation:
+            with unsaid(), closing(Simulation(scene.with_values(changes), comm)) as simulation:
                 found = _newton_step(simulation, given, share)
             if found is None:  # too far: back to half of the way
                 length /= 2
@@ -116,26 +116,6 @@ def _is_whole(file: MeshFile) -> bool:
     return bool((determinants * np.sign(determinants.mean()) > 0).all())
 
 
-@contextmanager
-def _quietly() -> Iterator[None]:
-    """Each mesh on the way has the same lines in the log; those of the last one are said by the run."""
-    before = logging.root.manager.disable
-    logging.disable(logging.WARNING)
-    try:
-        yield
-    finally:
-        logging.disable(before)
-
-
-@contextmanager
-def _built(scene: Scene, comm: MPI.Intracomm) -> Iterator[Simulation]:
-    simulation = Simulation(scene, comm)
-    try:
-        yield simulation
-    finally:
-        simulation.close()
-
-
 def _newton_step(simulation: Simulation, given: Array, share: float) -> Array | None:
     """How the unloaded nodes move, (nodes, 3) in the order of the file, on all ranks; None beyond the limits.
 
@@ -150,8 +130,8 @@ def _newton_step(simulation: Simulation, given: Array, share: float) -> Array | 
     """
     domain, state, scene = simulation.domain, simulation.state, simulation.scene
     equilibrium, unknown = simulation.stepper.coupling.equilibrium, simulation.unknown
-    end = max((load.ramp[-1][0] for load in scene.loads.values()), default=0.0)
-    state.loading.set({name: share * value for name, value in simulation.load_values(end).items()})
+    loads = simulation.load_values(scene.end_of_ramps)
+    state.loading.set({name: share * value for name, value in loads.items()})
     dofs = dof_of_node(domain, unknown.function_space)
     unknown.x.array.reshape(-1, 3)[dofs] = given[domain.node_number] - domain.mesh.geometry.x
     if not equilibrium.extension().admissible:

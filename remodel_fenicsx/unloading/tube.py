@@ -102,19 +102,14 @@ def _inverse(scene: Scene, target: Array, share: float, axial: float) -> Array:
     tissues = {name: properties.tissue for name, properties in scene.properties().items()}
     layers = loaded.geometry.layers_of_tissue(Natural(), loaded.regions, tissues)
     pressure = scene.loads["pressure"] if "pressure" in scene.loads else None
-    value = 0.0 if pressure is None else pressure.value * pressure.factor(_end(scene)) * share
+    value = 0.0 if pressure is None else pressure.value * pressure.factor(scene.end_of_ramps) * share
     radii = closing(layers, 0.0, Loads(value, None, axial)).natural_radius(target[:-1])
     return np.append(radii, target[-1] / axial)
 
 
-def _end(scene: Scene) -> float:
-    """Of all ramps."""
-    return max((load.ramp[-1][0] for load in scene.loads.values()), default=0.0)
-
-
 def _loaded(scene: Scene, comm: MPI.Intracomm, numbers: Array, share: float) -> Array:
     """Radii and length under a share of the loads, as a run has them."""
-    end = _end(scene) or 1.0
+    end = scene.end_of_ramps or 1.0
     changes: dict[str, Any] = {"output.columns": [], "output.times": [], "output.fields": False}
     if scene.natural.cells == AS_GIVEN:
         changes |= {"remodeling.law": "none", "remodeling.coupling": "staggered", "remodeling.threshold": 0.0}
