@@ -37,6 +37,7 @@ from remodel_fenicsx.model.chains import BOLTZMANN_CONSTANT, CHAINS
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
 from remodel_fenicsx.model.energy import MATRICES, REPULSIONS, Tissue
 from remodel_fenicsx.model.laws import LAWS
+from remodel_fenicsx.model.load_cases import MEANS
 from remodel_fenicsx.model.spectral import PAIRINGS
 from remodel_fenicsx.schema.tables import OneOf, Table, allowed, fault, is_number, quoted, shown
 from remodel_fenicsx.schema.times import is_multiple, same_time
@@ -261,11 +262,15 @@ def _initial_cells(value: Any) -> Any:
     return value
 
 
-def _entries(value: Any) -> Any:
-    """A list of tables as a tuple; anything else is a fault."""
-    if not isinstance(value, (list, tuple)):
-        raise fault("must be a list of tables, each [[natural.layers]]")
-    return tuple(value)
+def tables_of(name: str) -> BeforeValidator:
+    """A list of tables of this name as a tuple; anything else is a fault."""
+
+    def entries(value: Any) -> Any:
+        if not isinstance(value, (list, tuple)):
+            raise fault(f"must be a list of tables, each [[{name}]]")
+        return tuple(value)
+
+    return BeforeValidator(entries)
 
 
 POSITIVE: JsonDict = {"allowed": "a finite number greater than 0"}
@@ -345,7 +350,7 @@ class Natural(Table):
         "that of the sector. Fung's opening angle, between the lines from the middle of the inner arc to its ends, is "
         "half of it. 0: the mesh is free of stress.",
     )
-    layers: Annotated[tuple[NaturalLayer, ...], BeforeValidator(_entries)] = Field(
+    layers: Annotated[tuple[NaturalLayer, ...], tables_of("natural.layers")] = Field(
         default=(),
         description="Parts of the wall with a prestretch, a table `[[natural.layers]]` each; a tube and its layers "
         "close so that it is in equilibrium without loads, an own body moves when it is let go.",
@@ -476,6 +481,8 @@ class CouplingKind:
         The class of the `Coupling`, or its dotted name: scenes are read without dolfinx, which it needs.
     makes_a_share
         Whether it makes the share `relaxation_factor` of a pass.
+    takes_cases
+        Whether it solves several load cases with the same cells.
     needs_a_target
         Whether it is for laws with a target alone (`Law.target`).
     """
@@ -484,6 +491,7 @@ class CouplingKind:
     coupling: Callable[..., Any] | str
     makes_a_share: bool = False
     needs_a_target: bool = False
+    takes_cases: bool = True
 
     @property
     def make(self) -> Callable[..., Any]:
@@ -511,6 +519,7 @@ COUPLINGS = {
         "the cells belong to the stress of the same step: Newton's method on both, for the law 'tensor' (with a "
         "repulsion that sees no axes) and the laws of the paper",
         "remodel_fenicsx.evolution.implicit:Implicit",
+        takes_cases=False,
     ),
 }
 """Couplings by the name that a scene gives them."""
@@ -609,6 +618,12 @@ class Remodeling(Table):
         le=16,
         description="n of the target (D+)^n over its trace: 2 is the paper's, 1 that of netting analysis. For the law "
         "'tensor' (docs/laws.md).",
+    )
+    mean: Annotated[str, OneOf(MEANS)] = Field(
+        default="tensor",
+        description="What the cells follow where there are several load cases ([[cases]]): "
+        + "; ".join(f"{name!r}: {mean.meaning}" for name, mean in MEANS.items())
+        + " (docs/cycles.md).",
     )
     rotation_time: float = Field(
         default=40.0,
@@ -829,6 +844,21 @@ class Load(Table):
         """The value of largest magnitude from time 0 to `end`, with its sign."""
         times = [end, *(time for time, _ in self.ramp if time < end)]
         return max((self.value * self.factor(time) for time in times), key=abs)
+
+
+class LoadCase(Table):
+    """A load case of a cycle, diastole or systole say (docs/cycles.md): a share of the time with loads of its own.
+
+    Every case is a state of its own, solved with the same cells; these follow a mean over the cases. The columns and
+    fields of a run are those of the first case. The others have columns with their number, `inner_radius@2` say.
+    """
+
+    weight: float = Field(gt=0, le=1, description="Share of the time; the weights of all cases sum to 1.")
+    loads: dict[str, float] = Field(
+        default_factory=dict,
+        description="Factor on each load by its name, beside its ramp; 1 for loads that are not named.",
+        json_schema_extra={"allowed": "a table of numbers by the names of loads"},
+    )
 
 
 def faces_of(loads: Mapping[str, Any]) -> dict[str, str]:

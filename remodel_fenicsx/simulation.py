@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -96,9 +97,7 @@ class Simulation:
         shape = scene.geometry
         self.domain = domain = checked_domain(build(scene, comm) if domain is None else domain, scene)
         mesh = domain.mesh
-        kinematics: Any = KINEMATICS[scene.model.kinematics].on(mesh, shape)
-        if scene.has_free_length:
-            kinematics = FreeLength(kinematics, shape)
+        kinematics = on_mesh_alone(scene, domain)
         self.unknown = kinematics.unknown(mesh, scene.mesh.degree)
         self.quadrature = Quadrature(mesh, scene.mesh.degree, kinematics.weight(mesh))
         properties, local_axes = scene.properties(), shape.local_axes(domain, self.quadrature)
@@ -107,13 +106,8 @@ class Simulation:
             kinematics = from_natural(kinematics, scene, self.quadrature, domain, local_axes)
         fibres = measured_fibres(scene, domain)
         self.cells = UnitCells(self.quadrature, domain, scene.cells, local_axes, own, fibres)
-        self.loading = Loading(domain, self.unknown, kinematics)
-        shape.support(self.loading, scene.supports.ends)
-        matrices = [one.material for one in properties.values()]
-        modulus = max(material.lame_lambda + 2 * material.lame_mu for material in matrices)
-        shape.hold_faces(self.loading, scene.supports.faces, modulus, scene.loads)
-        formulation = FORMULATIONS[scene.mesh.formulation]
-        self.state = State(self.unknown, kinematics, self.cells, self.loading, formulation)
+        self.state = unloaded_state(scene, self.unknown, kinematics, self.cells, domain)
+        self.loading, formulation = self.state.loading, FORMULATIONS[scene.mesh.formulation]
         tissue, kappa = parameters_of(properties, domain)
         if scene.remodeling.turnover.is_on:
             from remodel_fenicsx.evolution.turnover import turned_over
@@ -127,6 +121,10 @@ class Simulation:
         parts = self.state, tissue, scene.remodeling, solver, self.load_values
         self.stepper = Stepper(*parts, self._at_once(tissue, solver, kappa) if at_once else coupling, kappa)
         self.tissue = self.stepper.tissue
+        if scene.cases[1:]:
+            if coupling is not None:
+                raise SceneError("cases: a coupling of one's own solves one load case alone; leave out [[cases]]")
+            self._join_cases(solver, kappa)
         counted = "negative_eigenvalues" in scene.output.columns
         self.stability = EquilibriumStability(self.stepper, scene.solver.unstable, every_step=counted)
         more: list[str] = []
@@ -184,9 +182,27 @@ class Simulation:
 
         return make
 
-    def load_values(self, time: float) -> LoadValues:
-        """Magnitude of every load at a time."""
-        return {name: load.value * load.factor(time) for name, load in self.scene.loads.items()}
+    def load_values(self, time: float, case: int = 0) -> LoadValues:
+        """Magnitude of every load at a time, in a load case; the first is 0."""
+        factors = self.scene.factors(case)
+        loads = self.scene.loads.items()
+        return {name: load.value * load.factor(time) * factors.get(name, 1.0) for name, load in loads}
+
+    def _join_cases(self, solver: Solver, kappa: Any) -> None:
+        """The states of the scene's further load cases, on the same cells."""
+        from remodel_fenicsx.evolution.load_cases import OtherCase, join
+
+        scene, others = self.scene, []
+        for index in range(1, len(scene.cases)):
+            kinematics = on_mesh_alone(scene, self.domain)  # a prescribed strain of the whole body is its own
+            unknown = kinematics.unknown(self.domain.mesh, scene.mesh.degree)
+            if not scene.natural.is_of_the_mesh:
+                first = self.state.kinematics
+                kinematics = NaturalConfiguration(kinematics, first.gradient, first.closing)
+            state = unloaded_state(scene, unknown, kinematics, self.cells, self.domain)
+            values = partial(self.load_values, case=index)
+            others.append(OtherCase(index + 1, state, values, self.stepper, solver, kappa))
+        join(self.stepper, others, [case.weight for case in scene.cases])
 
     def steps(self, watchers: Sequence[Watcher] = ()) -> Iterator[Step]:
         """Solve and remodel step by step, from where the state is; what is yielded has been accepted.
@@ -220,6 +236,22 @@ class Simulation:
         """Free PETSc's objects and options."""
         self.stability.close()
         self.stepper.close()
+
+
+def on_mesh_alone(scene: Scene, domain: Domain) -> Any:
+    """The scene's kinematics, of a mesh that is free of stress."""
+    kinematics = KINEMATICS[scene.model.kinematics].on(domain.mesh, scene.geometry)
+    return FreeLength(kinematics, scene.geometry) if scene.has_free_length else kinematics
+
+
+def unloaded_state(scene: Scene, unknown: Any, kinematics: Any, cells: UnitCells, domain: Domain) -> State:
+    """Unknowns of the body with its supports, and with loads that are zero."""
+    shape, loading = scene.geometry, Loading(domain, unknown, kinematics)
+    shape.support(loading, scene.supports.ends)
+    matrices = [one.material for one in scene.properties().values()]
+    modulus = max(material.lame_lambda + 2 * material.lame_mu for material in matrices)
+    shape.hold_faces(loading, scene.supports.faces, modulus, scene.loads)
+    return State(unknown, kinematics, cells, loading, FORMULATIONS[scene.mesh.formulation])
 
 
 def from_natural(

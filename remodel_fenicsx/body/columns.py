@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Container, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -36,6 +36,8 @@ class Column:
         Whether it is known only when the cells have remodeled; all others belong to the solved state.
     extreme
         Whether it is the largest or smallest value of the body: of random cells it goes with their number.
+    by_case
+        Whether it has another value in each load case: what belongs to the cells or to the step as a whole has not.
     """
 
     name: str
@@ -44,6 +46,12 @@ class Column:
     value: Callable[[Any], float]
     after_pass: bool = False
     extreme: bool = False
+    by_case: bool = True
+
+    def of_case(self, number: int) -> Column:
+        """The same of another load case; the first one is 1."""
+        meaning = f"{self.meaning}, in load case {number}"
+        return replace(self, name=f"{self.name}@{number}", meaning=meaning, value=lambda m: self.value(m.of_case(number)))
 
 
 # ---------------------------------------------------------------- the fibre angle through a body, whatever the mesh
@@ -75,6 +83,7 @@ _PROFILE_COLUMNS = tuple(
         f"mean of the reference fibre angle about {number}/{PROFILE_PLACES - 1} of the way through the wall of a tube, "
         "or along z, weighted with a hat function as wide as a quarter of the way",
         partial(_profile_value, number),
+        by_case=False,
     )
     for number, name in enumerate(PROFILE)
 )
@@ -91,6 +100,7 @@ def columns_of_region(name: str) -> tuple[Column, Column]:
             "degrees",
             f"mean of the reference fibre angle over the region `{name}`, over the chains that have one",
             lambda m: float(m.quadrature.mean_of_known(m.fibre_angle, m.elements_of_region(name))),
+            by_case=False,
         ),
         Column(
             f"max_chain_extension_{name}",
@@ -103,7 +113,7 @@ def columns_of_region(name: str) -> tuple[Column, Column]:
 
 
 # ---------------------------------------------------------------- which a history has
-FIRST_COLUMN = Column("time", "time", "time of the scene", lambda m: m.step.time)
+FIRST_COLUMN = Column("time", "time", "time of the scene", lambda m: m.step.time, by_case=False)
 COLUMNS: dict[str, Column] = {
     column.name: column
     for column in (
@@ -128,13 +138,21 @@ COLUMNS: dict[str, Column] = {
             "",
             "Newton iterations of the step, failed attempts included",
             lambda m: m.step.work.newton_iterations,
+            by_case=False,
         ),
-        Column("linear_iterations", "", "linear iterations of the same", lambda m: m.step.work.linear_iterations),
+        Column(
+            "linear_iterations",
+            "",
+            "linear iterations of the same",
+            lambda m: m.step.work.linear_iterations,
+            by_case=False,
+        ),
         Column(
             "substeps",
             "",
             "solves that made up the step; 1: the paper's step in one piece",
             lambda m: m.step.work.substeps,
+            by_case=False,
         ),
         Column("seconds", "s", "wall time of the step", lambda m: m.step.seconds, after_pass=True),
     )
@@ -169,18 +187,21 @@ COLUMNS_ON_REQUEST: dict[str, Column] = {
             "",
             "negative eigenvalues of the tangent's symmetric part: 0 where the equilibrium is stable",
             lambda m: m.step.negative_eigenvalues,
+            by_case=False,
         ),
         Column(
             "held_points",
             "",
             "points at which the coupling 'implicit' found no cells that belong to their stress",
             lambda m: m.step.work.held_points,
+            by_case=False,
         ),
         Column(
             "asleep_share",
             "",
             "share of the volume in which no principal value of the driving tensor is above remodeling.threshold",
             lambda m: m.observer.stepper.remodeling.asleep_share(),
+            by_case=False,
         ),
         *(
             Column(
@@ -188,6 +209,7 @@ COLUMNS_ON_REQUEST: dict[str, Column] = {
                 "",
                 f"{what} of the collagen over that at the start, volume mean; with remodeling.turnover",
                 partial(_turned_over, name),
+                by_case=False,
             )
             for name, what in (("content", "amount"), ("natural_length", "natural length"))
         ),
@@ -209,6 +231,7 @@ def columns_of(
     requested: Sequence[str] = (),
     loads: Container[str] | None = None,
     regions: Iterable[str] = (),
+    cases: int = 1,
 ) -> tuple[Column, ...]:
     """The columns of a shape's history, in the order of the file, those on request last.
 
@@ -225,6 +248,8 @@ def columns_of(
         length of the body is on request where it is not among them.
     regions
         Names of the scene's regions.
+    cases
+        Number of its load cases: what differs in them has a column for each.
 
     Raises
     ------
@@ -244,7 +269,9 @@ def columns_of(
     known = {column.name for column in (*always, *others)}
     on_request = columns_on_request(shape)
     extra = (on_request[name] for name in requested if name not in known)
-    return (*always, *(chosen or others), *extra)
+    found = (*always, *(chosen or others), *extra)
+    differ = [column for column in found if column.by_case and not column.after_pass]
+    return (*found, *(column.of_case(number) for number in range(2, cases + 1) for column in differ))
 
 
 def columns_on_request(shape: Shape | type[Shape]) -> dict[str, Column]:

@@ -309,6 +309,7 @@ class Tube(Walled):
             "degrees",
             "angle of the sector that is missing when the unloaded tube is cut along its length, cells as they are",
             _opening_angle,
+            by_case=False,
         ),
         *angle_columns_on_request(MEANS),
         *Walled.columns_on_request,

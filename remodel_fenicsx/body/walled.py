@@ -73,7 +73,13 @@ def angle_columns(means: Mapping[str, tuple[str, AngleOf]]) -> tuple[Column, ...
         By where, "inner" say: which elements they are, in words, and the mean over them.
     """
     return tuple(
-        Column(f"fibre_angle_{where}", "degrees", f"{ANGLE_IN} {words}", partial(_of, mean, "fibre_angle"))
+        Column(
+            f"fibre_angle_{where}",
+            "degrees",
+            f"{ANGLE_IN} {words}",
+            partial(_of, mean, "fibre_angle"),
+            by_case=False,
+        )
         for where, (words, mean) in means.items()
     )
 
@@ -100,6 +106,7 @@ class Walled(Shape):
             "",
             "volume mean of A_rr / tr A: 0 where all chains lie in the wall, 1 where they point out of it",
             lambda m: m.quadrature.mean(m.radial_share),
+            by_case=False,
         ),
     )
     angle_layers: ClassVar[dict[str, float]] = {

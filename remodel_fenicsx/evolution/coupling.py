@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable
-from typing import Protocol
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +45,8 @@ class Coupling(Protocol):
         kappa times the longest step that may be chosen for its error: longer ones of an explicit rule swing.
     compares
         Whether `better` is wanted; set it before the first step.
+    others
+        Further load cases, solved with the same cells after the state itself (`load_cases.OtherCase`).
     better
         After `remodel`: cells at all points in one row that a better rule gives for the row; None if it has no error.
     """
@@ -56,6 +58,7 @@ class Coupling(Protocol):
     accumulates: bool
     longest: float
     compares: bool
+    others: Sequence[Any]
 
     @property
     def better(self) -> UnitCell | None: ...
@@ -86,7 +89,8 @@ class Staggered:
         self.newton = GuardedNewton(self.equilibrium, settings)
         self.predictor = PREDICTORS[settings.predictor](state)
         self._last = Numbers(state, "last_solution", {"extension": 0.0})  # its largest r/L
-        self.share, self.compares, self._residual = 1.0, False, 0.0
+        self.share, self.compares, self.residual = 1.0, False, 0.0
+        self.others: Sequence[Any] = ()
         self.blend: Blend | None = None
         if remodeling.law.remodels:  # now, for no form is compiled in the middle of a run
             self.blend = Blend(state, tissue, settings)
@@ -112,16 +116,18 @@ class Staggered:
         self._whole(time, old_loads, loads).look_back(before, work)
         self.predictor.solved(step, before)
         self.state.settle_cells()
-        self._residual = work.residual
+        self.residual = work.residual
         work.extension = work.extension or self.equilibrium.extension()
         self._last["extension"] = work.extension.max_chain_extension
+        for case in self.others:
+            work.count(case.solve(time))
         return work
 
     def remodel(self, time: float) -> float:
         """The pass with the solved state."""
         if not self.remodeling.law.remodels:
             return 0.0
-        return self.remodeling.apply(self.state.time, time, self._residual, self.share)
+        return self.remodeling.apply(self.state.time, time, self.residual, self.share)
 
     @property
     def better(self) -> UnitCell | None:
@@ -131,6 +137,8 @@ class Staggered:
     def close(self) -> None:
         """Free PETSc's objects."""
         self.newton.close()
+        for case in self.others:
+            case.coupling.close()
         if self.blend is not None:
             self.blend.close()
 

@@ -73,7 +73,7 @@ class Extrapolated(Staggered):
         expected = self._extrapolated(time)
         self._follow(expected, time)
         work = super().solve(time, loads)
-        self._found = self.remodeling.target(self._residual)
+        self._found = self.remodeling.target(self.residual)
         self._begins = (self._known(0).share < COUNTS) & (self._found.share >= COUNTS)
         if not self._anywhere(self._begins):
             return work
@@ -81,7 +81,7 @@ class Extrapolated(Staggered):
         cells.set(self._start.dimensions.reshape(*shape, 3), self._start.axes.reshape(*shape, 3, 3))
         self._follow(expected.where(self._begins, self._found), time)
         again = super().solve(time, loads)
-        self._found = self.remodeling.target(self._residual)
+        self._found = self.remodeling.target(self.residual)
         again.substeps += work.substeps - 1
         again.count(work)
         return again

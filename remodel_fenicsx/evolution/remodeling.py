@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable, Sequence
 from numbers import Real
 from typing import Any, NamedTuple
 
@@ -19,6 +20,7 @@ from remodel_fenicsx.model.cells import UnitCell, structure_tensor
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES, carried_axes
 from remodel_fenicsx.model.energy import Tissue, axes_sum
 from remodel_fenicsx.model.laws import LAWS, Drive, tensor_target
+from remodel_fenicsx.model.load_cases import MEANS, mean_target
 from remodel_fenicsx.model.tensor_law import ABOVE_ROUNDING, Target
 from remodel_fenicsx.settings import Remodeling
 from remodel_fenicsx.solver.pointwise import PointStresses
@@ -79,6 +81,8 @@ class RemodelingPass:
     def __init__(self, state: State, tissue: Tissue, settings: Remodeling, kappa: Any = None):
         self.state, self.settings = state, settings
         self.quadrature = state.cells.quadrature
+        self.others: Sequence[Callable[[], Drive]] = ()  # drives of further load cases (`load_cases`)
+        self.weights: Sequence[float] = (1.0,)  # of all cases, this one first
         self.tissue = with_kernels(on_mesh(tissue, self.quadrature.mesh), state.comm)
         self.parameters = Parameters(self.tissue, self.quadrature)
         self.driver, self.law, self.frame = DRIVERS[settings.driver], LAWS[settings.law], FRAMES[settings.frame]
@@ -115,7 +119,18 @@ class RemodelingPass:
         return self.kernels.gradient_and_driver(values)
 
     def drive(self, residual: float = 0.0) -> Drive:
-        """What acts on the cells in the present state, which was accepted with this norm of out-of-balance forces."""
+        """What acts on the cells in the present state, which was accepted with this norm of out-of-balance forces.
+
+        With several load cases: in all of their states.
+        """
+        if not self.others:
+            return self._own_drive(residual)
+        return MEANS[self.settings.mean].drive(self._drives(residual), self.weights)
+
+    def _drives(self, residual: float) -> list[Drive]:
+        return [self._own_drive(residual), *(drive() for drive in self.others)]
+
+    def _own_drive(self, residual: float) -> Drive:
         F, tensor = self.driving_tensor()
         noise, rounding = self.noise(F, tensor, residual)
         return Drive(
@@ -190,13 +205,25 @@ class RemodelingPass:
 
         Changes nothing.
         """
-        drive = self.drive(residual)
         cells = self.state.cells.point_cells if cells is None else cells
+        if self._averages_targets:
+            followed = self.followed(self.target(residual), time_new - time_old, cells)
+            return followed, self.state.elastic_gradient()
+        drive = self.drive(residual)
         return self.law.update(cells, drive, time_old, time_new), drive.deformation_gradient
 
     def target(self, residual: float = 0.0) -> Target:
         """What the structure tensor tends to in the present state; of laws that have one."""
-        drive, target = self.drive(residual), self.law.target
+        if self._averages_targets:
+            return mean_target([self._target_of(drive) for drive in self._drives(residual)], self.weights)
+        return self._target_of(self.drive(residual))
+
+    @property
+    def _averages_targets(self) -> bool:
+        return bool(self.others) and MEANS[self.settings.mean].of_targets
+
+    def _target_of(self, drive: Drive) -> Target:
+        target = self.law.target
         assert target is not None
         if target is not tensor_target or self.settings.has_set_point:  # C knows the paper's alone
             return target(drive)
@@ -215,7 +242,7 @@ class RemodelingPass:
 
     def asleep_share(self) -> float:
         """Share of the body's volume in which no principal value is above `remodeling.threshold`."""
-        _, tensor = self.driving_tensor()
+        tensor = self.drive().tensor if self.others else self.driving_tensor()[1]
         asleep = np.linalg.eigvalsh(tensor)[:, -1] <= self.settings.threshold
         return float(self.quadrature.mean(asleep.reshape(self.quadrature.shape).astype(float)))
 

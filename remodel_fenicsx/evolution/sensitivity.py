@@ -371,7 +371,7 @@ class StaggeredDerivatives(Staggered):
         law = self.remodeling.law
         if not law.remodels:
             return super().remodel(time)
-        drive, old, change = self.remodeling.drive(self._residual), self._cells(), self._rows()
+        drive, old, change = self.remodeling.drive(self.residual), self._cells(), self._rows()
         times = self.state.time, time
         power = super().remodel(time)
         if law.dimensions is not None:
@@ -450,7 +450,7 @@ class ExtrapolatedDerivatives(Extrapolated, StaggeredDerivatives):
 
     def _of_found(self) -> Changes:
         """Of the target of the solved state."""
-        return target_changes(self.remodeling.drive(self._residual), self._driver)
+        return target_changes(self.remodeling.drive(self.residual), self._driver)
 
     def _of_extrapolated(self, time: float) -> Changes:
         """As `Target.towards` has it: sE changes linearly, and s is its trace."""

@@ -127,6 +127,7 @@ class Stepper:
         make = coupling or COUPLINGS[name].make
         self.coupling: Coupling = make(state, self.tissue, self.remodeling, solver)
         self.turnover: Any = None  # `TurnoverPass`
+        self.cases: Sequence[Any] = ()  # further load cases (`load_cases.OtherCase`)
         if remodeling.turnover.is_on:
             from remodel_fenicsx.evolution.turnover import TurnoverPass
 
@@ -199,7 +200,7 @@ class Stepper:
                     step.seconds += rejected.seconds
                     step.processor_seconds += rejected.processor_seconds
                 self.judge(step)
-                state.time, state.number = time, step.number
+                state.reach(time, step.number)
                 for watcher in watchers:
                     watcher.completed(step)
         for watcher in watchers:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import logging
 import time as clock
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import cast
+from typing import TypeVar, cast
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from remodel_fenicsx.state.state import State
 from remodel_fenicsx.system.environment import versions
 
 log = logging.getLogger(__name__)
+T = TypeVar("T")
 
 LONGEST_LOSS = 600.0  # seconds
 SHORTEST_PAUSE = 10.0  # seconds between two that are chosen by time: below it nothing worth a write is lost
@@ -97,8 +98,8 @@ class Checkpoints(Watcher):
                 number=state.number,
                 scene=self.scene_text,
                 versions=self._versions,
-                loads=dict(state.loading.values),
-                numbers=dict(state.numbers),
+                loads=marked({mark: case.loading.values for mark, case in state.cases().items()}),
+                numbers=marked({mark: case.numbers for mark, case in state.cases().items()}),
                 functions=list(arrays),
                 arrays={f"function/{name}": values for name, values in arrays.items()} | self._mesh,
             )
@@ -144,24 +145,27 @@ def restore_state(state: State, checkpoint: Checkpoint | None) -> None:
     mesh, first = mesh_arrays(domain), comm.rank == 0
     agreed(comm, lambda: _check(state, domain, cast(Checkpoint, checkpoint), mesh or {}) if first else None)
     header = comm.bcast(checkpoint.model_copy(update={"arrays": {}}) if first and checkpoint else None)
-    missing = [name for name in state.functions() if name not in header.functions]
+    missing, counts = [name for name in state.functions() if name not in header.functions], _counts(state)
     for name, function in state.functions().items():
         if name not in missing:
             values = checkpoint.arrays[f"function/{name}"] if first and checkpoint else None
             function.x.array[_places(function)] = domain.scatter_elements(values)
-    state.time, state.number = header.time, header.number
-    state.numbers |= header.numbers | {state.counts[name]: 0.0 for name in missing}
+    state.reach(header.time, header.number)
+    numbers = header.numbers | {counts[name]: 0.0 for name in missing}
     if missing and first:
         log.info("what the checkpoint does not hold begins anew: %s", ", ".join(missing))
-    state.loading.set(header.loads)
+    for mark, case in state.cases().items():
+        case.numbers |= with_mark(numbers, mark)
+        case.loading.set(with_mark(header.loads, mark))
 
 
 def _check(state: State, domain: Domain, checkpoint: Checkpoint, mesh: dict[str, Array]) -> None:
     """Raise CheckpointError unless the checkpoint is one of this state."""
-    here, there = state.functions(), checkpoint.functions
-    if any(name not in there and name not in state.counts for name in here):
+    here, there, counts = state.functions(), checkpoint.functions, _counts(state)
+    if any(name not in there and name not in counts for name in here):
         raise CheckpointError(f"the checkpoint has the functions {', '.join(there)}, this run has {', '.join(here)}")
-    loads, own = sorted(checkpoint.loads), sorted(state.loading.values)
+    loads = sorted(checkpoint.loads)
+    own = sorted(marked({mark: case.loading.values for mark, case in state.cases().items()}))
     if loads != own:
         raise CheckpointError(f"the checkpoint has the loads {loads}, this run has {own}")
     for name in [name for name in here if name in there]:
@@ -175,6 +179,23 @@ def _check(state: State, domain: Domain, checkpoint: Checkpoint, mesh: dict[str,
     if not same or not np.allclose(points, mesh["points"], rtol=0.0, atol=1e-9 * domain.size):
         words = "the checkpoint has another mesh: perhaps Gmsh is of another version, run.log says which it was"
         raise CheckpointError(words)
+
+
+def marked(values: Mapping[str, Mapping[str, T]]) -> dict[str, T]:
+    """Values by name of all load cases in one, each name with the mark of its case."""
+    return {f"{name}{mark}": value for mark, of_case in values.items() for name, value in of_case.items()}
+
+
+def with_mark(values: Mapping[str, T], mark: str) -> dict[str, T]:
+    """Those of one load case, by their names without its mark."""
+    parts = {name: name.partition("@") for name in values}
+    return {parts[name][0]: value for name, value in values.items() if "".join(parts[name][1:]) == mark}
+
+
+def _counts(state: State) -> dict[str, str]:
+    """`State.counts` of all load cases."""
+    cases = state.cases().items()
+    return {f"{name}{mark}": f"{count}{mark}" for mark, case in cases for name, count in case.counts.items()}
 
 
 def _places(function: object) -> Array:

@@ -35,12 +35,12 @@ class Observer(Watcher):
     shape
         Says which columns there are, and what the fibre angle is.
     stepper
-        What is measured; nothing here changes it.
+        What is measured, with its further load cases; nothing here changes it.
     columns
         Other columns than `columns_of(shape)` of the loads that there are.
     """
 
-    def __init__(self, shape: Shape, stepper: Stepper, columns: Sequence[Column] | None = None):
+    def __init__(self, shape: Shape, stepper: Any, columns: Sequence[Column] | None = None):
         self.shape, self.stepper, self.state = shape, stepper, stepper.state
         if columns is None:
             columns = columns_of(shape, loads=self.state.loading.values)
@@ -48,6 +48,7 @@ class Observer(Watcher):
         self.quadrature: Quadrature = self.state.cells.quadrature
         self.domain: Domain = self.state.loading.domain
         self.tools: dict[Any, Any] = {}
+        self.others = [Observer(shape, case, ()) for case in stepper.cases]
 
     # ------------------------------------------------------------ as a watcher
     def started(self, step: Step) -> None:
@@ -194,6 +195,15 @@ class Measurement:
         radii = np.linalg.norm(nodes[..., :2], axis=-1)
         tolerance = 1e-6 * self.domain.size
         return (radii.min(axis=1) <= radius + tolerance) & (radii.max(axis=1) >= radius - tolerance)
+
+    def of_case(self, number: int) -> Measurement:
+        """The same step in another load case; the first one is 1."""
+
+        def measured() -> Measurement:
+            observer = self.observer.others[number - 2]
+            return Measurement(observer, observer.stepper.seen(self.step))
+
+        return self if number == 1 else self.tool_of_step(("case", number), measured)  # type: ignore[no-any-return]
 
     def tool(self, key: Any, make: Callable[[], Any]) -> Any:
         """What a column needs for every step, a compiled form say: made once, by make(), and kept under a key."""

@@ -6,6 +6,7 @@ keys (`scene.reference`).
 
 from __future__ import annotations
 
+import math
 import os
 import re
 from collections.abc import Iterable, Iterator, Mapping
@@ -24,6 +25,7 @@ from remodel_fenicsx.model.chains import CHAINS
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
 from remodel_fenicsx.model.energy import MATRICES, REPULSIONS, TURNED_OVER, Matrix
 from remodel_fenicsx.model.laws import LAWS
+from remodel_fenicsx.model.load_cases import MEANS
 from remodel_fenicsx.scene.experiments import check_exclusive, with_own_numbers, without_replaced
 from remodel_fenicsx.scene.plausibility import doubts, largest_stress
 from remodel_fenicsx.scene.presets import EXACT, PRESETS, PROFILES, default_method
@@ -31,12 +33,14 @@ from remodel_fenicsx.schema.tables import SceneError, Table, VariantOf, allowed,
 from remodel_fenicsx.schema.toml import merged, parse_override, put, read_toml, toml_text
 from remodel_fenicsx.schema.units import FORCE, LENGTH_UNIT, LENGTH_UNITS, STRESS_UNIT, in_units
 from remodel_fenicsx.settings import (
+    COUPLINGS,
     REGION,
     UNLOADED,
     STRESS_UNITS,
     MEASURED_CELLS,
     Cells,
     Load,
+    LoadCase,
     Material,
     Mesh,
     Model,
@@ -50,12 +54,14 @@ from remodel_fenicsx.settings import (
     Time,
     faces_of,
     nearest_multiples,
+    tables_of,
 )
 
 NAME = r"[A-Za-z][A-Za-z0-9_]{0,39}"  # of a region or a further load: part of the name of a column
 FORMAT = 2  # of recorded scenes: raised where a reader of the one before would not understand them
 RENAMED = {"mesh.cell": "mesh.element", "loads.stretch": "loads.elongation", "solver.profile": "solver.method"}
 """Dotted key of an earlier format -> the key that has taken its place, for the error."""
+SUM_OF_WEIGHTS = 1e-9  # how far from 1 the weights of load cases may sum: rounding, and 1/3 with ten digits
 FORGOTTEN_AFTER = (
     1000.0  # times 1/kappa after which nothing is left of a start, of cells under a hundredth of a tension too
 )
@@ -106,6 +112,7 @@ class Scene(Table):
     natural: Natural = Natural()
     regions: dict[str, Region] = {}
     loads: dict[str, Load] = {}
+    cases: Annotated[tuple[LoadCase, ...], tables_of("cases")] = ()
     remodeling: Remodeling = Remodeling()
     time: Time
     solver: Solver = Solver()
@@ -182,6 +189,7 @@ class Scene(Table):
         self._check_length()
         self._check_natural()
         self._check_loaded_shape()
+        self._check_cases()
         if self.model.kinematics != AUTO and (reasons := objections(self, self.model.kinematics)):
             raise fault("; ".join(reasons), "model.kinematics", self.model.kinematics)
         return self
@@ -195,6 +203,8 @@ class Scene(Table):
             return "mesh.formulation = 'displacement': in the others the stress at a point depends on its whole element"
         if not material.chain_density:
             return "chains: material.chain_density above 0"
+        if self.cases[1:]:
+            return "no [[cases]]: cells that answer within a solve have the stress of one load case"
         if remodeling.turnover.is_on:
             return "no remodeling.turnover: it has no derivatives here"
         if remodeling.has_set_point:
@@ -288,6 +298,41 @@ class Scene(Table):
             rule = f"must be smaller than {region}contour_length / end_to_end_length = {shown(longest)}"
             raise fault(rule, "remodeling.turnover.deposition_stretch", turnover.deposition_stretch)
 
+    def factors(self, case: int) -> dict[str, float]:
+        """Factors on loads by name in a load case; the first is 0."""
+        return self.cases[case].loads if self.cases else {}
+
+    def _check_cases(self) -> None:
+        """Shares of one whole and factors on loads that there are; what has no load cases is refused by name."""
+        for index, case in enumerate(self.cases):
+            for name, factor in case.loads.items():
+                if name not in self.loads:
+                    rule = "no such load; the scene has " + (", ".join(self.loads) or "none")
+                    raise fault(rule, f"cases[{index}].loads.{quoted(name)}", factor)
+        total = math.fsum(case.weight for case in self.cases)
+        if self.cases and abs(total - 1.0) > SUM_OF_WEIGHTS:
+            last = len(self.cases) - 1
+            rule = f"the weights of all cases sum to {total:.10g}; they must sum to 1"
+            raise fault(rule, f"cases[{last}].weight", self.cases[last].weight)
+        remodeling, time = self.remodeling, self.time
+        if remodeling.mean != "tensor" and not self.cases:
+            raise fault("needs [[cases]]", "remodeling.mean", remodeling.mean)
+        if MEANS[remodeling.mean].of_targets and LAWS[remodeling.law].target is None:
+            able = ", ".join(repr(name) for name, law in LAWS.items() if law.target is not None)
+            raise fault(f"needs a remodeling.law with a target: {able}", "remodeling.mean", remodeling.mean)
+        if not self.cases[1:]:
+            return
+        refused: list[tuple[bool, str, Any]] = [
+            (not COUPLINGS[remodeling.coupling].takes_cases, "remodeling.coupling", remodeling.coupling),
+            (remodeling.turnover.is_on, "remodeling.turnover", None),
+            (time.tolerance is not None, "time.tolerance", time.tolerance),
+            (time.is_equilibrium, "time.end", time.end),
+            (self.geometry.is_loaded, "geometry.is", "loaded"),
+        ]
+        for is_asked, key, value in refused:
+            if is_asked:
+                raise fault("goes with one load case alone; leave out [[cases]] or this", key, value)
+
     def properties(self) -> dict[str, Properties]:
         """What holds in each region by its name, and under "" what holds beside them, where there may be anything."""
         body = Properties(self.material, self.cells, self.remodeling.kappa)
@@ -310,12 +355,11 @@ class Scene(Table):
         for index, (time, factor) in enumerate(load.ramp):
             if not self.time.is_equilibrium and time <= self.time.end and not self.time.is_hit(time):
                 raise fault(nearest_multiples(time, step, "time.step"), f"{key}.ramp[{index}][0]", time)
-            value, above = load.value * factor, self.load_kinds[name].above
-            if value <= above:
-                rule = (
-                    f"must be greater than {above:g} at every time; with the factor {shown(factor)} it is {value:.6g}"
-                )
-                raise fault(rule, f"{key}.value", load.value)
+            for share in (self.factors(case).get(name, 1.0) for case in range(len(self.cases) or 1)):
+                value, above = load.value * factor * share, self.load_kinds[name].above
+                if value <= above:
+                    words = f"with the factor {shown(factor * share)} it is {value:.6g}"
+                    raise fault(f"must be greater than {above:g} at every time; {words}", f"{key}.value", load.value)
 
     def _check_output_times(self) -> None:
         for index, time in enumerate(self.output.times):
@@ -341,7 +385,8 @@ class Scene(Table):
 
     def columns(self, more: Iterable[str] = ()) -> tuple[Column, ...]:
         """Of its history, in the order of the file; with `more` of those on request."""
-        return columns_of(self.geometry, [*self.output.columns, *more], self.loads, self.regions)
+        requested = [*self.output.columns, *more]
+        return columns_of(self.geometry, requested, self.loads, self.regions, len(self.cases))
 
     def stops(self) -> list[float]:
         """Times at which a step ends, however long steps are: corners of ramps, output.times and the end."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -19,13 +19,17 @@ from remodel_fenicsx.state.unit_cells import CellField, UnitCells
 
 @dataclass(frozen=True)
 class Snapshot:
-    """Values of a state: arrays by the names of `State.functions`, loads, time, number of steps, further numbers."""
+    """Values of a state: arrays by the names of its functions, loads, time, number of steps, further numbers.
+
+    `others` are those of further load cases.
+    """
 
     arrays: dict[str, NDArray[np.float64]]
     loads: dict[str, float]
     time: float
     number: int
     numbers: dict[str, float]
+    others: tuple[Snapshot, ...] = ()
 
 
 class State:
@@ -57,6 +61,8 @@ class State:
         What else is remembered from step to step, by name: a coupling puts its own here, its functions by `remember`.
     counts
         Functions that a checkpoint may lack, each with the name of the number that is 0 then: how many are known.
+    others
+        States of further load cases, with the same cells: snapshots and checkpoints hold them too.
     """
 
     def __init__(
@@ -82,6 +88,7 @@ class State:
         self.time, self.number = 0.0, 0
         self.numbers: dict[str, float] = {}
         self.counts: dict[str, str] = {}
+        self.others: Sequence[State] = ()
         # the body starts unloaded; a load that is there from t = 0 on comes with the first step
         loading.set(dict.fromkeys(loading.values, 0.0))
 
@@ -135,8 +142,21 @@ class State:
         return shares
 
     def functions(self) -> dict[str, Any]:
-        """Every dolfinx function of the state by its name."""
-        return dict(self._functions)
+        """Every dolfinx function of the state by its name, those of further load cases with their mark ("@2")."""
+        shared = {self.cells.dimensions.name, self.cells.axes.name}
+        found = dict(self._functions)
+        for mark, case in list(self.cases().items())[1:]:
+            found |= {f"{name}{mark}": function for name, function in case._functions.items() if name not in shared}
+        return found
+
+    def cases(self) -> dict[str, State]:
+        """The states of all load cases by the mark that their names have: this one has none, then "@2", "@3"."""
+        return {"": self} | {f"@{number}": case for number, case in enumerate(self.others, start=2)}
+
+    def reach(self, time: float, number: int) -> None:
+        """A step is done: its time, and how many there have been, in all load cases."""
+        for case in self.cases().values():
+            case.time, case.number = time, number
 
     def _add(self, function: Any) -> None:
         self._functions[function.name], self._arrays[function.name] = function, function.x.array
@@ -171,7 +191,8 @@ class State:
     def snapshot(self) -> Snapshot:
         """A copy of all values."""
         arrays = {name: array.copy() for name, array in self._arrays.items()}
-        return Snapshot(arrays, dict(self.loading.values), self.time, self.number, dict(self.numbers))
+        others = tuple(case.snapshot() for case in self.others)
+        return Snapshot(arrays, dict(self.loading.values), self.time, self.number, dict(self.numbers), others)
 
     def restore(self, snapshot: Snapshot) -> None:
         """Take all values from a snapshot."""
@@ -180,6 +201,8 @@ class State:
         self.loading.set(snapshot.loads)
         self.time, self.number = snapshot.time, snapshot.number
         self.numbers = dict(snapshot.numbers)
+        for case, values in zip(self.others, snapshot.others, strict=True):
+            case.restore(values)
 
     @contextmanager
     def tentative(self) -> Iterator[None]:

@@ -1,0 +1,92 @@
+"""Further load cases of a cycle: each a state of its own with the same cells, which all of them drive."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+from remodel_fenicsx.body.loading import LoadValues
+from remodel_fenicsx.evolution.coupling import Staggered
+from remodel_fenicsx.evolution.remodeling import RemodelingPass
+from remodel_fenicsx.evolution.stepper import Step, Stepper
+from remodel_fenicsx.model.laws import Drive
+from remodel_fenicsx.settings import Solver
+from remodel_fenicsx.solver.continuation import StepFailure, Work
+from remodel_fenicsx.state.state import State
+
+
+class OtherCase:
+    """A load case beside the first: solved after it in each step, and asked for its drive before the pass.
+
+    To those who measure it is a stepper: it has `state`, `coupling` and `remodeling`.
+
+    Parameters
+    ----------
+    number
+        2 for the second one, and so on.
+    state
+        Its unknowns and loads, and the cells of all cases.
+    load_values
+        Magnitudes of its loads by time.
+    stepper
+        Whose tissue and remodeling it has.
+    solver, kappa
+        As the stepper's.
+    """
+
+    def __init__(
+        self,
+        number: int,
+        state: State,
+        load_values: Callable[[float], LoadValues],
+        stepper: Stepper,
+        solver: Solver,
+        kappa: Any = None,
+    ):
+        self.number, self.state, self.load_values = number, state, load_values
+        self.remodeling = RemodelingPass(state, stepper.tissue, stepper.remodeling.settings, kappa)
+        self.coupling = Staggered(state, stepper.tissue, self.remodeling, solver)
+        self.coupling.equilibrium.stop_signal = lambda: stepper.stop_signal()
+        self.cases: Sequence[OtherCase] = ()
+
+    def solve(self, time: float) -> Work:
+        """Equilibrium at `time` with the present cells.
+
+        Raises
+        ------
+        StepFailure
+            If no admissible equilibrium is found.
+        """
+        try:
+            return self.coupling.solve(time, self.load_values(time))
+        except StepFailure as failure:
+            raise StepFailure(failure.time, f"load case {self.number}: {failure}", failure.refusal) from failure
+
+    def drive(self) -> Drive:
+        """Of the solved state."""
+        return self.remodeling.drive(self.coupling.residual)
+
+    def seen(self, step: Step) -> Step:
+        """A step as it is in this case."""
+        extension = self.coupling.equilibrium.extension()
+        return replace(step, loads=dict(self.state.loading.values), extension=extension)
+
+
+def join(stepper: Stepper, cases: Sequence[OtherCase], weights: Sequence[float]) -> None:
+    """From now on the stepper solves these cases too, and its pass follows the mean of all.
+
+    Parameters
+    ----------
+    stepper
+        Of the first case.
+    cases
+        The others.
+    weights
+        Shares of time, the first case's first.
+    """
+    stepper.cases = stepper.coupling.others = list(cases)
+    stepper.state.others = [case.state for case in cases]
+    if stepper.remodeling.law.remodels:
+        stepper.remodeling.others = [case.drive for case in cases]
+        stepper.remodeling.weights = tuple(weights)
