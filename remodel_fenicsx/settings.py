@@ -37,7 +37,7 @@ from remodel_fenicsx.model.chains import BOLTZMANN_CONSTANT, CHAINS
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
 from remodel_fenicsx.model.energy import MATRICES, REPULSIONS, Tissue
 from remodel_fenicsx.model.laws import LAWS
-from remodel_fenicsx.model.load_cases import MEANS
+from remodel_fenicsx.model.load_cases import MEANS_OF_CASES
 from remodel_fenicsx.model.spectral import PAIRINGS
 from remodel_fenicsx.schema.tables import OneOf, Table, allowed, fault, is_number, quoted, shown
 from remodel_fenicsx.schema.times import is_multiple, same_time
@@ -619,10 +619,10 @@ class Remodeling(Table):
         description="n of the target (D+)^n over its trace: 2 is the paper's, 1 that of netting analysis. For the law "
         "'tensor' (docs/laws.md).",
     )
-    mean: Annotated[str, OneOf(MEANS)] = Field(
+    mean: Annotated[str, OneOf(MEANS_OF_CASES)] = Field(
         default="tensor",
         description="What the cells follow where there are several load cases ([[cases]]): "
-        + "; ".join(f"{name!r}: {mean.meaning}" for name, mean in MEANS.items())
+        + "; ".join(f"{name!r}: {mean.meaning}" for name, mean in MEANS_OF_CASES.items())
         + " (docs/cycles.md).",
     )
     rotation_time: float = Field(

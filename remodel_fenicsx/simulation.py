@@ -197,7 +197,7 @@ class Simulation:
             kinematics = on_mesh_alone(scene, self.domain)  # a prescribed strain of the whole body is its own
             unknown = kinematics.unknown(self.domain.mesh, scene.mesh.degree)
             if not scene.natural.is_of_the_mesh:
-                first = self.state.kinematics
+                first: Any = self.state.kinematics
                 kinematics = NaturalConfiguration(kinematics, first.gradient, first.closing)
             state = unloaded_state(scene, unknown, kinematics, self.cells, self.domain)
             values = partial(self.load_values, case=index)

@@ -50,8 +50,8 @@ class Column:
 
     def of_case(self, number: int) -> Column:
         """The same of another load case; the first one is 1."""
-        meaning = f"{self.meaning}, in load case {number}"
-        return replace(self, name=f"{self.name}@{number}", meaning=meaning, value=lambda m: self.value(m.of_case(number)))
+        name, meaning = f"{self.name}@{number}", f"{self.meaning}, in load case {number}"
+        return replace(self, name=name, meaning=meaning, value=lambda m: self.value(m.of_case(number)))
 
 
 # ---------------------------------------------------------------- the fibre angle through a body, whatever the mesh

@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,6 +85,7 @@ class Homeostasis:
     """
 
     order, accumulates, longest, share, better = 1, True, math.inf, 1.0, None
+    others: Sequence[Any] = ()  # it takes no load cases
 
     def __init__(self, way: StepControl, remodeling: RemodelingPass, held_from: float, limit: Limit | None):
         self.way, self.remodeling, self.held_from, self.limit = way, remodeling, held_from, limit

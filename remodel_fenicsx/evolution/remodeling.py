@@ -20,7 +20,7 @@ from remodel_fenicsx.model.cells import UnitCell, structure_tensor
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES, carried_axes
 from remodel_fenicsx.model.energy import Tissue, axes_sum
 from remodel_fenicsx.model.laws import LAWS, Drive, tensor_target
-from remodel_fenicsx.model.load_cases import MEANS, mean_target
+from remodel_fenicsx.model.load_cases import MEANS_OF_CASES, mean_target
 from remodel_fenicsx.model.tensor_law import ABOVE_ROUNDING, Target
 from remodel_fenicsx.settings import Remodeling
 from remodel_fenicsx.solver.pointwise import PointStresses
@@ -125,7 +125,7 @@ class RemodelingPass:
         """
         if not self.others:
             return self._own_drive(residual)
-        return MEANS[self.settings.mean].drive(self._drives(residual), self.weights)
+        return MEANS_OF_CASES[self.settings.mean].drive(self._drives(residual), self.weights)
 
     def _drives(self, residual: float) -> list[Drive]:
         return [self._own_drive(residual), *(drive() for drive in self.others)]
@@ -220,7 +220,7 @@ class RemodelingPass:
 
     @property
     def _averages_targets(self) -> bool:
-        return bool(self.others) and MEANS[self.settings.mean].of_targets
+        return bool(self.others) and MEANS_OF_CASES[self.settings.mean].of_targets
 
     def _target_of(self, drive: Drive) -> Target:
         target = self.law.target

@@ -1,7 +1,7 @@
 """Means over load cases: what cells follow that are in several states by turns. Pure functions on arrays.
 
-With weights w_i, the shares of time, and the states' F_i = R_i U_i: D = sum_i w_i R_i^T sigma_i R_i, each driving tensor
-in material space. Remodeling takes days and a cycle a second, so that cells see the mean of many cycles.
+With weights w_i, the shares of time, and the states' F_i = R_i U_i: D = sum_i w_i R_i^T sigma_i R_i, which takes each
+driving tensor to material space. Remodeling takes days and a cycle a second, so that cells see the mean of many cycles.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ class Mean:
     of_targets: bool = False
 
 
-MEANS: dict[str, Mean] = {
+MEANS_OF_CASES: dict[str, Mean] = {
     "tensor": Mean("the weighted mean of the driving tensors"),
     "target": Mean("the weighted mean of the targets that each case has, for the law 'tensor'", of_targets=True),
     "largest": Mean("at each point the case with the largest tension, whatever its weight", largest_tension),

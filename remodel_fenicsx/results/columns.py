@@ -17,7 +17,7 @@ from remodel_fenicsx.body.columns import Column, columns_of
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.mesh_faces import cap_volume
 from remodel_fenicsx.body.shape import Shape
-from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
+from remodel_fenicsx.evolution.stepper import Step, Watcher
 from remodel_fenicsx.fem import compat, jit
 from remodel_fenicsx.fem.assembly import over_ranks
 from remodel_fenicsx.fem.quadrature import Quadrature

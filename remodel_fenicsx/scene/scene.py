@@ -25,7 +25,7 @@ from remodel_fenicsx.model.chains import CHAINS
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
 from remodel_fenicsx.model.energy import MATRICES, REPULSIONS, TURNED_OVER, Matrix
 from remodel_fenicsx.model.laws import LAWS
-from remodel_fenicsx.model.load_cases import MEANS
+from remodel_fenicsx.model.load_cases import MEANS_OF_CASES
 from remodel_fenicsx.scene.experiments import check_exclusive, with_own_numbers, without_replaced
 from remodel_fenicsx.scene.plausibility import doubts, largest_stress
 from remodel_fenicsx.scene.presets import EXACT, PRESETS, PROFILES, default_method
@@ -112,7 +112,11 @@ class Scene(Table):
     natural: Natural = Natural()
     regions: dict[str, Region] = {}
     loads: dict[str, Load] = {}
-    cases: Annotated[tuple[LoadCase, ...], tables_of("cases")] = ()
+    cases: Annotated[tuple[LoadCase, ...], tables_of("cases")] = Field(
+        default=(),
+        description="Load cases of a cycle, a table `[[cases]]` each; without them loads act all the time.",
+        json_schema_extra={"allowed": "a list of tables"},
+    )
     remodeling: Remodeling = Remodeling()
     time: Time
     solver: Solver = Solver()
@@ -317,7 +321,7 @@ class Scene(Table):
         remodeling, time = self.remodeling, self.time
         if remodeling.mean != "tensor" and not self.cases:
             raise fault("needs [[cases]]", "remodeling.mean", remodeling.mean)
-        if MEANS[remodeling.mean].of_targets and LAWS[remodeling.law].target is None:
+        if MEANS_OF_CASES[remodeling.mean].of_targets and LAWS[remodeling.law].target is None:
             able = ", ".join(repr(name) for name, law in LAWS.items() if law.target is not None)
             raise fault(f"needs a remodeling.law with a target: {able}", "remodeling.mean", remodeling.mean)
         if not self.cases[1:]:
