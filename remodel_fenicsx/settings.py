@@ -847,10 +847,11 @@ class Load(Table):
 
 
 class LoadCase(Table):
-    """A load case of a cycle, diastole or systole say (docs/cycles.md): a share of the time with loads of its own.
+    """A load case of a cycle, diastole say (docs/cycles.md): a share of the time and its loads.
 
-    Every case is a state of its own, solved with the same cells; these follow a mean over the cases. The columns and
-    fields of a run are those of the first case. The others have columns with their number, `inner_radius@2` say.
+    Every case is a state of its own, solved with the same cells, which follow a mean over the
+    cases. The columns and fields of a run are those of the first case. The others have columns
+    with their number, `inner_radius@2` say.
     """
 
     weight: float = Field(gt=0, le=1, description="Share of the time; the weights of all cases sum to 1.")

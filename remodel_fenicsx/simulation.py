@@ -94,19 +94,25 @@ class Simulation:
             for line in explained(scene):
                 log.info("%s", line)
         self.scene = scene = with_kinematics(scene, domain)
+        self._loads = [case.loads for case in scene.each_case()]
         shape = scene.geometry
         self.domain = domain = checked_domain(build(scene, comm) if domain is None else domain, scene)
         mesh = domain.mesh
-        kinematics = on_mesh_alone(scene, domain)
-        self.unknown = kinematics.unknown(mesh, scene.mesh.degree)
+        # a state for each load case; made in the order of those of the first, so that all have the same kernels
+        made = [on_mesh_alone(scene, domain) for _ in self._loads]
+        unknowns = [one.unknown(mesh, scene.mesh.degree) for one in made]
+        kinematics, self.unknown = made[0], unknowns[0]
         self.quadrature = Quadrature(mesh, scene.mesh.degree, kinematics.weight(mesh))
         properties, local_axes = scene.properties(), shape.local_axes(domain, self.quadrature)
         own = {name: properties[name].cells for name in scene.regions}
         if not scene.natural.is_of_the_mesh:
-            kinematics = from_natural(kinematics, scene, self.quadrature, domain, local_axes)
+            natural = from_natural(kinematics, scene, self.quadrature, domain, local_axes)
+            made = [NaturalConfiguration(one, natural.gradient, natural.closing) for one in made]
         fibres = measured_fibres(scene, domain)
         self.cells = UnitCells(self.quadrature, domain, scene.cells, local_axes, own, fibres)
-        self.state = unloaded_state(scene, self.unknown, kinematics, self.cells, domain)
+        self.state, *others = (
+            unloaded_state(scene, u, k, self.cells, domain) for u, k in zip(unknowns, made, strict=True)
+        )
         self.loading, formulation = self.state.loading, FORMULATIONS[scene.mesh.formulation]
         tissue, kappa = parameters_of(properties, domain)
         if scene.remodeling.turnover.is_on:
@@ -124,7 +130,7 @@ class Simulation:
         if scene.cases[1:]:
             if coupling is not None:
                 raise SceneError("cases: a coupling of one's own solves one load case alone; leave out [[cases]]")
-            self._join_cases(solver, kappa)
+            self._join_cases(others, solver, kappa)
         counted = "negative_eigenvalues" in scene.output.columns
         self.stability = EquilibriumStability(self.stepper, scene.solver.unstable, every_step=counted)
         more: list[str] = []
@@ -184,25 +190,17 @@ class Simulation:
 
     def load_values(self, time: float, case: int = 0) -> LoadValues:
         """Magnitude of every load at a time, in a load case; the first is 0."""
-        factors = self.scene.factors(case)
-        loads = self.scene.loads.items()
-        return {name: load.value * load.factor(time) * factors.get(name, 1.0) for name, load in loads}
+        loads = self._loads[case].items()
+        return {name: load.value * load.factor(time) for name, load in loads}
 
-    def _join_cases(self, solver: Solver, kappa: Any) -> None:
-        """The states of the scene's further load cases, on the same cells."""
+    def _join_cases(self, states: Sequence[State], solver: Solver, kappa: Any) -> None:
+        """Further load cases, on the same cells."""
         from remodel_fenicsx.evolution.load_cases import OtherCase, join
 
-        scene, others = self.scene, []
-        for index in range(1, len(scene.cases)):
-            kinematics = on_mesh_alone(scene, self.domain)  # a prescribed strain of the whole body is its own
-            unknown = kinematics.unknown(self.domain.mesh, scene.mesh.degree)
-            if not scene.natural.is_of_the_mesh:
-                first: Any = self.state.kinematics
-                kinematics = NaturalConfiguration(kinematics, first.gradient, first.closing)
-            state = unloaded_state(scene, unknown, kinematics, self.cells, self.domain)
-            values = partial(self.load_values, case=index)
-            others.append(OtherCase(index + 1, state, values, self.stepper, solver, kappa))
-        join(self.stepper, others, [case.weight for case in scene.cases])
+        values = [partial(self.load_values, case=index) for index in range(1, len(self._loads))]
+        parts = zip(states, values, strict=True)
+        others = [OtherCase(n, *part, self.stepper, solver, kappa) for n, part in enumerate(parts, start=2)]
+        join(self.stepper, others, [case.weight for case in self.scene.cases])
 
     def steps(self, watchers: Sequence[Watcher] = ()) -> Iterator[Step]:
         """Solve and remodel step by step, from where the state is; what is yielded has been accepted.

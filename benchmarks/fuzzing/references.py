@@ -24,7 +24,7 @@ def known(scene: Values) -> bool:
         r["law"] != "rotation" and not lags and (r["pairing"] == "sorted" or r["law"] in ("tensor", "none"))
         and "tolerance" not in time and time["end"] != "equilibrium" and scene["material"]["repulsion"] != "length"
         and scene["cells"]["initial"] != "random" and "natural" not in scene
-        and "is" not in scene["geometry"] and "turnover" not in r
+        and "is" not in scene["geometry"] and "turnover" not in r and "cases" not in scene
         and r.get("exponent", 2.0) == 2.0 and not r.get("threshold")
         and scene["cells"]["axes"] == ("cylindrical" if g == "tube" else "global")
         and (g != "tube" or scene["supports"]["ends"] == "free" and "axial_force" not in scene["loads"])

@@ -254,10 +254,26 @@ def _rarely(random: Random, scene: Values, stiffness: float) -> None:
     if turns and plain and not locked and scene["material"]["chain_density"] and random.random() < 0.2:
         numbers = {"time": rounded(random.uniform(20, 80)), "deposition_stretch": rounded(random.uniform(1.02, 1.2))}
         scene["remodeling"]["turnover"] = numbers | {"gain": rounded(random.uniform(0.5, 2))}
-    if _closes_from_a_sector(scene) and scene["supports"]["ends"] != "clamped" and random.random() < 0.05:
+    if plain and "turnover" not in scene["remodeling"] and scene["remodeling"]["coupling"] != "implicit":
+        _cases(random, scene)
+    alone = scene["supports"]["ends"] != "clamped" and "cases" not in scene
+    if _closes_from_a_sector(scene) and alone and random.random() < 0.05:
         scene["geometry"]["is"] = "loaded"
         if scene["time"]["end"] == "equilibrium":
             scene.setdefault("natural", {})["cells"] = "equilibrium"
+
+
+def _cases(random: Random, scene: Values) -> None:
+    """Two load cases, or one that is no other than none; what they follow."""
+    if random.random() > 0.15:
+        return
+    weight = rounded(random.uniform(0.2, 0.8))
+    name = random.choice(sorted(scene["loads"]))
+    factors = [{"loads": {name: rounded(random.uniform(0.5, 1.0))}}, {}]
+    weights = [weight, 1 - weight] if random.random() < 0.7 else [1.0]
+    scene["cases"] = [{"weight": share} | more for share, more in zip(weights, factors, strict=False)]
+    means = ("tensor", "largest") + ("target",) * (scene["remodeling"]["law"] == "tensor")
+    scene["remodeling"]["mean"] = random.choice(means)
 
 
 def _set_points(random: Random, scene: Values, stiffness: float) -> None:

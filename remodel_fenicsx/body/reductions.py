@@ -129,6 +129,11 @@ def threats(scene: Any) -> list[str]:
     """What may make a body buckle, in words: loads below zero (compression, suction), thrust near Euler's load."""
     if not scene.geometry.reductions:
         return []
+    return list(dict.fromkeys(words for case in scene.each_case() for words in _threats(case)))
+
+
+def _threats(scene: Any) -> list[str]:
+    """Of one load case."""
     smallest = {name: min(load.value * factor for _, factor in load.ramp) for name, load in scene.loads.items()}
     pressing = [f"loads.{name}" for name, value in smallest.items() if value < 0]
     words = [f"{' and '.join(pressing)} press"] if pressing else []

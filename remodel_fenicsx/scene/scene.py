@@ -302,9 +302,15 @@ class Scene(Table):
             rule = f"must be smaller than {region}contour_length / end_to_end_length = {shown(longest)}"
             raise fault(rule, "remodeling.turnover.deposition_stretch", turnover.deposition_stretch)
 
-    def factors(self, case: int) -> dict[str, float]:
-        """Factors on loads by name in a load case; the first is 0."""
-        return self.cases[case].loads if self.cases else {}
+    def each_case(self) -> list[Scene]:
+        """Of each load case a scene with its loads alone; where there are no cases, the scene itself."""
+        found = []
+        for case in self.cases:
+            loads = dict(self.loads)
+            for name in {*case.loads} & {*loads}:
+                loads[name] = loads[name].model_copy(update={"value": loads[name].value * case.loads[name]})
+            found.append(self.model_copy(update={"loads": loads, "cases": ()}))
+        return found or [self]
 
     def _check_cases(self) -> None:
         """Shares of one whole and factors on loads that there are; what has no load cases is refused by name."""
@@ -324,6 +330,8 @@ class Scene(Table):
         if MEANS_OF_CASES[remodeling.mean].of_targets and LAWS[remodeling.law].target is None:
             able = ", ".join(repr(name) for name, law in LAWS.items() if law.target is not None)
             raise fault(f"needs a remodeling.law with a target: {able}", "remodeling.mean", remodeling.mean)
+        if self.cases and self.geometry.is_loaded:
+            raise fault("goes without [[cases]]: the loaded shape has one set of loads", "geometry.is", "loaded")
         if not self.cases[1:]:
             return
         refused: list[tuple[bool, str, Any]] = [
@@ -331,11 +339,10 @@ class Scene(Table):
             (remodeling.turnover.is_on, "remodeling.turnover", None),
             (time.tolerance is not None, "time.tolerance", time.tolerance),
             (time.is_equilibrium, "time.end", time.end),
-            (self.geometry.is_loaded, "geometry.is", "loaded"),
         ]
         for is_asked, key, value in refused:
             if is_asked:
-                raise fault("goes with one load case alone; leave out [[cases]] or this", key, value)
+                raise fault("goes with one load case alone, and there are several [[cases]]", key, value)
 
     def properties(self) -> dict[str, Properties]:
         """What holds in each region by its name, and under "" what holds beside them, where there may be anything."""
@@ -359,10 +366,11 @@ class Scene(Table):
         for index, (time, factor) in enumerate(load.ramp):
             if not self.time.is_equilibrium and time <= self.time.end and not self.time.is_hit(time):
                 raise fault(nearest_multiples(time, step, "time.step"), f"{key}.ramp[{index}][0]", time)
-            for share in (self.factors(case).get(name, 1.0) for case in range(len(self.cases) or 1)):
-                value, above = load.value * factor * share, self.load_kinds[name].above
-                if value <= above:
-                    words = f"with the factor {shown(factor * share)} it is {value:.6g}"
+            for case in self.each_case():
+                full, above = case.loads[name].value, self.load_kinds[name].above
+                if full * factor <= above:
+                    share = factor * full / load.value if load.value else factor
+                    words = f"with the factor {shown(share)} it is {full * factor:.6g}"
                     raise fault(f"must be greater than {above:g} at every time; {words}", f"{key}.value", load.value)
 
     def _check_output_times(self) -> None:
@@ -477,8 +485,9 @@ class Scene(Table):
     def summary(self) -> str:
         """Stiffness of network and matrix and the largest loads, in one unit and on one line."""
         loads = {}
-        for name, load in self.loads.items():
-            stress = largest_stress(self.load_kinds[name], load.largest(self.last_time), self.geometry)
+        for name in self.loads:
+            largest = max((case.loads[name].largest(self.last_time) for case in self.each_case()), key=abs)
+            stress = largest_stress(self.load_kinds[name], largest, self.geometry)
             if stress is not None:
                 is_force = self.load_kinds[name].dimension == FORCE
                 loads[f"largest {name}{' over its area' if is_force else ''}"] = stress
@@ -493,8 +502,9 @@ class Scene(Table):
         if self.geometry.fills(self.regions):
             properties.pop("", None)  # it holds nowhere
         for name, (material, cells, _) in properties.items():
-            lines = doubts(material, self.geometry, self.loads, cells.end_to_end_length, self.last_time)
-            found |= dict.fromkeys(line if line.startswith("geometry.") else _words(name) + line for line in lines)
+            for case in self.each_case():
+                lines = doubts(material, self.geometry, case.loads, cells.end_to_end_length, self.last_time)
+                found |= dict.fromkeys(line if line.startswith("geometry.") else _words(name) + line for line in lines)
         return [*found, *self.remodeling.warnings()]
 
     def with_values(self, changes: Mapping[str, Any]) -> Scene:

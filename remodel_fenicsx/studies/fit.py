@@ -314,6 +314,8 @@ def fit(
     OSError
         If a file cannot be written.
     """
+    if scene.cases:
+        raise SceneError("cases: a fit is one of a single load case; leave out [[cases]]")
     unknowns, tables = read_measurements(Path(data), scene)
     mark = fingerprint(scene, unknowns, tables)
     place = _place(folder, f"{scene.name}-{FIT}", mark)

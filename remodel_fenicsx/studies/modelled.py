@@ -60,6 +60,7 @@ def without_derivatives(scene: Scene, table: Measured) -> str | None:
         return f"model.kinematics = {scene.model.kinematics!r}"
     for key, there in (
         ("regions", bool(scene.regions)),
+        ("cases", bool(scene.cases)),
         ("natural.opening_angle", bool(scene.natural.opening_angle)),
         ("time.tolerance", scene.time.tolerance is not None or scene.time.is_equilibrium),
         ("cells.fibres", bool(scene.measured_cells)),

@@ -1,0 +1,284 @@
+"""[[cases]]: load cases of a cycle, solved with the same cells, which follow their mean."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from remodel_fenicsx import SceneError, Simulation, cli
+from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
+from remodel_fenicsx.model.laws import Drive
+from remodel_fenicsx.model.load_cases import largest_tension, mean_target, mean_tensor
+from remodel_fenicsx.model.tensor_law import Target, target
+from remodel_fenicsx.scene import scene_from_dict
+from remodel_fenicsx.solver.continuation import StepFailure
+from tests.reference.radial import CIRCUMFERENTIAL, RadialMaterial, Tube, cauchy_stress, structure
+
+ANGLES = ["fibre_angle_inner", "fibre_angle_middle", "fibre_angle_outer"]
+LAWS = [("tensor", "extrapolated"), ("tensor", "relaxed"), ("explicit", "staggered")]
+HALVES = [{"weight": 0.5}, {"weight": 0.5}]
+COUNTED = ("newton_iterations", "linear_iterations", "seconds")
+TURNS = 1e-9  # relative: rounding, after steps that hand it on
+
+
+def pulse(a: float) -> list[dict[str, Any]]:
+    """Diastole and systole about the same mean pressure."""
+    return [{"weight": 2 / 3, "loads": {"pressure": 1 - a}}, {"weight": 1 / 3, "loads": {"pressure": 1 + 2 * a}}]
+
+
+def artery(cases: Any = (), end: float = 30.0, columns: Any = (), pressure: float = 4.8, **tables: Any) -> Any:
+    """The paper's artery on one radius."""
+    ramp = [[0.0, 0.0], [24.0, 1.0]]
+    values: dict[str, Any] = {
+        "preset": "consistent",
+        "geometry": {"shape": "tube"},
+        "model": {"kinematics": "radial"},
+        "mesh": {"refinement": 4, "degree": 2},
+        "cells": {"initial": "isotropic"},
+        "material": {"repulsion": "length"},
+        "loads": {"pressure": {"value": pressure, "ramp": ramp}, "elongation": {"value": 0.1, "ramp": ramp}},
+        "time": {"end": end, "step": 2.0},
+        "output": {"fields": False, "columns": list(columns)},
+    }
+    return values | ({"cases": list(cases)} if cases else {}) | tables
+
+
+def simulated(values: dict[str, Any]) -> list[dict[str, float]]:
+    """All rows."""
+    simulation = Simulation(scene_from_dict(values))
+    try:
+        return [dict(step.row) for step in simulation.steps()]
+    finally:
+        simulation.close()
+
+
+def rest(cases: Any = (), **changes: Any) -> np.ndarray:
+    """Angles inside, half-way and outside, once the cells rest."""
+    row = simulated(artery(cases, end=400.0, columns=ANGLES, **changes))[-1]
+    return np.array([row[name] for name in ANGLES])
+
+
+# ---------------------------------------------------------------- cases that are none
+@pytest.mark.parametrize("law, coupling", LAWS)
+def test_one_case_is_none_to_the_last_bit(law: str, coupling: str) -> None:
+    remodeling = {"law": law, "coupling": coupling}
+    plain, one = (simulated(artery(cases, remodeling=remodeling)) for cases in ((), [{"weight": 1.0}]))
+    for row, other in zip(plain, one, strict=True):
+        assert {**row, "seconds": 0} == {**other, "seconds": 0}
+
+
+@pytest.mark.parametrize("mean", ["tensor", "target", "largest"])
+@pytest.mark.parametrize("law, coupling", LAWS)
+def test_two_equal_halves_are_none_to_rounding(law: str, coupling: str, mean: str) -> None:
+    if mean == "target" and law != "tensor":
+        pytest.skip("it has no target")
+    remodeling = {"law": law, "coupling": coupling}
+    plain = simulated(artery((), remodeling=remodeling))
+    halves = simulated(artery(HALVES, remodeling=remodeling | {"mean": mean}))
+    for row, other in zip(plain, halves, strict=True):
+        for name in row.keys() - {*COUNTED}:
+            assert other[name] == pytest.approx(row[name], rel=TURNS, abs=TURNS, nan_ok=True), name
+        for name in ("pressure", "axial_elongation", "inner_radius", "stored_energy", "max_chain_extension"):
+            assert other[f"{name}@2"] == pytest.approx(row[name], rel=TURNS, abs=TURNS), name
+    assert not [name for name in plain[0] if "@" in name]
+    assert not {"time@2", "fibre_angle_inner@2", "seconds@2", "remodeling_power@2"} & halves[0].keys()
+
+
+# ---------------------------------------------------------------- cases that differ
+def test_against_an_independent_program() -> None:
+    """Two states on one radius, solved and remodeled by a program that shares no code (law tensor, staggered)."""
+    weights, factors, end, step, kappa = (2 / 3, 1 / 3), (0.7, 1.6), 60.0, 2.0, 0.025
+    tube = Tube(1.0, 3.0, 12, RadialMaterial())
+    radii = [tube.nodes.copy() for _ in factors]
+    squares = np.full((len(tube.points), 3), 1 / 3)
+    old = [(squares, 0.0, 1.0) for _ in factors]
+    rows = []
+    for time in np.arange(step, end + step / 2, step):
+        share, stresses = min(time / 24.0, 1.0), []
+        for k, factor in enumerate(factors):
+            new = (squares, 4.8 * share * factor, 1 + 0.1 * share)
+            radii[k], old[k] = tube.advance(radii[k], old[k], new), new
+            stresses.append(cauchy_stress(tube.stretches(radii[k], new[2]), squares, tube.material))
+        rows.append([value for r in radii for value in (r[0], r[-1])])
+        mean = sum(weight * stress for weight, stress in zip(weights, stresses, strict=True))
+        squares = structure(squares, mean, kappa * step, 1.0)
+    cases = [{"weight": w, "loads": {"pressure": f}} for w, f in zip(weights, factors, strict=True)]
+    simulation = Simulation(scene_from_dict(artery(
+        cases, end, remodeling={"coupling": "staggered"}, material={"repulsion": "log"}
+    )))  # fmt: skip
+    found = [step.row for step in simulation.steps()]
+    simulation.close()
+    names = ("inner_radius", "outer_radius", "inner_radius@2", "outer_radius@2")
+    np.testing.assert_allclose([[row[name] for name in names] for row in found], rows, rtol=5e-4)
+    assert found[-1]["inner_radius@2"] > found[-1]["inner_radius"] + 0.05
+    order = np.argsort(simulation.quadrature.coordinates[..., 0].ravel())
+    cells, local = simulation.cells, simulation.cells.local_axes.axes
+    around = np.einsum("epa,epab,epb->ep", local[..., 0, :], cells.structure_tensor(), local[..., 0, :]).ravel()[order]
+    depth = simulation.quadrature.coordinates[..., 0].ravel()[order]
+    expected = np.interp(depth, tube.points, squares[:, CIRCUMFERENTIAL])
+    np.testing.assert_allclose(around, expected, atol=5e-3)
+
+
+def test_which_case_is_first_changes_no_cell() -> None:
+    first, second = pulse(0.4)
+    one, two = simulated(artery([first, second])), simulated(artery([second, first]))
+    for row, other in zip(one, two, strict=True):
+        for name in (*ANGLES, "inner_radius@2", "pressure@2"):
+            assert other[name.removesuffix("@2")] == pytest.approx(row[name], rel=TURNS, abs=TURNS, nan_ok=True)
+    assert one[-1]["pressure@2"] == pytest.approx(1.8 * 4.8) and one[-1]["pressure"] == pytest.approx(0.6 * 4.8)
+
+
+def test_a_pulse_is_seen_as_its_mean() -> None:
+    """The figures of docs/cycles.md: a normal pulse does not count, axial excursions and the largest tension do."""
+    mean = rest()
+    assert rest(pulse(0.1))[1] - mean[1] == pytest.approx(0.6, abs=0.3)
+    assert rest(pulse(0.33))[1] - mean[1] == pytest.approx(6.1, abs=1.0)
+    assert rest(pulse(0.2)) - mean == pytest.approx([0.0, 2.5, 0.5], abs=0.5)
+    axial = [{"weight": 0.5, "loads": {"elongation": 0.0}}, {"weight": 0.5, "loads": {"elongation": 2.0}}]
+    assert rest(axial)[1] - mean[1] > 6.0
+    assert rest(axial, remodeling={"mean": "target"})[1] - mean[1] == pytest.approx(-14.8, abs=1.0)
+
+
+def test_the_largest_tension_of_a_pulse_is_that_of_systole() -> None:
+    """More pressure is more tension at every point: as if systole never ended."""
+    largest = rest(pulse(0.1), remodeling={"mean": "largest"})
+    assert largest == pytest.approx(rest(pressure=1.2 * 4.8), abs=1e-6)
+    assert largest[1] < rest()[1] - 5.0
+
+
+def test_with_residual_stress_the_mean_is_enough() -> None:
+    natural = {"opening_angle": 120.0}
+    assert rest(pulse(0.2), natural=natural) - rest(natural=natural) == pytest.approx(0.0, abs=0.3)
+
+
+# ---------------------------------------------------------------- means of drives
+def drives(turns: Rotation) -> list[Drive]:
+    """Two states of three points; each deformed body turned by a rotation of its own."""
+    random = np.random.default_rng(1)
+    F = np.eye(3) + 0.2 * random.standard_normal((2, 3, 3, 3))
+    stress = random.standard_normal((2, 3, 3, 3))
+    stress = stress + np.swapaxes(stress, -1, -2)
+    Q = turns.as_matrix()
+    return [
+        Drive(q @ f, q @ s @ q.T, DRIVERS["cauchy"], FRAMES["material"], 1e-9, np.ones((3, 3)), 1.0, 1.0)
+        for q, f, s in zip(Q, F, stress, strict=True)
+    ]
+
+
+def test_the_mean_is_objective_and_weighted() -> None:
+    """However the bodies of the cases are turned in space."""
+    weights = (0.3, 0.7)
+    none = Rotation.from_rotvec(np.zeros((2, 3)))
+    turned = Rotation.from_rotvec([[0.3, 2.0, -1.0], [1.0, 0.2, 0.4]])
+    one, two = (mean_tensor(drives(turns), weights) for turns in (none, turned))
+    np.testing.assert_allclose(two.tensor, one.tensor, atol=1e-12)
+    assert one.driver.material and one.driver.is_stress
+    for pick in (0, 1):
+        alone = mean_tensor(drives(none), np.eye(2)[pick])
+        F, stress = drives(none)[pick].deformation_gradient, drives(none)[pick].tensor
+        u, _, v = np.linalg.svd(F)
+        R = u @ v
+        np.testing.assert_allclose(alone.tensor, np.swapaxes(R, 1, 2) @ stress @ R, atol=1e-12)
+
+
+def test_the_largest_tension_is_taken_point_by_point() -> None:
+    states = [drive._replace(driver=DRIVERS["pk2"]) for drive in drives(Rotation.identity(2))]
+    found = largest_tension(states, (0.9, 0.1)).tensor
+    tops = np.array([np.linalg.eigvalsh(state.tensor)[:, -1] for state in states])
+    assert {0, 1} == {*tops.argmax(axis=0)}
+    for point, case in enumerate(tops.argmax(axis=0)):
+        np.testing.assert_array_equal(found[point], states[case].tensor[point])
+
+
+def test_the_mean_of_targets_has_their_shares() -> None:
+    """One case without tension takes no part."""
+    pulled = target(np.diag([1.0, 0.5, -0.1])[None], 1e-9)
+    nothing = Target(np.zeros((1, 3, 3)), np.zeros(1))
+    mean = mean_target([pulled, nothing], (0.25, 0.75))
+    np.testing.assert_allclose(mean.direction, pulled.direction, atol=1e-15)
+    assert mean.share == pytest.approx(0.25 * pulled.share)
+
+
+# ---------------------------------------------------------------- runs
+def test_a_run_goes_on_with_all_cases(tmp_path: Path) -> None:
+    """Two parts are the whole, to the last digit."""
+    (tmp_path / "scene.toml").write_text(scene_from_dict(artery(pulse(0.4), 20.0)).to_toml())
+    command = ["run", str(tmp_path / "scene.toml"), "-q", "--set", "output.report=false"]
+    assert cli.main([*command, "-o", str(tmp_path / "all")]) == 0
+    assert cli.main([*command, "-o", str(tmp_path / "run"), "--set", "time.end=10"]) == 0
+    assert cli.main(["run", "--resume", str(tmp_path / "run"), "--set", "time.end=20", "-q"]) == 0
+    tables = [(tmp_path / name / "history.csv").read_text().splitlines() for name in ("run", "all")]
+    seconds = tables[0][0].split(",").index("seconds")
+    rows = [[line.split(",") for line in table] for table in tables]
+    assert [row[:seconds] + row[seconds + 1 :] for row in rows[0]] == [
+        row[:seconds] + row[seconds + 1 :] for row in rows[1]
+    ]
+    assert "inner_radius@2" in rows[0][0]
+    assert cli.main(["run", "--resume", str(tmp_path / "run"), "--set", "cases=[]", "-q"]) == 2
+
+
+def test_a_case_that_is_not_solved_takes_the_step_back() -> None:
+    """In all cases; the message names it."""
+    values = artery(
+        [{"weight": 0.9}, {"weight": 0.1, "loads": {"elongation": 40.0}}],
+        remodeling={"law": "none", "coupling": "staggered"},
+    )
+    simulation = Simulation(scene_from_dict(values | {"solver": {"maximum_halvings": 1}}))
+    states, before = list(simulation.state.cases().values()), []
+    with pytest.raises(StepFailure, match="load case 2: no equilibrium at time"):
+        for step in simulation.steps():
+            before = [(state.unknown.x.array.copy(), dict(state.loading.values), state.time) for state in states]
+    simulation.close()
+    for state, (unknown, loads, time) in zip(states, before, strict=True):
+        np.testing.assert_array_equal(state.unknown.x.array, unknown)
+        assert (state.loading.values, state.time) == (loads, time)
+    assert before[0][1] != before[1][1] and before[0][2] > 0
+
+
+CUBE = {
+    "geometry": {"shape": "cube"}, "time": {"end": 4.0}, "model": {"kinematics": "full"},
+    "loads": {"force": {"value": 2.0, "ramp": [[0.0, 0.0], [2.0, 1.0]]}},
+    "preset": "consistent", "solver": {"method": "direct", "relative_tolerance": 1e-13},
+    "cases": [{"weight": 0.6, "loads": {"force": 0.5}}, {"weight": 0.4, "loads": {"force": 1.75}}],
+}  # fmt: skip
+ON_ONE_AND_TWO_RANKS = [{"scene": CUBE}]
+
+
+def test_one_and_two_ranks_agree(cases: Any) -> None:
+    """Random cells in three dimensions."""
+    (one,), (two,) = (cases(ON_ONE_AND_TWO_RANKS, ranks) for ranks in (1, 2))
+    np.testing.assert_allclose(two["l"], one["l"], atol=1e-9)
+    np.testing.assert_allclose(two["mean_stretch@2"], one["mean_stretch@2"], rtol=1e-9)
+    assert one["mean_stretch@2"][-1] > one["mean_stretch"][-1] + 0.01
+
+
+# ---------------------------------------------------------------- refusals
+@pytest.mark.parametrize(
+    ("tables", "words"),
+    [
+        ({"cases": [{"weight": 0.5}, {"weight": 0.4}]}, r"cases\[1\].weight = 0.4: .* sum to 0.9; they must sum to 1"),
+        ({"cases": [{"weight": 0.5}]}, r"cases\[0\].weight = 0.5: .* they must sum to 1"),
+        ({"cases": [{"weight": 1.5}]}, r"cases\[0\].weight = 1.5: must be"),
+        ({"cases": [{}]}, r"cases\[0\].weight: missing"),
+        ({"cases": [{"weight": 1.0, "loads": {"force": 2.0}}]}, r"cases\[0\].loads.force = 2.0: no such load; the"),
+        ({"cases": [{"weight": 1.0, "pressure": 2.0}]}, r"cases\[0\].pressure = 2.0: unknown key"),
+        ({"cases": [{"weight": 1.0, "loads": {"elongation": -20.0}}]}, "loads.elongation.value = 0.1: must be greater"),
+        ({"cases": {"weight": 1.0}}, r"cases = .*: must be a list of tables, each \[\[cases\]\]"),
+        ({"remodeling": {"mean": "target"}, "cases": []}, "remodeling.mean = 'target': needs"),
+        ({"remodeling": {"mean": "median"}}, "remodeling.mean = 'median': allowed are"),
+        ({"remodeling": {"law": "explicit", "coupling": "staggered", "mean": "target"}}, "with a target: 'tensor'"),
+        ({"remodeling": {"coupling": "implicit"}}, "remodeling.coupling = 'implicit'"),
+        ({"remodeling": {"turnover": {"time": 40.0}}}, "remodeling.turnover: goes with one load case alone"),
+        ({"time": {"end": 30.0, "tolerance": 1.0}}, "time.tolerance = 1.0: goes with one"),
+        ({"time": {"end": "equilibrium"}}, "time.end = 'equilibrium': goes with one"),
+        ({"geometry": {"shape": "tube", "is": "loaded"}}, "geometry.is = 'loaded': goes without"),
+    ],
+)
+def test_what_has_no_cases_is_refused(tables: dict[str, Any], words: str) -> None:
+    with pytest.raises(SceneError, match=words) as refused:
+        scene_from_dict(artery(HALVES) | tables)
+    assert "\n" not in str(refused.value)
