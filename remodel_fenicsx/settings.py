@@ -491,7 +491,7 @@ class CouplingKind:
     coupling: Callable[..., Any] | str
     makes_a_share: bool = False
     needs_a_target: bool = False
-    takes_cases: bool = True
+    takes_cases: bool = False
 
     @property
     def make(self) -> Callable[..., Any]:
@@ -501,25 +501,28 @@ class CouplingKind:
 
 COUPLINGS = {
     "staggered": CouplingKind(
-        "solve with the cells of the step before, then remodel once", "remodel_fenicsx.evolution.coupling:Staggered"
+        "solve with the cells of the step before, then remodel once",
+        "remodel_fenicsx.evolution.coupling:Staggered",
+        takes_cases=True,
     ),
     "relaxed": CouplingKind(
         "the same with a share, relaxation_factor, of what the pass changes: half of it is stable for every driver and "
         "frame but under weak loads, where 'staggered' over-corrects with 'pk2' and 'finger'",
         "remodel_fenicsx.evolution.coupling:Relaxed",
         makes_a_share=True,
+        takes_cases=True,
     ),
     "extrapolated": CouplingKind(
         "remodel first, towards the stress of the middle of the step, extrapolated from the two steps before; then "
         "solve: of second order, for the law 'tensor'",
         "remodel_fenicsx.evolution.extrapolated:Extrapolated",
         needs_a_target=True,
+        takes_cases=True,
     ),
     "implicit": CouplingKind(
         "the cells belong to the stress of the same step: Newton's method on both, for the law 'tensor' (with a "
         "repulsion that sees no axes) and the laws of the paper",
         "remodel_fenicsx.evolution.implicit:Implicit",
-        takes_cases=False,
     ),
 }
 """Couplings by the name that a scene gives them."""

@@ -119,18 +119,20 @@ class Simulation:
             from remodel_fenicsx.evolution.turnover import turned_over
 
             tissue = turned_over(tissue, self.state)
+        self._cases: list[Any] = []  # further ones (`OtherCase`)
         at_once = scene.time.is_equilibrium
         predictor: str = scene.solver.predictor
         if (at_once or scene.time.tolerance is not None) and predictor != "none":
             predictor = "responsive"  # steps have all lengths
         solver = scene.solver.model_copy(update={"predictor": predictor})
         parts = self.state, tissue, scene.remodeling, solver, self.load_values
-        self.stepper = Stepper(*parts, self._at_once(tissue, solver, kappa) if at_once else coupling, kappa)
+        if others and coupling is not None:
+            raise SceneError("cases: a coupling of one's own solves one load case alone; leave out [[cases]]")
+        make = self._at_once(tissue, solver, kappa, others) if at_once else coupling
+        self.stepper = Stepper(*parts, make, kappa)
         self.tissue = self.stepper.tissue
-        if scene.cases[1:]:
-            if coupling is not None:
-                raise SceneError("cases: a coupling of one's own solves one load case alone; leave out [[cases]]")
-            self._join_cases(others, solver, kappa)
+        if others:
+            self._join_cases(self.stepper, others, solver, kappa)
         counted = "negative_eigenvalues" in scene.output.columns
         self.stability = EquilibriumStability(self.stepper, scene.solver.unstable, every_step=counted)
         more: list[str] = []
@@ -163,7 +165,7 @@ class Simulation:
             if self.stepper.remodeling.law.of_absolute_time:
                 self.warnings.append(RestedCells(self.stepper, over_correction))
 
-    def _at_once(self, tissue: Tissue, solver: Solver, kappa: Any) -> Maker:
+    def _at_once(self, tissue: Tissue, solver: Solver, kappa: Any, others: Sequence[State]) -> Maker:
         """The coupling that goes to the equilibrium, with the steps of a stepper of its own on the same state."""
         from remodel_fenicsx.evolution import homeostasis
         from remodel_fenicsx.evolution.step_control import StepControl
@@ -177,6 +179,8 @@ class Simulation:
             # cells that jump from rank to rank: no step is short enough, and passes swing
             settings, tolerance = settings.model_copy(update={"coupling": "relaxed"}), homeostasis.COARSE
         way = Stepper(self.state, tissue, settings, solver, self.load_values, kappa=kappa)
+        if others:
+            self._join_cases(way, others, solver, kappa)
         way.coupling.longest = min(way.coupling.longest, homeostasis.LONGEST)
         control = StepControl(way, tolerance, scene.time.step, stops)
         until = scene.solver.model_copy(update={"maximum_iterations": homeostasis.LIMIT_ITERATIONS})
@@ -193,14 +197,17 @@ class Simulation:
         loads = self._loads[case].items()
         return {name: load.value * load.factor(time) for name, load in loads}
 
-    def _join_cases(self, states: Sequence[State], solver: Solver, kappa: Any) -> None:
-        """Further load cases, on the same cells."""
-        from remodel_fenicsx.evolution.load_cases import OtherCase, join
+    def _join_cases(self, stepper: Stepper, states: Sequence[State], solver: Solver, kappa: Any) -> None:
+        """Further load cases, on the same cells: the stepper follows them too, and the first that comes solves them."""
+        from remodel_fenicsx.evolution.load_cases import OtherCase, follow, join
 
+        weights = [case.weight for case in self.scene.cases]
+        if self._cases:
+            return follow(stepper, self._cases, weights)
         values = [partial(self.load_values, case=index) for index in range(1, len(self._loads))]
         parts = zip(states, values, strict=True)
-        others = [OtherCase(n, *part, self.stepper, solver, kappa) for n, part in enumerate(parts, start=2)]
-        join(self.stepper, others, [case.weight for case in self.scene.cases])
+        self._cases = [OtherCase(n, *part, stepper, solver, kappa) for n, part in enumerate(parts, start=2)]
+        join(stepper, self._cases, weights)
 
     def steps(self, watchers: Sequence[Watcher] = ()) -> Iterator[Step]:
         """Solve and remodel step by step, from where the state is; what is yielded has been accepted.

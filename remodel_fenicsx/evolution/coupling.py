@@ -91,6 +91,7 @@ class Staggered:
         self._last = Numbers(state, "last_solution", {"extension": 0.0})  # its largest r/L
         self.share, self.compares, self.residual = 1.0, False, 0.0
         self.others: Sequence[Any] = ()
+        self.tangents = 0  # that were assembled in the last solve of the state itself
         self.blend: Blend | None = None
         if remodeling.law.remodels:  # now, for no form is compiled in the middle of a run
             self.blend = Blend(state, tissue, settings)
@@ -119,6 +120,7 @@ class Staggered:
         self.residual = work.residual
         work.extension = work.extension or self.equilibrium.extension()
         self._last["extension"] = work.extension.max_chain_extension
+        self.tangents = work.tangents
         for case in self.others:
             work.count(case.solve(time))
         return work

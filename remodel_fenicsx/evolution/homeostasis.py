@@ -85,7 +85,7 @@ class Homeostasis:
     """
 
     order, accumulates, longest, share, better = 1, True, math.inf, 1.0, None
-    others: Sequence[Any] = ()  # it takes no load cases
+    others: Sequence[Any] = ()  # its way solves further load cases
 
     def __init__(self, way: StepControl, remodeling: RemodelingPass, held_from: float, limit: Limit | None):
         self.way, self.remodeling, self.held_from, self.limit = way, remodeling, held_from, limit
@@ -119,8 +119,9 @@ class Homeostasis:
             log.info("the cells have a front, and its place depends on the way: it is gone again with the tolerance")
             state.restore(self._held)
             self._go(time, loads, max(start, self.held_from), False, work)
-        state.time, state.number = start, number
-        state.settle_cells()
+        state.reach(start, number)
+        for case in state.cases().values():
+            case.settle_cells()
         self._residual = work.residual
         return work
 

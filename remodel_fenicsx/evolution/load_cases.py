@@ -47,7 +47,7 @@ class OtherCase:
         self.number, self.state, self.load_values = number, state, load_values
         self.remodeling = RemodelingPass(state, stepper.tissue, stepper.remodeling.settings, kappa)
         self.coupling = Staggered(state, stepper.tissue, self.remodeling, solver)
-        self.coupling.equilibrium.stop_signal = lambda: stepper.stop_signal()
+        self.coupling.equilibrium.stop_signal = lambda: stepper.coupling.equilibrium.stop_signal()
         self.cases: Sequence[OtherCase] = ()
 
     def solve(self, time: float) -> Work:
@@ -85,8 +85,16 @@ def join(stepper: Stepper, cases: Sequence[OtherCase], weights: Sequence[float])
     weights
         Shares of time, the first case's first.
     """
-    stepper.cases = stepper.coupling.others = list(cases)
+    stepper.coupling.others = list(cases)
     stepper.state.others = [case.state for case in cases]
+    follow(stepper, cases, weights)
+
+
+def follow(stepper: Stepper, cases: Sequence[OtherCase], weights: Sequence[float]) -> None:
+    """The stepper's pass follows the mean of these cases too, whoever solves them."""
+    stepper.cases = list(cases)
+    if stepper.turnover is not None:
+        stepper.turnover.weights = tuple(weights)
     if stepper.remodeling.law.remodels:
         stepper.remodeling.others = [case.drive for case in cases]
         stepper.remodeling.weights = tuple(weights)

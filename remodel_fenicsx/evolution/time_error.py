@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -145,8 +147,10 @@ class TimeError:
 
     def _held(self, step: Step) -> bool:
         """Whether no load has changed over the step."""
-        before = self.stepper.load_values(self.state.time)
-        return all(step.loads.get(name) == value for name, value in before.items())
+        time = self.state.time
+        return _same(self.stepper.load_values(time), step.loads) and all(
+            _same(case.load_values(time), case.state.loading.values) for case in self.stepper.cases
+        )
 
     # ------------------------------------------------------------ distances
     def _angle(self, row: UnitCell, better: UnitCell) -> float:
@@ -155,12 +159,26 @@ class TimeError:
         return float(np.sqrt(self.quadrature.mean(apart**2)))
 
     def _strain(self, step: Step, cells: UnitCell) -> tuple[float, bool]:
-        """Give the body other cells, and let it answer: the largest change of a length, and whether that is a state."""
-        state, shape = self.state, self.quadrature.shape
-        before = state.elastic_gradient()
-        state.cells.set(cells.dimensions.reshape(*shape, 3), cells.axes.reshape(*shape, 3, 3))
-        equilibrium, newton = self.stepper.coupling.equilibrium, self.stepper.coupling.newton
-        state.unknown.x.array[:] += newton.answer(equilibrium, step.work.tangents)
+        """Give the body other cells, and let it answer: the largest change of a length, and whether that is a state.
+
+        In all load cases.
+        """
+        shape, cases = self.quadrature.shape, self.stepper.cases
+        before = [case.state.elastic_gradient() for case in (self.stepper, *cases)]
+        self.state.cells.set(cells.dimensions.reshape(*shape, 3), cells.axes.reshape(*shape, 3, 3))
+        tangents = [case.coupling.tangents for case in (self.stepper, *cases)] if cases else [step.work.tangents]
+        found = [self._answered(*parts) for parts in zip((self.stepper, *cases), before, tangents, strict=True)]
+        return max(strain for strain, _ in found), all(admissible for _, admissible in found)
+
+    def _answered(self, case: Any, before: Array, tangents: int) -> tuple[float, bool]:
+        """Of one load case, a stepper or what is one to those who look on; `before`: its F_e."""
+        state, equilibrium = case.state, case.coupling.equilibrium
+        state.unknown.x.array[:] += case.coupling.newton.answer(equilibrium, tangents)
         after, admissible = state.elastic_gradient(), equilibrium.extension().admissible
-        changes = np.minimum(largest_change_of_length(before, after), LARGEST_LINEAR_CHANGE).reshape(shape)
-        return float(np.degrees(self.quadrature.maximum(changes))), admissible
+        changes = np.minimum(largest_change_of_length(before, after), LARGEST_LINEAR_CHANGE)
+        strain = self.quadrature.maximum(changes.reshape(self.quadrature.shape))
+        return float(np.degrees(strain)), admissible
+
+
+def _same(before: Mapping[str, float], loads: Mapping[str, float]) -> bool:
+    return all(loads.get(name) == value for name, value in before.items())

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from remodel_fenicsx.model.energy import TURNED_OVER, Tissue
-from remodel_fenicsx.model.turnover import rates
+from remodel_fenicsx.model.turnover import TurnoverRates, rates
 from remodel_fenicsx.settings import Turnover
 from remodel_fenicsx.state.memory import Numbers
 from remodel_fenicsx.state.parameters import Parameters, on_mesh
@@ -49,19 +50,28 @@ class TurnoverPass:
         self.tissue = on_mesh(tissue, self.quadrature.mesh)
         self._parameters = Parameters(self.tissue, self.quadrature)
         self._numbers = Numbers(state, "turnover", {"said": 0})
+        self.weights: Sequence[float] = (1.0,)  # of the load cases, that of `state` first
 
     def apply(self, duration: float) -> None:
-        """A step with the rates of the solved state: m and rho change by exp(rate * duration)."""
-        cells = self.state.equilibrium_cells
-        squared = cells.kernels.squared_length(self.state.elastic_gradient(), cells.point_cells)
-        given = self.settings.time or np.inf, self.settings.deposition_stretch, self.settings.gain
-        found = rates(self._parameters.at_points(), np.sqrt(squared), *given)
+        """A step with the rates of the solved state: m and rho change by exp(rate * duration).
+
+        With several load cases: with the weighted mean of the rates in each.
+        """
+        parts = [self._rates(state) for state in (self.state, *self.state.others)]
+        found = TurnoverRates(*(sum(w * values for w, values in zip(self.weights, part)) for part in zip(*parts)))
         changes = found.content * duration, np.clip(
             found.natural_length * duration, -LARGEST_TURNOVER, LARGEST_TURNOVER
         )
         for name, change in zip(TURNED_OVER, changes, strict=True):
             getattr(self.tissue, name).x.array[:] *= np.exp(change)
         self._warn()
+
+    def _rates(self, state: State) -> TurnoverRates:
+        """In one load case."""
+        cells = state.equilibrium_cells
+        squared = cells.kernels.squared_length(state.elastic_gradient(), cells.point_cells)
+        given = self.settings.time or np.inf, self.settings.deposition_stretch, self.settings.gain
+        return rates(self._parameters.at_points(), np.sqrt(squared), *given)
 
     def mean(self, name: str) -> float:
         """Volume mean of `content` or `natural_length`."""

@@ -243,6 +243,7 @@ def facts(run: ReportedRun) -> Card:
         ("Supports", f"ends {scene.supports.ends}"),
         ("Cells", f"{cells}{seed}, axes {scene.cells.axes}"),
         ("Loads", loads or "none"),
+        *([("Load cases", _load_cases(scene))] if scene.cases else []),
         ("Material", scene.summary()),
         ("Remodeling", f"law {remodeling.law}, driver {remodeling.driver}, frame {remodeling.frame}, "
                        f"coupling {remodeling.coupling}, kappa {kappa}"),
@@ -257,6 +258,16 @@ def _by_region(scene: Scene, in_words: Callable[[Properties], str]) -> str:
     if len(set(found.values())) == 1:
         return next(iter(found.values()))
     return "; ".join(f"{name or 'elsewhere'}: {text}" for name, text in found.items())
+
+
+def _load_cases(scene: Any) -> str:
+    """Weight and factors of each."""
+    factors = (
+        ", ".join(f"{words(name)} times {factor:g}" for name, factor in case.loads.items()) for case in scene.cases
+    )
+    return "; ".join(
+        f"{case.weight:.3g} of the time{': ' if f else ''}{f}" for case, f in zip(scene.cases, factors, strict=True)
+    )
 
 
 def _cells(properties: Properties) -> str:

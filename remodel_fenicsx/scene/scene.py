@@ -324,7 +324,7 @@ class Scene(Table):
             last = len(self.cases) - 1
             rule = f"the weights of all cases sum to {total:.10g}; they must sum to 1"
             raise fault(rule, f"cases[{last}].weight", self.cases[last].weight)
-        remodeling, time = self.remodeling, self.time
+        remodeling = self.remodeling
         if remodeling.mean != "tensor" and not self.cases:
             raise fault("needs [[cases]]", "remodeling.mean", remodeling.mean)
         if MEANS_OF_CASES[remodeling.mean].of_targets and LAWS[remodeling.law].target is None:
@@ -332,17 +332,9 @@ class Scene(Table):
             raise fault(f"needs a remodeling.law with a target: {able}", "remodeling.mean", remodeling.mean)
         if self.cases and self.geometry.is_loaded:
             raise fault("goes without [[cases]]: the loaded shape has one set of loads", "geometry.is", "loaded")
-        if not self.cases[1:]:
-            return
-        refused: list[tuple[bool, str, Any]] = [
-            (not COUPLINGS[remodeling.coupling].takes_cases, "remodeling.coupling", remodeling.coupling),
-            (remodeling.turnover.is_on, "remodeling.turnover", None),
-            (time.tolerance is not None, "time.tolerance", time.tolerance),
-            (time.is_equilibrium, "time.end", time.end),
-        ]
-        for is_asked, key, value in refused:
-            if is_asked:
-                raise fault("goes with one load case alone, and there are several [[cases]]", key, value)
+        if self.cases[1:] and not COUPLINGS[remodeling.coupling].takes_cases:
+            able = ", ".join(repr(name) for name, kind in COUPLINGS.items() if kind.takes_cases)
+            raise fault(f"with [[cases]] must be one of: {able}", "remodeling.coupling", remodeling.coupling)
 
     def properties(self) -> dict[str, Properties]:
         """What holds in each region by its name, and under "" what holds beside them, where there may be anything."""

@@ -79,6 +79,7 @@ class State:
         self._natural = getattr(kinematics, "gradient", None)  # G, of a body that is free of stress elsewhere
         self._deformation_gradient = jit.expression(F, cells.quadrature.points)
         self.equilibrium_cells = CellField(cells.quadrature, "equilibrium_cell")
+        self.others: Sequence[State] = ()
         self.settle_cells()
         solved = self.equilibrium_cells
         self._functions: dict[str, Any] = {}
@@ -88,7 +89,6 @@ class State:
         self.time, self.number = 0.0, 0
         self.numbers: dict[str, float] = {}
         self.counts: dict[str, str] = {}
-        self.others: Sequence[State] = ()
         # the body starts unloaded; a load that is there from t = 0 on comes with the first step
         loading.set(dict.fromkeys(loading.values, 0.0))
 
