@@ -146,7 +146,8 @@ class EveryTangent:
     def factorisation(self) -> Any | None:
         """PETSc's preconditioner with the factors of the last tangent; None where there are none."""
         preconditioner = self.snes.getKSP().getPC()
-        return preconditioner if preconditioner.getType() in ("lu", "cholesky", "telescope") else None
+        has_factors = self.tangents and preconditioner.getType() in ("lu", "cholesky", "telescope")
+        return preconditioner if has_factors else None
 
     def close(self) -> None:
         """Free PETSc's objects."""

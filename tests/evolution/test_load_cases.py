@@ -168,7 +168,16 @@ def test_chosen_steps_look_at_all_cases(law: str, coupling: str) -> None:
     fine["time"] = {"end": 60.0, "step": 0.25}
     short = simulated(fine)
     for name in ("inner_radius", "outer_radius@2", "fibre_angle_outer"):
-        assert chosen[-1][name] == pytest.approx(short[-1][name], rel=5e-3), name
+        assert chosen[-1][name] == pytest.approx(short[-1][name], rel=5e-3, abs=0.5 if "angle" in name else 0.0), name
+
+
+def test_which_case_is_first_changes_no_step() -> None:
+    """The estimated error is that of the case that is worst."""
+    tables = {"time": {"end": 40.0, "step": 2.0, "tolerance": 0.5}, "remodeling": {"coupling": "staggered"}}
+    first, second = pulse(0.6)
+    one, two = simulated(artery([first, second], **tables)), simulated(artery([second, first], **tables))
+    for name in ("time", "time_error"):
+        assert [row[name] for row in two] == pytest.approx([row[name] for row in one], rel=1e-6, abs=1e-9), name
 
 
 def test_a_case_whose_loads_change_is_not_held() -> None:
@@ -200,14 +209,14 @@ def test_the_equilibrium_of_a_cycle_is_that_of_a_long_march() -> None:
 
 
 def test_turnover_has_the_mean_rates_of_all_cases() -> None:
-    """Equal halves are none; after one step ln m is the mean of what each case alone has, for the cells are the same."""
+    """Equal halves are none. After one step ln m is the mean of what each case alone has: their cells are the same."""
     turnover = {"time": 40.0, "deposition_stretch": 1.1, "gain": 1.0}
     columns = ["content", "natural_length", "inner_radius", *ANGLES]
     tables = {"remodeling": {"turnover": turnover, "coupling": "staggered"}, "columns": columns}
     plain, halves = simulated(artery((), **tables)), simulated(artery(HALVES, **tables))
     for name in columns:
         assert halves[-1][name] == pytest.approx(plain[-1][name], rel=TURNS, abs=TURNS), name
-    assert abs(plain[-1]["content"] - 1) > 0.05
+    assert abs(plain[-1]["content"] - 1) > 0.01
     changes = []
     for cases in (pulse(0.33), *([case | {"weight": 1.0}] for case in pulse(0.33))):
         simulation = Simulation(scene_from_dict(artery(cases, end=2.0, **tables)))
@@ -221,7 +230,8 @@ def test_turnover_has_the_mean_rates_of_all_cases() -> None:
 
 def test_kinematics_agree() -> None:
     """One radius, and a half-plane of closed ends: each case has a length of its own."""
-    loads = {"pressure": {"value": 4.8, "ramp": [[0.0, 0.0], [8.0, 1.0]]}}
+    ramp = [[0.0, 0.0], [8.0, 1.0]]
+    loads = {"pressure": {"value": 4.8, "ramp": ramp}, "elongation": {"value": 0.0, "ramp": ramp}}
     base = {"loads": loads, "supports": {"ends": "closed"}, "time": {"end": 16.0, "step": 4.0}}
     one, two = (
         simulated(artery(pulse(0.33), **base, mesh={"degree": 2}, model={"kinematics": name}))[-1]
