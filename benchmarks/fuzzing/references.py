@@ -74,11 +74,12 @@ def broken(scene: Values, run: Run) -> list[str]:
     if np.nanmax(history["max_chain_extension"]) >= 1 or np.nanmin(history["min_jacobian"]) <= 0:
         found.append("r >= L or J <= 0")
     found_length = scene["supports"]["ends"] == "closed" or "axial_force" in scene["loads"]
+    first = scene.get("cases", [{}])[0].get("loads", {})  # columns are those of the first case
     for name, load in scene["loads"].items() if end != "equilibrium" else ():
         if name == "elongation" and found_length:
             continue
         column = history.get("axial_elongation" if name == "elongation" else name, np.full(len(times), np.nan))
-        asked = load["value"] * factor(load["ramp"], times)
+        asked = load["value"] * first.get(name, 1.0) * factor(load["ramp"], times)
         near = 1e-4 if name == "axial_force" else 1e-9  # the one is that of the wall, as solved
         if np.nanmax(np.abs(column - asked)[1:], initial=0.0) > near * max(map(abs, asked)):
             found.append(f"{name} is not its ramp")

@@ -254,13 +254,12 @@ def _rarely(random: Random, scene: Values, stiffness: float) -> None:
     if turns and plain and not locked and scene["material"]["chain_density"] and random.random() < 0.2:
         numbers = {"time": rounded(random.uniform(20, 80)), "deposition_stretch": rounded(random.uniform(1.02, 1.2))}
         scene["remodeling"]["turnover"] = numbers | {"gain": rounded(random.uniform(0.5, 2))}
-    if "profile" not in scene and scene["remodeling"]["coupling"] != "implicit":
-        _cases(random, scene)
-    alone = scene["supports"]["ends"] != "clamped" and "cases" not in scene
-    if _closes_from_a_sector(scene) and alone and random.random() < 0.05:
+    if _closes_from_a_sector(scene) and scene["supports"]["ends"] != "clamped" and random.random() < 0.05:
         scene["geometry"]["is"] = "loaded"
         if scene["time"]["end"] == "equilibrium":
             scene.setdefault("natural", {})["cells"] = "equilibrium"
+    if "profile" not in scene and "is" not in scene["geometry"] and scene["remodeling"]["coupling"] != "implicit":
+        _cases(random, scene)
 
 
 def _cases(random: Random, scene: Values) -> None:

@@ -176,8 +176,8 @@ class TimeError:
         state.unknown.x.array[:] += case.coupling.newton.answer(equilibrium, tangents)
         after, admissible = state.elastic_gradient(), equilibrium.extension().admissible
         changes = np.minimum(largest_change_of_length(before, after), LARGEST_LINEAR_CHANGE)
-        strain = self.quadrature.maximum(changes.reshape(self.quadrature.shape))
-        return float(np.degrees(strain)), admissible
+        changes = changes.reshape(self.quadrature.shape)
+        return float(np.degrees(self.quadrature.maximum(changes))), admissible
 
 
 def _same(before: Mapping[str, float], loads: Mapping[str, float]) -> bool:

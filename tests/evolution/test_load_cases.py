@@ -294,8 +294,10 @@ def test_the_mean_of_targets_has_their_shares() -> None:
 def test_a_run_goes_on_with_all_cases(tmp_path: Path) -> None:
     """Two parts are the whole, to the last digit."""
     (tmp_path / "scene.toml").write_text(scene_from_dict(artery(pulse(0.4), 20.0)).to_toml())
-    command = ["run", str(tmp_path / "scene.toml"), "-q", "--set", "output.report=false"]
+    command = ["run", str(tmp_path / "scene.toml"), "-q"]
     assert cli.main([*command, "-o", str(tmp_path / "all")]) == 0
+    page = (tmp_path / "all" / "report.html").read_text()
+    assert "0.667 of the time: pressure times 0.6; 0.333 of the time: pressure times 1.8" in page
     assert cli.main([*command, "-o", str(tmp_path / "run"), "--set", "time.end=10"]) == 0
     assert cli.main(["run", "--resume", str(tmp_path / "run"), "--set", "time.end=20", "-q"]) == 0
     tables = [(tmp_path / name / "history.csv").read_text().splitlines() for name in ("run", "all")]
