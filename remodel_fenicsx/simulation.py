@@ -113,7 +113,7 @@ class Simulation:
         self.state, *others = (
             unloaded_state(scene, u, k, self.cells, domain) for u, k in zip(unknowns, made, strict=True)
         )
-        self.loading, formulation = self.state.loading, FORMULATIONS[scene.mesh.formulation]
+        self.loading = self.state.loading
         tissue, kappa = parameters_of(properties, domain)
         if scene.remodeling.turnover.is_on:
             from remodel_fenicsx.evolution.turnover import turned_over
@@ -135,6 +135,7 @@ class Simulation:
             self._join_cases(self.stepper, others, solver, kappa)
         counted = "negative_eigenvalues" in scene.output.columns
         self.stability = EquilibriumStability(self.stepper, scene.solver.unstable, every_step=counted)
+        self._closing = [self.stability]
         more: list[str] = []
         self.control: Any = None  # `StepControl`
         if scene.time.tolerance is not None and not at_once:
@@ -148,22 +149,35 @@ class Simulation:
 
             self.stepper.judge = TimeError(self.stepper).measure
         self.observer = Observer(shape, self.stepper, scene.columns(more))
-        self.warnings: list[Watcher] = [
-            LockingWarning(self.stepper, formulation.locks),
-            VolumeLoss(self.stepper),
-            RadialChains(self.stepper, shape.radial_share),
-            FrontsInLayers(self.stepper, shape),
-        ]
-        strut = shape.strut(scene.supports.ends) if kinematics.reduced else None
-        if strut is not None:  # a whole body buckles by itself
-            from remodel_fenicsx.watch.buckling import BucklingWarning
+        self.warnings = self._of_the_state(self.stepper)
+        self.warnings += [RadialChains(self.stepper, shape.radial_share), FrontsInLayers(self.stepper, shape)]
+        if self._cases:
+            from remodel_fenicsx.evolution.load_cases import OtherCaseWatcher
 
-            self.warnings.insert(1, BucklingWarning(self.stepper, strut))
+            looked_at = [(case, EquilibriumStability(case, scene.solver.unstable)) for case in self._cases]
+            self._closing += [stability for _, stability in looked_at]
+            self.warnings += [
+                OtherCaseWatcher(case, one) for case, own in looked_at for one in (own, *self._of_the_state(case))
+            ]
         if self.stepper.remodeling.law.remodels and not at_once:
             over_correction = OverCorrection(self.stepper)
             self.warnings.insert(0, over_correction)
             if self.stepper.remodeling.law.of_absolute_time:
                 self.warnings.append(RestedCells(self.stepper, over_correction))
+
+    def _of_the_state(self, stepper: Any) -> list[Watcher]:
+        """What is said of solved states, whatever the cells do: of a stepper's, or another load case's."""
+        scene = self.scene
+        found: list[Watcher] = [
+            LockingWarning(stepper, FORMULATIONS[scene.mesh.formulation].locks),
+            VolumeLoss(stepper),
+        ]
+        strut = scene.geometry.strut(scene.supports.ends) if stepper.state.kinematics.reduced else None
+        if strut is not None:  # a whole body buckles by itself
+            from remodel_fenicsx.watch.buckling import BucklingWarning
+
+            found.insert(1, BucklingWarning(stepper, strut))
+        return found
 
     def _at_once(self, tissue: Tissue, solver: Solver, kappa: Any, others: Sequence[State]) -> Maker:
         """The coupling that goes to the equilibrium, with the steps of a stepper of its own on the same state."""
@@ -239,7 +253,8 @@ class Simulation:
 
     def close(self) -> None:
         """Free PETSc's objects and options."""
-        self.stability.close()
+        for stability in self._closing:
+            stability.close()
         self.stepper.close()
 
 

@@ -9,7 +9,7 @@ from typing import Any
 from remodel_fenicsx.body.loading import LoadValues
 from remodel_fenicsx.evolution.coupling import Staggered
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
-from remodel_fenicsx.evolution.stepper import Step, Stepper
+from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
 from remodel_fenicsx.model.laws import Drive
 from remodel_fenicsx.settings import Solver
 from remodel_fenicsx.solver.continuation import StepFailure, Work
@@ -19,7 +19,7 @@ from remodel_fenicsx.state.state import State
 class OtherCase:
     """A load case beside the first: solved after it in each step, and asked for its drive before the pass.
 
-    To those who measure it is a stepper: it has `state`, `coupling` and `remodeling`.
+    To those who measure or watch it is a stepper: it has `state`, `coupling`, `remodeling` and `tissue`.
 
     Parameters
     ----------
@@ -45,6 +45,7 @@ class OtherCase:
         kappa: Any = None,
     ):
         self.number, self.state, self.load_values = number, state, load_values
+        self.tissue = stepper.tissue
         self.remodeling = RemodelingPass(state, stepper.tissue, stepper.remodeling.settings, kappa)
         self.coupling = Staggered(state, stepper.tissue, self.remodeling, solver)
         self.coupling.equilibrium.stop_signal = lambda: stepper.coupling.equilibrium.stop_signal()
@@ -70,7 +71,41 @@ class OtherCase:
     def seen(self, step: Step) -> Step:
         """A step as it is in this case."""
         extension = self.coupling.equilibrium.extension()
-        return replace(step, loads=dict(self.state.loading.values), extension=extension)
+        return replace(step, loads=dict(self.state.loading.values), extension=extension, case=self.number)
+
+
+class OtherCaseWatcher(Watcher):
+    """A watcher of the states of another load case: it sees each step as it is there.
+
+    Parameters
+    ----------
+    case
+        The load case.
+    watcher
+        Made for it, as for a stepper.
+    """
+
+    def __init__(self, case: OtherCase, watcher: Watcher):
+        self.case, self.watcher = case, watcher
+
+    def started(self, step: Step) -> None:
+        """As the watcher does, and so all others."""
+        self.watcher.started(self.case.seen(step))
+
+    def resumed(self, step: Step) -> None:
+        self.watcher.resumed(self.case.seen(step))
+
+    def solved(self, step: Step) -> None:
+        self.watcher.solved(self.case.seen(step))
+
+    def completed(self, step: Step) -> None:
+        self.watcher.completed(self.case.seen(step))
+
+    def undone(self, step: Step) -> None:
+        self.watcher.undone(self.case.seen(step))
+
+    def committed(self, step: Step) -> None:
+        self.watcher.committed(self.case.seen(step))
 
 
 def join(stepper: Stepper, cases: Sequence[OtherCase], weights: Sequence[float]) -> None:

@@ -47,6 +47,8 @@ class Step:
         Of the tangent at the solved state; NaN where nobody counts them (`watch.equilibrium_stability`).
     row
         Its columns by name, where somebody measures (`results.columns.Observer`).
+    case
+        Number of the load case that is looked at.
     """
 
     time: float
@@ -61,6 +63,12 @@ class Step:
     time_error: float = math.nan
     negative_eigenvalues: float = math.nan
     row: dict[str, float] = field(default_factory=dict)
+    case: int = 1
+
+    @property
+    def moment(self) -> str:
+        """Its time in words, and which load case it is, if not the first."""
+        return f"time {self.time:g}" + (f", load case {self.case}" if self.case > 1 else "")
 
 
 class Watcher:

@@ -100,19 +100,19 @@ class EquilibriumStability(Watcher):
 
     def _say(self, step: Step, before: int, now: int) -> None:
         if now < before:
-            self._info("time %g: %s of the tangent, %d before", step.time, eigenvalues(now), before)
+            self._info("%s: %s of the tangent, %d before", step.moment, eigenvalues(now), before)
             return
         unloaded, scale = self._of_the_unloaded_body()
         if now <= unloaded:
             self._info(
-                "time %g: %s of the tangent, as the unloaded body has %d: stress that its cells have from the start, "
-                "no lost equilibrium", step.time, eigenvalues(now), unloaded,
+                "%s: %s of the tangent, as the unloaded body has %d: stress that its cells have from the start, "
+                "no lost equilibrium", step.moment, eigenvalues(now), unloaded,
             )  # fmt: skip
             return
         text = f"{eigenvalues(now)} of the tangent ({before} before); {described(self.inertia.lowest(), scale)}"
         if self.stops:
-            raise StepFailure(step.time, f"the equilibrium at time {step.time:g} is unstable: {text}", UNSTABLE)
-        self._warn("time %g: the equilibrium is unstable, the body would leave it: %s", step.time, text)
+            raise StepFailure(step.time, f"the equilibrium at {step.moment} is unstable: {text}", UNSTABLE)
+        self._warn("%s: the equilibrium is unstable, the body would leave it: %s", step.moment, text)
 
     def _of_the_unloaded_body(self) -> tuple[int, float]:
         """`inertia.of_the_unloaded_body`, once."""

@@ -38,4 +38,4 @@ class WarnsOnce(Watcher):
         """Now, on the first rank, with the time of the step."""
         self._numbers["said"] = True
         if self.state.comm.rank == 0:
-            log.log(level, "time %g: %s", step.time, text)
+            log.log(level, "%s: %s", step.moment, text)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from remodel_fenicsx import SceneError, Simulation, cli
+from remodel_fenicsx import Recording, SceneError, Simulation, cli
 from remodel_fenicsx.evolution.stepper import Step, Watcher
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
 from remodel_fenicsx.model.laws import Drive
@@ -310,6 +310,17 @@ def test_a_run_goes_on_with_all_cases(tmp_path: Path) -> None:
     assert cli.main(["run", "--resume", str(tmp_path / "run"), "--set", "cases=[]", "-q"]) == 2
 
 
+def test_the_demo(tmp_path: Path) -> None:
+    """Diastole and systole in mmHg, about the mean that it names."""
+    demo = Path(__file__).parents[2] / "demos" / "pulse.toml"
+    words = ["--set", "time.end=20", "--set", "time.step=5", "--set", "output.fields=false"]
+    assert cli.main(["run", str(demo), "-q", "-o", str(tmp_path / "run"), *words]) == 0
+    history = Recording(tmp_path / "run").history
+    both = np.array([history["pressure"][-1], history["pressure@2"][-1]]) / 0.133322  # mmHg in kPa
+    np.testing.assert_allclose(both, [80.0, 120.0], rtol=1e-3)
+    assert history["inner_radius@2"][-1] > history["inner_radius"][-1] + 0.03
+
+
 def test_a_case_that_is_not_solved_takes_the_step_back() -> None:
     """In all cases; the message names it."""
     values = artery(
@@ -326,6 +337,15 @@ def test_a_case_that_is_not_solved_takes_the_step_back() -> None:
         np.testing.assert_array_equal(state.unknown.x.array, unknown)
         assert (state.loading.values, state.time) == (loads, time)
     assert before[0][1] != before[1][1] and before[0][2] > 0
+
+
+def test_what_threatens_one_case_is_said_of_it(caplog: pytest.LogCaptureFixture) -> None:
+    """A case of suction, in which the whole tube would buckle; the first has none."""
+    thin = {"shape": "tube", "inner_radius": 1.0, "outer_radius": 1.1, "length": 4.0}
+    cases = [{"weight": 0.5}, {"weight": 0.5, "loads": {"pressure": -1.0}}]
+    simulated(artery(cases, end=24.0, pressure=0.3, geometry=thin, mesh={"degree": 2}))
+    found = [record.getMessage() for record in caplog.records if "would buckle" in record.getMessage()]
+    assert len(found) == 1 and ", load case 2: the whole body would buckle" in found[0]
 
 
 CUBE = {
