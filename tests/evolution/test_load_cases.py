@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from remodel_fenicsx import Recording, SceneError, Simulation, cli
+from remodel_fenicsx.evolution.coupling import Staggered
 from remodel_fenicsx.evolution.stepper import Step, Watcher
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
 from remodel_fenicsx.model.laws import Drive
@@ -17,6 +18,8 @@ from remodel_fenicsx.model.load_cases import largest_tension, mean_target, mean_
 from remodel_fenicsx.model.tensor_law import Target, target
 from remodel_fenicsx.scene import scene_from_dict
 from remodel_fenicsx.solver.continuation import StepFailure
+from remodel_fenicsx.studies.fit import fit
+from remodel_fenicsx.studies.stability import stability
 from tests.reference.radial import CIRCUMFERENTIAL, RadialMaterial, Tube, cauchy_stress, structure
 
 ANGLES = ["fibre_angle_inner", "fibre_angle_middle", "fibre_angle_outer"]
@@ -388,3 +391,14 @@ def test_what_has_no_cases_is_refused(tables: dict[str, Any], words: str) -> Non
     with pytest.raises(SceneError, match=words) as refused:
         scene_from_dict(artery(HALVES) | tables)
     assert "\n" not in str(refused.value)
+
+
+def test_studies_of_one_load_case_refuse_several(tmp_path: Path) -> None:
+    """Their derivatives are those of a single state."""
+    scene = scene_from_dict(artery(HALVES))
+    for study in (lambda: fit(scene, tmp_path / "data.toml"), lambda: stability(scene, tmp_path / "run")):
+        with pytest.raises(SceneError, match="cases: .* a single load case; leave out"):
+            study()
+    assert not list(tmp_path.iterdir())
+    with pytest.raises(SceneError, match="a coupling of one's own solves one load case alone"):
+        Simulation(scene, coupling=Staggered)

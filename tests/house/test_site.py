@@ -42,7 +42,13 @@ def found(site: Path, words: str) -> set[str]:
 
 @pytest.mark.parametrize(
     "words, page",
-    [("residual stress", "natural"), ("mmHg", "scene"), ("resume", "commands"), ("STL", "my_own_vessel")],
+    [
+        ("residual stress", "natural"),
+        ("mmHg", "scene"),
+        ("resume", "commands"),
+        ("STL", "my_own_vessel"),
+        ("systole", "cycles"),
+    ],
 )
 def test_the_search_finds(site: Path, words: str, page: str) -> None:
     assert page in found(site, words)
