@@ -101,7 +101,6 @@ class EveryTangent:
 
     given_up = False  # whether this way leads to nothing
     keeps = False  # whether factors outlast a solve
-    more_iterations = 1  # times solver.maximum_iterations before a solve has failed
 
     def __init__(self, equilibrium: Equilibrium, snes: Any, matrix: Any, options: ProblemOptions):
         self.equilibrium, self.snes, self.matrix, self.options = equilibrium, snes, matrix, options
@@ -134,14 +133,22 @@ class EveryTangent:
         """A slower and safer way for a solve that has failed, and in words; None where this was it."""
         return None
 
+    def keep_nothing(self) -> None:
+        """From now on each iteration takes new factors; here it does."""
+
+    @property
+    def more_iterations(self) -> int:
+        """Times solver.maximum_iterations before a solve has failed."""
+        return 1
+
     @contextmanager
     def _anew(self) -> Iterator[None]:
         """Meanwhile nothing is kept from one iteration to the next."""
-        self._always = True
+        before, self._always = self._always, True
         try:
             yield
         finally:
-            self._always = False
+            self._always = before
 
     def factorisation(self) -> Any | None:
         """PETSc's preconditioner with the factors of the last tangent; None where there are none."""
@@ -184,7 +191,7 @@ class Lagged(EveryTangent):
     preconditioner, that one is kept in place of the factor.
     """
 
-    more_iterations, keeps = 3, True
+    keeps = True
 
     def __init__(self, equilibrium: Equilibrium, snes: Any, matrix: Any, options: ProblemOptions):
         super().__init__(equilibrium, snes, matrix, options)
@@ -198,6 +205,14 @@ class Lagged(EveryTangent):
         self._before = 0  # tangents before the solve
         self._norms: list[float] = []  # of the residual since the tangent was renewed, of this solve
         self._due = True
+        self._spent, self._solves = 0, 0  # iterations since the factor was made, its cost included, and solves
+
+    @property
+    def more_iterations(self) -> int:
+        return 1 if self._always else 3
+
+    def keep_nothing(self) -> None:
+        self._always = True
 
     def begin(self) -> None:
         self._norms = []
@@ -219,6 +234,7 @@ class Lagged(EveryTangent):
             self.factor.renew(self.matrix)
         self.secants.forget()
         self._norms, self._due = self._norms[-1:], False
+        self._spent, self._solves = WORTH, 0
 
     def improve(self, x: Any, residual: Any, step: Any, is_exact: bool) -> bool:
         if self._always or not is_exact:
@@ -227,10 +243,15 @@ class Lagged(EveryTangent):
         return self.secants.improve(x, residual, step)
 
     def ended(self, iterations: int) -> None:
-        self._due = self._always or iterations > SLOW_STEP
+        """The next step starts with a new factor after a slow one, or one dearer than those on this factor on average.
+
+        The mean cost of a step, its share of the factor included, is least where the next step would cost more.
+        """
+        self._spent, self._solves = self._spent + iterations, self._solves + 1
+        self._due = self._always or iterations > SLOW_STEP or iterations * self._solves > self._spent
 
     def second_try(self) -> tuple[str, AbstractContextManager[None]] | None:
-        return "with new factors in every iteration", self._anew()
+        return None if self._always else ("with new factors in every iteration", self._anew())
 
     def _costs_more(self, tolerance: float) -> bool:
         """Whether the iterations that are left cost more than new factors; also where the residual rises.

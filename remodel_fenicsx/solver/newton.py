@@ -163,7 +163,7 @@ class GuardedNewton:
     settings
         Method, tolerances, limits and PETSc options.
     robust
-        Take new factors in every iteration, where the method would keep them.
+        Take new factors in every iteration where `lagged` would keep them.
 
     Attributes
     ----------
@@ -180,15 +180,13 @@ class GuardedNewton:
         kinematics = equilibrium.state.kinematics
         reduced = kinematics.reduced
         self.method = chosen(settings.method, unknowns, ranks, reduced, kinematics.suits_multigrid)
-        if robust and self.method == LAGGED:
-            self.method = "direct"
         # where a method is named, three dimensions stay with it: its numbers shall not depend on their size
         small = is_small(unknowns, reduced) and (reduced or settings.method == AUTO)
         self._options = ProblemOptions(method_options(self.method, ranks, small), settings.petsc_options)
         self._residual, self._external, self._trial = (self._x.duplicate() for _ in range(3))
         self._matrix = equilibrium.create_matrix()
         self.convergence = Convergence(equilibrium, settings)
-        bounded = self.method == LAGGED and "snes_linesearch_type" not in self._options.given
+        bounded = self.method == LAGGED and not robust and "snes_linesearch_type" not in self._options.given
         self.limits = Limits(equilibrium, bounded)
         self._present = _Solve(self._values.copy())
         self._start_is_known = False  # whether the limits have been asked for the start of the next solve
@@ -204,6 +202,8 @@ class GuardedNewton:
         self._snes: Any = snes
         make_linear = SOLVER_METHODS[self.method].make_linear
         self._linear: EveryTangent = make_linear(equilibrium, snes, self._matrix, self._options)
+        if robust:
+            self._linear.keep_nothing()
 
     def close(self) -> None:
         """Free PETSc's objects and take the options out of its database; calling it again does nothing."""
