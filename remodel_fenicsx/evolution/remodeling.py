@@ -13,7 +13,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from remodel_fenicsx.fem import jit
-from remodel_fenicsx.fem.assembly import coefficient, over_ranks, point_values
+from remodel_fenicsx.fem.assembly import Remembered, coefficient, over_ranks, point_values
 from remodel_fenicsx.kernels.library import with_kernels
 from remodel_fenicsx.model import spectral
 from remodel_fenicsx.model.cells import UnitCell, structure_tensor
@@ -96,11 +96,12 @@ class RemodelingPass:
         self._numbers = Numbers(state, "noise", {"said": 0})
         self._smallest_area = self.quadrature.minimum(self.quadrature.smallest_areas)
         F = state.kinematics.elastic_gradient(state.unknown)
-        self._stresses = PointStresses(state, self.tissue)
-        tensor = self.driver.tensor(F, self._stresses.ufl)
+        self.stresses = PointStresses(state, self.tissue)
+        tensor = self.driver.tensor(F, self.stresses.ufl)
         # one stacked expression: F_e comes at no cost with the driver
-        stacked = ufl.as_vector([t[i, j] for t in (F, tensor) for i in range(3) for j in range(3)])
-        self._expression = jit.expression(stacked, self.quadrature.points)
+        self.stacked = ufl.as_vector([t[i, j] for t in (F, tensor) for i in range(3) for j in range(3)])
+        self._expression = jit.expression(self.stacked, self.quadrature.points)
+        self._known: Remembered[Array] = Remembered(state.comm, self.stacked)
 
     def _set_kappa(self, kappa: Any) -> None:
         self.kappa: Any = kappa
@@ -114,9 +115,16 @@ class RemodelingPass:
 
     def driving_tensor(self) -> tuple[Array, Array]:
         """F and the symmetric driving tensor at all points, each (elements * points, 3, 3)."""
-        self._stresses.refresh()
-        values = self.quadrature.evaluate(self._expression, (2, 3, 3)).reshape(-1, 2, 3, 3)
-        return self.kernels.gradient_and_driver(values)
+        return self.kernels.gradient_and_driver(self.stacked_values().reshape(-1, 2, 3, 3))
+
+    def stacked_values(self) -> Array:
+        """F_e and the driving tensor, row by row, (elements, points, 18); of one state they are computed once."""
+
+        def evaluated() -> Array:
+            self.stresses.refresh()
+            return self.quadrature.evaluate(self._expression, (18,))
+
+        return self._known(evaluated)
 
     def drive(self, residual: float = 0.0) -> Drive:
         """What acts on the cells in the present state, which was accepted with this norm of out-of-balance forces.

@@ -71,11 +71,15 @@ class ElementFields:
         state = self.state
         F = state.kinematics.deformation_gradient(state.unknown)
         tensors = [F]
-        self._stresses = PointStresses(state, self.tissue) if "cauchy_stress" in self.names else None
+        remodeling = stepper.remodeling if stepper.remodeling.law.remodels else None
+        self._stresses: PointStresses | None = None
+        if "cauchy_stress" in self.names:
+            self._stresses = PointStresses(state, self.tissue) if remodeling is None else remodeling.stresses
         if self._stresses is not None:
             tensors.append(self._stresses.ufl.cauchy)
-        entries = [t[i, j] for t in tensors for i in range(3) for j in range(3)]
-        self._state = jit.expression(ufl.as_vector(entries), self.quadrature.points)
+        stacked = ufl.as_vector([t[i, j] for t in tensors for i in range(3) for j in range(3)])
+        self._shared = remodeling if remodeling is not None and remodeling.stacked == stacked else None
+        self._state = None if self._shared else jit.expression(stacked, self.quadrature.points)
 
     def __call__(self) -> dict[str, Array]:
         """By name, one row per local element.
@@ -86,9 +90,7 @@ class ElementFields:
         chain has one); `chain_extension` (largest r/L in the element; 0 where no chain locks); `region` (its number,
         `Domain.regions`).
         """
-        if self._stresses is not None:
-            self._stresses.refresh()
-        values = self.quadrature.evaluate(self._state, (9 if self._stresses is None else 18,))
+        values = self._values()
         F = values[..., :9].reshape(*values.shape[:2], 3, 3)
         elastic = self.state.elastic(F)
         cells = self.state.cells
@@ -117,6 +119,14 @@ class ElementFields:
         if REGION in wanted:
             found[REGION] = self.state.loading.domain.element_region.astype(np.float64)
         return {name: found[name] for name in OF_ELEMENTS if name in wanted}
+
+    def _values(self) -> Array:
+        """F, and Cauchy stress where it is wanted, row by row, (elements, points, 9 or 18)."""
+        if self._shared is not None:  # the pass will ask for the same
+            return self._shared.stacked_values()
+        if self._stresses is not None:
+            self._stresses.refresh()
+        return self.quadrature.evaluate(self._state, (9 if self._stresses is None else 18,))
 
     def mean_cells(self) -> tuple[Array, Array]:
         """Lengths (elements, 3) and axes as rows (elements, 3, 3) of the mean structure tensor, longest first."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -169,7 +170,7 @@ class TransientGrid:
                     self._rows_of_field(kind, name, block).write(step, block)
                     self._rows(f"Steps/{kind}Offsets/{name}").write(step, step * len(block))
             for name, values in (constant or {}).items():
-                if name not in self._root["CellData"]:
+                if f"CellData/{name}" not in self._datasets:
                     self._rows_of_field("CellData", name, np.asarray(values)).write(0, np.asarray(values))
                 self._rows(f"Steps/CellDataOffsets/{name}").write(step, 0)
             if points is not None:
@@ -189,7 +190,7 @@ class TransientGrid:
             self._file.flush()
             # the number of steps comes last: until then a reader sees the series without this step
             self.number_of_steps, self.last_time = step + 1, time
-            self._root["Steps"].attrs.modify("NSteps", np.int64(step + 1))
+            self._steps.modify("NSteps", np.int64(step + 1))
             self._file.flush()
             self._staged.commit()
 
@@ -198,9 +199,14 @@ class TransientGrid:
         with signals_held_back():
             self._count(self.number_of_steps - 1)
 
-    @property
+    @cached_property
     def _number_of_points(self) -> int:
         return int(self._root["NumberOfPoints"][0])
+
+    @cached_property
+    def _steps(self) -> Any:
+        """The group with the attribute that says how many steps there are."""
+        return self._root["Steps"].attrs
 
     def _count(self, number: int) -> None:
         """The file has so many steps from now on, whatever stands behind them."""

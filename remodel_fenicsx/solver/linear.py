@@ -53,6 +53,12 @@ class KeptFactor:
             if self._factorised(kind, matrix):
                 return
 
+    def is_definite(self, matrix: Any) -> bool:
+        """Whether a symmetric matrix is certainly positive definite: CHOLMOD takes it, which needs a single rank."""
+        taken = self.comm.size == 1 and self._factorised(DEFINITE, matrix)
+        matrix.setOption(PETSc.Mat.Option.SPD, False)  # of others' factors nothing is known
+        return taken
+
     def close(self) -> None:
         """Free PETSc's objects."""
         if self.preconditioner is not None:

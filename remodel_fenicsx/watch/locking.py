@@ -90,19 +90,21 @@ class LockingWarning(WarnsOnce):
         """Of the present state; zero where neither loads nor prescribed displacements deform the body."""
         return self._missing(*self.energies())
 
-    def _missing(self, energy: float, volume: float, shape: float) -> Missing:
-        work, free_work = self.work(), self.work(free=True)
+    def _missing(self, energy: float, volume: float, shape: float, enough: float = 0.0) -> Missing:
+        """With these energies. Where it is certainly not more than `enough`, a bound: the tangent is not asked."""
+        work, free_work = self.work()
         driven = Missing(0.0, 0.0)
         if work > DRIVEN * energy > 0:
             driven = Missing(volume / work, shape / work)
-        if volume <= NOTICEABLE * energy or (lacking := self.response()) is None:
+        if volume <= NOTICEABLE * energy:
             return driven
+        moved = max(free_work, 0.0) + self._energy_of_elongation() >= DRIVEN * energy
+        of_forces = volume / free_work if free_work > 0 else np.inf
+        bound = max(driven, Missing(of_forces if moved else 0.0, 0.0), key=sum)
+        if sum(bound) <= enough or (lacking := self.response()) is None:
+            return bound if sum(bound) <= enough else driven
         driven = driven._replace(volume=min(driven.volume, lacking))
-        if max(free_work, 0.0) + self._energy_of_elongation() < DRIVEN * energy:
-            return driven
-        if free_work > 0:
-            lacking = min(lacking, volume / free_work)
-        return max(driven, Missing(lacking, 0.0), key=sum)
+        return max(driven, Missing(min(lacking, of_forces) if moved else 0.0, 0.0), key=sum)
 
     def _energy_of_elongation(self) -> float:
         """That a prescribed elongation e gives a matrix of constant volume: 3/2 mu e^2 over the body."""
@@ -140,18 +142,19 @@ class LockingWarning(WarnsOnce):
         jumps = JUMPS * 2 * shear * quadrature.jumps(F)
         return np.asarray(np.minimum(1.0, jumps / np.maximum(inside, np.finfo(float).tiny)))
 
-    def work(self, free: bool = False) -> float:
+    def work(self) -> tuple[float, float]:
         """Half of the internal nodal forces times the unknowns: the work of loads and supports if all were linear.
 
-        `free`: of the unknowns that nothing prescribes alone, the work of forces.
+        The second number is that of the unknowns alone that nothing prescribes, the work of forces.
         """
         state, equilibrium = self.stepper.state, self.stepper.coupling.equilibrium
         unknowns = state.unknown.x.array
-        if free:
-            unknowns = np.where(np.isnan(equilibrium.prescribed_values()), unknowns, 0.0)
+        free = np.where(np.isnan(equilibrium.prescribed_values()), unknowns, 0.0)
         # shares of the ranks in a node's force are not added up: their sum over all ranks is the same
-        local = sum(float(dolfinx.fem.assemble_vector(form).array @ unknowns) for form in equilibrium.internal_forms)
-        return float(state.comm.allreduce(local, MPI.SUM)) / 2
+        forces = sum(dolfinx.fem.assemble_vector(form).array for form in equilibrium.internal_forms)
+        local = np.array([forces @ unknowns, forces @ free])
+        whole, of_forces = state.comm.allreduce(local, MPI.SUM).tolist()
+        return whole / 2, of_forces / 2
 
     def solved(self, step: Step) -> None:
         """Look, until it was said."""
@@ -160,7 +163,7 @@ class LockingWarning(WarnsOnce):
         energies = self.energies()
         if not self._are_news(*energies):
             return
-        missing = self._missing(*energies)
+        missing = self._missing(*energies, WARNED_SHARE)
         if sum(missing) > WARNED_SHARE:
             self.say(step, self.in_words(missing))
 
