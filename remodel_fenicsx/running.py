@@ -14,7 +14,7 @@ from mpi4py import MPI
 
 from remodel_fenicsx.evolution.pause import Pause
 from remodel_fenicsx.evolution.stepper import Step, Watcher
-from remodel_fenicsx.fem.solver_methods import LARGE_ON_RANKS
+from remodel_fenicsx.fem.solver_methods import WORTH_RANKS
 from remodel_fenicsx.results.checkpoint import Checkpoints, restore_state
 from remodel_fenicsx.results.checkpoint_file import Checkpoint, CheckpointError, read_checkpoint
 from remodel_fenicsx.results.fields import Fields, field_names
@@ -243,7 +243,7 @@ def _record(
         log.info(BEGUN + "%s on %d ranks, results in %s", scene.name, comm.size, place)
         log.info("%s", scene.summary())
         unknowns = simulation.unknown.x.petsc_vec.getSize()
-        if comm.size > 1 and unknowns <= LARGE_ON_RANKS:
+        if comm.size > 1 and unknowns < WORTH_RANKS:
             log.info("%d unknowns: one rank is faster than %d (docs/speed.md, Ranks)", unknowns, comm.size)
         for warning in simulation.scene.warnings():  # the one whose files have places
             log.warning("%s", warning)

@@ -980,7 +980,7 @@ class Solver(Table):
     method: Annotated[str, OneOf(SOLVER_METHODS, (AUTO,), REMOVED)] = Field(
         default=AUTO,
         description=f"'auto': 'direct' up to {SMALL_BODY} unknowns ({SMALL_REDUCTION} of a reduction), then 'lagged', "
-        f"above {LARGE} (on several ranks {LARGE_ON_RANKS}) 'iterative'; "
+        f"above {LARGE} (on several ranks {LARGE_ON_RANKS} while loads change) 'iterative'; "
         + "; ".join(f"{name!r}: {method.meaning}" for name, method in SOLVER_METHODS.items())
         + " (docs/speed.md).",
     )

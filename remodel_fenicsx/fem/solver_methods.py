@@ -115,7 +115,8 @@ FACTOR_OPTIONS: dict[str, Mapping[str, Any]] = {
 # unknowns, 0.6 of it at 380, 0.4 at 650 and 0.25 at 1,500 (cubes and tubes of random cells, 40 steps).
 SMALL_REDUCTION, SMALL_BODY = 2000, 200
 LARGE = 100_000  # unknowns from which on even a few factors cost more than multigrid, in time and in memory
-LARGE_ON_RANKS = 20_000  # the same on several ranks, where one of them keeps the factor for all
+LARGE_ON_RANKS = 20_000  # the same on several ranks while loads change: one of them factorises for all
+WORTH_RANKS = 5_000  # unknowns below which a second rank costs more than it brings
 
 
 def is_small(unknowns: int, reduced: bool) -> bool:
@@ -123,11 +124,25 @@ def is_small(unknowns: int, reduced: bool) -> bool:
     return unknowns <= (SMALL_REDUCTION if reduced else SMALL_BODY)
 
 
-def chosen(method: str, unknowns: int, ranks: int, reduced: bool, multigrid: bool = True) -> str:
-    """The method that `auto` stands for; `multigrid`: whether that solves for these unknowns."""
+def chosen(method: str, unknowns: int, ranks: int, reduced: bool, multigrid: bool = True, held: bool = False) -> str:
+    """The method that `auto` stands for.
+
+    Parameters
+    ----------
+    method
+        The scene's; any other than `auto` is taken.
+    unknowns, ranks
+        How many there are.
+    reduced
+        Whether the kinematics is.
+    multigrid
+        Whether that solves for these unknowns.
+    held
+        Whether the loads of the last step are held: a factor then serves for many steps.
+    """
     if method != AUTO:
         return method
-    if multigrid and unknowns > (LARGE if ranks == 1 else LARGE_ON_RANKS):
+    if multigrid and unknowns > (LARGE if ranks == 1 or held else LARGE_ON_RANKS):
         return "iterative"
     return "direct" if is_small(unknowns, reduced) else LAGGED
 
@@ -140,10 +155,9 @@ def method_options(method: str, ranks: int, small: bool = False) -> dict[str, An
     return _on_ranks(options, method, ranks)
 
 
-def factor_options(kind: str, ranks: int) -> dict[str, Any]:
-    """PETSc options of a preconditioner that factorises, a key of `FACTOR_OPTIONS`."""
-    options = {name: value for name, value in FACTOR_OPTIONS[kind].items() if name.startswith(("pc_", "mat_"))}
-    return _on_ranks(options, "direct", ranks)
+def factor_options(kind: str) -> dict[str, Any]:
+    """PETSc options of a preconditioner that factorises on one rank, a key of `FACTOR_OPTIONS`."""
+    return {name: value for name, value in FACTOR_OPTIONS[kind].items() if name.startswith(("pc_", "mat_"))}
 
 
 def _on_ranks(options: dict[str, Any], method: str, ranks: int) -> dict[str, Any]:

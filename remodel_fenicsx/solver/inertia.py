@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from remodel_fenicsx.solver.equilibrium import Equilibrium
-from remodel_fenicsx.solver.linear import KeptFactor
+from remodel_fenicsx.solver.linear import kept_factor
 
 Array = NDArray[np.float64]
 
@@ -63,7 +63,7 @@ class Inertia:
         self._symmetric: Any = None
         self._factorised: Any = None
         self._factorisation: Any = None
-        self._definite = KeptFactor(equilibrium.comm)
+        self._definite = kept_factor(equilibrium.comm)
 
     def close(self) -> None:
         """Free PETSc's objects; the next question makes new ones."""

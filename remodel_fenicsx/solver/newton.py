@@ -21,6 +21,7 @@ from remodel_fenicsx.solver.convergence import PRESCRIBED_ROUNDING, Convergence
 from remodel_fenicsx.solver.equilibrium import Equilibrium, Extension, Look
 from remodel_fenicsx.solver.limits import Limits, reserved
 from remodel_fenicsx.solver.linear import EveryTangent
+from remodel_fenicsx.state.state import State
 from remodel_fenicsx.system.interrupts import Interrupted
 
 log = logging.getLogger(__name__)
@@ -153,6 +154,28 @@ def failure_text(reason: int, iterations: int, extension: Extension) -> str:
     return SNES_REASONS.get(reason, f"SNES stopped with reason {reason}")
 
 
+class LoadPhase:
+    """Tells whether the loads are held: those of this step are those of the step before.
+
+    Parameters
+    ----------
+    state
+        With the loads, and the number of the last accepted step.
+    """
+
+    def __init__(self, state: State):
+        self._state, self._step = state, state.number
+        self._before: dict[str, float] = {}
+        self._now = dict(state.loading.values)
+
+    def held(self) -> bool:
+        """Whether they are, in the step under way."""
+        if self._step != self._state.number:
+            self._before, self._step = self._now, self._state.number
+        self._now = dict(self._state.loading.values)
+        return self._now == self._before
+
+
 class GuardedNewton:
     """Solves an equilibrium from the present unknowns; use `close` (or `with`) when it is needed no more.
 
@@ -172,25 +195,33 @@ class GuardedNewton:
     """
 
     def __init__(self, equilibrium: Equilibrium, settings: Solver, robust: bool = False):
-        self.equilibrium, self.settings = equilibrium, settings
+        self.equilibrium, self.settings, self._robust = equilibrium, settings, robust
         self.unknown = equilibrium.state.unknown
         self._values = self.unknown.x.array
         self._x = self.unknown.x.petsc_vec.duplicate()
-        unknowns, ranks = self._x.getSize(), equilibrium.comm.size
-        kinematics = equilibrium.state.kinematics
-        reduced = kinematics.reduced
-        self.method = chosen(settings.method, unknowns, ranks, reduced, kinematics.suits_multigrid)
-        # where a method is named, three dimensions stay with it: its numbers shall not depend on their size
-        small = is_small(unknowns, reduced) and (reduced or settings.method == AUTO)
-        self._options = ProblemOptions(method_options(self.method, ranks, small), settings.petsc_options)
         self._residual, self._external, self._trial = (self._x.duplicate() for _ in range(3))
         self._matrix = equilibrium.create_matrix()
         self.convergence = Convergence(equilibrium, settings)
-        bounded = self.method == LAGGED and not robust and "snes_linesearch_type" not in self._options.given
-        self.limits = Limits(equilibrium, bounded)
         self._present = _Solve(self._values.copy())
         self._start_is_known = False  # whether the limits have been asked for the start of the next solve
         self._options_checked = False
+        self._phase = LoadPhase(equilibrium.state)
+        self._make_solver(self._chosen(held=False))
+
+    def _chosen(self, held: bool) -> str:
+        """The method for loads that change, or are held."""
+        kinematics, unknowns, ranks = self.equilibrium.state.kinematics, self._x.getSize(), self.equilibrium.comm.size
+        return chosen(self.settings.method, unknowns, ranks, kinematics.reduced, kinematics.suits_multigrid, held)
+
+    def _make_solver(self, method: str) -> None:
+        """PETSc's objects of a method."""
+        equilibrium, settings, self.method = self.equilibrium, self.settings, method
+        unknowns, ranks, reduced = self._x.getSize(), equilibrium.comm.size, equilibrium.state.kinematics.reduced
+        # where a method is named, three dimensions stay with it: its numbers shall not depend on their size
+        small = is_small(unknowns, reduced) and (reduced or settings.method == AUTO)
+        self._options = ProblemOptions(method_options(method, ranks, small), settings.petsc_options)
+        bounded = method == LAGGED and not self._robust and "snes_linesearch_type" not in self._options.given
+        self.limits = Limits(equilibrium, bounded)
         snes: Any = PETSc.SNES().create(equilibrium.comm)
         snes.setFunction(self._assemble_residual, self._residual)
         snes.setJacobian(self._assemble_tangent, self._matrix)
@@ -200,20 +231,33 @@ class GuardedNewton:
         self._most_iterations = snes.getTolerances()[3]  # the user's PETSc option may have changed it
         snes.setConvergenceTest(self._converged)
         self._snes: Any = snes
-        make_linear = SOLVER_METHODS[self.method].make_linear
-        self._linear: EveryTangent = make_linear(equilibrium, snes, self._matrix, self._options)
-        if robust:
+        self._linear: EveryTangent = SOLVER_METHODS[method].make_linear(equilibrium, snes, self._matrix, self._options)
+        if self._robust:
             self._linear.keep_nothing()
+
+    def _suit_phase(self) -> None:
+        """Take the method for this step, where loads that are held have one of their own."""
+        method = self._chosen(self._phase.held())
+        if method == self.method:
+            return
+        if self.equilibrium.comm.rank == 0:
+            log.info("from now on solver.method = %r", method)
+        self._close_solver()
+        self._make_solver(method)
 
     def close(self) -> None:
         """Free PETSc's objects and take the options out of its database; calling it again does nothing."""
         if self._snes is None:
             return
-        self._linear.close()
-        for thing in (self._snes, self._matrix, self._x, self._residual, self._external, self._trial):
+        self._close_solver()
+        for thing in (self._matrix, self._x, self._residual, self._external, self._trial):
             thing.destroy()
-        self._options.close()
         self._snes = None
+
+    def _close_solver(self) -> None:
+        self._linear.close()
+        self._snes.destroy()
+        self._options.close()
 
     def __enter__(self) -> GuardedNewton:
         return self
@@ -237,6 +281,7 @@ class GuardedNewton:
         Interrupted
             If a signal asked for the end; the unknowns are restored.
         """
+        self._suit_phase()
         try:
             return self._attempt(origin, self._linear.more_iterations)
         except SolveFailure as failure:

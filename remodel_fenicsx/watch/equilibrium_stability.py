@@ -10,6 +10,7 @@ import numpy as np
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.solver.inertia import FactorisationFailed, Inertia, Mode, of_the_unloaded_body, uneven
+from remodel_fenicsx.solver.linear import negative_pivots
 from remodel_fenicsx.solver.refusals import UNSTABLE
 from remodel_fenicsx.state.memory import Earlier, Numbers
 
@@ -189,33 +190,6 @@ class Signs:
         vector.destroy()
         image.destroy()
         return float(curvature)
-
-
-def negative_pivots(factorisation: Any) -> int | None:
-    """How many there are, on all ranks; 1 or 0, odd or even, where only the determinant is known; None: nothing is."""
-    package = factorisation.getFactorSolverType()
-    if package == "cholmod":
-        return 0  # it takes positive definite matrices only
-    if package == "petsc":
-        return _on_the_diagonal(factorisation.getFactorMatrix())
-    if package != "mumps":
-        return None
-    factor = factorisation.getFactorMatrix()
-    found = None
-    if factorisation.getType() == "cholesky":
-        found = factor.getMumpsInfog(12)
-    elif factor.getMumpsIcntl(33):
-        found = int(factor.getMumpsRinfog(12) < 0)
-    return factorisation.comm.tompi4py().bcast(found)  # type: ignore[no-any-return]  # the first rank knows it
-
-
-def _on_the_diagonal(factor: Any) -> int:
-    """Of U in PETSc's own LU, which exchanges no rows: a symmetric matrix is L D L^T, with D its diagonal."""
-    pivots = factor.createVecRight()
-    factor.getDiagonal(pivots)
-    count = int(np.count_nonzero(pivots.array_r < 0))
-    pivots.destroy()
-    return count
 
 
 def eigenvalues(number: int) -> str:
