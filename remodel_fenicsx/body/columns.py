@@ -80,8 +80,8 @@ _PROFILE_COLUMNS = tuple(
     Column(
         name,
         "degrees",
-        f"mean reference fibre angle near {number}/{PROFILE_PLACES - 1} of the way through the wall of a tube, or along "
-        "z in a cube or tendon; the weight is a hat function as wide as a quarter of the way",
+        f"mean reference fibre angle near {number}/{PROFILE_PLACES - 1} of the way through the wall of a tube, or "
+        "along z in a cube or tendon; the weight is a hat function as wide as a quarter of the way",
         partial(_profile_value, number),
         by_case=False,
     )
