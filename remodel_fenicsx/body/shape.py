@@ -86,8 +86,9 @@ _is: Any = {  # a word of Python
         Literal["unloaded", "loaded"],
         Field(
             default="unloaded",
-            description="What the geometry is: the body without loads, or, of a tube and a body of one's own, the one "
-            "under the loads of the end of their ramps. The unloaded one is found then (docs/natural.md).",
+            description="What the geometry describes. 'unloaded': the body without loads. 'loaded', for a tube or a "
+            "body of your own: the body under the loads at the end of their ramps; the unloaded body is found first "
+            "(docs/natural.md).",
         ),
     )
 }
