@@ -80,8 +80,8 @@ class MeshBody(WalledMesh):
         ),
         "elongation": LoadKind(
             lambda shape, loading, name: None,  # a part of the supports (`support`)
-            "engineering strain of the length, prescribed: the outlet moves by so much of the length of the body along "
-            "its own normal",
+            "prescribed engineering strain of the length: the outlet moves along its own normal by this share of the "
+            "length of the body",
             column="axial_elongation",
             above=-1.0,
             doubtful=(1.0, "an elongation is an engineering strain: a stretch of 1.1 is an elongation of 0.1"),
@@ -91,7 +91,7 @@ class MeshBody(WalledMesh):
         Column(
             "lumen_volume",
             "length^3",
-            "volume inside the deformed inner face, with flat caps on its rims",
+            "volume inside the deformed inner face, closed by flat caps at its ends",
             lambda m: m.lumen_volume(),
         ),
         *WalledMesh.columns,
