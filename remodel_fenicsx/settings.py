@@ -35,7 +35,7 @@ from remodel_fenicsx.fem.solver_methods import (
 from remodel_fenicsx.model.local_axes import AXES
 from remodel_fenicsx.model.chains import BOLTZMANN_CONSTANT, CHAINS
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
-from remodel_fenicsx.model.energy import MATRICES, REPULSIONS, Tissue
+from remodel_fenicsx.model.energy import MATRICES, REPULSIONS, TURNED_OVER, Tissue
 from remodel_fenicsx.model.laws import LAWS
 from remodel_fenicsx.model.load_cases import MEANS_OF_CASES
 from remodel_fenicsx.model.spectral import PAIRINGS
@@ -1152,7 +1152,7 @@ class Solver(Table):
 
 FIELDS_BY_NAME = (
     "displacement", "deformation_gradient", "cauchy_stress", "cell_dimensions", "axis_1", "axis_2", "axis_3",
-    "fibre_angle", "fibre_angle_unloaded", "fibre_angle_deformed", "chain_extension", "region", "chains",
+    "fibre_angle", "fibre_angle_unloaded", "fibre_angle_deformed", "chain_extension", *TURNED_OVER, "region", "chains",
 )  # fmt: skip
 """What `output.fields` may name (`results.fields`); "chains" are the lines of fields_chains.vtkhdf."""
 REGION = "region"  # the field of bodies with regions

@@ -147,7 +147,7 @@ class _PartsApart(Dilatation):
 
 
 FORMULATIONS: dict[str, Formulation] = {
-    # docs/theory.md, Volumetric locking, has the measurements behind these numbers
+    # docs/appendix_elements.md has the measurements behind these numbers
     "displacement": AtAllPoints(
         "at all quadrature points; right where the bulk is soft or elements are small. A run whose elements lock warns"
     ),

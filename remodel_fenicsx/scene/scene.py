@@ -415,7 +415,9 @@ class Scene(Table):
         """Fields that the body has not, each with the reason."""
         found = {} if self.regions else {REGION: "the scene has no regions"}
         same = "the mesh is free of stress ([natural]): 'fibre_angle' is that of the unloaded body"
-        return found | ({UNLOADED: same} if self.natural.is_of_the_mesh else {})
+        found |= {UNLOADED: same} if self.natural.is_of_the_mesh else {}
+        stays = "it changes with remodeling.turnover alone"
+        return found | ({} if self.remodeling.turnover.is_on else dict.fromkeys(TURNED_OVER, stays))
 
     @property
     def has_free_length(self) -> bool:
