@@ -94,8 +94,8 @@ class TurnoverPass:
             if self.state.comm.rank == 0:
                 log.warning(
                     "turnover: %s has changed by more than a factor of %g at (%s) in the step after time %g: growth "
-                    "that does not rest (mechanobiological instability, docs/turnover.md); a larger "
-                    "remodeling.turnover.gain or a thicker wall comes to rest",
+                    "does not come to rest (mechanobiological instability, docs/turnover.md); try a larger "
+                    "remodeling.turnover.gain or a thicker wall",
                     name.replace("_", " "),
                     BEYOND_REST,
                     place,

@@ -148,7 +148,7 @@ def test_a_run_goes_on_with_its_content(tmp_path: Path) -> None:
 
 
 def test_its_columns_and_numbers_need_it() -> None:
-    with pytest.raises(SceneError, match="'content' changes with remodeling.turnover alone"):
+    with pytest.raises(SceneError, match="'content' changes only with remodeling.turnover"):
         scene_from_dict(wall(40.0, 4.0, None, COLUMNS))
     with pytest.raises(SceneError, match="remodeling.turnover.time: missing"):
         scene_from_dict(wall(40.0, 4.0, {"gain": 2.0}, []))
@@ -164,7 +164,7 @@ def test_its_columns_and_numbers_need_it() -> None:
         ({"turnover": {"gain": -1.0}}, {}, "remodeling.turnover.gain = -1"),
         ({"turnover": {"pace": 1.0}}, {}, "remodeling.turnover.pace = 1.0: unknown key"),
         ({}, {"tolerance": 0.1}, "time.tolerance = 0.1: must be left out"),
-        ({}, {"end": "equilibrium"}, "remodeling.turnover has no equilibrium"),
+        ({}, {"end": "equilibrium"}, "remodeling.turnover: its equilibrium cannot be found at once"),
     ],
 )
 def test_what_has_no_turnover_is_refused(remodeling: dict[str, Any], time: dict[str, Any], words: str) -> None:
