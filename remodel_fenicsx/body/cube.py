@@ -46,7 +46,7 @@ class Cube(Shape):
     loads: ClassVar[dict[str, LoadKind]] = {
         "force": LoadKind(
             lambda shape, loading, name: loading.add_dead_force(name, "z1", component=2),
-            "total dead force along z on the top",
+            "total force along z on the top; its direction stays (a dead load)",
             FORCE,
             reductions=("point",),
         )

@@ -104,8 +104,9 @@ _is: Any = {  # a word of Python
         Literal["unloaded", "loaded"],
         Field(
             default="unloaded",
-            description="What the geometry is: the body without loads, or, of a tube and a body of one's own, the one "
-            "under the loads of the end of their ramps. The unloaded one is found then (docs/natural.md).",
+            description="What the geometry describes. 'unloaded': the body without loads. 'loaded', for a tube or a "
+            "body of your own: the body under the loads at the end of their ramps; the unloaded body is found first "
+            "(docs/natural.md).",
         ),
     )
 }
@@ -454,13 +455,25 @@ def uniaxial_columns(top: str, length: str) -> tuple[Column, ...]:
         return float(1.0 + m.face_mean(top, m.displacement[:, 2]) / m.domain.dimensions[length])
 
     return (
-        Column("mean_stretch", "", "length over reference length, mean of the top", mean_stretch),
-        Column("min_stretch", "", "smallest element mean of F_zz", lambda m: m.smallest(m.axial_stretch), extreme=True),
-        Column("max_stretch", "", "largest element mean of F_zz", lambda m: m.largest(m.axial_stretch), extreme=True),
+        Column("mean_stretch", "", "deformed length over reference length, mean over the top", mean_stretch),
+        Column(
+            "min_stretch",
+            "",
+            "smallest stretch F_zz of an element (its mean)",
+            lambda m: m.smallest(m.axial_stretch),
+            extreme=True,
+        ),
+        Column(
+            "max_stretch",
+            "",
+            "largest stretch F_zz of an element (its mean)",
+            lambda m: m.largest(m.axial_stretch),
+            extreme=True,
+        ),
         Column(
             "mean_fibre_angle",
             "degrees",
-            "reference angle between chain direction and load axis, mean over the volume",
+            "angle between chains and load axis in the reference body, mean over the volume",
             lambda m: m.quadrature.mean_of_known(m.fibre_angle),
         ),
     )

@@ -58,7 +58,7 @@ class Tendon(Shape):
     loads: ClassVar[dict[str, LoadKind]] = {
         "force": LoadKind(
             lambda shape, loading, name: loading.add_dead_force(name, "top", component=2),
-            "total dead force along z on the top",
+            "total force along z on the top; its direction stays (a dead load)",
             FORCE,
             reductions=("point",),
         )

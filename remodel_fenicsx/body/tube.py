@@ -202,9 +202,9 @@ def _layer_angle(share: float) -> AngleOf:
 
 
 MEANS = {
-    "inner": ("that touch R_i", _layer_angle(0.0)),
-    "middle": ("that touch (R_i + R_o)/2", _layer_angle(0.5)),
-    "outer": ("that touch R_o", _layer_angle(1.0)),
+    "inner": ("that touch the inner radius", _layer_angle(0.0)),
+    "middle": ("that touch the middle radius, (R_i + R_o)/2", _layer_angle(0.5)),
+    "outer": ("that touch the outer radius", _layer_angle(1.0)),
 }
 
 
@@ -282,14 +282,14 @@ class Tube(Walled):
     loads: ClassVar[dict[str, LoadKind]] = {
         "pressure": LoadKind(
             lambda shape, loading, name: _add_pressure(loading, name),
-            "pressure on the deformed inner face, with closed ends also on their caps",
+            "pressure on the deformed inner face, and on the caps of closed ends",
             STRESS,
             reductions=("radial", "axisymmetric", "sector"),
         ),
         "elongation": LoadKind(
             lambda shape, loading, name: loading.add_prescribed_elongation(name, "top", 2, shape.length),
-            "engineering strain of the length (0.1: 10 % longer), prescribed; its column shows what was found where "
-            "the length is an unknown",
+            "prescribed engineering strain of the length (0.1: 10 % longer); where the length is an unknown the column "
+            "shows the strain that was found",
             column="axial_elongation",
             above=-1.0,
             reductions=("radial", "axisymmetric", "sector"),
@@ -298,8 +298,8 @@ class Tube(Walled):
         ),
         "axial_force": LoadKind(
             lambda shape, loading, name: loading.add_axial_force(name),
-            "force of the wall along z on its end section. As a load it is a dead force on the ends, which move in "
-            "parallel, with closed ends beside the pressure on their caps; the length is then an unknown",
+            "force along z in the wall at the end z = `length`. As a load it is a dead force on the ends, which stay "
+            "parallel; the length is then an unknown, and the pressure on the caps of closed ends acts beside it",
             FORCE,
             reductions=("radial", "axisymmetric", "sector"),
             frees_length=True,
@@ -319,13 +319,13 @@ class Tube(Walled):
         Column(
             "reduced_axial_force",
             "force",
-            "`axial_force` less the pressure times the lumen's area at that end, p pi r_i^2: what a machine measures",
+            "what a testing machine measures: `axial_force` less the pressure on the lumen at that end, p pi r_i^2",
             _reduced_axial_force,
         ),
         Column(
             "opening_angle",
             "degrees",
-            "angle of the sector that is missing when the unloaded tube is cut along its length, cells as they are",
+            "angle by which the unloaded tube would open if it were cut along its length now: the missing sector",
             _opening_angle,
             by_case=False,
         ),

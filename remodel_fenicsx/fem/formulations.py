@@ -167,12 +167,12 @@ class _PartsApart(Dilatation):
 
 
 FORMULATIONS: dict[str, Formulation] = {
-    # docs/theory.md, Volumetric locking, has the measurements behind these numbers
+    # docs/appendix_elements.md has the measurements behind these numbers
     "displacement": AtAllPoints(
-        "at all quadrature points, right where the bulk is soft or elements are small; a run whose elements lock warns"
+        "at all quadrature points; right where the bulk is soft or elements are small. A run whose elements lock warns"
     ),
     "selective-integration": Selective(
-        "the volumetric part of the matrix at fewer points, in linear hexahedra at the centroid; hexahedra do not lock "
+        "the volumetric part of the matrix at fewer points, in linear hexahedra at the centroid. Hexahedra do not lock "
         "with it",
         {(kind, degree): degree for kind in ("hexahedron", "quadrilateral", "interval") for degree in (1, 2)},
     ),

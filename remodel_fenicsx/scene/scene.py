@@ -113,22 +113,29 @@ class Scene(Table):
         default=FORMAT,
         ge=1,
         le=FORMAT,
-        description="Number of the form in which a scene is written; a scene as run has it. Version 0.1.0 wrote none.",
+        description="Number of the format of scenes. A scene as run has it; version 0.1.0 wrote none.",
     )
     name: Annotated[str, BeforeValidator(_name)] = Field(
         default="scene",
-        description="Name of the scene and of its results folder. Default: the file's name without `.toml`.",
+        description=("Name of the scene and of its results folder. Default: the name of the file without `.toml`."),
         json_schema_extra={"allowed": "a file name without a path"},
     )
     preset: str | None = Field(
         default=None,
-        description="Named parameters that lie under the scene's own keys, table by table (see Presets below).",
+        description=(
+            "A published model whose values hold where the scene says nothing, table by table (see the "
+            "presets below)."
+        ),
         json_schema_extra={"allowed": "one of " + ", ".join(map(repr, PRESETS))},
     )
     profile: str | None = Field(
         default=None,
-        description="How much accuracy: settings of mesh, kinematics and steps that lie over the preset's and under "
-        "the scene's own keys (docs/speed_and_accuracy.md has their errors and costs). `--profile` lays them over all.",
+        description=(
+            "Chooses speed or accuracy: settings of mesh, kinematics and steps "
+            "(docs/speed_and_accuracy.md has their errors and costs). They replace those of the preset,"
+            " and the scene's own keys replace them. `--profile` on the command line replaces all of "
+            "these."
+        ),
         json_schema_extra={"allowed": "one of " + ", ".join(map(repr, PROFILES))},
     )
     geometry: Annotated[SerializeAsAny[Shape], VariantOf(SHAPES, "shape")]
@@ -142,7 +149,7 @@ class Scene(Table):
     loads: dict[str, Load] = {}
     cases: Annotated[tuple[LoadCase, ...], tables_of("cases")] = Field(
         default=(),
-        description="Load cases of a cycle, a table `[[cases]]` each; without them loads act all the time.",
+        description="Load cases of a cycle, a table `[[cases]]` each. Without them the loads act all the time.",
         json_schema_extra={"allowed": "a list of tables"},
     )
     remodeling: Remodeling = Remodeling()
@@ -436,7 +443,9 @@ class Scene(Table):
         """Fields that the body has not, each with the reason."""
         found = {} if self.regions else {REGION: "the scene has no regions"}
         same = "the mesh is free of stress ([natural]): 'fibre_angle' is that of the unloaded body"
-        return found | ({UNLOADED: same} if self.natural.is_of_the_mesh else {})
+        found |= {UNLOADED: same} if self.natural.is_of_the_mesh else {}
+        stays = "it changes with remodeling.turnover alone"
+        return found | ({} if self.remodeling.turnover.is_on else dict.fromkeys(TURNED_OVER, stays))
 
     @property
     def has_free_length(self) -> bool:

@@ -9,6 +9,7 @@ import difflib
 import inspect
 import math
 import re
+import textwrap
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args, get_origin
@@ -18,6 +19,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import CoreSchema, ErrorDetails, PydanticCustomError, PydanticUndefined, core_schema
 
 LONGEST_VALUE = 60  # characters of a value in an error
+PAGE_WIDTH = 98  # characters of a line of a page
 _MISSING = object()
 
 
@@ -415,7 +417,13 @@ def _section(key: str, variant: str, table: type[BaseModel]) -> str:
         if field.description
     ]
     head = ["| key | default | allowed | meaning |", "|---|---|---|---|"]
-    return "\n".join([title, "", *meaning(table).splitlines(), "", *head, *rows, ""])
+    return "\n".join([title, "", *paragraphs(meaning(table)), "", *head, *rows, ""])
+
+
+def paragraphs(text: str) -> list[str]:
+    """The lines of a text, filled to the width of a Markdown page."""
+    filled = (textwrap.wrap(part, PAGE_WIDTH, break_on_hyphens=False) for part in text.split("\n\n"))
+    return "\n\n".join(map("\n".join, filled)).split("\n")
 
 
 def _cell(text: str) -> str:
