@@ -24,7 +24,6 @@ LONG_LINES: dict[str, int] = {
     "docs/laws.md": 24,
     "docs/natural.md": 10,
     "docs/own_body.md": 16,
-    "docs/scene.md": 36,
     "docs/speed_and_accuracy.md": 27,
     "docs/stability.md": 204,
 }
@@ -39,7 +38,6 @@ LONG_PARAGRAPHS: dict[str, int] = {
     "docs/natural.md": 6,
     "docs/own_body.md": 9,
     "docs/reliability.md": 4,
-    "docs/scene.md": 1,
     "docs/speed.md": 8,
     "docs/speed_and_accuracy.md": 6,
     "docs/stability.md": 2,
