@@ -55,7 +55,26 @@ NOT_NEGATIVE: JsonDict = {"type": "number", "minimum": 0}
 
 
 class Mesh(Table):
-    """The finite elements."""
+    """The finite elements.
+
+    Its keyword arguments are the keys of `[mesh]` in a scene (docs/scene.md).
+
+    Raises
+    ------
+    SceneError
+        If a value is not allowed: one line.
+
+    Examples
+    --------
+    >>> from remodel_fenicsx import parts
+    >>> mesh = parts.Mesh(refinement=3, element="hexahedron", degree=1)
+    >>> parts.Cube(side=1.0).build(mesh).number_of_elements
+    27
+    >>> parts.Mesh(refinement=0)
+    Traceback (most recent call last):
+        ...
+    remodel_fenicsx.schema.tables.SceneError: refinement = 0: must be a whole number at least 1
+    """
 
     refinement: int = Field(
         default=1,
@@ -175,7 +194,29 @@ class Supports(Table):
 
 
 class Material(Table):
-    """The tissue: an isotropic matrix (Lame constants) with a network of collagen chains."""
+    """The tissue: an isotropic matrix (Lame constants) with a network of collagen chains.
+
+    Its keyword arguments are the keys of `[material]` in a scene (docs/scene.md; paper, eqs. 2 to 4). Stresses are in
+    `stress_unit`, lengths of chains in link lengths, `chain_density` in 1/m^3, `temperature` in kelvin.
+
+    Raises
+    ------
+    SceneError
+        If a value is not allowed: one line.
+
+    Examples
+    --------
+    The paper's tissue, in kPa:
+
+    >>> from remodel_fenicsx import parts
+    >>> material = parts.Material(lame_lambda=27.293, lame_mu=3.103, chain_density=7e21, contour_length=2.125,
+    ...                           persistence_length=1.82, temperature=310.0)
+    >>> round(material.network_modulus, 3)  # c of docs/theory.md
+    4.116
+    >>> tissue = material.tissue(end_to_end_length=1.0)
+    >>> tissue.contour_length
+    2.125
+    """
 
     lame_lambda: Annotated[float, STRESS] = Field(
         default=27.293, ge=0, description="First Lame constant lambda of the matrix, in stress_unit."
@@ -429,7 +470,25 @@ class Natural(Table):
 
 
 class Cells(Table):
-    """The orthotropic unit cells of the collagen network before the first remodeling pass."""
+    """The orthotropic unit cells of the collagen network before the first remodeling pass.
+
+    Its keyword arguments are the keys of `[cells]` in a scene (docs/scene.md); lengths are in link lengths. Fig. 2 of
+    the paper shows such a cell.
+
+    Raises
+    ------
+    SceneError
+        If a value is not allowed: one line.
+
+    Examples
+    --------
+    >>> from remodel_fenicsx import parts
+    >>> parts.Cells(initial="isotropic", end_to_end_length=1.0).dimensions(2).round(4)
+    array([[0.5774, 0.5774, 0.5774],
+           [0.5774, 0.5774, 0.5774]])
+    >>> parts.Cells(initial="random", seed=7).dimensions(1000).shape
+    (1000, 3)
+    """
 
     initial: Annotated[str | tuple[float, float, float], BeforeValidator(_initial_cells)] = Field(
         default="random",
@@ -540,6 +599,22 @@ class CouplingKind:
         Whether it solves several load cases with the same cells.
     needs_a_target
         Whether it is for laws with a target alone (`Law.target`).
+
+    Examples
+    --------
+    A coupling whose cells wait until t = 1:
+
+    >>> from remodel_fenicsx import Simulation, preset_scene
+    >>> from remodel_fenicsx.extend import COUPLINGS, CouplingKind, Staggered
+    >>> class Late(Staggered):
+    ...     def remodel(self, time):
+    ...         return super().remodel(time) if time > 1.0 else 0.0
+    >>> COUPLINGS["late"] = CouplingKind("as staggered, but the cells stay as they are up to t = 1", Late)
+    >>> late = {"remodeling.coupling": "late", "time.end": 3.0}
+    >>> scene = preset_scene("kuhl-holzapfel-2007", "cube").with_values(late)
+    >>> [round(step.row["mean_fibre_angle"], 2) for step in Simulation(scene).steps()]
+    [54.74, 54.74, 52.41]
+    >>> del COUPLINGS["late"]
     """
 
     meaning: str
@@ -623,7 +698,26 @@ class Turnover(Table):
 
 
 class Remodeling(Table):
-    """How the cells follow the load: driving tensor, evolution law, frame and speed."""
+    """How the cells follow the load: driving tensor, evolution law, frame and speed.
+
+    Its keyword arguments are the keys of `[remodeling]` in a scene (docs/scene.md; paper, eqs. 8 to 11); `kappa` is in
+    1/time.
+
+    Raises
+    ------
+    SceneError
+        If a value is not allowed: one line.
+
+    Examples
+    --------
+    >>> from remodel_fenicsx import parts
+    >>> parts.Remodeling(driver="cauchy", law="explicit", frame="spatial", kappa=0.025).coupling
+    'staggered'
+    >>> parts.Remodeling(driver="heat", law="explicit", frame="spatial", kappa=0.025)
+    Traceback (most recent call last):
+        ...
+    remodel_fenicsx.schema.tables.SceneError: driver = 'heat': allowed are 'cauchy', 'pk2', 'finger'
+    """
 
     driver: Annotated[str, OneOf(DRIVERS)] = Field(
         default="cauchy",
@@ -1081,7 +1175,27 @@ def _petsc_options(value: Any) -> Any:
 
 
 class Solver(Table):
-    """Solution of the nonlinear problem of each step."""
+    """Solution of the nonlinear problem of each step.
+
+    Its keyword arguments are the keys of `[solver]` in a scene (docs/scene.md).
+
+    Raises
+    ------
+    SceneError
+        If a value is not allowed: one line.
+
+    Examples
+    --------
+    >>> from remodel_fenicsx import parts
+    >>> parts.Solver().relative_tolerance
+    1e-10
+    >>> parts.Solver(method="direct", maximum_iterations=50).maximum_iterations
+    50
+    >>> parts.Solver(method="guess")
+    Traceback (most recent call last):
+        ...
+    remodel_fenicsx.schema.tables.SceneError: method = 'guess': allowed are 'auto', 'direct', 'lagged', 'iterative'
+    """
 
     method: Annotated[str, OneOf(SOLVER_METHODS, (AUTO,), REMOVED)] = Field(
         default=AUTO,

@@ -41,6 +41,12 @@ class Kinematics(ABC):
         Of which sector a tube is made (`model.closing.Closing`), where it has residual stress.
     cost
         Of a step for each quadrature point, in that of one of a hexahedron, as measured on the artery.
+
+    Examples
+    --------
+    >>> from remodel_fenicsx.extend import KINEMATICS
+    >>> {name: kinematics.reduced for name, kinematics in KINEMATICS.items()}
+    {'full': False, 'sector': True, 'axisymmetric': True, 'radial': True, 'point': True}
     """
 
     name: ClassVar[str]
@@ -108,7 +114,19 @@ class Kinematics(ABC):
 
 
 class FullKinematics(Kinematics):
-    """The displacement field in three dimensions: F = I + grad u."""
+    """The displacement field in three dimensions: F = I + grad u.
+
+    Examples
+    --------
+    >>> from remodel_fenicsx import parts
+    >>> domain = parts.Cube(side=1.0).build(parts.Mesh())
+    >>> kinematics = parts.FullKinematics()
+    >>> displacement = kinematics.unknown(domain.mesh, degree=1)
+    >>> kinematics.deformation_gradient(displacement).ufl_shape
+    (3, 3)
+    >>> kinematics.nodal_displacement(displacement).shape  # (nodes, 3)
+    (8, 3)
+    """
 
     name = "full"
     meaning = "the displacement in three dimensions"

@@ -28,6 +28,18 @@ class SolverMethod:
         scenes are read without PETSc, which it needs.
     on_several_ranks
         Options that replace those of the same name there.
+
+    Examples
+    --------
+    GMRES in place of a factorisation:
+
+    >>> from remodel_fenicsx.extend import SOLVER_METHODS, SolverMethod
+    >>> options = {"snes_type": "newtonls", "ksp_type": "gmres", "pc_type": "jacobi", "ksp_rtol": 1e-12}
+    >>> SOLVER_METHODS["krylov"] = SolverMethod(options, "for small bodies")
+    >>> from remodel_fenicsx import preset_scene
+    >>> preset_scene("kuhl-holzapfel-2007", "cube").with_values({"solver.method": "krylov"}).solver.method
+    'krylov'
+    >>> del SOLVER_METHODS["krylov"]
     """
 
     options: Mapping[str, Any]
