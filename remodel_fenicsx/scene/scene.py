@@ -267,7 +267,7 @@ class Scene(Table):
         """Why there is no equilibrium of the cells, or one that depends on the way there; None where neither is so."""
         law, laws = self.remodeling.law, ", ".join(repr(name) for name, law in LAWS.items() if law.has_limit)
         if not LAWS[law].has_limit:
-            return f"remodeling.law = {law!r}: its equilibrium depends on the path; allowed are the laws {laws}"
+            return f"remodeling.law = {law!r} has no limit that is the same on every path; allowed are the laws {laws}"
         if self.remodeling.turnover.is_on:
             return "remodeling.turnover: its equilibrium cannot be found at once; set time.end to a late time"
         if self.remodeling.threshold:

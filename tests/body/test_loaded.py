@@ -166,7 +166,7 @@ def test_what_has_no_unloaded_shape_says_at_which_share(tmp_path: Path, capsys: 
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"supports.ends": "clamped"}, "geometry.is = 'loaded': a tube with clamped ends"),
+        ({"supports.ends": "clamped"}, "geometry.is = 'loaded': not allowed with supports.ends = 'clamped'"),
         ({"natural.cells": "equilibrium"}, "natural.cells = 'equilibrium': needs time.end = 'equilibrium'"),
         (
             {"geometry.is": "unloaded", "natural.cells": "equilibrium"},
