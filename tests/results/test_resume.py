@@ -393,6 +393,7 @@ def test_a_signal_is_exit_code_4_and_one_line_says_how_to_go_on(half: Path, whol
     said = status(half)
     assert said[0] == f"{half}: scene, step {last:g} of 500, time {last:g} of 500"
     assert said[1].startswith("not running, the last step was done at ") and "killed" not in said[1]
+    assert said[1].endswith("; stopped by SIGUSR1") and said[1].count("stopped") == 1
     assert said[3] == f"checkpoint at time {last:g}; it goes on with: remodel-fenicsx run --resume {half}"
 
 
