@@ -483,6 +483,8 @@ class CouplingKind:
         Whether it makes the share `relaxation_factor` of a pass.
     takes_cases
         Whether it solves several load cases with the same cells.
+    takes_turnover
+        Whether it changes content and natural length of the collagen (`remodeling.turnover`).
     needs_a_target
         Whether it is for laws with a target alone (`Law.target`).
     """
@@ -492,6 +494,7 @@ class CouplingKind:
     makes_a_share: bool = False
     needs_a_target: bool = False
     takes_cases: bool = False
+    takes_turnover: bool = False
 
     @property
     def make(self) -> Callable[..., Any]:
@@ -504,6 +507,7 @@ COUPLINGS = {
         "solve with the cells of the step before, then remodel once",
         "remodel_fenicsx.evolution.coupling:Staggered",
         takes_cases=True,
+        takes_turnover=True,
     ),
     "relaxed": CouplingKind(
         "the same with a share, relaxation_factor, of what the pass changes: half of it is stable for every driver and "
@@ -518,6 +522,7 @@ COUPLINGS = {
         "remodel_fenicsx.evolution.extrapolated:Extrapolated",
         needs_a_target=True,
         takes_cases=True,
+        takes_turnover=True,
     ),
     "implicit": CouplingKind(
         "the cells belong to the stress of the same step: Newton's method on both, for the law 'tensor' (with a "
@@ -526,9 +531,6 @@ COUPLINGS = {
     ),
 }
 """Couplings by the name that a scene gives them."""
-
-
-TURNOVER_COUPLINGS = ("staggered", "extrapolated")  # the others ask for derivatives of the turnover, or share passes
 
 
 class Turnover(Table):
@@ -669,8 +671,8 @@ class Remodeling(Table):
             return self
         if LAWS[self.law] is not LAWS["tensor"]:
             raise fault("needs remodeling.law = 'tensor'", "turnover", None)
-        if self.coupling not in TURNOVER_COUPLINGS:
-            allowed_ones = ", ".join(map(repr, TURNOVER_COUPLINGS))
+        if not COUPLINGS[self.coupling].takes_turnover:
+            allowed_ones = ", ".join(repr(name) for name, kind in COUPLINGS.items() if kind.takes_turnover)
             raise fault(f"with remodeling.turnover must be one of: {allowed_ones}", "coupling", self.coupling)
         return self
 

@@ -47,6 +47,8 @@ class Coupling(Protocol):
         Whether `better` is wanted; set it before the first step.
     others
         Further load cases, solved with the same cells after the state itself (`load_cases.OtherCase`).
+    turnover
+        Content and natural length of the collagen (`turnover.TurnoverPass`), which it changes; None where they stay.
     better
         After `remodel`: cells at all points in one row that a better rule gives for the row; None if it has no error.
     """
@@ -59,6 +61,7 @@ class Coupling(Protocol):
     longest: float
     compares: bool
     others: Sequence[Any]
+    turnover: Any
 
     @property
     def better(self) -> UnitCell | None: ...
@@ -91,6 +94,7 @@ class Staggered:
         self._last = Numbers(state, "last_solution", {"extension": 0.0})  # its largest r/L
         self.share, self.compares, self.residual = 1.0, False, 0.0
         self.others: Sequence[Any] = ()
+        self.turnover: Any = None
         self.tangents = 0  # that were assembled in the last solve of the state itself
         self.blend: Blend | None = None
         if remodeling.law.remodels:  # now, for no form is compiled in the middle of a run
@@ -127,9 +131,12 @@ class Staggered:
 
     def remodel(self, time: float) -> float:
         """The pass with the solved state."""
-        if not self.remodeling.law.remodels:
-            return 0.0
-        return self.remodeling.apply(self.state.time, time, self.residual, self.share)
+        power = 0.0
+        if self.remodeling.law.remodels:
+            power = self.remodeling.apply(self.state.time, time, self.residual, self.share)
+        if self.turnover is not None:
+            self.turnover.lag(time)
+        return power
 
     @property
     def better(self) -> UnitCell | None:

@@ -84,12 +84,57 @@ def test_other_walls_open_as_an_independent_solver_says(
     assert known["opening_angle"] == pytest.approx(angle, abs=1.0)
 
 
-def test_without_turnover_it_is_the_law_tensor() -> None:
+@pytest.mark.parametrize("coupling", ["staggered", "extrapolated"])
+@pytest.mark.parametrize("time", [{}, {"tolerance": 1.0}], ids=["equal", "chosen"])
+def test_without_turnover_it_is_the_law_tensor(coupling: str, time: dict[str, float]) -> None:
     """Gain 0 and a huge time."""
-    for coupling in ("staggered", "extrapolated"):
-        never = {"time": 1e12, "deposition_stretch": 1.1, "gain": 0.0}
-        plain, turned = (simulated(wall(40.0, 4.0, t, [], coupling=coupling))[0][-1] for t in (None, never))
-        assert turned == pytest.approx(plain, rel=1e-9, abs=1e-9, nan_ok=True)
+    never = {"time": 1e12, "deposition_stretch": 1.1, "gain": 0.0}
+    scenes = [wall(40.0, 4.0, turnover, [], coupling=coupling) for turnover in (None, never)]
+    plain, turned = (simulated(scene | {"time": scene["time"] | time})[0] for scene in scenes)
+    assert len(turned) == len(plain)
+    assert turned[-1] == pytest.approx(plain[-1], rel=1e-9, abs=1e-9, nan_ok=True)
+
+
+# ---------------------------------------------------------------- errors in time
+GROWS = {"time": 40.0, "deposition_stretch": 1.1, "gain": 1.0}
+
+
+@pytest.fixture(scope="module")
+def small_steps() -> tuple[dict[str, float], dict[str, np.ndarray]]:
+    """The last row, and what is known at the points, at t = 96, m there 1.7."""
+    rows, known = simulated(wall(96.0, 0.5, GROWS, COLUMNS))
+    return rows[-1], known
+
+
+def errors(values: dict[str, Any], small_steps: Any) -> tuple[Array, int, float]:
+    """Of m and rho at the points and of the angles, in degrees, number of steps and the largest estimate."""
+    (rows, known), (last, reference) = simulated(values), small_steps
+    found = [np.degrees(np.abs(np.log(known[name] / reference[name])).max()) for name in COLUMNS]
+    found.append(max(abs(rows[-1][name] - last[name]) for name in ANGLES))
+    return np.array(found), len(rows), max(row.get("time_error", 0.0) for row in rows)
+
+
+@pytest.mark.parametrize(("coupling", "order"), [("staggered", 1), ("extrapolated", 2)])
+def test_the_order_of_the_coupling_is_that_of_content_and_natural_length(
+    coupling: str, order: int, small_steps: Any
+) -> None:
+    coarse, fine = (errors(wall(96.0, step, GROWS, COLUMNS, coupling=coupling), small_steps)[0] for step in (8.0, 2.0))
+    np.testing.assert_allclose(np.log(coarse / fine) / np.log(4.0), order, atol=0.35)
+
+
+@pytest.mark.parametrize("coupling", ["staggered", "extrapolated"])
+def test_chosen_steps_watch_content_and_natural_length(coupling: str, small_steps: Any) -> None:
+    """Errors fall as the tolerance does, and are below it; the estimate is as large as the error of the content."""
+    found, counts = [], []
+    for tolerance in (2.0, 0.5):
+        values = wall(96.0, 1.0, GROWS, COLUMNS, coupling=coupling)
+        values["time"]["tolerance"] = tolerance
+        error, count, estimate = errors(values, small_steps)
+        assert error.max() < tolerance and error[0] / 2 < estimate <= tolerance
+        found.append(error)
+        counts.append(count)
+    assert ((found[0] / found[1])[:2] > 2.5).all(), found
+    assert counts[1] > 1.5 * counts[0]
 
 
 def test_rates_against_their_equation() -> None:
@@ -145,9 +190,12 @@ def test_kinematics_agree() -> None:
         assert ends[0][name] > 1.05
 
 
-def test_a_run_goes_on_with_its_content(tmp_path: Path) -> None:
+@pytest.mark.parametrize("time", [{}, {"tolerance": 1.0}], ids=["equal", "chosen"])
+def test_a_run_goes_on_with_its_content(time: dict[str, float], tmp_path: Path) -> None:
     """Two parts are the whole, to the last digit."""
     values = wall(80.0, 4.0, {"time": 40.0, "gain": 1.0}, COLUMNS)
+    values["time"] |= time
+    values["output"]["times"] = [40.0]
     (tmp_path / "scene.toml").write_text(scene_from_dict(values).to_toml())
     command = ["run", str(tmp_path / "scene.toml"), "-q", "--set", "output.report=false"]
     assert cli.main([*command, "-o", str(tmp_path / "all")]) == 0
@@ -175,7 +223,6 @@ def test_its_columns_and_numbers_need_it() -> None:
         ({"turnover": {"deposition_stretch": 1.6}}, {}, "deposition_stretch = 1.6: must be smaller than"),
         ({"turnover": {"gain": -1.0}}, {}, "remodeling.turnover.gain = -1"),
         ({"turnover": {"pace": 1.0}}, {}, "remodeling.turnover.pace = 1.0: unknown key"),
-        ({}, {"tolerance": 0.1}, "time.tolerance = 0.1: must be left out"),
         ({}, {"end": "equilibrium"}, "remodeling.turnover has no equilibrium"),
     ],
 )
