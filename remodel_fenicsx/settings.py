@@ -515,6 +515,7 @@ COUPLINGS = {
         "remodel_fenicsx.evolution.coupling:Relaxed",
         makes_a_share=True,
         takes_cases=True,
+        takes_turnover=True,
     ),
     "extrapolated": CouplingKind(
         "remodel first, towards the stress of the middle of the step, extrapolated from the two steps before; then "
@@ -536,7 +537,7 @@ COUPLINGS = {
 class Turnover(Table):
     """How collagen is removed and deposited under a stretch (docs/turnover.md); without `time` none is.
 
-    For the law `tensor`, with the couplings `staggered` and `extrapolated`.
+    For the law `tensor`, with the couplings `staggered`, `relaxed` and `extrapolated`.
     """
 
     time: float | None = Field(

@@ -101,7 +101,7 @@ class Extrapolated(Staggered):
         values[:, :, 0, 9] = target.share.reshape(values.shape[:2])
         values[:, :, 0, 10] = time
         if self.turnover is not None:
-            self.turnover.look(time)
+            self.turnover.complete(time)
         return self._power
 
     def _mean(self, target: Target, duration: float) -> Target:

@@ -119,7 +119,7 @@ class TimeError:
             better, angle = known, most
         before, after = (structure_tensor(*some.cells[:2]) for some in (row, better))
         self._last.push(tensors.to_mandel(after - before).ravel())
-        if better.turnover is not None:
+        if row.turnover is not None and better.turnover is not None:
             self._last_turnover.push(np.ravel((better.turnover - row.turnover).T))
         return max(angle, strain)
 

@@ -42,9 +42,9 @@ def changed(start: Array, rates: Array, duration: float) -> Array:
 class TurnoverPass:
     """Changes content and natural length with the lengths of solved states, as the coupling asks.
 
-    Where rows lag (`lag`) a step has the rates of its end, and the row those before it, as with the cells of a staggered
-    pass. Otherwise (`extrapolate`) content and natural length are those of the end of the row's step, from the rates
-    that the last two states let expect for its middle (Adams and Bashforth's second-order rule).
+    They are always those of the last solved state. Where rows lag (`lag`), a row has them from the rates of the rows
+    before it, as the cells of a staggered pass. Otherwise (`extrapolate`) they are those of the end of the row's step,
+    from the rates that the last two states let expect for its middle (Adams and Bashforth's second-order rule).
 
     Parameters
     ----------
@@ -72,32 +72,46 @@ class TurnoverPass:
         self._earlier = Earlier(state, "turnover_rates", lambda: self.quadrature.function("", (2,)), 1)
         self.weights: Sequence[float] = (1.0,)  # of the load cases, that of `state` first
         self.slowest, self.fastest = 1.0 / settings.time, max(1.0, settings.gain) / settings.time
-        self._start = self.row = self.better = self.logarithms()
+        self._start = self._before = self.row = self.better = self.logarithms()  # before: of the last solved state
+        self._extrapolates = False
 
     # ------------------------------------------------------------ over a step
     def lag(self, time: float) -> None:
-        """After a step to `time`: m and rho of the next row, with the rates of the solved state."""
-        self.row = self.logarithms()
-        self.better = self.after(self.row, time - self.state.time)
-        self.set(self.better)
-        self._warn()
+        """Before a step to `time` is solved: m and rho change with the rates of the last row, over its step."""
+        self._change(self.rates(), self._numbers["duration"])
+        self._numbers["duration"], self._extrapolates = time - self.state.time, False
 
     def extrapolate(self, time: float) -> None:
         """Before a step to `time` is solved: m and rho of its end."""
-        duration, mean = time - self.state.time, self.rates()
-        self._start, start = self.logarithms(), mean
+        duration, start = time - self.state.time, self.rates()
+        mean = start
         if self._earlier.known:
             before = self._earlier.values[0].reshape(-1, 2).T
             mean = start + duration / (2 * self._numbers["duration"]) * (start - before)
         self._earlier.push(np.ravel(start.T))
-        self._numbers["duration"] = duration
-        self.row = changed(self._start, mean, duration)
+        self._numbers["duration"], self._extrapolates = duration, True
+        self._change(mean, duration)
+
+    def _change(self, rates: Array, duration: float) -> None:
+        self._before = self._start = self.logarithms()
+        self.row = changed(self._start, rates, duration)
         self.set(self.row)
 
-    def look(self, time: float) -> None:
-        """After a step that was extrapolated: what the rates at both ends give together."""
-        start = self._earlier.values[0].reshape(-1, 2).T
-        self.better = changed(self._start, (start + self.rates()) / 2, time - self.state.time)
+    def set_part(self, fraction: float) -> None:
+        """A part of what has changed since the last solved state."""
+        self.set(self._before + fraction * (self.row - self._before))
+
+    def settle(self) -> None:
+        """The present state is solved."""
+        self._before = self.row
+
+    def complete(self, time: float) -> None:
+        """After a step: what is better than the row."""
+        duration = time - self.state.time
+        self.better = self.after(self.row, duration)
+        if self._extrapolates:  # the rates at both ends together
+            start = self._earlier.values[0].reshape(-1, 2).T
+            self.better = changed(self._start, (start + self.rates()) / 2, duration)
         self._warn()
 
     def after(self, start: Array, duration: float, present: bool = False) -> Array:
