@@ -49,8 +49,15 @@ class Coupling(Protocol):
         Further load cases, solved with the same cells after the state itself (`load_cases.OtherCase`).
     turnover
         Content and natural length of the collagen (`turnover.TurnoverPass`), which it changes; None where they stay.
-    better
-        After `remodel`: cells at all points in one row that a better rule gives for the row; None if it has no error.
+
+    Examples
+    --------
+    What a script writes is most often a `Staggered` with another second half; a simulation has one:
+
+    >>> from remodel_fenicsx import Simulation, preset_scene
+    >>> coupling = Simulation(preset_scene("kuhl-holzapfel-2007", "cube")).stepper.coupling
+    >>> coupling.order, coupling.accumulates
+    (1, False)
     """
 
     equilibrium: Equilibrium
@@ -64,7 +71,8 @@ class Coupling(Protocol):
     turnover: Any
 
     @property
-    def better(self) -> UnitCell | None: ...
+    def better(self) -> UnitCell | None:
+        """After `remodel`: cells (n, 3) and (n, 3, 3) that a better rule gives; None if the row has no error."""
 
     def solve(self, time: float, loads: LoadValues) -> Work:
         """Bring the state to equilibrium with the loads of `time`; `state.equilibrium_cells` are those of the row."""
@@ -77,10 +85,31 @@ class Coupling(Protocol):
 
 
 class Staggered:
-    """The paper's: solve with the cells of the step before, then one remodeling pass.
+    """The paper's coupling: solve with the cells of the step before, then one remodeling pass.
 
     Where Newton's method cannot go to the new state in one piece, the change of the cells and then the change of the
     loads are applied in parts (docs/theory.md, "Steps that are too large"): the state at the end is the same.
+
+    Parameters
+    ----------
+    state
+        What is advanced.
+    tissue
+        Its constitutive parameters, on the mesh.
+    remodeling
+        The pass that changes the cells.
+    settings
+        Of the solver.
+
+    Examples
+    --------
+    A coupling of one's own overrides one of its halves, see `CouplingKind`. A simulation makes it:
+
+    >>> from remodel_fenicsx import Simulation, preset_scene
+    >>> from remodel_fenicsx.extend import Staggered
+    >>> simulation = Simulation(preset_scene("kuhl-holzapfel-2007", "cube"), coupling=Staggered)
+    >>> type(simulation.stepper.coupling).__name__
+    'Staggered'
     """
 
     order, accumulates, longest = 1, False, math.inf

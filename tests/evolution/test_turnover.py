@@ -185,18 +185,6 @@ def test_a_growth_that_does_not_rest_is_said(caplog: pytest.LogCaptureFixture) -
     assert sum("mechanobiological instability" in record.message for record in caplog.records) == 1
 
 
-def test_kinematics_agree() -> None:
-    """One radius and a half-plane, while it grows."""
-    turnover = {"time": 40.0, "deposition_stretch": 1.1, "gain": 1.0}
-    ends = []
-    for kinematics in ("radial", "axisymmetric"):
-        values = wall(120.0, 8.0, turnover, COLUMNS) | {"model": {"kinematics": kinematics}}
-        ends.append(simulated(values)[0][-1])
-    for name in (*COLUMNS, "outer_radius"):
-        assert ends[1][name] == pytest.approx(ends[0][name], rel=2e-3), name
-        assert ends[0][name] > 1.05
-
-
 @pytest.mark.parametrize("time", [{}, {"tolerance": 1.0}], ids=["equal", "chosen"])
 def test_a_run_goes_on_with_its_content(time: dict[str, float], tmp_path: Path) -> None:
     """Two parts are the whole, to the last digit."""
