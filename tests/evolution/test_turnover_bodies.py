@@ -150,7 +150,7 @@ def test_regions_of_one_tissue_are_none() -> None:
 
 
 def test_each_region_turns_over_with_its_own_chains() -> None:
-    """The second row has for ln m and ln rho the rates of the first one's length L, r0 and chains, written down here."""
+    """After the first row ln m and ln rho have the rates of its length L, r0 and chains, written down here."""
     outer = {"material": {"contour_length": 1.9, "chain_density": 2.0}, "cells": {"end_to_end_length": 1.2}}
     remodeling = {"turnover": TURNOVER, "coupling": "staggered"}  # the first step is solved with the cells of the start
     of = grown(regions=layers(**outer), time={"end": 2.0, "step": 2.0}, remodeling=remodeling)
