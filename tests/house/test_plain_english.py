@@ -36,7 +36,6 @@ DECODED = (  # what a native reader had to decode
     "waits for nobody",
     "let expect the solution",
     "lets expect the solution",
-    "the way is gone",
     "one that is finished is lengthened",
     "with another one the stress at a point belongs to its element",
 )
