@@ -182,7 +182,7 @@ run sees it by itself.
 
 ## Thick tube
 
-Radii 1 and 3, plane strain, no chains, pressure 2 in four steps, mu = 3.103. Each cell of the table
+Radii 1 and 3, plane strain, no chains, pressure 2 in four steps, mu = 3.103. Each entry of the table
 has three numbers:
 
 1. the error of the inner displacement against {exact}, that of the incompressible tube (at
