@@ -333,9 +333,6 @@ class Scene(Table):
             return
         if not material.chain_density:
             raise fault("needs chains: material.chain_density above 0", "remodeling.turnover", None)
-        if self.time.tolerance is not None:
-            rule = "must be left out with remodeling.turnover, whose error is not estimated: give time.step alone"
-            raise fault(rule, "time.tolerance", self.time.tolerance)
         longest = material.contour_length / r0
         if CHAINS[material.chain].locks and turnover.deposition_stretch >= longest:
             rule = f"must be smaller than {region}contour_length / end_to_end_length = {shown(longest)}"
