@@ -150,6 +150,10 @@ class TurnoverPass:
         values: Array = self.quadrature.values(getattr(self.tissue, name), ())
         return values
 
+    def grows_on(self) -> bool:
+        """Whether the natural length has grown so much anywhere that it is not expected to come to rest."""
+        return self.quadrature.maximum(self._values("natural_length")) > BEYOND_REST
+
     def _warn(self) -> None:
         if self._numbers["said"]:
             return

@@ -268,8 +268,6 @@ class Scene(Table):
         law, laws = self.remodeling.law, ", ".join(repr(name) for name, law in LAWS.items() if law.has_limit)
         if not LAWS[law].has_limit:
             return f"remodeling.law = {law!r} has no limit that is the same on every path; allowed are the laws {laws}"
-        if self.remodeling.turnover.is_on:
-            return "remodeling.turnover: its equilibrium cannot be found at once; set time.end to a late time"
         if self.remodeling.threshold:
             return "remodeling.threshold is above 0: where cells rest depends on the path; set time.end to a late time"
         if self.remodeling.has_set_point:
@@ -289,7 +287,9 @@ class Scene(Table):
         """The time of the last row: where the equilibrium is asked for, one at which nothing is left of the start."""
         if not self.time.is_equilibrium:
             return float(self.time.end)
-        return self.end_of_ramps + FORGOTTEN_AFTER / min(properties.kappa for properties in self.properties().values())
+        rates = [properties.kappa for properties in self.properties().values()]
+        rates += [1 / self.remodeling.turnover.time] if self.remodeling.turnover.time else []
+        return self.end_of_ramps + FORGOTTEN_AFTER / min(rates)
 
     def _check_regions(self) -> None:
         shape, columns = self.geometry, {column.name for column in columns_of(self.geometry)}
