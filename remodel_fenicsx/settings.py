@@ -597,6 +597,8 @@ class CouplingKind:
         Whether it makes the share `relaxation_factor` of a pass.
     takes_cases
         Whether it solves several load cases with the same cells.
+    takes_turnover
+        Whether it changes content and natural length of the collagen (`remodeling.turnover`).
     needs_a_target
         Whether it is for laws with a target alone (`Law.target`).
 
@@ -622,6 +624,7 @@ class CouplingKind:
     makes_a_share: bool = False
     needs_a_target: bool = False
     takes_cases: bool = False
+    takes_turnover: bool = False
 
     @property
     def make(self) -> Callable[..., Any]:
@@ -634,6 +637,7 @@ COUPLINGS = {
         "solve with the cells of the step before, then remodel once",
         "remodel_fenicsx.evolution.coupling:Staggered",
         takes_cases=True,
+        takes_turnover=True,
     ),
     "relaxed": CouplingKind(
         "as 'staggered', but only the share relaxation_factor of each change is made; one half is stable for every "
@@ -641,6 +645,7 @@ COUPLINGS = {
         "remodel_fenicsx.evolution.coupling:Relaxed",
         makes_a_share=True,
         takes_cases=True,
+        takes_turnover=True,
     ),
     "extrapolated": CouplingKind(
         "first remodel towards the stress of the middle of the step, extrapolated from the two steps before, then "
@@ -648,6 +653,7 @@ COUPLINGS = {
         "remodel_fenicsx.evolution.extrapolated:Extrapolated",
         needs_a_target=True,
         takes_cases=True,
+        takes_turnover=True,
     ),
     "implicit": CouplingKind(
         "find cells and equilibrium of the same step together, by Newton's method; for the law 'tensor' (with a "
@@ -658,13 +664,10 @@ COUPLINGS = {
 """Couplings by the name that a scene gives them."""
 
 
-TURNOVER_COUPLINGS = ("staggered", "extrapolated")  # the others ask for derivatives of the turnover, or share passes
-
-
 class Turnover(Table):
     """How collagen is removed, and deposited again under a stretch (docs/turnover.md). Without `time` it is not.
 
-    For the law `tensor`, with the couplings `staggered` and `extrapolated`.
+    For the law `tensor`, with the couplings `staggered`, `relaxed` and `extrapolated`.
     """
 
     time: float | None = Field(
@@ -853,8 +856,8 @@ class Remodeling(Table):
             return self
         if LAWS[self.law] is not LAWS["tensor"]:
             raise fault("needs remodeling.law = 'tensor'", "turnover", None)
-        if self.coupling not in TURNOVER_COUPLINGS:
-            allowed_ones = ", ".join(map(repr, TURNOVER_COUPLINGS))
+        if not COUPLINGS[self.coupling].takes_turnover:
+            allowed_ones = ", ".join(repr(name) for name, kind in COUPLINGS.items() if kind.takes_turnover)
             raise fault(f"with remodeling.turnover must be one of: {allowed_ones}", "coupling", self.coupling)
         return self
 

@@ -171,18 +171,34 @@ class Stepper:
         name = remodeling.coupling if self.remodeling.law.remodels else "staggered"
         make = coupling or COUPLINGS[name].make
         self.coupling: Coupling = make(state, self.tissue, self.remodeling, solver)
-        self.turnover: Any = None  # `TurnoverPass`
+        # `TurnoverPass`; there already where the coupling's way is another stepper's
+        self.turnover: Any = getattr(self.coupling, "turnover", None)
         self.cases: Sequence[Any] = ()  # further load cases (`load_cases.OtherCase`)
-        if remodeling.turnover.is_on:
+        if remodeling.turnover.is_on and self.turnover is None:
             from remodel_fenicsx.evolution.turnover import TurnoverPass
 
-            self.turnover = TurnoverPass(state, self.tissue, remodeling.turnover)
+            self.turnover = self.coupling.turnover = TurnoverPass(state, self.tissue, remodeling.turnover)
         self._closed = False
         # asked on each rank in every solve: the signal (SIGINT, SIGTERM) that should end it, or 0
         self.stop_signal: Callable[[], int] = lambda: 0
         self.coupling.equilibrium.stop_signal = lambda: self.stop_signal()
         # asked when a step's pass is done; what it raises takes the step back (`step_control`)
         self.judge: Callable[[Step], object] = lambda step: None
+
+    @property
+    def slowest(self) -> float:
+        """The smallest rate above 0 of cells and turnover, in 1/time; 0 where nothing remodels."""
+        return min((rate for rate in self._rates("slowest") if rate), default=0.0)
+
+    @property
+    def fastest(self) -> float:
+        """The largest one."""
+        return max(self._rates("fastest"), default=0.0)
+
+    def _rates(self, name: str) -> list[float]:
+        parts = [self.remodeling] if self.remodeling.law.remodels else []
+        parts += [] if self.turnover is None else [self.turnover]
+        return [getattr(part, name) for part in parts]
 
     def start(self, watchers: Sequence[Watcher] = ()) -> Step:
         """The present state as the step that watchers see before all others."""
@@ -237,8 +253,6 @@ class Stepper:
                 for watcher in watchers:
                     watcher.solved(step)
                 step.remodeling_power = self.coupling.remodel(time)
-                if self.turnover is not None:
-                    self.turnover.apply(time - state.time)
                 step.seconds = clock.perf_counter() - start
                 step.processor_seconds = clock.process_time() - processor_start
                 if rejected is not None:

@@ -266,8 +266,6 @@ class Scene(Table):
         law, laws = self.remodeling.law, ", ".join(repr(name) for name, law in LAWS.items() if law.has_limit)
         if not LAWS[law].has_limit:
             return f"remodeling.law = {law!r} has no limit that the way there does not decide; those with one: {laws}"
-        if self.remodeling.turnover.is_on:
-            return "remodeling.turnover has no equilibrium that is found at once; march to a late time"
         if self.remodeling.threshold:
             return "remodeling.threshold is above 0: where cells fall asleep depends on the way; march to a late time"
         if self.remodeling.has_set_point:
@@ -287,7 +285,9 @@ class Scene(Table):
         """The time of the last row: where the equilibrium is asked for, one at which nothing is left of the start."""
         if not self.time.is_equilibrium:
             return float(self.time.end)
-        return self.end_of_ramps + FORGOTTEN_AFTER / min(properties.kappa for properties in self.properties().values())
+        rates = [properties.kappa for properties in self.properties().values()]
+        rates += [1 / self.remodeling.turnover.time] if self.remodeling.turnover.time else []
+        return self.end_of_ramps + FORGOTTEN_AFTER / min(rates)
 
     def _check_regions(self) -> None:
         shape, columns = self.geometry, {column.name for column in columns_of(self.geometry)}
@@ -329,9 +329,6 @@ class Scene(Table):
             return
         if not material.chain_density:
             raise fault("needs chains: material.chain_density above 0", "remodeling.turnover", None)
-        if self.time.tolerance is not None:
-            rule = "must be left out with remodeling.turnover, whose error is not estimated: give time.step alone"
-            raise fault(rule, "time.tolerance", self.time.tolerance)
         longest = material.contour_length / r0
         if CHAINS[material.chain].locks and turnover.deposition_stretch >= longest:
             rule = f"must be smaller than {region}contour_length / end_to_end_length = {shown(longest)}"

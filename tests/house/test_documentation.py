@@ -94,6 +94,28 @@ def test_files_and_modules_that_a_page_names_are_there(name: str) -> None:
         assert (ROOT / name).parent.joinpath(link).exists(), link
 
 
+def named_sections(text: str) -> list[tuple[str, str]]:
+    """Page and section of `docs/page.md, Section` in prose, comments, docstrings and strings in several parts."""
+    text = re.sub(r"[\"']\s*\n\s*f?[\"']", "", text)
+    text = re.sub(r"\s*\n\s*(?:# )?", " ", text)
+    return re.findall(r"(?:docs/|\]\()(\w+)\.md\)?, \"?([A-Z][\w -]+\w)", text)
+
+
+def test_sections_that_are_named_are_there() -> None:
+    """By run messages, docstrings and pages."""
+    files = [*ROOT.glob("remodel_fenicsx/**/*.py"), *ROOT.glob("benchmarks/**/*.py"), *ROOT.glob("docs/*.md")]
+    heads = {file.stem: re.findall(r"^#+ (.*)$", file.read_text(encoding="utf-8"), re.M) for file in files}
+    found = {
+        (file.name, name, section)
+        for file in files
+        for name, section in named_sections(file.read_text(encoding="utf-8"))
+        if file.stem != "appendix_stability"  # messages that are cut off
+    }
+    assert len(found) > 30
+    assert not [one for one in found if not any(one[2].startswith(head) for head in heads.get(one[1], []))]
+    assert named_sections('"so (docs/theory.md, No "\n    "section)"') == [("theory", "No section")]
+
+
 def test_a_name_that_the_package_does_not_have_is_refused() -> None:
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         remodel_fenicsx.nothing  # noqa: B018

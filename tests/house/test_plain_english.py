@@ -36,6 +36,7 @@ DECODED = (  # what a native reader had to decode
     "by what its passes multiply a small change",
     "waits for nobody",
     "let expect the solution",
+    "lets expect the solution",
     "one that is finished is lengthened",
     "with another one the stress at a point belongs to its element",
 )
