@@ -108,7 +108,7 @@ def objections(scene: Any, name: str) -> list[str]:
         return [f"a {shape.name} has no such reduction; it has {known}"]
     reasons = [reason for rule in shape.reductions[name].rules if (reason := rule(scene)) is not None]
     if scene.solver.unstable == "stop":
-        reasons.append("solver.unstable = 'stop' asks for modes of the whole body")
+        reasons.append("solver.unstable = 'stop' needs the modes of the whole body")
     return reasons
 
 
@@ -223,7 +223,7 @@ def round_about_z(scene: Any) -> str | None:
     axes = scene.cells.axes
     if axes == "cylindrical" or (axes == "global" and all(a == b == 0 for a, b, _ in _dimensions(scene))):
         return None
-    return f"cells.axes = {axes!r} makes another tube along x than along the diagonal"
+    return f"cells.axes = {axes!r}: the tube is not round, along x it differs from along the diagonal"
 
 
 def symmetric_planes(scene: Any) -> str | None:
@@ -250,7 +250,9 @@ def homogeneous(scene: Any) -> str | None:
 def free_ends(scene: Any) -> str | None:
     """Ends that move radially as all other sections do."""
     ends = scene.supports.ends
-    return None if ends in ("free", "closed") else f"supports.ends = {ends!r}: the sections are not alike"
+    return (
+        None if ends in ("free", "closed") else f"supports.ends = {ends!r}: the sections are not alike"
+    )
 
 
 def known_loads(name: str) -> Rule:
