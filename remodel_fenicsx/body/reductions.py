@@ -250,9 +250,7 @@ def homogeneous(scene: Any) -> str | None:
 def free_ends(scene: Any) -> str | None:
     """Ends that move radially as all other sections do."""
     ends = scene.supports.ends
-    return (
-        None if ends in ("free", "closed") else f"supports.ends = {ends!r}: the sections are not alike"
-    )
+    return None if ends in ("free", "closed") else f"supports.ends = {ends!r}: the sections are not alike"
 
 
 def known_loads(name: str) -> Rule:
