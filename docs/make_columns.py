@@ -23,10 +23,13 @@ def _rows() -> Iterator[str]:
     for (name, unit, meaning), having in sorted(shapes.items(), key=lambda item: len(item[1]) != len(SHAPES)):
         of = "all" if len(having) == len(SHAPES) else ", ".join(having)
         yield f"| `{name}` | {of} | {unit} | {meaning} |"
+    asked: dict[tuple[str, str, str], list[str]] = {}
     for shape, kind in SHAPES.items():
         of_loads = (load.make_column(name) for name, load in kind.loads.items() if load.frees_length)
         for column in (*of_loads, *kind.columns_on_request):
-            yield f"| `{column.name}` | {shape}, on request | {column.unit} | {column.meaning} |"
+            asked.setdefault(_key(column), []).append(shape)
+    for (name, unit, meaning), having in asked.items():
+        yield f"| `{name}` | {', '.join(having)}, on request | {unit} | {meaning} |"
     for column in COLUMNS_ON_REQUEST.values():
         yield f"| `{column.name}` | on request | {column.unit} | {column.meaning} |"
 

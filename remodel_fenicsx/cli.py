@@ -61,128 +61,232 @@ def parser() -> argparse.ArgumentParser:
     main_parser = _Parser(
         prog="remodel-fenicsx",
         description="Predict how collagen in living tissue reorients under load (Kuhl & Holzapfel 2007).",
-        epilog="exit codes: " + ", ".join(f"{code} {meaning}" for code, meaning in EXIT_CODES.items()),
+        epilog=MAIN_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    main_parser.add_argument("--version", action="version", version=__version__)
-    commands = main_parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    main_parser.add_argument("--version", action="version", version=__version__, help="Print the version and end.")
+    commands = _Commands(main_parser.add_subparsers(dest="command", required=True, metavar="COMMAND"))
+    _add_runs(commands)
+    _add_views(commands)
+    _add_preparations(commands)
+    _add_studies(commands)
+    commands.found.add_parser(SERVE)  # of the processes of a study; not listed
+    commands.add("info", "Print the versions of the program and its libraries, the solvers and the BLAS.", "info")
+    return main_parser
 
-    def command(name: str, text: str) -> argparse.ArgumentParser:
-        return commands.add_parser(name, help=text, description=text)
 
-    def scene_command(name: str, text: str) -> argparse.ArgumentParser:
+MAIN_EPILOG = (
+    "examples:\n"
+    "  remodel-fenicsx new kuhl-holzapfel-2007 > artery.toml\n"
+    "  remodel-fenicsx run artery.toml -o artery\n"
+    "  remodel-fenicsx report artery --open\n\n"
+    "'remodel-fenicsx COMMAND --help' explains a command; docs/commands.md explains all.\n\n"
+    "exit codes:\n" + "\n".join(f"  {code:<5}{meaning}" for code, meaning in EXIT_CODES.items())
+)
+
+
+class _Commands:
+    """The commands of a parser. Each says what it is for, and ends its help with examples."""
+
+    def __init__(self, found: Any) -> None:
+        self.found = found
+
+    def add(self, name: str, text: str, *examples: str) -> argparse.ArgumentParser:
+        """One more; an example is what follows the program's name."""
+        shown = "\n".join(f"  remodel-fenicsx {example}" for example in examples)
+        epilog = f"{'examples' if len(examples) > 1 else 'example'}:\n{shown}"
+        raw = argparse.RawDescriptionHelpFormatter
+        added: argparse.ArgumentParser = self.found.add_parser(
+            name, help=text.replace("%", "%%"), description=text, epilog=epilog, formatter_class=raw
+        )
+        return added
+
+    def add_for_scene(self, name: str, text: str, *examples: str) -> argparse.ArgumentParser:
         """One that reads a scene, which `run --resume` finds in the folder."""
-        found, meaning = command(name, text), "scene file (TOML), see docs/scene.md"
+        found, meaning = self.add(name, text, *examples), "The scene file (TOML); docs/scene.md lists its keys."
         if name == "run":
             which = found.add_mutually_exclusive_group(required=True)
             which.add_argument("scene", type=Path, nargs="?", metavar="SCENE", help=meaning)
-            text = "go on with the run in DIR from its last checkpoint"
+            text = "Go on with the run in DIR from its last checkpoint, in place of a new run of SCENE."
             which.add_argument("--resume", type=Path, metavar="DIR", help=text)
         else:
             found.add_argument("scene", type=Path, metavar="SCENE", help=meaning)
-        text = "set a key of the scene, e.g. cells.seed=2 or time.end=10; may be repeated"
+        text = "Change one key of the scene, such as cells.seed=2 or time.end=10. May be repeated."
         found.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help=text)
-        found.add_argument("--profile", choices=PROFILES, help="lay the settings of a profile over the scene's own")
+        text = "Choose speed or accuracy: mesh, step and element of a measured profile replace those of the scene."
+        found.add_argument("--profile", choices=PROFILES, help=text)
         return found
 
-    def writes(found: argparse.ArgumentParser, text: str) -> None:
-        found.add_argument("-o", "--output", type=Path, metavar="DIR", help=text)
+    def add_for_run(self, name: str, text: str, *examples: str) -> argparse.ArgumentParser:
+        """One that reads the folder of a run."""
+        found = self.add(name, text, *examples)
+        found.add_argument("folder", type=Path, metavar="DIR", help="The folder of a run.")
+        return found
 
-    run_command = scene_command("run", "Run a scene; mpirun -n N remodel-fenicsx run ... is the same run on N ranks.")
-    writes(run_command, "new or empty folder for the results (default: results/NAME)")
-    text = "stop before this time is over, after a whole step, with exit code 4: 90s, 30min, 2h, 1.5d"
+
+def _writes(found: argparse.ArgumentParser, text: str, metavar: str = "DIR") -> None:
+    found.add_argument("-o", "--output", type=Path, metavar=metavar, help=text)
+
+
+def _quiet(found: argparse.ArgumentParser) -> None:
+    found.add_argument("-q", "--quiet", action="store_true", help="Show no progress, only warnings.")
+
+
+def _jobs(found: argparse.ArgumentParser, kind: Callable[[str], int] = positive) -> None:
+    text = "Do at most N runs at a time (default: as many as there are cores)."
+    found.add_argument("--jobs", type=kind, metavar="N", help=text)
+
+
+def _add_runs(commands: _Commands) -> None:
+    """Those that solve a scene once, or say where that is."""
+    run_command = commands.add_for_scene(
+        "run",
+        "Solve a scene, or go on with a run that was stopped.",
+        "run artery.toml -o artery",
+        "run artery.toml --set time.end=10 -o short",
+        "run --resume artery --set time.end=300",
+        "run artery.toml --max-wall-time 2h",
+    )
+    _writes(run_command, "Put the results into this folder, which must be new or empty (default: results/NAME).")
+    text = "Stop before this time is over (90s, 30min, 2h, 1.5d): after a whole step, with exit code 4."
     run_command.add_argument("--max-wall-time", type=wall_time, metavar="TIME", help=text)
-    text = "leave no report.html at the end, as with output.report = false"
+    text = "Make no report.html at the end, as with output.report = false."
     run_command.add_argument("--no-report", dest="report", action="store_false", help=text)
-    stability = scene_command("stability", "Run a scene and say whether its passes damp small changes of the cells.")
-    writes(stability, "new or empty folder (default: results/NAME-stability)")
-    stability.add_argument("--times", type=positive, default=10, metavar="N", help="times to analyse (default: 10)")
-    stability.set_defaults(resume=None, max_wall_time=None, report=False)
-    ensemble = scene_command("ensemble", "Run a scene of random cells with many seeds, and with isotropic cells.")
-    ensemble.add_argument("--seeds", type=positive, default=32, metavar="N", help="how many (default: 32; at least 2)")
-    trade = scene_command("trade", "Run a scene with a ladder of settings: what each costs, and how far off it is.")
-    text = "wall time for the runs: 90s, 10min, 2h (default: 10min); cheap settings first"
-    trade.add_argument("--budget", type=wall_time, default=600.0, metavar="TIME", help=text)
-    sweep = scene_command("sweep", "Run a scene with other numbers: how its end depends on them.")
-    text = "KEY=a:b:n (n numbers from a to b) or KEY=a,b,...; of several all combinations are run"
-    sweep.add_argument("axes", nargs="+", metavar="KEY=a:b:n", help=text)
-    text = "N points of a Latin hypercube in place of all combinations; then each key is KEY=a:b"
-    sweep.add_argument("--latin", type=positive, metavar="N", help=text)
-    sweep.add_argument("--seed", type=int, default=1, metavar="N", help="of the Latin hypercube (default: 1)")
-    for study, name in ((ensemble, "ensemble"), (trade, "trade"), (sweep, "sweep")):
-        text = "finished runs of the same scene that it holds are used, others go on"
-        writes(study, f"folder (default: results/NAME-{name}); {text}")
-        study.add_argument("--jobs", type=positive, metavar="N", help="runs at a time (default: as many as cores)")
-    fitting = scene_command("fit", "Fit numbers of a scene to measurements, with 95 % bands.")
-    text = "the unknowns, and tables of measurements (TOML), see docs/fit.md"
-    fitting.add_argument("data", type=Path, metavar="DATA", help=text)
-    writes(fitting, "new or empty folder, or that of the same fit, which goes on (default: results/NAME-fit)")
-    text = "the given one, and others within a factor of two (default: 3)"
-    fitting.add_argument(
-        "--no-likelihood-profiles", dest="profiles", action="store_false", help="of unknowns that go together"
-    )
-    fitting.add_argument("--starts", type=positive, default=3, metavar="N", help=text)
-    for found in (run_command, stability, ensemble, trade, sweep, fitting):
-        found.add_argument("-q", "--quiet", action="store_true", help="no progress")
-    status = command("status", "Say where the run in DIR is, how fast, and whether it is alive.")
-    status.add_argument("folder", type=Path, metavar="DIR", help="folder of a run")
-    report = command(
-        "report", "Make the page of the run in DIR for a browser, also while it runs; it needs no network."
-    )
-    report.add_argument("folder", type=Path, metavar="DIR", help="folder of a run")
-    text = "a file that does not exist yet (default: DIR/report.html, which is made anew)"
-    report.add_argument("-o", "--output", type=Path, metavar="FILE", help=text)
-    text = "MB that the page may have (default: %(default)g): where it would be larger fewer times are shown"
+    _quiet(run_command)
+    text = "Say where the run in DIR is, how fast it is, and whether it is alive."
+    commands.add_for_run("status", text, "status artery")
+
+
+def _add_views(commands: _Commands) -> None:
+    """Those that show a run, or write it for other programs."""
+    text = "Make the page of the run in DIR for a browser, finished or not."
+    report = commands.add_for_run("report", text, "report artery --open", "report artery -o artery.html --size 5")
+    _writes(report, "Write the page to this new file (default: DIR/report.html, which is made anew).", "FILE")
+    text = "Limit the page to this many MB (default: %(default)g); where it would be larger it shows fewer times."
     report.add_argument("--size", type=megabytes, default=20.0, metavar="MB", help=text)
-    report.add_argument("--open", action="store_true", help="show it in a browser")
-    picture = command("picture", "Draw the body of the run in DIR: PNG, SVG or PDF.")
-    animate = command("animate", "Draw the body of the run in DIR as it moves: GIF or WebP, MP4 where ffmpeg is.")
+    report.add_argument("--open", action="store_true", help="Show the page in a browser.")
+    picture = commands.add_for_run(
+        "picture",
+        "Draw the body of the run in DIR: PNG, SVG or PDF.",
+        "picture artery --time 0 25 150 --cut half",
+        "picture artery --layers 3 --view above -o wall.pdf",
+    )
+    animate = commands.add_for_run(
+        "animate",
+        "Draw the body of the run in DIR as it moves: GIF, WebP, or MP4 with ffmpeg.",
+        "animate artery -o artery.webp --frames 40",
+    )
     for found, default in ((picture, "DIR/NAME-t150.png"), (animate, "DIR/NAME-t0-t150.gif")):
-        found.add_argument("folder", type=Path, metavar="DIR", help="folder of a run")
-        text = "show this many layers, from the inside of a tube, from the bottom of others (default: all)"
+        text = "Show this many layers: of a tube from the inside, of others from the bottom (default: all)."
         found.add_argument("--layers", type=int, metavar="K", help=text)
-        text = "leave out the half, or the quarter, that is in front"
+        text = "Leave out the half in front of the middle, or only the quarter in front and to the right."
         found.add_argument("--cut", choices=("half", "quarter"), help=text)
-        text = "front, above, or where the eye is from the middle of the body: --view=X,Y,Z (default: front)"
+        text = (
+            "Look from the front or from above, or from X,Y,Z as seen from the middle: --view=X,Y,Z (default: front)."
+        )
         found.add_argument("--view", default="front", metavar="VIEW", help=text)
-        text = f"a file that does not exist yet; its ending says the kind (default: {default}, numbered when taken)"
-        found.add_argument("-o", "--output", type=Path, metavar="FILE", help=text)
-    text = "times to show beside each other, the nearest recorded ones (default: the last)"
+        text = f"Write to this new file, whose ending says the kind (default: {default}, numbered when taken)."
+        _writes(found, text, "FILE")
+    text = "Show these times beside each other, each the nearest recorded one (default: the last)."
     picture.add_argument("--time", type=float, nargs="+", metavar="T", help=text)
-    text = "recorded times to show, from 2 to 500 (default: %(default)s, or all where there are fewer)"
+    text = "Show this many recorded times, from 2 to 500 (default: %(default)s, or all where there are fewer)."
     animate.add_argument("--frames", type=int, default=60, metavar="N", help=text)
-    revolve = command("revolve", "Write the fields of a reduced run in DIR on the whole body: fields_body.vtkhdf.")
-    revolve.add_argument("folder", type=Path, metavar="DIR", help="folder of a run")
-    fibres = command("export", "Write the cells of the run in DIR for other programs: a structure tensor an element.")
-    fibres.add_argument("folder", type=Path, metavar="DIR", help="folder of a run")
-    text = "vtu (ParaView, meshio), febio (.feb), abaqus (.inp, CalculiX too) or csv"
+    text = "Write the fields of a reduced run in DIR on the whole body, for ParaView."
+    commands.add_for_run("revolve", text, "revolve artery")
+    text = "Write the fibres of the run in DIR for FEBio, Abaqus, ParaView or as a table."
+    fibres = commands.add_for_run("export", text, "export artery --format febio -o fibres.feb")
+    text = "Write vtu (ParaView, meshio), febio (.feb), abaqus (.inp, CalculiX too) or csv."
     fibres.add_argument("--format", required=True, choices=("vtu", "febio", "abaqus", "csv"), help=text)
-    text = "a file that does not exist yet (default: fibres in DIR, with the format's ending)"
-    fibres.add_argument("-o", "--output", type=Path, metavar="FILE", help=text)
-    fibres.add_argument("--time", type=float, metavar="T", help="a recorded time (default: the last)")
-    scene_command("validate", "Check a scene without running it.")
-    axes = scene_command("axes", "Write the local axes of a scene's body, before any solve, as a VTU file.")
-    text = "a file that does not exist yet (default: NAME-axes.vtu)"
-    axes.add_argument("-o", "--output", type=Path, metavar="FILE", help=text)
-    unload = scene_command("unload", "Find the unloaded body of a scene whose geometry is the loaded one.")
-    text = "folder for its scene and mesh, which does not exist yet (default: NAME-unloaded)"
-    unload.add_argument("-o", "--output", type=Path, metavar="FOLDER", help=text)
-    new = command("new", "Print a scene of a preset.")
-    new.add_argument("preset", metavar="PRESET", help=", ".join(PRESETS))
-    new.add_argument("--shape", default="tube", help="cube, tendon or tube (default: tube)")
-    schema = command("schema", "Print the JSON Schema of scenes, with which an editor completes and checks keys.")
-    schema.add_argument("-o", "--output", type=Path, metavar="FILE", help="new file for it (default: print it)")
-    text = "Draw the paper's figures from own runs, each with its data as CSV; runs still valid are used again."
-    figures = commands.add_parser("figures", help="Draw the paper's figures.", description=text)
-    figures.add_argument("names", nargs="*", metavar="NAME", help="fig1, fig5 to fig11, rate, energy (default: all)")
-    writes(figures, "folder for the figures (default: figures)")
-    figures.add_argument("--runs", type=Path, metavar="DIR", help="recorded runs (default: results/figures-cache)")
-    text = "png, pdf or svg, or several with commas between; may be repeated (default: png)"
+    _writes(fibres, "Write to this new file (default: fibres in DIR, with the ending of the format).", "FILE")
+    fibres.add_argument("--time", type=float, metavar="T", help="Take this recorded time (default: the last).")
+
+
+def _add_preparations(commands: _Commands) -> None:
+    """Those that make or look at a scene before it is run."""
+    new = commands.add(
+        "new", "Print a scene of a published model, with every key.", "new kuhl-holzapfel-2007 --shape tube > mine.toml"
+    )
+    new.add_argument("preset", metavar="PRESET", help=f"The model: {', '.join(PRESETS)}.")
+    new.add_argument("--shape", default="tube", help="The body: cube, tendon or tube (default: tube).")
+    text = "Check a scene without running it, and show what it means."
+    commands.add_for_scene("validate", text, "validate artery.toml", "validate artery.toml --profile fast")
+    text = "Write the local axes of a scene's body as a VTU file, before any solve."
+    axes = commands.add_for_scene("axes", text, "axes artery.toml -o artery-axes.vtu")
+    _writes(axes, "Write to this new file (default: NAME-axes.vtu).", "FILE")
+    text = "Find the unloaded body of a scene whose geometry is the loaded one."
+    unload = commands.add_for_scene("unload", text, "unload scanned.toml -o unloaded")
+    _writes(unload, "Put its scene and mesh into this new folder (default: NAME-unloaded).", "FOLDER")
+    text = "Print the JSON Schema of scenes, with which an editor completes and checks keys."
+    schema = commands.add("schema", text, "schema -o scene.schema.json")
+    _writes(schema, "Write it to this new file (default: print it).", "FILE")
+
+
+def _add_studies(commands: _Commands) -> None:
+    """Those that run a scene several times, or look at it more closely."""
+    sweep = commands.add_for_scene(
+        "sweep",
+        "Run a scene with other numbers, and show how its end depends on them.",
+        "sweep mine.toml loads.pressure.value=2:6:5",
+        "sweep mine.toml loads.pressure.value=2:6:5 remodeling.kappa=0.02,0.05",
+        "sweep mine.toml loads.pressure.value=2:6 material.lame_mu=10:40 --latin 20",
+    )
+    text = "Vary a key: KEY=a:b:n takes n numbers from a to b, KEY=a,b,... these. Several keys are combined."
+    sweep.add_argument("axes", nargs="+", metavar="KEY=a:b:n", help=text)
+    text = "Take N points of a Latin hypercube in place of all combinations. Each key is then KEY=a:b."
+    sweep.add_argument("--latin", type=positive, metavar="N", help=text)
+    text = "Draw the Latin hypercube from this seed (default: 1)."
+    sweep.add_argument("--seed", type=int, default=1, metavar="N", help=text)
+    text = "Run a scene of random cells with many seeds, and with isotropic cells."
+    ensemble = commands.add_for_scene("ensemble", text, "ensemble artery.toml --seeds 32 -o seeds")
+    text = "Use this many seeds (default: 32; at least 2)."
+    ensemble.add_argument("--seeds", type=positive, default=32, metavar="N", help=text)
+    text = "Run a scene with coarse and fine settings: what each costs, and how far off it is."
+    trade = commands.add_for_scene("trade", text, "trade artery.toml --budget 10min")
+    text = "Begin no run that would end after this wall time: 90s, 10min, 2h (default: 10min). Cheap runs come first."
+    trade.add_argument("--budget", type=wall_time, default=600.0, metavar="TIME", help=text)
+    for study, name in ((sweep, "sweep"), (ensemble, "ensemble"), (trade, "trade")):
+        text = "The same command goes on there: finished runs are used again."
+        _writes(study, f"Put the results into this folder (default: results/NAME-{name}). {text}")
+        _jobs(study)
+        _quiet(study)
+    _add_fit(commands)
+    text = "Run a scene and say whether its remodeling passes damp small errors or amplify them."
+    stability = commands.add_for_scene("stability", text, "stability artery.toml --times 5 -o stable")
+    _writes(stability, "Put the results into this new or empty folder (default: results/NAME-stability).")
+    text = "Look at N times of the run (default: 10)."
+    stability.add_argument("--times", type=positive, default=10, metavar="N", help=text)
+    stability.set_defaults(resume=None, max_wall_time=None, report=False)
+    _quiet(stability)
+    _add_figures(commands)
+
+
+def _add_fit(commands: _Commands) -> None:
+    text = "Find numbers of a scene from measurements, with 95 % bands."
+    fitting = commands.add_for_scene("fit", text, "fit tube.toml inflation.toml -o fitted")
+    text = "A TOML file with the unknowns and the tables of measurements; docs/fit.md explains it."
+    fitting.add_argument("data", type=Path, metavar="DATA", help=text)
+    text = "A folder of the same fit goes on."
+    _writes(fitting, f"Put the results into this new or empty folder (default: results/NAME-fit). {text}")
+    text = "Leave out the likelihood profiles, which are made for unknowns that depend on each other."
+    fitting.add_argument("--no-likelihood-profiles", dest="profiles", action="store_false", help=text)
+    text = "Start from N points: the given one, and others within a factor of two (default: 3)."
+    fitting.add_argument("--starts", type=positive, default=3, metavar="N", help=text)
+    _quiet(fitting)
+
+
+def _add_figures(commands: _Commands) -> None:
+    text = "Draw the paper's figures from runs of its own, each with its data as CSV."
+    figures = commands.add("figures", text, "figures fig7 fig8 --format png,pdf -o figures")
+    text = "The figures: fig1, fig5 to fig11, rate, energy (default: all)."
+    figures.add_argument("names", nargs="*", metavar="NAME", help=text)
+    _writes(figures, "Put the figures into this folder (default: figures).")
+    text = "Keep the runs in this folder (default: results/figures-cache). Runs that are still valid are used again."
+    figures.add_argument("--runs", type=Path, metavar="DIR", help=text)
+    text = "Write png, pdf or svg, or several with commas between. May be repeated (default: png)."
     figures.add_argument("--format", action="append", default=[], metavar="FORMAT", help=text)
-    figures.add_argument("--stamp", action="store_true", help="show in each picture what it was made with")
-    figures.add_argument("--jobs", type=int, metavar="N", help="runs at a time (default: as many as there are cores)")
-    commands.add_parser(SERVE)  # of the processes of a study; not listed
-    command("info", "Print versions, solvers and BLAS.")
-    return main_parser
+    text = "Show in each picture with which versions it was made."
+    figures.add_argument("--stamp", action="store_true", help=text)
+    _jobs(figures, int)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -247,7 +351,10 @@ def _run(options: argparse.Namespace, task: Callable[..., Path] | None = None) -
     scene = None if options.resume else read_scene(options.scene, options.set, options.profile)
     wishes: Any = {"quiet": options.quiet, "deadline": deadline, "report": options.report}
     if options.resume and (options.output or options.profile):
-        return _fail(f"{'-o' if options.output else '--profile'}: a run goes on in its own folder, as it is", BAD_INPUT)
+        return _fail(
+            f"{'-o' if options.output else '--profile'}: a run goes on in its own folder, with its own settings",
+            BAD_INPUT,
+        )
     _check(reason_unusable())
     interrupts.take_back_signals()
     from remodel_fenicsx.body import GeometryError
@@ -368,7 +475,7 @@ def _sweep(options: argparse.Namespace) -> int:
         for text in options.axes:
             key, numbers = study.read_axis(text, options.latin)
             if key in axes:
-                raise SceneError(f"sweep {key}: is there twice")
+                raise SceneError(f"sweep {key}: this key is given twice")
             axes[key] = numbers
         if math.prod(map(len, axes.values())) > MOST_RUNS:
             raise SceneError(f"sweep: {math.prod(map(len, axes.values()))} runs; allowed are at most {MOST_RUNS}")
@@ -450,12 +557,12 @@ def _report(options: argparse.Namespace) -> int:
     _say(str(written))
     size = written.stat().st_size / 1e6
     if size > options.size:
-        _complain(f"warning: it has {size:.3g} MB, more than --size {options.size:g}: two times of this body need that")
+        _complain(f"warning: the page has {size:.3g} MB, more than --size {options.size:g}: even two times need that")
     if options.open:
         import webbrowser  # slow to import, and seldom asked for
 
         if not webbrowser.open(written.resolve().as_uri()):
-            _complain(f"warning: no browser is to be found from here; open {written} in yours")
+            _complain(f"warning: no browser was found; open {written} in yours")
     return 0
 
 
@@ -545,7 +652,7 @@ def _axes(options: argparse.Namespace) -> int:
 def _unload(options: argparse.Namespace) -> int:
     scene = read_scene(options.scene, options.set, options.profile)
     if not scene.geometry.is_loaded:
-        return _fail("geometry.is = 'unloaded': nothing to find; allowed is 'loaded'", BAD_INPUT)
+        return _fail("geometry.is = 'unloaded': the body is unloaded already; allowed is 'loaded'", BAD_INPUT)
     _check(reason_unusable())
     from remodel_fenicsx.studies.unloaded_folder import write_unloaded
     from remodel_fenicsx.unloading import NoUnloadedShape

@@ -76,8 +76,9 @@ def run(
 
     Returns
     -------
-    The folder with history.csv, fields.vtkhdf, fields_chains.vtkhdf, scene.toml, run.log, report.html and the
-    checkpoints.
+    Path
+        The folder with history.csv, fields.vtkhdf, fields_chains.vtkhdf, scene.toml, run.log, report.html and the
+        checkpoints.
 
     Raises
     ------
@@ -91,6 +92,18 @@ def run(
         On SIGUSR1, or before the deadline; all is recorded, with a checkpoint.
     OSError
         If the results cannot be written.
+
+    Examples
+    --------
+    >>> from remodel_fenicsx import preset_scene, run
+    >>> scene = preset_scene("kuhl-holzapfel-2007", "cube").with_values({"time.end": 1.0})
+    >>> folder = run(scene, "one-step", report=False)
+    >>> sorted(path.name for path in folder.glob("*.vtkhdf"))
+    ['fields.vtkhdf', 'fields_chains.vtkhdf']
+    >>> run(scene, "one-step")
+    Traceback (most recent call last):
+        ...
+    remodel_fenicsx.results.run_lock.FolderTaken: -o one-step: is not empty; allowed is a new or an empty folder
     """
     end_all_ranks_on_exception()
     # what the scene asks for is built before anything is written
@@ -180,7 +193,7 @@ def _say_where(checkpoint: Checkpoint) -> None:
     now = versions()
     for name, version in checkpoint.versions.items():
         if now.get(name) != version:
-            log.warning("goes on with %s %s, was %s", name, now.get(name), version)
+            log.warning("goes on with %s %s, the run was begun with %s", name, now.get(name), version)
 
 
 def _built(scene: Scene, comm: MPI.Intracomm) -> Simulation:
@@ -240,7 +253,8 @@ def _record(
         steps = scene.time.number_of_steps if simulation.control else state.number + len(simulation.remaining())
         rank, done = -1 if quiet else comm.rank, scene.time.progress(state.number, state.time)
         progress = stack.enter_context(Progress(steps, scene.name, rank, done=done))
-        log.info(BEGUN + "%s on %d ranks, results in %s", scene.name, comm.size, place)
+        ranks = "1 rank" if comm.size == 1 else f"{comm.size} ranks"
+        log.info(BEGUN + "%s on %s, results in %s", scene.name, ranks, place)
         log.info("%s", scene.summary())
         unknowns = simulation.unknown.x.petsc_vec.getSize()
         if comm.size > 1 and unknowns < WORTH_RANKS:

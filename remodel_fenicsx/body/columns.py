@@ -38,6 +38,19 @@ class Column:
         Whether it is the largest or smallest value of the body: of random cells it goes with their number.
     by_case
         Whether it has another value in each load case: what belongs to the cells or to the step as a whole has not.
+
+    Examples
+    --------
+    A column of every shape; a scene's history then has it:
+
+    >>> from remodel_fenicsx import Simulation, preset_scene
+    >>> from remodel_fenicsx.extend import COLUMNS, Column
+    >>> COLUMNS["reach"] = Column("reach", "length", "largest z", lambda m: float(m.position[:, 2].max()))
+    >>> simulation = Simulation(preset_scene("kuhl-holzapfel-2007", "cube"))
+    >>> for _, step in zip(range(1), simulation.steps()):
+    ...     print(round(step.row["reach"], 4), round(step.row["mean_stretch"], 4))
+    1.0808 1.0808
+    >>> del COLUMNS["reach"]
     """
 
     name: str
@@ -80,8 +93,8 @@ _PROFILE_COLUMNS = tuple(
     Column(
         name,
         "degrees",
-        f"mean of the reference fibre angle about {number}/{PROFILE_PLACES - 1} of the way through the wall of a tube, "
-        "or along z, weighted with a hat function as wide as a quarter of the way",
+        f"mean reference fibre angle near {number}/{PROFILE_PLACES - 1} of the way through the wall of a tube, or "
+        "along z in a cube or tendon; the weight is a hat function as wide as a quarter of the way",
         partial(_profile_value, number),
         by_case=False,
     )
@@ -98,14 +111,14 @@ def columns_of_region(name: str) -> tuple[Column, Column]:
         Column(
             f"fibre_angle_{name}",
             "degrees",
-            f"mean of the reference fibre angle over the region `{name}`, over the chains that have one",
+            f"mean reference fibre angle in the region `{name}`; chains without an angle do not count",
             lambda m: float(m.quadrature.mean_of_known(m.fibre_angle, m.elements_of_region(name))),
             by_case=False,
         ),
         Column(
             f"max_chain_extension_{name}",
             "",
-            f"largest r/L in the region `{name}` (0 where no chain locks)",
+            f"largest r/L in the region `{name}`; 0 where the chain law has no limit",
             lambda m: float(m.quadrature.maximum(m.chain_extension * m.elements_of_region(name)[:, None])),
             extreme=True,
         ),
@@ -120,37 +133,48 @@ COLUMNS: dict[str, Column] = {
         Column(
             "max_chain_extension",
             "",
-            "largest r/L, always below 1 (0 where no chain locks)",
+            "largest r/L of all chains, always below 1; 0 where the chain law has no limit",
             lambda m: m.step.extension.max_chain_extension,
             extreme=True,
         ),
-        Column("min_jacobian", "", "smallest J, always above 0", lambda m: m.step.extension.min_jacobian, extreme=True),
-        Column("stored_energy", "stress length^3", "integral of W", lambda m: m.equilibrium.stored_energy()),
+        Column(
+            "min_jacobian",
+            "",
+            "smallest volume ratio J, always above 0",
+            lambda m: m.step.extension.min_jacobian,
+            extreme=True,
+        ),
+        Column(
+            "stored_energy",
+            "stress length^3",
+            "strain energy of the body, the integral of W",
+            lambda m: m.equilibrium.stored_energy(),
+        ),
         Column(
             "remodeling_power",
             "stress length^3 / time",
-            "power released by the remodeling pass that follows (docs/theory.md)",
+            "energy per time that the remodeling pass after this row releases (docs/theory.md)",
             lambda m: m.step.remodeling_power,
             after_pass=True,
         ),
         Column(
             "newton_iterations",
             "",
-            "Newton iterations of the step, failed attempts included",
+            "Newton iterations of the step, with those of failed attempts",
             lambda m: m.step.work.newton_iterations,
             by_case=False,
         ),
         Column(
             "linear_iterations",
             "",
-            "linear iterations of the same",
+            "iterations of the linear solver in the step, with those of failed attempts",
             lambda m: m.step.work.linear_iterations,
             by_case=False,
         ),
         Column(
             "substeps",
             "",
-            "solves that made up the step; 1: the paper's step in one piece",
+            "number of solves that made up the step; 1 where it was solved in one piece, as in the paper",
             lambda m: m.step.work.substeps,
             by_case=False,
         ),
@@ -170,36 +194,36 @@ COLUMNS_ON_REQUEST: dict[str, Column] = {
         Column(
             "pass_residual",
             "squared link length",
-            "largest norm of A_pass - A over all points: how far the row is from cells that belong to its own stress",
+            "distance of the cells from those that their own stress asks for: largest norm of A_pass - A",
             lambda m: m.observer.stepper.remodeling.residual(),
             after_pass=True,
         ),
         Column(
             "time_error",
             "degrees",
-            "estimated error in time: of the direction of the chains, root mean square over the body, or of lengths, "
-            "relative (1 radian is 100 %), the larger; there without request with `time.tolerance`",
+            "estimated error in time, the larger of two: of chain directions (root mean square over the body) and of "
+            "lengths (relative, 100 % count as 1 radian); with `time.tolerance` it is there without being asked for",
             lambda m: m.step.time_error,
             after_pass=True,
         ),
         Column(
             "negative_eigenvalues",
             "",
-            "negative eigenvalues of the tangent's symmetric part: 0 where the equilibrium is stable",
+            "number of negative eigenvalues of the tangent's symmetric part; 0 where the equilibrium is stable",
             lambda m: m.step.negative_eigenvalues,
             by_case=False,
         ),
         Column(
             "held_points",
             "",
-            "points at which the coupling 'implicit' found no cells that belong to their stress",
+            "number of points at which the coupling 'implicit' found no cells that fit their own stress",
             lambda m: m.step.work.held_points,
             by_case=False,
         ),
         Column(
             "asleep_share",
             "",
-            "share of the volume in which no principal value of the driving tensor is above remodeling.threshold",
+            "share of the volume that does not remodel: no principal value of the driver is above remodeling.threshold",
             lambda m: m.observer.stepper.remodeling.asleep_share(),
             by_case=False,
         ),
@@ -207,7 +231,7 @@ COLUMNS_ON_REQUEST: dict[str, Column] = {
             Column(
                 name,
                 "",
-                f"{what} of the collagen over that at the start, volume mean; with remodeling.turnover",
+                f"{what} of the collagen over that at the start, volume mean; for scenes with remodeling.turnover",
                 partial(_turned_over, name),
                 by_case=False,
             )
@@ -216,7 +240,7 @@ COLUMNS_ON_REQUEST: dict[str, Column] = {
         Column(
             "processor_seconds",
             "s",
-            "time of the first rank's processor in the step: on a machine that others use it says more than `seconds`",
+            "processor time of the first rank in the step; other programs on the machine change it less than `seconds`",
             lambda m: m.step.processor_seconds,
             after_pass=True,
         ),
@@ -251,10 +275,23 @@ def columns_of(
     cases
         Number of its load cases: what differs in them has a column for each.
 
+    Returns
+    -------
+    tuple of Column
+        In the order of the file.
+
     Raises
     ------
     KeyError
         If a column that is requested does not exist.
+
+    Examples
+    --------
+    >>> from remodel_fenicsx import parts
+    >>> [column.name for column in parts.columns_of(parts.Cube(side=1.0))][:5]
+    ['time', 'force', 'mean_stretch', 'min_stretch', 'max_stretch']
+    >>> [column.name for column in parts.columns_of(parts.Cube(side=1.0), requested=["mean_stretch"])]
+    ['time', 'force', 'mean_stretch']
     """
     kinds = shape.loads_on(faces_of(loads) if isinstance(loads, Mapping) else {})
     of_loads = (

@@ -80,8 +80,8 @@ class MeshBody(WalledMesh):
         ),
         "elongation": LoadKind(
             lambda shape, loading, name: None,  # a part of the supports (`support`)
-            "engineering strain of the length, prescribed: the outlet moves by so much of the length of the body along "
-            "its own normal",
+            "prescribed engineering strain of the length: the outlet moves along its own normal by this share of the "
+            "length of the body",
             column="axial_elongation",
             above=-1.0,
             doubtful=(1.0, "an elongation is an engineering strain: a stretch of 1.1 is an elongation of 0.1"),
@@ -91,7 +91,7 @@ class MeshBody(WalledMesh):
         Column(
             "lumen_volume",
             "length^3",
-            "volume inside the deformed inner face, with flat caps on its rims",
+            "volume inside the deformed inner face, closed by flat caps at its ends",
             lambda m: m.lumen_volume(),
         ),
         *WalledMesh.columns,
@@ -113,8 +113,10 @@ class MeshBody(WalledMesh):
 
     shape: Literal["mesh"] = Field(default="mesh", description="Which body it is.")
     file: Annotated[str, BeforeValidator(_file)] = Field(
-        description="The mesh, a file by Gmsh (`.msh`, format 2.2 or 4.1, text) or one that meshio reads (`.vtu`, "
-        "`.vtk`, `.xdmf`), relative to the scene's folder.",
+        description=(
+            "The mesh: a file by Gmsh (`.msh`, format 2.2 or 4.1, text) or one that meshio reads "
+            "(`.vtu`, `.vtk`, `.xdmf`). Its path is relative to the scene's folder."
+        ),
         json_schema_extra={"allowed": "the path of a file .msh, .vtu, .vtk or .xdmf"},
     )
     tags: str | None = Field(
@@ -126,13 +128,16 @@ class MeshBody(WalledMesh):
     )
     file_unit: Literal["m", "cm", "mm", "um"] | None = Field(
         default=None,
-        description="Unit of the file's numbers, where it is another one than `length_unit`.",
+        description="Unit of the numbers in the file, where it differs from `length_unit`.",
         json_schema_extra={"allowed": "one of " + ", ".join(map(repr, LENGTH_UNITS))},
     )
     faces: Annotated[dict[str, tuple[str | int, ...]], BeforeValidator(_faces)] = Field(
         default={},
-        description="Name of a face -> name or number of a named face of the file, or a list. `inner`, `outer`, "
-        "`inlet`, `outlet` are needed where the file's own names are others. Further ones are for supports.",
+        description=(
+            "Names of faces, each with the name or number of a face in the file, or a list of them. "
+            "`inner`, `outer`, `inlet` and `outlet` are needed where the file has other names. Further "
+            "faces are for supports and loads."
+        ),
         json_schema_extra={
             "allowed": "a table of names, numbers or lists of them",
             "additionalProperties": {"anyOf": [_ENTRY, {"type": "array", "items": _ENTRY, "minItems": 1}]},
@@ -140,19 +145,26 @@ class MeshBody(WalledMesh):
     )
     regions: Annotated[dict[str, tuple[str | int, ...]], BeforeValidator(_faces)] = Field(
         default={},
-        description="Name of a region -> name or number of a volume of the file, or a list. Default: the file's names.",
+        description=(
+            "Names of regions, each with the name or number of a volume in the file, or a list of them."
+            " Default: the names in the file."
+        ),
         json_schema_extra={
             "allowed": "a table of names, numbers or lists of them",
             "additionalProperties": {"anyOf": [_ENTRY, {"type": "array", "items": _ENTRY, "minItems": 1}]},
         },
     )
     open_boundary: bool = Field(
-        default=False, description="Whether a part of the boundary may be in no face; otherwise it is taken for a hole."
+        default=False,
+        description=(
+            "Whether parts of the boundary may belong to no face. Without it such a part is taken for a"
+            " hole and refused."
+        ),
     )
     sha256: str | None = Field(
         default=None,
         pattern="^[0-9a-f]{64}$",
-        description="SHA-256 of the file: a scene as run has it, and another file is refused.",
+        description="SHA-256 of the file. A scene as run has it, and refuses another file.",
         json_schema_extra={"allowed": "64 hexadecimal digits"},
     )
 
@@ -251,7 +263,7 @@ class MeshBody(WalledMesh):
         except MeshFileError as error:
             asked = f"mesh.refinement = {mesh.refinement}, mesh.degree = {mesh.degree}"
             raise SceneError(f"{asked}: {Path(self.file).name} {error}") from None
-        words = "the body stays that of the file's plane faces"
+        words = "the faces of the body stay plane as in the file"
         log.info("split into %d elements of degree %d; %s", len(file.cells), file.degree, words)
         return file, boundary_of(file, self._groups(file), self.open_boundary)
 
@@ -300,7 +312,9 @@ class MeshBody(WalledMesh):
         numbers = mesh_file.distinct(file.cell_groups)
         if 0 in numbers and len(numbers) > 1:
             lost = file.cell_numbers[file.cell_groups == 0]
-            raise self._fault(f"{len(lost)} elements are in no named volume, the first is {lost[0]}; the others are")
+            raise self._fault(
+                f"{len(lost)} elements are in no named volume, the first is {lost[0]}; name all volumes, or none"
+            )
         names = {number: name for name, number in file.names[3].items()}
         names |= {self._volumes(file, name, entries[:1])[0]: name for name, entries in self.regions.items()}
         return {names.get(number, str(number) if number else "body"): number for number in numbers}
@@ -331,7 +345,8 @@ class MeshBody(WalledMesh):
         log.info("%s: %s, SHA-256 %s", Path(self.file).name, counts, file.sha256)
         if through_the_wall(boundary):
             log.warning(
-                "the wall is one element thick in places: bending and the fibre angle through it are lost there"
+                "the wall is one element thick in places: bending, and how the fibre angle changes through it, are "
+                "lost there; try mesh.refinement = 2"
             )
 
     # ------------------------------------------------------------ supports

@@ -202,9 +202,9 @@ def _layer_angle(share: float) -> AngleOf:
 
 
 MEANS = {
-    "inner": ("that touch R_i", _layer_angle(0.0)),
-    "middle": ("that touch (R_i + R_o)/2", _layer_angle(0.5)),
-    "outer": ("that touch R_o", _layer_angle(1.0)),
+    "inner": ("that touch the inner radius", _layer_angle(0.0)),
+    "middle": ("that touch the middle radius, (R_i + R_o)/2", _layer_angle(0.5)),
+    "outer": ("that touch the outer radius", _layer_angle(1.0)),
 }
 
 
@@ -259,19 +259,37 @@ class Tube(Walled):
 
     Its ends stay in their planes; they are free to move radially, clamped, or closed by caps (`supports.ends`). Inner
     radius, wall thickness and length: 1e-6 to 1e6, one up to 10,000 times the other.
+
+    Its keyword arguments are the keys of `[geometry]`: `inner_radius`, `outer_radius` and `length` in the unit
+    `length_unit`, or in any one unit.
+
+    Raises
+    ------
+    SceneError
+        If a value is not allowed: one line.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from remodel_fenicsx import parts
+    >>> body = parts.Tube(inner_radius=1.0, outer_radius=3.0, length=8.0)
+    >>> body.depth(np.array([[2.0, 0.0, 4.0]]))  # through the wall
+    array([0.5])
+    >>> round(body.section_area, 4), list(body.loads)
+    (25.1327, ['pressure', 'elongation', 'axial_force'])
     """
 
     loads: ClassVar[dict[str, LoadKind]] = {
         "pressure": LoadKind(
             lambda shape, loading, name: _add_pressure(loading, name),
-            "pressure on the deformed inner face, with closed ends also on their caps",
+            "pressure on the deformed inner face, and on the caps of closed ends",
             STRESS,
             reductions=("radial", "axisymmetric", "sector"),
         ),
         "elongation": LoadKind(
             lambda shape, loading, name: loading.add_prescribed_elongation(name, "top", 2, shape.length),
-            "engineering strain of the length (0.1: 10 % longer), prescribed; its column shows what was found where "
-            "the length is an unknown",
+            "prescribed engineering strain of the length (0.1: 10 % longer); where the length is an unknown the column "
+            "shows the strain that was found",
             column="axial_elongation",
             above=-1.0,
             reductions=("radial", "axisymmetric", "sector"),
@@ -280,8 +298,8 @@ class Tube(Walled):
         ),
         "axial_force": LoadKind(
             lambda shape, loading, name: loading.add_axial_force(name),
-            "force of the wall along z on its end section. As a load it is a dead force on the ends, which move in "
-            "parallel, with closed ends beside the pressure on their caps; the length is then an unknown",
+            "force along z in the wall at the end z = `length`. As a load it is a dead force on the ends, which stay "
+            "parallel; the length is then an unknown, and the pressure on the caps of closed ends acts beside it",
             FORCE,
             reductions=("radial", "axisymmetric", "sector"),
             frees_length=True,
@@ -301,13 +319,13 @@ class Tube(Walled):
         Column(
             "reduced_axial_force",
             "force",
-            "`axial_force` less the pressure times the lumen's area at that end, p pi r_i^2: what a machine measures",
+            "what a testing machine measures: `axial_force` less the pressure on the lumen at that end, p pi r_i^2",
             _reduced_axial_force,
         ),
         Column(
             "opening_angle",
             "degrees",
-            "angle of the sector that is missing when the unloaded tube is cut along its length, cells as they are",
+            "angle by which the unloaded tube would open if it were cut along its length now: the missing sector",
             _opening_angle,
             by_case=False,
         ),
@@ -437,17 +455,17 @@ class Tube(Walled):
         return Strut(self.length, factor, about_z, squared_distances, radii, capped=ends == "closed")
 
     def depth(self, coordinates: Array) -> Array:
-        """From the inner (0) to the outer face (1); plane faces of elements lie inside of the cylinders."""
+        """From the inner (0) to the outer face (1), (...,); plane faces of elements lie inside of the cylinders."""
         radii = np.linalg.norm(coordinates[..., :2], axis=-1)
         depth: Array = np.clip((radii - self.inner_radius) / (self.outer_radius - self.inner_radius), 0.0, 1.0)
         return depth
 
     def axes_at(self, coordinates: Array) -> Array:
-        """About the z axis."""
+        """Circumferential, axial, radial about the z axis, rows (..., 3, 3)."""
         return cylindrical_axes(coordinates)
 
     def station(self, coordinates: Array) -> Array:
-        """Along z."""
+        """Along z, from 0 to 1, (...,)."""
         return np.asarray(coordinates[..., 2] / self.length, dtype=np.float64)
 
 

@@ -21,15 +21,12 @@ if TYPE_CHECKING:
 
 AngleOf = Callable[[Any, Array], float]  # of a measurement and angles at its points
 NODES_AT_A_DEPTH = 1e-3  # layers of nodes of a regular mesh have their depth to 1e-4
-ANGLE_IN = (
-    "mean of the reference angle, from circumferential (0) to axial (90 degrees), over the chains that do not point "
-    "out of the wall, in the elements"
-)
+ANGLE_IN = "mean reference fibre angle (0 circumferential, 90 axial) of the chains in the wall, in the elements"
 
 
 CONFIGURATIONS = {
-    "unloaded": "the same of the cells in the unloaded body, where the tissue is free of stress in another one",
-    "deformed": "the same of the cells in the deformed body, in local axes that move with it",
+    "unloaded": "measured in the unloaded body; it differs where the unloaded body has residual stress",
+    "deformed": "measured in the deformed body, in local axes that move with it",
 }
 """Configurations, beside that of the cells, whose angles may be asked for, each with its words."""
 
@@ -87,7 +84,12 @@ def angle_columns(means: Mapping[str, tuple[str, AngleOf]]) -> tuple[Column, ...
 def angle_columns_on_request(means: Mapping[str, tuple[str, AngleOf]]) -> tuple[Column, ...]:
     """Of the other configurations."""
     return tuple(
-        Column(f"fibre_angle_{name}_{where}", "degrees", meaning, partial(_of, mean, f"fibre_angle_{name}"))
+        Column(
+            f"fibre_angle_{name}_{where}",
+            "degrees",
+            f"as `fibre_angle_{where}`, but {meaning}",
+            partial(_of, mean, f"fibre_angle_{name}"),
+        )
         for name, meaning in CONFIGURATIONS.items()
         for where, (_, mean) in means.items()
     )
@@ -104,7 +106,7 @@ class Walled(Shape):
         Column(
             "radial_share",
             "",
-            "volume mean of A_rr / tr A: 0 where all chains lie in the wall, 1 where they point out of it",
+            "share of the chains that points out of the wall, the volume mean of A_rr / tr A: 0 none, 1 all",
             lambda m: m.quadrature.mean(m.radial_share),
             by_case=False,
         ),
@@ -119,11 +121,11 @@ class Walled(Shape):
     angle_in_words: ClassVar[tuple[str, str]] = ("around", "along")
 
     def fibre_angle(self, dimensions: Array, axes: Array, local: Array) -> Array:
-        """Angle in degrees of the chain direction in the wall, from circumferential (0) to axial (90); NaN across."""
+        """Angle of the chain direction in the wall, degrees, (...,): circumferential 0, axial 90, NaN across."""
         return pitch_angle(dimensions, axes, local)
 
     def radial_share(self, dimensions: Array, axes: Array, local: Array) -> Array:
-        """A_rr / tr A."""
+        """Share of the chains across the wall, A_rr / tr A, (...,)."""
         return radial_share(dimensions, axes, local)
 
 

@@ -90,7 +90,7 @@ def cache_folder() -> Path:
     other = Path(tempfile.gettempdir()) / f"remodel-fenicsx-forms-{os.getuid()}"
     other.mkdir(mode=0o700, exist_ok=True)
     if other.is_symlink() or other.stat().st_uid != os.getuid():
-        raise PermissionError(f"{other}: of another user; set TMPDIR to a folder of your own")
+        raise PermissionError(f"{other}: belongs to another user; set TMPDIR to a folder of your own")
     log.warning("cannot write to %s: forms are compiled into %s", folder, other)
     return other / name
 
@@ -140,12 +140,30 @@ def form(ufl_form: Any, name: str | None = None) -> Any:
     name
         What is being compiled, for people: "the mass matrix". Default: by the number of its arguments.
 
+    Returns
+    -------
+    dolfinx.fem.Form
+        Compiled, for dolfinx to assemble.
+
     Raises
     ------
     Interrupted
         If a `StopRequest` is waiting for signals and one came while it was compiled.
     RuntimeError
         If the kernel does not compile.
+
+    Examples
+    --------
+    The volume of a body:
+
+    >>> import dolfinx
+    >>> from remodel_fenicsx import Simulation, preset_scene
+    >>> from remodel_fenicsx.extend import form
+    >>> import ufl
+    >>> simulation = Simulation(preset_scene("kuhl-holzapfel-2007", "cube"))
+    >>> F = simulation.state.kinematics.deformation_gradient(simulation.unknown)
+    >>> round(dolfinx.fem.assemble_scalar(form(ufl.det(F) * simulation.quadrature.dx, "the volume")), 12)
+    1.0
     """
     kind, seconds = _KINDS[len(ufl_form.arguments())]
     with _compiler_watched(ufl_form.ufl_domains()[0].ufl_cargo().comm, name or kind, seconds):
@@ -333,7 +351,9 @@ def _alone(kernel: str) -> Iterator[None]:
             _take(lock)
             _remove_unfinished(kernel)
         except OSError as error:  # some network file systems have no locks
-            log.warning("%s cannot be locked (%s): runs at once may wait for each other", lock.name, error.strerror)
+            log.warning(
+                "%s cannot be locked (%s): several runs at a time may wait for each other", lock.name, error.strerror
+            )
         yield
 
 

@@ -16,6 +16,7 @@ from remodel_fenicsx.body.shape import Shape
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
 from remodel_fenicsx.fem import compat, jit
 from remodel_fenicsx.fem.quadrature import Quadrature
+from remodel_fenicsx.model.energy import TURNED_OVER
 from remodel_fenicsx.model.local_axes import LocalAxes
 from remodel_fenicsx.results.chain_lines import AXIS_FIELDS, OF_CHAINS, append_chains
 from remodel_fenicsx.results.recording import CHAIN_LINES, FIELDS
@@ -32,7 +33,9 @@ OF_ELEMENTS = tuple(name for name in FIELDS_BY_NAME if name not in ("displacemen
 
 
 def field_names(
-    asked: bool | Sequence[str], lacking: Collection[str] = (REGION, UNLOADED), constant: Sequence[str] = ()
+    asked: bool | Sequence[str],
+    lacking: Collection[str] = (REGION, UNLOADED, *TURNED_OVER),
+    constant: Sequence[str] = (),
 ) -> tuple[str, ...]:
     """The fields that a scene's `output.fields` asks for; where it says all, without those that it lacks.
 
@@ -87,8 +90,8 @@ class ElementFields:
         `deformation_gradient` and `cauchy_stress` (9, row by row); `cell_dimensions` (3) and `axis_1..3`: the cell
         whose structure tensor is the element's mean, longest first; `fibre_angle`, `fibre_angle_unloaded` and
         `fibre_angle_deformed` (degrees, to the load axis, or in a tube from circumferential to axial; NaN where no
-        chain has one); `chain_extension` (largest r/L in the element; 0 where no chain locks); `region` (its number,
-        `Domain.regions`).
+        chain has one); `chain_extension` (largest r/L in the element; 0 where no chain locks); with turnover `content`
+        and `natural_length`; `region` (its number, `Domain.regions`).
         """
         values = self._values()
         F = values[..., :9].reshape(*values.shape[:2], 3, 3)
@@ -116,9 +119,12 @@ class ElementFields:
         if "chain_extension" in wanted:
             squared = cells.kernels.squared_length(elastic.reshape(-1, 3, 3), cells.point_cells).reshape(F.shape[:2])
             found["chain_extension"] = np.max(np.sqrt(squared) / self._locking_length(), axis=1)
+        for name in TURNED_OVER:
+            if name in wanted and getattr(self.tissue, name) is not None:
+                found[name] = mean(self.quadrature.values(getattr(self.tissue, name), ()))
         if REGION in wanted:
             found[REGION] = self.state.loading.domain.element_region.astype(np.float64)
-        return {name: found[name] for name in OF_ELEMENTS if name in wanted}
+        return {name: found[name] for name in OF_ELEMENTS if name in wanted and name in found}
 
     def _values(self) -> Array:
         """F, and Cauchy stress where it is wanted, row by row, (elements, points, 9 or 18)."""
@@ -169,6 +175,19 @@ class Fields(Watcher):
         If they cannot be written.
     RecordingError
         On rank 0, if those to go on with are damaged.
+
+    Examples
+    --------
+    >>> from remodel_fenicsx import Recording, Simulation, parts, preset_scene
+    >>> scene = preset_scene("kuhl-holzapfel-2007", "cube").with_values({"time.end": 3.0})
+    >>> simulation = Simulation(scene)
+    >>> with parts.RunFolder("with-fields", scene.to_toml()) as record:
+    ...     fields = parts.Fields(record.folder, scene.geometry, simulation.stepper, names=("displacement",))
+    ...     for step in simulation.steps([record, fields]):
+    ...         pass
+    ...     fields.close()
+    >>> Recording("with-fields").times
+    array([0., 1., 2., 3.])
     """
 
     def __init__(
@@ -259,7 +278,7 @@ def _continued(path: Path, after: float | None) -> TransientGrid | None:
     if after is None:
         return None
     if not path.exists():
-        log.warning("%s is not there: a new one begins with the next step", path.name)
+        log.warning("%s is missing: a new one begins with the next step", path.name)
         return None
     return TransientGrid.continued(path, after * (1 + SAME_TIME))
 

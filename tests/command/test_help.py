@@ -1,0 +1,43 @@
+"""Help on the command line: it can be asked for, each option says something, and its examples are understood."""
+
+from __future__ import annotations
+
+import argparse
+import re
+import shlex
+
+import pytest
+
+from remodel_fenicsx import cli
+
+(SUBPARSERS,) = [action for action in cli.parser()._actions if isinstance(action, argparse._SubParsersAction)]
+COMMANDS: dict[str, argparse.ArgumentParser] = {
+    name: found for name, found in SUBPARSERS.choices.items() if name != cli.SERVE
+}
+
+
+def examples(text: str) -> list[list[str]]:
+    """Arguments of the commands below "example:" or "examples:"."""
+    below = text.split("example:" if "example:" in text else "examples:")[1].split("\n\n")[0]
+    return [shlex.split(line)[1:] for line in below.split(">")[0].strip().splitlines()]
+
+
+def test_the_help_lists_every_command(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        cli.main(["--help"])
+    text = capsys.readouterr().out
+    assert end.value.code == 0 and set(COMMANDS) == {*cli.COMMANDS} - {cli.SERVE}
+    assert all(re.search(rf"^    {name} ", text, re.MULTILINE) for name in COMMANDS)
+    assert all(re.search(rf"^  {code} +\w", text, re.MULTILINE) for code in cli.EXIT_CODES)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_the_help_of_a_command_has_examples_that_it_takes(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        cli.main([name, "--help"])
+    text = capsys.readouterr().out
+    assert end.value.code == 0
+    for words in examples(text):
+        assert words[0] == name and cli.parser().parse_args(words).command == name
+    for action in COMMANDS[name]._actions:
+        assert action.help and (action.dest == "help" or action.help[0].isupper() and action.help.endswith((".", ").")))

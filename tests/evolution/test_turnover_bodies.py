@@ -1,0 +1,211 @@
+"""remodeling.turnover in every kinematics, with every driver, in regions, bodies from a file and natural states."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from remodel_fenicsx import Recording, SceneError, Simulation
+from remodel_fenicsx.body.tube import whole_tube
+from remodel_fenicsx.model.chains import CHAINS
+from remodel_fenicsx.model.drivers import DRIVERS
+from remodel_fenicsx.model.energy import Tissue
+from remodel_fenicsx.running import run
+from remodel_fenicsx.scene import scene_from_dict
+from tests.conftest import Cases
+from tests.evolution.test_load_cases import CUBE
+from tests.mesh_files import COUNTS, LENGTH, RADII, write_tube
+
+SELF = MPI.COMM_SELF
+TURNED = ["content", "natural_length"]
+TURNOVER = {"time": 10.0, "deposition_stretch": 1.1, "gain": 1.0}
+RAMP = [[0.0, 0.0], [8.0, 1.0]]
+WALL = {"shape": "tube", "inner_radius": 1.0, "outer_radius": 1.3, "length": 2.0}
+
+
+def grown(kinematics: str = "radial", driver: str = "cauchy", pressure: float = 1.2, **tables: Any) -> Any:
+    """A thin tube under load while its collagen is turned over."""
+    values = {
+        "preset": "consistent",
+        "geometry": WALL,
+        "model": {"kinematics": kinematics},
+        "mesh": {"degree": 2},
+        "cells": {"initial": "isotropic"},
+        "remodeling": {"driver": driver, "turnover": TURNOVER},
+        "loads": {name: {"value": v, "ramp": RAMP} for name, v in (("pressure", pressure), ("elongation", 0.1))},
+        "time": {"end": 12.0, "step": 2.0},
+        "output": {"fields": False, "columns": [*TURNED, "inner_radius", "outer_radius", "fibre_angle_outer"]},
+    }
+    return scene_from_dict({name: table for name, table in (values | tables).items() if table is not None})
+
+
+def at_its_end(scene: Any, domain: Any = None) -> tuple[dict[str, float], Simulation]:
+    """The last row, and the simulation, to be looked into."""
+    simulation = Simulation(scene, SELF, domain)
+    rows = [dict(step.row) for step in simulation.steps()]
+    return rows[-1], simulation
+
+
+def points_of(simulation: Simulation) -> tuple[Tissue, np.ndarray, np.ndarray]:
+    """The tissue as arrays over the points, F_e and the radii there."""
+    tissue = simulation.stepper.remodeling.parameters.at_points()
+    return tissue, simulation.state.elastic_gradient(), simulation.quadrature.coordinates[..., 0].ravel()
+
+
+def cauchy_of_the_energy(simulation: Simulation) -> np.ndarray:
+    """At all points, by differences of W."""
+    tissue, F, _ = points_of(simulation)
+    cells, h = [simulation.cells.point_cells], 1e-5
+    P = np.zeros_like(F)
+    for i, j in np.ndindex(3, 3):
+        way = np.zeros((3, 3))
+        way[i, j] = h
+        P[:, i, j] = (tissue.strain_energy(F + way, cells) - tissue.strain_energy(F - way, cells)) / (2 * h)
+    found: np.ndarray = P @ np.swapaxes(F, 1, 2) / np.linalg.det(F)[:, None, None]
+    return found
+
+
+# ---------------------------------------------------------------- kinematics
+def test_kinematics_agree() -> None:
+    """One radius, a half-plane, a piece of the ring in three dimensions."""
+    rows = {}
+    for kinematics in ("radial", "axisymmetric", "sector"):
+        rows[kinematics], simulation = at_its_end(grown(kinematics))
+        simulation.close()
+    one = rows.pop("radial")
+    assert one["content"] > 1.2 and one["natural_length"] > 1.05
+    for kinematics, row in rows.items():
+        for name in one:
+            assert row[name] == pytest.approx(one[name], rel=1e-5), (kinematics, name)
+
+
+def test_whole_tubes_agree_with_one_radius(tmp_path: Path) -> None:
+    """Eight stiff linear elements around and two through the wall, as a shape and from a file, whose fields are
+    those of the column."""
+    shape = {"shape": "tube", "inner_radius": RADII[0], "outer_radius": RADII[1], "length": LENGTH}
+    same: dict[str, Any] = {"mesh": {"degree": 1}, "solver": {"method": "direct"}, "pressure": 4.0}
+    one, simulation = at_its_end(grown(geometry=shape, pressure=4.0))
+    simulation.close()
+    of = grown("full", geometry=shape, **same)
+    whole, simulation = at_its_end(of, whole_tube(of.geometry, COUNTS, "hexahedron", 1, SELF))
+    simulation.close()
+    mesh = {"shape": "mesh", "file": str(write_tube(tmp_path / "tube.msh"))}
+    output = {"fields": ["displacement", *TURNED], "columns": [*TURNED, "fibre_angle_outer"], "report": False}
+    as_preset = {"preset": None, "material": {"repulsion": "log"}}  # of the consistent one, which has no own bodies
+    folder = run(grown("full", geometry=mesh, output=output, **as_preset, **same), tmp_path / "run", SELF)
+    recording = Recording(folder)
+    for name in (*TURNED, "fibre_angle_outer"):
+        assert whole[name] == pytest.approx(one[name], rel=0.05), name
+        assert recording.history[name][-1] == pytest.approx(whole[name], rel=1e-3), name
+    first, last = recording.fields(0.0), recording.fields(12.0)
+    assert set(last) == {"displacement", *TURNED}
+    for name in TURNED:
+        assert np.all(first[name] == 1.0) and np.ptp(last[name]) > 0.01
+        assert last[name].min() < recording.history[name][-1] < last[name].max()
+
+
+def test_fields_are_written_where_there_is_turnover(tmp_path: Path) -> None:
+    """All fields have both; of a reduction they are turned to the whole body like any number."""
+    folder = run(grown("sector", output={"every": 6, "report": False}), tmp_path / "run", SELF)
+    fields = Recording(folder).fields(12.0)
+    assert {*TURNED} < set(fields) and 1.0 < fields["content"].min() < fields["content"].max()
+    with pytest.raises(SceneError, match="output.fields = 'content': it changes only with remodeling.turnover"):
+        grown(remodeling={}, output={"fields": ["content"]})
+
+
+# ---------------------------------------------------------------- drivers
+@pytest.mark.parametrize("repulsion", ["log", "length"])
+@pytest.mark.parametrize("driver", DRIVERS)
+def test_drivers_see_content_and_natural_length(driver: str, repulsion: str) -> None:
+    """Each is that of W with m and rho, by differences."""
+    row, simulation = at_its_end(grown(driver=driver, material={"repulsion": repulsion}))
+    F, found = simulation.stepper.remodeling.driving_tensor()
+    cauchy = cauchy_of_the_energy(simulation)
+    inverse = np.linalg.inv(F)
+    expected = {
+        "cauchy": cauchy,
+        "pk2": np.linalg.det(F)[:, None, None] * inverse @ cauchy @ np.swapaxes(inverse, 1, 2),
+        "finger": F @ np.swapaxes(F, 1, 2),
+    }
+    simulation.close()
+    assert row["content"] > 1.2 and row["natural_length"] > 1.05
+    np.testing.assert_allclose(found, expected[driver], atol=1e-6 * np.abs(found).max())
+
+
+# ---------------------------------------------------------------- regions
+def layers(**outer: Any) -> Any:
+    return {"adventitia": outer, "media": {"outer_radius": 1.15}}
+
+
+def test_regions_of_one_tissue_are_none() -> None:
+    plain, one = at_its_end(grown(mesh={"degree": 2, "refinement": 2}))
+    layered, two = at_its_end(grown(mesh={"degree": 2, "refinement": 2}, regions=layers()))
+    one.close(), two.close()
+    for name in (*TURNED, "inner_radius", "outer_radius"):
+        assert layered[name] == pytest.approx(plain[name], rel=1e-9), name
+
+
+def test_each_region_turns_over_with_its_own_chains() -> None:
+    """After the first row ln m and ln rho have the rates of its length L, r0 and chains, written down here."""
+    outer = {"material": {"contour_length": 1.9, "chain_density": 2.0}, "cells": {"end_to_end_length": 1.2}}
+    remodeling = {"turnover": TURNOVER, "coupling": "staggered"}  # the first step is solved with the cells of the start
+    of = grown(regions=layers(**outer), time={"end": 2.0, "step": 2.0}, remodeling=remodeling)
+    _, simulation = at_its_end(of)
+    tissue, F, radius = points_of(simulation)
+    g, is_outer = CHAINS["wormlike"].stiffness, radius > 1.15
+    L, r0 = np.where(is_outer, 1.9, tissue.contour_length), np.where(is_outer, 1.2, 1.0)
+    np.testing.assert_array_equal(tissue.end_to_end_length, r0)
+    stretch = np.sqrt((F**2).sum(axis=(1, 2)) / 3)  # of isotropic cells
+    tension = stretch * g(stretch * r0, L) / (1.1 * g(1.1 * r0, L))
+    content = np.clip(tension - 1.0, -1.0, 1.0) / 10.0
+    length = (0.1 + np.maximum(content, 0.0)) * (stretch / 1.1 - 1.0)
+    values = simulation.stepper.turnover.better
+    simulation.close()
+    np.testing.assert_allclose(values, 2.0 * np.array([content, length]), rtol=1e-9)
+    assert len(set(is_outer)) == 2
+
+
+def test_the_deposition_stretch_fits_each_region() -> None:
+    with pytest.raises(SceneError, match=r"deposition_stretch = 1.1: must be smaller than .*adventitia.* = 1.05"):
+        grown(regions=layers(material={"contour_length": 1.05}))
+
+
+# ---------------------------------------------------------------- natural states
+def test_closed_ends_and_residual_stress() -> None:
+    """The driver is that of W at F_e; the length grows with the tissue; a cut before any growth opens as given."""
+    columns = [*TURNED, "opening_angle", "axial_elongation"]
+    of = grown(
+        natural={"opening_angle": 120.0},
+        supports={"ends": "closed"},
+        remodeling={"turnover": TURNOVER, "coupling": "staggered"},  # its first row has not grown
+        output={"fields": False, "columns": columns},
+        loads={"pressure": {"value": 1.2, "ramp": RAMP}, "elongation": {"value": 0.0}},
+    )
+    simulation = Simulation(of, SELF)
+    rows = [dict(step.row) for step in simulation.steps()]
+    found, expected = simulation.stepper.remodeling.driving_tensor()[1], cauchy_of_the_energy(simulation)
+    simulation.close()
+    np.testing.assert_allclose(found, expected, atol=1e-6 * np.abs(found).max())
+    assert rows[0]["opening_angle"] == pytest.approx(120.0, abs=0.01)
+    assert rows[-1]["content"] > 1.2 and rows[-1]["axial_elongation"] > rows[3]["axial_elongation"] > 0.05
+
+
+# ---------------------------------------------------------------- ranks
+GROWING_CUBE = CUBE | {
+    "remodeling": {"turnover": TURNOVER},
+    "output": {"columns": ["mean_stretch", *TURNED]},
+}
+ON_ONE_AND_TWO_RANKS = [{"scene": GROWING_CUBE}]
+
+
+def test_one_and_two_ranks_agree(cases: Cases) -> None:
+    """Random cells in three dimensions, with two load cases."""
+    (one,), (two,) = (cases(ON_ONE_AND_TWO_RANKS, ranks) for ranks in (1, 2))
+    np.testing.assert_allclose(two["l"], one["l"], atol=1e-9)
+    for name in (*TURNED, "mean_stretch@2"):
+        np.testing.assert_allclose(two[name], one[name], rtol=1e-9)
+    assert abs(one["content"][-1] - 1.0) > 0.01
