@@ -255,27 +255,34 @@ SHARED = "dolfinx"  # attribute of a PETSc matrix: dolfinx's own, with the same 
 def create_matrix(form: Any) -> Any:
     """An empty PETSc matrix with the pattern of a compiled bilinear form. Collective.
 
-    On one rank its rows are those of a `dolfinx.la.MatrixCSR`: then no value goes through PETSc's insertion, which
-    takes as long as the kernels.
+    Forms are assembled into a `dolfinx.la.MatrixCSR`. On one rank its memory is that of the matrix; on several ranks
+    the matrix takes its values as a whole. Either way none goes through PETSc's insertion, which takes as long as the
+    kernels.
     """
-    if form.mesh.comm.size > 1:
-        return dolfinx.fem.petsc.create_matrix(form)
     shared = dolfinx.fem.create_matrix(form, dolfinx.la.BlockMode.expanded)
-    rows = shared.indptr.astype(PETSc.IntType), shared.indices.astype(PETSc.IntType, copy=False), shared.data
-    size, block = len(rows[0]) - 1, form.function_spaces[0].dofmap.index_map_bs
-    matrix = PETSc.Mat().createAIJWithArrays((size, size), rows, comm=form.mesh.comm)
-    matrix.setBlockSizes(block, block)  # for multigrid
-    matrix.setAttr(SHARED, shared)
+    block, matrix = form.function_spaces[0].dofmap.index_map_bs, PETSc.Mat()
+    rows, columns = (shared.index_map(axis) for axis in (0, 1))
+    size = rows.size_local
+    starts, numbers = shared.indptr[: size + 1].astype(PETSc.IntType), shared.indices[: shared.indptr[size]]
+    if form.mesh.comm.size == 1:
+        own = starts, numbers.astype(PETSc.IntType, copy=False), shared.data
+        matrix.createAIJWithArrays((size, size), own, comm=form.mesh.comm)
+        matrix.setBlockSizes(block, block)  # for multigrid
+    else:
+        own = starts, columns.local_to_global(numbers).astype(PETSc.IntType)
+        matrix.createAIJ(((size, None), (size, None)), block, csr=(*own, None), comm=form.mesh.comm)
+    matrix.setAttr(SHARED, (shared, *own[:2]))
     return matrix
 
 
 def assemble_matrix(matrix: Any, forms: Sequence[Any], conditions: Sequence[Any]) -> None:
     """The sum of compiled bilinear forms; zero in the rows and columns of conditions, one on their diagonal."""
-    matrix.zeroEntries()
-    target: Any = matrix.getAttr(SHARED)
+    shared, starts, numbers = matrix.getAttr(SHARED)
+    shared.set_value(0.0)
     assemble: Any = dolfinx.fem.assemble_matrix  # mypy sees one overload of a single-dispatch function
-    if target is None:
-        target, assemble = matrix, dolfinx.fem.petsc.assemble_matrix
     for form in forms:
-        assemble(target, form, bcs=list(conditions))
-        matrix.assemble()
+        assemble(shared, form, bcs=list(conditions))
+    if matrix.comm.size > 1:
+        shared.scatter_reverse()
+        matrix.setValuesCSR(starts, numbers, shared.data[: len(numbers)])
+    matrix.assemble()
