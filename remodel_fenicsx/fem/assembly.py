@@ -249,7 +249,7 @@ def invariants(density: Any, unknown: Any) -> list[Any]:
 
 
 # ---------------------------------------------------------------- matrices
-SHARED = "dolfinx"  # attribute of a PETSc matrix: dolfinx's own, with the same numbers
+SHARED = "dolfinx"  # attribute of a PETSc matrix: dolfinx's own, with the starts of its rows and the column numbers
 
 
 def create_matrix(form: Any) -> Any:
@@ -265,13 +265,13 @@ def create_matrix(form: Any) -> Any:
     size = rows.size_local
     starts, numbers = shared.indptr[: size + 1].astype(PETSc.IntType), shared.indices[: shared.indptr[size]]
     if form.mesh.comm.size == 1:
-        own = starts, numbers.astype(PETSc.IntType, copy=False), shared.data
-        matrix.createAIJWithArrays((size, size), own, comm=form.mesh.comm)
+        numbers = numbers.astype(PETSc.IntType, copy=False)
+        matrix.createAIJWithArrays((size, size), (starts, numbers, shared.data), comm=form.mesh.comm)
         matrix.setBlockSizes(block, block)  # for multigrid
     else:
-        own = starts, columns.local_to_global(numbers).astype(PETSc.IntType)
-        matrix.createAIJ(((size, None), (size, None)), block, csr=(*own, None), comm=form.mesh.comm)
-    matrix.setAttr(SHARED, (shared, *own[:2]))
+        numbers = columns.local_to_global(numbers).astype(PETSc.IntType)
+        matrix.createAIJ(((size, None), (size, None)), block, csr=(starts, numbers, None), comm=form.mesh.comm)
+    matrix.setAttr(SHARED, (shared, starts, numbers))
     return matrix
 
 

@@ -134,10 +134,16 @@ def radial_share(dimensions: Array, axes: Array, local: Array) -> Array:
 
 def _local_components(dimensions: Array, axes: Array, local: Array) -> list[Array]:
     """Roots of A_cc, A_aa and A_rr."""
-    x, y, z = (axes[..., i] for i in range(3))
-    # by columns: sums of three products, each rounded by itself, are the same numbers with every BLAS
-    along = (local[..., k, :, None] for k in range(3))
-    return [_norm(dimensions * (x * d[..., 0, :] + y * d[..., 1, :] + z * d[..., 2, :])) for d in along]
+    l, n, d = by_component(dimensions, 1), by_component(axes), by_component(local)
+    # sums of three products, each rounded by itself: the same numbers with every BLAS
+    along = ([n[i, 0] * d[k, 0] + n[i, 1] * d[k, 1] + n[i, 2] * d[k, 2] for i in range(3)] for k in range(3))
+    return [np.sqrt((l[0] * x) ** 2 + (l[1] * y) ** 2 + (l[2] * z) ** 2) for x, y, z in along]
+
+
+def by_component(values: Array, rank: int = 2) -> Array:
+    """Vectors (..., 3) or tensors (..., 3, 3) with the components first: numpy is twice as fast over all points."""
+    last = tuple(range(-rank, 0))
+    return np.ascontiguousarray(np.moveaxis(values, last, range(rank)))
 
 
 def angle_between(first: UnitCell, second: UnitCell) -> Array:

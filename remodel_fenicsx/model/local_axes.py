@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from remodel_fenicsx.model.cells import cylindrical_axes, global_axes
+from remodel_fenicsx.model.cells import by_component, cylindrical_axes, global_axes
 
 Array = NDArray[np.float64]
 Maker = Callable[[], Array]
@@ -101,16 +101,24 @@ class LocalAxes:
         ``c' = F c / |F c|`` follows a material line. ``r' = F^-T r / |F^-T r|`` stays normal to a material surface,
         and is taken as F c x F a, which needs no inverse. a' = r' x c' lies in that surface, square to c'.
         """
+        F, axes = by_component(deformation_gradient), by_component(self.axes)
         circumferential, axial = (
-            np.einsum("...ij,...j->...i", deformation_gradient, self.axes[..., k, :]) for k in (0, 1)
+            [F[i, 0] * axes[k, 0] + F[i, 1] * axes[k, 1] + F[i, 2] * axes[k, 2] for i in range(3)] for k in (0, 1)
         )
-        radial = _unit(np.cross(circumferential, axial))
+        radial = _unit(_cross(circumferential, axial))
         circumferential = _unit(circumferential)
-        return np.stack([circumferential, np.cross(radial, circumferential), radial], axis=-2)
+        rows = [circumferential, _cross(radial, circumferential), radial]
+        return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
 
 
-def _unit(vectors: Array) -> Array:
-    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+def _cross(one: list[Array], other: list[Array]) -> list[Array]:
+    """Of vectors by component."""
+    return [one[j] * other[k] - one[k] * other[j] for j, k in ((1, 2), (2, 0), (0, 1))]
+
+
+def _unit(vector: list[Array]) -> list[Array]:
+    length = np.sqrt(vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)
+    return [component / length for component in vector]
 
 
 AXES: dict[str, Callable[[LocalAxes], Array]] = {

@@ -156,8 +156,13 @@ class OverCorrection(WarnsOnce):
 
     def _rested(self, cells: list[Array]) -> bool:
         """Whether one of the passes has left most cells as they were: what goes on after that jumps."""
-        same = [self._at_points(a == b).all(axis=-1) for a, b in pairwise(cells[: ORDER + 1])]
+        same = [self._at_points(a == b).all(axis=-1) for a, b in pairwise(cells[: ORDER + 1]) if self._may_rest(a, b)]
         return any(self.quadrature.mean(passed.astype(np.float64)) > RESTED_SHARE for passed in same)
+
+    def _may_rest(self, a: Array, b: Array) -> bool:
+        """Whether some point has kept its first component: most often none has, and nothing need be summed up."""
+        first = a[:: len(tensors.MANDEL)] == b[:: len(tensors.MANDEL)]
+        return bool(over_ranks(self.state.comm, bool(first.any()), MPI.LOR))
 
     def _evenly(self, step: Step) -> bool:
         """Whether the passes are about as far from each other: of others a single jump looks like a swing."""
@@ -178,7 +183,7 @@ class OverCorrection(WarnsOnce):
         owned = self.state.number_of_owned_unknowns
 
         def of_cells(a: Array, b: Array) -> float:
-            return self.quadrature.integral(self._at_points(a * b).sum(axis=-1))
+            return self.quadrature.integral(np.einsum("epi,epi->ep", self._at_points(a), self._at_points(b)))
 
         def of_body(a: Array, b: Array) -> float:
             return float(over_ranks(self.state.comm, float(np.dot(a[:owned], b[:owned])), MPI.SUM))

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from remodel_fenicsx.body.shape import Shape
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
 from remodel_fenicsx.fem.compat import geometry_dofmap
+from remodel_fenicsx.state.memory import Occasions
 from remodel_fenicsx.system import NOTICE
 from remodel_fenicsx.watch.once import WarnsOnce
 
@@ -85,10 +86,11 @@ class RadialChains(WarnsOnce):
     def __init__(self, stepper: Stepper, radial_share: Callable[[Array, Array, Array], Array]):
         super().__init__(stepper, "radial_chains", {"share": 0.0})
         self.radial_share = radial_share
+        self._occasions = Occasions(stepper.state, "radial_chains")
 
     def solved(self, step: Step) -> None:
-        """Measure, until it was said."""
-        if not self.said:
+        """Measure from time to time, until it was said."""
+        if not self.said and (self._occasions.due() or step.is_last):
             cells = self.state.cells
             share = self.radial_share(cells.dimension_values, cells.axis_values, cells.local_axes.axes)
             self._numbers["share"] = self.quadrature.mean(share)
