@@ -244,8 +244,6 @@ class Scene(Table):
             return "chains: material.chain_density above 0"
         if self.cases[1:]:
             return "no [[cases]]: cells that answer within a solve have the stress of one load case"
-        if remodeling.turnover.is_on:
-            return "no remodeling.turnover: it has no derivatives here"
         if remodeling.has_set_point:
             return "remodeling.exponent = 2 and remodeling.threshold = 0: their targets have no derivatives here"
         parts = LAWS[remodeling.law], DRIVERS[remodeling.driver], FRAMES[remodeling.frame]
