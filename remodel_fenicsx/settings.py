@@ -668,7 +668,7 @@ COUPLINGS = {
 class Turnover(Table):
     """How collagen is removed, and deposited again under a stretch (docs/turnover.md). Without `time` it is not.
 
-    For the law `tensor`, with the couplings `staggered`, `relaxed` and `extrapolated`.
+    For the law `tensor`.
     """
 
     time: float | None = Field(

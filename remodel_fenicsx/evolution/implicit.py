@@ -147,7 +147,8 @@ class Implicit:
 
         def set_fraction(fraction: float) -> None:
             loading.set({name: old[name] + fraction * (loads[name] - old[name]) for name in loads})
-            answers.set_time(start + fraction * (time - start))
+            # nothing remodels where cells do not answer: the first step starts from the loaded body as it was
+            answers.set_time(start + (fraction * (time - start) if answering else 0.0))
 
         if not answering:
             answers.freeze()

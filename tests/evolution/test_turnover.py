@@ -173,6 +173,17 @@ def test_implicit_steps_end_nearer_to_the_solution(small_steps: list[dict[str, f
     np.testing.assert_allclose(np.log2(found["implicit", 4.0][1] / found["implicit", 2.0][1]), 1.0, atol=0.1)
 
 
+def test_long_implicit_steps() -> None:
+    """The ramp of a thick wall in one step; steps of 0.6 T come to the rest of small ones."""
+    values = wall(48.0, 24.0, GROWS, COLUMNS, coupling="implicit")
+    values["geometry"]["outer_radius"], values["loads"]["pressure"]["value"] = 3.0, 4.8
+    rows, known = simulated(values)
+    assert [row["time"] for row in rows] == [24.0, 48.0] and known["content"].max() > 2.0
+    rows, known = simulated(wall(1440.0, 24.0, GROWS, COLUMNS, coupling="implicit"))
+    assert [rows[-1][name] for name in COLUMNS] == pytest.approx([2.912, 1.311], rel=1e-3)
+    assert known["opening_angle"] == pytest.approx(115.3, abs=2.0)  # extrapolated 102, staggered 92
+
+
 def test_the_tangent_of_implicit_steps_is_the_derivative_of_the_forces() -> None:
     """Ratios of Taylor remainders near 4, in the middle of growth."""
     simulation = Simulation(scene_from_dict(wall(48.0, 8.0, GROWS, [], coupling="implicit")))
@@ -261,10 +272,13 @@ def test_a_growth_that_does_not_rest_is_said(caplog: pytest.LogCaptureFixture) -
     assert sum("mechanobiological instability" in record.message for record in caplog.records) == 1
 
 
-@pytest.mark.parametrize("time", [{}, {"tolerance": 1.0}], ids=["equal", "chosen"])
-def test_a_run_goes_on_with_its_content(time: dict[str, float], tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("coupling", "time"),
+    [("staggered", {}), ("extrapolated", {}), ("extrapolated", {"tolerance": 1.0}), ("implicit", {"tolerance": 3.0})],
+)
+def test_a_run_goes_on_with_its_content(coupling: str, time: dict[str, float], tmp_path: Path) -> None:
     """Two parts are the whole, to the last digit."""
-    values = wall(80.0, 4.0, {"time": 40.0, "gain": 1.0}, COLUMNS)
+    values = wall(80.0, 4.0, {"time": 40.0, "gain": 1.0}, COLUMNS, coupling=coupling)
     values["time"] |= time
     values["output"]["times"] = [40.0]
     (tmp_path / "scene.toml").write_text(scene_from_dict(values).to_toml())
