@@ -14,6 +14,7 @@ import argparse
 import time as clock
 from collections.abc import Iterator
 from pathlib import Path
+from textwrap import fill
 from typing import Any, NamedTuple
 
 import matplotlib
@@ -85,7 +86,7 @@ def errors() -> Iterator[dict[str, Any]]:
         for name, scheme in SCHEMES.items():
             printed_random = cells == "random" and scheme.values is PRINTED
             if printed_random and name != "printed-staggered":
-                continue  # no limit: docs/theory.md, Points that are held
+                continue  # no limit (docs/appendix_coupling.md, Points that are held)
             coupling, finest = ("staggered", FINEST) if printed_random else scheme.limit
             key = cells, str(scheme.values)
             if key not in limits:
@@ -206,7 +207,7 @@ def page() -> str:
     text = (Path(__file__).parent / "couplings.template.md").read_text(encoding="utf-8")
     return text.format(
         table="\n".join("| " + " | ".join(line) + " |" for line in lines),
-        caption=CAPTION[1],
+        caption=fill(f"*{CAPTION[1]}*", 100),
         steps_of_error=f"{END / 1.25:.0f}",
         cost=cost_table(),
     )

@@ -166,50 +166,69 @@ def table(head: list[str], rows: Iterator[list[str]]) -> str:
 
 PAGE_TEXT = """# Elements that lock, and elements that do not
 
-Made by `./with-fenicsx benchmarks/locking.py` with {versions}.
-What is compared is explained in docs/theory.md, Volumetric locking.
+A material that hardly changes its volume may be too much for its elements: they keep the volume
+only by not deforming at all. This page measures which elements do so, on bodies whose answer is
+known. docs/theory.md, Volumetric locking, has the formulation. docs/appendix_elements.md says how a
+run sees it by itself.
+
+## What to take
+
+| body | take |
+|---|---|
+| moderate lambda/mu (the paper's is 8.8) | the default; a run warns where it is not enough |
+| large lambda/mu, hexahedra | `mesh.formulation = "selective-integration"`, best with `mesh.degree = 2` |
+| tubes with reduced kinematics | `mesh.degree = 2`; "What a run says of itself", below, shows how far that goes |
+| large lambda/mu, tetrahedra | no remedy: take hexahedra |
 
 ## Thick tube
 
-Radii 1 and 3, plane strain, no chains, pressure 2 in four steps, mu = 3.103. Error of the inner
-displacement against {exact}, that of the incompressible tube (at lambda/mu = 100 the body itself
-moves {compressible} % more), in parentheses what the run itself says is missing: the warning comes
-above 5 %. Then the Newton iterations of all four steps.
+Radii 1 and 3, plane strain, no chains, pressure 2 in four steps, mu = 3.103. Each cell of the table
+has three numbers:
+
+1. the error of the inner displacement against {exact}, that of the incompressible tube (at
+   lambda/mu = 100 the body itself moves {compressible} % more);
+2. in parentheses what the run itself says is missing; the warning comes above 5 %;
+3. the Newton iterations of all four steps.
 
 {tube}
 
-With chains (isotropic cells that do not remodel), on 16 x 8 linear hexahedra, against quadratic
-ones on 8 x 4 with `selective-integration`. c is the network modulus. The stiffer the network, the
-less the same lambda/mu locks: the estimate knows, lambda/mu does not. (Sixteen plane sides are 2 %
-off by themselves.)
+**With chains** (isotropic cells that do not remodel), on 16 x 8 linear hexahedra, against quadratic
+ones on 8 x 4 with `selective-integration`. c is the network modulus.
 
 {network}
+
+The stiffer the network, the less the same lambda/mu locks. The estimate of a run knows this,
+lambda/mu does not. (Sixteen plane sides are 2 % off by themselves.)
 
 ## What a run says of itself
 
 Tubes of inner radius 1 and outer radius R_o, no chains, length held, kinematics `radial` with its
 eight elements through the wall. The pressure is the given part of mu ln R_o, the one that bursts an
-incompressible tube. Error of the inner displacement against 400 quadratic elements of
-`tests/reference/radial.py`; in parentheses what the run says is missing.
+incompressible tube. The table has the error of the inner displacement against 400 quadratic
+elements of `tests/reference/radial.py`, and in parentheses what the run says is missing.
 
 {radial}
 
 ## Cook's membrane
 
-A slab in plane strain, clamped on the left, 100 of dead force upwards on the right, mu = 80.194,
-lambda/mu = 1e4. Rise of the upper right corner by elements on a side, and Newton iterations of all
-four steps.
+A slab in plane strain is clamped on the left. 100 of dead force pull it upwards on the right;
+mu = 80.194, lambda/mu = 1e4. The table has the rise of the upper right corner by elements on a
+side, and the Newton iterations of all four steps.
 
 {membrane}
 
 ## The bar of the cardiac mechanics benchmark
 
-S. Land et al., Proc. R. Soc. A 471 (2015) 20150641, problem 1: 10 x 1 x 1 mm, clamped at x = 0,
-transversely isotropic exponential law with fibres along the bar, a pressure of 0.004 kPa on the
-deformed bottom; lambda/C = 1e3. The participants of the benchmark agree on a tip at z = {tip} mm.
+S. Land et al., Proc. R. Soc. A 471 (2015) 20150641, problem 1. The bar is 10 x 1 x 1 mm and clamped
+at x = 0. Its law is transversely isotropic and exponential, with fibres along the bar;
+lambda/C = 1e3. A pressure of 0.004 kPa acts on the deformed bottom. The participants of the
+benchmark agree on a tip at z = {tip} mm.
+
 The matrix energy and the shape are given from outside of the package (`tests/locking_bodies.py`).
 
 {bar}
+
+Made by `./with-fenicsx benchmarks/locking.py` with {versions}.
 """
 
 

@@ -8,8 +8,8 @@ for the printed coupling, the implicit one and the consistent variant, against t
 tests/reference with steps of 1/8 and 1/16 (1/2 and 1/4 for the law tensor), extrapolated; `end`, chosen steps against
 equal ones there, in turns; `paper`, the paper's own mesh there, at its points too; `whole`, the whole tube in three
 dimensions, up to 20 minutes a run; `hold`, chosen steps against equal ones to t = 1000; `tendon`, the paper's with
-random cells. An hour or more of one core, most of it the whole tube. Then makes docs/speed_and_accuracy.md and its
-picture; --only makes no page, --report makes it from what is there. What is recorded is used again.
+random cells. An hour or more of one core, most of it the whole tube. Then makes docs/speed_and_accuracy.md, its
+appendix and picture; --only makes no page, --report makes it from what is there. What is recorded is used again.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import fill
 
 import numpy as np
 from matplotlib import rc_context
@@ -38,7 +39,8 @@ from remodel_fenicsx.system.environment import versions
 from tests.reference.radial import solve_radial
 
 DOCS = Path(__file__).parents[1] / "docs"
-PAGE, PICTURE = DOCS / "speed_and_accuracy.md", "speed_and_accuracy"
+PICTURE = "speed_and_accuracy"
+PAGES = {"work_precision": "speed_and_accuracy", "work_precision_appendix": "appendix_speed_and_accuracy"}  # templates
 PARTS = ("artery", "end", "paper", "whole", "hold", "tendon")
 COARSE = (8.0, 4.0)  # tolerances, degrees
 TIMES = chosen.TO_THE_END
@@ -216,18 +218,19 @@ def points(folder: Path) -> list[Point]:
 
 
 def report(folder: Path) -> None:
-    """Write the page and its picture."""
+    """Write the page, its appendix and its picture."""
     found = sorted(points(folder), key=lambda point: point.seconds)
     best = {id(p) for p, on in zip(found, _front(found), strict=True) if on}
     rows = [_row(p, id(p) in best) for p in found]
     made = ", ".join(f"{name} {version}" for name, version in versions().items() if name != "BLAS")
-    text = (Path(__file__).with_name("work_precision.template.md")).read_text(encoding="utf-8")
     parts = {"rows": "\n".join(rows), "whole": whole_rows(found), "hold": chosen.hold_rows(folder),
-             "end": chosen.end_rows(folder), "tendon": tendon.rows(folder), "made": made,
-             "paper": paper_words(found), "places": places.words(folder)}  # fmt: skip
-    for name, words in parts.items():
-        text = text.replace(f"{{{name}}}", words)
-    PAGE.write_text(text, encoding="utf-8")
+             "end": chosen.end_rows(folder), "tendon": tendon.rows(folder), "made": fill(f"Made with {made}.", 100),
+             "paper": paper_rows(found), "places": places.words(folder)}  # fmt: skip
+    for template, page in PAGES.items():
+        text = Path(__file__).with_name(f"{template}.template.md").read_text(encoding="utf-8")
+        for name, words in parts.items():
+            text = text.replace(f"{{{name}}}", words)
+        (DOCS / f"{page}.md").write_text(text, encoding="utf-8")
     _draw(found, made)
 
 
@@ -244,12 +247,12 @@ def whole_rows(found: Sequence[Point]) -> str:
     return "\n".join(_row(p, on) for p, on in zip(mine, _front(mine), strict=True))
 
 
-def paper_words(found: Sequence[Point]) -> str:
+def paper_rows(found: Sequence[Point]) -> str:
     """The paper's own setting beside the wall alone on the same elements."""
     printed = {point.name: point for point in found if point.method == "printed"}
     whole, wall = printed["full-1-degree-1-step-1"], printed["radial-1-degree-1-step-1"]
-    own = f"{whole.seconds:.3g} s for {whole.degrees:.2g} degrees, {whole.largest:.2g} at the front"
-    return f"{own}; the wall alone on the same elements gives {wall.degrees:.2g} degrees for {wall.seconds:.1g} s"
+    own = f"| the whole tube | {whole.seconds:.3g} | {whole.degrees:.2g} | {whole.largest:.2g} |"
+    return f"{own}\n| the wall alone on the same elements | {wall.seconds:.1g} | {wall.degrees:.2g} | |"
 
 
 def _front(found: Sequence[Point]) -> list[bool]:

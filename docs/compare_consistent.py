@@ -197,7 +197,7 @@ def layer_table(layers: Columns) -> str:
 
 def main() -> None:
     """Run, draw, write the page."""
-    from make_verification import KEPT, page
+    from make_verification import KEPT, write_pages
 
     if "--page" not in sys.argv[1:]:
         table = histories()
@@ -208,7 +208,7 @@ def main() -> None:
     tables = (read_table(KEPT / f"{name}.csv") for name in ("consistent", "consistent-layers", "fig6"))
     with matplotlib.rc_context(STYLE):
         Page(KEPT, "consistent", *CAPTION).save_figure(draw(*tables), "docs/compare_consistent.py")
-    (DOCS / "verification.md").write_text(page(), encoding="utf-8")
+    write_pages()
 
 
 if __name__ == "__main__":

@@ -1,8 +1,11 @@
-"""Makes docs/verification.md and docs/figures/ anew: ./with-fenicsx python3 docs/make_verification.py [--keep]
+"""Makes docs/verification.md, its appendix and docs/figures/ anew:
+
+    ./with-fenicsx python3 docs/make_verification.py [--keep]
 
 Draws every figure, solves the independent radial reference of tests/, makes the studies of verification_studies.py, and
-keeps the pictures and the small tables in docs/figures/. The page is make_verification.template.md; each {name} in it
-is computed from the tables in docs/figures/, so that a test can do the same without a run.
+keeps the pictures and the small tables in docs/figures/. The page is make_verification.template.md, the appendix
+appendix_verification.template.md. Each {name} in them is computed from the tables in docs/figures/, so that a test can
+do the same without a run.
 
 All runs are made anew. --keep uses runs and tables that are there: after a stop, or where results have not changed.
 """
@@ -13,6 +16,7 @@ import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 import matplotlib
@@ -385,8 +389,8 @@ def made_with(folder: Path) -> str:
     return (folder / "fig7.csv").read_text(encoding="utf-8").splitlines()[1].removeprefix("# ").split(";")[0]
 
 
-def page(kept: Path = KEPT) -> str:
-    """docs/verification.md from the tables in docs/figures."""
+def page(kept: Path = KEPT, template: str = "make_verification") -> str:
+    """docs/verification.md, or the page of another template, from the tables in docs/figures."""
     values = all_numbers(kept) | page_values(kept) | {
         "table_layers": layer_table(kept),
         "table_cases": case_table(kept),
@@ -400,7 +404,14 @@ def page(kept: Path = KEPT) -> str:
         **{f"caption_{name}": figure.caption for name, figure in figures.FIGURES.items()},
         "caption_reference": REFERENCE_CAPTION[1],
     }  # fmt: skip
-    return (DOCS / "make_verification.template.md").read_text(encoding="utf-8").format_map(values)
+    values |= {name: fill(f"*{text}*", 100) for name, text in values.items() if name.startswith("caption_")}
+    return (DOCS / f"{template}.template.md").read_text(encoding="utf-8").format_map(values)
+
+
+def write_pages() -> None:
+    """Both, from what is there."""
+    (DOCS / "verification.md").write_text(page(), encoding="utf-8")
+    (DOCS / "appendix_verification.md").write_text(page(template="appendix_verification"), encoding="utf-8")
 
 
 def main() -> None:
@@ -418,7 +429,7 @@ def main() -> None:
         shutil.copyfile(drawn / f"{name}.png", KEPT / f"{name}.png")
     for name in (*pictures, *MORE_TABLES, *studies):
         shutil.copyfile(drawn / f"{name}.csv", KEPT / f"{name}.csv")
-    (DOCS / "verification.md").write_text(page(), encoding="utf-8")
+    write_pages()
 
 
 if __name__ == "__main__":

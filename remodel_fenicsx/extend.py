@@ -1,10 +1,52 @@
 """Registries, and what is put into them: a scene then knows the name. CONTRIBUTING.md says which to use for what.
 
-    from remodel_fenicsx.extend import DRIVERS, Driver
-
-    DRIVERS["mine"] = Driver(lambda F, stresses: stresses.cauchy, material=False)
-
 Importing this needs no dolfinx; asking for couplings, measurements, linear solvers or `form` does.
+
+Attributes
+----------
+AXES
+    Initial axes of the cells by name (`cells.axes`): functions of a `LocalAxes` that give rows n_I, (..., 3, 3).
+CHAINS
+    Laws of a single chain by name (`material.chain`): `Chain`.
+COLUMNS, COLUMNS_ON_REQUEST
+    Columns of every shape's history by name, those that are always there and those that `output.columns` may name:
+    `Column`.
+COUPLINGS
+    How equilibrium and remodeling are coupled, by name (`remodeling.coupling`): `CouplingKind`.
+DRIVERS
+    Driving tensors by name (`remodeling.driver`; paper, eq. 8): `Driver`.
+FORMULATIONS
+    Where elements take the change of volume, by name (`mesh.formulation`): `Formulation`.
+FRAMES
+    What becomes of the eigenvectors of a spatial driver, by name (`remodeling.frame`; paper, eq. 9): `Frame`.
+KINEMATICS
+    What the unknowns mean, by name (`model.kinematics`): `Kinematics`.
+LAWS
+    Evolution laws by name (`remodeling.law`; paper, eqs. 10 and 11): `Law`.
+MATRICES
+    Energies of the matrix by name (`material.matrix`): functions of F, lambda and mu; `Matrix` for all formulations.
+PAIRINGS
+    Which principal value belongs to which dimension, by name (`remodeling.pairing`): functions like `principal`.
+REPULSIONS
+    Forms of the repulsive energy by name (`material.repulsion`): `Repulsion`.
+SHAPES
+    Bodies by name (`geometry.shape`): subclasses of `Shape`.
+SOLVER_METHODS
+    How the nonlinear problem is solved, by name (`solver.method`): `SolverMethod`.
+neo_hookean
+    The paper's matrix, W = lambda/2 ln^2 J + mu/2 (tr C - 3) - mu ln J (eq. 4a): a `Matrix`.
+AREA, FORCE, LENGTH, NUMBER_DENSITY, STRESS, TEMPERATURE
+    What a number of a scene measures, for the field of a table: ``side: Annotated[float, LENGTH]``; a `Dimension`.
+LENGTH_UNIT, STRESS_UNIT
+    The keys that choose a scene's units, for a `Dimension` of one's own.
+
+Examples
+--------
+>>> from remodel_fenicsx.extend import DRIVERS, Driver
+>>> DRIVERS["mine"] = Driver(lambda F, stresses: stresses.cauchy, material=False)
+>>> sorted(DRIVERS)
+['cauchy', 'finger', 'mine', 'pk2']
+>>> del DRIVERS["mine"]
 """
 
 from __future__ import annotations

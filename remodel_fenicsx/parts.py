@@ -1,8 +1,14 @@
 """What a script assembles a simulation from, where a scene does not say it: see demos/artery.py.
 
-from remodel_fenicsx import parts
+Stresses, lengths and times are in the script's own units, the same everywhere; dimensions of unit cells and lengths of
+chains are in link lengths, angles in degrees.
 
-body = parts.Tube(inner_radius=1.0, outer_radius=3.0, length=8.0)
+Examples
+--------
+>>> from remodel_fenicsx import parts
+>>> body = parts.Tube(inner_radius=1.0, outer_radius=3.0, length=8.0)
+>>> body.face_names
+('bottom', 'top', 'inner', 'outer')
 """
 
 from remodel_fenicsx.body import Cube, GeometryError, Tendon, Tube

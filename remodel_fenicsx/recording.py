@@ -39,9 +39,19 @@ class Recording(RecordedRun):
 
     Examples
     --------
-    >>> recording = Recording("results/artery")
-    >>> recording.history["inner_radius"][-1]
-    >>> recording.plot(layers=2).show()
+    The cube of the paper's Fig. 5, pulled for two steps:
+
+    >>> from remodel_fenicsx import Recording, preset_scene, run
+    >>> scene = preset_scene("kuhl-holzapfel-2007", "cube").with_values({"time.end": 2.0})
+    >>> recording = Recording(run(scene, "pulled-cube", report=False))
+    >>> recording.history["mean_fibre_angle"].round(2)
+    array([54.74, 54.74, 53.57])
+    >>> recording.times
+    array([0., 1., 2.])
+    >>> recording.fields(2.0)["displacement"].shape  # (nodes, 3)
+    (8, 3)
+
+    In a notebook `recording` alone shows the report, and `recording.plot(layers=2).show()` the body.
     """
 
     def _repr_html_(self) -> str:
@@ -63,7 +73,8 @@ class Recording(RecordedRun):
 
         Returns
         -------
-        The file.
+        Path
+            The file.
 
         Raises
         ------
@@ -88,8 +99,9 @@ class Recording(RecordedRun):
 
         Returns
         -------
-        The reference body. Its points have `displacement`, (n, 3), where that was recorded:
-        `grid.warp_by_vector("displacement")` is the deformed body. Its elements have all other fields, and `layer`.
+        pyvista.UnstructuredGrid
+            The reference body. Its points have `displacement`, (n, 3), where that was recorded, and
+            `grid.warp_by_vector("displacement")` is the deformed body. Its elements have all other fields, and `layer`.
 
         Raises
         ------
@@ -128,7 +140,8 @@ class Recording(RecordedRun):
 
         Returns
         -------
-        The plotter, not shown yet.
+        pyvista.Plotter
+            Not shown yet.
 
         Raises
         ------
@@ -163,7 +176,8 @@ class Recording(RecordedRun):
 
         Returns
         -------
-        The file.
+        Path
+            The file.
 
         Raises
         ------

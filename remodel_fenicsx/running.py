@@ -76,8 +76,9 @@ def run(
 
     Returns
     -------
-    The folder with history.csv, fields.vtkhdf, fields_chains.vtkhdf, scene.toml, run.log, report.html and the
-    checkpoints.
+    Path
+        The folder with history.csv, fields.vtkhdf, fields_chains.vtkhdf, scene.toml, run.log, report.html and the
+        checkpoints.
 
     Raises
     ------
@@ -91,6 +92,18 @@ def run(
         On SIGUSR1, or before the deadline; all is recorded, with a checkpoint.
     OSError
         If the results cannot be written.
+
+    Examples
+    --------
+    >>> from remodel_fenicsx import preset_scene, run
+    >>> scene = preset_scene("kuhl-holzapfel-2007", "cube").with_values({"time.end": 1.0})
+    >>> folder = run(scene, "one-step", report=False)
+    >>> sorted(path.name for path in folder.glob("*.vtkhdf"))
+    ['fields.vtkhdf', 'fields_chains.vtkhdf']
+    >>> run(scene, "one-step")
+    Traceback (most recent call last):
+        ...
+    remodel_fenicsx.results.run_lock.FolderTaken: -o one-step: is not empty; allowed is a new or an empty folder
     """
     end_all_ranks_on_exception()
     # what the scene asks for is built before anything is written

@@ -55,23 +55,46 @@ NOT_NEGATIVE: JsonDict = {"type": "number", "minimum": 0}
 
 
 class Mesh(Table):
-    """The finite elements."""
+    """The finite elements.
+
+    Its keyword arguments are the keys of `[mesh]` in a scene (docs/scene.md).
+
+    Raises
+    ------
+    SceneError
+        If a value is not allowed: one line.
+
+    Examples
+    --------
+    >>> from remodel_fenicsx import parts
+    >>> mesh = parts.Mesh(refinement=3, element="hexahedron", degree=1)
+    >>> parts.Cube(side=1.0).build(mesh).number_of_elements
+    27
+    >>> parts.Mesh(refinement=0)
+    Traceback (most recent call last):
+        ...
+    remodel_fenicsx.schema.tables.SceneError: refinement = 0: must be a whole number at least 1
+    """
 
     refinement: int = Field(
         default=1,
         ge=1,
-        description="Factor on the paper's number of elements in every direction (1: its own meshes). More than 10 "
-        "million hexahedra, or those split into tetrahedra, are refused.",
+        description=(
+            "Multiplies the paper's number of elements in every direction; 1 is the paper's mesh. More "
+            "than 10 million hexahedra, or as many split into tetrahedra, are refused."
+        ),
     )
     element: Literal["hexahedron", "tetrahedron"] = Field(default="hexahedron", description="Shape of the elements.")
     degree: Annotated[int, OneOf((1, 2))] = Field(
-        default=1, description="Polynomial degree of the displacement: 1 (the paper's) or 2."
+        default=1, description="Polynomial degree of the displacement in an element: 1, as in the paper, or 2."
     )
     formulation: Annotated[str, OneOf(FORMULATIONS)] = Field(
         default="displacement",
-        description="Where the elements take the change of volume: "
-        + "; ".join(f"{name!r}: {formulation.meaning}" for name, formulation in FORMULATIONS.items())
-        + ".",
+        description=(
+            "How elements treat the change of volume. "
+            + ". ".join(f"{name!r}: {formulation.meaning}" for name, formulation in FORMULATIONS.items())
+            + "."
+        ),
     )
 
     @model_validator(mode="after")
@@ -89,40 +112,50 @@ class Model(Table):
 
     kinematics: Annotated[str, OneOf(KINEMATICS, (AUTO,))] = Field(
         default=AUTO,
-        description="'auto': the cheapest that is exact for the scene; a scene as run has its name. "
-        + "; ".join(f"{name!r}: {kinematics.meaning}" for name, kinematics in KINEMATICS.items())
-        + ". One that would be wrong for the scene is refused with the reason (docs/kinematics.md).",
+        description=(
+            "'auto' takes the cheapest one that is exact for the scene; the scene as run has its name. "
+            + ". ".join(f"{name!r}: {kinematics.meaning}" for name, kinematics in KINEMATICS.items())
+            + ". One that would be wrong for the scene is refused with the reason (docs/kinematics.md)."
+        ),
     )
 
 
 class Support(Table):
-    """How a face of an own body (shape `'mesh'`) is held, `[supports.inlet]` say; a tube has `[supports.outer]`.
+    """How a face of a body of your own (shape `'mesh'`) is held, such as `[supports.inlet]`.
 
-    NAME is a face of `geometry.faces`, or one that the file names. N is the face's mean outward normal in the
-    reference, of each of its parts; c goes around the middle of the part. Where a scene says nothing, inlet and outlet
-    are guided, all other faces free.
+    NAME is a face of `geometry.faces`, or one that the file names. N is the mean outward normal of the face, or of each
+    part of it, in the reference body; c goes around the middle of the part. Where a scene says nothing, inlet and
+    outlet are guided and all other faces are free. A tube has `[supports.outer]` alone, for what surrounds it.
     """
 
     kind: Literal["guided", "sliding", "held", "elastic", "free"] = Field(
         default="guided",
-        description="'guided': the face stays in its plane and around its middle, its circumference may grow; "
-        "'sliding': it stays in its plane; 'held': it does not move, but along N as loads.elongation says; 'elastic': "
-        "on springs of fixed direction, as in what surrounds the body; 'free'.",
+        description=(
+            "'guided': the face stays in its plane and its circle stays centred, but may grow. "
+            "'sliding': the face stays in its plane. 'held': the face does not move, except along N as "
+            "loads.elongation says. 'elastic': springs of fixed direction hold the face, like the "
+            "tissue around a vessel. 'free': nothing holds the face."
+        ),
     )
     stiffness: Annotated[float | None, FOUNDATION] = Field(
         default=None,
         gt=0,
-        description="Force per area and displacement, in stress_unit over the scene's unit of length. 'elastic' needs "
-        "it; for 'guided' and 'sliding' the default is 1000 (lame_lambda + 2 lame_mu) over the wall's thickness: it "
-        "moves a plane by a thousandth of what the wall's own compression does.",
+        description=(
+            "Force per area and displacement, in stress_unit over the scene's unit of length. 'elastic'"
+            " needs it. For 'guided' and 'sliding' the default is 1000 (lame_lambda + 2 lame_mu) over "
+            "the wall's thickness. With it a plane moves by a thousandth of what the wall's own "
+            "compression does."
+        ),
         json_schema_extra={"allowed": "a finite number greater than 0"},
     )
     tangential: float = Field(
         default=1.0,
         ge=0,
         le=1,
-        description="Of 'elastic': stiffness across N over that along N. Below 0.5 a wall that has grown may twist. "
-        "With 0 a tube may be solved on one radius, which cannot twist.",
+        description=(
+            "For 'elastic': stiffness across N over stiffness along N. Below 0.5 a wall that has grown "
+            "may twist. With 0 a tube may be solved on one radius, which cannot twist."
+        ),
     )
 
     @model_validator(mode="after")
@@ -133,8 +166,8 @@ class Support(Table):
 
 
 class Supports(Table):
-    """How the body is held. An own body (shape `'mesh'`) has a table for each of its faces that is held, a tube one
-    for what surrounds it, `[supports.outer]`.
+    """How the body is held. A body of your own (shape `'mesh'`) has a table for each face that is held. A tube may have
+    `[supports.outer]`, for what surrounds it.
     """
 
     further = Support
@@ -143,8 +176,11 @@ class Supports(Table):
 
     ends: str = Field(
         default="free",
-        description="Ends of a tube: 'free' to move radially in their planes; 'clamped', which keeps their circles; "
-        "or 'closed': free, with caps on which the pressure acts, and the length an unknown.",
+        description=(
+            "What holds the ends of a tube. 'free': they stay in their planes and may move radially. "
+            "'clamped': they also keep their circles. 'closed': they are free and have caps on which "
+            "the pressure acts; the length is then an unknown."
+        ),
         json_schema_extra={"allowed": "'free', for a tube also 'clamped' and 'closed'"},
     )
 
@@ -158,7 +194,29 @@ class Supports(Table):
 
 
 class Material(Table):
-    """The tissue: an isotropic matrix (Lame constants) with a network of collagen chains."""
+    """The tissue: an isotropic matrix (Lame constants) with a network of collagen chains.
+
+    Its keyword arguments are the keys of `[material]` in a scene (docs/scene.md; paper, eqs. 2 to 4). Stresses are in
+    `stress_unit`, lengths of chains in link lengths, `chain_density` in 1/m^3, `temperature` in kelvin.
+
+    Raises
+    ------
+    SceneError
+        If a value is not allowed: one line.
+
+    Examples
+    --------
+    The paper's tissue, in kPa:
+
+    >>> from remodel_fenicsx import parts
+    >>> material = parts.Material(lame_lambda=27.293, lame_mu=3.103, chain_density=7e21, contour_length=2.125,
+    ...                           persistence_length=1.82, temperature=310.0)
+    >>> round(material.network_modulus, 3)  # c of docs/theory.md
+    4.116
+    >>> tissue = material.tissue(end_to_end_length=1.0)
+    >>> tissue.contour_length
+    2.125
+    """
 
     lame_lambda: Annotated[float, STRESS] = Field(
         default=27.293, ge=0, description="First Lame constant lambda of the matrix, in stress_unit."
@@ -167,28 +225,37 @@ class Material(Table):
         default=3.103, gt=0, description="Second Lame constant mu of the matrix, in stress_unit."
     )
     chain_density: Annotated[float, NUMBER_DENSITY] = Field(
-        default=2.0e21, ge=0, description="Number of chains n_chn per volume, in 1/m^3; 0: no chains."
+        default=2.0e21, ge=0, description="Number n_chn of chains per volume, in 1/m^3. 0 means no chains."
     )
     contour_length: float = Field(
-        default=1.594, gt=0, description="Contour length L of a chain, at which it locks, in link lengths."
+        default=1.594,
+        gt=0,
+        description=(
+            "Contour length L of a chain, its length when pulled straight, in link lengths. The chain locks there."
+        ),
     )
     persistence_length: float = Field(
         default=1.365,
         gt=0,
-        description="Persistence length A_p of a chain, its bending stiffness over k theta, in link lengths.",
+        description="Persistence length A_p of a chain, in link lengths: its bending stiffness over k theta.",
     )
     initial_stiffness: Annotated[float | None, STRESS] = Field(
         default=None,
         gt=0,
-        description="In place of chain_density: slope of the network's nominal stress over the stretch along aligned "
-        "chains at stretch 1, c r0^2 (d(g r)/dr + g) at r0, in stress_unit. A scene as run has chain_density.",
+        description=(
+            "In place of chain_density: the slope of a measured curve at stretch 1, nominal stress of "
+            "the network over stretch along aligned chains, in stress_unit. It is c r0^2 (d(g r)/dr + "
+            "g) at r0. The scene as run has chain_density (docs/which_numbers.md)."
+        ),
         json_schema_extra={"allowed": "a finite number greater than 0"},
     )
     locking_stretch: float | None = Field(
         default=None,
         gt=1,
-        description="In place of contour_length: stretch L / r0 along aligned chains at which they lock. A scene as "
-        "run has contour_length.",
+        description=(
+            "In place of contour_length: the stretch L / r0 along aligned chains at which they lock. "
+            "The scene as run has contour_length (docs/which_numbers.md)."
+        ),
         json_schema_extra={"allowed": "a finite number greater than 1"},
     )
     temperature: Annotated[float, TEMPERATURE] = Field(
@@ -196,22 +263,29 @@ class Material(Table):
     )
     energy_factor: Annotated[int, OneOf((1, 4))] = Field(
         default=1,
-        description="Factor omega of the chain energy: 1 is the stress as printed (eq. 7; reproduces Fig. 6), "
-        "4 the energy as printed (eq. 4b).",
+        description=(
+            "Factor omega of the chain energy. 1 gives the stress as printed (eq. 7) and reproduces "
+            "Fig. 6. 4 gives the energy as printed (eq. 4b)."
+        ),
     )
     matrix: Annotated[str, OneOf(MATRICES)] = Field(default="neo-hookean", description="Energy of the matrix.")
     chain: Annotated[str, OneOf(CHAINS)] = Field(default="wormlike", description="Force law of a single chain.")
     repulsion: Annotated[str, OneOf(REPULSIONS)] = Field(
         default="axes",
-        description="Form of the repulsive energy that makes the reference state stress-free: 'axes' is the paper's, "
-        "in the stretches along the three cell axes; 'log' sees the structure tensor alone (A : ln C), equals it where "
-        "both have the same axes and suits the law 'tensor'; 'length' is a function of the chains' length alone. Where "
-        "neither scene nor preset says it: 'log' with the law 'tensor'.",
+        description=(
+            "Form of the repulsive energy that makes the reference state free of stress. 'axes' is the "
+            "paper's, in the stretches along the three cell axes. 'log' depends on the structure tensor"
+            " alone (A : ln C); it equals 'axes' where both have the same axes, and suits the law "
+            "'tensor'. 'length' depends on the length of the chains alone. Where neither scene nor "
+            "preset names one, the law 'tensor' has 'log'."
+        ),
     )
     stress_unit: Literal["Pa", "kPa", "MPa"] = Field(
         default="Pa",
-        description="Unit of every stress, pressure and Lame constant of the scene; forces are in it times the unit of "
-        "length squared.",
+        description=(
+            "Unit of every stress, pressure and Lame constant of the scene. Forces are in this unit "
+            "times the unit of length squared."
+        ),
     )
 
     @property
@@ -279,11 +353,13 @@ POSITIVE: JsonDict = {"allowed": "a finite number greater than 0"}
 class Prestretch(Table):
     """How far a part of the wall was stretched before it was joined to the rest, along its local axes.
 
-    What is not said follows from the volume, which stays: two others are alike.
+    Stretches that are left out keep the volume; two that are left out are equal.
     """
 
-    circumferential: float | None = Field(default=None, gt=0, description="Stretch around.", json_schema_extra=POSITIVE)
-    axial: float | None = Field(default=None, gt=0, description="Stretch along.", json_schema_extra=POSITIVE)
+    circumferential: float | None = Field(
+        default=None, gt=0, description="Stretch around the body.", json_schema_extra=POSITIVE
+    )
+    axial: float | None = Field(default=None, gt=0, description="Stretch along the body.", json_schema_extra=POSITIVE)
     radial: float | None = Field(default=None, gt=0, description="Stretch across the wall.", json_schema_extra=POSITIVE)
 
     @model_validator(mode="after")
@@ -316,10 +392,10 @@ class NaturalLayer(_Share):  # type: ignore[misc]
     """A part of the wall that was stretched before it was joined to the rest (docs/natural.md)."""
 
     region: str | None = Field(
-        default=None, min_length=1, description="A region, in place of `from` and `to`.",
+        default=None, min_length=1, description="Name of a region, in place of `from` and `to`.",
         json_schema_extra={"allowed": "the name of a region"},
     )  # fmt: skip
-    prestretch: Prestretch = Field(description="From its natural state to the unloaded body.")
+    prestretch: Prestretch = Field(description="Stretches from the layer's natural state to the unloaded body.")
 
     @model_validator(mode="after")
     def _is_somewhere(self) -> NaturalLayer:
@@ -340,28 +416,37 @@ AS_GIVEN: Literal["as-given"] = "as-given"
 
 
 class Natural(Table):
-    """The configuration in which the tissue is free of stress, where it is not the mesh's (docs/natural.md)."""
+    """The configuration in which the tissue is free of stress, if that is not the mesh (docs/natural.md)."""
 
     opening_angle: float = Field(
         default=0.0,
         ge=0,
         le=180,
-        description="Of a tube: angle of the sector that is missing when a cut ring has opened, in degrees, 360 less "
-        "that of the sector. Fung's opening angle, between the lines from the middle of the inner arc to its ends, is "
-        "half of it. 0: the mesh is free of stress.",
+        description=(
+            "For a tube: how far a cut ring opens, as the angle of the missing sector in degrees (360 "
+            "less the angle of the sector). Fung's opening angle, between the lines from the middle of "
+            "the inner arc to its ends, is half of it. 0 means that the tissue of the mesh is free of "
+            "stress."
+        ),
     )
     layers: Annotated[tuple[NaturalLayer, ...], tables_of("natural.layers")] = Field(
         default=(),
-        description="Parts of the wall with a prestretch, a table `[[natural.layers]]` each; a tube and its layers "
-        "close so that it is in equilibrium without loads, an own body moves when it is let go.",
+        description=(
+            "Parts of the wall that were stretched before they were joined, a table "
+            "`[[natural.layers]]` each. A tube of such layers is closed so that it is in equilibrium "
+            "without loads. A body of your own moves when it is let go."
+        ),
         json_schema_extra={"allowed": "a list of tables"},
     )
 
     cells: Literal["as-given", "equilibrium"] = Field(
         default=AS_GIVEN,
-        description="Of a tube that is the loaded one (geometry.is): cells of the loaded tube, 'as-given' by [cells], "
-        "or 'equilibrium': those that remodeling comes to under these loads, as in a scan of a vessel. The run begins "
-        "with [cells] and comes to the given tube at its end, time.end = 'equilibrium'.",
+        description=(
+            "Cells of a tube whose geometry is the loaded one (geometry.is). 'as-given': those of "
+            "[cells]. 'equilibrium': those that remodeling comes to under these loads, as in a vessel "
+            "that was scanned. The run then begins with [cells] and comes to the given tube at its end;"
+            " it needs time.end = 'equilibrium'."
+        ),
     )
 
     @property
@@ -385,14 +470,34 @@ class Natural(Table):
 
 
 class Cells(Table):
-    """The orthotropic unit cells of the collagen network before the first remodeling pass."""
+    """The orthotropic unit cells of the collagen network before the first remodeling pass.
+
+    Its keyword arguments are the keys of `[cells]` in a scene (docs/scene.md); lengths are in link lengths. Fig. 2 of
+    the paper shows such a cell.
+
+    Raises
+    ------
+    SceneError
+        If a value is not allowed: one line.
+
+    Examples
+    --------
+    >>> from remodel_fenicsx import parts
+    >>> parts.Cells(initial="isotropic", end_to_end_length=1.0).dimensions(2).round(4)
+    array([[0.5774, 0.5774, 0.5774],
+           [0.5774, 0.5774, 0.5774]])
+    >>> parts.Cells(initial="random", seed=7).dimensions(1000).shape
+    (1000, 3)
+    """
 
     initial: Annotated[str | tuple[float, float, float], BeforeValidator(_initial_cells)] = Field(
         default="random",
-        description="Cell dimensions l_I at t = 0, with |l| = end_to_end_length: 'random' (one draw per element, "
-        "uniform on the positive octant of the sphere), 'isotropic' (three equal ones), 'aligned' (all of it along "
-        "aligned_axis), 'fibres' (those of the file cells.fibres, which says it by itself), or [l1, l2, l3] in link "
-        "lengths.",
+        description=(
+            "Cell dimensions l_I at t = 0, with |l| = end_to_end_length. 'random': one draw per "
+            "element, uniform on the positive octant of the sphere. 'isotropic': three equal ones. "
+            "'aligned': all of it along aligned_axis. 'fibres': those of the file cells.fibres; naming "
+            "the file is enough. [l1, l2, l3]: these, in link lengths."
+        ),
         json_schema_extra={
             "allowed": "'random', 'isotropic', 'aligned', 'fibres' or three lengths [l1, l2, l3]",
             "anyOf": [
@@ -404,37 +509,46 @@ class Cells(Table):
     fibres: str | None = Field(
         default=None,
         min_length=1,
-        description="File of measured fibres (.vtu, .xdmf or .csv, relative to the scene): axes and dimensions of the "
-        "cells at t = 0 (docs/own_body.md, Fibres in and out). It is copied into the folder of the run.",
+        description=(
+            "File of measured fibres (.vtu, .xdmf or .csv, relative to the scene). It gives axes and "
+            "dimensions of the cells at t = 0 (docs/own_body.md, Fibres in and out). The run keeps a "
+            "copy in its folder."
+        ),
         json_schema_extra={"allowed": "the name of a file .vtu, .xdmf or .csv"},
     )
     fibres_sha256: str | None = Field(
         default=None,
         pattern="^[0-9a-f]{64}$",
-        description="SHA-256 of that file: a scene as run has it, and another file is refused.",
+        description="SHA-256 of that file. A scene as run has it, and refuses another file.",
         json_schema_extra={"allowed": "64 hexadecimal digits"},
     )
     axes: Annotated[str, OneOf(AXES)] = Field(
         default="global",
-        description="Cell axes n_I before the first pass: 'global' (x, y, z), 'cylindrical' (circumferential, axial, "
-        "radial, about the z axis) or 'local' (the same found on a mesh, docs/own_body.md). Where neither scene nor "
-        "preset says it: a tube starts with 'cylindrical'.",
+        description=(
+            "Cell axes n_I before the first pass. 'global': x, y, z. 'cylindrical': circumferential, "
+            "axial, radial, about the z axis. 'local': the same, found on a mesh (docs/own_body.md). "
+            "Where neither scene nor preset names them, a tube has 'cylindrical'."
+        ),
     )
     aligned_axis: Annotated[int, OneOf((1, 2, 3))] = Field(
         default=3,
-        description="Number of the axis that 'aligned' cells lie along: with global axes 3 is z, the load axis of cube "
-        "and tendon; with cylindrical axes 1 is circumferential, 2 axial, 3 radial.",
+        description=(
+            "Number of the axis that 'aligned' cells lie along. With global axes 3 is z, the load axis "
+            "of cube and tendon. With cylindrical axes 1 is circumferential, 2 axial and 3 radial."
+        ),
     )
     seed: int = Field(
         default=1,
         ge=0,
-        description="Seed of the random cells. The same seed and mesh give the same cells on any number of processes.",
+        description=("Seed of the random cells. The same seed and mesh give the same cells on any number of ranks."),
     )
     end_to_end_length: float = Field(
         default=1.0,
         gt=0,
-        description="Length r0 of a chain at t = 0, in link lengths; smaller than material.contour_length. A material "
-        "constant: it keeps its value in the repulsive energy while the cells remodel.",
+        description=(
+            "Length r0 of a chain at t = 0, in link lengths, smaller than material.contour_length. It "
+            "is a material constant: the repulsive energy keeps this value while the cells remodel."
+        ),
     )
 
     @model_validator(mode="after")
@@ -483,8 +597,26 @@ class CouplingKind:
         Whether it makes the share `relaxation_factor` of a pass.
     takes_cases
         Whether it solves several load cases with the same cells.
+    takes_turnover
+        Whether it changes content and natural length of the collagen (`remodeling.turnover`).
     needs_a_target
         Whether it is for laws with a target alone (`Law.target`).
+
+    Examples
+    --------
+    A coupling whose cells wait until t = 1:
+
+    >>> from remodel_fenicsx import Simulation, preset_scene
+    >>> from remodel_fenicsx.extend import COUPLINGS, CouplingKind, Staggered
+    >>> class Late(Staggered):
+    ...     def remodel(self, time):
+    ...         return super().remodel(time) if time > 1.0 else 0.0
+    >>> COUPLINGS["late"] = CouplingKind("as staggered, but the cells stay as they are up to t = 1", Late)
+    >>> late = {"remodeling.coupling": "late", "time.end": 3.0}
+    >>> scene = preset_scene("kuhl-holzapfel-2007", "cube").with_values(late)
+    >>> [round(step.row["mean_fibre_angle"], 2) for step in Simulation(scene).steps()]
+    [54.74, 54.74, 52.41]
+    >>> del COUPLINGS["late"]
     """
 
     meaning: str
@@ -492,6 +624,7 @@ class CouplingKind:
     makes_a_share: bool = False
     needs_a_target: bool = False
     takes_cases: bool = False
+    takes_turnover: bool = False
 
     @property
     def make(self) -> Callable[..., Any]:
@@ -504,49 +637,56 @@ COUPLINGS = {
         "solve with the cells of the step before, then remodel once",
         "remodel_fenicsx.evolution.coupling:Staggered",
         takes_cases=True,
+        takes_turnover=True,
     ),
     "relaxed": CouplingKind(
-        "the same with a share, relaxation_factor, of what the pass changes: half of it is stable for every driver and "
-        "frame but under weak loads, where 'staggered' over-corrects with 'pk2' and 'finger'",
+        "as 'staggered', but only the share relaxation_factor of each change is made; one half is stable for every "
+        "driver and frame except under weak loads, while 'staggered' over-corrects with 'pk2' and 'finger'",
         "remodel_fenicsx.evolution.coupling:Relaxed",
         makes_a_share=True,
         takes_cases=True,
+        takes_turnover=True,
     ),
     "extrapolated": CouplingKind(
-        "remodel first, towards the stress of the middle of the step, extrapolated from the two steps before; then "
-        "solve: of second order, for the law 'tensor'",
+        "first remodel towards the stress of the middle of the step, extrapolated from the two steps before, then "
+        "solve; of second order, for the law 'tensor'",
         "remodel_fenicsx.evolution.extrapolated:Extrapolated",
         needs_a_target=True,
         takes_cases=True,
+        takes_turnover=True,
     ),
     "implicit": CouplingKind(
-        "the cells belong to the stress of the same step: Newton's method on both, for the law 'tensor' (with a "
-        "repulsion that sees no axes) and the laws of the paper",
+        "find cells and equilibrium of the same step together, by Newton's method; for the law 'tensor' (with a "
+        "repulsion that does not depend on axes) and the laws of the paper",
         "remodel_fenicsx.evolution.implicit:Implicit",
     ),
 }
 """Couplings by the name that a scene gives them."""
 
 
-TURNOVER_COUPLINGS = ("staggered", "extrapolated")  # the others ask for derivatives of the turnover, or share passes
-
-
 class Turnover(Table):
-    """How collagen is removed and deposited under a stretch (docs/turnover.md); without `time` none is.
+    """How collagen is removed, and deposited again under a stretch (docs/turnover.md). Without `time` it is not.
 
-    For the law `tensor`, with the couplings `staggered` and `extrapolated`.
+    For the law `tensor`, with the couplings `staggered`, `relaxed` and `extrapolated`.
     """
 
     time: float | None = Field(
         default=None,
         gt=0,
-        description="T, time in which collagen is turned over. Without it nothing is.",
+        description="Time T in which collagen is turned over. Without it there is no turnover.",
         json_schema_extra={"allowed": "a finite number greater than 0"},
     )
     deposition_stretch: float = Field(
-        default=1.1, gt=1, description="lambda_h, stretch of chains over r0 under which they are deposited."
+        default=1.1, gt=1, description="Stretch lambda_h, over r0, under which new chains are deposited."
     )
-    gain: float = Field(default=1.0, ge=0, description="k: how fast the content follows the chains' tension; 0: never.")
+    gain: float = Field(
+        default=1.0,
+        ge=0,
+        description=(
+            "Gain k: how fast the amount of collagen follows the tension of the chains. 0 means that "
+            "the amount stays."
+        ),
+    )
 
     @property
     def is_on(self) -> bool:
@@ -561,78 +701,125 @@ class Turnover(Table):
 
 
 class Remodeling(Table):
-    """How the cells follow the load: driving tensor, evolution law, frame and speed."""
+    """How the cells follow the load: driving tensor, evolution law, frame and speed.
+
+    Its keyword arguments are the keys of `[remodeling]` in a scene (docs/scene.md; paper, eqs. 8 to 11); `kappa` is in
+    1/time.
+
+    Raises
+    ------
+    SceneError
+        If a value is not allowed: one line.
+
+    Examples
+    --------
+    >>> from remodel_fenicsx import parts
+    >>> parts.Remodeling(driver="cauchy", law="explicit", frame="spatial", kappa=0.025).coupling
+    'staggered'
+    >>> parts.Remodeling(driver="heat", law="explicit", frame="spatial", kappa=0.025)
+    Traceback (most recent call last):
+        ...
+    remodel_fenicsx.schema.tables.SceneError: driver = 'heat': allowed are 'cauchy', 'pk2', 'finger'
+    """
 
     driver: Annotated[str, OneOf(DRIVERS)] = Field(
         default="cauchy",
-        description="Tensor whose positive eigenvalues the cells follow: 'cauchy' stress, second Piola-Kirchhoff "
-        "stress 'pk2', or 'finger' tensor b (it remodels even a body without load, and l_3 does not vanish).",
+        description=(
+            "Tensor whose positive eigenvalues the cells follow. 'cauchy': the Cauchy stress. 'pk2': "
+            "the second Piola-Kirchhoff stress. 'finger': the Finger tensor b; it remodels even a body "
+            "without load, and l_3 does not vanish."
+        ),
     )
     law: Annotated[str, OneOf(LAWS)] = Field(
         default="explicit",
-        description="Evolution of the cells: 'explicit' is eq. (11), in absolute time; 'rate' integrates eq. (10); "
-        "'relaxation' is dl/dt = kappa (r0 e - l), right for changing loads; 'rotation' (Remark 5) turns the axis of "
-        "the largest dimension gradually and leaves the dimensions alone; 'tensor' is 'relaxation' for the "
-        "structure tensor as a whole, without ranks and axes; 'none' leaves the cells alone. Where neither scene nor "
-        "preset says it: 'tensor'.",
+        description=(
+            "How the cells change in time. 'explicit' is eq. (11), in absolute time. 'rate' integrates "
+            "eq. (10). 'relaxation' is dl/dt = kappa (r0 e - l), right for changing loads. 'rotation' "
+            "(Remark 5) turns the axis of the largest dimension gradually and keeps the dimensions. "
+            "'tensor' is 'relaxation' for the structure tensor as a whole, without ranks and axes. "
+            "'none' leaves the cells as they are. Where neither scene nor preset names one, it is "
+            "'tensor'."
+        ),
     )
     frame: Annotated[str, OneOf(FRAMES)] = Field(
         default="material",
-        description="Axes of the remodeled cells, for the drivers 'cauchy' and 'finger': 'material' takes the fibres "
-        "that the deformation carries onto the principal directions (objective), 'spatial' the principal directions "
-        "themselves, as printed. The driver 'pk2' has material eigenvectors of its own.",
+        description=(
+            "Axes of the remodeled cells, for the drivers 'cauchy' and 'finger'. 'material': the fibres"
+            " that the deformation carries onto the principal directions (objective). 'spatial': the "
+            "principal directions themselves, as printed. The driver 'pk2' has material eigenvectors of"
+            " its own."
+        ),
     )
     pairing: Annotated[str, OneOf(PAIRINGS)] = Field(
         default="sorted",
-        description="Which dimension follows which principal value: 'sorted' by rank, as printed (where two values "
-        "cross, the cell turns by 90 degrees at once), 'continuous' by axis (each principal direction goes on from the "
-        "axis that it overlaps most). The law 'rotation' does not ask.",
+        description=(
+            "Which cell dimension follows which principal value. 'sorted': by rank, as printed; where "
+            "two values cross, the cell turns by 90 degrees at once. 'continuous': by axis; each "
+            "principal direction continues the axis that it overlaps most. The law 'rotation' does not "
+            "use it."
+        ),
     )
     coupling: Annotated[str, OneOf(COUPLINGS)] = Field(
         default="staggered",
-        description="; ".join(f"{name!r}: {kind.meaning}" for name, kind in COUPLINGS.items())
-        + ". Where neither scene nor preset says it: 'extrapolated' with the law 'tensor'.",
+        description=(
+            "In which order a step solves and remodels. "
+            + ". ".join(f"{name!r}: {kind.meaning}" for name, kind in COUPLINGS.items())
+            + ". Where neither scene nor preset names one, the law 'tensor' has 'extrapolated'."
+        ),
     )
     relaxation_factor: float = Field(
         default=0.5,
         gt=0,
         le=1,
-        description="Share theta of a pass's change of the structure tensor that 'relaxed' makes; 1 is 'staggered'.",
+        description=(
+            "For the coupling 'relaxed': the share theta of a pass's change of the structure tensor "
+            "that is made. With 1 it is 'staggered'."
+        ),
     )
     kappa: float = Field(
-        default=0.025, ge=0, description="Speed of remodeling kappa, in 1/time; a difference fades like exp(-kappa t)."
+        default=0.025, ge=0, description="Speed of remodeling, in 1/time. A difference fades like exp(-kappa t)."
     )
     half_life: float | None = Field(
         default=None,
         gt=0,
-        description="In place of kappa: time after which half of a difference is left, ln 2 / kappa. A scene as run "
-        "has kappa.",
+        description=(
+            "In place of kappa: the time after which half of a difference is left, ln 2 / kappa. The "
+            "scene as run has kappa (docs/which_numbers.md)."
+        ),
         json_schema_extra={"allowed": "a finite number greater than 0"},
     )
     threshold: Annotated[float, STRESS] = Field(
         default=0.0,
         ge=0,
-        description="Lazy zone: principal stress s0 up to which a point sleeps; kappa acts with a share of "
-        "max(0, 1 - s0/s), s the largest one. For the law 'tensor' and drivers that are stresses (docs/laws.md).",
+        description=(
+            "Lazy zone: the principal stress s0 up to which a point does not remodel. Above it kappa "
+            "has the factor max(0, 1 - s0/s), where s is the largest principal stress. For the law "
+            "'tensor' and drivers that are stresses (docs/laws.md)."
+        ),
     )
     exponent: float = Field(
         default=2.0,
         gt=0,
         le=16,
-        description="n of the target (D+)^n over its trace: 2 is the paper's, 1 that of netting analysis. For the law "
-        "'tensor' (docs/laws.md).",
+        description=(
+            "Exponent n of the target (D+)^n over its trace: 2 is the paper's, 1 that of netting "
+            "analysis. For the law 'tensor' (docs/laws.md)."
+        ),
     )
     mean: Annotated[str, OneOf(MEANS_OF_CASES)] = Field(
         default="tensor",
-        description="What the cells follow where there are several load cases ([[cases]]): "
-        + "; ".join(f"{name!r}: {mean.meaning}" for name, mean in MEANS_OF_CASES.items())
-        + " (docs/cycles.md).",
+        description=(
+            "What the cells follow where there are several load cases ([[cases]]). "
+            + ". ".join(f"{name!r}: {mean.meaning}" for name, mean in MEANS_OF_CASES.items())
+            + " (docs/cycles.md)."
+        ),
     )
     rotation_time: float = Field(
         default=40.0,
         gt=0,
-        description="Time of the law 'rotation': a small angle between fibre and tension fades like "
-        "exp(-t / rotation_time).",
+        description=(
+            "For the law 'rotation': a small angle between fibre and tension fades like exp(-t / rotation_time)."
+        ),
     )
 
     turnover: Turnover = Turnover()
@@ -669,8 +856,8 @@ class Remodeling(Table):
             return self
         if LAWS[self.law] is not LAWS["tensor"]:
             raise fault("needs remodeling.law = 'tensor'", "turnover", None)
-        if self.coupling not in TURNOVER_COUPLINGS:
-            allowed_ones = ", ".join(map(repr, TURNOVER_COUPLINGS))
+        if not COUPLINGS[self.coupling].takes_turnover:
+            allowed_ones = ", ".join(repr(name) for name, kind in COUPLINGS.items() if kind.takes_turnover)
             raise fault(f"with remodeling.turnover must be one of: {allowed_ones}", "coupling", self.coupling)
         return self
 
@@ -706,12 +893,12 @@ def _as_in(table: type[Table], name: str, key: str) -> Any:
     rule = re.sub(r"^(must be|allowed is|allowed are) ", "", allowed(field))
     extra = field.json_schema_extra if isinstance(field.json_schema_extra, dict) else {}
     field.json_schema_extra = extra | {"allowed": rule}
-    field.default, field.description = None, f"As `{key}.{name}`, in the region; where it is left out that holds."
+    field.default, field.description = None, f"As `{key}.{name}`, for this region. Default: that of the whole body."
     return field
 
 
 class RegionMaterial(Table):
-    """Numbers of `[material]` that are others in the region; all else of it is one for the whole body."""
+    """Keys of `[material]` that differ in the region. The other keys of `[material]` hold for the whole body."""
 
     lame_lambda: float | None = _as_in(Material, "lame_lambda", "material")
     lame_mu: float | None = _as_in(Material, "lame_mu", "material")
@@ -724,7 +911,7 @@ class RegionMaterial(Table):
 
 
 class RegionCells(Table):
-    """Keys of `[cells]` that are others in the region; axes and seed are one for the whole body."""
+    """Keys of `[cells]` that differ in the region. Axes and seed hold for the whole body."""
 
     initial: str | tuple[float, float, float] | None = _as_in(Cells, "initial", "cells")
     fibres: str | None = _as_in(Cells, "fibres", "cells")
@@ -734,25 +921,27 @@ class RegionCells(Table):
 
 
 class RegionRemodeling(Table):
-    """Keys of `[remodeling]` that are others in the region; the law is one for the whole body."""
+    """Keys of `[remodeling]` that differ in the region. The law holds for the whole body."""
 
     kappa: float | None = _as_in(Remodeling, "kappa", "remodeling")
     half_life: float | None = _as_in(Remodeling, "half_life", "remodeling")
 
 
 class Region(Table):
-    """A named part of the body with properties of its own, `[regions.media]` say. What it does not say is as elsewhere.
+    """A named part of the body with properties of its own, such as `[regions.media]`. Other properties are the body's.
 
-    Regions of a tube are layers of its wall, in the order of their outer radii; together they are the wall. Elements
-    through the wall are shared out so that none lies in two layers. NAME is a letter, then letters, digits and `_`.
-    Keys of other tables stand after the region: `material.chain_density = 4e21` in `[regions.media]`.
+    Regions of a tube are layers of its wall, in the order of their outer radii; together they are the wall. No element
+    lies in two layers. NAME is a letter, then letters, digits and `_`. Keys of other tables stand after the region:
+    `material.chain_density = 4e21` in `[regions.media]`.
     """
 
     outer_radius: Annotated[float | None, LENGTH] = Field(
         default=None,
         gt=0,
-        description="Of shape 'tube': where the layer ends, in the scene's unit of length; it begins where the one "
-        "inside of it ends. The outermost may leave it out.",
+        description=(
+            "For a tube: the outer radius of the layer, in the scene's unit of length. The layer begins"
+            " where the one inside of it ends. The outermost layer may leave it out."
+        ),
         json_schema_extra={"allowed": "a finite number greater than 0"},
     )
     material: RegionMaterial = RegionMaterial()
@@ -792,35 +981,42 @@ def _ramp(value: Any) -> tuple[tuple[float, float], ...]:
 
 
 class Load(Table):
-    """A load by name: `force` of cube and tendon, `pressure` and `elongation` of a tube; zero if it is not listed.
+    """A load by name: `force` of cube and tendon, `pressure` and `elongation` of a tube. One that is left out is zero.
 
-    An own body (shape `'mesh'`) may have further ones under names of your choice, each on one of its faces.
+    A body of your own (shape `'mesh'`) may have further loads under names of your choice, each on one of its faces.
 
-    `force` is the total dead force along z on the top; `pressure` acts on the deformed inner face; `elongation` is the
-    prescribed engineering strain of the length (0.1: 10 % longer). A tube with `axial_force` in place of `elongation`
-    has a length that is an unknown.
+    `force` is the total dead force along z on the top. `pressure` acts on the deformed inner face. `elongation` is the
+    prescribed engineering strain of the length (0.1: 10 % longer). A tube may have `axial_force` in place of
+    `elongation`; its length is then an unknown.
     """
 
     value: float = Field(
-        description="Full value at factor 1: force in stress_unit times length squared, pressure in stress_unit, "
-        "elongation without unit (above -1)."
+        description=(
+            "Full value, at factor 1. A force is in stress_unit times length squared, a pressure in "
+            "stress_unit. An elongation has no unit and is above -1."
+        )
     )
     ramp: Annotated[tuple[tuple[float, float], ...], BeforeValidator(_ramp)] = Field(
-        description="Factor on the value over time, as [time, factor] pairs with increasing times: linear in between, "
-        "held before the first and after the last pair. Times up to time.end must be multiples of time.step; with "
-        "time.tolerance they are hit.",
+        description=(
+            "Factor on the value over time: pairs [time, factor] with increasing times. The factor is "
+            "linear between pairs, and constant before the first and after the last. Times up to "
+            "time.end must be multiples of time.step; with time.tolerance a step ends at each."
+        ),
         json_schema_extra={"allowed": "a list of pairs [time, factor] with increasing times"},
     )
 
     kind: Literal["pressure"] | None = Field(
         default=None,
-        description="Of a further load of an own body: 'pressure', against the deformed face's outward normal.",
+        description=(
+            "For a further load of a body of your own: 'pressure' acts against the outward normal of "
+            "the deformed face."
+        ),
         json_schema_extra={"allowed": "'pressure'"},
     )
     face: str | None = Field(
         default=None,
         min_length=1,
-        description="The face that a further load of an own body acts on.",
+        description="For a further load of a body of your own: the face that it acts on.",
         json_schema_extra={"allowed": "the name of a face"},
     )
 
@@ -850,17 +1046,19 @@ class Load(Table):
 
 
 class LoadCase(Table):
-    """A load case of a cycle, diastole say (docs/cycles.md): a share of the time and its loads.
+    """A load case of a cycle, such as diastole (docs/cycles.md): a share of the time and its loads.
 
-    Every case is a state of its own, solved with the same cells, which follow a mean over the
+    Every case is a state of its own, solved with the same cells. The cells follow a mean over the
     cases. The columns and fields of a run are those of the first case. The others have columns
-    with their number, `inner_radius@2` say.
+    with their number, such as `inner_radius@2`.
     """
 
-    weight: float = Field(gt=0, le=1, description="Share of the time; the weights of all cases sum to 1.")
+    weight: float = Field(gt=0, le=1, description="Share of the time. The weights of all cases sum to 1.")
     loads: dict[str, float] = Field(
         default_factory=dict,
-        description="Factor on each load by its name, beside its ramp; 1 for loads that are not named.",
+        description=(
+            "Factor on each load by its name, beside the factor of its ramp. Loads that are not named have 1."
+        ),
         json_schema_extra={"allowed": "a table of numbers by the names of loads"},
     )
 
@@ -892,24 +1090,29 @@ class Time(Table):
 
     # a number for all who step through time; those who take the word ask `is_equilibrium` first
     end: Annotated[Any, BeforeValidator(_end)] = Field(
-        description="Last time, a whole number of steps, or any time with a tolerance; or 'equilibrium': at once to "
-        "the state that remodeling comes to under the loads at the end of their ramps (docs/theory.md, Equilibrium at "
-        "once).",
+        description=(
+            "Last time, a whole number of steps; with a tolerance any time. 'equilibrium' goes at once "
+            "to the state that remodeling comes to under the loads at the end of their ramps "
+            "(docs/theory.md, Equilibrium at once)."
+        ),
         json_schema_extra={
             "allowed": "a finite number greater than 0, or 'equilibrium'",
             "anyOf": [{"type": "number", "exclusiveMinimum": 0}, {"const": EQUILIBRIUM}],
         },
     )
     step: float = Field(
-        default=1.0, gt=0, description="Time between two remodeling passes; with a tolerance the first step."
+        default=1.0, gt=0, description="Time between two remodeling passes. With a tolerance it is the first step."
     )
     tolerance: float | None = Field(
         default=None,
         gt=0,
-        description="Where it is given, steps are as long as the estimated error in time stays below it, in degrees: "
-        "of the direction of the chains, root mean square over the body, and of lengths, relative, as an angle (1 "
-        "degree is 1.7 %). Times of ramps and output.times are hit. On the way to an equilibrium steps are always "
-        "chosen so; default there: 3 degrees, 0.5 where a load falls.",
+        description=(
+            "Lets the program choose the steps: as long as the estimated error in time stays below this"
+            " angle, in degrees. The error is that of chain directions (root mean square over the body)"
+            " and that of lengths (relative; 1 degree stands for 1.7 %). A step ends at each time of a "
+            "ramp and of output.times. On the way to an equilibrium steps are always chosen so; the "
+            "default there is 3 degrees, or 0.5 where a load falls."
+        ),
         json_schema_extra={"allowed": "a number greater than 0, in degrees"},
     )
 
@@ -975,49 +1178,86 @@ def _petsc_options(value: Any) -> Any:
 
 
 class Solver(Table):
-    """Solution of the nonlinear problem of each step."""
+    """Solution of the nonlinear problem of each step.
+
+    Its keyword arguments are the keys of `[solver]` in a scene (docs/scene.md).
+
+    Raises
+    ------
+    SceneError
+        If a value is not allowed: one line.
+
+    Examples
+    --------
+    >>> from remodel_fenicsx import parts
+    >>> parts.Solver().relative_tolerance
+    1e-10
+    >>> parts.Solver(method="direct", maximum_iterations=50).maximum_iterations
+    50
+    >>> parts.Solver(method="guess")
+    Traceback (most recent call last):
+        ...
+    remodel_fenicsx.schema.tables.SceneError: method = 'guess': allowed are 'auto', 'direct', 'lagged', 'iterative'
+    """
 
     method: Annotated[str, OneOf(SOLVER_METHODS, (AUTO,), REMOVED)] = Field(
         default=AUTO,
-        description=f"'auto': 'direct' up to {SMALL_BODY} unknowns ({SMALL_REDUCTION} of a reduction), then 'lagged', "
-        f"above {LARGE} (on several ranks {LARGE_ON_RANKS}) 'iterative'; "
-        + "; ".join(f"{name!r}: {method.meaning}" for name, method in SOLVER_METHODS.items())
-        + " (docs/speed.md).",
+        description=(
+            f"How the equations of each step are solved. 'auto' takes 'direct' up to {SMALL_BODY} "
+            f"unknowns ({SMALL_REDUCTION} of a reduction), then 'lagged', and above {LARGE} (on several "
+            f"ranks {LARGE_ON_RANKS}) 'iterative'. "
+            + ". ".join(f"{name!r}: {method.meaning}" for name, method in SOLVER_METHODS.items())
+            + " (docs/speed.md)."
+        ),
     )
     predictor: Literal["none", "autoregressive", "with-tolerance"] = Field(
         default="autoregressive",
-        description="Where Newton's method starts a step: 'none': at the displacement of the step before; "
-        "'autoregressive': at what the increments of the last steps predict; 'with-tolerance': as predicted where "
-        "steps are chosen (time.tolerance), 'none' where they are equal. The solutions are the same to the "
-        "tolerance.",
+        description=(
+            "Where Newton's method starts a step. 'none': at the displacement of the step before. "
+            "'autoregressive': at what the increments of the last steps predict. 'with-tolerance': as "
+            "predicted where steps are chosen (time.tolerance), otherwise as 'none'. The solutions are "
+            "the same to the tolerance."
+        ),
     )
     absolute_tolerance: Annotated[float, FORCE] = Field(
         default=0.0,
         ge=0,
-        description="A step is solved when |R| <= absolute_tolerance + relative_tolerance |nodal forces|, R the "
-        "vector of out-of-balance nodal forces; in the unit of force, so that it depends on the units of the scene.",
+        description=(
+            "A step is solved when |R| <= absolute_tolerance + relative_tolerance |nodal forces|, where"
+            " R has the out-of-balance nodal forces. It is a force, so it depends on the units of the "
+            "scene."
+        ),
     )
     relative_tolerance: float = Field(
         default=1e-10,
         ge=0,
         lt=1,
-        description="See absolute_tolerance; relative to the norm of the internal nodal forces, which stays when the "
-        "load is held.",
+        description=(
+            "See absolute_tolerance. It is relative to the norm of the internal nodal forces, which "
+            "stays when the load is held."
+        ),
     )
-    maximum_iterations: int = Field(default=25, ge=1, description="Newton iterations before a step counts as failed.")
+    maximum_iterations: int = Field(
+        default=25, ge=1, description="Newton iterations after which a step counts as failed."
+    )
     maximum_halvings: int = Field(
         default=12, ge=0, description="How often a failed step is halved before the run ends with an error."
     )
     unstable: Literal["warn", "stop"] = Field(
         default="warn",
-        description="What happens at an equilibrium that the body would leave, one with more negative eigenvalues of "
-        "the tangent than before: a warning that says where, or, looked for in every step, the end of the run after "
-        "the last stable step (exit code 3).",
+        description=(
+            "What to do at an equilibrium that the body would leave: one with more negative eigenvalues"
+            " of the tangent than before. 'warn': say where, and go on. 'stop': look for it in every "
+            "step, and end the run after the last stable step (exit code 3)."
+        ),
     )
     petsc_options: Annotated[dict[str, Any], BeforeValidator(_petsc_options)] = Field(
         default_factory=dict,
-        description="PETSc options that override the method's, without the leading '-': snes_..., ksp_..., pc_... "
-        "and mat_.... None that runs code or writes files; those of PETSC_OPTIONS are the user's own.",
+        description=(
+            "PETSc options that replace the method's, without the leading '-': snes_..., ksp_..., "
+            "pc_... and mat_.... Options that run code or write files are refused. Options of the "
+            "variable PETSC_OPTIONS are not looked at."
+        ),
     )
 
     @model_validator(mode="after")
@@ -1070,8 +1310,11 @@ class Output(Table):
 
     fields: Annotated[bool | tuple[str, ...], BeforeValidator(_fields)] = Field(
         default=True,
-        description="Fields to write for ParaView: true for all, false for none, or names (docs/commands.md), 'chains' "
-        "for the chain lines. What no name asks for is not computed.",
+        description=(
+            "Fields to write for ParaView: true for all, false for none, or a list of names "
+            "(docs/commands.md). 'chains' stands for the chain lines. Fields that are not asked for are"
+            " not computed."
+        ),
         json_schema_extra={
             "allowed": "true, false or a list of names of fields",
             "anyOf": [{"type": "boolean"}, {"type": "array", "items": {"enum": [*FIELDS_BY_NAME, *CONSTANT_FIELDS]}}],
@@ -1079,26 +1322,32 @@ class Output(Table):
     )
     columns: Annotated[tuple[str, ...], BeforeValidator(_columns)] = Field(
         default=(),
-        description="Columns of the history: 'pass_residual' and 'negative_eigenvalues' come beside those that it "
-        "has without being asked; where some of these are named, only they are measured, with time and loads "
-        "(docs/commands.md).",
+        description=(
+            "Columns of the history. Those that are there only on request ('pass_residual', "
+            "'negative_eigenvalues' and others, docs/commands.md) are added. Where any others are "
+            "named, only those are measured, with time and loads."
+        ),
         json_schema_extra={"allowed": "a list of names of columns"},
     )
-    every: int = Field(default=1, ge=1, description="Write the fields of every n-th step; the last one always.")
+    every: int = Field(default=1, ge=1, description="Write the fields of every n-th step, and of the last one.")
     times: Annotated[tuple[float, ...], BeforeValidator(_times)] = Field(
         default=(),
-        description="Times up to time.end that have a row and whose fields are written beside those of every n-th "
-        "step: multiples of time.step; with time.tolerance a step ends there.",
+        description=(
+            "Times up to time.end that have a row and fields in any case. They must be multiples of "
+            "time.step; with time.tolerance a step ends at each."
+        ),
         json_schema_extra={"allowed": "a list of increasing times above 0"},
     )
     report: bool = Field(
-        default=True, description="Leave a page of the run for a browser, report.html, at its end (docs/report.md)."
+        default=True, description="Make a page of the run for a browser, report.html, at its end (docs/report.md)."
     )
     checkpoint: int | None = Field(
         default=None,
         ge=0,
-        description="Steps between two checkpoints, from which a run can be resumed; 0: only at the end. Without it "
-        "they are chosen by time: at most 10 minutes are lost, and they cost below 5 % of the run. There is always one "
-        "at the end, however the run ends.",
+        description=(
+            "Number of steps between two checkpoints, from which a run can be resumed; 0 means only at "
+            "the end. Without it time decides: at most 10 minutes are lost, and checkpoints cost less "
+            "than 5 % of the run. There is always one at the end, however the run ends."
+        ),
         json_schema_extra={"allowed": "a whole number at least 0"},
     )

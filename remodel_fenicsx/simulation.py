@@ -72,6 +72,19 @@ class Simulation:
         If `domain` is not a mesh of the scene's body and elements.
     TypeError
         If `scene` is none.
+
+    Examples
+    --------
+    >>> from remodel_fenicsx import Simulation, preset_scene
+    >>> scene = preset_scene("kuhl-holzapfel-2007", "cube").with_values({"time.end": 2.0})
+    >>> simulation = Simulation(scene)
+    >>> for step in simulation.steps():
+    ...     print(step.time, round(step.row["mean_stretch"], 3))
+    1.0 1.081
+    2.0 1.172
+    >>> simulation.cells.dimension_values.shape  # l_I of this rank, (elements, points, 3), in link lengths
+    (1, 8, 3)
+    >>> simulation.close()
     """
 
     def __init__(

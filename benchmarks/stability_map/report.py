@@ -1,4 +1,4 @@
-"""Tables, the page docs/stability.md and its picture, from what has been measured."""
+"""Tables, the page docs/stability.md, its appendix and its picture, from what has been measured."""
 
 from __future__ import annotations
 
@@ -15,8 +15,7 @@ from benchmarks.stability_map.judging import OUTCOMES
 
 Record = dict[str, Any]
 PROJECT = Path(__file__).resolve().parents[2]
-PAGE = PROJECT / "docs" / "stability.md"
-TEMPLATE = PROJECT / "docs" / "stability.template.md"
+PAGES = ("stability", "appendix_stability")  # docs/NAME.md from docs/NAME.template.md
 BEFORE = Path(__file__).with_name("results-0.1.0.jsonl")
 
 
@@ -84,16 +83,15 @@ def comparison(before: Sequence[Record], after: Sequence[Record]) -> str:
 
 
 def listed(records: Iterable[Record], cases: Mapping[str, Case], chosen: Any) -> str:
-    """The chosen cases, a line each with what is said of them; for the first of a family the command that shows it."""
-    lines, families = [], set()
+    """The chosen cases as Markdown, with what is said of them; for the first of a family the command that shows it."""
+    lines, commands = ["| case | what is said |", "|---|---|"], dict[str, str]()
     for record in records:
         if chosen(record):
             words = " ".join(record["words"].split()).replace("|", "/")[:200]
-            lines.append(f"- {record['key']}: {words}")
-            if record["family"] not in families:
-                lines[-1] += f"  \n  `{cases[record['key']].command}`"
-            families.add(record["family"])
-    return "\n".join(lines) or "None."
+            lines.append(f"| {record['key']} | {words} |")
+            commands.setdefault(record["family"], cases[record["key"]].command)
+    shown = "\n".join(("One of each family again:\n\n```sh", *commands.values(), "```"))
+    return "\n".join(lines) + f"\n\n{shown}" if commands else "None."
 
 
 # ---------------------------------------------------------------- the picture
@@ -148,7 +146,7 @@ def draw(file: Path, cases: Mapping[str, Case], sides: Mapping[str, Iterable[Rec
 
 # ---------------------------------------------------------------- the page
 def write(results: Path, cases: Mapping[str, Case], source: str, digest: Any) -> int:
-    """docs/stability.md and its picture; 1 if nothing has been measured."""
+    """docs/stability.md, its appendix and its picture; 1 if nothing has been measured."""
     version = source.partition("+")[0]
     after = latest(read_records(results / f"{version}.jsonl"), cases, digest, source)
     before = latest([*read_records(BEFORE), *read_records(results / "0.1.0.jsonl")], cases)
@@ -167,10 +165,11 @@ def write(results: Path, cases: Mapping[str, Case], source: str, digest: Any) ->
         "references": references(cases),
         "made": made(source, after, cases),
     }
-    text = TEMPLATE.read_text(encoding="utf-8")
-    for name, value in words.items():
-        text = text.replace("{{" + name + "}}", value)
-    PAGE.write_text(text, encoding="utf-8")
+    for page in PAGES:
+        text = (PROJECT / "docs" / f"{page}.template.md").read_text(encoding="utf-8")
+        for name, value in words.items():
+            text = text.replace("{{" + name + "}}", value)
+        (PROJECT / "docs" / f"{page}.md").write_text(text, encoding="utf-8")
     return 0
 
 
@@ -190,6 +189,6 @@ def made(source: str, records: Sequence[Record], cases: Mapping[str, Case]) -> s
     missing = len(cases) - len(records)
     rest = f"; {missing} of {len(cases)} cases have not been run with it" if missing else ""
     return (
-        f"Package {source}, numpy and scipy {scipy.__version__}, Python {platform.python_version()}, "
+        f"Made with package {source}, numpy and scipy {scipy.__version__}, Python {platform.python_version()},\n"
         f"{datetime.date.today()}: {len(records)} cases, {seconds / 60:.0f} minutes of one core{rest}."
     )

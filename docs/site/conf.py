@@ -1,8 +1,10 @@
 """What Sphinx is told; docs/build calls it."""
 
+import re
 from typing import Any
 
 from pygments.lexers.special import TextLexer
+from sphinx.domains.python import PyObject
 
 from remodel_fenicsx import __version__
 
@@ -14,8 +16,10 @@ myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3
 napoleon_google_docstring = False
 napoleon_use_ivar = True
+default_role = "py:obj"  # what docstrings have in backticks: a link where it is a public name, else code
 autodoc_typehints = "none"
 autodoc_member_order = "bysource"
+toc_object_entries_show_parents = "hide"  # else they are wider than their column
 suppress_warnings = ["misc.highlighting_failure"]  # shells' prompts and shortened TOML in examples
 html_theme = "pydata_sphinx_theme"
 html_title = "remodel_fenicsx"
@@ -23,7 +27,7 @@ html_copy_source = html_show_sourcelink = False
 html_theme_options = {"show_toc_level": 2, "header_links_before_dropdown": 6, "secondary_sidebar_items": ["page-toc"]}
 # KaTeX in the site's own folder: formulas need no network
 mathjax_path = "katex/katex.min.js"
-html_css_files = ["katex/katex.min.css"]
+html_css_files = ["katex/katex.min.css", "site.css"]
 html_js_files = [
     ("katex/contrib/auto-render.js", {"defer": "defer"}),
     (
@@ -33,6 +37,15 @@ html_js_files = [
 ]
 
 
+def link(app: Any, what: str, name: str, value: Any, options: Any, lines: list[str]) -> None:
+    """Pages that a docstring names."""
+    lines[:] = [re.sub(r"docs/(\w+)\.md", r":doc:`\1`", line) for line in lines]
+
+
 def setup(app: Any) -> None:
-    """Tables in pages: Pygments knows no CSV."""
+    """Tables in pages: Pygments knows no CSV. Attributes of classes: under the name that they have in docstrings."""
     app.add_lexer("csv", TextLexer)
+    for field in PyObject.doc_field_types:
+        if field.name == "variable":
+            field.label = "Attributes"
+    app.connect("autodoc-process-docstring", link)

@@ -23,7 +23,25 @@ if TYPE_CHECKING:
 
 
 class Cube(Shape):
-    """A cube, pulled along z: the homogeneous body of the paper's Fig. 5. It slides on the planes x = y = z = 0."""
+    """A cube, pulled along z: the homogeneous body of the paper's Fig. 5. It slides on the planes x = y = z = 0.
+
+    Its keyword arguments are the keys of `[geometry]`: `side` in the unit `length_unit`, or in any one unit.
+
+    Raises
+    ------
+    SceneError
+        If a value is not allowed: one line.
+
+    Examples
+    --------
+    >>> from remodel_fenicsx import parts
+    >>> body = parts.Cube(side=2.0)
+    >>> domain = body.build(parts.Mesh(element="hexahedron", degree=1))
+    >>> domain.number_of_elements, sorted(domain.faces)
+    (1, ['x0', 'x1', 'y0', 'y1', 'z0', 'z1'])
+    >>> body.section_area, list(body.loads)
+    (4.0, ['force'])
+    """
 
     loads: ClassVar[dict[str, LoadKind]] = {
         "force": LoadKind(

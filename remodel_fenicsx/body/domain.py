@@ -34,7 +34,7 @@ class Domain:
     input). They do not depend on the number of ranks: what belongs to an element or a node for good is drawn and
     written by them.
 
-    Attributes
+    Parameters
     ----------
     mesh
         dolfinx mesh of the reference body, distributed.
@@ -43,7 +43,7 @@ class Domain:
     faces
         Name of a face -> its value in `facet_tags`, on every rank.
     shape
-        Name of the shape (`body.SHAPES`).
+        Name of the shape (`extend.SHAPES`).
     dimensions
         The shape's dimensions by name, in the scene's unit of length. Tendon: also `radius`, that of the outer nodes.
     regions
@@ -53,12 +53,25 @@ class Domain:
     element_region
         Number of each local element's region, owned ones first, then ghosts, (local elements,) int32; default: the
         one region.
+
+    Attributes
+    ----------
     element_number
         Number of each local element, owned ones first, then ghosts, (local elements,) int64.
     node_number
         Number of each local geometry node, owned ones first, then ghosts, (local nodes,) int64.
     number_of_elements, number_of_nodes
         Of the whole mesh.
+
+    Examples
+    --------
+    >>> from remodel_fenicsx import parts
+    >>> domain = parts.Cube(side=1.0).build(parts.Mesh(refinement=2))
+    >>> domain.number_of_elements, domain.number_of_nodes, domain.dimensions
+    (8, 27, {'side': 1.0})
+    >>> points, elements = domain.gather_mesh()  # on rank 0
+    >>> points.shape, elements.shape
+    ((27, 3), (8, 8))
     """
 
     mesh: Any

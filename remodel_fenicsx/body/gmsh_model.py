@@ -14,7 +14,18 @@ SMALLEST_LENGTH, LARGEST_LENGTH, LARGEST_LENGTH_RATIO = 1e-6, 1e6, 1e4
 
 
 class GeometryError(RuntimeError):
-    """Gmsh could not build or read a mesh; raised on all ranks."""
+    """Gmsh could not build or read a mesh; raised on all ranks.
+
+    Examples
+    --------
+    Its text is one line, for whoever has asked for the mesh:
+
+    >>> from remodel_fenicsx import parts
+    >>> raise parts.GeometryError("Gmsh could not mesh the tube")
+    Traceback (most recent call last):
+        ...
+    remodel_fenicsx.body.gmsh_model.GeometryError: Gmsh could not mesh the tube
+    """
 
 
 def length_fault(lengths: Mapping[str, float]) -> tuple[str, str] | None:

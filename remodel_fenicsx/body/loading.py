@@ -40,6 +40,20 @@ class Loading:
         Present magnitude of each named load.
     has_caps
         Whether a pressure inside acts on caps at the ends too: a support says so.
+
+    Examples
+    --------
+    >>> from remodel_fenicsx import parts
+    >>> domain = parts.Cube(side=2.0).build(parts.Mesh())
+    >>> kinematics = parts.FullKinematics()
+    >>> displacement = kinematics.unknown(domain.mesh, degree=1)
+    >>> loading = parts.Loading(domain, displacement, kinematics)
+    >>> for component, face in enumerate(("x0", "y0", "z0")):
+    ...     loading.hold_face(face, component)
+    >>> loading.add_dead_force("force", "z1", component=2)
+    >>> loading.set({"force": 10.0})  # in the unit of stress times that of length squared
+    >>> loading.values, round(loading.area("z1"), 12), len(loading.boundary_conditions)
+    ({'force': 10.0}, 4.0, 3)
     """
 
     def __init__(self, domain: Domain, unknown: Any, kinematics: Kinematics | None = None):

@@ -113,8 +113,10 @@ class MeshBody(WalledMesh):
 
     shape: Literal["mesh"] = Field(default="mesh", description="Which body it is.")
     file: Annotated[str, BeforeValidator(_file)] = Field(
-        description="The mesh, a file by Gmsh (`.msh`, format 2.2 or 4.1, text) or one that meshio reads (`.vtu`, "
-        "`.vtk`, `.xdmf`), relative to the scene's folder.",
+        description=(
+            "The mesh: a file by Gmsh (`.msh`, format 2.2 or 4.1, text) or one that meshio reads "
+            "(`.vtu`, `.vtk`, `.xdmf`). Its path is relative to the scene's folder."
+        ),
         json_schema_extra={"allowed": "the path of a file .msh, .vtu, .vtk or .xdmf"},
     )
     tags: str | None = Field(
@@ -126,13 +128,16 @@ class MeshBody(WalledMesh):
     )
     file_unit: Literal["m", "cm", "mm", "um"] | None = Field(
         default=None,
-        description="Unit of the file's numbers, where it is another one than `length_unit`.",
+        description="Unit of the numbers in the file, where it differs from `length_unit`.",
         json_schema_extra={"allowed": "one of " + ", ".join(map(repr, LENGTH_UNITS))},
     )
     faces: Annotated[dict[str, tuple[str | int, ...]], BeforeValidator(_faces)] = Field(
         default={},
-        description="Name of a face -> name or number of a named face of the file, or a list. `inner`, `outer`, "
-        "`inlet`, `outlet` are needed where the file's own names are others. Further ones are for supports.",
+        description=(
+            "Names of faces, each with the name or number of a face in the file, or a list of them. "
+            "`inner`, `outer`, `inlet` and `outlet` are needed where the file has other names. Further "
+            "faces are for supports and loads."
+        ),
         json_schema_extra={
             "allowed": "a table of names, numbers or lists of them",
             "additionalProperties": {"anyOf": [_ENTRY, {"type": "array", "items": _ENTRY, "minItems": 1}]},
@@ -140,19 +145,26 @@ class MeshBody(WalledMesh):
     )
     regions: Annotated[dict[str, tuple[str | int, ...]], BeforeValidator(_faces)] = Field(
         default={},
-        description="Name of a region -> name or number of a volume of the file, or a list. Default: the file's names.",
+        description=(
+            "Names of regions, each with the name or number of a volume in the file, or a list of them."
+            " Default: the names in the file."
+        ),
         json_schema_extra={
             "allowed": "a table of names, numbers or lists of them",
             "additionalProperties": {"anyOf": [_ENTRY, {"type": "array", "items": _ENTRY, "minItems": 1}]},
         },
     )
     open_boundary: bool = Field(
-        default=False, description="Whether a part of the boundary may be in no face; otherwise it is taken for a hole."
+        default=False,
+        description=(
+            "Whether parts of the boundary may belong to no face. Without it such a part is taken for a"
+            " hole and refused."
+        ),
     )
     sha256: str | None = Field(
         default=None,
         pattern="^[0-9a-f]{64}$",
-        description="SHA-256 of the file: a scene as run has it, and another file is refused.",
+        description="SHA-256 of the file. A scene as run has it, and refuses another file.",
         json_schema_extra={"allowed": "64 hexadecimal digits"},
     )
 

@@ -59,6 +59,24 @@ class LoadKind:
         Whether the body's length is an unknown where a scene has it. Elsewhere its column is there on request.
     doubtful
         Magnitude from which on a value is hardly meant, and what may have been.
+
+    Examples
+    --------
+    The weight of the cube, per reference volume:
+
+    >>> import ufl
+    >>> from remodel_fenicsx import preset_scene
+    >>> from remodel_fenicsx.extend import LENGTH_UNIT, STRESS_UNIT, Dimension, LoadKind
+    >>> from remodel_fenicsx.parts import Cube
+    >>> def add_weight(shape, loading, name):
+    ...     weight = loading.magnitude(name)
+    ...     loading.add_term(lambda u, v: -weight * v[2] * loading.weight * ufl.dx)
+    >>> per_volume = Dimension("force per volume", "9.81 kN/m^3", ((STRESS_UNIT, 1), (LENGTH_UNIT, -1)))
+    >>> Cube.loads["weight"] = LoadKind(add_weight, "weight along z", per_volume)
+    >>> heavy = {"loads": {"weight": {"value": 0.02, "ramp": [[0.0, 0.0], [2.0, 1.0]]}}}
+    >>> preset_scene("kuhl-holzapfel-2007", "cube").with_values(heavy).loads["weight"].value
+    0.02
+    >>> del Cube.loads["weight"]
     """
 
     add: Callable[[Any, Loading, str], None]
@@ -86,8 +104,9 @@ _is: Any = {  # a word of Python
         Literal["unloaded", "loaded"],
         Field(
             default="unloaded",
-            description="What the geometry is: the body without loads, or, of a tube and a body of one's own, the one "
-            "under the loads of the end of their ramps. The unloaded one is found then (docs/natural.md).",
+            description="What the geometry describes. 'unloaded': the body without loads. 'loaded', for a tube or a "
+            "body of your own: the body under the loads at the end of their ramps; the unloaded body is found first "
+            "(docs/natural.md).",
         ),
     )
 }
@@ -148,6 +167,34 @@ class Shape(_Is):  # type: ignore[misc]
         Whether a scene may give its loaded shape, `geometry.is = "loaded"`.
     unloads_by_numbers
         Whether a few numbers are all of the unloaded shape.
+
+    Raises
+    ------
+    SceneError
+        If a key is unknown or missing, or a value is not allowed: one line.
+
+    Examples
+    --------
+    The keys of a new body; tests/body/test_extensions.py has one whole, with mesh, supports and loads:
+
+    >>> from typing import Annotated, Literal
+    >>> from pydantic import Field
+    >>> from remodel_fenicsx.extend import LENGTH, Shape
+    >>> class Bar(Shape):
+    ...     shape: Literal["bar"] = "bar"
+    ...     length: Annotated[float, LENGTH] = Field(default=4.0, gt=0, description="Length along z.")
+    ...
+    ...     def build(self, mesh, comm=None):
+    ...         raise NotImplementedError("here a script makes a mesh and returns a Domain")
+    ...
+    ...     def hold(self, loading):
+    ...         loading.hold_face("z0", component=2)
+    >>> Bar(length=2.0).length, Bar().name
+    (2.0, 'bar')
+    >>> Bar(length=-2.0)
+    Traceback (most recent call last):
+        ...
+    remodel_fenicsx.schema.tables.SceneError: length = -2.0: must be a finite number greater than 0
     """
 
     loads: ClassVar[dict[str, LoadKind]]
@@ -365,12 +412,13 @@ class Shape(_Is):  # type: ignore[misc]
 
         Returns
         -------
-        (...,), NaN where the chain direction has no such angle: means are over the others.
+        array (...,)
+            Degrees; NaN where the chain direction has no such angle: means are over the others.
         """
         return angle_to_axis(dimensions, axes, np.array([0.0, 0.0, 1.0]))
 
     def radial_share(self, dimensions: Array, axes: Array, local: Array) -> Array:
-        """Share of the chains, by their squared length, that `fibre_angle` does not see; parameters as there."""
+        """Share of the chains, by squared length, that `fibre_angle` does not see, (...,); parameters as there."""
         return np.zeros(dimensions.shape[:-1])
 
 
@@ -382,7 +430,26 @@ def check_lengths(shape: Shape, lengths: dict[str, float]) -> None:
 
 
 def uniaxial_columns(top: str, length: str) -> tuple[Column, ...]:
-    """Columns of a body that is pulled along z at the face `top`; `length` names its dimension along z."""
+    """Columns of a body that is pulled along z: its stretches and its mean fibre angle.
+
+    Parameters
+    ----------
+    top
+        Name of the face that is pulled.
+    length
+        Name of the body's dimension along z (`Domain.dimensions`).
+
+    Returns
+    -------
+    tuple of Column
+        For `Shape.columns`.
+
+    Examples
+    --------
+    >>> from remodel_fenicsx.extend import uniaxial_columns
+    >>> [column.name for column in uniaxial_columns("z1", "length")]
+    ['mean_stretch', 'min_stretch', 'max_stretch', 'mean_fibre_angle']
+    """
 
     def mean_stretch(m: Any) -> float:
         return float(1.0 + m.face_mean(top, m.displacement[:, 2]) / m.domain.dimensions[length])

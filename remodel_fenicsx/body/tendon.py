@@ -34,6 +34,25 @@ class Tendon(Shape):
     """A cylinder along z, held at its bottom and pulled at its top: the tendon of the paper's Fig. 6.
 
     Length and square root of the area: 1e-6 to 1e6, one up to 10,000 times the other.
+
+    Its keyword arguments are the keys of `[geometry]`: `length` and `area` in the unit `length_unit`, or in any
+    one unit.
+
+    Raises
+    ------
+    SceneError
+        If a value is not allowed: one line.
+
+    Examples
+    --------
+    >>> from remodel_fenicsx import parts
+    >>> body = parts.Tendon(length=10.0, area=1.0)
+    >>> body.axial_length, body.section_area, list(body.loads)
+    (10.0, 1.0, ['force'])
+    >>> parts.Tendon(length=-1.0, area=1.0)
+    Traceback (most recent call last):
+        ...
+    remodel_fenicsx.schema.tables.SceneError: length = -1.0: must be a finite number greater than 0
     """
 
     loads: ClassVar[dict[str, LoadKind]] = {

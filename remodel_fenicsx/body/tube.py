@@ -259,6 +259,24 @@ class Tube(Walled):
 
     Its ends stay in their planes; they are free to move radially, clamped, or closed by caps (`supports.ends`). Inner
     radius, wall thickness and length: 1e-6 to 1e6, one up to 10,000 times the other.
+
+    Its keyword arguments are the keys of `[geometry]`: `inner_radius`, `outer_radius` and `length` in the unit
+    `length_unit`, or in any one unit.
+
+    Raises
+    ------
+    SceneError
+        If a value is not allowed: one line.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from remodel_fenicsx import parts
+    >>> body = parts.Tube(inner_radius=1.0, outer_radius=3.0, length=8.0)
+    >>> body.depth(np.array([[2.0, 0.0, 4.0]]))  # through the wall
+    array([0.5])
+    >>> round(body.section_area, 4), list(body.loads)
+    (25.1327, ['pressure', 'elongation', 'axial_force'])
     """
 
     loads: ClassVar[dict[str, LoadKind]] = {
@@ -437,17 +455,17 @@ class Tube(Walled):
         return Strut(self.length, factor, about_z, squared_distances, radii, capped=ends == "closed")
 
     def depth(self, coordinates: Array) -> Array:
-        """From the inner (0) to the outer face (1); plane faces of elements lie inside of the cylinders."""
+        """From the inner (0) to the outer face (1), (...,); plane faces of elements lie inside of the cylinders."""
         radii = np.linalg.norm(coordinates[..., :2], axis=-1)
         depth: Array = np.clip((radii - self.inner_radius) / (self.outer_radius - self.inner_radius), 0.0, 1.0)
         return depth
 
     def axes_at(self, coordinates: Array) -> Array:
-        """About the z axis."""
+        """Circumferential, axial, radial about the z axis, rows (..., 3, 3)."""
         return cylindrical_axes(coordinates)
 
     def station(self, coordinates: Array) -> Array:
-        """Along z."""
+        """Along z, from 0 to 1, (...,)."""
         return np.asarray(coordinates[..., 2] / self.length, dtype=np.float64)
 
 

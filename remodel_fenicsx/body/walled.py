@@ -121,11 +121,11 @@ class Walled(Shape):
     angle_in_words: ClassVar[tuple[str, str]] = ("around", "along")
 
     def fibre_angle(self, dimensions: Array, axes: Array, local: Array) -> Array:
-        """Angle in degrees of the chain direction in the wall, from circumferential (0) to axial (90); NaN across."""
+        """Angle of the chain direction in the wall, degrees, (...,): circumferential 0, axial 90, NaN across."""
         return pitch_angle(dimensions, axes, local)
 
     def radial_share(self, dimensions: Array, axes: Array, local: Array) -> Array:
-        """A_rr / tr A."""
+        """Share of the chains across the wall, A_rr / tr A, (...,)."""
         return radial_share(dimensions, axes, local)
 
 

@@ -47,8 +47,17 @@ class Coupling(Protocol):
         Whether `better` is wanted; set it before the first step.
     others
         Further load cases, solved with the same cells after the state itself (`load_cases.OtherCase`).
-    better
-        After `remodel`: cells at all points in one row that a better rule gives for the row; None if it has no error.
+    turnover
+        Content and natural length of the collagen (`turnover.TurnoverPass`), which it changes; None where they stay.
+
+    Examples
+    --------
+    What a script writes is most often a `Staggered` with another second half; a simulation has one:
+
+    >>> from remodel_fenicsx import Simulation, preset_scene
+    >>> coupling = Simulation(preset_scene("kuhl-holzapfel-2007", "cube")).stepper.coupling
+    >>> coupling.order, coupling.accumulates
+    (1, False)
     """
 
     equilibrium: Equilibrium
@@ -59,9 +68,11 @@ class Coupling(Protocol):
     longest: float
     compares: bool
     others: Sequence[Any]
+    turnover: Any
 
     @property
-    def better(self) -> UnitCell | None: ...
+    def better(self) -> UnitCell | None:
+        """After `remodel`: cells (n, 3) and (n, 3, 3) that a better rule gives; None if the row has no error."""
 
     def solve(self, time: float, loads: LoadValues) -> Work:
         """Bring the state to equilibrium with the loads of `time`; `state.equilibrium_cells` are those of the row."""
@@ -74,10 +85,31 @@ class Coupling(Protocol):
 
 
 class Staggered:
-    """The paper's: solve with the cells of the step before, then one remodeling pass.
+    """The paper's coupling: solve with the cells of the step before, then one remodeling pass.
 
     Where Newton's method cannot go to the new state in one piece, the change of the cells and then the change of the
     loads are applied in parts (docs/theory.md, "Steps that are too large"): the state at the end is the same.
+
+    Parameters
+    ----------
+    state
+        What is advanced.
+    tissue
+        Its constitutive parameters, on the mesh.
+    remodeling
+        The pass that changes the cells.
+    settings
+        Of the solver.
+
+    Examples
+    --------
+    A coupling of one's own overrides one of its halves, see `CouplingKind`. A simulation makes it:
+
+    >>> from remodel_fenicsx import Simulation, preset_scene
+    >>> from remodel_fenicsx.extend import Staggered
+    >>> simulation = Simulation(preset_scene("kuhl-holzapfel-2007", "cube"), coupling=Staggered)
+    >>> type(simulation.stepper.coupling).__name__
+    'Staggered'
     """
 
     order, accumulates, longest = 1, False, math.inf
@@ -91,9 +123,12 @@ class Staggered:
         self._last = Numbers(state, "last_solution", {"extension": 0.0})  # its largest r/L
         self.share, self.compares, self.residual = 1.0, False, 0.0
         self.others: Sequence[Any] = ()
+        self.turnover: Any = None
         self.tangents = 0  # that were assembled in the last solve of the state itself
         self.blend: Blend | None = None
-        if remodeling.law.remodels:  # now, for no form is compiled in the middle of a run
+        if (
+            remodeling.law.remodels or remodeling.settings.turnover.is_on
+        ):  # now, for no form is compiled in the middle of a run
             self.blend = Blend(state, tissue, settings)
             self.blend.equilibrium.stop_signal = lambda: self.equilibrium.stop_signal()
 
@@ -105,6 +140,8 @@ class Staggered:
         StepFailure
             If no admissible equilibrium is found.
         """
+        if self.turnover is not None and not self.accumulates:
+            self.turnover.lag(time)
         work, before, old_loads = Work(), self.state.unknown.x.array.copy(), dict(self.state.loading.values)
         step = LoadStep.between(self.state.time, old_loads, time, loads)
         if self._solved_as_expected(step, loads, work):
@@ -117,6 +154,8 @@ class Staggered:
         self._whole(time, old_loads, loads).look_back(before, work)
         self.predictor.solved(step, before)
         self.state.settle_cells()
+        if self.turnover is not None:
+            self.turnover.settle()
         self.residual = work.residual
         work.extension = work.extension or self.equilibrium.extension()
         self._last["extension"] = work.extension.max_chain_extension
@@ -127,9 +166,12 @@ class Staggered:
 
     def remodel(self, time: float) -> float:
         """The pass with the solved state."""
-        if not self.remodeling.law.remodels:
-            return 0.0
-        return self.remodeling.apply(self.state.time, time, self.residual, self.share)
+        power = 0.0
+        if self.remodeling.law.remodels:
+            power = self.remodeling.apply(self.state.time, time, self.residual, self.share)
+        if self.turnover is not None:
+            self.turnover.complete(time)
+        return power
 
     @property
     def better(self) -> UnitCell | None:
@@ -184,13 +226,16 @@ class Staggered:
     def _solve_in_parts(
         self, time: float, old_loads: LoadValues, new_loads: LoadValues, work: Work, failure: SolveFailure | None
     ) -> None:
-        """First the change of the cells, then that of the loads; `failure`: that of the whole step, if it was tried."""
+        """First the change of the cells and of turnover, then that of the loads.
+
+        `failure`: that of the whole step, if it was tried.
+        """
         loading, halvings = self.state.loading, self.settings.maximum_halvings
         loading.set(old_loads)
         if self.blend is not None and self._cells_changed():
             blend = self.blend
             stage = "the change of the cells"
-            Change(time, stage, blend.set, blend.newton, halvings, blend.largest_part, roughly=True).advance(work)
+            Change(time, stage, self._set_part, blend.newton, halvings, blend.largest_part, roughly=True).advance(work)
             failure = None  # the loads have not been tried from here
 
         def set_load_fraction(fraction: float) -> None:
@@ -207,14 +252,24 @@ class Staggered:
         def set_fraction(fraction: float) -> None:
             self.state.loading.set(between(old_loads, new_loads, fraction))
             if blend is not None:
-                blend.set(fraction)
+                self._set_part(fraction)
 
         halvings = self.settings.maximum_halvings
         if blend is None:
             return Change(time, "the step", set_fraction, self.newton, halvings)
         return Change(time, "the step", set_fraction, blend.newton, halvings, blend.largest_part)
 
+    def _set_part(self, fraction: float) -> None:
+        """Of what the cells have changed since the last solved state, and content and natural length."""
+        assert self.blend is not None
+        self.blend.set(fraction)
+        if self.turnover is not None:
+            self.turnover.set_part(fraction)
+
     def _cells_changed(self) -> bool:
+        """Or content and natural length."""
+        if self.turnover is not None:
+            return True
         same = self.state.equilibrium_cells.equals(self.state.cells)
         return bool(self.state.comm.allreduce(int(not same)) > 0)
 

@@ -72,6 +72,8 @@ class Extrapolated(Staggered):
         self._start = UnitCell(*(values.copy() for values in cells.point_cells[:2]))
         expected = self._extrapolated(time)
         self._follow(expected, time)
+        if self.turnover is not None:
+            self.turnover.extrapolate(time)
         work = super().solve(time, loads)
         self._found = self.remodeling.target(self.residual)
         self._begins = (self._known(0).share < COUNTS) & (self._found.share >= COUNTS)
@@ -98,6 +100,8 @@ class Extrapolated(Staggered):
         values[:, :, 0, :9] = target.direction.reshape(*values.shape[:2], 9)
         values[:, :, 0, 9] = target.share.reshape(values.shape[:2])
         values[:, :, 0, 10] = time
+        if self.turnover is not None:
+            self.turnover.complete(time)
         return self._power
 
     def _mean(self, target: Target, duration: float) -> Target:

@@ -86,6 +86,7 @@ class Homeostasis:
 
     order, accumulates, longest, share, better = 1, True, math.inf, 1.0, None
     others: Sequence[Any] = ()  # its way solves further load cases
+    turnover: Any = None
 
     def __init__(self, way: StepControl, remodeling: RemodelingPass, held_from: float, limit: Limit | None):
         self.way, self.remodeling, self.held_from, self.limit = way, remodeling, held_from, limit

@@ -139,8 +139,8 @@ class StepControl:
         self._remember_refused(duration)
         self._count(step, error, duration)
         wanted = max(numbers["usual"] if numbers["goes_on"] else wanted, shortest)
-        kappa = self.stepper.remodeling.fastest
-        numbers["wanted"] = min(wanted, self.stepper.coupling.longest / kappa if kappa else wanted)
+        fastest = self.stepper.fastest
+        numbers["wanted"] = min(wanted, self.stepper.coupling.longest / fastest if fastest else wanted)
         numbers["before"], numbers["effective"] = max(error, TELLING_ERROR), self._effective(duration)
 
     def _longer_with_the_same(self, error: float, duration: float) -> float:
@@ -165,13 +165,12 @@ class StepControl:
 
     def _fastest_time(self) -> float:
         """In which chains may turn by `FASTEST` degrees."""
-        remodeling, time = self.stepper.remodeling, self.state.time
-        settings = remodeling.settings
+        remodeling, time, fastest = self.stepper.remodeling, self.state.time, self.stepper.fastest
         after = next(stop for stop in self.stops if stop > time and not same_time(stop, time))
         before = max([0.0, *(stop for stop in self.stops if stop < after)])
-        if not remodeling.law.remodels:
-            return after - before
-        return min(after - before, 1 / remodeling.fastest if remodeling.law.asks_kappa else settings.rotation_time)
+        if remodeling.law.remodels and not remodeling.law.asks_kappa:
+            return min(after - before, remodeling.settings.rotation_time)
+        return min(after - before, 1 / fastest) if fastest else after - before
 
     def _shortest(self) -> float:
         """Length below which no step is cut for its error."""

@@ -49,6 +49,17 @@ class Step:
         Its columns by name, where somebody measures (`results.columns.Observer`).
     case
         Number of the load case that is looked at.
+
+    Examples
+    --------
+    >>> from remodel_fenicsx import Simulation, preset_scene
+    >>> simulation = Simulation(preset_scene("kuhl-holzapfel-2007", "cube"))
+    >>> for _, step in zip(range(2), simulation.steps()):
+    ...     print(step.number, step.time, step.loads, step.work.newton_iterations)
+    1 1.0 {'force': 1.0} 4
+    2 2.0 {'force': 2.0} 3
+    >>> round(step.extension.max_chain_extension, 4), step.moment
+    (0.4769, 'time 2')
     """
 
     time: float
@@ -75,6 +86,21 @@ class Watcher:
     """Follows the steps; whoever wants to know less overrides less.
 
     `solved` and `completed` happen inside the step's transaction: an exception there undoes the step for all watchers.
+
+    Examples
+    --------
+    >>> from remodel_fenicsx import Simulation, parts, preset_scene
+    >>> class Loudest(parts.Watcher):
+    ...     found = 0.0
+    ...
+    ...     def committed(self, step):
+    ...         self.found = max(self.found, step.extension.max_chain_extension)
+    >>> scene = preset_scene("kuhl-holzapfel-2007", "cube").with_values({"time.end": 3.0})
+    >>> watcher = Loudest()
+    >>> for step in Simulation(scene).steps([watcher]):
+    ...     pass
+    >>> round(watcher.found, 4)
+    0.486
     """
 
     def started(self, step: Step) -> None:
@@ -115,6 +141,17 @@ class Stepper:
         Makes a coupling in place of the one that `remodeling` names.
     kappa
         Of `RemodelingPass`.
+
+    Examples
+    --------
+    >>> from remodel_fenicsx import Simulation, preset_scene
+    >>> simulation = Simulation(preset_scene("kuhl-holzapfel-2007", "cube"))
+    >>> stepper = simulation.stepper
+    >>> for step in stepper.march([1.0, 2.0], [simulation.observer]):
+    ...     print(step.time, round(step.row["mean_fibre_angle"], 3))
+    1.0 54.736
+    2.0 53.569
+    >>> stepper.close()
     """
 
     def __init__(
@@ -139,13 +176,28 @@ class Stepper:
         if remodeling.turnover.is_on:
             from remodel_fenicsx.evolution.turnover import TurnoverPass
 
-            self.turnover = TurnoverPass(state, self.tissue, remodeling.turnover)
+            self.turnover = self.coupling.turnover = TurnoverPass(state, self.tissue, remodeling.turnover)
         self._closed = False
         # asked on each rank in every solve: the signal (SIGINT, SIGTERM) that should end it, or 0
         self.stop_signal: Callable[[], int] = lambda: 0
         self.coupling.equilibrium.stop_signal = lambda: self.stop_signal()
         # asked when a step's pass is done; what it raises takes the step back (`step_control`)
         self.judge: Callable[[Step], object] = lambda step: None
+
+    @property
+    def slowest(self) -> float:
+        """The smallest rate above 0 of cells and turnover, in 1/time; 0 where nothing remodels."""
+        return min((rate for rate in self._rates("slowest") if rate), default=0.0)
+
+    @property
+    def fastest(self) -> float:
+        """The largest one."""
+        return max(self._rates("fastest"), default=0.0)
+
+    def _rates(self, name: str) -> list[float]:
+        parts = [self.remodeling] if self.remodeling.law.remodels else []
+        parts += [] if self.turnover is None else [self.turnover]
+        return [getattr(part, name) for part in parts]
 
     def start(self, watchers: Sequence[Watcher] = ()) -> Step:
         """The present state as the step that watchers see before all others."""
@@ -200,8 +252,6 @@ class Stepper:
                 for watcher in watchers:
                     watcher.solved(step)
                 step.remodeling_power = self.coupling.remodel(time)
-                if self.turnover is not None:
-                    self.turnover.apply(time - state.time)
                 step.seconds = clock.perf_counter() - start
                 step.processor_seconds = clock.process_time() - processor_start
                 if rejected is not None:
@@ -240,7 +290,26 @@ def undone_by_all(watchers: Sequence[Watcher], step: Step) -> Iterator[None]:
 
 
 def times(end: float, step: float) -> Iterator[float]:
-    """Times after t = 0: multiples of step as decimal numbers (3 * 0.1 is 0.3); the last one is end."""
+    """Times of steps after t = 0: multiples of the step as decimal numbers (3 * 0.1 is 0.3); the last one is the end.
+
+    Parameters
+    ----------
+    end
+        Last time.
+    step
+        From one time to the next; in the same unit.
+
+    Yields
+    ------
+    float
+        Ascending; without 0.
+
+    Examples
+    --------
+    >>> from remodel_fenicsx import parts
+    >>> list(parts.times(0.35, step=0.1))
+    [0.1, 0.2, 0.35]
+    """
     end, step = float(end), float(step)
     number_of_steps = round(end / step)
     for number in range(1, number_of_steps):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +28,8 @@ class Estimate:
 
     The larger of two errors: that of the direction of the chains in space (`angle_between`), root mean square over the
     body, and the largest error of a length in the body, relative to this length, as an angle in radians. A strain of
-    this size turns lines of the body by up to this angle.
+    this size turns lines of the body by up to this angle. With turnover the errors of content and natural length count
+    like those of lengths.
 
     Attributes
     ----------
@@ -42,6 +43,13 @@ class Estimate:
     row: float
 
 
+class Remodeled(NamedTuple):
+    """What remodels, at all points in one row: cells, and with turnover ln m and ln rho (2, n)."""
+
+    cells: UnitCell
+    turnover: Array | None = None
+
+
 class TimeError:
     """Compares each row with a better one, which the coupling has from the same step (docs/theory.md).
 
@@ -49,7 +57,7 @@ class TimeError:
     goes from that of its start to that of its end. Each step then adds an error, and kappa forgets it: it ends at the
     error of a step over 1 - exp(-kappa dt), if all steps are alike. Cells forget with kappa, but the stress follows the
     cells, so that body and cells together forget more slowly: with the rate at which they slow down under loads that
-    are held, which is measured. With time an error grows by kappa over it.
+    are held, which is measured. With time an error grows by kappa over it. Those of turnover are forgotten with 1/T.
 
     A staggered row is solved with cells that lag a step behind: those that its own pass makes are better. But the
     stress, to which the pass answers, lags too: the better cells are those that a pass makes with the stress of a body
@@ -66,17 +74,20 @@ class TimeError:
     def __init__(self, stepper: Stepper):
         self.stepper, self.state = stepper, stepper.state
         self.quadrature, self.kappa = stepper.state.cells.quadrature, stepper.remodeling.slowest
+        self.turnover = stepper.turnover
         stepper.coupling.compares = True
-        initial = {"row": 0.0, "speed": 0.0, "duration": 0.0, "fading": self.kappa, "answer": 1.0}
+        initial = {"row": 0.0, "speed": 0.0, "duration": 0.0, "fading": self.kappa, "answer": 1.0, "turnover": 0.0}
         self._numbers = Numbers(stepper.state, "time_error", initial)
         # of structure tensors: with rows that lag the last error, with others the last row
         self._last = Earlier(stepper.state, "time_error_cells", lambda: self.quadrature.function("", COMPONENTS), 1)
+        if self.turnover is not None:  # the same of ln m and ln rho
+            made = stepper.state, "time_error_turnover", lambda: self.quadrature.function("", (2,)), 1
+            self._last_turnover = Earlier(*made)
 
     def measure(self, step: Step) -> Estimate:
         """The estimate of a step whose pass is done, within its transaction."""
         duration = step.time - self.state.time
-        solved, better = self.state.equilibrium_cells, self.stepper.coupling.better
-        row = UnitCell(solved.dimension_values.reshape(-1, 3), solved.axis_values.reshape(-1, 3, 3))
+        row, better = self._row_and_better()
         if self.stepper.coupling.accumulates:
             found = self._added_up(step, row, better, duration)
         elif better is None:
@@ -84,56 +95,93 @@ class TimeError:
         else:
             lag = self._lag(step, row, better, duration)
             found = Estimate(lag, lag)
-        self._numbers["row"], self._numbers["duration"] = found.row, duration
+        self._numbers["duration"] = duration
         step.time_error = found.row
         return found
 
+    def _row_and_better(self) -> tuple[Remodeled, Remodeled | None]:
+        """Of the solved state, and what the coupling has that is better; None where nothing is."""
+        cells, better = UnitCell(*self.state.equilibrium_cells.point_cells[:2]), self.stepper.coupling.better
+        if self.turnover is None:
+            return Remodeled(cells), None if better is None else Remodeled(better)
+        return Remodeled(cells, self.turnover.row), Remodeled(better or cells, self.turnover.better)
+
     # ------------------------------------------------------------ rows that lag behind
-    def _lag(self, step: Step, row: UnitCell, better: UnitCell, duration: float) -> float:
-        """Distance to the cells of a pass with the stress that belongs to such cells."""
-        before, expected = structure_tensor(*row[:2]), better
-        if self._last.known:
-            last = tensors.from_mandel(self._last.values[0].reshape(-1, *COMPONENTS))
-            squared, axes = spectral.continued(before + duration / self._numbers["duration"] * last, row.axes)
-            expected = UnitCell(np.sqrt(np.maximum(squared, 0.0)), axes)
-        known, angle = better, self._angle(row, better)
+    def _lag(self, step: Step, row: Remodeled, better: Remodeled, duration: float) -> float:
+        """Distance to what a pass makes with the stress of a body that has remodeled so."""
+        known, angle = better, self._apart(row, better)
         with self.state.tentative():
-            strain, admissible = self._strain(step, expected)
+            strain, admissible = self._strain(step, self._expected(row, better, duration))
             if admissible:
-                remodeling = self.stepper.remodeling
-                better, _ = remodeling.updated_cells(self.state.time, step.time, step.work.residual, row)
-        most, angle = SLOWEST * angle, self._angle(row, better)
+                better = self._passed(step, row, duration)
+        most, angle = SLOWEST * angle, self._apart(row, better)
         if angle > most:  # another state, to which this one does not tend
             better, angle = known, most
-        self._last.push(tensors.to_mandel(structure_tensor(*better[:2]) - before).ravel())
+        before, after = (structure_tensor(*some.cells[:2]) for some in (row, better))
+        self._last.push(tensors.to_mandel(after - before).ravel())
+        if row.turnover is not None and better.turnover is not None:
+            self._last_turnover.push(np.ravel((better.turnover - row.turnover).T))
         return max(angle, strain)
 
+    def _expected(self, row: Remodeled, better: Remodeled, duration: float) -> Remodeled:
+        """By what the last error lets expect; at first the better ones."""
+        if not self._last.known:
+            return better
+        longer = duration / self._numbers["duration"]
+        last = tensors.from_mandel(self._last.values[0].reshape(-1, *COMPONENTS))
+        squared, axes = spectral.continued(structure_tensor(*row.cells[:2]) + longer * last, row.cells.axes)
+        cells = UnitCell(np.sqrt(np.maximum(squared, 0.0)), axes)
+        if row.turnover is None:
+            return Remodeled(cells)
+        return Remodeled(cells, row.turnover + longer * self._last_turnover.values[0].reshape(-1, 2).T)
+
+    def _passed(self, step: Step, row: Remodeled, duration: float) -> Remodeled:
+        """What the present state makes of the row's cells and collagen."""
+        remodeling, turnover, cells = self.stepper.remodeling, row.turnover, row.cells
+        if remodeling.law.remodels:
+            cells, _ = remodeling.updated_cells(self.state.time, step.time, step.work.residual, cells)
+        if turnover is not None:
+            turnover = self.turnover.after(turnover, duration, present=True)
+        return Remodeled(cells, turnover)
+
     # ------------------------------------------------------------ errors that add up
-    def _added_up(self, step: Step, row: UnitCell, better: UnitCell | None, duration: float) -> Estimate:
+    def _added_up(self, step: Step, row: Remodeled, better: Remodeled | None, duration: float) -> Estimate:
         fading = self._fading(step, row, duration)
-        answer, difference = self._answer(fading, duration), 0.0
+        answer, numbers, difference, turned_over = self._answer(fading, duration), self._numbers, 0.0, 0.0
         if better is not None:
             with self.state.tentative():
                 strain, _ = self._strain(step, better)
-            difference = max(self._angle(row, better), strain)
-        forgotten = float(-np.expm1(-self.kappa * duration))
-        left = float(np.exp(-fading * duration)) * self._numbers["row"] + difference
-        return Estimate(answer * difference / forgotten if forgotten else difference, left)
+            difference = max(self._angle(row.cells, better.cells), strain)
+            turned_over = self._largest(row, better)
+        ends = [_end_of(difference, self.kappa * duration)]
+        left = float(np.exp(-fading * duration)) * numbers["row"] + difference
+        numbers["row"] = left
+        if self.turnover is not None:
+            # the rates of turnover, which are bounded, change no longer than the cells do
+            ends.append(_end_of(turned_over, max(self.kappa, self.turnover.slowest) * duration))
+            fading = min(fading, self.turnover.slowest) if fading else self.turnover.slowest
+            numbers["turnover"] = float(np.exp(-fading * duration)) * numbers["turnover"] + turned_over
+            left = max(left, numbers["turnover"])
+        return Estimate(answer * max(ends), left)
 
-    def _fading(self, step: Step, row: UnitCell, duration: float) -> float:
-        """Rate at which errors fade: that at which the cells slow down while loads are held."""
-        numbers, known = self._numbers, self._last.values
+    def _fading(self, step: Step, row: Remodeled, duration: float) -> float:
+        """Rate at which errors fade: that at which cells and turnover slow down while loads are held."""
+        numbers, known = self._numbers, self._last.known
         before, fading, speed = numbers["speed"], numbers["fading"], 0.0
-        present = tensors.to_mandel(structure_tensor(*row[:2])).ravel()
+        kept = [(self._last, tensors.to_mandel(structure_tensor(*row.cells[:2])).ravel())]
+        if row.turnover is not None:
+            kept.append((self._last_turnover, np.ravel(row.turnover.T)))
         if known:
-            change = ((present - known[0]) ** 2).reshape(*self.quadrature.shape, -1).sum(axis=-1)
-            speed = float(np.sqrt(self.quadrature.mean(change))) / duration
+            changes = [present - last.values[0] for last, present in kept]
+            squares = [(change**2).reshape(*self.quadrature.shape, -1).sum(axis=-1) for change in changes]
+            speed = float(np.sqrt(self.quadrature.mean(sum(squares)))) / duration
         if not self._held(step):
             fading = self.kappa
         elif before > 0 and speed > 0:
             rate = np.log(before / speed) / (0.5 * (duration + numbers["duration"]))
             fading = float(np.sqrt(fading * np.clip(rate, self.kappa / SLOWEST, self.kappa)))
-        self._last.push(present)
+        for last, present in kept:
+            last.push(present)
         numbers["speed"], numbers["fading"] = speed, fading
         return fading
 
@@ -153,19 +201,32 @@ class TimeError:
         )
 
     # ------------------------------------------------------------ distances
+    def _apart(self, row: Remodeled, better: Remodeled) -> float:
+        """Between the directions of the chains, or the largest relative one of content and natural length, degrees."""
+        return max(self._angle(row.cells, better.cells), self._largest(row, better))
+
+    def _largest(self, row: Remodeled, better: Remodeled) -> float:
+        """Relative difference of content or natural length in the body, as an angle in radians, in degrees."""
+        if row.turnover is None or better.turnover is None:
+            return 0.0
+        largest = np.abs(better.turnover - row.turnover).max(axis=0).reshape(self.quadrature.shape)
+        return float(np.degrees(self.quadrature.maximum(largest)))
+
     def _angle(self, row: UnitCell, better: UnitCell) -> float:
         """Between the directions of the chains, root mean square over the body."""
         apart = angle_between(row, better).reshape(self.quadrature.shape)
         return float(np.sqrt(self.quadrature.mean(apart**2)))
 
-    def _strain(self, step: Step, cells: UnitCell) -> tuple[float, bool]:
-        """Give the body other cells, and let it answer: the largest change of a length, and whether that is a state.
+    def _strain(self, step: Step, remodeled: Remodeled) -> tuple[float, bool]:
+        """Let the body answer what has remodeled: the largest change of a length, and whether that is a state.
 
         In all load cases.
         """
-        shape, cases = self.quadrature.shape, self.stepper.cases
+        shape, cases, cells = self.quadrature.shape, self.stepper.cases, remodeled.cells
         before = [case.state.elastic_gradient() for case in (self.stepper, *cases)]
         self.state.cells.set(cells.dimensions.reshape(*shape, 3), cells.axes.reshape(*shape, 3, 3))
+        if remodeled.turnover is not None:
+            self.turnover.set(remodeled.turnover)
         tangents = [case.coupling.tangents for case in (self.stepper, *cases)] if cases else [step.work.tangents]
         found = [self._answered(*parts) for parts in zip((self.stepper, *cases), before, tangents, strict=True)]
         return max(strain for strain, _ in found), all(admissible for _, admissible in found)
@@ -178,6 +239,12 @@ class TimeError:
         changes = np.minimum(largest_change_of_length(before, after), LARGEST_LINEAR_CHANGE)
         changes = changes.reshape(self.quadrature.shape)
         return float(np.degrees(self.quadrature.maximum(changes))), admissible
+
+
+def _end_of(difference: float, forgotten: float) -> float:
+    """Where an error ends that each step adds to, if all steps are alike and exp(-forgotten) is left after each."""
+    share = float(-np.expm1(-forgotten))
+    return difference / share if share else difference
 
 
 def _same(before: Mapping[str, float], loads: Mapping[str, float]) -> bool:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from remodel_fenicsx.model.energy import TURNED_OVER, Tissue
 from remodel_fenicsx.model.turnover import TurnoverRates, rates
 from remodel_fenicsx.settings import Turnover
-from remodel_fenicsx.state.memory import Numbers
+from remodel_fenicsx.state.memory import Earlier, Numbers
 from remodel_fenicsx.state.parameters import Parameters, on_mesh
 from remodel_fenicsx.state.state import State
 
@@ -32,8 +32,19 @@ def turned_over(tissue: Tissue, state: State) -> Tissue:
     return replace(tissue, **made)
 
 
+def changed(start: Array, rates: Array, duration: float) -> Array:
+    """ln m and ln rho (2, n) after a time with rates (2, n)."""
+    content, length = rates * duration
+    found: Array = start + [content, np.clip(length, -LARGEST_TURNOVER, LARGEST_TURNOVER)]
+    return found
+
+
 class TurnoverPass:
-    """Changes content and natural length with the lengths of the solved state.
+    """Changes content and natural length with the lengths of solved states, as the coupling asks.
+
+    They are always those of the last solved state. Where rows lag (`lag`), a row has them from the rates of the rows
+    before it, as the cells of a staggered pass. Otherwise (`extrapolate`) they are those of the end of the row's step,
+    from the rates that the last two states let expect for its middle (Adams and Bashforth's second-order rule).
 
     Parameters
     ----------
@@ -43,35 +54,99 @@ class TurnoverPass:
         Of `turned_over`.
     settings
         Time, stretch of deposition and gain.
+
+    Attributes
+    ----------
+    slowest, fastest
+        Rates of rho and m: 1/T, and the larger one of 1/T and k/T, in 1/time.
+    row, better
+        ln m and ln rho of the last row, and what a better rule gives for it, (2, n); known after its step.
     """
 
     def __init__(self, state: State, tissue: Tissue, settings: Turnover):
+        assert settings.time is not None
         self.state, self.settings, self.quadrature = state, settings, state.cells.quadrature
         self.tissue = on_mesh(tissue, self.quadrature.mesh)
         self._parameters = Parameters(self.tissue, self.quadrature)
-        self._numbers = Numbers(state, "turnover", {"said": 0})
+        self._numbers = Numbers(state, "turnover", {"said": 0, "duration": 0.0})
+        self._earlier = Earlier(state, "turnover_rates", lambda: self.quadrature.function("", (2,)), 1)
         self.weights: Sequence[float] = (1.0,)  # of the load cases, that of `state` first
+        self.slowest, self.fastest = 1.0 / settings.time, max(1.0, settings.gain) / settings.time
+        self._start = self._before = self.row = self.better = self.logarithms()  # before: of the last solved state
+        self._extrapolates = False
 
-    def apply(self, duration: float) -> None:
-        """A step with the rates of the solved state: m and rho change by exp(rate * duration).
+    # ------------------------------------------------------------ over a step
+    def lag(self, time: float) -> None:
+        """Before a step to `time` is solved: m and rho change with the rates of the last row, over its step."""
+        self._change(self.rates(), self._numbers["duration"])
+        self._numbers["duration"], self._extrapolates = time - self.state.time, False
 
-        With several load cases: with the weighted mean of the rates in each.
-        """
-        parts = [self._rates(state) for state in (self.state, *self.state.others)]
-        found = TurnoverRates(*(sum(w * values for w, values in zip(self.weights, part)) for part in zip(*parts)))
-        changes = found.content * duration, np.clip(
-            found.natural_length * duration, -LARGEST_TURNOVER, LARGEST_TURNOVER
-        )
-        for name, change in zip(TURNED_OVER, changes, strict=True):
-            getattr(self.tissue, name).x.array[:] *= np.exp(change)
+    def extrapolate(self, time: float) -> None:
+        """Before a step to `time` is solved: m and rho of its end."""
+        duration, start = time - self.state.time, self.rates()
+        mean = start
+        if self._earlier.known:
+            before = self._earlier.values[0].reshape(-1, 2).T
+            mean = start + duration / (2 * self._numbers["duration"]) * (start - before)
+        self._earlier.push(np.ravel(start.T))
+        self._numbers["duration"], self._extrapolates = duration, True
+        self._change(mean, duration)
+
+    def _change(self, rates: Array, duration: float) -> None:
+        self._before = self._start = self.logarithms()
+        self.row = changed(self._start, rates, duration)
+        self.set(self.row)
+
+    def set_part(self, fraction: float) -> None:
+        """A part of what has changed since the last solved state."""
+        self.set(self._before + fraction * (self.row - self._before))
+
+    def settle(self) -> None:
+        """The present state is solved."""
+        self._before = self.row
+
+    def complete(self, time: float) -> None:
+        """After a step: what is better than the row."""
+        duration = time - self.state.time
+        self.better = self.after(self.row, duration)
+        if self._extrapolates:  # the rates at both ends together
+            start = self._earlier.values[0].reshape(-1, 2).T
+            self.better = changed(self._start, (start + self.rates()) / 2, duration)
         self._warn()
 
-    def _rates(self, state: State) -> TurnoverRates:
+    def after(self, start: Array, duration: float, present: bool = False) -> Array:
+        """ln m and ln rho (2, n) after a time with the rates of the solved state; `present`: with its present cells."""
+        return changed(start, self.rates(present), duration)
+
+    # ------------------------------------------------------------ values
+    def logarithms(self) -> Array:
+        """ln m and ln rho at all points in one row, (2, n)."""
+        found: Array = np.log([getattr(self.tissue, name).x.array for name in TURNED_OVER])
+        return found
+
+    def set(self, logarithms: Array) -> None:
+        """Other m and rho."""
+        for name, values in zip(TURNED_OVER, np.exp(logarithms), strict=True):
+            getattr(self.tissue, name).x.array[:] = values
+
+    def rates(self, present: bool = False) -> Array:
+        """d ln m / dt and d ln rho / dt of the solved state (2, n), of several load cases the weighted mean."""
+        states = (self.state, *self.state.others)
+        parts = [np.array(self._rates(state, present)) for state in states]
+        return np.asarray(sum(weight * part for weight, part in zip(self.weights, parts, strict=True)))
+
+    def _rates(self, state: State, present: bool) -> TurnoverRates:
         """In one load case."""
-        cells = state.equilibrium_cells
+        cells = state.cells if present else state.equilibrium_cells
         squared = cells.kernels.squared_length(state.elastic_gradient(), cells.point_cells)
         given = self.settings.time or np.inf, self.settings.deposition_stretch, self.settings.gain
         return rates(self._parameters.at_points(), np.sqrt(squared), *given)
+
+    def power(self) -> float:
+        """Stored energy per time that turnover releases in the solved state, at its F and cells."""
+        cells = self.state.equilibrium_cells.point_cells
+        increment = self._parameters.at_points().turnover_increment(self.state.elastic_gradient(), cells, *self.rates())
+        return 0.0 - float(self.quadrature.integral(self.state.per_mesh_volume(increment)))
 
     def mean(self, name: str) -> float:
         """Volume mean of `content` or `natural_length`."""

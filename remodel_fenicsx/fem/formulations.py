@@ -58,6 +58,15 @@ class Formulation:
         Whether it needs a matrix energy whose volumetric part is told apart (`model.energy.Matrix`).
     locks
         Whether differences of J inside an element cost energy: elements lock where the bulk is stiff.
+
+    Examples
+    --------
+    >>> from remodel_fenicsx.extend import FORMULATIONS
+    >>> whole, selective = FORMULATIONS["displacement"], FORMULATIONS["selective-integration"]
+    >>> whole.locks, selective.locks
+    (True, False)
+    >>> selective.has("hexahedron", 1)
+    True
     """
 
     meaning: str
@@ -87,10 +96,21 @@ class AtAllPoints(Formulation):
 class Selective(Formulation):
     """The volumetric part by a rule of fewer points; in between, its J is the polynomial through them.
 
-    Attributes
+    Parameters
     ----------
+    meaning
+        What it does, for docs/scene.md.
     degrees
         Degree of that rule by element and degree; what is not in it would lock all the same.
+    takes_parts, locks
+        As in `Formulation`.
+
+    Examples
+    --------
+    >>> from remodel_fenicsx.extend import Selective
+    >>> selective = Selective("volume at one point", {("hexahedron", 1): 1})
+    >>> selective.has("hexahedron", 1), selective.has("tetrahedron", 1)
+    (True, False)
     """
 
     meaning: str
@@ -149,10 +169,10 @@ class _PartsApart(Dilatation):
 FORMULATIONS: dict[str, Formulation] = {
     # docs/appendix_elements.md has the measurements behind these numbers
     "displacement": AtAllPoints(
-        "at all quadrature points, right where the bulk is soft or elements are small; a run whose elements lock warns"
+        "at all quadrature points; right where the bulk is soft or elements are small. A run whose elements lock warns"
     ),
     "selective-integration": Selective(
-        "the volumetric part of the matrix at fewer points, in linear hexahedra at the centroid; hexahedra do not lock "
+        "the volumetric part of the matrix at fewer points, in linear hexahedra at the centroid. Hexahedra do not lock "
         "with it",
         {(kind, degree): degree for kind in ("hexahedron", "quadrilateral", "interval") for degree in (1, 2)},
     ),

@@ -140,12 +140,30 @@ def form(ufl_form: Any, name: str | None = None) -> Any:
     name
         What is being compiled, for people: "the mass matrix". Default: by the number of its arguments.
 
+    Returns
+    -------
+    dolfinx.fem.Form
+        Compiled, for dolfinx to assemble.
+
     Raises
     ------
     Interrupted
         If a `StopRequest` is waiting for signals and one came while it was compiled.
     RuntimeError
         If the kernel does not compile.
+
+    Examples
+    --------
+    The volume of a body:
+
+    >>> import dolfinx
+    >>> from remodel_fenicsx import Simulation, preset_scene
+    >>> from remodel_fenicsx.extend import form
+    >>> import ufl
+    >>> simulation = Simulation(preset_scene("kuhl-holzapfel-2007", "cube"))
+    >>> F = simulation.state.kinematics.deformation_gradient(simulation.unknown)
+    >>> round(dolfinx.fem.assemble_scalar(form(ufl.det(F) * simulation.quadrature.dx, "the volume")), 12)
+    1.0
     """
     kind, seconds = _KINDS[len(ufl_form.arguments())]
     with _compiler_watched(ufl_form.ufl_domains()[0].ufl_cargo().comm, name or kind, seconds):

@@ -41,6 +41,12 @@ class Kinematics(ABC):
         Of which sector a tube is made (`model.closing.Closing`), where it has residual stress.
     cost
         Of a step for each quadrature point, in that of one of a hexahedron, as measured on the artery.
+
+    Examples
+    --------
+    >>> from remodel_fenicsx.extend import KINEMATICS
+    >>> {name: kinematics.reduced for name, kinematics in KINEMATICS.items()}
+    {'full': False, 'sector': True, 'axisymmetric': True, 'radial': True, 'point': True}
     """
 
     name: ClassVar[str]
@@ -108,7 +114,19 @@ class Kinematics(ABC):
 
 
 class FullKinematics(Kinematics):
-    """The displacement field in three dimensions: F = I + grad u."""
+    """The displacement field in three dimensions: F = I + grad u.
+
+    Examples
+    --------
+    >>> from remodel_fenicsx import parts
+    >>> domain = parts.Cube(side=1.0).build(parts.Mesh())
+    >>> kinematics = parts.FullKinematics()
+    >>> displacement = kinematics.unknown(domain.mesh, degree=1)
+    >>> kinematics.deformation_gradient(displacement).ufl_shape
+    (3, 3)
+    >>> kinematics.nodal_displacement(displacement).shape  # (nodes, 3)
+    (8, 3)
+    """
 
     name = "full"
     meaning = "the displacement in three dimensions"
@@ -145,7 +163,7 @@ class SectorKinematics(FullKinematics):
     """The full displacement of a quarter of a tube between its planes of symmetry x = 0 and y = 0."""
 
     name = "sector"
-    meaning = "the same on a quarter of a tube, with planes of symmetry"
+    meaning = "the displacement in three dimensions on a quarter of a tube, between planes of symmetry"
     reduced = True
     moves_rigidly = False
     symmetry_planes: ClassVar[Mapping[str, int]] = {"plane_x": 0, "plane_y": 1}
@@ -188,7 +206,7 @@ class AxisymmetricKinematics(_Reduced):
     """
 
     name = "axisymmetric"
-    meaning = "a tube that stays one of revolution: u_r and u_z over radius and length"
+    meaning = "u_r and u_z over radius and length of a tube that stays a body of revolution"
     element_kind = "quadrilateral"
     components = (0, None, 1)
     cost = 0.3
@@ -227,7 +245,7 @@ class RadialKinematics(_Reduced):
     """
 
     name = "radial"
-    meaning = "a tube whose sections stay round, plane and alike: u_r over the radius"
+    meaning = "u_r over the radius of a tube whose sections stay round, plane and alike"
     element_kind = "interval"
     components = (None, None, None)
     turns_nothing = True
@@ -277,7 +295,7 @@ class PointKinematics(_Reduced):
     """
 
     name = "point"
-    meaning = "a cube or tendon with the same strain everywhere: three numbers"
+    meaning = "three numbers, for a cube or tendon with the same strain everywhere"
     element_kind = "interval"
     components = (None, None, None)
     homogeneous = True

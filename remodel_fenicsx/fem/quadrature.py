@@ -56,6 +56,19 @@ class Quadrature:
     largest_areas, smallest_areas
         Volume over the least and over the largest extent, (elements,): a stress times these is about the largest and
         the smallest force that it means for a node of the element.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from remodel_fenicsx import parts
+    >>> domain = parts.Cube(side=2.0).build(parts.Mesh())
+    >>> quadrature = parts.Quadrature(domain.mesh, element_degree=1)
+    >>> quadrature.shape  # (elements, points)
+    (1, 8)
+    >>> round(quadrature.volume, 12), round(quadrature.mean(quadrature.coordinates[..., 2]), 12)
+    (8.0, 1.0)
+    >>> round(quadrature.integral(np.full(quadrature.shape, 0.5)), 12)
+    4.0
     """
 
     def __init__(self, mesh: Any, element_degree: int, weight: Any = 1):
@@ -118,7 +131,7 @@ class Quadrature:
         return expression.eval(self.mesh, self.elements).reshape(*self.shape, *value_shape)
 
     def owned(self, values: NDArray[Any]) -> NDArray[Any]:
-        """The rows of the elements that this rank owns."""
+        """The rows of the elements that this rank owns, (owned elements, ...)."""
         return values[: self.number_of_owned_elements]
 
     def integral(self, values: NDArray[np.float64]) -> float:

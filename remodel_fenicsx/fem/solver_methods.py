@@ -28,6 +28,18 @@ class SolverMethod:
         scenes are read without PETSc, which it needs.
     on_several_ranks
         Options that replace those of the same name there.
+
+    Examples
+    --------
+    GMRES in place of a factorisation:
+
+    >>> from remodel_fenicsx.extend import SOLVER_METHODS, SolverMethod
+    >>> options = {"snes_type": "newtonls", "ksp_type": "gmres", "pc_type": "jacobi", "ksp_rtol": 1e-12}
+    >>> SOLVER_METHODS["krylov"] = SolverMethod(options, "for small bodies")
+    >>> from remodel_fenicsx import preset_scene
+    >>> preset_scene("kuhl-holzapfel-2007", "cube").with_values({"solver.method": "krylov"}).solver.method
+    'krylov'
+    >>> del SOLVER_METHODS["krylov"]
     """
 
     options: Mapping[str, Any]
@@ -54,7 +66,7 @@ SOLVER_METHODS = {
             "pc_factor_mat_solver_type": "mumps",
             "mat_mumps_icntl_33": 1,  # the determinant, whose sign tells of unstable equilibria; costs nothing
         },
-        "Newton's method, each system factorised by MUMPS; runs on so many ranks are the same to the last digit",
+        "Newton's method; MUMPS factorises each system. Runs on the same number of ranks are equal to the last digit",
         on_several_ranks={
             "pc_type": "telescope",
             "telescope_ksp_type": "preonly",
@@ -64,7 +76,7 @@ SOLVER_METHODS = {
     ),
     LAGGED: SolverMethod(
         NEWTON | {"ksp_type": "preonly"},
-        "few tangents are factorised, and quasi-Newton steps (L-BFGS) make up for it",
+        "few tangents are factorised, and quasi-Newton steps (L-BFGS) correct for it",
         linear="remodel_fenicsx.solver.linear.Lagged",
     ),
     # GMRES, because tangents of random cells are not always definite; levels cost as much as 20 of its iterations, and
@@ -84,7 +96,7 @@ SOLVER_METHODS = {
             "mg_levels_ksp_type": "chebyshev",
             "mg_levels_pc_type": "sor",
         },
-        "Newton's method with GMRES and algebraic multigrid (GAMG), whose levels are kept for some iterations",
+        "Newton's method with GMRES and algebraic multigrid (GAMG); levels are kept for some iterations",
         linear="remodel_fenicsx.solver.linear.Multigrid",
     ),
 }

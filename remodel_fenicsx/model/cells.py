@@ -24,6 +24,17 @@ class UnitCell(NamedTuple):
     weight
         Share of this cell in r^2 and in W_rep. One for a whole cell; a blend of an old and a new cell (weights that add
         up to one) is how a remodeling increment is applied in parts.
+
+    Examples
+    --------
+    Two cells along the axes, the second one stretched to twice its length along x:
+
+    >>> import numpy as np
+    >>> from remodel_fenicsx.extend import UnitCell, squared_end_to_end_length
+    >>> cells = UnitCell(np.full((2, 3), 3**-0.5), np.broadcast_to(np.eye(3), (2, 3, 3)))
+    >>> F = np.stack([np.eye(3), np.diag([2.0, 1.0, 1.0])])
+    >>> squared_end_to_end_length(F, [cells]).round(4)  # r^2
+    array([1., 2.])
     """
 
     dimensions: Any
@@ -65,10 +76,33 @@ def radial_direction(coordinates: Array) -> Array:
 
 
 def angle_to_axis(dimensions: Array, axes: Array, direction: Array) -> Array:
-    """Angle in degrees between the chain direction and a unit vector, from the structure tensor: (..., ) in [0, 90].
+    """Angle in degrees between the chain direction and a unit vector, from the structure tensor.
 
     cos^2 = d . A d / tr A, which is the angle of sum_I l_I n_I when d is one of the axes (docs/theory.md). The part
     across d is summed by itself, so that small angles keep their digits.
+
+    Parameters
+    ----------
+    dimensions
+        l_I, (..., 3), in any one unit of length.
+    axes
+        n_I as rows, (..., 3, 3).
+    direction
+        A unit vector, (3,) or (..., 3).
+
+    Returns
+    -------
+    array
+        Degrees, (...,), from 0 to 90.
+
+    Examples
+    --------
+    Chains of an isotropic cell:
+
+    >>> import numpy as np
+    >>> from remodel_fenicsx.extend import angle_to_axis
+    >>> angle_to_axis(np.ones((1, 3)), np.eye(3)[None], np.array([0.0, 0.0, 1.0])).round(4)
+    array([54.7356])
     """
     along = np.einsum("...ij,...j->...i", axes, np.broadcast_to(direction, dimensions.shape))
     parallel = along[..., None] * np.broadcast_to(direction, dimensions.shape)[..., None, :]

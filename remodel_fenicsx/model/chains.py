@@ -42,7 +42,9 @@ def wormlike_stiffness(end_to_end_length: Any, contour_length: Any) -> Any:
 
 @dataclass(frozen=True)
 class Chain:
-    """A chain law.
+    """A law of a single chain: its energy and force (paper, eq. 2).
+
+    Both functions take numbers, arrays or UFL; lengths are in link lengths.
 
     Attributes
     ----------
@@ -52,6 +54,19 @@ class Chain:
         Its secant stiffness g(r, L): d(energy)/dr = g r.
     locks
         Whether a chain cannot become longer than L. Where it can, nothing is held below L, and r0 may be above it.
+
+    Examples
+    --------
+    The wormlike chain of the paper, and a spring that never locks:
+
+    >>> from remodel_fenicsx.extend import CHAINS, Chain
+    >>> wormlike = CHAINS["wormlike"]
+    >>> round(wormlike.force(1.0, contour_length=2.125, persistence_length=1.82), 4)
+    0.6113
+    >>> CHAINS["spring"] = Chain(lambda r, L: 0.35 * r**2, lambda r, L: 0.7, locks=False)
+    >>> round(CHAINS["spring"].force(1.0, contour_length=2.125, persistence_length=1.82), 4)
+    0.3846
+    >>> del CHAINS["spring"]
     """
 
     energy: Callable[[Any, Any], Any]

@@ -28,6 +28,18 @@ class Driver:
     is_stress
         Whether it is a stress, zero up to the rounding of stresses and to the residual that was accepted; else it is a
         number near one, zero up to its own rounding.
+
+    Examples
+    --------
+    The Kirchhoff stress, which turns the cells as Cauchy's does:
+
+    >>> import ufl
+    >>> from remodel_fenicsx.extend import DRIVERS, Driver
+    >>> DRIVERS["kirchhoff"] = Driver(lambda F, stresses: ufl.det(F) * stresses.cauchy, material=False)
+    >>> from remodel_fenicsx import preset_scene
+    >>> preset_scene("kuhl-holzapfel-2007", "cube").with_values({"remodeling.driver": "kirchhoff"}).remodeling.driver
+    'kirchhoff'
+    >>> del DRIVERS["kirchhoff"]
     """
 
     tensor: Callable[[Any, Stresses], Any]
@@ -50,7 +62,7 @@ DRIVERS: dict[str, Driver] = {
 
 
 def rotated_back(F: Array, spatial_tensor: Array) -> Array:
-    """R^T t R with the rotation R of F = R U: objective. For t = sigma it is U S U / J, for t = b it is C."""
+    """R^T t R (n, 3, 3) with the rotation R of F = R U: objective. For t = sigma it is U S U / J, for t = b it is C."""
     squared, basis = eigen(np.swapaxes(F, 1, 2) @ F)
     R = F @ (basis / np.sqrt(squared)[:, None, :]) @ np.swapaxes(basis, 1, 2)  # F U^-1
     back: Array = np.swapaxes(R, 1, 2) @ spatial_tensor @ R
@@ -69,6 +81,22 @@ class Frame:
         Whether the cells' axes move with the material, so that F n_I are the previous axes in space.
     tensor
         A spatial tensor as one in material space, from (F (n, 3, 3), tensor (n, 3, 3)): for laws that need no axes.
+
+    Examples
+    --------
+    A frame that turns spatial axes back with the rotation R of F = R U:
+
+    >>> import numpy as np
+    >>> from remodel_fenicsx.extend import FRAMES, Frame
+    >>> def rotated_back(F, spatial_axes):
+    ...     left, _, right = np.linalg.svd(F)
+    ...     return spatial_axes @ (left @ right)
+    >>> FRAMES["rotated"] = Frame(rotated_back, carries_axes=False)
+    >>> FRAMES["rotated"].axes(np.diag([2.0, 1.0, 1.0])[None], np.eye(3)[None])[0]
+    array([[1., 0., 0.],
+           [0., 1., 0.],
+           [0., 0., 1.]])
+    >>> del FRAMES["rotated"]
     """
 
     axes: Callable[[Array, Array], Array]

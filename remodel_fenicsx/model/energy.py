@@ -41,6 +41,17 @@ class Matrix:
     derivatives
         S and dS/dC of the whole energy at points, from (eigenvalues of C (n, 3), lambda, mu, whether dS/dC is asked
         for), in the eigenbasis of C: tensors (n, 3, 3) and Mandel matrices (n, 6, 6). The coupling "implicit" needs it.
+
+    Examples
+    --------
+    A matrix that resists changes of volume by (J - 1)^2:
+
+    >>> import numpy as np
+    >>> from remodel_fenicsx.extend import MATRICES, Matrix, neo_hookean
+    >>> MATRICES["quadratic"] = Matrix(lambda J, lame_lambda, mu: lame_lambda / 2 * (J - 1) ** 2, *neo_hookean.others)
+    >>> float(MATRICES["quadratic"](np.eye(3), 27.293, 3.103))
+    0.0
+    >>> del MATRICES["quadratic"]
     """
 
     def __init__(self, volumetric: Term, *others: Term, derivatives: Callable[..., tuple[Any, Any]] | None = None):
@@ -98,7 +109,28 @@ that formulations other than "displacement" can take are a `Matrix`."""
 
 
 def squared_end_to_end_length(deformation_gradient: Any, cells: Sequence[UnitCell]) -> Any:
-    """r^2 = sum_I l_I^2 n_I . C n_I (eq. 5)."""
+    """r^2 = sum_I l_I^2 n_I . C n_I, the squared end-to-end length of the chains (paper, eq. 5).
+
+    Parameters
+    ----------
+    deformation_gradient
+        F, UFL of shape (3, 3) or array (..., 3, 3).
+    cells
+        One whole cell, or shares of it.
+
+    Returns
+    -------
+    UFL or array (...,)
+        In squared link lengths.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from remodel_fenicsx.extend import UnitCell, squared_end_to_end_length
+    >>> cell = UnitCell(np.array([0.6, 0.0, 0.8]), np.eye(3))
+    >>> round(float(squared_end_to_end_length(np.diag([1.0, 1.0, 2.0]), [cell])), 4)
+    2.92
+    """
     return sum(
         cell.weight * component(cell.dimensions, i) ** 2 * stretch
         for cell in cells
@@ -107,7 +139,32 @@ def squared_end_to_end_length(deformation_gradient: Any, cells: Sequence[UnitCel
 
 
 def axes_sum(deformation_gradient: Any, cells: Sequence[UnitCell], end_to_end_length: Any) -> Any:
-    """M = sum_I l_I^2 ln(n_I . C n_I); UFL or arrays."""
+    """M = sum_I l_I^2 ln(n_I . C n_I), of which the paper's repulsive energy is made (eq. 4c).
+
+    Parameters
+    ----------
+    deformation_gradient
+        F, UFL of shape (3, 3) or array (..., 3, 3).
+    cells
+        One whole cell, or shares of it.
+    end_to_end_length
+        r0, in link lengths; this form does not need it.
+
+    Returns
+    -------
+    UFL or array (...,)
+        In squared link lengths; zero at F = I.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from remodel_fenicsx.extend import UnitCell, axes_sum
+    >>> cell = UnitCell(np.full(3, 3**-0.5), np.eye(3))
+    >>> float(axes_sum(np.eye(3), [cell], 1.0))
+    0.0
+    >>> round(float(axes_sum(np.diag([1.0, 1.0, 2.0]), [cell], 1.0)), 4)
+    0.4621
+    """
     return sum(
         cell.weight * component(cell.dimensions, i) ** 2 * ln(stretch)
         for cell in cells
@@ -154,8 +211,19 @@ class Repulsion:
     sum
         M from (F, cells, r0): arrays, and UFL too where there are no `derivatives`.
     derivatives
-        Where M is no closed expression for UFL: dM/dC and, on request, d^2M/dC^2 as Mandel matrices from (C, A,
-        second), arrays.
+        Where M is no closed expression for UFL: dM/dC (n, 3, 3) and, on request, d^2M/dC^2 as Mandel matrices (n, 6, 6)
+        from (C, A, second), arrays.
+
+    Examples
+    --------
+    M = r^2 is another one that leaves unloaded tissue free of stress:
+
+    >>> from remodel_fenicsx.extend import REPULSIONS, Repulsion, squared_end_to_end_length
+    >>> REPULSIONS["squared"] = Repulsion(lambda F, cells, r0: squared_end_to_end_length(F, cells))
+    >>> from remodel_fenicsx import preset_scene
+    >>> preset_scene("kuhl-holzapfel-2007", "cube").with_values({"material.repulsion": "squared"}).material.repulsion
+    'squared'
+    >>> del REPULSIONS["squared"]
     """
 
     sum: Callable[[Any, Sequence[UnitCell], Any], Any]
@@ -173,7 +241,26 @@ REPULSIONS: dict[str, Repulsion] = {
 
 
 class Stresses(NamedTuple):
-    """Stress tensors of one state, UFL, shape (3, 3)."""
+    """Stress tensors of one state (paper, eqs. 6 and 7), in the unit of the Lame constants.
+
+    Attributes
+    ----------
+    first_piola_kirchhoff
+        P = dW/dF, UFL, (3, 3).
+    second_piola_kirchhoff
+        S = F^-1 P, UFL, (3, 3).
+    cauchy
+        sigma = P F^T / J, UFL, (3, 3).
+
+    Examples
+    --------
+    They are what a driver is made of:
+
+    >>> from remodel_fenicsx.extend import DRIVERS, Stresses
+    >>> stresses = Stresses(first_piola_kirchhoff="P", second_piola_kirchhoff="S", cauchy="sigma")
+    >>> DRIVERS["cauchy"].tensor("F", stresses), DRIVERS["pk2"].tensor("F", stresses)
+    ('sigma', 'S')
+    """
 
     first_piola_kirchhoff: Any
     second_piola_kirchhoff: Any
@@ -218,6 +305,21 @@ class Tissue:
     content, natural_length
         m, density of the chains, and rho, their natural length, each over those at the start (`model.turnover`):
         W_net = m c (w(r/rho) - g(r0) M / 2). None where they stay 1.
+
+    Examples
+    --------
+    The same functions take arrays and UFL:
+
+    >>> import numpy as np
+    >>> from remodel_fenicsx import parts
+    >>> from remodel_fenicsx.extend import UnitCell
+    >>> tissue = parts.Tissue(lame_lambda=27.293, lame_mu=3.103, network_modulus=2.0, contour_length=2.125,
+    ...                       end_to_end_length=1.0)
+    >>> cell = UnitCell(np.full(3, 3**-0.5), np.eye(3))
+    >>> still, pulled = np.eye(3), np.diag([0.9, 0.9, 1.3])
+    >>> W0, W = (tissue.strain_energy(F, [cell]) for F in (still, pulled))
+    >>> round(float(W - W0), 4)  # in the unit of the Lame constants
+    0.4364
     """
 
     lame_lambda: Any

@@ -48,9 +48,23 @@ class Drive(NamedTuple):
     kernels
         Whose `principal` and `positive_direction` are called: those of `spectral`, or of C (`kernels.points`).
     rounding
-        The part of the threshold that is the rounding of a stress.
+        The part of the threshold that is the rounding of a stress, in its unit; (n,) or a number.
     exponent, least_tension
         Of `tensor_law.target` and `tensor_law.awake`.
+
+    Examples
+    --------
+    One cell under tension along z makes one step of the paper's law:
+
+    >>> import numpy as np
+    >>> from remodel_fenicsx.extend import DRIVERS, FRAMES, LAWS, Drive, UnitCell
+    >>> cells = UnitCell(np.full((1, 3), 3**-0.5), np.eye(3)[None])
+    >>> stress = np.diag([0.0, 0.0, 2.0])[None]
+    >>> drive = Drive(np.eye(3)[None], stress, DRIVERS["cauchy"], FRAMES["spatial"], threshold=1e-9,
+    ...               initial_dimensions=cells.dimensions, end_to_end_length=1.0, kappa=0.1)
+    >>> after = LAWS["explicit"].update(cells, drive, 0.0, 1.0)
+    >>> after.dimensions.round(4)  # by rank of the principal values, in link lengths
+    array([[0.6176, 0.5224, 0.5224]])
     """
 
     deformation_gradient: Array
@@ -75,7 +89,7 @@ class Drive(NamedTuple):
 
     @property
     def floor(self) -> Array | float:
-        """Of `tensor_law.target`."""
+        """Tension below which a principal value counts as none, (n,) or a number, in the unit of the tensor."""
         floor: Array | float = tensor_law.floor_above(self.threshold, self.rounding)
         return floor
 
@@ -124,6 +138,24 @@ class Law:
         Whether kappa = 0 means that cells never change, so that there is no pass at all.
     share
         Cells that have made a share of a change, from (old, new, factor); `relaxed` where the law has none of its own.
+
+    Examples
+    --------
+    Collagen that is lost, whatever acts on it (`ranked` makes laws of the paper's kind):
+
+    >>> import numpy as np
+    >>> from remodel_fenicsx import Simulation, preset_scene
+    >>> from remodel_fenicsx.extend import LAWS, Law, UnitCell
+    >>> def lost(cells, drive, time_old, time_new):
+    ...     return UnitCell(cells.dimensions * np.exp(-drive.kappas * (time_new - time_old)), cells.axes)
+    >>> LAWS["lost"] = Law(lost)
+    >>> scene = preset_scene("kuhl-holzapfel-2007", "cube").with_values({"remodeling.law": "lost", "time.end": 2.0})
+    >>> simulation = Simulation(scene)
+    >>> for step in simulation.steps():
+    ...     pass
+    >>> (simulation.cells.dimension_values / simulation.cells.initial_dimensions)[0, 0].round(4)
+    array([0.9512, 0.9512, 0.9512])
+    >>> del LAWS["lost"]
     """
 
     update: Callable[[UnitCell, Drive, float, float], UnitCell]
@@ -139,7 +171,7 @@ class Law:
 
 
 def ranked(function: RankedFunction, has_limit: bool = False, of_absolute_time: bool = False) -> Law:
-    """A law of the paper's kind: axes at the drive's principal directions, dimensions by rank from `function`.
+    """A law of the paper's kind (eqs. 8 to 11): axes at the drive's principal directions, dimensions by rank.
 
     Parameters
     ----------
@@ -149,6 +181,25 @@ def ranked(function: RankedFunction, has_limit: bool = False, of_absolute_time: 
         kappa a number, or (n, 1) where regions differ. Points without a positive value, or kappa, keep their cells.
     has_limit, of_absolute_time
         As in `Law`.
+
+    Returns
+    -------
+    Law
+        For `LAWS`.
+
+    Examples
+    --------
+    Relaxation by Euler's explicit method:
+
+    >>> from remodel_fenicsx import Simulation, preset_scene
+    >>> from remodel_fenicsx.extend import LAWS, ranked
+    >>> def euler(l, l0, target, kappa, time_old, time_new):
+    ...     return l + kappa * (time_new - time_old) * (target - l)
+    >>> LAWS["euler"] = ranked(euler, has_limit=True)
+    >>> scene = preset_scene("kuhl-holzapfel-2007", "cube").with_values({"remodeling.law": "euler", "time.end": 3.0})
+    >>> [round(step.row["mean_fibre_angle"], 3) for step in Simulation(scene).steps()]
+    [54.736, 53.554, 52.378]
+    >>> del LAWS["euler"]
     """
 
     def update(cells: UnitCell, drive: Drive, time_old: float, time_new: float) -> UnitCell:

@@ -89,6 +89,6 @@ class Mean:
 MEANS_OF_CASES: dict[str, Mean] = {
     "tensor": Mean("the weighted mean of the driving tensors"),
     "target": Mean("the weighted mean of the targets that each case has, for the law 'tensor'", of_targets=True),
-    "largest": Mean("at each point the case with the largest tension, whatever its weight", largest_tension),
+    "largest": Mean("at each point the load case with the largest tension, whatever its weight", largest_tension),
 }
 """By the name that `remodeling.mean` has."""

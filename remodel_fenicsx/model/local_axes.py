@@ -42,6 +42,24 @@ class LocalAxes:
         Of the wall at the points, (...,); None where the shape's keys say it.
     undefined
         Where the axes are those of the nearest point that has some, (...,); None where all have their own.
+
+    Examples
+    --------
+    Those of a tube at one place, half through its wall:
+
+    >>> import numpy as np
+    >>> from remodel_fenicsx import parts
+    >>> from remodel_fenicsx.extend import LocalAxes
+    >>> tube = parts.Tube(inner_radius=1.0, outer_radius=3.0, length=8.0)
+    >>> places = np.array([[2.0, 0.0, 4.0]])
+    >>> local = LocalAxes(places, axes=lambda: tube.axes_at(places), depth=lambda: tube.depth(places),
+    ...                   station=lambda: tube.station(places), nodal_depth=lambda: None)
+    >>> local.axes[0]  # circumferential, axial, radial
+    array([[-0.,  1.,  0.],
+           [ 0.,  0.,  1.],
+           [ 1.,  0.,  0.]])
+    >>> local.depth, local.station
+    (array([0.5]), array([0.5]))
     """
 
     def __init__(

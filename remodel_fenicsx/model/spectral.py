@@ -65,6 +65,18 @@ def principal(
     ------
     FloatingPointError
         If a tensor or a previous axis holds NaN or infinity; names the first one.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from remodel_fenicsx.extend import principal
+    >>> values, axes = principal(np.diag([1.0, 3.0, 2.0])[None], np.eye(3)[None])
+    >>> values
+    array([[3., 2., 1.]])
+    >>> axes[0]
+    array([[0., 1., 0.],
+           [0., 0., 1.],
+           [1., 0., 0.]])
     """
     values, axes, reference = _decomposed(tensors, previous)
     return values, _settled(axes, reference, *_agreeing(values, tolerance, threshold))

@@ -38,6 +38,19 @@ class Observer(Watcher):
         What is measured, with its further load cases; nothing here changes it.
     columns
         Other columns than `columns_of(shape)` of the loads that there are.
+
+    Examples
+    --------
+    A simulation has one; its rows are the history:
+
+    >>> from remodel_fenicsx import Simulation, preset_scene
+    >>> simulation = Simulation(preset_scene("kuhl-holzapfel-2007", "cube"))
+    >>> [column.name for column in simulation.observer.columns][:4]
+    ['time', 'force', 'mean_stretch', 'min_stretch']
+    >>> for _, step in zip(range(2), simulation.steps()):
+    ...     print(step.row["force"], round(step.row["max_stretch"], 4))
+    1.0 1.0808
+    2.0 1.1717
     """
 
     def __init__(self, shape: Shape, stepper: Any, columns: Sequence[Column] | None = None):
@@ -79,6 +92,13 @@ class Observer(Watcher):
 class Measurement:
     """What columns may ask of a step; everything is computed once, when the first one asks.
 
+    Parameters
+    ----------
+    observer
+        Whose measurement it is.
+    step
+        The step.
+
     Attributes
     ----------
     step
@@ -87,6 +107,20 @@ class Measurement:
         Whose measurement it is.
     domain, quadrature, state
         The body, its quadrature points and its state.
+
+    Examples
+    --------
+    A column's function gets one; here in a watcher:
+
+    >>> from remodel_fenicsx import Simulation, preset_scene
+    >>> from remodel_fenicsx.extend import Measurement
+    >>> simulation = Simulation(preset_scene("kuhl-holzapfel-2007", "cube"))
+    >>> for _, step in zip(range(1), simulation.steps()):
+    ...     measured = Measurement(simulation.observer, step)
+    >>> measured.displacement.shape, measured.fibre_angle.shape  # (nodes, 3), (elements, points)
+    ((8, 3), (1, 8))
+    >>> round(measured.face_mean("z1", measured.position[:, 2]), 4), round(measured.face_area("z1"), 4)
+    (1.0808, 1.0)
     """
 
     def __init__(self, observer: Observer, step: Step):

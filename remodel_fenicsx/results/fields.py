@@ -165,6 +165,19 @@ class Fields(Watcher):
         If they cannot be written.
     RecordingError
         On rank 0, if those to go on with are damaged.
+
+    Examples
+    --------
+    >>> from remodel_fenicsx import Recording, Simulation, parts, preset_scene
+    >>> scene = preset_scene("kuhl-holzapfel-2007", "cube").with_values({"time.end": 3.0})
+    >>> simulation = Simulation(scene)
+    >>> with parts.RunFolder("with-fields", scene.to_toml()) as record:
+    ...     fields = parts.Fields(record.folder, scene.geometry, simulation.stepper, names=("displacement",))
+    ...     for step in simulation.steps([record, fields]):
+    ...         pass
+    ...     fields.close()
+    >>> Recording("with-fields").times
+    array([0., 1., 2., 3.])
     """
 
     def __init__(

@@ -29,7 +29,16 @@ LARGEST_HISTORY = 10**9  # bytes: the million steps that a scene may have, of a 
 
 
 class RecordingError(ValueError):
-    """A folder is no recorded run, is damaged, or does not hold what was asked for; one line says which."""
+    """A folder is no recorded run, is damaged, or does not hold what was asked for; one line says which.
+
+    Examples
+    --------
+    >>> from remodel_fenicsx import Recording
+    >>> Recording("no-such-folder")
+    Traceback (most recent call last):
+        ...
+    remodel_fenicsx.results.recording.RecordingError: no-such-folder: there is no such folder
+    """
 
 
 class HistoryColumns(dict[str, Array]):
@@ -172,7 +181,7 @@ class RecordedRun:
             count = int(root["NumberOfCells"][0])
             numbers = np.asarray(root["Connectivity"][:], dtype=np.int64).reshape(count, -1)
             if not np.isin(numbers, np.arange(len(root["Points"]))).all():
-                raise ValueError("elements have nodes that are not there")
+                raise RecordingError("elements have nodes that are not there")
             return numbers
 
     def fields(self, time: float, names: Collection[str] | None = None) -> dict[str, Array]:

@@ -68,14 +68,35 @@ def choose_folder(requested: Path | None, name: str) -> Path:
 
 
 def chosen_folder(requested: Path | str | None, name: str, comm: MPI.Intracomm) -> Path:
-    """`choose_folder` on rank 0, its folder or its refusal on all ranks. Collective.
+    """The folder for a run's results: what is decided on rank 0 holds on all ranks. Collective.
+
+    Parameters
+    ----------
+    requested
+        A new or empty folder; None: results/NAME, with a number where that is taken.
+    name
+        Of the run.
+    comm
+        MPI communicator.
+
+    Returns
+    -------
+    Path
+        The folder; it is not made yet.
 
     Raises
     ------
     FolderTaken
-        As `choose_folder` does, on all ranks.
+        If the folder asked for is not empty; on all ranks.
     OSError
-        As `choose_folder` does, on rank 0.
+        If it cannot be looked at; on rank 0.
+
+    Examples
+    --------
+    >>> from mpi4py import MPI
+    >>> from remodel_fenicsx import parts
+    >>> str(parts.chosen_folder(None, "my-cube", MPI.COMM_WORLD))
+    'results/my-cube'
     """
     wanted = None if requested is None else Path(requested)
     chosen = agreed(comm, lambda: choose_folder(wanted, name) if comm.rank == 0 else None)
@@ -186,6 +207,17 @@ class RunFolder(Watcher):
         If the folder cannot be made or written.
     RecordingError
         If the history does not hold the steps that were done; nothing has changed then.
+
+    Examples
+    --------
+    >>> from remodel_fenicsx import Recording, Simulation, parts, preset_scene
+    >>> scene = preset_scene("kuhl-holzapfel-2007", "cube").with_values({"time.end": 2.0})
+    >>> simulation = Simulation(scene)
+    >>> with parts.RunFolder("rows-alone", scene.to_toml()) as record:
+    ...     for step in simulation.steps([record]):
+    ...         pass
+    >>> Recording("rows-alone").history["time"]
+    array([0., 1., 2.])
     """
 
     def __init__(

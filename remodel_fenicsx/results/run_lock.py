@@ -16,7 +16,20 @@ _WRITER = re.compile(r"process \d+ on [\w.-]+( \(\d+ ranks\))?")
 
 
 class FolderTaken(ValueError):
-    """The folder asked for holds something already, or a run writes in it."""
+    """The folder asked for holds something already, or a run writes in it.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from mpi4py import MPI
+    >>> from remodel_fenicsx import parts
+    >>> Path("taken").mkdir()
+    >>> written = Path("taken/notes.txt").write_text("mine")
+    >>> parts.chosen_folder("taken", "cube", MPI.COMM_WORLD)
+    Traceback (most recent call last):
+        ...
+    remodel_fenicsx.results.run_lock.FolderTaken: -o taken: is not empty; allowed is a new or an empty folder
+    """
 
 
 class RunLock:

@@ -6,7 +6,6 @@ alone can tell.
 
 from __future__ import annotations
 
-import inspect
 from typing import Any, get_args, get_origin
 
 from pydantic import BaseModel
@@ -15,7 +14,7 @@ from pydantic.fields import FieldInfo
 from remodel_fenicsx.body import SHAPES, Shape
 from remodel_fenicsx.scene.presets import PRESETS, PROFILES
 from remodel_fenicsx.scene.scene import FORMAT, Scene
-from remodel_fenicsx.schema.tables import choices, free_names, is_table, listed_tables
+from remodel_fenicsx.schema.tables import choices, free_names, is_table, listed_tables, meaning
 from remodel_fenicsx.schema.units import QUANTITY, STRESS, Dimension, dimension_of
 from remodel_fenicsx.settings import Load, Supports
 
@@ -41,10 +40,10 @@ def _table(table: type[BaseModel]) -> Schema:
     """Of a table with all its keys; none of them is required."""
     by_pydantic = table.model_json_schema()["properties"]
     properties = {name: _field(field, by_pydantic[name]) for name, field in table.model_fields.items()}
-    meaning = {"description": inspect.cleandoc(table.__doc__)} if table.__doc__ else {}
+    description = {"description": text} if (text := meaning(table)) else {}
     further = free_names(table)
     others = _table(further) if further is not None else False
-    return {"type": "object", **meaning, "properties": properties, "additionalProperties": others}
+    return {"type": "object", **description, "properties": properties, "additionalProperties": others}
 
 
 def _field(field: FieldInfo, by_pydantic: Schema) -> Schema:

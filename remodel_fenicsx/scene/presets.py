@@ -128,11 +128,11 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
 PRESET_NOTES = {
     "kuhl-holzapfel-2007": "The printed method on the three bodies of the paper: Fig. 5 (cube), Fig. 6 (tendon), "
     "Figs. 7 to 11 (tube). The frame is 'spatial', as printed in eq. (9).",
-    "consistent": "The paper's bodies and parameters with a law and an energy that see the structure tensor alone "
-    "(docs/theory.md, The consistent variant), second order in the time step.",
+    "consistent": "The paper's bodies and parameters with a law and an energy that depend on the structure tensor "
+    "alone (docs/theory.md, The consistent variant). It is of second order in the time step.",
     "sun-2002": "The printed method with collagen I as measured with optical tweezers (paper, Remark 2): contour "
     "length 309 nm, persistence length 14.5 nm, all chain lengths in nm. End-to-end length (that of a free chain) and "
-    "chain density (the same initial stiffness of the network) are choices of this project, not of the paper.",
+    "chain density (it gives the same initial stiffness of the network) are choices of this project, not of the paper.",
 }
 
 # ---------------------------------------------------------------- profiles
@@ -162,14 +162,19 @@ class Profile:
     takes_exact_coupling: bool = False
 
     def in_words(self, name: str) -> str:
-        """What it was measured to be."""
+        """What it sets, and its measured error and cost."""
+        return (
+            f"profile {name!r}: {self.settings_in_words()}. Measured on the artery of isotropic cells: error of the "
+            f"fibre angle {self.degrees:g} degrees, of the radii {self.percent:g} %, processor time {self.seconds:g} s "
+            "(docs/speed_and_accuracy.md)"
+        )
+
+    def settings_in_words(self) -> str:
+        """The keys that it sets."""
         settings = ", ".join(f"{key} = {value}" for key, value in self.values.items())
         if self.takes_exact_coupling:
             settings += f", remodeling.coupling = {EXACT} where that leaves no error in time"
-        return (
-            f"profile {name!r}: {settings}; measured on the artery of isotropic cells: {self.degrees:g} degrees, radii "
-            f"{self.percent:g} %, {self.seconds:g} s (docs/speed_and_accuracy.md)"
-        )
+        return settings
 
     def tables(self) -> dict[str, Any]:
         """Its values as tables of a scene."""

@@ -9,6 +9,7 @@ import difflib
 import inspect
 import math
 import re
+import textwrap
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args, get_origin
@@ -18,11 +19,27 @@ from pydantic.fields import FieldInfo
 from pydantic_core import CoreSchema, ErrorDetails, PydanticCustomError, PydanticUndefined, core_schema
 
 LONGEST_VALUE = 60  # characters of a value in an error
+PAGE_WIDTH = 98  # characters of a line of a page
 _MISSING = object()
 
 
 class SceneError(ValueError):
-    """Bad input. Its text is one line: the dotted key, the value, what is allowed."""
+    """Bad input. Its text is one line: the dotted key, the value, what is allowed.
+
+    Parameters
+    ----------
+    message
+        The line; what no terminal can show is replaced.
+
+    Examples
+    --------
+    >>> from remodel_fenicsx import SceneError, preset_scene
+    >>> try:
+    ...     preset_scene("kuhl-holzapfel-2007", "cube").with_values({"time.end": "soon"})
+    ... except SceneError as error:
+    ...     print(error)
+    time.end = 'soon': must be a finite number greater than 0, or 'equilibrium'
+    """
 
     def __init__(self, message: str):
         super().__init__(printable(message))
@@ -363,8 +380,31 @@ def sections(table: type[BaseModel], key: str = "", variant: str = "") -> Iterat
 # ---------------------------------------------------------------- documentation
 
 
+def meaning(table: type[BaseModel]) -> str:
+    """What a reader of scenes is told of a table: its docstring up to what scripts need."""
+    return re.split(r"\n\nIts keyword arguments |\n\n\w+\n---", inspect.cleandoc(table.__doc__ or ""))[0]
+
+
 def markdown_reference(table: type[BaseModel]) -> str:
-    """One Markdown section for each table in a table: its keys with default, what is allowed, and description."""
+    """The keys of a table and of the tables in it as Markdown, as docs/scene.md has them.
+
+    Parameters
+    ----------
+    table
+        The class of the table, `Scene` or one of a script's own.
+
+    Returns
+    -------
+    str
+        One section for each table: its keys with default, what is allowed, and description.
+
+    Examples
+    --------
+    >>> from remodel_fenicsx import Scene
+    >>> from remodel_fenicsx.extend import markdown_reference
+    >>> print(markdown_reference(Scene).splitlines()[0])
+    ## Top of the file
+    """
     return "\n".join(_section(key, variant, inner) for key, variant, inner in sections(table))
 
 
@@ -377,7 +417,13 @@ def _section(key: str, variant: str, table: type[BaseModel]) -> str:
         if field.description
     ]
     head = ["| key | default | allowed | meaning |", "|---|---|---|---|"]
-    return "\n".join([title, "", *inspect.cleandoc(table.__doc__ or "").splitlines(), "", *head, *rows, ""])
+    return "\n".join([title, "", *paragraphs(meaning(table)), "", *head, *rows, ""])
+
+
+def paragraphs(text: str) -> list[str]:
+    """The lines of a text, filled to the width of a Markdown page."""
+    filled = (textwrap.wrap(part, PAGE_WIDTH, break_on_hyphens=False) for part in text.split("\n\n"))
+    return "\n\n".join(map("\n".join, filled)).split("\n")
 
 
 def _cell(text: str) -> str:

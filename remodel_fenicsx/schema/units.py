@@ -58,6 +58,14 @@ class Dimension:
         A value with a unit.
     powers
         The unit of the number: powers of units, each the name of a unit or the key that chooses it.
+
+    Examples
+    --------
+    A force per volume, in the units of the scene:
+
+    >>> from remodel_fenicsx.extend import LENGTH_UNIT, STRESS_UNIT, Dimension
+    >>> Dimension("force per volume", "9.81 kN/m^3", ((STRESS_UNIT, 1), (LENGTH_UNIT, -1))).powers
+    (('material.stress_unit', 1), ('geometry.length_unit', -1))
     """
 
     name: str

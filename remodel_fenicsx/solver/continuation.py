@@ -59,12 +59,37 @@ class Work(Counted):
 class StepFailure(RuntimeError):
     """A step cannot be solved, or is not wanted; the state is that of the last accepted step.
 
+    Parameters
+    ----------
+    time
+        Of the step.
+    text
+        One line: where it stops, and why.
+    refusal
+        What kind of refusal it is, and what helps.
+
     Attributes
     ----------
     time
         Of the step.
     refusal
         Why, and what helps.
+
+    Examples
+    --------
+    A large force in few steps, with too few iterations of Newton's method:
+
+    >>> from remodel_fenicsx import Simulation, parts, preset_scene
+    >>> scene = preset_scene("kuhl-holzapfel-2007", "cube").with_values({
+    ...     "loads.force.value": 1e6, "solver.maximum_iterations": 2, "solver.maximum_halvings": 0})
+    >>> try:
+    ...     for step in Simulation(scene).steps():
+    ...         pass
+    ... except parts.StepFailure as failure:
+    ...     print(str(failure).split(":")[0])
+    ...     print(failure.refusal)
+    no equilibrium at time 1
+    try a smaller time.step, a slower ramp or lower loads
     """
 
     def __init__(self, time: float, text: str, refusal: Refusal):

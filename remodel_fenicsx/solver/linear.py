@@ -97,6 +97,25 @@ class EveryTangent:
         PETSc's solver with its options, and the tangent.
     options
         Those of the problem.
+
+    Examples
+    --------
+    A solver that counts its tangents (see `SolverMethod`):
+
+    >>> from remodel_fenicsx import Simulation, preset_scene
+    >>> from remodel_fenicsx.extend import SOLVER_METHODS, EveryTangent, SolverMethod
+    >>> class Counted(EveryTangent):
+    ...     tangents = 0
+    ...
+    ...     def renew(self):
+    ...         super().renew()
+    ...         Counted.tangents += 1
+    >>> SOLVER_METHODS["counted"] = SolverMethod(SOLVER_METHODS["direct"].options, "direct, counted", Counted)
+    >>> scene = preset_scene("kuhl-holzapfel-2007", "cube").with_values({"solver.method": "counted", "time.end": 2.0})
+    >>> iterations = [step.row["newton_iterations"] for step in Simulation(scene).steps()]
+    >>> Counted.tangents == sum(iterations)
+    True
+    >>> del SOLVER_METHODS["counted"]
     """
 
     given_up = False  # whether this way leads to nothing

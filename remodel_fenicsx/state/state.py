@@ -63,6 +63,20 @@ class State:
         Functions that a checkpoint may lack, each with the name of the number that is 0 then: how many are known.
     others
         States of further load cases, with the same cells: snapshots and checkpoints hold them too.
+
+    Examples
+    --------
+    >>> from remodel_fenicsx import Simulation, preset_scene
+    >>> simulation = Simulation(preset_scene("kuhl-holzapfel-2007", "cube"))
+    >>> state = simulation.state
+    >>> start = state.snapshot()
+    >>> for _, step in zip(range(3), simulation.steps()):
+    ...     pass
+    >>> state.time, state.number, state.deformation_gradient().shape  # F at all points in one row
+    (3.0, 3, (8, 3, 3))
+    >>> state.restore(start)
+    >>> state.time, float(abs(simulation.unknown.x.array).max())
+    (0.0, 0.0)
     """
 
     def __init__(
@@ -128,7 +142,7 @@ class State:
         return found
 
     def elastic_gradient(self) -> NDArray[np.float64]:
-        """F_e of the present unknowns at all points in one row, as `deformation_gradient`."""
+        """F_e of the present unknowns at all points in one row, (elements * points, 3, 3)."""
         F = self.deformation_gradient()
         return self.elastic(F.reshape(*self.cells.quadrature.shape, 3, 3)).reshape(-1, 3, 3)
 

@@ -92,6 +92,18 @@ class UnitCells(CellField):
         As given.
     initial_dimensions
         l0_I by rank (not by direction), shape (cells, points, 3), in link lengths.
+
+    Examples
+    --------
+    >>> from remodel_fenicsx import Simulation, preset_scene
+    >>> simulation = Simulation(preset_scene("kuhl-holzapfel-2007", "cube"))
+    >>> cells = simulation.cells
+    >>> cells.dimension_values.shape, cells.axis_values.shape  # (elements, points, 3) and (elements, points, 3, 3)
+    ((1, 8, 3), (1, 8, 3, 3))
+    >>> cells.structure_tensor()[0, 0].round(4)
+    array([[0.3333, 0.    , 0.    ],
+           [0.    , 0.3333, 0.    ],
+           [0.    , 0.    , 0.3333]])
     """
 
     def __init__(

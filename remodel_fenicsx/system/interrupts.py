@@ -125,6 +125,15 @@ def end_all_ranks_on_exception() -> None:
     The others would wait for it for ever. (``python3 -m mpi4py`` is not enough once PETSc is there: its own end is
     collective and comes first.) On one rank nothing changes but that signals are taken back from PETSc, which would
     end a rank in its own way (`take_back_signals`).
+
+    Notes
+    -----
+    Call it once, after MPI and PETSc have been imported.
+
+    Examples
+    --------
+    >>> from remodel_fenicsx import parts
+    >>> parts.end_all_ranks_on_exception()
     """
     from mpi4py import MPI
 

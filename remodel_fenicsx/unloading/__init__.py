@@ -43,12 +43,29 @@ def unloaded(scene: Scene, comm: MPI.Intracomm = MPI.COMM_WORLD, folder: Path | 
     folder
         Where the mesh of an own body is written, on rank 0.
 
+    Returns
+    -------
+    Scene
+        With the geometry of the unloaded body in place of the loaded one.
+
     Raises
     ------
     SceneError
         If the body has no numbers or nodes to be found, or an own body no folder.
     NoUnloadedShape
         If none is found.
+
+    Examples
+    --------
+    A tube that is measured under its pressure:
+
+    >>> from remodel_fenicsx import preset_scene, unloaded
+    >>> tube = preset_scene("kuhl-holzapfel-2007", "tube")
+    >>> seen = tube.with_values({"geometry.is": "loaded", "model.kinematics": "radial", "cells.axes": "cylindrical",
+    ...                          "cells.initial": "isotropic", "loads.pressure.value": 0.5})
+    >>> found = unloaded(seen).geometry
+    >>> round(found.inner_radius, 3), round(found.outer_radius, 3)  # 1 and 3 are under pressure and elongation
+    (0.968, 3.101)
     """
     if not scene.geometry.is_loaded:
         return scene

@@ -1,11 +1,14 @@
-"""Tutorials and how-to pages: each command and each file of a page, in its order, with short times.
+"""Start, tutorials and how-to pages: each command and each file of a page, in its order, with short times.
 
-What is said to be left out: pictures (a window of their own, tested elsewhere). Blocks of `text` are no commands.
+What a page says that a command prints is compared, all but the numbers. docs/make_tutorials.py runs the same pages in
+full and brings numbers and pictures up to date. NOT_RUN lists the commands that are shown and not run, and why.
+docs/fit.md is run by tests/studies/test_fit.py, docs/my_own_vessel.md by tests/body/test_my_own_vessel.py.
 """
 
 from __future__ import annotations
 
 import re
+import runpy
 import shlex
 import shutil
 import subprocess
@@ -14,30 +17,45 @@ from pathlib import Path
 
 import pytest
 
-from remodel_fenicsx import cli
+from remodel_fenicsx import cli, read_scene
 
 ROOT = Path(__file__).parents[2]
 TUBE = "tutorial_tube"
-BLOCK = re.compile(r"^```(\w+)\n(.*?)^```", re.MULTILINE | re.DOTALL)
-NAMED = re.compile(r"# (\w+\.(?:toml|py))\n")
+MADE = runpy.run_path(str(ROOT / "docs" / "make_tutorials.py"))
+keep, printed_as = MADE["keep"], MADE["printed_as"]
 SHORT = {  # a test's times for those of the page
     "end = 100.0": "end = 2.0",
     "time.end=120": "time.end=3",
     "time.end=300": "time.end=2",
     "demos/artery.toml -o artery": "demos/artery.toml -o artery --set time.end=1",
+    "demos/artery.toml -o first": "demos/artery.toml -o first --set time.end=1",
+    "loads.pressure.value=2.4 -o half": "loads.pressure.value=2.4 -o half --set time.end=1",
     "demos/layers.toml -o": "demos/layers.toml --set time.end=2 -o",
     "run bent.toml": "run bent.toml --set time.end=1",
+    "run fitted/scene.toml": "run fitted/scene.toml --set time.end=2",
     "inflation.toml -o": "inflation.toml --starts 1 -o",
-    "=8:16:3": "=8:16:2",
+    "--time 0 25 150": "--time 0 1",
+    "--time 0 100": "--time 0 2",
+    "--time 0 150": "--time 0 2",
+    "--time 0 60": "--time 0 1",
 }
-PAGES = sorted(page.stem for kind in ("tutorial", "howto") for page in (ROOT / "docs").glob(f"{kind}_*.md"))
+NOT_RUN = {  # beginnings of commands in blocks of text, which nobody runs
+    "git clone": "needs the network",
+    "cd ": "the clone is where the tests are",
+    "docker ": "tests/container/run does, where there is an engine",
+    "./with-fenicsx remodel-fenicsx trade": "tests/studies/test_trade.py does; it takes the time that it gets",
+    "./with-fenicsx remodel-fenicsx run demos/artery.toml --set loads.force.value=2.4": "shows a refusal",
+}
+REFUSAL = "loads.force"
+PAGES = ["start", *sorted(page.stem for kind in ("tutorial", "howto") for page in (ROOT / "docs").glob(f"{kind}_*.md"))]
 LEFT_BEHIND = {
-    "tutorial_artery": ["artery/history.csv"],
-    "tutorial_tube": ["high/report.html"],
-    "tutorial_layers": ["layers/report.html", "bent-axes.vtu", "bent/history.csv"],
-    "tutorial_residual_stress": ["with/history.csv"],
-    "tutorial_fit": ["fitted/fit.csv", "fitted/fit.png"],
-    "tutorial_sweep": ["sweep/sweep.csv", "at-16/history.csv"],
+    "start": ["first/report.html", "half/history.csv"],
+    "tutorial_artery": ["artery/history.csv", "artery.png"],
+    "tutorial_tube": ["high/report.html", "tube.png"],
+    "tutorial_layers": ["layers/report.html", "layers.png", "bent-axes.vtu", "bent/history.csv", "bent.png"],
+    "tutorial_residual_stress": ["with/history.csv", "angles.png"],
+    "tutorial_fit": ["fitted/fit.csv", "fitted/fit.png", "vessel/history.csv"],
+    "tutorial_sweep": ["sweep/sweep.csv", "sweep/sweep.png", "at-16/history.csv"],
     "howto_accuracy": ["fast/history.csv"],
     "howto_container": [],
     "howto_export": ["fibres.feb", "fibres.inp", "fibres.vtu", "fibres.csv"],
@@ -53,50 +71,96 @@ def blocks(page: str) -> list[tuple[str, str]]:
     text = (ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8")
     for long, short in SHORT.items():
         text = text.replace(long, short)
-    return BLOCK.findall(text)
+    return [(str(language), str(block)) for language, block in MADE["BLOCK"].findall(text)]
 
 
-def keep(text: str) -> bool:
-    """Write the block into the file that its first line names; whether it names one."""
-    name = NAMED.match(text)
-    if name is not None:
-        Path(name[1]).write_text(text, encoding="utf-8")
-    return name is not None
+def is_left_out(line: str) -> bool:
+    """Whether it is a command that no test runs, for a reason that is said."""
+    return line.startswith(tuple(NOT_RUN))
 
 
-def obey(line: str) -> None:
-    """One command of a page."""
+def obey(line: str, capture: pytest.CaptureFixture[str]) -> str:
+    """One command of a page; what it prints."""
     program, *words = shlex.split(line.removeprefix("./with-fenicsx "))
     words = [str(ROOT / word) if word.startswith("demos/") else word for word in words]
     if program == "remodel-fenicsx":
-        if words[0] != "picture":
-            assert cli.main(words) == 0, line
-    elif program == "cp":
+        assert cli.main(words) == 0, line
+        results, progress = capture.readouterr()
+        return progress + results
+    if program == "cp":
         shutil.copy(*words)
-    else:
-        assert program in ("python3", "mpirun"), line
-        command = [sys.executable if program == "python3" else program, *words]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=200)
-        assert done.returncode == 0, line + "\n" + done.stderr[-1000:]
+        return ""
+    assert program in ("python3", "mpirun"), line
+    command = [sys.executable if program == "python3" else program, *words]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=200)
+    assert done.returncode == 0, line + "\n" + done.stderr[-1000:]
+    return done.stdout + done.stderr
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_a_reader_gets_through_the_page(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_reader_gets_through_the_page(
+    page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     if page != TUBE:
         for _, text in blocks(TUBE):
             keep(text)
+    printed = ""
     for language, text in blocks(page):
         if language == "sh":
-            for line in text.splitlines():
-                obey(line)
+            printed = "".join(obey(line, capsys) for line in text.splitlines() if not is_left_out(line))
+        elif language == "output":
+            assert list(printed_as(text, printed))
         elif language in ("python", "toml"):
             assert keep(text), f"a block that no file takes: {text[:60]}"
     for name in LEFT_BEHIND[page]:
         assert Path(name).stat().st_size > 0, name
 
 
-def test_what_is_said_to_be_shortened_is_there() -> None:
+@pytest.mark.parametrize("page", PAGES)
+def test_no_command_of_a_page_is_passed_over_in_silence(page: str) -> None:
+    """In blocks of text, and in those whose language the test does not know."""
+    for language, text in blocks(page):
+        assert language in ("sh", "output", "python", "toml", "text"), language
+        if language == "text":
+            commands = [
+                line for line in text.splitlines() if re.match(r"(\./|docker |podman |git |cd |python3? )", line)
+            ]
+            assert all(map(is_left_out, commands)), commands
+
+
+def test_what_is_said_to_be_shortened_or_left_out_is_there() -> None:
     text = "".join((ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8") for page in PAGES)
-    assert all(long in text for long in SHORT)
+    assert all(words in text for words in (*SHORT, *NOT_RUN))
+
+
+def test_the_refusal_of_the_first_page_is_the_one_that_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    (text,) = (text for language, text in blocks("start") if language == "text" and REFUSAL in text)
+    command, *shown = text.splitlines()
+    words = [str(ROOT / word) if word.startswith("demos/") else word for word in shlex.split(command)[2:]]
+    assert cli.main(words) == 2
+    assert capsys.readouterr().err.split() == " ".join(shown).split()
+
+
+def test_output_that_was_not_printed_is_found() -> None:
+    printed = "tube: step 2/2, t = 2\nresults in tube\n"
+    assert list(printed_as("tube: step 100/100, t = 100\n...\n", printed)) == ["tube: step 2/2, t = 2", "..."]
+    for wrong in ("results in pipe\n", "results in tube\ntube: step 1/1, t = 1\n"):  # another word, another order
+        with pytest.raises(LookupError, match="was not printed"):
+            list(printed_as(wrong, printed))
+
+
+def test_numbers_of_an_experiment_go_into_the_tutorials_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """docs/which_numbers.md: its table in place of the one of `tube.toml`."""
+    monkeypatch.chdir(tmp_path)
+    for _, text in blocks(TUBE):
+        keep(text)
+    page = (ROOT / "docs" / "which_numbers.md").read_text(encoding="utf-8")
+    (table,) = re.findall(r"^```toml\n(\[material\]\n.*?)^```", page, re.MULTILINE | re.DOTALL)
+    scene = re.sub(r"^\[material\]\n.*?(?=^\[)", "", Path("tube.toml").read_text(), flags=re.MULTILINE | re.DOTALL)
+    scene = re.sub(r"^kappa = .*\n", "", scene, flags=re.MULTILINE) if "half_life" in table else scene
+    merged, _, remodeling = table.partition("[remodeling]")
+    scene = scene.replace("[remodeling]", f"{merged}\n[remodeling]{remodeling}")
+    Path("mine.toml").write_text(scene)
+    assert read_scene("mine.toml").material.contour_length == 1.35

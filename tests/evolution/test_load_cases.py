@@ -223,12 +223,12 @@ def test_the_equilibrium_of_a_cycle_is_that_of_a_long_march() -> None:
 
 
 def test_turnover_has_the_mean_rates_of_all_cases() -> None:
-    """After one step ln m is the mean of what each case alone has: their cells are the same."""
+    """In the second row ln m is the mean of what each case alone has: the first had the same cells."""
     columns = ["content", "natural_length", "inner_radius", *ANGLES]
     tables = {"remodeling": GROWING[0], "columns": columns}
     changes = []
     for cases in (pulse(0.33), *([case | {"weight": 1.0}] for case in pulse(0.33))):
-        simulation = Simulation(scene_from_dict(artery(cases, end=2.0, **tables)))
+        simulation = Simulation(scene_from_dict(artery(cases, end=4.0, **tables)))
         list(simulation.steps())
         changes.append([np.log(simulation.stepper.turnover._values(name)) for name in columns[:2]])
         simulation.close()

@@ -15,6 +15,7 @@ from remodel_fenicsx.model.chains import CHAINS
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.model.turnover import rates
 from remodel_fenicsx.scene import scene_from_dict
+from remodel_fenicsx.solver.newton import SolveFailure
 
 COLUMNS = ["content", "natural_length"]
 ANGLES = ["fibre_angle_inner", "fibre_angle_middle", "fibre_angle_outer"]
@@ -84,12 +85,63 @@ def test_other_walls_open_as_an_independent_solver_says(
     assert known["opening_angle"] == pytest.approx(angle, abs=1.0)
 
 
-def test_without_turnover_it_is_the_law_tensor() -> None:
+@pytest.mark.parametrize("coupling", ["staggered", "relaxed", "extrapolated"])
+@pytest.mark.parametrize("time", [{}, {"tolerance": 1.0}], ids=["equal", "chosen"])
+def test_without_turnover_it_is_the_law_tensor(coupling: str, time: dict[str, float]) -> None:
     """Gain 0 and a huge time."""
-    for coupling in ("staggered", "extrapolated"):
-        never = {"time": 1e12, "deposition_stretch": 1.1, "gain": 0.0}
-        plain, turned = (simulated(wall(40.0, 4.0, t, [], coupling=coupling))[0][-1] for t in (None, never))
-        assert turned == pytest.approx(plain, rel=1e-9, abs=1e-9, nan_ok=True)
+    never = {"time": 1e12, "deposition_stretch": 1.1, "gain": 0.0}
+    scenes = [wall(40.0, 4.0, turnover, [], coupling=coupling) for turnover in (None, never)]
+    plain, turned = (simulated(scene | {"time": scene["time"] | time})[0] for scene in scenes)
+    assert len(turned) == len(plain)
+    assert turned[-1] == pytest.approx(plain[-1], rel=1e-9, abs=1e-9, nan_ok=True)
+
+
+# ---------------------------------------------------------------- errors in time
+GROWS = {"time": 40.0, "deposition_stretch": 1.1, "gain": 1.0}
+
+
+@pytest.fixture(scope="module")
+def small_steps() -> list[dict[str, float]]:
+    """Rows up to t = 96, where m is 1.7."""
+    return simulated(wall(96.0, 0.5, GROWS, COLUMNS))[0]
+
+
+def errors(rows: list[dict[str, float]], small_steps: list[dict[str, float]]) -> np.ndarray:
+    """The largest ones of mean m, mean rho and the angle in the middle over all rows, in degrees."""
+    times, exact = [row["time"] for row in rows], [row["time"] for row in small_steps]
+    found = []
+    for name in (*COLUMNS, ANGLES[1]):
+        here = np.array([row[name] for row in rows])
+        there = np.interp(times, exact, [row[name] for row in small_steps])
+        found.append(np.abs(here - there).max() if name in ANGLES else np.degrees(np.abs(np.log(here / there)).max()))
+    return np.array(found)
+
+
+@pytest.mark.parametrize(("coupling", "order"), [("staggered", 1), ("extrapolated", 2)])
+def test_content_and_natural_length_have_the_order_of_the_coupling(
+    coupling: str, order: int, small_steps: list[dict[str, float]]
+) -> None:
+    coarse, fine = (
+        errors(simulated(wall(96.0, step, GROWS, COLUMNS, coupling=coupling))[0][-1:], small_steps)
+        for step in (8.0, 2.0)
+    )
+    np.testing.assert_allclose(np.log(coarse / fine) / np.log(4.0), order, atol=0.35)
+
+
+@pytest.mark.parametrize("coupling", ["staggered", "extrapolated"])
+def test_chosen_steps_watch_content_and_natural_length(coupling: str, small_steps: list[dict[str, float]]) -> None:
+    """Errors fall as the tolerance does, and are below it; the estimate is about the error of the content."""
+    found, counts = [], []
+    for tolerance in (2.0, 0.5):
+        values = wall(96.0, 1.0, GROWS, COLUMNS, coupling=coupling)
+        values["time"]["tolerance"] = tolerance
+        rows, _ = simulated(values)
+        error, estimate = errors(rows, small_steps), max(row["time_error"] for row in rows)
+        assert error.max() < tolerance and error[0] / 1.5 < estimate <= tolerance
+        found.append(error)
+        counts.append(len(rows))
+    assert ((found[0] / found[1])[:2] > 2.5).all(), found
+    assert counts[1] > 1.5 * counts[0]
 
 
 def test_rates_against_their_equation() -> None:
@@ -133,9 +185,12 @@ def test_a_growth_that_does_not_rest_is_said(caplog: pytest.LogCaptureFixture) -
     assert sum("mechanobiological instability" in record.message for record in caplog.records) == 1
 
 
-def test_a_run_goes_on_with_its_content(tmp_path: Path) -> None:
+@pytest.mark.parametrize("time", [{}, {"tolerance": 1.0}], ids=["equal", "chosen"])
+def test_a_run_goes_on_with_its_content(time: dict[str, float], tmp_path: Path) -> None:
     """Two parts are the whole, to the last digit."""
     values = wall(80.0, 4.0, {"time": 40.0, "gain": 1.0}, COLUMNS)
+    values["time"] |= time
+    values["output"]["times"] = [40.0]
     (tmp_path / "scene.toml").write_text(scene_from_dict(values).to_toml())
     command = ["run", str(tmp_path / "scene.toml"), "-q", "--set", "output.report=false"]
     assert cli.main([*command, "-o", str(tmp_path / "all")]) == 0
@@ -159,11 +214,9 @@ def test_its_columns_and_numbers_need_it() -> None:
     [
         ({"law": "explicit", "coupling": "staggered"}, {}, "remodeling.turnover: needs remodeling.law = 'tensor'"),
         ({"coupling": "implicit"}, {}, "remodeling.coupling = 'implicit'"),
-        ({"coupling": "relaxed"}, {}, "remodeling.coupling = 'relaxed'"),
         ({"turnover": {"deposition_stretch": 1.6}}, {}, "deposition_stretch = 1.6: must be smaller than"),
         ({"turnover": {"gain": -1.0}}, {}, "remodeling.turnover.gain = -1"),
         ({"turnover": {"pace": 1.0}}, {}, "remodeling.turnover.pace = 1.0: unknown key"),
-        ({}, {"tolerance": 0.1}, "time.tolerance = 0.1: must be left out"),
         ({}, {"end": "equilibrium"}, "remodeling.turnover has no equilibrium"),
     ],
 )
@@ -174,3 +227,39 @@ def test_what_has_no_turnover_is_refused(remodeling: dict[str, Any], time: dict[
     values["time"] |= time
     with pytest.raises(SceneError, match=words):
         scene_from_dict(values)
+
+
+@pytest.mark.parametrize("coupling", ["staggered", "extrapolated"])
+def test_a_step_in_parts_has_parts_of_its_turnover(coupling: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The end is that of the whole step; half-way ln m is half-way too."""
+    values = wall(40.0, 8.0, GROWS, COLUMNS, coupling=coupling) | {"solver": {"predictor": "none"}}
+    whole, _ = simulated(values)
+    simulation = Simulation(scene_from_dict(values))
+    coupled, turnover = simulation.stepper.coupling, simulation.stepper.turnover
+    set_part, parts, refused = turnover.set_part, [], set()
+    newton = coupled.blend.newton
+    solve = newton.solve
+
+    def in_parts(time: float, loads: Any, work: Any) -> None:
+        coupled._solve_in_parts(time, dict(simulation.loading.values), loads, work, None)
+
+    def solved(origin: Any = None) -> Any:
+        if simulation.state.number not in refused:
+            refused.add(simulation.state.number)
+            raise SolveFailure("in vain", 0, 0, coupled.equilibrium.extension())
+        return solve(origin=origin)
+
+    def noted(fraction: float) -> None:
+        set_part(fraction)
+        parts.append((fraction, turnover.logarithms()[0].mean()))
+
+    monkeypatch.setattr(newton, "solve", solved)
+    monkeypatch.setattr(coupled, "_solve_in_one", in_parts)
+    monkeypatch.setattr(turnover, "set_part", noted)
+    rows = [dict(step.row) for step in simulation.steps()]
+    simulation.close()
+    for name in (*COLUMNS, *ANGLES, "outer_radius"):
+        assert rows[-1][name] == pytest.approx(whole[-1][name], rel=1e-7), name
+    assert {fraction for fraction, _ in parts} >= {0.5, 1.0}
+    ends = {fraction: value for fraction, value in parts[-10:] if fraction in (0.5, 1.0)}
+    assert 0.0 < ends[0.5] < ends[1.0]

@@ -62,7 +62,7 @@ def test_the_python_of_the_readme_runs_as_it_stands(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["README.md", "CONTRIBUTING.md", *(f"docs/{name}.md" for name in (
     "architecture", "commands", "environment", "interface", "laws", "locking", "reliability", "report", "stability",
     "theory", "verification", "appendix_coupling", "appendix_elements", "appendix_equilibria", "appendix_pass",
-    "appendix_rest", "appendix_solver", "appendix_steps"))])  # fmt: skip
+    "appendix_rest", "appendix_solver", "appendix_stability", "appendix_steps", "appendix_verification"))])  # fmt: skip
 def test_files_and_modules_that_a_page_names_are_there(name: str) -> None:
     """Paths in backticks or links, and modules after the package's name."""
     text = re.sub(r"```.*?```", "", page(name), flags=re.DOTALL)
@@ -92,6 +92,28 @@ def test_files_and_modules_that_a_page_names_are_there(name: str) -> None:
         assert (ROOT / module.replace(".", "/")).with_suffix(".py").exists(), module
     for link in re.findall(r"\]\((?!http)([\w./-]+)\)", text):
         assert (ROOT / name).parent.joinpath(link).exists(), link
+
+
+def named_sections(text: str) -> list[tuple[str, str]]:
+    """Page and section of `docs/page.md, Section` in prose, comments, docstrings and strings in several parts."""
+    text = re.sub(r"[\"']\s*\n\s*f?[\"']", "", text)
+    text = re.sub(r"\s*\n\s*(?:# )?", " ", text)
+    return re.findall(r"(?:docs/|\]\()(\w+)\.md\)?, \"?([A-Z][\w -]+\w)", text)
+
+
+def test_sections_that_are_named_are_there() -> None:
+    """By run messages, docstrings and pages."""
+    files = [*ROOT.glob("remodel_fenicsx/**/*.py"), *ROOT.glob("benchmarks/**/*.py"), *ROOT.glob("docs/*.md")]
+    heads = {file.stem: re.findall(r"^#+ (.*)$", file.read_text(encoding="utf-8"), re.M) for file in files}
+    found = {
+        (file.name, name, section)
+        for file in files
+        for name, section in named_sections(file.read_text(encoding="utf-8"))
+        if file.stem != "appendix_stability"  # messages that are cut off
+    }
+    assert len(found) > 30
+    assert not [one for one in found if not any(one[2].startswith(head) for head in heads.get(one[1], []))]
+    assert named_sections('"so (docs/theory.md, No "\n    "section)"') == [("theory", "No section")]
 
 
 def test_a_name_that_the_package_does_not_have_is_refused() -> None:

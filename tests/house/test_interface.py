@@ -58,30 +58,3 @@ def test_the_table_of_exit_codes_has_those_of_the_command() -> None:
     assert rows is not None
     codes = [int(code) for row in rows[0].splitlines()[2:] if row for code in row.split("|")[1].split(",")]
     assert codes == list(cli.EXIT_CODES)
-
-
-def test_every_public_class_and_function_says_what_it_is() -> None:
-    """A docstring of its own, of each and of its public methods; neither from a base nor made by dataclass."""
-    import inspect
-
-    import remodel_fenicsx
-    from remodel_fenicsx import extend, parts
-
-    known = {f"{coupling}.better" for coupling in ("Coupling",)}  # still without
-    found = set()
-    for module in (remodel_fenicsx, parts, extend):
-        for name in module.__all__:
-            value = getattr(module, name)
-            if not inspect.isclass(value) and not inspect.isfunction(value):
-                continue
-            own = vars(value).get("__doc__") if inspect.isclass(value) else value.__doc__
-            if not own or own.startswith(f"{name}("):
-                found.add(name)
-            for method, member in vars(value).items():
-                if (
-                    inspect.isfunction(member)
-                    and not method.startswith("_")
-                    and not inspect.getdoc(getattr(value, method))
-                ):
-                    found.add(f"{name}.{method}")
-    assert found <= known, found - known

@@ -154,3 +154,4 @@ def test_the_command_lists_and_goes_on(tmp_path: Path, capsys: pytest.CaptureFix
     said = capsys.readouterr()
     assert "1 cases, 0 to run" in said.err and "wrong: load: frame spatial, force 10.0: off" in said.out
     assert report.counts([record])["**all**"]["wrong"] == 1
+    assert f"| {key} | off |\n" in report.listed([record], CASES, lambda one: True)

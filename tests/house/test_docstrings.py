@@ -1,0 +1,200 @@
+"""Docstrings of the public interface: numpydoc's sections, shapes of arrays, errors, and examples that run.
+
+What is asked is what a reader needs: every parameter, what comes back, the errors that the code itself raises, an
+example. The examples run as doctests, all in one child.
+"""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import doctest
+import inspect
+import re
+import textwrap
+from collections.abc import Iterator
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import remodel_fenicsx
+from remodel_fenicsx import extend, parts
+from remodel_fenicsx.schema.tables import Table
+from tests.forks import forked
+
+MODULES = (remodel_fenicsx, parts, extend)
+PUBLIC = {name: getattr(module, name) for module in MODULES for name in module.__all__ if not name.startswith("__")}
+DESCRIBED = {name: value for name, value in PUBLIC.items() if inspect.isclass(value) or inspect.isfunction(value)}
+HEADS = ("Parameters", "Attributes", "Returns", "Yields", "Raises", "Notes", "References", "Examples")
+SHAPE = re.compile(r"\((\.\.\., ?\)|[\w. +*]+,[\w., +*]*\))")  # (n, 3), (elements, points), (n,), (..., 3)
+ARRAYS = re.compile(r"Array\b|NDArray|ndarray")
+
+
+def sections(text: str) -> dict[str, str]:
+    """Text under each of numpydoc's heads; "" is what comes before the first."""
+    pieces = re.split(rf"^({'|'.join(HEADS)})\n-+\n", inspect.cleandoc(text), flags=re.MULTILINE)
+    return {"": pieces[0], **dict(zip(pieces[1::2], pieces[2::2], strict=True))}
+
+
+def entries(text: str) -> dict[str, str]:
+    """Of a section: what is said of each name; "a, b : type" are two names."""
+    found: dict[str, str] = {}
+    for head, said in re.findall(r"^(\S.*)\n((?:(?: .*)?\n?)*)", text, re.MULTILINE):
+        names, _, kind = head.partition(" : ")
+        found |= {name.strip().lstrip("*"): f"{kind} {said}" for name in names.split(",")}
+    return found
+
+
+def own(value: Any) -> str:
+    """The docstring that the object itself has; what dataclass writes is none."""
+    text = vars(value).get("__doc__") if inspect.isclass(value) else value.__doc__
+    return "" if not text or text.startswith(f"{value.__name__}(") else text
+
+
+def parameters(value: Any) -> dict[str, str]:
+    """What it is made with, or called with: names with their annotations. Tables have keys in place of them."""
+    made = inspect.isclass(value) and (
+        dataclasses.is_dataclass(value) or hasattr(value, "_fields") or "__init__" in vars(value)
+    )
+    if inspect.isclass(value) and (not made or issubclass(value, Table) or getattr(value, "_is_protocol", False)):
+        return {}
+    found = inspect.signature(value).parameters
+    return {name: str(each.annotation) for name, each in found.items() if name not in ("self", "args", "kwargs")}
+
+
+def raised(function: Any) -> set[str]:
+    """Names of the errors that its own lines raise."""
+    if function.__code__.co_filename == "<string>":
+        return set()  # of what dataclass writes
+    tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
+    calls = [node.exc for node in ast.walk(tree) if isinstance(node, ast.Raise) and node.exc is not None]
+    names = {ast.unparse(call.func if isinstance(call, ast.Call) else call).rpartition(".")[2] for call in calls}
+    return {name for name in names if name[0].isupper() and name != "NotImplementedError"}
+
+
+def members(kind: type) -> Iterator[tuple[str, Any]]:
+    """Public methods and properties of the package's own: name and function."""
+    for name in dict.fromkeys(name for base in kind.__mro__ for name in vars(base)):
+        base = next(base for base in kind.__mro__ if name in vars(base))
+        member = vars(base)[name]
+        function = (
+            member.fget
+            if isinstance(member, property)
+            else member.func if isinstance(member, cached_property) else getattr(member, "__func__", member)
+        )
+        if base.__module__.startswith("remodel_fenicsx") and name[0] != "_" and inspect.isfunction(function):
+            yield name, function
+
+
+def faults(value: Any) -> Iterator[str]:
+    """What the docstring of a public class or function lacks."""
+    said = sections(own(value))
+    if not said[""].strip():
+        yield "no docstring"
+    if ">>> " not in said.get("Examples", ""):
+        yield "no Examples"
+    known = entries(said.get("Parameters", "")) | entries(said.get("Attributes", ""))
+    for name, kind in parameters(value).items():
+        if name not in known:
+            yield f"parameter {name} is not described"
+        elif ARRAYS.search(kind) and not SHAPE.search(known[name]):
+            yield f"parameter {name}: no shape"
+    made = () if getattr(value, "_is_protocol", False) else ("__init__", "__post_init__")
+    started = [vars(value)[name] for name in made if name in vars(value)]
+    for function in [value] if inspect.isfunction(value) else filter(inspect.isfunction, started):
+        if missing := {name for name in raised(function) if name not in entries(said.get("Raises", ""))}:
+            yield f"raises {missing}, which Raises does not say"
+    if inspect.isfunction(value):
+        yield from faults_of_return(value, said)
+
+
+def faults_of_return(function: Any, said: dict[str, str]) -> Iterator[str]:
+    """What is said of a function's value."""
+    kind = str(function.__annotations__.get("return"))
+    section = said.get("Returns", "") + said.get("Yields", "")
+    if kind != "None":
+        if not re.match(r"\S.*\n +\S", section):
+            yield "no Returns with a type and, indented, what it is"
+        elif ARRAYS.search(kind) and not SHAPE.search(section):
+            yield "Returns: no shape"
+
+
+def faults_of_member(kind: type, name: str, function: Any) -> Iterator[str]:
+    """What the docstring of a method or a property lacks; that of a base class counts."""
+    text = inspect.getdoc(getattr(kind, name)) or ""
+    said = sections(text)
+    if not text.strip():
+        yield f"{name}: no docstring"
+    if ARRAYS.search(str(function.__annotations__.get("return"))) and not SHAPE.search(text):
+        yield f"{name}: no shape of what it returns"
+    if "Returns" in said and not re.match(r"\S.*\n +\S", said["Returns"]):
+        yield f"{name}: Returns without a type and, indented, what it is"
+    if missing := {error for error in raised(function) if error not in text}:
+        yield f"{name}: raises {missing} and does not say so"
+
+
+@pytest.mark.parametrize("name", DESCRIBED)
+def test_a_public_name_has_a_docstring_with_all_sections(name: str) -> None:
+    value = DESCRIBED[name]
+    found = list(faults(value))
+    if inspect.isclass(value):
+        found += [fault for member in members(value) for fault in faults_of_member(value, *member)]
+    assert not found
+
+
+@pytest.mark.parametrize("module", MODULES[1:], ids=lambda module: module.__name__)
+def test_a_module_says_what_its_constants_are(module: Any) -> None:
+    """Registries and dimensions have no docstring of their own: the module's has a section for them."""
+    constants = {name for name in module.__all__ if name not in DESCRIBED}
+    assert set(entries(sections(module.__doc__).get("Attributes", ""))) == constants
+    assert ">>> " in module.__doc__
+
+
+def test_what_a_docstring_lacks_is_found() -> None:
+    """Of a function that says too little."""
+
+    def bad(values: np.ndarray, factor: float) -> np.ndarray:  # type: ignore[name-defined]  # noqa: F821
+        """Do it.
+
+        Parameters
+        ----------
+        values
+            Some.
+
+        Returns
+        -------
+        The values.
+        """
+        raise ValueError(factor)
+
+    assert list(faults(bad)) == [
+        "no Examples",
+        "parameter values: no shape",
+        "parameter factor is not described",
+        "raises {'ValueError'}, which Raises does not say",
+        "no Returns with a type and, indented, what it is",
+    ]
+
+
+def run_examples() -> None:
+    """All of them, each name's with nothing but Python's own; prints what fails, then how many there were."""
+    flags = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE | doctest.IGNORE_EXCEPTION_DETAIL
+    runner, parser = doctest.DocTestRunner(optionflags=flags), doctest.DocTestParser()
+    texts = {name: own(value) for name, value in DESCRIBED.items()}
+    texts |= {module.__name__: module.__doc__ or "" for module in MODULES}
+    for name, value in DESCRIBED.items():
+        if inspect.isclass(value):
+            texts |= {f"{name}.{each}": inspect.getdoc(getattr(value, each)) or "" for each, _ in members(value)}
+    for name, text in texts.items():
+        runner.run(parser.get_doctest(text, {"__name__": "__main__"}, name, name, 0))
+    print(f"{runner.failures} of {runner.tries} failed")
+
+
+def test_the_examples_run(tmp_path: Path) -> None:
+    program = "from tests.house.test_docstrings import run_examples; run_examples()"
+    done = forked("python", program, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr[-3000:]
+    failed, of = re.findall(r"^(\d+) of (\d+) failed$", done.stdout, re.MULTILINE)[-1]
+    assert int(failed) == 0 and int(of) > 150, done.stdout[-5000:]
