@@ -241,7 +241,7 @@ COLUMNS_ON_REQUEST: dict[str, Column] = {
         Column(
             TURNOVER_POWER,
             "stress length^3 / time",
-            "power that turnover releases in the row's state; with remodeling.turnover",
+            "power that turnover releases in the state of the row; for scenes with remodeling.turnover",
             lambda m: m.observer.stepper.turnover.power(),
             by_case=False,
         ),

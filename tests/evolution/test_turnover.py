@@ -182,7 +182,7 @@ def test_a_growth_that_does_not_rest_is_said(caplog: pytest.LogCaptureFixture) -
     turnover = {"time": 40.0, "deposition_stretch": 1.1, "gain": 0.2}
     rows, _ = simulated(wall(720.0, 4.0, turnover, COLUMNS))
     assert rows[-1]["outer_radius"] > 5.0
-    assert sum("mechanobiological instability" in record.message for record in caplog.records) == 1
+    assert sum("by more than a factor of 10" in record.message for record in caplog.records) == 1
 
 
 @pytest.mark.parametrize("time", [{}, {"tolerance": 1.0}], ids=["equal", "chosen"])
@@ -202,9 +202,25 @@ def test_a_run_goes_on_with_its_content(time: dict[str, float], tmp_path: Path) 
     assert last[0] == last[1] and float(last[0][0]) > 1.1
 
 
+@pytest.mark.parametrize(("gain", "rests"), [(0.5, False), (0.2, False), (1.0, True)])
+def test_growth_that_does_not_come_to_rest_is_said_at_the_end(
+    gain: float, rests: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Ever more slowly, or faster and faster; not of a wall that rests some time later, nor of a short run."""
+    turnover = {"time": 40.0, "deposition_stretch": 1.1, "gain": gain}
+    simulated(wall(480.0, 4.0, turnover, COLUMNS))
+    found = [record.message for record in caplog.records if "does not come to rest" in record.message]
+    assert len(found) == (0 if rests else 1)
+    assert rests or "fall no faster than 1/t (mechanobiological instability" in found[0]
+    caplog.clear()
+    simulated(wall(240.0, 4.0, turnover, COLUMNS))
+    assert "come to rest" not in caplog.text
+
+
 def test_its_columns_and_numbers_need_it() -> None:
-    with pytest.raises(SceneError, match="'content' changes with remodeling.turnover alone"):
-        scene_from_dict(wall(40.0, 4.0, None, COLUMNS))
+    for name in (*COLUMNS, "turnover_power"):
+        with pytest.raises(SceneError, match=f"'{name}' changes with remodeling.turnover alone"):
+            scene_from_dict(wall(40.0, 4.0, None, [name]))
     with pytest.raises(SceneError, match="remodeling.turnover.time: missing"):
         scene_from_dict(wall(40.0, 4.0, {"gain": 2.0}, []))
 
