@@ -182,8 +182,8 @@ run sees it by itself.
 
 ## Thick tube
 
-Radii 1 and 3, plane strain, no chains, pressure 2 in four steps, mu = 3.103. Each cell of the table
-has three numbers:
+Radii 1 and 3, plane strain, no chains, pressure 2 in four steps, mu = 3.103. The table has three
+numbers for each mesh, formulation and lambda/mu:
 
 1. the error of the inner displacement against {exact}, that of the incompressible tube (at
    lambda/mu = 100 the body itself moves {compressible} % more);

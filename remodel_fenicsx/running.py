@@ -193,7 +193,7 @@ def _say_where(checkpoint: Checkpoint) -> None:
     now = versions()
     for name, version in checkpoint.versions.items():
         if now.get(name) != version:
-            log.warning("goes on with %s %s, was %s", name, now.get(name), version)
+            log.warning("goes on with %s %s, the run was begun with %s", name, now.get(name), version)
 
 
 def _built(scene: Scene, comm: MPI.Intracomm) -> Simulation:

@@ -86,12 +86,12 @@ class Homeostasis:
 
     order, accumulates, longest, share, better = 1, True, math.inf, 1.0, None
     others: Sequence[Any] = ()  # its way solves further load cases
-    turnover: Any = None
 
     def __init__(self, way: StepControl, remodeling: RemodelingPass, held_from: float, limit: Limit | None):
         self.way, self.remodeling, self.held_from, self.limit = way, remodeling, held_from, limit
         self.state = way.state
         self.tolerance, self.coupling = way.tolerance, way.stepper.coupling
+        self.turnover: Any = way.stepper.turnover
         self.equilibrium: Equilibrium = self.coupling.equilibrium
         self.newton: GuardedNewton = self.coupling.newton
         if limit is not None:
@@ -114,10 +114,12 @@ class Homeostasis:
         state, work = self.state, Work()
         start, number, self.steps = state.time, state.number, 0
         self._held = None
-        loosens = not self.coupling.accumulates and self.tolerance < COARSE
+        loosens = not self.coupling.accumulates and self.tolerance < COARSE and self.turnover is None
         self._go(time, loads, max(start, self.held_from), loosens, work)
         if loosens and self._held is not None and self._largest_jump()[0] > FRONT:
-            log.info("the cells have a front, and its place depends on the way: it is gone again with the tolerance")
+            log.info(
+                "the cells have a front, whose place depends on the path: the path is followed again with the tolerance"
+            )
             state.restore(self._held)
             self._go(time, loads, max(start, self.held_from), False, work)
         state.reach(start, number)
@@ -129,7 +131,8 @@ class Homeostasis:
     def _go(self, time: float, loads: LoadValues, held: float, loosens: bool, work: Work) -> None:
         """From where the state is until the cells rest; loads are held from a time on, from which the way may loosen.
 
-        The error of a row that lags leaves nothing once the cells rest, unless they come to rest elsewhere.
+        The error of a row that lags leaves nothing once the cells rest, unless they come to rest elsewhere. Where
+        collagen comes to rest depends on the way.
         """
         state, self.near, self.tries = self.state, NEAR, TRIES
         self.way.tolerance = self.tolerance
@@ -138,7 +141,7 @@ class Homeostasis:
             work.add(step.work)
             work.substeps += step.work.substeps
             work.residual = step.work.residual
-            log.info("on the way: time %g, %d Newton iterations", step.time, step.work.newton_iterations)
+            log.info("on the path: time %g, %d Newton iterations", step.time, step.work.newton_iterations)
             if state.time < self.held_from:
                 continue
             if loosens:
@@ -146,7 +149,7 @@ class Homeostasis:
             ahead, solved = state.snapshot(), state.equilibrium_cells
             self._held = self._held or ahead
             state.cells.set(solved.dimension_values, solved.axis_values)  # those that the stress belongs to
-            if self._is_over(time, loads, self.remodeling.slowest * (state.time - held), work):
+            if self._is_over(time, loads, self.way.stepper.slowest * (state.time - held), work):
                 return
             state.restore(ahead)
 
@@ -159,12 +162,28 @@ class Homeostasis:
             self.near, self.tries = AGAIN * rest, self.tries - 1
             if self._arrived(self.limit, time, loads, towards, work):
                 return True
-        soon = self.state.time + 1 / self.remodeling.slowest
-        if self._largest(self._change_by_a_pass(soon, work.residual)) <= REST:
+        soon = self.state.time + 1 / self.way.stepper.slowest
+        if max(self._largest(self._change_by_a_pass(soon, work.residual)), self._growth()) <= REST:
+            return True
+        if self.turnover is not None and self.turnover.grows_on():
+            text = "growth does not come to rest (docs/turnover.md): the state is that of time %g, on the path"
+            self._warn(text, self.state.time)
             return True
         if waiting > LONGEST_HOLD:
-            self._warn("the cells do not come to rest: a pass to the limit changes A by up to %.2g r0^2", rest)
+            self._warn(
+                "the cells do not come to rest: a pass to its limit changes the structure tensor A by up to %.2g r0^2",
+                rest,
+            )
+            if self.turnover is not None:
+                self._warn("content or natural length change by up to %.2g in a time of T", self._growth())
         return waiting > LONGEST_HOLD
+
+    def _growth(self) -> float:
+        """Largest relative change of content or natural length in the time in which `REST` is asked for."""
+        if self.turnover is None:
+            return 0.0
+        rates = np.abs(self.turnover.rates()).max(axis=0).reshape(self.state.cells.quadrature.shape)
+        return self.state.cells.quadrature.maximum(rates) / self.way.stepper.slowest
 
     def _arrived(self, limit: Limit, time: float, loads: LoadValues, towards: Array, work: Work) -> bool:
         """Make the rest of the way in one step; if it is not solved or leads elsewhere, all is as before."""
@@ -175,13 +194,13 @@ class Homeostasis:
             found = limit.solve(time, loads)
         except SolveFailure as failure:
             work.add(failure)
-            log.info("the rest of the way is not solved in one step: %s", failure.reason)
+            log.info("the rest of the path was not solved in one step: %s", failure.reason)
             state.restore(before)
             return False
         work.add(found)
         if not self._is_along(state.cells.structure_tensor() - structure, towards):
             work.residual = residual
-            log.info("the rest of the way in one step leads elsewhere")
+            log.info("one step for the rest of the path led to another state; it is not used")
             state.restore(before)
             return False
         self.steps, work.substeps, work.residual = self.steps + 1, work.substeps + 1, found.residual
@@ -243,17 +262,17 @@ class Homeostasis:
         if jump > FRONT and self.state.comm.rank == 0:
             log.log(
                 NOTICE,
-                "the cells have a front about %.4g, %.4g, %.4g: A differs by %.2g r0^2 from one point to the next. A "
-                "front may rest elsewhere too: its place depends on the way, and is as exact as time.tolerance and the "
-                "points of the mesh (docs/theory.md, Equilibrium at once)",
+                "the cells have a front near %.4g, %.4g, %.4g: the structure tensor A differs by %.2g r0^2 between "
+                "neighbouring points. The front might rest at another place: its place depends on the path, and is as "
+                "exact as time.tolerance and the mesh (docs/theory.md, Equilibrium at once)",
                 *place,
                 jump,
             )
         if share and self.state.comm.rank == 0:
             log.log(
                 NOTICE,
-                "%.3g %% of the body has no tension at rest, or hardly any beside compression: cells there stay where "
-                "the way has left them, and depend on it (docs/theory.md, Equilibrium at once)",
+                "%.3g %% of the body has no tension at rest, or hardly any beside compression. The cells there stay as "
+                "the path has left them, and depend on it (docs/theory.md, Equilibrium at once)",
                 100 * share,
             )
         return 0.0

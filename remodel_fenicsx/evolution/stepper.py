@@ -171,9 +171,10 @@ class Stepper:
         name = remodeling.coupling if self.remodeling.law.remodels else "staggered"
         make = coupling or COUPLINGS[name].make
         self.coupling: Coupling = make(state, self.tissue, self.remodeling, solver)
-        self.turnover: Any = None  # `TurnoverPass`
+        # `TurnoverPass`; there already where the coupling's way is another stepper's
+        self.turnover: Any = getattr(self.coupling, "turnover", None)
         self.cases: Sequence[Any] = ()  # further load cases (`load_cases.OtherCase`)
-        if remodeling.turnover.is_on:
+        if remodeling.turnover.is_on and self.turnover is None:
             from remodel_fenicsx.evolution.turnover import TurnoverPass
 
             self.turnover = self.coupling.turnover = TurnoverPass(state, self.tissue, remodeling.turnover)

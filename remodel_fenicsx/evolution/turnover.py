@@ -156,6 +156,10 @@ class TurnoverPass:
         values: Array = self.quadrature.values(getattr(self.tissue, name), ())
         return values
 
+    def grows_on(self) -> bool:
+        """Whether the natural length has grown so much anywhere that it is not expected to come to rest."""
+        return self.quadrature.maximum(self._values("natural_length")) > BEYOND_REST
+
     def _warn(self) -> None:
         if self._numbers["said"]:
             return
@@ -169,8 +173,8 @@ class TurnoverPass:
             if self.state.comm.rank == 0:
                 log.warning(
                     "turnover: %s has changed by more than a factor of %g at (%s) in the step after time %g: growth "
-                    "that does not rest (mechanobiological instability, docs/turnover.md); a larger "
-                    "remodeling.turnover.gain or a thicker wall comes to rest",
+                    "does not come to rest (mechanobiological instability, docs/turnover.md); try a larger "
+                    "remodeling.turnover.gain or a thicker wall",
                     name.replace("_", " "),
                     BEYOND_REST,
                     place,

@@ -76,8 +76,8 @@ class EquilibriumStability(Watcher):
             overdue = False
             if step.is_last:
                 self._info(
-                    "the stability of equilibria was not looked at: with %d unknowns it is on request only, by the "
-                    "column negative_eigenvalues or solver.unstable = 'stop'", self.unknowns,
+                    "the stability of equilibria was not checked: with %d unknowns that is done only on request, by "
+                    "the column negative_eigenvalues or solver.unstable = 'stop'", self.unknowns,
                 )  # fmt: skip
         if not (suspicious or overdue or self.every_step):
             return
@@ -105,8 +105,8 @@ class EquilibriumStability(Watcher):
         unloaded, scale = self._of_the_unloaded_body()
         if now <= unloaded:
             self._info(
-                "%s: %s of the tangent, as the unloaded body has %d: stress that its cells have from the start, "
-                "no lost equilibrium", step.moment, eigenvalues(now), unloaded,
+                "%s: %s of the tangent. The unloaded body has %d, from the stress of its cells at the start: the "
+                "equilibrium is not lost", step.moment, eigenvalues(now), unloaded,
             )  # fmt: skip
             return
         text = f"{eigenvalues(now)} of the tangent ({before} before); {described(self.inertia.lowest(), scale)}"

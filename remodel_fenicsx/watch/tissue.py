@@ -147,7 +147,7 @@ class RadialChains(WarnsOnce):
             self.say(
                 step,
                 f"more than half of the chains point out of the wall (radial_share {self._numbers['share']:.2g}); the "
-                "fibre angles are those of the others",
+                "fibre angles are means over the other chains",
                 NOTICE,
             )
 
@@ -198,8 +198,8 @@ class FrontsInLayers(Watcher):
         """Say it."""
         for name, low, high in self._found if self.state.comm.rank == 0 else ():
             log.warning(
-                "time %g: %s is a mean over elements in which the angle jumps, from %.3g to %.3g degrees: a front lies "
-                "in them, and the mean depends on the mesh; set a larger mesh.refinement",
+                "time %g: %s is a mean over elements in which the angle jumps from %.3g to %.3g degrees. A front lies "
+                "there, so the mean depends on the mesh; set a larger mesh.refinement",
                 step.time,
                 name,
                 low,

@@ -473,7 +473,10 @@ def test_the_bases_of_the_bad_scenes_are_good():
 
 def test_a_preset_without_the_shape(monkeypatch):
     monkeypatch.setitem(PRESETS, "bent", {"tendon": {}, "tube": {}})
-    assert refusal({**CUBE, "preset": "bent"}) == "geometry.shape = 'cube': the preset 'bent' has 'tendon', 'tube'"
+    assert (
+        refusal({**CUBE, "preset": "bent"})
+        == "geometry.shape = 'cube': the preset 'bent' has the shapes 'tendon', 'tube'"
+    )
 
 
 def test_a_law_registered_later_is_allowed(monkeypatch):
