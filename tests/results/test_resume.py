@@ -426,7 +426,7 @@ def test_the_status_of_a_run_that_failed_says_why(tmp_path: Path) -> None:
     said = status(tmp_path / "out")
     assert said[1].startswith("failed: no equilibrium at time 1: ") and said[2].startswith("not running, ")
     with (tmp_path / "out" / "run.log").open("a") as log:
-        log.write("2026-01-01 00:00:00,000 INFO scene cube on 1 ranks, results in out\n")
+        log.write("2026-01-01 00:00:00,000 INFO scene cube on 1 rank, results in out\n")
     assert said[2:] == status(tmp_path / "out")[1:]
     with (tmp_path / "out" / "run.log").open("a") as log:
         log.write("2026-01-01 00:00:00,000 INFO ended: SIGTERM\n")
