@@ -43,6 +43,11 @@ NOT_RUN = {  # beginnings of commands in blocks of text, which nobody runs
     "git clone": "needs the network",
     "cd ": "the clone is where the tests are",
     "docker ": "tests/container/run does, where there is an engine",
+    "apptainer ": "needs a cluster's engine",
+    "sbatch ": "needs a cluster's queue",
+    './with-fenicsx mpirun -n "$SLURM_NTASKS"': "the same; ranks are run above it on the page",
+    "./with-fenicsx remodel-fenicsx status vessel": "the same",
+    "./with-fenicsx remodel-fenicsx info            # makes": "is run on the first page",
     "./with-fenicsx remodel-fenicsx trade": "tests/studies/test_trade.py does; it takes the time that it gets",
     "./with-fenicsx remodel-fenicsx run demos/artery.toml --set loads.force.value=2.4": "shows a refusal",
 }
@@ -125,7 +130,9 @@ def test_no_command_of_a_page_is_passed_over_in_silence(page: str) -> None:
         assert language in ("sh", "output", "python", "toml", "text"), language
         if language == "text":
             commands = [
-                line for line in text.splitlines() if re.match(r"(\./|docker |podman |git |cd |python3? )", line)
+                line
+                for line in text.splitlines()
+                if re.match(r"(\./|docker |podman |apptainer |sbatch |git |cd |python3? )", line)
             ]
             assert all(map(is_left_out, commands)), commands
 
