@@ -229,7 +229,8 @@ mesh = {degree = 2}
 cells = {initial = "isotropic"}
 remodeling = {turnover = {time = 10.0}}
 time = {end = 80.0, step = 2.0}
-loads = {pressure = {value = 1.2, ramp = [[0.0, 0.0], [8.0, 1.0]]}, elongation = {value = 0.1, ramp = [[0.0, 0.0], [8.0, 1.0]]}}
+loads.pressure = {value = 1.2, ramp = [[0.0, 0.0], [8.0, 1.0]]}
+loads.elongation = {value = 0.1, ramp = [[0.0, 0.0], [8.0, 1.0]]}
 output = {fields = ["content", "natural_length"], every = 8, checkpoint = 2, report = false, columns = COLUMNS}
 cases = [{weight = 0.6, loads = {pressure = 0.8}}, {weight = 0.4, loads = {pressure = 1.3}}]
 """

@@ -99,7 +99,7 @@ def test_collagen_is_neither_made_nor_lost(coupling: str, order: int) -> None:
 
 # ---------------------------------------------------------------- a held stretch
 def held_stretch(force: float, step: float, coupling: str = "staggered") -> tuple[float, list[dict[str, float]]]:
-    """r/r0 of isotropic cells that do not turn, in a matrix so stiff that the chains do not change its stretch; rows."""
+    """r/r0 of isotropic cells that do not turn, in a matrix so stiff that chains leave it as it is; rows."""
     values: dict[str, Any] = {
         "geometry": {"shape": "cube"},
         "model": {"kinematics": "point"},
