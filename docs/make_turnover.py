@@ -30,7 +30,7 @@ from remodel_fenicsx.system.environment import versions  # noqa: E402
 KEPT = DOCS / "figures"
 TIME, STEP, TOLERANCE, RAMP_END = 40.0, 4.0, 1.0, 24.0  # of turnover; the first step; degrees, of chosen steps
 END = 60 * TIME
-AT_REST = 1e-6  # largest |d ln m/dt|, |d ln rho/dt|: the change in T is below 1e-4
+AT_REST = 2.5e-4 / TIME  # largest d ln m/dt, d ln rho/dt; steps of half a T leave 2e-4 of rounding and error
 SLOW = 40 * TIME  # what rests later rests slowly
 WIDE = 10.0  # times the outer radius at the start: far beyond any vessel
 FASTER = 1.1  # the rates at the end over their least: from where on growth speeds up
