@@ -106,8 +106,8 @@ class GrowthWithoutRest(WarnsOnce):
         if rate * elapsed >= numbers["early_rate"] * early_time:
             place = ", ".join(f"{c:.4g}" for c in self.quadrature.place_of_largest(rates))
             self._text = (
-                f"the tissue does not come to rest: content or natural length change by up to {100 * rate * period:.2g} "
-                f"% in remodeling.turnover.time, at ({place}), and the rates fall no faster than 1/t "
+                f"the tissue does not come to rest: content or natural length change by up to {100 * rate * period:.2g}"
+                f" % in remodeling.turnover.time, at ({place}); the rates fall no faster than 1/t "
                 "(mechanobiological instability, docs/turnover.md); try a larger remodeling.turnover.gain"
             )
 
