@@ -150,6 +150,39 @@ def test_the_refusal_of_the_first_page_is_the_one_that_is_printed(capsys: pytest
     assert capsys.readouterr().err.split() == " ".join(shown).split()
 
 
+README_SHORT = {  # a test's times, and numbers of runs, for those of the README
+    "run demos/artery.toml": "run demos/artery.toml --set time.end=1",
+    "inflation.toml": "inflation.toml --starts 1 --no-likelihood-profiles",
+    "sweep demos/layers.toml loads.pressure.value=8:16:3": "sweep demos/layers.toml loads.pressure.value=8:16:2 "
+    "--set time.end=1",
+}
+
+
+def test_the_examples_of_the_readme_run_and_its_other_commands_are_commands(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What stands before "More commands" is run, the rest is read by the parser: it takes minutes."""
+    monkeypatch.chdir(tmp_path)
+    for _, text in blocks(TUBE):
+        keep(text)
+    text, more = (ROOT / "README.md").read_text(encoding="utf-8").split("## More commands")
+    for long, short in README_SHORT.items():
+        assert long in text
+        text = text.replace(long, short)
+    lines = [line.partition("    #")[0] for block in re.findall(r"^```sh\n(.*?)^```", text, re.M | re.S)
+             for line in block.splitlines() if not is_left_out(line)]  # fmt: skip
+    assert len(lines) == 5
+    for line in lines:
+        obey(line, capsys)
+    assert Path("results/artery/report.html").exists() and Path("tube/history.csv").exists()
+    (block,) = re.findall(r"^```sh\n(.*?)^```", more, re.MULTILINE | re.DOTALL)
+    commands = [words for line in block.splitlines()
+                if (words := shlex.split(re.sub(r" > .*|  #.*", "", line)))[1] == "remodel-fenicsx"]  # fmt: skip
+    assert len(commands) == len(block.splitlines()) - 2  # but for mpirun's and the tests
+    for _, _, *words in commands:
+        cli.parser().parse_args(words)
+
+
 def test_output_that_was_not_printed_is_found() -> None:
     printed = "tube: step 2/2, t = 2\nresults in tube\n"
     assert list(printed_as("tube: step 100/100, t = 100\n...\n", printed)) == ["tube: step 2/2, t = 2", "..."]
