@@ -142,6 +142,12 @@ class TurnoverPass:
         given = self.settings.time or np.inf, self.settings.deposition_stretch, self.settings.gain
         return rates(self._parameters.at_points(), np.sqrt(squared), *given)
 
+    def power(self) -> float:
+        """Stored energy per time that turnover releases in the solved state, at its F and cells."""
+        cells = self.state.equilibrium_cells.point_cells
+        increment = self._parameters.at_points().turnover_increment(self.state.elastic_gradient(), cells, *self.rates())
+        return 0.0 - float(self.quadrature.integral(self.state.per_mesh_volume(increment)))
+
     def mean(self, name: str) -> float:
         """Volume mean of `content` or `natural_length`."""
         return float(self.quadrature.mean(self._values(name)))
