@@ -351,7 +351,10 @@ def _run(options: argparse.Namespace, task: Callable[..., Path] | None = None) -
     scene = None if options.resume else read_scene(options.scene, options.set, options.profile)
     wishes: Any = {"quiet": options.quiet, "deadline": deadline, "report": options.report}
     if options.resume and (options.output or options.profile):
-        return _fail(f"{'-o' if options.output else '--profile'}: a run goes on in its own folder, as it is", BAD_INPUT)
+        return _fail(
+            f"{'-o' if options.output else '--profile'}: a run goes on in its own folder, with its own settings",
+            BAD_INPUT,
+        )
     _check(reason_unusable())
     interrupts.take_back_signals()
     from remodel_fenicsx.body import GeometryError
@@ -472,7 +475,7 @@ def _sweep(options: argparse.Namespace) -> int:
         for text in options.axes:
             key, numbers = study.read_axis(text, options.latin)
             if key in axes:
-                raise SceneError(f"sweep {key}: is there twice")
+                raise SceneError(f"sweep {key}: this key is given twice")
             axes[key] = numbers
         if math.prod(map(len, axes.values())) > MOST_RUNS:
             raise SceneError(f"sweep: {math.prod(map(len, axes.values()))} runs; allowed are at most {MOST_RUNS}")
@@ -554,12 +557,12 @@ def _report(options: argparse.Namespace) -> int:
     _say(str(written))
     size = written.stat().st_size / 1e6
     if size > options.size:
-        _complain(f"warning: it has {size:.3g} MB, more than --size {options.size:g}: two times of this body need that")
+        _complain(f"warning: the page has {size:.3g} MB, more than --size {options.size:g}: even two times need that")
     if options.open:
         import webbrowser  # slow to import, and seldom asked for
 
         if not webbrowser.open(written.resolve().as_uri()):
-            _complain(f"warning: no browser is to be found from here; open {written} in yours")
+            _complain(f"warning: no browser was found; open {written} in yours")
     return 0
 
 
@@ -649,7 +652,7 @@ def _axes(options: argparse.Namespace) -> int:
 def _unload(options: argparse.Namespace) -> int:
     scene = read_scene(options.scene, options.set, options.profile)
     if not scene.geometry.is_loaded:
-        return _fail("geometry.is = 'unloaded': nothing to find; allowed is 'loaded'", BAD_INPUT)
+        return _fail("geometry.is = 'unloaded': the body is unloaded already; allowed is 'loaded'", BAD_INPUT)
     _check(reason_unusable())
     from remodel_fenicsx.studies.unloaded_folder import write_unloaded
     from remodel_fenicsx.unloading import NoUnloadedShape

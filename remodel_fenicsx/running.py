@@ -193,7 +193,7 @@ def _say_where(checkpoint: Checkpoint) -> None:
     now = versions()
     for name, version in checkpoint.versions.items():
         if now.get(name) != version:
-            log.warning("goes on with %s %s, was %s", name, now.get(name), version)
+            log.warning("goes on with %s %s, the run was begun with %s", name, now.get(name), version)
 
 
 def _built(scene: Scene, comm: MPI.Intracomm) -> Simulation:
@@ -253,7 +253,8 @@ def _record(
         steps = scene.time.number_of_steps if simulation.control else state.number + len(simulation.remaining())
         rank, done = -1 if quiet else comm.rank, scene.time.progress(state.number, state.time)
         progress = stack.enter_context(Progress(steps, scene.name, rank, done=done))
-        log.info(BEGUN + "%s on %d ranks, results in %s", scene.name, comm.size, place)
+        ranks = "1 rank" if comm.size == 1 else f"{comm.size} ranks"
+        log.info(BEGUN + "%s on %s, results in %s", scene.name, ranks, place)
         log.info("%s", scene.summary())
         unknowns = simulation.unknown.x.petsc_vec.getSize()
         if comm.size > 1 and unknowns <= LARGE_ON_RANKS:

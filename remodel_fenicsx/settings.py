@@ -403,7 +403,7 @@ class NaturalLayer(_Share):  # type: ignore[misc]
         if not low < high:
             raise fault(f"must be smaller than to = {shown(high)}", "from", low)
         if self.region is not None and self.share != (0.0, 1.0):
-            raise fault("the layer has a region: from and to say nothing more", "region", self.region)
+            raise fault("a layer with a region takes no from and to", "region", self.region)
         return self
 
     @property
@@ -460,7 +460,7 @@ class Natural(Table):
             for other in self.layers[:index]:
                 same = layer.region is not None and layer.region == other.region
                 if (layer.region is None) != (other.region is None):
-                    raise fault("some layers have a region and some a share of the wall: allowed is one of both",
+                    raise fault("some layers have a region and some a share of the wall: allowed is one kind",
                                 f"layers[{index}].region", layer.region)  # fmt: skip
                 apart = layer.share[0] >= other.share[1] or layer.share[1] <= other.share[0]
                 if same or (layer.region is None and not apart):
@@ -1302,7 +1302,7 @@ def _times(value: Any) -> Any:
         raise fault("must be a list of times above 0")
     times = tuple(map(float, value))
     if any(later <= time for time, later in zip(times, times[1:], strict=False)):
-        raise fault("must increase from time to time")
+        raise fault("times must increase")
     return times
 
 

@@ -35,7 +35,7 @@ from remodel_fenicsx.system.interrupts import take_back_signals
 from remodel_fenicsx.watch.equilibrium_stability import EquilibriumStability
 from remodel_fenicsx.watch.locking import LockingWarning
 from remodel_fenicsx.watch.over_correction import OverCorrection, RestedCells
-from remodel_fenicsx.watch.tissue import FrontsInLayers, RadialChains, VolumeLoss
+from remodel_fenicsx.watch.tissue import FrontsInLayers, GrowthWithoutRest, RadialChains, VolumeLoss
 
 log = logging.getLogger(__name__)
 
@@ -101,7 +101,7 @@ class Simulation:
         take_back_signals()
         if scene.geometry.is_loaded:
             raise SceneError(
-                "geometry.is = 'loaded': this takes the unloaded body; remodel-fenicsx unload SCENE writes its scene"
+                "geometry.is = 'loaded': the unloaded body is needed; remodel-fenicsx unload SCENE writes its scene"
             )
         if scene.model.kinematics == AUTO and domain is None and comm.rank == 0:
             for line in explained(scene):
@@ -140,7 +140,7 @@ class Simulation:
         solver = scene.solver.model_copy(update={"predictor": predictor})
         parts = self.state, tissue, scene.remodeling, solver, self.load_values
         if others and coupling is not None:
-            raise SceneError("cases: a coupling of one's own solves one load case alone; leave out [[cases]]")
+            raise SceneError("cases: a coupling of your own solves one load case; leave out [[cases]]")
         make = self._at_once(tissue, solver, kappa, others) if at_once else coupling
         self.stepper = Stepper(*parts, make, kappa)
         self.tissue = self.stepper.tissue
@@ -164,6 +164,8 @@ class Simulation:
         self.observer = Observer(shape, self.stepper, scene.columns(more))
         self.warnings = self._of_the_state(self.stepper)
         self.warnings += [RadialChains(self.stepper, shape.radial_share), FrontsInLayers(self.stepper, shape)]
+        if self.stepper.turnover is not None:
+            self.warnings.append(GrowthWithoutRest(self.stepper, scene.end_of_ramps))
         if self._cases:
             from remodel_fenicsx.evolution.load_cases import OtherCaseWatcher
 

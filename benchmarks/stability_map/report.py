@@ -54,11 +54,17 @@ def counts(records: Iterable[Record]) -> dict[str, Counter[str]]:
     return rows
 
 
+def used(total: Counter[str]) -> list[str]:
+    """Columns that are not empty; `wrong` in any case, which should be."""
+    return [name for name in (*OUTCOMES, *EXTRA) if total[name] or name == "wrong"]
+
+
 def table(records: Iterable[Record]) -> str:
     """Outcomes by family, as Markdown."""
-    columns = [*OUTCOMES, *EXTRA]
+    rows = counts(records)
+    columns = used(rows["**all**"])
     lines = ["| family | cases | " + " | ".join(columns) + " |", "|---" * (len(columns) + 2) + "|"]
-    for name, row in counts(records).items():
+    for name, row in rows.items():
         number = sum(row[outcome] for outcome in OUTCOMES)
         lines.append(f"| {name} | {number} | " + " | ".join(str(row[c] or "") for c in columns) + " |")
     return "\n".join(lines)
@@ -68,7 +74,7 @@ def comparison(before: Sequence[Record], after: Sequence[Record]) -> str:
     """Totals of both, over all cases and over those that both can express, as Markdown."""
     both = {record["key"] for record in after}
     there = {record["key"] for record in before if record["outcome"] != "not there"}
-    columns = [*OUTCOMES, *EXTRA]
+    columns = used(sum((counts(records)["**all**"] for records in (before, after)), Counter()))
     lines = ["| | cases | " + " | ".join(columns) + " |", "|---" * (len(columns) + 2) + "|"]
     for name, records in (
         ("0.1.0", before),

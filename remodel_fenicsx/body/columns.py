@@ -188,6 +188,7 @@ def _turned_over(name: str, m: Any) -> float:
     return float(m.observer.stepper.turnover.mean(name))
 
 
+TURNOVER_POWER = "turnover_power"
 COLUMNS_ON_REQUEST: dict[str, Column] = {
     column.name: column
     for column in (
@@ -236,6 +237,13 @@ COLUMNS_ON_REQUEST: dict[str, Column] = {
                 by_case=False,
             )
             for name, what in (("content", "amount"), ("natural_length", "natural length"))
+        ),
+        Column(
+            TURNOVER_POWER,
+            "stress length^3 / time",
+            "power that turnover releases in the state of the row; for scenes with remodeling.turnover",
+            lambda m: m.observer.stepper.turnover.power(),
+            by_case=False,
         ),
         Column(
             "processor_seconds",

@@ -61,11 +61,11 @@ def found_axes(
         words = f"undefined in {100 * share:.2g} % of the wall, first at ({x:.4g}, {y:.4g}, {z:.4g})"
         if share > MOST_UNDEFINED:
             raise UndefinedAxes(
-                f"geometry.faces: the local axes are {words}; allowed is {100 * MOST_UNDEFINED:g} %: does an outer "
-                "face lie across the wall from an inner one there?"
+                f"geometry.faces: the local axes are {words}; allowed is {100 * MOST_UNDEFINED:g} %. Is there an outer "
+                "face across the wall from the inner one?"
             )
         if domain.comm.rank == 0:
-            log.info("the local axes are %s; they are taken from the nearest point that has some", words)
+            log.info("the local axes are %s; those of the nearest point are used there", words)
         _fill(axes, known, quadrature)
     depth, station = (_share(values[..., k], values[..., k + 1]) for k in (6, 8))
     nodal = _share(*(_at_nodes(length) for length in (fields.from_inner, fields.from_outer)))

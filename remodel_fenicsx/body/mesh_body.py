@@ -66,7 +66,7 @@ def _text(value: Any) -> str | None:
 
 
 class MeshBody(WalledMesh):
-    """A body of one's own from a mesh file, a vessel with an inner and an outer face and ends.
+    """A body of your own from a mesh file: a vessel with an inner and an outer face and ends.
 
     The file is data: it is read, and never run. Its elements are tetrahedra or hexahedra,
     all of one kind. A run keeps a copy of the file.
@@ -263,7 +263,7 @@ class MeshBody(WalledMesh):
         except MeshFileError as error:
             asked = f"mesh.refinement = {mesh.refinement}, mesh.degree = {mesh.degree}"
             raise SceneError(f"{asked}: {Path(self.file).name} {error}") from None
-        words = "the body stays that of the file's plane faces"
+        words = "the faces of the body stay plane as in the file"
         log.info("split into %d elements of degree %d; %s", len(file.cells), file.degree, words)
         return file, boundary_of(file, self._groups(file), self.open_boundary)
 
@@ -312,7 +312,9 @@ class MeshBody(WalledMesh):
         numbers = mesh_file.distinct(file.cell_groups)
         if 0 in numbers and len(numbers) > 1:
             lost = file.cell_numbers[file.cell_groups == 0]
-            raise self._fault(f"{len(lost)} elements are in no named volume, the first is {lost[0]}; the others are")
+            raise self._fault(
+                f"{len(lost)} elements are in no named volume, the first is {lost[0]}; name all volumes, or none"
+            )
         names = {number: name for name, number in file.names[3].items()}
         names |= {self._volumes(file, name, entries[:1])[0]: name for name, entries in self.regions.items()}
         return {names.get(number, str(number) if number else "body"): number for number in numbers}
@@ -343,7 +345,8 @@ class MeshBody(WalledMesh):
         log.info("%s: %s, SHA-256 %s", Path(self.file).name, counts, file.sha256)
         if through_the_wall(boundary):
             log.warning(
-                "the wall is one element thick in places: bending and the fibre angle through it are lost there"
+                "the wall is one element thick in places: bending, and how the fibre angle changes through it, are "
+                "lost there; try mesh.refinement = 2"
             )
 
     # ------------------------------------------------------------ supports

@@ -137,8 +137,8 @@ def check_supports(domain: MeshDomain, supports: Mapping[str, Support], elongate
     sliding = [part for part in domain.parts if supports.get(part.name, Support(kind="free")).kind == "sliding"]
     if elongated and len(sliding) == 2 and np.linalg.norm(np.cross(sliding[0].normal, sliding[1].normal)) > PARALLEL:
         raise SceneError(
-            "loads.elongation: both ends slide and are not parallel: the elongation would only shift the body, which "
-            "the pressure on its ends holds; allowed with an end that is 'guided' or 'held'"
+            "loads.elongation: both ends slide and are not parallel, so the elongation would only shift the body, "
+            "held by the pressure on its ends; allowed with an end that is 'guided' or 'held'"
         )
     for name, support in supports.items():
         warn_of_twist(name, support, domain.comm)
@@ -148,8 +148,8 @@ def warn_of_twist(name: str, support: Support, comm: Any) -> None:
     """Say so where springs may turn a body about its axis."""
     if support.kind == "elastic" and support.tangential < LEAST_TANGENTIAL and comm.rank == 0:
         log.warning(
-            "supports.%s.tangential = %g: springs that hold a wall hardly across their direction push it sideways "
-            "once it has grown, and it twists; from %g on none has",
+            "supports.%s.tangential = %g: springs that hardly hold a wall across their direction push it sideways "
+            "once it has grown, and it twists; with %g and more no wall has twisted",
             name, support.tangential, LEAST_TANGENTIAL,
         )  # fmt: skip
 

@@ -108,7 +108,7 @@ def objections(scene: Any, name: str) -> list[str]:
         return [f"a {shape.name} has no such reduction; it has {known}"]
     reasons = [reason for rule in shape.reductions[name].rules if (reason := rule(scene)) is not None]
     if scene.solver.unstable == "stop":
-        reasons.append("solver.unstable = 'stop' asks for modes of the whole body")
+        reasons.append("solver.unstable = 'stop' needs the modes of the whole body")
     return reasons
 
 
@@ -223,7 +223,7 @@ def round_about_z(scene: Any) -> str | None:
     axes = scene.cells.axes
     if axes == "cylindrical" or (axes == "global" and all(a == b == 0 for a, b, _ in _dimensions(scene))):
         return None
-    return f"cells.axes = {axes!r} makes another tube along x than along the diagonal"
+    return f"cells.axes = {axes!r}: the tube is not round, along x it differs from along the diagonal"
 
 
 def symmetric_planes(scene: Any) -> str | None:

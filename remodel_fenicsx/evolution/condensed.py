@@ -287,7 +287,7 @@ class AnsweringNewton(GuardedNewton):
         except SolveFailure as failure:
             if self.answering.frozen is not None:
                 raise
-            log.info("solved once more, after passes: %s", failure.reason)
+            log.info("the step is solved once more, from where remodeling passes lead: %s", failure.reason)
             try:
                 return self._after_passes(failure, start, accepted)
             except SolveFailure:
@@ -298,7 +298,7 @@ class AnsweringNewton(GuardedNewton):
         """Solve from where passes lead; where no law jumps, at last from the start with shorter steps."""
         try:
             if not self._pass(failure):
-                log.info("passes do not settle")
+                log.info("remodeling passes do not converge")
                 raise failure
             solution = self._solved()
             solution.count(failure)
@@ -309,7 +309,7 @@ class AnsweringNewton(GuardedNewton):
             if self.answering.jumps_somewhere():
                 raise
             self.unknown.x.array[:], self.answering.accepted, self._patient = start, accepted, True
-            log.info("solved once more, with shorter steps: %s", again.reason)
+            log.info("the step is solved once more, with shorter Newton steps: %s", again.reason)
             try:
                 solution = self._solved()
                 solution.count(again)
@@ -363,7 +363,7 @@ class AnsweringNewton(GuardedNewton):
             extension = self.equilibrium.extension()
             self.unknown.x.array[:] = start
             iterations = solution.newton_iterations, solution.linear_iterations
-            text = "points without cells that belong to their stress"
+            text = "points without cells that fit their own stress"
             raise SolveFailure(text, *iterations, extension, tangents=solution.tangents)
         self.answering.accept()
         return solution

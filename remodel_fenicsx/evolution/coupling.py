@@ -206,7 +206,7 @@ class Staggered:
                 return True
         except SolveFailure as failure:
             work.add(failure)
-            log.info("not solved from where it was expected: %s", failure.reason)
+            log.info("not solved from the predicted displacement: %s", failure.reason)
         unknown[:] = before
         loading.set(old_loads)
         return False

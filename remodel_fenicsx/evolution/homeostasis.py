@@ -118,7 +118,9 @@ class Homeostasis:
         loosens = not self.coupling.accumulates and self.tolerance < COARSE and self.turnover is None
         self._go(time, loads, max(start, self.held_from), loosens, work)
         if loosens and self._held is not None and self._largest_jump()[0] > FRONT:
-            log.info("the cells have a front, and its place depends on the way: it is gone again with the tolerance")
+            log.info(
+                "the cells have a front, whose place depends on the path: the path is followed again with the tolerance"
+            )
             state.restore(self._held)
             self._go(time, loads, max(start, self.held_from), False, work)
         state.reach(start, number)
@@ -140,7 +142,7 @@ class Homeostasis:
             work.add(step.work)
             work.substeps += step.work.substeps
             work.residual = step.work.residual
-            log.info("on the way: time %g, %d Newton iterations", step.time, step.work.newton_iterations)
+            log.info("on the path: time %g, %d Newton iterations", step.time, step.work.newton_iterations)
             if state.time < self.held_from:
                 continue
             if loosens:
@@ -166,11 +168,14 @@ class Homeostasis:
         if max(self._largest(self._change_by_a_pass(soon, work.residual)), self._growth()) <= REST:
             return True
         if self.turnover is not None and self.turnover.grows_on():
-            text = "growth does not come to rest (docs/turnover.md): the state is that of time %g, on the way"
+            text = "growth does not come to rest (docs/turnover.md): the state is that of time %g, on the path"
             self._warn(text, self.state.time)
             return True
         if waiting > LONGEST_HOLD:
-            self._warn("the cells do not come to rest: a pass to the limit changes A by up to %.2g r0^2", rest)
+            self._warn(
+                "the cells do not come to rest: a pass to its limit changes the structure tensor A by up to %.2g r0^2",
+                rest,
+            )
             if self.turnover is not None:
                 self._warn("content or natural length change by up to %.2g in a time of T", self._growth())
         return waiting > LONGEST_HOLD
@@ -192,14 +197,14 @@ class Homeostasis:
             found = limit.solve(time, loads)
         except SolveFailure as failure:
             work.add(failure)
-            log.info("the rest of the way is not solved in one step: %s", failure.reason)
+            log.info("the rest of the path was not solved in one step: %s", failure.reason)
             state.restore(before)
             return False
         work.add(found)
         leads_on = self._is_along(state.cells.structure_tensor() - structure, towards)
         if not leads_on or not self._grows_along(self._grown() - grown, growth):
             work.residual = residual
-            log.info("the rest of the way in one step leads elsewhere")
+            log.info("one step for the rest of the path led to another state; it is not used")
             state.restore(before)
             return False
         self.steps, work.substeps, work.residual = self.steps + 1, work.substeps + 1, found.residual
@@ -274,17 +279,17 @@ class Homeostasis:
         if jump > FRONT and self.state.comm.rank == 0:
             log.log(
                 NOTICE,
-                "the cells have a front about %.4g, %.4g, %.4g: A differs by %.2g r0^2 from one point to the next. A "
-                "front may rest elsewhere too: its place depends on the way, and is as exact as time.tolerance and the "
-                "points of the mesh (docs/theory.md, Equilibrium at once)",
+                "the cells have a front near %.4g, %.4g, %.4g: the structure tensor A differs by %.2g r0^2 between "
+                "neighbouring points. The front might rest at another place: its place depends on the path, and is as "
+                "exact as time.tolerance and the mesh (docs/theory.md, Equilibrium at once)",
                 *place,
                 jump,
             )
         if share and self.state.comm.rank == 0:
             log.log(
                 NOTICE,
-                "%.3g %% of the body has no tension at rest, or hardly any beside compression: cells there stay where "
-                "the way has left them, and depend on it (docs/theory.md, Equilibrium at once)",
+                "%.3g %% of the body has no tension at rest, or hardly any beside compression. The cells there stay as "
+                "the path has left them, and depend on it (docs/theory.md, Equilibrium at once)",
                 100 * share,
             )
         return 0.0

@@ -109,8 +109,8 @@ class Implicit:
         self._numbers["held"] = share
         if self.state.comm.rank == 0:
             log.warning(
-                "time %g: in %.3g %% of the body no cells belong to their stress, not in parts of the step either: "
-                "there they are held, and the row is not the implicit solution. "
+                "time %g: in %.3g %% of the body no cells were found that fit their own stress, in parts of the step "
+                "neither. The cells there keep their last values, so the row is not the implicit solution. "
                 "The column held_points counts the points; smaller steps have fewer, the law 'tensor' has none",
                 time,
                 100 * share,
@@ -131,7 +131,7 @@ class Implicit:
         try:
             self._solve_or_part(time, loads, work, answering, min(STEP_HALVINGS, most))
         except StepFailure as failure:
-            log.info("some cells are held: %s", failure)
+            log.info("some cells keep their last values: %s", failure)
             unknown[:] = before
             self.state.loading.set(old)
             answers.begin(time, residual)

@@ -182,9 +182,9 @@ class RemodelingPass:
             self._numbers["said"] = 1
             if self.state.comm.rank == 0:
                 log.warning(
-                    "solver tolerance: the forces that are out of balance may be stresses of %.2g, the body's are "
-                    "%.2g; up to %.2g is not taken for tension; lower solver.relative_tolerance or "
-                    "solver.absolute_tolerance",
+                    "solver tolerance: the out-of-balance forces may be stresses of up to %.2g, the stresses of "
+                    "the body are %.2g. Stresses up to %.2g do not count as tension; lower "
+                    "solver.relative_tolerance or solver.absolute_tolerance",
                     unbalanced,
                     typical,
                     most,

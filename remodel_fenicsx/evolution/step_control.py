@@ -214,12 +214,12 @@ class StepControl:
     def _say(self, step: Step) -> None:
         if self.state.comm.rank:
             return
-        goes_on = f"; steps of {self._numbers['usual']:.3g} go on" if self._numbers["goes_on"] else ""
+        goes_on = f". The run goes on with steps of {self._numbers['usual']:.3g}" if self._numbers["goes_on"] else ""
         log.log(
             self.level,
             "time %g: the estimated error in time, %.3g degrees, does not fall to time.tolerance = %g with steps of "
-            "%.3g: cells turn over at once there, or the pass over-corrects%s. The column time_error has what was "
-            "reached",
+            "%.3g: some cells turn at once, or the pass over-corrects%s. The column time_error has the error that "
+            "was reached",
             step.time,
             step.time_error,
             self.tolerance,

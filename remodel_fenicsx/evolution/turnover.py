@@ -151,6 +151,12 @@ class TurnoverPass:
         given = self.settings.time or np.inf, self.settings.deposition_stretch, self.settings.gain
         return rates(self._parameters.at_points(), np.sqrt(squared), *given)
 
+    def power(self) -> float:
+        """Stored energy per time that turnover releases in the solved state, at its F and cells."""
+        cells = self.state.equilibrium_cells.point_cells
+        increment = self._parameters.at_points().turnover_increment(self.state.elastic_gradient(), cells, *self.rates())
+        return 0.0 - float(self.quadrature.integral(self.state.per_mesh_volume(increment)))
+
     def mean(self, name: str) -> float:
         """Volume mean of `content` or `natural_length`."""
         return float(self.quadrature.mean(self._values(name)))
@@ -176,8 +182,8 @@ class TurnoverPass:
             if self.state.comm.rank == 0:
                 log.warning(
                     "turnover: %s has changed by more than a factor of %g at (%s) in the step after time %g: growth "
-                    "that does not rest (mechanobiological instability, docs/turnover.md); a larger "
-                    "remodeling.turnover.gain or a thicker wall comes to rest",
+                    "does not come to rest (mechanobiological instability, docs/turnover.md); try a larger "
+                    "remodeling.turnover.gain or a thicker wall",
                     name.replace("_", " "),
                     BEYOND_REST,
                     place,

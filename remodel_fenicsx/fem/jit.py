@@ -90,7 +90,7 @@ def cache_folder() -> Path:
     other = Path(tempfile.gettempdir()) / f"remodel-fenicsx-forms-{os.getuid()}"
     other.mkdir(mode=0o700, exist_ok=True)
     if other.is_symlink() or other.stat().st_uid != os.getuid():
-        raise PermissionError(f"{other}: of another user; set TMPDIR to a folder of your own")
+        raise PermissionError(f"{other}: belongs to another user; set TMPDIR to a folder of your own")
     log.warning("cannot write to %s: forms are compiled into %s", folder, other)
     return other / name
 
@@ -351,7 +351,9 @@ def _alone(kernel: str) -> Iterator[None]:
             _take(lock)
             _remove_unfinished(kernel)
         except OSError as error:  # some network file systems have no locks
-            log.warning("%s cannot be locked (%s): runs at once may wait for each other", lock.name, error.strerror)
+            log.warning(
+                "%s cannot be locked (%s): several runs at a time may wait for each other", lock.name, error.strerror
+            )
         yield
 
 

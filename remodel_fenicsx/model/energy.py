@@ -461,6 +461,24 @@ class Tissue:
         initial = self.chain.stiffness(self.end_to_end_length, self.contour_length)
         return self.present_modulus / 2 * (stiffness * squared_change - initial * repulsion_change)
 
+    def turnover_increment(self, deformation_gradient: Any, cell: UnitCell, content: Any, natural_length: Any) -> Any:
+        """First-order change of W at frozen F and cells when ln m and ln rho change, per reference volume; arrays.
+
+        dW = W_net d ln m - m c g(r/rho) (r/rho)^2 d ln rho.
+
+        Parameters
+        ----------
+        deformation_gradient, cell
+            F (..., 3, 3) and the unit cell.
+        content, natural_length
+            Changes of ln m and ln rho, (...).
+        """
+        assert self.chain is not None
+        F, cells = deformation_gradient, [cell]
+        length = self.relative(sqrt(squared_end_to_end_length(F, cells)))
+        tension = self.present_modulus * self.chain.stiffness(length, self.contour_length) * length**2
+        return self._with_network(0.0, F, cells) * content - tension * natural_length
+
 
 def _stresses(F: Any, first: Any) -> Stresses:
     """All of them from P; UFL."""

@@ -114,7 +114,7 @@ def draw_animation(
     encode = _encoder(ending)
     sight = Sight(RecordedRun(folder), viewing or Viewing())
     if len(sight.recording.times) < FEWEST_FRAMES:
-        raise FigureError(f"{sight.recording.path}: fields of one time are recorded, and nothing moves", 2)
+        raise FigureError(f"{sight.recording.path}: fields of one time alone are recorded, so nothing moves", 2)
     times = [float(time) for time in kept_times(sight.history, sight.recording.times, frames)]
     snapshots = sight.snapshots(times)
     view = sight.view(snapshots, ONE, FRAME_DOTS)
@@ -154,9 +154,9 @@ def _encoder(ending: str) -> Encoder:
         If the environment cannot write it, with exit code 5.
     """
     if ending == ".mp4" and shutil.which("ffmpeg") is None:
-        raise FigureError("mp4 wants ffmpeg; .webp needs nothing", 5)
+        raise FigureError("mp4 needs ffmpeg, which is not there; .webp needs nothing", 5)
     if ending == ".webp" and not features.check("webp"):
-        raise FigureError("webp wants a Pillow that writes it; .gif needs nothing", 5)
+        raise FigureError("webp needs a Pillow that writes it; .gif needs nothing", 5)
     return {".gif": _gif, ".webp": _webp, ".mp4": _mp4}[ending]
 
 

@@ -93,7 +93,7 @@ def _cut_off(whole: WholeBody, cut: str | None) -> NDArray[np.bool_]:
     if cut not in found:
         raise FigureError(f"--cut {cut}: allowed are {', '.join(CUTS)}", 2)
     if cut is not None and not found[cut].any():
-        raise FigureError(f"--cut {cut}: no element of this body lies whole in that part of it", 2)
+        raise FigureError(f"--cut {cut}: no whole element of this body lies in that part", 2)
     return found[cut]
 
 
@@ -127,7 +127,9 @@ class Sight:
         self.whole = WholeBody(recording)
         recorded = set(recording.fields(recording.times[0], SHOWN_FIELDS))
         if ANGLE not in recorded:
-            raise FigureError(f"{recording.path}: the run recorded no {ANGLE} (output.fields), which colours show", 2)
+            raise FigureError(
+                f"{recording.path}: the run recorded no {ANGLE} (output.fields), which the colours show", 2
+            )
         self.has_chains = set(OF_RIBBONS) <= recorded
         self.is_deformed = self.whole.is_turned <= ("deformation_gradient" in recorded) and "displacement" in recorded
         self.shown = shown_elements(self.whole, viewing)

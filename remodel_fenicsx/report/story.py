@@ -16,7 +16,7 @@ from remodel_fenicsx.system.regular_files import read_regular
 
 _LINE = re.compile(r"(\d{4}-\d\d-\d\d \d\d:\d\d:\d\d)\S* ([A-Z]+) (.*)")
 _STEP = re.compile(r"time (\S+?), ")
-_RANKS = re.compile(r"scene .* on (\d+) ranks, results in ")
+_RANKS = re.compile(r"scene .* on (\d+) ranks?, results in ")
 
 
 @dataclass

@@ -153,7 +153,7 @@ def restore_state(state: State, checkpoint: Checkpoint | None) -> None:
     state.reach(header.time, header.number)
     numbers = header.numbers | {counts[name]: 0.0 for name in missing}
     if missing and first:
-        log.info("what the checkpoint does not hold begins anew: %s", ", ".join(missing))
+        log.info("not in the checkpoint, so they begin anew: %s", ", ".join(missing))
     for mark, case in state.cases().items():
         case.numbers |= with_mark(numbers, mark)
         case.loading.set(with_mark(header.loads, mark))

@@ -268,7 +268,7 @@ def _continued(path: Path, after: float | None) -> TransientGrid | None:
     if after is None:
         return None
     if not path.exists():
-        log.warning("%s is not there: a new one begins with the next step", path.name)
+        log.warning("%s is missing: a new one begins with the next step", path.name)
         return None
     return TransientGrid.continued(path, after * (1 + SAME_TIME))
 

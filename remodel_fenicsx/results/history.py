@@ -143,9 +143,9 @@ def size_of_rows(path: Path, after: LastStep) -> int:
     except (ValueError, IndexError, csv.Error):
         right = False
     if not right:
-        raise RecordingError(f"{path}: has not the {rows} rows up to time {after.time:g} that belong to the checkpoint")
+        raise RecordingError(f"{path}: lacks rows: the checkpoint belongs to {rows} rows up to time {after.time:g}")
     if found != list(after.columns):
-        raise RecordingError(f"{path}: has other columns than this run; output.columns must stay what it was")
+        raise RecordingError(f"{path}: has other columns than this run; output.columns must stay as it was")
     return sum(map(len, lines))
 
 

@@ -80,7 +80,8 @@ def status(folder: Path) -> list[str]:
             lines.append(words)
         lines.append(f"not running, the last step was done at {when}{killed}")
         if words.startswith(STOPPED):
-            lines[-1] += f"; stopped by {words.removeprefix(STOPPED)}"
+            reason = words.removeprefix(STOPPED)  # a signal, or the whole sentence of a stop on purpose
+            lines[-1] += f"; {reason if reason.startswith('stopped') else f'stopped by {reason}'}"
     if rate:
         lines.append(f"{rate:.3g} s a step (mean of the last {len(seconds)})")
     generations = read_pointer(folder)

@@ -17,7 +17,7 @@ from pydantic import BaseModel, BeforeValidator, Field, ModelWrapValidatorHandle
 
 from remodel_fenicsx.body import SHAPES, Shape
 from remodel_fenicsx.body.shape import LoadKind
-from remodel_fenicsx.body.columns import Column, columns_of, columns_of_region, columns_on_request
+from remodel_fenicsx.body.columns import TURNOVER_POWER, Column, columns_of, columns_of_region, columns_on_request
 from remodel_fenicsx.body.reductions import AUTO, objections
 from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.fem.solver_methods import SOLVER_METHODS
@@ -176,7 +176,7 @@ class Scene(Table):
         else:
             if shape not in PRESETS[preset]:
                 known = ", ".join(map(repr, PRESETS[preset]))
-                raise fault(f"the preset {preset!r} has {known}", "geometry.shape", shape)
+                raise fault(f"the preset {preset!r} has the shapes {known}", "geometry.shape", shape)
             base = merged(base, PRESETS[preset][shape])
         if profile is not None:
             _check_name("profile", profile, PROFILES)
@@ -210,7 +210,9 @@ class Scene(Table):
                 raise fault("allowed here is 'elastic'", f"supports.{quoted(name)}.kind", support.kind)
         formulation = self.mesh.formulation
         if FORMULATIONS[formulation].takes_parts and not isinstance(MATRICES[material.matrix], Matrix):
-            rule = f"needs the volumetric part of material.matrix = {material.matrix!r}: an energy made as a Matrix"
+            rule = (
+                f"needs a material.matrix with a known volumetric part, made as a Matrix; {material.matrix!r} has none"
+            )
             raise fault(rule, "mesh.formulation", formulation)
         missing = self.missing_for_implicit() if self.remodeling.coupling == "implicit" else None
         if missing is not None:
@@ -243,9 +245,9 @@ class Scene(Table):
         if not material.chain_density:
             return "chains: material.chain_density above 0"
         if self.cases[1:]:
-            return "no [[cases]]: cells that answer within a solve have the stress of one load case"
+            return "a scene without [[cases]]: it finds the cells for the stress of one load case"
         if remodeling.has_set_point:
-            return "remodeling.exponent = 2 and remodeling.threshold = 0: their targets have no derivatives here"
+            return "remodeling.exponent = 2 and remodeling.threshold = 0: derivatives of other targets are not known"
         parts = LAWS[remodeling.law], DRIVERS[remodeling.driver], FRAMES[remodeling.frame]
         return refused(*parts, MATRICES[material.matrix], REPULSIONS[material.repulsion])
 
@@ -263,11 +265,11 @@ class Scene(Table):
         """Why there is no equilibrium of the cells, or one that depends on the way there; None where neither is so."""
         law, laws = self.remodeling.law, ", ".join(repr(name) for name, law in LAWS.items() if law.has_limit)
         if not LAWS[law].has_limit:
-            return f"remodeling.law = {law!r} has no limit that the way there does not decide; those with one: {laws}"
+            return f"remodeling.law = {law!r} has no limit that is the same on every path; allowed are the laws {laws}"
         if self.remodeling.threshold:
-            return "remodeling.threshold is above 0: where cells fall asleep depends on the way; march to a late time"
+            return "remodeling.threshold is above 0: where cells rest depends on the path; set time.end to a late time"
         if self.remodeling.has_set_point:
-            return "remodeling.exponent is not 2: the equilibrium is found by derivatives that this target has not here"
+            return "remodeling.exponent is not 2: derivatives of its target are not known; set time.end to a late time"
         for name, properties in self.properties().items():
             if properties.kappa == 0:
                 return f"{in_region(name)}remodeling.kappa = 0: the cells never change"
@@ -296,7 +298,9 @@ class Scene(Table):
                 able = ", ".join(repr(other) for other, kind in SHAPES.items() if kind.has_regions)
                 raise fault(f"a {shape.name} has no regions; shapes with regions: {able}", key, None)
             if not re.fullmatch(NAME, name):
-                raise fault("a region's name is a letter, then letters, digits and _, at most 40 in all", key, None)
+                raise fault(
+                    "the name of a region must be a letter, then letters, digits and _, at most 40 in all", key, None
+                )
             if taken := columns.intersection(column.name for column in columns_of_region(name)):
                 raise fault(f"the column {min(taken)!r} has another meaning; choose another name", key, None)
         shape.check_regions(self.regions, self.mesh)
@@ -314,7 +318,7 @@ class Scene(Table):
         if cells.initial == MEASURED_CELLS and cells.fibres is None:
             raise fault("needs cells.fibres, the name of a file", f"{region}cells.initial", cells.initial)
         if bool(material.chain_density) != bool(self.material.chain_density):
-            rule = "is 0 in all of the body or nowhere (material.chain_density): without chains nothing locks"
+            rule = "must be above 0 in every region, or 0 in all of the body (material.chain_density)"
             raise fault(rule, f"{region}material.chain_density", material.chain_density)
         self._check_turnover(region, properties)
         law = LAWS[self.remodeling.law]
@@ -361,7 +365,9 @@ class Scene(Table):
             able = ", ".join(repr(name) for name, law in LAWS.items() if law.target is not None)
             raise fault(f"needs a remodeling.law with a target: {able}", "remodeling.mean", remodeling.mean)
         if self.cases and self.geometry.is_loaded:
-            raise fault("goes without [[cases]]: the loaded shape has one set of loads", "geometry.is", "loaded")
+            raise fault(
+                "not allowed with [[cases]]: the loaded body belongs to one set of loads", "geometry.is", "loaded"
+            )
         if self.cases[1:] and not COUPLINGS[remodeling.coupling].takes_cases:
             able = ", ".join(repr(name) for name, kind in COUPLINGS.items() if kind.takes_cases)
             raise fault(f"with [[cases]] must be one of: {able}", "remodeling.coupling", remodeling.coupling)
@@ -398,7 +404,9 @@ class Scene(Table):
     def _check_output_times(self) -> None:
         for index, time in enumerate(self.output.times):
             if self.time.is_equilibrium:
-                raise fault("there are no times on the way to an equilibrium", f"output.times[{index}]", time)
+                raise fault(
+                    "not allowed with time.end = 'equilibrium', which has no times", f"output.times[{index}]", time
+                )
             if time > self.time.end:
                 raise fault(f"must be at most time.end = {shown(self.time.end)}", f"output.times[{index}]", time)
             if not self.time.is_hit(time):
@@ -410,9 +418,9 @@ class Scene(Table):
         known = dict.fromkeys([*columns_on_request(self.geometry), *(column.name for column in always)])
         for name in self.output.columns:
             if self.regions and name in self.geometry.columns_of_one_tissue:
-                raise fault(f"{name!r} is for one tissue; the scene has regions", "output.columns", name)
-            if name in TURNED_OVER and not self.remodeling.turnover.is_on:
-                raise fault(f"{name!r} changes with remodeling.turnover alone", "output.columns", name)
+                raise fault(f"{name!r} is for bodies of one tissue; the scene has regions", "output.columns", name)
+            if name in (*TURNED_OVER, TURNOVER_POWER) and not self.remodeling.turnover.is_on:
+                raise fault(f"{name!r} changes only with remodeling.turnover, which is not set", "output.columns", name)
             if name not in known:
                 rule = f"no such column on request; allowed for shape {self.geometry.name!r} are "
                 raise fault(rule + ", ".join(map(repr, known)), "output.columns", name)
@@ -439,7 +447,7 @@ class Scene(Table):
         found = {} if self.regions else {REGION: "the scene has no regions"}
         same = "the mesh is free of stress ([natural]): 'fibre_angle' is that of the unloaded body"
         found |= {UNLOADED: same} if self.natural.is_of_the_mesh else {}
-        stays = "it changes with remodeling.turnover alone"
+        stays = "it changes only with remodeling.turnover, which is not set"
         return found | ({} if self.remodeling.turnover.is_on else dict.fromkeys(TURNED_OVER, stays))
 
     @property
@@ -488,11 +496,15 @@ class Scene(Table):
             able = ", ".join(repr(name) for name, kind in SHAPES.items() if kind.unloads)
             raise fault(f"allowed for the shapes {able}", "geometry.is", "loaded")
         if self.supports.ends == "clamped":
-            raise fault("a tube with clamped ends has no one radius under loads", "geometry.is", "loaded")
+            raise fault(
+                "not allowed with supports.ends = 'clamped': the loaded tube would not have one radius",
+                "geometry.is",
+                "loaded",
+            )
         if self.measured_cells:
             key = f"{in_region(next(iter(self.measured_cells)))}cells.fibres"
             raise fault(
-                f"rows of {key} are found again by their places, which unloading moves", "geometry.is", "loaded"
+                f"not allowed with {key}: its rows belong to places, which unloading moves", "geometry.is", "loaded"
             )
 
     def _check_length(self) -> None:
@@ -686,10 +698,14 @@ def _check_load_on_face(shape: type[Shape], name: str, load: Mapping[str, Any]) 
         raise fault("missing; a load of this kind needs the name of a face", f"{key}.face", load.get("face"))
     if name in shape.loads:
         raise fault(
-            f"{shape.loads[name].meaning}; a load on another face has another name", f"{key}.face", load["face"]
+            f"{shape.loads[name].meaning}; give a load on another face another name", f"{key}.face", load["face"]
         )
     if not re.fullmatch(NAME, name) or name in {column.name for column in columns_of(shape)}:
-        raise fault("a letter, then letters, digits and _, at most 40 in all, and the name of no column", key, None)
+        raise fault(
+            "its name must be a letter, then letters, digits and _, at most 40 in all, and not the name of a column",
+            key,
+            None,
+        )
 
 
 def _plain(value: Any, every_value: bool = False) -> Any:

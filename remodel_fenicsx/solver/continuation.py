@@ -256,12 +256,16 @@ class Change:
             if self.refusal is None and failure.refusal.kind in WAYS_END:
                 self._jumped(found, failure.refusal)
             leads_on = False
-            log.info("time %g: far from where its tangent points to, and not solved in parts: %s", self.time, failure)
+            log.info(
+                "time %g: the solution is far from what the tangent predicts, and parts of the step fail: %s",
+                self.time,
+                failure,
+            )
         else:
             leads_on = self.refusal is None
         work.count(parts)
         if leads_on and self._size(unknown - found) > SAME_SOLUTION * self._size(found - before):
-            log.info("time %g: several solutions; taken is the one to which parts of the step lead", self.time)
+            log.info("time %g: there are several solutions; parts of the step lead to the one that is taken", self.time)
             work.residual, work.extension, work.substeps = parts.residual, parts.extension, parts.substeps
             return
         unknown[:] = found
@@ -298,8 +302,8 @@ class Change:
         if state.comm.rank == 0:
             loads = ", ".join(f"{name} {value:.4g}" for name, value in state.loading.values.items() if value)
             log.warning(
-                "time %g: the body jumps by %.3g to another solution, there is no way on beyond %s. %s; a smaller "
-                "time.step shows the way there", self.time, far, loads or "the start", refusal,
+                "time %g: the body jumps by %.3g to another solution: the path of the last one ends at %s. %s; a "
+                "smaller time.step shows that path", self.time, far, loads or "the start", refusal,
             )  # fmt: skip
 
     def _halved(self, part: float, done: float, failure: SolveFailure, work: Work) -> float:

@@ -244,7 +244,7 @@ class GuardedNewton:
             if second is None:
                 raise
             words, other_way = second
-            log.info("solved once more, %s: %s", words, failure.reason)
+            log.info("the step is solved once more, %s: %s", words, failure.reason)
             with other_way:
                 try:
                     solution = self._attempt(origin)

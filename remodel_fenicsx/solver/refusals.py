@@ -50,12 +50,12 @@ class Refusal:
 TOO_LARGE = Refusal("", "try a smaller time.step, a slower ramp or lower loads")
 LIMIT_POINT = Refusal(
     "limit point",
-    "the load approaches the largest that the body can carry, its displacement grows without bound; lower the load, or "
-    "prescribe a displacement in its place",
+    "the load approaches the largest that the body can carry, and the displacement grows without bound; lower the "
+    "load, or prescribe a displacement in its place",
 )
 BIFURCATION = Refusal(
     "bifurcation",
-    "the body leaves the way that it was on, buckling or losing its symmetry; lower the load, hold it by supports, "
+    "the body buckles or loses its symmetry; lower the load, hold the body by supports, "
     'or stop before it with solver.unstable = "stop"',
 )
 CHAIN_LOCKING = Refusal(
@@ -64,14 +64,14 @@ CHAIN_LOCKING = Refusal(
 )
 KINEMATIC_LOCKING = Refusal(
     "kinematic locking",
-    "supports and loads leave elements no volume; prescribe less, or refine the mesh",
+    "supports and loads leave elements without volume; prescribe a smaller motion, or refine the mesh",
 )
 SOLVER_TOLERANCE = Refusal(
     "solver tolerance",
-    "the residual goes no further down; try a larger solver.maximum_iterations, or a smaller time.step",
+    "the residual does not fall below the tolerance; try a larger solver.maximum_iterations, or a smaller time.step",
 )
 SEVERAL_SOLUTIONS = Refusal(
-    "several solutions", "this one is not that to which the last one leads; try a slower ramp, or lower loads"
+    "several solutions", "this solution does not continue the last one; try a slower ramp, or lower loads"
 )
 UNSTABLE = Refusal("lost stability", 'lower the load, or go on beyond it with solver.unstable = "warn"')
 
@@ -108,7 +108,7 @@ def diagnosed(
             return found
         return _of_the_tolerance(failure) or found
     except FactorisationFailed as reason:
-        log.info("the kind of the refusal is not known: %s", reason)
+        log.info("why the step was not solved could not be found out: %s", reason)
         return TOO_LARGE
     finally:
         inertia.close()
@@ -122,7 +122,7 @@ def _of_the_tolerance(failure: SolveFailure) -> Refusal | None:
     if failure.relative_residual > LOOSEST:
         return found
     enough = 10.0 ** np.ceil(np.log10(2 * failure.relative_residual))  # twice: it is not the same in every iteration
-    return replace(found, advice=f"{found.advice}; solver.relative_tolerance = {enough:g} takes it as solved")
+    return replace(found, advice=f"{found.advice}; solver.relative_tolerance = {enough:g} would accept this state")
 
 
 def _of_the_tangent(inertia: Inertia, direction: NDArray[np.float64] | None) -> Refusal:
@@ -130,9 +130,9 @@ def _of_the_tangent(inertia: Inertia, direction: NDArray[np.float64] | None) -> 
     at_start, unloaded = of_the_unloaded_body(inertia)
     place = ", ".join(f"{c:.4g}" for c in mode.place)
     finding = (
-        f"the lowest eigenvalue of the tangent is {mode.eigenvalue:.3g}, {unloaded:.3g} in the unloaded body, its mode "
+        f"the lowest eigenvalue of the tangent is {mode.eigenvalue:.3g}, and {unloaded:.3g} in the unloaded body; its "
     )
-    finding += f"largest at ({place})"
+    finding += f"mode is largest at ({place})"
     if negative > at_start:
         return replace(BIFURCATION, finding=finding)
     if mode.eigenvalue > NEARLY_CRITICAL * unloaded:

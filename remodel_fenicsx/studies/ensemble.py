@@ -91,7 +91,7 @@ def members_of(scene: Scene, folder: Path, seeds: int) -> list[Run]:
         If the scene has no random cells.
     """
     if not scene.has_random_cells:
-        raise SceneError(f"cells.initial = {scene.cells.initial!r}: an ensemble is one of 'random' cells")
+        raise SceneError(f"cells.initial = {scene.cells.initial!r}: an ensemble needs 'random' cells")
     if scene.time.tolerance is not None and not scene.time.is_equilibrium:
         raise SceneError(f"time.tolerance = {scene.time.tolerance:g}: each seed would have other steps; leave it out")
     numbers = range(scene.cells.seed, scene.cells.seed + seeds)

@@ -206,7 +206,7 @@ def estimated(results: Sequence[Result]) -> tuple[list[Row], list[str]]:
     for other, guess in guesses.items():
         if other != name and np.isfinite(guess.unknown):
             apart = typical(guess.angles - best.angles)
-            notes.append(f"couplings: what {other!r} tends to is {apart:.2g} degrees from what {name!r} does")
+            notes.append(f"couplings: the limits of {other!r} and {name!r} are {apart:.2g} degrees apart")
     rows = [_row(result, best) for result in results]
     rows.sort(key=lambda row: row.result.seconds)
     on_front = pareto([row.result.seconds for row in rows], [row.angle_error for row in rows])
@@ -223,7 +223,7 @@ def _guess(fixed: Sequence[Result]) -> _Guess:
         sweeps["mesh"] = _mesh_sweep(fixed)
     for factor, (sweep, words) in sweeps.items():
         if not sweep:
-            notes.append(f"{factor}: fewer than two settings of it: its error is in no estimate")
+            notes.append(f"{factor}: fewer than two settings were run, so its error is in no estimate")
             unknown = np.inf
             continue
         found, found_lengths = limit([r.angles for r in sweep]), limit([r.lengths for r in sweep])
@@ -246,7 +246,7 @@ def _row(result: Result, guess: _Guess) -> Row:
     if unknown > UNKNOWN_SHARE * error:
         doubt = "no order seen" if np.isfinite(unknown) else "a factor was not varied"
     if SPREAD * result.noise > error:
-        doubt = f"cells' noise {result.noise:.2g}"
+        doubt = f"noise of random cells {result.noise:.2g}"
     return Row(result, error, length, doubt=doubt)
 
 

@@ -315,7 +315,7 @@ def fit(
         If a file cannot be written.
     """
     if scene.cases:
-        raise SceneError("cases: a fit is one of a single load case; leave out [[cases]]")
+        raise SceneError("cases: a fit takes one load case; leave out [[cases]]")
     unknowns, tables = read_measurements(Path(data), scene)
     mark = fingerprint(scene, unknowns, tables)
     place = _place(folder, f"{scene.name}-{FIT}", mark)

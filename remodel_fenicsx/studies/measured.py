@@ -147,7 +147,7 @@ def _table(table: Any, place: str, folder: Path, scene: Scene) -> Measured:
     if state not in STATES:
         raise SceneError(f"{place}.state = {shown(state)}: must be one of {', '.join(map(repr, STATES))}")
     if ("time" in table) != (state == "after"):
-        raise SceneError(f"{place}.time: goes with state = 'after', until when the tissue has remodeled")
+        raise SceneError(f"{place}.time: allowed only with state = 'after': the time until which the tissue remodels")
     time = _positive(table["time"], f"{place}.time") if state == "after" else 0.0
     columns = _read_columns(folder / table["file"], f"{place}.file")
     loads = tuple(name for name in columns if name in scene.loads)

@@ -69,9 +69,9 @@ def stability(
     if not LAWS[scene.remodeling.law].remodels:
         raise SceneError(f"remodeling.law = {scene.remodeling.law!r}: nothing remodels, so there is no pass to analyse")
     if scene.cases[1:]:
-        raise SceneError("cases: the analysis is one of a single load case; leave out [[cases]]")
+        raise SceneError("cases: the analysis takes one load case; leave out [[cases]]")
     if scene.time.tolerance is not None and not scene.time.is_equilibrium:
-        raise SceneError(f"time.tolerance = {scene.time.tolerance:g}: the analysis is one of equal steps; leave it out")
+        raise SceneError(f"time.tolerance = {scene.time.tolerance:g}: the analysis needs equal steps; leave it out")
     end_all_ranks_on_exception()
     with hold_log(comm.rank, quiet=quiet) as held:
         simulation = Simulation(scene, comm)

@@ -140,7 +140,7 @@ class _Runner:
             return "the same command tries again what has failed"
         return (
             f"a larger budget goes on; the cheapest {number} need about {sum(sorted(left)[:number]):.2g} s for their "
-            "steps, each process a few seconds for its start, and more where kernels are to be compiled"
+            "steps; add a few seconds for the start of each process, and more where code must be compiled"
         )
 
     def _expected(self, setting: Setting) -> float:
@@ -196,7 +196,9 @@ def in_words(found: Trade) -> str:
             f"{'* ' if row.on_front else '  '}{row.result.seconds:9.3g} {row.angle_error:9.2g} "
             f"{100 * row.length_error:9.2g}  {setting.in_words()}{doubt}"
         )
-    lines.append("*: no other one is as good for less. Errors are estimates; degrees: fibre angle, root mean square.")
+    lines.append(
+        "*: no other setting is as good for less. Errors are estimates; degrees: fibre angle, root mean square."
+    )
     lines += [verdict(found.rows), *found.notes]
     if found.left_out:
         lines.append(f"left out, over the budget: {', '.join(found.left_out)}")

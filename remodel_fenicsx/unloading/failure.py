@@ -36,7 +36,7 @@ def in_shares(find: Callable[[float, Found], Found], start: Found) -> Found:
     try:
         return find(1.0, start)
     except refusals as error:
-        log.info("unloading: not in one piece (%s); in shares of the loads", " ".join(str(error).split()))
+        log.info("unloading all loads at once failed (%s); they are now taken in parts", " ".join(str(error).split()))
     done = 0.0
     for share in SHARES:
         try:
@@ -44,8 +44,8 @@ def in_shares(find: Callable[[float, Found], Found], start: Found) -> Found:
         except refusals as error:
             reason = " ".join(str(error).split())
             raise NoUnloadedShape(
-                f"geometry.is = 'loaded': no unloaded shape at {100 * share:g} % of the loads, there is one at "
-                f"{100 * done:g} %: {reason}; try lower loads, or a stiffer tissue"
+                f"geometry.is = 'loaded': no unloaded body was found at {100 * share:g} % of the loads, there is "
+                f"one at {100 * done:g} %: {reason}; try lower loads, or a stiffer tissue"
             ) from error
         done = share
     return start

@@ -85,7 +85,7 @@ def unloaded_mesh(scene: Scene, comm: MPI.Intracomm, folder: Path) -> Scene:
             if found is None:  # too far: back to half of the way
                 length /= 2
                 if length < LEAST_STEP or not step.any():
-                    raise ArithmeticError("no admissible state on the way: r >= L or J <= 0")
+                    raise ArithmeticError("no admissible state on the path: r >= L or J <= 0")
                 places = places - length * step
                 continue
             size, length = float(np.abs(found).max()), 1.0
@@ -97,7 +97,7 @@ def unloaded_mesh(scene: Scene, comm: MPI.Intracomm, folder: Path) -> Scene:
             places = places + length * step
             if size <= LEAST_MOVE * float(np.ptp(given, axis=0).max()):
                 return places
-        raise ArithmeticError(f"places still move by {size:.2g} after {MOST_MOVES} iterations")
+        raise ArithmeticError(f"nodes still move by {size:.2g} after {MOST_MOVES} iterations")
 
     write(in_shares(find, given))
     log.info("unloaded: %s, found in %d Newton iterations", UNLOADED_MESH, iterations)

@@ -194,7 +194,7 @@ class LinearPass:
         solver.solve()
         if not solver.getConverged():
             raise NotFound(
-                f"no eigenvalue of the pass to {FACTOR_ERROR:g} after {solver.getIterationNumber()} restarts"
+                f"no factor of the pass was found to {FACTOR_ERROR:g} after {solver.getIterationNumber()} restarts"
             )
         found = self._mode(float(np.real(solver.getEigenpair(0, start))), self.tensors(start.array_r))
         for thing in (solver, operator, start):

@@ -55,13 +55,15 @@ class BucklingWarning(WarnsOnce):
         """What is too much in the present state; nothing where it is stable."""
         shares = {"thrust along z": self.thrust_share(), "suction": self.suction_share()}
         said = [
-            f"{name} is about {share:.2g} of what it bears" for name, share in shares.items() if share > WARNED_LOAD
+            f"{name} is about {share:.2g} times what it can bear"
+            for name, share in shares.items()
+            if share > WARNED_LOAD
         ]
         if not said:
             return ""
         return (
-            f"the whole body would buckle (its {' and its '.join(said)}), which kinematics "
-            f"{self.state.kinematics.name!r} cannot show; set model.kinematics = 'full' (docs/theory.md, Buckling)"
+            f"the whole body would buckle: its {' and its '.join(said)}. Kinematics {self.state.kinematics.name!r} "
+            "cannot show that; set model.kinematics = 'full' (docs/theory.md, Buckling)"
         )
 
     def thrust_share(self) -> float:

@@ -76,8 +76,8 @@ class EquilibriumStability(Watcher):
             overdue = False
             if step.is_last:
                 self._info(
-                    "the stability of equilibria was not looked at: with %d unknowns it is on request only, by the "
-                    "column negative_eigenvalues or solver.unstable = 'stop'", self.unknowns,
+                    "the stability of equilibria was not checked: with %d unknowns that is done only on request, by "
+                    "the column negative_eigenvalues or solver.unstable = 'stop'", self.unknowns,
                 )  # fmt: skip
         if not (suspicious or overdue or self.every_step):
             return
@@ -105,14 +105,14 @@ class EquilibriumStability(Watcher):
         unloaded, scale = self._of_the_unloaded_body()
         if now <= unloaded:
             self._info(
-                "%s: %s of the tangent, as the unloaded body has %d: stress that its cells have from the start, "
-                "no lost equilibrium", step.moment, eigenvalues(now), unloaded,
+                "%s: %s of the tangent. The unloaded body has %d, from the stress of its cells at the start: the "
+                "equilibrium is not lost", step.moment, eigenvalues(now), unloaded,
             )  # fmt: skip
             return
         text = f"{eigenvalues(now)} of the tangent ({before} before); {described(self.inertia.lowest(), scale)}"
         if self.stops:
             raise StepFailure(step.time, f"the equilibrium at {step.moment} is unstable: {text}", UNSTABLE)
-        self._warn("%s: the equilibrium is unstable, the body would leave it: %s", step.moment, text)
+        self._warn("%s: the equilibrium is unstable, and the body would leave it: %s", step.moment, text)
 
     def _of_the_unloaded_body(self) -> tuple[int, float]:
         """`inertia.of_the_unloaded_body`, once."""
@@ -226,5 +226,5 @@ def eigenvalues(number: int) -> str:
 def described(mode: Mode, unloaded: float) -> str:
     """A mode in words; `unloaded`: the lowest eigenvalue of the unloaded body, which is the unit where positive."""
     place = ", ".join(f"{c:.4g}" for c in mode.place)
-    size = f"{mode.eigenvalue / unloaded:.3g} of its unloaded value" if unloaded > 0 else f"{mode.eigenvalue:.3g}"
-    return f"the lowest is {size}, its mode largest at ({place})"
+    size = f"{mode.eigenvalue / unloaded:.3g} times its unloaded value" if unloaded > 0 else f"{mode.eigenvalue:.3g}"
+    return f"the lowest is {size}, and its mode is largest at ({place})"

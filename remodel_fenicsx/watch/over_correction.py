@@ -197,9 +197,10 @@ class OverCorrection(WarnsOnce):
     def _in_words(self, swing: Swing) -> str:
         place = ", ".join(f"{coordinate:.4g}" for coordinate in self._place())
         return (
-            f"the remodeling pass over-corrects: from pass to pass the cells swing to and fro, A by {swing.cells:.2g} "
-            f"r0^2 (root mean square; most at {place}), the displacement by {swing.body:.2g} of itself; a pass "
-            f"multiplies this by about {swing.cells_factor:.2g}. Results may be wrong from here on; set "
+            "the remodeling pass over-corrects: from pass to pass the cells swing to and fro. The structure tensor A "
+            f"changes by {swing.cells:.2g} r0^2 (root mean square; most at {place}), the displacement by "
+            f"{swing.body:.2g} of its size; each pass multiplies this by about {swing.cells_factor:.2g}. Results may "
+            "be wrong from here on; set "
             f"{self._advice(swing.cells_factor)} (docs/theory.md, Stability of the pass)"
         )
 
@@ -280,11 +281,11 @@ class RestedCells(WarnsOnce):
         share, place = self.quadrature.mean((squares > 0).astype(float)), self.quadrature.place_of_largest(squares)
         self.say(
             step,
-            "cells that had rested for want of tension remodel again, and the law makes up for it in one pass: "
-            f"{100 * share:.2g} % of the body, A by {change:.2g} r0^2 (root mean square over the body; most at "
-            f"{', '.join(f'{coordinate:.4g}' for coordinate in place)}). When they rest depends on time.step, and so "
-            'does the result; set remodeling.coupling = "relaxed", or a remodeling.law that is a rate (docs/theory.md, '
-            "Stability of the pass)",
+            "cells that had rested without tension remodel again, and the law catches up in one pass. In "
+            f"{100 * share:.2g} % of the body the structure tensor A changes by {change:.2g} r0^2 (root mean square "
+            f"over the body; most at {', '.join(f'{coordinate:.4g}' for coordinate in place)}). When cells rest "
+            'depends on time.step, and so does the result; set remodeling.coupling = "relaxed", or a remodeling.law '
+            "that is a rate (docs/theory.md, Stability of the pass)",
         )
 
 

@@ -91,5 +91,5 @@ def test_no_equilibrium_of_the_cut_is_said(monkeypatch: pytest.MonkeyPatch, capl
 
 
 def test_layers_have_no_cut() -> None:
-    with pytest.raises(SceneError, match="'opening_angle' is for one tissue; the scene has regions"):
+    with pytest.raises(SceneError, match="'opening_angle' is for bodies of one tissue; the scene has regions"):
         scene(**{"regions": {"inside": {"outer_radius": 2.0}, "outside": {}}})

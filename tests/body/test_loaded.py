@@ -154,17 +154,19 @@ def test_two_ranks_find_the_same(tmp_path: Path) -> None:
 def test_what_has_no_unloaded_shape_says_at_which_share(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Exit code 3, and nothing is left behind; from Python an exception."""
     thin = LOADED | VIRGIN | {"geometry.inner_radius": 3.0, "loads.pressure.value": 30.0}
-    with pytest.raises(NoUnloadedShape, match=r"no unloaded shape at \d+ % of the loads, there is one at \d+ %"):
+    with pytest.raises(
+        NoUnloadedShape, match=r"no unloaded body was found at \d+ % of the loads, there is one at \d+ %"
+    ):
         unloaded(scene("radial", **thin), SELF)
     of = own_scene(tmp_path, pressure=500.0)
     assert cli.main(["run", str(of), "-o", str(tmp_path / "run"), "-q"]) == 3
-    assert "no unloaded shape at" in capsys.readouterr().err and not (tmp_path / "run").exists()
+    assert "no unloaded body was found at" in capsys.readouterr().err and not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"supports.ends": "clamped"}, "geometry.is = 'loaded': a tube with clamped ends"),
+        ({"supports.ends": "clamped"}, "geometry.is = 'loaded': not allowed with supports.ends = 'clamped'"),
         ({"natural.cells": "equilibrium"}, "natural.cells = 'equilibrium': needs time.end = 'equilibrium'"),
         (
             {"geometry.is": "unloaded", "natural.cells": "equilibrium"},

@@ -93,7 +93,7 @@ def test_a_line_of_the_mesh_that_is_there_already_changes_nothing() -> None:
      "regions.media.outer_radius = 1.00001: the layer is a length of 1e-05 is too small beside one of 3; allowed is a "
      "ratio up to 10000"),
     ({"inner": {}}, "regions.inner: the column 'fibre_angle_inner' has another meaning; choose another name"),
-    ({"1st layer": {}}, "regions.'1st layer': a region's name is a letter, then letters, digits and _, at most 40 in"),
+    ({"1st layer": {}}, "regions.'1st layer': the name of a region must be a letter, then letters, digits and _"),
     ({"media": {"outer_radius": "2 kPa"}}, "regions.media.outer_radius = '2 kPa': 'kPa' is no unit of length; "),
     ({"media": 2.0}, "regions.media = 2.0: must be a table"),
 ])  # fmt: skip

@@ -98,7 +98,7 @@ def test_growth_has_no_equilibrium_and_says_so(caplog: pytest.LogCaptureFixture)
     simulation, row = at_rest(0.2)
     simulation.close()
     assert row["natural_length"] > 5.0
-    assert sum("growth does not come to rest" in record.message for record in caplog.records) == 1
+    assert sum("growth does not come to rest (docs" in record.message for record in caplog.records) == 1
 
 
 @pytest.mark.parametrize(
@@ -234,14 +234,14 @@ def test_chosen_steps_watch_content_and_natural_length(coupling: str, small_step
 def test_rates_against_their_equation() -> None:
     """At the stretch of deposition nothing changes; beyond it m and rho grow, and no faster than 1/T and its double."""
     chain, r0, contour, time = CHAINS["wormlike"], 1.0, 1.594, 40.0
-    tissue = Tissue(1.0, 1.0, 1.0, contour, r0, content=np.ones(3), natural_length=np.array([1.0, 1.3, 1.3]))
-    stretches = np.array([1.1, 1.15, 0.9])
+    tissue = Tissue(1.0, 1.0, 1.0, contour, r0, content=np.ones(4), natural_length=np.array([1.0, 1.3, 1.3, 1.0]))
+    stretches = np.array([1.1, 1.15, 0.9, 1.4])
     found = rates(tissue, stretches * tissue.natural_length, time, 1.1, 1.0)
     tension = stretches * chain.stiffness(stretches, contour) / (1.1 * chain.stiffness(1.1, contour))
     assert found.content == pytest.approx(np.clip(tension - 1, -1, 1) / time, abs=1e-15)
     growth = (1 / time + np.maximum(found.content, 0)) * (stretches / 1.1 - 1)
     assert found.natural_length == pytest.approx(growth, abs=1e-15)
-    assert found.content[1] > 0 > found.content[2]
+    assert found.content[1] > 0 > found.content[2] and found.content[3] == 1 / time
 
 
 def test_energy_and_its_increment() -> None:
@@ -269,7 +269,7 @@ def test_a_growth_that_does_not_rest_is_said(caplog: pytest.LogCaptureFixture) -
     turnover = {"time": 40.0, "deposition_stretch": 1.1, "gain": 0.2}
     rows, _ = simulated(wall(720.0, 4.0, turnover, COLUMNS))
     assert rows[-1]["outer_radius"] > 5.0
-    assert sum("mechanobiological instability" in record.message for record in caplog.records) == 1
+    assert sum("by more than a factor of 10" in record.message for record in caplog.records) == 1
 
 
 @pytest.mark.parametrize(
@@ -292,9 +292,25 @@ def test_a_run_goes_on_with_its_content(coupling: str, time: dict[str, float], t
     assert last[0] == last[1] and float(last[0][0]) > 1.1
 
 
+@pytest.mark.parametrize(("gain", "rests"), [(0.5, False), (0.2, False), (1.0, True)])
+def test_growth_that_does_not_come_to_rest_is_said_at_the_end(
+    gain: float, rests: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Ever more slowly, or faster and faster; not of a wall that rests some time later, nor of a short run."""
+    turnover = {"time": 40.0, "deposition_stretch": 1.1, "gain": gain}
+    simulated(wall(480.0, 4.0, turnover, COLUMNS))
+    found = [record.message for record in caplog.records if "does not come to rest" in record.message]
+    assert len(found) == (0 if rests else 1)
+    assert rests or "fall no faster than 1/t (mechanobiological instability" in found[0]
+    caplog.clear()
+    simulated(wall(240.0, 4.0, turnover, COLUMNS))
+    assert "come to rest" not in caplog.text
+
+
 def test_its_columns_and_numbers_need_it() -> None:
-    with pytest.raises(SceneError, match="'content' changes with remodeling.turnover alone"):
-        scene_from_dict(wall(40.0, 4.0, None, COLUMNS))
+    for name in (*COLUMNS, "turnover_power"):
+        with pytest.raises(SceneError, match=f"'{name}' changes only with remodeling.turnover"):
+            scene_from_dict(wall(40.0, 4.0, None, [name]))
     with pytest.raises(SceneError, match="remodeling.turnover.time: missing"):
         scene_from_dict(wall(40.0, 4.0, {"gain": 2.0}, []))
 

@@ -113,7 +113,7 @@ def test_fields_are_written_where_there_is_turnover(tmp_path: Path) -> None:
     folder = run(grown("sector", output={"every": 6, "report": False}), tmp_path / "run", SELF)
     fields = Recording(folder).fields(12.0)
     assert {*TURNED} < set(fields) and 1.0 < fields["content"].min() < fields["content"].max()
-    with pytest.raises(SceneError, match="output.fields = 'content': it changes with remodeling.turnover alone"):
+    with pytest.raises(SceneError, match="output.fields = 'content': it changes only with remodeling.turnover"):
         grown(remodeling={}, output={"fields": ["content"]})
 
 

@@ -359,7 +359,7 @@ def test_what_does_not_fit_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
         Scene(**cubic, mesh={"formulation": "f-bar"})
     monkeypatch.setitem(MATRICES, "plain", lambda F, *lame: neo_hookean(F, *lame))
     Scene(**cubic, material={"matrix": "plain"})
-    line = "needs the volumetric part of material.matrix = 'plain': an energy made as a Matrix$"
+    line = "needs a material.matrix with a known volumetric part, made as a Matrix; 'plain' has none$"
     with pytest.raises(SceneError, match=f"^mesh.formulation = 'selective-integration': {line}"):
         Scene(**cubic, material={"matrix": "plain"}, mesh={"formulation": SELECTIVE})
     made = distorted_cube()

@@ -252,7 +252,7 @@ def test_mp4_without_ffmpeg_is_one_line(
     words = ["animate", str(recorded("cube")), "-o", str(tmp_path / "film.mp4")]
     monkeypatch.setattr(files.shutil, "which", lambda name: None)
     assert cli.main(words) == 5
-    assert capsys.readouterr().err == "remodel-fenicsx: mp4 wants ffmpeg; .webp needs nothing\n"
+    assert capsys.readouterr().err == "remodel-fenicsx: mp4 needs ffmpeg, which is not there; .webp needs nothing\n"
     monkeypatch.undo()
     fake_ffmpeg(tmp_path, monkeypatch, "cat > /dev/null; echo Unknown encoder >&2; exit 1")
     assert cli.main([*words, "--frames", "2"]) == 5
@@ -270,7 +270,7 @@ def test_mp4_without_ffmpeg_is_one_line(
     ("cube", ["picture", "DIR", "--view", "1,2"], "--view 1,2: allowed is "),
     ("tendon", ["picture", "DIR", "--layers", "0"], "--layers 0: allowed is a whole number from 1 to 10, from the bot"),
     ("artery", ["animate", "DIR", "--layers", "9"], "--layers 9: allowed is a whole number from 1 to 8, from the in"),
-    ("cube", ["picture", "DIR", "--cut", "half"], "--cut half: no element of this body lies whole in that part"),
+    ("cube", ["picture", "DIR", "--cut", "half"], "--cut half: no whole element of this body lies in that part"),
     ("cube", ["picture", "DIR", "-o", "x.jpg"], "-o x.jpg: allowed is a name that ends in .png, .svg, .pdf"),
     ("cube", ["picture", "DIR", "-o", "x.gif"], "-o x.gif: allowed is a name that ends in .png, .svg, .pdf"),
     ("cube", ["animate", "DIR", "-o", "x.png"], "-o x.png: allowed is a name that ends in .gif, .webp, .mp4"),
@@ -304,7 +304,7 @@ def test_a_run_of_one_time_does_not_move(recorded: Recorded, tmp_path: Path, cap
         fields = run.fields(run.times[-1])
         grid.append(0.0, {"displacement": fields.pop("displacement")}, fields)
     assert cli.main(["animate", str(folder)]) == 2
-    assert f"{folder}: fields of one time are recorded, and nothing moves" in capsys.readouterr().err
+    assert f"{folder}: fields of one time alone are recorded, so nothing moves" in capsys.readouterr().err
     assert cli.main(["picture", str(folder)]) == 0 and (folder / "cube-t0.png").is_file()
 
 

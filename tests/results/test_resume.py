@@ -227,7 +227,7 @@ def test_a_signal_lets_the_step_end(tmp_path: Path, whole: Path, monkeypatch: py
         (["loads.force.value=9"], "loads.force = 9 at time 4: was 8; "),
         (["loads.force.ramp=[[0, 0], [4, 1], [5, 1], [9, 2]]"], "loads.force = 10 at time 6: was 8; "),
         (["time.end=4"], "time.end = 4.0: must be at least 6, where the checkpoint is"),
-        (["output.columns=['pass_residual']"], "has other columns than this run; output.columns must stay what it was"),
+        (["output.columns=['pass_residual']"], "has other columns than this run; output.columns must stay as it was"),
     ],
 )
 def test_another_scene_is_refused_and_nothing_changes(half: Path, changes: list[str], message: str) -> None:
@@ -288,7 +288,7 @@ def test_fields_that_are_gone_begin_with_the_next_step(half: Path) -> None:
     (half / "fields.vtkhdf").unlink()
     resume(half, ["time.end=9.0", "output.every=1"], SELF)
     assert Recording(half).times.tolist() == [7.0, 8.0, 9.0]
-    assert "WARNING fields.vtkhdf is not there: a new one begins with the next step" in (half / "run.log").read_text()
+    assert "WARNING fields.vtkhdf is missing: a new one begins with the next step" in (half / "run.log").read_text()
 
 
 # ---------------------------------------------------------------- other numbers of ranks
@@ -393,6 +393,7 @@ def test_a_signal_is_exit_code_4_and_one_line_says_how_to_go_on(half: Path, whol
     said = status(half)
     assert said[0] == f"{half}: scene, step {last:g} of 500, time {last:g} of 500"
     assert said[1].startswith("not running, the last step was done at ") and "killed" not in said[1]
+    assert said[1].endswith("; stopped by SIGUSR1") and said[1].count("stopped") == 1
     assert said[3] == f"checkpoint at time {last:g}; it goes on with: remodel-fenicsx run --resume {half}"
 
 
@@ -425,7 +426,7 @@ def test_the_status_of_a_run_that_failed_says_why(tmp_path: Path) -> None:
     said = status(tmp_path / "out")
     assert said[1].startswith("failed: no equilibrium at time 1: ") and said[2].startswith("not running, ")
     with (tmp_path / "out" / "run.log").open("a") as log:
-        log.write("2026-01-01 00:00:00,000 INFO scene cube on 1 ranks, results in out\n")
+        log.write("2026-01-01 00:00:00,000 INFO scene cube on 1 rank, results in out\n")
     assert said[2:] == status(tmp_path / "out")[1:]
     with (tmp_path / "out" / "run.log").open("a") as log:
         log.write("2026-01-01 00:00:00,000 INFO ended: SIGTERM\n")

@@ -43,7 +43,7 @@ def test_on_the_command_line_it_lies_over_the_scene(tmp_path: Path, capsys: pyte
     assert "steps of an error below 1 degrees" in words
     assert PROFILES["fast"].in_words("fast") in words
     assert cli.main(["run", "--resume", str(tmp_path), "--profile", "fast"]) == 2
-    assert "--profile: a run goes on in its own folder, as it is" in capsys.readouterr().err
+    assert "--profile: a run goes on in its own folder, with its own settings" in capsys.readouterr().err
 
 
 ISOTROPIC = TUBE | {"cells": {"initial": "isotropic"}}

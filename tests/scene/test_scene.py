@@ -327,7 +327,8 @@ BAD_SCENES = [
     (
         CUBE,
         {"remodeling.coupling": "implicit", "remodeling.law": "tensor", "material.repulsion": "axes"},
-        "remodeling.coupling = 'implicit': needs a material.repulsion that sees no axes, as its law: 'log', 'length'",
+        "remodeling.coupling = 'implicit': needs a material.repulsion that does not depend on axes, "
+        "like its law: 'log', 'length'",
     ),
     (
         CUBE,
@@ -473,7 +474,10 @@ def test_the_bases_of_the_bad_scenes_are_good():
 
 def test_a_preset_without_the_shape(monkeypatch):
     monkeypatch.setitem(PRESETS, "bent", {"tendon": {}, "tube": {}})
-    assert refusal({**CUBE, "preset": "bent"}) == "geometry.shape = 'cube': the preset 'bent' has 'tendon', 'tube'"
+    assert (
+        refusal({**CUBE, "preset": "bent"})
+        == "geometry.shape = 'cube': the preset 'bent' has the shapes 'tendon', 'tube'"
+    )
 
 
 def test_a_law_registered_later_is_allowed(monkeypatch):

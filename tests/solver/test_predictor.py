@@ -143,7 +143,7 @@ def test_it_is_resumed_with_what_it_remembers(predicted: Path, tmp_path: Path) -
     resume(tmp_path / "other", ["time.end=13.0", "solver.predictor='none'"], SELF)
     resume(tmp_path / "other", ["time.end=16.0", "solver.predictor='autoregressive'"], SELF)
     assert (
-        "what the checkpoint does not hold begins anew: predictor_increment_0"
+        "not in the checkpoint, so they begin anew: predictor_increment_0"
         in (tmp_path / "other" / "run.log").read_text()
     )
     kept, wanted = (read_checkpoint(one) for one in (tmp_path / "other", predicted))

@@ -239,7 +239,7 @@ def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
     path = tmp_path / "scene.toml"
     path.write_text(scene(output={"fields": False}).with_values({"cells.initial": "isotropic"}).to_toml())
     assert cli.main(["ensemble", str(path), "-o", str(tmp_path / "out")]) == 2
-    assert "an ensemble is one of 'random' cells" in capsys.readouterr().err
+    assert "an ensemble needs 'random' cells" in capsys.readouterr().err
     assert cli.main(["ensemble", str(path), "--seeds", "1"]) == 2
     assert "--seeds 1: allowed is a whole number at least 2" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

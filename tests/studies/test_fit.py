@@ -340,7 +340,7 @@ MODULI = ("lame_lambda", "lame_mu", "chain_density")
         ("lower = 1e20", "lower = 2e21", "must lie between lower 2e+21 and upper 1e+23"),
         ("material.lame_mu", "material.lame", "material.lame"),
         ('state = "history"', 'state = "past"', "measured 2.state = 'past': must be one of 'virgin'"),
-        ('state = "history"', 'state = "after"', "measured 2.time: goes with state = 'after'"),
+        ('state = "history"', 'state = "after"', "measured 2.time: allowed only with state = 'after'"),
         ("start = 4.0", "start = 4.0, prior = 3.0", "prior and prior_sd (of the logarithm) go together"),
         ("[unknowns]", "[unknown]", "'unknown': no such key; allowed are unknowns, measured"),
     ],

@@ -92,7 +92,7 @@ def test_whole_numbers_stay_whole() -> None:
         (["remodeling.kappa=1"], "sweep: 1 runs; allowed are 2 to 10000"),
         (["remodeling.kapa=1,2"], "remodeling.kapa"),
         (["remodeling.kappa=-1,2"], "remodeling.kappa = -1"),
-        (["remodeling.kappa=1,2", "remodeling.kappa=3,4"], "sweep remodeling.kappa: is there twice"),
+        (["remodeling.kappa=1,2", "remodeling.kappa=3,4"], "sweep remodeling.kappa: this key is given twice"),
         (["remodeling.kappa=1:2:3", "--latin", "4"], "must be KEY=a:b with --latin"),
         (["remodeling.kappa=1:2:9999", "time.end=1:2:9999"], "runs; allowed are at most 10000"),
     ],

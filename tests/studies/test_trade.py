@@ -84,7 +84,7 @@ def test_estimates_are_the_errors_of_a_smooth_problem() -> None:
     said = "\n".join(notes)
     assert "time: no error (steps 5, 2.5 on refinement 1, degree 1)" in said  # of 'implicit', whose guess is taken
     assert "mesh: order 2 (refinements 1, 2, 4 of degree 2)" in said
-    assert "couplings: what 'staggered' tends to is " in said
+    assert "couplings: the limits of 'staggered' and " in said
     exact_ones = {row.result.setting.scene.remodeling.coupling for row in rows if row.angle_error < 0.02}
     assert exact_ones == {"implicit"}
 
@@ -110,10 +110,10 @@ def test_doubts_are_said() -> None:
     assert any("no order seen" in note for note in notes)
     assert any(row.doubt == "no order seen" for row in rows)
     rows, _ = estimated([made_up(setting, noise=1.0) for setting in ladder(artery())])
-    assert {row.doubt for row in rows if row.angle_error < 1.0} == {"cells' noise 1"}
+    assert {row.doubt for row in rows if row.angle_error < 1.0} == {"noise of random cells 1"}
     only_time = [made_up(s) for s in ladder(artery()) if s.mesh == ("radial", 1, 1)]
     rows, notes = estimated(only_time)
-    assert "mesh: fewer than two settings of it: its error is in no estimate" in notes
+    assert "mesh: fewer than two settings were run, so its error is in no estimate" in notes
     assert {row.doubt for row in rows} == {"a factor was not varied"}
 
 

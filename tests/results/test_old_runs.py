@@ -1,0 +1,61 @@
+"""Folders of runs of earlier versions: they are read, shown and gone on with; a newer one is refused plainly.
+
+run-0.2.0.zip is the folder that `remodel-fenicsx run demos/cube.toml --set time.end=3` of version 0.2.0 left.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from remodel_fenicsx import Recording, __version__, cli, preset_scene, run
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """The run of 0.2.0."""
+    found = tmp_path / "run"
+    with zipfile.ZipFile(Path(__file__).with_name("run-0.2.0.zip")) as archive:
+        archive.extractall(found)
+    return found
+
+
+def test_a_run_of_the_version_before_is_read_and_shown(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    recording = Recording(folder)
+    assert recording.versions["remodel_fenicsx"] == "0.2.0" and recording.scene.name == "cube"
+    np.testing.assert_array_equal(recording.times, [0.0, 1.0, 2.0, 3.0])
+    stretched = recording.points + recording.fields(3.0)["displacement"]
+    assert stretched[:, 2].max() == pytest.approx(recording.history["mean_stretch"][-1], rel=1e-6)
+    assert recording.report().stat().st_size > 100_000
+    assert cli.main(["status", str(folder)]) == 0 and "step 3 of 3" in capsys.readouterr().out
+
+
+def test_it_goes_on_as_if_this_version_had_begun_it(folder: Path, tmp_path: Path) -> None:
+    """The same rows, and the log says that the version is another one."""
+    assert cli.main(["run", "--resume", str(folder), "--set", "time.end=5", "-q", "--no-report"]) == 0
+    whole = Recording(run(preset_scene("kuhl-holzapfel-2007", "cube").with_values({"time.end": 5.0}), tmp_path / "new"))
+    found, expected = Recording(folder).history, whole.history
+    np.testing.assert_array_equal(found["time"], expected["time"])
+    for name in ("force", "mean_stretch", "mean_fibre_angle", "max_chain_extension", "stored_energy"):
+        np.testing.assert_allclose(found[name], expected[name], rtol=1e-7, err_msg=name)
+    said = f"goes on with remodel_fenicsx {__version__}, was 0.2.0" in (folder / "run.log").read_text()
+    assert said == (__version__ != "0.2.0")
+
+
+@pytest.mark.parametrize("name, old, new", [("scene.toml", "\nformat = 2\n", "\nformat = 99\n"),
+                                            ("checkpoint.json", '"format": 1', '"format": 99')])  # fmt: skip
+def test_what_a_newer_version_has_left_is_refused_in_one_line(
+    folder: Path, capsys: pytest.CaptureFixture[str], name: str, old: str, new: str
+) -> None:
+    """Of a later format; nothing changes in the folder."""
+    text = (folder / name).read_text()
+    assert old in text
+    (folder / name).write_text(text.replace(old, new))
+    kept = {path: path.read_bytes() for path in folder.iterdir()}
+    assert cli.main(["run", "--resume", str(folder), "--set", "time.end=5", "-q"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "newer version" in line
+    assert {path: path.read_bytes() for path in folder.iterdir()} == kept
