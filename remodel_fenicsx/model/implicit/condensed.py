@@ -110,7 +110,7 @@ def refused(law: Law, driver: Driver, frame: Frame, matrix: Any, repulsion: Repu
     if named(repulsion, REPULSIONS) not in network.TERMS:
         return "a material.repulsion with derivatives: " + ", ".join(map(repr, network.TERMS))
     if repulsion is REPULSIONS["axes"] and law.dimensions is None:
-        return "a material.repulsion that sees no axes, as its law: 'log', 'length'"
+        return "a material.repulsion that does not depend on axes, like its law: 'log', 'length'"
     return None
 
 
