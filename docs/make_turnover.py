@@ -15,6 +15,7 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 DOCS = Path(__file__).resolve().parent
 sys.path[:0] = [str(DOCS.parent)]
@@ -54,9 +55,10 @@ GROWN = (
 )
 MAP = (
     "Where turnover comes to rest",
-    "By gain and deposition stretch: opening angle at rest in degrees; an asterisk where it rests after 40 T only; "
-    "'slower' where the wall still dilates at 60 T, ever more slowly, 'faster' where it dilates faster and faster. "
-    "Law tensor, T = 40, chosen steps (tolerance 1), isotropic cells at t = 0, one radius, elongation 10 %.",
+    "By gain and deposition stretch: opening angle at rest in degrees, below 0 where a cut ring would overlap; an "
+    "asterisk where it rests after 40 T only; 'slower' where the wall still dilates at 60 T, ever more slowly, "
+    "'faster' where it dilates faster and faster. Law tensor, T = 40, chosen steps (tolerance 1), isotropic cells at "
+    "t = 0, one radius, elongation 10 %.",
 )
 
 
@@ -138,7 +140,7 @@ def draw_map(page: Page) -> None:
             axes.set(title=f"wall of 1 to {wall.outer_radius:g}, pressure {wall.pressure:g}")
             axes.set_xlabel("deposition stretch")
         panels[0].set_ylabel("gain")
-        figure.colorbar(image, ax=panels, label="opening angle at rest, degrees")
+        figure.colorbar(image, ax=panels, label="opening angle at rest, degrees", extend="min")
         panel_letters(*panels)
         page.save_figure(figure, made_with())
 
@@ -198,22 +200,23 @@ def draw(page: Page) -> None:
     """Three panels: opening angle over time, stress and angle over the depth."""
     over_time, table = read_table(KEPT / "turnover-time.csv"), read_table(KEPT / "turnover.csv")
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(7.2, 2.9), layout="constrained")
+        figure = Figure(figsize=(7.2, 3.1), layout="constrained")
         panels = figure.subplots(1, 3)
         for colour, (name, wall) in zip(COLOURS, WALLS.items(), strict=False):
-            label = f"1 to {wall.outer_radius:g}"
+            label = f"wall of 1 to {wall.outer_radius:g}"
             for cells, line in (("turn", "-"), ("fixed", "--")):
                 here = (over_time["wall"] == name) & (over_time["cells"] == cells)
-                of = label if cells == "turn" else None
-                panels[0].plot(over_time["time"][here], over_time["angle"][here], line, color=colour, label=of)
+                panels[0].plot(over_time["time"][here], over_time["angle"][here], line, color=colour)
             for axes, what in zip(panels[1:], ("stress", "angle"), strict=True):
-                axes.plot(table["depth"], table[f"{what}_{name}_with"], color=colour, label=f"{label}, turnover")
-                axes.plot(table["depth"], table[f"{what}_{name}_without"], ":", color=colour, label=f"{label}, none")
+                axes.plot(table["depth"], table[f"{what}_{name}_with"], color=colour, label=label)
+                axes.plot(table["depth"], table[f"{what}_{name}_without"], ":", color=colour)
         panels[0].set(xlabel="time", ylabel="opening angle, degrees", ylim=(0, None))
-        panels[0].legend(title="dashed: cells do not turn", fontsize=7, title_fontsize=7)
         panels[1].set(xlabel="depth in the wall", ylabel="hoop stress under load", yscale="log")
         panels[2].set(xlabel="depth in the wall", ylabel="fibre angle, degrees", ylim=(0, 90))
-        panels[2].legend(fontsize=7)
+        styles = {"turnover": "-", "cells that do not turn": "--", "no turnover": ":"}
+        handles = [*panels[2].get_lines()[::2], *(Line2D([], [], color="0.3", ls=style) for style in styles.values())]
+        labels = [*(str(line.get_label()) for line in handles[:2]), *styles]
+        figure.legend(handles, labels, loc="outside lower center", ncols=5, fontsize=7)
         panel_letters(*panels)
         page.save_figure(figure, made_with())
 

@@ -62,7 +62,13 @@ class Column:
     by_case: bool = True
 
     def of_case(self, number: int) -> Column:
-        """The same of another load case; the first one is 1."""
+        """The same of another load case; the first one is 1.
+
+        Parameters
+        ----------
+        number
+            Of the load case, from 1.
+        """
         name, meaning = f"{self.name}@{number}", f"{self.meaning}, in load case {number}"
         return replace(self, name=name, meaning=meaning, value=lambda m: self.value(m.of_case(number)))
 
