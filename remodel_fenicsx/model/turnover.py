@@ -21,9 +21,9 @@ from remodel_fenicsx.model.energy import Tissue
 Array = NDArray[np.float64]
 
 
-ITERATIONS = 60  # of Newton's method for one number; halved brackets alone reach a last digit from any start
-TINY = 1e-30  # of complex steps
-NEARLY_LOCKED = 1e-9  # of ln lambda_e: nearer to the locking stretch nothing is looked for
+STRETCH_ITERATIONS = 60  # of Newton's method for one number; halved brackets alone reach a last digit from any start
+COMPLEX_STEP = 1e-30  # of complex steps
+LOCKING_MARGIN = 1e-9  # of ln lambda_e: nearer to the locking stretch nothing is looked for
 
 
 class TurnoverRates(NamedTuple):
@@ -122,17 +122,17 @@ def at_the_end(rule: TurnoverRule, tissue: Tissue, length: Array, duration: floa
     start = np.log(length / (tissue.end_to_end_length * tissue.natural_length))
     deposited = np.full_like(start, np.log(rule.deposition_stretch))
     locked = np.log(tissue.contour_length / tissue.end_to_end_length) if tissue.chain.locks else np.inf + 0 * start
-    below = locked - NEARLY_LOCKED  # where the tension is still a number
+    below = locked - LOCKING_MARGIN  # where the tension is still a number
 
     def missing(y: Array) -> tuple[Array, Array]:
-        found = rule.rates(tissue, np.exp(y + 1j * TINY))
+        found = rule.rates(tissue, np.exp(y + 1j * COMPLEX_STEP))
         change = duration * found.natural_length
-        return start - y - change.real, -1.0 - change.imag / TINY
+        return start - y - change.real, -1.0 - change.imag / COMPLEX_STEP
 
     low, high = np.minimum(start, deposited), np.minimum(np.maximum(start, deposited), below)
     lost = (high >= below) & (missing(high)[0] > 0.0)
     y = np.clip(start, low, high)
-    for _ in range(ITERATIONS):
+    for _ in range(STRETCH_ITERATIONS):
         value, slope = missing(y)
         low, high = np.where(value > 0.0, y, low), np.where(value > 0.0, high, y)
         better = y - value / slope
@@ -141,9 +141,9 @@ def at_the_end(rule: TurnoverRule, tissue: Tissue, length: Array, duration: floa
             break
         y = better
     # beyond the locking stretch: as much as r is beyond the largest one that the step can follow
-    found = rule.rates(tissue, np.exp(y + 1j * TINY))
+    found = rule.rates(tissue, np.exp(y + 1j * COMPLEX_STEP))
     y = np.where(lost, locked + missing(y)[0], y)
-    by_stretch = [np.imag(rate) * duration / TINY for rate in found]  # of the changes of ln m and ln rho, by y
+    by_stretch = [np.imag(rate) * duration / COMPLEX_STEP for rate in found]  # of the changes of ln m and ln rho, by y
     answer = 1.0 / (1.0 + by_stretch[1])  # dy / d ln r
     content = tissue.content * np.exp(duration * np.real(found.content))
     natural_length = length / (tissue.end_to_end_length * np.exp(y))
