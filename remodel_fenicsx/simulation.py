@@ -35,7 +35,7 @@ from remodel_fenicsx.system.interrupts import take_back_signals
 from remodel_fenicsx.watch.equilibrium_stability import EquilibriumStability
 from remodel_fenicsx.watch.locking import LockingWarning
 from remodel_fenicsx.watch.over_correction import OverCorrection, RestedCells
-from remodel_fenicsx.watch.tissue import FrontsInLayers, RadialChains, VolumeLoss
+from remodel_fenicsx.watch.tissue import FrontsInLayers, GrowthWithoutRest, RadialChains, VolumeLoss
 
 log = logging.getLogger(__name__)
 
@@ -164,6 +164,8 @@ class Simulation:
         self.observer = Observer(shape, self.stepper, scene.columns(more))
         self.warnings = self._of_the_state(self.stepper)
         self.warnings += [RadialChains(self.stepper, shape.radial_share), FrontsInLayers(self.stepper, shape)]
+        if self.stepper.turnover is not None:
+            self.warnings.append(GrowthWithoutRest(self.stepper, scene.end_of_ramps))
         if self._cases:
             from remodel_fenicsx.evolution.load_cases import OtherCaseWatcher
 

@@ -62,7 +62,13 @@ class Column:
     by_case: bool = True
 
     def of_case(self, number: int) -> Column:
-        """The same of another load case; the first one is 1."""
+        """The same of another load case; the first one is 1.
+
+        Parameters
+        ----------
+        number
+            Of the load case, from 1.
+        """
         name, meaning = f"{self.name}@{number}", f"{self.meaning}, in load case {number}"
         return replace(self, name=name, meaning=meaning, value=lambda m: self.value(m.of_case(number)))
 
@@ -188,6 +194,7 @@ def _turned_over(name: str, m: Any) -> float:
     return float(m.observer.stepper.turnover.mean(name))
 
 
+TURNOVER_POWER = "turnover_power"
 COLUMNS_ON_REQUEST: dict[str, Column] = {
     column.name: column
     for column in (
@@ -236,6 +243,13 @@ COLUMNS_ON_REQUEST: dict[str, Column] = {
                 by_case=False,
             )
             for name, what in (("content", "amount"), ("natural_length", "natural length"))
+        ),
+        Column(
+            TURNOVER_POWER,
+            "stress length^3 / time",
+            "power that turnover releases in the state of the row; for scenes with remodeling.turnover",
+            lambda m: m.observer.stepper.turnover.power(),
+            by_case=False,
         ),
         Column(
             "processor_seconds",

@@ -69,11 +69,26 @@ class Loading:
 
     # ------------------------------------------------------------ supports
     def hold_face(self, face: str, component: int) -> None:
-        """u_component = 0 on a named face."""
+        """u_component = 0 on a named face.
+
+        Parameters
+        ----------
+        face
+            Its name, of `Domain.faces`.
+        component
+            0, 1 or 2: x, y or z.
+        """
         self._prescribe_face(face, component, self.constant(0.0))
 
     def hold_node(self, point: tuple[float, float, float], component: int) -> None:
         """u_component = 0 at the mesh node at `point`, where the body could move as a whole.
+
+        Parameters
+        ----------
+        point
+            Its reference place, (3,), in the unit of length.
+        component
+            0, 1 or 2: x, y or z.
 
         Raises
         ------
@@ -117,14 +132,32 @@ class Loading:
 
     # ------------------------------------------------------------ loads
     def add_dead_force(self, name: str, face: str, component: int) -> None:
-        """A total force on a face: constant nominal traction, force over reference area, along a coordinate axis."""
+        """A total force on a face: constant nominal traction, force over reference area, along a coordinate axis.
+
+        Parameters
+        ----------
+        name
+            Of the load; `set` gives it a magnitude by this name. It is a force: stress times length squared.
+        face
+            Its name, of `Domain.faces`.
+        component
+            0, 1 or 2: x, y or z.
+        """
         traction = self.magnitude(name, 1.0 / self.area(face))
         direction = ufl.as_vector([1.0 if i == component else 0.0 for i in range(3)])
         measure = self.surface_measure(face)
         self.add_term(lambda u, v: -traction * ufl.inner(direction, v) * self.weight * measure)
 
     def add_follower_pressure(self, name: str, face: str) -> None:
-        """A pressure on the deformed face, against its outward normal: p cof(F) N . v, with the exact linearisation."""
+        """A pressure on the deformed face, against its outward normal: p cof(F) N . v, with the exact linearisation.
+
+        Parameters
+        ----------
+        name
+            Of the load; `set` gives it a magnitude by this name. It is a stress.
+        face
+            Its name, of `Domain.faces`.
+        """
         pressure = self.magnitude(name)
         normal = ufl.FacetNormal(self.domain.mesh)
         measure = self.surface_measure(face)
@@ -136,6 +169,13 @@ class Loading:
 
         Its potential is -p V with the volume V = -1/2 integral of (x e_x + y e_y) . cof(F) N over the face: the caps,
         across which z alone changes, add nothing to it.
+
+        Parameters
+        ----------
+        name
+            Of the load; `set` gives it a magnitude by this name. It is a stress.
+        face
+            Its name, of `Domain.faces`.
         """
         pressure, normal, measure = self.magnitude(name), ufl.FacetNormal(self.domain.mesh), self.surface_measure(face)
 
@@ -160,7 +200,19 @@ class Loading:
         self.add_potential(lambda u: -force * change(u) * self.weight * dx)
 
     def add_prescribed_elongation(self, name: str, face: str, component: int, length: float) -> None:
-        """u_component = elongation * length on a face: the engineering strain of the whole length."""
+        """u_component = elongation * length on a face: the engineering strain of the whole length.
+
+        Parameters
+        ----------
+        name
+            Of the load; `set` gives it a magnitude by this name. It is a number: 0.1 is 10 % longer.
+        face
+            Its name, of `Domain.faces`.
+        component
+            0, 1 or 2: x, y or z.
+        length
+            The reference length, in the unit of length.
+        """
         strain = self.kinematics.uniform_strain(component)
         if strain is not None:
             self._take(name, strain, 1.0)
@@ -227,6 +279,11 @@ class Loading:
 
     def set(self, values: Mapping[str, float]) -> None:
         """Give the named loads new magnitudes.
+
+        Parameters
+        ----------
+        values
+            Magnitude of each load by name, in its unit: of a pressure stress, of a force stress times length squared.
 
         Raises
         ------

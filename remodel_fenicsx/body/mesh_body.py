@@ -66,7 +66,7 @@ def _text(value: Any) -> str | None:
 
 
 class MeshBody(WalledMesh):
-    """A body of one's own from a mesh file, a vessel with an inner and an outer face and ends.
+    """A body of your own from a mesh file: a vessel with an inner and an outer face and ends.
 
     The file is data: it is read, and never run. Its elements are tetrahedra or hexahedra,
     all of one kind. A run keeps a copy of the file.

@@ -255,19 +255,45 @@ class Shape(_Is):  # type: ignore[misc]
         return None
 
     def axes_at(self, coordinates: Array) -> Array:
-        """Local axes at places (..., 3), rows circumferential, axial, radial: here y, z, x, axial along the load."""
+        """Local axes at places (..., 3), rows circumferential, axial, radial: here y, z, x, axial along the load.
+
+        Parameters
+        ----------
+        coordinates
+            Reference places, (..., 3), in the unit of length.
+        """
         return np.broadcast_to(np.roll(np.eye(3), -1, axis=0), (*coordinates.shape[:-1], 3, 3))
 
     def depth(self, coordinates: Array) -> Array:
-        """How far places (..., 3) are through the body, from 0 to 1: here along z."""
+        """How far places (..., 3) are through the body, from 0 to 1: here along z.
+
+        Parameters
+        ----------
+        coordinates
+            Reference places, (..., 3), in the unit of length.
+        """
         return np.asarray(coordinates[..., 2] / self.axial_length, dtype=np.float64)
 
     def station(self, coordinates: Array) -> Array:
-        """How far places (..., 3) are along the body, from 0 to 1: here along z."""
+        """How far places (..., 3) are along the body, from 0 to 1: here along z.
+
+        Parameters
+        ----------
+        coordinates
+            Reference places, (..., 3), in the unit of length.
+        """
         return np.asarray(coordinates[..., 2] / self.axial_length, dtype=np.float64)
 
     def local_axes(self, domain: Domain, quadrature: Quadrature) -> LocalAxes:
-        """Axes, depth and station at the points of a mesh of the body: here functions of the place."""
+        """Axes, depth and station at the points of a mesh of the body: here functions of the place.
+
+        Parameters
+        ----------
+        domain
+            The meshed body.
+        quadrature
+            Its points.
+        """
         places = quadrature.coordinates
         return LocalAxes(
             places,
@@ -289,6 +315,13 @@ class Shape(_Is):  # type: ignore[misc]
     @abstractmethod
     def build(self, mesh: Mesh, comm: MPI.Intracomm | None = None) -> Domain:
         """Mesh the body. Collective.
+
+        Parameters
+        ----------
+        mesh
+            Settings of the elements, a `Mesh`.
+        comm
+            MPI communicator; default: all ranks.
 
         Raises
         ------
@@ -325,7 +358,13 @@ class Shape(_Is):  # type: ignore[misc]
 
     @abstractmethod
     def hold(self, loading: Loading) -> None:
-        """Hold the body as it is held without loads, its ends free."""
+        """Hold the body as it is held without loads, its ends free.
+
+        Parameters
+        ----------
+        loading
+            Of the body; its conditions are added to it.
+        """
 
     def support(self, loading: Loading, ends: str = "free") -> None:
         """Hold the body and add every load that it knows, each zero.

@@ -75,10 +75,24 @@ class Coupling(Protocol):
         """After `remodel`: cells (n, 3) and (n, 3, 3) that a better rule gives; None if the row has no error."""
 
     def solve(self, time: float, loads: LoadValues) -> Work:
-        """Bring the state to equilibrium with the loads of `time`; `state.equilibrium_cells` are those of the row."""
+        """Bring the state to equilibrium with the loads of `time`; `state.equilibrium_cells` are those of the row.
+
+        Parameters
+        ----------
+        time
+            Of the step.
+        loads
+            Magnitudes of all loads at this time, by name.
+        """
 
     def remodel(self, time: float) -> float:
-        """Make the cells that the next step starts with; returns the power of remodeling."""
+        """Make the cells that the next step starts with; returns the power of remodeling.
+
+        Parameters
+        ----------
+        time
+            Of the step.
+        """
 
     def close(self) -> None:
         """Free PETSc's objects."""

@@ -267,7 +267,15 @@ class Stepper:
         return step
 
     def march(self, times: Iterable[float], watchers: Sequence[Watcher] = ()) -> Iterator[Step]:
-        """The loop through time: start, and every step to the end of `times`; what is yielded is committed."""
+        """The loop through time: start, and every step to the end of `times`; what is yielded is committed.
+
+        Parameters
+        ----------
+        times
+            Of the steps, ascending.
+        watchers
+            Who follows them.
+        """
         remaining = list(times)
         self.start(watchers)
         for number, time in enumerate(remaining, start=1):

@@ -74,11 +74,25 @@ class Formulation:
     locks: bool = True
 
     def has(self, element: str, degree: int) -> bool:
-        """Whether it changes anything for such an element."""
+        """Whether it changes anything for such an element.
+
+        Parameters
+        ----------
+        element
+            "hexahedron" or "tetrahedron".
+        degree
+            Of the displacement.
+        """
         return True
 
     def on(self, kinematics: Any, unknown: Any, quadrature: Any) -> Dilatation:
-        """The formulation for these unknowns at these points."""
+        """The formulation for these unknowns at these points.
+
+        Parameters
+        ----------
+        kinematics, unknown, quadrature
+            What the unknowns mean, their dolfinx function, and the points.
+        """
         return Dilatation(quadrature)
 
 

@@ -70,7 +70,15 @@ class Kinematics(ABC):
 
     @abstractmethod
     def unknown(self, mesh: Any, degree: int) -> Any:
-        """A dolfinx function of the unknowns, zero, with elements of this degree."""
+        """A dolfinx function of the unknowns, zero, with elements of this degree.
+
+        Parameters
+        ----------
+        mesh
+            dolfinx mesh.
+        degree
+            Of the elements, 1 or 2.
+        """
 
     @abstractmethod
     def displacement(self, unknown: Any) -> Any:
@@ -97,7 +105,15 @@ class Kinematics(ABC):
         return 1
 
     def subspace(self, space: Any, component: int) -> Any:
-        """The part of the unknown's space that a support of the displacement in x, y or z (0, 1, 2) holds, or None."""
+        """The part of the unknown's space that a support of the displacement in x, y or z (0, 1, 2) holds, or None.
+
+        Parameters
+        ----------
+        space
+            Function space of the unknown.
+        component
+            0, 1 or 2: x, y or z.
+        """
         return space.sub(component)
 
     def uniform_strain(self, component: int) -> Any:

@@ -116,7 +116,15 @@ class Quadrature:
         return ufl.Measure("dx", domain=self.mesh, metadata={"quadrature_degree": self.degree})
 
     def function(self, name: str, value_shape: tuple[int, ...]) -> Any:
-        """A dolfinx function with values of `value_shape` at the points."""
+        """A dolfinx function with values of `value_shape` at the points.
+
+        Parameters
+        ----------
+        name
+            Of the dolfinx function.
+        value_shape
+            Of its value at a point: (), (3,) or (3, 3).
+        """
         if value_shape not in self._spaces:  # one for each shape: its dofmap takes time and memory
             element = basix.ufl.quadrature_element(self.element_kind, value_shape=value_shape, degree=self.degree)
             self._spaces[value_shape] = dolfinx.fem.functionspace(self.mesh, element)

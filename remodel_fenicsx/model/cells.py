@@ -42,7 +42,13 @@ class UnitCell(NamedTuple):
     weight: Any = 1.0
 
     def squared_stretches(self, deformation_gradient: Any) -> list[Any]:
-        """I_I = n_I . C n_I, the squared stretches along the three axes (eq. 5)."""
+        """I_I = n_I . C n_I, the squared stretches along the three axes (eq. 5).
+
+        Parameters
+        ----------
+        deformation_gradient
+            F, UFL of shape (3, 3) or array (..., 3, 3).
+        """
         return [squared_stretch(deformation_gradient, self.axes, i) for i in range(3)]
 
 

@@ -74,7 +74,15 @@ class Chain:
     locks: bool = True
 
     def force(self, end_to_end_length: Any, contour_length: Any, persistence_length: Any, k_theta: Any = 1.0) -> Any:
-        """Force that holds the ends of one chain apart: k theta / A_p times the derivative of its energy (eq. 2)."""
+        """Force that holds the ends of one chain apart: k theta / A_p times the derivative of its energy (eq. 2).
+
+        Parameters
+        ----------
+        end_to_end_length, contour_length, persistence_length
+            r, L and A_p, in one unit of length; numbers, arrays or UFL.
+        k_theta
+            Boltzmann's constant times the temperature: an energy. With 1 the force is in k theta over that length.
+        """
         return k_theta / persistence_length * self.stiffness(end_to_end_length, contour_length) * end_to_end_length
 
 

@@ -63,7 +63,15 @@ class Matrix:
         return sum((term(deformation_gradient, lame_lambda, lame_mu) for term in self.others), volumetric)
 
     def distortional(self, deformation_gradient: Any, lame_lambda: Any, lame_mu: Any) -> Any:
-        """All but the volumetric part."""
+        """All but the volumetric part.
+
+        Parameters
+        ----------
+        deformation_gradient
+            F, UFL of shape (3, 3) or array (..., 3, 3).
+        lame_lambda, lame_mu
+            In the unit of stress.
+        """
         first, *rest = (term(deformation_gradient, lame_lambda, lame_mu) for term in self.others)
         return sum(rest, first)
 
@@ -267,7 +275,15 @@ class Stresses(NamedTuple):
     cauchy: Any
 
     def plus(self, deformation_gradient: Any, second_piola_kirchhoff: Any) -> Stresses:
-        """With what `Tissue.strain_energy` leaves out of UFL, a second Piola-Kirchhoff stress."""
+        """With what `Tissue.strain_energy` leaves out of UFL, a second Piola-Kirchhoff stress.
+
+        Parameters
+        ----------
+        deformation_gradient
+            F, UFL, (3, 3).
+        second_piola_kirchhoff
+            What is added to S, UFL, (3, 3).
+        """
         import ufl
 
         F, S = deformation_gradient, second_piola_kirchhoff
@@ -354,6 +370,11 @@ class Tissue:
 
         lambda + 2 mu + c (r^2 d(g r)/dr + g(r0) r0^2): near the contour length the chains' force changes by much more
         than itself when r changes by a little.
+
+        Parameters
+        ----------
+        end_to_end_length
+            r, in link lengths; numbers, arrays or UFL.
         """
         matrix = self.lame_lambda + 2 * self.lame_mu
         if self.chain is None:
@@ -392,7 +413,13 @@ class Tissue:
         return self._with_network(energy, deformation_gradient, cells)
 
     def volumetric_energy(self, jacobian: Any) -> Any:
-        """The volumetric part of the matrix, U(J)."""
+        """The volumetric part of the matrix, U(J).
+
+        Parameters
+        ----------
+        jacobian
+            J, UFL or array.
+        """
         return self._parts().volumetric(jacobian, self.lame_lambda, self.lame_mu)
 
     def _parts(self) -> Matrix:
@@ -421,7 +448,15 @@ class Tissue:
         return self.present_modulus * self.chain.stiffness(self.end_to_end_length, self.contour_length)
 
     def stresses(self, deformation_gradient: Any, cells: Sequence[UnitCell]) -> Stresses:
-        """P = dW/dF, S = F^-1 P and sigma = P F^T / J (eqs. 6 and 7 with erratum 5), by differentiation of W; UFL."""
+        """P = dW/dF, S = F^-1 P and sigma = P F^T / J (eqs. 6 and 7 with erratum 5), by differentiation of W; UFL.
+
+        Parameters
+        ----------
+        deformation_gradient
+            F, UFL of shape (3, 3).
+        cells
+            The unit cell: one whole cell, or shares whose weights add up to one.
+        """
         import ufl
 
         F = ufl.variable(deformation_gradient)
@@ -441,6 +476,13 @@ class Tissue:
         W depends on the cells through r^2 = A : C and M = sum_I l_I^2 ln I_I only:
         dW = c g(r)/2 d(r^2) - c/2 g(r0) dM, taken at the old cells, where r < L. (Remark 6; the new cells themselves
         may have r > L until the next solve, so their energy is not always defined.)
+
+        Parameters
+        ----------
+        deformation_gradient
+            F, (..., 3, 3).
+        old, new
+            The cells, (..., 3) and (..., 3, 3).
         """
         F = deformation_gradient
         if self.chain is None:
@@ -460,6 +502,24 @@ class Tissue:
             stiffness = stiffness / self.natural_length**2
         initial = self.chain.stiffness(self.end_to_end_length, self.contour_length)
         return self.present_modulus / 2 * (stiffness * squared_change - initial * repulsion_change)
+
+    def turnover_increment(self, deformation_gradient: Any, cell: UnitCell, content: Any, natural_length: Any) -> Any:
+        """First-order change of W at frozen F and cells when ln m and ln rho change, per reference volume; arrays.
+
+        dW = W_net d ln m - m c g(r/rho) (r/rho)^2 d ln rho.
+
+        Parameters
+        ----------
+        deformation_gradient, cell
+            F (..., 3, 3) and the unit cell.
+        content, natural_length
+            Changes of ln m and ln rho, (...).
+        """
+        assert self.chain is not None
+        F, cells = deformation_gradient, [cell]
+        length = self.relative(sqrt(squared_end_to_end_length(F, cells)))
+        tension = self.present_modulus * self.chain.stiffness(length, self.contour_length) * length**2
+        return self._with_network(0.0, F, cells) * content - tension * natural_length
 
 
 def _stresses(F: Any, first: Any) -> Stresses:

@@ -100,6 +100,11 @@ class LocalAxes:
 
         ``c' = F c / |F c|`` follows a material line. ``r' = F^-T r / |F^-T r|`` stays normal to a material surface,
         and is taken as F c x F a, which needs no inverse. a' = r' x c' lies in that surface, square to c'.
+
+        Parameters
+        ----------
+        deformation_gradient
+            F at the points, (..., 3, 3).
         """
         F, axes = by_component(deformation_gradient), by_component(self.axes)
         circumferential, axial = (

@@ -189,7 +189,17 @@ class Measurement:
         return self.quadrature.element_mean(F[:, 2, 2].reshape(self.quadrature.shape))
 
     def face_mean(self, face: str, nodal_values: Array, deformed: bool = False) -> float:
-        """Mean of nodal values (nodes,) over a named face, by its reference or its deformed area."""
+        """Mean of nodal values (nodes,) over a named face, by its reference or its deformed area.
+
+        Parameters
+        ----------
+        face
+            Its name, of `Domain.faces`.
+        nodal_values
+            At the local nodes, (nodes,); the mean is in their unit.
+        deformed
+            Whether by the deformed area.
+        """
         return self._face(face, deformed).mean(nodal_values)
 
     def face_area(self, face: str, deformed: bool = False) -> float:
@@ -212,12 +222,24 @@ class Measurement:
         return float(self.tool("lumen volume", lambda: _LumenVolume(self.observer))())
 
     def largest(self, values: Array) -> float:
-        """Largest of one value per local element, over all ranks."""
+        """Largest of one value per local element, over all ranks.
+
+        Parameters
+        ----------
+        values
+            One a local element, (elements,).
+        """
         local = float(np.max(self.quadrature.owned(values), initial=-np.inf))
         return float(self.domain.comm.allreduce(local, MPI.MAX))
 
     def smallest(self, values: Array) -> float:
-        """Smallest of one value per local element, over all ranks."""
+        """Smallest of one value per local element, over all ranks.
+
+        Parameters
+        ----------
+        values
+            One a local element, (elements,).
+        """
         return -self.largest(-values)
 
     def elements_touching_radius(self, radius: float) -> NDArray[np.bool_]:
@@ -231,7 +253,13 @@ class Measurement:
         return (radii.min(axis=1) <= radius + tolerance) & (radii.max(axis=1) >= radius - tolerance)
 
     def of_case(self, number: int) -> Measurement:
-        """The same step in another load case; the first one is 1."""
+        """The same step in another load case; the first one is 1.
+
+        Parameters
+        ----------
+        number
+            Of the load case, from 1.
+        """
 
         def measured() -> Measurement:
             observer = self.observer.others[number - 2]

@@ -17,7 +17,7 @@ from pydantic import BaseModel, BeforeValidator, Field, ModelWrapValidatorHandle
 
 from remodel_fenicsx.body import SHAPES, Shape
 from remodel_fenicsx.body.shape import LoadKind
-from remodel_fenicsx.body.columns import Column, columns_of, columns_of_region, columns_on_request
+from remodel_fenicsx.body.columns import TURNOVER_POWER, Column, columns_of, columns_of_region, columns_on_request
 from remodel_fenicsx.body.reductions import AUTO, objections
 from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.fem.solver_methods import SOLVER_METHODS
@@ -246,8 +246,6 @@ class Scene(Table):
             return "chains: material.chain_density above 0"
         if self.cases[1:]:
             return "a scene without [[cases]]: it finds the cells for the stress of one load case"
-        if remodeling.turnover.is_on:
-            return "a scene without remodeling.turnover, whose derivatives are not known"
         if remodeling.has_set_point:
             return "remodeling.exponent = 2 and remodeling.threshold = 0: derivatives of other targets are not known"
         parts = LAWS[remodeling.law], DRIVERS[remodeling.driver], FRAMES[remodeling.frame]
@@ -421,7 +419,7 @@ class Scene(Table):
         for name in self.output.columns:
             if self.regions and name in self.geometry.columns_of_one_tissue:
                 raise fault(f"{name!r} is for bodies of one tissue; the scene has regions", "output.columns", name)
-            if name in TURNED_OVER and not self.remodeling.turnover.is_on:
+            if name in (*TURNED_OVER, TURNOVER_POWER) and not self.remodeling.turnover.is_on:
                 raise fault(f"{name!r} changes only with remodeling.turnover, which is not set", "output.columns", name)
             if name not in known:
                 rule = f"no such column on request; allowed for shape {self.geometry.name!r} are "

@@ -210,7 +210,15 @@ class EveryTangent:
         """A solve begins."""
 
     def tangent(self, norm: float, tolerance: float) -> None:
-        """A linear system is about to be solved, at a residual of this norm."""
+        """A linear system is about to be solved, at a residual of this norm.
+
+        Parameters
+        ----------
+        norm
+            Of the residual, in the unit of forces.
+        tolerance
+            Below which the solve ends.
+        """
         self.renew()
 
     def renew(self) -> None:

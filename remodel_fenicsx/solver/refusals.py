@@ -130,9 +130,9 @@ def _of_the_tangent(inertia: Inertia, direction: NDArray[np.float64] | None) -> 
     at_start, unloaded = of_the_unloaded_body(inertia)
     place = ", ".join(f"{c:.4g}" for c in mode.place)
     finding = (
-        f"the lowest eigenvalue of the tangent is {mode.eigenvalue:.3g}, {unloaded:.3g} in the unloaded body, its mode "
+        f"the lowest eigenvalue of the tangent is {mode.eigenvalue:.3g}, and {unloaded:.3g} in the unloaded body; its "
     )
-    finding += f"largest at ({place})"
+    finding += f"mode is largest at ({place})"
     if negative > at_start:
         return replace(BIFURCATION, finding=finding)
     if mode.eigenvalue > NEARLY_CRITICAL * unloaded:

@@ -168,7 +168,15 @@ class State:
         return {"": self} | {f"@{number}": case for number, case in enumerate(self.others, start=2)}
 
     def reach(self, time: float, number: int) -> None:
-        """A step is done: its time, and how many there have been, in all load cases."""
+        """A step is done: its time, and how many there have been, in all load cases.
+
+        Parameters
+        ----------
+        time
+            Of the step that is done.
+        number
+            How many steps there have been.
+        """
         for case in self.cases().values():
             case.time, case.number = time, number
 

@@ -113,7 +113,7 @@ class EquilibriumStability(Watcher):
         text = f"{eigenvalues(now)} of the tangent ({before} before); {described(self.inertia.lowest(), scale)}"
         if self.stops:
             raise StepFailure(step.time, f"the equilibrium at {step.moment} is unstable: {text}", UNSTABLE)
-        self._warn("%s: the equilibrium is unstable, the body would leave it: %s", step.moment, text)
+        self._warn("%s: the equilibrium is unstable, and the body would leave it: %s", step.moment, text)
 
     def _of_the_unloaded_body(self) -> tuple[int, float]:
         """`inertia.of_the_unloaded_body`, once."""
@@ -200,5 +200,5 @@ def eigenvalues(number: int) -> str:
 def described(mode: Mode, unloaded: float) -> str:
     """A mode in words; `unloaded`: the lowest eigenvalue of the unloaded body, which is the unit where positive."""
     place = ", ".join(f"{c:.4g}" for c in mode.place)
-    size = f"{mode.eigenvalue / unloaded:.3g} of its unloaded value" if unloaded > 0 else f"{mode.eigenvalue:.3g}"
-    return f"the lowest is {size}, its mode largest at ({place})"
+    size = f"{mode.eigenvalue / unloaded:.3g} times its unloaded value" if unloaded > 0 else f"{mode.eigenvalue:.3g}"
+    return f"the lowest is {size}, and its mode is largest at ({place})"

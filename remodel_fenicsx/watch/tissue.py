@@ -22,6 +22,8 @@ log = logging.getLogger(__name__)
 # paper's tendon and artery, lambda/mu = 8.8, keep J above 0.92 at every point.
 NOTED = 0.05  # mean loss that the log mentions at the end
 MEAN_LOSS, LEAST_JACOBIAN = 0.2, 0.6  # from where on it is hardly meant
+LONG = 10.0  # times of turnover, before which rates say little: walls that rest have risen and fall by then
+FAR_FROM_REST = 0.01  # change of ln m or ln rho in a time of turnover
 RADIAL_SHARE = 0.5  # of the chains: more of them out of the wall are said
 # degrees between two points of an element that are a front, not a slope: within its elements the paper's artery turns
 # by up to 14 degrees; and the share of a layer that such elements make up
@@ -68,6 +70,52 @@ class VolumeLoss(WarnsOnce):
             "the tissue has lost up to {lost:.2g} % of its volume (mean J {mean:.3g} at time {mean_time:g}; least "
             "J {least:.3g} at {x:.4g}, {y:.4g}, {z:.4g}, time {least_time:g})"
         ).format(lost=100 * (1 - found["mean"]), **found)
+
+
+class GrowthWithoutRest(WarnsOnce):
+    """Warns at the end where turnover goes on, and its rates do not fall as those do that come to rest.
+
+    These fall exponentially. Rates that fall no faster than 1/t have no finite integral: the content or the natural
+    length has no bound (mechanobiological instability; Latorre and Humphrey 2019).
+
+    Parameters
+    ----------
+    stepper
+        Whose rates are looked at.
+    held_from
+        Time from which on no load changes.
+    """
+
+    def __init__(self, stepper: Stepper, held_from: float):
+        names = ("early", "late"), ("time", "rate")
+        super().__init__(stepper, "growth", {f"{when}_{what}": 0.0 for when in names[0] for what in names[1]})
+        self.held_from, self._text = held_from, ""
+
+    def solved(self, step: Step) -> None:
+        """Remember the rates at times that double; at the end compare the last with one of them."""
+        numbers, turnover, elapsed = self._numbers, self.stepper.turnover, step.time - self.held_from
+        if elapsed <= 0:
+            return
+        rates = np.abs(turnover.rates()).max(axis=0).reshape(self.quadrature.shape)
+        rate, self._text = self.quadrature.maximum(rates), ""
+        if elapsed >= 2 * numbers["late_time"]:
+            numbers["early_time"], numbers["early_rate"] = numbers["late_time"], numbers["late_rate"]
+            numbers["late_time"], numbers["late_rate"] = elapsed, rate
+        period, early_time = turnover.settings.time, numbers["early_time"]
+        if not step.is_last or elapsed < LONG * period or rate * period < FAR_FROM_REST or not early_time:
+            return
+        if rate * elapsed >= numbers["early_rate"] * early_time:
+            place = ", ".join(f"{c:.4g}" for c in self.quadrature.place_of_largest(rates))
+            self._text = (
+                f"the tissue does not come to rest: content or natural length change by up to {100 * rate * period:.2g}"
+                f" % in remodeling.turnover.time, at ({place}); the rates fall no faster than 1/t "
+                "(mechanobiological instability, docs/turnover.md); try a larger remodeling.turnover.gain"
+            )
+
+    def committed(self, step: Step) -> None:
+        """Say it."""
+        if self._text and not self.said:
+            self.say(step, self._text)
 
 
 class RadialChains(WarnsOnce):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import re
 import shlex
+from pathlib import Path
 
 import pytest
 
@@ -41,3 +42,19 @@ def test_the_help_of_a_command_has_examples_that_it_takes(name: str, capsys: pyt
         assert words[0] == name and cli.parser().parse_args(words).command == name
     for action in COMMANDS[name]._actions:
         assert action.help and (action.dest == "help" or action.help[0].isupper() and action.help.endswith((".", ").")))
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_the_page_of_commands_has_an_example_and_every_option(name: str) -> None:
+    """In the section of the command, or in the table of options of most commands."""
+    page = (Path(__file__).parents[2] / "docs" / "commands.md").read_text(encoding="utf-8")
+    common = page.split("\n## Run and look\n")[0].split("Most commands")[1]
+    (section,) = re.findall(rf"^### (?:\w+ and )?{name}(?: and \w+)?\n(.*?)(?=^##)", page, re.MULTILINE | re.DOTALL)
+    for line in re.findall(r"^\./with-fenicsx remodel-fenicsx (.*)$", section, re.MULTILINE):
+        assert cli.parser().parse_args(shlex.split(line.split(" > ")[0])).command in (name, "picture", "animate")
+    assert f"remodel-fenicsx {name}" in section
+    for action in COMMANDS[name]._actions:
+        option = next((o for o in action.option_strings if o.startswith("--")), "")
+        short = next((o for o in action.option_strings if not o.startswith("--")), option)
+        if option != "--help":
+            assert option in section + common or short in section + common, option

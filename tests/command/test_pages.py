@@ -43,6 +43,11 @@ NOT_RUN = {  # beginnings of commands in blocks of text, which nobody runs
     "git clone": "needs the network",
     "cd ": "the clone is where the tests are",
     "docker ": "tests/container/run does, where there is an engine",
+    "apptainer ": "needs a cluster's engine",
+    "sbatch ": "needs a cluster's queue",
+    './with-fenicsx mpirun -n "$SLURM_NTASKS"': "the same; ranks are run above it on the page",
+    "./with-fenicsx remodel-fenicsx status vessel": "the same",
+    "./with-fenicsx remodel-fenicsx info            # makes": "is run on the first page",
     "./with-fenicsx remodel-fenicsx trade": "tests/studies/test_trade.py does; it takes the time that it gets",
     "./with-fenicsx remodel-fenicsx run demos/artery.toml --set loads.force.value=2.4": "shows a refusal",
 }
@@ -125,7 +130,9 @@ def test_no_command_of_a_page_is_passed_over_in_silence(page: str) -> None:
         assert language in ("sh", "output", "python", "toml", "text"), language
         if language == "text":
             commands = [
-                line for line in text.splitlines() if re.match(r"(\./|docker |podman |git |cd |python3? )", line)
+                line
+                for line in text.splitlines()
+                if re.match(r"(\./|docker |podman |apptainer |sbatch |git |cd |python3? )", line)
             ]
             assert all(map(is_left_out, commands)), commands
 
@@ -141,6 +148,39 @@ def test_the_refusal_of_the_first_page_is_the_one_that_is_printed(capsys: pytest
     words = [str(ROOT / word) if word.startswith("demos/") else word for word in shlex.split(command)[2:]]
     assert cli.main(words) == 2
     assert capsys.readouterr().err.split() == " ".join(shown).split()
+
+
+README_SHORT = {  # a test's times, and numbers of runs, for those of the README
+    "run demos/artery.toml": "run demos/artery.toml --set time.end=1",
+    "inflation.toml": "inflation.toml --starts 1 --no-likelihood-profiles",
+    "sweep demos/layers.toml loads.pressure.value=8:16:3": "sweep demos/layers.toml loads.pressure.value=8:16:2 "
+    "--set time.end=1",
+}
+
+
+def test_the_examples_of_the_readme_run_and_its_other_commands_are_commands(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What stands before "More commands" is run, the rest is read by the parser: it takes minutes."""
+    monkeypatch.chdir(tmp_path)
+    for _, text in blocks(TUBE):
+        keep(text)
+    text, more = (ROOT / "README.md").read_text(encoding="utf-8").split("## More commands")
+    for long, short in README_SHORT.items():
+        assert long in text
+        text = text.replace(long, short)
+    lines = [line.partition("    #")[0] for block in re.findall(r"^```sh\n(.*?)^```", text, re.M | re.S)
+             for line in block.splitlines() if not is_left_out(line)]  # fmt: skip
+    assert len(lines) == 5
+    for line in lines:
+        obey(line, capsys)
+    assert Path("results/artery/report.html").exists() and Path("tube/history.csv").exists()
+    (block,) = re.findall(r"^```sh\n(.*?)^```", more, re.MULTILINE | re.DOTALL)
+    commands = [words for line in block.splitlines()
+                if (words := shlex.split(re.sub(r" > .*|  #.*", "", line)))[1] == "remodel-fenicsx"]  # fmt: skip
+    assert len(commands) == len(block.splitlines()) - 2  # but for mpirun's and the tests
+    for _, _, *words in commands:
+        cli.parser().parse_args(words)
 
 
 def test_output_that_was_not_printed_is_found() -> None:

@@ -11,12 +11,15 @@ import pytest
 
 from remodel_fenicsx import SceneError, Simulation, cli
 from remodel_fenicsx.body.tube import _opening_angle
+from remodel_fenicsx.model import closing
 from remodel_fenicsx.model.chains import CHAINS
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.model.turnover import rates
 from remodel_fenicsx.scene import scene_from_dict
+from remodel_fenicsx.studies.page import read_table
 from remodel_fenicsx.solver.newton import SolveFailure
 
+FIGURES = Path(__file__).resolve().parents[2] / "docs" / "figures"
 COLUMNS = ["content", "natural_length"]
 ANGLES = ["fibre_angle_inner", "fibre_angle_middle", "fibre_angle_outer"]
 
@@ -70,6 +73,13 @@ def test_an_unstressed_wall_comes_to_rest_with_an_opening_angle_of_its_own() -> 
         assert known[name][[0, len(known[name]) // 2, -1]] == pytest.approx(expected, rel=0.03)
 
 
+def test_a_cut_of_a_soft_wall_is_found_soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In 19 iterations: its bending is so soft that with coarser differences Newton's method took 25 and more."""
+    monkeypatch.setattr(closing, "ITERATIONS", 22)
+    _, known = simulated(wall(720.0, 4.0, {"time": 40.0, "deposition_stretch": 1.1, "gain": 1.0}, []))
+    assert known["opening_angle"] == pytest.approx(114.5, abs=0.2)
+
+
 def at_rest(gain: float) -> tuple[Simulation, dict[str, float]]:
     """At the end of the way to the equilibrium."""
     values = wall(1440.0, 4.0, {"time": 40.0, "deposition_stretch": 1.1, "gain": gain}, COLUMNS)
@@ -88,7 +98,7 @@ def test_the_equilibrium_is_that_rest(caplog: pytest.LogCaptureFixture) -> None:
     for name, expected in (("content", (3.9, 2.9, 2.2)), ("natural_length", (1.43, 1.31, 1.22))):
         values = turnover._values(name).ravel()[order]
         assert values[[0, len(values) // 2, -1]] == pytest.approx(expected, rel=0.03)
-    assert simulation.stepper.coupling.steps < 100
+    assert simulation.stepper.coupling.steps < 40
     assert 40.0 * np.abs(turnover.rates()).max() < 2e-4
     assert not [record for record in caplog.records if record.levelname == "WARNING"]
     simulation.close()
@@ -98,7 +108,7 @@ def test_growth_has_no_equilibrium_and_says_so(caplog: pytest.LogCaptureFixture)
     simulation, row = at_rest(0.2)
     simulation.close()
     assert row["natural_length"] > 5.0
-    assert sum("growth does not come to rest" in record.message for record in caplog.records) == 1
+    assert sum("growth does not come to rest (docs" in record.message for record in caplog.records) == 1
 
 
 @pytest.mark.parametrize(
@@ -116,7 +126,7 @@ def test_other_walls_open_as_an_independent_solver_says(
     assert known["opening_angle"] == pytest.approx(angle, abs=1.0)
 
 
-@pytest.mark.parametrize("coupling", ["staggered", "relaxed", "extrapolated"])
+@pytest.mark.parametrize("coupling", ["staggered", "relaxed", "extrapolated", "implicit"])
 @pytest.mark.parametrize("time", [{}, {"tolerance": 1.0}], ids=["equal", "chosen"])
 def test_without_turnover_it_is_the_law_tensor(coupling: str, time: dict[str, float]) -> None:
     """Gain 0 and a huge time."""
@@ -159,7 +169,63 @@ def test_content_and_natural_length_have_the_order_of_the_coupling(
     np.testing.assert_allclose(np.log(coarse / fine) / np.log(4.0), order, atol=0.35)
 
 
-@pytest.mark.parametrize("coupling", ["staggered", "extrapolated"])
+def test_implicit_steps_end_nearer_to_the_solution(small_steps: list[dict[str, float]]) -> None:
+    """Of first order, with smaller errors of m, rho and angles at the end than staggered steps, and in the same state.
+
+    On the way m is no better: in the ramp two errors of a staggered row cancel in part.
+    """
+    found = {}
+    for coupling, step in (("staggered", 4.0), ("implicit", 4.0), ("implicit", 2.0)):
+        rows = simulated(wall(96.0, step, GROWS, COLUMNS, coupling=coupling))[0]
+        found[coupling, step] = errors(rows[-1:], small_steps), errors(rows, small_steps)
+    ends = [ends for ends, _ in found.values()]
+    assert (ends[1] < ends[0]).all() and (ends[1][:2] < 0.4 * ends[0][:2]).all()
+    np.testing.assert_allclose(np.log2(found["implicit", 4.0][1] / found["implicit", 2.0][1]), 1.0, atol=0.1)
+
+
+def test_long_implicit_steps() -> None:
+    """The ramp of a thick wall in one step; steps of 0.6 T come to the rest of small ones."""
+    values = wall(48.0, 24.0, GROWS, COLUMNS, coupling="implicit")
+    values["geometry"]["outer_radius"], values["loads"]["pressure"]["value"] = 3.0, 4.8
+    rows, known = simulated(values)
+    assert [row["time"] for row in rows] == [24.0, 48.0] and known["content"].max() > 2.0
+    rows, known = simulated(wall(1440.0, 24.0, GROWS, COLUMNS, coupling="implicit"))
+    assert [rows[-1][name] for name in COLUMNS] == pytest.approx([2.912, 1.311], rel=1e-3)
+    assert known["opening_angle"] == pytest.approx(115.3, abs=2.0)  # extrapolated 102, staggered 92
+
+
+def test_the_tangent_of_implicit_steps_is_the_derivative_of_the_forces() -> None:
+    """Ratios of Taylor remainders near 4, in the middle of growth."""
+    simulation = Simulation(scene_from_dict(wall(48.0, 8.0, GROWS, [], coupling="implicit")))
+    list(simulation.steps())
+    coupling: Any = simulation.stepper.coupling
+    equilibrium, unknown = coupling.newton.equilibrium, simulation.unknown
+    coupling.answering.begin(60.0, 0.0)
+    residual, matrix = unknown.x.petsc_vec.duplicate(), equilibrium.create_matrix()
+    direction = np.random.default_rng(3).standard_normal(len(unknown.x.array)) * 1e-4
+    free = np.isnan(equilibrium.prescribed_values())
+    direction[~free] = 0.0
+    start = unknown.x.array.copy()
+
+    def force(h: float) -> np.ndarray:
+        unknown.x.array[:] = start + h * direction
+        equilibrium.assemble_internal(residual)
+        loads = residual.duplicate()
+        equilibrium.assemble_external(loads)
+        total: np.ndarray = (residual.array + loads.array)[free]
+        return total
+
+    zero = force(0.0)
+    equilibrium.assemble_tangent(matrix)
+    change, step = matrix.createVecLeft(), matrix.createVecRight()
+    step.array[:] = direction
+    matrix.mult(step, change)
+    left = [np.linalg.norm(force(h) - zero - h * change.array[free]) for h in (1.0, 0.5, 0.25)]
+    simulation.close()
+    np.testing.assert_allclose(np.array(left[:-1]) / left[1:], 4.0, atol=0.4)
+
+
+@pytest.mark.parametrize("coupling", ["staggered", "extrapolated", "implicit"])
 def test_chosen_steps_watch_content_and_natural_length(coupling: str, small_steps: list[dict[str, float]]) -> None:
     """Errors fall as the tolerance does, and are below it; the estimate is about the error of the content."""
     found, counts = [], []
@@ -178,14 +244,14 @@ def test_chosen_steps_watch_content_and_natural_length(coupling: str, small_step
 def test_rates_against_their_equation() -> None:
     """At the stretch of deposition nothing changes; beyond it m and rho grow, and no faster than 1/T and its double."""
     chain, r0, contour, time = CHAINS["wormlike"], 1.0, 1.594, 40.0
-    tissue = Tissue(1.0, 1.0, 1.0, contour, r0, content=np.ones(3), natural_length=np.array([1.0, 1.3, 1.3]))
-    stretches = np.array([1.1, 1.15, 0.9])
+    tissue = Tissue(1.0, 1.0, 1.0, contour, r0, content=np.ones(4), natural_length=np.array([1.0, 1.3, 1.3, 1.0]))
+    stretches = np.array([1.1, 1.15, 0.9, 1.4])
     found = rates(tissue, stretches * tissue.natural_length, time, 1.1, 1.0)
     tension = stretches * chain.stiffness(stretches, contour) / (1.1 * chain.stiffness(1.1, contour))
     assert found.content == pytest.approx(np.clip(tension - 1, -1, 1) / time, abs=1e-15)
     growth = (1 / time + np.maximum(found.content, 0)) * (stretches / 1.1 - 1)
     assert found.natural_length == pytest.approx(growth, abs=1e-15)
-    assert found.content[1] > 0 > found.content[2]
+    assert found.content[1] > 0 > found.content[2] and found.content[3] == 1 / time
 
 
 def test_energy_and_its_increment() -> None:
@@ -213,13 +279,16 @@ def test_a_growth_that_does_not_rest_is_said(caplog: pytest.LogCaptureFixture) -
     turnover = {"time": 40.0, "deposition_stretch": 1.1, "gain": 0.2}
     rows, _ = simulated(wall(720.0, 4.0, turnover, COLUMNS))
     assert rows[-1]["outer_radius"] > 5.0
-    assert sum("mechanobiological instability" in record.message for record in caplog.records) == 1
+    assert sum("by more than a factor of 10" in record.message for record in caplog.records) == 1
 
 
-@pytest.mark.parametrize("time", [{}, {"tolerance": 1.0}], ids=["equal", "chosen"])
-def test_a_run_goes_on_with_its_content(time: dict[str, float], tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("coupling", "time"),
+    [("staggered", {}), ("extrapolated", {}), ("extrapolated", {"tolerance": 1.0}), ("implicit", {"tolerance": 3.0})],
+)
+def test_a_run_goes_on_with_its_content(coupling: str, time: dict[str, float], tmp_path: Path) -> None:
     """Two parts are the whole, to the last digit."""
-    values = wall(80.0, 4.0, {"time": 40.0, "gain": 1.0}, COLUMNS)
+    values = wall(80.0, 4.0, {"time": 40.0, "gain": 1.0}, COLUMNS, coupling=coupling)
     values["time"] |= time
     values["output"]["times"] = [40.0]
     (tmp_path / "scene.toml").write_text(scene_from_dict(values).to_toml())
@@ -233,9 +302,45 @@ def test_a_run_goes_on_with_its_content(time: dict[str, float], tmp_path: Path) 
     assert last[0] == last[1] and float(last[0][0]) > 1.1
 
 
+@pytest.mark.parametrize(("gain", "rests"), [(0.5, False), (0.2, False), (1.0, True)])
+def test_growth_that_does_not_come_to_rest_is_said_at_the_end(
+    gain: float, rests: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Ever more slowly, or faster and faster; not of a wall that rests some time later, nor of a short run."""
+    turnover = {"time": 40.0, "deposition_stretch": 1.1, "gain": gain}
+    simulated(wall(480.0, 4.0, turnover, COLUMNS))
+    found = [record.message for record in caplog.records if "does not come to rest" in record.message]
+    assert len(found) == (0 if rests else 1)
+    assert rests or "fall no faster than 1/t (mechanobiological instability" in found[0]
+    caplog.clear()
+    simulated(wall(240.0, 4.0, turnover, COLUMNS))
+    assert "come to rest" not in caplog.text
+
+
+def test_the_figures_show_what_the_page_says() -> None:
+    """docs/figures: both walls end at the independent solver's angles, with stress that varies less; and the map."""
+    time, wall_of, of_map = (
+        read_table(FIGURES / f"{name}.csv") for name in ("turnover-time", "turnover", "turnover_map")
+    )
+    for name, angle, fixed in (("thin", 115.4, 27.5), ("thick", 92.7, 21.7)):
+        for cells, expected in (("turn", angle), ("fixed", fixed)):
+            here = (time["wall"] == name) & (time["cells"] == cells)
+            assert time["angle"][here][-1] == pytest.approx(expected, abs=0.5)
+        spread = {how: np.ptp(np.log(wall_of[f"stress_{name}_{how}"])) for how in ("with", "without")}
+        assert spread["with"] < 0.6 * spread["without"]
+        assert wall_of[f"angle_{name}_with"][-1] < 0.6 * wall_of[f"angle_{name}_without"][-1]
+        for gain, outcome in ((0.2, "faster"), (0.5, "slower"), (1.0, "rests")):
+            (row,) = np.flatnonzero(
+                (of_map["wall"] == name) & (of_map["gain"] == gain) & (of_map["deposition_stretch"] == 1.1)
+            )
+            assert of_map["outcome"][row] == outcome
+        assert of_map["opening_angle"][row] == pytest.approx(angle, abs=1.0)
+
+
 def test_its_columns_and_numbers_need_it() -> None:
-    with pytest.raises(SceneError, match="'content' changes only with remodeling.turnover"):
-        scene_from_dict(wall(40.0, 4.0, None, COLUMNS))
+    for name in (*COLUMNS, "turnover_power"):
+        with pytest.raises(SceneError, match=f"'{name}' changes only with remodeling.turnover"):
+            scene_from_dict(wall(40.0, 4.0, None, [name]))
     with pytest.raises(SceneError, match="remodeling.turnover.time: missing"):
         scene_from_dict(wall(40.0, 4.0, {"gain": 2.0}, []))
 
@@ -244,7 +349,7 @@ def test_its_columns_and_numbers_need_it() -> None:
     ("remodeling", "time", "words"),
     [
         ({"law": "explicit", "coupling": "staggered"}, {}, "remodeling.turnover: needs remodeling.law = 'tensor'"),
-        ({"coupling": "implicit"}, {}, "remodeling.coupling = 'implicit'"),
+        ({"law": "relaxation", "coupling": "implicit"}, {}, "remodeling.turnover: needs remodeling.law = 'tensor'"),
         ({"turnover": {"deposition_stretch": 1.6}}, {}, "deposition_stretch = 1.6: must be smaller than"),
         ({"turnover": {"gain": -1.0}}, {}, "remodeling.turnover.gain = -1"),
         ({"turnover": {"pace": 1.0}}, {}, "remodeling.turnover.pace = 1.0: unknown key"),

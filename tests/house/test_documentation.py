@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import runpy
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -12,6 +13,7 @@ from pathlib import Path
 import pytest
 
 import remodel_fenicsx
+from remodel_fenicsx import cli
 from tests.forks import COARSE, forked
 
 ROOT = Path(__file__).parents[2]
@@ -114,6 +116,26 @@ def test_sections_that_are_named_are_there() -> None:
     assert len(found) > 30
     assert not [one for one in found if not any(one[2].startswith(head) for head in heads.get(one[1], []))]
     assert named_sections('"so (docs/theory.md, No "\n    "section)"') == [("theory", "No section")]
+
+
+def test_commands_that_pages_show_are_commands(capsys: pytest.CaptureFixture[str]) -> None:
+    """With options that they have; whether they do what the page says, tests of the page ask."""
+    found = 0
+    for path in [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]:
+        if path.name == "interface.md":  # a synopsis
+            continue
+        for block in re.findall(r"^```(?:sh|text)\n(.*?)^```", path.read_text(encoding="utf-8"), re.M | re.S):
+            for line in block.replace("\\\n", " ").splitlines():
+                command = re.match(r"(?:\./with-fenicsx )?(?:mpirun -n \S+ )?remodel-fenicsx (.*)", line)
+                if command is None or line.startswith("remodel-fenicsx: "):  # a message
+                    continue
+                words = shlex.split(re.sub(r" > .*|  +#.*", "", command[1]))
+                try:
+                    cli.parser().parse_args(words)
+                except SystemExit as end:
+                    assert not end.code, f"{path.name}: {line}: {capsys.readouterr().err}"
+                found += 1
+    assert found > 50
 
 
 def test_a_name_that_the_package_does_not_have_is_refused() -> None:

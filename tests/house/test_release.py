@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 import tarfile
+import tomllib
 import zipfile
 from pathlib import Path
 
@@ -16,6 +17,9 @@ import pytest
 from remodel_fenicsx import __version__
 
 ROOT = Path(__file__).parents[2]
+ASSETS = ROOT / "remodel_fenicsx" / "report" / "assets"
+PRESET = "kuhl-holzapfel-2007"
+VENDORED = tomllib.loads((ASSETS / "VENDOR.toml").read_text(encoding="utf-8"))["package"]
 
 
 def test_citation_and_image_say_the_version() -> None:
@@ -24,6 +28,15 @@ def test_citation_and_image_say_the_version() -> None:
     assert (
         labels["version"] == __version__ and labels["licenses"] == "MIT" and labels["title"] and labels["description"]
     )
+
+
+def test_the_licences_of_what_others_have_written_are_named() -> None:
+    """Of what is in every report: in the README, with a copyright line in a file of its own."""
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert {package["name"] for package in VENDORED} == {"three", "uplot"}
+    for package in VENDORED:
+        assert package["licence"] in readme and package["licence_file"] in readme
+        assert "Copyright" in (ASSETS / package["licence_file"]).read_text(encoding="utf-8")
 
 
 def test_the_package_is_built_and_installed_beside_a_dolfinx(tmp_path: Path) -> None:
@@ -49,10 +62,16 @@ def test_the_package_is_built_and_installed_beside_a_dolfinx(tmp_path: Path) -> 
     needed = {"py.typed", "kernels/spectral.c", "kernels/algebra.h", "report/assets/template.html"}
     with zipfile.ZipFile(wheel) as archive:
         assert {f"remodel_fenicsx/{name}" for name in needed} <= set(archive.namelist())
+        (place,) = (name for name in archive.namelist() if name.endswith("/METADATA"))
+        metadata = archive.read(place).decode()
+    assert "\nLicense-Expression: MIT\n" in metadata
+    assert len(re.findall(r"^License-File: .*LICENSE", metadata, re.MULTILINE)) == 1 + len(VENDORED)
     with tarfile.open(sdist) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
         assert {f"remodel_fenicsx/{name}" for name in needed} | {"LICENSE", "README.md"} <= names
     call(sys.executable, "-m", "venv", "--system-site-packages", tmp_path / "venv")
     call(tmp_path / "venv/bin/python", "-m", "pip", "install", "--no-index", "--no-deps", wheel)
     assert __version__ in call(tmp_path / "venv/bin/remodel-fenicsx", "info")
-    assert "[geometry]" in call(tmp_path / "venv/bin/remodel-fenicsx", "new", "consistent", "--shape", "tube")
+    (tmp_path / "cube.toml").write_text(call(tmp_path / "venv/bin/remodel-fenicsx", "new", PRESET, "--shape", "cube"))
+    call(tmp_path / "venv/bin/remodel-fenicsx", "run", "cube.toml", "-q", "--set", "time.end=1", "-o", "cube")
+    assert (tmp_path / "cube" / "report.html").stat().st_size > 100_000

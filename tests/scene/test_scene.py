@@ -327,7 +327,8 @@ BAD_SCENES = [
     (
         CUBE,
         {"remodeling.coupling": "implicit", "remodeling.law": "tensor", "material.repulsion": "axes"},
-        "remodeling.coupling = 'implicit': needs a material.repulsion that sees no axes, as its law: 'log', 'length'",
+        "remodeling.coupling = 'implicit': needs a material.repulsion that does not depend on axes, "
+        "like its law: 'log', 'length'",
     ),
     (
         CUBE,

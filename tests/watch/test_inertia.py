@@ -110,7 +110,7 @@ def test_a_compressed_cube_in_every_row(force: float, expected: list[int], caplo
     assert len(said) == len(set(expected)) - 1  # each change once
     if said:
         assert "time 2: the equilibrium is unstable" in said[0] and "1 negative eigenvalue of the tangent (0" in said[0]
-        assert "the lowest is -2.3 of its unloaded value, its mode largest at (1, 1, 0)" in said[1]
+        assert "the lowest is -2.3 times its unloaded value, and its mode is largest at (1, 1, 0)" in said[1]
 
 
 # ---------------------------------------------------------------- when somebody looks
