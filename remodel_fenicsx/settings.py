@@ -659,6 +659,7 @@ COUPLINGS = {
         "find cells and equilibrium of the same step together, by Newton's method; for the law 'tensor' (with a "
         "repulsion that does not depend on axes) and the laws of the paper",
         "remodel_fenicsx.evolution.implicit:Implicit",
+        takes_turnover=True,
     ),
 }
 """Couplings by the name that a scene gives them."""
@@ -667,7 +668,7 @@ COUPLINGS = {
 class Turnover(Table):
     """How collagen is removed, and deposited again under a stretch (docs/turnover.md). Without `time` it is not.
 
-    For the law `tensor`, with the couplings `staggered`, `relaxed` and `extrapolated`.
+    For the law `tensor`.
     """
 
     time: float | None = Field(

@@ -21,6 +21,7 @@ from remodel_fenicsx.model.implicit import condensed
 from remodel_fenicsx.model.implicit.responses import StepOfCells, jumps_by_rank
 from remodel_fenicsx.model.laws import relaxed
 from remodel_fenicsx.model.tensors import determinant
+from remodel_fenicsx.model.turnover import TurnoverRule
 from remodel_fenicsx.settings import Solver
 from remodel_fenicsx.solver.equilibrium import Equilibrium, Look
 from remodel_fenicsx.solver.newton import GuardedNewton, Solution, SolveFailure
@@ -92,7 +93,9 @@ class AnsweringCells:
         """The present state is the start of a step to this time; it was accepted with these out-of-balance forces."""
         drive, cells = self.remodeling.drive(residual), self.state.cells.point_cells
         old = UnitCell(cells.dimensions.copy(), cells.axes.copy())
-        step = StepOfCells(self.remodeling.law, drive, old, structure_tensor(*old[:2]), self.state.time, time)
+        given = self.remodeling.settings.turnover
+        rule = TurnoverRule(given.time, given.deposition_stretch, given.gain) if given.time else None
+        step = StepOfCells(self.remodeling.law, drive, old, structure_tensor(*old[:2]), self.state.time, time, rule)
         self._points = condensed_points(self._kernels, at_points(self.tissue, self.quadrature), step)
         self.accepted = self._points.with_cells(drive.deformation_gradient, old).driving_tensor
         self._jumps = jumps_by_rank(step)
@@ -128,6 +131,11 @@ class AnsweringCells:
     def asked(self) -> UnitCell:
         """The cells of the last update."""
         return self._points.unit_cells(self._found)
+
+    @property
+    def turnover(self) -> Array | None:
+        """ln m and ln rho (2, n) of the last update, where they change."""
+        return None if self._found.turnover is None else self._found.turnover.T
 
     def jumps_somewhere(self) -> bool:
         """Whether there are points, on any rank, where the law jumps."""

@@ -95,6 +95,7 @@ class Homeostasis:
         self.equilibrium: Equilibrium = self.coupling.equilibrium
         self.newton: GuardedNewton = self.coupling.newton
         if limit is not None:
+            limit.turnover = self.turnover
             limit.equilibrium.stop_signal = lambda: self.equilibrium.stop_signal()
         self.compares, self.steps, self._residual = False, 0, 0.0
         way.level = (
@@ -158,8 +159,9 @@ class Homeostasis:
         towards, quadrature = self._change_by_a_pass(time, work.residual), self.state.cells.quadrature
         towards[self.remodeling.without_tension(work.residual).reshape(quadrature.shape)] = 0.0
         rest = self._largest(towards)
-        if self.limit is not None and self.tries and rest <= self.near:
-            self.near, self.tries = AGAIN * rest, self.tries - 1
+        far = max(rest, self._growth())
+        if self.limit is not None and self.tries and far <= self.near:
+            self.near, self.tries = AGAIN * far, self.tries - 1
             if self._arrived(self.limit, time, loads, towards, work):
                 return True
         soon = self.state.time + 1 / self.way.stepper.slowest
@@ -188,7 +190,8 @@ class Homeostasis:
     def _arrived(self, limit: Limit, time: float, loads: LoadValues, towards: Array, work: Work) -> bool:
         """Make the rest of the way in one step; if it is not solved or leads elsewhere, all is as before."""
         state, before, residual = self.state, self.state.snapshot(), work.residual
-        structure = state.cells.structure_tensor()
+        growth = np.zeros(1) if self.turnover is None else self.turnover.rates()
+        structure, grown = state.cells.structure_tensor(), self._grown()
         state.numbers[RESIDUAL] = residual
         try:
             found = limit.solve(time, loads)
@@ -198,7 +201,8 @@ class Homeostasis:
             state.restore(before)
             return False
         work.add(found)
-        if not self._is_along(state.cells.structure_tensor() - structure, towards):
+        leads_on = self._is_along(state.cells.structure_tensor() - structure, towards)
+        if not leads_on or not self._grows_along(self._grown() - grown, growth):
             work.residual = residual
             log.info("one step for the rest of the path led to another state; it is not used")
             state.restore(before)
@@ -211,6 +215,19 @@ class Homeostasis:
         size, pass_size = (np.linalg.norm(tensors, axis=(-1, -2)) for tensors in (change, towards))
         aside = (change * towards).sum(axis=(-1, -2)) < SAME_WAY * size * pass_size
         return self._largest(np.where((aside | (pass_size == 0.0))[..., None, None], change, 0.0)) <= NO_CHANGE
+
+    def _grown(self) -> Array:
+        """ln m and ln rho."""
+        found: Array = np.zeros(1) if self.turnover is None else self.turnover.logarithms()
+        return found
+
+    def _grows_along(self, change: Array, rates: Array) -> bool:
+        """Whether ln m and ln rho change as their rates do, at all points where it counts."""
+        if self.turnover is None:
+            return True
+        against = np.where(change * rates < 0.0, np.abs(change), 0.0).max(axis=0)
+        quadrature = self.state.cells.quadrature
+        return quadrature.maximum(against.reshape(quadrature.shape)) <= NO_CHANGE
 
     def _change_by_a_pass(self, time: float, residual: float) -> Array:
         """Of A up to a time, at all points."""

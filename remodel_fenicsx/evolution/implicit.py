@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from typing import Any
 
 from remodel_fenicsx.body.loading import LoadValues
 from remodel_fenicsx.evolution.condensed import AnsweringCells, AnsweringEquilibrium, AnsweringNewton
@@ -47,6 +48,7 @@ class Implicit:
         solved.stop_signal = lambda: self.equilibrium.stop_signal()
         self.newton: GuardedNewton = AnsweringNewton(solved, settings)
         self.share, self.compares, self._power = 1.0, False, 0.0
+        self.turnover: Any = None
         self._better: UnitCell | None = None
         state.numbers[RESIDUAL] = 0.0
         self._numbers = Numbers(state, "implicit", {"held": 0.0})  # the largest share that a warning has named
@@ -61,6 +63,8 @@ class Implicit:
         """
         work, start = Work(), self.state.elastic_gradient()
         self.answering.begin(time, self.state.numbers[RESIDUAL])
+        if self.turnover is not None:
+            self.turnover.begin()
         if self.state.number == 0:
             self._solve(time, loads, work, answering=False)
             self.answering.begin(time, work.residual)
@@ -76,10 +80,14 @@ class Implicit:
         work.extension = None  # the row's is with the cells that are taken over now
         self._power = self.remodeling.replace(self.answering.asked, start, time - self.state.time)
         self.state.settle_cells()
+        if self.turnover is not None:
+            self.turnover.take(self.answering.turnover)
         return work
 
     def remodel(self, time: float) -> float:
         """Nothing is left to do."""
+        if self.turnover is not None:
+            self.turnover.complete(time)
         return self._power
 
     @property
@@ -139,7 +147,8 @@ class Implicit:
 
         def set_fraction(fraction: float) -> None:
             loading.set({name: old[name] + fraction * (loads[name] - old[name]) for name in loads})
-            answers.set_time(start + fraction * (time - start))
+            # nothing remodels where cells do not answer: the first step starts from the loaded body as it was
+            answers.set_time(start + (fraction * (time - start) if answering else 0.0))
 
         if not answering:
             answers.freeze()

@@ -45,6 +45,7 @@ class TurnoverPass:
     They are always those of the last solved state. Where rows lag (`lag`), a row has them from the rates of the rows
     before it, as the cells of a staggered pass. Otherwise (`extrapolate`) they are those of the end of the row's step,
     from the rates that the last two states let expect for its middle (Adams and Bashforth's second-order rule).
+    Implicit steps find them together with the state (`take`).
 
     Parameters
     ----------
@@ -73,13 +74,13 @@ class TurnoverPass:
         self.weights: Sequence[float] = (1.0,)  # of the load cases, that of `state` first
         self.slowest, self.fastest = 1.0 / settings.time, max(1.0, settings.gain) / settings.time
         self._start = self._before = self.row = self.better = self.logarithms()  # before: of the last solved state
-        self._extrapolates = False
+        self._start_rates: Array | None = None  # where those of both ends together are better
 
     # ------------------------------------------------------------ over a step
     def lag(self, time: float) -> None:
         """Before a step to `time` is solved: m and rho change with the rates of the last row, over its step."""
         self._change(self.rates(), self._numbers["duration"])
-        self._numbers["duration"], self._extrapolates = time - self.state.time, False
+        self._numbers["duration"], self._start_rates = time - self.state.time, None
 
     def extrapolate(self, time: float) -> None:
         """Before a step to `time` is solved: m and rho of its end."""
@@ -89,8 +90,17 @@ class TurnoverPass:
             before = self._earlier.values[0].reshape(-1, 2).T
             mean = start + duration / (2 * self._numbers["duration"]) * (start - before)
         self._earlier.push(np.ravel(start.T))
-        self._numbers["duration"], self._extrapolates = duration, True
+        self._numbers["duration"], self._start_rates = duration, start
         self._change(mean, duration)
+
+    def begin(self) -> None:
+        """Before a step is solved that finds m and rho of its end itself, and gives them to `take`."""
+        self._start, self._start_rates = self.logarithms(), self.rates()
+
+    def take(self, logarithms: Array) -> None:
+        """ln m and ln rho (2, n) that were found with the state."""
+        self._before = self.row = logarithms
+        self.set(logarithms)
 
     def _change(self, rates: Array, duration: float) -> None:
         self._before = self._start = self.logarithms()
@@ -109,9 +119,8 @@ class TurnoverPass:
         """After a step: what is better than the row."""
         duration = time - self.state.time
         self.better = self.after(self.row, duration)
-        if self._extrapolates:  # the rates at both ends together
-            start = self._earlier.values[0].reshape(-1, 2).T
-            self.better = changed(self._start, (start + self.rates()) / 2, duration)
+        if self._start_rates is not None:
+            self.better = changed(self._start, (self._start_rates + self.rates()) / 2, duration)
         self._warn()
 
     def after(self, start: Array, duration: float, present: bool = False) -> Array:

@@ -90,6 +90,7 @@ def condensed_points(kernels: TensorKernels | None, tissue: Tissue, step: StepOf
         step.law is LAWS["tensor"]
         and named(step.drive.driver, DRIVERS) in condensed.DRIVING_TENSORS
         and not step.is_spatial
+        and step.turnover is None
         and tissue.chain is CHAINS["wormlike"]
         and tissue.matrix is MATRICES["neo-hookean"]
         and named(tissue.repulsion, REPULSIONS) in COMPILED_REPULSIONS

@@ -246,8 +246,6 @@ class Scene(Table):
             return "chains: material.chain_density above 0"
         if self.cases[1:]:
             return "a scene without [[cases]]: it finds the cells for the stress of one load case"
-        if remodeling.turnover.is_on:
-            return "a scene without remodeling.turnover, whose derivatives are not known"
         if remodeling.has_set_point:
             return "remodeling.exponent = 2 and remodeling.threshold = 0: derivatives of other targets are not known"
         parts = LAWS[remodeling.law], DRIVERS[remodeling.driver], FRAMES[remodeling.frame]

@@ -19,6 +19,7 @@ from remodel_fenicsx.model.implicit.condensed import CondensedPoints, LocalSolut
 from remodel_fenicsx.model.implicit.network import OrthotropicCells, Strain
 from remodel_fenicsx.model.implicit.responses import StepOfCells, jumps_by_rank, response
 from remodel_fenicsx.model.laws import LAWS, Drive
+from remodel_fenicsx.model.turnover import TurnoverRule, at_the_end, rates
 
 Array = NDArray[np.float64]
 
@@ -274,3 +275,69 @@ def test_a_long_step_is_followed_where_newtons_method_does_not_find_its_end() ->
     A = found.structure
     np.testing.assert_allclose(np.trace(A, axis1=1, axis2=2)[found.converged], 1.0, atol=1e-12)
     assert (np.linalg.eigvalsh(A) > -1e-12).all()
+
+
+# ---------------------------------------------------------------- turnover
+RULE = TurnoverRule(40.0, 1.1, 1.0)
+
+
+def turning_over(repulsion: str, driver: str, duration: float) -> CondensedPoints:
+    """With content and natural length of their own at the start of the step."""
+    some, rng = points("tensor", repulsion, driver, "material", 40), np.random.default_rng(11)
+    content, length = rng.uniform(0.7, 2.0, 40), rng.uniform(0.95, 1.3, 40)
+    step = some.step._replace(time_new=some.step.time_old + duration, turnover=RULE)
+    return CondensedPoints(replace(some.tissue, content=content, natural_length=length), step)
+
+
+@pytest.mark.parametrize("duration", [4.0, 1e3, 1e5])
+@pytest.mark.parametrize(("repulsion", "driver"), [("log", "cauchy"), ("length", "pk2"), ("log", "finger")])
+def test_the_tangent_with_turnover_is_the_derivative(repulsion: str, driver: str, duration: float) -> None:
+    """Taylor remainders a quarter at half the way."""
+    rng = np.random.default_rng(1)
+    some, F = turning_over(repulsion, driver, duration), deformations(40, rng)
+    found = solved(some, F)
+    assert found.converged.mean() > 0.9
+    tangent, ok = some.tangent(found, np.zeros(40, dtype=bool)), found.converged
+    H = 2e-4 * rng.standard_normal((40, 3, 3))
+    left = []
+    for h in (1.0, 0.5):
+        moved = some.solve(F + h * H, found.driving_tensor).first_piola_kirchhoff - found.first_piola_kirchhoff
+        error = moved - h * np.einsum("niJkL,nkL->niJ", tangent, H)
+        left.append(np.linalg.norm(error, axis=(1, 2))[ok])
+    assert np.median(left[0] / left[1]) == pytest.approx(4.0, abs=0.1)
+
+
+def test_content_and_natural_length_belong_to_the_end_of_the_step() -> None:
+    """ln m and ln rho have changed by the rates at the end; the stress is that of W with them."""
+    some, F = turning_over("log", "cauchy", 4.0), deformations(40, np.random.default_rng(2))
+    found = solved(some, F)
+    assert found.turnover is not None and found.converged.all()
+    m, rho = np.exp(found.turnover.T)
+    C, tissue = np.swapaxes(F, 1, 2) @ F, some.tissue
+    r = np.sqrt(np.einsum("nij,nij->n", found.structure, C))
+    end = replace(tissue, content=m, natural_length=rho)
+    content, length = rates(end, r, *RULE)
+    np.testing.assert_allclose(np.log(m / tissue.content), 4.0 * content, atol=1e-12)
+    np.testing.assert_allclose(np.log(rho / tissue.natural_length), 4.0 * length, atol=1e-12)
+    assert np.ptp(content) > 0.02  # some fall, some grow as fast as they can
+    P = stress_of_the_energy(end, F, cells_of(found))
+    np.testing.assert_allclose(found.first_piola_kirchhoff, P, rtol=1e-7, atol=1e-7 * np.abs(P).max())
+    np.testing.assert_allclose(found.squared_lengths, (r * tissue.natural_length / rho) ** 2, rtol=1e-12)
+
+
+def test_chains_that_turnover_cannot_follow_are_locked() -> None:
+    """Within a step rho grows by (1 + k)/T (L/(lambda_h r0) - 1) at most; up to there r < rho L, beyond it not."""
+    ones = np.ones(2)
+    tissue = Tissue(*(v * ones for v in (27.3, 3.1, 1.57, 1.594, 1.0)), content=ones, natural_length=ones)
+    largest = 1.594 * np.exp(20.0 * 2.0 / 40.0 * (1.594 / 1.1 - 1.0))
+    r = largest * np.array([0.9999, 1.0001])
+    ratio = r / at_the_end(RULE, tissue, r, 20.0).natural_length / 1.594
+    assert ratio[0] < 1.0 < ratio[1] and ratio == pytest.approx(1.0, abs=1e-3)
+
+
+def test_a_step_without_end_leads_to_the_stretch_of_deposition() -> None:
+    ones = np.ones(3)
+    tissue = Tissue(*(v * ones for v in (27.3, 3.1, 1.57, 1.594, 1.0)), content=ones, natural_length=ones)
+    found = at_the_end(RULE, tissue, np.array([0.7, 1.1, 3.0]), 1e8)
+    np.testing.assert_allclose(found.natural_length, np.array([0.7, 1.1, 3.0]) / 1.1, rtol=1e-5)
+    np.testing.assert_allclose(found.natural_length_slope, 1.0, atol=1e-5)

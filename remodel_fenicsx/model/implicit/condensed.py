@@ -5,7 +5,9 @@ At a point the cells at the end of a step are a function of F. The unknown is th
 
     D(C, S(C, y)) - D = 0,    y = y(F, D)                                        (i1)
 
-with six numbers y of the cells (`network`). A change of F at a solution, with indices for derivatives, has
+with six numbers y of the cells (`network`). With turnover, S has in it content and natural length at the end of the
+step, which are functions of r(C, y) (`model.turnover.at_the_end`). A change of F at a solution, with indices for
+derivatives, has
 
     (1 - D_S S_y y_D) dD = D_C dC + D_S dS|_D,    dS|_D = S_C dC + S_y y_F dF    (i2)
     dP = dF S + F dS,    dS = dS|_D + S_y y_D dD                                 (i3)
@@ -131,11 +133,13 @@ class LocalSolution(NamedTuple):
     first_piola_kirchhoff
         P = F S, (n, 3, 3).
     squared_lengths
-        r^2 = A : C, (n,).
+        r^2 = A : C, (n,); with turnover over (rho/rho_0)^2, rho_0 at the start: chains lock where it is rho_0^2 L^2.
     converged
         Whether the cells are those of D and D that of the stress, (n,); where not, cells belong to the last D.
     cells
         Lengths and axes of laws by rank.
+    turnover
+        ln m and ln rho at the end of the step, (n, 2), where they change.
     """
 
     gradient: Array
@@ -145,6 +149,7 @@ class LocalSolution(NamedTuple):
     squared_lengths: Array
     converged: Flags
     cells: UnitCell | None = None
+    turnover: Array | None = None
 
 
 class Trial(NamedTuple):
@@ -254,14 +259,18 @@ class CondensedPoints:
         if isinstance(trial.cells, OrthotropicCells):
             local = trial.cells.cell
             cells = UnitCell(local.dimensions, local.axes @ np.swapaxes(strain.basis, 1, 2))
+        squared, turnover = np.einsum("nii,ni->n", A, strain.squared), trial.stress.turnover
+        if turnover is not None:
+            squared = squared * (self.tissue.natural_length / np.exp(turnover[:, 1])) ** 2
         return LocalSolution(
             strain.gradient,
             strain.outside(trial.tensor),
             strain.outside(A),
             strain.gradient @ strain.outside(trial.stress.value),
-            np.einsum("nii,ni->n", A, strain.squared),
+            squared,
             trial.converged,
             cells,
+            turnover,
         )
 
     def _cells(self, strain: Strain, structure: Array, cells: UnitCell | None) -> LocalCells:
@@ -275,7 +284,7 @@ class CondensedPoints:
     def _stress(self, strain: Strain, cells: LocalCells, derivatives: bool = False) -> Stress:
         """S with these cells."""
         terms = network.TERMS[str(named(self.tissue.repulsion, REPULSIONS))]
-        return network.stress(self.tissue, terms, strain, cells, derivatives)
+        return network.stress(self.tissue, terms, strain, cells, derivatives, self.step.turned_over)
 
     def _driving(self, strain: Strain, stress: Array, derivatives: bool = False) -> Driving:
         """D of S."""

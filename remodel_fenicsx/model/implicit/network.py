@@ -6,6 +6,8 @@ and the three turns of an orthotropic cell.
 
     S = S_matrix + c (g(r) A - g(r0) G),    r^2 = A : C,    G = dM/dC
 
+With turnover it is m c (g(r/rho)/rho^2 A - g(r0) G), m and rho those at the end of a step as functions of r.
+
 Points are named tuples of arrays, one entry of each array a point: `at` takes some of them, `put` puts some into them.
 """
 
@@ -20,6 +22,7 @@ from numpy.typing import NDArray
 from remodel_fenicsx.model import tensors
 from remodel_fenicsx.model.cells import UnitCell, structure_tensor
 from remodel_fenicsx.model.energy import Tissue
+from remodel_fenicsx.model.turnover import TurnedOver
 
 Array = NDArray[np.float64]
 
@@ -217,15 +220,56 @@ TERMS: dict[str, Callable[[Strain, LocalCells, Array, bool], Terms]] = {
 
 
 class Stress(NamedTuple):
-    """S (n, 3, 3) in the eigenbasis of C, r/L (n,), and derivatives of S by y and by C, (n, 6, 6)."""
+    """S (n, 3, 3) in the eigenbasis of C, r/L (n,), and derivatives of S by y and by C, (n, 6, 6).
+
+    With turnover r/(rho L), and ln m and ln rho (n, 2).
+    """
 
     value: Array
     extension: Array
     by_cells: Array | None = None
     by_strain: Array | None = None
+    turnover: Array | None = None
 
 
-def stress(tissue: Tissue, terms: Callable[..., Terms], strain: Strain, cells: LocalCells, derivatives: bool) -> Stress:
+class Moduli(NamedTuple):
+    """Of chains with length r: S = S_matrix + `chains` A - `repulsion` G, their slopes by r, and r/L; arrays (n,)."""
+
+    chains: Array
+    chains_slope: Array
+    repulsion: Array
+    repulsion_slope: Array
+    extension: Array
+    turnover: Array | None = None
+
+
+def moduli(tissue: Tissue, r: Array, turned_over: TurnedOver | None) -> Moduli:
+    """c g(r) and c g(r0); with turnover m c g(r/rho)/rho^2 and m c g(r0)."""
+    chain, L, c = tissue.chain, tissue.contour_length, tissue.network_modulus
+    assert chain is not None
+    s = r if turned_over is None else r / turned_over.natural_length
+    extension = s / L if chain.locks else np.zeros_like(r)
+    tiny = 1e-30
+    stiffness = chain.stiffness(s + 1j * tiny, L)  # plain arithmetic: its derivative by a complex step
+    g, slope = stiffness.real, stiffness.imag / tiny
+    g0 = c * chain.stiffness(tissue.end_to_end_length, L)
+    if turned_over is None:
+        return Moduli(c * g, c * slope, g0, np.zeros_like(r), extension)
+    m, rho, by_m, by_rho = turned_over
+    chains = m * c * g / rho**2
+    relative = by_m + s * slope / g * (1.0 - by_rho) - 2.0 * by_rho
+    logarithms = np.log(np.stack([m, rho], axis=1))
+    return Moduli(chains, chains * relative / r, m * g0, m * g0 * by_m / r, extension, logarithms)
+
+
+def stress(
+    tissue: Tissue,
+    terms: Callable[..., Terms],
+    strain: Strain,
+    cells: LocalCells,
+    derivatives: bool,
+    turned_over: Callable[[Tissue, Array], TurnedOver] | None = None,
+) -> Stress:
     """S of points whose parameters are arrays (n,).
 
     Parameters
@@ -234,30 +278,25 @@ def stress(tissue: Tissue, terms: Callable[..., Terms], strain: Strain, cells: L
         Its matrix energy has `derivatives`, its parameters are arrays (n,).
     terms
         Of its repulsion, of `TERMS`.
+    turned_over
+        Content and natural length from the tissue and r, where they change within the step.
     """
-    chain, matrix = tissue.chain, tissue.matrix.derivatives  # type: ignore[attr-defined]
-    assert chain is not None
-    L, r0, c = tissue.contour_length, tissue.end_to_end_length, tissue.network_modulus
-    A = cells.structure
+    matrix, A = tissue.matrix.derivatives, cells.structure  # type: ignore[attr-defined]
     r = np.sqrt(np.einsum("nii,ni->n", A, strain.squared))
-    extension = r / L if chain.locks else np.zeros_like(r)
-    tiny = 1e-30
-    stiffness = chain.stiffness(r + 1j * tiny, L)  # plain arithmetic: its derivative by a complex step
-    g, slope = stiffness.real, stiffness.imag / tiny
-    g0 = c * chain.stiffness(r0, L)
-    repulsion = terms(strain, cells, r0, derivatives)
+    chains = moduli(tissue, r, None if turned_over is None else turned_over(tissue, r))
+    repulsion = terms(strain, cells, tissue.end_to_end_length, derivatives)
     of_matrix, by_strain = matrix(strain.squared, tissue.lame_lambda, tissue.lame_mu, derivatives)
-    value = of_matrix + (c * g)[:, None, None] * A - g0[:, None, None] * repulsion.value
+    g, g0 = chains.chains[:, None, None], chains.repulsion[:, None, None]
+    value = of_matrix + g * A - g0 * repulsion.value
     if not derivatives:
-        return Stress(value, extension)
+        return Stress(value, chains.extension, turnover=chains.turnover)
     assert repulsion.by_cells is not None and repulsion.by_strain is not None
     a, by_cells = tensors.to_mandel(A), cells.structure_by_cells()
-    steep = c * slope / (2 * r)
+    by_length = chains.chains_slope[:, None] * a
+    if turned_over is not None:
+        by_length = by_length - chains.repulsion_slope[:, None] * tensors.to_mandel(repulsion.value)
+    steep = by_length / (2 * r)[:, None]  # by r^2 = A : C
     along = np.einsum("na,nab->nb", tensors.on_diagonal(strain.squared), by_cells)
-    by_cells = (
-        tensors.dyads(steep[:, None] * a, along)
-        + (c * g)[:, None, None] * by_cells
-        - g0[:, None, None] * repulsion.by_cells
-    )
-    by_strain = by_strain + tensors.dyads(steep[:, None] * a, a) - g0[:, None, None] * repulsion.by_strain
-    return Stress(value, extension, by_cells, by_strain)
+    by_cells = tensors.dyads(steep, along) + g * by_cells - g0 * repulsion.by_cells
+    by_strain = by_strain + tensors.dyads(steep, a) - g0 * repulsion.by_strain
+    return Stress(value, chains.extension, by_cells, by_strain, chains.turnover)

@@ -6,6 +6,7 @@ material space, or, for a spatial driver and the frame `spatial`, in space. The 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,8 +15,10 @@ from numpy.typing import NDArray
 from remodel_fenicsx.model import spectral, tensor_law, tensors
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.drivers import carried_axes
+from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.model.implicit.network import LocalCells, OrthotropicCells, Strain, StructureCells
 from remodel_fenicsx.model.laws import Drive, Law, Ranked, by_rank
+from remodel_fenicsx.model.turnover import TurnedOver, TurnoverRule, at_the_end
 
 Array = NDArray[np.float64]
 
@@ -38,6 +41,8 @@ class StepOfCells(NamedTuple):
         At the start of the step: lengths (n, 3) and axes (n, 3, 3), and A (n, 3, 3).
     time_old, time_new
         Of the step.
+    turnover
+        How content and natural length change over it; None where they stay.
     """
 
     law: Law
@@ -46,6 +51,13 @@ class StepOfCells(NamedTuple):
     structure: Array
     time_old: float
     time_new: float
+    turnover: TurnoverRule | None = None
+
+    @property
+    def turned_over(self) -> Callable[[Tissue, Array], TurnedOver] | None:
+        """Content and natural length at its end from the tissue and r there."""
+        rule, duration = self.turnover, self.time_new - self.time_old
+        return None if rule is None else lambda tissue, length: at_the_end(rule, tissue, length, duration)
 
     @property
     def is_spatial(self) -> bool:
