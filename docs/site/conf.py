@@ -1,6 +1,7 @@
 """What Sphinx is told; docs/build calls it."""
 
 import re
+from pathlib import Path
 from typing import Any
 
 from pygments.lexers.special import TextLexer
@@ -23,6 +24,7 @@ toc_object_entries_show_parents = "hide"  # else they are wider than their colum
 suppress_warnings = ["misc.highlighting_failure"]  # shells' prompts and shortened TOML in examples
 html_theme = "pydata_sphinx_theme"
 html_title = "remodel_fenicsx"
+html_search_scorer = str(Path(__file__).with_name("scorer.js"))
 html_copy_source = html_show_sourcelink = False
 html_theme_options = {"show_toc_level": 2, "header_links_before_dropdown": 6, "secondary_sidebar_items": ["page-toc"]}
 # KaTeX in the site's own folder: formulas need no network

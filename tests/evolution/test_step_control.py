@@ -374,7 +374,7 @@ def test_where_errors_do_not_fall_the_number_of_steps_is_bounded(caplog: pytest.
     assert 20 <= in_vain <= 20 + 15 * (end - 25.0) * settings.kappa + 8
     assert len(times) < end + 150 and tried < 2 * len(times)
     said = [record.message for record in caplog.records if "does not fall to time.tolerance" in record.message]
-    assert len(said) == 2 and "go on" not in said[0] and "steps of 1.04 go on" in said[1]
+    assert len(said) == 2 and "goes on" not in said[0] and "goes on with steps of 1.04" in said[1]
 
 
 def test_the_tolerance_counts_again_when_errors_fall() -> None:

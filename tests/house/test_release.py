@@ -22,8 +22,10 @@ PRESET = "kuhl-holzapfel-2007"
 VENDORED = tomllib.loads((ASSETS / "VENDOR.toml").read_text(encoding="utf-8"))["package"]
 
 
-def test_citation_and_image_say_the_version() -> None:
+def test_citation_image_and_change_log_say_the_version() -> None:
     assert f"\nversion: {__version__}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    changes = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert re.findall(r"^## (.*)$", changes, re.MULTILINE)[0] in (__version__, f"{__version__} (unreleased)")
     labels = dict(re.findall(r'org\.opencontainers\.image\.(\w+)="([^"]*)"', (ROOT / "Dockerfile").read_text()))
     assert (
         labels["version"] == __version__ and labels["licenses"] == "MIT" and labels["title"] and labels["description"]
