@@ -11,6 +11,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
+from remodel_fenicsx.fem.solver_methods import LARGE
 from remodel_fenicsx.solver.equilibrium import Equilibrium
 from remodel_fenicsx.solver.linear import kept_factor
 
@@ -83,7 +84,10 @@ class Inertia:
             If MUMPS gives up.
         """
         self._assemble()
-        return 0 if self._definite.is_definite(self._symmetric) else self._negative_of(self._symmetric)
+        kept = self._symmetric.getSize()[0] <= LARGE  # of larger ones MUMPS on all ranks takes less time and memory
+        if kept and self._definite.is_definite(self._symmetric):
+            return 0
+        return self._negative_of(self._symmetric)
 
     def lowest(self) -> Mode:
         """The lowest eigenvalue and its mode, by Krylov-Schur iterations (SLEPc) with the inverse about a lower bound.
