@@ -59,13 +59,14 @@ class ShownBody:
         """
         rows: dict[str, list[NDArray[np.float32]]] = {name: [] for name in ("position", "angle", "extension", "edges")}
         is_deformed = True
-        for time in times:
-            displacement, found = whole.fields(float(time), NAMES)
-            is_deformed = displacement is not None
-            moved = 0.0 if displacement is None else displacement
-            rows["position"].append((whole.points + moved).astype(np.float32))
-            for name, values in _of_elements(found).items():
-                rows[name].append(values.astype(np.float32))
+        with whole.recording.kept_open():
+            for time in times:
+                displacement, found = whole.fields(float(time), NAMES)
+                is_deformed = displacement is not None
+                moved = 0.0 if displacement is None else displacement
+                rows["position"].append((whole.points + moved).astype(np.float32))
+                for name, values in _of_elements(found).items():
+                    rows[name].append(values.astype(np.float32))
         series: Any = {name: np.stack(values) if values else None for name, values in rows.items()}
         volume = _volumes(whole.points[whole.elements])
         return cls(whole, times, volume, **series, is_deformed=is_deformed)
