@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from remodel_fenicsx import SceneError, Simulation, cli
+from remodel_fenicsx import Recording, SceneError, Simulation, cli
 from remodel_fenicsx.body.tube import _opening_angle
 from remodel_fenicsx.model import closing
 from remodel_fenicsx.model.chains import CHAINS
@@ -102,6 +102,16 @@ def test_the_equilibrium_is_that_rest(caplog: pytest.LogCaptureFixture) -> None:
     assert 40.0 * np.abs(turnover.rates()).max() < 2e-4
     assert not [record for record in caplog.records if record.levelname == "WARNING"]
     simulation.close()
+
+
+def test_the_demo(tmp_path: Path) -> None:
+    """Its row is that of docs/turnover.md, and nothing warns."""
+    demo = Path(__file__).parents[2] / "demos" / "turnover.toml"
+    assert cli.main(["run", str(demo), "-q", "--no-report", "-o", str(tmp_path / "run")]) == 0
+    history = Recording(tmp_path / "run").history
+    assert [history[name][-1] for name in ANGLES] == pytest.approx([6.5, 10.5, 14.7], abs=0.1)
+    assert [history[name][-1] for name in ("content", "opening_angle")] == pytest.approx([2.91, 115.5], rel=0.005)
+    assert "WARNING" not in (tmp_path / "run" / "run.log").read_text()
 
 
 def test_growth_has_no_equilibrium_and_says_so(caplog: pytest.LogCaptureFixture) -> None:
