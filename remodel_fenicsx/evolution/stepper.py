@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import time as clock
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -19,6 +20,8 @@ from remodel_fenicsx.solver.continuation import Work
 from remodel_fenicsx.solver.equilibrium import Extension
 from remodel_fenicsx.state.parameters import on_mesh
 from remodel_fenicsx.state.state import State
+
+log = logging.getLogger(__name__)
 
 
 @dataclass
@@ -169,6 +172,12 @@ class Stepper:
         self.remodeling = RemodelingPass(state, self.tissue, remodeling, kappa)
         # cells that never change are coupled to nothing
         name = remodeling.coupling if self.remodeling.law.remodels else "staggered"
+        if remodeling.turnover.is_on and name != remodeling.coupling and state.comm.rank == 0:
+            log.warning(
+                "kappa is 0: cells stay as they are, and content and natural length follow with the coupling "
+                "'staggered' in place of %r, whose errors fall with the step",
+                remodeling.coupling,
+            )
         make = coupling or COUPLINGS[name].make
         self.coupling: Coupling = make(state, self.tissue, self.remodeling, solver)
         # `TurnoverPass`; there already where the coupling's way is another stepper's

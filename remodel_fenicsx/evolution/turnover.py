@@ -20,6 +20,14 @@ log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 
 LARGEST_TURNOVER = 0.5  # largest |change of ln rho| in a step: the prototype's; it does not act at rest
+GROWN = (
+    "growth does not come to rest (mechanobiological instability, docs/turnover.md); try a larger "
+    "remodeling.turnover.gain or a thicker wall"
+)
+LOST = (
+    "the tissue wastes away, for its chains are stretched less than remodeling.turnover.deposition_stretch; try a "
+    "smaller one, or larger loads"
+)
 BEYOND_REST = 10.0  # factor of content or natural length from which on growth is hardly meant
 
 
@@ -179,14 +187,14 @@ class TurnoverPass:
                 continue
             self._numbers["said"] = 1
             place = ", ".join(f"{c:.3f}" for c in self.quadrature.place_of_largest(factor))
+            grown = self.quadrature.maximum(self._values(name)) > BEYOND_REST
             if self.state.comm.rank == 0:
                 log.warning(
-                    "turnover: %s has changed by more than a factor of %g at (%s) in the step after time %g: growth "
-                    "does not come to rest (mechanobiological instability, docs/turnover.md); try a larger "
-                    "remodeling.turnover.gain or a thicker wall",
+                    "turnover: %s has changed by more than a factor of %g at (%s) in the step after time %g: %s",
                     name.replace("_", " "),
                     BEYOND_REST,
                     place,
                     self.state.time,
+                    GROWN if grown else LOST,
                 )
             return

@@ -417,6 +417,9 @@ class Scene(Table):
         always = columns_of(self.geometry, regions=self.regions)
         known = dict.fromkeys([*columns_on_request(self.geometry), *(column.name for column in always)])
         for name in self.output.columns:
+            if name == "time_error" and self.time.is_equilibrium:
+                rule = "is an error of steps; must be left out with time.end = 'equilibrium'"
+                raise fault(f"{name!r} {rule}", "output.columns", name)
             if self.regions and name in self.geometry.columns_of_one_tissue:
                 raise fault(f"{name!r} is for bodies of one tissue; the scene has regions", "output.columns", name)
             if name in (*TURNED_OVER, TURNOVER_POWER) and not self.remodeling.turnover.is_on:
@@ -541,7 +544,19 @@ class Scene(Table):
             for case in self.each_case():
                 lines = doubts(material, self.geometry, case.loads, cells.end_to_end_length, self.last_time)
                 found |= dict.fromkeys(line if line.startswith("geometry.") else _words(name) + line for line in lines)
-        return [*found, *self.remodeling.warnings()]
+        return [*found, *self._too_long_for_turnover(), *self.remodeling.warnings()]
+
+    def _too_long_for_turnover(self) -> list[str]:
+        """Explicit steps of turnover that are longer than its time: content then swings about its rest."""
+        turnover, step = self.remodeling.turnover, self.time.step
+        chosen = self.time.is_equilibrium or self.time.tolerance is not None
+        if chosen or self.remodeling.coupling == "implicit" or step <= (turnover.time or math.inf):
+            return []
+        return [
+            f"time.step = {step:g} is longer than remodeling.turnover.time = {turnover.time:g}: content and natural "
+            "length overshoot in each step; set a shorter time.step, time.tolerance, or remodeling.coupling = "
+            "'implicit'"
+        ]
 
     def with_values(self, changes: Mapping[str, Any]) -> Scene:
         """A validated copy with other values by dotted key: ``scene.with_values({"loads.pressure.value": 2.4})``.

@@ -67,7 +67,7 @@ LEFT_BEHIND = {
     "howto_extend": ["driven/history.csv"],
     "howto_paraview": ["tube/fields_body.vtkhdf"],
     "howto_ranks": ["ranks/history.csv"],
-    "howto_resume": ["tube/history.csv"],
+    "howto_resume": ["long/history.csv"],
 }
 
 

@@ -408,3 +408,50 @@ def test_a_step_in_parts_has_parts_of_its_turnover(coupling: str, monkeypatch: p
     assert {fraction for fraction, _ in parts} >= {0.5, 1.0}
     ends = {fraction: value for fraction, value in parts[-10:] if fraction in (0.5, 1.0)}
     assert 0.0 < ends[0.5] < ends[1.0]
+
+
+def cube(end: float, step: float, turnover: dict[str, float], **changes: Any) -> dict[str, Any]:
+    """Equal cells under a force: one point."""
+    return {
+        "preset": "consistent",
+        "geometry": {"shape": "cube"},
+        "cells": {"initial": "isotropic"},
+        "loads": {"force": {"value": 3.0, "ramp": [[0.0, 0.0], [10.0, 1.0]]}},
+        "remodeling": {"turnover": {"time": 40.0} | turnover} | changes,
+        "time": {"end": end, "step": step},
+        "output": {"fields": False, "columns": COLUMNS},
+    }
+
+
+def test_steps_that_are_too_long_for_the_turnover_are_said() -> None:
+    """Of the explicit couplings; implicit and chosen steps come to rest."""
+    long = cube(100.0, 10.0, {"time": 5.0})
+    (line,) = (line for line in scene_from_dict(long).warnings() if "turnover.time" in line)
+    assert "time.step = 10 is longer than remodeling.turnover.time = 5" in line
+    chosen = long | {"time": {"end": 100.0, "tolerance": 1.0}}
+    for fine in (cube(100.0, 10.0, {"time": 5.0}, coupling="implicit"), cube(100.0, 10.0, {}), chosen):
+        assert not [line for line in scene_from_dict(fine).warnings() if "turnover.time" in line]
+
+
+def test_cells_that_stay_are_said_to_take_staggered_turnover(caplog: pytest.LogCaptureFixture) -> None:
+    Simulation(scene_from_dict(cube(10.0, 5.0, {}, kappa=0.0, coupling="implicit"))).close()
+    assert "kappa is 0" in caplog.text and "in place of 'implicit'" in caplog.text
+
+
+def test_tissue_that_wastes_away_is_not_called_growth(caplog: pytest.LogCaptureFixture) -> None:
+    """A deposition stretch that the load never reaches."""
+    values = cube(200.0, 2.0, {"time": 10.0, "deposition_stretch": 1.59})
+    values["loads"]["force"]["value"] = 0.3
+    simulation = Simulation(scene_from_dict(values))
+    rows = [dict(step.row) for step in simulation.steps()]
+    simulation.close()
+    assert rows[-1]["content"] < 0.1
+    said = [record.message for record in caplog.records if record.message.startswith("turnover: content")]
+    assert len(said) == 1 and "wastes away" in said[0] and "growth" not in said[0]
+
+
+def test_the_error_of_steps_is_no_column_of_the_equilibrium() -> None:
+    values = cube(100.0, 5.0, {})
+    values["time"], values["output"] = {"end": "equilibrium"}, {"fields": False, "columns": ["time_error"]}
+    with pytest.raises(SceneError, match="'time_error' is an error of steps"):
+        scene_from_dict(values)
