@@ -279,7 +279,7 @@ def test_equal_pressures_inside_and_outside_compress_alike_everywhere(tube: Path
         ({"pressure": _outside()}, "loads.pressure.face = 'outer': pressure on the deformed inner face"),
         ({"tissue": {"kind": "pressure", "value": 1.0, "ramp": [[0, 0]]}}, "loads.tissue.face: missing"),
         ({"tissue": {"face": "outer", "value": 1.0, "ramp": [[0, 0]]}}, "loads.tissue.kind: missing"),
-        ({"fibre_angle_outer": _outside()}, "loads.fibre_angle_outer: a letter, then"),
+        ({"fibre_angle_outer": _outside()}, "loads.fibre_angle_outer: its name must be a letter, then"),
         ({"tissue": _outside(kind="traction")}, "loads.tissue.kind = 'traction'"),
     ],
 )

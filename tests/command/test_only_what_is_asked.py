@@ -157,14 +157,15 @@ def test_fields_that_are_named_are_the_only_ones_written(tmp_path: Path) -> None
 def test_stress_that_nobody_writes_is_not_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
     from remodel_fenicsx.results.fields import ElementFields
 
-    simulation = Simulation(scene(), SELF)
-    sizes = {}
-    for names in (("cauchy_stress",), ("fibre_angle",)):
-        fields = ElementFields(simulation.scene.geometry, simulation.stepper, names)
-        assert set(fields()) == set(names)
-        sizes[names] = fields._state.ufl_expression.ufl_shape
-    assert list(sizes.values()) == [(18,), (9,)]
-    simulation.close()
+    sizes = []
+    for driver, name in (("cauchy", "cauchy_stress"), ("pk2", "cauchy_stress"), ("cauchy", "fibre_angle")):
+        simulation = Simulation(scene().with_values({"remodeling.driver": driver}), SELF)
+        fields = ElementFields(simulation.scene.geometry, simulation.stepper, [name])
+        assert set(fields()) == {name}
+        sizes.append(None if fields._state is None else fields._state.ufl_expression.ufl_shape)
+        assert (fields._shared is simulation.stepper.remodeling) == (sizes[-1] is None)
+        simulation.close()
+    assert sizes == [None, (18,), (9,)]  # the stress that drives the cells is there already
 
 
 def test_rows_that_come_fast_are_flushed_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
