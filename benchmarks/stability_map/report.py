@@ -8,6 +8,7 @@ import platform
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from textwrap import shorten
 from typing import Any
 
 from benchmarks.stability_map.cases import Case
@@ -93,7 +94,7 @@ def listed(records: Iterable[Record], cases: Mapping[str, Case], chosen: Any) ->
     lines, commands = ["| case | what is said |", "|---|---|"], dict[str, str]()
     for record in records:
         if chosen(record):
-            words = " ".join(record["words"].split()).replace("|", "/")[:200]
+            words = shorten(record["words"].replace("|", "/"), 200, placeholder=" ...")
             lines.append(f"| {record['key']} | {words} |")
             commands.setdefault(record["family"], cases[record["key"]].command)
     shown = "\n".join(("One of each family again:\n\n```sh", *commands.values(), "```"))
