@@ -178,7 +178,15 @@ def expression(ufl_expression: Any, points: Any, name: str | None = None) -> Any
         return dolfinx.fem.Expression(map_expr_dag(_OwnLabels(), ufl_expression), points, jit_options=jit_options())
 
 
-def library(comm: MPI.Intracomm, declarations: str, source: str, what: str, seconds: int = 2) -> Any:
+def library(
+    comm: MPI.Intracomm,
+    declarations: str,
+    source: str,
+    what: str,
+    seconds: int = 2,
+    include: Path | None = None,
+    libraries: tuple[str, ...] = (),
+) -> Any:
     """Compile C functions of our own, or take them from the cache. Collective; says and raises what `form` does.
 
     Parameters
@@ -189,6 +197,8 @@ def library(comm: MPI.Intracomm, declarations: str, source: str, what: str, seco
         What can be called, and the code; for every architecture, in ISO C.
     what, seconds
         What is being compiled, and about how long it takes, for people.
+    include, libraries
+        A folder of headers, and names of libraries that the code calls.
 
     Returns
     -------
@@ -201,7 +211,7 @@ def library(comm: MPI.Intracomm, declarations: str, source: str, what: str, seco
     if comm.rank == 0 and not _is_cached(name):
         try:
             with _compiling(name, what, seconds):
-                _build(name, declarations, source)
+                _build(name, declarations, source, include, libraries)
         except BaseException as error:
             failure = error
     if comm.bcast(failure is not None):
@@ -209,13 +219,16 @@ def library(comm: MPI.Intracomm, declarations: str, source: str, what: str, seco
     return _loaded(name)
 
 
-def _build(name: str, declarations: str, source: str) -> None:
+def _build(
+    name: str, declarations: str, source: str, include: Path | None = None, libraries: tuple[str, ...] = ()
+) -> None:
     """What FFCx does with its kernels: the source, the library, and last the end mark."""
     if _is_cached(name):
         return
     builder = cffi.FFI()
     builder.cdef(declarations)
-    builder.set_source(name, source, extra_compile_args=LIBRARY_FLAGS, libraries=["m"])
+    folders = {} if include is None else {"include_dirs": [str(include)], "library_dirs": [str(include.parent / "lib")]}
+    builder.set_source(name, source, extra_compile_args=LIBRARY_FLAGS, libraries=["m", *libraries], **folders)
     builder.compile(tmpdir=str(cache_folder()))
     (cache_folder() / f"{name}.c.cached").touch()
 

@@ -105,7 +105,8 @@ REMOVED = {"exact": "was removed; take 'lagged', or 'direct' for a new tangent i
 """Methods of earlier versions, and what to take in their place."""
 
 # Factors that are kept, by what is known of the tangent, the best first; each but the last may be refused
-DEFINITE, SYMMETRIC, GENERAL = "positive definite", "symmetric", "general"
+SINGLE, DEFINITE = "positive definite in single precision", "positive definite"  # both by CHOLMOD
+SYMMETRIC, GENERAL = "symmetric", "general"  # by MUMPS
 FACTOR_OPTIONS: dict[str, Mapping[str, Any]] = {
     DEFINITE: {
         "pc_type": "cholesky",

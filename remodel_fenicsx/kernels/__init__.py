@@ -2,7 +2,8 @@
 
 `library` compiles the C files and calls them; `points` and `tensor` have a method for each function. Most stand for a
 function of the package: it is the reference, decides where C leaves a point open, and runs in its place with
-``REMODEL_FENICSX_KERNELS=numpy`` in the environment, for a debugger.
+``REMODEL_FENICSX_KERNELS=numpy`` in the environment, for a debugger. Those of `factor`, which calls CHOLMOD, stand for
+none: without them factors are PETSc's, in double precision.
 
 =================== =====================================================================================
 in C                stands for
@@ -21,5 +22,9 @@ log_derivatives     model.energy.log_derivatives
 target              model.laws.tensor_target
 solve               model.implicit.condensed.CondensedPoints.solve
 tangent             model.implicit.condensed.CondensedPoints.tangent
+factor_new          kernels.factor.SingleFactor
+factor_renew        kernels.factor.SingleFactor.renew
+factor_solve        kernels.factor.SingleFactor.solve
+factor_free         kernels.factor.SingleFactor.close
 =================== =====================================================================================
 """

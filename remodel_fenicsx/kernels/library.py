@@ -71,13 +71,23 @@ class Library:
         As for `jit.library`.
     numbers
         As for `source`.
+    include, libraries
+        As for `jit.library`.
     """
 
     def __init__(
-        self, comm: MPI.Intracomm, name: str, what: str, seconds: int = 2, numbers: Mapping[str, float] = NO_NUMBERS
+        self,
+        comm: MPI.Intracomm,
+        name: str,
+        what: str,
+        seconds: int = 2,
+        numbers: Mapping[str, float] = NO_NUMBERS,
+        include: Path | None = None,
+        libraries: tuple[str, ...] = (),
     ):
         text = source(name, numbers)
-        module = jit.library(comm, "".join(f"{line};\n" for line in declarations(text)), text, what, seconds)
+        called = "".join(f"{line};\n" for line in declarations(text))
+        module = jit.library(comm, called, text, what, seconds, include, libraries)
         self._functions, self._ffi = module.lib, module.ffi
 
     def __call__(self, name: str, *arguments: Any) -> Any:
@@ -88,6 +98,8 @@ class Library:
         if isinstance(value, np.ndarray):
             if value.dtype in (np.bool_, np.uint8):
                 return self._ffi.from_buffer("uint8_t[]", value)
+            if value.dtype == np.int32:
+                return self._ffi.from_buffer("int32_t[]", np.ascontiguousarray(value))
             return self._ffi.from_buffer("double[]", np.ascontiguousarray(value, np.float64))
         return self._ffi.NULL if value is None else value
 

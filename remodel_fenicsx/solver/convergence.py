@@ -78,6 +78,11 @@ class Convergence:
         certain = requested if coarse else self.tolerance(rounded_strains=0.0)
         return norm <= certain or norm > STAGNATION * previous
 
+    def goal(self) -> float:
+        """Norm of the residual at which the solve ends, about."""
+        coarse = INTERMEDIATE_TOLERANCE * self.force_scale if self.intermediate else 0.0
+        return max(coarse, self.tolerance())
+
     def tolerance(self, rounded_strains: float = ROUNDED_STRAINS) -> float:
         """In the unit of force: relative to the nodal forces, not below the rounding of forces that cancel there.
 

@@ -13,7 +13,7 @@ from petsc4py import PETSc
 
 from remodel_fenicsx.fem.solver_methods import LARGE
 from remodel_fenicsx.solver.equilibrium import Equilibrium
-from remodel_fenicsx.solver.linear import kept_factor
+from remodel_fenicsx.solver.linear import kept_factor, uneven
 
 Array = NDArray[np.float64]
 
@@ -224,9 +224,3 @@ def of_the_unloaded_body(inertia: Inertia) -> tuple[int, float]:
     finally:
         state.restore(before)
 
-
-def uneven(vector: Any) -> Any:
-    """The vector, filled with what no symmetry leaves unchanged."""
-    first, last = vector.getOwnershipRange()
-    vector.array[:] = np.sin(1.0 + np.arange(first, last) * np.sqrt(2.0))
-    return vector

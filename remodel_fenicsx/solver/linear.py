@@ -11,7 +11,8 @@ import numpy as np
 from petsc4py import PETSc
 
 from remodel_fenicsx.fem.petsc_options import ProblemOptions
-from remodel_fenicsx.fem.solver_methods import DEFINITE, GENERAL, SYMMETRIC, factor_options
+from remodel_fenicsx.fem.solver_methods import DEFINITE, GENERAL, SINGLE, SYMMETRIC, factor_options
+from remodel_fenicsx.kernels import factor
 from remodel_fenicsx.solver.equilibrium import Equilibrium
 from remodel_fenicsx.solver.quasi_newton import Secants
 
@@ -20,6 +21,7 @@ log = logging.getLogger(__name__)
 UNSYMMETRIC = 1e-10  # relative to the largest row: what a symmetric tangent may be unsymmetric by
 OVER = 3  # iterations over which the rate of convergence is taken, but for the first one
 SLOW_STEP = 2 / 3  # of `worth`: iterations of a step after which the next one starts with a new factor
+SINGLE_ERROR = 0.1  # relative, of the answer to the softest motion: about what an iteration with an old factor leaves
 MOST_RENEWALS = 6  # of one solve: what needs more is no matter of old factors
 
 
@@ -35,6 +37,7 @@ class KeptFactor:
     """Factors of an earlier tangent, which PETSc takes as a preconditioner of Python's.
 
     CHOLMOD takes definite tangents only, and then raises; so factors are made here, outside SNES, and MUMPS follows.
+    The first choice is CHOLMOD in single precision, for half of the time: quasi-Newton steps make up for the digits.
     """
 
     comm: Any = PETSc.COMM_SELF
@@ -43,23 +46,44 @@ class KeptFactor:
         self.preconditioner: Any = None
         self._options: ProblemOptions | None = None
         self._kind = ""
+        self._takes_single = factor.is_available()
+        self._single: factor.SingleFactor | None = None
+        self._soft: Any = None  # the softest motion that is known: a vector of length one
 
     def apply(self, _: Any, x: Any, y: Any) -> None:
         """PETSc asks for y, the inverse of the kept tangent times x; NaN where there is none: the solve then fails."""
-        if self.preconditioner is None:
+        if self._kind == SINGLE and self._single is not None:
+            if not self._single.solve(x.array_r, y.array_w):
+                y.set(np.nan)
+        elif self.preconditioner is None:
             y.set(np.nan)
         else:
             self.preconditioner.apply(x, y)
 
+    @property
+    def negative_pivots(self) -> int | None:
+        """How many there are, as far as the factors tell (`negative_pivots`)."""
+        if self._kind == SINGLE:
+            return 0
+        return None if self.preconditioner is None else negative_pivots(self.preconditioner)
+
     def renew(self, matrix: Any) -> None:
         """Factorise a tangent. Where that fails there are no factors at all, and a log line."""
         symmetric = matrix.isSymmetric(UNSYMMETRIC * matrix.norm(PETSc.NormType.NORM_INFINITY))
-        kinds = [DEFINITE, SYMMETRIC, GENERAL] if symmetric else [GENERAL]
+        kinds, refused = [DEFINITE, SYMMETRIC, GENERAL] if symmetric else [GENERAL], False
         if symmetric and self._was_indefinite():
             kinds.remove(DEFINITE)  # most likely refused again
+        elif symmetric and self._takes_single:
+            answers = self._answers_in_single(matrix)
+            if answers:
+                return
+            if refused := answers is None:
+                kinds.remove(DEFINITE)  # most likely indefinite
         for kind in kinds:
             if self._factorised(kind, matrix):
-                return
+                break
+        if refused and self._kind == SYMMETRIC and not self._was_indefinite():
+            self._takes_single = False  # it refuses what is definite
 
     def is_definite(self, matrix: Any) -> bool:
         """Whether a symmetric matrix is positive definite: CHOLMOD takes it."""
@@ -68,12 +92,49 @@ class KeptFactor:
         return taken
 
     def close(self) -> None:
-        """Free PETSc's objects."""
+        """Free PETSc's objects and CHOLMOD's."""
+        self._let_go()
+        if self._single is not None:
+            self._single.close()
+            self._soft.destroy()
+        self._single = self._soft = None
+
+    def _let_go(self) -> None:
+        """Free the factor of PETSc."""
         if self.preconditioner is not None:
             self.preconditioner.destroy()
         if self._options is not None:
             self._options.close()
         self.preconditioner, self._options, self._kind = None, None, ""
+
+    def _answers_in_single(self, matrix: Any) -> bool | None:
+        """Whether a factor in single precision answers soft motions well enough; None where there is no such factor."""
+        starts, columns, values = matrix.getValuesCSR()
+        looks = 1
+        if self._single is None:
+            self._single, self._soft = factor.SingleFactor(starts, columns), uneven(matrix.createVecRight())
+            looks = 2
+        if not self._single.renew(values):
+            log.info("the tangent cannot be factorised as %s", SINGLE)
+            return None
+        self._let_go()
+        self._kind = SINGLE
+        answer, back = self._soft.duplicate(), self._soft.duplicate()
+        for _ in range(looks):  # motions become softer from one to the next: there what rounding has done is largest
+            self.apply(None, self._soft, answer)
+            matrix.mult(answer, back)
+            back.axpy(-1.0, self._soft)
+            error = back.norm() / self._soft.norm()
+            answer.copy(self._soft)
+            self._soft.normalize()
+        answer.destroy()
+        back.destroy()
+        if error < SINGLE_ERROR:
+            return True
+        log.info("a factor in single precision is %.2g off", error)
+        self._kind = ""
+        uneven(self._soft)
+        return False
 
     def _was_indefinite(self) -> bool:
         """Whether the kept factor has negative pivots, which MUMPS counts of a symmetric tangent."""
@@ -81,7 +142,7 @@ class KeptFactor:
 
     def _factorised(self, kind: str, matrix: Any) -> bool:
         if self._kind != kind:
-            self.close()
+            self._let_go()
             self._options = ProblemOptions(factor_options(kind), {})
             self.preconditioner, self._kind = PETSc.PC().create(self.comm), kind
             self._options.apply(self.preconditioner)
@@ -96,7 +157,7 @@ class KeptFactor:
             failed = True
         if failed:
             log.info("the tangent cannot be factorised as %s", kind)
-            self.close()
+            self._let_go()
         return not failed
 
 
@@ -121,8 +182,7 @@ class GatheredFactor:
     @property
     def negative_pivots(self) -> int | None:
         """As `negative_pivots` of the kept factors. Collective."""
-        kept = self.first.preconditioner
-        return self.comm.bcast(None if kept is None else negative_pivots(kept))  # type: ignore[no-any-return]
+        return self.comm.bcast(self.first.negative_pivots)  # type: ignore[no-any-return]
 
     def apply(self, _: Any, x: Any, y: Any) -> None:
         """As of `KeptFactor`. Collective."""
@@ -241,7 +301,7 @@ class EveryTangent:
         return None
 
     def keep_nothing(self) -> None:
-        """From now on each iteration takes new factors; here it does."""
+        """From now on no factor is kept from solve to solve; here none is kept at all."""
 
     @property
     def more_iterations(self) -> int:
@@ -299,6 +359,7 @@ class Lagged(EveryTangent):
     """
 
     keeps = True
+    _begins_anew = False  # whether each solve has factors of its own, renewed as soon as one iteration says so
 
     def __init__(self, equilibrium: Equilibrium, snes: Any, matrix: Any, options: ProblemOptions):
         super().__init__(equilibrium, snes, matrix, options)
@@ -317,19 +378,19 @@ class Lagged(EveryTangent):
 
     @property
     def more_iterations(self) -> int:
-        return 1 if self._always else 3
+        return 1 if self._always or self._begins_anew else 3
 
     def keep_nothing(self) -> None:
-        self._always = True
+        self._begins_anew = True
 
     def begin(self) -> None:
-        self._norms = []
+        self._norms, self._due = [], self._due or self._begins_anew
         self._before = self.tangents
         self.secants.interrupt()
 
     @property
     def given_up(self) -> bool:  # type: ignore[override]
-        return not self._always and self.tangents - self._before > MOST_RENEWALS
+        return not self._always and not self._begins_anew and self.tangents - self._before > MOST_RENEWALS
 
     def tangent(self, norm: float, tolerance: float) -> None:
         self._norms.append(norm)
@@ -368,17 +429,15 @@ class Lagged(EveryTangent):
         L-BFGS makes up for it: only three of them tell more.
         """
         since = len(self._norms) - 1
-        if since != 1 and since < OVER:
+        if since == 0 or (1 < since < OVER and not self._begins_anew):
             return False
-        over = min(since, OVER)
+        over = 1 if self._begins_anew else min(since, OVER)
         rate = (self._norms[-1] / self._norms[-1 - over]) ** (1 / over)
         return bool(not rate < 1 or np.log(tolerance / self._norms[-1]) / np.log(rate) > self.worth)
 
     def factorisation(self) -> Any | None:
         if not self._own:
             return super().factorisation()
-        if isinstance(self.factor, KeptFactor):
-            return self.factor.preconditioner
         return self.snes.getKSP().getPC() if self.tangents else None
 
     def close(self) -> None:
@@ -404,6 +463,13 @@ def negative_pivots(factorisation: Any) -> int | None:
     elif factor.getMumpsIcntl(33):
         found = int(factor.getMumpsRinfog(12) < 0)
     return factorisation.comm.tompi4py().bcast(found)  # type: ignore[no-any-return]  # the first rank knows it
+
+
+def uneven(vector: Any) -> Any:
+    """The vector, filled with what no symmetry leaves unchanged."""
+    first, last = vector.getOwnershipRange()
+    vector.array[:] = np.sin(1.0 + np.arange(first, last) * np.sqrt(2.0))
+    return vector
 
 
 def _on_the_diagonal(factor: Any) -> int:

@@ -186,7 +186,7 @@ class GuardedNewton:
     settings
         Method, tolerances, limits and PETSc options.
     robust
-        Take new factors in every iteration where `lagged` would keep them.
+        Let `lagged` keep no factor from solve to solve: for problems whose tangents change much.
 
     Attributes
     ----------
@@ -467,7 +467,7 @@ class GuardedNewton:
         self.convergence.displacement = x.norm(PETSc.NormType.NORM_INFINITY)
 
     def _assemble_tangent(self, snes: Any, x: Any, matrix: Any, preconditioner: Any) -> None:
-        self._linear.tangent(self._present.norm, self.convergence.tolerance())
+        self._linear.tangent(self._present.norm, self.convergence.goal())
 
     def _keep_admissible(self, x: Any, step: Any) -> bool:
         """Halve the Newton step until r < L and J > 0 everywhere (trial: x - step). True when it changed the step.

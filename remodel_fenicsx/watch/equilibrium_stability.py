@@ -9,8 +9,8 @@ import numpy as np
 
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
 from remodel_fenicsx.solver.continuation import StepFailure
-from remodel_fenicsx.solver.inertia import FactorisationFailed, Inertia, Mode, of_the_unloaded_body, uneven
-from remodel_fenicsx.solver.linear import negative_pivots
+from remodel_fenicsx.solver.inertia import FactorisationFailed, Inertia, Mode, of_the_unloaded_body
+from remodel_fenicsx.solver.linear import negative_pivots, uneven
 from remodel_fenicsx.solver.refusals import UNSTABLE
 from remodel_fenicsx.state.memory import Earlier, Numbers
 

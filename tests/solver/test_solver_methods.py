@@ -127,9 +127,10 @@ def matrix_of(values: np.ndarray) -> Any:
     return matrix
 
 
-def test_factors_of_every_kind(caplog: pytest.LogCaptureFixture) -> None:
-    """CHOLMOD, MUMPS for the indefinite and the unsymmetric one, and back again; without factors there is no answer."""
+def test_factors_of_every_kind(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In double precision: CHOLMOD, MUMPS for the indefinite and the unsymmetric one, and back again; without factors there is no answer."""
     caplog.set_level(logging.INFO)
+    monkeypatch.setattr(single, "is_available", lambda: False)
     rng = np.random.default_rng(3)
     some = rng.standard_normal((30, 30))
     definite, indefinite, general = some @ some.T + np.eye(30), some + some.T, some + 30 * np.eye(30)
@@ -151,9 +152,12 @@ def test_factors_of_every_kind(caplog: pytest.LogCaptureFixture) -> None:
     factor.close()
 
 
-def test_a_tangent_that_stays_indefinite_is_refused_once(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_tangent_that_stays_indefinite_is_refused_once(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """CHOLMOD is asked again when MUMPS has found no negative pivot."""
     caplog.set_level(logging.INFO)
+    monkeypatch.setattr(single, "is_available", lambda: False)
     factor, packages = KeptFactor(), []
     for shift in (-3.0, -2.0, -1.0, 1.0, 2.0):
         factor.renew(matrix_of(np.diag(np.arange(5.0)) + shift * np.eye(5) + 0.1))
@@ -161,6 +165,74 @@ def test_a_tangent_that_stays_indefinite_is_refused_once(caplog: pytest.LogCaptu
     assert packages == ["mumps", "mumps", "mumps", "mumps", "cholmod"]
     assert len(caplog.records) == 1 and "as positive definite" in caplog.text
     factor.close()
+
+
+needs_single = pytest.mark.skipif(not single.is_available(), reason="no header of CHOLMOD 5 (SuiteSparse 7) is here")
+
+
+@needs_single
+def test_a_factor_in_single_precision_has_seven_digits_whatever_the_unit() -> None:
+    some = np.random.default_rng(3).standard_normal((30, 30))
+    values, unit = some @ some.T + np.eye(30), 1e150
+    x, factor = some[0], KeptFactor()
+    matrix = matrix_of(unit * values)
+    right, answer = matrix.createVecs()
+    right.array[:] = x / unit
+    factor.renew(matrix)
+    factor.apply(None, right, answer)
+    error = np.abs(values @ (unit**2 * answer.array) - x).max()
+    assert 1e-12 < error < 1e-4 and factor.negative_pivots == 0 and factor.preconditioner is None
+    right.array[3] = np.nan
+    factor.apply(None, right, answer)
+    assert np.isnan(answer.array).all()
+    factor.close()
+
+
+@needs_single
+def test_an_indefinite_tangent_goes_from_single_precision_to_mumps_and_back(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+    factor, found = KeptFactor(), []
+    for shift in (1.0, -3.0, -2.0, 1.0, 2.0):
+        factor.renew(matrix_of(np.diag(np.arange(5.0)) + shift * np.eye(5) + 0.1))
+        found.append((factor.preconditioner is None, factor.negative_pivots))
+    assert found == [(True, 0), (False, 2), (False, 1), (False, 0), (True, 0)]
+    assert [r.message for r in caplog.records] == [
+        "the tangent cannot be factorised as positive definite in single precision"
+    ]
+    factor.close()
+
+
+@needs_single
+@pytest.mark.parametrize("softest", [1e-6, 1e-7, 1e-9])
+def test_soft_motions_that_single_precision_cannot_tell_have_a_factor_in_double(softest: float) -> None:
+    """It is off, or refuses what is definite; then CHOLMOD or MUMPS has all digits, now and with the next tangent."""
+    axes = np.linalg.qr(np.random.default_rng(4).standard_normal((30, 30)))[0]
+    values = axes @ np.diag(np.geomspace(softest, 1.0, 30)) @ axes.T
+    factor, matrix = KeptFactor(), matrix_of((values + values.T) / 2)
+    right, answer = matrix.createVecs()
+    right.array[:] = axes[:, 0]
+    for _ in range(2):
+        factor.renew(matrix)
+        factor.apply(None, right, answer)
+        error = np.abs(softest * answer.array - axes[:, 0]).max()
+        assert error < 0.15 and (factor.preconditioner is not None or softest == 1e-6)
+        assert factor.negative_pivots == 0
+    factor.close()
+
+
+@needs_single
+def test_rows_are_those_of_factors_in_double_precision(monkeypatch: pytest.MonkeyPatch) -> None:
+    taken = []
+    answers = KeptFactor._answers_in_single
+    monkeypatch.setattr(KeptFactor, "_answers_in_single", lambda *a: taken.append(answers(*a)) or taken[-1])
+    simulation, rows = simulated("lagged")
+    simulation.close()
+    assert taken and all(taken)
+    monkeypatch.setattr(single, "is_available", lambda: False)
+    simulation, expected = simulated("lagged")
+    simulation.close()
+    assert_same(rows, expected)
+    assert sum(row["newton_iterations"] for row in rows) < 1.2 * sum(row["newton_iterations"] for row in expected)
 
 
 def test_a_kept_factor_stays_when_its_matrix_changes() -> None:
@@ -246,6 +318,14 @@ def test_where_old_factors_do_not_do_every_tangent_is_taken(
 def test_a_factor_is_renewed_where_that_costs_less(norms: list[float], renewed: bool) -> None:
     lagged = object.__new__(Lagged)
     lagged._norms, lagged.worth = norms, worth(5616)
+    assert lagged._costs_more(1e-8) is renewed
+
+
+@pytest.mark.parametrize(("norms", "renewed"), [([1.0], False), ([1.0, 0.01, 0.9], True), ([1.0, 0.5, 0.01], False)])
+def test_in_parts_each_iteration_is_judged_by_itself(norms: list[float], renewed: bool) -> None:
+    lagged = object.__new__(Lagged)
+    lagged._norms, lagged.worth = norms, worth(5616)
+    lagged.keep_nothing()
     assert lagged._costs_more(1e-8) is renewed
 
 
