@@ -182,14 +182,16 @@ class Profile:
         if self.takes_exact_coupling:
             settings += f", remodeling.coupling = {EXACT} where that leaves no error in time"
         if self.is_for_means:
-            settings += " or, of a tube, sector: its means over seeds are nearly those of the whole"
+            settings += (
+                " or, of a tube, sector with cells.antithetic: their means over seeds are nearly those of the whole"
+            )
         return settings
 
     def settings(self, scene: Any) -> dict[str, Any]:
         """Its values for a scene, by dotted key."""
         found = dict(self.values)
-        if self.is_for_means:
-            found["model.kinematics"] = for_means(scene)
+        if self.is_for_means and (part := for_means(scene)) != AUTO:
+            found |= {"model.kinematics": part, "cells.antithetic": True}  # of fewer cells each draw scatters more
         if self.takes_exact_coupling and scene.has_exact_coupling:
             found["remodeling.coupling"] = EXACT
         return found
@@ -217,7 +219,7 @@ PROFILES: dict[str, Profile] = {
 
 # Another mesh has other random cells, and with a tolerance each seed has other steps: both stay the scene's own. A
 # looser solve adds nothing to their error (docs/speed.md, What random cells cost)
-_LOOSE = {"model.kinematics": AUTO, "solver.relative_tolerance": 1e-6}
+_LOOSE = {"solver.relative_tolerance": 1e-6, "model.kinematics": AUTO}
 _QUICK = Profile(_LOOSE, 0.8, 0.4, 1.0, "random", is_for_means=True)
 RANDOM_CELLS: dict[str, Profile] = {
     "fast": _QUICK,

@@ -59,6 +59,7 @@ def test_random_cells_keep_mesh_and_steps(name: str, changes: dict[str, Any], ki
     plain = scene_from_dict({**TUBE, **changes})
     scene = scene_from_dict({**TUBE, **changes, "profile": name})
     assert scene.model.kinematics == kinematics and scene.solver.relative_tolerance == 1e-6
+    assert scene.cells.antithetic == (kinematics != "auto")
     assert (scene.mesh, scene.time, scene.remodeling) == (plain.mesh, plain.time, plain.remodeling)
     path = tmp_path / "scene.toml"
     path.write_text(plain.to_toml())
