@@ -17,7 +17,7 @@ from typing import Any, NoReturn
 
 from remodel_fenicsx._version import __version__
 from remodel_fenicsx.body.reductions import explained
-from remodel_fenicsx.scene.presets import PRESETS, PROFILES
+from remodel_fenicsx.scene.presets import PRESETS, PROFILES, profile_for
 from remodel_fenicsx.scene.scene import Scene, SceneError, preset_scene, read_scene
 from remodel_fenicsx.schema.tables import printable
 from remodel_fenicsx.system import interrupts
@@ -633,7 +633,7 @@ def _validate(options: argparse.Namespace) -> int:
     _say(scene.summary())
     _say("\n".join(explained(scene)))
     if scene.profile is not None:
-        _say(PROFILES[scene.profile].in_words(scene.profile))
+        _say(profile_for(scene.profile, scene).in_words(scene.profile))
     if _rank() == 0:
         for warning in scene.warnings():
             _complain(f"warning: {warning}")

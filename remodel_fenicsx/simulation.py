@@ -13,7 +13,7 @@ from mpi4py import MPI
 
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.loading import Loading, LoadValues
-from remodel_fenicsx.body.reductions import AUTO, choice, explained
+from remodel_fenicsx.body.reductions import AUTO, choice, explained, only_for_means
 from remodel_fenicsx.evolution.coupling import Coupling, Maker
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher, times
@@ -103,8 +103,8 @@ class Simulation:
             raise SceneError(
                 "geometry.is = 'loaded': the unloaded body is needed; remodel-fenicsx unload SCENE writes its scene"
             )
-        if scene.model.kinematics == AUTO and domain is None and comm.rank == 0:
-            for line in explained(scene):
+        if domain is None and comm.rank == 0:
+            for line in explained(scene) if scene.model.kinematics == AUTO else only_for_means(scene):
                 log.info("%s", line)
         self.scene = scene = with_kinematics(scene, domain)
         self._loads = [case.loads for case in scene.each_case()]

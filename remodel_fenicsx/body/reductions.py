@@ -50,6 +50,9 @@ class Reduction:
     whole
         Function of the shape and of the places (nodes, 3) and corners of the reduction's mesh: the whole body for
         reports (`body.whole`); None: they show none.
+    in_the_mean
+        Why it is right only for means over many seeds, as rules say it: then it is taken where a scene names it, and
+        `auto` leaves it.
 
     Examples
     --------
@@ -65,6 +68,7 @@ class Reduction:
     rules: tuple[Rule, ...]
     turn: Turn
     whole: Callable[[Any, NDArray[np.float64], Corners], Body] | None = None
+    in_the_mean: tuple[Rule, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -95,7 +99,8 @@ def choice(scene: Any) -> Choice:
         return Choice(scene.model.kinematics, found)
     if threats(scene):
         return Choice("full", found)
-    return Choice(next((name for name, reasons in found.items() if not reasons), "full"), found)
+    exact = (name for name, reasons in found.items() if not reasons and not is_for_means(scene, name))
+    return Choice(next(exact, "full"), found)
 
 
 def objections(scene: Any, name: str) -> list[str]:
@@ -112,6 +117,28 @@ def objections(scene: Any, name: str) -> list[str]:
     return reasons
 
 
+def is_for_means(scene: Any, name: str) -> bool:
+    """Whether a kinematics, where it is allowed, is right for means over many seeds alone."""
+    reduction = scene.geometry.reductions.get(name)
+    return reduction is not None and any(rule(scene) is not None for rule in reduction.in_the_mean)
+
+
+def only_for_means(scene: Any) -> list[str]:
+    """Why the scene's own kinematics is right for means over many seeds alone, in words; nothing where it is exact."""
+    name = scene.model.kinematics
+    reduction = scene.geometry.reductions.get(name)
+    rules = () if reduction is None else reduction.in_the_mean
+    return [f"{name!r}: {reason}" for rule in rules if (reason := rule(scene)) is not None]
+
+
+def for_means(scene: Any) -> str:
+    """The cheapest kinematics with the body's means over many seeds of random cells; `auto` where there is none."""
+    if threats(scene):
+        return AUTO
+    found = (name for name in scene.geometry.reductions if is_for_means(scene, name) and not objections(scene, name))
+    return next(found, AUTO)
+
+
 def explained(scene: Any) -> list[str]:
     """The choice in words: what it costs, why nothing cheaper, what it cannot show."""
     made = choice(scene)
@@ -119,8 +146,10 @@ def explained(scene: Any) -> list[str]:
     lines = [f"kinematics {made.name!r}: {KINEMATICS[made.name].meaning}{cost}"]
     for name, reasons in made.objections.items():
         if name != made.name:
-            lines.append(f"{name!r}{', allowed' if not reasons else ''} ({_cost(scene, name)})")
+            means = " for means over seeds" if is_for_means(scene, name) else ""
+            lines.append(f"{name!r}{f', allowed{means}' if not reasons else ''} ({_cost(scene, name)})")
             lines[-1] += "".join(f"{': not allowed: ' if not index else '; '}{r}" for index, r in enumerate(reasons))
+    lines += only_for_means(scene)
     if KINEMATICS[made.name].reduced and (swinging := _leaves_symmetry(scene)):
         lines.append(
             f"{made.name!r} is the symmetric solution; with {swinging} the full body leaves it after a while, because "
@@ -203,9 +232,17 @@ def mirrored(places: NDArray[np.float64]) -> NDArray[np.float64]:
 
 # ---------------------------------------------------------------- rules
 def same_cells(scene: Any) -> str | None:
+    """Random or measured cells are other ones in every element."""
+    return unmeasured_cells(scene) or drawn_once(scene)
+
+
+def unmeasured_cells(scene: Any) -> str | None:
+    """A file gives the cells of all elements."""
+    return "cells.fibres gives other cells to each element" if scene.measured_cells else None
+
+
+def drawn_once(scene: Any) -> str | None:
     """Random cells are other ones in every element."""
-    if scene.measured_cells:
-        return "cells.fibres gives other cells to each element"
     number = scene.geometry.number_of_elements * scene.mesh.refinement**3
     if not scene.has_random_cells or (number == 1 and scene.mesh.element == "hexahedron"):
         return None

@@ -27,6 +27,8 @@ class Kinematics(ABC):
         What it does, for docs/scene.md.
     reduced
         Whether it needs a mesh of its own, which a shape's `reductions` make, and is exact for some scenes only.
+    three_dimensional
+        Whether the unknown is the displacement field of a mesh in three dimensions: F = I + grad u.
     moves_rigidly
         Whether the body can move as a whole across z, or turn about it: then supports at single nodes hold it.
     symmetry_planes
@@ -52,6 +54,7 @@ class Kinematics(ABC):
     name: ClassVar[str]
     meaning: ClassVar[str]
     reduced: ClassVar[bool] = True
+    three_dimensional: ClassVar[bool] = False
     moves_rigidly: ClassVar[bool] = False
     symmetry_planes: ClassVar[Mapping[str, int]] = {}
     homogeneous: ClassVar[bool] = False
@@ -147,6 +150,7 @@ class FullKinematics(Kinematics):
     name = "full"
     meaning = "the displacement in three dimensions"
     reduced = False
+    three_dimensional = True
     moves_rigidly = True
 
     def unknown(self, mesh: Any, degree: int) -> Any:

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from remodel_fenicsx.body.reductions import AUTO, for_means
 from remodel_fenicsx.schema.toml import put
 
 # ---------------------------------------------------------------- without a preset
@@ -148,23 +149,29 @@ class Profile:
     ----------
     values
         Over those of the preset, by dotted key.
-    takes_exact_coupling
-        Whether the coupling is `EXACT` too where that leaves no error in time (`Scene.has_exact_coupling`).
     degrees, percent, seconds
         Error of the fibre angle, root mean square, and of the radii, and time of the processor in the steps, as
-        measured on the paper's artery with isotropic cells.
+        measured on the paper's artery.
+    cells
+        Of the cells of that artery; of random ones the error is that of means over seeds.
+    takes_exact_coupling
+        Whether the coupling is `EXACT` too where that leaves no error in time (`Scene.has_exact_coupling`).
+    is_for_means
+        Whether the kinematics is a part of the body that stands for it in means over seeds, where there is one.
     """
 
     values: dict[str, Any]
     degrees: float
     percent: float
     seconds: float
+    cells: str = "isotropic"
     takes_exact_coupling: bool = False
+    is_for_means: bool = False
 
     def in_words(self, name: str) -> str:
         """What it sets, and its measured error and cost."""
         return (
-            f"profile {name!r}: {self.settings_in_words()}. Measured on the artery of isotropic cells: error of the "
+            f"profile {name!r}: {self.settings_in_words()}. Measured on the artery of {self.cells} cells: error of the "
             f"fibre angle {self.degrees:g} degrees, of the radii {self.percent:g} %, processor time {self.seconds:g} s "
             "(docs/speed_and_accuracy.md)"
         )
@@ -174,18 +181,32 @@ class Profile:
         settings = ", ".join(f"{key} = {value}" for key, value in self.values.items())
         if self.takes_exact_coupling:
             settings += f", remodeling.coupling = {EXACT} where that leaves no error in time"
+        if self.is_for_means:
+            settings += (
+                " or, of a tube, sector with cells.antithetic: their means over seeds are nearly those of the whole"
+            )
         return settings
 
-    def tables(self) -> dict[str, Any]:
-        """Its values as tables of a scene."""
-        tables: dict[str, Any] = {}
-        for key, value in self.values.items():
-            put(tables, key, value)
-        return tables
+    def settings(self, scene: Any) -> dict[str, Any]:
+        """Its values for a scene, by dotted key."""
+        found = dict(self.values)
+        if self.is_for_means and (part := for_means(scene)) != AUTO:
+            found |= {"model.kinematics": part, "cells.antithetic": True}  # of fewer cells each draw scatters more
+        if self.takes_exact_coupling and scene.has_exact_coupling:
+            found["remodeling.coupling"] = EXACT
+        return found
+
+
+def nested(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Values by dotted key as tables of a scene."""
+    tables: dict[str, Any] = {}
+    for key, value in values.items():
+        put(tables, key, value)
+    return tables
 
 
 def _values(refinement: int, degree: int, tolerance: float) -> dict[str, Any]:
-    values = {"model.kinematics": "auto", "mesh.refinement": refinement, "mesh.degree": degree}
+    values = {"model.kinematics": AUTO, "mesh.refinement": refinement, "mesh.degree": degree}
     return values | {"time.tolerance": tolerance}
 
 
@@ -195,3 +216,19 @@ PROFILES: dict[str, Profile] = {
     "reference": Profile(_values(2, 2, 0.1), 0.0036, 0.0008, 1.4, takes_exact_coupling=True),
 }
 """Points of the front of docs/speed_and_accuracy.md; `remodel-fenicsx trade SCENE` measures any scene."""
+
+# Another mesh has other random cells, and with a tolerance each seed has other steps: both stay the scene's own. A
+# looser solve adds nothing to their error (docs/speed.md, What random cells cost)
+_LOOSE = {"solver.relative_tolerance": 1e-6, "model.kinematics": AUTO}
+_QUICK = Profile(_LOOSE, 0.8, 0.4, 1.0, "random", is_for_means=True)
+RANDOM_CELLS: dict[str, Profile] = {
+    "fast": _QUICK,
+    "balanced": _QUICK,
+    "reference": Profile({"model.kinematics": AUTO}, 0.8, 0.4, 4.1, "random"),
+}
+"""The profiles where cells are random."""
+
+
+def profile_for(name: str, scene: Any) -> Profile:
+    """The profile of this name for the cells of a scene."""
+    return (RANDOM_CELLS if scene.has_random_cells else PROFILES)[name]

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
@@ -28,7 +28,7 @@ from remodel_fenicsx.model.laws import LAWS
 from remodel_fenicsx.model.load_cases import MEANS_OF_CASES
 from remodel_fenicsx.scene.experiments import check_exclusive, with_own_numbers, without_replaced
 from remodel_fenicsx.scene.plausibility import doubts, largest_stress
-from remodel_fenicsx.scene.presets import EXACT, PRESETS, PROFILES, default_method
+from remodel_fenicsx.scene.presets import PRESETS, PROFILES, default_method, nested, profile_for
 from remodel_fenicsx.schema.tables import SceneError, Table, VariantOf, allowed, fault, quoted, shown
 from remodel_fenicsx.schema.toml import merged, parse_override, put, read_toml, toml_text
 from remodel_fenicsx.schema.units import FORCE, LENGTH_UNIT, LENGTH_UNITS, STRESS_UNIT, in_units
@@ -178,15 +178,15 @@ class Scene(Table):
                 known = ", ".join(map(repr, PRESETS[preset]))
                 raise fault(f"the preset {preset!r} has the shapes {known}", "geometry.shape", shape)
             base = merged(base, PRESETS[preset][shape])
-        if profile is not None:
-            _check_name("profile", profile, PROFILES)
-            base = merged(base, PROFILES[profile].tables())
-        values = with_own_numbers(_in_own_units(merged(base, own), SHAPES[shape]))
-        scene = handler(values)
-        if profile is not None and PROFILES[profile].takes_exact_coupling and scene.has_exact_coupling:
-            if "coupling" not in own.get("remodeling", {}):
-                scene = handler(merged(values, {"remodeling": {"coupling": EXACT}}))
-        return scene
+
+        def made(settings: Mapping[str, Any]) -> Scene:
+            values = merged(merged(base, nested(settings)), own)
+            return handler(with_own_numbers(_in_own_units(values, SHAPES[shape])))
+
+        if profile is None:
+            return made({})
+        _check_name("profile", profile, PROFILES)
+        return _with_profile(profile, made)
 
     @model_validator(mode="after")
     def _tables_fit_together(self) -> Scene:
@@ -818,19 +818,27 @@ def read_scene(path: str | os.PathLike[str], overrides: Iterable[str] = (), prof
     >>> scene.time.end, scene.remodeling.kappa
     (5.0, 0.1)
     """
-    values, overrides = read_toml(Path(path)), list(overrides)
-    if profile is not None:
-        values = merged(values, {"profile": profile} | PROFILES[profile].tables())
-    for override in overrides:
-        key, value = parse_override(override)
-        put(values, key, value)
+    read = read_toml(Path(path))
     name = re.sub(r"\.toml$", "", Path(path).name, flags=re.IGNORECASE)  # what follows another dot is part of it
-    values.setdefault("name", re.sub(r"^[^\w]+|[^\w+-]+$|[^\w .+-]", "", name)[:100].rstrip(" .") or "scene")
-    scene = scene_from_dict(_beside(values, Path(path).parent))
-    if profile is None or not PROFILES[profile].takes_exact_coupling or not scene.has_exact_coupling:
-        return scene
-    asked = any(parse_override(override)[0] == "remodeling.coupling" for override in overrides)
-    return scene if asked else scene.with_values({"remodeling.coupling": EXACT})
+    read.setdefault("name", re.sub(r"^[^\w]+|[^\w+-]+$|[^\w .+-]", "", name)[:100].rstrip(" .") or "scene")
+    changes = [parse_override(override) for override in overrides]
+
+    def made(settings: Mapping[str, Any]) -> Scene:
+        values = merged(read, nested(settings))
+        for key, value in changes:
+            put(values, key, value)
+        return scene_from_dict(_beside(values, Path(path).parent))
+
+    if profile is None:
+        return made({})
+    return _with_profile(profile, lambda settings: made({"profile": profile, **settings}))
+
+
+def _with_profile(name: str, made: Callable[[Mapping[str, Any]], Scene]) -> Scene:
+    """The scene that is made with a profile's settings: they depend on its cells and loads."""
+    scene = made(PROFILES[name].values)
+    settings = profile_for(name, scene).settings(scene)
+    return scene if settings == PROFILES[name].values else made(settings)
 
 
 # ---------------------------------------------------------------- where a run goes on

@@ -29,7 +29,7 @@ class Limits:
     def __init__(self, equilibrium: Equilibrium, bounded: bool):
         self.equilibrium, state = equilibrium, equilibrium.state
         self._unknown: Array = state.unknown.x.array
-        self.bounded = bounded and not state.kinematics.reduced and state.dilatation.jacobians().shape[1] == 0
+        self.bounded = bounded and state.kinematics.three_dimensional and state.dilatation.jacobians().shape[1] == 0
         self._gain = equilibrium.quadrature.largest_gradient if self.bounded else np.inf
         self.forget()
 

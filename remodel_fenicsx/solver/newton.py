@@ -211,14 +211,16 @@ class GuardedNewton:
     def _chosen(self, held: bool) -> str:
         """The method for loads that change, or are held."""
         kinematics, unknowns, ranks = self.equilibrium.state.kinematics, self._x.getSize(), self.equilibrium.comm.size
-        return chosen(self.settings.method, unknowns, ranks, kinematics.reduced, kinematics.suits_multigrid, held)
+        narrow = not kinematics.three_dimensional
+        return chosen(self.settings.method, unknowns, ranks, narrow, kinematics.suits_multigrid, held)
 
     def _make_solver(self, method: str) -> None:
         """PETSc's objects of a method."""
         equilibrium, settings, self.method = self.equilibrium, self.settings, method
-        unknowns, ranks, reduced = self._x.getSize(), equilibrium.comm.size, equilibrium.state.kinematics.reduced
+        unknowns, ranks = self._x.getSize(), equilibrium.comm.size
+        narrow = not equilibrium.state.kinematics.three_dimensional
         # where a method is named, three dimensions stay with it: its numbers shall not depend on their size
-        small = is_small(unknowns, reduced) and (reduced or settings.method == AUTO)
+        small = is_small(unknowns, narrow) and (narrow or settings.method == AUTO)
         self._options = ProblemOptions(method_options(method, ranks, small), settings.petsc_options)
         bounded = method == LAGGED and not self._robust and "snes_linesearch_type" not in self._options.given
         self.limits = Limits(equilibrium, bounded)

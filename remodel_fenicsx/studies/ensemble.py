@@ -12,6 +12,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from remodel_fenicsx.body.reductions import only_for_means
 from remodel_fenicsx.scene.scene import Scene, SceneError, in_region
 from remodel_fenicsx.schema.times import same_time
 from remodel_fenicsx.results.words import unit_of, words
@@ -45,6 +46,8 @@ class Ensemble:
         Last words of runs that have failed, by name.
     extremes
         Columns of a largest or smallest value: isotropic cells, the same everywhere, have no such values to compare.
+    note
+        What the deviations are not, of a kinematics that is right for means alone.
     """
 
     time: Array
@@ -52,6 +55,7 @@ class Ensemble:
     isotropic: dict[str, Array]
     failed: dict[str, str]
     extremes: frozenset[str] = frozenset()
+    note: str = ""
 
     @property
     def seeds(self) -> int:
@@ -97,7 +101,8 @@ def members_of(scene: Scene, folder: Path, seeds: int) -> list[Run]:
     numbers = range(scene.cells.seed, scene.cells.seed + seeds)
     every: dict[str, dict[str, Any]] = {f"seed-{number}": {"cells.seed": number} for number in numbers}
     random = [name for name, properties in scene.properties().items() if properties.cells.initial == "random"]
-    every[ISOTROPIC] = {f"{in_region(name)}cells.initial": ISOTROPIC for name in random}
+    isotropic = {f"{in_region(name)}cells.initial": ISOTROPIC for name in random}
+    every[ISOTROPIC] = isotropic | {"profile": None}  # of isotropic cells it has steps of a tolerance, not the seeds'
     return [
         Run(name, scene.with_values({"output.fields": False, "name": name, **change}), folder / name)
         for name, change in every.items()
@@ -166,7 +171,9 @@ def gathered(members: list[Run], failed: dict[str, str]) -> Ensemble:
     scene = members[0].scene
     extremes = frozenset(column.name for column in scene.columns() if column.extreme)
     same = {name: isotropic[name] for name in columns if name in isotropic}
-    return Ensemble(first["time"], columns, same, failed, extremes)
+    means = only_for_means(scene)
+    note = f" The deviations are not those of the whole body: {'; '.join(means)}." if means else ""
+    return Ensemble(first["time"], columns, same, failed, extremes, note)
 
 
 # ---------------------------------------------------------------- in words
@@ -226,10 +233,11 @@ def verdict(found: Ensemble, time: float) -> str:
         return f"At time {time:g} no column differs between the seeds: there is nothing to compare."
     if outside:
         names = ", ".join(outside)
-        return f"At time {time:g} isotropic cells do not stand for random ones: outside of the spread are {names}."
+        words = f"At time {time:g} isotropic cells do not stand for random ones: outside of the spread are {names}."
+        return words + found.note
     return (
         f"At time {time:g} isotropic cells lie within {WITHIN:g} deviations of the mean of {found.seeds} seeds in all "
-        f"{len(compared)} columns: they say what one sample of random cells would."
+        f"{len(compared)} columns: they say what one sample of random cells would.{found.note}"
     )
 
 

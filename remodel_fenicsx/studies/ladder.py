@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from remodel_fenicsx.body.columns import PROFILE
-from remodel_fenicsx.body.reductions import AUTO, choice, objections, step_cost
+from remodel_fenicsx.body.reductions import AUTO, choice, is_for_means, objections, step_cost
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.model.laws import LAWS
-from remodel_fenicsx.scene.presets import EXACT, PROFILES
+from remodel_fenicsx.scene.presets import EXACT, PROFILES, profile_for
 from remodel_fenicsx.scene.scene import Scene, SceneError
 
 log = logging.getLogger(__name__)
@@ -104,7 +104,7 @@ def ladder(scene: Scene) -> list[Setting]:
     SceneError
         If steps of the scene's own length do not hit its corners and its end: with a tolerance they need not.
     """
-    own = choice(scene).name
+    solved = choice(scene).name
     base = scene.with_values({"model.kinematics": _cheapest(scene), "time.tolerance": None})
     step, mesh = base.time.step, (base.mesh.refinement, base.mesh.degree)
     random, seed = scene.has_random_cells, scene.cells.seed
@@ -134,10 +134,13 @@ def ladder(scene: Scene) -> list[Setting]:
 
     add(MESH, several, {})
     remodels = LAWS[scene.remodeling.law].remodels
-    for name, profile in PROFILES.items() if remodels else ():
-        values = profile.values | {"model.kinematics": base.model.kinematics}
-        exact = base.with_values(known(values)).has_exact_coupling and profile.takes_exact_coupling
-        add(BOTH, several, values | ({COUPLING: EXACT} if exact else {}), name)
+    for name in PROFILES if remodels else ():
+        profile = profile_for(name, base)
+        own = {"model.kinematics": base.model.kinematics}
+        values = profile.settings(base.with_values(known(profile.values | own)))
+        values |= own if values["model.kinematics"] == AUTO else {}
+        if values != own and all(values != setting.changes for setting in found.values()):
+            add(BOTH, several, values, name)
     for factor in [*STEPS, *(0.5**k for k in range(1, FINER_STEPS + 1))]:
         add(TIME, (seed,), {"time.step": factor * step})
     for refinement, degree in MESHES:
@@ -155,9 +158,9 @@ def ladder(scene: Scene) -> list[Setting]:
             add(MESH, several, values | meshes(refinement, degree) | {"time.step": longest})
         for tolerance in TOLERANCES[:1]:
             add(BOTH, several, values | meshes(2, 2) | {"time.tolerance": tolerance})
-    for name in dict.fromkeys((own, "sector", "full")):
-        if name == own or not objections(scene, name):
-            add(KINEMATIC, (seed,), {"model.kinematics": name})
+    for name in dict.fromkeys((solved, "sector", "full")):
+        if name == solved or not (objections(scene, name) or is_for_means(scene, name)):
+            add(KINEMATIC, several if is_for_means(scene, name) else (seed,), {"model.kinematics": name})
     return sorted(found.values(), key=lambda setting: setting.expected_seconds)
 
 

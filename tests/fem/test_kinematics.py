@@ -169,6 +169,39 @@ def test_a_clamped_quarter_converges_to_the_clamped_half_plane() -> None:
     assert coarse / fine > 3.5
 
 
+# ---------------------------------------------------------------- random cells of a quarter
+def test_a_quarter_of_random_cells_is_the_tube_that_has_their_mirror_images() -> None:
+    """With all layers along z: the whole tube, given these cells by hand, has the same columns."""
+    random = {"cells": {"initial": "random", "axes": "cylindrical", "seed": 3}}
+    quarter, whole = (Simulation(scene("tube", name, 2.0, **random), SELF) for name in ("sector", "full"))
+    assert quarter.domain.number_of_elements == 384
+    own, every = (one.quadrature.coordinates.mean(axis=1) for one in (quarter, whole))
+    distances = np.linalg.norm(np.abs(every)[:, None] - own, axis=-1)
+    assert distances.min(axis=1).max() < 1e-6
+    cells, lengths = whole.cells, quarter.cells.dimension_values[distances.argmin(axis=1)]
+    assert np.ptp(lengths[:, 0, 0]) > 0.9
+    cells.set(lengths, cells.initial_axes())
+    cells.initial_dimensions[:] = lengths
+    rows = [[step.row for step in one.steps()] for one in (quarter, whole)]
+    for part, body in zip(*rows, strict=True):
+        for name in set(part) - {*OF_THE_SOLVER, "time"}:
+            assert part[name] == pytest.approx(body[name], rel=1e-8, abs=1e-10), name
+    for one in (quarter, whole):
+        one.close()
+
+
+def test_it_is_named_never_chosen_and_says_what_it_means(caplog: pytest.LogCaptureFixture) -> None:
+    base = scene("tube", "sector", 2.0, cells={"initial": "random", "axes": "cylindrical"})
+    words = [line for line in explained(base) if "means over seeds are nearly those of the whole tube" in line]
+    assert len(words) == 1
+    left = explained(base.with_values({"model.kinematics": AUTO}))
+    assert "'full'" in left[0] and any(line.startswith("'sector', allowed for means over seeds") for line in left)
+    with caplog.at_level("INFO"):
+        Simulation(base, SELF).close()
+    assert words[0] in caplog.messages
+    assert not [line for line in explained(scene("tube", "sector", 2.0)) if "means over seeds" in line]
+
+
 # ---------------------------------------------------------------- rules
 TUBE = values("tube", AUTO, 2.0)
 RULES = [
@@ -179,7 +212,7 @@ RULES = [
     ("radial", {"supports.ends": "clamped"}, {"supports.ends": "free"}, "not alike"),
     ("radial", {"cells.initial": "random"}, {"cells.initial": [0.6, 0.0, 0.8]}, "1536 elements"),
     ("axisymmetric", {"cells.initial": "random"}, {"supports.ends": "clamped"}, "1536 elements"),
-    ("sector", {"cells.initial": "random"}, {"cells.axes": "global"}, "1536 elements"),
+    ("sector", {"cells.initial": "random", "remodeling.law": "rotation"}, {"cells.initial": "random"}, "of symmetry"),
     ("sector", {"remodeling.law": "rotation"}, {"remodeling.law": "rate"}, "planes of symmetry"),
     ("radial", {"remodeling.law": "rotation"}, {"remodeling.law": "tensor"}, "planes of symmetry"),
 ]
@@ -282,7 +315,7 @@ def test_global_axes_make_another_tube_and_radial_would_not_know(monkeypatch: py
         ("tube", {}, "radial"),
         ("tube", {"supports": {"ends": "clamped"}}, "axisymmetric"),
         ("tube", {"cells": ISOTROPIC | {"axes": "global"}}, "sector"),
-        ("tube", {"cells": {"initial": "random"}}, "full"),
+        ("tube", {"cells": {"initial": "random"}}, "full"),  # the quarter is right for means alone
         ("cube", {}, "point"),
         ("tendon", {"cells": {"initial": "random"}}, "full"),
     ],
@@ -374,6 +407,7 @@ TWICE = {
     "radial": values("tube", "radial", 5.0),
     "axisymmetric": values("tube", "axisymmetric", 5.0, supports={"ends": "clamped"}),
     "sector": values("tube", "sector", 5.0),
+    "random cells": values("tube", "sector", 2.0, cells={"initial": "random", "axes": "cylindrical"}),
 }
 ON_ONE_AND_TWO_RANKS = [{"scene": scene | {"solver": {"relative_tolerance": 1e-13}}} for scene in TWICE.values()]
 

@@ -44,6 +44,19 @@ def test_random_cells_are_the_seeds() -> None:
     assert np.abs(one - other).max() > 0.1
 
 
+def test_antithetic_seeds_are_isotropic_in_threes_and_as_random_each() -> None:
+    """1 to 3 and 4 to 6: A of the mean is r0^2/3 I in every element; two threes are strangers."""
+    found = [
+        Cells(initial="random", seed=s, antithetic=True, end_to_end_length=R0).dimensions(2000) for s in range(1, 7)
+    ]
+    for three in (found[:3], found[3:]):
+        np.testing.assert_allclose(np.square(three).mean(axis=0), R0**2 / 3, rtol=1e-12)
+    alone = Cells(initial="random", seed=1, end_to_end_length=R0).dimensions(2000)
+    for one in found:
+        np.testing.assert_allclose(np.square(one).mean(axis=0), np.square(alone).mean(axis=0), atol=0.03 * R0**2)
+    assert abs(np.corrcoef(found[0][:, 0], found[3][:, 0])[0, 1]) < 0.1
+
+
 def test_other_cells_are_what_their_names_say() -> None:
     isotropic = Cells(initial="isotropic", end_to_end_length=R0).dimensions(2)
     np.testing.assert_allclose(isotropic, np.full((2, 3), R0 / np.sqrt(3)), rtol=1e-15)

@@ -8,19 +8,19 @@ from typing import Any
 import pytest
 
 from remodel_fenicsx import SceneError, cli, read_scene
-from remodel_fenicsx.scene.presets import PROFILES
-from remodel_fenicsx.scene.scene import preset_scene, scene_from_dict
+from remodel_fenicsx.scene.presets import PROFILES, RANDOM_CELLS
+from remodel_fenicsx.scene.scene import scene_from_dict
 
-TUBE = {"preset": "kuhl-holzapfel-2007", "geometry": {"shape": "tube"}}
+TUBE = {"preset": "kuhl-holzapfel-2007", "geometry": {"shape": "tube"}}  # of random cells
+ISOTROPIC = TUBE | {"cells": {"initial": "isotropic"}}
 
 
 @pytest.mark.parametrize("name", PROFILES)
 def test_a_profile_lies_over_the_preset_and_under_the_scene(name: str) -> None:
-    scene = scene_from_dict(TUBE | {"profile": name})
+    scene = scene_from_dict(ISOTROPIC | {"profile": name})
     assert scene.model.kinematics == "auto" and scene.time.tolerance == PROFILES[name].values["time.tolerance"]
     assert scene.mesh.degree == PROFILES[name].values["mesh.degree"]
-    assert scene.remodeling == preset_scene(TUBE["preset"], "tube").remodeling  # type: ignore[arg-type]  # random cells
-    own = scene_from_dict(TUBE | {"profile": name, "mesh": {"refinement": 5}, "model": {"kinematics": "full"}})
+    own = scene_from_dict(ISOTROPIC | {"profile": name, "mesh": {"refinement": 5}, "model": {"kinematics": "full"}})
     assert own.mesh.refinement == 5 and own.model.kinematics == "full"
     assert own.mesh.degree == PROFILES[name].values["mesh.degree"]
 
@@ -33,7 +33,7 @@ def test_each_is_finer_than_the_one_before() -> None:
 
 def test_on_the_command_line_it_lies_over_the_scene(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "artery.toml"
-    path.write_text(preset_scene("kuhl-holzapfel-2007", "tube").to_toml())
+    path.write_text(scene_from_dict(ISOTROPIC).to_toml())
     assert read_scene(path).mesh.degree == 1
     scene = read_scene(path, ["mesh.refinement=3"], "balanced")
     assert scene.mesh.degree == 2 and scene.mesh.refinement == 3 and scene.profile == "balanced"
@@ -46,7 +46,26 @@ def test_on_the_command_line_it_lies_over_the_scene(tmp_path: Path, capsys: pyte
     assert "--profile: a run goes on in its own folder, with its own settings" in capsys.readouterr().err
 
 
-ISOTROPIC = TUBE | {"cells": {"initial": "isotropic"}}
+@pytest.mark.parametrize("name", ["fast", "balanced"])
+@pytest.mark.parametrize(("changes", "kinematics"), [
+    ({}, "sector"),
+    ({"remodeling": {"law": "rotation"}}, "auto"),  # leaves the planes of symmetry
+    ({"loads": {"pressure": {"value": -4.8}}}, "auto"),  # suction may make it buckle
+    ({"geometry": {"shape": "tendon"}}, "auto"),
+    ({"model": {"kinematics": "full"}}, "full"),  # the scene's own
+])  # fmt: skip
+def test_random_cells_keep_mesh_and_steps(name: str, changes: dict[str, Any], kinematics: str, tmp_path: Path) -> None:
+    """Both decide which cells are drawn, and what all seeds have in common; on the command line too."""
+    plain = scene_from_dict({**TUBE, **changes})
+    scene = scene_from_dict({**TUBE, **changes, "profile": name})
+    assert scene.model.kinematics == kinematics and scene.solver.relative_tolerance == 1e-6
+    assert scene.cells.antithetic == (kinematics != "auto")
+    assert (scene.mesh, scene.time, scene.remodeling) == (plain.mesh, plain.time, plain.remodeling)
+    path = tmp_path / "scene.toml"
+    path.write_text(plain.to_toml())
+    over = read_scene(path, ["solver.relative_tolerance=1e-8"], name)
+    assert over.model.kinematics == ("sector" if kinematics == "full" else kinematics)  # over all that the file says
+    assert over.solver.relative_tolerance == 1e-8 and over.time == plain.time
 
 
 @pytest.mark.parametrize(("changes", "coupling"), [
@@ -72,6 +91,16 @@ def test_the_finest_takes_the_coupling_without_error_in_time(
     assert over.remodeling.coupling == ("implicit" if coupling == "relaxed" else coupling)
     asked = ["remodeling.coupling=staggered", "remodeling.law=explicit"]
     assert read_scene(path, asked, "reference").remodeling.coupling == "staggered"
+
+
+def test_validate_says_what_was_measured_for_random_cells(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "artery.toml"
+    path.write_text(scene_from_dict(TUBE).to_toml())
+    assert cli.main(["validate", str(path), "--profile", "balanced"]) == 0
+    words = capsys.readouterr().out
+    assert RANDOM_CELLS["balanced"].in_words("balanced") in words and "the artery of random cells" in words
+    assert cli.main(["validate", str(path), "--profile", "balanced", "--set", "cells.initial=isotropic"]) == 0
+    assert PROFILES["balanced"].in_words("balanced") in capsys.readouterr().out
 
 
 def test_an_unknown_one_is_refused() -> None:

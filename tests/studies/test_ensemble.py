@@ -18,7 +18,7 @@ from remodel_fenicsx import Recording, SceneError, cli, read_scene
 from remodel_fenicsx.evolution.coupling import Staggered
 from remodel_fenicsx.results.status import status
 from remodel_fenicsx.running import run
-from remodel_fenicsx.scene.scene import Scene
+from remodel_fenicsx.scene.scene import Scene, scene_from_dict
 from remodel_fenicsx.studies import ensemble as study
 from remodel_fenicsx.studies.runs import Run, TooFewRuns, run_all
 from remodel_fenicsx.system.interrupts import Paused
@@ -243,3 +243,18 @@ def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert cli.main(["ensemble", str(path), "--seeds", "1"]) == 2
     assert "--seeds 1: allowed is a whole number at least 2" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_seeds_of_a_quarter_have_its_means_and_isotropic_cells_its_steps(tmp_path: Path) -> None:
+    """A profile has other steps for isotropic cells: these must not come back when the scene is read again."""
+    tube = {"preset": "kuhl-holzapfel-2007", "profile": "balanced", "geometry": {"shape": "tube"}}
+    members = study.members_of(scene_from_dict(tube), tmp_path, 2)
+    for member in members:
+        path = tmp_path / f"{member.name}.toml"
+        path.write_text(member.scene.to_toml())
+        assert read_scene(path) == member.scene and member.scene.time.tolerance is None
+        assert member.scene.model.kinematics == "sector"
+    found = study.Ensemble(
+        np.arange(2.0), {"stretch": np.eye(6)[:, :2]}, {"stretch": np.zeros(2)}, {}, note=" Mirrored."
+    )
+    assert study.verdict(found, 1.0).endswith("Mirrored.")
