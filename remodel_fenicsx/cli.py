@@ -733,10 +733,12 @@ def _info(options: argparse.Namespace) -> int:
     _check(reason_unusable())
     from remodel_fenicsx.fem.jit import has_simd_logarithm
     from remodel_fenicsx.fem.solver_methods import SOLVER_METHODS
+    from remodel_fenicsx.kernels.factor import is_available
 
     for name, version in versions().items():
         _say(f"{name:16} {version}")
     _say(f"{'logarithms':16} {'of several points at once' if has_simd_logarithm() else 'point by point'}")
+    _say(f"{'kept factors':16} in {'single' if is_available() else 'double'} precision")
     _say(f"{'solver methods':16} {', '.join(SOLVER_METHODS)}")
     return 0
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import logging
 import re
 import sys
 from pathlib import Path
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.kernels.library import Library, in_numpy
 
+log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 HEADER = "suitesparse/cholmod.h"
 FIRST = 5  # CHOLMOD's version that has single precision
@@ -21,12 +23,14 @@ FIRST = 5  # CHOLMOD's version that has single precision
 
 @functools.cache
 def include_folder() -> Path | None:
-    """Where CHOLMOD's header is; None where there is none, or one of a version without single precision."""
+    """Where CHOLMOD's header is; None, and a line in the log, where there is none of a version with single precision."""
     for folder in (Path(sys.prefix) / "include", Path("/usr/include"), Path("/usr/local/include")):
         path = folder / HEADER
         if path.is_file():
             version = re.search(r"define CHOLMOD_MAIN_VERSION\s+(\d+)", path.read_text(encoding="utf-8"))
-            return folder if version and int(version[1]) >= FIRST else None
+            if version and int(version[1]) >= FIRST:
+                return folder
+    log.info("kept factors have double precision, for twice the time: no header of CHOLMOD %d or later is here", FIRST)
     return None
 
 
@@ -53,7 +57,7 @@ class SingleFactor:
         self._call = Library(
             MPI.COMM_SELF, "factor.c", "factors in single precision", include=include_folder(), libraries=("cholmod",)
         )
-        self._handle = self._call("factor_new", len(starts) - 1, starts, columns)
+        self._handle: Any = self._call("factor_new", len(starts) - 1, starts, columns)
         if not self._handle:
             raise MemoryError("no memory for a factor in single precision")
 
@@ -69,4 +73,4 @@ class SingleFactor:
         """Free its memory."""
         if self._handle:
             self._call("factor_free", self._handle)
-        self._handle: Any = None
+        self._handle = None

@@ -223,4 +223,3 @@ def of_the_unloaded_body(inertia: Inertia) -> tuple[int, float]:
         return inertia.negative_eigenvalues(), inertia.lowest().eigenvalue
     finally:
         state.restore(before)
-

@@ -48,7 +48,20 @@ def test_there_is_no_warning(name: str, tmp_path: Path) -> None:
     if name == "factor.c" and not factor.is_available():
         pytest.skip("no header of CHOLMOD 5 (SuiteSparse 7) is here")
     folder = f"-I{factor.include_folder() or ROOT}"
-    command = [*CC, *jit.LIBRARY_FLAGS, folder, "-Wall", "-Wextra", "-Werror", "-c", "-x", "c", "-", "-o", tmp_path / "object"]
+    command = [
+        *CC,
+        *jit.LIBRARY_FLAGS,
+        folder,
+        "-Wall",
+        "-Wextra",
+        "-Werror",
+        "-c",
+        "-x",
+        "c",
+        "-",
+        "-o",
+        tmp_path / "object",
+    ]
     text = library.source(name, NUMBERS[name])
     done = subprocess.run(command, input=text, capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
