@@ -23,7 +23,7 @@ FIRST = 5  # CHOLMOD's version that has single precision
 
 @functools.cache
 def include_folder() -> Path | None:
-    """Where CHOLMOD's header is; None, and a line in the log, where there is none of a version with single precision."""
+    """Where CHOLMOD's header is; None, and a line in the log, where no version with single precision is."""
     for folder in (Path(sys.prefix) / "include", Path("/usr/include"), Path("/usr/local/include")):
         path = folder / HEADER
         if path.is_file():
