@@ -116,8 +116,9 @@ def _cells(random: Random, shape: str, r0: float) -> Values:
         drawn = [random.uniform(0.1, 1) for _ in range(3)]
         initial = [r0 * part / math.hypot(*drawn) for part in drawn]
     axes = "cylindrical" if shape == "tube" and random.random() < 0.9 else "global"
+    aligned_axis, seed = random.choice((1, 2, 3)), random.randrange(1000)
     return {
-        "initial": initial, "axes": axes, "aligned_axis": random.choice((1, 2, 3)), "seed": random.randrange(1000),
+        "initial": initial, "axes": axes, "aligned_axis": aligned_axis, "seed": seed, "antithetic": seed % 2 == 1,
         "end_to_end_length": r0,
     }  # fmt: skip
 

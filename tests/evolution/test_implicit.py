@@ -32,6 +32,7 @@ def short_tube(end: float, step: float = 1.0, law: str = "tensor", comm: Any = M
         "material": {"repulsion": "log" if law == "tensor" else "axes"},
         "cells": {"initial": changes.pop("cells", "random")},
         "time": {"end": end, "step": step},
+        "solver": {"method": changes.pop("method", "auto")},
         "output": {"columns": ["held_points", "pass_residual"]},
         "remodeling": {"law": law, "coupling": "implicit", "frame": "material"} | changes,
     }
@@ -103,9 +104,9 @@ def test_the_other_printed_laws_are_of_first_order(law: str) -> None:
     "law, cells, end", [("explicit", "isotropic", 5.0), ("tensor", "random", 3.0), *slowly(("tensor", "random", 5.0))]
 )
 def test_long_steps_run(law: str, cells: str, end: float) -> None:
-    """kappa times the step is ten."""
+    """kappa times the step is ten; iterations are counted with the tangent of each, for kept factors take more."""
     divisions = (12, 3, 1) if end == 5.0 else (4, 3, 1)
-    simulation = short_tube(end, law=law, cells=cells, kappa=10.0, divisions=divisions)
+    simulation = short_tube(end, law=law, cells=cells, kappa=10.0, divisions=divisions, method="direct")
     rows = run(simulation)
     assert all(row["held_points"] == 0 for row in rows)
     assert rows[-1]["newton_iterations"] <= 4 and rows[-1]["substeps"] == 1
