@@ -173,7 +173,9 @@ class TimeError:
             kept.append((self._last_turnover, np.ravel(row.turnover.T)))
         if known:
             changes = [present - last.values[0] for last, present in kept]
-            squares = [(change**2).reshape(*self.quadrature.shape, -1).sum(axis=-1) for change in changes]
+            shape = self.quadrature.shape
+            points = max(shape[0] * shape[1], 1)  # a rank may have none
+            squares = [(change**2).reshape(*shape, change.size // points).sum(axis=-1) for change in changes]
             speed = float(np.sqrt(self.quadrature.mean(sum(squares)))) / duration
         if not self._held(step):
             fading = self.kappa

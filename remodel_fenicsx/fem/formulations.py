@@ -175,9 +175,7 @@ class _PartsApart(Dilatation):
         self.quadrature.values(self._jacobian, ())[:] = self.jacobians() @ self._interpolation.T
 
     def jacobians(self) -> Array:
-        elements = self.quadrature.elements
-        values: Array = self._expression.eval(self.quadrature.mesh, elements).reshape(len(elements), -1)
-        return values
+        return self._expression.eval(self.quadrature.mesh, self.quadrature.elements)
 
 
 FORMULATIONS: dict[str, Formulation] = {

@@ -165,7 +165,7 @@ class Quadrature:
             Of the points beside their volume, of the same shape or one for each element; default: one.
         """
         known = ~np.isnan(values)
-        counted = known if weights is None else known * weights.reshape(len(weights), -1)
+        counted = known if weights is None else known * (weights if weights.ndim == 2 else weights[:, None])
         volume = self.integral(counted.astype(np.float64))
         return self.integral(np.where(known, values, 0.0) * counted) / volume if volume > 0 else np.nan
 

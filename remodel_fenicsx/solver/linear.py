@@ -22,7 +22,7 @@ UNSYMMETRIC = 1e-10  # relative to the largest row: what a symmetric tangent may
 OVER = 3  # iterations over which the rate of convergence is taken, but for the first one
 SLOW_STEP = 2 / 3  # of `worth`: iterations of a step after which the next one starts with a new factor
 SINGLE_ERROR = 0.1  # relative, of the answer to the softest motion: about what an iteration with an old factor leaves
-MOST_RENEWALS = 6  # of one solve: what needs more is no matter of old factors
+MOST_RENEWALS = 6  # of one solve: what needs more is no matter of old factors; Newton's method goes on, as often again
 
 
 def worth(unknowns: int) -> float:
@@ -390,11 +390,15 @@ class Lagged(EveryTangent):
 
     @property
     def given_up(self) -> bool:  # type: ignore[override]
-        return not self._always and not self._begins_anew and self.tangents - self._before > MOST_RENEWALS
+        return self._renewed_over(2 * MOST_RENEWALS)
+
+    def _renewed_over(self, most: int) -> bool:
+        """Whether this solve, where factors may be kept, has made more than so many."""
+        return not self._always and not self._begins_anew and self.tangents - self._before > most
 
     def tangent(self, norm: float, tolerance: float) -> None:
         self._norms.append(norm)
-        if self._always or self._due or self._costs_more(tolerance):
+        if self._always or self._due or self._renewed_over(MOST_RENEWALS) or self._costs_more(tolerance):
             self.renew()
 
     def renew(self) -> None:
@@ -406,7 +410,7 @@ class Lagged(EveryTangent):
         self._spent, self._solves = self.worth, 0
 
     def improve(self, x: Any, residual: Any, step: Any, is_exact: bool) -> bool:
-        if self._always or not is_exact:
+        if self._always or not is_exact or self._renewed_over(MOST_RENEWALS):
             self.secants.interrupt()
             return False
         return self.secants.improve(x, residual, step)

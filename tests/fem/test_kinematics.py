@@ -402,8 +402,11 @@ def test_the_mesh_of_a_reduction_is_where_that_part_of_the_body_lies() -> None:
         simulation.close()
 
 
+TENSOR = {"law": "tensor", "coupling": "extrapolated"}
 TWICE = {
     "point": values("cube", "point", 5.0),
+    "one element": values("cube", "full", 3.0, mesh={"formulation": "selective-integration"}),
+    "chosen steps of a point": values("cube", "point", 3.0, time={"end": 3.0, "tolerance": 1.0}, remodeling=TENSOR),
     "radial": values("tube", "radial", 5.0),
     "axisymmetric": values("tube", "axisymmetric", 5.0, supports={"ends": "clamped"}),
     "sector": values("tube", "sector", 5.0),
