@@ -207,7 +207,7 @@ def test_an_indefinite_tangent_goes_from_single_precision_to_mumps_and_back(capl
 
 @needs_single
 @pytest.mark.parametrize(
-    ("softest", "serves", "asked"), [(1e-6, True, 2), (1e-7, True, 2), (1e-8, False, 2), (1e-9, False, 1)]
+    ("softest", "serves", "asked"), [(1e-6, True, 2), (1e-7, True, 2), (5e-9, False, 2), (1e-9, False, 1)]
 )
 def test_soft_motions_that_single_precision_cannot_tell_have_a_factor_in_double(
     softest: float, serves: bool, asked: int, monkeypatch: pytest.MonkeyPatch
