@@ -220,6 +220,7 @@ class VolumeResponse:
         forces, first = factors.getOperators()[0].createVecs()
         self._assemble(stress, forces)
         factors.apply(forces, first)
+        self._refine(first, forces, factors)
         resisted = first.dot(forces)
         if not resisted > 0:
             lacking = 0.0
@@ -229,6 +230,17 @@ class VolumeResponse:
         for vector in (forces, first):
             vector.destroy()
         return lacking
+
+    @staticmethod
+    def _refine(answer: Any, forces: Any, factors: Any) -> None:
+        """One step of iterative refinement, with the matrix that was factorised: factors may have few digits."""
+        left, better = forces.duplicate(), forces.duplicate()
+        factors.getOperators()[0].mult(answer, left)
+        left.aypx(-1.0, forces)
+        factors.apply(left, better)
+        answer.axpy(1.0, better)
+        for vector in (left, better):
+            vector.destroy()
 
     def _stress(self) -> Array:
         """P of the present unknowns, (elements, points, 3, 3); cof F = J F^-T."""

@@ -26,6 +26,7 @@ from remodel_fenicsx.solver.limits import Limits
 from remodel_fenicsx.solver.linear import KeptFactor, Lagged, worth
 from remodel_fenicsx.solver.newton import LoadPhase
 from remodel_fenicsx.solver.quasi_newton import Secants
+from remodel_fenicsx.watch.locking import VolumeResponse
 from tests import parts
 from tests.parts import tube
 
@@ -227,6 +228,27 @@ def test_soft_motions_that_single_precision_cannot_tell_have_a_factor_in_double(
         assert error < (0.15 if serves else 1e-7) and (factor.preconditioner is None) == serves
         assert factor.negative_pivots == 0
     assert len(calls) == asked
+    factor.close()
+
+
+@needs_single
+def test_one_refinement_makes_up_for_single_precision() -> None:
+    """As the watch for locking takes it, of the motion that the factor knows worst."""
+    axes = np.linalg.qr(np.random.default_rng(4).standard_normal((30, 30)))[0]
+    values = axes @ np.diag(np.geomspace(1e-7, 1.0, 30)) @ axes.T
+    factor, matrix = KeptFactor(), matrix_of((values + values.T) / 2)
+    factor.renew(matrix)
+    factors = PETSc.PC().create(PETSc.COMM_SELF)
+    factors.setType(PETSc.PC.Type.PYTHON)
+    factors.setPythonContext(factor)
+    factors.setOperators(matrix)
+    forces, answer = matrix.createVecs()
+    forces.array[:] = axes[:, 0]
+    factors.apply(forces, answer)
+    before = np.abs(1e-7 * answer.array - axes[:, 0]).max()
+    VolumeResponse._refine(answer, forces, factors)
+    assert before > 1e-3 and np.abs(1e-7 * answer.array - axes[:, 0]).max() < before / 10
+    factors.destroy()
     factor.close()
 
 
