@@ -12,7 +12,9 @@ PRESCRIBED_TOLERANCE = (
     1e-10  # of the body's size: how far a prescribed displacement may be missed; no force measures it
 )
 PRESCRIBED_ROUNDING = 1e-13  # of the body's size: prescribed values that are met to rounding
-INTERMEDIATE_TOLERANCE = 1e-3  # of the nodal forces: residual of a part that others follow
+# Of the nodal forces: residual of a part that others follow. A part may be 1/256 of a step, and the next one is held
+# against its direction: of 1e-3, which quasi-Newton steps stop just below, some were taken for jumps
+INTERMEDIATE_TOLERANCE = 1e-5
 # Above this r/L the rounding of one point may be more than this share of the nodal forces. A residual below it is then
 # accepted only when an iteration leaves more than this share of it
 NEARLY_STRAIGHT, COARSE, STAGNATION = 0.99, 1e-8, 0.25

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
+from benchmarks.stability_map.cases import all_cases
+from benchmarks.stability_map.running import Runner
 from remodel_fenicsx import Scene, Simulation
 from remodel_fenicsx.scene import scene_from_dict
 from remodel_fenicsx.solver.continuation import Change, StepFailure
@@ -152,3 +154,16 @@ def test_a_body_that_jumps_again_and_again_is_looked_into_three_times(caplog: py
     found, _ = radii(scene)
     assert sum(np.abs(np.diff(found)) > 1.0) >= 4
     assert len(warnings(caplog)) == 3
+
+
+@pytest.mark.parametrize("method", ["direct", "lagged"])
+def test_parts_of_quasi_newton_steps_are_no_jump(method: str) -> None:
+    """Quasi-Newton steps stop just below the tolerance of a part: that rest once looked like a change of direction."""
+    case = all_cases()["random cells: frame material, force 3000.0"]
+    scene = case.scene | {"solver": {"method": method}, "time": {"step": 1.0, "end": 6.0}}
+    runner = Runner(limit=60)
+    run = runner.run({"scene": scene, "counts": case.counts, "extended": case.extended})
+    runner.close()
+    assert run.code == 0 and max(run.column("substeps")) > 4
+    assert run.column("mean_stretch")[-1] == pytest.approx(1.81231133, rel=1e-8)
+    assert not any("jumps" in warning for warning in run.warnings)
