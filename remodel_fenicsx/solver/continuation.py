@@ -18,7 +18,7 @@ from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.settings import Solver
 from remodel_fenicsx.solver.equilibrium import Equilibrium, Extension
-from remodel_fenicsx.solver.newton import POSSIBLE_JUMP, Counted, GuardedNewton, Solution, SolveFailure
+from remodel_fenicsx.solver.newton import MANY, POSSIBLE_JUMP, Counted, GuardedNewton, Solution, SolveFailure
 from remodel_fenicsx.solver.refusals import BIFURCATION, LIMIT_POINT, SEVERAL_SOLUTIONS, Refusal, diagnosed
 from remodel_fenicsx.state.memory import Numbers
 from remodel_fenicsx.state.state import State
@@ -228,12 +228,14 @@ class Change:
         return bound
 
     def look_back(self, before: NDArray[np.float64], work: Work) -> bool:
-        """After a step: look into one that has ended far from its tangent or from the step before; whether it did."""
+        """After a step: look into one that has ended far from its tangent or from the step before, or that took many
+        tangents, as from a start that leads astray; whether it did."""
         unknown, jumps = self.newton.unknown.x.array, self._jumps
         moved, last = self._size(unknown - before), jumps["moved"]
         least = POSSIBLE_JUMP * self.newton.equilibrium.state.loading.domain.size
         again = jumps["time"] == self.time  # solved once more, with other cells: that is no step of its own
-        is_far = work.is_far or (not again and last > 0.0 and moved > max(least, FASTER * last))
+        strayed = work.substeps == 1 and work.tangents > MANY
+        is_far = work.is_far or strayed or (not again and last > 0.0 and moved > max(least, FASTER * last))
         looked = is_far and self._looks()
         if looked:
             self.confirm(before, work)

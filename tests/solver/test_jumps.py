@@ -167,3 +167,21 @@ def test_parts_of_quasi_newton_steps_are_no_jump(method: str) -> None:
     assert run.code == 0 and max(run.column("substeps")) > 4
     assert run.column("mean_stretch")[-1] == pytest.approx(1.81231133, rel=1e-8)
     assert not any("jumps" in warning for warning in run.warnings)
+
+
+@pytest.mark.parametrize("method", ["direct", "lagged"])
+def test_a_step_that_takes_many_tangents_is_gone_in_parts(method: str) -> None:
+    """A thin tube of random cells under long steps has several equilibria; 20 to 200 parts lead to this one."""
+    scene = scene_from_dict({
+        "preset": "kuhl-holzapfel-2007",
+        "geometry": {"shape": "tube", "inner_radius": 1.0, "outer_radius": 1.2, "length": 3.0},
+        "model": {"kinematics": "sector"},
+        "cells": {"initial": "random", "seed": 1},
+        "loads": {"pressure": {"value": 1.0, "ramp": [[0.0, 0.0], [4.0, 1.0]]},
+                  "elongation": {"value": 0.1, "ramp": [[0.0, 0.0], [4.0, 1.0]]}},
+        "time": {"end": 3.0, "step": 1.0},
+        "solver": {"method": method},
+        "output": {"columns": ["inner_radius"]},
+    })  # fmt: skip
+    found, _ = radii(scene)
+    assert found[-1] == pytest.approx(1.45346788, rel=1e-8)
