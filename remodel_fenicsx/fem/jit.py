@@ -206,13 +206,18 @@ class PointValues:
     def __init__(self, parts: list[Any], points: int):
         self._parts, self._points = parts, points
 
+    @property
+    def components(self) -> int:
+        """Of the whole expression."""
+        return sum(part.value_size for part in self._parts)
+
     def eval(self, mesh: Any, elements: Any) -> NDArray[np.float64]:
         """The components, in their order, at the points of each element: (elements, points * components)."""
         values = [
             part.eval(mesh, elements).reshape(len(elements), self._points, part.value_size) for part in self._parts
         ]
         whole = values[0] if len(values) == 1 else np.concatenate(values, axis=2)
-        return whole.reshape(len(elements), self._points * whole.shape[2])
+        return whole.reshape(len(elements), self._points * self.components)
 
 
 def library(
