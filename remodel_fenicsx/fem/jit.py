@@ -182,14 +182,15 @@ def form(ufl_form: Any, name: str | None = None) -> Any:
 def expression(ufl_expression: Any, points: Any, name: str | None = None) -> PointValues:
     """Compile a UFL expression for evaluation at reference points of shape (n, 3); otherwise like `form`."""
     flat = [ufl_expression[place] if place else ufl_expression for place in np.ndindex(ufl_expression.ufl_shape)]
-    parts, comm = [], extract_unique_domain(ufl_expression).ufl_cargo().comm
+    parts, sizes, comm = [], [], extract_unique_domain(ufl_expression).ufl_cargo().comm
     while flat:
         size = next(size for size in SIMD_COMPONENTS if size <= len(flat))
         part, flat = as_vector(flat[:size]), flat[size:]
         with _compiler_watched(comm, name or "an expression", 1):
             own = map_expr_dag(_OwnLabels(), part)
             parts.append(dolfinx.fem.Expression(own, points, jit_options=jit_options()))
-    return PointValues(parts, len(points))
+            sizes.append(size)
+    return PointValues(parts, sizes, len(points))
 
 
 class PointValues:
@@ -197,24 +198,26 @@ class PointValues:
 
     Parameters
     ----------
-    parts
-        dolfinx's expressions, of one vector each.
+    parts, sizes
+        dolfinx's expressions, of one vector each, and their numbers of components.
     points
         Their number.
+
+    Attributes
+    ----------
+    components
+        Of the whole expression.
     """
 
-    def __init__(self, parts: list[Any], points: int):
-        self._parts, self._points = parts, points
-
-    @property
-    def components(self) -> int:
-        """Of the whole expression."""
-        return sum(part.value_size for part in self._parts)
+    def __init__(self, parts: list[Any], sizes: list[int], points: int):
+        self._parts, self._sizes, self._points = parts, sizes, points
+        self.components = sum(sizes)
 
     def eval(self, mesh: Any, elements: Any) -> NDArray[np.float64]:
         """The components, in their order, at the points of each element: (elements, points * components)."""
         values = [
-            part.eval(mesh, elements).reshape(len(elements), self._points, part.value_size) for part in self._parts
+            part.eval(mesh, elements).reshape(len(elements), self._points, size)
+            for part, size in zip(self._parts, self._sizes, strict=True)
         ]
         whole = values[0] if len(values) == 1 else np.concatenate(values, axis=2)
         return whole.reshape(len(elements), self._points * self.components)
