@@ -117,6 +117,7 @@ def _cells(random: Random, shape: str, r0: float) -> Values:
         initial = [r0 * part / math.hypot(*drawn) for part in drawn]
     axes = "cylindrical" if shape == "tube" and random.random() < 0.9 else "global"
     aligned_axis, seed = random.choice((1, 2, 3)), random.randrange(1000)
+    # by the seed: a further draw would make every scene another one
     return {
         "initial": initial, "axes": axes, "aligned_axis": aligned_axis, "seed": seed, "antithetic": seed % 2 == 1,
         "end_to_end_length": r0,

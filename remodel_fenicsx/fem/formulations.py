@@ -175,7 +175,7 @@ class _PartsApart(Dilatation):
         self.quadrature.values(self._jacobian, ())[:] = self.jacobians() @ self._interpolation.T
 
     def jacobians(self) -> Array:
-        return self._expression.eval(self.quadrature.mesh, self.quadrature.elements)
+        return self._expression.eval(self.quadrature.mesh, self.quadrature.elements)[..., 0]
 
 
 FORMULATIONS: dict[str, Formulation] = {

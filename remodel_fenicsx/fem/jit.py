@@ -214,13 +214,12 @@ class PointValues:
         self.components = sum(sizes)
 
     def eval(self, mesh: Any, elements: Any) -> NDArray[np.float64]:
-        """The components, in their order, at the points of each element: (elements, points * components)."""
+        """The components, in their order, at the points of each element: (elements, points, components)."""
         values = [
             part.eval(mesh, elements).reshape(len(elements), self._points, size)
             for part, size in zip(self._parts, self._sizes, strict=True)
         ]
-        whole = values[0] if len(values) == 1 else np.concatenate(values, axis=2)
-        return whole.reshape(len(elements), self._points * self.components)
+        return values[0] if len(values) == 1 else np.concatenate(values, axis=2)
 
 
 def library(

@@ -34,7 +34,8 @@ FAR = 2.0
 """`Solution.reach` from which on a way is looked at again in parts. The paper's bodies have at most 1.25, a tube
 without chains that comes near its largest pressure in one step 2.9, a jump over a limit point 3.9 and more."""
 
-NEAR, MANY = 0.5, 12  # chains near their contour length make ends nearer too, but within 11 iterations
+# Iterations, or tangents of a whole step: chains near their contour length make ends nearer too, but within 11
+NEAR, MANY = 0.5, 12
 
 
 class Counted:

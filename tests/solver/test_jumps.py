@@ -162,8 +162,10 @@ def test_parts_of_quasi_newton_steps_are_no_jump(method: str) -> None:
     case = all_cases()["random cells: frame material, force 3000.0"]
     scene = case.scene | {"solver": {"method": method}, "time": {"step": 1.0, "end": 6.0}}
     runner = Runner(limit=60)
-    run = runner.run({"scene": scene, "counts": case.counts, "extended": case.extended})
-    runner.close()
+    try:
+        run = runner.run({"scene": scene, "counts": case.counts, "extended": case.extended})
+    finally:
+        runner.close()
     assert run.code == 0 and max(run.column("substeps")) > 4
     assert run.column("mean_stretch")[-1] == pytest.approx(1.81231133, rel=1e-8)
     assert not any("jumps" in warning for warning in run.warnings)
