@@ -631,7 +631,7 @@ def _validate(options: argparse.Namespace) -> int:
     scene = read_scene(options.scene, options.set, options.profile)
     _say(f"{options.scene}: a valid scene ({scene.geometry.name}, {scene.time.in_words()})")
     _say(scene.summary())
-    _say("\n".join(explained(scene)))
+    _say("\n".join([*explained(scene), scene.formulation_in_words()]))
     if scene.profile is not None:
         _say(profile_for(scene.profile, scene).in_words(scene.profile))
     if _rank() == 0:

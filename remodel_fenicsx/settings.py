@@ -20,7 +20,7 @@ from pydantic import BeforeValidator, ConfigDict, Field, create_model, model_val
 from pydantic.config import JsonDict
 
 from remodel_fenicsx._lazy import resolved
-from remodel_fenicsx.fem.formulations import FORMULATIONS
+from remodel_fenicsx.fem.formulations import FORMULATIONS, NOT_LOCKING, STIFF_BULK
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.fem.solver_methods import (
     AUTO,
@@ -88,10 +88,12 @@ class Mesh(Table):
     degree: Annotated[int, OneOf((1, 2))] = Field(
         default=1, description="Polynomial degree of the displacement in an element: 1, as in the paper, or 2."
     )
-    formulation: Annotated[str, OneOf(FORMULATIONS)] = Field(
-        default="displacement",
+    formulation: Annotated[str, OneOf(FORMULATIONS, (AUTO,))] = Field(
+        default=AUTO,
         description=(
-            "How elements treat the change of volume. "
+            f"How elements treat the change of volume. 'auto' takes {NOT_LOCKING!r} where lambda/mu is above "
+            f"{STIFF_BULK['hexahedron']:g} (tetrahedra of degree 2: {STIFF_BULK['tetrahedron']:g}) and nothing of the "
+            "scene needs 'displacement'; the scene as run has its name. "
             + ". ".join(f"{name!r}: {formulation.meaning}" for name, formulation in FORMULATIONS.items())
             + "."
         ),
@@ -100,7 +102,7 @@ class Mesh(Table):
     @model_validator(mode="after")
     def _formulation_has_the_element(self) -> Mesh:
         pair = self.element, self.degree
-        if not FORMULATIONS[self.formulation].has(*pair):
+        if self.formulation != AUTO and not FORMULATIONS[self.formulation].has(*pair):
             able = [name for name, formulation in FORMULATIONS.items() if formulation.has(*pair)]
             rule = f"allowed for elements {self.element!r} of degree {self.degree} is {', '.join(map(repr, able))}"
             raise fault(rule, "formulation", self.formulation)

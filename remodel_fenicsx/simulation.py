@@ -33,9 +33,9 @@ from remodel_fenicsx.state.state import State
 from remodel_fenicsx.state.unit_cells import UnitCells
 from remodel_fenicsx.system.interrupts import take_back_signals
 from remodel_fenicsx.watch.equilibrium_stability import EquilibriumStability
-from remodel_fenicsx.watch.locking import LockingWarning
+from remodel_fenicsx.watch.locking import LockingWarning, PressureNoise
 from remodel_fenicsx.watch.over_correction import OverCorrection, RestedCells
-from remodel_fenicsx.watch.tissue import FrontsInLayers, GrowthWithoutRest, RadialChains, VolumeLoss
+from remodel_fenicsx.watch.tissue import FrontsInLayers, GrowthWithoutRest, RadialChains, VolumeLoss, WeakTension
 
 log = logging.getLogger(__name__)
 
@@ -106,7 +106,9 @@ class Simulation:
         if domain is None and comm.rank == 0:
             for line in explained(scene) if scene.model.kinematics == AUTO else only_for_means(scene):
                 log.info("%s", line)
-        self.scene = scene = with_kinematics(scene, domain)
+        if scene.mesh.formulation == AUTO and comm.rank == 0:
+            log.info("%s", scene.formulation_in_words())
+        self.scene = scene = with_choices(scene, domain)
         self._loads = [case.loads for case in scene.each_case()]
         shape = scene.geometry
         self.domain = domain = checked_domain(build(scene, comm) if domain is None else domain, scene)
@@ -163,7 +165,14 @@ class Simulation:
             self.stepper.judge = TimeError(self.stepper).measure
         self.observer = Observer(shape, self.stepper, scene.columns(more))
         self.warnings = self._of_the_state(self.stepper)
-        self.warnings += [RadialChains(self.stepper, shape.radial_share), FrontsInLayers(self.stepper, shape)]
+        remodeling, locks = self.stepper.remodeling, FORMULATIONS[scene.mesh.formulation].locks
+        if locks and remodeling.law.remodels and remodeling.driver.is_stress and not kinematics.homogeneous:
+            self.warnings.append(PressureNoise(self.stepper))
+        self.warnings += [
+            WeakTension(self.stepper),
+            RadialChains(self.stepper, shape.radial_share),
+            FrontsInLayers(self.stepper, shape),
+        ]
         if self.stepper.turnover is not None:
             self.warnings.append(GrowthWithoutRest(self.stepper, scene.end_of_ramps))
         if self._cases:
@@ -383,12 +392,12 @@ def parameters_of(properties: Mapping[str, Properties], domain: Domain) -> tuple
     return tissue, kappa if len(set(kappas.values())) == 1 else by_region(domain, kappas)
 
 
-def with_kinematics(scene: Scene, domain: Domain | None = None) -> Scene:
-    """The scene with the kinematics that it is run with, where it leaves the choice. A mesh of one's own is full."""
-    if scene.model.kinematics != AUTO:
+def with_choices(scene: Scene, domain: Domain | None = None) -> Scene:
+    """The scene with what it is run with where it leaves the choice. A mesh of one's own is full."""
+    if AUTO not in (scene.model.kinematics, scene.mesh.formulation):
         return scene
-    name = choice(scene).name if domain is None else "full"
-    return scene.with_values({"model.kinematics": name})
+    name = choice(scene).name if domain is None or scene.model.kinematics != AUTO else "full"
+    return scene.with_values({"model.kinematics": name, "mesh.formulation": scene.formulation})
 
 
 def build(scene: Scene, comm: MPI.Intracomm) -> Domain:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from benchmarks.fuzzing.scenes import Values
+from benchmarks.fuzzing.scenes import STIFF_NAME, Values
 from benchmarks.stability_map.cases import Finding, Run
 from benchmarks.stability_map.march import Bar, Wall, factor, march
 
@@ -16,6 +16,8 @@ WALL_TOLERANCE, POLYGON_TOLERANCE = 0.08, 0.2
 
 def known(scene: Values) -> bool:
     """Whether the reference can do it: axes that stay, no residual stress, equal steps, sorted values."""
+    if scene.get("name") == STIFF_NAME:  # its elements have noise of its own in a bulk as stiff as that
+        return False
     r, g, time = scene["remodeling"], scene["geometry"]["shape"], scene["time"]
     lags = r["coupling"] == "relaxed" and r["law"] in ("rate", "relaxation")  # slower than its law says
     # across a bar two values agree: which of them has which rank matters where the old cells tell x from y, and stay

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.fuzzing.scenes import Values, has_free_length
+from benchmarks.fuzzing.scenes import STIFF_NAME, Values, has_free_length
 from benchmarks.stability_map.cases import Finding, Run
 
 EXACT, SOLVED = 1e-6, 1e-4  # relative tolerance of lengths: of the same arithmetic; of another way to the same solution
@@ -201,6 +201,19 @@ def _equilibrium(scene: Values, random: Random) -> Other | None:
     return Other("in time", s, tolerance=5e-3, degrees=0.5, last_only=True)
 
 
+def _elements(scene: Values, random: Random) -> Other | None:
+    s = deepcopy(scene)
+    if scene.get("name") != STIFF_NAME:
+        return None
+    s["mesh"] |= {"formulation": "selective-integration", "element": "hexahedron"}
+    implicit = scene["remodeling"].get("coupling") == "implicit"
+    if implicit:  # it needs the other formulation, and has no error in time
+        s["remodeling"]["coupling"] = "extrapolated"
+        s["time"]["step"] /= 8
+    last = implicit or "profile" in scene
+    return Other("by selective integration", s, tolerance=5e-3, degrees=1.0, last_only=last)
+
+
 Relation = Callable[[Values, Random], Other | None]
 RELATIONS: tuple[tuple[int, Relation], ...] = (
     (3, _stress), (3, _length), (3, _time), (3, _chain), (3, _said), (2, _ramp), (2, _recorded), (4, _resumed),
@@ -210,6 +223,8 @@ RELATIONS: tuple[tuple[int, Relation], ...] = (
 
 def chosen(scene: Values, random: Random) -> Other:
     """One that the scene allows."""
+    if (elements := _elements(scene, random)) is not None:
+        return elements
     found = [(weight, other) for weight, relation in RELATIONS if (other := relation(scene, random)) is not None]
     return random.choices([other for _, other in found], [weight for weight, _ in found])[0]
 

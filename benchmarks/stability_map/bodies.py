@@ -159,7 +159,7 @@ MESHES = {
 def thick_wall(family: str, changes: Values, place: Place, **more: Any) -> Case:
     """Without chains, p = 2, on one of the meshes."""
     kind, degree, counts, tolerance = MESHES[place["mesh"]]
-    changes = {**PRESSED, "mesh.element": kind, "mesh.degree": degree, **changes}
+    changes = {**PRESSED, "mesh.formulation": "displacement", "mesh.element": kind, "mesh.degree": degree, **changes}
     more |= {"counts": counts, "options": {"tolerance": tolerance}}
     return tube_case(family, changes, place, check_inner_displacement, **more)
 

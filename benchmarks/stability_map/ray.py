@@ -18,6 +18,7 @@ RAY: dict[str, Any] = with_values(
 REFERENCE, CURVE = "tube in one dimension", "tube in one dimension, its inner radius prescribed"
 CONSISTENT = {"remodeling.law": "tensor", "remodeling.frame": "material", "material.repulsion": "log"}
 UNLOADED = {"material.chain_density": 0.0, "remodeling.law": "none"}
+AT_ALL_POINTS = {"mesh.formulation": "displacement"}
 ELEMENTS = 8  # through the wall of a scene with refinement 1
 
 
@@ -38,16 +39,19 @@ def ray_case(family: str, changes: Values, place: Place, check: Check, reference
 
 
 # ---------------------------------------------------------------- held against the march
-def marched(scene: dict[str, Any]) -> March:
+def marched(scene: dict[str, Any], elements: int = 40) -> March:
     """The reference with the scene's steps, or finer ones where the scene's cells are not a step behind."""
     step, end = scene["time"]["step"], scene["time"]["end"]
     finer = 1 if scene["remodeling"]["coupling"] == "staggered" else 8
-    return march_of(scene, step / finer * np.arange(1, round(end / step) * finer + 1))
+    return march_of(scene, step / finer * np.arange(1, round(end / step) * finer + 1), elements)
 
 
 def check_march(case: Case, run: Run) -> Finding:
-    """Inner and outer radius of all rows; `displacement`: in their place the inner one, within this share."""
-    expected, rows = marched(case.scene), run.column("time")
+    """Inner and outer radius of all rows; `displacement`: in their place the inner one, within this share.
+
+    `angles`: the angles at three places too, within so many degrees.
+    """
+    expected, rows = marched(case.scene, case.options.get("elements", 40)), run.column("time")
     rows = rows[: np.searchsorted(rows, (expected.times or [0.0])[-1] + 1e-9)]
     if not len(rows):
         return Finding(
@@ -67,8 +71,24 @@ def check_march(case: Case, run: Run) -> Finding:
         moved = np.array(expected.inner)[at] - inner
         error = float(np.max(np.abs((run.column("inner_radius")[: len(rows)] - inner) / moved - 1)))
         words, ratio = f"{words}; inner displacement off by {100 * error:.3g} %", abs(error) / share
+    if (degrees := case.options.get("angles")) is not None:
+        angle = max(_angles_off(case.scene, expected, run, at))
+        words, ratio = f"{words}; an angle by {angle:.3g} degrees", max(ratio, angle / degrees)
     ratio = np.inf if run.code == 0 and expected.ended else ratio
     return Finding(ratio, words, solvable=not expected.ended)
+
+
+def _angles_off(scene: dict[str, Any], expected: March, run: Run, at: Any) -> list[float]:
+    """Largest difference of each angle column, in degrees, from the same means over elements."""
+    inner, outer = scene["geometry"]["inner_radius"], scene["geometry"]["outer_radius"]
+    middle, size = (inner + outer) / 2, (outer - inner) / ELEMENTS
+    places = {"inner": (inner, inner + size), "outer": (outer - size, outer), "middle": (middle - size, middle + size)}
+    return [
+        float(
+            np.max(np.abs(run.column(f"fibre_angle_{name}")[: len(at)] - [expected.mean_angle(*place, k) for k in at]))
+        )
+        for name, place in places.items()
+    ]
 
 
 marched_case = partial(ray_case, check=check_march)
@@ -109,10 +129,26 @@ table(
         "outer radius": (1.5, 3.0, 10.0), "degree": (1, 2), "refinement": (1, 2),
         "lambda/mu": (8.8, 20.0, 49.0, 100.0),
     },
-    lambda p: {**UNLOADED, "time.end": 4.0, "pressure": (2.0 if p["outer radius"] > 2 else 0.8, 4.0)},
+    lambda p: {**UNLOADED, **AT_ALL_POINTS, "time.end": 4.0, "pressure": (2.0 if p["outer radius"] > 2 else 0.8, 4.0)},
     only=lambda p: (p["degree"], p["refinement"]) != (2, 2),
     reduced=lambda p: (p["outer radius"], p["refinement"], p["lambda/mu"]) == (3.0, 1, 49.0),
     more={"options": {"tolerance": 0.035}},
+)  # fmt: skip
+
+
+# tissue that hardly changes its volume and remodels: what drives the cells must be as right as the radii
+table(
+    "nearly incompressible", marched_case,
+    {
+        "outer radius": (1.3, 3.0), "law": ("explicit", "tensor"), "lambda/mu": (50.0, 300.0, 1e3, 1e4),
+        "degree": (1, 2), "formulation": ("auto", "displacement"),
+    },
+    lambda p: {
+        "pressure": (1.2 if p["outer radius"] < 2 else 4.8, 20.0), "elongation": (0.1, 20.0),
+        "mesh.formulation": p["formulation"], "time": {"end": 40.0, "step": 1.0},
+    },
+    reduced=lambda p: (p["outer radius"], p["law"], p["degree"]) == (3.0, "tensor", 2) and p["lambda/mu"] == 1e3,
+    more={"options": {"radii": 5e-3, "angles": 1.0, "elements": 160}},
 )  # fmt: skip
 
 

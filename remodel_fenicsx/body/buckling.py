@@ -15,6 +15,7 @@ from remodel_fenicsx.model.energy import Tissue
 Array = NDArray[np.float64]
 NEAR_LOCKING = 0.9  # r/L that chains of the inner face are thought to reach
 WALL_POINTS = 100  # through the wall
+WIDEST = 3.0  # radius, over the inner one at rest: a thin wall of unit mu bears 99 % there of the most that it ever can
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,7 @@ def expected_thrust(scene: Any) -> float:
 
     The wall is taken as an incompressible neo-Hookean one of the tissue's small-strain modulus, a closed form, with
     Lame's term for a compressible one beside it. Where a force is given, that and the lumen are all there is. Of
-    several regions it has the mean over the section.
+    several regions it has the mean over the section. Euler's load is that of the inflated wall.
     """
     shape = scene.geometry
     strut = shape.strut(scene.supports.ends)
@@ -67,18 +68,19 @@ def expected_thrust(scene: Any) -> float:
     ratio, modulus = (sum(share * part[k] for share, part in parts) for k in (0, 1))
     longest = min(part[2] for _, part in parts)
 
-    def thrust(time: float) -> float:
+    def share(time: float) -> float:
         loads = {name: load.value * load.factor(time) for name, load in scene.loads.items()}
         pressure, stretch = loads.get("pressure", 0.0), 1 + loads.get("elongation", 0.0)
-        radius, reduced = inflated(pressure / (modulus / 3), inner, outer, stretch, longest)
+        radius, reduced, bending = inflated(pressure / (modulus / 3), inner, outer, stretch, longest)
         lumen = math.pi * radius**2
         if scene.has_free_length:
-            return (0.0 if strut.capped else pressure * lumen) - loads.get("axial_force", 0.0)
-        return (1 - 2 * ratio) * pressure * lumen - modulus / 3 * reduced
+            thrust = (0.0 if strut.capped else pressure * lumen) - loads.get("axial_force", 0.0)
+        else:
+            thrust = (1 - 2 * ratio) * pressure * lumen - modulus / 3 * reduced
+        return thrust / strut.euler_load(modulus / 3 * bending, strut.length * stretch)
 
     corners = {float(time) for load in scene.loads.values() for time, _ in load.ramp}
-    largest = max((thrust(time) for time in corners), default=0.0)
-    return max(0.0, largest) / strut.euler_load(modulus * math.pi / 4 * (outer**4 - inner**4), strut.length)
+    return max(0.0, max(map(share, corners), default=0.0))
 
 
 def _stiffness(tissue: Tissue) -> tuple[float, float, float]:
@@ -92,28 +94,33 @@ def _stiffness(tissue: Tissue) -> tuple[float, float, float]:
     return ratio, modulus, longest
 
 
-def inflated(pressure: float, inner: float, outer: float, stretch: float, longest: float) -> tuple[float, float]:
-    """Inner radius, and reduced axial force over mu, of an incompressible neo-Hookean tube of unit mu under a pressure.
+def inflated(pressure: float, inner: float, outer: float, stretch: float, longest: float) -> tuple[float, float, float]:
+    """Inner radius, reduced axial force and bending stiffness of an incompressible neo-Hookean tube of unit mu.
 
-    p = int (t^2 - 1/(t z)^2) dr/r,  F = pi int (2 z^2 - 1/(t z)^2 - t^2) r dr,  t = r/R, z the axial stretch. Chains of
-    isotropic cells bound t: their mean stretch stays below `longest`.
+    p = int (t^2 - 1/(t z)^2) dr/r,  F = pi int (2 z^2 - 1/(t z)^2 - t^2) r dr,  EI = pi int E r^3 dr, t = r/R, z the
+    axial stretch, E the modulus along z at constant stress across. Chains of isotropic cells bound t: their mean
+    stretch stays below `longest`. What bears no such pressure has the radius at which it bears nearly all that it can.
     """
     R2 = np.linspace(inner**2, outer**2, WALL_POINTS)
 
-    def of(radius: float) -> tuple[float, float]:
+    def of(radius: float) -> tuple[float, float, float]:
         r2 = radius**2 + (R2 - inner**2) / stretch
         hoop, radial = r2 / R2, R2 / (r2 * stretch**2)
         areas = np.gradient(r2) / 2  # r dr
         areas[[0, -1]] /= 2
         carried = float(((hoop - radial) / r2 * areas).sum())
-        return carried, math.pi * float(((2 * stretch**2 - radial - hoop) * areas).sum())
+        modulus = 2 * stretch**2 + 2 * radial - 2 * radial**2 / (hoop + radial)
+        reduced, bending = (2 * stretch**2 - radial - hoop, modulus * r2)
+        force, stiffness = (math.pi * float((part * areas).sum()) for part in (reduced, bending))
+        return carried, force, stiffness
 
     def extended(hoop: float) -> bool:
         return (hoop**2 + stretch**2 + 1 / (hoop * stretch) ** 2) / 3 > longest**2
 
-    low, high = inner * 1e-3, inner * 1e3
+    low, high = inner * 1e-3, inner * WIDEST
     for _ in range(60):
         middle = math.sqrt(low * high)
         over = of(middle)[0] > pressure or (middle > inner and extended(middle / inner))
         low, high = (low, middle) if over else (middle, high)
-    return low, of(low)[1]
+    _, force, stiffness = of(low)
+    return low, force, stiffness

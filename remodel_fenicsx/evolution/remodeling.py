@@ -21,7 +21,7 @@ from remodel_fenicsx.model.drivers import DRIVERS, FRAMES, carried_axes
 from remodel_fenicsx.model.energy import Tissue, axes_sum
 from remodel_fenicsx.model.laws import LAWS, Drive, tensor_target
 from remodel_fenicsx.model.load_cases import MEANS_OF_CASES, mean_target
-from remodel_fenicsx.model.tensor_law import ABOVE_ROUNDING, Target
+from remodel_fenicsx.model.tensor_law import ABOVE_ROUNDING, Target, floor_above
 from remodel_fenicsx.settings import Remodeling
 from remodel_fenicsx.solver.pointwise import PointStresses
 from remodel_fenicsx.state.memory import Numbers
@@ -93,7 +93,7 @@ class RemodelingPass:
             return
         self._change: tuple[UnitCell, UnitCell] | None = None
         self.kernels = state.cells.kernels
-        self._numbers = Numbers(state, "noise", {"said": 0})
+        self._numbers = Numbers(state, "noise", {"said": 0, "stress": 0.0, "floor": 0.0})
         self._smallest_area = self.quadrature.minimum(self.quadrature.smallest_areas)
         F = state.kinematics.elastic_gradient(state.unknown)
         self.stresses = PointStresses(state, self.tissue)
@@ -197,7 +197,20 @@ class RemodelingPass:
                     typical,
                     most,
                 )
-        return Noise(rounded + min(unbalanced, most), rounding)
+        noise = Noise(rounded + min(unbalanced, most), rounding)
+        if typical > self._numbers["stress"]:
+            self._numbers["stress"], self._numbers["floor"] = typical, floor_above(*noise)
+        return noise
+
+    def weakness(self) -> float:
+        """Tension of which half counts, over the stress of the body when that was largest; 0 of what nothing loads.
+
+        Laws that follow a target by its share are slower there (`tensor_law.floor_above`).
+        """
+        if not self.law.remodels or self.law.target is None or not self.driver.is_stress:
+            return 0.0
+        stress, floor = self._numbers["stress"], self._numbers["floor"]
+        return floor / stress if stress * ABOVE_ROUNDING > floor else 0.0
 
     def _max_chain_extension(self, F: Array) -> float:
         length = self.parameters.at_points().locking_length

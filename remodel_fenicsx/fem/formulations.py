@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -85,6 +86,16 @@ class Formulation:
         """
         return True
 
+    def pays_above(self, element: str, degree: int) -> float:
+        """The lambda/mu from which on "auto" takes it for such an element.
+
+        Parameters
+        ----------
+        element, degree
+            As in `has`.
+        """
+        return np.inf
+
     def on(self, kinematics: Any, unknown: Any, quadrature: Any) -> Dilatation:
         """The formulation for these unknowns at these points.
 
@@ -116,6 +127,8 @@ class Selective(Formulation):
         What it does, for docs/scene.md.
     degrees
         Degree of that rule by element and degree; what is not in it would lock all the same.
+    pays
+        Least lambda/mu for which "auto" takes it, by element; it never does for one that is not in it.
     takes_parts, locks
         As in `Formulation`.
 
@@ -129,12 +142,17 @@ class Selective(Formulation):
 
     meaning: str
     degrees: Mapping[tuple[str, int], int]
+    pays: Mapping[str, float] = MappingProxyType({})
     takes_parts: bool = True
     locks: bool = False
 
     def has(self, element: str, degree: int) -> bool:
         """Where there is a rule."""
         return (element, degree) in self.degrees
+
+    def pays_above(self, element: str, degree: int) -> float:
+        """By element, where there is a rule."""
+        return self.pays.get(element, np.inf) if self.has(element, degree) else np.inf
 
     def on(self, kinematics: Any, unknown: Any, quadrature: Any) -> Dilatation:
         """With J at the points of the rule."""
@@ -178,15 +196,23 @@ class _PartsApart(Dilatation):
         return self._expression.eval(self.quadrature.mesh, self.quadrature.elements)[..., 0]
 
 
+NOT_LOCKING = "selective-integration"
+STIFF_BULK = {"hexahedron": 10.0, "tetrahedron": 300.0}
+"""Largest lambda/mu with which "auto" takes J at all points (docs/locking.md, Cells that turn). Of tubes that remodel
+linear hexahedra lost 0.04 degrees and 0.05 % of the radii at 8.8, 0.6 degrees at 20, 17 at 100. Quadratic tetrahedra
+lost 0.6 degrees at 300; with U at one point they have 0.3 % of error of their own."""
+
 FORMULATIONS: dict[str, Formulation] = {
     # docs/appendix_elements.md has the measurements behind these numbers
     "displacement": AtAllPoints(
         "at all quadrature points; right where the bulk is soft or elements are small. A run whose elements lock warns"
     ),
-    "selective-integration": Selective(
-        "the volumetric part of the matrix at fewer points, in linear hexahedra at the centroid. Hexahedra do not lock "
-        "with it",
-        {(kind, degree): degree for kind in ("hexahedron", "quadrilateral", "interval") for degree in (1, 2)},
+    NOT_LOCKING: Selective(
+        "the volumetric part of the matrix at fewer points, in linear hexahedra at the centroid. Hexahedra, and "
+        "tetrahedra of degree 2, do not lock with it",
+        {(kind, degree): degree for kind in ("hexahedron", "quadrilateral", "interval") for degree in (1, 2)}
+        | {("tetrahedron", 2): 1},
+        STIFF_BULK,
     ),
 }
 """Formulations by the name that a scene gives them."""

@@ -143,7 +143,7 @@ class Quadrature:
         return values[: self.number_of_owned_elements]
 
     def integral(self, values: NDArray[np.float64]) -> float:
-        """Integral over the body of values (elements, points), over all ranks."""
+        """Integral over the body of values (elements or owned elements, points), over all ranks."""
         local = float((self.owned(values) * self.owned(self.volumes)).sum())
         return float(over_ranks(self.mesh.comm, local, MPI.SUM))
 

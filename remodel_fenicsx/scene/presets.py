@@ -206,7 +206,7 @@ def nested(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _values(refinement: int, degree: int, tolerance: float) -> dict[str, Any]:
-    values = {"model.kinematics": AUTO, "mesh.refinement": refinement, "mesh.degree": degree}
+    values = {"model.kinematics": AUTO, "mesh.refinement": refinement, "mesh.degree": degree, "mesh.formulation": AUTO}
     return values | {"time.tolerance": tolerance}
 
 
@@ -219,12 +219,12 @@ PROFILES: dict[str, Profile] = {
 
 # Another mesh has other random cells, and with a tolerance each seed has other steps: both stay the scene's own. A
 # looser solve adds nothing to their error (docs/speed.md, What random cells cost)
-_LOOSE = {"solver.relative_tolerance": 1e-6, "model.kinematics": AUTO}
+_LOOSE = {"solver.relative_tolerance": 1e-6, "model.kinematics": AUTO, "mesh.formulation": AUTO}
 _QUICK = Profile(_LOOSE, 0.8, 0.4, 1.0, "random", is_for_means=True)
 RANDOM_CELLS: dict[str, Profile] = {
     "fast": _QUICK,
     "balanced": _QUICK,
-    "reference": Profile({"model.kinematics": AUTO}, 0.8, 0.4, 4.1, "random"),
+    "reference": Profile({"model.kinematics": AUTO, "mesh.formulation": AUTO}, 0.8, 0.4, 4.1, "random"),
 }
 """The profiles where cells are random."""
 

@@ -18,8 +18,9 @@ from pydantic import BaseModel, BeforeValidator, Field, ModelWrapValidatorHandle
 from remodel_fenicsx.body import SHAPES, Shape
 from remodel_fenicsx.body.shape import LoadKind
 from remodel_fenicsx.body.columns import TURNOVER_POWER, Column, columns_of, columns_of_region, columns_on_request
-from remodel_fenicsx.body.reductions import AUTO, objections
-from remodel_fenicsx.fem.formulations import FORMULATIONS
+from remodel_fenicsx.body.reductions import AUTO, choice, objections
+from remodel_fenicsx.fem.formulations import FORMULATIONS, NOT_LOCKING
+from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.fem.solver_methods import SOLVER_METHODS
 from remodel_fenicsx.model.chains import CHAINS
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
@@ -209,7 +210,7 @@ class Scene(Table):
             if not geometry.holds_faces and support.kind != "elastic":
                 raise fault("allowed here is 'elastic'", f"supports.{quoted(name)}.kind", support.kind)
         formulation = self.mesh.formulation
-        if FORMULATIONS[formulation].takes_parts and not isinstance(MATRICES[material.matrix], Matrix):
+        if formulation != AUTO and FORMULATIONS[formulation].takes_parts and not self._tells_volume_apart:
             rule = (
                 f"needs a material.matrix with a known volumetric part, made as a Matrix; {material.matrix!r} has none"
             )
@@ -235,12 +236,49 @@ class Scene(Table):
             raise fault("; ".join(reasons), "model.kinematics", self.model.kinematics)
         return self
 
+    @property
+    def _stiffness_ratio(self) -> float:
+        """Largest lambda/mu of its regions."""
+        materials = [one.material for one in self.properties().values()]
+        return max(material.lame_lambda / material.lame_mu for material in materials)
+
+    @property
+    def _tells_volume_apart(self) -> bool:
+        return isinstance(MATRICES[self.material.matrix], Matrix)
+
+    @property
+    def formulation(self) -> str:
+        """That of `mesh.formulation`, or the one that "auto" takes."""
+        if self.mesh.formulation != AUTO:
+            return self.mesh.formulation
+        return "displacement" if not self._bulk_is_stiff or self._needs_all_points() else NOT_LOCKING
+
+    @property
+    def _bulk_is_stiff(self) -> bool:
+        return self._stiffness_ratio > FORMULATIONS[NOT_LOCKING].pays_above(self.mesh.element, self.mesh.degree)
+
+    def _needs_all_points(self) -> str:
+        """What keeps "auto" from the formulation that does not lock, in words; nothing where nothing does."""
+        if self.remodeling.coupling == "implicit":
+            return "remodeling.coupling = 'implicit'"
+        if not self.natural.is_of_the_mesh:
+            return "[natural]"
+        if not self._tells_volume_apart:
+            return f"material.matrix = {self.material.matrix!r}"
+        return "a body of one F" if KINEMATICS[choice(self).name].homogeneous else ""
+
+    def formulation_in_words(self) -> str:
+        """What "auto" takes, and why."""
+        needs = self._needs_all_points() if self._bulk_is_stiff else ""
+        ratio = f"lambda/mu = {self._stiffness_ratio:.4g}"
+        return f"formulation {self.formulation!r}: {ratio}{f', but {needs} needs it' if needs else ''}"
+
     def missing_for_implicit(self) -> str | None:
         """What the scene lacks for the coupling "implicit"; None where it lacks nothing."""
         from remodel_fenicsx.model.implicit.condensed import refused  # six modules that most runs need not load
 
         material, remodeling = self.material, self.remodeling
-        if self.mesh.formulation != "displacement":
+        if self.formulation != "displacement":
             return "mesh.formulation = 'displacement': in the others the stress at a point depends on its whole element"
         if not material.chain_density:
             return "chains: material.chain_density above 0"
@@ -473,7 +511,7 @@ class Scene(Table):
             able = [name for name, kind in SHAPES.items() if kind.has_a_wall]
         needs: list[tuple[str, Any, list[str]]] = [
             ("geometry.shape", shape.name, able),
-            ("mesh.formulation", self.mesh.formulation, ["displacement"]),
+            ("mesh.formulation", self.formulation, ["displacement"]),
         ]
         if shape.closes_from_a_sector:  # the closing knows isotropic cells
             needs.append(("cells.axes", self.cells.axes, ["cylindrical"]))

@@ -16,7 +16,7 @@ from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.model.laws import LAWS
 from remodel_fenicsx.results.columns import Measurement
 from remodel_fenicsx.scene.scene import Scene
-from remodel_fenicsx.simulation import Simulation, with_kinematics
+from remodel_fenicsx.simulation import Simulation, with_choices
 from remodel_fenicsx.studies.measured import Measured
 
 Array = NDArray[np.float64]
@@ -55,7 +55,7 @@ class Modelled(NamedTuple):
 
 def without_derivatives(scene: Scene, table: Measured) -> str | None:
     """Why the model of a table has no derivatives but differences, in words; None where it has."""
-    scene = with_kinematics(scene)
+    scene = with_choices(scene)
     if not KINEMATICS[scene.model.kinematics].turns_nothing:
         return f"model.kinematics = {scene.model.kinematics!r}"
     for key, there in (
@@ -153,7 +153,7 @@ def model_of(scene: Scene, table: Measured, scales: Mapping[str, float], ways: S
         )
     cells, dimensions = None, None
     if table.state == "after":
-        scene = with_kinematics(scene)
+        scene = with_choices(scene)
         before = _Run(scene.with_values({"time.end": table.time}), table, ways)
         before.rows(lambda time: False)
         cells, dimensions = before.cells, before.dimensions
@@ -317,7 +317,7 @@ class RowChanges(Watcher):
 
 def rotated_cells(scene: Scene) -> bool:
     """Whether cells do not lie along the coordinates of the mesh, so that there are no derivatives."""
-    simulation = Simulation(with_kinematics(scene), MPI.COMM_SELF)
+    simulation = Simulation(with_choices(scene), MPI.COMM_SELF)
     try:
         return not axes_lie_along(simulation.cells.point_cells.axes)
     finally:

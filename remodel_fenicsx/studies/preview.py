@@ -13,7 +13,7 @@ from remodel_fenicsx.results.fields import local_fields
 from remodel_fenicsx.results.vtkhdf import vtk_cells
 from remodel_fenicsx.results.vtu import write_vtu
 from remodel_fenicsx.scene import Scene
-from remodel_fenicsx.simulation import build, checked_domain, with_kinematics
+from remodel_fenicsx.simulation import build, checked_domain, with_choices
 
 
 def write_axes(scene: Scene, path: Path, comm: MPI.Intracomm = MPI.COMM_WORLD) -> str:
@@ -39,7 +39,7 @@ def write_axes(scene: Scene, path: Path, comm: MPI.Intracomm = MPI.COMM_WORLD) -
     FileExistsError
         If the file is there.
     """
-    scene = with_kinematics(scene)
+    scene = with_choices(scene)
     domain, shape = checked_domain(build(scene, comm), scene), scene.geometry
     mesh = domain.mesh
     weight = KINEMATICS[scene.model.kinematics].on(mesh, shape).weight(mesh)

@@ -136,12 +136,12 @@ def _same(recorded: Scene, wanted: Scene) -> bool:
     from mpi4py import MPI
 
     from remodel_fenicsx.running import with_files_kept
-    from remodel_fenicsx.simulation import with_kinematics
+    from remodel_fenicsx.simulation import with_choices
     from remodel_fenicsx.unloading import as_unloaded
 
     try:
         with as_unloaded(wanted, MPI.COMM_SELF) as found:
-            return with_files_kept(recorded)[0] == with_files_kept(with_kinematics(found))[0]
+            return with_files_kept(recorded)[0] == with_files_kept(with_choices(found))[0]
     except OSError:  # a file of fibres that is not there any more
         return False
 

@@ -24,6 +24,7 @@ NOTED = 0.05  # mean loss that the log mentions at the end
 MEAN_LOSS, LEAST_JACOBIAN = 0.2, 0.6  # from where on it is hardly meant
 LONG = 10.0  # times of turnover, before which rates say little: walls that rest have risen and fall by then
 FAR_FROM_REST = 0.01  # change of ln m or ln rho in a time of turnover
+WEAK = 0.05  # the paper's tube by the law "tensor": angles were 0.02 degrees off at 0.014, 1.2 at 0.14, 12 at 1.4
 RADIAL_SHARE = 0.5  # of the chains: more of them out of the wall are said
 # degrees between two points of an element that are a front, not a slope: within its elements the paper's artery turns
 # by up to 14 degrees; and the share of a layer that such elements make up
@@ -70,6 +71,28 @@ class VolumeLoss(WarnsOnce):
             "the tissue has lost up to {lost:.2g} % of its volume (mean J {mean:.3g} at time {mean_time:g}; least "
             "J {least:.3g} at {x:.4g}, {y:.4g}, {z:.4g}, time {least_time:g})"
         ).format(lost=100 * (1 - found["mean"]), **found)
+
+
+class WeakTension(WarnsOnce):
+    """Says at the end that stresses were never far above those that count as rounding: cells turned too slowly.
+
+    Parameters
+    ----------
+    stepper
+        Whose passes take the stress.
+    """
+
+    def __init__(self, stepper: Stepper):
+        super().__init__(stepper, "weak_tension")
+
+    def committed(self, step: Step) -> None:
+        """Look at the end."""
+        if step.is_last and not self.said and (weakness := self.stepper.remodeling.weakness()) > WEAK:
+            self.say(
+                step,
+                f"the loads are weak: a tension of {weakness:.2g} times the largest stress of the body counts by half, "
+                "for smaller ones may be rounding; cells turned too slowly. Choose a unit or loads with larger strains",
+            )
 
 
 class GrowthWithoutRest(WarnsOnce):

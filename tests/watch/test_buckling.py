@@ -13,7 +13,9 @@ import pytest
 from mpi4py import MPI
 
 from remodel_fenicsx import Scene, Simulation
+from remodel_fenicsx.body.buckling import expected_thrust
 from remodel_fenicsx.body.reductions import choice, explained
+from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.studies.stability import in_words, stability
 from remodel_fenicsx.watch.buckling import BucklingWarning
 from tests.parts import tube
@@ -177,3 +179,32 @@ def test_the_analysis_of_a_reduction_says_what_it_does_not_see(tmp_path: Path) -
     assert "kinematics 'radial' sees changes that keep its symmetry only" in unseen
     assert unseen in log and unseen in in_words(table, unseen)
     assert f"time 2: a pass multiplies the worst small change by {table['factor'][0]:.3g}" in log
+
+
+# ---------------------------------------------------------------- near and beyond a limit load
+def inflated_wall(pressure: float) -> Scene:
+    """A thin wall without chains, which can bear 23.8 mmHg."""
+    return Scene(
+        geometry={"shape": "tube", "length_unit": "mm", "inner_radius": 3.0, "outer_radius": 3.3, "length": 12.0},
+        mesh={"degree": 2}, material={"stress_unit": "kPa", "lame_mu": 34.0, "lame_lambda": 3400.0, "chain_density": 0},
+        cells={"initial": "isotropic"}, remodeling={"law": "none"}, time={"end": 10.0},
+        loads={"pressure": {"value": f"{pressure} mmHg", "ramp": [[0, 0], [10, 1]]}},
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("pressure", [15.0, 22.0, 23.5])
+def test_what_is_expected_of_an_inflated_wall_is_what_comes(pressure: float) -> None:
+    """Thrust over Euler's load, of radii up to 2.4 times those at rest."""
+    scene = inflated_wall(pressure)
+    assert choice(scene).name == "radial"
+    with watched(scene) as watcher:
+        assert expected_thrust(scene) == pytest.approx(watcher.thrust_share(), rel=0.05)
+
+
+def test_beyond_a_limit_load_the_run_says_limit_point() -> None:
+    """And is no whole body for a thrust that no state has."""
+    scene = inflated_wall(30.0)
+    assert choice(scene).name == "radial" and 0.4 < expected_thrust(scene) < 0.7
+    with pytest.raises(StepFailure) as caught, watched(scene):
+        pass
+    assert caught.value.refusal.kind == "limit point"

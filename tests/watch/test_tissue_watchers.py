@@ -131,3 +131,23 @@ def test_one_and_two_ranks_agree(case: Case) -> None:
     one, two = (case(scene, ranks=ranks) for ranks in (1, 2))
     for name in columns:
         np.testing.assert_allclose(two[name], one[name], rtol=1e-10)
+
+
+# ---------------------------------------------------------------- weak loads
+@pytest.mark.parametrize(("factor", "told"), [(1e-6, False), (1e-8, True), (0.0, False)])
+def test_loads_that_are_hardly_more_than_rounding_are_told(factor: float, told: bool, caplog: Any) -> None:
+    """Whose tensions count in part: the angle is another one than that of loads a hundred times as large."""
+    loads = {"pressure": 4.8 * factor, "elongation": 0.1 * factor}
+    scene = Scene(
+        geometry={"shape": "tube", "inner_radius": 1.0, "outer_radius": 3.0, "length": 2.0},
+        model={"kinematics": "radial"}, cells={"initial": "isotropic"}, remodeling={"law": "tensor"},
+        loads={name: {"value": value, "ramp": [[0, 0], [25, 1]]} for name, value in loads.items()},
+        time={"end": 50.0, "step": 2.5},
+    )  # fmt: skip
+    simulation = Simulation(scene, MPI.COMM_SELF)
+    with caplog.at_level(logging.WARNING):
+        rows = [step.row for step in simulation.steps()]
+    simulation.close()
+    if factor:
+        assert (abs(rows[-1]["fibre_angle_inner"] - 23.03) > 1.0) == told
+    assert ["the loads are weak" in record.getMessage() for record in caplog.records] == [True] * told
