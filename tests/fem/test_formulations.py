@@ -316,10 +316,11 @@ def test_linear_tetrahedra_in_a_stiff_bulk_are_told(caplog: Any) -> None:
 
 def test_what_auto_takes() -> None:
     """What a scene needs decides; the choice is that of the scene as run."""
+    linear = {"mesh.element": "tetrahedron", "mesh.degree": 1}
     for values, taken in (
         ({}, SELECTIVE), ({"material.lame_lambda": 27.293}, "displacement"), ({"mesh.degree": 1}, SELECTIVE),
         ({"remodeling.coupling": "implicit"}, "displacement"), ({"natural.opening_angle": 60.0}, "displacement"),
-        ({"mesh.element": "tetrahedron", "mesh.degree": 1}, "displacement"), ({"mesh.element": "tetrahedron"}, SELECTIVE),
+        (linear, "displacement"), ({"mesh.element": "tetrahedron"}, SELECTIVE),
     ):  # fmt: skip
         scene = remodeling_tube(1e3, **values, **{"time.end": 40.0})
         assert scene.mesh.formulation == "auto" and scene.formulation == taken, values
