@@ -17,7 +17,7 @@ from remodel_fenicsx.model.drivers import DRIVERS
 from remodel_fenicsx.model.energy import MATRICES, neo_hookean
 from remodel_fenicsx.scene import preset_scene
 from remodel_fenicsx.settings import Cells, Material
-from remodel_fenicsx.watch.locking import WARNED_SHARE, LockingWarning
+from remodel_fenicsx.watch.locking import WARNED_SHARE, LockingWarning, PressureNoise
 from tests import parts
 from tests.conftest import Case, slowly
 from tests.locking_bodies import EXACT_TUBE, bar_scene, membrane_scene, registered, thick_tube
@@ -304,6 +304,18 @@ def test_pressure_that_is_noise_is_told(ratio: float, degree: int, told: bool, c
         record.getMessage() for record in caplog.records if "pressure inside elements is noise" in record.getMessage()
     ]
     assert len(said) == told and all("mesh.formulation = 'selective-integration'" in line for line in said)
+
+
+def test_a_slope_of_the_pressure_is_no_noise() -> None:
+    """Quadratic elements follow it: what turns is a third of what would if their mean alone were right."""
+    scene = remodeling_tube(20.0, **{"mesh.formulation": "displacement"})
+    with simulated(scene) as (simulation, _):
+        watcher = PressureNoise(simulation.stepper)
+        noise, quadrature = watcher.degrees(), watcher.quadrature
+        with pytest.MonkeyPatch.context() as patch:
+            beyond = quadrature.beyond
+            patch.setattr(quadrature, "beyond", lambda degree, values: beyond(0, values))
+            assert noise < 0.4 * watcher.degrees()
 
 
 def test_linear_tetrahedra_in_a_stiff_bulk_are_told(caplog: Any) -> None:
