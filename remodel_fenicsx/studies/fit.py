@@ -213,7 +213,7 @@ class Problem:
     def _evaluated(self, x: Array, derivatives: bool) -> Evaluation:
         scales, parts, slopes_ = self.scales_of(x), [], []
         models: list[Modelled] | None = None
-        with suppress(StepFailure):
+        with suppress(StepFailure, SceneError):  # numbers that do not go together have no equilibrium either
             models = self.models(x, derivatives)
         for number, table in enumerate(self.tables):
             for name, sd in table.sd.items():
@@ -234,17 +234,14 @@ class Problem:
 
     def jacobian(self, logarithms: Array, central: bool = False) -> Array:
         """Derivatives, (residuals, unknowns): of the model where it has them, else by differences of runs."""
-        present, found = self.at(logarithms)
-        found = found.copy()
-        for k, change in enumerate(LOGARITHM_CHANGE * np.eye(len(logarithms))):
-            if self.exact[k]:
-                continue
-            if central:
-                ahead, behind = (self.at(logarithms + way, False).residuals for way in (change, -change))
-                found[:, k] = (ahead - behind) / (2 * LOGARITHM_CHANGE)
-            else:
-                ahead = self.at(logarithms + 0.1 * change, False).residuals
-                found[:, k] = (ahead - present) / (0.1 * LOGARITHM_CHANGE)
+        found, step = self.at(logarithms).jacobian.copy(), LOGARITHM_CHANGE * (1.0 if central else 0.1)
+        ends = [np.log([getattr(unknown, end) for unknown in self.unknowns]) for end in ("lower", "upper")]
+        for k in np.flatnonzero(~self.exact):
+            ahead, behind = (np.clip(logarithms + way * np.eye(len(logarithms))[k], *ends) for way in (step, -step))
+            if not central:
+                behind, ahead = (logarithms, ahead) if ahead[k] > logarithms[k] else (behind, logarithms)
+            off = self.at(ahead, False).residuals - self.at(behind, False).residuals
+            found[:, k] = off / (ahead[k] - behind[k])
         return found
 
     def check_tells_apart(self, jacobian: Array) -> None:

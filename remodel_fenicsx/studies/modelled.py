@@ -297,7 +297,7 @@ class RowChanges(Watcher):
         with state.tentative():
             state.unknown.x.array[:] += way * coupling.unknowns[k]  # type: ignore[attr-defined]
             state.cells.dimension_values[:] += way * coupling.dimensions[k]  # type: ignore[attr-defined]
-            state.loading.set({name: value + way * loads[name][k] for name, value in step.loads.items()})
+            state.loading.set({**step.loads, **{name: step.loads[name] + way * by[k] for name, by in loads.items()}})
             before = {name: float(getattr(tissue, name).value) for name in self.directions.tissue}
             for name, value in before.items():
                 getattr(tissue, name).value = value + way * self.directions.tissue[name][k]

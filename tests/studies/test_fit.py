@@ -333,7 +333,8 @@ MODULI = ("lame_lambda", "lame_mu", "chain_density")
         ("virgin.csv", "none.csv", "measured 1.file = 'none.csv': "),
         ("virgin.csv", "bad.csv", "measured 1.file = 'bad.csv': row 2, outer_radius: 'nan' is no number"),
         ("virgin.csv", "short.csv", "measured 1.file = 'short.csv': row 1 has 1 numbers, not 2"),
-        ("virgin.csv", "other.csv", "'diameter' is no load of the scene and no column; allowed are "),
+        ("virgin.csv", "other.csv", "the column 'diameter' is not known; allowed are "),
+        ("virgin.csv", "twice.csv", "measured 1.file = 'twice.csv': the column outer_radius is there twice"),
         ("sd = { outer_radius = 0.01 }", "sd = {}", "measured 1.sd: has no outer_radius"),
         ("sd = { outer_radius = 0.01 }", "sd = { outer_radius = -1 }", "measured 1.sd.outer_radius = -1: must be a "),
         ("sd = { outer_radius = 0.01 }", "sd = { radius = 1.0 }", "measured 1.sd.radius: the file has no such column"),
@@ -349,6 +350,7 @@ def test_bad_data_is_one_line(folder: Path, old: str, new: str, said: str, capsy
     """Exit code 2, before any solve, and nothing is written."""
     (folder / "bad.csv").write_text("pressure,outer_radius\n1,1.3\n2,nan\n")
     (folder / "short.csv").write_text("pressure,outer_radius\n1\n")
+    (folder / "twice.csv").write_text("pressure,outer_radius,Outer_Radius\n1,1.3,1.4\n")
     (folder / "other.csv").write_text("pressure,diameter\n1,1.3\n2,1.4\n")
     assert old in DATA
     (folder / "data.toml").write_text(DATA.replace(old, new, 1))
@@ -380,6 +382,96 @@ def test_the_page_leads_from_a_curve_to_numbers(tmp_path: Path, monkeypatch: pyt
         for name, number in (("value", value), ("profile_lower", low), ("profile_upper", high)):
             assert float(found[name]) == pytest.approx(float(number), rel=1e-2), key
     assert len(table) == 3 and Path("vessel/history.csv").exists()
+
+
+CURVE = """force,mean_stretch
+100,1.13
+120,1.16
+230,1.18
+400,1.19
+900,1.198
+1900,1.206
+3400,1.216
+4200,1.223
+"""
+
+
+def stretched(network: dict[str, float]) -> Scene:
+    """A strip of tissue whose chains lie along a force."""
+    return Scene(
+        name="strip",
+        geometry={"shape": "cube"},
+        model={"kinematics": "point"},
+        material={"stress_unit": "Pa", "lame_lambda": 2e4, "lame_mu": 200.0, "initial_stiffness": 200.0, **network},
+        cells={"initial": "aligned"},
+        loads={"force": {"value": 4184.0, "ramp": [[0.0, 0.0], [10.0, 1.0]]}},
+        remodeling={"law": "none"},
+        time={"end": 10.0},
+    )
+
+
+@pytest.mark.parametrize(("key", "start"), [("locking_stretch", 1.4), ("contour_length", 1.4)])
+def test_a_fit_stays_in_the_range_of_a_key(key: str, start: float, tmp_path: Path) -> None:
+    """From some starts a trial has chains that are shorter than their ends are apart; the end is not at an edge."""
+    (tmp_path / "curve.csv").write_text(CURVE)
+    (tmp_path / "curve.toml").write_text(
+        f"""
+[unknowns]
+"material.lame_mu" = {{ start = 200.0 }}
+"material.initial_stiffness" = {{ start = 200.0 }}
+"material.{key}" = {{ start = {start} }}
+
+[[measured]]
+file = "curve.csv"
+sd = {{ mean_stretch = 0.005 }}
+"""
+    )
+    found = fit(stretched({key: start}), tmp_path / "curve.toml", tmp_path / "out", profiles=False)[1]
+    assert found.misfit < 1.3 and found.values[2] == pytest.approx(1.224, rel=2e-3)
+
+
+def test_bounds_are_those_of_the_key(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A step before an open end; radii that are fitted together may pass each other's start; what is typed is refused.
+
+    At a bound the difference of two runs is taken on its inner side.
+    """
+    scene, path = read_scene(folder / "scene.toml"), folder / "data.toml"
+    inner, outer = '"geometry.inner_radius" = { start = 1.0 }', '"geometry.outer_radius" = { start = 1.3 }'
+    path.write_text(DATA.replace('"remodeling.kappa" = { start = 0.035 }', inner))
+    problem = Problem(scene, *read_measurements(path, scene))
+    one = problem.unknowns[-1]
+    assert one.lower == 1e-3 and 1.298 < one.upper < 1.3
+    x = np.log([unknown.start for unknown in problem.unknowns])
+    x[-1] = np.log(one.upper)
+    assert np.abs(problem.jacobian(x, central=True)[:, -1]).max() < 1e5, "no row is that of a state without equilibrium"
+    path.write_text(DATA.replace('"remodeling.kappa" = { start = 0.035 }', f"{inner}\n{outer}"))
+    both = read_measurements(path, scene)[0][-2:]
+    assert both[0].upper > 1.3 and both[1].lower < 1.0
+    path.write_text(DATA.replace("start = 0.035", "start = 0.035, lower = 0.01, upper = 0.04"))
+    assert read_measurements(path, scene)[0][-1].upper == 0.04
+    path.write_text(DATA.replace('"remodeling.kappa" = { start = 0.035', '"material.locking_stretch" = { start = 2.0'))
+    assert 1.0 < read_measurements(path, scene)[0][-1].lower < 1.001
+    path.write_text(path.read_text().replace("start = 2.0 }", "start = 2.0, lower = 0.9 }"))
+    assert cli.main(["fit", str(folder / "scene.toml"), str(path), "-o", str(folder / "out"), "-q"]) == 2
+    errors = capsys.readouterr().err
+    assert "material.locking_stretch = 0.9: " in errors and errors.count("\n") == 1
+    assert not (folder / "out").exists()
+
+
+def test_loads_that_a_scene_has_not_are_zero(tmp_path: Path) -> None:
+    """Without [loads.elongation] the state still has one; derivatives are those of differences."""
+    demo = ROOT / "demos" / "fit"
+    text = (demo / "scene.toml").read_text()
+    (tmp_path / "scene.toml").write_text(text[: text.index("[loads.elong")] + text[text.index("[remodeling]") :])
+    scene = read_scene(tmp_path / "scene.toml")
+    assert list(scene.loads) == ["pressure"]
+    problem = Problem(scene, *read_measurements(demo / "inflation.toml", scene))
+    assert problem.exact.all()
+    x = np.log([unknown.start for unknown in problem.unknowns])
+    found = problem.jacobian(x)
+    for k, step in enumerate(1e-4 * np.eye(len(x))):
+        ends = [problem.at(x + side * step, False).residuals for side in (1, -1)]
+        np.testing.assert_allclose(found[:, k], (ends[0] - ends[1]) / 2e-4, atol=2e-6 * np.abs(found[:, k]).max())
 
 
 def test_derivatives_of_one_point_are_exact(tmp_path: Path) -> None:

@@ -66,6 +66,23 @@ def test_a_run_that_fails_is_nan_and_named(cube: Path, tmp_path: Path, capsys: p
     assert [key for key, angle in angles.items() if not np.isfinite(float(angle or "nan"))] == [("0.1", "4")]
 
 
+def test_drawn_numbers_outside_of_a_range_are_failed_points(
+    cube: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The ends that are typed are allowed together; of the points some are no scenes, and the others are run."""
+    out = tmp_path / "out"
+    with forked_children():
+        words = ["cells.end_to_end_length=1.5:2.5", "material.contour_length=1.6:2.6", "--latin", "6", "-o", str(out)]
+        assert cli.main(["sweep", str(cube), *words, "-q"]) == 3
+    table, errors = rows(out), capsys.readouterr().err
+    beyond = [float(r["cells.end_to_end_length"]) >= float(r["material.contour_length"]) for r in table]
+    assert len(table) == 6 and 0 < sum(beyond) < 5
+    assert [not np.isfinite(float(row["mean_fibre_angle"] or "nan")) for row in table] == beyond
+    assert errors.count("has failed: ") == sum(beyond) and "Traceback" not in errors
+    assert cli.main(["sweep", str(cube), "remodeling.kappa=-3:-2", "--latin", "5", "-o", str(tmp_path / "no")]) == 2
+    assert "remodeling.kappa = -" in capsys.readouterr().err and not (tmp_path / "no").exists()
+
+
 def test_each_part_of_each_range_has_one_point() -> None:
     """And another seed has others."""
     ranges = {"a.b": (2.0, 6.0), "a.c": (-1.0, 1.0)}
