@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,11 +17,14 @@ from remodel_fenicsx.system.regular_files import read_regular
 
 Array = NDArray[np.float64]
 
+log = logging.getLogger(__name__)
+
 LARGEST_FIBRES = 2 * 10**9  # bytes; a structure tensor and a mesh of ten million hexahedra as VTU
 FIBRE_ENDINGS = (".vtu", ".xdmf", ".csv")
 SAME_PLACE = 1e-4  # of an element: files may have 7 digits; a neighbour is a whole one away
 SYMMETRIC_COMPONENTS = ("xx", "yy", "zz", "xy", "yz", "xz")
 ALL_COMPONENTS = tuple(f"{i}{j}" for i in "xyz" for j in "xyz")
+SMALL = 0.1  # degrees: fibres that all lie along circles
 GROUPS = {"structure_tensor": ALL_COMPONENTS, "fibre": tuple("xyz"), "fibre_2": tuple("xyz")}  # columns of a table
 COLUMNS = (*"xyz", "element", "angle", "weight", *(f"{name}_{c}" for name, parts in GROUPS.items() for c in parts))
 # ParaView writes the number of a component, and Points for places
@@ -115,6 +119,8 @@ def read_fibre_file(path: Path) -> FibreFile:
         raise FibreFileError(found)
     if places is not None and not np.isfinite(places).all():
         raise FibreFileError("has places that are not finite")
+    if "angle" in measured and SMALL < np.abs(measured["angle"]).max() <= np.pi:
+        log.warning("%s: all angles lie within 3.14, as in radians; degrees are asked", path.name)
     return FibreFile(measured, places, hashlib.sha256(data).hexdigest())
 
 

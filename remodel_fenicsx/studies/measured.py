@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -28,6 +28,8 @@ KEYS_OF_UNKNOWNS = ("start", "lower", "upper", "prior", "prior_sd")
 KEYS_OF_TABLES = ("file", "state", "time", "sd", "scale", "units")
 SCALE_BOUNDS = (1e-3, 1e3)  # bounds of a scale
 WIDE = 1e3  # a bound that nobody gives over the start
+TWICE = (1.7, 2.4)  # diameters over radii of the model at the start, whose tissue is a guess
+ANOTHER_UNIT = 5.0  # lengths over those of the model, or less than its inverse: units differ by ten and more
 FROM_EDGE = 5e-4  # of a logarithm, from the end of a key's range: derivatives look 2e-4 to both sides
 
 
@@ -116,6 +118,23 @@ def read_measurements(path: Path, scene: Scene) -> tuple[list[Unknown], list[Mea
     if len(unknowns) > sum(table.rows * len(table.sd) for table in measured):
         raise SceneError(f"unknowns: {len(unknowns)} unknowns need as many measurements at least")
     return unknowns, measured
+
+
+def doubts(tables: Sequence[Measured], modelled: Sequence[Mapping[str, Array]], scene: Scene) -> Iterator[str]:
+    """What measured numbers look like beside those of the model at the start: diameters, another unit; a line each."""
+    units = {column.name: column.unit for column in _all_columns(scene)}
+    for table, model in zip(tables, modelled, strict=True):
+        for name in table.sd.keys() - set(table.scaled):
+            found, known, place = np.abs(table.columns[name]), np.abs(model[name]), f"{table.name}, {name}"
+            if units[name] == "degrees" and found.max() <= np.pi < known.max():
+                yield f"{place}: all lie within 3.14, those of the scene reach {known.max():.3g}; degrees are asked"
+            if units[name] != "length":
+                continue
+            ratio, one = float(np.median(found / known)), f"geometry.length_unit = {scene.geometry.length_unit!r}"
+            if name.endswith("radius") and TWICE[0] < (found / known).min() <= ratio < TWICE[1]:
+                yield f"{place}: {ratio:.3g} times those of the scene at the start; are they diameters?"
+            elif not 1 / ANOTHER_UNIT < ratio < ANOTHER_UNIT:
+                yield f"{place}: {ratio:.3g} times those of the scene at the start; {one}, see units"
 
 
 def _only(table: Mapping[str, Any], keys: Iterable[str], place: str) -> None:

@@ -105,7 +105,7 @@ class Page:
             self._write(f"{self.name}.{ending}", as_file(figure, ending, about, self.colours))
 
     def save_table(self, columns: Mapping[str, ArrayLike], notes: Sequence[str], part: str = "") -> None:
-        """Write NAME.csv or NAME-PART.csv: the columns, all of one length, under their names; the notes to NAME.json."""
+        """Write NAME.csv or NAME-PART.csv, columns of one length under their names; the notes go into NAME.json."""
         names, values = list(columns), [np.asarray(column) for column in columns.values()]
         text, file = io.StringIO(), f"{self.name}-{part}.csv" if part else f"{self.name}.csv"
         writer = csv.writer(text, lineterminator="\n")

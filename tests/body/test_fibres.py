@@ -148,6 +148,15 @@ def test_tables_are_read_however_they_are_written(
     assert np.ptp(wanted[:, 0, 0, 0]) > 0.1 and "found.csv: 32 rows of x, y, z, angle; " in caplog.text
 
 
+@pytest.mark.parametrize(("angle", "doubted"), [("1.2", True), ("0", False), ("40", False)])
+def test_angles_that_look_like_radians_are_doubted(
+    angle: str, doubted: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "a.csv").write_text("angle\n" + "-0.5\n" * 31 * doubted + "0\n" * 31 * (not doubted) + f"{angle}\n")
+    tensors_of(scene(tmp_path / "a.csv"))
+    assert [record.levelname for record in caplog.records if "radians" in record.message] == ["WARNING"] * doubted
+
+
 def test_values_of_points_go_to_the_nearest_elements(exported: Callable[[str], Path], tmp_path: Path) -> None:
     mesh = meshio.read(exported("vtu"))
     direction = mesh.points * [0.0, 0.0, 1.0] + [1.0, 0.0, 0.0]

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import base64
 import csv
 import re
 import shlex
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from mpi4py import MPI
+from PIL import Image
 
 from benchmarks.recovery import MOST, fitted, noisy, tables
 from benchmarks.recovery import TRUTH as RECOVERED
@@ -114,7 +117,11 @@ def test_the_numbers_that_made_the_data_are_found(folder: Path, capsys: pytest.C
     assert fitted.material.lame_mu == pytest.approx(3.0, rel=1e-3) and fitted.time.end == 40.0
     assert (out / "fit.png").stat().st_size > 10_000
     page = (out / "fit.html").read_text()
-    assert "material.lame_mu" in page and "data:image/png" in page and "<script" in page
+    assert "material.lame_mu" in page and "<script" in page and '<p class="note">The model is off by' in page
+    assert page.count("The model is off by") == 1 and page.count("measured and fitted</h1>") == 1
+    with Image.open(BytesIO(base64.b64decode(page.split("data:image/png;base64,")[1].split('"')[0]))) as picture:
+        with Image.open(out / "fit.png") as whole:  # which has title and verdict above
+            assert picture.width == whole.width and picture.height < whole.height
     (folder / "data.toml").write_text(DATA.replace("outer_radius = 0.01", "outer_radius = 0.02"))
     assert cli.main(words) == 2 and "holds a fit of another scene, data or version" in capsys.readouterr().err
     (folder / "own").mkdir()
@@ -456,6 +463,38 @@ def test_bounds_are_those_of_the_key(folder: Path, capsys: pytest.CaptureFixture
     errors = capsys.readouterr().err
     assert "material.locking_stretch = 0.9: " in errors and errors.count("\n") == 1
     assert not (folder / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "factor", "said"),
+    [
+        ("outer_radius", 2.0, "are they diameters?"),
+        ("outer_radius", 1e-3, "geometry.length_unit = 'mm'"),
+        ("inner_radius", 10.0, "geometry.length_unit = 'mm'"),
+        ("fibre_angle_outer", np.pi / 180, "degrees are asked"),
+        ("outer_radius", 1.1, ""),
+    ],
+)
+def test_numbers_of_another_kind_are_doubted(
+    name: str, factor: float, said: str, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Judged against the model at the start: a line, which the log of the fit has too."""
+    path = folder / ("virgin.csv" if name == "outer_radius" else "history.csv")
+    table = list(csv.reader(path.read_text().splitlines()))
+    column = table[0].index(name)
+    for row in table[1:]:
+        row[column] = str(factor * float(row[column]))
+    path.write_text("\n".join(map(",".join, table)))
+    unknown, *tables = DATA.split("[[measured]]")
+    one = next(table for table in tables if path.name in table)
+    (folder / "data.toml").write_text(f"{unknown.splitlines()[1]}\n{unknown.splitlines()[2]}\n[[measured]]{one}")
+    words = ["--starts", "1", "-q", "--no-likelihood-profiles"]
+    cli.main(["fit", str(folder / "scene.toml"), str(folder / "data.toml"), "-o", str(folder / "o"), *words])
+    warned = [line for line in capsys.readouterr().err.splitlines() if ".csv, " in line]
+    assert len(warned) == bool(said) and all(f"{path.name}, {name}: " in line and said in line for line in warned)
+    log = (folder / "o" / "fit.log").read_text()
+    assert all(line.removeprefix("WARNING: ") in log for line in warned)
+    assert "derivatives: exact by material.lame_mu" in log and f"{path.name}: {len(table) - 1} rows of " in log
 
 
 def test_loads_that_a_scene_has_not_are_zero(tmp_path: Path) -> None:
