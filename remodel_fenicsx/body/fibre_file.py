@@ -26,7 +26,7 @@ SYMMETRIC_COMPONENTS = ("xx", "yy", "zz", "xy", "yz", "xz")
 ALL_COMPONENTS = tuple(f"{i}{j}" for i in "xyz" for j in "xyz")
 SMALL = 0.1  # degrees: fibres that all lie along circles
 GROUPS = {"structure_tensor": ALL_COMPONENTS, "fibre": tuple("xyz"), "fibre_2": tuple("xyz")}  # columns of a table
-COLUMNS = (*"xyz", "element", "angle", "weight", *(f"{name}_{c}" for name, parts in GROUPS.items() for c in parts))
+OF_TABLES = (*"xyz", "element", "angle", "weight", *(f"{name}_{c}" for name, parts in GROUPS.items() for c in parts))
 # ParaView writes the number of a component, and Points for places
 SPELLINGS = {f"{name}:{n}": f"{name}_{c}" for name, parts in GROUPS.items() for n, c in enumerate(parts)}
 SPELLINGS |= {f"points:{n}": c for n, c in enumerate("xyz")}
@@ -127,7 +127,7 @@ def read_fibre_file(path: Path) -> FibreFile:
 def _of_csv(data: bytes, file: str) -> tuple[dict[str, Array], Array | None]:
     """Columns by name: structure_tensor_xx ..., fibre_x ..., fibre_2_x ..., weight, angle; element, or x, y, z."""
     try:
-        columns = read_columns(data, file, COLUMNS, SPELLINGS, EXPORTED)
+        columns = read_columns(data, file, OF_TABLES, SPELLINGS, EXPORTED)
     except TableFileError as error:
         raise FibreFileError(str(error)) from error
     left = dict.fromkeys(columns)
