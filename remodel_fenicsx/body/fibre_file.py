@@ -29,7 +29,7 @@ GROUPS = {"structure_tensor": ALL_COMPONENTS, "fibre": tuple("xyz"), "fibre_2": 
 OF_TABLES = (*"xyz", "element", "angle", "weight", *(f"{name}_{c}" for name, parts in GROUPS.items() for c in parts))
 # ParaView writes the number of a component, and Points for places
 SPELLINGS = {f"{name}:{n}": f"{name}_{c}" for name, parts in GROUPS.items() for n, c in enumerate(parts)}
-SPELLINGS |= {f"points:{n}": c for n, c in enumerate("xyz")}
+SPELLINGS |= {f"points{mark}{n}": c for n, c in enumerate("xyz") for mark in ":_"}
 EXPORTED = [f"cell_dimension_{i}" for i in (1, 2, 3)] + [f"axis_{i}_{c}" for i in (1, 2, 3) for c in "xyz"]
 
 

@@ -104,7 +104,7 @@ def _cells(data: bytes) -> tuple[list[str], list[list[str]], str]:
 
 def _number(cell: str, mark: str) -> float | None:
     """A finite number with this decimal mark; None of what is none."""
-    if mark == "," and "." in cell:
+    if "_" in cell or (mark == "," and "." in cell):  # Python would take 1_0 for 10
         return None
     try:
         value = float(cell.replace(",", "."))

@@ -113,6 +113,9 @@ def read_measurements(path: Path, scene: Scene) -> tuple[list[Unknown], list[Mea
     scene.with_values(starts)  # what does not go together is refused
     ends = [[_end(unknown, end, scene, starts) for end in ("lower", "upper")] for unknown in unknowns]
     unknowns = [replace(one, lower=lower, upper=upper) for one, (lower, upper) in zip(unknowns, ends, strict=True)]
+    for one in unknowns:
+        if not one.lower < one.upper:
+            raise SceneError(f"unknowns.{one.key}: the scene takes no number beside {one.start:g}, so it is not fitted")
     scales = dict.fromkeys(name for table in measured for name in table.scaled)
     unknowns += [Unknown(f"scale.{name}", 1.0, *SCALE_BOUNDS) for name in scales]
     if len(unknowns) > sum(table.rows * len(table.sd) for table in measured):

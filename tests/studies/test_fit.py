@@ -347,6 +347,11 @@ MODULI = ("lame_lambda", "lame_mu", "chain_density")
         ("sd = { outer_radius = 0.01 }", "sd = { radius = 1.0 }", "measured 1.sd.radius: the file has no such column"),
         ("lower = 1e20", "lower = 2e21", "must lie between lower 2e+21 and upper 1e+23"),
         ("material.lame_mu", "material.lame", "material.lame"),
+        (
+            '"material.lame_mu" = { start = 4.0',
+            '"time.end" = { start = 40.0',
+            "unknowns.time.end: the scene takes no number",
+        ),
         ('state = "history"', 'state = "past"', "measured 2.state = 'past': must be one of 'virgin'"),
         ('state = "history"', 'state = "after"', "measured 2.time: allowed only with state = 'after'"),
         ("start = 4.0", "start = 4.0, prior = 3.0", "prior and prior_sd (of the logarithm) go together"),
