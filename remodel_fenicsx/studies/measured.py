@@ -127,8 +127,9 @@ def doubts(tables: Sequence[Measured], modelled: Sequence[Mapping[str, Array]], 
     """What measured numbers look like beside those of the model at the start: diameters, another unit; a line each."""
     units = {column.name: column.unit for column in _all_columns(scene)}
     for table, model in zip(tables, modelled, strict=True):
-        for name in table.sd.keys() - set(table.scaled):
-            found, known, place = np.abs(table.columns[name]), np.abs(model[name]), f"{table.name}, {name}"
+        for name in (one for one in table.sd if one not in table.scaled):
+            found, place = np.abs(table.columns[name]), f"{table.name}, {name}"
+            known = np.maximum(np.abs(model[name]), 1e-300)
             if units[name] == "degrees" and found.max() <= np.pi < known.max():
                 yield f"{place}: all lie within 3.14, those of the scene reach {known.max():.3g}; degrees are asked"
             if units[name] != "length":
@@ -136,7 +137,7 @@ def doubts(tables: Sequence[Measured], modelled: Sequence[Mapping[str, Array]], 
             ratio, one = float(np.median(found / known)), f"geometry.length_unit = {scene.geometry.length_unit!r}"
             if name.endswith("radius") and TWICE[0] < (found / known).min() <= ratio < TWICE[1]:
                 yield f"{place}: {ratio:.3g} times those of the scene at the start; are they diameters?"
-            elif not 1 / ANOTHER_UNIT < ratio < ANOTHER_UNIT:
+            elif ratio > ANOTHER_UNIT or ratio < 1 / ANOTHER_UNIT:
                 yield f"{place}: {ratio:.3g} times those of the scene at the start; {one}, see units"
 
 
