@@ -64,7 +64,6 @@ def without_derivatives(scene: Scene, table: Measured) -> str | None:
         ("natural.opening_angle", bool(scene.natural.opening_angle)),
         ("time.tolerance", scene.time.tolerance is not None or scene.time.is_equilibrium),
         ("cells.fibres", bool(scene.measured_cells)),
-        (f"mesh.formulation = {scene.mesh.formulation!r}", scene.mesh.formulation != "displacement"),
     ):
         if there:
             return key

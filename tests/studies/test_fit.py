@@ -234,10 +234,11 @@ MODELS = (
     {},
     {"remodeling.law": "explicit"},
     {"remodeling.coupling": "extrapolated", "material.repulsion": "log"},
+    {"mesh.formulation": "selective-integration"},
 )
 
 
-@pytest.mark.parametrize("changes", MODELS, ids=["tensor", "explicit", "extrapolated"])
+@pytest.mark.parametrize("changes", MODELS, ids=["tensor", "explicit", "extrapolated", "selective-integration"])
 def test_derivatives_are_exact(folder: Path, changes: dict[str, Any]) -> None:
     """Taylor remainders fall by four where the step is halved; central differences of runs are the same numbers."""
     (folder / "after.csv").write_text("pressure,inner_radius,reduced_axial_force\n0.6,1.2,0.5\n1.2,1.3,0.1\n")
