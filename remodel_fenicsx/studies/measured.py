@@ -200,6 +200,8 @@ def _table(table: Any, place: str, folder: Path, scene: Scene) -> Measured:
     state = table.get("state", "virgin")
     if state not in STATES:
         raise SceneError(f"{place}.state = {shown(state)}: must be one of {', '.join(map(repr, STATES))}")
+    if state == "after" and scene.remodeling.turnover.is_on:
+        raise SceneError(f"{place}.state = 'after': takes cells alone, not what remodeling.turnover has changed")
     if ("time" in table) != (state == "after"):
         raise SceneError(f"{place}.time: allowed only with state = 'after': the time until which the tissue remodels")
     time = _positive(table["time"], f"{place}.time") if state == "after" else 0.0

@@ -174,7 +174,8 @@ def _with_columns(scene: Scene, table: Measured) -> Scene:
 
 def _passive(scene: Scene, table: Measured, scales: Mapping[str, float]) -> Scene:
     """Cells that stay, and a step for each row; loads that the table has not keep their last value."""
-    changes: dict[str, Any] = {"remodeling.law": "none", "remodeling.coupling": "staggered", "output.times": []}
+    changes: dict[str, Any] = {"remodeling.law": "none", "remodeling.coupling": "staggered", "remodeling.turnover": {}}
+    changes |= {"output.times": [], "output.fields": False, "output.columns": [*table.sd]}  # some need turnover
     changes |= {"time.step": 1.0, "time.end": float(table.rows), "time.tolerance": None}
     for name, load in scene.loads.items():
         values: Array = np.full(table.rows, load.value * load.factor(scene.last_time))

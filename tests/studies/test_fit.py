@@ -519,6 +519,35 @@ def test_loads_that_a_scene_has_not_are_zero(tmp_path: Path) -> None:
         np.testing.assert_allclose(found[:, k], (ends[0] - ends[1]) / 2e-4, atol=2e-6 * np.abs(found[:, k]).max())
 
 
+def test_virgin_tissue_whose_collagen_will_be_turned_over(tmp_path: Path) -> None:
+    """It is as without turnover; what a scene records beside does not matter. A test after turnover is refused."""
+    scene = read_scene(ROOT / "demos" / "turnover.toml").with_values({"output.fields": ["content", "fibre_angle"]})
+    (tmp_path / "d.csv").write_text("pressure,outer_radius\n0.6,1.35\n1.2,1.5\n")
+    one = """[unknowns]
+"material.lame_mu" = { start = 3.0 }
+[[measured]]
+file = "d.csv"
+sd = { outer_radius = 0.1 }
+"""
+    (tmp_path / "d.toml").write_text(one)
+    found, other = (
+        Problem(each, *read_measurements(tmp_path / "d.toml", each)).residuals(np.log([3.0]))
+        for each in (scene, tube_without_turnover(scene))
+    )
+    np.testing.assert_allclose(found, other, rtol=1e-9)
+    assert np.abs(found).max() < 100, "it has an equilibrium"
+    (tmp_path / "d.toml").write_text(one + 'state = "after"\ntime = 4.0\n')
+    with pytest.raises(SceneError, match="measured 1.state = 'after': takes cells alone, not what remodeling.turnover"):
+        read_measurements(tmp_path / "d.toml", scene)
+
+
+def tube_without_turnover(scene: Scene) -> Scene:
+    """The same tissue, whose collagen stays."""
+    return scene.with_values(
+        {"remodeling.turnover": {}, "output.columns": [], "output.fields": True, "time.end": 40.0, "time.step": 4.0}
+    )
+
+
 def test_derivatives_of_one_point_are_exact(tmp_path: Path) -> None:
     """A tendon as three numbers, pulled by a force: as central differences of runs."""
     scene = preset_scene("consistent", "tendon").with_values(
