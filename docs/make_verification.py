@@ -31,7 +31,7 @@ from verification_studies import study  # noqa: E402
 
 from remodel_fenicsx import paper as figures  # noqa: E402
 from remodel_fenicsx.paper.runs import LOAD_CASES  # noqa: E402
-from remodel_fenicsx.studies.page import COLOURS, STYLE, Page, read_table  # noqa: E402
+from remodel_fenicsx.studies.page import COLOURS, STYLE, Page, read_notes, read_table  # noqa: E402
 from tests.reference.radial import RadialHistory, solve_radial  # noqa: E402
 
 KEPT = DOCS / "figures"
@@ -386,7 +386,7 @@ RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 def made_with(folder: Path) -> str:
     """The line of Fig. 7 that says what it was made with."""
-    return (folder / "fig7.csv").read_text(encoding="utf-8").splitlines()[1].removeprefix("# ").split(";")[0]
+    return read_notes(folder, "fig7")["fig7.csv"][0].split(";")[0]
 
 
 def page(kept: Path = KEPT, template: str = "make_verification") -> str:

@@ -26,7 +26,7 @@ from remodel_fenicsx.model.spectral import positive_direction  # noqa: E402
 from remodel_fenicsx.paper.runs import library_versions, scenes  # noqa: E402
 from remodel_fenicsx.results.columns import Measurement  # noqa: E402
 from remodel_fenicsx.simulation import Simulation  # noqa: E402
-from remodel_fenicsx.studies.page import Page, read_table  # noqa: E402
+from remodel_fenicsx.studies.page import Page, read_notes, read_table  # noqa: E402
 from remodel_fenicsx.system.children import cores  # noqa: E402
 
 Row = dict[str, Any]
@@ -219,4 +219,4 @@ def _key() -> str:
 
 
 def _is_valid(path: Path, key: str) -> bool:
-    return path.is_file() and f"# {key}\n" in path.read_text(encoding="utf-8") and len(read_table(path)) > 0
+    return path.is_file() and key in read_notes(path.parent, path.stem).get(path.name, ()) and len(read_table(path)) > 0

@@ -481,7 +481,7 @@ def _sweep(options: argparse.Namespace) -> int:
             raise SceneError(f"sweep: {math.prod(map(len, axes.values()))} runs; allowed are at most {MOST_RUNS}")
         sampled = options.latin is not None
         points = study.latin_hypercube(axes, options.latin, options.seed) if sampled else study.grid(axes)
-        folder, found = study.sweep(scene, points, options.output, options.jobs, options.quiet)
+        folder, found = study.sweep(scene, points, options.output, options.jobs, options.quiet, sampled)
         return folder, study.in_words(found, scene), found.failed
 
     return _study(options, task)

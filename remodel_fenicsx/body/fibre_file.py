@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import csv
 import hashlib
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,15 +12,25 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.body.exchange_file import ExchangeFileError, read_exchange_file
 from remodel_fenicsx.model.fibres import MEASURED, SOURCES, fault_of_fibres
+from remodel_fenicsx.schema.csv_table import TableFileError, read_columns
 from remodel_fenicsx.system.regular_files import read_regular
 
 Array = NDArray[np.float64]
+
+log = logging.getLogger(__name__)
 
 LARGEST_FIBRES = 2 * 10**9  # bytes; a structure tensor and a mesh of ten million hexahedra as VTU
 FIBRE_ENDINGS = (".vtu", ".xdmf", ".csv")
 SAME_PLACE = 1e-4  # of an element: files may have 7 digits; a neighbour is a whole one away
 SYMMETRIC_COMPONENTS = ("xx", "yy", "zz", "xy", "yz", "xz")
 ALL_COMPONENTS = tuple(f"{i}{j}" for i in "xyz" for j in "xyz")
+SMALL = 0.1  # degrees: fibres that all lie along circles
+GROUPS = {"structure_tensor": ALL_COMPONENTS, "fibre": tuple("xyz"), "fibre_2": tuple("xyz")}  # columns of a table
+OF_TABLES = (*"xyz", "element", "angle", "weight", *(f"{name}_{c}" for name, parts in GROUPS.items() for c in parts))
+# ParaView writes the number of a component, and Points for places
+SPELLINGS = {f"{name}:{n}": f"{name}_{c}" for name, parts in GROUPS.items() for n, c in enumerate(parts)}
+SPELLINGS |= {f"points{mark}{n}": c for n, c in enumerate("xyz") for mark in ":_"}
+EXPORTED = [f"cell_dimension_{i}" for i in (1, 2, 3)] + [f"axis_{i}_{c}" for i in (1, 2, 3) for c in "xyz"]
 
 
 class FibreFileError(ValueError):
@@ -104,43 +114,48 @@ def read_fibre_file(path: Path) -> FibreFile:
         data = read_regular(path, LARGEST_FIBRES)
     except OSError as error:
         raise FibreFileError(f"cannot be read: {error.strerror or error}") from error
-    measured, places = _of_csv(data) if ending == ".csv" else _of_mesh(path, data)
+    measured, places = _of_csv(data, path.name) if ending == ".csv" else _of_mesh(path, data)
     if (found := fault_of_fibres(measured)) is not None:
         raise FibreFileError(found)
     if places is not None and not np.isfinite(places).all():
         raise FibreFileError("has places that are not finite")
+    if "angle" in measured and SMALL < np.abs(measured["angle"]).max() <= np.pi:
+        log.warning("%s: all angles lie within 3.14, as in radians; degrees are asked", path.name)
     return FibreFile(measured, places, hashlib.sha256(data).hexdigest())
 
 
-def _of_csv(data: bytes) -> tuple[dict[str, Array], Array | None]:
+def _of_csv(data: bytes, file: str) -> tuple[dict[str, Array], Array | None]:
     """Columns by name: structure_tensor_xx ..., fibre_x ..., fibre_2_x ..., weight, angle; element, or x, y, z."""
     try:
-        names, *rows = csv.reader(data.decode().splitlines())
-        table = np.array([[float(word) for word in row] for row in rows if row])
-    except (ValueError, csv.Error) as error:
-        raise FibreFileError(f"is no table of numbers with names of columns above: {error}") from error
-    if table.ndim != 2 or table.shape[1] != len(names):
-        raise FibreFileError("is no table: rows with as many numbers as names of columns, one row at least")
-    columns = dict(zip((name.strip() for name in names), table.T, strict=True))
+        columns = read_columns(data, file, OF_TABLES, SPELLINGS, EXPORTED)
+    except TableFileError as error:
+        raise FibreFileError(str(error)) from error
+    left = dict.fromkeys(columns)
 
     def together(name: str, *components: str) -> Array | None:
         keys = [f"{name}_{c}" if name else c for c in components]
-        return np.stack([columns[key] for key in keys], axis=1) if set(keys) <= set(columns) else None
+        if not set(keys) <= set(columns):
+            return None
+        for key in keys:
+            left.pop(key, None)
+        return np.stack([columns[key] for key in keys], axis=1)
 
     found = {"structure_tensor": together("structure_tensor", *ALL_COMPONENTS)}
     if found["structure_tensor"] is None:
         found["structure_tensor"] = together("structure_tensor", *SYMMETRIC_COMPONENTS)
     found |= {name: together(name, *"xyz") for name in ("fibre", "fibre_2")}
     found |= {name: together("", name) for name in ("angle", "weight")}
+    places, elements = together("", *"xyz"), together("", "element")
+    if left:
+        raise FibreFileError(f"has {', '.join(left)} without the other columns of x, y, z or of the tensor")
     measured = {name: values for name, values in found.items() if values is not None}
     if not set(measured) & set(SOURCES):
         raise FibreFileError(f"has columns {', '.join(columns)}; {_NEEDED} with _xx ... or _x, _y, _z")
-    if "element" not in columns:
-        return measured, together("", *"xyz")
-    order = np.argsort(columns["element"])
-    if not np.array_equal(columns["element"][order], np.arange(1, len(order) + 1)):
+    if elements is None:
+        return measured, places
+    order = np.argsort(elements[:, 0])
+    if not np.array_equal(elements[order, 0], np.arange(1, len(order) + 1)):
         raise FibreFileError(f"the column element must have the numbers 1 to {len(order)}, each once")
-    places = together("", *"xyz")
     return {name: values[order] for name, values in measured.items()}, None if places is None else places[order]
 
 

@@ -36,6 +36,7 @@ from remodel_fenicsx.state.state import State
 Array = NDArray[np.float64]
 
 _COMPLEX_STEP = 1e-30  # its square vanishes beside 1: the derivative is exact to rounding
+_JACOBIAN_STEP = 1e-5  # of a logarithm of an unknown: errors of 1e-10, from the cubic and from rounding
 
 
 class Directions(NamedTuple):
@@ -129,6 +130,7 @@ class LinearisedEquilibrium:
         self._change_of_unknown = dolfinx.fem.Function(u.function_space)
         self._change_of_dimensions = quadrature.function("change_of_dimensions", (3,))
         self._change_of_stress = quadrature.function("change_of_repulsion_stress", (3, 3))
+        self._change_of_jacobian = quadrature.function("change_of_jacobian", ())
         F, test = state.kinematics.elastic_gradient(u), ufl.TestFunction(u.function_space)
         residuals = [ufl.derivative(energy, u, test) for energy in equilibrium.energies]
         forms = [along_constants(residual, ways) for residual in residuals]
@@ -174,6 +176,8 @@ class LinearisedEquilibrium:
         terms = [ufl.derivative(tensor, u, way), along_constants(tensor, ways)]
         if tissue.chain is not None:
             terms.append(ufl.derivative(tensor, state.cells.dimensions, self._change_of_dimensions))
+        if (jacobian := state.dilatation.jacobian) is not None:
+            terms.append(ufl.derivative(tensor, jacobian, self._change_of_jacobian))
         if pointwise is not None and remodeling.driver.is_stress:  # linear in the stress
             change = self._whole_change_of_stress(F, _sum([ufl.derivative(F, u, way), along_constants(F, ways)]))
             nothing = ufl.zero(3, 3)
@@ -213,6 +217,7 @@ class LinearisedEquilibrium:
             for k, change in enumerate(unknowns):
                 self._set(directions, loads, k, dimensions, stresses)
                 self._change_of_unknown.x.array[:] = change
+                self._set_jacobian(change)
                 found[k] = quadrature.evaluate(self._driver, (3,))
         return found.reshape(len(dimensions), -1, 3)
 
@@ -227,6 +232,18 @@ class LinearisedEquilibrium:
         self._change_of_dimensions.x.array[:] = dimensions[k].reshape(-1)
         if stresses is not None:
             self._change_of_stress.x.array[:] = stresses[k].reshape(-1)
+
+    def _set_jacobian(self, change: Any) -> None:
+        """The change of a formulation's own J, by a central difference: it is a cubic of the unknowns at most."""
+        dilatation, values = self.state.dilatation, self.state.unknown.x.array
+        if dilatation.jacobian is None:
+            return
+        present, ends = values.copy(), []
+        for way in (_JACOBIAN_STEP, -_JACOBIAN_STEP, 0.0):
+            values[:] = present + way * change
+            dilatation.refresh()
+            ends.append(dilatation.jacobian.x.array.copy())
+        self._change_of_jacobian.x.array[:] = (ends[0] - ends[1]) / (2 * _JACOBIAN_STEP)
 
     def _changes_of_stress(self, directions: Directions, dimensions: Array) -> Array | None:
         """Of a repulsion that is linear in A, at frozen F: (k, n, 3, 3)."""

@@ -19,7 +19,15 @@ Array = NDArray[np.float64]
 
 
 class Dilatation:
-    """A formulation on a mesh: the energy's integral, and stresses and J to go with it; here J at all points."""
+    """A formulation on a mesh: the energy's integral, and stresses and J to go with it; here J at all points.
+
+    Attributes
+    ----------
+    jacobian
+        dolfinx function of the J that `stresses` takes in place of that of F; None where it takes none.
+    """
+
+    jacobian: Any = None
 
     def __init__(self, quadrature: Any):
         self.quadrature = quadrature
@@ -176,7 +184,7 @@ class _PartsApart(Dilatation):
         polynomials = basix.create_element(basix.ElementFamily.P, kind, degree // 2, discontinuous=True)
         there, here = (np.asarray(polynomials.tabulate(0, p))[0, :, :, 0] for p in (points, quadrature.points))
         self._interpolation = here @ np.linalg.pinv(there)  # exactly one and the same where the rule has one point
-        self._jacobian = quadrature.function("jacobian_of_the_formulation", ())
+        self.jacobian = quadrature.function("jacobian_of_the_formulation", ())
         self.refresh()
 
     def energies(self, tissue: Any, deformation_gradient: Any, cells: Any, weight: Any) -> list[Any]:
@@ -187,10 +195,10 @@ class _PartsApart(Dilatation):
         return [distortional * weight * self.quadrature.dx, volumetric * weight * self.dx]
 
     def stresses(self, tissue: Any, deformation_gradient: Any, cells: Any) -> Any:
-        return tissue.stresses_of_parts(deformation_gradient, cells, self._jacobian)
+        return tissue.stresses_of_parts(deformation_gradient, cells, self.jacobian)
 
     def refresh(self) -> None:
-        self.quadrature.values(self._jacobian, ())[:] = self.jacobians() @ self._interpolation.T
+        self.quadrature.values(self.jacobian, ())[:] = self.jacobians() @ self._interpolation.T
 
     def jacobians(self) -> Array:
         return self._expression.eval(self.quadrature.mesh, self.quadrature.elements)[..., 0]

@@ -137,7 +137,7 @@ def draw(
     names
         Keys of `FIGURES`; none: all.
     folder
-        For NAME.png (or .pdf, .svg) and NAME*.csv. Only files that this function wrote are ever overwritten.
+        For NAME.png (or .pdf, .svg), NAME*.csv and NAME.json. Only files that this function wrote are ever overwritten.
     runs
         Recorded runs.
     jobs

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import base64
+import io
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
 from html import escape
 from pathlib import Path
@@ -25,12 +26,12 @@ from remodel_fenicsx.results.words import unit_of, words
 from remodel_fenicsx.scene.scene import Scene, SceneError
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.studies.journal import Evaluation, Journal, Point, fingerprint, fingerprint_in
-from remodel_fenicsx.studies.measured import Measured, Unknown, read_measurements
+from remodel_fenicsx.studies.measured import Measured, Unknown, doubts, read_measurements
 from remodel_fenicsx.studies.modelled import Modelled, Slopes, model_of, rotated_cells, slopes, without_derivatives
-from remodel_fenicsx.studies.page import COLOURS, STYLE, Page, add_head
+from remodel_fenicsx.studies.page import COLOURS, DOTS_PER_INCH, STYLE, Page, add_head
 from remodel_fenicsx.system.environment import versions
 from remodel_fenicsx.system.regular_files import ForeignFileError, write_whole
-from remodel_fenicsx.system.terminal import Line, unsaid
+from remodel_fenicsx.system.terminal import Line, hold_log, open_log, unsaid
 
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
@@ -213,7 +214,7 @@ class Problem:
     def _evaluated(self, x: Array, derivatives: bool) -> Evaluation:
         scales, parts, slopes_ = self.scales_of(x), [], []
         models: list[Modelled] | None = None
-        with suppress(StepFailure):
+        with suppress(StepFailure, SceneError):  # numbers that do not go together have no equilibrium either
             models = self.models(x, derivatives)
         for number, table in enumerate(self.tables):
             for name, sd in table.sd.items():
@@ -234,17 +235,14 @@ class Problem:
 
     def jacobian(self, logarithms: Array, central: bool = False) -> Array:
         """Derivatives, (residuals, unknowns): of the model where it has them, else by differences of runs."""
-        present, found = self.at(logarithms)
-        found = found.copy()
-        for k, change in enumerate(LOGARITHM_CHANGE * np.eye(len(logarithms))):
-            if self.exact[k]:
-                continue
-            if central:
-                ahead, behind = (self.at(logarithms + way, False).residuals for way in (change, -change))
-                found[:, k] = (ahead - behind) / (2 * LOGARITHM_CHANGE)
-            else:
-                ahead = self.at(logarithms + 0.1 * change, False).residuals
-                found[:, k] = (ahead - present) / (0.1 * LOGARITHM_CHANGE)
+        found, step = self.at(logarithms).jacobian.copy(), LOGARITHM_CHANGE * (1.0 if central else 0.1)
+        ends = [np.log([getattr(unknown, end) for unknown in self.unknowns]) for end in ("lower", "upper")]
+        for k in np.flatnonzero(~self.exact):
+            ahead, behind = (np.clip(logarithms + way * np.eye(len(logarithms))[k], *ends) for way in (step, -step))
+            if not central:
+                behind, ahead = (logarithms, ahead) if ahead[k] > logarithms[k] else (behind, logarithms)
+            off = self.at(ahead, False).residuals - self.at(behind, False).residuals
+            found[:, k] = off / (ahead[k] - behind[k])
         return found
 
     def check_tells_apart(self, jacobian: Array) -> None:
@@ -301,7 +299,7 @@ def fit(
 
     Returns
     -------
-    The folder with fit.csv, correlations.csv, scene.toml, fit.png and fit.html; and what they hold.
+    The folder with fit.csv, correlations.csv, scene.toml, fit.png, fit.html and fit.log; and what they hold.
 
     Raises
     ------
@@ -316,15 +314,18 @@ def fit(
     """
     if scene.cases:
         raise SceneError("cases: a fit takes one load case; leave out [[cases]]")
-    unknowns, tables = read_measurements(Path(data), scene)
-    mark = fingerprint(scene, unknowns, tables)
-    place = _place(folder, f"{scene.name}-{FIT}", mark)
-    problem, line = Problem(scene, unknowns, tables), Line(f"{scene.name} {FIT}")
-    first = np.log([unknown.start for unknown in unknowns])
-    log.info("%s", problem.how())
-    problem.models(first)  # what has no equilibrium here says so
-    problem.check_tells_apart(problem.jacobian(first, central=True))
-    problem.keep(Journal(place, mark))
+    with hold_log(quiet=quiet) as held:
+        unknowns, tables = read_measurements(Path(data), scene)
+        mark = fingerprint(scene, unknowns, tables)
+        place = _place(folder, f"{scene.name}-{FIT}", mark)
+        problem, line = Problem(scene, unknowns, tables), Line(f"{scene.name} {FIT}")
+        first = np.log([unknown.start for unknown in unknowns])
+        log.info("%s", problem.how())
+        at_start = problem.models(first)  # what has no equilibrium here says so
+        for doubt in doubts(tables, [modelled.columns for modelled in at_start], scene):
+            log.warning("%s", doubt)
+        problem.check_tells_apart(problem.jacobian(first, central=True))
+        problem.keep(Journal(place, mark))
 
     def announced(key: str) -> None:
         if not quiet:
@@ -332,7 +333,9 @@ def fit(
 
     random = np.random.default_rng(1)
     found = []
-    try:
+    with ExitStack() as stack:
+        stack.enter_context(open_log(place / f"{FIT}.log", quiet=quiet, held=held))
+        stack.callback(line.end)
         for number in range(starts):
             start = first + (random.uniform(-START_SPREAD, START_SPREAD, len(first)) if number else 0.0)
 
@@ -341,13 +344,13 @@ def fit(
                     line.show(f"start {number + 1} of {starts}, misfit {misfit:.4g}")
 
             found.append(minimised(problem, start, said))
+            log.info("start %d: sum of squares %.6g, %d evaluations", number + 1, 2 * found[-1].cost, found[-1].nfev)
         result = result_of(problem, found)
         if profiles:
             result = with_profiles(problem, result, announced)
-    finally:
-        line.end()
-    write_whole(place / "scene.toml", result.scene.to_toml(f"fitted to {Path(data).name}").encode())
-    _draw(result, tables, place)
+        log.info("%s", verdict(result))
+        write_whole(place / "scene.toml", result.scene.to_toml(f"fitted to {Path(data).name}").encode())
+        _draw(result, tables, place)
     return place, result
 
 
@@ -561,15 +564,16 @@ def _draw(found: Fit, tables: Sequence[Measured], folder: Path) -> None:
         grid[0].legend()
         for axes in grid[len(panels) :]:
             axes.set_axis_off()
+        figure.savefig(plain := io.BytesIO(), dpi=DOTS_PER_INCH["png"])  # the page has title and verdict as text
         add_head(figure, title, verdict(found))
         page.save_figure(figure, made_with)
-    picture = base64.b64encode((folder / f"{FIT}.png").read_bytes()).decode("ascii")
+    picture = base64.b64encode(plain.getvalue()).decode("ascii")
     write_whole(folder / f"{FIT}.html", _web_page(found, title, picture, made_with).encode())
 
 
 def _web_page(found: Fit, title: str, picture: str, made_with: str) -> str:
     """All that a fit has found, as a page like a run's report."""
-    head = f'<header class="whole"><h1>{escape(title)}</h1><p class="reason">{escape(verdict(found))}</p></header>'
+    head = f'<header class="whole"><h1>{escape(title)}</h1><p class="note">{escape(verdict(found))}</p></header>'
     image = f'<img alt="measured and fitted" width="100%" src="data:image/png;base64,{picture}">'
     numbers = []
     for number, u in enumerate(found.unknowns):

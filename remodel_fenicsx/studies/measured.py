@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import csv
 import math
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from remodel_fenicsx.scene.scene import Scene, SceneError
+from remodel_fenicsx.schema.csv_table import TableFileError, read_columns
 from remodel_fenicsx.schema.tables import shown
 from remodel_fenicsx.schema.toml import read_toml
 from remodel_fenicsx.schema.units import FORCE, LENGTH, LENGTH_UNIT, STRESS, STRESS_UNIT, factor_to_scene
@@ -26,6 +27,10 @@ DIMENSIONS = {"stress": STRESS, "length": LENGTH, "stress * length^2": FORCE, "f
 KEYS_OF_UNKNOWNS = ("start", "lower", "upper", "prior", "prior_sd")
 KEYS_OF_TABLES = ("file", "state", "time", "sd", "scale", "units")
 SCALE_BOUNDS = (1e-3, 1e3)  # bounds of a scale
+WIDE = 1e3  # a bound that nobody gives over the start
+TWICE = (1.7, 2.4)  # diameters over radii of the model at the start, whose tissue is a guess
+ANOTHER_UNIT = 5.0  # lengths over those of the model, or less than its inverse: units differ by ten and more
+FROM_EDGE = 5e-4  # of a logarithm, from the end of a key's range: derivatives look 2e-4 to both sides
 
 
 @dataclass(frozen=True)
@@ -104,11 +109,36 @@ def read_measurements(path: Path, scene: Scene) -> tuple[list[Unknown], list[Mea
     if not isinstance(given, Mapping) or not given:
         raise SceneError(f'{path}: must have a table [unknowns], as "material.lame_mu" = {{ start = 10.0 }}')
     unknowns = [_unknown(str(key), table, scene) for key, table in given.items()]
+    starts = {unknown.key: unknown.start for unknown in unknowns}
+    scene.with_values(starts)  # what does not go together is refused
+    ends = [[_end(unknown, end, scene, starts) for end in ("lower", "upper")] for unknown in unknowns]
+    unknowns = [replace(one, lower=lower, upper=upper) for one, (lower, upper) in zip(unknowns, ends, strict=True)]
+    for one in unknowns:
+        if not one.lower < one.upper:
+            raise SceneError(f"unknowns.{one.key}: the scene takes no number beside {one.start:g}, so it is not fitted")
     scales = dict.fromkeys(name for table in measured for name in table.scaled)
     unknowns += [Unknown(f"scale.{name}", 1.0, *SCALE_BOUNDS) for name in scales]
     if len(unknowns) > sum(table.rows * len(table.sd) for table in measured):
         raise SceneError(f"unknowns: {len(unknowns)} unknowns need as many measurements at least")
     return unknowns, measured
+
+
+def doubts(tables: Sequence[Measured], modelled: Sequence[Mapping[str, Array]], scene: Scene) -> Iterator[str]:
+    """What measured numbers look like beside those of the model at the start: diameters, another unit; a line each."""
+    units = {column.name: column.unit for column in _all_columns(scene)}
+    for table, model in zip(tables, modelled, strict=True):
+        for name in (one for one in table.sd if one not in table.scaled):
+            found, place = np.abs(table.columns[name]), f"{table.name}, {name}"
+            known = np.maximum(np.abs(model[name]), 1e-300)
+            if units[name] == "degrees" and found.max() <= np.pi < known.max():
+                yield f"{place}: all lie within 3.14, those of the scene reach {known.max():.3g}; degrees are asked"
+            if units[name] != "length":
+                continue
+            ratio, one = float(np.median(found / known)), f"geometry.length_unit = {scene.geometry.length_unit!r}"
+            if name.endswith("radius") and TWICE[0] < (found / known).min() <= ratio < TWICE[1]:
+                yield f"{place}: {ratio:.3g} times those of the scene at the start; are they diameters?"
+            elif ratio > ANOTHER_UNIT or ratio < 1 / ANOTHER_UNIT:
+                yield f"{place}: {ratio:.3g} times those of the scene at the start; {one}, see units"
 
 
 def _only(table: Mapping[str, Any], keys: Iterable[str], place: str) -> None:
@@ -130,13 +160,37 @@ def _unknown(key: str, table: Any, scene: Scene) -> Unknown:
     _only(table, KEYS_OF_UNKNOWNS, place)
     numbers = {name: _positive(value, f"{place}.{name}") for name, value in table.items()}
     start = numbers["start"]
-    lower, upper = numbers.get("lower", start / 1e3), numbers.get("upper", start * 1e3)
+    lower, upper = numbers.get("lower", start / WIDE), numbers.get("upper", start * WIDE)
     if not lower <= start <= upper or lower == upper:
         raise SceneError(f"{place}.start = {start:g}: must lie between lower {lower:g} and upper {upper:g}")
     if ("prior" in numbers) != ("prior_sd" in numbers):
         raise SceneError(f"{place}: prior and prior_sd (of the logarithm) go together")
     scene.with_values({key: start})  # a key that there is not, or that takes no such number, is refused
     return Unknown(key, start, lower, upper, numbers.get("prior"), numbers.get("prior_sd"))
+
+
+def _end(unknown: Unknown, end: str, scene: Scene, starts: Mapping[str, float]) -> float:
+    """The lower or upper end of an unknown, or the last number before it that is of the key's own range."""
+    given, start = getattr(unknown, end), unknown.start
+    inside, outside = np.log([start, given])
+    back = FROM_EDGE * np.sign(inside - outside)
+
+    def allowed(number: float) -> bool:
+        """Whether it may be, with the others as they are or moved by the same factor: a wall keeps its form."""
+        moved = {key: other * number / start for key, other in starts.items()}
+        for values in ({**starts, unknown.key: number}, moved):
+            with suppress(SceneError):
+                return bool(scene.with_values(values))
+        return False
+
+    if not math.isclose(abs(np.log(given / start)), np.log(WIDE)) and not allowed(given):
+        scene.with_values({unknown.key: given})  # refuses what somebody has typed
+    if allowed(float(np.exp(outside - back))):
+        return float(given)
+    while abs(outside - inside) > FROM_EDGE:
+        middle = (inside + outside) / 2
+        inside, outside = (middle, outside) if allowed(float(np.exp(middle - back))) else (inside, middle)
+    return float(np.exp(inside))
 
 
 def _table(table: Any, place: str, folder: Path, scene: Scene) -> Measured:
@@ -146,10 +200,12 @@ def _table(table: Any, place: str, folder: Path, scene: Scene) -> Measured:
     state = table.get("state", "virgin")
     if state not in STATES:
         raise SceneError(f"{place}.state = {shown(state)}: must be one of {', '.join(map(repr, STATES))}")
+    if state == "after" and scene.remodeling.turnover.is_on:
+        raise SceneError(f"{place}.state = 'after': takes cells alone, not what remodeling.turnover has changed")
     if ("time" in table) != (state == "after"):
         raise SceneError(f"{place}.time: allowed only with state = 'after': the time until which the tissue remodels")
     time = _positive(table["time"], f"{place}.time") if state == "after" else 0.0
-    columns = _read_columns(folder / table["file"], f"{place}.file")
+    columns = _read_columns(folder / table["file"], f"{place}.file", scene)
     loads = tuple(name for name in columns if name in scene.loads)
     _check_columns(columns, loads, state, f"{place}.file = {shown(table['file'])}", scene)
     for name, unit in _pairs(table, "units", place, columns):
@@ -194,42 +250,16 @@ def _all_columns(scene: Scene) -> tuple[Any, ...]:
     return scene.columns(column.name for column in scene.geometry.columns_on_request)
 
 
-def _read_columns(path: Path, place: str) -> dict[str, Array]:
+def _read_columns(path: Path, place: str, scene: Scene) -> dict[str, Array]:
+    known = {column.name for column in _all_columns(scene)} - {"seconds", "substeps"}
     try:
-        text = read_regular(path, LARGEST_TABLE).decode("utf-8-sig")
-    except (OSError, ForeignFileError, UnicodeDecodeError) as error:
-        words = getattr(error, "strerror", None) or "is no text"
-        raise SceneError(f"{place} = {shown(path.name)}: {words}") from error
-    lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
-    table = [[cell.strip() for cell in row] for row in csv.reader(lines)]
-    if len(table) < 2:
-        raise SceneError(f"{place} = {shown(path.name)}: must have a row of names, and rows of numbers")
-    head = table[0]
-    if len(set(head)) < len(head):
-        raise SceneError(f"{place} = {shown(path.name)}: a column is there twice")
-    for number, row in enumerate(table[1:], 1):
-        if len(row) != len(head):
-            raise SceneError(f"{place} = {shown(path.name)}: row {number} has {len(row)} numbers, not {len(head)}")
-        for name, cell in zip(head, row, strict=True):
-            if not _is_finite(cell):
-                raise SceneError(f"{place} = {shown(path.name)}: row {number}, {name}: {shown(cell)} is no number")
-    values = np.array([[float(cell) for cell in row] for row in table[1:]])
-    return {name: values[:, index] for index, name in enumerate(head)}
-
-
-def _is_finite(cell: str) -> bool:
-    try:
-        return math.isfinite(float(cell))
-    except ValueError:
-        return False
+        data = read_regular(path, LARGEST_TABLE)
+        return read_columns(data, path.name, sorted({*scene.loads, *known, "time"}))
+    except (OSError, ForeignFileError, TableFileError) as error:
+        raise SceneError(f"{place} = {shown(path.name)}: {getattr(error, 'strerror', None) or error}") from error
 
 
 def _check_columns(columns: Mapping[str, Array], loads: tuple[str, ...], state: str, place: str, scene: Scene) -> None:
-    known = {column.name for column in _all_columns(scene)} - {"seconds", "substeps"}
-    for name in columns:
-        if name not in known and name not in scene.loads and name != "time":
-            allowed = ", ".join(sorted({*scene.loads, *known}))
-            raise SceneError(f"{place}: {shown(name)} is no load of the scene and no column; allowed are {allowed}")
     if set(columns) <= {*loads, "time"}:
         raise SceneError(f"{place}: has no measured column")
     if state == "history":

@@ -64,7 +64,6 @@ def without_derivatives(scene: Scene, table: Measured) -> str | None:
         ("natural.opening_angle", bool(scene.natural.opening_angle)),
         ("time.tolerance", scene.time.tolerance is not None or scene.time.is_equilibrium),
         ("cells.fibres", bool(scene.measured_cells)),
-        (f"mesh.formulation = {scene.mesh.formulation!r}", scene.mesh.formulation != "displacement"),
     ):
         if there:
             return key
@@ -175,7 +174,8 @@ def _with_columns(scene: Scene, table: Measured) -> Scene:
 
 def _passive(scene: Scene, table: Measured, scales: Mapping[str, float]) -> Scene:
     """Cells that stay, and a step for each row; loads that the table has not keep their last value."""
-    changes: dict[str, Any] = {"remodeling.law": "none", "remodeling.coupling": "staggered", "output.times": []}
+    changes: dict[str, Any] = {"remodeling.law": "none", "remodeling.coupling": "staggered", "remodeling.turnover": {}}
+    changes |= {"output.times": [], "output.fields": False, "output.columns": [*table.sd]}  # some need turnover
     changes |= {"time.step": 1.0, "time.end": float(table.rows), "time.tolerance": None}
     for name, load in scene.loads.items():
         values: Array = np.full(table.rows, load.value * load.factor(scene.last_time))
@@ -297,7 +297,7 @@ class RowChanges(Watcher):
         with state.tentative():
             state.unknown.x.array[:] += way * coupling.unknowns[k]  # type: ignore[attr-defined]
             state.cells.dimension_values[:] += way * coupling.dimensions[k]  # type: ignore[attr-defined]
-            state.loading.set({name: value + way * loads[name][k] for name, value in step.loads.items()})
+            state.loading.set({**step.loads, **{name: step.loads[name] + way * by[k] for name, by in loads.items()}})
             before = {name: float(getattr(tissue, name).value) for name in self.directions.tissue}
             for name, value in before.items():
                 getattr(tissue, name).value = value + way * self.directions.tissue[name][k]

@@ -1,12 +1,13 @@
 """What a figure or a study leaves in its folder: a picture, in some formats, and its data.
 
-Each file says what it was made with.
+Each picture says what it was made with; what is to be said of tables stands in a file beside them.
 """
 
 from __future__ import annotations
 
 import csv
 import io
+import json
 import tempfile
 import textwrap
 from collections.abc import Mapping, Sequence
@@ -26,7 +27,7 @@ from PIL.PngImagePlugin import PngInfo
 from remodel_fenicsx._version import __version__
 from remodel_fenicsx.system.regular_files import write_whole
 
-MARK = "remodel_fenicsx figures"  # in every file: what bears it may be drawn anew
+MARK = "remodel_fenicsx figures"  # in every picture, and beside every table: what bears it may be drawn anew
 FORMATS = ("png", "pdf", "svg")
 DOTS_PER_INCH = {"png": 200, "pdf": 300, "svg": 300}  # of pictures in space where all else is lines and letters
 STYLE: dict[str, Any] = {
@@ -66,7 +67,7 @@ class Page:
     folder
         Where they go.
     name
-        Name of the figure: NAME.png, NAME.csv, NAME-PART.csv.
+        Name of the figure: NAME.png, NAME.csv, NAME-PART.csv, and NAME.json with what is to be said of the tables.
     title, caption
         What the figure is, and what is to be known to read it: in the file of the picture, not in the picture.
     colours
@@ -104,23 +105,24 @@ class Page:
             self._write(f"{self.name}.{ending}", as_file(figure, ending, about, self.colours))
 
     def save_table(self, columns: Mapping[str, ArrayLike], notes: Sequence[str], part: str = "") -> None:
-        """Write NAME.csv or NAME-PART.csv: notes as comments, then the columns, all of one length."""
+        """Write NAME.csv or NAME-PART.csv, columns of one length under their names; the notes go into NAME.json."""
         names, values = list(columns), [np.asarray(column) for column in columns.values()]
-        text = io.StringIO()
-        for note in (f"{MARK} {__version__}: {self.name}", *notes):
-            text.write(f"# {note}\n")
+        text, file = io.StringIO(), f"{self.name}-{part}.csv" if part else f"{self.name}.csv"
         writer = csv.writer(text, lineterminator="\n")
         writer.writerow(names)
         for row in zip(*values, strict=True):
             writer.writerow([_cell(value) for value in row])
-        self._write(f"{self.name}-{part}.csv" if part else f"{self.name}.csv", text.getvalue().encode())
+        _check_ours(self.folder / file, self.name)
+        said = {"made by": f"{MARK} {__version__}", "notes": read_notes(self.folder, self.name) | {file: list(notes)}}
+        self._write(f"{self.name}.json", (json.dumps(said, indent=1, ensure_ascii=False) + "\n").encode())
+        self._write(file, text.getvalue().encode())
 
     def _write(self, name: str, content: bytes) -> None:
         path = self.folder / name
-        _check_ours(path)
+        _check_ours(path, self.name)
         self.folder.mkdir(parents=True, exist_ok=True)
         write_whole(path, content)
-        self.written.append(path)
+        self.written += [path] if path not in self.written else []
 
 
 @dataclass(frozen=True)
@@ -256,20 +258,31 @@ def check_folder(folder: Path, names: Sequence[str], formats: Sequence[str]) -> 
     if folder.exists() and not folder.is_dir():
         raise FigureError(f"-o {folder}: is a file; allowed is a folder", 2)
     for name in names:
-        endings = (*formats, "csv")
+        endings = (*formats, "csv", "json")
         for path in (*(folder / f"{name}.{ending}" for ending in endings), *folder.glob(f"{name}-*.csv")):
-            _check_ours(path)
+            _check_ours(path, name)
     there = next(place for place in (folder, *folder.absolute().parents) if place.exists())
     with tempfile.TemporaryDirectory(prefix=".remodel-fenicsx-", dir=there):
         pass
 
 
-def _check_ours(path: Path) -> None:
+def _check_ours(path: Path, name: str) -> None:
     if not path.exists():
         return
-    if MARK.encode() not in path.read_bytes():  # in a PDF it comes last
+    # in a PDF it comes last; tables of older versions begin with it
+    if MARK.encode() not in path.read_bytes() and path.name not in read_notes(path.parent, name):
         message = f"{path}: is not a figure of this command and is not overwritten; choose another folder with -o"
         raise FigureError(message, 2)
+
+
+def read_notes(folder: Path, name: str) -> dict[str, list[str]]:
+    """What NAME.json says of each table of a figure, by the table's file; nothing where there is none."""
+    path = folder / f"{name}.json"
+    text = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
+    try:
+        return dict(json.loads(text)["notes"]) if MARK in text else {}
+    except (ValueError, KeyError, TypeError):  # was cut short, or is somebody else's
+        return {}
 
 
 def read_table(path: Path) -> dict[str, NDArray[Any]]:

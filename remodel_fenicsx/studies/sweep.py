@@ -126,8 +126,12 @@ def _spaced(text: str, given: list[Number]) -> list[Number]:
     return [_rounded(float(number)) for number in np.linspace(low, high, count)]
 
 
-def members_of(scene: Scene, points: Sequence[Mapping[str, Number]], folder: Path) -> list[Run]:
-    """A run for each point; its name has the numbers, so that a finer sweep uses what is there.
+def members_of(
+    scene: Scene, points: Sequence[Mapping[str, Number]], folder: Path, sampled: bool = False
+) -> tuple[list[str], list[Run], dict[str, str]]:
+    """Names of the points, runs, and why points that were drawn have none: nobody has typed their numbers.
+
+    A name has the numbers, so that a finer sweep uses what is there.
 
     Raises
     ------
@@ -136,14 +140,20 @@ def members_of(scene: Scene, points: Sequence[Mapping[str, Number]], folder: Pat
     """
     if not FEWEST_RUNS <= len(points) <= MOST_RUNS:
         raise SceneError(f"sweep: {len(points)} runs; allowed are {FEWEST_RUNS} to {MOST_RUNS}")
-    members = []
+    names, members, refused = [], [], {}
     for point in points:
-        name = "_".join(f"{key}-{value:.10g}" for key, value in point.items())
-        changed = scene.with_values({**point, "output.fields": False})
+        names.append(name := "_".join(f"{key}-{value:.10g}" for key, value in point.items()))
+        try:
+            changed = scene.with_values({**point, "output.fields": False})
+        except SceneError as error:
+            refused[name] = str(error)
+            if not sampled or len(refused) > len(points) - FEWEST_RUNS:
+                raise
+            continue
         if any(value != _value_of(changed, key) for key, value in point.items()):
             raise SceneError(f"sweep {', '.join(point)}: one of these keys does not take a number")
         members.append(Run(name, changed, folder / name))
-    return members
+    return names, members, refused
 
 
 def _value_of(scene: Scene, key: str) -> Any:
@@ -160,6 +170,7 @@ def sweep(
     folder: Path | str | None = None,
     jobs: int | None = None,
     quiet: bool = True,
+    sampled: bool = False,
 ) -> tuple[Path, Sweep]:
     """Run a scene with other numbers, several runs at a time.
 
@@ -175,6 +186,8 @@ def sweep(
         Runs at a time; default: the number of cores.
     quiet
         No progress.
+    sampled
+        Whether the points were drawn: those whose numbers are not allowed, or not together, count as failed.
 
     Returns
     -------
@@ -192,15 +205,17 @@ def sweep(
         If a file cannot be written.
     """
     place = Path(folder or Path("results") / f"{scene.name}-{SWEEP}")
-    members = members_of(scene, points, place)
+    names, members, refused = members_of(scene, points, place, sampled)
     checked = partial(write_study, place, SWEEP, scene.name, members)
-    failed = run_all(members, jobs or cores(), f"{scene.name} {SWEEP}", quiet, checked=checked)
-    found = gathered(members, points, failed)
+    failed = refused | run_all(members, jobs or cores(), f"{scene.name} {SWEEP}", quiet, checked=checked)
+    found = gathered(names, members, points, failed)
     draw(found, place, scene)
     return place, found
 
 
-def gathered(members: Sequence[Run], points: Sequence[Mapping[str, Number]], failed: dict[str, str]) -> Sweep:
+def gathered(
+    every: list[str], members: Sequence[Run], points: Sequence[Mapping[str, Number]], failed: dict[str, str]
+) -> Sweep:
     """The last rows of all that have not failed.
 
     Raises
@@ -214,11 +229,11 @@ def gathered(members: Sequence[Run], points: Sequence[Mapping[str, Number]], fai
         if member.name not in failed
     }
     if len(ends) < FEWEST_RUNS:
-        raise TooFewRuns(f"{len(ends)} of {len(members)} runs reached the end", failed)
+        raise TooFewRuns(f"{len(ends)} of {len(every)} runs reached the end", failed)
     values = {key: np.array([point[key] for point in points], dtype=np.float64) for key in points[0]}
     names = next(iter(ends.values()))
-    columns = {name: np.array([ends.get(one.name, {}).get(name, np.nan) for one in members]) for name in names}
-    return Sweep(values, columns, [member.name for member in members], failed)
+    columns = {name: np.array([ends.get(one, {}).get(name, np.nan) for one in every]) for name in names}
+    return Sweep(values, columns, every, failed)
 
 
 # ---------------------------------------------------------------- words and picture

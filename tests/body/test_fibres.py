@@ -117,6 +117,46 @@ def test_rows_belong_to_numbers_or_else_to_places(exported: Callable[[str], Path
         np.testing.assert_allclose(tensors_of(scene(path)), wanted, atol=1e-12)
 
 
+DIALECTS: dict[str, Callable[[str], str | bytes]] = {
+    "mark of the byte order": lambda text: b"\xef\xbb\xbf" + text.encode(),
+    "UTF-16": lambda text: text.encode("utf-16"),
+    "capitals": lambda text: text.replace("x,y,z,angle", "X,Y,Z,Angle"),
+    "ParaView": lambda text: text.replace("x,y,z,angle", '"Points:0","Points:1","Points:2","angle"'),
+    "tabs": lambda text: text.replace(",", "\t"),
+    "spaces": lambda text: "  " + text.replace(",", "   ").replace("\n", " \n  "),
+    "semicolons and decimal commas": lambda text: text.replace(",", ";").replace(".", ","),
+    "as it is said": lambda text: "SEP=|\n" + text.replace(",", "|"),
+    "trailing commas": lambda text: text.replace("\n", ",,\n") + ",,,,,\n",
+    "quotes and spaces": lambda text: "\n".join('"' + line.replace(",", '", "') + '"' for line in text.splitlines()),
+    "comments and empty lines": lambda text: "# of the left wall\n\n" + text.replace("\n", "\r\n") + "\r\n",
+}
+
+
+@pytest.mark.parametrize("dialect", DIALECTS)
+def test_tables_are_read_however_they_are_written(
+    dialect: str, exported: Callable[[str], Path], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Rows of another order go by their places: another angle in each. The log says what was found."""
+    rows = rows_of(exported("csv"))[::-1]
+    plain = "x,y,z,angle\n" + "".join(f"{r['x']},{r['y']},{r['z']},{2.5 * n}\n" for n, r in enumerate(rows))
+    (tmp_path / "plain.csv").write_text(plain)
+    written = DIALECTS[dialect](plain)
+    (tmp_path / "found.csv").write_bytes(written if isinstance(written, bytes) else written.encode())
+    wanted = tensors_of(scene(tmp_path / "plain.csv"))
+    with caplog.at_level("INFO"):
+        np.testing.assert_array_equal(tensors_of(scene(tmp_path / "found.csv")), wanted)
+    assert np.ptp(wanted[:, 0, 0, 0]) > 0.1 and "found.csv: 32 rows of x, y, z, angle; " in caplog.text
+
+
+@pytest.mark.parametrize(("angle", "doubted"), [("1.2", True), ("0", False), ("40", False)])
+def test_angles_that_look_like_radians_are_doubted(
+    angle: str, doubted: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "a.csv").write_text("angle\n" + "-0.5\n" * 31 * doubted + "0\n" * 31 * (not doubted) + f"{angle}\n")
+    tensors_of(scene(tmp_path / "a.csv"))
+    assert [record.levelname for record in caplog.records if "radians" in record.message] == ["WARNING"] * doubted
+
+
 def test_values_of_points_go_to_the_nearest_elements(exported: Callable[[str], Path], tmp_path: Path) -> None:
     mesh = meshio.read(exported("vtu"))
     direction = mesh.points * [0.0, 0.0, 1.0] + [1.0, 0.0, 0.0]
@@ -224,11 +264,25 @@ HEAD = "element,fibre_x,fibre_y,fibre_z\n"
 BAD = {
     "a.txt": ("", r"allowed are files .vtu, .xdmf, .csv"),
     "nothing.csv": (None, r"cannot be read: No such file"),
-    "empty.csv": ("", r"is no table of numbers"),
-    "words.csv": ("angle\nsteep\n", r"is no table of numbers with names of columns above"),
+    "empty.csv": ("", r"is no table: needed are a row of names and rows of numbers"),
+    "words.csv": ("angle\nsteep\n", r"row 1, angle: 'steep' is no number"),
     "short.csv": ("angle\n" + "1\n" * 31, r"has 31 rows without places \(x, y, z\), the mesh has 32 elements"),
-    "unknown.csv": ("x,y,z,direction\n0,0,0,1\n", r"has columns x, y, z, direction; needed is one of structure_tensor"),
-    "nan.csv": ("angle\n" + "1\n" * 4 + "nan\n" + "1\n" * 27, r"angle of row 5 is not finite"),
+    "unknown.csv": ("x,y,z,direction\n0,0,0,1\n", r"the column 'direction' is not known; allowed are x, y, z, element"),
+    "weights.csv": ("angle,weights\n" + "1,0.5\n" * 32, r"the column 'weights' is not known; allowed are .*, weight, "),
+    "spread.csv": ("angle,kappa\n" + "1,0.1\n" * 32, r"the column 'kappa' is not known"),
+    "second.csv": (
+        "fibre_x,fibre_y,fibre_z,fibre2_x,fibre2_y,fibre2_z\n" + "1,0,0,0,1,0\n" * 32,
+        r"the column 'fibre2_x' is not known; allowed are .*, fibre_2_x, ",
+    ),
+    "twice.csv": ("angle,Angle\n" + "1,2\n" * 32, r"the column angle is there twice"),
+    "flat.csv": ("x,y,angle\n" + "1,2,3\n" * 32, r"has x, y without the other columns"),
+    "part.csv": ("angle,fibre_2_x\n" + "1,2\n" * 32, r"has fibre_2_x without the other columns"),
+    "places.csv": ("x,y,z\n" + "1,2,3\n" * 32, r"has columns x, y, z; needed is one of structure_tensor"),
+    "nameless.csv": ("1,2\n3,4\n", r"begins with a row of numbers; the first row must have the names of the columns"),
+    "mixed.csv": ("x;y;z;angle\n0,5;1.5;2;3\n", r"row 1, y: '1.5' is no number \(others have decimal commas\)"),
+    "latin.csv": (b"angle,\xb5\n1,2\n", r"is no text in UTF-8"),
+    "separator.csv": ("sep=ab\nangle\n1\n", r"cannot be read as a table: "),
+    "nan.csv": ("angle\n" + "1\n" * 4 + "nan\n" + "1\n" * 27, r"row 5, angle: 'nan' is no number"),
     "zero.csv": (HEAD + "\n".join(f"{n},0,0,{n - 9}" for n in range(1, 33)), r"fibre of row 9 is the zero vector"),
     "weight.csv": ("angle,weight\n" + "1,0.5\n" * 31 + "1,1.5\n", r"weight of row 32 is not from 0 to 1"),
     "numbers.csv": ("element,angle\n" + "1,1\n" * 32, r"element must have the numbers 1 to 32, each once"),
@@ -250,7 +304,7 @@ def test_a_bad_file_is_said_in_one_line(
 ) -> None:
     text, said = BAD[name]
     if text is not None:
-        (tmp_path / name).write_text(text)
+        (tmp_path / name).write_bytes(text if isinstance(text, bytes) else text.encode())
     with pytest.raises(SceneError, match=rf"^cells.fibres = '.*{name}': .*{said}") as error:
         Simulation(scene(tmp_path / name), SELF)
     assert "\n" not in str(error.value)

@@ -79,13 +79,23 @@ def test_every_name_of_the_contract_is_there() -> None:
     assert all(scene.name == name for name, scene in known.items())
 
 
-@pytest.mark.parametrize("name", ["fig1.png", "fig1.pdf", "fig1.svg", "fig1.csv", "fig1-mine.csv"])
+@pytest.mark.parametrize("name", ["fig1.png", "fig1.pdf", "fig1.svg", "fig1.csv", "fig1-mine.csv", "fig1.json"])
 def test_a_file_of_somebody_else_is_not_overwritten(name: str, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     theirs = tmp_path / name
     theirs.write_text("a year of work")
     assert cli.main(["figures", "fig1", "-o", str(tmp_path), "--format", "png,pdf,svg"]) == 2
     assert f"{theirs}: is not a figure of this command" in capsys.readouterr().err
     assert theirs.read_text() == "a year of work" and os.listdir(tmp_path) == [name]
+
+
+def test_tables_begin_with_their_names_and_those_of_older_versions_are_drawn_anew(tmp_path: Path) -> None:
+    """An older one begins with what was said of it; it is read, and taken for the command's own."""
+    (tmp_path / "fig1.csv").write_text("# remodel_fenicsx figures 0.3.0: fig1\n# no simulation\nextension\n0.5\n")
+    assert page.read_table(tmp_path / "fig1.csv")["extension"].tolist() == [0.5]
+    assert cli.main(["figures", "fig1", "-o", str(tmp_path)]) == 0
+    assert (tmp_path / "fig1.csv").read_text().startswith("extension,force_A_0.1,")
+    assert "no simulation" in (tmp_path / "fig1.json").read_text()
+    assert cli.main(["figures", "fig1", "-o", str(tmp_path)]) == 0
 
 
 # ---------------------------------------------------------------- which recorded runs are valid
@@ -351,7 +361,7 @@ def test_figures_say_with_what_they_were_made(drawn: Path) -> None:
     assert notes["Comment"] == "remodel-fenicsx figures fig5"
     assert (notes["Title"], notes["Description"]) == (FIGURES["fig5"].title, FIGURES["fig5"].caption)
     version = runs.library_versions()["fenics-dolfinx"].split(".post")[0]
-    for text in (notes["Source"], (drawn / "fig5.csv").read_text().splitlines()[1]):
+    for text in (notes["Source"], page.read_notes(drawn, "fig5")["fig5.csv"][0]):
         assert f"remodel_fenicsx {remodel_fenicsx.__version__}, dolfinx {version}" in text
         assert "preset kuhl-holzapfel-2007 with kinematics point, frame spatial, isotropic cells" in text
 
@@ -369,7 +379,7 @@ def formats(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_figure_in_every_format_says_what_it_is(formats: Path) -> None:
-    assert sorted(os.listdir(formats / "plain")) == ["fig1.csv", "fig1.pdf", "fig1.png", "fig1.svg"]
+    assert sorted(os.listdir(formats / "plain")) == ["fig1.csv", "fig1.json", "fig1.pdf", "fig1.png", "fig1.svg"]
     title, caption = FIGURES["fig1"].title, FIGURES["fig1"].caption
     pdf, svg = (formats / "plain" / "fig1.pdf").read_bytes(), (formats / "plain" / "fig1.svg").read_text()
     assert pdf.startswith(b"%PDF-") and title.replace("(", "\\(").replace(")", "\\)").encode() in pdf
@@ -389,7 +399,7 @@ def test_only_the_format_that_is_wanted_is_written_and_the_same_figure_is_the_sa
     formats: Path, drawn: Path, tmp_path: Path
 ) -> None:
     assert cli.main(["figures", "fig1", "-o", str(tmp_path), "--format", "pdf"]) == 0
-    assert sorted(os.listdir(tmp_path)) == ["fig1.csv", "fig1.pdf"]
+    assert sorted(os.listdir(tmp_path)) == ["fig1.csv", "fig1.json", "fig1.pdf"]
     again = {"pdf": tmp_path / "fig1.pdf", "svg": formats / "first.svg", "png": drawn / "fig1.png"}
     assert set(again) == set(page.FORMATS)
     for ending, path in again.items():
@@ -695,9 +705,8 @@ def test_numbers_of_the_verification_page_follow_their_tables(
     shutil.copytree(DOCS / "figures", kept, ignore=shutil.ignore_patterns("*.png"))
     before, page = make_verification.all_numbers(kept)[said], make_verification.page(kept)
     lines = (kept / f"{table}.csv").read_text().splitlines()
-    first = next(number for number, line in enumerate(lines) if not line.startswith("#"))
-    index = lines[first].split(",").index(column)
-    for number in range(first + 1, len(lines)):
+    index = lines[0].split(",").index(column)
+    for number in range(1, len(lines)):
         cells = lines[number].split(",")
         cells[index] = f"{1.2 * float(cells[index])}"
         lines[number] = ",".join(cells)

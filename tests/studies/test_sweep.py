@@ -27,7 +27,7 @@ def cube(tmp_path: Path) -> Path:
 
 def rows(folder: Path) -> list[dict[str, str]]:
     with (folder / "sweep.csv").open() as file:
-        return list(csv.DictReader(line for line in file if not line.startswith("#")))
+        return list(csv.DictReader(file))
 
 
 def test_the_ends_follow_the_closed_form(cube: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -45,6 +45,8 @@ def test_the_ends_follow_the_closed_form(cube: Path, tmp_path: Path, capsys: pyt
             expected = np.degrees(np.arctan(np.sqrt(2) * (1 - s) / (1 - s + np.sqrt(3) * s)))
             assert float(row["mean_fibre_angle"]) == pytest.approx(expected, abs=1e-5)
         before = {path: path.stat().st_mtime_ns for path in out.glob("*/history.csv")}
+        (out / "sweep.json").unlink()  # as a folder of 0.3.0
+        (out / "sweep.csv").write_text(f"# remodel_fenicsx figures 0.3.0: sweep\n{(out / 'sweep.csv').read_text()}")
         assert cli.main([*words[:2], "remodeling.kappa=0.05:0.15:5", *words[3:]]) == 0
     assert {path: path.stat().st_mtime_ns for path in before} == before
     assert len(rows(out)) == 5 and len(list(out.glob("*/history.csv"))) == 5
@@ -64,6 +66,23 @@ def test_a_run_that_fails_is_nan_and_named(cube: Path, tmp_path: Path, capsys: p
     angles = {(row["remodeling.kappa"], row["loads.force.value"]): row["mean_fibre_angle"] for row in rows(out)}
     assert sorted(angles) == [("0.05", "4"), ("0.05", "8"), ("0.1", "4"), ("0.1", "8")]
     assert [key for key, angle in angles.items() if not np.isfinite(float(angle or "nan"))] == [("0.1", "4")]
+
+
+def test_drawn_numbers_outside_of_a_range_are_failed_points(
+    cube: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The ends that are typed are allowed together; of the points some are no scenes, and the others are run."""
+    out = tmp_path / "out"
+    with forked_children():
+        words = ["cells.end_to_end_length=1.5:2.5", "material.contour_length=1.6:2.6", "--latin", "6", "-o", str(out)]
+        assert cli.main(["sweep", str(cube), *words, "-q"]) == 3
+    table, errors = rows(out), capsys.readouterr().err
+    beyond = [float(r["cells.end_to_end_length"]) >= float(r["material.contour_length"]) for r in table]
+    assert len(table) == 6 and 0 < sum(beyond) < 5
+    assert [not np.isfinite(float(row["mean_fibre_angle"] or "nan")) for row in table] == beyond
+    assert errors.count("has failed: ") == sum(beyond) and "Traceback" not in errors
+    assert cli.main(["sweep", str(cube), "remodeling.kappa=-3:-2", "--latin", "5", "-o", str(tmp_path / "no")]) == 2
+    assert "remodeling.kappa = -" in capsys.readouterr().err and not (tmp_path / "no").exists()
 
 
 def test_each_part_of_each_range_has_one_point() -> None:

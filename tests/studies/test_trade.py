@@ -246,7 +246,7 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     names = [f"point-1-degree-1-step-{step}" for step in ("2", "1", "0.5")]
     assert [name in (out / "trade.csv").read_text() for name in names] == [True] * 3
     with (out / "trade.csv").open() as file:
-        table = list(csv.DictReader(line for line in file if not line.startswith("#")))
+        table = list(csv.DictReader(file))
     assert list(table[0])[:7] == ["setting", "scene", "error_degrees", "error_stretch", "cpu_seconds", "on_front",
                                   "trusted"]  # fmt: skip
     for entry in table:
@@ -296,7 +296,7 @@ def test_what_is_doubted_is_not_trusted(tmp_path: Path) -> None:
     rows, notes = estimated([made_up(setting, noise=0.3) for setting in ladder(artery())])
     write(Trade(rows, notes, [], {}), tmp_path, artery())
     with (tmp_path / "trade.csv").open() as file:
-        table = list(csv.DictReader(line for line in file if not line.startswith("#")))
+        table = list(csv.DictReader(file))
     assert [entry["trusted"] == "1" for entry in table] == [entry["doubt"] == "" for entry in table]
     assert {entry["trusted"] for entry in table} == {"0", "1"} and "error_radii" in table[0]
 

@@ -100,7 +100,7 @@ def test_the_factor_is_that_by_which_a_tilt_grows_in_a_run() -> None:
 def read(folder: Path) -> dict[str, list[float]]:
     """Columns of stability.csv."""
     with (folder / "stability.csv").open() as file:
-        rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
+        rows = list(csv.DictReader(file))
     return {name: [float(row[name]) for row in rows] for name in rows[0]}
 
 
