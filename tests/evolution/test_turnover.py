@@ -458,6 +458,23 @@ def test_cells_that_stay_are_said_to_take_staggered_turnover(caplog: pytest.LogC
     assert "kappa is 0" in caplog.text and "in place of 'implicit'" in caplog.text
 
 
+@pytest.mark.parametrize(("gain", "thickness", "stress"), [(1.0, 0.70, 3.1), (2.0, 0.86, 2.0)])
+def test_the_wall_does_not_thicken_under_more_pressure(gain: float, thickness: float, stress: float) -> None:
+    """As docs/turnover.md says under Limits: its thickness and p r_i/h after half as much again, over those before."""
+    found = []
+    for factor in (1.0, 1.5):
+        values = wall(2400.0, 4.0, {"time": 40.0, "deposition_stretch": 1.1, "gain": gain}, COLUMNS)
+        values["loads"]["pressure"]["ramp"] += [[1400.0, 1.0], [1424.0, factor]]
+        values["time"] = {"end": "equilibrium", "step": 4.0}
+        values["output"]["columns"].append("inner_radius")
+        simulation = Simulation(scene_from_dict(values))
+        row = dict([step.row for step in simulation.steps()][-1])
+        simulation.close()
+        wall_thickness = row["outer_radius"] - row["inner_radius"]
+        found.append((wall_thickness, factor * row["inner_radius"] / wall_thickness))
+    assert np.divide(found[1], found[0]) == pytest.approx([thickness, stress], rel=0.02)
+
+
 def test_tissue_that_loses_nearly_all_of_its_collagen_and_rests_is_no_instability(
     caplog: pytest.LogCaptureFixture,
 ) -> None:

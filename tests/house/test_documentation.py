@@ -39,6 +39,13 @@ def test_the_table_of_columns_is_the_one_that_the_code_makes() -> None:
     assert found is not None and found[1] == columns_table(), f"between the two comments belongs: {remedy}"
 
 
+def test_the_sizes_on_the_page_of_the_architecture_are_those_of_the_code() -> None:
+    script = ROOT / "docs" / "make_architecture.py"
+    code = f"import runpy; made = runpy.run_path({str(script)!r}); print(made['page_text'](made['table']()), end='')"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == page("docs/architecture.md"), "./with-fenicsx python3 docs/make_architecture.py"
+
+
 def test_every_column_of_every_shape_is_in_the_table() -> None:
     """The names of the contract, one by one."""
     names = set(re.findall(r"^\| `(\w+)` \|", columns_table(), re.MULTILINE))
