@@ -19,7 +19,7 @@ DOCS = Path(__file__).resolve().parent
 sys.path[:0] = [str(DOCS), str(DOCS.parent)]
 
 from remodel_fenicsx import Simulation  # noqa: E402
-from remodel_fenicsx.scene.scene import scene_from_dict  # noqa: E402
+from remodel_fenicsx.scene.scene import preset_scene, scene_from_dict  # noqa: E402
 from remodel_fenicsx.studies.page import COLOURS, STYLE, Page, read_table  # noqa: E402
 
 KEPT, PAGE = DOCS / "figures", DOCS / "against_measurements.md"
@@ -40,6 +40,12 @@ WALLS = {
     "1 to 3, opening angle 120": (3.0, 4.8, 120.0),
 }
 """Label -> outer radius, pressure, opening angle."""
+LENGTHS = (0.0, 0.05, 0.1, 0.2, 0.3)
+"""Elongations of the thin wall."""
+STIFFER = 2.0
+"""Factor of all moduli of the thin wall, 10 % longer, in one more run."""
+MODULI = ("lame_lambda", "lame_mu", "chain_density")
+FORCE = "reduced_axial_force"
 
 
 def von_mises_angle(mean: float, concentration: float) -> float:
@@ -63,8 +69,11 @@ def last_row(values: dict[str, Any]) -> dict[str, float]:
         simulation.close()
 
 
-def wall(outer_radius: float, pressure: float, opening_angle: float) -> dict[str, float]:
-    """Bands of the angle of a tube that has come to rest, 10 % longer."""
+def wall(
+    outer_radius: float, pressure: float, opening_angle: float, elongation: float = 0.1, stiffer: float = 1.0
+) -> dict[str, float]:
+    """Bands of the angle of a tube that has come to rest, and its axial force without that of its closed ends."""
+    tissue = preset_scene("consistent", "tube").material
     found = last_row(
         {
             "preset": "consistent",
@@ -73,12 +82,13 @@ def wall(outer_radius: float, pressure: float, opening_angle: float) -> dict[str
             "model": {"kinematics": "radial"},
             "cells": {"initial": "isotropic"},
             "natural": {"opening_angle": opening_angle},
-            "loads": {"pressure": {"value": pressure}},
+            "material": {name: stiffer * getattr(tissue, name) for name in MODULI},
+            "loads": {"pressure": {"value": pressure}, "elongation": {"value": elongation}},
             "time": {"end": "equilibrium"},
-            "output": {"fields": False},
+            "output": {"fields": False, "columns": [*BANDS, FORCE]},
         }
     )
-    return {name: found[name] for name in BANDS}
+    return {name: found[name] for name in (*BANDS, FORCE)}
 
 
 def sheet(kappa: float) -> float:
@@ -101,10 +111,14 @@ def sheet(kappa: float) -> float:
 def runs(page: Page) -> None:
     """Make the table."""
     rows = {label: wall(*numbers) for label, numbers in WALLS.items()}
+    thin = WALLS["1 to 1.3"]
+    rows |= {f"{100 * elongation:g} % longer": wall(*thin, elongation) for elongation in LENGTHS}
+    rows["10 % longer, all moduli doubled"] = wall(*thin, stiffer=STIFFER)
     before, after = (np.radians(normal_angle(*SHEET[name])) for name in ("before", "after"))
     kappa = float(np.log(np.sin(before) ** 2 / np.sin(after) ** 2) / DAYS)
     table: dict[str, Any] = {"case": [*rows, "sheet"]}
     table |= {name: [*(row[name] for row in rows.values()), sheet(kappa)] for name in BANDS}
+    table[FORCE] = [*(row[FORCE] for row in rows.values()), 0.0]
     page.save_table(table | {"kappa": [0.0] * len(rows) + [kappa]}, list(CAPTION))
 
 
@@ -118,8 +132,14 @@ def tables(kept: Path = KEPT) -> dict[str, str]:
         "| wall, 10 % longer, in equilibrium | inside | half-way | outside |",
         "|---|---|---|---|",
     ]
-    lines = zip(found["case"], *(found[name] for name in BANDS), strict=True)
-    carotid += [f"| {case} | {a:.1f} | {b:.1f} | {c:.1f} |" for case, a, b, c in lines if case != "sheet"]
+    lines = list(zip(found["case"], *(found[name] for name in (*BANDS, FORCE)), strict=True))
+    carotid += [f"| {case} | {a:.1f} | {b:.1f} | {c:.1f} |" for case, a, b, c, _ in lines if case in WALLS]
+    other = ["| the thin wall | inside | half-way | outside | axial force less p pi r_i^2 |", "|---|---|---|---|---|"]
+    other += [
+        f"| {case} | {a:.1f} | {b:.1f} | {c:.1f} | {force:.2f} |"
+        for case, a, b, c, force in lines
+        if case not in WALLS and case != "sheet"
+    ]
     before, after = (normal_angle(*SHEET[name]) for name in ("before", "after"))
     sheet_lines = [
         "| | before | after 5 days |",
@@ -128,7 +148,8 @@ def tables(kept: Path = KEPT) -> dict[str, str]:
         f"| measured: angle of the second moment | {before:.1f} | {after:.1f} |",
         f"| model, kappa = {found['kappa'][-1]:.3f} per day | {before:.1f} | {found[BANDS[0]][-1]:.1f} |",
     ]
-    return {"carotid": "\n".join(carotid) + "\n", "sheet": "\n".join(sheet_lines) + "\n"}
+    made = {"carotid": carotid, "loads": other, "sheet": sheet_lines}
+    return {name: "\n".join(text) + "\n" for name, text in made.items()}
 
 
 def page_text(kept: Path = KEPT) -> str:

@@ -7,6 +7,7 @@ import contextlib
 import json
 import math
 import os
+import re
 import shlex
 import sys
 import time as clock
@@ -27,6 +28,7 @@ from remodel_fenicsx.system.environment import kernels, reason_undrawable, reaso
 from remodel_fenicsx.system.regular_files import ForeignFileError, write_new
 
 BAD_INPUT, SOLVE_FAILED, STOPPED, BAD_ENVIRONMENT = 2, 3, interrupts.PAUSED, 5
+OPTIONS = {"folder": "-o", "path": "-o", "times": "--time", "layers": "--layers", "cut": "--cut", "view": "--view"}
 STUDY_STOPPED = "stopped; all that is recorded is kept, the same command goes on"
 EXIT_CODES = {
     0: "finished",
@@ -302,7 +304,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             sys.stdout.flush()
             return code
         except SceneError as error:
-            return _fail(str(error), BAD_INPUT)
+            return _fail(_as_typed(error), BAD_INPUT)
         except _UnusableEnvironment as error:
             return _fail(f"the environment is not usable: {error}; run through ./with-fenicsx", BAD_ENVIRONMENT)
         except OSError as error:  # all others are caught where files are written
@@ -346,6 +348,12 @@ def _fail(message: str, code: int) -> int:
     return code
 
 
+def _as_typed(refusal: Exception) -> str:
+    """In one line; where it begins with an argument of Python's, that is the option which was typed."""
+    line = " ".join(str(refusal).split())
+    return re.sub(r"^\w+(?=[ :])", lambda name: OPTIONS.get(name[0], name[0]), line)
+
+
 def _run(options: argparse.Namespace, task: Callable[..., Path] | None = None) -> int:
     deadline = None if options.max_wall_time is None else clock.monotonic() + options.max_wall_time
     scene = None if options.resume else read_scene(options.scene, options.set, options.profile)
@@ -373,7 +381,7 @@ def _run(options: argparse.Namespace, task: Callable[..., Path] | None = None) -
         else:
             folder = run(scene, options.output, **wishes)
     except (FolderTaken, SceneError, GeometryError, CheckpointError, RecordingError) as error:
-        return _fail(" ".join(str(error).split()), BAD_INPUT)
+        return _fail(_as_typed(error), BAD_INPUT)
     except NoUnloadedShape as failure:
         return _fail(str(failure), SOLVE_FAILED)
     except StepFailure as failure:
@@ -426,7 +434,7 @@ def _study(options: argparse.Namespace, task: Callable[[Scene], tuple[Path, str,
         _complain_of(early.failed)
         return _fail(str(early), SOLVE_FAILED if early.failed else STOPPED)
     except FigureError as refusal:  # a picture or a table of somebody else's stands in its place
-        return _fail(str(refusal), refusal.exit_code)
+        return _fail(_as_typed(refusal), refusal.exit_code)
     except interrupts.Interrupted as interruption:
         return _fail(STUDY_STOPPED, interruption.exit_code)
     except ForeignFileError as error:
@@ -498,7 +506,7 @@ def _fit(options: argparse.Namespace) -> int:
                 scene, options.data, options.output, options.starts, options.quiet, options.profiles
             )
         except FolderTaken as error:
-            raise SceneError(" ".join(str(error).split())) from error
+            raise SceneError(str(error)) from error
         except StepFailure as failure:
             raise _NoStart(f"at the start of the fit {failure}. {failure.refusal}; choose other starts") from failure
         return folder, study.in_words(found), {}
@@ -549,7 +557,7 @@ def _report(options: argparse.Namespace) -> int:
     try:
         written = write_report(options.folder, options.output, options.size)
     except (RecordingError, ReportError) as error:
-        return _fail(str(error), BAD_INPUT)
+        return _fail(_as_typed(error), BAD_INPUT)
     except ForeignFileError as error:
         return _fail(f"{error.filename}: {error.strerror}", BAD_INPUT)
     except OSError as error:
@@ -583,7 +591,7 @@ def _drawing(options: argparse.Namespace) -> int:
         else:
             written = draw_animation(options.folder, options.frames, viewing, options.output)
     except FigureError as refusal:
-        return _fail(str(refusal), refusal.exit_code)
+        return _fail(_as_typed(refusal), refusal.exit_code)
     except RecordingError as error:
         return _fail(str(error), BAD_INPUT)
     except ForeignFileError as error:
@@ -720,7 +728,7 @@ def _figures(options: argparse.Namespace) -> int:
         with interrupts.StopRequest(), interrupts.stopping_at_once():
             written = figures.draw(options.names, folder, runs, options.jobs, formats, options.stamp)
     except figures.FigureError as error:
-        return _fail(str(error), error.exit_code)
+        return _fail(_as_typed(error), error.exit_code)
     except interrupts.Interrupted as interruption:
         return _fail(STUDY_STOPPED, interruption.exit_code)
     except OSError as error:

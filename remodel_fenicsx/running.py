@@ -103,7 +103,7 @@ def run(
     >>> run(scene, "one-step")
     Traceback (most recent call last):
         ...
-    remodel_fenicsx.results.run_lock.FolderTaken: -o one-step: is not empty; allowed is a new or an empty folder
+    remodel_fenicsx.results.run_lock.FolderTaken: folder one-step: is not empty; allowed is a new or an empty folder
     """
     end_all_ranks_on_exception()
     # what the scene asks for is built before anything is written

@@ -91,7 +91,7 @@ class MeshBody(WalledMesh):
         Column(
             "lumen_volume",
             "length^3",
-            "volume inside the deformed inner face, closed by flat caps at its ends",
+            "volume inside the deformed inner face, closed by flat caps at its ends; empty where it encloses none",
             lambda m: m.lumen_volume(),
         ),
         *WalledMesh.columns,

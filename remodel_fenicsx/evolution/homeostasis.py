@@ -20,6 +20,7 @@ from remodel_fenicsx.body.loading import LoadValues
 from remodel_fenicsx.evolution.implicit import RESIDUAL, Implicit
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
 from remodel_fenicsx.evolution.step_control import StepControl
+from remodel_fenicsx.evolution.turnover import MUCH, Slowing
 from remodel_fenicsx.fem import assembly
 from remodel_fenicsx.model.cells import structure_tensor
 from remodel_fenicsx.solver.continuation import Work
@@ -135,7 +136,7 @@ class Homeostasis:
         The error of a row that lags leaves nothing once the cells rest, unless they come to rest elsewhere. Where
         collagen comes to rest depends on the way.
         """
-        state, self.near, self.tries = self.state, NEAR, TRIES
+        state, self.near, self.tries, self._slowing = self.state, NEAR, TRIES, Slowing(dict(Slowing.INITIAL))
         self.way.tolerance = self.tolerance
         for step in self.way.march():
             self.steps += 1
@@ -167,8 +168,11 @@ class Homeostasis:
         soon = self.state.time + 1 / self.way.stepper.slowest
         if max(self._largest(self._change_by_a_pass(soon, work.residual)), self._growth()) <= REST:
             return True
-        if self.turnover is not None and self.turnover.grows_on():
-            text = "growth does not come to rest (docs/turnover.md): the state is that of time %g, on the path"
+        if self._grows_on(waiting):
+            text = (
+                "growth does not come to rest, its rates fall no faster than 1/t (docs/turnover.md): the state is that "
+                "of time %g, on the path"
+            )
             self._warn(text, self.state.time)
             return True
         if waiting > LONGEST_HOLD:
@@ -184,8 +188,14 @@ class Homeostasis:
         """Largest relative change of content or natural length in the time in which `REST` is asked for."""
         if self.turnover is None:
             return 0.0
-        rates = np.abs(self.turnover.rates()).max(axis=0).reshape(self.state.cells.quadrature.shape)
-        return self.state.cells.quadrature.maximum(rates) / self.way.stepper.slowest
+        return self.state.cells.quadrature.maximum(self.turnover.fastest_changes()) / self.way.stepper.slowest
+
+    def _grows_on(self, waiting: float) -> bool:
+        """Whether the natural length has grown much, and its rates do not fall as those do that come to rest."""
+        if self.turnover is None:
+            return False
+        goes_on = self._slowing.goes_on(waiting, self._growth())
+        return goes_on and self.state.cells.quadrature.maximum(self.turnover.factors("natural_length")) > MUCH
 
     def _arrived(self, limit: Limit, time: float, loads: LoadValues, towards: Array, work: Work) -> bool:
         """Make the rest of the way in one step; if it is not solved or leads elsewhere, all is as before."""

@@ -188,7 +188,7 @@ class StepControl:
             numbers["goes_on"] = float(error > NEAR and numbers["in_vain"] > AGAIN * IN_VAIN)
         elif numbers["in_vain"] > IN_VAIN:
             numbers["goes_on"] = 1.0
-        said = 2.0 * numbers["goes_on"] or float(error > 1 and step.time_error > self.tolerance)
+        said = float(error > 1 and step.time_error > self.tolerance) * (1.0 + numbers["goes_on"])
         if said > numbers["said"]:
             self._say(step)
             numbers["said"] = said

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,19 +16,10 @@ from remodel_fenicsx.state.memory import Earlier, Numbers
 from remodel_fenicsx.state.parameters import Parameters, on_mesh
 from remodel_fenicsx.state.state import State
 
-log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 
 LARGEST_TURNOVER = 0.5  # largest |change of ln rho| in a step: the prototype's; it does not act at rest
-GROWN = (
-    "growth does not come to rest (mechanobiological instability, docs/turnover.md); try a larger "
-    "remodeling.turnover.gain or a thicker wall"
-)
-LOST = (
-    "the tissue wastes away, for its chains are stretched less than remodeling.turnover.deposition_stretch; try a "
-    "smaller one, or larger loads"
-)
-BEYOND_REST = 10.0  # factor of content or natural length from which on growth is hardly meant
+MUCH = 10.0  # factor of content or natural length that is said
 
 
 def turned_over(tissue: Tissue, state: State) -> Tissue:
@@ -45,6 +36,31 @@ def changed(start: Array, rates: Array, duration: float) -> Array:
     content, length = rates * duration
     found: Array = start + [content, np.clip(length, -LARGEST_TURNOVER, LARGEST_TURNOVER)]
     return found
+
+
+class Slowing:
+    """Whether rates fall faster than 1/t: told from what they were after a quarter to a half of the time.
+
+    Those of what comes to rest fall exponentially. The integral of rates that fall no faster than 1/t has no bound.
+
+    Parameters
+    ----------
+    numbers
+        What is remembered, at first `INITIAL`.
+    """
+
+    INITIAL = dict.fromkeys(("early_time", "early_rate", "late_time", "late_rate"), 0.0)
+
+    def __init__(self, numbers: Any):
+        self.numbers = numbers
+
+    def goes_on(self, elapsed: float, rate: float) -> bool:
+        """Whether the rate after a time does not fall so; False where that is not known yet."""
+        numbers = self.numbers
+        if elapsed >= 2 * numbers["late_time"]:
+            numbers["early_time"], numbers["early_rate"] = numbers["late_time"], numbers["late_rate"]
+            numbers["late_time"], numbers["late_rate"] = elapsed, rate
+        return bool(numbers["early_time"] and rate * elapsed >= numbers["early_rate"] * numbers["early_time"])
 
 
 class TurnoverPass:
@@ -77,7 +93,7 @@ class TurnoverPass:
         self.state, self.settings, self.quadrature = state, settings, state.cells.quadrature
         self.tissue = on_mesh(tissue, self.quadrature.mesh)
         self._parameters = Parameters(self.tissue, self.quadrature)
-        self._numbers = Numbers(state, "turnover", {"said": 0, "duration": 0.0})
+        self._numbers = Numbers(state, "turnover", {"duration": 0.0})
         self._earlier = Earlier(state, "turnover_rates", lambda: self.quadrature.function("", (2,)), 1)
         self.weights: Sequence[float] = (1.0,)  # of the load cases, that of `state` first
         self.slowest, self.fastest = 1.0 / settings.time, max(1.0, settings.gain) / settings.time
@@ -129,7 +145,6 @@ class TurnoverPass:
         self.better = self.after(self.row, duration)
         if self._start_rates is not None:
             self.better = changed(self._start, (self._start_rates + self.rates()) / 2, duration)
-        self._warn()
 
     def after(self, start: Array, duration: float, present: bool = False) -> Array:
         """ln m and ln rho (2, n) after a time with the rates of the solved state; `present`: with its present cells."""
@@ -173,28 +188,12 @@ class TurnoverPass:
         values: Array = self.quadrature.values(getattr(self.tissue, name), ())
         return values
 
-    def grows_on(self) -> bool:
-        """Whether the natural length has grown so much anywhere that it is not expected to come to rest."""
-        return self.quadrature.maximum(self._values("natural_length")) > BEYOND_REST
+    def fastest_changes(self) -> Array:
+        """Larger one of |d ln m / dt| and |d ln rho / dt| in the solved state, (elements, points)."""
+        found: Array = np.abs(self.rates()).max(axis=0).reshape(self.quadrature.shape)
+        return found
 
-    def _warn(self) -> None:
-        if self._numbers["said"]:
-            return
-        for name in TURNED_OVER:
-            factor = np.exp(np.abs(np.log(self._values(name))))
-            largest = self.quadrature.maximum(factor)
-            if largest <= BEYOND_REST:
-                continue
-            self._numbers["said"] = 1
-            place = ", ".join(f"{c:.3f}" for c in self.quadrature.place_of_largest(factor))
-            grown = self.quadrature.maximum(self._values(name)) > BEYOND_REST
-            if self.state.comm.rank == 0:
-                log.warning(
-                    "turnover: %s has changed by more than a factor of %g at (%s) in the step after time %g: %s",
-                    name.replace("_", " "),
-                    BEYOND_REST,
-                    place,
-                    self.state.time,
-                    GROWN if grown else LOST,
-                )
-            return
+    def factors(self, name: str) -> Array:
+        """By what `content` or `natural_length` has changed, up or down: 1 or more, (elements, points)."""
+        found: Array = np.exp(np.abs(np.log(self._values(name))))
+        return found

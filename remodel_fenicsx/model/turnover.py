@@ -6,7 +6,7 @@ lambda_h the stretch of deposition and tau(lambda) = g(lambda r0) lambda, propor
     dm/dt / m = k/T (tau(lambda_e)/tau(lambda_h) - 1), limited to k/T,
     drho/dt / rho = (1/T + (dm/dt / m)^+) (lambda_e/lambda_h - 1)
 
-after Cyron, Aydin and Humphrey 2016 (docs/turnover.md).
+The idea is that of Cyron, Aydin and Humphrey 2016, whose rates are others (docs/turnover.md, Limits).
 """
 
 from __future__ import annotations

@@ -69,7 +69,7 @@ def draw_picture(
     sight = Sight(RecordedRun(folder), viewing or Viewing())
     shown = sight.times(times)
     if len(shown) > MOST_PANELS:
-        raise FigureError(f"--time: {len(shown)} times; allowed are {MOST_PANELS} in a picture (animate shows more)", 2)
+        raise FigureError(f"times: {len(shown)} times; allowed are {MOST_PANELS} in a picture (animate shows more)", 2)
     ending = path.suffix.lower() if path else ".png"
     dots = DOTS_PER_INCH[ending[1:]]
     snapshots = sight.snapshots(shown)
@@ -215,15 +215,15 @@ def _check_new(path: Path | None, endings: Sequence[str]) -> None:
     if path is None:
         return
     if path.suffix.lower() not in endings:
-        raise FigureError(f"-o {path}: allowed is a name that ends in {', '.join(endings)}", 2)
+        raise FigureError(f"path {path}: allowed is a name that ends in {', '.join(endings)}", 2)
     if os.path.lexists(path):
         raise _taken(path)
     if not path.parent.is_dir():
-        raise FigureError(f"-o {path}: there is no folder {path.parent}", 2)
+        raise FigureError(f"path {path}: there is no folder {path.parent}", 2)
 
 
 def _taken(path: Path) -> FigureError:
-    return FigureError(f"-o {path}: is there already; allowed is a new file", 2)
+    return FigureError(f"path {path}: is there already; allowed is a new file", 2)
 
 
 def _write(path: Path | None, sight: Sight, times: Sequence[float], ending: str, data: bytes) -> Path:

@@ -64,8 +64,8 @@ class Viewing:
         except ValueError:
             x = y = z = math.nan
         if not 0 < math.hypot(x, y, z) < math.inf:
-            allowed = f"{', '.join(VIEWS)} or --view=X,Y,Z, where the eye is from the middle of the body"
-            raise FigureError(f"--view {self.view}: allowed is {allowed}", 2)
+            allowed = f"{', '.join(VIEWS)} or X,Y,Z, where the eye is from the middle of the body"
+            raise FigureError(f"view {self.view}: allowed is {allowed}", 2)
         return x, y, z
 
 
@@ -80,7 +80,7 @@ def shown_elements(whole: WholeBody, viewing: Viewing) -> NDArray[np.bool_]:
     layers, count = viewing.layers, len(whole.depth)
     if layers is not None and not 1 <= layers <= count:
         start = whole.recording.scene.geometry.depth_in_words[1]
-        raise FigureError(f"--layers {layers}: allowed is a whole number from 1 to {count}, from the {start}", 2)
+        raise FigureError(f"layers {layers}: allowed is a whole number from 1 to {count}, from the {start}", 2)
     return (whole.layer < (layers or count)) & ~_cut_off(whole, viewing.cut)
 
 
@@ -91,9 +91,9 @@ def _cut_off(whole: WholeBody, cut: str | None) -> NDArray[np.bool_]:
     is_front, is_right = centres[:, 1] < middle[1] - slack, centres[:, 0] > middle[0] + slack
     found = {None: np.zeros(len(centres), dtype=bool), "half": is_front, "quarter": is_front & is_right}
     if cut not in found:
-        raise FigureError(f"--cut {cut}: allowed are {', '.join(CUTS)}", 2)
+        raise FigureError(f"cut {cut}: allowed are {', '.join(CUTS)}", 2)
     if cut is not None and not found[cut].any():
-        raise FigureError(f"--cut {cut}: no whole element of this body lies in that part", 2)
+        raise FigureError(f"cut {cut}: no whole element of this body lies in that part", 2)
     return found[cut]
 
 
@@ -152,7 +152,7 @@ class Sight:
         for time in wanted or ():
             inside = first <= time <= last or same_time(time, first) or same_time(time, last)
             if not inside:
-                raise FigureError(f"--time {time:g}: allowed are times from {first:g} to {last:g}", 2)
+                raise FigureError(f"times {time:g}: allowed are times from {first:g} to {last:g}", 2)
         nearest = [float(recorded[np.abs(recorded - time).argmin()]) for time in wanted or (last,)]
         return list(dict.fromkeys(nearest))
 

@@ -67,11 +67,11 @@ def write_report(folder: str | os.PathLike[str], path: Path | None = None, size:
         try:
             write_new(path, page_of(recording, size).encode("utf-8"))
         except FileExistsError as error:
-            raise ReportError(f"-o {path}: is there already; allowed is a new file") from error
+            raise ReportError(f"path {path}: is there already; allowed is a new file") from error
         return path
     path = recording.path / REPORT
     if path.exists() and GENERATOR_TAG not in read_regular(path, LARGEST_PAGE)[:4096]:
-        raise ReportError(f"{path}: is no report of this command and is not overwritten; choose another file with -o")
+        raise ReportError(f"{path}: is no report of this command and is not overwritten; choose another file")
     write_whole(path, page_of(recording, size).encode("utf-8"))
     return path
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from html import escape
-from itertools import chain
+from itertools import chain, takewhile
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +32,8 @@ from remodel_fenicsx.results.drawing import (
 from remodel_fenicsx.results.recording import HISTORY, LARGEST_HISTORY, SCENE, RecordedRun
 from remodel_fenicsx.results.words import unit_of, with_unit, words
 from remodel_fenicsx.scene.scene import Scene
-from remodel_fenicsx.settings import Properties
+from remodel_fenicsx.schema.tables import Table
+from remodel_fenicsx.settings import Load, Properties
 from remodel_fenicsx.system.regular_files import read_regular
 from remodel_fenicsx.system.terminal import duration
 
@@ -165,6 +166,8 @@ def angles(run: ReportedRun) -> Card | None:
     if body is None or body.angle is None:
         return None
     through, start, end = shape.depth_in_words
+    if not np.isfinite(run.story.history.get("lumen_volume", np.zeros(1))).any():
+        through = "through the body"  # its inner face encloses nothing
     along, across = shape.angle_in_words
     legend = '<p class="note">Red: now, mean and 10 to 90 % of the volume. Grey: other times.</p>'
     profile = section(f"Collagen angle {through}, deformed", f'<div id="profile"></div>{legend}', "narrow")
@@ -212,8 +215,9 @@ def _title(names: list[str]) -> str:
     if len(names) == 1:
         return words(names[0])[0].upper() + words(names[0])[1:]
     parts = [name.split("_") for name in names]
-    common = parts[0][:2] if all(part[:2] == parts[0][:2] for part in parts) else parts[0][-1:]
-    return " ".join(common).capitalize()
+    starts = [same[0] for same in takewhile(lambda each: len(set(each)) == 1, zip(*parts, strict=False))]
+    common = words("_".join(starts or parts[0][-1:]))
+    return common[0].upper() + common[1:]
 
 
 def _finite(value: float) -> float | None:
@@ -228,16 +232,18 @@ def facts(run: ReportedRun) -> Card:
     sizes = ", ".join(
         f"{words(name)} {value:g}" for name, value in shape.model_dump().items() if isinstance(value, (int, float))
     )
+    given = f"; {story.unloaded}" if story.unloaded else ""
     count = f", {len(run.recording.elements):,} in number" if run.body else ""
     name = KINEMATICS[scene.model.kinematics].element(mesh.element)
     seed = f", seed {scene.cells.seed}" if scene.has_random_cells else ""
     cells, kappa = _by_region(scene, _cells), _by_region(scene, lambda properties: f"{properties.kappa:g}")
-    loads = "; ".join(f"{words(name)} {load.value:g}" for name, load in scene.loads.items())
+    loads = "; ".join(f"{words(name)} {load.value:g}{_ramp(load)}" for name, load in scene.loads.items())
     seconds = story.history.get("seconds", np.zeros(0))
     solving = f"; {duration(float(np.nansum(seconds)))} of solving" if len(seconds) else ""
     ranks = f", {story.ranks} ranks" if story.ranks not in ("", "1") else ""
     rows = [
-        ("Body", f"{shape.name}: {sizes}"),
+        ("Body", f"{shape.name}: {sizes}{f' in {shape.length_unit}' if shape.length_unit else ''}{given}"),
+        *([] if scene.natural.is_of_the_mesh else [("Free of stress", _natural(scene))]),
         ("Mesh", f"{name} elements{count}, degree {mesh.degree}, refinement {mesh.refinement}, {mesh.formulation}"),
         ("Kinematics", f"{scene.model.kinematics}: {KINEMATICS[scene.model.kinematics].meaning}"),
         ("Supports", f"ends {scene.supports.ends}"),
@@ -247,9 +253,29 @@ def facts(run: ReportedRun) -> Card:
         ("Material", scene.summary()),
         ("Remodeling", f"law {remodeling.law}, driver {remodeling.driver}, frame {remodeling.frame}, "
                        f"coupling {remodeling.coupling}, kappa {kappa}"),
+        *([("Turnover", _keys(remodeling.turnover))] if remodeling.turnover.is_on else []),
         ("Time", f"{max(0, len(story.history['time']) - 1)} of {scene.time.in_words()}{solving}{ranks}"),
     ]  # fmt: skip
     return Card("facts", section("What was run", table(rows)))
+
+
+def _ramp(load: Load) -> str:
+    """By what it is multiplied over time."""
+    return f", times {', '.join(f'{factor:g} at t = {time:g}' for time, factor in load.ramp)}"
+
+
+def _natural(scene: Scene) -> str:
+    """In which pieces the tissue is, and how they were stretched."""
+    layers = [_keys(layer) for layer in scene.natural.layers]
+    return "; ".join([f"opening angle {scene.natural.opening_angle:g}°", *(f"layer {layer}" for layer in layers)])
+
+
+def _keys(table: Table) -> str:
+    """All keys of a table that have a value."""
+    found = table.model_dump(exclude_none=True).items()
+    return ", ".join(
+        f"{words(name)} {value:g}" if isinstance(value, float) else f"{words(name)} {value}" for name, value in found
+    )
 
 
 def _by_region(scene: Scene, in_words: Callable[[Properties], str]) -> str:

@@ -16,6 +16,7 @@ from remodel_fenicsx.system.regular_files import read_regular
 
 _LINE = re.compile(r"(\d{4}-\d\d-\d\d \d\d:\d\d:\d\d)\S* ([A-Z]+) (.*)")
 _STEP = re.compile(r"time (\S+?), ")
+UNLOADED = "unloaded: "  # as logs say it
 _RANKS = re.compile(r"scene .* on (\d+) ranks?, results in ")
 
 
@@ -56,6 +57,8 @@ class Story:
         Of the last start.
     warnings
         In the order of the log.
+    unloaded
+        What the body was found from, where a loaded one was given.
     """
 
     state: str
@@ -65,6 +68,7 @@ class Story:
     ended: str
     ranks: str
     warnings: list[Warned]
+    unloaded: str = ""
 
     @classmethod
     def of(cls, recording: RecordedRun) -> Story:
@@ -80,8 +84,9 @@ class Story:
         lines = list(_log(recording.path))
         stamps = [stamp for stamp, _, _ in lines] or [""]
         ranks = [found[1] for _, _, text in lines if (found := _RANKS.match(text))] or [""]
+        unloaded = [text for _, _, text in lines if text.startswith(UNLOADED)] or [""]
         state, words = _state(recording, history, lives)
-        return cls(state, words, history, stamps[0], stamps[-1], ranks[-1], _warnings(lines))
+        return cls(state, words, history, stamps[0], stamps[-1], ranks[-1], _warnings(lines), unloaded[-1])
 
 
 def _log(folder: Path) -> Iterator[tuple[str, str, str]]:

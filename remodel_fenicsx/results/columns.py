@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -25,6 +26,7 @@ from remodel_fenicsx.results.fields import NodalGather
 from remodel_fenicsx.solver.equilibrium import Equilibrium
 
 Array = NDArray[np.float64]
+NO_LUMEN = 1e-9  # of the body's size cubed: what a flat inner face encloses by rounding
 
 
 class Observer(Watcher):
@@ -317,7 +319,7 @@ class _LumenVolume:
 
     def __init__(self, observer: Observer):
         domain, state = observer.domain, observer.state
-        self._rims, self._comm = domain.rims, domain.comm  # type: ignore[attr-defined]
+        self._rims, self._comm, self._size = domain.rims, domain.comm, domain.size  # type: ignore[attr-defined]
         self._nodes, self._displacement = domain.gather_nodes(domain.mesh.geometry.x), NodalGather(domain, state)
         place = ufl.SpatialCoordinate(domain.mesh) + state.kinematics.displacement(state.unknown)
         normal = ufl.cofac(state.kinematics.deformation_gradient(state.unknown)) * ufl.FacetNormal(domain.mesh)
@@ -329,7 +331,8 @@ class _LumenVolume:
         displacement = self._displacement()
         if displacement is not None and self._nodes is not None:
             volume += sum(cap_volume(self._nodes + displacement, rim) for rim in self._rims)
-        return float(over_ranks(self._comm, volume, MPI.SUM))
+        volume = float(over_ranks(self._comm, volume, MPI.SUM))
+        return volume if abs(volume) > NO_LUMEN * self._size**3 else math.nan
 
 
 class EndForce(NamedTuple):

@@ -52,11 +52,11 @@ def choose_folder(requested: Path | None, name: str) -> Path:
     """
     if requested is not None:
         if len(requested.parts) > DEEPEST:
-            raise FolderTaken(f"-o {requested}: lies in more than {DEEPEST} folders")
+            raise FolderTaken(f"folder {requested}: lies in more than {DEEPEST} folders")
         if requested.exists() and not requested.is_dir():
-            raise FolderTaken(f"-o {requested}: is a file; allowed is a new or an empty folder")
+            raise FolderTaken(f"folder {requested}: is a file; allowed is a new or an empty folder")
         if requested.is_dir() and not is_vacant(requested):
-            raise FolderTaken(f"-o {requested}: is not empty; allowed is a new or an empty folder")
+            raise FolderTaken(f"folder {requested}: is not empty; allowed is a new or an empty folder")
         return requested
     Path("results").mkdir(exist_ok=True)
     for number in itertools.count(1):
@@ -135,7 +135,7 @@ def _lock(folder: Path, ranks: int, new: bool) -> RunLock:
     lock = RunLock(folder, ranks)
     if new and (folder / SCENE).exists():
         lock.close()
-        raise FolderTaken(f"-o {folder}: is not empty; allowed is a new or an empty folder")
+        raise FolderTaken(f"folder {folder}: is not empty; allowed is a new or an empty folder")
     return lock
 
 

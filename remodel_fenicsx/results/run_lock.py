@@ -28,7 +28,7 @@ class FolderTaken(ValueError):
     >>> parts.chosen_folder("taken", "cube", MPI.COMM_WORLD)
     Traceback (most recent call last):
         ...
-    remodel_fenicsx.results.run_lock.FolderTaken: -o taken: is not empty; allowed is a new or an empty folder
+    remodel_fenicsx.results.run_lock.FolderTaken: folder taken: is not empty; allowed is a new or an empty folder
     """
 
 

@@ -61,7 +61,7 @@ class WholeBody:
             self._turned = TurnedFields(points, elements, *solved, reduction.turn)
         self._used, corners = np.unique(elements, return_inverse=True)
         self.points, self.elements = points[self._used], corners.reshape(elements.shape)
-        self.layer, self.depth = _layers(self._depths(shape))
+        self.layer, self.depth = _layers(self._depths(shape), self.elements)
 
     def _depths(self, shape: Shape) -> Numbers:
         """Of the elements, (m,): as recorded, or by their places."""
@@ -96,11 +96,19 @@ def has_a_body(recording: RecordedRun) -> bool:
     return bool(len(recording.times)) and (reduction is None or reduction.whole is not None)
 
 
-def _layers(depth: Numbers) -> tuple[NDArray[np.int64], Numbers]:
-    """Number of each element's layer and the mean depth of each: those of the mesh, or equal parts of the way."""
+def _layers(depth: Numbers, elements: NDArray[np.int64]) -> tuple[NDArray[np.int64], Numbers]:
+    """Number of each element's layer and the mean depth of each: those of the mesh, or equal parts of the way.
+
+    There are as many as elements lie behind one another. Tetrahedra have more depths than that: each part of the way
+    takes all that lie between the same faces, for they differ in kind.
+    """
+    nodes = np.bincount(elements.ravel(), weights=np.repeat(depth, elements.shape[1])) / np.bincount(elements.ravel())
+    extent = np.ptp(nodes[elements], axis=1).mean()
+    number = max(1, round(float(np.ptp(nodes) / extent))) if extent > 0 else 1
     layer = rank_of(depth)
-    if layer.max() >= MOST_LAYERS:
-        layer = np.minimum((FEW_LAYERS * np.clip(depth, 0.0, 1.0)).astype(np.int64), FEW_LAYERS - 1)
+    if layer.max() >= number or number > MOST_LAYERS:
+        number = number if number <= MOST_LAYERS else FEW_LAYERS
+        layer = np.minimum((number * np.clip(depth, 0.0, 1.0)).astype(np.int64), number - 1)
         layer = np.unique(layer, return_inverse=True)[1].reshape(-1)  # none without an element
     counts = np.bincount(layer)
     return layer, np.bincount(layer, weights=depth) / counts

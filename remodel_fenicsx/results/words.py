@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 WORDS = {"max_chain_extension": "largest r/L", "min_jacobian": "smallest J", "seconds": "seconds a step"}
@@ -9,12 +10,15 @@ WORDS = {"max_chain_extension": "largest r/L", "min_jacobian": "smallest J", "se
 
 def words(name: str) -> str:
     """A column's name."""
-    return WORDS.get(name) or name.replace("_", " ")
+    known = next((known for known in WORDS if f"{name}_".startswith(f"{known}_")), "")
+    return WORDS.get(known, "") + name.removeprefix(known).replace("_", " ")
 
 
 def number(value: float) -> str:
-    """Three digits."""
-    return f"{value:.3g}" if abs(value) < 1e5 and (abs(value) >= 1e-3 or value == 0) else f"{value:.2e}"
+    """Three digits, all of them: 3.40 beside 2.45."""
+    if value == 0:
+        return "0"
+    return f"{value:#.3g}".rstrip(".") if 1e-3 <= abs(value) < 1e5 else f"{value:.2e}"
 
 
 def with_unit(value: float, unit: str) -> str:
@@ -24,5 +28,8 @@ def with_unit(value: float, unit: str) -> str:
 
 def unit_of(scene: Any, dimension: str) -> str:
     """The unit of a `Column` by what it measures, where the scene says what it is, else nothing."""
-    names = {"stress": scene.material.stress_unit, "length": scene.geometry.length_unit, "degrees": "°", "s": "s"}
-    return names.get(dimension) or ""
+    names = {"stress": scene.material.stress_unit, "length": scene.geometry.length_unit, "degrees": "°"}
+    parts = re.split(r"(\w+)", dimension.replace("force", "stress length^2"))
+    if not all(names.get(part, part) for part in parts if part):
+        return ""
+    return "".join(names.get(part) or part for part in parts).replace("^2", "²").replace("^3", "³")

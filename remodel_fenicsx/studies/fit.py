@@ -360,11 +360,11 @@ def _place(folder: Path | str | None, name: str, mark: str) -> Path:
     try:
         there = fingerprint_in(wanted)
     except (ForeignFileError, OSError) as error:
-        raise SceneError(f"-o {wanted}: {error}") from error
+        raise SceneError(f"folder {wanted}: {error}") from error
     if there == mark:
         return wanted
     if there is not None and folder is not None:
-        raise SceneError(f"-o {wanted}: holds a fit of another scene, data or version; choose another folder")
+        raise SceneError(f"folder {wanted}: holds a fit of another scene, data or version; choose another folder")
     return chosen_folder(folder, name, MPI.COMM_SELF)
 
 

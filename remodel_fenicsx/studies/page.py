@@ -256,7 +256,7 @@ def check_folder(folder: Path, names: Sequence[str], formats: Sequence[str]) -> 
         If nothing can be written there.
     """
     if folder.exists() and not folder.is_dir():
-        raise FigureError(f"-o {folder}: is a file; allowed is a folder", 2)
+        raise FigureError(f"folder {folder}: is a file; allowed is a folder", 2)
     for name in names:
         endings = (*formats, "csv", "json")
         for path in (*(folder / f"{name}.{ending}" for ending in endings), *folder.glob(f"{name}-*.csv")):

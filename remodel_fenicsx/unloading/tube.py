@@ -45,8 +45,8 @@ def unloaded_tube(scene: Scene, comm: MPI.Intracomm) -> Scene:
 
     found = in_shares(find, given)
     geometry = _with_numbers(scene, found)
-    words = ", ".join(f"{value:.6g}" for value in found[:-1])
-    log.info("unloaded: radii %s, length %.6g; loaded again it is as given (%d runs)", words, found[-1], runs)
+    unloaded, loaded = (f"radii {', '.join(f'{r:.6g}' for r in radii)}, length {l:.6g}" for *radii, l in (found, given))
+    log.info("unloaded: %s, so that under the loads it has the given %s (%d runs)", unloaded, loaded, runs)
     return geometry
 
 

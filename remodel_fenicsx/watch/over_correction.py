@@ -92,6 +92,9 @@ class OverCorrection(WarnsOnce):
         times = {f"time_{age}": 0.0 for age in range(ORDER + 1)}
         super().__init__(stepper, "over_correction", {"growing": 0, "sustained": 0} | times)
         self.swing: Swing | None = None
+        # cells that belong to the stress of their own row, by a rule for any step, go nowhere too far
+        coupling = stepper.coupling
+        self._may_swing = not coupling.accumulates or coupling.longest < np.inf
         # of the passes before, with the newest one
         cells = partial(self.quadrature.function, "", (6,))
         self._cells = Earlier(self.state, "over_correction_cells", cells, ORDER + 1)
@@ -122,7 +125,7 @@ class OverCorrection(WarnsOnce):
 
     def committed(self, step: Step) -> None:
         """Warn."""
-        if self.said or self.swing is None:
+        if self.said or self.swing is None or not self._may_swing:
             return
         next_one = self.swing.cells * abs(self.swing.cells_factor)  # as large as it will be after one pass more
         begins = self._numbers["growing"] >= GROWING_PASSES and next_one >= CELL_TOLERANCE

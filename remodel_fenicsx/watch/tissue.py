@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.body.shape import Shape
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
+from remodel_fenicsx.evolution.turnover import MUCH, Slowing
 from remodel_fenicsx.fem.compat import geometry_dofmap
+from remodel_fenicsx.model.energy import TURNED_OVER
 from remodel_fenicsx.state.memory import Occasions
 from remodel_fenicsx.system import NOTICE
 from remodel_fenicsx.watch.once import WarnsOnce
@@ -68,9 +70,9 @@ class VolumeLoss(WarnsOnce):
     def _in_words(self) -> str:
         found = {name: self._numbers[name] for name in self._numbers.initial}
         return (
-            "the tissue has lost up to {lost:.2g} % of its volume (mean J {mean:.3g} at time {mean_time:g}; least "
-            "J {least:.3g} at {x:.4g}, {y:.4g}, {z:.4g}, time {least_time:g})"
-        ).format(lost=100 * (1 - found["mean"]), **found)
+            "the tissue has lost up to {lost:.2g} % of its volume at {x:.4g}, {y:.4g}, {z:.4g} (least J {least:.3g}, "
+            "time {least_time:g}), {whole:.2g} % in all (mean J {mean:.3g}, time {mean_time:g})"
+        ).format(lost=100 * (1 - found["least"]), whole=100 * (1 - found["mean"]), **found)
 
 
 class WeakTension(WarnsOnce):
@@ -96,10 +98,10 @@ class WeakTension(WarnsOnce):
 
 
 class GrowthWithoutRest(WarnsOnce):
-    """Warns at the end where turnover goes on, and its rates do not fall as those do that come to rest.
+    """Warns at the end where turnover goes on, and its rates do not fall as those do that come to rest (`Slowing`).
 
-    These fall exponentially. Rates that fall no faster than 1/t have no finite integral: the content or the natural
-    length has no bound (mechanobiological instability; Latorre and Humphrey 2019).
+    Growth without bound is the mechanobiological instability (Latorre and Humphrey 2019). How much the tissue has grown
+    tells nothing of that: it is a notice.
 
     Parameters
     ----------
@@ -110,33 +112,43 @@ class GrowthWithoutRest(WarnsOnce):
     """
 
     def __init__(self, stepper: Stepper, held_from: float):
-        names = ("early", "late"), ("time", "rate")
-        super().__init__(stepper, "growth", {f"{when}_{what}": 0.0 for when in names[0] for what in names[1]})
-        self.held_from, self._text = held_from, ""
+        super().__init__(stepper, "growth", {"noticed": 0} | Slowing.INITIAL)
+        self.held_from, self._slowing = held_from, Slowing(self._numbers)
+        self._text = self._notice = ""
 
     def solved(self, step: Step) -> None:
-        """Remember the rates at times that double; at the end compare the last with one of them."""
-        numbers, turnover, elapsed = self._numbers, self.stepper.turnover, step.time - self.held_from
-        if elapsed <= 0:
+        """Look at the rates, and at what they have made."""
+        turnover, elapsed = self.stepper.turnover, step.time - self.held_from
+        rates, period = turnover.fastest_changes(), turnover.settings.time
+        rate, self._text, self._notice = self.quadrature.maximum(rates), "", ""
+        change = f"by up to {100 * rate * period:.2g} % in remodeling.turnover.time"
+        for name in TURNED_OVER if not self._numbers["noticed"] else ():
+            factors = turnover.factors(name)
+            if self.quadrature.maximum(factors) > MUCH:
+                self._notice = (
+                    f"{name.replace('_', ' ')} has changed by more than a factor of {MUCH:g} at "
+                    f"{self._place(factors)}; content or natural length now change {change} (docs/turnover.md)"
+                )
+        goes_on = elapsed > 0 and self._slowing.goes_on(elapsed, rate)
+        if not (goes_on and step.is_last and elapsed >= LONG * period and rate * period >= FAR_FROM_REST):
             return
-        rates = np.abs(turnover.rates()).max(axis=0).reshape(self.quadrature.shape)
-        rate, self._text = self.quadrature.maximum(rates), ""
-        if elapsed >= 2 * numbers["late_time"]:
-            numbers["early_time"], numbers["early_rate"] = numbers["late_time"], numbers["late_rate"]
-            numbers["late_time"], numbers["late_rate"] = elapsed, rate
-        period, early_time = turnover.settings.time, numbers["early_time"]
-        if not step.is_last or elapsed < LONG * period or rate * period < FAR_FROM_REST or not early_time:
-            return
-        if rate * elapsed >= numbers["early_rate"] * early_time:
-            place = ", ".join(f"{c:.4g}" for c in self.quadrature.place_of_largest(rates))
-            self._text = (
-                f"the tissue does not come to rest: content or natural length change by up to {100 * rate * period:.2g}"
-                f" % in remodeling.turnover.time, at ({place}); the rates fall no faster than 1/t "
-                "(mechanobiological instability, docs/turnover.md); try a larger remodeling.turnover.gain"
-            )
+        self._text = (
+            f"the tissue has not come to rest: content or natural length change {change}, most at "
+            f"{self._place(rates)}, and since time {self.held_from + self._numbers['early_time']:g} the rates have "
+            "fallen no faster than 1/t. It goes on without bound (mechanobiological instability, docs/turnover.md), or "
+            "rests much later; with a larger remodeling.turnover.gain it rests sooner"
+        )
+
+    def _place(self, values: Array) -> str:
+        """Where they are largest."""
+        return f"({', '.join(f'{c:.4g}' for c in self.quadrature.place_of_largest(values))})"
 
     def committed(self, step: Step) -> None:
         """Say it."""
+        if self._notice:
+            said = self.said
+            self.say(step, self._notice, NOTICE)
+            self._numbers["noticed"], self._numbers["said"] = 1, said
         if self._text and not self.said:
             self.say(step, self._text)
 

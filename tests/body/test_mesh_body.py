@@ -12,6 +12,7 @@ from mpi4py import MPI
 
 from remodel_fenicsx import SceneError
 from remodel_fenicsx.body import Tube
+from remodel_fenicsx.body.gmsh_model import gmsh_model
 from remodel_fenicsx.body.mesh_supports import free_motions
 from remodel_fenicsx.body.tube import whole_tube
 from remodel_fenicsx.results.columns import Measurement
@@ -350,3 +351,20 @@ def test_a_bend_with_sliding_ends_carries_the_force_of_a_closed_tube(tmp_path: P
         spread.append(float(np.ptp(angle[band] - expected[band])))
         assert angle[band & beside].mean() == pytest.approx(expected[band & beside].mean(), abs=1.0), low
     assert min(spread) > 2.0  # and around the section they differ, as a bend's do
+
+
+def test_a_flat_inner_face_encloses_no_lumen(tmp_path: Path) -> None:
+    """A strip whose lower and upper face are called inner and outer: rounding is no volume."""
+    with gmsh_model("strip") as gmsh:
+        gmsh.model.occ.addBox(3.0, 1.0, 2.0, 3.0, 1.0, 1.0)
+        gmsh.model.occ.synchronize()
+        gmsh.model.addPhysicalGroup(3, [1], name="tissue")
+        for name, tag in (("inlet", 1), ("outlet", 2), ("inner", 5), ("outer", 6)):
+            gmsh.model.addPhysicalGroup(2, [tag], name=name)
+        gmsh.option.setNumber("Mesh.MeshSizeMax", 0.6)
+        gmsh.model.mesh.generate(3)
+        gmsh.write(str(tmp_path / "strip.msh"))
+    geometry = {"shape": "mesh", "file": str(tmp_path / "strip.msh"), "open_boundary": True}
+    loads = {"elongation": LOADS["elongation"]}
+    row, _, _ = solved(scene_of(tmp_path / "strip.msh", geometry=geometry, loads=loads))
+    assert np.isnan(row["lumen_volume"]) and row["fibre_angle_inner"] > 45.0

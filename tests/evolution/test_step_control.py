@@ -377,6 +377,20 @@ def test_where_errors_do_not_fall_the_number_of_steps_is_bounded(caplog: pytest.
     assert len(said) == 2 and "goes on" not in said[0] and "goes on with steps of 1.04" in said[1]
 
 
+def test_rows_within_the_tolerance_are_not_said_to_be_above_it(caplog: pytest.LogCaptureFixture) -> None:
+    """Steps of which the next ones would add up to more, however short; the rows are far from that."""
+    simulation = Simulation(tube("extrapolated", 100.0, **{"time.tolerance": 1.0}), MPI.COMM_SELF)
+
+    def measured(step: Step) -> Estimate:
+        step.time_error = 0.02
+        return Estimate(30.0, step.time_error)
+
+    simulation.control.error.measure = measured  # type: ignore[method-assign,union-attr]
+    list(simulation.steps())
+    assert simulation.control._numbers["goes_on"]  # type: ignore[union-attr]
+    assert "does not fall" not in caplog.text
+
+
 def test_the_tolerance_counts_again_when_errors_fall() -> None:
     """Nothing helps for a while; what comes then is resolved."""
 

@@ -14,6 +14,7 @@ import pytest
 
 import remodel_fenicsx
 from remodel_fenicsx import cli
+from tests.conftest import mpirun
 from tests.forks import COARSE, forked
 
 ROOT = Path(__file__).parents[2]
@@ -38,6 +39,13 @@ def test_the_table_of_columns_is_the_one_that_the_code_makes() -> None:
     assert found is not None and found[1] == columns_table(), f"between the two comments belongs: {remedy}"
 
 
+def test_the_sizes_on_the_page_of_the_architecture_are_those_of_the_code() -> None:
+    script = ROOT / "docs" / "make_architecture.py"
+    code = f"import runpy; made = runpy.run_path({str(script)!r}); print(made['page_text'](made['table']()), end='')"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == page("docs/architecture.md"), "./with-fenicsx python3 docs/make_architecture.py"
+
+
 def test_every_column_of_every_shape_is_in_the_table() -> None:
     """The names of the contract, one by one."""
     names = set(re.findall(r"^\| `(\w+)` \|", columns_table(), re.MULTILINE))
@@ -49,16 +57,24 @@ def test_every_column_of_every_shape_is_in_the_table() -> None:
 
 
 def test_the_python_of_the_readme_runs_as_it_stands(tmp_path: Path) -> None:
-    (code,) = re.findall(r"```python\n(.*?)```", page("README.md"), re.DOTALL)
+    """With both commands that stand after it, in their order."""
+    (code, commands) = re.findall(
+        r"```python\n(.*?)```\n\nSave it as `mine.py` and run (.*?)\. ", page("README.md"), re.DOTALL
+    )[0]
+    one, two = (command.split() for command in re.findall(r"`./with-fenicsx (.*?)`", commands))
     short, number = re.subn(r'"time\.end": 30\.0', '"time.end": 1.0', code)
-    assert number == 1
-    done = forked("python", COARSE + short, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr[-2000:]
-    *steps, radii = done.stdout.strip().split("\n")
-    assert [float(line.split()[0]) for line in steps] == [1.0]
-    recorded = [float(radius) for radius in radii.strip("[]").split()]
-    assert recorded == pytest.approx([3.0, *(float(line.split()[1]) for line in steps)], abs=1e-7)
-    assert (tmp_path / "results" / "half-pressure" / "fields.vtkhdf").exists()
+    assert number == 1 and one[0] == "python3" and two == ["mpirun", "-n", "2", *one]
+    (tmp_path / "mine.py").write_text(COARSE + short)
+    outputs = [forked("python", COARSE + short, cwd=tmp_path)]
+    command = mpirun(2, sys.executable, "mine.py")
+    outputs.append(subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=200))
+    for done, folder in zip(outputs, ("tube", "tube-2"), strict=True):
+        assert done.returncode == 0, done.stderr[-2000:]
+        *steps, radii = done.stdout.strip().split("\n")
+        assert [float(line.split()[0]) for line in steps] == [1.0]
+        recorded = [float(radius) for radius in radii.strip("[]").split()]
+        assert recorded == pytest.approx([3.0, *(float(line.split()[1]) for line in steps)], abs=1e-7)
+        assert (tmp_path / "results" / folder / "fields.vtkhdf").exists()
 
 
 @pytest.mark.parametrize("name", ["README.md", "CONTRIBUTING.md", *(f"docs/{name}.md" for name in (

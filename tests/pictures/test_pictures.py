@@ -264,7 +264,7 @@ def test_mp4_without_ffmpeg_is_one_line(
 @pytest.mark.parametrize(("name", "words", "said"), [
     ("cube", ["picture", "DIR", "--time", "11"], "--time 11: allowed are times from 0 to 10"),
     ("cube", ["picture", "DIR", "--time", "nan"], "--time nan: allowed are times from 0 to 10"),
-    ("cube", ["picture", "DIR", "--view", "behind"], "--view behind: allowed is front, above or --view=X,Y,Z"),
+    ("cube", ["picture", "DIR", "--view", "behind"], "--view behind: allowed is front, above or X,Y,Z, wh"),
     ("cube", ["picture", "DIR", "--view", "0,0,0"], "--view 0,0,0: allowed is "),
     ("cube", ["picture", "DIR", "--view", "1,inf,0"], "--view 1,inf,0: allowed is "),
     ("cube", ["picture", "DIR", "--view", "1,2"], "--view 1,2: allowed is "),

@@ -155,8 +155,16 @@ def test_a_screenshot_is_the_picture_of_the_command(
     monkeypatch.setenv("MPLBACKEND", "module://matplotlib_inline.backend_inline")  # as in a kernel of Jupyter
     path = Recording(recorded("cube")).screenshot(tmp_path / "cube.png", [0.0, 10.0], view="above")
     assert path.read_bytes().startswith(b"\x89PNG")
-    with pytest.raises(ValueError, match="exists|already|not exist"):
-        Recording(recorded("cube")).screenshot(path)
+    recording = Recording(recorded("cube"))
+    for said, wish in (
+        ("path .*cube.png: is there already", {}),
+        ("cut third: allowed", {"cut": "third"}),
+        ("layers 9: allowed", {"layers": 9}),
+        ("view behind: allowed", {"view": "behind"}),
+        ("times 11: allowed", {"times": [11.0]}),
+    ):  # by the arguments of this method, not by the options of the command
+        with pytest.raises(ValueError, match=f"^{said}"):
+            recording.screenshot(**{"path": tmp_path / "new.png" if wish else path} | wish)
 
 
 # ---------------------------------------------------------------- the notebook

@@ -23,6 +23,8 @@ RUNS = {
     "tendon": ("tendon", "time.end=5"),
     "cube": ("cube", "time.end=10"),
     "tetrahedra": ("cube", "time.end=2 | mesh.element=tetrahedron"),
+    "three tetrahedra": ("cube", "time.end=1 | mesh.element=tetrahedron | mesh.refinement=3"),
+    "unloaded": ("turnover", "time.end=4 | time.step=2 | natural.opening_angle=60 | geometry.is=loaded"),
     "quadratic": ("cube", "time.end=2 | mesh.degree=2"),
     "radial": ("artery", "time.end=3 | cells.initial=isotropic | model.kinematics=radial"),
     "axisymmetric": ("artery", "time.end=3 | cells.initial=isotropic | model.kinematics=axisymmetric"),

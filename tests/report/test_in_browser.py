@@ -6,6 +6,7 @@ Without a browser these tests are skipped: WITH_FENICSX_ADD=browser ./with-fenic
 from __future__ import annotations
 
 import os
+import re
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -89,6 +90,30 @@ def test_profile_and_rose_are_volume_means(browser: Browser, recorded: Recorded,
         assert sum(rose) == pytest.approx(1.0, abs=1e-9)
         counted = np.histogram(angle, bins=np.linspace(0, 90, len(ANGLE_COLOURS) + 1), weights=volume)[0]
         np.testing.assert_allclose(rose, counted, atol=1e-5)
+
+
+def test_labels_stand_at_the_lines_that_they_name(browser: Browser, recorded: Recorded) -> None:
+    """Moved apart both ways, each with a line to the end of its curve."""
+    browser.open(recorded("artery") / REPORT)
+    script = (
+        "(() => { const all = (name) => [...document.querySelectorAll(`#profile ${name}`)];"
+        " const number = (e, name) => Number(e.getAttribute(name));"
+        " return [all('.leader').map((e) => ['x1', 'y1', 'y2'].map((name) => number(e, name))),"
+        " all('text').filter((e) => e.textContent.startsWith('t = ')).map((e) => number(e, 'y')),"
+        " all('path[fill=none]').map((e) => e.getAttribute('d').split('L').at(-1).split(' ').map(Number))]; })()"
+    )
+    leaders, labels, ends = browser.value(script)
+    assert len(leaders) == len(labels) == 5 and min(np.diff(labels)) > 11
+    for (x, start, end), label in zip(leaders, labels, strict=True):
+        assert abs(end + 4 - label) < 0.1
+        assert min(np.hypot(x - 4 - a, start - b) for a, b in ends) < 0.2
+    assert max(abs(start - end) for _, start, end in leaders) < 36
+
+
+def test_curves_have_names_and_units_at_their_axes(browser: Browser, recorded: Recorded) -> None:
+    browser.open(recorded("layers") / REPORT)
+    values = browser.value("[...document.querySelectorAll('.curve .values')].map((e) => e.textContent).join(' ')")
+    assert re.search(r"inner radius [0-9.]+ mm", values) and re.search(r"fibre angle inner [0-9.]+°", values)
 
 
 def test_the_browser_unpacks_what_python_has_packed(browser: Browser, recorded: Recorded) -> None:

@@ -29,6 +29,7 @@ from remodel_fenicsx.results.kept_times import kept_times
 from remodel_fenicsx import Recording
 from remodel_fenicsx.results.recording import HistoryColumns
 from remodel_fenicsx.results.vtkhdf import TransientGrid
+from remodel_fenicsx.results.words import unit_of, with_unit
 from remodel_fenicsx.scene.scene import preset_scene
 from tests.forks import forked
 from tests.report.conftest import DEMOS, Recorded
@@ -121,10 +122,43 @@ def test_regions_are_shown_by_name(recorded: Recorded) -> None:
         "fibre angle adventitia",
     ]
     assert curves["Fibre angle"] == angles
-    assert {"max chain extension media", "max chain extension adventitia"} <= set(sum(curves.values(), []))
+    assert curves["Largest r/L"] == ["largest r/L media", "largest r/L adventitia", "largest r/L"]
     for words in ("kappa media: 0.05; adventitia: 0.025", "media: isotropic, r0 = 1; adventitia: (0.5, 0.85, 0.165"):
         assert words in found.text
     assert Decoded.of(recorded("artery")).data["parts"]["angles"]["regions"] == []
+
+
+def test_what_was_run_has_all_that_makes_the_result(recorded: Recorded) -> None:
+    """Where it is free of stress, the loaded body that was given, turnover and ramps; nothing that is not there."""
+    text = html.unescape(Decoded.of(recorded("unloaded")).text)
+    expected = [
+        "opening angle 60°", "so that under the loads it has the given radii 1, 1.3, length 2",
+        "time 40, deposition stretch 1.1, gain 1", "pressure 1.2, times 0 at t = 0, 1 at t = 24",
+    ]  # fmt: skip
+    assert not [words for words in expected if words not in text]
+    text = Decoded.of(recorded("cube")).text
+    assert not [words for words in ("Free of stress", "<th>Turnover", "so that under the loads") if words in text]
+
+
+def test_tetrahedra_have_as_many_layers_as_lie_behind_one_another(recorded: Recorded) -> None:
+    """And not one for each place that the middle of one of the six kinds has."""
+    found = Decoded.of(recorded("three tetrahedra"))
+    depth = found.data["parts"]["angles"]["depth"]
+    np.testing.assert_allclose(depth, (np.arange(3) + 0.5) / 3, atol=1e-6)
+    shares = np.bincount(found.arrays["view.layer"], weights=found.arrays["view.volume"])
+    np.testing.assert_allclose(shares, 1 / 3, rtol=1e-5)
+
+
+def test_numbers_beside_each_other_have_as_many_digits_and_their_units() -> None:
+    assert [with_unit(value, "mm") for value in (3.4, 2.45, 12.0, 120.0, 0.0)] == [
+        "3.40 mm", "2.45 mm", "12.0 mm", "120 mm", "0 mm",
+    ]  # fmt: skip
+    units = {"material.stress_unit": "kPa", "geometry.length_unit": "mm"}
+    scene = preset_scene("kuhl-holzapfel-2007", "tube").with_values(units)
+    found = [unit_of(scene, name) for name in ("stress", "force", "length^3", "stress length^3 / time", "s", "")]
+    assert found == ["kPa", "kPa mm²", "mm³", "kPa mm³ / time", "s", ""]
+    bare = preset_scene("kuhl-holzapfel-2007", "tube")
+    assert [unit_of(bare, name) for name in ("force", "length^3", "degrees")] == ["", "", "°"]
 
 
 def test_volumes_and_layers_are_those_of_the_body(recorded: Recorded) -> None:

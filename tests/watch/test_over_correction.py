@@ -103,8 +103,8 @@ def test_loads_that_swing_themselves_are_no_over_correction(caplog: pytest.LogCa
 class Scripted:
     """Sets the cells and the displacement after each pass to A_0 + a smooth course + a swing, instead of a law."""
 
-    def __init__(self, factor: float, size: float):
-        self.simulation = cube(1.0, loads__force__ramp=[[0.0, 1.0]])
+    def __init__(self, factor: float, size: float, **changes: Any):
+        self.simulation = cube(1.0, loads__force__ramp=[[0.0, 1.0]], **changes)
         self.stepper: Stepper = self.simulation.stepper
         (self.watcher,) = (watcher for watcher in self.simulation.warnings if isinstance(watcher, OverCorrection))
         self.factor, self.size = factor, size
@@ -130,6 +130,19 @@ def test_factor_and_size_of_a_swing_are_found_beside_a_smooth_course(factor: flo
     expected = 4e-5 * abs(factor) ** 3 * abs(factor - 1) ** 3 / 8
     assert scripted.watcher.swing.cells == pytest.approx(expected, rel=1e-6)
     assert scripted.watcher.said == (factor == -3.0)
+
+
+@pytest.mark.parametrize(("coupling", "said"), [("staggered", True), ("extrapolated", True), ("implicit", False)])
+def test_rows_whose_cells_belong_to_their_stress_over_correct_nothing(coupling: str, said: bool) -> None:
+    """Long steps may look like a swing; an explicit rule does swing."""
+    law = {"remodeling__law": "tensor", "material__repulsion": "log", "remodeling__coupling": coupling}
+    scripted = Scripted(-3.0, 4e-5, **law)
+    scripted.watcher.started(scripted.step(0))
+    for number in range(1, 9):
+        step = scripted.step(number)
+        scripted.watcher.completed(step)
+        scripted.watcher.committed(step)
+    assert scripted.watcher.said == said
 
 
 def test_passes_around_a_rest_do_not_count() -> None:

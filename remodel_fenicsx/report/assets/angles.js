@@ -46,9 +46,17 @@ PARTS.angles = (data, arrays, clock) => {
   clock.roseAt = (index) => roseOf(stepsAt(index), volume, data.colours.length);
 };
 
+// Places in rising order, moved down and up alike until labels there do not lie upon each other.
+function apart(places) {
+  const down = [...places], up = [...places];
+  for (let k = 1; k < places.length; k++) down[k] = Math.max(down[k], down[k - 1] + 12);
+  for (let k = places.length - 2; k >= 0; k--) up[k] = Math.min(up[k], up[k + 1] - 12);
+  return places.map((_, k) => (down[k] + up[k]) / 2);
+}
+
 function profileDrawing(data, clock, others, profileAt) {
   const x = (depth) => 34 + 226 * depth, y = (degrees) => 168 - 1.7 * degrees;
-  const drawing = element("svg", { viewBox: "0 0 330 196", role: "img" });
+  const drawing = element("svg", { viewBox: "0 0 345 196", role: "img" });
   drawing.append(element("title", {}, `Mean fibre angle ${data.through} at t = ${inDigits(clock.time)}`));
   for (const degrees of [0, 30, 60, 90]) {
     drawing.append(element("line", { x1: 34, x2: 260, y1: y(degrees), y2: y(degrees), stroke: "var(--line)" }));
@@ -78,13 +86,13 @@ function profileDrawing(data, clock, others, profileAt) {
     }
     const stroke = isNow ? "var(--first)" : "var(--soft)";
     drawing.append(element("path", { d: path(middle), fill: "none", stroke, "stroke-width": isNow ? 2.2 : 0.7 }));
-    labels.push({ place: middle.at(-1)[1] + 4, text: `t = ${inDigits(clock.times[index])}` });
+    labels.push({ end: middle.at(-1), text: `t = ${inDigits(clock.times[index])}` });
   }
-  labels.sort((a, b) => a.place - b.place);
-  labels.forEach((label, k) => {  // below one another, where they would lie upon each other
-    if (k && label.text === labels[k - 1].text) { label.place = labels[k - 1].place; return; }
-    if (k) label.place = Math.max(label.place, labels[k - 1].place + 12);
-    drawing.append(element("text", { x: 266, y: label.place }, label.text));
+  labels.sort((a, b) => a.end[1] - b.end[1]);
+  apart(labels.map((label) => label.end[1])).forEach((place, k) => {
+    const { end: [x1, y1], text } = labels[k], stroke = "var(--soft)";
+    drawing.append(element("line", { x1: x1 + 4, y1, x2: 277, y2: place, stroke, "stroke-width": 0.5, class: "leader" }));
+    drawing.append(element("text", { x: 280, y: place + 4 }, text));
   });
   drawing.append(element("text", { x: 147, y: 188, "text-anchor": "middle" }, data.through));
   return drawing;

@@ -21,15 +21,15 @@ class Curve {
 
   draw() {
     this.plot?.destroy();
-    const axis = () => ({
-      stroke: colourOf("--soft"), grid: { stroke: colourOf("--line"), width: 1 }, ticks: { show: false }, font: "12px sans-serif",
+    const axis = (label) => ({
+      label, labelSize: 16, labelFont: "12px sans-serif", stroke: colourOf("--soft"), grid: { stroke: colourOf("--line"), width: 1 }, ticks: { show: false }, font: "12px sans-serif",
     });
     const lines = this.curve.series.map((_, k) => ({
       stroke: colourOf(CURVE_COLOURS[k % CURVE_COLOURS.length]), width: 1.6, spanGaps: false, points: { show: false },
     }));
     const options = {
       ...this.size(), legend: { show: false }, scales: { x: { time: false } },
-      axes: [axis(), { ...axis(), size: 56 }], series: [{}, ...lines],
+      axes: [{ ...axis("time"), size: 34 }, { ...axis(this.curve.unit || this.curve.title), size: 56 }], series: [{}, ...lines],
       cursor: { drag: { x: false, y: false }, points: { show: false }, y: false },
       hooks: { draw: [(plot) => this.drawMark(plot)] },
     };
@@ -62,11 +62,12 @@ class Curve {
     this.times.forEach((time, k) => {
       if (Math.abs(time - this.clock.time) < Math.abs(this.times[row] - this.clock.time)) row = k;
     });
+    const unit = this.curve.unit && (this.curve.unit === "°" ? "°" : ` ${this.curve.unit}`);
     this.values.replaceChildren(element("span", {}, `t = ${inDigits(this.times[row])}`));
     this.curve.series.forEach((series, k) => {
       const swatch = element("i");
       swatch.style.background = `var(${CURVE_COLOURS[k % CURVE_COLOURS.length]})`;
-      this.values.append(element("span", {}, swatch, `${series.name} `, element("b", {}, inDigits(series.values[row]))));
+      this.values.append(element("span", {}, swatch, `${series.name} `, element("b", {}, inDigits(series.values[row]) + unit)));
     });
   }
 }
