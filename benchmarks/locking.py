@@ -255,8 +255,10 @@ turn the cells are wrong. Radii follow the cells.
 Tubes of isotropic cells under pressure (1.2, 3 and 4.8) and an elongation of 0.1 remodel by the law
 `tensor` for a time of 2/kappa, on eight elements through the wall. The columns are lambda/mu. Each
 entry has the largest error of the three angles and that of the radii, against 200 quadratic
-elements of a reference that shares no code; in parentheses the angle by which the run itself finds
-the tensions turned by noise. A run warns above 2 degrees, where lambda/mu is above 10.
+elements of a reference that shares no code.
+
+In parentheses stands the angle by which the run itself finds the tensions turned by noise. A run
+warns above 2 degrees, where lambda/mu is above 10.
 
 {turning}
 

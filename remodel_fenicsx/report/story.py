@@ -16,7 +16,7 @@ from remodel_fenicsx.system.regular_files import read_regular
 
 _LINE = re.compile(r"(\d{4}-\d\d-\d\d \d\d:\d\d:\d\d)\S* ([A-Z]+) (.*)")
 _STEP = re.compile(r"time (\S+?), ")
-UNLOADED = "unloaded: "  # as logs say it
+SAID_UNLOADED = "unloaded: "  # as logs say it
 _RANKS = re.compile(r"scene .* on (\d+) ranks?, results in ")
 
 
@@ -84,7 +84,7 @@ class Story:
         lines = list(_log(recording.path))
         stamps = [stamp for stamp, _, _ in lines] or [""]
         ranks = [found[1] for _, _, text in lines if (found := _RANKS.match(text))] or [""]
-        unloaded = [text for _, _, text in lines if text.startswith(UNLOADED)] or [""]
+        unloaded = [text for _, _, text in lines if text.startswith(SAID_UNLOADED)] or [""]
         state, words = _state(recording, history, lives)
         return cls(state, words, history, stamps[0], stamps[-1], ranks[-1], _warnings(lines), unloaded[-1])
 
