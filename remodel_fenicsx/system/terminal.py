@@ -21,7 +21,7 @@ from remodel_fenicsx.system.regular_files import open_own
 
 LOGGER = "remodel_fenicsx"
 LOG_FORMAT = "%(asctime)s %(levelname)s %(message)s"
-RECENT = 20  # steps, whose seconds tell those of the next ones
+LAST_PACES = 20  # steps, whose seconds tell those of the next ones
 LINE_EVERY = 10.0  # seconds, of lines that stay
 
 
@@ -51,7 +51,7 @@ class Progress:
         self._last: tuple[float, float] | None = (
             None  # step and clock: of the first one of a process, which compiles, too
         )
-        self._paces: deque[float] = deque(maxlen=RECENT)  # seconds a step
+        self._paces: deque[float] = deque(maxlen=LAST_PACES)  # seconds a step
         self._pending: str | None = None  # the newest line that was not printed
         self._bar: Any = None  # `bar.Bar`, on a terminal
 
