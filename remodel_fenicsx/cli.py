@@ -22,7 +22,7 @@ from remodel_fenicsx.scene.presets import PRESETS, PROFILES, profile_for
 from remodel_fenicsx.scene.scene import Scene, SceneError, preset_scene, read_scene
 from remodel_fenicsx.schema.tables import printable
 from remodel_fenicsx.system import interrupts
-from remodel_fenicsx.system.arguments import MOST_RUNS, megabytes, positive, wall_time
+from remodel_fenicsx.system.arguments import MOST_RUNS, megabytes, positive, typed, wall_time
 from remodel_fenicsx.system.children import SERVE, serve
 from remodel_fenicsx.system.environment import kernels, reason_undrawable, reason_unusable, versions
 from remodel_fenicsx.system.regular_files import ForeignFileError, write_new
@@ -388,7 +388,7 @@ def _run(options: argparse.Namespace, task: Callable[..., Path] | None = None) -
         way = "" if task is not None else ", and run --resume goes on from there"
         return _fail(f"{failure}. {failure.refusal}; every finished step is kept{way}", SOLVE_FAILED)
     except interrupts.Paused as pause:
-        way = f"it goes on with: remodel-fenicsx run --resume {shlex.quote(str(pause.folder))}"
+        way = f"it goes on with: {typed()} run --resume {shlex.quote(str(pause.folder))}"
         return _fail(f"{pause}: all is kept up to time {pause.time:g}; {way}", STOPPED)
     except interrupts.Interrupted as interruption:
         end = _fail if interruption.on_all_ranks else _end_all

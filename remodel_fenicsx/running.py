@@ -335,4 +335,5 @@ class _Report(Watcher):
         message = f"time {step.time:g} solved in {parts} parts" if parts > 1 else None
         loads = ", ".join(f"{name} {step.row[name]:.4g}" for name in self.loads if name in step.row)
         done = self.time.progress(step.number, step.time)
-        self.progress.step(done, step.time, loads, step.work.newton_iterations, message)
+        count = f"{step.number} at {step.time / self.time.end:.0%}" if self.time.chooses else None
+        self.progress.step(done, step.time, loads, step.work.newton_iterations, message, count)

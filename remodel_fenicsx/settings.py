@@ -1159,9 +1159,14 @@ class Time(Table):
         """Whether a step ends at a time, or may end there."""
         return self.tolerance is not None or is_multiple(time, self.step)
 
-    def progress(self, number: int, time: float) -> int:
-        """How many of `number_of_steps` are behind a step; with a tolerance, by its time."""
-        return number if self.tolerance is None or self.is_equilibrium else math.floor(time / self.step * (1 + 1e-12))
+    @property
+    def chooses(self) -> bool:
+        """Whether the run chooses its steps; their number is not known then."""
+        return self.tolerance is not None and not self.is_equilibrium
+
+    def progress(self, number: int, time: float) -> float:
+        """How many of `number_of_steps` are behind a step; where steps are chosen, by its time."""
+        return time / self.step if self.chooses else number
 
     def in_words(self) -> str:
         """How it is divided."""

@@ -31,6 +31,7 @@ from remodel_fenicsx.settings import Cells, Properties, Solver
 from remodel_fenicsx.state.parameters import by_region
 from remodel_fenicsx.state.state import State
 from remodel_fenicsx.state.unit_cells import UnitCells
+from remodel_fenicsx.system.arguments import typed
 from remodel_fenicsx.system.interrupts import take_back_signals
 from remodel_fenicsx.watch.equilibrium_stability import EquilibriumStability
 from remodel_fenicsx.watch.locking import LockingWarning, PressureNoise
@@ -101,7 +102,7 @@ class Simulation:
         take_back_signals()
         if scene.geometry.is_loaded:
             raise SceneError(
-                "geometry.is = 'loaded': the unloaded body is needed; remodel-fenicsx unload SCENE writes its scene"
+                f"geometry.is = 'loaded': the unloaded body is needed; {typed()} unload SCENE writes its scene"
             )
         if domain is None and comm.rank == 0:
             for line in explained(scene) if scene.model.kinematics == AUTO else only_for_means(scene):

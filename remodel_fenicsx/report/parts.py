@@ -34,6 +34,7 @@ from remodel_fenicsx.results.words import unit_of, with_unit, words
 from remodel_fenicsx.scene.scene import Scene
 from remodel_fenicsx.schema.tables import Table
 from remodel_fenicsx.settings import Load, Properties
+from remodel_fenicsx.system.arguments import typed
 from remodel_fenicsx.system.regular_files import read_regular
 from remodel_fenicsx.system.terminal import duration
 
@@ -240,6 +241,7 @@ def facts(run: ReportedRun) -> Card:
     loads = "; ".join(f"{words(name)} {load.value:g}{_ramp(load)}" for name, load in scene.loads.items())
     seconds = story.history.get("seconds", np.zeros(0))
     solving = f"; {duration(float(np.nansum(seconds)))} of solving" if len(seconds) else ""
+    steps = f"{max(0, len(story.history['time']) - 1)}{'' if scene.time.chooses else ' of'}"
     ranks = f", {story.ranks} ranks" if story.ranks not in ("", "1") else ""
     rows = [
         ("Body", f"{shape.name}: {sizes}{f' in {shape.length_unit}' if shape.length_unit else ''}{given}"),
@@ -254,7 +256,7 @@ def facts(run: ReportedRun) -> Card:
         ("Remodeling", f"law {remodeling.law}, driver {remodeling.driver}, frame {remodeling.frame}, "
                        f"coupling {remodeling.coupling}, kappa {kappa}"),
         *([("Turnover", _keys(remodeling.turnover))] if remodeling.turnover.is_on else []),
-        ("Time", f"{max(0, len(story.history['time']) - 1)} of {scene.time.in_words()}{solving}{ranks}"),
+        ("Time", f"{steps} {scene.time.in_words()}{solving}{ranks}"),
     ]  # fmt: skip
     return Card("facts", section("What was run", table(rows)))
 
@@ -311,7 +313,7 @@ def warnings(run: ReportedRun) -> Card:
     )
     said = f"<ul>{items}</ul>" if found else '<p class="note">None: the run raised no warnings.</p>'
     name = run.recording.scene.name
-    again = f"./with-fenicsx remodel-fenicsx run scene.toml -o {shlex.quote(f'results/{name}-again')}"
+    again = f"{typed()} run scene.toml -o {shlex.quote(f'results/{name}-again')}"
     buttons = "".join(f'<a class="download" data-file="{file}" href="#">{file}</a>' for file in _files(run))
     html = section(f"Warnings ({sum(one.count for one in found)})", said + f'<h2>Run it again</h2><pre id="again">'
                    f'{escape(again)}</pre><p><button id="copy">copy</button> {buttons}</p>')  # fmt: skip

@@ -26,7 +26,7 @@ from remodel_fenicsx.results.recording import (
 )
 from remodel_fenicsx.results.run_lock import writer
 from remodel_fenicsx.schema.times import same_time
-from remodel_fenicsx.system.arguments import MOST_RUNS
+from remodel_fenicsx.system.arguments import MOST_RUNS, typed
 from remodel_fenicsx.system.regular_files import ForeignFileError, read_regular
 from remodel_fenicsx.system.terminal import duration
 
@@ -86,7 +86,7 @@ def status(folder: Path) -> list[str]:
         lines.append(f"{rate:.3g} s a step (mean of the last {len(seconds)})")
     generations = read_pointer(folder)
     kept = f"checkpoint at time {generations[0].time:g}" if generations else "no checkpoint yet"
-    lines.append(kept if lives or done else f"{kept}; it goes on with: remodel-fenicsx run --resume {folder}")
+    lines.append(kept if lives or done else f"{kept}; it goes on with: {typed()} run --resume {folder}")
     return lines
 
 
@@ -123,7 +123,7 @@ def _of_study(folder: Path) -> list[str]:
     answer = folder / f"{name}.csv"
     lines.append(f"its answer: {answer}" if answer.exists() else "no answer yet")
     if set(counted) - {"finished", "running"}:
-        lines[-1] += f"; the same command goes on: remodel-fenicsx {name} SCENE -o {folder}"
+        lines[-1] += f"; the same command goes on: {typed()} {name} SCENE -o {folder}"
     return lines
 
 

@@ -81,7 +81,7 @@ class Run:
             return min(steps_recorded(self.folder), self.scene.time.number_of_steps)
         with suppress(RecordingError):  # none yet, or a row that is being written
             times = self.history()["time"]
-            return self.scene.time.progress(len(times) - 1, float(times[-1])) if len(times) else 0
+            return int(self.scene.time.progress(len(times) - 1, float(times[-1]))) if len(times) else 0
         return 0
 
     def is_under_way(self) -> bool:

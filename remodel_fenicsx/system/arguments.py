@@ -1,10 +1,14 @@
-"""Values that are typed on the command line."""
+"""What is typed on the command line."""
 
 from __future__ import annotations
 
 import argparse
 import math
+import os
 import re
+import shlex
+import shutil
+from pathlib import Path
 
 
 def wall_time(text: str) -> float:
@@ -59,3 +63,13 @@ def megabytes(text: str) -> float:
     if not 0 < number <= MOST_MEGABYTES:
         raise argparse.ArgumentTypeError(f"{text!r}: allowed is a number of MB above 0, up to {MOST_MEGABYTES:g}")
     return number
+
+
+def typed() -> str:
+    """The command as it has to be typed here: through the launcher, where that is how its programs are found."""
+    launcher = Path(__file__).resolve().parents[2] / "with-fenicsx"
+    found = shutil.which("remodel-fenicsx")
+    if found is None or Path(found).resolve() != launcher.parent / "bin" / "remodel-fenicsx":
+        return "remodel-fenicsx"
+    near = os.path.relpath(launcher)
+    return f"{shlex.quote(str(launcher) if near.startswith('..') else f'./{near}')} remodel-fenicsx"

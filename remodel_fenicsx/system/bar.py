@@ -26,12 +26,12 @@ class Bar(Progress):
         Number of the last step, and how many were done before.
     """
 
-    def __init__(self, title: str, total: int, done: int):
+    def __init__(self, title: str, total: int, done: float):
         self._stderr = Console(stderr=True)
         super().__init__(
             _Cropped("title"),
             BarColumn(24),
-            TextColumn("{task.completed:.0f}/{task.total:.0f}"),
+            TextColumn("{task.fields[count]}"),
             _Cropped("state"),
             TimeElapsedColumn(),
             TextColumn("{task.fields[left]}"),
@@ -39,15 +39,16 @@ class Bar(Progress):
             refresh_per_second=4,
             redirect_stdout=sys.stdout.isatty(),
         )
-        self._task = self.add_task("", total=total, completed=done, title=title, state="starting", left="")
+        self._task = self.add_task("", total=total, title=title, count="", state="starting", left="")
+        self.update(self._task, completed=done)
 
     def get_renderables(self) -> Iterator[RenderableType]:
         """The line, short of the terminal's edge."""
         yield Constrain(self.make_tasks_table(self.tasks), self._stderr.width - _MARGIN)
 
-    def show(self, done: float, state: str, left: str) -> None:
-        """Steps that are done, their time, iterations and loads in words, and the time that is left."""
-        self.update(self._task, completed=done, state=state, left=left)
+    def show(self, done: float, count: str, state: str, left: str) -> None:
+        """Steps that are done, in words too, their time, iterations and loads, and the time that is left."""
+        self.update(self._task, completed=done, count=count, state=state, left=left)
 
     def say(self, text: str) -> None:
         """Print a line above the bar."""

@@ -8,10 +8,12 @@ import os
 import shutil
 import sys
 import time as clock
+from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from io import TextIOWrapper
 from pathlib import Path
+from statistics import median_low
 from typing import Any, cast
 
 from remodel_fenicsx.system import NOTICE
@@ -19,6 +21,7 @@ from remodel_fenicsx.system.regular_files import open_own
 
 LOGGER = "remodel_fenicsx"
 LOG_FORMAT = "%(asctime)s %(levelname)s %(message)s"
+LAST_PACES = 20  # steps, whose seconds tell those of the next ones
 LINE_EVERY = 10.0  # seconds, of lines that stay
 
 
@@ -41,15 +44,18 @@ class Progress:
         Steps that were done before.
     """
 
-    def __init__(self, total_steps: int, title: str, comm_rank: int = 0, *, interval: float = 60.0, done: int = 0):
+    def __init__(self, total_steps: int, title: str, comm_rank: int = 0, *, interval: float = 60.0, done: float = 0):
         self._total, self._title, self._done = total_steps, title, done
         self._silent, self._interval = comm_rank != 0, interval
-        self._start, self._line_is_due = clock.monotonic(), -math.inf
+        self._line_is_due = -math.inf
+        self._last: tuple[float, float] | None = (
+            None  # step and clock: of the first one of a process, which compiles, too
+        )
+        self._paces: deque[float] = deque(maxlen=LAST_PACES)  # seconds a step
         self._pending: str | None = None  # the newest line that was not printed
         self._bar: Any = None  # `bar.Bar`, on a terminal
 
     def __enter__(self) -> Progress:
-        self._start = clock.monotonic()
         if not self._silent and _is_terminal():
             from remodel_fenicsx.system.bar import Bar  # late: most runs have no terminal
 
@@ -66,7 +72,13 @@ class Progress:
         self._bar, self._pending = None, None
 
     def step(
-        self, index: int, time: float, load_text: str = "", newton_iterations: int = 0, message: str | None = None
+        self,
+        index: float,
+        time: float,
+        load_text: str = "",
+        newton_iterations: int = 0,
+        message: str | None = None,
+        count: str | None = None,
     ) -> None:
         """Step `index` (1 to total_steps) is done; of steps that are no whole ones, 0 to total_steps.
 
@@ -80,16 +92,19 @@ class Progress:
             Iterations of this step.
         message
             Something out of the ordinary; it gets a line of its own at once and stays.
+        count
+            How far that is; default: "index/total_steps".
         """
         if self._silent:
             return
         if message is not None:
             self.message(message)
+        count = count or f"{index}/{self._total}"
         at, newton, left = f"t = {time:g}", f"{newton_iterations} Newton", self._time_left(index)
         if self._bar is not None:  # what stands last is lost first where the terminal is narrow
-            self._bar.show(index, _joined(at, newton, load_text), left)
+            self._bar.show(index, count, _joined(at, newton, load_text), left)
             return
-        self._pending = f"{self._title}: " + _joined(f"step {index}/{self._total}", at, load_text, newton, left)
+        self._pending = f"{self._title}: " + _joined(f"step {count}", at, load_text, newton, left)
         now = clock.monotonic()
         if index >= self._total or now >= self._line_is_due:
             announce(self._pending)
@@ -103,12 +118,15 @@ class Progress:
         elif not self._silent:
             announce(f"{self._title}: {text}")
 
-    def _time_left(self, index: int) -> str:
-        """The mean of this run's steps so far, times the steps that are left; steps alike take alike long."""
+    def _time_left(self, index: float) -> str:
+        """The median of the last steps, times the steps that are left; the first one says nothing."""
+        now, last = clock.monotonic(), self._last
+        if last is None or index > last[0]:
+            self._last = index, now
+        if last is not None and index > last[0]:
+            self._paces.append((now - last[1]) / (index - last[0]))
         remaining = self._total - index
-        if remaining < 1 or index <= self._done:
-            return ""
-        return f"{duration((clock.monotonic() - self._start) / (index - self._done) * remaining)} left"
+        return f"{duration(median_low(self._paces) * remaining)} left" if self._paces and remaining > 0 else ""
 
 
 def _joined(*parts: str) -> str:

@@ -9,12 +9,15 @@ import re
 import subprocess
 import sys
 import warnings
+from pathlib import Path
 
 import pytest
 
 from remodel_fenicsx.system import terminal
 from remodel_fenicsx.system import NOTICE
+from remodel_fenicsx.system.arguments import typed
 from remodel_fenicsx.system.terminal import Progress, hold_log, open_log
+from tests.forks import forked
 
 SCRIPT = """
 import sys, time, logging
@@ -125,7 +128,7 @@ def test_a_pipe_gets_plain_lines_now_and_then(capsys, time_passes):
     out, err = capsys.readouterr()
     assert out == ""
     lines = err.splitlines()
-    assert lines[0] == "tendon: step 1/20, t = 0.5, force 25, 4 Newton, 38 s left"
+    assert lines[0] == "tendon: step 1/20, t = 0.5, force 25, 4 Newton"
     assert lines[1] == "tendon: halved the step"
     assert lines[2] == "tendon: step 4/20, t = 2, force 25, 4 Newton, 32 s left"
     steps = [int(re.search(r"step (\d+)", line).group(1)) for line in lines if "step " in line and "/20" in line]
@@ -144,10 +147,54 @@ def test_the_last_step_of_an_interrupted_run_is_said(capsys, time_passes):
 
 
 def test_time_left(capsys, time_passes):
-    with Progress(150, "artery", 0) as progress:
-        time_passes[0] += 10.0
-        progress.step(10, 10.0)
-    assert capsys.readouterr().err.splitlines() == ["artery: step 10/150, t = 10, 0 Newton, 2:20 min left"]
+    """What the first steps compile is no time of a step, nor one long step among others."""
+    with Progress(150, "artery", 0, interval=0.0) as progress:
+        for k, seconds in enumerate((60.0, 20.0, 1.0, 1.0, 30.0, 1.0), start=1):
+            time_passes[0] += seconds
+            progress.step(k, float(k))
+    said = [line.split(", ")[3:] for line in capsys.readouterr().err.splitlines()]
+    assert said == [[], ["49:20 min left"], ["2:27 min left"], ["2:26 min left"], ["2:25 min left"], ["2:24 min left"]]
+
+
+def test_time_left_of_a_run_that_goes_on(capsys, time_passes):
+    """By its own steps, which are parts of others where they are chosen."""
+    with Progress(100, "artery", 0, interval=0.0, done=50.0) as progress:
+        for index in (50.25, 50.5, 51.5):
+            time_passes[0] += 2.0
+            progress.step(index, index, count=f"{int(4 * index)} at {index:.0f}%")
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[1:] == [
+        "artery: step 202 at 50%, t = 50.5, 0 Newton, 6:36 min left",
+        "artery: step 206 at 52%, t = 51.5, 0 Newton, 1:37 min left",
+    ]
+
+
+def test_chosen_steps_are_counted_and_their_share_is_that_of_time(tmp_path):
+    """Not as if they were the equal ones that time.step would make."""
+    demo = Path(__file__).parents[2] / "demos" / "cube.toml"
+    changes = ["--set", "time.end=20", "--set", "time.tolerance=5", "--set", "output.fields=false"]
+    done = forked("remodel-fenicsx", "run", demo, *changes, "-o", tmp_path / "run", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    number = len((tmp_path / "run" / "history.csv").read_text().splitlines()) - 2
+    assert number != 20 and f"cube: step {number} at 100%, t = 20" in done.stderr
+    page = (tmp_path / "run" / "report.html").read_text()
+    assert f"{number} steps of an error below 5 degrees" in page and "20/20" not in done.stderr
+
+
+def test_hints_are_typed_as_the_command_was_found(tmp_path, monkeypatch):
+    """Through the launcher, whose folder of commands comes first; an installed one by its name."""
+    checkout = Path(__file__).parents[2]
+    monkeypatch.setenv("PATH", f"{checkout / 'bin'}:{os.environ['PATH']}")
+    monkeypatch.chdir(checkout)
+    assert typed() == "./with-fenicsx remodel-fenicsx"
+    monkeypatch.chdir(tmp_path)
+    assert typed() == f"{checkout / 'with-fenicsx'} remodel-fenicsx"
+    done = forked(
+        "remodel-fenicsx", "run", checkout / "demos" / "cube.toml", "-o", "run", "-q", "--max-wall-time", "0.001s"
+    )
+    assert done.returncode == 4 and "with-fenicsx remodel-fenicsx run --resume" in done.stderr
+    monkeypatch.setenv("PATH", "/usr/bin:/bin")
+    assert typed() == "remodel-fenicsx"
 
 
 def test_other_ranks_are_silent(capsys, tmp_path):

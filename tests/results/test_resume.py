@@ -26,6 +26,7 @@ from remodel_fenicsx.model.cells import structure_tensor
 from remodel_fenicsx.results.checkpoint import Checkpoints, gather_state, restore_state
 from remodel_fenicsx.results.checkpoint_file import Checkpoint, CheckpointError, _read, read_checkpoint, read_pointer
 from remodel_fenicsx.results.recording import RecordingError
+from remodel_fenicsx.system.arguments import typed
 from remodel_fenicsx.results.run_lock import FolderTaken, RunLock, writer
 from remodel_fenicsx.results.status import status
 from remodel_fenicsx.running import resume, run
@@ -387,14 +388,14 @@ def test_a_signal_is_exit_code_4_and_one_line_says_how_to_go_on(half: Path, whol
     assert process.returncode == 4
     assert errors == (
         f"remodel-fenicsx: stopped by SIGUSR1: all is kept up to time {last:g}; "
-        f"it goes on with: remodel-fenicsx run --resume {half}\n"
+        f"it goes on with: {typed()} run --resume {half}\n"
     )
     assert read_pointer(half)[0].time == last and rows(half)[:10] == rows(whole)[:10]
     said = status(half)
     assert said[0] == f"{half}: scene, step {last:g} of 500, time {last:g} of 500"
     assert said[1].startswith("not running, the last step was done at ") and "killed" not in said[1]
     assert said[1].endswith("; stopped by SIGUSR1") and said[1].count("stopped") == 1
-    assert said[3] == f"checkpoint at time {last:g}; it goes on with: remodel-fenicsx run --resume {half}"
+    assert said[3] == f"checkpoint at time {last:g}; it goes on with: {typed()} run --resume {half}"
 
 
 def test_what_is_damaged_is_said_in_one_line_and_nothing_else(half: Path) -> None:
