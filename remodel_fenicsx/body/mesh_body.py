@@ -226,7 +226,7 @@ class MeshBody(WalledMesh):
         SceneError
             If the file is no mesh of one body with these faces; one line.
         """
-        from remodel_fenicsx.body.mesh_faces import FaceError, boundary_of
+        from remodel_fenicsx.body.mesh_faces import FaceError, boundary_of, likely_exchange
 
         file = self._with_regions(self._read())
         scale = METRES[self.file_unit] / METRES[self.length_unit] if self.file_unit and self.length_unit else 1.0
@@ -242,6 +242,9 @@ class MeshBody(WalledMesh):
             raise SceneError(f"geometry.faces.{error.face} = {shown(self._asked(error.face))}: {error}") from None
         except MeshFileError as error:
             raise self._fault(str(error)) from None
+        if pair := likely_exchange(file.points, boundary):
+            words = f"inner and outer touch each other: are {pair[0]} and {pair[1]} swapped?"
+            raise SceneError(f"geometry.faces.{pair[0]} = {shown(self._asked(pair[0]))}: {words}")
         inner, outer = boundary.area("inner"), boundary.area("outer")
         if inner > outer:
             words = f"its area is {inner:.4g}, that of outer {outer:.4g}: are inner and outer swapped?"

@@ -164,6 +164,31 @@ def through_the_wall(boundary: Boundary) -> bool:
     return bool(np.isin(inner, outer).any())
 
 
+def likely_exchange(points: Array, boundary: Boundary) -> tuple[str, str] | None:
+    """Which wall (inner or outer) and which end (inlet or outlet) have each other's name; None where none seem to.
+
+    Inner and outer touch only then: ends lie between them. It is one after whose exchange they touch no more, and of
+    these the pair in which the wall is the flatter.
+    """
+    walls = {"inner": "outer", "outer": "inner"}
+
+    def touch(one: str, other: str) -> bool:
+        nodes = [
+            {node for part in boundary.parts(name) for node in boundary.facets[part.facets].flat}
+            for name in (one, other)
+        ]
+        return len(nodes[0] & nodes[1]) > 1
+
+    def flatness(name: str) -> float:
+        vectors = [_area_vectors(points[boundary.facets[part.facets]]).sum(axis=0) for part in boundary.parts(name)]
+        return sum(float(np.linalg.norm(vector)) for vector in vectors) / boundary.area(name)
+
+    if not touch("inner", "outer"):
+        return None
+    pairs = [(wall, end) for wall in walls for end in ("inlet", "outlet") if not touch(end, walls[wall])]
+    return max(pairs, key=lambda names: flatness(names[0]) - flatness(names[1])) if pairs else None
+
+
 def rims(file: MeshFile, boundary: Boundary, face: str) -> list[Integers]:
     """The closed lines in which a face ends, each as nodes of its edges, (edges, 2 or 3: start, end, middle).
 

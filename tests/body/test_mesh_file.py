@@ -210,6 +210,31 @@ def test_faces_that_the_file_has_not(good: Path, geometry: dict[str, Any], words
     assert words in refusal(good, **geometry)
 
 
+def bent(x: Any) -> Any:
+    """About an axis 4 away."""
+    radius, angle = 4 + x[:, 0], x[:, 2] / 2
+    return np.stack([radius * np.cos(angle), x[:, 1], radius * np.sin(angle)], axis=1)
+
+
+@pytest.mark.parametrize("end", ["inlet", "outlet"])
+@pytest.mark.parametrize("wall", ["inner", "outer"])
+@pytest.mark.parametrize(
+    "body",
+    [
+        {},
+        {"length": 0.1},  # the ends are larger than the inner face
+        {"moved": bent},
+        {"element": "tetrahedron", "degree": 2},
+    ],
+    ids=["tube", "ring", "bent", "curved tetrahedra"],
+)
+def test_an_end_and_a_wall_that_are_exchanged(tmp_path: Path, body: dict[str, Any], wall: str, end: str) -> None:
+    """Whichever two of the names; the line says which."""
+    file = write_tube(tmp_path / "tube.msh", **body)
+    said = refusal(file, faces={wall: end, end: wall})
+    assert f"geometry.faces.{wall} = '{end}': inner and outer touch each other: are {wall} and {end} swapped?" in said
+
+
 def test_a_body_of_another_unit_is_refused(tmp_path: Path) -> None:
     large = write_tube(tmp_path / "large.msh", turn=1e3 * np.eye(3))
     said = refusal(large, file_unit="m", length_unit="um")
