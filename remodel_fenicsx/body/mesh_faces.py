@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -109,7 +109,6 @@ def boundary_of(file: MeshFile, groups: Groups, open_boundary: bool) -> Boundary
     MeshFileError
         One line.
     """
-    _check_elements(file)
     facets, cell, twice = _facets(file)
     places = file.points[facets]
     normals = _area_vectors(places)
@@ -153,6 +152,13 @@ def groups_inside(file: MeshFile) -> set[int]:
     """Numbers of the named faces with facets that are not on the boundary: between regions, say."""
     outside, rows = set(as_rows(np.sort(_facets(file)[0], axis=1))), as_rows(np.sort(file.facets, axis=1))
     return {int(n) for n, corners in zip(file.facet_groups, rows, strict=True) if corners not in outside}
+
+
+def again(corners: Integers, groups: Integers, numbers: Collection[int]) -> NDArray[np.bool_]:
+    """Which elements or facets of other groups are also in groups of these numbers, (rows,)."""
+    chosen = np.isin(groups, list(numbers))
+    _, which = np.unique(np.sort(corners, axis=1), axis=0, return_inverse=True)
+    return np.asarray(~chosen & np.isin(which.reshape(-1), which.reshape(-1)[chosen]))
 
 
 def through_the_wall(boundary: Boundary) -> bool:
@@ -242,6 +248,7 @@ def components(rows: Integers, nodes: int) -> Integers:
 
 def _facets(file: MeshFile) -> tuple[Integers, Integers, Integers]:
     """Facets of the boundary with normals outwards, the elements behind them, and the facets between two elements."""
+    _check_elements(file)
     local = np.array(FACETS[file.kind])
     facets = file.corners[:, local].reshape(-1, local.shape[1])
     _, first, inverse, count = np.unique(

@@ -401,6 +401,22 @@ class Shape(_Is):  # type: ignore[misc]
         """
         return cls.loads
 
+    def check_faces(self, domain: Domain, supports: Mapping[str, Support], loads: Mapping[str, Load]) -> None:
+        """Refuse supports of, and loads on, faces of a mesh that cannot have them. Collective.
+
+        Parameters
+        ----------
+        domain
+            The mesh.
+        supports, loads
+            As for `hold_faces`.
+
+        Raises
+        ------
+        SceneError
+            On all ranks; one line that names the key.
+        """
+
     def hold_faces(
         self, loading: Loading, supports: Mapping[str, Support], modulus: float, loads: Mapping[str, Load]
     ) -> None:
