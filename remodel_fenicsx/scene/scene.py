@@ -18,7 +18,7 @@ from pydantic import BaseModel, BeforeValidator, Field, ModelWrapValidatorHandle
 from remodel_fenicsx.body import SHAPES, Shape
 from remodel_fenicsx.body.shape import LoadKind
 from remodel_fenicsx.body.columns import TURNOVER_POWER, Column, columns_of, columns_of_region, columns_on_request
-from remodel_fenicsx.body.reductions import AUTO, choice, objections
+from remodel_fenicsx.body.reductions import AUTO, check_number, choice, objections
 from remodel_fenicsx.fem.formulations import FORMULATIONS, NOT_LOCKING
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.fem.solver_methods import SOLVER_METHODS
@@ -234,6 +234,8 @@ class Scene(Table):
         self._check_cases()
         if self.model.kinematics != AUTO and (reasons := objections(self, self.model.kinematics)):
             raise fault("; ".join(reasons), "model.kinematics", self.model.kinematics)
+        if geometry.refines:
+            check_number(self)
         return self
 
     @property
