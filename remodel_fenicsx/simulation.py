@@ -411,7 +411,7 @@ def check_files(scene: Scene) -> str:
     number = scene.geometry.number_of_elements * scene.mesh.refinement**3
     if large or number > ELEMENTS_OF_A_LOOK:
         return f"{', '.join([*large, f'how files fit the body of {number} elements'])}; the run does"
-    scene = with_kinematics(scene)
+    scene = with_choices(scene)
     domain = checked_domain(build(scene, MPI.COMM_SELF), scene)
     scene.geometry.check_faces(domain, scene.supports.faces, scene.loads)
     measured_fibres(scene, domain)
