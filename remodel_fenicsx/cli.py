@@ -636,7 +636,9 @@ def _export(options: argparse.Namespace) -> int:
 
 
 def _validate(options: argparse.Namespace) -> int:
-    scene = read_scene(options.scene, options.set, options.profile)
+    scene, unseen = read_scene(options.scene, options.set, options.profile), ""
+    if _rank() == 0 and (scene.measured_cells or scene.geometry.kept_files()[1]):
+        unseen = _unseen_files(scene)
     _say(f"{options.scene}: a valid scene ({scene.geometry.name}, {scene.time.in_words()})")
     _say(scene.summary())
     _say("\n".join([*explained(scene), scene.formulation_in_words()]))
@@ -645,7 +647,22 @@ def _validate(options: argparse.Namespace) -> int:
     if _rank() == 0:
         for warning in scene.warnings():
             _complain(f"warning: {warning}")
+    if unseen:
+        _say(f"not looked at: {unseen}")
     return 0
+
+
+def _unseen_files(scene: Scene) -> str:
+    """What was not looked at of the files that it names; raises `SceneError` where a run would refuse one."""
+    if (reason := reason_unusable()) is not None:
+        return f"the files that it names; {reason}"
+    from remodel_fenicsx.body import GeometryError
+    from remodel_fenicsx.simulation import check_files
+
+    try:
+        return check_files(scene)
+    except GeometryError as error:
+        raise SceneError(str(error)) from error
 
 
 def _axes(options: argparse.Namespace) -> int:

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mpi4py import MPI
@@ -38,9 +38,14 @@ from remodel_fenicsx.watch.locking import LockingWarning, PressureNoise
 from remodel_fenicsx.watch.over_correction import OverCorrection, RestedCells
 from remodel_fenicsx.watch.tissue import FrontsInLayers, GrowthWithoutRest, RadialChains, VolumeLoss, WeakTension
 
+if TYPE_CHECKING:
+    from remodel_fenicsx.body.fibre_file import FibreFile
+
 log = logging.getLogger(__name__)
 
 TIME_ERROR = "time_error"  # the column
+ELEMENTS_OF_A_LOOK, LARGEST_LOOK = 10**5, 10**8
+"""Elements of a body, and bytes of a file of fibres, that are looked at in a few seconds without a run."""
 
 
 class Simulation:
@@ -363,14 +368,23 @@ def measured_fibres(scene: Scene, domain: Domain) -> dict[str, dict[str, Any]]:
     return domain.comm.bcast(agreed(domain.comm, read)) or {}
 
 
-def _fibres_of(cells: Cells, region: str, corners: Any, chosen: Any) -> dict[str, Any]:
+def _fibre_file(cells: Cells, region: str) -> FibreFile:
     from remodel_fenicsx.body.fibre_file import FibreFileError, read_fibre_file  # few scenes have one
 
-    key = f"{in_region(region)}cells.fibres"
     try:
         file = read_fibre_file(Path(str(cells.fibres)))
         if cells.fibres_sha256 not in (None, file.sha256):
             raise FibreFileError(f"has changed since the run: its SHA-256 was {str(cells.fibres_sha256)[:12]}...")
+    except FibreFileError as error:
+        raise SceneError(f"{in_region(region)}cells.fibres = {cells.fibres!r}: {error}") from error
+    return file
+
+
+def _fibres_of(cells: Cells, region: str, corners: Any, chosen: Any) -> dict[str, Any]:
+    from remodel_fenicsx.body.fibre_file import FibreFileError
+
+    key, file = f"{in_region(region)}cells.fibres", _fibre_file(cells, region)
+    try:
         rows, farthest = file.rows_of(corners, chosen)
     except FibreFileError as error:
         raise SceneError(f"{key} = {cells.fibres!r}: {error}") from error
@@ -378,6 +392,31 @@ def _fibres_of(cells: Cells, region: str, corners: Any, chosen: Any) -> dict[str
     way = "by number" if farthest is None else f"the nearest ones, {farthest:.3g} away at most"
     log.info("%s: %s of %d rows, %s; SHA-256 %s", key, names, count, way, file.sha256)
     return {name: values[rows] for name, values in file.measured.items()}
+
+
+def check_files(scene: Scene) -> str:
+    """Refuse what a run would, of the files that a scene names; in words what was not looked at. For one rank.
+
+    Raises
+    ------
+    SceneError, GeometryError
+        As a run does.
+    """
+    large = []
+    for name, cells in scene.measured_cells.items():
+        file = Path(str(cells.fibres))
+        if file.is_file() and file.stat().st_size > LARGEST_LOOK:
+            large.append(f"{in_region(name)}cells.fibres (over {LARGEST_LOOK / 1e6:g} MB)")
+        else:
+            _fibre_file(cells, name)
+    number = scene.geometry.number_of_elements * scene.mesh.refinement**3
+    if large or number > ELEMENTS_OF_A_LOOK:
+        return f"{', '.join([*large, f'how files fit the body of {number} elements'])}; the run does"
+    scene = with_choices(scene)
+    domain = checked_domain(build(scene, MPI.COMM_SELF), scene)
+    scene.geometry.check_faces(domain, scene.supports.faces, scene.loads)
+    measured_fibres(scene, domain)
+    return ""
 
 
 def parameters_of(properties: Mapping[str, Properties], domain: Domain) -> tuple[Tissue, Any]:

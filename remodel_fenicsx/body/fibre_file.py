@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from remodel_fenicsx.body.exchange_file import ExchangeFileError, read_exchange_file
 from remodel_fenicsx.model.fibres import MEASURED, SOURCES, fault_of_fibres
@@ -79,24 +80,13 @@ class FibreFile:
         if self.places is None:
             raise FibreFileError(f"has {count} rows without places (x, y, z), the mesh has {len(centres)} elements")
         rows = np.zeros(len(centres), dtype=np.int64)
-        rows[chosen] = _nearest(centres[chosen], self.places)
-        far = np.linalg.norm(self.places[rows[chosen]] - centres[chosen], axis=1)
+        far, rows[chosen] = cKDTree(self.places).query(centres[chosen])
         if (far > sizes[chosen]).any():
             worst = (far / sizes[chosen]).argmax()
             place, size = ", ".join(f"{x:.4g}" for x in centres[chosen][worst]), sizes[chosen][worst]
             rule = f"nothing is measured within one element ({size:.3g}) of ({place}); "
             raise FibreFileError(rule + f"the nearest is {far[worst]:.3g} away")
         return rows, float(far.max())
-
-
-def _nearest(places: Array, candidates: Array) -> NDArray[np.int64]:
-    """Number of the nearest candidate; a million distances at a time."""
-    step = max(1, 10**6 // len(candidates))
-    parts = [
-        np.linalg.norm(places[start : start + step, None] - candidates, axis=-1).argmin(axis=1)
-        for start in range(0, len(places), step)
-    ]
-    return np.concatenate(parts)
 
 
 def read_fibre_file(path: Path) -> FibreFile:

@@ -14,6 +14,7 @@ from petsc4py import PETSc
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.kinematics import FullKinematics, Kinematics, field_degree
+from remodel_fenicsx.schema.tables import SceneError
 
 LoadValues = dict[str, float]
 
@@ -65,6 +66,7 @@ class Loading:
         self._magnitudes: dict[str, list[tuple[Any, Any]]] = {}  # constant, and its value at magnitude 1
         self._terms: list[Callable[[Any, Any], Any]] = []
         self._potentials: list[Callable[[Any], Any]] = []
+        self._begins: dict[int, str] = {}  # where the strain is one number: the face from which it is counted
         self.has_caps = False
 
     # ------------------------------------------------------------ supports
@@ -78,7 +80,12 @@ class Loading:
         component
             0, 1 or 2: x, y or z.
         """
-        self._prescribe_face(face, component, self.constant(0.0))
+        if self.kinematics.uniform_unknown(self.space, component) is None:
+            self._prescribe_face(face, component, self.constant(0.0))
+        elif face in self.domain.faces and component != 2:
+            raise SceneError(f"model.kinematics = {self.kinematics.name!r}: {face} is held across, so it bulges")
+        elif self._begins.setdefault(component, face) != face:
+            self._prescribe_strain(component, self.constant(0.0))
 
     def hold_node(self, point: tuple[float, float, float], component: int) -> None:
         """u_component = 0 at the mesh node at `point`, where the body could move as a whole.
@@ -124,6 +131,8 @@ class Loading:
         way
             Displacement at magnitude 1, (3,).
         """
+        if not self.kinematics.three_dimensional:
+            raise SceneError(f"model.kinematics = {self.kinematics.name!r}: allowed for facets that are held is 'full'")
         value = dolfinx.fem.Constant(self.domain.mesh, np.zeros(3, dtype=PETSc.ScalarType))
         dofs = dolfinx.fem.locate_dofs_topological(self.space, self.domain.mesh.topology.dim - 1, facets)
         self.boundary_conditions.append(dolfinx.fem.dirichletbc(value, dofs, self.space))
@@ -216,8 +225,10 @@ class Loading:
         strain = self.kinematics.uniform_strain(component)
         if strain is not None:
             self._take(name, strain, 1.0)
-            return
-        self._prescribe_face(face, component, self.magnitude(name, length))
+        elif (unknown := self.kinematics.uniform_unknown(self.space, component)) is not None:
+            self._prescribe_strain(component, self.magnitude(name, unknown[1]))
+        else:
+            self._prescribe_face(face, component, self.magnitude(name, length))
 
     def add_term(self, term: Callable[[Any, Any], Any]) -> None:
         """Any other load, as a term of the residual: minus its virtual work.
@@ -310,6 +321,10 @@ class Loading:
         """From now on the constant is the named load's magnitude times `scale`."""
         self._magnitudes.setdefault(name, []).append((constant, scale))
         self.values[name] = 0.0
+
+    def _prescribe_strain(self, component: int, value: Any) -> None:
+        number, _ = self.kinematics.uniform_unknown(self.space, component)
+        self.boundary_conditions.append(dolfinx.fem.dirichletbc(value, number.dofmap.list.flatten(), number))
 
     def _prescribe_face(self, face: str, component: int, value: Any) -> None:
         subspace = self.kinematics.subspace(self.space, component)

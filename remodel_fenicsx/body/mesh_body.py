@@ -7,7 +7,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeGuard
 
 import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
@@ -55,14 +55,22 @@ def _faces(value: Any) -> Any:
     return found
 
 
+def _is_mesh(value: Any) -> TypeGuard[str]:
+    return isinstance(value, str) and "\x00" not in value and Path(value).suffix.lower() in MESH_ENDINGS
+
+
 def _file(value: Any) -> Any:
-    if not isinstance(value, str) or "\x00" in value or Path(value).suffix.lower() not in MESH_ENDINGS:
+    if not _is_mesh(value):
         raise fault(f"must be the path of a mesh ({', '.join(MESH_ENDINGS)}), relative to the scene's folder")
     return value
 
 
 def _text(value: Any) -> str | None:
     return value if isinstance(value, str) else None
+
+
+def _with_ends(supports: Mapping[str, Support]) -> dict[str, Support]:
+    return {"inlet": Support(), "outlet": Support()} | dict(supports)
 
 
 class MeshBody(WalledMesh):
@@ -178,17 +186,17 @@ class MeshBody(WalledMesh):
     def with_files_from(cls, geometry: Mapping[str, Any], folder: Path) -> dict[str, Any]:
         """The keys as they were read, with the place of the file."""
         file = geometry.get("file")
-        return {**geometry, **({"file": str(folder.absolute() / file)} if isinstance(file, str) else {})}
+        return {**geometry, **({"file": str(folder.absolute() / file)} if _is_mesh(file) else {})}
 
     @classmethod
     def defaults_of(cls, own: Mapping[str, Any]) -> dict[str, Any]:
         """Element and degree of the file, where the scene does not say them."""
         mesh, file = own.get("mesh", {}), own["geometry"].get("file")
         said = isinstance(mesh, Mapping) and "element" in mesh and "degree" in mesh
-        if said or not isinstance(file, str):
+        if said or not _is_mesh(file):
             return cls.defaults
         try:
-            found = read_mesh(Path(_file(file)), _text(own["geometry"].get("tags")))
+            found = read_mesh(Path(file), _text(own["geometry"].get("tags")))
         except MeshFileError as error:
             raise fault(str(error), "geometry.file", Path(file).name) from None
         return cls.defaults | {"mesh": {"element": found.kind, "degree": found.degree}}
@@ -202,7 +210,7 @@ class MeshBody(WalledMesh):
     @property
     def number_of_elements(self) -> int:  # type: ignore[override]
         """Of the file."""
-        return len(self._read().cells)
+        return len(self._with_regions(self._read()).cells)
 
     def check_size(self, mesh: Mesh) -> None:
         """Edges are halved, as often as asked for."""
@@ -226,7 +234,7 @@ class MeshBody(WalledMesh):
         SceneError
             If the file is no mesh of one body with these faces; one line.
         """
-        from remodel_fenicsx.body.mesh_faces import FaceError, boundary_of
+        from remodel_fenicsx.body.mesh_faces import FaceError, boundary_of, likely_exchange
 
         file = self._with_regions(self._read())
         scale = METRES[self.file_unit] / METRES[self.length_unit] if self.file_unit and self.length_unit else 1.0
@@ -235,13 +243,15 @@ class MeshBody(WalledMesh):
         if not SMALLEST_LENGTH <= extent <= LARGEST_LENGTH:
             limits = f"allowed are {SMALLEST_LENGTH:g} to {LARGEST_LENGTH:g} (geometry.file_unit, geometry.length_unit)"
             raise self._fault(f"the body is {extent:g} long in the scene's unit; {limits}")
-        groups = self._groups(file)
         try:
-            boundary = boundary_of(file, groups, self.open_boundary)
+            boundary = boundary_of(file, self._groups(file), self.open_boundary)
         except FaceError as error:
             raise SceneError(f"geometry.faces.{error.face} = {shown(self._asked(error.face))}: {error}") from None
         except MeshFileError as error:
             raise self._fault(str(error)) from None
+        if pair := likely_exchange(file.points, boundary):
+            words = f"inner and outer touch each other: are {pair[0]} and {pair[1]} swapped?"
+            raise SceneError(f"geometry.faces.{pair[0]} = {shown(self._asked(pair[0]))}: {words}")
         inner, outer = boundary.area("inner"), boundary.area("outer")
         if inner > outer:
             words = f"its area is {inner:.4g}, that of outer {outer:.4g}: are inner and outer swapped?"
@@ -286,7 +296,7 @@ class MeshBody(WalledMesh):
 
     def _groups(self, file: MeshFile) -> dict[str, tuple[int, ...]]:
         """Numbers of the file's groups by name of the face, further named faces of the file under their own."""
-        from remodel_fenicsx.body.mesh_faces import groups_inside
+        from remodel_fenicsx.body.mesh_faces import again, groups_inside
 
         names, there = file.names[2], sorted(set(mesh_file.distinct(file.facet_groups)) - {0})
         listed = ", ".join([*map(repr, names), *(str(number) for number in there if number not in names.values())])
@@ -304,9 +314,19 @@ class MeshBody(WalledMesh):
             if numbers:
                 groups[face] = tuple(numbers)
         taken = {number for numbers in groups.values() for number in numbers}
-        others = {name: (number,) for name, number in names.items() if number in there and number not in taken}
-        between = groups_inside(file) if others else set()
-        return groups | {n: numbers for n, numbers in others.items() if n not in groups and numbers[0] not in between}
+        others = {name: number for name, number in names.items() if number in there and number not in taken}
+        left = groups_inside(file) if others else set()
+        for name, number in others.items():
+            if name in groups or number in left:
+                continue
+            if number in file.facet_groups[again(file.facets, file.facet_groups, taken)]:
+                log.info(
+                    "face %r of the file shares facets with others, and the scene does not name it: left out", name
+                )
+            else:
+                groups[name] = (number,)
+                taken.add(number)
+        return groups
 
     def _regions(self, file: MeshFile) -> dict[str, int]:
         numbers = mesh_file.distinct(file.cell_groups)
@@ -320,12 +340,18 @@ class MeshBody(WalledMesh):
         return {names.get(number, str(number) if number else "body"): number for number in numbers}
 
     def _with_regions(self, file: MeshFile) -> MeshFile:
-        """Volumes of one region under one number."""
-        groups = file.cell_groups.copy()
+        """Volumes of one region under one number, without others that have the same elements."""
+        from remodel_fenicsx.body.mesh_faces import again
+
+        if not self.regions:
+            return file
+        groups, taken = file.cell_groups.copy(), set()
         for name, entries in self.regions.items():
             numbers = self._volumes(file, name, entries)
             groups[np.isin(groups, numbers)] = numbers[0]
-        return replace(file, cell_groups=groups)
+            taken.add(numbers[0])
+        own = ~again(file.corners, groups, taken)
+        return replace(file, cells=file.cells[own], cell_numbers=file.cell_numbers[own], cell_groups=groups[own])
 
     def _volumes(self, file: MeshFile, region: str, entries: Names) -> list[int]:
         """Numbers of the volumes that a region has in the file."""
@@ -365,35 +391,15 @@ class MeshBody(WalledMesh):
         """Whether they are all volumes of the file."""
         return bool(regions) and set(self._regions(self._with_regions(self._read()))) <= set(regions)
 
-    def hold_faces(
-        self, loading: Loading, supports: Mapping[str, Support], modulus: float, loads: Mapping[str, Load]
-    ) -> None:
-        """Hold them as a scene says, inlet and outlet guided where it does not; add pressures on them. Collective.
+    def check_faces(self, domain: Domain, supports: Mapping[str, Support], loads: Mapping[str, Load]) -> None:
+        """Whether they are there, the body cannot move as a whole, and no support takes all of a pressure."""
+        from remodel_fenicsx.body.mesh_supports import check_supports
 
-        Raises
-        ------
-        SceneError
-            On all ranks: if there is no such face, if the body can move as a whole, if ends that slide can not be
-            pulled apart, or if a support takes all of a pressure.
-        """
-        from remodel_fenicsx.body.mesh_supports import GUIDE, add_support, check_supports
-
-        domain: Any = loading.domain
         for name in supports:
             if name not in domain.faces:
                 raise SceneError(f"supports.{name}: the body has no such face; it has {', '.join(domain.faces)}")
-        chosen = {name: Support() for name in ("inlet", "outlet") if name in domain.faces} | dict(supports)
-        check_supports(domain, chosen, "elongation" in loads)
-        length = domain.length()
-        unit = f" {self.length_unit}" if self.length_unit else ""
-        if domain.comm.rank == 0:
-            words = f"mean thickness of the wall {domain.thickness:.6g}{unit}, with plane faces"
-            log.info("%s%s", words, f"; length from inlet to outlet {length:.6g}{unit}" if length else "")
-        for name, support in chosen.items():
-            moves = ("elongation", length) if name == "outlet" else None
-            add_support(loading, name, support, GUIDE * modulus / domain.thickness, moves)
-        if "elongation" not in loading.values:
-            loading.leave_out("elongation")
+        chosen = _with_ends(supports)
+        check_supports(domain, chosen, "elongation" in loads)  # type: ignore[arg-type]
         for name, face in faces_of(loads).items():
             key, kind = f"loads.{name}.face = {shown(face)}", chosen.get(face, Support(kind="free")).kind
             if face not in domain.faces:
@@ -402,4 +408,24 @@ class MeshBody(WalledMesh):
                 raise SceneError(
                     f"{key}: its support ({kind!r}) takes all of the pressure; allowed are faces that move"
                 )
+
+    def hold_faces(
+        self, loading: Loading, supports: Mapping[str, Support], modulus: float, loads: Mapping[str, Load]
+    ) -> None:
+        """Hold them as a scene says, inlet and outlet guided where it does not; add pressures on them. Collective."""
+        from remodel_fenicsx.body.mesh_supports import GUIDE, add_support
+
+        domain: Any = loading.domain
+        self.check_faces(domain, supports, loads)
+        length = domain.length()
+        unit = f" {self.length_unit}" if self.length_unit else ""
+        if domain.comm.rank == 0:
+            words = f"mean thickness of the wall {domain.thickness:.6g}{unit}, with plane faces"
+            log.info("%s%s", words, f"; length from inlet to outlet {length:.6g}{unit}" if length else "")
+        for name, support in _with_ends(supports).items():
+            moves = ("elongation", length) if name == "outlet" else None
+            add_support(loading, name, support, GUIDE * modulus / domain.thickness, moves)
+        if "elongation" not in loading.values:
+            loading.leave_out("elongation")
+        for name, face in faces_of(loads).items():
             loading.add_follower_pressure(name, face)

@@ -61,6 +61,10 @@ class MeshDomain(Domain):
         """Of a named face, with plane facets."""
         return sum(part.area for part in self.parts if part.name == face)
 
+    def middle(self, face: str) -> Array:
+        """Mean of the places of a named face, (3,)."""
+        return np.asarray(np.concatenate([part.places for part in self.parts if part.name == face]).mean(axis=0))
+
     @property
     def thickness(self) -> float:
         """Mean thickness of the wall: twice the volume over the areas of its two faces."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -109,7 +109,6 @@ def boundary_of(file: MeshFile, groups: Groups, open_boundary: bool) -> Boundary
     MeshFileError
         One line.
     """
-    _check_elements(file)
     facets, cell, twice = _facets(file)
     places = file.points[facets]
     normals = _area_vectors(places)
@@ -155,6 +154,13 @@ def groups_inside(file: MeshFile) -> set[int]:
     return {int(n) for n, corners in zip(file.facet_groups, rows, strict=True) if corners not in outside}
 
 
+def again(corners: Integers, groups: Integers, numbers: Collection[int]) -> NDArray[np.bool_]:
+    """Which elements or facets of other groups are also in groups of these numbers, (rows,)."""
+    chosen = np.isin(groups, list(numbers))
+    _, which = np.unique(np.sort(corners, axis=1), axis=0, return_inverse=True)
+    return np.asarray(~chosen & np.isin(which.reshape(-1), which.reshape(-1)[chosen]))
+
+
 def through_the_wall(boundary: Boundary) -> bool:
     """Whether an element has facets on the inner and on the outer face."""
     inner, outer = (
@@ -162,6 +168,31 @@ def through_the_wall(boundary: Boundary) -> bool:
         for name in ("inner", "outer")
     )
     return bool(np.isin(inner, outer).any())
+
+
+def likely_exchange(points: Array, boundary: Boundary) -> tuple[str, str] | None:
+    """Which wall (inner or outer) and which end (inlet or outlet) have each other's name; None where none seem to.
+
+    Inner and outer touch only then: ends lie between them. It is one after whose exchange they touch no more, and of
+    these the pair in which the wall is the flatter.
+    """
+    walls = {"inner": "outer", "outer": "inner"}
+
+    def touch(one: str, other: str) -> bool:
+        nodes = [
+            {node for part in boundary.parts(name) for node in boundary.facets[part.facets].flat}
+            for name in (one, other)
+        ]
+        return len(nodes[0] & nodes[1]) > 1
+
+    def flatness(name: str) -> float:
+        vectors = [_area_vectors(points[boundary.facets[part.facets]]).sum(axis=0) for part in boundary.parts(name)]
+        return sum(float(np.linalg.norm(vector)) for vector in vectors) / boundary.area(name)
+
+    if not touch("inner", "outer"):
+        return None
+    pairs = [(wall, end) for wall in walls for end in ("inlet", "outlet") if not touch(end, walls[wall])]
+    return max(pairs, key=lambda names: flatness(names[0]) - flatness(names[1])) if pairs else None
 
 
 def rims(file: MeshFile, boundary: Boundary, face: str) -> list[Integers]:
@@ -217,6 +248,7 @@ def components(rows: Integers, nodes: int) -> Integers:
 
 def _facets(file: MeshFile) -> tuple[Integers, Integers, Integers]:
     """Facets of the boundary with normals outwards, the elements behind them, and the facets between two elements."""
+    _check_elements(file)
     local = np.array(FACETS[file.kind])
     facets = file.corners[:, local].reshape(-1, local.shape[1])
     _, first, inverse, count = np.unique(

@@ -6,6 +6,7 @@ its own (`Shape.reductions`).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -19,6 +20,8 @@ from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.fem.solver_methods import AUTO
 from remodel_fenicsx.model.cells import cylindrical_axes, global_axes
 from remodel_fenicsx.model.laws import LAWS
+from remodel_fenicsx.schema.tables import fault
+from remodel_fenicsx.settings import LARGEST_MESH
 
 Rule = Callable[[Any], str | None]
 Turn = Callable[[NDArray[np.float64]], NDArray[np.float64]]
@@ -183,14 +186,30 @@ def _threats(scene: Any) -> list[str]:
     return words
 
 
+def elements(scene: Any, name: str) -> int:
+    """How many hexahedra, or elements of fewer dimensions, a kinematics has."""
+    if KINEMATICS[name].reduced:
+        return scene.geometry.reductions[name].elements(scene)
+    number: int = scene.geometry.number_of_elements * scene.mesh.refinement**3
+    return number
+
+
+def check_number(scene: Any) -> None:
+    """Refuse a body, or the part that stands for it, of too many elements: raise a `fault` that names the key."""
+    name, refinement = choice(scene).name, scene.mesh.refinement
+    if (number := elements(scene, name)) > LARGEST_MESH:
+        dimension = {"interval": 1, "quadrilateral": 2}.get(KINEMATICS[name].element(scene.mesh.element), 3)
+        largest = math.floor(math.exp(math.log(refinement) - (math.log(number) - math.log(LARGEST_MESH)) / dimension))
+        rule = f"must be at most {largest} for a {scene.geometry.name}: more makes over {LARGEST_MESH:g} elements"
+        raise fault(rule, "mesh.refinement", refinement)
+
+
 def step_cost(scene: Any, name: str) -> float:
     """Of a step, in that of one point of a hexahedron; a rough figure from the number of quadrature points."""
     kinematics, mesh = KINEMATICS[name], scene.mesh
-    element, number = kinematics.element(mesh.element), scene.geometry.number_of_elements * mesh.refinement**3
+    element, number = kinematics.element(mesh.element), elements(scene, name)
     if element == "tetrahedron":
         number *= 6
-    if kinematics.reduced:
-        number = scene.geometry.reductions[name].elements(scene)
     return POINTS_OF_THE_REST + kinematics.cost * number * POINTS[element, mesh.degree]
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from abc import abstractmethod
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
@@ -23,7 +22,7 @@ from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.model.local_axes import LocalAxes
 from remodel_fenicsx.schema.tables import Table, fault
 from remodel_fenicsx.schema.units import Dimension, LengthUnit
-from remodel_fenicsx.settings import LARGEST_MESH, Load, Mesh, Natural, Region, Support
+from remodel_fenicsx.settings import Load, Mesh, Natural, Region, Support
 
 if TYPE_CHECKING:  # shapes are part of every scene: they are read without dolfinx
     from mpi4py import MPI
@@ -401,6 +400,22 @@ class Shape(_Is):  # type: ignore[misc]
         """
         return cls.loads
 
+    def check_faces(self, domain: Domain, supports: Mapping[str, Support], loads: Mapping[str, Load]) -> None:
+        """Refuse supports of, and loads on, faces of a mesh that cannot have them. Collective.
+
+        Parameters
+        ----------
+        domain
+            The mesh.
+        supports, loads
+            As for `hold_faces`.
+
+        Raises
+        ------
+        SceneError
+            On all ranks; one line that names the key.
+        """
+
     def hold_faces(
         self, loading: Loading, supports: Mapping[str, Support], modulus: float, loads: Mapping[str, Load]
     ) -> None:
@@ -433,12 +448,7 @@ class Shape(_Is):  # type: ignore[misc]
         return {}, {}
 
     def check_size(self, mesh: Mesh) -> None:
-        """Refuse a mesh that is too large: raise a `fault` that names the key."""
-        number = self.number_of_elements
-        if number * mesh.refinement**3 > LARGEST_MESH:
-            largest = math.floor((LARGEST_MESH / number) ** (1 / 3))
-            rule = f"must be at most {largest} for a {self.name}: more makes over {LARGEST_MESH:g} elements"
-            raise fault(rule, "mesh.refinement", mesh.refinement)
+        """Refuse a mesh that the shape cannot have, whatever its size: raise a `fault` that names the key."""
 
     def fibre_angle(self, dimensions: Array, axes: Array, local: Array) -> Array:
         """Angle of the chain direction in degrees; here to the load axis z.

@@ -25,7 +25,7 @@ from remodel_fenicsx.fem import jit
 from remodel_fenicsx.model import tensor_law
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.energy import Stresses, Tissue
-from remodel_fenicsx.model.laws import Drive, Law, RankedFunction
+from remodel_fenicsx.model.laws import Drive, Law, RankedFunction, tensor_target
 from remodel_fenicsx.model.tensor_law import Target
 from remodel_fenicsx.settings import Remodeling, Solver
 from remodel_fenicsx.solver.continuation import Work
@@ -65,7 +65,7 @@ def refused(settings: Remodeling, law: Law, coupling: str) -> str | None:
         return "remodeling.turnover has no derivative"
     if settings.has_set_point:
         return "remodeling.threshold and remodeling.exponent have no derivative"
-    if law.target is None and law.dimensions is None:
+    if law.target is not tensor_target and law.dimensions is None:
         return f"remodeling.law = {settings.law!r} has no derivative"
     if coupling not in COUPLINGS_WITH_DERIVATIVES:
         return f"remodeling.coupling = {coupling!r} has no derivative"

@@ -123,6 +123,10 @@ class Kinematics(ABC):
         """The Constant that is the engineering strain along x, y or z where it is prescribed as a whole, or None."""
         return None
 
+    def uniform_unknown(self, space: Any, component: int) -> Any:
+        """Where the strain along x, y or z is an unknown: its part of the space, and its value at strain 1. Or None."""
+        return None
+
     def nodal_space(self, unknown: Any) -> Any:
         """A space, scalar or blocked, with the mesh's nodes in the order of `nodal_displacement`."""
         return unknown.function_space
@@ -302,6 +306,10 @@ class RadialKinematics(_Reduced):
         """The axial strain."""
         return self.axial_strain if component == 2 else None
 
+    def subspace(self, space: Any, component: int) -> Any:
+        """All of it is along x."""
+        return space if component == 0 else None
+
     def nodal_displacement(self, unknown: Any) -> Array:
         """Of the nodes on the ray, (nodes, 3)."""
         return unknown.x.array[:, None] * np.array([1.0, 0.0, 0.0])
@@ -344,6 +352,10 @@ class PointKinematics(_Reduced):
 
         stretches = (_along(i, unknown[i] / self.axial_length) for i in range(3))
         return sum(stretches, ufl.Identity(3))
+
+    def uniform_unknown(self, space: Any, component: int) -> Any:
+        """The number along that axis."""
+        return space.sub(component), self.body.axial_length
 
     def weight(self, mesh: Any) -> Any:
         """Area of the section."""

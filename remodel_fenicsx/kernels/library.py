@@ -15,7 +15,7 @@ import numpy as np
 from mpi4py import MPI
 
 from remodel_fenicsx.fem import jit
-from remodel_fenicsx.model.energy import REPULSIONS, Repulsion, Tissue
+from remodel_fenicsx.model.energy import BY_LOG, Repulsion, Tissue
 from remodel_fenicsx.system import environment
 from remodel_fenicsx.system import NOTICE
 
@@ -106,7 +106,7 @@ class Library:
 
 def with_kernels(tissue: Tissue, comm: MPI.Intracomm) -> Tissue:
     """The tissue with its repulsion in C, where it is `log`."""
-    if tissue.chain is None or tissue.repulsion is not REPULSIONS["log"] or in_numpy():
+    if tissue.chain is None or tissue.repulsion != BY_LOG or in_numpy():
         return tissue
     from remodel_fenicsx.kernels.tensor import TensorKernels  # with the law `tensor`: most runs need neither
 

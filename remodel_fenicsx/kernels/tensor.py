@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -13,27 +15,30 @@ from numpy.typing import NDArray
 from remodel_fenicsx.kernels.library import Library, in_numpy
 from remodel_fenicsx.model import tensor_law, tensors
 from remodel_fenicsx.model.cells import UnitCell
-from remodel_fenicsx.model.chains import CHAINS
-from remodel_fenicsx.model.drivers import DRIVERS, rotated_back
-from remodel_fenicsx.model.energy import MATRICES, REPULSIONS, Tissue, whole_structure_tensor
+from remodel_fenicsx.model.chains import WORMLIKE
+from remodel_fenicsx.model.drivers import CAUCHY, FINGER, PK2, Driver, rotated_back
+from remodel_fenicsx.model.energy import BY_LENGTH, BY_LOG, Repulsion, Tissue, neo_hookean, whole_structure_tensor
 from remodel_fenicsx.model.implicit import condensed
-from remodel_fenicsx.model.implicit.condensed import CondensedPoints, LocalSolution, named
+from remodel_fenicsx.model.implicit.condensed import CondensedPoints, LocalSolution
 from remodel_fenicsx.model.implicit.network import at, put
 from remodel_fenicsx.model.implicit.responses import StepOfCells
-from remodel_fenicsx.model.laws import LAWS, Drive
+from remodel_fenicsx.model.laws import Drive, tensor_target
 from remodel_fenicsx.model.tensor_law import Target
+
+log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-COMPILED_REPULSIONS = ("log", "length")
+# what tensor.c knows, and the numbers that it has there; of chains WORMLIKE, of matrices neo_hookean, of laws the
+# one with tensor_target. A part that is not here, though it has derivatives, is numpy's
+COMPILED_DRIVERS: dict[Driver, int] = {CAUCHY: 0, PK2: 1, FINGER: 2}
+COMPILED_REPULSIONS: dict[Repulsion, int] = {BY_LOG: 0, BY_LENGTH: 1}
 PARAMETERS = ("lame_lambda", "lame_mu", "network_modulus", "contour_length", "end_to_end_length")
 NUMBERS = {
-    **{
-        name.upper(): i
-        for names in (condensed.DRIVING_TENSORS, COMPILED_REPULSIONS, PARAMETERS)
-        for i, name in enumerate(names)
-    },
+    **dict(zip(("CAUCHY", "PK2", "FINGER"), COMPILED_DRIVERS.values(), strict=True)),
+    **dict(zip(("LOG", "LENGTH"), COMPILED_REPULSIONS.values(), strict=True)),
+    **{name.upper(): i for i, name in enumerate(PARAMETERS)},
     "PARAMETERS": len(PARAMETERS),
     "ITERATIONS": condensed.LOCAL_ITERATIONS,
     "HALVINGS": condensed.LOCAL_HALVINGS,
@@ -86,16 +91,26 @@ def tensor_kernels(comm: MPI.Intracomm) -> TensorKernels | None:
 
 def condensed_points(kernels: TensorKernels | None, tissue: Tissue, step: StepOfCells) -> CondensedPoints:
     """Tissue and step of n points: in C, where that knows all of its parts."""
-    known = (
-        step.law is LAWS["tensor"]
-        and named(step.drive.driver, DRIVERS) in condensed.DRIVING_TENSORS
-        and not step.is_spatial
-        and step.turnover is None
-        and tissue.chain is CHAINS["wormlike"]
-        and tissue.matrix is MATRICES["neo-hookean"]
-        and named(tissue.repulsion, REPULSIONS) in COMPILED_REPULSIONS
-    )
-    return CompiledPoints(tissue, step, kernels) if kernels is not None and known else CondensedPoints(tissue, step)
+    if kernels is None:
+        return CondensedPoints(tissue, step)
+    known = {
+        "law": step.law.target is tensor_target,
+        "driver": step.drive.driver in COMPILED_DRIVERS,
+        "frame": not step.is_spatial,
+        "turnover": step.turnover is None,
+        "chain": tissue.chain == WORMLIKE,
+        "matrix": tissue.matrix is neo_hookean,
+        "repulsion": tissue.repulsion in COMPILED_REPULSIONS,
+    }
+    if all(known.values()):
+        return CompiledPoints(tissue, step, kernels)
+    _say_so(", ".join(part for part, is_known in known.items() if not is_known))
+    return CondensedPoints(tissue, step)
+
+
+@functools.cache
+def _say_so(parts: str) -> None:
+    log.info("numpy finds the cells of an implicit step, slower: C does not have this %s", parts)
 
 
 @dataclass(frozen=True)
@@ -107,8 +122,7 @@ class CompiledPoints(CondensedPoints):
     def _call(self, name: str, F: Array, tensor: Array, *results: Array | Flags) -> None:
         """A function in C with F, D, the cells at the start, parameters, and what else it takes of tissue and step."""
         drive, tissue = self.step.drive, self.tissue
-        parts = (drive.driver, DRIVERS), (tissue.repulsion, REPULSIONS)
-        numbers = (NUMBERS[str(named(*part)).upper()] for part in parts)
+        numbers = COMPILED_DRIVERS[drive.driver], COMPILED_REPULSIONS[tissue.repulsion]
         parameters = np.stack([getattr(tissue, name) for name in PARAMETERS])
         rate = np.broadcast_to(self.step.rate, len(F))
         given = self.step.structure, parameters, drive.floor, drive.rounding, rate, *numbers

@@ -86,6 +86,5 @@ class Chain:
         return k_theta / persistence_length * self.stiffness(end_to_end_length, contour_length) * end_to_end_length
 
 
-CHAINS: dict[str, Chain] = {
-    "wormlike": Chain(wormlike_energy, wormlike_stiffness),
-}
+WORMLIKE = Chain(wormlike_energy, wormlike_stiffness)
+CHAINS: dict[str, Chain] = {"wormlike": WORMLIKE}

@@ -23,6 +23,8 @@ from remodel_fenicsx.model.panels import Panels
 
 Array = NDArray[np.float64]
 DEGREE = 24  # of R(r): the paper's artery at 160 degrees changes by less than 1e-8 from 16 to 32
+MISSING = 1e-8  # of dR/dr: a panel that leaves more of it out is halved; walls of 1 to 7 and thicker have some
+MOST_PANELS = 8  # of one layer
 LARGEST_TURN = (
     0.5  # of k: walls of 1 to 1.05 ... 3 close at 180 degrees (k = 2) in one piece too, and this is half of it
 )
@@ -79,7 +81,7 @@ class Closing(NamedTuple):
     layers
         Of the ring, from the lumen outwards.
     panels
-        One for each layer.
+        One for each layer, which is a part of one where a polynomial does not follow it.
     radius
         R at the panels' points.
     circumferential, axial
@@ -132,16 +134,39 @@ def closing(layers: Sequence[Layer], opening_angle: float, loads: Loads = Loads(
     """
     whole = 360.0 / (360.0 - opening_angle)
     panels = Panels([layers[0].radii[0], *(layer.radii[1] for layer in layers)], DEGREE)
-    ring = panels.places
-    values = np.append(ring, loads.axial)  # R at the points, and g_z
-    stiffness = max(layer.tissue.lame_lambda + 2 * layer.tissue.lame_mu for layer in layers)
-    scale: Array = np.append(np.full(ring.size, panels.edges[-1]), 1.0)
     turns = np.linspace(1.0, whole, 1 + max(1, int(np.ceil((whole - 1.0) / LARGEST_TURN))))[1:]
+    found = Closing(tuple(layers), panels, panels.places.copy(), 1.0, loads.axial)
     for k in turns:
-        values[:-1] *= np.mean(values[:-1] + (k - 1.0) * ring.ravel() * 0.5) / np.mean(values[:-1])
-        residual = partial(_residual, tuple(layers), panels, float(k), loads)
-        values = solved(residual, values, scale, stiffness)
-    return Closing(tuple(layers), panels, values[:-1].reshape(ring.shape), whole, float(values[-1]))
+        grown = np.mean(found.radius + (k - 1.0) * panels.places * 0.5) / np.mean(found.radius)
+        found = _balanced(found._replace(radius=grown * found.radius, circumferential=float(k)), loads)
+    while (rough := found.panels.missing(found.panels.derivative(found.radius)) > MISSING).any():
+        parts = [
+            part
+            for layer, one in zip(found.layers, rough, strict=True)
+            for part in (_halves(layer) if one else [layer])
+        ]
+        if len(parts) > MOST_PANELS * len(layers):
+            raise ArithmeticError(f"ring and sector vary too much through the wall for {len(parts)} polynomials")
+        finer = Panels([parts[0].radii[0], *(part.radii[1] for part in parts)], DEGREE)
+        radius = found.natural_radius(finer.places)
+        found = _balanced(found._replace(layers=tuple(parts), panels=finer, radius=radius), loads)
+    return found
+
+
+def _halves(layer: Layer) -> list[Layer]:
+    """Of one ratio of radii: what closes varies with the logarithm of the radius."""
+    low, high = layer.radii
+    middle = float(np.sqrt(low * high))
+    return [layer._replace(radii=(low, middle)), layer._replace(radii=(middle, high))]
+
+
+def _balanced(near: Closing, loads: Loads) -> Closing:
+    """The equilibrium that is near."""
+    stiffness = max(layer.tissue.lame_lambda + 2 * layer.tissue.lame_mu for layer in near.layers)
+    scale: Array = np.append(np.full(near.radius.size, near.panels.edges[-1]), 1.0)
+    residual = partial(_residual, near.layers, near.panels, near.circumferential, loads)
+    values = solved(residual, np.append(near.radius, near.axial), scale, stiffness)
+    return near._replace(radius=values[:-1].reshape(near.radius.shape), axial=float(values[-1]))
 
 
 def solved(function: Callable[[Array], Array], values: Array, scale: Array, stiffness: float) -> Array:

@@ -80,7 +80,7 @@ def cut(layers: Sequence[Layer], closed: Closing | None, radius: Array, squared_
     squared, turned = squared[..., :3], np.moveaxis(squared[..., 3:], -1, 0)
     natural, start = np.ones_like(squared), (panels.places.copy(), 1.0, 1.0)
     if closed is not None:
-        fine = closed._replace(panels=panels, radius=closed.panels.onto(panels, closed.radius))
+        fine = closed._replace(layers=tuple(layers), panels=panels, radius=closed.natural_radius(panels.places))
         natural = fine.at_panels()
         start = (fine.radius, 1 / closed.axial, 1 / closed.circumferential)  # what opens, were the cells as they were
     tissues = []

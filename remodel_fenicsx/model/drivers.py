@@ -54,11 +54,10 @@ def finger_tensor(deformation_gradient: Any, stresses: Stresses) -> Any:
     return ufl.dot(deformation_gradient, deformation_gradient.T)
 
 
-DRIVERS: dict[str, Driver] = {
-    "cauchy": Driver(lambda F, s: s.cauchy, material=False),
-    "pk2": Driver(lambda F, s: s.second_piola_kirchhoff, material=True),
-    "finger": Driver(finger_tensor, material=False, is_stress=False),
-}
+CAUCHY = Driver(lambda F, s: s.cauchy, material=False)
+PK2 = Driver(lambda F, s: s.second_piola_kirchhoff, material=True)
+FINGER = Driver(finger_tensor, material=False, is_stress=False)
+DRIVERS: dict[str, Driver] = {"cauchy": CAUCHY, "pk2": PK2, "finger": FINGER}
 
 
 def rotated_back(F: Array, spatial_tensor: Array) -> Array:
@@ -121,10 +120,9 @@ def material_frame(F: Array, spatial_axes: Array) -> Array:
     return np.stack([first, second, np.cross(first, second)], axis=1)
 
 
-FRAMES: dict[str, Frame] = {
-    "material": Frame(material_frame, carries_axes=True),
-    "spatial": Frame(spatial_frame, carries_axes=False, tensor=lambda F, tensor: tensor),
-}
+MATERIAL = Frame(material_frame, carries_axes=True)
+SPATIAL = Frame(spatial_frame, carries_axes=False, tensor=lambda F, tensor: tensor)
+FRAMES: dict[str, Frame] = {"material": MATERIAL, "spatial": SPATIAL}
 
 
 def carried_axes(F: Array, axes: Array) -> Array:

@@ -238,11 +238,8 @@ class Repulsion:
     derivatives: Callable[..., tuple[Array, Array | None]] | None = None
 
 
-REPULSIONS: dict[str, Repulsion] = {
-    "axes": Repulsion(axes_sum),
-    "log": Repulsion(log_sum, log_derivatives),
-    "length": Repulsion(length_sum),
-}
+BY_AXES, BY_LOG, BY_LENGTH = Repulsion(axes_sum), Repulsion(log_sum, log_derivatives), Repulsion(length_sum)
+REPULSIONS: dict[str, Repulsion] = {"axes": BY_AXES, "log": BY_LOG, "length": BY_LENGTH}
 
 
 # ---------------------------------------------------------------- the tissue

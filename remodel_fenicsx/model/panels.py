@@ -1,6 +1,6 @@
 """Functions of the radius on panels: values at Chebyshev points, with derivative and integral.
 
-A panel is a layer: within it a function is smooth, from one to the next its derivative may jump.
+A panel is a layer or a part of one: within it a function is smooth, from one to the next its derivative may jump.
 """
 
 from __future__ import annotations
@@ -60,10 +60,10 @@ class Panels:
         """Number of the panel of each radius (...,); what is outside belongs to the nearest."""
         return np.clip(np.searchsorted(self.edges, radius, side="right") - 1, 0, len(self.edges) - 2)
 
-    def onto(self, other: Panels, values: Array) -> Array:
-        """Of values (panels, points), at the points of other panels with the same edges."""
-        found: Array = values @ (chebyshev.chebvander(other._points, self.degree) @ self._coefficients).T
-        return found
+    def missing(self, values: Array) -> Array:
+        """About what the polynomials leave out of values (panels, points), as shares of the largest; (panels,)."""
+        found: Array = np.abs(values @ self._coefficients.T)
+        return found[:, -2:].max(axis=1) / found.max()
 
     def at(self, radius: Array, values: Array) -> Array:
         """Of values (panels, points), at radii (...,)."""

@@ -315,13 +315,19 @@ class _FaceIntegral:
 
 
 class _LumenVolume:
-    """-1/3 integral of x . cof(F) N over the inner face, and the cones over flat caps on its rims."""
+    """-1/3 integral of x . cof(F) N over the inner face, and the cones over flat caps on its rims.
+
+    x is the place beside the middle of that face: digits of a place far away would be those of the volume.
+    """
 
     def __init__(self, observer: Observer):
         domain, state = observer.domain, observer.state
         self._rims, self._comm, self._size = domain.rims, domain.comm, domain.size  # type: ignore[attr-defined]
-        self._nodes, self._displacement = domain.gather_nodes(domain.mesh.geometry.x), NodalGather(domain, state)
-        place = ufl.SpatialCoordinate(domain.mesh) + state.kinematics.displacement(state.unknown)
+        middle = domain.middle("inner")  # type: ignore[attr-defined]
+        self._nodes = domain.gather_nodes(domain.mesh.geometry.x - middle)
+        self._displacement = NodalGather(domain, state)
+        place = ufl.SpatialCoordinate(domain.mesh) - dolfinx.fem.Constant(domain.mesh, middle)
+        place += state.kinematics.displacement(state.unknown)
         normal = ufl.cofac(state.kinematics.deformation_gradient(state.unknown)) * ufl.FacetNormal(domain.mesh)
         self._form = jit.form(-ufl.inner(place, normal) / 3 * state.loading.measure_alone("inner"))
 

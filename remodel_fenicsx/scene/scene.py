@@ -18,7 +18,7 @@ from pydantic import BaseModel, BeforeValidator, Field, ModelWrapValidatorHandle
 from remodel_fenicsx.body import SHAPES, Shape
 from remodel_fenicsx.body.shape import LoadKind
 from remodel_fenicsx.body.columns import TURNOVER_POWER, Column, columns_of, columns_of_region, columns_on_request
-from remodel_fenicsx.body.reductions import AUTO, choice, objections
+from remodel_fenicsx.body.reductions import AUTO, check_number, choice, objections
 from remodel_fenicsx.fem.formulations import FORMULATIONS, NOT_LOCKING
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.fem.solver_methods import SOLVER_METHODS
@@ -36,6 +36,7 @@ from remodel_fenicsx.schema.units import FORCE, LENGTH_UNIT, LENGTH_UNITS, STRES
 from remodel_fenicsx.settings import (
     COUPLINGS,
     REGION,
+    AS_GIVEN,
     UNLOADED,
     STRESS_UNITS,
     MEASURED_CELLS,
@@ -234,6 +235,8 @@ class Scene(Table):
         self._check_cases()
         if self.model.kinematics != AUTO and (reasons := objections(self, self.model.kinematics)):
             raise fault("; ".join(reasons), "model.kinematics", self.model.kinematics)
+        if geometry.refines:
+            check_number(self)
         return self
 
     @property
@@ -404,7 +407,10 @@ class Scene(Table):
             raise fault(f"needs a remodeling.law with a target: {able}", "remodeling.mean", remodeling.mean)
         if self.cases and self.geometry.is_loaded:
             raise fault(
-                "not allowed with [[cases]]: the loaded body belongs to one set of loads", "geometry.is", "loaded"
+                "not allowed with [[cases]]: the loaded body belongs to one set of loads; remodel-fenicsx unload "
+                "SCENE, with those alone, writes the scene of the unloaded one, to which [[cases]] may be added",
+                "geometry.is",
+                "loaded",
             )
         if self.cases[1:] and not COUPLINGS[remodeling.coupling].takes_cases:
             able = ", ".join(repr(name) for name, kind in COUPLINGS.items() if kind.takes_cases)
@@ -582,7 +588,23 @@ class Scene(Table):
             for case in self.each_case():
                 lines = doubts(material, self.geometry, case.loads, cells.end_to_end_length, self.last_time)
                 found |= dict.fromkeys(line if line.startswith("geometry.") else _words(name) + line for line in lines)
-        return [*found, *self._too_long_for_turnover(), *self.remodeling.warnings()]
+        return [*found, *self.turned_away(), *self._too_long_for_turnover(), *self.remodeling.warnings()]
+
+    def turned_away(self) -> list[str]:
+        """Whether rows leave the loaded shape that is given, for its cells turn; with the way out."""
+        turns = LAWS[self.remodeling.law].remodels and any(one.kappa for one in self.properties().values())
+        if not (self.geometry.is_loaded and turns and self.natural.cells == AS_GIVEN):
+            return []
+        way = "let all loads act in the first step to have a row with it"
+        if self.geometry.unloads_by_numbers:
+            way = (
+                "natural.cells = 'equilibrium' with time.end = 'equilibrium' takes it for that of cells that have come "
+                f"to rest; or {way}"
+            )
+        return [
+            "geometry.is = 'loaded': the given shape is that under all loads with the cells of t = 0. They turn while "
+            f"loads rise and afterwards, so rows have another one; {way}"
+        ]
 
     def _too_long_for_turnover(self) -> list[str]:
         """Explicit steps of turnover that are longer than its time: content then swings about its rest."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,6 +12,8 @@ from mpi4py import MPI
 
 from remodel_fenicsx.scene import Scene, SceneError
 from remodel_fenicsx.unloading.failure import NoUnloadedShape
+
+log = logging.getLogger(__name__)
 
 __all__ = ["NoUnloadedShape", "as_unloaded", "unloaded"]
 
@@ -27,6 +30,8 @@ def as_unloaded(scene: Scene, comm: MPI.Intracomm) -> Iterator[Scene]:
     if not scene.geometry.is_loaded:
         yield scene
         return
+    for line in scene.turned_away() if comm.rank == 0 else ():
+        log.warning("%s", line)
     with TemporaryDirectory() as folder:
         yield unloaded(scene, comm, Path(comm.bcast(folder)))
 

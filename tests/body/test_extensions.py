@@ -68,7 +68,7 @@ from remodel_fenicsx.extend import (
     squared_end_to_end_length,
     uniaxial_columns,
 )
-from remodel_fenicsx.parts import Cube, Domain, Remodeling
+from remodel_fenicsx.parts import Cube, Domain, Remodeling, Tube
 
 KAPPA = 0.1
 SCENE: dict[str, Any] = {
@@ -305,6 +305,71 @@ def test_a_load(monkeypatch: pytest.MonkeyPatch) -> None:
     assert column(found, "weight") == [10.0, 20.0, 20.0, 20.0]
     with pytest.raises(SceneError, match="a tendon has no such load"):
         Scene(geometry={"shape": "tendon"}, loads={"weight": {"value": 1.0, "ramp": ramp}}, time={"end": 1.0})
+
+
+STRETCHED = LoadKind(
+    lambda shape, loading, name: loading.add_prescribed_elongation(name, "z1", 2, shape.side),
+    "strain of the height",
+    reductions=("point",),
+)
+
+
+class Held(Cube):
+    """A cube that is stretched, between walls: x can not change."""
+
+    loads: ClassVar[dict[str, LoadKind]] = {"stretch": STRETCHED}
+
+    shape: Literal["held"] = Field(default="held", description="Which body it is.")
+
+    def hold(self, loading: Any) -> None:
+        super().hold(loading)
+        loading.hold_face("x1", 0)
+
+
+class Clamped(Held):
+    """The same, whose ends keep their width."""
+
+    shape: Literal["clamped"] = Field(default="clamped", description="Which body it is.")
+
+    def hold(self, loading: Any) -> None:
+        super().hold(loading)
+        loading.hold_face("z1", 1)
+
+
+def test_a_prescribed_displacement_of_a_body_as_a_point(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The rows are those of the whole cube; what the one strain cannot be is refused."""
+    for shape in (Held, Clamped):
+        monkeypatch.setitem(SHAPES, shape.model_fields["shape"].default, shape)
+    values = scene().model_dump(exclude={"geometry", "preset", "format", "model", "loads"}, exclude_none=True)
+    values["loads"] = {"stretch": {"value": 0.3, "ramp": [[0.0, 0.0], [2.0, 1.0]]}}
+    held = Scene(**values, geometry={"shape": "held", "side": 2.0}, model={"kinematics": "full"})
+    expected, found = (rows_of(held.with_values({"model.kinematics": name})) for name in ("full", "point"))
+    assert column(found, "mean_stretch") == pytest.approx([1.15, 1.3, 1.3, 1.3])
+    for name in ("mean_stretch", "min_jacobian", "stored_energy", "mean_fibre_angle"):
+        np.testing.assert_allclose(column(found, name), column(expected, name), rtol=1e-9, err_msg=name)
+    clamped = Scene(**values, geometry={"shape": "clamped"}, model={"kinematics": "point"})
+    with pytest.raises(SceneError, match="^model.kinematics = 'point': z1 is held across"):
+        rows_of(clamped)
+
+
+class Cased(Tube):
+    """A tube in a stiff case: seen along a ray, its outer radius stays."""
+
+    shape: Literal["cased"] = Field(default="cased", description="Which body it is.")
+
+    def hold(self, loading: Any) -> None:
+        super().hold(loading)
+        loading.hold_face("outer", 0)
+
+
+def test_a_radius_that_is_held_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(SHAPES, "cased", Cased)
+    values = scene().model_dump(exclude={"geometry", "preset", "format", "model", "loads"}, exclude_none=True)
+    values["loads"] = {"pressure": {"value": 3.0, "ramp": [[0.0, 0.0], [2.0, 1.0]]}}
+    radii = {"inner_radius": 1.0, "outer_radius": 2.0, "length": 1.0}
+    values["cells"]["axes"], values["remodeling"]["frame"] = "cylindrical", "material"
+    rows = rows_of(Scene(**values, geometry={"shape": "cased", **radii}, model={"kinematics": "radial"}))
+    assert rows[-1]["inner_radius"] > 1.02 and rows[-1]["outer_radius"] == pytest.approx(2.0, abs=1e-12)
 
 
 def test_a_column(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from remodel_fenicsx import Scene, SceneError, Simulation, cli, read_scene, unloaded
+from remodel_fenicsx import Recording, Scene, SceneError, Simulation, cli, read_scene, run, unloaded
 from remodel_fenicsx.body.mesh_reader import read_mesh
 from remodel_fenicsx.results.fields import NodalGather
 from remodel_fenicsx.unloading import NoUnloadedShape
@@ -179,6 +179,26 @@ def test_what_cannot_be_loaded_is_refused(changes: dict[str, Any], words: str) -
     with pytest.raises(SceneError) as refused:
         scene("radial" if "supports.ends" not in changes else "auto", **(LOADED | VIRGIN | changes))
     assert words in str(refused.value)
+
+
+def test_a_loaded_shape_that_turning_cells_leave_is_warned_of(tmp_path: Path) -> None:
+    """By scene and run; the way out that the line names has a row with the given radii."""
+    ramp = {f"loads.{name}.ramp": [[0.0, 1.0]] for name in ("pressure", "elongation")}
+    turning = scene("radial", **(LOADED | {"natural.opening_angle": 0.0, "loads.pressure.value": 1.2, **ramp}))
+    turning = turning.with_values({"time.end": 8.0, "time.step": 1.0})
+    (line,) = (line for line in turning.warnings() if line.startswith("geometry.is = 'loaded': "))
+    assert "natural.cells = 'equilibrium'" in line and "first step" in line
+    rows = Recording(run(turning, tmp_path / "run")).history["inner_radius"]
+    assert rows[1] == pytest.approx(1.4, abs=1e-6) and abs(rows[-1] - 1.4) > 1e-3
+    assert (tmp_path / "run" / "run.log").read_text().count(line) == 1
+    for still in ({"remodeling.law": "none"}, {"geometry.is": "unloaded"}):
+        assert not any("geometry.is" in other for other in turning.with_values(still).warnings())
+
+
+def test_load_cases_of_a_loaded_body_are_refused_with_the_way_out() -> None:
+    cases = [{"weight": 0.5}, {"weight": 0.5, "loads": {"pressure": 0.5}}]
+    with pytest.raises(SceneError, match=r"^geometry.is = 'loaded': not allowed with \[\[cases\]\].*unload SCENE"):
+        scene("radial", **(LOADED | VIRGIN | {"cases": cases}))
 
 
 def test_a_simulation_asks_for_the_unloaded_body() -> None:

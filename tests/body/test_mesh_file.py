@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from remodel_fenicsx import SceneError
-from remodel_fenicsx.scene import scene_from_dict
+from remodel_fenicsx.body.gmsh_model import gmsh_model
+from remodel_fenicsx.scene import read_scene, scene_from_dict
 from tests.mesh_files import edited, write_tube
 
 Edit = Callable[[list[str]], list[str]]
@@ -208,6 +209,93 @@ SWAPPED = "geometry.faces.inner = 'outer': its area is 36.74, that of outer 18.3
 )
 def test_faces_that_the_file_has_not(good: Path, geometry: dict[str, Any], words: str) -> None:
     assert words in refusal(good, **geometry)
+
+
+def bent(x: Any) -> Any:
+    """About an axis 4 away."""
+    radius, angle = 4 + x[:, 0], x[:, 2] / 2
+    return np.stack([radius * np.cos(angle), x[:, 1], radius * np.sin(angle)], axis=1)
+
+
+@pytest.mark.parametrize("end", ["inlet", "outlet"])
+@pytest.mark.parametrize("wall", ["inner", "outer"])
+@pytest.mark.parametrize(
+    "body",
+    [
+        {},
+        {"length": 0.1},  # the ends are larger than the inner face
+        {"moved": bent},
+        {"element": "tetrahedron", "degree": 2},
+    ],
+    ids=["tube", "ring", "bent", "curved tetrahedra"],
+)
+def test_an_end_and_a_wall_that_are_exchanged(tmp_path: Path, body: dict[str, Any], wall: str, end: str) -> None:
+    """Whichever two of the names; the line says which."""
+    file = write_tube(tmp_path / "tube.msh", **body)
+    said = refusal(file, faces={wall: end, end: wall})
+    assert f"geometry.faces.{wall} = '{end}': inner and outer touch each other: are {wall} and {end} swapped?" in said
+
+
+@pytest.mark.parametrize("file", ["lumen.stl", "vessel.inp", "vessel.pvtu", "vessel.msh.gz", "vessel", "", "a/b.txt"])
+@pytest.mark.parametrize("known", [{}, {"element": "hexahedron", "degree": 1}])
+def test_another_ending_is_refused_by_key_and_value(tmp_path: Path, file: str, known: dict[str, Any]) -> None:
+    """As the scene has it, whether or not element and degree have to be read from the file."""
+    (tmp_path / "scene.toml").write_text(SCENE.format(file))
+    settings = [f"mesh.{key}={value}" for key, value in known.items()]
+    with pytest.raises(SceneError) as error:
+        read_scene(tmp_path / "scene.toml", settings)
+    assert str(error.value).startswith(f"geometry.file = {file!r}: must be the path of a mesh (.msh, ")
+
+
+def overlapping(path: Path, version: float) -> Path:
+    """Two boxes and their faces, with names for both boxes at once, for all of the boundary, and for two faces."""
+    with gmsh_model("boxes") as gmsh:
+        for z in (0, 1):
+            gmsh.model.occ.addBox(0, 0, z, 1, 1, 1)
+        gmsh.model.occ.fragment([(3, 1)], [(3, 2)])
+        gmsh.model.occ.synchronize()
+        centre = {tag: gmsh.model.occ.getCenterOfMass(2, tag) for _, tag in gmsh.model.getEntities(2)}
+
+        def at(axis: int, value: float) -> list[int]:
+            return [tag for tag, place in centre.items() if abs(place[axis] - value) < 1e-9]
+
+        for number, (axis, value, name) in enumerate(
+            [
+                (0, 0.0, "inner"),
+                (0, 1.0, "outer"),
+                (2, 0.0, "inlet"),
+                (2, 2.0, "outlet"),
+                (1, 0.0, "front"),
+                (1, 1.0, "back"),
+            ],
+            1,
+        ):
+            gmsh.model.addPhysicalGroup(2, at(axis, value), number, name)
+        gmsh.model.addPhysicalGroup(2, [tag for tag in centre if tag not in at(2, 1.0)], 7, "boundary")
+        gmsh.model.addPhysicalGroup(2, at(1, 0.0) + at(1, 1.0), 8, "sides")
+        for number, (tags, name) in enumerate([([1], "lower"), ([2], "upper"), ([1, 2], "wall")], 11):
+            gmsh.model.addPhysicalGroup(3, tags, number, name)
+        gmsh.model.mesh.setSize(gmsh.model.getEntities(0), 0.5)
+        gmsh.model.mesh.generate(3)
+        gmsh.option.setNumber("Mesh.MshFileVersion", version)
+        gmsh.write(str(path))
+    return path
+
+
+@pytest.mark.parametrize("version", [2.2, 4.1])
+@pytest.mark.parametrize("refinement", [1, 2])
+def test_groups_that_the_scene_does_not_name_may_overlap(tmp_path: Path, version: float, refinement: int) -> None:
+    """They are left alone; those that it names may not."""
+    file = overlapping(tmp_path / "boxes.msh", version)
+    regions = {"lower": "lower", "upper": "upper"}
+    values = {"geometry": {"shape": "mesh", "file": str(file), "regions": regions}, "time": {"end": 1.0, "step": 1.0},
+              "mesh": {"refinement": refinement}}  # fmt: skip
+    scene = scene_from_dict(values)
+    _, boundary, found = scene.geometry.checked(scene.mesh)
+    assert {face.name for face in boundary.faces} == {"inner", "outer", "inlet", "outlet", "front", "back"}
+    assert boundary.volume == pytest.approx(2.0) and set(found) == {"lower", "upper"}
+    assert "shares facets with the face" in refusal(file, regions=regions, faces={"all": "boundary"})
+    assert "in two named volumes" in refusal(file, regions={**regions, "all": "wall"})
 
 
 def test_a_body_of_another_unit_is_refused(tmp_path: Path) -> None:

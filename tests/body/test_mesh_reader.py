@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+import shlex
+import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -102,6 +105,22 @@ def test_a_run_of_it_is_that_of_gmsh_s_file(tmp_path: Path) -> None:
     for name in ("lumen_volume", "fibre_angle_inner", "stored_energy"):
         assert found[name] == pytest.approx(expected[name], rel=1e-10), name
     assert scene.geometry.kept_files()[1].keys() == {"tube.vtu"}
+
+
+@pytest.mark.parametrize("sign", [1, -1])  # SALOME counts families of elements below zero
+def test_a_med_file_is_converted_as_the_docs_say(tmp_path: Path, sign: int) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "own_body.md").read_text()
+    command = re.search(r"^\./with-fenicsx (.*meshio.*)$", page, flags=re.MULTILINE)
+    source = write_tube(tmp_path / "tube.msh")
+    mesh, kinds = meshio.read(source), ("quad", "hexahedron")
+    tags = [sign * mesh.get_cell_data("gmsh:physical", kind).astype(np.int64) for kind in kinds]
+    cells = [(kind, mesh.get_cells_type(kind)) for kind in kinds]
+    meshio.Mesh(mesh.points, cells, cell_data={"cell_tags": tags}).write(tmp_path / "a.med")
+    assert command is not None
+    subprocess.run(shlex.split(command[1]), cwd=tmp_path, check=True)
+    faces = {name: sign * number for name, number in numbers_of(source).items()}
+    _, boundary, _ = scene_of(tmp_path / "b.vtu", faces=faces, tags="cell_tags").geometry.checked()
+    assert boundary.area("inner") == pytest.approx(scene_of(source).geometry.checked()[1].area("inner"))
 
 
 def test_what_is_wrong_is_said_in_one_line(tmp_path: Path) -> None:

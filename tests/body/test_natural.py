@@ -68,6 +68,27 @@ def test_the_sector_of_a_neo_hookean_tube_tends_to_the_incompressible_one() -> N
     assert errors[1] < 0.2 * errors[0]
 
 
+@pytest.mark.parametrize(
+    ("ratio", "angle", "axial"),
+    [(20.0, 179.0, 1.0439205), (10.0, 179.0, None)],
+)
+def test_the_closing_of_a_thick_wall_follows_its_own_error(
+    monkeypatch: pytest.MonkeyPatch, ratio: float, angle: float, axial: float | None
+) -> None:
+    """The axial stretch: as integrated by shooting, for one, and the same with polynomials of another degree."""
+    tissue = preset_scene("kuhl-holzapfel-2007", "tube").properties()[""].tissue
+    layers = [Layer((1.0, ratio), tissue)]
+    found = closing(layers, angle)
+    if axial is not None:
+        assert found.axial == pytest.approx(axial, abs=1e-7)
+    monkeypatch.setattr("remodel_fenicsx.model.closing.DEGREE", 34)
+    again = closing(layers, angle)
+    assert found.axial == pytest.approx(again.axial, abs=1e-7)
+    places = np.geomspace(1.0, ratio, 9)
+    np.testing.assert_allclose(found.natural_radius(places), again.natural_radius(places), rtol=5e-6)
+    np.testing.assert_allclose(found.stretches(places), again.stretches(places), rtol=5e-5)
+
+
 @pytest.mark.parametrize("kinematics", ["radial", "axisymmetric"])
 def test_balance_and_driver_see_the_residual_stress(kinematics: str) -> None:
     """Without loads the ring keeps its radii and has no axial force; the driver has the stress of the closing."""

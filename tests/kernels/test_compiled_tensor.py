@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
+import ufl
 from mpi4py import MPI
 from scipy.spatial.transform import Rotation
 
+from remodel_fenicsx import SceneError, preset_scene
+from remodel_fenicsx.kernels.library import with_kernels
 from remodel_fenicsx.kernels.tensor import CompiledPoints, TensorKernels, condensed_points
 from remodel_fenicsx.model import energy
 from remodel_fenicsx.model.cells import UnitCell
-from remodel_fenicsx.model.chains import CHAINS
-from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
+from remodel_fenicsx.model.chains import CHAINS, Chain
+from remodel_fenicsx.model.drivers import DRIVERS, FRAMES, Driver
 from remodel_fenicsx.model.implicit import condensed
-from remodel_fenicsx.model.implicit.condensed import CondensedPoints
-from remodel_fenicsx.model.laws import Drive, tensor_target
+from remodel_fenicsx.model.implicit.condensed import CondensedPoints, Driving
+from remodel_fenicsx.model.laws import LAWS, Drive, Law, follow_tensor, tensor_target
 from tests.model.test_condensed import deformations, points
 from tests.model.test_tensor_law import cells_of, right_cauchy_green, structures
 
@@ -144,3 +148,81 @@ def test_parts_that_the_kernel_does_not_know_are_numpys(kernels: TensorKernels) 
     ):
         assert type(condensed_points(kernels, tissue, step)) is CondensedPoints
     assert type(condensed_points(None, some.tissue, some.step)) is CondensedPoints
+
+
+SPRING = Chain(lambda r, L: 0.35 * r**2, lambda r, L: 0.7 + 0.0 * r, locks=False)
+SOFTER = energy.Matrix(
+    lambda *given: energy.neo_hookean.volumetric(*given) / 2,
+    *(lambda *given, term=term: term(*given) / 2 for term in energy.neo_hookean.others),
+    derivatives=lambda *given: tuple(
+        None if value is None else value / 2 for value in energy.neo_hookean_derivatives(*given)
+    ),
+)
+
+
+def kirchhoff(strain: Any, stress: np.ndarray, derivatives: bool) -> Driving:
+    """J times Cauchy's stress; Newton's method needs no better slope."""
+    cauchy = condensed.DRIVING_TENSORS[DRIVERS["cauchy"]](strain, stress, derivatives)
+    J = strain.stretches.prod(axis=1)[:, None, None]
+    return Driving(J * cauchy.tensor, *(None if part is None else J * part for part in cauchy[1:]))
+
+
+@pytest.mark.parametrize(
+    "registry, name, part", [(CHAINS, "wormlike", SPRING), (energy.MATRICES, "neo-hookean", SOFTER)]
+)
+def test_a_part_under_a_name_that_c_knows_is_numpys(
+    kernels: TensorKernels, monkeypatch: pytest.MonkeyPatch, registry: Any, name: str,
+    part: Any,
+) -> None:  # fmt: skip
+    """C asks which part it is, not what it is called."""
+    rng = np.random.default_rng(3)
+    F, some = deformations(COUNT, rng), points("tensor", "log", "cauchy", "material", COUNT, "random")
+    monkeypatch.setitem(registry, name, part)
+    other = replace(some, tissue=replace(some.tissue, **{"chain" if registry is CHAINS else "matrix": part}))
+    start = other.with_cells(F, other.step.cells).driving_tensor
+    expected = other.solve(F, start)
+    found = condensed_points(kernels, other.tissue, other.step).solve(F, start)
+    np.testing.assert_array_equal(found.structure, expected.structure)
+    of_c = compiled_twin(kernels, some).solve(F, start)
+    assert np.abs(of_c.structure - expected.structure).max() > 1e-3
+
+
+def test_a_driver_with_derivatives_that_c_does_not_know_is_numpys(
+    kernels: TensorKernels, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """J times Cauchy's stress has the same target: the same cells."""
+    mine = Driver(lambda F, s: ufl.det(F) * s.cauchy, material=False)
+    monkeypatch.setitem(DRIVERS, "kirchhoff", mine)
+    monkeypatch.setitem(condensed.DRIVING_TENSORS, mine, kirchhoff)
+    F = deformations(COUNT, np.random.default_rng(3))
+    found = {}
+    for name in ("cauchy", "kirchhoff"):
+        some = points("tensor", "log", name, "material", COUNT, "random")
+        start = some.with_cells(F, some.step.cells).driving_tensor
+        found[name] = condensed_points(kernels, some.tissue, some.step).solve(F, start)
+        assert found[name].converged.all()
+    np.testing.assert_allclose(found["kirchhoff"].structure, found["cauchy"].structure, atol=1e-9)
+
+
+@pytest.mark.parametrize("registry, name, part", [
+    (DRIVERS, "cauchy", Driver(lambda F, s: -s.cauchy, material=False)),
+    (FRAMES, "material", replace(FRAMES["material"], axes=lambda F, axes: axes)),
+    (energy.REPULSIONS, "log", energy.Repulsion(energy.length_sum, energy.log_derivatives)),
+    (LAWS, "tensor", Law(LAWS["tensor"].update, target=lambda drive: tensor_target(drive), follow=follow_tensor)),
+])  # fmt: skip
+def test_another_part_under_a_known_name_has_not_its_derivatives(
+    monkeypatch: pytest.MonkeyPatch, registry: Any, name: str, part: Any
+) -> None:
+    """The coupling "implicit" refuses the scene, and names what has them."""
+    implicit = {"remodeling.coupling": "implicit", "remodeling.law": "tensor", "material.repulsion": "log"}
+    scene = preset_scene("consistent", "cube").with_values(implicit)
+    monkeypatch.setitem(registry, name, part)
+    with pytest.raises(SceneError, match="^remodeling.coupling = 'implicit': needs a .*: '"):
+        scene.with_values({"time.end": 3.0})
+
+
+def test_another_repulsion_under_a_known_name_is_not_replaced_by_c(monkeypatch: pytest.MonkeyPatch) -> None:
+    part = energy.Repulsion(energy.length_sum, energy.log_derivatives)
+    monkeypatch.setitem(energy.REPULSIONS, "log", part)
+    tissue = replace(points("tensor", "length", "cauchy", "material", 2).tissue, repulsion=part)
+    assert with_kernels(tissue, MPI.COMM_SELF).repulsion is part

@@ -359,6 +359,11 @@ BAD_SCENES = [
         "mesh.refinement = 19: must be at most 18 for a tube: more makes over 1e+07 elements",
     ),
     (
+        TUBE | {"cells": {"initial": "isotropic", "axes": "cylindrical"}, "model": {"kinematics": "radial"}},
+        {"mesh.refinement": 10**7},
+        "mesh.refinement = 10000000: must be at most 1250000 for a tube: more makes over 1e+07 elements",
+    ),
+    (
         CUBE,
         {"mesh.refinement": 10**30},
         re.compile("mesh.refinement = 10+: must be at most 215 for a cube: more makes over 1e.07 elements"),
@@ -500,6 +505,15 @@ def test_what_is_read_is_of_the_present_format():
     text = scene_from_dict({**CUBE, "format": 1}).to_toml("as run")
     assert tomllib.loads(text)["format"] == FORMAT
     assert [line for line in text.splitlines() if line and not line.startswith("#")][0] == "format = 2"
+
+
+@pytest.mark.parametrize("kinematics, most", [("radial", 10**6), ("axisymmetric", 197), ("sector", 29), ("full", 18)])
+def test_elements_are_counted_of_the_mesh_that_is_made(kinematics: str, most: int) -> None:
+    """A ray or a quarter has fewer than the tube, and more of them in each direction are allowed."""
+    tube = changed(TUBE, {"cells": {"initial": "isotropic", "axes": "cylindrical"}, "model.kinematics": kinematics})
+    assert scene_from_dict(changed(tube, {"mesh.refinement": most})).mesh.refinement == most
+    with pytest.raises(SceneError, match=f"^mesh.refinement = {20 * most}: must be at most"):
+        scene_from_dict(changed(tube, {"mesh.refinement": 20 * most}))
 
 
 @pytest.mark.parametrize("values", [None, [], 3, {1: 2}])

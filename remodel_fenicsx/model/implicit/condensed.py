@@ -17,7 +17,7 @@ which is not symmetric (docs/theory.md, "Implicit coupling"). Plain arrays of n 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Container, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -26,12 +26,12 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.model import spectral, tensors
 from remodel_fenicsx.model.cells import UnitCell, structure_tensor
-from remodel_fenicsx.model.drivers import DRIVERS, FRAMES, Driver, Frame
-from remodel_fenicsx.model.energy import REPULSIONS, Matrix, Repulsion, Tissue
+from remodel_fenicsx.model.drivers import CAUCHY, DRIVERS, FINGER, FRAMES, MATERIAL, PK2, SPATIAL, Driver, Frame
+from remodel_fenicsx.model.energy import BY_AXES, REPULSIONS, Matrix, Repulsion, Tissue
 from remodel_fenicsx.model.implicit import network
 from remodel_fenicsx.model.implicit.network import LocalCells, OrthotropicCells, Strain, Stress, StructureCells, at, put
 from remodel_fenicsx.model.implicit.responses import StepOfCells, jumps_by_rank, response
-from remodel_fenicsx.model.laws import LAWS, Law
+from remodel_fenicsx.model.laws import LAWS, Law, tensor_target
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -85,33 +85,33 @@ def _right_cauchy_green(strain: Strain, stress: Array, derivatives: bool) -> Dri
     return Driving(C, np.zeros((1, 6, 6)), IDENTITY[None])
 
 
-DRIVING_TENSORS: dict[str, Callable[..., Driving]] = {
-    "cauchy": _cauchy,
-    "pk2": _second_piola_kirchhoff,
-    "finger": _right_cauchy_green,
+DRIVING_TENSORS: dict[Driver, Callable[..., Driving]] = {
+    CAUCHY: _cauchy,
+    PK2: _second_piola_kirchhoff,
+    FINGER: _right_cauchy_green,
 }
-"""D in material space of the drivers, by their names in `drivers.DRIVERS`."""
+"""D in material space of the drivers themselves: another of the same name has another."""
 
 
-def named(part: Any, registry: Mapping[str, Any]) -> str | None:
-    """The name of a part in its registry; None of one that is not there."""
-    return next((name for name, other in registry.items() if other is part), None)
+def _known(registry: Mapping[str, Any], table: Container[Any]) -> str:
+    """Names of the parts that a table has."""
+    return ", ".join(repr(name) for name, part in registry.items() if part in table)
 
 
 def refused(law: Law, driver: Driver, frame: Frame, matrix: Any, repulsion: Repulsion) -> str | None:
     """What a condensed step would need, where a part of the model has no derivatives for it; None where all have."""
-    if law.dimensions is None and law.target is None:
-        laws = ", ".join(repr(name) for name, other in LAWS.items() if other.dimensions or other.target)
-        return f"a remodeling.law towards a target: {laws}"
-    if named(driver, DRIVERS) not in DRIVING_TENSORS:
-        return "a remodeling.driver with derivatives: " + ", ".join(map(repr, DRIVING_TENSORS))
-    if named(frame, FRAMES) not in ("material", "spatial"):
-        return "a remodeling.frame with derivatives: 'material', 'spatial'"
+    laws = [other for other in LAWS.values() if other.dimensions or other.target is tensor_target]
+    if law not in laws:
+        return f"a remodeling.law towards a target: {_known(LAWS, laws)}"
+    if driver not in DRIVING_TENSORS:
+        return f"a remodeling.driver with derivatives: {_known(DRIVERS, DRIVING_TENSORS)}"
+    if frame not in (MATERIAL, SPATIAL):
+        return f"a remodeling.frame with derivatives: {_known(FRAMES, (MATERIAL, SPATIAL))}"
     if not isinstance(matrix, Matrix) or matrix.derivatives is None:
         return "a material.matrix that is a Matrix with derivatives"
-    if named(repulsion, REPULSIONS) not in network.TERMS:
-        return "a material.repulsion with derivatives: " + ", ".join(map(repr, network.TERMS))
-    if repulsion is REPULSIONS["axes"] and law.dimensions is None:
+    if repulsion not in network.TERMS:
+        return f"a material.repulsion with derivatives: {_known(REPULSIONS, network.TERMS)}"
+    if repulsion == BY_AXES and law.dimensions is None:
         return "a material.repulsion that does not depend on axes, like its law: 'log', 'length'"
     return None
 
@@ -283,12 +283,12 @@ class CondensedPoints:
     # ------------------------------------------------------------ the functions of eq. (i1)
     def _stress(self, strain: Strain, cells: LocalCells, derivatives: bool = False) -> Stress:
         """S with these cells."""
-        terms = network.TERMS[str(named(self.tissue.repulsion, REPULSIONS))]
+        terms = network.TERMS[self.tissue.repulsion]
         return network.stress(self.tissue, terms, strain, cells, derivatives, self.step.turned_over)
 
     def _driving(self, strain: Strain, stress: Array, derivatives: bool = False) -> Driving:
         """D of S."""
-        return DRIVING_TENSORS[str(named(self.step.drive.driver, DRIVERS))](strain, stress, derivatives)
+        return DRIVING_TENSORS[self.step.drive.driver](strain, stress, derivatives)
 
     def _place(self, strain: Strain, tensor: Array) -> Array:
         """X of D in the eigenbasis of C (`responses`)."""

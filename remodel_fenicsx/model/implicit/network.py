@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.model import tensors
 from remodel_fenicsx.model.cells import UnitCell, structure_tensor
-from remodel_fenicsx.model.energy import Tissue
+from remodel_fenicsx.model.energy import BY_AXES, BY_LENGTH, BY_LOG, Repulsion, Tissue
 from remodel_fenicsx.model.turnover import TurnedOver
 
 Array = NDArray[np.float64]
@@ -211,12 +211,12 @@ def axes_terms(strain: Strain, cells: LocalCells, r0: Array, derivatives: bool) 
     return Terms(value, to_axes @ changes, along @ np.swapaxes(to_axes, 1, 2))
 
 
-TERMS: dict[str, Callable[[Strain, LocalCells, Array, bool], Terms]] = {
-    "axes": axes_terms,
-    "log": log_terms,
-    "length": length_terms,
+TERMS: dict[Repulsion, Callable[[Strain, LocalCells, Array, bool], Terms]] = {
+    BY_AXES: axes_terms,
+    BY_LOG: log_terms,
+    BY_LENGTH: length_terms,
 }
-"""Of the repulsions, by their names in `energy.REPULSIONS`."""
+"""Of the repulsions themselves: another of the same name has others."""
 
 
 class Stress(NamedTuple):

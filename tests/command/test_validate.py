@@ -1,0 +1,106 @@
+"""`validate` opens the files that a scene names: what `run` refuses before its first solve, it refuses too."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from typing import Any
+
+import pytest
+import tomlkit
+
+from remodel_fenicsx import cli, simulation
+from tests.body.test_mesh_file import of_type
+from tests.mesh_files import edited, write_tube
+
+
+@pytest.fixture(scope="module")
+def tube(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """48 hexahedra with fibres beside them: a row for each element, and some that are far away."""
+    folder = tmp_path_factory.mktemp("tube")
+    file = write_tube(folder / "tube.msh", version=2.2)
+
+    def in_two_faces(lines: list[str]) -> list[str]:
+        row = next(row for row in of_type(lines, 3) if lines[row].split()[3] == "1")
+        words = lines[row].split()
+        words[3] = "2"
+        return [str(int(lines[0]) + 1), *lines[1:], " ".join(["9999", *words[1:]])]
+
+    edited(file, folder / "twice.msh", "Elements", in_two_faces)
+    (folder / "fibres.txt").write_text("angle\n30\n")
+    (folder / "short.csv").write_text("angle\n30\n")
+    (folder / "broken.vtu").write_text("<VTKFile>")
+    for name, away in (("near.csv", 0.0), ("far.csv", 100.0)):
+        with (folder / name).open("w", newline="") as table:
+            rows = csv.writer(table)
+            rows.writerow(["x", "y", "z", "angle"])
+            rows.writerows(
+                [x + away, y, z, 30] for x in (-1.5, 0, 1.5) for y in (-1.5, 0, 1.5) for z in (0.5, 1.5, 2.5)
+            )
+    return file
+
+
+def written(tube: Path, tables: dict[str, Any]) -> Path:
+    """A scene of these tables beside the mesh."""
+    scene = {"time": {"end": 1.0, "step": 1.0}, **tables}
+    scene["geometry"] = {"shape": "mesh", "file": tube.name, **tables.get("geometry", {})}
+    path = tube.parent / "scene.toml"
+    path.write_text(tomlkit.dumps(scene))
+    return path
+
+
+BAD: dict[str, tuple[dict[str, Any], str]] = {
+    "a face that is not there": ({"geometry": {"faces": {"inner": "lumen"}}}, "geometry.faces.inner = 'lumen'"),
+    "facets in two faces": ({"geometry": {"file": "twice.msh"}}, "geometry.faces."),
+    "a support of no face": ({"supports": {"wall": {"kind": "held"}}}, "supports.wall: the body has no such face"),
+    "a load on no face": (
+        {"loads": {"more": {"kind": "pressure", "face": "wall", "value": 1.0, "ramp": [[0.0, 1.0]]}}},
+        "loads.more.face = 'wall': the body has no such face",
+    ),
+    "free to move": (
+        {"supports": {"inlet": {"kind": "free"}, "outlet": {"kind": "free"}}},
+        "supports (inlet 'free', outlet 'free'): they leave the body free",
+    ),
+    "no region": ({"regions": {"media": {}}}, "regions.media: the mesh has no such region"),
+    "no fibres": ({"cells": {"fibres": "none.csv"}}, "none.csv': cannot be read"),
+    "another ending": ({"cells": {"fibres": "fibres.txt"}}, "fibres.txt': allowed are files"),
+    "no mesh": ({"cells": {"fibres": "broken.vtu"}}, "broken.vtu': "),
+    "too few fibres": ({"cells": {"fibres": "short.csv"}}, "has 1 rows without places"),
+    "fibres far away": ({"cells": {"fibres": "far.csv"}}, "nothing is measured within one element"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_what_run_refuses_validate_refuses(tube: Path, case: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """The same line, exit code 2, and nothing is written."""
+    tables, words = BAD[case]
+    scene, out = written(tube, tables), tube.parent / "out"
+    before = {*tube.parent.iterdir()}
+    assert cli.main(["validate", str(scene)]) == 2
+    said = capsys.readouterr()
+    assert words in said.err and len(said.err.strip().splitlines()) == 1 and not said.out
+    assert cli.main(["run", str(scene), "-o", str(out)]) == 2
+    assert capsys.readouterr().err == said.err
+    assert {*tube.parent.iterdir()} == before
+
+
+def test_files_that_fit_are_valid(tube: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["validate", str(written(tube, {"cells": {"fibres": "near.csv"}}))]) == 0
+    assert "a valid scene" in (said := capsys.readouterr().out) and "not looked at" not in said
+
+
+@pytest.mark.parametrize(
+    ("limit", "words"),
+    [
+        ("ELEMENTS_OF_A_LOOK", "not looked at: how files fit the body of 48 elements"),
+        ("LARGEST_LOOK", "not looked at: cells.fibres"),
+    ],
+)
+def test_what_would_take_long_is_said(
+    tube: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], limit: str, words: str
+) -> None:
+    """Files that are not there are found nevertheless."""
+    monkeypatch.setattr(simulation, limit, 10)
+    assert cli.main(["validate", str(written(tube, {"cells": {"fibres": "far.csv"}}))]) == 0
+    assert words in capsys.readouterr().out
+    assert cli.main(["validate", str(written(tube, {"cells": {"fibres": "none.csv"}}))]) == 2
