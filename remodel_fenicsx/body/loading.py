@@ -79,6 +79,11 @@ class Loading:
             Its name, of `Domain.faces`.
         component
             0, 1 or 2: x, y or z.
+
+        Raises
+        ------
+        SceneError
+            Where the strain is one unknown: if a face across z is held along it, for then the body bulges.
         """
         if self.kinematics.uniform_unknown(self.space, component) is None:
             self._prescribe_face(face, component, self.constant(0.0))
@@ -130,6 +135,11 @@ class Loading:
             Of the load whose magnitude it is; None: u = 0.
         way
             Displacement at magnitude 1, (3,).
+
+        Raises
+        ------
+        SceneError
+            Of kinematics that are not those of a mesh in three dimensions.
         """
         if not self.kinematics.three_dimensional:
             raise SceneError(f"model.kinematics = {self.kinematics.name!r}: allowed for facets that are held is 'full'")
