@@ -6,7 +6,7 @@ import logging
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -37,9 +37,6 @@ from remodel_fenicsx.watch.equilibrium_stability import EquilibriumStability
 from remodel_fenicsx.watch.locking import LockingWarning, PressureNoise
 from remodel_fenicsx.watch.over_correction import OverCorrection, RestedCells
 from remodel_fenicsx.watch.tissue import FrontsInLayers, GrowthWithoutRest, RadialChains, VolumeLoss, WeakTension
-
-if TYPE_CHECKING:
-    from remodel_fenicsx.body.fibre_file import FibreFile
 
 log = logging.getLogger(__name__)
 
@@ -368,7 +365,7 @@ def measured_fibres(scene: Scene, domain: Domain) -> dict[str, dict[str, Any]]:
     return domain.comm.bcast(agreed(domain.comm, read)) or {}
 
 
-def _fibre_file(cells: Cells, region: str) -> FibreFile:
+def _fibre_file(cells: Cells, region: str) -> Any:
     from remodel_fenicsx.body.fibre_file import FibreFileError, read_fibre_file  # few scenes have one
 
     try:

@@ -83,7 +83,7 @@ class Loading:
         Raises
         ------
         SceneError
-            If a body of one F would have to bulge.
+            Where the strain is one unknown: if a face across z is held along it, for then the body bulges.
         """
         if self.kinematics.uniform_unknown(self.space, component) is None:
             self._prescribe_face(face, component, self.constant(0.0))
@@ -139,7 +139,7 @@ class Loading:
         Raises
         ------
         SceneError
-            If the kinematics is a reduced one.
+            Of kinematics that are not those of a mesh in three dimensions.
         """
         if not self.kinematics.three_dimensional:
             raise SceneError(f"model.kinematics = {self.kinematics.name!r}: allowed for facets that are held is 'full'")

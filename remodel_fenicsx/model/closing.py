@@ -24,7 +24,7 @@ from remodel_fenicsx.model.panels import Panels
 Array = NDArray[np.float64]
 DEGREE = 24  # of R(r): the paper's artery at 160 degrees changes by less than 1e-8 from 16 to 32
 MISSING = 1e-8  # of dR/dr: a panel that leaves more of it out is halved; walls of 1 to 7 and thicker have some
-PANELS_OF_A_LAYER = 8  # of one layer
+MOST_POLYNOMIALS = 8  # of one layer
 LARGEST_TURN = (
     0.5  # of k: walls of 1 to 1.05 ... 3 close at 180 degrees (k = 2) in one piece too, and this is half of it
 )
@@ -145,7 +145,7 @@ def closing(layers: Sequence[Layer], opening_angle: float, loads: Loads = Loads(
             for layer, one in zip(found.layers, rough, strict=True)
             for part in (_halves(layer) if one else [layer])
         ]
-        if len(parts) > PANELS_OF_A_LAYER * len(layers):
+        if len(parts) > MOST_POLYNOMIALS * len(layers):
             raise ArithmeticError(f"ring and sector vary too much through the wall for {len(parts)} polynomials")
         finer = Panels([parts[0].radii[0], *(part.radii[1] for part in parts)], DEGREE)
         radius = found.natural_radius(finer.places)
