@@ -38,7 +38,6 @@ TYPES_ONLY = {
     "body.walled": {"body.domain", "fem.quadrature"},
     "extend": {"evolution.coupling", "solver.linear", "fem.jit", "results.columns"},
     "results.recording": {"scene.scene"},
-    "simulation": {"body.fibre_file"},
 }
 
 
