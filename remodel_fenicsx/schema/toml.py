@@ -143,7 +143,7 @@ def _fill(container: Any, table: BaseModel | Mapping[str, Any]) -> None:
             _fill(inner, value)
             if len(inner) or not fields:  # an empty table says nothing, but a name does
                 container.add(name, inner)
-        elif value is not None and value != ():
+        elif value is not None:
             for line in textwrap.wrap((name in fields and fields[name].description) or "", COMMENT_WIDTH):
                 container.add(tomlkit.comment(line))
             container.add(name, value)
