@@ -18,6 +18,7 @@ from typing import Any, NoReturn
 
 from remodel_fenicsx._version import __version__
 from remodel_fenicsx.body.reductions import explained
+from remodel_fenicsx.results.recording import RecordingError
 from remodel_fenicsx.scene.presets import PRESETS, PROFILES, profile_for
 from remodel_fenicsx.scene.scene import Scene, SceneError, preset_scene, read_scene
 from remodel_fenicsx.schema.tables import printable
@@ -25,7 +26,7 @@ from remodel_fenicsx.system import interrupts
 from remodel_fenicsx.system.arguments import MOST_RUNS, megabytes, positive, typed, wall_time
 from remodel_fenicsx.system.children import SERVE, serve
 from remodel_fenicsx.system.environment import kernels, reason_undrawable, reason_unusable, versions
-from remodel_fenicsx.system.regular_files import ForeignFileError, write_new
+from remodel_fenicsx.system.regular_files import ForeignFileError, refusal_in_words, write_new
 
 BAD_INPUT, SOLVE_FAILED, STOPPED, BAD_ENVIRONMENT = 2, 3, interrupts.PAUSED, 5
 OPTIONS = {"folder": "-o", "path": "-o", "times": "--time", "layers": "--layers", "cut": "--cut", "view": "--view"}
@@ -303,7 +304,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             code = COMMANDS[options.command](options)
             sys.stdout.flush()
             return code
-        except SceneError as error:
+        except (SceneError, RecordingError) as error:
             return _fail(_as_typed(error), BAD_INPUT)
         except _UnusableEnvironment as error:
             return _fail(f"the environment is not usable: {error}; run through ./with-fenicsx", BAD_ENVIRONMENT)
@@ -354,6 +355,13 @@ def _as_typed(refusal: Exception) -> str:
     return re.sub(r"^\w+(?=[ :])", lambda name: OPTIONS.get(name[0], name[0]), line)
 
 
+def _refused(error: OSError, what: str) -> int:
+    """The system does not let it, or something that no run has made stands in the place of a file."""
+    if isinstance(error, ForeignFileError):
+        return _fail(refusal_in_words(error), BAD_INPUT)
+    return _fail(f"{what}: {refusal_in_words(error)}", BAD_ENVIRONMENT)
+
+
 def _run(options: argparse.Namespace, task: Callable[..., Path] | None = None) -> int:
     deadline = None if options.max_wall_time is None else clock.monotonic() + options.max_wall_time
     scene = None if options.resume else read_scene(options.scene, options.set, options.profile)
@@ -367,7 +375,6 @@ def _run(options: argparse.Namespace, task: Callable[..., Path] | None = None) -
     interrupts.take_back_signals()
     from remodel_fenicsx.body import GeometryError
     from remodel_fenicsx.results.checkpoint_file import CheckpointError
-    from remodel_fenicsx.results.recording import RecordingError
     from remodel_fenicsx.results.run_folder import FolderTaken
     from remodel_fenicsx.running import resume, run
     from remodel_fenicsx.solver.continuation import StepFailure
@@ -399,7 +406,7 @@ def _run(options: argparse.Namespace, task: Callable[..., Path] | None = None) -
             return _end_all(text, BAD_INPUT)
         if isinstance(error, ForeignFileError):
             return _end_all(f"{error.filename}: {error.strerror}", BAD_INPUT)
-        return _end_all(f"cannot write the results: {error}", BAD_ENVIRONMENT)
+        return _end_all(f"cannot write the results: {refusal_in_words(error)}", BAD_ENVIRONMENT)
     except Exception:
         traceback.print_exc()
         return _end_all("stopped by a defect of the program, see above", 1)
@@ -437,10 +444,8 @@ def _study(options: argparse.Namespace, task: Callable[[Scene], tuple[Path, str,
         return _fail(_as_typed(refusal), refusal.exit_code)
     except interrupts.Interrupted as interruption:
         return _fail(STUDY_STOPPED, interruption.exit_code)
-    except ForeignFileError as error:
-        return _fail(f"{error.filename}: {error.strerror}", BAD_INPUT)
     except OSError as error:
-        return _fail(f"cannot write the results: {error}", BAD_ENVIRONMENT)
+        return _refused(error, "cannot write the results")
     _say(words)
     _say(f"results in {folder}")
     _complain_of(failed)
@@ -533,17 +538,14 @@ def _end_all(message: str, code: int) -> int:
 
 def _status(options: argparse.Namespace) -> int:
     from remodel_fenicsx.results.checkpoint_file import CheckpointError
-    from remodel_fenicsx.results.recording import RecordingError
     from remodel_fenicsx.results.status import status
 
     try:
         lines = status(options.folder)
-    except (RecordingError, CheckpointError) as error:
+    except CheckpointError as error:
         return _fail(str(error), BAD_INPUT)
-    except ForeignFileError as error:
-        return _fail(f"{error.filename}: {error.strerror}", BAD_INPUT)
     except OSError as error:
-        return _fail(f"{options.folder}: cannot be read: {error.strerror}", BAD_ENVIRONMENT)
+        return _refused(error, "cannot read the run")
     _say("\n".join(map(printable, lines)))
     return 0
 
@@ -552,16 +554,13 @@ def _report(options: argparse.Namespace) -> int:
     if not interrupts.is_first_rank():  # the work of one process
         return 0
     from remodel_fenicsx.report import ReportError, write_report
-    from remodel_fenicsx.results.recording import RecordingError
 
     try:
         written = write_report(options.folder, options.output, options.size)
-    except (RecordingError, ReportError) as error:
+    except ReportError as error:
         return _fail(_as_typed(error), BAD_INPUT)
-    except ForeignFileError as error:
-        return _fail(f"{error.filename}: {error.strerror}", BAD_INPUT)
     except OSError as error:
-        return _fail(f"cannot write the report: {error}", BAD_ENVIRONMENT)
+        return _refused(error, "cannot write the report")
     _say(str(written))
     size = written.stat().st_size / 1e6
     if size > options.size:
@@ -581,7 +580,6 @@ def _drawing(options: argparse.Namespace) -> int:
         return 0
     from remodel_fenicsx.pictures.files import draw_animation, draw_picture
     from remodel_fenicsx.pictures.sight import Viewing
-    from remodel_fenicsx.results.recording import RecordingError
     from remodel_fenicsx.studies.page import FigureError
 
     viewing = Viewing(options.layers, options.cut, options.view)
@@ -592,12 +590,8 @@ def _drawing(options: argparse.Namespace) -> int:
             written = draw_animation(options.folder, options.frames, viewing, options.output)
     except FigureError as refusal:
         return _fail(_as_typed(refusal), refusal.exit_code)
-    except RecordingError as error:
-        return _fail(str(error), BAD_INPUT)
-    except ForeignFileError as error:
-        return _fail(f"{error.filename}: {error.strerror}", BAD_INPUT)
     except OSError as error:
-        return _fail(f"cannot write the picture: {error}", BAD_ENVIRONMENT)
+        return _refused(error, "cannot write the picture")
     _say(str(written))
     return 0
 
@@ -606,15 +600,12 @@ def _revolve(options: argparse.Namespace) -> int:
     _check(reason_unusable())
     if not interrupts.is_first_rank():  # the work of one process
         return 0
-    from remodel_fenicsx.results.recording import RecordingError
     from remodel_fenicsx.results.revolve import revolve
 
     try:
         written = revolve(options.folder)
-    except RecordingError as error:
-        return _fail(str(error), BAD_INPUT)
     except OSError as error:
-        return _fail(f"cannot write the fields: {error}", BAD_ENVIRONMENT)
+        return _refused(error, "cannot write the fields")
     _say("\n".join(map(str, written)))
     return 0
 
@@ -623,14 +614,11 @@ def _export(options: argparse.Namespace) -> int:
     if not interrupts.is_first_rank():  # the work of one process
         return 0
     from remodel_fenicsx.results.export import export
-    from remodel_fenicsx.results.recording import RecordingError
 
     try:
         written = export(options.folder, options.format, options.output, options.time)
-    except RecordingError as error:
-        return _fail(str(error), BAD_INPUT)
     except OSError as error:
-        return _fail(f"cannot write the fibres: {error}", BAD_ENVIRONMENT)
+        return _refused(error, "cannot write the fibres")
     _say(str(written))
     return 0
 
@@ -749,7 +737,7 @@ def _figures(options: argparse.Namespace) -> int:
     except interrupts.Interrupted as interruption:
         return _fail(STUDY_STOPPED, interruption.exit_code)
     except OSError as error:
-        return _fail(f"cannot write the figures: {error}", BAD_ENVIRONMENT)
+        return _refused(error, "cannot write the figures")
     print("\n".join(map(str, written)))
     return 0
 

@@ -80,7 +80,7 @@ class Recording(RecordedRun):
         ------
         ReportError
             If the file is there already, or a report.html that this package has not made; a ValueError.
-        RecordingError, SceneError
+        RecordingError
             If the folder is damaged.
         OSError
             If it cannot be written.
@@ -183,7 +183,7 @@ class Recording(RecordedRun):
         ------
         FigureError
             One line: what is not allowed, or that nothing can be drawn here; a ValueError.
-        RecordingError, SceneError
+        RecordingError
             If the folder is damaged.
         OSError
             If the file cannot be written.

@@ -18,7 +18,7 @@ from remodel_fenicsx.fem.solver_methods import WORTH_RANKS
 from remodel_fenicsx.results.checkpoint import Checkpoints, restore_state
 from remodel_fenicsx.results.checkpoint_file import Checkpoint, CheckpointError, read_checkpoint
 from remodel_fenicsx.results.fields import Fields, field_names
-from remodel_fenicsx.results.recording import LOG, SCENE, RecordingError
+from remodel_fenicsx.results.recording import LOG, SCENE, RecordingError, scene_as_run
 from remodel_fenicsx.results.run_folder import (
     FolderTaken,
     LastStep,
@@ -169,7 +169,12 @@ def _kept(place: Path, overrides: Sequence[str], comm: MPI.Intracomm) -> tuple[S
     """Scene, and checkpoint on rank 0, of a run that goes on; or the refusal on all ranks."""
 
     def read() -> tuple[Scene, Checkpoint | None]:
-        scene, checkpoint = read_scene(place / SCENE, overrides), read_checkpoint(place)
+        try:
+            scene = read_scene(place / SCENE, overrides)
+        except SceneError:
+            scene_as_run(place)  # which may say that the folder is damaged; else it is the overrides
+            raise
+        checkpoint = read_checkpoint(place)
         if checkpoint is None:
             log.info("no checkpoint yet: starts again at t = 0")
         else:

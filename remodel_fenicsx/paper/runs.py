@@ -20,6 +20,7 @@ from remodel_fenicsx.results.run_lock import is_vacant
 from remodel_fenicsx.scene.scene import Scene, SceneError, preset_scene
 from remodel_fenicsx.studies.page import FigureError
 from remodel_fenicsx.studies.runs import Run, run_all
+from remodel_fenicsx.system.regular_files import refusal_in_words
 from remodel_fenicsx.system.terminal import announce
 
 PRESET = "kuhl-holzapfel-2007"
@@ -119,7 +120,8 @@ def _is_whole(run: Run) -> bool:
         _ = RecordedRun(run.folder).history
         return run.is_complete()
     except (SceneError, RecordingError, OSError) as error:
-        announce(f"figures: run again: {run.folder}: {' '.join(str(error).split())}")
+        words = refusal_in_words(error) if isinstance(error, OSError) else error
+        announce(f"figures: run again: {run.folder}: {words}")
         shutil.rmtree(run.folder)
         return False
 

@@ -60,7 +60,7 @@ def draw_picture(
     ------
     FigureError
         One line and the exit code of the command: bad input 2, nothing can be drawn 5.
-    RecordingError, SceneError
+    RecordingError
         If it is no folder of a run, or damaged.
     OSError
         If the file cannot be written.
@@ -104,7 +104,7 @@ def draw_animation(
 
     Raises
     ------
-    FigureError, RecordingError, SceneError, OSError
+    FigureError, RecordingError, OSError
         As of `draw_picture`.
     """
     _check_new(path, ANIMATIONS)

@@ -116,7 +116,7 @@ class Sight:
     ------
     FigureError
         If nothing of the kind can be drawn, with exit code 2.
-    RecordingError, SceneError
+    RecordingError
         If the folder is damaged.
     """
 

@@ -55,7 +55,7 @@ def write_report(folder: str | os.PathLike[str], path: Path | None = None, size:
 
     Raises
     ------
-    RecordingError, SceneError
+    RecordingError
         If it is no folder of a run, or damaged.
     ReportError
         If the file is there already, or a report.html that this command has not made.

@@ -76,7 +76,7 @@ class Story:
 
         Raises
         ------
-        RecordingError, SceneError, OSError
+        RecordingError, OSError
             If the folder is damaged or cannot be read.
         """
         lives = writer(recording.path)[1]

@@ -95,16 +95,14 @@ class RecordedRun:
     # ------------------------------------------------------------ scene
     @cached_property
     def scene(self) -> Scene:
-        """The scene as run (this alone imports pydantic).
+        """The scene as run.
 
         Raises
         ------
-        SceneError
-            If scene.toml is not a scene.
+        RecordingError
+            If scene.toml is damaged.
         """
-        from remodel_fenicsx.scene.scene import read_scene
-
-        return read_scene(self.path / SCENE)
+        return scene_as_run(self.path)
 
     @cached_property
     def versions(self) -> dict[str, str]:
@@ -248,6 +246,23 @@ class RecordedRun:
             raise RecordingError(f"{path}: is damaged or of another kind: {' '.join(str(error).split())}") from error
 
 
+def scene_as_run(folder: Path) -> Scene:
+    """The scene of a run's folder (this alone imports pydantic).
+
+    Raises
+    ------
+    RecordingError
+        If its scene.toml is damaged.
+    """
+    from remodel_fenicsx.scene.scene import SceneError, read_scene
+
+    path = folder / SCENE
+    try:
+        return read_scene(path)
+    except SceneError as error:  # about the file, or about a key of this one
+        raise RecordingError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
+
+
 def steps_recorded(folder: str | os.PathLike[str]) -> int:
     """How many steps a run has recorded so far, without reading them; 0 before it has begun."""
     try:
@@ -268,7 +283,9 @@ def read_history(folder: str | os.PathLike[str]) -> HistoryColumns:
     path = Path(folder) / HISTORY
     try:
         text = read_regular(path, LARGEST_HISTORY).decode()
-    except (OSError, UnicodeDecodeError) as error:
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
         raise RecordingError(f"{path}: cannot be read: {error}") from error
     if not text:
         return HistoryColumns(time=np.zeros(0))
@@ -287,6 +304,8 @@ def read_history(folder: str | os.PathLike[str]) -> HistoryColumns:
         values = np.array([[float(cell) if cell else np.nan for cell in row] for row in rows]).reshape(-1, len(names))
     except ValueError as error:
         raise RecordingError(f"{path}: {error}") from error
+    if np.isinf(values).any() or np.isnan(values[:, names.index("time")]).any():
+        raise RecordingError(f"{path}: has numbers that are not finite")  # what was not computed is not there
     return HistoryColumns(zip(names, values.T, strict=True))
 
 

@@ -14,7 +14,7 @@ from mpi4py import MPI
 
 from remodel_fenicsx.evolution.stepper import Step, Watcher
 from remodel_fenicsx.results.history import History, LastStep, size_of_rows
-from remodel_fenicsx.results.recording import CHAIN_LINES, FIELDS, HISTORY, LOG, SCENE
+from remodel_fenicsx.results.recording import CHAIN_LINES, FIELDS, HISTORY, LOG, SCENE, RecordingError
 from remodel_fenicsx.results.run_lock import FolderTaken, RunLock, is_vacant
 from remodel_fenicsx.results.vtkhdf import check_file
 from remodel_fenicsx.system.regular_files import open_own, write_whole
@@ -165,9 +165,11 @@ def check_before_resuming(folder: Path, after: LastStep | None, fields: bool) ->
             os.close(open_own(folder / name, os.O_RDONLY))
     if after is None:
         return
+    if not (folder / HISTORY).exists():
+        raise RecordingError(f"{folder}: has a checkpoint, but no {HISTORY}: rows that are gone are not computed again")
     size_of_rows(folder / HISTORY, after)
     for name in (FIELDS, CHAIN_LINES) if fields else ():
-        if (folder / name).exists():
+        if os.path.lexists(folder / name):
             check_file(folder / name)
 
 

@@ -43,7 +43,7 @@ def status(folder: Path) -> list[str]:
 
     Raises
     ------
-    RecordingError, SceneError, CheckpointError
+    RecordingError, CheckpointError
         If it is no folder of a run or of a study, or damaged.
     OSError
         If it cannot be read.

@@ -42,7 +42,7 @@ class WholeBody:
 
     Raises
     ------
-    RecordingError, SceneError
+    RecordingError
         If the folder is damaged.
     """
 

@@ -35,8 +35,6 @@ def read_toml(path: Path) -> dict[str, Any]:
     """
     try:
         text = read_regular(path, LARGEST).decode("utf-8-sig")
-    except IsADirectoryError:
-        raise SceneError(f"{path}: is a folder; a scene is a TOML file") from None
     except FileNotFoundError:
         raise SceneError(f"{path}: no such file; a scene is a TOML file") from None
     except UnicodeDecodeError as error:

@@ -30,7 +30,7 @@ from remodel_fenicsx.studies.measured import Measured, Unknown, doubts, read_mea
 from remodel_fenicsx.studies.modelled import Modelled, Slopes, model_of, rotated_cells, slopes, without_derivatives
 from remodel_fenicsx.studies.page import COLOURS, DOTS_PER_INCH, STYLE, Page, add_head
 from remodel_fenicsx.system.environment import versions
-from remodel_fenicsx.system.regular_files import ForeignFileError, write_whole
+from remodel_fenicsx.system.regular_files import refusal_in_words, write_whole
 from remodel_fenicsx.system.terminal import Line, hold_log, open_log, unsaid
 
 Array = NDArray[np.float64]
@@ -359,8 +359,8 @@ def _place(folder: Path | str | None, name: str, mark: str) -> Path:
     wanted = Path(folder or Path("results") / name)
     try:
         there = fingerprint_in(wanted)
-    except (ForeignFileError, OSError) as error:
-        raise SceneError(f"folder {wanted}: {error}") from error
+    except OSError as error:
+        raise SceneError(f"folder {wanted}: {refusal_in_words(error)}") from error
     if there == mark:
         return wanted
     if there is not None and folder is not None:

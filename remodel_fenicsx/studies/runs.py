@@ -31,7 +31,7 @@ from remodel_fenicsx.scene.scene import Scene, SceneError
 from remodel_fenicsx.schema.times import same_time
 from remodel_fenicsx.system.children import Worker, wait_for_one
 from remodel_fenicsx.system.interrupts import PAUSE, PAUSED, Interrupted, StopRequest
-from remodel_fenicsx.system.regular_files import check_no_link, make_own_folder, write_whole
+from remodel_fenicsx.system.regular_files import check_no_link, make_own_folder, refusal_in_words, write_whole
 from remodel_fenicsx.system.terminal import Line
 
 POLL = 0.1  # seconds
@@ -94,12 +94,14 @@ class Run:
         Raises
         ------
         SceneError
-            If the folder holds another scene, or a record of its end that is not the scene's or damaged.
+            If the folder holds another scene.
+        RecordingError
+            If it is damaged, so that the run could not go on.
         """
         if not (self.folder / SCENE).exists() or not (self.folder / HISTORY).exists():
             return False
         recording = RecordedRun(self.folder)
-        if not _same(recording.scene, self.scene):
+        if not _same(recording, self.scene):
             raise SceneError(f"{self.folder}: holds a run of another scene; choose another folder with -o")
         try:
             history = recording.history
@@ -108,12 +110,9 @@ class Run:
         if not len(history["time"]) or not same_time(float(history["time"][-1]), self.scene.last_time):
             return False
         if not self._has_all_rows(history):
-            raise SceneError(f"{self.folder}: its history has other columns or rows than its scene asks for")
+            raise RecordingError(f"{self.folder}: its history has other columns or rows than its scene asks for")
         if self.scene.output.fields:
-            try:
-                recording.fields(self.scene.last_time)  # the last ones are behind all others in the file
-            except RecordingError as error:
-                raise SceneError(str(error)) from error
+            recording.fields(self.scene.last_time)  # the last ones are behind all others in the file
         return True
 
     def _has_all_rows(self, history: HistoryColumns) -> bool:
@@ -129,9 +128,9 @@ class Run:
         return read_history(self.folder)
 
 
-def _same(recorded: Scene, wanted: Scene) -> bool:
-    """Whether they are one scene: with the kinematics that "auto" took, and its files by SHA-256, wherever they are."""
-    if recorded == wanted:
+def _same(recording: RecordedRun, wanted: Scene) -> bool:
+    """Whether it is of this scene: with the kinematics that "auto" took, its files by SHA-256 wherever they are."""
+    if recording.scene == wanted:
         return True
     from mpi4py import MPI
 
@@ -140,10 +139,12 @@ def _same(recorded: Scene, wanted: Scene) -> bool:
     from remodel_fenicsx.unloading import as_unloaded
 
     try:
-        with as_unloaded(wanted, MPI.COMM_SELF) as found:
-            return with_files_kept(recorded)[0] == with_files_kept(with_choices(found))[0]
-    except OSError:  # a file of fibres that is not there any more
-        return False
+        kept, _ = with_files_kept(recording.scene)
+    except (SceneError, OSError) as error:
+        words = refusal_in_words(error) if isinstance(error, OSError) else error
+        raise RecordingError(f"{recording.path}: {words}") from error
+    with as_unloaded(wanted, MPI.COMM_SELF) as found:
+        return kept == with_files_kept(with_choices(found))[0]
 
 
 def write_study(folder: Path, name: str, scene: str, runs: Sequence[Run]) -> None:
@@ -178,7 +179,7 @@ def run_all(
     ended: Callable[[Run, int, str], None] = lambda run, code, last_words: None,
     checked: Callable[[], None] = lambda: None,
 ) -> dict[str, str]:
-    """Run what is not complete; returns the last words of those that have failed, by name.
+    """Run what is not complete; returns the last words of those that have failed or are damaged, by name.
 
     Parameters
     ----------
@@ -210,7 +211,7 @@ def run_all(
     """
     executor = _Executor(runs, jobs, fits)
     checked()
-    line, failed, pausing = Line(title), {}, False
+    line, failed, pausing = Line(title), executor.failed, False
     with StopRequest() as stop:
         try:
             while executor.waiting or executor.running:
@@ -244,9 +245,18 @@ class _Executor:
 
     def __init__(self, runs: Sequence[Run], jobs: int, fits: Callable[[Run], bool]):
         self.runs, self.jobs, self.fits = runs, jobs, fits
-        self.waiting = [run for run in runs if not run.is_complete()]
+        self.failed: dict[str, str] = {}
+        self.waiting = [run for run in runs if self._is_left(run)]
         self.running: dict[Worker, Run] = {}
         self.idle: list[Worker] = []
+
+    def _is_left(self, run: Run) -> bool:
+        """Whether it is to be run. One whose folder is damaged is not: nothing of the user's is removed."""
+        try:
+            return not run.is_complete()
+        except RecordingError as error:
+            self.failed[run.name] = str(error)
+            return False
 
     def begin(self) -> None:
         """Begin runs until there are as many as jobs, or go on with what is there of them."""
@@ -256,7 +266,7 @@ class _Executor:
             if run.is_under_way():  # by another command, or by a process whose command was killed and that is ending
                 continue
             self.waiting.remove(run)
-            if not run.is_complete() and self.fits(run):
+            if self._is_left(run) and self.fits(run):
                 worker = self.idle.pop() if self.idle else Worker()
                 self.running[worker] = run
                 _begin(worker, run)

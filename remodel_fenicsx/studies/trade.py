@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time as clock
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from remodel_fenicsx.body.columns import PROFILE
+from remodel_fenicsx.results.recording import RecordingError
 from remodel_fenicsx.scene.scene import Scene
 from remodel_fenicsx.schema.times import same_time
 from remodel_fenicsx.studies.estimates import Result, Row, Trade, estimated, typical
@@ -153,18 +155,22 @@ class _Runner:
         return clock.monotonic() + self._expected(setting) < self.deadline
 
     def _finished(self) -> None:
-        """Read, say and learn from what is new."""
+        """Learn from what is new."""
         for setting in self.settings:
             members = self.members[setting.name]
-            if setting.name in self._results or not all(member.is_complete() for member in members):
-                continue
-            result = self._results[setting.name] = read(setting, members, self.times)
-            self._pace[setting.way] = max(result.wall_seconds / setting.expected_seconds, 0.1)
-            if self.say is not None:
-                rows, _ = estimated(self.results()) if len(self._results) > 1 else ([], [])
-                error = next((row.angle_error for row in rows if row.result.setting == setting), np.nan)
-                so_far = f"so far {error:.2g} degrees off" if error > NOTHING else "the finest so far"
-                self.say(f"{setting.in_words()}: {result.seconds:.2g} s, {so_far}")
+            with suppress(RecordingError):  # one that is damaged will be among those that have failed
+                if setting.name not in self._results and all(member.is_complete() for member in members):
+                    self._learn_from(setting, members)
+
+    def _learn_from(self, setting: Setting, members: Sequence[Run]) -> None:
+        """Read its runs, and say what they say."""
+        result = self._results[setting.name] = read(setting, members, self.times)
+        self._pace[setting.way] = max(result.wall_seconds / setting.expected_seconds, 0.1)
+        if self.say is not None:
+            rows, _ = estimated(self.results()) if len(self._results) > 1 else ([], [])
+            error = next((row.angle_error for row in rows if row.result.setting == setting), np.nan)
+            so_far = f"so far {error:.2g} degrees off" if error > NOTHING else "the finest so far"
+            self.say(f"{setting.in_words()}: {result.seconds:.2g} s, {so_far}")
 
 
 def read(setting: Setting, members: Sequence[Run], times: Sequence[float]) -> Result:

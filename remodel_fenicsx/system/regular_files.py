@@ -15,10 +15,19 @@ NEVER_WAITING = os.O_NONBLOCK | os.O_CLOEXEC  # opening a pipe without a writer 
 
 NO_FILE = "is a pipe or a device, not a file"
 LINK = "is a link; nothing is written through one"
+# what the system says of a link in a circle, a folder, and a link that leads nowhere where a file is to be made
+FOREIGN = {errno.ELOOP: LINK, errno.EISDIR: "is a folder, not a file", errno.EEXIST: LINK}
 
 
 class ForeignFileError(OSError):
     """Under a name that a run uses there is something that no run has made: a link, a pipe, a file without end."""
+
+
+def refusal_in_words(error: OSError) -> str:
+    """What the system has refused, on one line; Python's own words have `PosixPath(...)` in them."""
+    if error.strerror is None:  # h5py's, say
+        return " ".join(str(error).split())
+    return f"{error.filename}: {error.strerror}" if error.filename is not None else error.strerror
 
 
 def read_regular(path: Path, most: int) -> bytes:
@@ -38,9 +47,13 @@ def read_regular(path: Path, most: int) -> bytes:
     ForeignFileError
         If it is no regular file, or larger.
     """
-    descriptor = os.open(path, os.O_RDONLY | NEVER_WAITING)
-    with open(descriptor, "rb") as file:
+    descriptor = _opened(path, os.O_RDONLY)
+    try:
         size = _check_regular(descriptor, path).st_size
+    except OSError:
+        os.close(descriptor)
+        raise
+    with open(descriptor, "rb") as file:
         data = file.read(size + 1) if size <= most else b""
     if max(size, len(data)) > most:
         raise ForeignFileError(errno.EFBIG, f"is larger than {most / 1e6:g} MB", str(path))
@@ -70,12 +83,7 @@ def open_own(path: Path, flags: int) -> int:
     ForeignFileError
         If it is no regular file, is a link, or has other names.
     """
-    try:
-        descriptor = os.open(path, flags | os.O_NOFOLLOW | NEVER_WAITING, 0o666)
-    except OSError as error:
-        if error.errno == errno.ELOOP:
-            raise ForeignFileError(errno.ELOOP, LINK, str(path)) from None
-        raise
+    descriptor = _opened(path, flags | os.O_NOFOLLOW)
     try:
         if _check_regular(descriptor, path).st_nlink > 1:
             raise ForeignFileError(errno.EMLINK, "has a second name (a hard link); nothing is written to it", str(path))
@@ -157,10 +165,19 @@ def write_new(path: Path, data: bytes) -> None:
         raise
 
 
+def _opened(path: Path, flags: int) -> int:
+    try:
+        return os.open(path, flags | NEVER_WAITING, 0o666)
+    except OSError as error:
+        if error.errno in FOREIGN:
+            raise ForeignFileError(error.errno, FOREIGN[error.errno], str(path)) from None
+        raise
+
+
 def _check_regular(descriptor: int, path: Path) -> os.stat_result:
     found = os.fstat(descriptor)
     if stat.S_ISDIR(found.st_mode):
-        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+        raise ForeignFileError(errno.EISDIR, FOREIGN[errno.EISDIR], str(path))
     if not stat.S_ISREG(found.st_mode):
         raise ForeignFileError(errno.EINVAL, NO_FILE, str(path))
     return found

@@ -402,7 +402,7 @@ def test_a_study_takes_no_history_that_is_not_its_scenes(forge: Callable[[str], 
     member = Run("run", Recording(folder).scene, folder)
     assert member.is_complete()
     (folder / "history.csv").write_text(forge((folder / "history.csv").read_text()))
-    with pytest.raises(SceneError, match="its history has other columns or rows than its scene asks for"):
+    with pytest.raises(RecordingError, match="its history has other columns or rows than its scene asks for"):
         member.is_complete()
 
 
@@ -412,6 +412,29 @@ def test_elements_of_nodes_that_are_not_there_are_refused(by: int, folder: Path)
         file["VTKHDF/Connectivity"][:] += by
     with pytest.raises(RecordingError, match="nodes that are not there"):
         _ = Recording(folder).elements
+
+
+@pytest.mark.parametrize("name", ["history.csv", "run.log", "scene.toml", "checkpoint.json", "fields.vtkhdf"])
+@pytest.mark.parametrize("change", ["folder", "circle", "gone", "text", "infinite"])
+def test_every_reader_of_a_damaged_run_names_its_folder(name: str, change: str, folder: Path) -> None:
+    """In one line with exit code 2, if it reads the file at all."""
+    path = folder / name
+    if change == "infinite":
+        path.write_bytes(path.read_bytes().replace(b"1", b"inf"))
+    else:
+        path.unlink()
+    if change == "folder":
+        path.mkdir()
+    elif change == "circle":
+        path.symlink_to(name)
+    elif change == "text":
+        path.write_text("a = 1\n")
+    commands = [["status", folder], ["report", folder], ["export", "--format", "csv", folder], ["revolve", folder]]
+    for words in [*commands, ["run", "-q", "--resume", folder]]:
+        result = run(*words)
+        assert result.returncode in (0, 2), (words, result.stderr)
+        if result.returncode == 2:
+            assert result.stderr.count("\n") == 1 and str(folder) in result.stderr and len(result.stderr) < 400, words
 
 
 # ---------------------------------------------------------------- fields

@@ -154,10 +154,10 @@ def test_what_is_no_folder_of_a_run_is_refused(folder: Path, tmp_path_factory: p
         Recording(other)
 
 
-def test_a_scene_of_another_kind_is_a_scene_error(folder: Path) -> None:
+def test_a_scene_of_another_kind_is_damage_of_the_folder(folder: Path) -> None:
     (folder / "scene.toml").write_text("[tool.black]\n")
     assert Recording(folder).history["time"].tolist() == [1.0, 2.0]
-    with pytest.raises(SceneError):
+    with pytest.raises(RecordingError, match=rf"^{folder}/scene\.toml: geometry\.shape: missing"):
         _ = Recording(folder).scene
 
 

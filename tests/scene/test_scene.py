@@ -547,7 +547,7 @@ def test_a_file_that_is_not_toml_gives_one_line_with_its_line(tmp_path, content,
 def test_a_missing_file_and_a_folder(tmp_path):
     with pytest.raises(SceneError, match=r"/none\.toml: no such file; a scene is a TOML file$"):
         read_scene(tmp_path / "none.toml")
-    with pytest.raises(SceneError, match=re.escape(f"{tmp_path}: is a folder; a scene is a TOML file")):
+    with pytest.raises(SceneError, match=re.escape(f"{tmp_path}: cannot be read: is a folder, not a file")):
         read_scene(tmp_path)
     with pytest.raises(SceneError, match="cannot be read: .*embedded null"):
         read_scene("a\0b")

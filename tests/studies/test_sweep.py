@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import os
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -83,6 +85,53 @@ def test_drawn_numbers_outside_of_a_range_are_failed_points(
     assert errors.count("has failed: ") == sum(beyond) and "Traceback" not in errors
     assert cli.main(["sweep", str(cube), "remodeling.kappa=-3:-2", "--latin", "5", "-o", str(tmp_path / "no")]) == 2
     assert "remodeling.kappa = -" in capsys.readouterr().err and not (tmp_path / "no").exists()
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a scene and a sweep of it, out/."""
+    folder = tmp_path_factory.mktemp("done")
+    changes = {"model.kinematics": "point", "time.end": 2.0, "name": "cube"}
+    (folder / "cube.toml").write_text(preset_scene(PAPER, "cube").with_values(changes).to_toml())
+    with forked_children():
+        assert cli.main(sweep_of(folder)) == 0
+    return folder
+
+
+def sweep_of(folder: Path) -> list[str]:
+    """The words of its command."""
+    return ["sweep", str(folder / "cube.toml"), "remodeling.kappa=0.05,0.1,0.15", "-o", str(folder / "out"), "-q"]
+
+
+@pytest.mark.parametrize(
+    ("file", "damage"),
+    [
+        *(("history.csv", damage) for damage in ("folder", "pipe", "other columns", "cut")),
+        *(("scene.toml", damage) for damage in ("folder", "pipe", "a = 1", "\0", "", "cells.seed = -1")),
+    ],
+)
+def test_a_damaged_finished_run_is_left_out_and_named(
+    done: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], file: str, damage: str
+) -> None:
+    """The others are the answer; nothing of the damaged folder is removed."""
+    shutil.copytree(done, tmp_path, dirs_exist_ok=True)
+    path = tmp_path / "out" / "remodeling.kappa-0.1" / file
+    text = path.read_text()
+    path.unlink()
+    if damage in ("folder", "pipe"):
+        path.mkdir() if damage == "folder" else os.mkfifo(path)
+    else:
+        path.write_text(
+            {"cut": text[:-20], "other columns": text.replace("time,", "time,other,", 1)}.get(damage, damage)
+        )
+    with forked_children():
+        assert cli.main(sweep_of(tmp_path)) == 3
+    said = capsys.readouterr().err.strip()
+    assert said.startswith("remodel-fenicsx: remodeling.kappa-0.1 has failed: ") and "\n" not in said
+    assert str(path.parent) in said and len(said) < 600
+    angles = [float(row["mean_fibre_angle"]) for row in rows(tmp_path / "out")]
+    assert np.isfinite(angles).tolist() == [True, False, True]
+    assert path.is_dir() == (damage == "folder")
 
 
 def test_each_part_of_each_range_has_one_point() -> None:
