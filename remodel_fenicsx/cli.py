@@ -21,7 +21,7 @@ from remodel_fenicsx.body.reductions import explained
 from remodel_fenicsx.results.recording import RecordingError
 from remodel_fenicsx.scene.presets import PRESETS, PROFILES, profile_for
 from remodel_fenicsx.scene.scene import Scene, SceneError, preset_scene, read_scene
-from remodel_fenicsx.schema.tables import printable
+from remodel_fenicsx.schema.tables import printable, shortened
 from remodel_fenicsx.system import interrupts
 from remodel_fenicsx.system.arguments import MOST_RUNS, megabytes, positive, typed, wall_time
 from remodel_fenicsx.system.children import SERVE, serve
@@ -56,7 +56,7 @@ class _Parser(argparse.ArgumentParser):
     """What it complains of stays on one line, control characters and all."""
 
     def error(self, message: str) -> NoReturn:
-        super().error(printable(message))
+        super().error(shortened(printable(message)))
 
 
 def parser() -> argparse.ArgumentParser:
@@ -294,6 +294,12 @@ def _add_figures(commands: _Commands) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code, one of `EXIT_CODES`."""
+    for stream in (0, 1, 2):  # where one is closed a file of the run would get its number, and what libraries print
+        with contextlib.suppress(OSError):
+            os.fstat(stream)
+            continue
+        os.open(os.devnull, os.O_RDWR)
+    sys.stdout, sys.stderr = sys.stdout or open(os.devnull, "w"), sys.stderr or open(os.devnull, "w")
     with interrupts.ending_at_once():
         options = _parsed(arguments)
         try:
@@ -340,7 +346,7 @@ def _say(text: str) -> None:
 
 def _complain(message: str) -> None:
     with contextlib.suppress(OSError):  # nobody is there to read it
-        print(f"remodel-fenicsx: {printable(message)}", file=sys.stderr, flush=True)
+        print(f"remodel-fenicsx: {shortened(printable(message))}", file=sys.stderr, flush=True)
 
 
 def _fail(message: str, code: int) -> int:

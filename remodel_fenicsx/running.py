@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 
 from mpi4py import MPI
+from petsc4py import PETSc
 
 from remodel_fenicsx.evolution.pause import Pause
 from remodel_fenicsx.evolution.stepper import Step, Watcher
@@ -32,6 +33,7 @@ from remodel_fenicsx.results.run_folder import (
 from remodel_fenicsx.results.status import BEGUN, FAILED, STOPPED
 from remodel_fenicsx.scene import Scene, SceneError, read_scene, scene_from_dict
 from remodel_fenicsx.scene.scene import check_continuation, in_region
+from remodel_fenicsx.schema.tables import shown
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.system.environment import versions
@@ -203,11 +205,23 @@ def _say_where(checkpoint: Checkpoint) -> None:
 
 def _built(scene: Scene, comm: MPI.Intracomm) -> Simulation:
     try:
-        with stopping_at_once():
+        with stopping_at_once(), _options_blamed(scene):
             return Simulation(scene, comm)
     except Interrupted as interruption:
         interruption.kept = "nothing was computed"
         raise
+
+
+@contextmanager
+def _options_blamed(scene: Scene) -> Iterator[None]:
+    """What PETSc refuses is the scene's own options, where it has any: many are looked at in the first solve only."""
+    try:
+        yield
+    except PETSc.Error as error:
+        if not (given := scene.solver.petsc_options):
+            raise
+        rule = f"PETSc refuses them (error {error.ierr}); allowed are the options of its manual pages"
+        raise SceneError(f"solver.petsc_options = {shown(given)}: {rule}") from error
 
 
 @contextmanager
@@ -278,8 +292,9 @@ def _record(
         leave_report = partial(_leave_report, place) if wants_report else lambda: None
         simulation.stepper.stop_signal = lambda: stop.number
         try:
-            for _ in simulation.steps(watchers):
-                pass
+            with _options_blamed(scene):
+                for _ in simulation.steps(watchers):
+                    pass
         except (StepFailure, Interrupted, Paused) as reason:
             if isinstance(reason, StepFailure):
                 log.info(FAILED + "%s. %s", reason, reason.refusal)

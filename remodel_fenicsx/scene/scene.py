@@ -630,6 +630,8 @@ class Scene(Table):
         """
         values = _plain({name: getattr(self, name) for name in type(self).model_fields}, every_value=True)
         for key, value in changes.items():
+            if not isinstance(key, str):
+                raise SceneError(f"{shown(key)} = {shown(value)}: a key must be text, as in 'cells.seed'")
             put(values, key, value)
         without_replaced(values, changes)
         return type(self)(**values)

@@ -19,6 +19,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import CoreSchema, ErrorDetails, PydanticCustomError, PydanticUndefined, core_schema
 
 LONGEST_VALUE = 60  # characters of a value in an error
+LONGEST_MESSAGE = 2000  # characters: all columns of a shape are a thousand
 PAGE_WIDTH = 98  # characters of a line of a page
 _MISSING = object()
 
@@ -42,7 +43,7 @@ class SceneError(ValueError):
     """
 
     def __init__(self, message: str):
-        super().__init__(printable(message))
+        super().__init__(shortened(printable(message)))
 
 
 class Table(BaseModel):
@@ -183,6 +184,11 @@ def is_number(value: Any) -> bool:
 def printable(text: str) -> str:
     """Text on one line: control characters and line ends become spaces."""
     return re.sub(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]+", " ", text)
+
+
+def shortened(text: str, most: int = LONGEST_MESSAGE) -> str:
+    """A text without its middle where it is longer: its ends say where and why."""
+    return text if len(text) <= most else f"{text[: most // 2 - 3]} ... {text[-(most // 2 - 2) :]}"
 
 
 def one_line(error: ValidationError, table: type[BaseModel]) -> str:

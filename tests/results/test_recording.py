@@ -18,7 +18,7 @@ from remodel_fenicsx.results import run_folder
 from remodel_fenicsx import Recording
 from remodel_fenicsx.results.recording import RecordingError, read_history
 from remodel_fenicsx.results.vtkhdf import TransientGrid
-from remodel_fenicsx.scene.scene import Scene, SceneError, scene_from_dict
+from remodel_fenicsx.scene.scene import Scene, scene_from_dict
 
 POINTS = np.array([[x, y, z] for z in (0, 1, 2) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))], dtype=float)
 ELEMENTS = np.array([np.arange(8), np.arange(4, 12)])
