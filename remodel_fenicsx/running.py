@@ -37,6 +37,7 @@ from remodel_fenicsx.schema.tables import shown
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.system.environment import versions
+from remodel_fenicsx.system.guarded import LARGEST_FILE
 from remodel_fenicsx.system.interrupts import (
     Interrupted,
     Paused,
@@ -315,13 +316,11 @@ def _record(
 
 def with_files_kept(scene: Scene) -> tuple[Scene, dict[str, bytes]]:
     """The scene with the names that its files have in the folder of the run and their SHA-256, and these files."""
-    from remodel_fenicsx.body.fibre_file import LARGEST_FIBRES
-
     changes, files = scene.geometry.kept_files()
     for region, cells in scene.measured_cells.items():
         path = Path(cells.fibres or "")
         name = f"fibres{'_' if region else ''}{region}{path.suffix.lower()}"
-        files[name] = read_regular(path, LARGEST_FIBRES)
+        files[name] = read_regular(path, LARGEST_FILE)
         changes[f"{in_region(region)}cells.fibres"] = name
         changes[f"{in_region(region)}cells.fibres_sha256"] = hashlib.sha256(files[name]).hexdigest()
     return scene.with_values(changes) if changes else scene, files

@@ -11,16 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from remodel_fenicsx.body.exchange_file import ExchangeFileError, read_exchange_file
+from remodel_fenicsx.body.exchange_file import read_exchange_file
 from remodel_fenicsx.model.fibres import MEASURED, SOURCES, fault_of_fibres
 from remodel_fenicsx.schema.csv_table import TableFileError, read_columns
+from remodel_fenicsx.system.guarded import LARGEST_FILE, UnreadableFile
 from remodel_fenicsx.system.regular_files import read_regular
 
 Array = NDArray[np.float64]
 
 log = logging.getLogger(__name__)
 
-LARGEST_FIBRES = 2 * 10**9  # bytes; a structure tensor and a mesh of ten million hexahedra as VTU
 FIBRE_ENDINGS = (".vtu", ".xdmf", ".csv")
 SAME_PLACE = 1e-4  # of an element: files may have 7 digits; a neighbour is a whole one away
 SYMMETRIC_COMPONENTS = ("xx", "yy", "zz", "xy", "yz", "xz")
@@ -48,13 +48,18 @@ class FibreFile:
         By name of `model.fibres.MEASURED`, (rows, columns).
     places
         Middles of the file's elements, or its points, (rows, 3); None: rows are elements of the run's mesh.
-    sha256
-        Of the file, in hexadecimal digits.
+    data
+        The file itself.
     """
 
     measured: dict[str, Array]
     places: Array | None
-    sha256: str
+    data: bytes
+
+    @property
+    def sha256(self) -> str:
+        """Of the file, in hexadecimal digits."""
+        return hashlib.sha256(self.data).hexdigest()
 
     def rows_of(self, corners: Array, chosen: NDArray[np.bool_]) -> tuple[NDArray[np.int64], float | None]:
         """The row for each element of a mesh, and how far the farthest is away; None where rows are elements.
@@ -101,17 +106,20 @@ def read_fibre_file(path: Path) -> FibreFile:
     if ending not in FIBRE_ENDINGS:
         raise FibreFileError(f"allowed are files {', '.join(FIBRE_ENDINGS)}")
     try:
-        data = read_regular(path, LARGEST_FIBRES)
+        if ending == ".csv":
+            data = read_regular(path, LARGEST_FILE)
+            measured, places = _of_csv(data, path.name)
+        else:
+            measured, places, data = _of_mesh(path)
     except OSError as error:
         raise FibreFileError(f"cannot be read: {error.strerror or error}") from error
-    measured, places = _of_csv(data, path.name) if ending == ".csv" else _of_mesh(path, data)
     if (found := fault_of_fibres(measured)) is not None:
         raise FibreFileError(found)
     if places is not None and not np.isfinite(places).all():
         raise FibreFileError("has places that are not finite")
     if "angle" in measured and SMALL < np.abs(measured["angle"]).max() <= np.pi:
         log.warning("%s: all angles lie within 3.14, as in radians; degrees are asked", path.name)
-    return FibreFile(measured, places, hashlib.sha256(data).hexdigest())
+    return FibreFile(measured, places, data)
 
 
 def _of_csv(data: bytes, file: str) -> tuple[dict[str, Array], Array | None]:
@@ -152,10 +160,10 @@ def _of_csv(data: bytes, file: str) -> tuple[dict[str, Array], Array | None]:
 _NEEDED = f"needed is one of {', '.join(SOURCES)}"
 
 
-def _of_mesh(path: Path, data: bytes) -> tuple[dict[str, Array], Array]:
-    """Arrays of the solid elements, or else of the points."""
+def _of_mesh(path: Path) -> tuple[dict[str, Array], Array, bytes]:
+    """Arrays of the solid elements, or else of the points; and the file."""
     try:
-        mesh = read_exchange_file(path, data)
+        mesh = read_exchange_file(path)
         solid = [n for n, block in enumerate(mesh.cells) if block.type.startswith(("tetra", "hexa", "wedge"))]
         of_cells = {
             name: np.concatenate([_columns(blocks[n]) for n in solid])
@@ -166,14 +174,14 @@ def _of_mesh(path: Path, data: bytes) -> tuple[dict[str, Array], Array]:
         points = np.asarray(mesh.points, dtype=np.float64)
         points = np.pad(points, [(0, 0), (0, 3 - points.shape[1])])
         centres = [points[mesh.cells[n].data].mean(axis=1) for n in solid]
-    except ExchangeFileError as error:
+    except UnreadableFile as error:
         raise FibreFileError(str(error)) from None
     except (ValueError, TypeError, IndexError) as error:
         raise FibreFileError(f"has arrays that do not fit its elements: {' '.join(str(error).split())}") from error
     if set(of_cells) & set(SOURCES):
-        return of_cells, np.concatenate(centres)
+        return of_cells, np.concatenate(centres), mesh.data
     if set(of_points) & set(SOURCES):
-        return of_points, points
+        return of_points, points, mesh.data
     known = ", ".join([*mesh.cell_data, *mesh.point_data]) or "none"
     raise FibreFileError(f"has arrays {known}; {_NEEDED}")
 

@@ -17,12 +17,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from remodel_fenicsx.system.guarded import LARGEST_FILE
 from remodel_fenicsx.system.regular_files import read_regular
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-LARGEST_FILE = 2 * 10**9  # bytes; ten million hexahedra take 1.1 GB
 VERSIONS = (b"2.2", b"4.1")
 # Gmsh's number of a type of element -> what it is
 VOLUMES = {4: ("tetrahedron", 1), 5: ("hexahedron", 1), 11: ("tetrahedron", 2), 12: ("hexahedron", 2)}

@@ -9,10 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from remodel_fenicsx.body.exchange_file import ENDINGS, ExchangeFileError, read_exchange_file
+from remodel_fenicsx.body.exchange_file import ENDINGS, read_exchange_file
 from remodel_fenicsx.body.mesh_file import (
     ALLOWED_ELEMENTS,
-    LARGEST_FILE,
     Block,
     Integers,
     MeshFile,
@@ -21,7 +20,7 @@ from remodel_fenicsx.body.mesh_file import (
     found_file,
     read_mesh_file,
 )
-from remodel_fenicsx.system.regular_files import read_regular
+from remodel_fenicsx.system.guarded import UnreadableFile
 
 TAGS = ("gmsh:physical", "CellEntityIds", "medit:ref")
 """Arrays of numbers of faces and volumes: as meshio, VMTK and Medit call them."""
@@ -68,16 +67,15 @@ def read_mesh(path: Path, tags: str | None = None) -> MeshFile:
 
 @functools.lru_cache(maxsize=1)
 def _read(path: Path, tags: str | None, _changed: int, _size: int) -> MeshFile:
-    data = read_regular(path, LARGEST_FILE)
     try:
-        mesh = read_exchange_file(path, data)
-    except ExchangeFileError as error:
+        mesh = read_exchange_file(path)
+    except UnreadableFile as error:
         raise MeshFileError(str(error)) from None
     points = np.asarray(mesh.points, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
         raise MeshFileError(f"its nodes have {points.shape[-1]} coordinates; needed are three")
     blocks = _blocks(mesh.cells, _tags(mesh.cell_data, tags))
-    return assembled(np.arange(len(points)), points, blocks, {2: {}, 3: {}}, data)
+    return assembled(np.arange(len(points)), points, blocks, {2: {}, 3: {}}, mesh.data)
 
 
 def _tags(arrays: dict[str, Any], asked: str | None) -> list[Integers]:

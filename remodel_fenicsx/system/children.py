@@ -121,10 +121,13 @@ def _process(arguments: Sequence[str], **streams: Any) -> subprocess.Popen[Any]:
     if shutil.which("setpriv"):  # the signal comes from now on; who was killed before is not the parent any more
         only_with_parent = ["sh", "-c", '[ "$PPID" = "$0" ] && exec "$@"', str(os.getpid())]
         command = ["setpriv", "--pdeathsig", signal.SIGTERM.name, *only_with_parent, *command]
-    # this very package, wherever it was imported from; one thread each, as there are jobs for the cores
+    return subprocess.Popen(command, env=environment_of_child(), **streams)
+
+
+def environment_of_child() -> dict[str, str]:
+    """With this very package, wherever it was imported from; one thread, as there are jobs for the cores."""
     paths = [str(Path(__file__).parents[2]), *filter(None, [os.environ.get("PYTHONPATH")])]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"}
-    return subprocess.Popen(command, env=environment, **streams)
+    return os.environ | {"PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"}
 
 
 def _emptied(messages: Path) -> TextIO:
