@@ -437,6 +437,7 @@ def _study(options: argparse.Namespace, task: Callable[[Scene], tuple[Path, str,
     """Several runs that answer one question: `task` makes the folder, the answer in words, and what has failed."""
     scene = read_scene(options.scene, options.set, options.profile)
     _check(reason_unusable() or reason_undrawable())
+    from remodel_fenicsx.results.run_lock import FolderTaken
     from remodel_fenicsx.studies.page import FigureError
     from remodel_fenicsx.studies.runs import TooFewRuns
 
@@ -446,6 +447,8 @@ def _study(options: argparse.Namespace, task: Callable[[Scene], tuple[Path, str,
     except TooFewRuns as early:
         _complain_of(early.failed)
         return _fail(str(early), SOLVE_FAILED if early.failed else STOPPED)
+    except FolderTaken as error:  # another such study is at work in it
+        return _fail(" ".join(str(error).split()), BAD_INPUT)
     except FigureError as refusal:  # a picture or a table of somebody else's stands in its place
         return _fail(_as_typed(refusal), refusal.exit_code)
     except interrupts.Interrupted as interruption:
@@ -508,7 +511,6 @@ def _sweep(options: argparse.Namespace) -> int:
 
 def _fit(options: argparse.Namespace) -> int:
     def task(scene: Scene) -> tuple[Path, str, dict[str, str]]:
-        from remodel_fenicsx.results.run_folder import FolderTaken
         from remodel_fenicsx.solver.continuation import StepFailure
         from remodel_fenicsx.studies import fit as study
 
@@ -516,8 +518,6 @@ def _fit(options: argparse.Namespace) -> int:
             folder, found = study.fit(
                 scene, options.data, options.output, options.starts, options.quiet, options.profiles
             )
-        except FolderTaken as error:
-            raise SceneError(str(error)) from error
         except StepFailure as failure:
             raise _NoStart(f"at the start of the fit {failure}. {failure.refusal}; choose other starts") from failure
         return folder, study.in_words(found), {}

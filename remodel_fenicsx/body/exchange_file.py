@@ -14,7 +14,7 @@ from remodel_fenicsx.system.guarded import read_guarded
 ENDINGS = (".vtu", ".vtk", ".xdmf")
 
 
-class Cells(NamedTuple):
+class ElementBlock(NamedTuple):
     """Elements of a type, by meshio's name of it: rows of nodes."""
 
     type: str
@@ -25,7 +25,7 @@ class ExchangeFile(NamedTuple):
     """What such a file holds: as a `meshio.Mesh`, and the file itself."""
 
     points: NDArray[Any]
-    cells: list[Cells]
+    cells: list[ElementBlock]
     point_data: dict[str, NDArray[Any]]
     cell_data: dict[str, list[NDArray[Any]]]
     data: bytes
@@ -45,7 +45,7 @@ def read_exchange_file(path: Path) -> ExchangeFile:
     types, points, cells = json.loads(arrays["names"].tobytes())
     return ExchangeFile(
         arrays["points"],
-        [Cells(kind, arrays[f"cells{n}"]) for n, kind in enumerate(types)],
+        [ElementBlock(kind, arrays[f"cells{n}"]) for n, kind in enumerate(types)],
         {name: arrays[f"point_data{n}"] for n, name in enumerate(points)},
         {name: [arrays[f"cell_data{n}_{m}"] for m in range(len(types))] for n, name in enumerate(cells)},
         data,

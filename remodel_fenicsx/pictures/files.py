@@ -7,7 +7,6 @@ import itertools
 import os
 import shutil
 import subprocess
-import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -26,6 +25,7 @@ from remodel_fenicsx.results.kept_times import kept_times
 from remodel_fenicsx.results.recording import RecordedRun
 from remodel_fenicsx.studies.page import DOTS_PER_INCH, STYLE, About, FigureError, Palette, as_file
 from remodel_fenicsx.system.regular_files import write_new
+from remodel_fenicsx.system.temporary import temporary_folder
 
 PICTURES, ANIMATIONS = (".png", ".svg", ".pdf"), (".gif", ".webp", ".mp4")
 MOST_PANELS = 12
@@ -191,12 +191,12 @@ def _mp4(frames: list[Image.Image], about: About) -> bytes:
     last = [frames[-1]] * (LAST_TIME // FRAME_TIME - 1)
     wide, tall = (size - size % 2 for size in frames[0].size)  # H.264 wants even ones
     pixels = b"".join(frame.crop((0, 0, wide, tall)).tobytes() for frame in frames + last)
-    with tempfile.TemporaryDirectory(prefix="remodel-fenicsx-") as folder:
+    with temporary_folder() as folder:
         given = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{wide}x{tall}", "-r", f"{1000 / FRAME_TIME:g}"]
         wanted = ["-pix_fmt", "yuv420p", "-movflags", "+faststart", "-metadata", f"comment={about.comment}", "film.mp4"]
         command = ["ffmpeg", "-v", "error", *given, "-i", "-", *wanted]
         done = subprocess.run(command, input=pixels, capture_output=True, cwd=folder)
-        film = Path(folder) / "film.mp4"
+        film = folder / "film.mp4"
         if done.returncode != 0 or not film.exists():
             said = (done.stderr.decode(errors="replace").strip().splitlines() or ["it said nothing"])[-1]
             raise FigureError(f"ffmpeg ended with {done.returncode}: {said}; .webp needs nothing", 5)

@@ -11,7 +11,6 @@ import pickle
 import shutil
 import subprocess
 import sys
-import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -21,6 +20,7 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.results.drawing import AMBIENT
 from remodel_fenicsx.studies.page import FigureError
+from remodel_fenicsx.system.temporary import temporary_folder
 
 Array = NDArray[np.float64]
 Pixels = NDArray[np.uint8]
@@ -78,8 +78,8 @@ def render(pictures: list[Picture]) -> list[Pixels]:
     FigureError
         If the child process could not draw (exit code 5: the environment).
     """
-    with tempfile.TemporaryDirectory(prefix="remodel-fenicsx-") as folder:
-        job = Path(folder) / "job"
+    with temporary_folder() as folder:
+        job = folder / "job"
         job.write_bytes(pickle.dumps(pictures))
         command = [sys.executable, "-m", __name__, str(job)]
         if shutil.which("xvfb-run"):

@@ -12,6 +12,7 @@ from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.results.chain_lines import OF_CHAINS, append_chains
 from remodel_fenicsx.results.recording import RecordedRun, RecordingError
 from remodel_fenicsx.results.turned import TurnedFields
+from remodel_fenicsx.system.regular_files import part_of
 from remodel_fenicsx.results.vtkhdf import TransientGrid, vtk_cells
 
 BODY, BODY_CHAINS = "fields_body.vtkhdf", "fields_body_chains.vtkhdf"
@@ -47,17 +48,23 @@ def revolve(folder: Path | str) -> list[Path]:
     if not len(recording.times):
         raise RecordingError(f"{recording.path}: the run recorded no fields")
     image = _Image(recording, recording.scene.geometry.reductions[name].turn)
-    with TransientGrid(paths[0], image.points, image.cells, image.cell_type) as grid:
+    parts = [part_of(path) for path in paths]
+    for part in parts:
+        part.unlink(missing_ok=True)  # of one that was killed
+    with TransientGrid(parts[0], image.points, image.cells, image.cell_type) as grid:
         chains: TransientGrid | None = None
         for time in recording.times:
             displacement, fields = image(recording.fields(float(time)))
             grid.append(float(time), {} if displacement is None else {"displacement": displacement}, fields)
             if displacement is not None and set(OF_CHAINS) <= set(fields):
                 middle = displacement[image.elements].mean(axis=1)
-                chains = append_chains(chains or paths[1], float(time), image.centres, image.scale, middle, fields)
+                chains = append_chains(chains or parts[1], float(time), image.centres, image.scale, middle, fields)
         if chains is not None:
             chains.close()
-    return paths if chains is not None else paths[:1]
+    written = [path for part, path in zip(parts, paths, strict=True) if part.exists()]
+    for path in reversed(written):  # the body last: where it is, all are
+        part_of(path).rename(path)
+    return written
 
 
 class _Image(TurnedFields):

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from remodel_fenicsx.body.reductions import only_for_means
 from remodel_fenicsx.scene.scene import Scene, SceneError, in_region
 from remodel_fenicsx.schema.times import same_time
+from remodel_fenicsx.results.run_lock import RunLock
 from remodel_fenicsx.results.words import unit_of, words
 from remodel_fenicsx.studies.page import COLOURS, STYLE, Page, add_head
 from remodel_fenicsx.studies.runs import FEWEST_RUNS, Run, TooFewRuns, run_all, write_study
@@ -146,9 +147,10 @@ def ensemble(
     place = Path(folder or Path("results") / f"{scene.name}-{NAME}")
     members = members_of(scene, place, seeds)
     checked = partial(write_study, place, NAME, scene.name, members)
-    failed = run_all(members, jobs or cores(), f"{scene.name} {NAME}", quiet, checked=checked)
-    found = gathered(members, failed)
-    draw(found, place, scene)
+    with RunLock(place):
+        failed = run_all(members, jobs or cores(), f"{scene.name} {NAME}", quiet, checked=checked)
+        found = gathered(members, failed)
+        draw(found, place, scene)
     return place, found
 
 

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from remodel_fenicsx.report.card import Card, folded, section
 from remodel_fenicsx.report.card import table as card_table
 from remodel_fenicsx.report.page import page_with
+from remodel_fenicsx.results.run_lock import RunLock
 from remodel_fenicsx.results.run_folder import chosen_folder
 from remodel_fenicsx.results.words import unit_of, words
 from remodel_fenicsx.scene.scene import Scene, SceneError
@@ -325,7 +326,6 @@ def fit(
         for doubt in doubts(tables, [modelled.columns for modelled in at_start], scene):
             log.warning("%s", doubt)
         problem.check_tells_apart(problem.jacobian(first, central=True))
-        problem.keep(Journal(place, mark))
 
     def announced(key: str) -> None:
         if not quiet:
@@ -334,6 +334,8 @@ def fit(
     random = np.random.default_rng(1)
     found = []
     with ExitStack() as stack:
+        stack.enter_context(RunLock(place))
+        problem.keep(Journal(place, mark))
         stack.enter_context(open_log(place / f"{FIT}.log", quiet=quiet, held=held))
         stack.callback(line.end)
         for number in range(starts):

@@ -16,6 +16,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from remodel_fenicsx.results.run_lock import RunLock
 from remodel_fenicsx.results.words import unit_of, words
 from remodel_fenicsx.scene.scene import Scene, SceneError
 from remodel_fenicsx.schema.tables import shown
@@ -207,9 +208,10 @@ def sweep(
     place = Path(folder or Path("results") / f"{scene.name}-{SWEEP}")
     names, members, refused = members_of(scene, points, place, sampled)
     checked = partial(write_study, place, SWEEP, scene.name, members)
-    failed = refused | run_all(members, jobs or cores(), f"{scene.name} {SWEEP}", quiet, checked=checked)
-    found = gathered(names, members, points, failed)
-    draw(found, place, scene)
+    with RunLock(place):
+        failed = refused | run_all(members, jobs or cores(), f"{scene.name} {SWEEP}", quiet, checked=checked)
+        found = gathered(names, members, points, failed)
+        draw(found, place, scene)
     return place, found
 
 

@@ -15,6 +15,7 @@ from matplotlib.lines import Line2D
 
 from remodel_fenicsx.body.columns import PROFILE
 from remodel_fenicsx.results.recording import RecordingError
+from remodel_fenicsx.results.run_lock import RunLock
 from remodel_fenicsx.scene.scene import Scene
 from remodel_fenicsx.schema.times import same_time
 from remodel_fenicsx.studies.estimates import Result, Row, Trade, estimated, typical
@@ -83,16 +84,19 @@ def trade(
         for setting in settings
     }
     runner = _Runner(settings, members, times, budget, say)
-    failed = runner.run(jobs or cores(), place, scene.name)
-    results = runner.results()
-    if len(results) < FEWEST_RUNS:
-        reached = f"{len(results)} of {len(settings)} settings reached the end within the budget of {budget:g} s"
-        raise TooFewRuns(reached, failed, runner.advice(FEWEST_RUNS - len(results), jobs or cores(), failed))
-    rows, notes = estimated(results)
-    done = {row.result.setting.name for row in rows}
-    left = [name for name, runs in members.items() if name not in done and not any(run.name in failed for run in runs)]
-    found = Trade(rows, notes, left, failed)
-    write(found, place, scene)
+    with RunLock(place):
+        failed = runner.run(jobs or cores(), place, scene.name)
+        results = runner.results()
+        if len(results) < FEWEST_RUNS:
+            reached = f"{len(results)} of {len(settings)} settings reached the end within the budget of {budget:g} s"
+            raise TooFewRuns(reached, failed, runner.advice(FEWEST_RUNS - len(results), jobs or cores(), failed))
+        rows, notes = estimated(results)
+        done = {row.result.setting.name for row in rows}
+        left = [
+            name for name, runs in members.items() if name not in done and not any(run.name in failed for run in runs)
+        ]
+        found = Trade(rows, notes, left, failed)
+        write(found, place, scene)
     return place, found
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 from mpi4py import MPI
@@ -11,6 +11,8 @@ from mpi4py import MPI
 from remodel_fenicsx.running import with_files_kept
 from remodel_fenicsx.scene import Scene
 from remodel_fenicsx.unloading import unloaded
+from remodel_fenicsx.system.regular_files import part_of
+from remodel_fenicsx.system.temporary import temporary_folder
 
 
 def write_unloaded(scene: Scene, folder: Path) -> str:
@@ -27,13 +29,16 @@ def write_unloaded(scene: Scene, folder: Path) -> str:
     """
     if folder.exists():
         raise FileExistsError(folder)
-    with TemporaryDirectory() as temporary:
-        found = unloaded(scene, MPI.COMM_SELF, Path(temporary))
+    with temporary_folder() as temporary:
+        found = unloaded(scene, MPI.COMM_SELF, temporary)
         kept, files = with_files_kept(found)
-        folder.mkdir(parents=True)
+        part = part_of(folder)
+        shutil.rmtree(part, ignore_errors=True)  # of one that was killed
+        part.mkdir(parents=True)
         for name, data in files.items():
-            (folder / name).write_bytes(data)
-        (folder / "scene.toml").write_text(kept.to_toml(f"the unloaded body of {scene.name}"), encoding="utf-8")
+            (part / name).write_bytes(data)
+        (part / "scene.toml").write_text(kept.to_toml(f"the unloaded body of {scene.name}"), encoding="utf-8")
+        part.rename(folder)
         return "unloaded: " + _in_words(scene, found)
 
 

@@ -9,6 +9,8 @@ from __future__ import annotations
 import errno
 import os
 import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 NEVER_WAITING = os.O_NONBLOCK | os.O_CLOEXEC  # opening a pipe without a writer would wait
@@ -128,26 +130,12 @@ def write_whole(path: Path, data: bytes) -> None:
     OSError
         If it cannot be written (disk full); the old file, if there was one, is still there.
     """
-    part = part_of(path)
-    part.unlink(missing_ok=True)  # of a run that was killed
-    try:
-        with open(open_own(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL), "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
+    with _written_beside(path, data) as part:
         part.replace(path)
-    except OSError:
-        part.unlink(missing_ok=True)  # the room it takes may be all there is
-        raise
-    folder = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)  # the name too
-    finally:
-        os.close(folder)
 
 
 def write_new(path: Path, data: bytes) -> None:
-    """Make a file that is not there; it is there whole or not at all, unless the process is killed.
+    """Make a file that is not there; it is there whole or not at all, whenever the process is killed.
 
     Raises
     ------
@@ -156,13 +144,35 @@ def write_new(path: Path, data: bytes) -> None:
     OSError
         If it cannot be written.
     """
-    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
+    if os.path.lexists(path):
+        raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
+    with _written_beside(path, data) as part:
+        try:
+            os.link(part, path)  # unlike a rename it never replaces what came meanwhile
+        except FileExistsError:
+            raise
+        except OSError:  # a file system without hard links
+            part.rename(path)
+
+
+@contextmanager
+def _written_beside(path: Path, data: bytes) -> Iterator[Path]:
+    """Within, the data are on the disk beside their place; then the new name is, and the other one is gone."""
+    part = part_of(path)
+    part.unlink(missing_ok=True)  # of a run that was killed
     try:
-        with open(descriptor, "wb") as file:
+        with open(open_own(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL), "wb") as file:
             file.write(data)
-    except BaseException:
-        path.unlink()
-        raise
+            file.flush()
+            os.fsync(file.fileno())
+        yield part
+    finally:
+        part.unlink(missing_ok=True)  # the room it takes may be all there is
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)  # the name too
+    finally:
+        os.close(folder)
 
 
 def _opened(path: Path, flags: int) -> int:

@@ -6,12 +6,12 @@ import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 from mpi4py import MPI
 
 from remodel_fenicsx.scene import Scene, SceneError
 from remodel_fenicsx.unloading.failure import NoUnloadedShape
+from remodel_fenicsx.system.temporary import temporary_folder
 
 log = logging.getLogger(__name__)
 
@@ -32,8 +32,8 @@ def as_unloaded(scene: Scene, comm: MPI.Intracomm) -> Iterator[Scene]:
         return
     for line in scene.turned_away() if comm.rank == 0 else ():
         log.warning("%s", line)
-    with TemporaryDirectory() as folder:
-        yield unloaded(scene, comm, Path(comm.bcast(folder)))
+    with temporary_folder() as folder:
+        yield unloaded(scene, comm, comm.bcast(folder))
 
 
 def unloaded(scene: Scene, comm: MPI.Intracomm = MPI.COMM_WORLD, folder: Path | None = None) -> Scene:

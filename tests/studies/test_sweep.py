@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from remodel_fenicsx import cli, preset_scene
+from remodel_fenicsx.results.run_lock import RunLock
 from remodel_fenicsx.results.status import status
 from remodel_fenicsx.studies.sweep import latin_hypercube, read_axis
 from tests.conftest import forked_children
@@ -171,3 +172,19 @@ def test_bad_input_is_one_line(cube: Path, words: list[str], said: str, capsys: 
     errors = capsys.readouterr().err
     assert said in errors and errors.count("\n") == 1
     assert not (cube.parent / "out").exists()
+
+
+def test_two_equal_studies_do_not_share_a_folder(
+    done: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The second names the first; when that has ended it may."""
+    shutil.copytree(done, tmp_path, dirs_exist_ok=True)
+    with forked_children():
+        with RunLock(tmp_path / "out"):
+            before = sorted(tmp_path.rglob("*"))
+            assert cli.main(sweep_of(tmp_path)) == 2
+            assert sorted(tmp_path.rglob("*")) == before
+        said = capsys.readouterr().err
+        assert said.count("\n") == 1 and f"process {os.getpid()} on " in said and f"{tmp_path}/out: " in said
+        assert cli.main(sweep_of(tmp_path)) == 0
+    assert not (tmp_path / "out" / "run.lock").exists()
