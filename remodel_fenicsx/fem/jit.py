@@ -80,7 +80,8 @@ def compiled_kernels() -> tuple[str, ...]:
 def cache_folder() -> Path:
     """Folder of compiled kernels: per processor type, because -march=native code must not meet another processor.
 
-    Below XDG_CACHE_HOME or ~/.cache; where that cannot be written, in a private temporary folder, with a warning.
+    Below XDG_CACHE_HOME or ~/.cache; where that cannot be written or is another user's, in a private temporary folder,
+    with a warning.
     """
     base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     try:
@@ -92,13 +93,13 @@ def cache_folder() -> Path:
     folder = base / "fenics" / name
     with suppress(OSError):
         folder.mkdir(parents=True, exist_ok=True)
-        if os.access(folder, os.W_OK):
+        if os.access(folder, os.W_OK) and folder.stat().st_uid == os.getuid():  # what is there is loaded and run
             return folder
     other = Path(tempfile.gettempdir()) / f"remodel-fenicsx-forms-{os.getuid()}"
     other.mkdir(mode=0o700, exist_ok=True)
     if other.is_symlink() or other.stat().st_uid != os.getuid():
         raise PermissionError(f"{other}: belongs to another user; set TMPDIR to a folder of your own")
-    log.warning("cannot write to %s: forms are compiled into %s", folder, other)
+    log.warning("cannot write to %s, or it belongs to another user: forms are compiled into %s", folder, other)
     return other / name
 
 

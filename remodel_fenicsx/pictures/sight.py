@@ -14,8 +14,6 @@ from remodel_fenicsx.pictures.bodies import ANGLE, OF_RIBBONS, SHOWN_FIELDS, Dra
 from remodel_fenicsx.pictures.rendering import Picture, Pixels, View, render
 from remodel_fenicsx.results.drawing import VIEWS
 from remodel_fenicsx.results.recording import HistoryColumns, RecordedRun
-from remodel_fenicsx.results.run_lock import writer
-from remodel_fenicsx.results.status import rows_so_far
 from remodel_fenicsx.results.whole_body import WholeBody, has_a_body
 from remodel_fenicsx.results.words import unit_of, with_unit, words
 from remodel_fenicsx.schema.times import same_time
@@ -137,7 +135,7 @@ class Sight:
     @cached_property
     def history(self) -> HistoryColumns:
         """Of the run, which may still be under way."""
-        return rows_so_far(self.recording, writer(self.recording.path)[1])
+        return self.recording.history
 
     def times(self, wanted: Sequence[float] | None) -> list[float]:
         """The recorded times nearest to these, each once; the last one where none are wanted.

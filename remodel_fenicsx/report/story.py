@@ -10,7 +10,7 @@ from pathlib import Path
 
 from remodel_fenicsx.results.recording import LARGEST_HISTORY, LOG, HistoryColumns, RecordedRun
 from remodel_fenicsx.results.run_lock import writer
-from remodel_fenicsx.results.status import FAILED, STOPPED, how_it_ended, rows_so_far
+from remodel_fenicsx.results.status import FAILED, STOPPED, how_it_ended
 from remodel_fenicsx.schema.times import same_time
 from remodel_fenicsx.system.regular_files import read_regular
 
@@ -80,7 +80,7 @@ class Story:
             If the folder is damaged or cannot be read.
         """
         lives = writer(recording.path)[1]
-        history = rows_so_far(recording, lives)
+        history = recording.history
         lines = list(_log(recording.path))
         stamps = [stamp for stamp, _, _ in lines] or [""]
         ranks = [found[1] for _, _, text in lines if (found := _RANKS.match(text))] or [""]

@@ -19,10 +19,8 @@ from remodel_fenicsx.results.recording import (
     LARGEST_HISTORY,
     LOG,
     STUDY,
-    HistoryColumns,
     RecordedRun,
     RecordingError,
-    read_history,
 )
 from remodel_fenicsx.results.run_lock import writer
 from remodel_fenicsx.schema.times import same_time
@@ -55,7 +53,7 @@ def status(folder: Path) -> list[str]:
         recording = RecordedRun(folder)  # what is no run's folder is refused
     else:
         return [f"{folder}: starting, {holder or 'a process'} is at work"]
-    scene, history = recording.scene, rows_so_far(recording, lives)
+    scene, history = recording.scene, recording.history
     times = history["time"]
     end, time = scene.last_time, float(times[-1]) if len(times) else 0.0
     number = max(0, len(times) - 1)
@@ -144,14 +142,3 @@ def _state(folder: Path) -> tuple[str, str]:
             return "finished", ""
     words = how_it_ended(folder)
     return ("failed", words) if words.startswith(FAILED) else ("stopped", "")
-
-
-def rows_so_far(recording: RecordedRun, lives: bool) -> HistoryColumns:
-    """The history; of a run that lives it may be read while a row is being written."""
-    try:
-        return recording.history
-    except RecordingError:
-        if not lives:
-            raise
-        clock.sleep(0.1)
-        return read_history(recording.path)

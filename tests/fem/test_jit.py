@@ -142,6 +142,20 @@ def test_runs_at_once_compile_one_after_the_other(tmp_path: Path) -> None:
     assert sorted(done.stdout.split()) == ["0", "1"]
 
 
+@pytest.mark.skipif(os.getuid() != 0, reason="only root can give a folder away")
+def test_a_cache_of_another_user_is_not_loaded(tmp_path: Path) -> None:
+    """What is there is run."""
+    (tmp_path / "temporary").mkdir()
+    assert compile_and_use(tmp_path / "cache", TMPDIR=str(tmp_path / "temporary")).returncode == 0
+    for folder in (tmp_path / "cache" / "fenics").iterdir():
+        try:
+            os.chown(folder, 12345, 12345)
+        except OSError:
+            pytest.skip("this root has one user alone")
+    done = compile_and_use(tmp_path / "cache", TMPDIR=str(tmp_path / "temporary"))
+    assert done.returncode == 0 and "belongs to another user" in done.stderr, done.stderr[-2000:]
+
+
 def test_a_cache_that_cannot_be_written_is_replaced_with_a_warning(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     temporary = tmp_path / "temporary"

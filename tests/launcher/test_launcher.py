@@ -261,6 +261,11 @@ def test_another_python_does_not_reach_in(ready):
         for name in (
             "PYTHONPATH",
             "PYTHONHOME",
+            "PYTHONWARNINGS",
+            "PYTHONINSPECT",
+            "PYTHONOPTIMIZE",
+            "PYTHONPLATLIBDIR",
+            "PYTHONDEVMODE",
             "VIRTUAL_ENV",
             "CONDA_PREFIX",
             "LD_LIBRARY_PATH",
@@ -854,3 +859,7 @@ def test_container_is_the_last_way(clone):
 def test_scripts_can_be_run():
     for name in ("with-fenicsx", "tests/run", "tests/container/run", "bin/remodel-fenicsx", ".ci/run"):
         assert (PROJECT / name).stat().st_mode & stat.S_IXUSR, name
+
+
+def test_a_temporary_folder_that_is_none_is_said(ready):
+    one_line(ready.run("true", environment={"TMPDIR": "/etc/passwd"}), "TMPDIR=/etc/passwd: is no folder")
