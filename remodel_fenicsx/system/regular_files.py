@@ -144,15 +144,13 @@ def write_new(path: Path, data: bytes) -> None:
     OSError
         If it cannot be written.
     """
-    if os.path.lexists(path):
-        raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
     with _written_beside(path, data) as part:
         try:
-            os.link(part, path)  # unlike a rename it never replaces what came meanwhile
-        except FileExistsError:
-            raise
-        except OSError:  # a file system without hard links
-            part.rename(path)
+            os.link(part, path)  # unlike a rename it replaces nothing
+        except OSError:
+            if os.path.lexists(path):
+                raise
+            part.rename(path)  # a file system without hard links
 
 
 @contextmanager
