@@ -34,7 +34,7 @@ from remodel_fenicsx.state.unit_cells import UnitCells
 from remodel_fenicsx.system.arguments import typed
 from remodel_fenicsx.system.interrupts import take_back_signals
 from remodel_fenicsx.watch.equilibrium_stability import EquilibriumStability
-from remodel_fenicsx.watch.locking import LockingWarning, PressureNoise
+from remodel_fenicsx.watch.locking import REMEDY, LockingWarning, PressureNoise
 from remodel_fenicsx.watch.over_correction import OverCorrection, RestedCells
 from remodel_fenicsx.watch.tissue import FrontsInLayers, GrowthWithoutRest, RadialChains, VolumeLoss, WeakTension
 
@@ -170,7 +170,7 @@ class Simulation:
         self.warnings = self._of_the_state(self.stepper)
         remodeling, locks = self.stepper.remodeling, FORMULATIONS[scene.mesh.formulation].locks
         if locks and remodeling.law.remodels and remodeling.driver.is_stress and not kinematics.homogeneous:
-            self.warnings.append(PressureNoise(self.stepper))
+            self.warnings.append(PressureNoise(self.stepper, remedy(scene)))
         self.warnings += [
             WeakTension(self.stepper),
             RadialChains(self.stepper, shape.radial_share),
@@ -196,7 +196,7 @@ class Simulation:
         """What is said of solved states, whatever the cells do: of a stepper's, or another load case's."""
         scene = self.scene
         found: list[Watcher] = [
-            LockingWarning(stepper, FORMULATIONS[scene.mesh.formulation].locks),
+            LockingWarning(stepper, FORMULATIONS[scene.mesh.formulation].locks, remedy(scene)),
             VolumeLoss(stepper),
         ]
         strut = scene.geometry.strut(scene.supports.ends) if stepper.state.kinematics.reduced else None
@@ -283,6 +283,13 @@ class Simulation:
         for stability in self._closing:
             stability.close()
         self.stepper.close()
+
+
+def remedy(scene: Scene) -> str:
+    """What a scene may set whose elements lock, in words."""
+    if needs := scene.needs_all_points():
+        return f"set mesh.degree = 2 or a larger mesh.refinement, for {needs} needs mesh.formulation = 'displacement'"
+    return REMEDY
 
 
 def on_mesh_alone(scene: Scene, domain: Domain) -> Any:

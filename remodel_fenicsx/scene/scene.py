@@ -254,13 +254,13 @@ class Scene(Table):
         """That of `mesh.formulation`, or the one that "auto" takes."""
         if self.mesh.formulation != AUTO:
             return self.mesh.formulation
-        return "displacement" if not self._bulk_is_stiff or self._needs_all_points() else NOT_LOCKING
+        return "displacement" if not self._bulk_is_stiff or self.needs_all_points() else NOT_LOCKING
 
     @property
     def _bulk_is_stiff(self) -> bool:
         return self._stiffness_ratio > FORMULATIONS[NOT_LOCKING].pays_above(self.mesh.element, self.mesh.degree)
 
-    def _needs_all_points(self) -> str:
+    def needs_all_points(self) -> str:
         """What keeps "auto" from the formulation that does not lock, in words; nothing where nothing does."""
         if self.remodeling.coupling == "implicit":
             return "remodeling.coupling = 'implicit'"
@@ -272,7 +272,7 @@ class Scene(Table):
 
     def formulation_in_words(self) -> str:
         """What "auto" takes, and why."""
-        needs = self._needs_all_points() if self._bulk_is_stiff else ""
+        needs = self.needs_all_points() if self._bulk_is_stiff else ""
         ratio = f"lambda/mu = {self._stiffness_ratio:.4g}"
         return f"formulation {self.formulation!r}: {ratio}{f', but {needs} needs it' if needs else ''}"
 

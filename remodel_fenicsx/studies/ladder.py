@@ -105,7 +105,8 @@ def ladder(scene: Scene) -> list[Setting]:
         If steps of the scene's own length do not hit its corners and its end: with a tolerance they need not.
     """
     solved = choice(scene).name
-    base = scene.with_values({"model.kinematics": _cheapest(scene), "time.tolerance": None})
+    # without its profile, which would choose the steps of every row; what the profile has set stays
+    base = scene.with_values({"model.kinematics": _cheapest(scene), "time.tolerance": None, "profile": None})
     step, mesh = base.time.step, (base.mesh.refinement, base.mesh.degree)
     random, seed = scene.has_random_cells, scene.cells.seed
     several = tuple(range(seed, seed + SEEDS)) if random else (seed,)

@@ -49,7 +49,7 @@ class BucklingWarning(WarnsOnce):
     def solved(self, step: Step) -> None:
         """Look, until it was said."""
         if not self.said and self._occasions.due() and (found := self.in_words()):
-            self.say(step, found)
+            self.find(found)
 
     def in_words(self) -> str:
         """What is too much in the present state; nothing where it is stable."""

@@ -76,14 +76,16 @@ class LockingWarning(WarnsOnce):
         Whose states are looked at.
     locks
         Whether differences of J inside an element cost energy (`Formulation.locks`).
+    remedy
+        What the scene may set against it, in words.
     """
 
-    def __init__(self, stepper: Stepper, locks: bool):
+    def __init__(self, stepper: Stepper, locks: bool, remedy: str = REMEDY):
         super().__init__(stepper, "locking", {"energy": 0, "vain": 0})
         tissue = at_points(stepper.tissue, self.quadrature)
         shape = self.quadrature.shape
         self.stiffnesses = [self.quadrature.owned(v.reshape(shape)) for v in (tissue.lame_lambda, tissue.lame_mu)]
-        self.locks = locks
+        self.locks, self.remedy = locks, remedy
         self.response = VolumeResponse(stepper, self.stiffnesses[0])
         self.homogeneous = stepper.state.kinematics.homogeneous  # then there are no elements that could hold it back
         self._occasions = Occasions(stepper.state, "locking")
@@ -171,7 +173,7 @@ class LockingWarning(WarnsOnce):
             return
         missing = self._missing(*energies, WARNED_SHARE)
         if sum(missing) > WARNED_SHARE:
-            self.say(step, self.in_words(missing))
+            self.find(self.in_words(missing))
 
     def _are_news(self, energy: float, *vain: float) -> bool:
         """Whether energies differ from those of the last look."""
@@ -186,7 +188,7 @@ class LockingWarning(WarnsOnce):
         lacks = f"displacements are off by about {100 * min(sum(missing), 1.0):.2g} %"
         if missing.volume >= missing.shape:
             return (
-                f"the elements lock, {lacks} (lambda/mu up to {self.stiffness_ratio():.4g}); {REMEDY} "
+                f"the elements lock, {lacks} (lambda/mu up to {self.stiffness_ratio():.4g}); {self.remedy} "
                 "(docs/theory.md, Volumetric locking)"
             )
         return (
@@ -207,10 +209,13 @@ class PressureNoise(WarnsOnce):
     ----------
     stepper
         Whose passes take the stress.
+    remedy
+        What the scene may set against it, in words.
     """
 
-    def __init__(self, stepper: Stepper):
+    def __init__(self, stepper: Stepper, remedy: str = REMEDY):
         super().__init__(stepper, "pressure_noise")
+        self.remedy = remedy
         points = at_points(stepper.tissue, self.quadrature)
         lame = points.lame_lambda.reshape(self.quadrature.shape)
         self.stiffness = self.quadrature.owned(lame)
@@ -241,11 +246,10 @@ class PressureNoise(WarnsOnce):
             return
         if (turned := self.degrees()) <= TURNED_BY_NOISE:
             return
-        self.say(
-            step,
+        self.find(
             f"the pressure inside elements is noise, which turns the tensions that drive the cells by {turned:.2g} "
-            f"degrees on the mean: fibre angles and radii are off (lambda/mu up to {self.ratio:.4g}); {REMEDY}, "
-            "or a larger mesh.refinement (docs/locking.md)",
+            f"degrees on the mean: fibre angles and radii are off (lambda/mu up to {self.ratio:.4g}); {self.remedy} "
+            "(docs/locking.md)"
         )
 
 

@@ -28,11 +28,26 @@ class WarnsOnce(Watcher):
         self.stepper, self.state = stepper, stepper.state
         self.quadrature = stepper.state.cells.quadrature
         self._numbers = Numbers(stepper.state, name, {"said": 0} | dict(initial or {}))
+        self._found = ""
 
     @property
     def said(self) -> bool:
         """Whether it was."""
         return bool(self._numbers["said"])
+
+    def find(self, text: str) -> None:
+        """In a solved state: it is said where the step is accepted, and else forgotten."""
+        self._numbers["said"], self._found = True, text
+
+    def undone(self, step: Step) -> None:
+        """Forget what was found."""
+        self._found = ""
+
+    def committed(self, step: Step) -> None:
+        """Say what was found."""
+        if self._found:
+            self.say(step, self._found)
+            self._found = ""
 
     def say(self, step: Step, text: str, level: int = logging.WARNING) -> None:
         """Now, on the first rank, with the time of the step."""

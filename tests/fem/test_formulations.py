@@ -326,6 +326,21 @@ def test_linear_tetrahedra_in_a_stiff_bulk_are_told(caplog: Any) -> None:
     assert any("pressure inside elements is noise" in record.getMessage() for record in caplog.records)
 
 
+@pytest.mark.parametrize(("changes", "remedy"), [
+    ({"natural.opening_angle": 60.0}, "mesh.degree = 2 or a larger mesh.refinement, for [natural] needs"),
+    ({"remodeling.coupling": "implicit"}, "for remodeling.coupling = 'implicit' needs"),
+    ({"time.tolerance": 0.5, "mesh.formulation": "displacement"}, "mesh.formulation = 'selective-integration'"),
+])  # fmt: skip
+def test_what_is_told_can_be_done_and_is_told_once(changes: dict[str, Any], remedy: str, caplog: Any) -> None:
+    """Of accepted steps alone: a step that is taken back has said nothing."""
+    scene = remodeling_tube(1e3, **{"mesh.degree": 1, "time.end": 5.0}, **changes)
+    with caplog.at_level(logging.WARNING), simulated(scene) as (_, rows):
+        times = [float(record.getMessage()[5:].split(":")[0]) for record in caplog.records]
+    told = [record.getMessage() for record in caplog.records if "is noise" in record.getMessage()]
+    assert len(told) == 1 and remedy in told[0]
+    assert all(np.isclose(time, [row["time"] for row in rows]).any() for time in times)
+
+
 def test_what_auto_takes() -> None:
     """What a scene needs decides; the choice is that of the scene as run."""
     linear = {"mesh.element": "tetrahedron", "mesh.degree": 1}

@@ -168,6 +168,15 @@ def test_the_ladder_has_each_setting_once_and_all_can_be_run() -> None:
         assert setting.scene.output == scene.output
 
 
+def test_a_scene_with_a_profile_has_a_ladder_too() -> None:
+    """With fixed steps on the profile's mesh, and other profiles."""
+    scene = artery().with_values({"profile": "balanced", "mesh.degree": 2})
+    settings = ladder(scene)
+    assert {"fast", "reference"} <= {setting.profile for setting in settings}
+    assert len({setting.step for setting in settings if setting.mesh[2] == 2}) > 4
+    assert compared_times(scene, settings)[-1] == 150.0
+
+
 def test_a_tendon_of_random_cells_stays_whole_and_has_seeds() -> None:
     settings = ladder(preset_scene(PAPER, "tendon"))
     assert {setting.mesh[0] for setting in settings} == {"full"}
