@@ -426,7 +426,8 @@ def main() -> None:
     KEPT.mkdir(exist_ok=True)
     pictures = (*figures.FIGURES, "radial-reference")
     for name in pictures:
-        shutil.copyfile(drawn / f"{name}.png", KEPT / f"{name}.png")
+        for ending in ("png", "json"):
+            shutil.copyfile(drawn / f"{name}.{ending}", KEPT / f"{name}.{ending}")
     for name in (*pictures, *MORE_TABLES, *studies):
         shutil.copyfile(drawn / f"{name}.csv", KEPT / f"{name}.csv")
     write_pages()
