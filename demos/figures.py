@@ -38,7 +38,7 @@ from mpi4py import MPI
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
-from remodel_fenicsx import Recording, Scene, __version__, preset_scene
+from remodel_fenicsx import Recording, RecordingError, Scene, __version__, preset_scene
 from remodel_fenicsx.extend import CHAINS
 
 PRESET = "kuhl-holzapfel-2007"
@@ -106,11 +106,14 @@ def run_all(wanted: Sequence[Scene], folder: Path, jobs: int) -> dict[str, Recor
             while waiting and len(running) < jobs:
                 scene = waiting.pop(0)
                 running[scene.name] = begin(scene, folders[scene.name])
+                steps, place = scene.time.number_of_steps, folders[scene.name]
+                print(f"figures: runs {scene.name}, {steps} steps, in {place}", file=sys.stderr)
             clock.sleep(0.1)
             for name, process in [(name, process) for name, process in running.items() if process.poll() is not None]:
                 del running[name]
                 if process.returncode:
-                    raise SystemExit(abs(process.returncode))  # its own last line has said why
+                    code = process.returncode  # its own last line has said why
+                    raise SystemExit(code if code > 0 else 128 - code)
     finally:
         for process in running.values():
             process.terminate()
@@ -123,8 +126,11 @@ def is_complete(scene: Scene, folder: Path) -> bool:
     if not (folder / "history.csv").is_file():
         return False
     run = Recording(folder)
-    has_fields = not scene.output.fields or scene.time.end in run.times
-    return len(run.history["time"]) == scene.time.number_of_steps + 1 and has_fields
+    try:
+        has_fields = not scene.output.fields or scene.time.end in run.times
+        return len(run.history["time"]) == scene.time.number_of_steps + 1 and has_fields
+    except RecordingError:  # `run --resume` mends what was cut off, or says what is wrong
+        return False
 
 
 def begin(scene: Scene, folder: Path) -> subprocess.Popen[bytes]:
@@ -136,9 +142,7 @@ def begin(scene: Scene, folder: Path) -> subprocess.Popen[bytes]:
         file.write_text(scene.to_toml(), encoding="utf-8")
         words = [str(file), "-o", str(folder)]
     command = ["remodel-fenicsx", "run", *words, "-q", "--no-report"]
-    process = subprocess.Popen(command, env=os.environ | {"OMP_NUM_THREADS": "1"})
-    print(f"figures: runs {scene.name}, {scene.time.number_of_steps} steps, in {folder}", file=sys.stderr)
-    return process
+    return subprocess.Popen(command, env=os.environ | {"OMP_NUM_THREADS": "1"})
 
 
 # ---------------------------------------------------------------- picture and tables of a figure
@@ -757,8 +761,12 @@ def main() -> None:
         said = "uses all cores by itself (--jobs); start it without mpirun"
     if said:
         parser.exit(2, f"figures.py: {said}\n" if MPI.COMM_WORLD.rank == 0 else "")
-    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))  # its runs end with it
-    draw(names, options.folder, options.runs, options.jobs)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda number, frame: sys.exit(128 + number))  # its runs end with it
+    try:
+        draw(names, options.folder, options.runs, options.jobs)
+    except (RecordingError, OSError) as error:
+        parser.exit(5 if isinstance(error, OSError) else 2, f"figures.py: {error}\n")
 
 
 def is_own(path: Path) -> bool:
