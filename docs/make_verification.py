@@ -24,13 +24,13 @@ import numpy as np
 from matplotlib.figure import Figure
 
 DOCS = Path(__file__).resolve().parent
-sys.path[:0] = [str(DOCS), str(DOCS.parent)]
+sys.path[:0] = [str(DOCS), str(DOCS.parent / "demos"), str(DOCS.parent)]
 
+import figures  # noqa: E402
 from compare_consistent import page_values  # noqa: E402
 from verification_studies import study  # noqa: E402
 
-from remodel_fenicsx import paper as figures  # noqa: E402
-from remodel_fenicsx.paper.runs import LOAD_CASES  # noqa: E402
+from remodel_fenicsx.system.children import cores  # noqa: E402
 from remodel_fenicsx.studies.page import COLOURS, STYLE, Page, read_notes, read_table  # noqa: E402
 from tests.reference.radial import RadialHistory, solve_radial  # noqa: E402
 
@@ -43,7 +43,7 @@ REFERENCE = {
     "finger": {"driver": "finger"},
     "rate": {"law": "rate"},
 }
-CASES = tuple((100 * elongation, pressure) for elongation, pressure in LOAD_CASES)
+CASES = tuple((100 * elongation, pressure) for elongation, pressure in figures.LOAD_CASES)
 REFERENCE_CAPTION = (
     "The artery against the independent radial reference",
     "Reference fibre angle at t = 150 by driver and law. Points: means of the layers of elements, random cells; "
@@ -416,17 +416,18 @@ def write_pages() -> None:
 
 def main() -> None:
     """Draw, compare, keep, write."""
-    keep, drawn, runs = sys.argv[1:] == ["--keep"], figures.DEFAULT_FOLDER, Path("results/verification-runs")
+    keep, drawn, runs = sys.argv[1:] == ["--keep"], Path("figures"), Path("results/verification-runs")
     if not keep:
         shutil.rmtree(runs, ignore_errors=True)
-    figures.draw(folder=drawn, runs=runs)
+    figures.draw(list(figures.FIGURES), drawn, runs, cores())
     with matplotlib.rc_context(STYLE):
         radial_reference(Page(drawn, "radial-reference", *REFERENCE_CAPTION))
     studies = study(drawn, keep)
     KEPT.mkdir(exist_ok=True)
     pictures = (*figures.FIGURES, "radial-reference")
     for name in pictures:
-        shutil.copyfile(drawn / f"{name}.png", KEPT / f"{name}.png")
+        for ending in ("png", "json"):
+            shutil.copyfile(drawn / f"{name}.{ending}", KEPT / f"{name}.{ending}")
     for name in (*pictures, *MORE_TABLES, *studies):
         shutil.copyfile(drawn / f"{name}.csv", KEPT / f"{name}.csv")
     write_pages()

@@ -6,6 +6,7 @@ Each study is a table, NAME.csv. They take minutes; a table may be used again wh
 from __future__ import annotations
 
 import hashlib
+import importlib.metadata
 import multiprocessing
 import os
 import sys
@@ -18,19 +19,23 @@ from typing import Any
 import numpy as np
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))
+sys.path[:0] = [str(ROOT / "demos"), str(ROOT)]
 
+from figures import scenes  # noqa: E402
+
+from remodel_fenicsx import __version__  # noqa: E402
 from remodel_fenicsx.evolution.remodeling import RemodelingPass  # noqa: E402
 from remodel_fenicsx.evolution.stepper import Step, Watcher  # noqa: E402
 from remodel_fenicsx.model.spectral import positive_direction  # noqa: E402
-from remodel_fenicsx.paper.runs import library_versions, scenes  # noqa: E402
 from remodel_fenicsx.results.columns import Measurement  # noqa: E402
 from remodel_fenicsx.simulation import Simulation  # noqa: E402
 from remodel_fenicsx.studies.page import Page, read_notes, read_table  # noqa: E402
 from remodel_fenicsx.system.children import cores  # noqa: E402
 
 Row = dict[str, Any]
+LIBRARIES = ("fenics-dolfinx", "fenics-ufl", "fenics-ffcx", "petsc4py", "gmsh", "numpy")
 USED_BY_STUDIES = (
+    "demos/figures.py",
     "docs/verification_studies.py",
     "tests/radial_comparison.py",
     "tests/reference/radial.py",
@@ -212,7 +217,8 @@ def study(folder: Path, keep: bool) -> list[str]:
 
 def _key() -> str:
     """Hash of what the tables depend on."""
-    digest = hashlib.sha256(str(library_versions()).encode())
+    digest = hashlib.sha256(str([importlib.metadata.version(name) for name in LIBRARIES]).encode())
+    digest.update(__version__.encode())
     for name in USED_BY_STUDIES:
         digest.update((ROOT / name).read_bytes())
     return digest.hexdigest()[:12]

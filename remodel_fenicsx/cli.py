@@ -260,7 +260,6 @@ def _add_studies(commands: _Commands) -> None:
     stability.add_argument("--times", type=positive, default=10, metavar="N", help=text)
     stability.set_defaults(resume=None, max_wall_time=None, report=False)
     _quiet(stability)
-    _add_figures(commands)
 
 
 def _add_fit(commands: _Commands) -> None:
@@ -277,21 +276,6 @@ def _add_fit(commands: _Commands) -> None:
     _quiet(fitting)
 
 
-def _add_figures(commands: _Commands) -> None:
-    text = "Draw the paper's figures from runs of its own, each with its data as CSV."
-    figures = commands.add("figures", text, "figures fig7 fig8 --format png,pdf -o figures")
-    text = "The figures: fig1, fig5 to fig11, rate, energy (default: all)."
-    figures.add_argument("names", nargs="*", metavar="NAME", help=text)
-    _writes(figures, "Put the figures into this folder (default: figures).")
-    text = "Keep the runs in this folder (default: results/figures-cache). Runs that are still valid are used again."
-    figures.add_argument("--runs", type=Path, metavar="DIR", help=text)
-    text = "Write png, pdf or svg, or several with commas between. May be repeated (default: png)."
-    figures.add_argument("--format", action="append", default=[], metavar="FORMAT", help=text)
-    text = "Show in each picture with which versions it was made."
-    figures.add_argument("--stamp", action="store_true", help=text)
-    _jobs(figures, int)
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code, one of `EXIT_CODES`."""
     for stream in (0, 1, 2):  # where one is closed a file of the run would get its number, and what libraries print
@@ -301,6 +285,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.open(os.devnull, os.O_RDWR)
     sys.stdout, sys.stderr = sys.stdout or open(os.devnull, "w"), sys.stderr or open(os.devnull, "w")
     with interrupts.ending_at_once():
+        if list(sys.argv[1:] if arguments is None else arguments)[:1] == ["figures"]:
+            return _fail("figures: is a script now: ./with-fenicsx python3 demos/figures.py fig8", BAD_INPUT)
         options = _parsed(arguments)
         try:
             kernels()  # not after minutes, when they are asked for
@@ -728,26 +714,6 @@ def _schema(options: argparse.Namespace) -> int:
     return 0
 
 
-def _figures(options: argparse.Namespace) -> int:
-    try:
-        from remodel_fenicsx import paper as figures
-    except ImportError as error:
-        raise _UnusableEnvironment(error) from error
-    folder, runs = options.output or figures.DEFAULT_FOLDER, options.runs or figures.DEFAULT_RUNS
-    try:
-        formats = [name for text in options.format for name in text.split(",")] or ["png"]
-        with interrupts.StopRequest(), interrupts.stopping_at_once():
-            written = figures.draw(options.names, folder, runs, options.jobs, formats, options.stamp)
-    except figures.FigureError as error:
-        return _fail(_as_typed(error), error.exit_code)
-    except interrupts.Interrupted as interruption:
-        return _fail(STUDY_STOPPED, interruption.exit_code)
-    except OSError as error:
-        return _refused(error, "cannot write the figures")
-    print("\n".join(map(str, written)))
-    return 0
-
-
 def _info(options: argparse.Namespace) -> int:
     _check(reason_unusable())
     from remodel_fenicsx.fem.jit import has_simd_logarithm
@@ -780,7 +746,6 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
     "unload": _unload,
     "new": _new,
     "schema": _schema,
-    "figures": _figures,
     "info": _info,
     SERVE: lambda options: serve(main),
 }

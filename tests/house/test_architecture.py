@@ -21,7 +21,7 @@ PACKAGE = "remodel_fenicsx"
 # what a room may import: itself, and those before it
 ROOMS = ("_lazy", "_version", "system", "schema", "model", "fem", "kernels", "settings", "body", "scene", "state",
          "solver", "evolution", "watch", "results", "report", "simulation", "unloading", "running", "studies",
-         "pictures", "recording", "paper", "cli",
+         "pictures", "recording", "cli",
          "parts", "extend")  # fmt: skip
 # imports that only the type checker follows: of what is there without dolfinx, to what is not
 TYPES_ONLY = {

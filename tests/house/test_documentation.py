@@ -97,7 +97,6 @@ def test_files_and_modules_that_a_page_names_are_there(name: str) -> None:
             "watch",
             "results",
             "report",
-            "paper",
             "system",
             "schema",
         )

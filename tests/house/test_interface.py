@@ -45,7 +45,9 @@ def test_a_demo_needs_one_import(name: str) -> None:
     assert len(source.splitlines()) < 80
 
 
-@pytest.mark.parametrize("name", ["README.md", "CONTRIBUTING.md", "docs/commands.md", "tests/body/test_extensions.py"])
+@pytest.mark.parametrize(
+    "name", ["README.md", "CONTRIBUTING.md", "docs/commands.md", "demos/figures.py", "tests/body/test_extensions.py"]
+)
 def test_what_users_are_shown_imports_public_names(name: str) -> None:
     text = (ROOT / name).read_text(encoding="utf-8")
     sources = [text] if name.endswith(".py") else re.findall(r"```python\n(.*?)```", text, re.DOTALL)

@@ -221,7 +221,6 @@ def place(tmp_path_factory: pytest.TempPathFactory, first_half: Path) -> Iterato
     before = Path.cwd()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(running, "run", lambda scene, output, **_: output or Path("results"))
-        patch.setitem(cli.COMMANDS, "figures", lambda options: 0)
         os.chdir(folder)
         yield folder
         os.chdir(before)
