@@ -1,4 +1,4 @@
-"""What a figure or a study leaves in its folder: a picture, in some formats, and its data.
+"""What a figure or a study leaves in its folder: a picture and its data.
 
 Each picture says what it was made with; what is to be said of tables stands in a file beside them.
 """
@@ -8,7 +8,6 @@ from __future__ import annotations
 import csv
 import io
 import json
-import tempfile
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -72,10 +71,6 @@ class Page:
         What the figure is, and what is to be known to read it: in the file of the picture, not in the picture.
     colours
         Colours (n, 3) in 0..1 that the picture must show as they are.
-    formats
-        Of `FORMATS`.
-    stamp
-        Whether the picture itself shows what it was made with, at its foot.
     """
 
     def __init__(
@@ -85,24 +80,16 @@ class Page:
         title: str = "",
         caption: str = "",
         colours: NDArray[np.float64] | None = None,
-        formats: Sequence[str] = ("png",),
-        stamp: bool = False,
     ):
         self.folder, self.name, self.title, self.caption = folder, name, title, caption
         self.colours = np.zeros((0, 3)) if colours is None else colours
-        self.formats, self.stamp = formats, stamp
         self.written: list[Path] = []
 
     def save_figure(self, figure: Figure, made_with: str) -> None:
-        """Write NAME.png, or what formats are wanted; title, caption and what it was made with stand in each file."""
+        """Write NAME.png; title, caption and what it was made with stand in the file."""
         made_with = f"{made_with}; matplotlib {matplotlib.__version__}"
-        if self.stamp:
-            figure.text(0.004, 0.004, made_with, fontsize=4.5, color="0.55", ha="left", va="bottom")
-        about = About(
-            f"{MARK} {__version__}", self.title, self.caption, made_with, f"remodel-fenicsx figures {self.name}"
-        )
-        for ending in self.formats:
-            self._write(f"{self.name}.{ending}", as_file(figure, ending, about, self.colours))
+        about = About(f"{MARK} {__version__}", self.title, self.caption, made_with, self.name)
+        self._write(f"{self.name}.png", as_file(figure, "png", about, self.colours))
 
     def save_table(self, columns: Mapping[str, ArrayLike], notes: Sequence[str], part: str = "") -> None:
         """Write NAME.csv or NAME-PART.csv, columns of one length under their names; the notes go into NAME.json."""
@@ -127,7 +114,7 @@ class Page:
 
 @dataclass(frozen=True)
 class About:
-    """What stands in a picture's file: the caption says how it is read, the comment which command made it."""
+    """What stands in a picture's file: the caption says how it is read, the comment what it is or who made it."""
 
     made_by: str
     title: str
@@ -243,27 +230,6 @@ def with_palette(picture: Image.Image, colours: NDArray[np.float64]) -> Image.Im
 
 def _cell(value: Any) -> str:
     return str(value) if isinstance(value, (str, int, np.integer)) else f"{float(value):.7g}"
-
-
-def check_folder(folder: Path, names: Sequence[str], formats: Sequence[str]) -> None:
-    """That the folder can take these figures without touching anything of anybody else's; nothing is left in it.
-
-    Raises
-    ------
-    FigureError
-        Exit code 2, one line.
-    OSError
-        If nothing can be written there.
-    """
-    if folder.exists() and not folder.is_dir():
-        raise FigureError(f"folder {folder}: is a file; allowed is a folder", 2)
-    for name in names:
-        endings = (*formats, "csv", "json")
-        for path in (*(folder / f"{name}.{ending}" for ending in endings), *folder.glob(f"{name}-*.csv")):
-            _check_ours(path, name)
-    there = next(place for place in (folder, *folder.absolute().parents) if place.exists())
-    with tempfile.TemporaryDirectory(prefix=".remodel-fenicsx-", dir=there):
-        pass
 
 
 def _check_ours(path: Path, name: str) -> None:
