@@ -177,7 +177,7 @@ def _opened(path: Path, flags: int) -> int:
     try:
         return os.open(path, flags | NEVER_WAITING, 0o666)
     except OSError as error:
-        if error.errno in FOREIGN:
+        if error.errno in FOREIGN and (error.errno != errno.EEXIST or path.is_symlink()):
             raise ForeignFileError(error.errno, FOREIGN[error.errno], str(path)) from None
         raise
 
