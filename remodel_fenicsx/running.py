@@ -9,6 +9,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -114,7 +115,7 @@ def run(
     with StopRequest() as stop, ExitStack() as body:
         with hold_log(comm.rank, quiet=quiet) as held:
             scene = body.enter_context(as_unloaded(scene, comm))
-            simulation = _built(scene, comm)
+            simulation = _built(_with_sums(scene, comm), comm)
             place = place or chosen_folder(None, scene.name, comm)
         with _closing(simulation), locked(place, comm, new=True):
             _record(simulation, place, stop, held, quiet, deadline, report)
@@ -314,16 +315,33 @@ def _record(
         leave_report()
 
 
+def _with_sums(scene: Scene, comm: MPI.Intracomm) -> Scene:
+    """With the SHA-256 of its files: one that is replaced from here on is refused, so what is kept is what is read."""
+    found = agreed(comm, lambda: _kept_files(scene)[0] if comm.rank == 0 else {})
+    sums = {key: value for key, value in comm.bcast(found).items() if key.endswith("sha256")}
+    return scene.with_values(sums) if sums else scene
+
+
 def with_files_kept(scene: Scene) -> tuple[Scene, dict[str, bytes]]:
     """The scene with the names that its files have in the folder of the run and their SHA-256, and these files."""
+    changes, files = _kept_files(scene)
+    return scene.with_values(changes) if changes else scene, files
+
+
+def _kept_files(scene: Scene) -> tuple[dict[str, Any], dict[str, bytes]]:
     changes, files = scene.geometry.kept_files()
     for region, cells in scene.measured_cells.items():
-        path = Path(cells.fibres or "")
+        key, path = f"{in_region(region)}cells.fibres", Path(cells.fibres or "")
         name = f"fibres{'_' if region else ''}{region}{path.suffix.lower()}"
-        files[name] = read_regular(path, LARGEST_FILE)
-        changes[f"{in_region(region)}cells.fibres"] = name
-        changes[f"{in_region(region)}cells.fibres_sha256"] = hashlib.sha256(files[name]).hexdigest()
-    return scene.with_values(changes) if changes else scene, files
+        try:
+            files[name] = read_regular(path, LARGEST_FILE)
+        except OSError as error:
+            raise SceneError(f"{key} = {cells.fibres!r}: cannot be read: {error.strerror or error}") from error
+        found = hashlib.sha256(files[name]).hexdigest()
+        if cells.fibres_sha256 not in (None, found):
+            raise SceneError(f"{key} = {cells.fibres!r}: has changed: its SHA-256 was {cells.fibres_sha256}")
+        changes |= {key: name, f"{key}_sha256": found}
+    return changes, files
 
 
 def _leave_report(place: Path) -> None:

@@ -378,7 +378,7 @@ def _fibre_file(cells: Cells, region: str) -> Any:
     try:
         file = read_fibre_file(Path(str(cells.fibres)))
         if cells.fibres_sha256 not in (None, file.sha256):
-            raise FibreFileError(f"has changed since the run: its SHA-256 was {str(cells.fibres_sha256)[:12]}...")
+            raise FibreFileError(f"has changed: its SHA-256 was {str(cells.fibres_sha256)[:12]}...")
     except FibreFileError as error:
         raise SceneError(f"{in_region(region)}cells.fibres = {cells.fibres!r}: {error}") from error
     return file

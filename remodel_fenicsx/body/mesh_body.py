@@ -283,7 +283,7 @@ class MeshBody(WalledMesh):
         except MeshFileError as error:
             raise self._fault(str(error)) from None
         if self.sha256 not in (None, file.sha256):
-            raise self._fault(f"has changed since the run: its SHA-256 was {str(self.sha256)[:12]}...")
+            raise self._fault(f"has changed: its SHA-256 was {str(self.sha256)[:12]}...")
         return file
 
     def _fault(self, rule: str) -> SceneError:

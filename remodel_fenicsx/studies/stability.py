@@ -15,7 +15,7 @@ from mpi4py import MPI
 
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.model.laws import LAWS
-from remodel_fenicsx.results.run_folder import RunFolder, chosen_folder
+from remodel_fenicsx.results.run_folder import RunFolder, chosen_folder, locked
 from remodel_fenicsx.scene import Scene, SceneError
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.studies.page import COLOURS, STYLE, Page, add_head
@@ -83,6 +83,7 @@ def stability(
     with ExitStack() as stack:
         stop = stack.enter_context(StopRequest())
         simulation.stepper.stop_signal = lambda: stop.number or (PAUSE if stop.pause else 0)
+        stack.enter_context(locked(place, comm, new=True))
         record = stack.enter_context(RunFolder(place, scene.to_toml("as analysed: all values"), comm.rank))
         stack.enter_context(open_log(place / "run.log", comm.rank, quiet=quiet, held=held))
         _say(

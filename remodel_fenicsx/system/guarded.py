@@ -71,10 +71,10 @@ def read_guarded(path: Path, reader: str) -> tuple[dict[str, NDArray[Any]], byte
                 command, stdin=subprocess.DEVNULL, capture_output=True, timeout=WAITING * seconds, **kept
             )
         except subprocess.TimeoutExpired:
-            raise UnreadableFile(f"takes more than {seconds:g} seconds to read") from None
+            raise UnreadableFile(f"takes more than {seconds:.3g} seconds to read") from None
         said = " ".join(done.stderr[-4000:].decode(errors="replace").split())
         if done.returncode < 0:
-            raise UnreadableFile(f"takes more than {seconds:g} seconds or {memory / 1e6:g} MB to read")
+            raise UnreadableFile(f"takes more than {seconds:.3g} seconds or {memory / 1e6:.0f} MB to read")
         if done.returncode or said:
             raise UnreadableFile(
                 f"cannot be read: {said if len(said) <= LONGEST_REASON else said[:LONGEST_REASON] + ' ...'}"
@@ -101,7 +101,9 @@ def main(reader: str, source: str, found: str, seconds: str, memory: str) -> Non
         with os.fdopen(int(found), "wb") as target:
             np.savez(target, **arrays)
     except MemoryError:
-        sys.exit(f"takes more than {int(memory) / 1e6:g} MB to read")
+        sys.exit(f"takes more than {int(memory) / 1e6:.0f} MB to read")
+    except KeyError as error:  # a table of types, or what was found
+        sys.exit(f"something in it is missing or unknown: {error}")
     except BaseException as error:  # readers raise whatever happens on the way
         sys.exit(str(error) or type(error).__name__)
 
@@ -158,7 +160,7 @@ def tree_by_rule(data: bytes) -> Any:
             raise UnreadableFile(f"header_type = {attributes['header_type']!r}; allowed are 'UInt32' and 'UInt64'")
         pieces.extend([tag] if tag == "Piece" else [])
         if len(pieces) > 1:
-            raise UnreadableFile("has several pieces; allowed is one")
+            raise UnreadableFile("has several pieces; allowed is one: read it in ParaView, Merge Blocks, save it again")
         builder.start(tag, attributes)
 
     if data.startswith((b"\xff\xfe", b"\xfe\xff")):  # which expat would follow, whatever it is told

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from remodel_fenicsx import Scene, SceneError, Simulation, cli, read_scene, run
+from remodel_fenicsx import Scene, SceneError, Simulation, cli, read_scene, run, running
 from remodel_fenicsx.body import tube
 from remodel_fenicsx.model.cells import structure_tensor
 from remodel_fenicsx.model.fibres import cells_of, structure_tensors
@@ -225,7 +225,7 @@ def test_a_run_keeps_the_file_and_goes_on_with_it(exported: Callable[[str], Path
         str(kept), digest)  # fmt: skip
     data = kept.read_bytes()
     kept.write_bytes(data.replace(b"axis_3", b"axis_4"))
-    with pytest.raises(SceneError, match=r"^cells.fibres = .*fibres.vtu': has changed since the run: its SHA-256 was "):
+    with pytest.raises(SceneError, match=r"^cells.fibres = .*fibres.vtu': has changed: its SHA-256 was "):
         resume(half, ["time.end=2.0"])
     kept.write_bytes(data)
     resume(half, ["time.end=2.0"])
@@ -235,6 +235,25 @@ def test_a_run_keeps_the_file_and_goes_on_with_it(exported: Callable[[str], Path
         np.loadtxt(folder / "history.csv", delimiter=",", skiprows=1, usecols=range(5)) for folder in (half, whole)
     )
     np.testing.assert_array_equal(again, once)
+
+
+@pytest.mark.parametrize("moment", ["before it is read", "before it is kept"])
+def test_what_is_kept_is_what_was_read(
+    moment: str, exported: Callable[[str], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A file that is replaced meanwhile: the run does not begin."""
+    path = tmp_path / "measured.vtu"
+    shutil.copy(exported("vtu"), path)
+    built = running.Simulation
+
+    def replaced(*arguments: Any) -> Any:
+        simulation = built(*arguments) if moment == "before it is kept" else None
+        path.write_bytes(path.read_bytes() + b" ")
+        return simulation or built(*arguments)
+
+    monkeypatch.setattr(running, "Simulation", replaced)
+    with pytest.raises(SceneError, match=r"^cells.fibres = .*measured.vtu': has changed: its SHA-256 was "):
+        run(scene(str(path)).with_values({"time.end": 1.0}), tmp_path / "run")
 
 
 def test_one_and_two_ranks_have_the_same(exported: Callable[[str], Path], case: Any) -> None:

@@ -11,10 +11,12 @@ import numpy as np
 import pytest
 
 from remodel_fenicsx import cli, preset_scene
-from remodel_fenicsx.results.run_lock import RunLock
+from remodel_fenicsx.results.run_lock import FolderTaken, RunLock
 from remodel_fenicsx.results.status import status
+from remodel_fenicsx.studies import stability
 from remodel_fenicsx.studies.sweep import latin_hypercube, read_axis
 from tests.conftest import forked_children
+from tests.parts import pulled_cube
 
 PAPER = "kuhl-holzapfel-2007"
 
@@ -172,6 +174,14 @@ def test_bad_input_is_one_line(cube: Path, words: list[str], said: str, capsys: 
     errors = capsys.readouterr().err
     assert said in errors and errors.count("\n") == 1
     assert not (cube.parent / "out").exists()
+
+
+def test_two_stability_studies_do_not_share_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The second has found the folder empty before the first took it."""
+    monkeypatch.setattr(stability, "chosen_folder", lambda folder, *_: folder)
+    with RunLock(tmp_path), pytest.raises(FolderTaken, match=f"process {os.getpid()} on .* writes in it"):
+        stability.stability(pulled_cube(1.0), tmp_path)
+    assert not list(tmp_path.iterdir())
 
 
 def test_two_equal_studies_do_not_share_a_folder(
