@@ -35,6 +35,7 @@ from remodel_fenicsx.results.status import BEGUN, FAILED, STOPPED
 from remodel_fenicsx.scene import Scene, SceneError, read_scene, scene_from_dict
 from remodel_fenicsx.scene.scene import check_continuation, in_region
 from remodel_fenicsx.schema.tables import shown
+from remodel_fenicsx.schema.toml import read_toml
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.system.environment import versions
@@ -183,11 +184,20 @@ def _kept(place: Path, overrides: Sequence[str], comm: MPI.Intracomm) -> tuple[S
             log.info("no checkpoint yet: starts again at t = 0")
         else:
             check_continuation(_scene_of(checkpoint), scene, checkpoint.time)
+            _check_whole(read_toml(place / SCENE), tomllib.loads(checkpoint.scene), place)
             _say_where(checkpoint)
         return scene, checkpoint
 
     scene, checkpoint = agreed(comm, lambda: read() if comm.rank == 0 else (None, None))
     return comm.bcast(scene), checkpoint
+
+
+def _check_whole(values: dict[str, Any], before: dict[str, Any], place: Path) -> None:
+    """A scene as run has all values: one that was cut might still be valid, with defaults that nobody asked for."""
+    for table in (name for name, keys in before.items() if isinstance(keys, dict) and name != "loads"):
+        if lost := set(before[table]) - set(values.get(table, {})):
+            rule = f"lacks {table}.{min(lost)}, which the run had; write it as it was, or another value"
+            raise RecordingError(f"{place / SCENE}: {rule}")
 
 
 def _scene_of(checkpoint: Checkpoint) -> Scene:

@@ -285,6 +285,18 @@ def test_damaged_files_are_refused_with_one_line(half: Path, name: str, fault: s
     assert str(half / name) in str(refusal.value) and "\n" not in str(refusal.value)
 
 
+@pytest.mark.parametrize("last", ["[output]", "[solver]", "every = ", "report = "])
+def test_a_scene_that_was_cut_and_is_valid_still_is_refused(half: Path, last: str) -> None:
+    """Defaults would take the place of what is gone; nothing changes."""
+    lines = (half / "scene.toml").read_text().splitlines(keepends=True)
+    cut = next(number for number, line in enumerate(lines) if line.startswith(last))
+    (half / "scene.toml").write_text("".join(lines[:cut]))
+    before = (half / "history.csv").read_bytes()
+    with pytest.raises(RecordingError, match=r"scene.toml: lacks (output|solver)\.[a-z_]+, which the run had"):
+        resume(half, ["time.end=9.0"], SELF)
+    assert (half / "history.csv").read_bytes() == before
+
+
 def test_fields_that_are_gone_begin_with_the_next_step(half: Path) -> None:
     (half / "fields.vtkhdf").unlink()
     resume(half, ["time.end=9.0", "output.every=1"], SELF)
