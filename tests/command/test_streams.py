@@ -22,6 +22,10 @@ def test_a_closed_output_is_like_one_that_nobody_reads(tmp_path: Path) -> None:
         assert (done.returncode, "Traceback" in done.stderr) == (0, False), done.stderr
     done = subprocess.run(f"{command} status {tmp_path}/none >&- 2>&-", shell=True)
     assert done.returncode == 2
+    program = "import os; from remodel_fenicsx import cli; cli.main(['validate', 'none']); "
+    program += f"open('{tmp_path}/streams', 'w').write(' '.join(os.readlink(f'/proc/self/fd/{{n}}') for n in range(3)))"
+    subprocess.run([*"sh -c".split(), 'exec "$@" <&- >&- 2>&-', "sh", sys.executable, "-c", program])
+    assert (tmp_path / "streams").read_text() == " ".join(["/dev/null"] * 3)
 
 
 @pytest.mark.parametrize(
