@@ -5,7 +5,9 @@ from __future__ import annotations
 import csv
 import os
 import shutil
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +16,9 @@ from remodel_fenicsx import cli, preset_scene
 from remodel_fenicsx.results.run_lock import FolderTaken, RunLock
 from remodel_fenicsx.results.status import status
 from remodel_fenicsx.studies import stability
+from remodel_fenicsx.studies.ensemble import ensemble
 from remodel_fenicsx.studies.sweep import latin_hypercube, read_axis
+from remodel_fenicsx.studies.trade import trade
 from tests.conftest import forked_children
 from tests.parts import pulled_cube
 
@@ -176,11 +180,15 @@ def test_bad_input_is_one_line(cube: Path, words: list[str], said: str, capsys: 
     assert not (cube.parent / "out").exists()
 
 
-def test_two_stability_studies_do_not_share_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("study", [stability.stability, ensemble, trade])
+def test_a_study_of_any_kind_is_alone_in_its_folder(
+    study: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The second has found the folder empty before the first took it."""
     monkeypatch.setattr(stability, "chosen_folder", lambda folder, *_: folder)
+    scene = pulled_cube(1.0).with_values({"cells.initial": "random"})
     with RunLock(tmp_path), pytest.raises(FolderTaken, match=f"process {os.getpid()} on .* writes in it"):
-        stability.stability(pulled_cube(1.0), tmp_path)
+        study(scene, tmp_path)
     assert not list(tmp_path.iterdir())
 
 
