@@ -19,6 +19,7 @@ from benchmarks.recovery import MOST, fitted, noisy, tables
 from benchmarks.recovery import TRUTH as RECOVERED
 from benchmarks.recovery import tube as tube_of_the_benchmark
 from remodel_fenicsx import Scene, SceneError, Simulation, cli, preset_scene, read_scene
+from remodel_fenicsx.results.run_lock import FolderTaken, RunLock
 from remodel_fenicsx.settings import STRESS_UNITS
 from remodel_fenicsx.studies.fit import Problem, fit, minimised
 from remodel_fenicsx.studies.measured import read_measurements
@@ -181,6 +182,14 @@ file = "virgin.csv"
 units = { pressure = "mmHg" }
 sd = { outer_radius = 0.01 }
 """
+
+
+def test_a_fit_is_alone_in_its_folder(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The second has found the folder empty before the first took it."""
+    monkeypatch.setattr("remodel_fenicsx.studies.fit.chosen_folder", lambda place, *_: place)
+    with RunLock(folder / "taken"), pytest.raises(FolderTaken, match="writes in it"):
+        fit(read_scene(folder / "scene.toml"), folder / "data.toml", folder / "taken", starts=1, profiles=False)
+    assert not list((folder / "taken").iterdir())
 
 
 def test_what_changes_nothing_is_named(folder: Path) -> None:
