@@ -9,9 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from remodel_fenicsx.system.guarded import read_guarded
+from remodel_fenicsx.system.guarded import DAMAGED, UnreadableFile, read_guarded
 
 ENDINGS = (".vtu", ".vtk", ".xdmf")
+REMEDY = "; save it as VTU with data mode ASCII (ParaView: File, Save Data), or as .msh"
 
 
 class ElementBlock(NamedTuple):
@@ -41,7 +42,10 @@ def read_exchange_file(path: Path) -> ExchangeFile:
     OSError
         If it cannot be opened.
     """
-    arrays, data = read_guarded(path, f"{__name__}:arrays_{path.suffix.lower()[1:]}")
+    try:
+        arrays, data = read_guarded(path, f"{__name__}:arrays_{path.suffix.lower()[1:]}")
+    except UnreadableFile as error:
+        raise UnreadableFile(f"{error}{REMEDY}" if str(error).startswith(DAMAGED) else str(error)) from None
     types, points, cells = json.loads(arrays["names"].tobytes())
     return ExchangeFile(
         arrays["points"],

@@ -90,6 +90,7 @@ def _tags(arrays: dict[str, Any], asked: str | None) -> list[Integers]:
     found = []
     for values in arrays[name]:
         numbers = np.asarray(values, dtype=np.float64)
+        numbers = numbers.reshape(len(numbers)) if numbers.shape == (len(numbers), 1) else numbers  # as Gmsh and VTK do
         if numbers.ndim != 1 or not np.isfinite(numbers).all() or (numbers != np.rint(numbers)).any():
             raise MeshFileError(f"the array {name!r} has no whole number for each element")
         found.append(numbers.astype(np.int64))

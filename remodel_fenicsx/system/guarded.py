@@ -29,7 +29,8 @@ SECONDS, SECONDS_PER_MB = 20.0, 1.0  # of processor time
 MEMORY, MEMORY_PER_BYTE = 10**9, 24  # bytes: of the libraries; of the file and all that it unfolds to
 WAITING = 10  # times the processor time: the machine may be busy
 ELSEWHERE = "its numbers stand in another file; allowed is a file that holds them (Format='XML')"
-LONGEST_REASON = 240  # characters of what is wrong
+LONGEST_REASON = 150  # characters of what is wrong
+DAMAGED = "cannot be read: "
 _COUNTS = re.compile(r"(?i)^(number.*|dimensions|offset)$")
 _LINES = re.compile(
     rb"(?im)^\s*(?:points|cells|cell_types|point_data|cell_data|offsets|connectivity)\b[^\n]{0,99}\s-\d"
@@ -76,9 +77,7 @@ def read_guarded(path: Path, reader: str) -> tuple[dict[str, NDArray[Any]], byte
         if done.returncode < 0:
             raise UnreadableFile(f"takes more than {seconds:.3g} seconds or {memory / 1e6:.0f} MB to read")
         if done.returncode or said:
-            raise UnreadableFile(
-                f"cannot be read: {said if len(said) <= LONGEST_REASON else said[:LONGEST_REASON] + ' ...'}"
-            )
+            raise UnreadableFile(DAMAGED + (said if len(said) <= LONGEST_REASON else f"{said[:LONGEST_REASON]} ..."))
         found.seek(0)
         with np.load(io.BytesIO(found.read()), allow_pickle=False) as arrays:
             return dict(arrays), data

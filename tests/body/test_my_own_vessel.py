@@ -53,3 +53,59 @@ def test_the_page_leads_from_a_surface_to_angles(tmp_path: Path, monkeypatch: py
     row = dict(zip(names, map(float, last), strict=True))
     assert row["fibre_angle_inner"] < row["fibre_angle_outer"] < 45.0
     assert meshio.read("fibres.vtu").cell_data["structure_tensor"][0].shape[1] in (6, 9)
+
+
+SCRIPT = ROOT / "demos" / "own_vessel" / "mesh.py"
+
+
+def written(path: Path, corners: np.ndarray) -> Path:
+    """Triangles (n, 3, 3) as an STL file."""
+    meshio.Mesh(corners.reshape(-1, 3), [("triangle", np.arange(corners.size // 3).reshape(-1, 3))]).write(path)
+    return path
+
+
+def open_tube() -> np.ndarray:
+    """Triangles of a round surface of radius 1, length 4, normals outwards."""
+    angles, heights = np.linspace(0, 2 * np.pi, 25), np.linspace(0, 4, 9)
+    places = np.stack([np.broadcast_to(f(angles)[:, None], (25, 9)) for f in (np.cos, np.sin)], axis=-1)
+    grid = np.concatenate([places, np.broadcast_to(heights, (25, 9))[..., None]], axis=-1).round(12)
+    a, b, c, d = grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]
+    return np.concatenate([np.stack(corners, axis=-2).reshape(-1, 3, 3) for corners in ((a, b, c), (a, c, d))])
+
+
+def meshed(surface: Path, *more: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, str(SCRIPT), str(surface), str(surface.with_suffix(".msh"))]
+    command += more or ("--thickness", "0.5", "--size", "0.6")
+    return subprocess.run(command, capture_output=True, text=True, timeout=120)
+
+
+@pytest.mark.parametrize("turned", [1, -1])
+def test_a_wall_is_outside_of_its_lumen_whichever_way_normals_point(tmp_path: Path, turned: int) -> None:
+    """As after marching cubes, whose normals point inwards."""
+    surface = written(tmp_path / "lumen.stl", open_tube()[:, ::turned])
+    assert meshed(surface).returncode == 0
+    mesh = meshio.read(surface.with_suffix(".msh"))
+    for number, radius in ((1, 1.0), (2, 1.5)):
+        faces = [
+            b.data[g == number] for b, g in zip(mesh.cells, mesh.cell_data["gmsh:physical"]) if b.type == "triangle6"
+        ]
+        nodes = mesh.points[np.unique(np.concatenate(faces))]
+        assert np.linalg.norm(nodes[:, :2], axis=1).mean() == pytest.approx(radius, rel=0.03)
+
+
+def test_a_surface_that_is_no_open_one_gets_one_line(tmp_path: Path) -> None:
+    """Closed by caps, not there, of another ending; a wall of no thickness."""
+    tube = open_tube()
+    rims = [(tube[np.isclose(tube[..., 2], z).sum(axis=1) == 2], z) for z in (0.0, 4.0)]
+    caps = []
+    for rim, z in rims:
+        ends = np.array([[corner for corner in one if np.isclose(corner[2], z)] for one in rim])
+        caps.append(np.concatenate([ends, np.broadcast_to([[[0.0, 0.0, z]]], (len(ends), 1, 3))], axis=1))
+    closed = written(tmp_path / "closed.stl", np.concatenate([tube, *caps]))
+    for done, words in (
+        (meshed(closed), "closed.stl has no open end: cut its ends"),
+        (meshed(tmp_path / "none.stl"), "none.stl: needed is an STL file that is there"),
+        (meshed(tmp_path / "lumen.ply"), "lumen.ply: needed is an STL file"),
+        (meshed(closed, "--thickness", "0", "--size", "1"), "must be above 0"),
+    ):
+        assert done.returncode == 2 and words in done.stderr and "Traceback" not in done.stderr
