@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from remodel_fenicsx.system.guarded import DAMAGED, UnreadableFile, read_guarded
 
 ENDINGS = (".vtu", ".vtk", ".xdmf")
-REMEDY = "; save it as VTU with data mode ASCII (ParaView: File, Save Data), or as .msh"
+SAVED_OTHERWISE = "; save it as VTU with data mode ASCII (ParaView: File, Save Data), or as .msh"
 
 
 class ElementBlock(NamedTuple):
@@ -45,7 +45,7 @@ def read_exchange_file(path: Path) -> ExchangeFile:
     try:
         arrays, data = read_guarded(path, f"{__name__}:arrays_{path.suffix.lower()[1:]}")
     except UnreadableFile as error:
-        raise UnreadableFile(f"{error}{REMEDY}" if str(error).startswith(DAMAGED) else str(error)) from None
+        raise UnreadableFile(f"{error}{SAVED_OTHERWISE}" if str(error).startswith(DAMAGED) else str(error)) from None
     types, points, cells = json.loads(arrays["names"].tobytes())
     return ExchangeFile(
         arrays["points"],
