@@ -110,8 +110,8 @@ def inflated(pressure: float, inner: float, outer: float, stretch: float, longes
         areas[[0, -1]] /= 2
         carried = float(((hoop - radial) / r2 * areas).sum())
         modulus = 2 * stretch**2 + 2 * radial - 2 * radial**2 / (hoop + radial)
-        reduced, bending = (2 * stretch**2 - radial - hoop, modulus * r2)
-        force, stiffness = (math.pi * float((part * areas).sum()) for part in (reduced, bending))
+        reduced = 2 * stretch**2 - radial - hoop
+        force, stiffness = (math.pi * float((part * areas).sum()) for part in (reduced, modulus * r2))
         return carried, force, stiffness
 
     def extended(hoop: float) -> bool:

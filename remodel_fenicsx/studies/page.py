@@ -27,7 +27,6 @@ from remodel_fenicsx._version import __version__
 from remodel_fenicsx.system.regular_files import write_whole
 
 MARK = "remodel_fenicsx figures"  # in every picture, and beside every table: what bears it may be drawn anew
-FORMATS = ("png", "pdf", "svg")
 DOTS_PER_INCH = {"png": 200, "pdf": 300, "svg": 300}  # of pictures in space where all else is lines and letters
 STYLE: dict[str, Any] = {
     "font.family": "DejaVu Sans",
@@ -124,7 +123,7 @@ class About:
 
 
 def as_file(figure: Figure, ending: str, about: About, colours: NDArray[np.float64]) -> bytes:
-    """A figure in one of `FORMATS`; a PNG has 256 colours, these (n, 3) in 0..1 as they are."""
+    """A figure as png, pdf or svg; a PNG has 256 colours, these (n, 3) in 0..1 as they are."""
     common = {"Title": about.title, "Creator": about.made_by}
     notes: dict[str, dict[str, Any]] = {
         "png": {"Software": about.made_by, "Title": about.title, "Description": about.caption,
@@ -235,7 +234,7 @@ def _cell(value: Any) -> str:
 def _check_ours(path: Path, name: str) -> None:
     if not path.exists():
         return
-    # in a PDF it comes last; tables of older versions begin with it
+    # tables of older versions begin with it
     if MARK.encode() not in path.read_bytes() and path.name not in read_notes(path.parent, name):
         message = f"{path}: is not a figure of this command and is not overwritten; choose another folder with -o"
         raise FigureError(message, 2)

@@ -176,7 +176,7 @@ def run_all(
     quiet: bool = False,
     deadline: float = math.inf,
     fits: Callable[[Run], bool] = lambda run: True,
-    ended: Callable[[Run, int, str], None] = lambda run, code, last_words: None,
+    ended: Callable[[], None] = lambda: None,
     checked: Callable[[], None] = lambda: None,
 ) -> dict[str, str]:
     """Run what is not complete; returns the last words of those that have failed or are damaged, by name.
@@ -194,8 +194,7 @@ def run_all(
     fits
         Asked before a run begins: whether it shall.
     ended
-        Called when a run has ended: with its exit code, negative for a signal that has killed it, and the last line
-        that it has said. Where it raises, all others are stopped.
+        Called when a run has ended. Where it raises, all others are stopped.
     checked
         Called before anything is written, when no folder holds another scene.
 
@@ -229,7 +228,7 @@ def run_all(
                         continue
                     if code != 0:
                         failed[run.name] = last_words
-                    ended(run, code, last_words)
+                    ended()
                 if not quiet:
                     line.show(executor.progress())
         finally:

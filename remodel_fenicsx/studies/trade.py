@@ -127,7 +127,7 @@ class _Runner:
             quiet=self.say is None,
             deadline=self.deadline,
             fits=self._fits,
-            ended=lambda *_: self._finished(),
+            ended=self._finished,
             checked=lambda: write_study(place, TRADE, name, every),
         )
 
