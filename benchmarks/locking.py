@@ -25,7 +25,7 @@ from remodel_fenicsx.scene.presets import PROFILES
 from remodel_fenicsx.scene.scene import scene_from_dict
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.system.environment import versions
-from remodel_fenicsx.watch.locking import LockingWarning, PressureNoise
+from remodel_fenicsx.watch.warnings import LockingWarning, PressureNoise
 from tests.locking_bodies import EXACT_TUBE, bar_scene, membrane_scene, registered, thick_tube
 from tests.reference.radial import RadialMaterial, solve_radial
 from tests.parts import tube

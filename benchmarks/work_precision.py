@@ -27,14 +27,14 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from benchmarks.precision import chosen, places, tendon, whole
-from remodel_fenicsx.body.columns import PROFILE, profile_weights
+from remodel_fenicsx.body.shape import PROFILE, profile_weights
 from remodel_fenicsx.scene.presets import PROFILES
 from remodel_fenicsx.scene.scene import Scene, preset_scene
 from remodel_fenicsx.schema.times import same_time
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.studies.page import COLOURS, STYLE, Page
-from remodel_fenicsx.studies import ladder as rungs
-from remodel_fenicsx.studies.estimates import pareto, typical
+from remodel_fenicsx.studies import trade as rungs
+from remodel_fenicsx.studies.trade import pareto, typical
 from remodel_fenicsx.system.environment import versions
 from tests.reference.radial import solve_radial
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from remodel_fenicsx.body import SHAPES
-from remodel_fenicsx.body.columns import COLUMNS_ON_REQUEST, Column, columns_of
+from remodel_fenicsx.body.shape import COLUMNS_ON_REQUEST, Column, columns_of
 
 
 def table() -> str:

@@ -22,7 +22,7 @@ from mpi4py import MPI
 
 import remodel_fenicsx
 from remodel_fenicsx import Scene, cli, extend, parts
-from remodel_fenicsx.body.columns import columns_of, columns_on_request
+from remodel_fenicsx.body.shape import columns_of, columns_on_request
 from remodel_fenicsx.scene.presets import PRESETS, PROFILES
 from remodel_fenicsx.schema.tables import Table, sections
 

@@ -21,7 +21,7 @@ DOCS = Path(__file__).resolve().parent
 sys.path[:0] = [str(DOCS.parent)]
 
 from remodel_fenicsx import Simulation  # noqa: E402
-from remodel_fenicsx.body.columns import columns_on_request  # noqa: E402
+from remodel_fenicsx.body.shape import columns_on_request  # noqa: E402
 from remodel_fenicsx.results.columns import Measurement  # noqa: E402
 from remodel_fenicsx.scene.scene import scene_from_dict  # noqa: E402
 from remodel_fenicsx.solver.continuation import StepFailure  # noqa: E402

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from remodel_fenicsx.body.gmsh_model import gmsh_model
 from remodel_fenicsx.body.tendon import draw_tendon
-from remodel_fenicsx.body.layers import Wall
+from remodel_fenicsx.body.wall import Wall
 from remodel_fenicsx.body.tube import draw_tube
 
 WALL = Wall.of(1.0, 3.0, 8, {})

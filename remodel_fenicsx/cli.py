@@ -23,10 +23,18 @@ from remodel_fenicsx.scene.presets import PRESETS, PROFILES, profile_for
 from remodel_fenicsx.scene.scene import Scene, SceneError, preset_scene, read_scene
 from remodel_fenicsx.schema.tables import printable, shortened
 from remodel_fenicsx.system import interrupts
-from remodel_fenicsx.system.arguments import MOST_RUNS, megabytes, positive, typed, wall_time
+from remodel_fenicsx.system.files import (
+    ForeignFileError,
+    MOST_RUNS,
+    megabytes,
+    positive,
+    refusal_in_words,
+    typed,
+    wall_time,
+    write_new,
+)
 from remodel_fenicsx.system.children import SERVE, serve
 from remodel_fenicsx.system.environment import kernels, reason_undrawable, reason_unusable, versions
-from remodel_fenicsx.system.regular_files import ForeignFileError, refusal_in_words, write_new
 
 BAD_INPUT, SOLVE_FAILED, STOPPED, BAD_ENVIRONMENT = 2, 3, interrupts.PAUSED, 5
 OPTIONS = {"folder": "-o", "path": "-o", "times": "--time", "layers": "--layers", "cut": "--cut", "view": "--view"}
@@ -425,7 +433,7 @@ def _study(options: argparse.Namespace, task: Callable[[Scene], tuple[Path, str,
     _check(reason_unusable() or reason_undrawable())
     from remodel_fenicsx.results.run_lock import FolderTaken
     from remodel_fenicsx.studies.page import FigureError
-    from remodel_fenicsx.studies.runs import TooFewRuns
+    from remodel_fenicsx.studies.study import TooFewRuns
 
     try:
         with interrupts.StopRequest(), interrupts.stopping_at_once():
@@ -571,7 +579,7 @@ def _drawing(options: argparse.Namespace) -> int:
     if not interrupts.is_first_rank():  # the work of one process
         return 0
     from remodel_fenicsx.pictures.files import draw_animation, draw_picture
-    from remodel_fenicsx.pictures.sight import Viewing
+    from remodel_fenicsx.pictures.bodies import Viewing
     from remodel_fenicsx.studies.page import FigureError
 
     viewing = Viewing(options.layers, options.cut, options.view)
@@ -648,7 +656,7 @@ def _unseen_files(scene: Scene) -> str:
 def _axes(options: argparse.Namespace) -> int:
     scene = read_scene(options.scene, options.set, options.profile)
     _check(reason_unusable())
-    from remodel_fenicsx.studies.preview import write_axes
+    from remodel_fenicsx.studies.study import write_axes
 
     path = options.output or Path(f"{scene.name}-axes.vtu")
     return _written(lambda: write_axes(scene, path), path, "file", f"local axes in {path}")
@@ -659,7 +667,7 @@ def _unload(options: argparse.Namespace) -> int:
     if not scene.geometry.is_loaded:
         return _fail("geometry.is = 'unloaded': the body is unloaded already; allowed is 'loaded'", BAD_INPUT)
     _check(reason_unusable())
-    from remodel_fenicsx.studies.unloaded_folder import write_unloaded
+    from remodel_fenicsx.studies.study import write_unloaded
     from remodel_fenicsx.unloading import NoUnloadedShape
 
     place = options.output or Path(f"{scene.name}-unloaded")
@@ -696,7 +704,7 @@ def _new(options: argparse.Namespace) -> int:
 
 
 def _schema(options: argparse.Namespace) -> int:
-    from remodel_fenicsx.scene.json_schema import json_schema
+    from remodel_fenicsx.scene.reference import json_schema
 
     text = json.dumps(json_schema(), indent=2, ensure_ascii=False)
     if options.output is None:

@@ -55,9 +55,8 @@ from typing import TYPE_CHECKING
 
 from remodel_fenicsx._lazy import on_demand
 from remodel_fenicsx.body import SHAPES, LoadKind, Shape
-from remodel_fenicsx.body.columns import COLUMNS, COLUMNS_ON_REQUEST, Column
+from remodel_fenicsx.body.shape import COLUMNS, COLUMNS_ON_REQUEST, Column, uniaxial_columns
 from remodel_fenicsx.body.reductions import Reduction
-from remodel_fenicsx.body.shape import uniaxial_columns
 from remodel_fenicsx.fem.formulations import FORMULATIONS, Formulation, Selective
 from remodel_fenicsx.fem.kinematics import KINEMATICS, FullKinematics, Kinematics
 from remodel_fenicsx.fem.solver_methods import SOLVER_METHODS, SolverMethod
@@ -75,7 +74,7 @@ from remodel_fenicsx.model.energy import (
     squared_end_to_end_length,
 )
 from remodel_fenicsx.model.laws import LAWS, Drive, Law, ranked
-from remodel_fenicsx.model.local_axes import AXES, LocalAxes
+from remodel_fenicsx.model.axes import AXES, LocalAxes
 from remodel_fenicsx.model.spectral import PAIRINGS, principal
 from remodel_fenicsx.schema.tables import markdown_reference
 from remodel_fenicsx.schema.units import (

@@ -12,7 +12,7 @@ Examples
 """
 
 from remodel_fenicsx.body import Cube, GeometryError, Tendon, Tube
-from remodel_fenicsx.body.columns import columns_of
+from remodel_fenicsx.body.shape import columns_of
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.loading import Loading
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher, times

@@ -110,7 +110,7 @@ class Recording(RecordedRun):
         ImportError
             If there is no PyVista.
         """
-        from remodel_fenicsx.pictures.plots import grid
+        from remodel_fenicsx.pictures.sheet import grid
 
         return grid(self, self._time(time))
 
@@ -152,8 +152,8 @@ class Recording(RecordedRun):
         ImportError
             If there is no PyVista.
         """
-        from remodel_fenicsx.pictures.plots import plot
-        from remodel_fenicsx.pictures.sight import Viewing
+        from remodel_fenicsx.pictures.sheet import plot
+        from remodel_fenicsx.pictures.bodies import Viewing
 
         return plot(self, self._time(time), name, Viewing(layers, cut), chains, plotter, options)
 
@@ -189,7 +189,7 @@ class Recording(RecordedRun):
             If the file cannot be written.
         """
         from remodel_fenicsx.pictures.files import draw_picture
-        from remodel_fenicsx.pictures.sight import Viewing
+        from remodel_fenicsx.pictures.bodies import Viewing
 
         return draw_picture(self.path, times, Viewing(layers, cut, view), None if path is None else Path(path))
 

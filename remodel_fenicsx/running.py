@@ -14,8 +14,7 @@ from typing import Any
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from remodel_fenicsx.evolution.pause import Pause
-from remodel_fenicsx.evolution.stepper import Step, Watcher
+from remodel_fenicsx.evolution.stepper import Pause, Step, Watcher
 from remodel_fenicsx.fem.solver_methods import WORTH_RANKS
 from remodel_fenicsx.results.checkpoint import Checkpoints, restore_state
 from remodel_fenicsx.results.checkpoint_file import Checkpoint, CheckpointError, read_checkpoint
@@ -47,7 +46,7 @@ from remodel_fenicsx.system.interrupts import (
     end_all_ranks_on_exception,
     stopping_at_once,
 )
-from remodel_fenicsx.system.regular_files import read_regular
+from remodel_fenicsx.system.files import read_regular
 from remodel_fenicsx.system.terminal import Progress, announce, hold_log, open_log
 from remodel_fenicsx.unloading import as_unloaded
 

@@ -32,12 +32,11 @@ from remodel_fenicsx.fem.solver_methods import (
     SOLVER_METHODS,
     fault_of_option,
 )
-from remodel_fenicsx.model.local_axes import AXES
+from remodel_fenicsx.model.axes import AXES
 from remodel_fenicsx.model.chains import BOLTZMANN_CONSTANT, CHAINS
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
 from remodel_fenicsx.model.energy import MATRICES, REPULSIONS, TURNED_OVER, Tissue
-from remodel_fenicsx.model.laws import LAWS
-from remodel_fenicsx.model.load_cases import MEANS_OF_CASES
+from remodel_fenicsx.model.laws import LAWS, MEANS_OF_CASES
 from remodel_fenicsx.model.spectral import PAIRINGS
 from remodel_fenicsx.schema.tables import OneOf, Table, allowed, fault, is_number, quoted, shown
 from remodel_fenicsx.schema.times import is_multiple, same_time

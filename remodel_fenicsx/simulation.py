@@ -22,21 +22,28 @@ from remodel_fenicsx.fem.kinematics import KINEMATICS, FreeLength, NaturalConfig
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.model.laws import LAWS
-from remodel_fenicsx.model.local_axes import LocalAxes
+from remodel_fenicsx.model.axes import LocalAxes
 from remodel_fenicsx.results.columns import Observer
 from remodel_fenicsx.results.run_folder import agreed
 from remodel_fenicsx.scene import Scene, SceneError
 from remodel_fenicsx.scene.scene import in_region
 from remodel_fenicsx.settings import Cells, Properties, Solver
-from remodel_fenicsx.state.parameters import by_region
-from remodel_fenicsx.state.state import State
+from remodel_fenicsx.state.state import State, by_region
 from remodel_fenicsx.state.unit_cells import UnitCells
-from remodel_fenicsx.system.arguments import typed
+from remodel_fenicsx.system.files import typed
 from remodel_fenicsx.system.interrupts import take_back_signals
-from remodel_fenicsx.watch.equilibrium_stability import EquilibriumStability
-from remodel_fenicsx.watch.locking import REMEDY, LockingWarning, PressureNoise
+from remodel_fenicsx.watch.stability import EquilibriumStability
+from remodel_fenicsx.watch.warnings import (
+    FrontsInLayers,
+    GrowthWithoutRest,
+    LockingWarning,
+    PressureNoise,
+    REMEDY,
+    RadialChains,
+    VolumeLoss,
+    WeakTension,
+)
 from remodel_fenicsx.watch.over_correction import OverCorrection, RestedCells
-from remodel_fenicsx.watch.tissue import FrontsInLayers, GrowthWithoutRest, RadialChains, VolumeLoss, WeakTension
 
 log = logging.getLogger(__name__)
 
@@ -157,13 +164,13 @@ class Simulation:
         more: list[str] = []
         self.control: Any = None  # `StepControl`
         if scene.time.tolerance is not None and not at_once:
-            from remodel_fenicsx.evolution.step_control import StepControl
+            from remodel_fenicsx.evolution.time_steps import StepControl
 
             settings = scene.time.tolerance, scene.time.step, scene.stops()
             self.control = StepControl(self.stepper, *settings)
             more += [TIME_ERROR] if TIME_ERROR not in scene.output.columns else []
         elif TIME_ERROR in scene.output.columns:
-            from remodel_fenicsx.evolution.time_error import TimeError
+            from remodel_fenicsx.evolution.time_steps import TimeError
 
             self.stepper.judge = TimeError(self.stepper).measure
         self.observer = Observer(shape, self.stepper, scene.columns(more))
@@ -209,7 +216,7 @@ class Simulation:
     def _at_once(self, tissue: Tissue, solver: Solver, kappa: Any, others: Sequence[State]) -> Maker:
         """The coupling that goes to the equilibrium, with the steps of a stepper of its own on the same state."""
         from remodel_fenicsx.evolution import homeostasis
-        from remodel_fenicsx.evolution.step_control import StepControl
+        from remodel_fenicsx.evolution.time_steps import StepControl
 
         scene, stops = self.scene, self.scene.stops()
         settings, tolerance = scene.remodeling, scene.time.tolerance
@@ -319,7 +326,7 @@ def from_natural(
         If nothing closes to the tube, or a layer has a region that the body has not.
     """
     from remodel_fenicsx.body.natural import gradient, prestretch
-    from remodel_fenicsx.model.closing import closing
+    from remodel_fenicsx.model.residual_stress import closing
 
     natural, shape, found = scene.natural, scene.geometry, None
     for index, layer in enumerate(natural.layers):
@@ -373,7 +380,7 @@ def measured_fibres(scene: Scene, domain: Domain) -> dict[str, dict[str, Any]]:
 
 
 def _fibre_file(cells: Cells, region: str) -> Any:
-    from remodel_fenicsx.body.fibre_file import FibreFileError, read_fibre_file  # few scenes have one
+    from remodel_fenicsx.body.fibres import FibreFileError, read_fibre_file  # few scenes have one
 
     try:
         file = read_fibre_file(Path(str(cells.fibres)))
@@ -385,7 +392,7 @@ def _fibre_file(cells: Cells, region: str) -> Any:
 
 
 def _fibres_of(cells: Cells, region: str, corners: Any, chosen: Any) -> dict[str, Any]:
-    from remodel_fenicsx.body.fibre_file import FibreFileError
+    from remodel_fenicsx.body.fibres import FibreFileError
 
     key, file = f"{in_region(region)}cells.fibres", _fibre_file(cells, region)
     try:

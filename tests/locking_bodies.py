@@ -17,9 +17,8 @@ from mpi4py import MPI
 from pydantic import Field
 
 from remodel_fenicsx import Scene
-from remodel_fenicsx.body import SHAPES, LoadKind, Shape
-from remodel_fenicsx.body import gmsh_model as model
-from remodel_fenicsx.body.columns import Column
+from remodel_fenicsx.body import LoadKind, SHAPES, Shape, gmsh_model as model
+from remodel_fenicsx.body.shape import Column
 from remodel_fenicsx.body.domain import Domain, build_domain
 from remodel_fenicsx.model.energy import MATRICES, Matrix, logarithmic_dilatation
 from remodel_fenicsx.schema.units import FORCE, STRESS

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from remodel_fenicsx.body.gmsh_model import gmsh_model
-from remodel_fenicsx.body.layers import Wall
+from remodel_fenicsx.body.wall import Wall
 from remodel_fenicsx.body.tube import draw_tube
 
 NAMES = {"bottom": "inlet", "top": "outlet", "inner": "inner", "outer": "outer"}

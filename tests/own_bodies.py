@@ -19,10 +19,10 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from remodel_fenicsx.body.domain import Domain, SymbolicMesh, build_domain
-from remodel_fenicsx.body.local_axes import found_axes
+from remodel_fenicsx.body.axes import found_axes
 from remodel_fenicsx.fem.compat import geometry_dofmap
 from remodel_fenicsx.fem.quadrature import Quadrature
-from remodel_fenicsx.model.local_axes import LocalAxes
+from remodel_fenicsx.model.axes import LocalAxes
 
 Array = NDArray[np.float64]
 FACES = ("inner", "outer", "inlet", "outlet")

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from benchmarks.precision.whole import EVERY_TANGENT
 from remodel_fenicsx.scene.scene import Scene, preset_scene
-from remodel_fenicsx.studies.estimates import typical
+from remodel_fenicsx.studies.trade import typical
 
 Array = NDArray[np.float64]
 Measured = Callable[[Scene, list[float]], dict[str, Array]]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from remodel_fenicsx.scene.scene import Scene
-from remodel_fenicsx.studies import ladder as rungs
+from remodel_fenicsx.studies import trade as rungs
 
 EVERY_TANGENT = {"solver.method": "direct", "solver.predictor": "with-tolerance"}
 """How the tables of docs/speed_and_accuracy.md were measured: the presets named this up to 0.2.0."""

@@ -10,9 +10,8 @@ import numpy as np
 from pydantic import Field
 
 from remodel_fenicsx.body import SHAPES, Cube, LoadKind
-from remodel_fenicsx.body.columns import Column
+from remodel_fenicsx.body.shape import Column, uniaxial_columns
 from remodel_fenicsx.body.domain import Domain
-from remodel_fenicsx.body.shape import uniaxial_columns
 from remodel_fenicsx.body.tendon import Tendon
 from remodel_fenicsx.schema.units import FORCE, LENGTH
 

@@ -14,13 +14,10 @@ from pydantic import BeforeValidator, Field, model_validator
 from pydantic.config import JsonDict
 
 from remodel_fenicsx.body import mesh_file
-from remodel_fenicsx.body.columns import Column
+from remodel_fenicsx.body.shape import Column, LoadKind
 from remodel_fenicsx.body.gmsh_model import LARGEST_LENGTH, SMALLEST_LENGTH
-from remodel_fenicsx.body.exchange_file import ENDINGS
-from remodel_fenicsx.body.mesh_file import MeshFile, MeshFileError
-from remodel_fenicsx.body.mesh_reader import TAGS, read_mesh
-from remodel_fenicsx.body.shape import LoadKind
-from remodel_fenicsx.body.walled import WalledMesh
+from remodel_fenicsx.body.mesh_file import ENDINGS, MeshFile, MeshFileError, TAGS, read_mesh
+from remodel_fenicsx.body.wall import WalledMesh
 from remodel_fenicsx.schema.tables import SceneError, fault, shown
 from remodel_fenicsx.schema.units import LENGTH_UNITS, STRESS
 from remodel_fenicsx.settings import LARGEST_MESH, Load, Mesh, Support, faces_of

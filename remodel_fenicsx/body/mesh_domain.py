@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import dolfinx.fem
 import numpy as np
@@ -11,16 +12,40 @@ import ufl
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from remodel_fenicsx.body.axis_fields import cells_of, facets_of
-
+from remodel_fenicsx.body.axes import cells_of, facets_of
 from remodel_fenicsx.body.domain import Domain, MeshArrays, share_mesh
 from remodel_fenicsx.body.mesh_faces import Boundary, Face, node_order, rims
-from remodel_fenicsx.body.mesh_file import Array, Integers, MeshFile
+from remodel_fenicsx.body.mesh_file import Array, Integers, MeshFile, VOLUMES
 from remodel_fenicsx.fem import jit
-from remodel_fenicsx.fem.assembly import over_ranks
+from remodel_fenicsx.fem.assembly import over_ranks, solve_positive
 from remodel_fenicsx.fem.kinematics import lagrange
-from remodel_fenicsx.fem.positive import solve_positive
 from remodel_fenicsx.schema.tables import SceneError
+
+
+# ---------------------------------------------------------------- a mesh as the text of a Gmsh file, format 2.2
+# A mesh as the text of a Gmsh file, format 2.2: what `mesh_file` reads.
+
+TYPE_OF = {kind: number for number, kind in VOLUMES.items()}
+FACET_OF = {3: 2, 4: 3}  # corners -> Gmsh's number of the type; facets are written by their corners
+
+
+def gmsh_text(file: MeshFile) -> str:
+    """Nodes, elements and named groups of a mesh; nodes have the numbers 1, 2, ... in their order."""
+    lines = ["$MeshFormat", "2.2 0 8", "$EndMeshFormat", "$PhysicalNames"]
+    names = [(dimension, number, name) for dimension, by in file.names.items() for name, number in by.items()]
+    lines += [str(len(names)), *(f'{dimension} {number} "{name}"' for dimension, number, name in names)]
+    lines += ["$EndPhysicalNames", "$Nodes", str(len(file.points))]
+    places: Any = file.points.tolist()
+    lines += [f"{row} {x:.17g} {y:.17g} {z:.17g}" for row, (x, y, z) in enumerate(places, start=1)]
+    facets, solid = FACET_OF[file.facets.shape[1]], TYPE_OF[file.kind, file.degree]
+    lines += ["$EndNodes", "$Elements", str(len(file.facets) + len(file.cells))]
+    number = 0
+    for kind, groups, rows in ((facets, file.facet_groups, file.facets), (solid, file.cell_groups, file.cells)):
+        listed: Any = (rows + 1).tolist()
+        for group, row in zip(groups, listed, strict=True):
+            number += 1
+            lines.append(f"{number} {kind} 2 {group} {group} {' '.join(str(node) for node in row)}")
+    return "\n".join([*lines, "$EndElements", ""])
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from remodel_fenicsx.body.layers import Wall
-from remodel_fenicsx.model.closing import UNSTRETCHED, Layer
+from remodel_fenicsx.body.wall import Wall
+from remodel_fenicsx.model.residual_stress import UNSTRETCHED, Layer
 from remodel_fenicsx.model.energy import Tissue
-from remodel_fenicsx.model.local_axes import LocalAxes
+from remodel_fenicsx.model.axes import LocalAxes
 from remodel_fenicsx.settings import Natural
 
 if TYPE_CHECKING:

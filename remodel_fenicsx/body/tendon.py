@@ -10,11 +10,8 @@ import numpy.typing as npt
 from pydantic import Field, model_validator
 
 from remodel_fenicsx.body import gmsh_model as model
-from remodel_fenicsx.body.buckling import Strut
-from remodel_fenicsx.body.columns import Column
-from remodel_fenicsx.body.reductions import Reduction, unturned
-from remodel_fenicsx.body.shape import LoadKind, Shape, check_lengths, homogeneous_bar, uniaxial_columns
-from remodel_fenicsx.body.whole import cylinder
+from remodel_fenicsx.body.reductions import Reduction, Strut, cylinder, unturned
+from remodel_fenicsx.body.shape import Column, LoadKind, Shape, check_lengths, homogeneous_bar, uniaxial_columns
 from remodel_fenicsx.schema.units import AREA, FORCE, LENGTH
 from remodel_fenicsx.settings import Mesh
 

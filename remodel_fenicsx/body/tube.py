@@ -12,25 +12,28 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from remodel_fenicsx.body import gmsh_model as model
-from remodel_fenicsx.body.buckling import Strut
-from remodel_fenicsx.body.columns import Column
-from remodel_fenicsx.body.layers import Wall, check_layers
 from remodel_fenicsx.body.reductions import (
+    Body,
+    Corners,
     Reduction,
+    Strut,
     about_z,
+    divided_along,
     drawn_once,
+    extended,
     free_ends,
     known_loads,
     mirrored,
+    mirrored_twice,
+    revolved,
     round_about_z,
     same_cells,
     symmetric_law,
     symmetric_planes,
     unmeasured_cells,
 )
-from remodel_fenicsx.body.shape import Array, LoadKind, check_lengths
-from remodel_fenicsx.body.walled import AngleOf, Walled, angle_columns, angle_columns_on_request
-from remodel_fenicsx.body.whole import Body, Corners, divided_along, extended, mirrored_twice, revolved
+from remodel_fenicsx.body.shape import Array, Column, LoadKind, check_lengths
+from remodel_fenicsx.body.wall import AngleOf, Wall, Walled, angle_columns, angle_columns_on_request, check_layers
 from remodel_fenicsx.model.cells import cylindrical_axes, structure_tensor
 from remodel_fenicsx.model.energy import TURNED_OVER, Tissue
 from remodel_fenicsx.schema.tables import fault, shown
@@ -242,8 +245,7 @@ def _reduced_axial_force(m: Any) -> float:
 
 def _opening_angle(m: Any) -> float:
     """Of the tube without loads, cut along its length, with its cells as they are; collective."""
-    from remodel_fenicsx.model.closing import Layer
-    from remodel_fenicsx.model.cutting import cut, means_through
+    from remodel_fenicsx.model.residual_stress import Layer, cut, means_through
 
     cells, shape, comm = m.state.cells, m.observer.shape, m.state.comm
     local = cells.local_axes

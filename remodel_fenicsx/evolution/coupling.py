@@ -19,8 +19,7 @@ from remodel_fenicsx.settings import Solver
 from remodel_fenicsx.solver.continuation import Blend, Change, Work
 from remodel_fenicsx.solver.equilibrium import Equilibrium
 from remodel_fenicsx.solver.newton import GuardedNewton, SolveFailure
-from remodel_fenicsx.state.memory import Numbers
-from remodel_fenicsx.state.state import State
+from remodel_fenicsx.state.state import Numbers, State
 
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from remodel_fenicsx.body.loading import LoadValues
 from remodel_fenicsx.evolution.implicit import RESIDUAL, Implicit
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
-from remodel_fenicsx.evolution.step_control import StepControl
+from remodel_fenicsx.evolution.time_steps import StepControl
 from remodel_fenicsx.evolution.turnover import MUCH, Slowing
 from remodel_fenicsx.fem import assembly
 from remodel_fenicsx.model.cells import structure_tensor

@@ -4,23 +4,377 @@ from __future__ import annotations
 
 import logging
 import math
+from dataclasses import replace
 from typing import Any
 
+import numpy as np
+import ufl
+from mpi4py import MPI
+from numpy.typing import NDArray
+
 from remodel_fenicsx.body.loading import LoadValues
-from remodel_fenicsx.evolution.condensed import AnsweringCells, AnsweringEquilibrium, AnsweringNewton
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
-from remodel_fenicsx.model.cells import UnitCell
+from remodel_fenicsx.fem.assembly import over_ranks
+from remodel_fenicsx.fem.solver_methods import AUTO
+from remodel_fenicsx.kernels.tensor import condensed_points, tensor_kernels
+from remodel_fenicsx.model import implicit as condensed
+from remodel_fenicsx.model.cells import UnitCell, structure_tensor
 from remodel_fenicsx.model.energy import Tissue
+from remodel_fenicsx.model.implicit import StepOfCells, jumps_by_rank
 from remodel_fenicsx.model.laws import relaxed
 from remodel_fenicsx.model.tensor_law import weight_of_the_end
+from remodel_fenicsx.model.tensors import determinant
+from remodel_fenicsx.model.turnover import TurnoverRule
 from remodel_fenicsx.settings import Solver
 from remodel_fenicsx.solver.continuation import Change, StepFailure, Work
-from remodel_fenicsx.solver.equilibrium import Equilibrium
-from remodel_fenicsx.solver.newton import GuardedNewton, SolveFailure
-from remodel_fenicsx.state.memory import Numbers
-from remodel_fenicsx.state.state import State
+from remodel_fenicsx.solver.equilibrium import Equilibrium, Look
+from remodel_fenicsx.solver.newton import GuardedNewton, Solution, SolveFailure
+from remodel_fenicsx.state.state import Numbers, State, at_points
+
+
+# ---------------------------------------------------------------- cells that answer within a solve
+# Cells that answer within a solve: equilibrium with stress and consistent tangent as values at the points.
 
 log = logging.getLogger(__name__)
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+BEFORE_HOLDING = 5
+"""Newton iterations after which cells that still jump are held (by rank there are states without a solution), or after
+which states where cells are not found are refused (where none may be held)."""
+PASSES = 8  # with frozen cells, before a second try
+SETTLES = 0.5  # of the largest change of the unknowns over a pass: what the last may be
+JUMP = 0.02
+"""Change of A over r0^2 from one iteration to the next that is a jump after so many."""
+
+
+class AnsweringCells:
+    """The cells at the end of a step as a function of the unknowns, at all points of this rank in one row.
+
+    Parameters
+    ----------
+    state
+        Its cells are those at the start of the step.
+    tissue
+        On the mesh.
+    remodeling
+        Driver, law, frame and speed.
+
+    Attributes
+    ----------
+    stress, tangent
+        P (3, 3) and dP/dF (9, 9), row by row: dolfinx functions that belong to the last `update`.
+    frozen
+        Cells of all points where none answers: those at the start of the step, or those of a pass.
+    held
+        Points whose cells answer no more in this solve.
+    may_hold
+        Whether points where the law jumps (`responses.jumps_by_rank`) may be held; otherwise a state with points that
+        have no solution is refused.
+    accepted
+        The driving tensor of the last accepted state, from which the next solve starts.
+    """
+
+    def __init__(self, state: State, tissue: Tissue, remodeling: RemodelingPass):
+        self.state, self.tissue, self.remodeling = state, tissue, remodeling
+        self.quadrature = state.cells.quadrature
+        self.stress = self.quadrature.function("answering_stress", (3, 3))
+        self.tangent = self.quadrature.function("answering_tangent", (9, 9))
+        self.frozen: UnitCell | None = None
+        self.may_hold = True
+        self.held: Flags
+        self._kernels = tensor_kernels(state.comm) if remodeling.law.target is not None else None
+        self._points: condensed.CondensedPoints
+        self._jumps: Flags  # points where the law jumps
+        self._found: condensed.LocalSolution
+        self._gradient: Array | None = None  # F of what was found
+        self._tangent_is_there = False
+        self._start: Array
+        self.accepted: Array
+        self._iterations = 0
+        self._last_structure: Array
+
+    # ------------------------------------------------------------ a step
+    def begin(self, time: float, residual: float) -> None:
+        """The present state is the start of a step to this time; it was accepted with these out-of-balance forces."""
+        drive, cells = self.remodeling.drive(residual), self.state.cells.point_cells
+        old = UnitCell(cells.dimensions.copy(), cells.axes.copy())
+        given = self.remodeling.settings.turnover
+        rule = TurnoverRule(given.time, given.deposition_stretch, given.gain) if given.time else None
+        step = StepOfCells(self.remodeling.law, drive, old, structure_tensor(*old[:2]), self.state.time, time, rule)
+        self._points = condensed_points(self._kernels, at_points(self.tissue, self.quadrature), step)
+        self.accepted = self._points.with_cells(drive.deformation_gradient, old).driving_tensor
+        self._jumps = jumps_by_rank(step)
+        self.release()
+
+    def set_time(self, time: float) -> None:
+        """Another end of the step, which starts with the same cells."""
+        self._points = replace(self._points, step=self._points.step._replace(time_new=time))
+        self.release()
+
+    def release(self) -> None:
+        """All cells answer again, from the driving tensor of the last accepted state."""
+        self.held = np.zeros_like(self._jumps)
+        self._start, self._gradient, self._iterations = self.accepted, None, 0
+
+    def freeze(self, cells: UnitCell | None = None) -> None:
+        """No cells answer: these stay, or those at the start of the step."""
+        self.frozen, self._gradient = cells or self._points.step.cells, None
+
+    def follow(self, factor: float) -> None:
+        """Frozen cells make a share of a pass with the present stress: towards what it asks for at the step's end."""
+        assert self.frozen is not None
+        self.update()
+        cells = self._points.unit_cells(self._points.passed(self._found))
+        self.freeze(relaxed(self.frozen, cells, factor))
+
+    def accept(self) -> None:
+        """The present state is a solved one."""
+        self.update()
+        self.accepted = self._found.driving_tensor
+
+    @property
+    def asked(self) -> UnitCell:
+        """The cells of the last update."""
+        return self._points.unit_cells(self._found)
+
+    @property
+    def turnover(self) -> Array | None:
+        """ln m and ln rho (2, n) of the last update, where they change."""
+        return None if self._found.turnover is None else self._found.turnover.T
+
+    def jumps_somewhere(self) -> bool:
+        """Whether there are points, on any rank, where the law jumps."""
+        return self._count(self._jumps) > 0
+
+    def complete(self) -> bool:
+        """Whether the cells of the present unknowns may end a step: all belong to their stress, or may be held."""
+        self.update()
+        return self._count(self._unanswered & ~self._holdable) == 0
+
+    def held_points(self) -> int:
+        """At how many points of all ranks the cells do not belong to the stress."""
+        return self._count(self._unanswered)
+
+    def held_share(self) -> float:
+        """Their share of the body."""
+        return self.quadrature.mean(self._unanswered.reshape(self.quadrature.shape).astype(np.float64))
+
+    @property
+    def _holdable(self) -> Flags:
+        return self._jumps & self.may_hold
+
+    @property
+    def _unanswered(self) -> Flags:
+        points: Flags = self.held | ~self._found.converged
+        return points
+
+    def _count(self, points: Flags) -> int:
+        owned = self.quadrature.owned(points.reshape(self.quadrature.shape))
+        return int(self.state.comm.allreduce(int(owned.sum())))
+
+    # ------------------------------------------------------------ values
+    def update(self, tangent: bool = False) -> None:
+        """Stress, and tangent on request, of the present unknowns."""
+        F = self.state.elastic_gradient()
+        if self._gradient is None or not np.array_equal(F, self._gradient):
+            self._found = self._solved(F)
+            self._gradient, self._tangent_is_there = F, False
+            stress = self._found.first_piola_kirchhoff.reshape(*self.quadrature.shape, 3, 3)
+            self.quadrature.values(self.stress, (3, 3))[:] = stress
+        if tangent and not self._tangent_is_there:
+            self._hold_what_jumps()
+            self._start = self._found.driving_tensor
+            held = self.held if self.frozen is None else np.ones_like(self.held)
+            values = self._points.tangent(self._found, held).reshape(*self.quadrature.shape, 9, 9)
+            self.quadrature.values(self.tangent, (9, 9))[:] = values
+            self._tangent_is_there = True
+
+    def _solved(self, F: Array) -> condensed.LocalSolution:
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            F = np.where((determinant(F) > 0)[:, None, None], F, np.eye(3))
+            if self.frozen is not None:
+                return self._points.with_cells(F, self.frozen)
+            before = self._found if self.held.any() else None
+            return self._points.solve(F, self._start, self.held, before)
+
+    def _hold_what_jumps(self) -> None:
+        """From an iteration on; only laws by rank jump, others fail and the step is made in parts."""
+        self._iterations += 1
+        structure = self._found.structure
+        if self._iterations > BEFORE_HOLDING and self.frozen is None:
+            change = np.linalg.norm(structure - self._last_structure, axis=(1, 2))
+            jumps = change > JUMP * self._points.step.drive.end_to_end_length**2
+            self.held = self.held | (self._holdable & (jumps | ~self._found.converged))
+        self._last_structure = structure
+
+    def squared_lengths(self) -> Array:
+        """r^2 at all points, (elements, points); infinite where there are no cells for these unknowns."""
+        self.update()
+        squared = np.where(self._refused, np.inf, self._found.squared_lengths)
+        return squared.reshape(self.quadrature.shape)
+
+    @property
+    def _refused(self) -> Flags:
+        """Points without a solution, after so many iterations that none is expected, that may not be held."""
+        return ~(self._found.converged | self._holdable) & (self._iterations > BEFORE_HOLDING)
+
+    def unsolved(self, locking_length: Array) -> bool:
+        """Whether the present unknowns are refused for points, on any rank, that have no solution with r < L."""
+        self.update()
+        return self._count(self._refused & (self._found.squared_lengths < locking_length.reshape(-1) ** 2)) > 0
+
+
+class AnsweringEquilibrium(Equilibrium):
+    """Equilibrium whose stress and tangent come from `AnsweringCells`.
+
+    Parameters
+    ----------
+    state, tissue
+        As for `Equilibrium`.
+    answering
+        The cells.
+    """
+
+    def __init__(self, state: State, tissue: Tissue, answering: AnsweringCells):
+        self.answering = answering
+        super().__init__(state, tissue)
+
+    def internal_and_tangents(self, F: Any, test: Any, trial: Any) -> tuple[list[Any], list[Any]]:
+        """Virtual work of P, and with it dP/dF."""
+        u, weight, dx = (
+            self.state.unknown,
+            self.state.kinematics.stress_free_weight(self.quadrature.mesh),
+            self.quadrature.dx,
+        )
+        variation, increment = (ufl.derivative(F, u, function) for function in (test, trial))
+        row, column = (ufl.as_vector([F_[i, j] for i in range(3) for j in range(3)]) for F_ in (variation, increment))
+        internal = ufl.inner(self.answering.stress, variation) * weight * dx
+        return [internal], [ufl.inner(ufl.dot(self.answering.tangent, column), row) * weight * dx]
+
+    def look(self) -> Look:
+        """As of `Equilibrium`, which knows nothing of cells that answer: nothing is remembered."""
+        return self._look()
+
+    def states(self) -> Array:
+        """As of `Equilibrium`, with the cells that belong to the present unknowns."""
+        states = super().states()
+        if np.all(states[..., 1] > 0):  # for a state that is inside out no cells are looked for
+            states[..., 0] = self.answering.squared_lengths()
+        return states
+
+    def assemble_internal(self, vector: Any) -> None:
+        """Internal nodal forces of the present unknowns."""
+        self.answering.update()
+        super().assemble_internal(vector)
+
+    def _update_tangent(self) -> None:
+        self.answering.update(tangent=True)
+
+
+class AnsweringNewton(GuardedNewton):
+    """Newton's method for cells that answer."""
+
+    def __init__(self, equilibrium: AnsweringEquilibrium, settings: Solver):
+        # cells that answer make steps far more nonlinear, and tangents unsymmetric: nothing is gained by old factors
+        super().__init__(equilibrium, settings, robust=settings.method == AUTO)
+        self.answering = equilibrium.answering
+        self._patient = False  # whether shorter steps are looked for where cells have no solution
+
+    def solve(self, origin: Array | None = None) -> Solution:
+        """As of `GuardedNewton`; at first no cells are held.
+
+        Where Newton's method fails, or some cells have no solution at its deformations, it starts again from the
+        equilibrium to which passes with frozen cells come: it often is near.
+        """
+        start, accepted = self.unknown.x.array.copy(), self.answering.accepted
+        try:
+            return self._solved(origin)
+        except SolveFailure as failure:
+            if self.answering.frozen is not None:
+                raise
+            log.info("the step is solved once more, from where remodeling passes lead: %s", failure.reason)
+            try:
+                return self._after_passes(failure, start, accepted)
+            except SolveFailure:
+                self.unknown.x.array[:], self.answering.accepted = start, accepted
+                raise
+
+    def _after_passes(self, failure: SolveFailure, start: Any, accepted: Any) -> Solution:
+        """Solve from where passes lead; where no law jumps, at last from the start with shorter steps."""
+        try:
+            if not self._pass(failure):
+                log.info("remodeling passes do not converge")
+                raise failure
+            solution = self._solved()
+            solution.count(failure)
+            return solution
+        except SolveFailure as again:
+            if again is not failure:
+                again.count(failure)
+            if self.answering.jumps_somewhere():
+                raise
+            self.unknown.x.array[:], self.answering.accepted, self._patient = start, accepted, True
+            log.info("the step is solved once more, with shorter Newton steps: %s", again.reason)
+            try:
+                solution = self._solved()
+                solution.count(again)
+                return solution
+            except SolveFailure as last:
+                last.count(again)
+                raise
+        finally:
+            self._patient = False
+
+    def _pass(self, work: SolveFailure) -> bool:
+        """Passes with frozen cells, each with its equilibrium, up to one that changes nothing; adds what they cost.
+
+        Returns whether they come nearer to each other.
+        """
+        answering, values, share = self.answering, self.unknown.x.array, 1.0
+        ways: list[float] = []  # of the unknowns, over each pass
+        try:
+            answering.freeze()
+            work.count(self._solved())
+            for _ in range(PASSES):
+                before, frozen = values.copy(), answering.frozen
+                try:
+                    answering.follow(share)
+                    solution = self._solved()
+                except SolveFailure as failure:  # too large a change of the cells: r >= L where they are longer
+                    work.count(failure)
+                    values[:], share = before, share / 2
+                    answering.freeze(frozen)
+                    continue
+                work.count(solution)
+                way = over_ranks(self.equilibrium.comm, float(np.abs(values - before).max(initial=0.0)), MPI.MAX)
+                ways.append(way / share)
+                if share == 1.0 and not solution.newton_iterations:
+                    break
+                share = min(1.0, 2 * share)
+        finally:
+            answering.frozen = None
+        return bool(ways) and ways[-1] <= SETTLES * max(ways)
+
+    def gives_up(self, trial: Look) -> bool:
+        """Where cells have no solution: passes cost less than shorter steps."""
+        right_way_out = trial.extension.min_jacobian > 0 and not self._patient
+        return right_way_out and self.answering.unsolved(self.equilibrium.locking_length())
+
+    def _solved(self, origin: Array | None = None) -> Solution:
+        self.answering.release()
+        start = self.unknown.x.array.copy()
+        solution = super().solve(origin)
+        if not self.answering.complete():
+            extension = self.equilibrium.extension()
+            self.unknown.x.array[:] = start
+            iterations = solution.newton_iterations, solution.linear_iterations
+            text = "points without cells that fit their own stress"
+            raise SolveFailure(text, *iterations, extension, tangents=solution.tangents)
+        self.answering.accept()
+        return solution
+
 
 RESIDUAL = "residual of the last step"
 MUCH_MORE = 2.0  # times the share that was said

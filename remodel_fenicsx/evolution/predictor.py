@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.fem.assembly import over_ranks
 from remodel_fenicsx.model import tensors
-from remodel_fenicsx.state.memory import Earlier, Numbers
-from remodel_fenicsx.state.state import State
+from remodel_fenicsx.state.state import Earlier, Numbers, State
 
 Array = NDArray[np.float64]
 

@@ -19,14 +19,11 @@ from remodel_fenicsx.model import spectral
 from remodel_fenicsx.model.cells import UnitCell, structure_tensor
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES, carried_axes
 from remodel_fenicsx.model.energy import Tissue, axes_sum
-from remodel_fenicsx.model.laws import LAWS, Drive, tensor_target
-from remodel_fenicsx.model.load_cases import MEANS_OF_CASES, mean_target
+from remodel_fenicsx.model.laws import Drive, LAWS, MEANS_OF_CASES, mean_target, tensor_target
 from remodel_fenicsx.model.tensor_law import ABOVE_ROUNDING, Target, floor_above
 from remodel_fenicsx.settings import Remodeling
-from remodel_fenicsx.solver.pointwise import PointStresses
-from remodel_fenicsx.state.memory import Numbers
-from remodel_fenicsx.state.parameters import Parameters, on_mesh, stress_rounding
-from remodel_fenicsx.state.state import State
+from remodel_fenicsx.solver.equilibrium import PointStresses
+from remodel_fenicsx.state.state import Numbers, Parameters, State, on_mesh, stress_rounding
 
 log = logging.getLogger(__name__)
 Array = NDArray[np.float64]

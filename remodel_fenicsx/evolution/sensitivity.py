@@ -29,8 +29,7 @@ from remodel_fenicsx.model.laws import Drive, Law, RankedFunction, tensor_target
 from remodel_fenicsx.model.tensor_law import Target
 from remodel_fenicsx.settings import Remodeling, Solver
 from remodel_fenicsx.solver.continuation import Work
-from remodel_fenicsx.solver.equilibrium import Equilibrium
-from remodel_fenicsx.solver.pointwise import mandel_vector
+from remodel_fenicsx.solver.equilibrium import Equilibrium, mandel_vector
 from remodel_fenicsx.state.state import State
 
 Array = NDArray[np.float64]

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from decimal import Decimal
+from pathlib import Path
 from typing import Any
 
 from remodel_fenicsx.body.loading import LoadValues
@@ -18,8 +19,8 @@ from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.settings import COUPLINGS, Remodeling, Solver
 from remodel_fenicsx.solver.continuation import Work
 from remodel_fenicsx.solver.equilibrium import Extension
-from remodel_fenicsx.state.parameters import on_mesh
-from remodel_fenicsx.state.state import State
+from remodel_fenicsx.state.state import State, on_mesh
+from remodel_fenicsx.system.interrupts import Paused
 
 log = logging.getLogger(__name__)
 
@@ -333,3 +334,57 @@ def times(end: float, step: float) -> Iterator[float]:
     for number in range(1, number_of_steps):
         yield float(number * Decimal(repr(step)))
     yield end
+
+
+# ---------------------------------------------------------------- stops on purpose, between two steps
+# Stops on purpose, between two steps: asked for by a signal, or because the time that was given is over.
+
+MARGIN = 1.2  # how much longer than those before it the next step may take
+NOT_ASKED, BY_SIGNAL, BY_CLOCK = range(3)
+REASONS = {BY_SIGNAL: "stopped by SIGUSR1", BY_CLOCK: "stopped before --max-wall-time is over"}
+
+
+class Pause(Watcher):
+    """Raises `Paused` after a step, on all ranks, if somebody asked for it or the next step would come too late.
+
+    Parameters
+    ----------
+    comm
+        Communicator; the clock is that of rank 0.
+    folder
+        Where the run is kept.
+    asked
+        Whether this rank was asked to stop.
+    deadline
+        `time.monotonic` at which the run must have ended; None: never.
+    """
+
+    def __init__(self, comm: Any, folder: Path, asked: Callable[[], bool], deadline: float | None = None):
+        self.comm, self.folder, self.asked, self.deadline = comm, folder, asked, deadline
+        self._last = clock.monotonic()
+        self._seconds = 0.0  # of a step with all that is written of it
+
+    def started(self, step: Step) -> None:
+        """Before the first step."""
+        self._last = clock.monotonic()
+        self._check(step)
+
+    def resumed(self, step: Step) -> None:
+        """Before the first step of this run."""
+        self.started(step)
+
+    def committed(self, step: Step) -> None:
+        """After each step but the last."""
+        now = clock.monotonic()
+        self._seconds, self._last = max(0.5 * self._seconds, now - self._last), now
+        if not step.is_last:
+            self._check(step)
+
+    def _check(self, step: Step) -> None:
+        reason = BY_SIGNAL if self.asked() else NOT_ASKED
+        if self.deadline is not None and self.comm.rank == 0 and not reason:
+            late = clock.monotonic() + MARGIN * self._seconds > self.deadline
+            reason = BY_CLOCK if late else NOT_ASKED
+        asked = [one for one in self.comm.allgather(reason) if one]
+        if asked:
+            raise Paused(REASONS[asked[0]], step.time, self.folder)

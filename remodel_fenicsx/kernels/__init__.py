@@ -20,8 +20,8 @@ room                kernels.points.PointKernels.room
 log_sum             model.energy.log_sum
 log_derivatives     model.energy.log_derivatives
 target              model.laws.tensor_target
-solve               model.implicit.condensed.CondensedPoints.solve
-tangent             model.implicit.condensed.CondensedPoints.tangent
+solve               model.implicit.CondensedPoints.solve
+tangent             model.implicit.CondensedPoints.tangent
 factor_new          kernels.factor.SingleFactor
 factor_renew        kernels.factor.SingleFactor.renew
 factor_solve        kernels.factor.SingleFactor.solve

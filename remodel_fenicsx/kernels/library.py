@@ -16,8 +16,7 @@ from mpi4py import MPI
 
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.model.energy import BY_LOG, Repulsion, Tissue
-from remodel_fenicsx.system import environment
-from remodel_fenicsx.system import NOTICE
+from remodel_fenicsx.system import NOTICE, environment
 
 log = logging.getLogger(__name__)
 

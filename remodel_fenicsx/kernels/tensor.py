@@ -13,15 +13,12 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from remodel_fenicsx.kernels.library import Library, in_numpy
-from remodel_fenicsx.model import tensor_law, tensors
+from remodel_fenicsx.model import implicit as condensed, tensor_law, tensors
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.chains import WORMLIKE
 from remodel_fenicsx.model.drivers import CAUCHY, FINGER, PK2, Driver, rotated_back
 from remodel_fenicsx.model.energy import BY_LENGTH, BY_LOG, Repulsion, Tissue, neo_hookean, whole_structure_tensor
-from remodel_fenicsx.model.implicit import condensed
-from remodel_fenicsx.model.implicit.condensed import CondensedPoints, LocalSolution
-from remodel_fenicsx.model.implicit.network import at, put
-from remodel_fenicsx.model.implicit.responses import StepOfCells
+from remodel_fenicsx.model.implicit import CondensedPoints, LocalSolution, StepOfCells, at, put
 from remodel_fenicsx.model.laws import Drive, tensor_target
 from remodel_fenicsx.model.tensor_law import Target
 
@@ -104,12 +101,12 @@ def condensed_points(kernels: TensorKernels | None, tissue: Tissue, step: StepOf
     }
     if all(known.values()):
         return CompiledPoints(tissue, step, kernels)
-    _say_so(", ".join(part for part, is_known in known.items() if not is_known))
+    _say_of_tensor(", ".join(part for part, is_known in known.items() if not is_known))
     return CondensedPoints(tissue, step)
 
 
 @functools.cache
-def _say_so(parts: str) -> None:
+def _say_of_tensor(parts: str) -> None:
     log.info("numpy finds the cells of an implicit step, slower: C does not have this %s", parts)
 
 

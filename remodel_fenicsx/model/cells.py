@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from remodel_fenicsx.model.operators import squared_stretch
+from remodel_fenicsx.model.tensors import squared_stretch
 
 Array = NDArray[np.float64]
 

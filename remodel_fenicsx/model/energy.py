@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from remodel_fenicsx.model import tensors
 from remodel_fenicsx.model.cells import UnitCell, structure_tensor
 from remodel_fenicsx.model.chains import CHAINS, Chain
-from remodel_fenicsx.model.operators import component, det, is_array, ln, sqrt, squared_norm
+from remodel_fenicsx.model.tensors import component, det, is_array, ln, sqrt, squared_norm
 
 Array = NDArray[np.float64]
 Term = Callable[[Any, Any, Any], Any]

@@ -17,14 +17,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image, features
 
 from remodel_fenicsx._version import __version__
-from remodel_fenicsx.pictures.bodies import scale_colours
-from remodel_fenicsx.pictures.rendering import Pixels
+from remodel_fenicsx.pictures.bodies import Pixels, Sight, Viewing, scale_colours
 from remodel_fenicsx.pictures.sheet import ONE, SEVERAL, Sheet
-from remodel_fenicsx.pictures.sight import Sight, Viewing
-from remodel_fenicsx.results.kept_times import kept_times
-from remodel_fenicsx.results.recording import RecordedRun
+from remodel_fenicsx.results.recording import RecordedRun, kept_times
 from remodel_fenicsx.studies.page import DOTS_PER_INCH, STYLE, About, FigureError, Palette, as_file
-from remodel_fenicsx.system.regular_files import write_new
+from remodel_fenicsx.system.files import write_new
 from remodel_fenicsx.system.temporary import temporary_folder
 
 PICTURES, ANIMATIONS = (".png", ".svg", ".pdf"), (".gif", ".webp", ".mp4")

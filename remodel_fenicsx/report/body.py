@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from remodel_fenicsx.report.card import Array
-from remodel_fenicsx.report.packing import of_angles, of_places, of_vectors
-from remodel_fenicsx.results.chain_lines import AXIS_FIELDS
+from remodel_fenicsx.report.card import Array, of_angles, of_places, of_vectors
+from remodel_fenicsx.results.turned import AXIS_FIELDS
 from remodel_fenicsx.results.whole_body import WholeBody
 
 Numbers = NDArray[np.float64]

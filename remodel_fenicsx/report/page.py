@@ -13,14 +13,11 @@ from typing import Any
 
 from remodel_fenicsx._version import __version__
 from remodel_fenicsx.report.body import ShownBody
-from remodel_fenicsx.report.card import Card
-from remodel_fenicsx.report.packing import packed
-from remodel_fenicsx.report.parts import ASSETS, ReportedRun, cards, data_of
-from remodel_fenicsx.report.story import Story
-from remodel_fenicsx.results.kept_times import kept_times
-from remodel_fenicsx.results.recording import RecordedRun
+from remodel_fenicsx.report.card import Card, packed
+from remodel_fenicsx.report.parts import ASSETS, ReportedRun, Story, cards, data_of
+from remodel_fenicsx.results.recording import RecordedRun, kept_times
 from remodel_fenicsx.results.whole_body import WholeBody, has_a_body
-from remodel_fenicsx.system.regular_files import read_regular, write_new, write_whole
+from remodel_fenicsx.system.files import read_regular, write_new, write_whole
 
 REPORT = "report.html"
 PAGE_SIZE = 20.0  # MB that a page has at most, if it need not be larger for two times

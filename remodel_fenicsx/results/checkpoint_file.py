@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from remodel_fenicsx.system.regular_files import ForeignFileError, read_regular, write_whole
+from remodel_fenicsx.system.files import ForeignFileError, read_regular, write_whole
 
 log = logging.getLogger(__name__)
 Array = NDArray[Any]

@@ -14,10 +14,9 @@ import ufl
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from remodel_fenicsx.body.columns import Column, columns_of
+from remodel_fenicsx.body.shape import Column, Shape, columns_of
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.mesh_faces import cap_volume
-from remodel_fenicsx.body.shape import Shape
 from remodel_fenicsx.evolution.stepper import Step, Watcher
 from remodel_fenicsx.fem import compat, jit
 from remodel_fenicsx.fem.assembly import over_ranks

@@ -1,30 +1,100 @@
-"""The cells of a recorded run as fibres of other programs: one structure tensor for each element. It needs no dolfinx.
-
-Elements and nodes have the numbers of the run's mesh file, counted from 1 in text. What is written where:
-
-- febio: https://help.febio.org, User Manual 4, sections Mesh and MeshData; read by FEBioMeshDataSection4.cpp. Axis 1 is
-  a, axis 2 lies in the plane of a and d; the cell dimensions are three data maps of the elements.
-- abaqus: Keywords Reference Guide, *DISTRIBUTION TABLE, *DISTRIBUTION and *ORIENTATION, which CalculiX reads too
-  (https://www.openaircraft.com/ccx-doc/ccx/node256.html). Neither has a place for the dimensions, which stand in
-  comments: `** cell_dimensions, element, l1, l2, l3`.
-"""
+"""Runs and fibres for other programs: VTU, FEBio, Abaqus, csv."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+import base64
+import zlib
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.model.cells import structure_tensor
-from remodel_fenicsx.results.chain_lines import AXIS_FIELDS
 from remodel_fenicsx.results.recording import RecordedRun, RecordingError
-from remodel_fenicsx.results.vtu import write_vtu
-from remodel_fenicsx.system.regular_files import write_new
+from remodel_fenicsx.results.turned import AXIS_FIELDS
+from remodel_fenicsx.system.files import write_new
+
+
+# ---------------------------------------------------------------- one unstructured grid as a VTU file, which
+# One unstructured grid as a VTU file, which ParaView, PyVista, VMTK, SimVascular and meshio read.
+
+_TYPES = {"f": ("Float64", np.float64), "i": ("Int64", np.int64), "u": ("UInt8", np.uint8), "b": ("UInt8", np.uint8)}
+
+
+def write_vtu(
+    path: Path,
+    points: ArrayLike,
+    cells: NDArray[np.int64],
+    cell_type: int,
+    cell_data: Mapping[str, ArrayLike],
+    point_data: Mapping[str, ArrayLike] = MappingProxyType({}),
+) -> None:
+    """Write a new file.
+
+    Parameters
+    ----------
+    path
+        That does not exist.
+    points
+        (points, 3).
+    cells
+        Node numbers of each cell in VTK's order, (cells, nodes).
+    cell_type
+        VTK's number, one for all cells.
+    cell_data, point_data
+        Arrays by name: scalars (n,), vectors (n, 3), tensors (n, 9).
+
+    Raises
+    ------
+    FileExistsError
+        If the path is taken.
+    OSError
+        If it cannot be written.
+    """
+    places = np.asarray(points, dtype=np.float64)
+    offsets = cells.shape[1] * np.arange(1, len(cells) + 1)
+    topology = {"connectivity": cells.ravel(), "offsets": offsets, "types": np.full(len(cells), cell_type, np.uint8)}
+    text = [
+        '<?xml version="1.0"?>',
+        '<VTKFile type="UnstructuredGrid" version="1.0" byte_order="LittleEndian" header_type="UInt64" '
+        'compressor="vtkZLibDataCompressor">',
+        f'<UnstructuredGrid><Piece NumberOfPoints="{len(places)}" NumberOfCells="{len(cells)}">',
+        *("<Points>", _array("Points", places), "</Points>"),
+        *("<Cells>", *(_array(name, values) for name, values in topology.items()), "</Cells>"),
+        *("<PointData>", *(_array(name, values) for name, values in point_data.items()), "</PointData>"),
+        *("<CellData>", *(_array(name, values) for name, values in cell_data.items()), "</CellData>"),
+        "</Piece></UnstructuredGrid></VTKFile>",
+    ]
+    write_new(path, "\n".join(text).encode())
+
+
+def _array(name: str, values: ArrayLike) -> str:
+    """One array: a header of four numbers (blocks, size of one, of the last, compressed size), then a zlib block."""
+    block = np.asarray(values)
+    kind, dtype = _TYPES[block.dtype.kind]
+    data = np.ascontiguousarray(block, dtype=np.dtype(dtype).newbyteorder("<")).tobytes()
+    packed = zlib.compress(data, 1)
+    header = np.array([1, len(data), 0, len(packed)], dtype="<u8").tobytes()
+    inside = (base64.b64encode(part).decode() for part in (header, packed))
+    columns = f' NumberOfComponents="{block.shape[1]}"' if block.ndim > 1 else ""
+    start = f'<DataArray type="{kind}" Name={quoteattr(name)}{columns} format="binary">'
+    return f"{start}{''.join(inside)}</DataArray>"
+
+
+# ---------------------------------------------------------------- the cells of a recorded run as fibres of other
+# The cells of a recorded run as fibres of other programs: one structure tensor for each element. It needs no dolfinx.
+#  Elements and nodes have the numbers of the run's mesh file, counted from 1 in text. What is written where:
+# - febio: https://help.febio.org, User Manual 4, sections Mesh and MeshData; read by FEBioMeshDataSection4.cpp. Axis
+# 1 is   a, axis 2 lies in the plane of a and d; the cell dimensions are three data maps of the elements. - abaqus:
+# Keywords Reference Guide, *DISTRIBUTION TABLE, *DISTRIBUTION and *ORIENTATION, which CalculiX reads too
+# (https://www.openaircraft.com/ccx-doc/ccx/node256.html). Neither has a place for the dimensions, which stand in
+# comments: `** cell_dimensions, element, l1, l2, l3`.
 
 Array = NDArray[np.float64]
 

@@ -17,13 +17,13 @@ from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
 from remodel_fenicsx.fem import compat, jit
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.model.energy import TURNED_OVER
-from remodel_fenicsx.model.local_axes import LocalAxes
-from remodel_fenicsx.results.chain_lines import AXIS_FIELDS, OF_CHAINS, append_chains
+from remodel_fenicsx.model.axes import LocalAxes
+from remodel_fenicsx.results.turned import AXIS_FIELDS, OF_CHAINS, append_chains
 from remodel_fenicsx.results.recording import CHAIN_LINES, FIELDS
 from remodel_fenicsx.results.vtkhdf import TransientGrid, vtk_cells
 from remodel_fenicsx.schema.times import SAME_TIME, same_time
 from remodel_fenicsx.settings import CONSTANT_FIELDS, FIELDS_BY_NAME, REGION, UNLOADED
-from remodel_fenicsx.solver.pointwise import PointStresses
+from remodel_fenicsx.solver.equilibrium import PointStresses
 from remodel_fenicsx.state.state import State
 
 Array = NDArray[np.float64]

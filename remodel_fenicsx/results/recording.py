@@ -9,18 +9,68 @@ from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
 from functools import cached_property, wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from remodel_fenicsx.schema.times import same_time
-from remodel_fenicsx.system.regular_files import check_regular, read_regular
+from remodel_fenicsx.system.files import check_regular, read_regular
 
 if TYPE_CHECKING:
     import h5py
 
     from remodel_fenicsx.scene.scene import Scene
+
+
+# ---------------------------------------------------------------- what pictures of bodies have in common, figures
+# What pictures of bodies have in common, figures and reports alike: colours of angles, how chains are drawn.
+
+LEVELS = 18  # steps of 5 degrees: a colour can be read off the scale
+# matplotlib's RdYlBu in LEVELS equal steps: red along the first direction (0 degrees), blue across it (90)
+ANGLE_COLOURS = (
+    "#a50026", "#c21c27", "#dc3b2c", "#ed5f3c", "#f7844e", "#fcaa5f", "#fec87a", "#fee496", "#fff6b1",
+    "#f6fbd0", "#e4f4f1", "#c7e7f1", "#a8d6e8", "#87bdd9", "#69a0ca", "#4d7fb9", "#3d5ba7", "#313695",
+)  # fmt: skip
+CHAIN_COLOUR = (0.08, 0.08, 0.10)
+CHAIN_REACH = 0.39  # half a chain's length over the shorter side of its face, both undeformed
+CHAIN_ROOM = 0.78  # how far a chain goes at most, over the way from the middle to the edge of its face
+CHAIN_WIDTH = 0.06  # over the shorter side
+CHAIN_LIFT = 0.2  # towards the eye, over the same: faces need not be plane
+AMBIENT = 0.8  # share of a colour that does not depend on where its face looks: it must mean the same everywhere
+VIEWS = {"front": (0.3, -1.0, 0.42), "above": (0.0, -0.02, 1.0)}  # where the eye is, from the middle of the body
+
+
+# ---------------------------------------------------------------- which of the recorded times are shown where all
+# Which of the recorded times are shown where all would be too many.
+
+Numbers = NDArray[np.float64]
+
+
+def kept_times(history: HistoryColumns, times: Numbers, most: int) -> Numbers:
+    """So many of the recorded times, the first and the last among them: spaced evenly, half in time, half in change.
+
+    Parameters
+    ----------
+    history
+        What changes: each column over its range.
+    times
+        That are recorded, (n,).
+    most
+        How many are kept, at least 2; all where there are no more.
+    """
+    if len(times) <= most:
+        return times
+    rows = np.stack([np.interp(times, history["time"], column) for column in history.values()])
+    rows = np.where(np.isfinite(rows), rows, 0.0)
+    change = np.abs(np.diff(rows, axis=1)) / np.maximum(np.ptp(rows, axis=1), np.finfo(float).tiny)[:, None]
+    share = [np.concatenate([[0.0], np.cumsum(part)]) for part in (np.diff(times), change.sum(axis=0))]
+    place = np.sum([part / (part[-1] or 1.0) for part in share], axis=0)
+    wanted = np.linspace(0.0, float(place[-1]), most)
+    chosen, number = np.abs(place[:, None] - wanted).argmin(axis=0), np.arange(most)
+    later = np.maximum.accumulate(chosen - number) + number  # none twice
+    return times[np.minimum(later, len(times) - most + number)]
+
 
 Array = NDArray[np.float64]
 

@@ -9,10 +9,9 @@ from mpi4py import MPI
 
 from remodel_fenicsx.body.reductions import Turn
 from remodel_fenicsx.fem.kinematics import KINEMATICS
-from remodel_fenicsx.results.chain_lines import OF_CHAINS, append_chains
+from remodel_fenicsx.results.turned import OF_CHAINS, TurnedFields, append_chains
 from remodel_fenicsx.results.recording import RecordedRun, RecordingError
-from remodel_fenicsx.results.turned import TurnedFields
-from remodel_fenicsx.system.regular_files import part_of
+from remodel_fenicsx.system.files import part_of
 from remodel_fenicsx.results.vtkhdf import TransientGrid, vtk_cells
 
 BODY, BODY_CHAINS = "fields_body.vtkhdf", "fields_body_chains.vtkhdf"

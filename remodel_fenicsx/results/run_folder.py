@@ -17,7 +17,7 @@ from remodel_fenicsx.results.history import History, LastStep, size_of_rows
 from remodel_fenicsx.results.recording import CHAIN_LINES, FIELDS, HISTORY, LOG, SCENE, RecordingError
 from remodel_fenicsx.results.run_lock import FolderTaken, RunLock, is_vacant
 from remodel_fenicsx.results.vtkhdf import check_file
-from remodel_fenicsx.system.regular_files import open_own, write_whole
+from remodel_fenicsx.system.files import open_own, write_whole
 
 DEEPEST = 100  # folders in folders: Python makes them by a function that calls itself
 

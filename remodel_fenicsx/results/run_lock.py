@@ -9,7 +9,7 @@ import socket
 from pathlib import Path
 
 from remodel_fenicsx.results.recording import SCENE
-from remodel_fenicsx.system.regular_files import open_own, part_of
+from remodel_fenicsx.system.files import open_own, part_of
 
 LOCK = "run.lock"
 _WRITER = re.compile(r"process \d+ on [\w.-]+( \(\d+ ranks\))?")

@@ -24,8 +24,7 @@ from remodel_fenicsx.results.recording import (
 )
 from remodel_fenicsx.results.run_lock import writer
 from remodel_fenicsx.schema.times import same_time
-from remodel_fenicsx.system.arguments import MOST_RUNS, typed
-from remodel_fenicsx.system.regular_files import ForeignFileError, read_regular
+from remodel_fenicsx.system.files import ForeignFileError, MOST_RUNS, read_regular, typed
 from remodel_fenicsx.system.terminal import duration
 
 _NAME = re.compile(r"\w[\w.+ -]{0,199}")  # as scenes have: of one file, in no folder elsewhere

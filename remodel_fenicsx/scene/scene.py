@@ -15,49 +15,150 @@ from typing import Annotated, Any, ClassVar
 
 from pydantic import BaseModel, BeforeValidator, Field, ModelWrapValidatorHandler, SerializeAsAny, model_validator
 
-from remodel_fenicsx.body import SHAPES, Shape
-from remodel_fenicsx.body.shape import LoadKind
-from remodel_fenicsx.body.columns import TURNOVER_POWER, Column, columns_of, columns_of_region, columns_on_request
+from remodel_fenicsx.body import LoadKind, SHAPES, Shape
 from remodel_fenicsx.body.reductions import AUTO, check_number, choice, objections
+from remodel_fenicsx.body.shape import Column, TURNOVER_POWER, columns_of, columns_of_region, columns_on_request
 from remodel_fenicsx.fem.formulations import FORMULATIONS, NOT_LOCKING
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.fem.solver_methods import SOLVER_METHODS
 from remodel_fenicsx.model.chains import CHAINS
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
-from remodel_fenicsx.model.energy import MATRICES, REPULSIONS, TURNED_OVER, Matrix
-from remodel_fenicsx.model.laws import LAWS
-from remodel_fenicsx.model.load_cases import MEANS_OF_CASES
-from remodel_fenicsx.scene.experiments import check_exclusive, with_own_numbers, without_replaced
-from remodel_fenicsx.scene.plausibility import doubts, largest_stress
-from remodel_fenicsx.scene.presets import PRESETS, PROFILES, default_method, nested, profile_for
+from remodel_fenicsx.model.energy import MATRICES, Matrix, REPULSIONS, TURNED_OVER
+from remodel_fenicsx.model.laws import LAWS, MEANS_OF_CASES
+from remodel_fenicsx.scene.presets import (
+    PRESETS,
+    PROFILES,
+    check_exclusive,
+    default_method,
+    nested,
+    profile_for,
+    with_own_numbers,
+    without_replaced,
+)
 from remodel_fenicsx.schema.tables import SceneError, Table, VariantOf, allowed, fault, quoted, shown
 from remodel_fenicsx.schema.toml import merged, parse_override, put, read_toml, toml_text
-from remodel_fenicsx.schema.units import FORCE, LENGTH_UNIT, LENGTH_UNITS, STRESS_UNIT, in_units
+from remodel_fenicsx.schema.units import FORCE, LENGTH_UNIT, LENGTH_UNITS, STRESS, STRESS_UNIT, in_units
 from remodel_fenicsx.settings import (
-    COUPLINGS,
-    REGION,
     AS_GIVEN,
-    UNLOADED,
-    STRESS_UNITS,
-    MEASURED_CELLS,
+    COUPLINGS,
     Cells,
     Load,
     LoadCase,
+    MEASURED_CELLS,
     Material,
     Mesh,
     Model,
     Natural,
     Output,
     Properties,
+    REGION,
     Region,
     Remodeling,
+    STRESS_UNITS,
     Solver,
     Supports,
     Time,
+    UNLOADED,
     faces_of,
     nearest_multiples,
     tables_of,
 )
+
+
+# ---------------------------------------------------------------- what a scene may say but hardly means
+# What a scene may say but hardly means: numbers in another unit than the others, told from ratios by decades.
+
+# Decades in which a ratio may lie. Units differ by a thousand and more, choices seldom by a hundred.
+NETWORK = (-2, 2)  # initial stiffness of the network over that of the matrix; the paper's bodies: 1.1 and 1.5
+LOAD = (-4, 2)  # largest stress of a load over the stiffness of both; the paper's: 0.7 to 4.6. Weak loads are a choice
+TEMPERATURES = (250.0, 400.0)  # K: of what is neither ice nor cooked
+
+
+def doubts(
+    material: Material, geometry: Shape, loads: Mapping[str, Load], end_to_end_length: float, end: float
+) -> list[str]:
+    """Lines on what is hardly meant; none on bodies of plausible tissue.
+
+    Parameters
+    ----------
+    material, geometry, loads
+        Of the scene.
+    end_to_end_length
+        r0, in link lengths.
+    end
+        Last time.
+    """
+    network = chain_stress(material, end_to_end_length)
+    found, kinds = [*_of_material(material, network), *_of_lengths(geometry)], geometry.loads_on(faces_of(loads))
+    for name, load in loads.items():
+        found += _of_load(name, kinds[name], load.largest(end), material, geometry, network)
+    return found
+
+
+def chain_stress(material: Material, end_to_end_length: float) -> float:
+    """c g(r0) r0^2, in stress_unit: whatever the unit of chain lengths; 0 without chains."""
+    tissue = material.tissue(end_to_end_length)
+    return float(tissue.repulsion_modulus * end_to_end_length**2) if tissue.chain is not None else 0.0
+
+
+def largest_stress(kind: LoadKind, value: float, geometry: Shape) -> float | None:
+    """Of a load: a stress itself, or a force over its area; None of an elongation."""
+    if kind.dimension == FORCE:
+        return value / geometry.loaded_area
+    return value if kind.dimension == STRESS else None
+
+
+def _of_material(material: Material, network: float) -> Iterator[str]:
+    unit, lowest, highest = material.stress_unit, *TEMPERATURES
+    ratio = network / material.lame_mu
+    if network and (way := _beyond(ratio, NETWORK)):
+        pascal = STRESS_UNITS[unit]
+        density = f": {material.chain_density:g} of a scene in Pa is {material.chain_density * pascal:g} in {unit}"
+        yield (
+            f"material.chain_density = {material.chain_density:g}: the network (c g(r0) r0^2 = {network:.3g} {unit}) "
+            f"is {_times(ratio)} {'softer' if way < 0 else 'stiffer'} than the matrix (lame_mu = "
+            f"{material.lame_mu:.4g} {unit}); the density is in 1/m^3 in every scene{density if pascal > 1 else ''}"
+        )
+    if not lowest <= material.temperature <= highest:
+        yield f"material.temperature = {material.temperature:g}: an absolute temperature in K; 37 degC are 310.15"
+
+
+def _of_lengths(geometry: Shape) -> Iterator[str]:
+    for key, words, ratio, decades in geometry.proportions:
+        if _beyond(ratio, decades):
+            value = getattr(geometry, key)
+            unit = "all lengths are in one unit, geometry.length_unit"
+            yield f"geometry.{key} = {value:g}: {words} is {ratio:.3g}; {unit}"
+
+
+def _of_load(
+    name: str, kind: LoadKind, value: float, material: Material, geometry: Shape, network: float
+) -> Iterator[str]:
+    key = f"loads.{name}.value"
+    if kind.doubtful is not None and abs(value) >= kind.doubtful[0]:
+        yield f"{key}: {value:g} at its largest; {kind.doubtful[1]}"
+    stress = largest_stress(kind, value, geometry)
+    if not stress:
+        return
+    ratio = abs(stress) / (material.lame_mu + network)
+    if way := _beyond(ratio, LOAD):
+        yield (
+            f"{key}: a stress of {abs(stress):.3g} {material.stress_unit} at its largest, {_times(ratio)} "
+            f"{'more' if way > 0 else 'less'} than the stiffness of matrix and network (lame_mu + c g(r0) r0^2 = "
+            f"{material.lame_mu + network:.3g} {material.stress_unit}); all are in one unit, material.stress_unit"
+        )
+
+
+def _beyond(ratio: float, decades: tuple[int, int]) -> int:
+    """-1 or 1 where it is below or above them, else 0."""
+    return (ratio > 10.0 ** decades[1]) - (ratio < 10.0 ** decades[0])
+
+
+def _times(ratio: float) -> str:
+    """By what it differs from one: two digits, and decades."""
+    factor = max(ratio, 1 / ratio)
+    return f"{float(f'{factor:.2g}'):g} times ({math.log10(factor):.1f} decades)"
+
 
 NAME = r"[A-Za-z][A-Za-z0-9_]{0,39}"  # of a region or a further load: part of the name of a column
 FORMAT = 2  # of recorded scenes: raised where a reader of the one before would not understand them
@@ -278,7 +379,7 @@ class Scene(Table):
 
     def missing_for_implicit(self) -> str | None:
         """What the scene lacks for the coupling "implicit"; None where it lacks nothing."""
-        from remodel_fenicsx.model.implicit.condensed import refused  # six modules that most runs need not load
+        from remodel_fenicsx.model.implicit import refused  # six modules that most runs need not load
 
         material, remodeling = self.material, self.remodeling
         if self.formulation != "displacement":

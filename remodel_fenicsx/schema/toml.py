@@ -17,7 +17,7 @@ from pydantic import BaseModel
 
 from remodel_fenicsx.schema.tables import SceneError, printable, shown
 from remodel_fenicsx.schema.units import is_quantity
-from remodel_fenicsx.system.regular_files import read_regular
+from remodel_fenicsx.system.files import read_regular
 
 COMMENT_WIDTH = 100  # characters of a line of comment
 LARGEST = 10**6  # bytes: thirty times a scene with all keys and their comments

@@ -19,9 +19,8 @@ from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.settings import Solver
 from remodel_fenicsx.solver.equilibrium import Equilibrium, Extension
 from remodel_fenicsx.solver.newton import MANY, POSSIBLE_JUMP, Counted, GuardedNewton, Solution, SolveFailure
-from remodel_fenicsx.solver.refusals import BIFURCATION, LIMIT_POINT, SEVERAL_SOLUTIONS, Refusal, diagnosed
-from remodel_fenicsx.state.memory import Numbers
-from remodel_fenicsx.state.state import State
+from remodel_fenicsx.solver.diagnosis import BIFURCATION, LIMIT_POINT, SEVERAL_SOLUTIONS, Refusal, diagnosed
+from remodel_fenicsx.state.state import Numbers, State
 
 SLOPE_SHARE = 1e-3  # of the bounded part: over it the slope of the residual is taken
 SAME_SOLUTION = (

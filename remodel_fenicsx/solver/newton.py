@@ -17,16 +17,198 @@ from remodel_fenicsx.fem.assembly import over_ranks
 from remodel_fenicsx.fem.petsc_options import ProblemOptions
 from remodel_fenicsx.fem.solver_methods import AUTO, LAGGED, SOLVER_METHODS, chosen, is_small, method_options
 from remodel_fenicsx.settings import Solver
-from remodel_fenicsx.solver.convergence import PRESCRIBED_ROUNDING, Convergence
 from remodel_fenicsx.solver.equilibrium import Equilibrium, Extension, Look
-from remodel_fenicsx.solver.limits import Limits, reserved
 from remodel_fenicsx.solver.linear import EveryTangent
-from remodel_fenicsx.state.state import State
+from remodel_fenicsx.state.state import State, stress_rounding
 from remodel_fenicsx.system.interrupts import Interrupted
+
+
+# ---------------------------------------------------------------- when Newton's method has converged
+# When Newton's method has converged: a residual below a tolerance that no rounding error can pass.
+
+FORCE_ROUNDINGS = 8.0  # how many times the rounding of assembled forces a residual may be
+ROUNDED_STRAINS = 2.0  # the same of the rounding of displacements; on thin walls 0.07 to 0.96 were measured
+PRESCRIBED_TOLERANCE = (
+    1e-10  # of the body's size: how far a prescribed displacement may be missed; no force measures it
+)
+PRESCRIBED_ROUNDING = 1e-13  # of the body's size: prescribed values that are met to rounding
+# Of the nodal forces: residual of a part that others follow. A part may be 1/256 of a step, and the next one is held
+# against its direction: of 1e-3, which quasi-Newton steps stop just below, some were taken for jumps
+INTERMEDIATE_TOLERANCE = 1e-5
+# Above this r/L the rounding of one point may be more than this share of the nodal forces. A residual below it is then
+# accepted only when an iteration leaves more than this share of it
+NEARLY_STRAIGHT, COARSE, STAGNATION = 0.99, 1e-8, 0.25
+
+
+class Convergence:
+    """|R| <= absolute_tolerance + relative_tolerance |nodal forces|, not below the rounding of assembled forces.
+
+    Parameters
+    ----------
+    equilibrium
+        Whose residual it is.
+    settings
+        The tolerances.
+
+    Attributes
+    ----------
+    force_scale
+        Norm of the nodal forces, reactions included, at the present state: a scale that does not vanish in a hold.
+    prescribed_gap
+        Largest distance of a prescribed value from its target, relative to the body's size.
+    max_chain_extension, displacement
+        r/L and the largest unknown of the last admissible state.
+    intermediate
+        Whether the solution is only the start of a further one: then it may be coarser.
+    """
+
+    def __init__(self, equilibrium: Equilibrium, settings: Solver):
+        self.equilibrium, self.settings = equilibrium, settings
+        quadrature = equilibrium.quadrature
+        areas, gradients = quadrature.largest_areas, quadrature.gradients
+        self._area = quadrature.norm(areas)
+        self._area_of_gradients = quadrature.norm(areas * gradients)  # per displacement
+        self.force_scale = self.max_chain_extension = self.displacement = 0.0
+        self.prescribed_gap, self.intermediate = float("inf"), False
+        self.begin()
+
+    def begin(self) -> None:
+        """A solve begins: parameters may be others from solve to solve, not within one."""
+        self._largest = self.equilibrium.parameters.largest()
+        self.extended(self.max_chain_extension)
+
+    def extended(self, max_chain_extension: float) -> None:
+        """An admissible state has this largest r/L."""
+        self.max_chain_extension = max_chain_extension
+        self._stress_rounding = stress_rounding(self._largest, max_chain_extension)
+
+    def reached(self, norm: float, previous: float) -> bool:
+        """Whether a residual of this norm is accepted; `previous`: that of the iteration before, infinite at first.
+
+        Near L the rounding of the worst point may be far above that of all others, and the largest displacement is not
+        that of all elements. What is below such a rounding is accepted only when it goes no further down.
+        """
+        if self.prescribed_gap > PRESCRIBED_TOLERANCE:
+            return False
+        if self.intermediate and norm <= INTERMEDIATE_TOLERANCE * self.force_scale:
+            return True
+        tolerance = self.tolerance()
+        if norm > tolerance:
+            return False
+        requested = self.settings.absolute_tolerance + self.settings.relative_tolerance * self.force_scale
+        coarse = self.max_chain_extension > NEARLY_STRAIGHT and tolerance > COARSE * self.force_scale
+        certain = requested if coarse else self.tolerance(rounded_strains=0.0)
+        return norm <= certain or norm > STAGNATION * previous
+
+    def goal(self) -> float:
+        """Norm of the residual at which the solve ends, about."""
+        coarse = INTERMEDIATE_TOLERANCE * self.force_scale if self.intermediate else 0.0
+        return max(coarse, self.tolerance())
+
+    def tolerance(self, rounded_strains: float = ROUNDED_STRAINS) -> float:
+        """In the unit of force: relative to the nodal forces, not below the rounding of forces that cancel there.
+
+        Stresses are rounded, and so are displacements: over a thin element that is a strain of eps |u|/h.
+        """
+        relative = self.settings.relative_tolerance * self.force_scale
+        area = FORCE_ROUNDINGS * self._area + rounded_strains * self.displacement * self._area_of_gradients
+        return self.settings.absolute_tolerance + max(relative, self._stress_rounding * area)
+
+
+# ---------------------------------------------------------------- admissible states
+# Admissible states: the limits r < L and J > 0 in the line search of Newton's method.
+
+Array = NDArray[np.float64]
+
+NEAR_LIMIT, RESERVE = 0.95, 0.3  # a Newton step that ends above this r/L keeps this share of 1 - r/L
+
+
+class Limits:
+    """How far from their limits r < L and J > 0 the states of one solve are; each is evaluated once.
+
+    Parameters
+    ----------
+    equilibrium
+        Whose states they are.
+    bounded
+        Whether a bound may stand for a look: |dF| <= G max |du|, |dr| <= |l| |dF|, and J > 0 while |dF| < 2 J / (F:F).
+        It needs displacements for unknowns, and J at the quadrature points alone.
+    """
+
+    def __init__(self, equilibrium: Equilibrium, bounded: bool):
+        self.equilibrium, state = equilibrium, equilibrium.state
+        self._unknown: Array = state.unknown.x.array
+        self.bounded = bounded and state.kinematics.three_dimensional and state.dilatation.jacobians().shape[1] == 0
+        self._gain = equilibrium.quadrature.largest_gradient if self.bounded else np.inf
+        self.forget()
+
+    def forget(self) -> None:
+        """Cells or loads may be others from now on."""
+        self._place: Array | None = None
+        self._chains: Array | None = None  # |l|/L at the points
+        self._room, self._travelled = 0.0, np.inf
+
+    def look(self) -> Look:
+        """`Equilibrium.look` of the present unknowns."""
+        if not self._is_here():
+            self._place = self._unknown.copy()
+            self._found = self.equilibrium.look()
+            if self.bounded:
+                self._room, self._travelled = self._room_around(self._found), 0.0
+        return self._found
+
+    def allow(self, before: Look, after: Look) -> bool:
+        """Whether a step may end there: at an admissible state, with a reserve near L, and no J <= 0 on the way."""
+        if not after.extension.admissible:
+            return False
+        near = after.extension.max_chain_extension > NEAR_LIMIT
+        if near and not self.equilibrium.keeps_reserve(before.stretches, after.stretches, RESERVE, NEAR_LIMIT):
+            return False
+        return not self.equilibrium.turns_inside_out(before.states, after.states)
+
+    def certainly_allow(self, largest_displacement: float) -> bool:
+        """Whether a further step is admissible by the bound, without a look at its end; it then counts as made.
+
+        Parameters
+        ----------
+        largest_displacement
+            Bound of the change of a node's displacement, over all ranks.
+        """
+        further = self._travelled + self._gain * largest_displacement
+        if not further < self._room:
+            return False
+        self._travelled = further
+        return True
+
+    def _is_here(self) -> bool:
+        here = self._place is not None and bool((self._place == self._unknown).all())
+        return bool(over_ranks(self.equilibrium.comm, here, MPI.LAND))
+
+    def _room_around(self, look: Look) -> float:
+        """Largest |dF| at which J > 0 and r/L < NEAR_LIMIT at every point of all ranks."""
+        if not look.extension.admissible:
+            return 0.0
+        quadrature, cells = self.equilibrium.quadrature, self.equilibrium.state.cells
+        if self._chains is None:
+            length = np.sqrt(squares_of(cells.dimension_values)) / self.equilibrium.locking_length()
+            self._chains = np.maximum(quadrature.owned(length), 1e-300).reshape(-1)
+        room = cells.kernels.room(look.states, look.stretches.reshape(-1), self._chains, NEAR_LIMIT)
+        return float(over_ranks(self.equilibrium.comm, room, MPI.MIN))
+
+
+def reserved(before: float, after: float) -> bool:
+    """Whether of two largest r/L the later one is no nearer to 1 than a Newton step would come."""
+    return not after > NEAR_LIMIT or 1 - after >= RESERVE * (1 - before)
+
+
+def squares_of(vectors: Array) -> Array:
+    """Squared length of vectors (..., 3)."""
+    squares: Array = vectors[..., 0] ** 2 + vectors[..., 1] ** 2 + vectors[..., 2] ** 2
+    return squares
+
 
 log = logging.getLogger(__name__)
 
-Array = NDArray[np.float64]
 
 LINE_SEARCH_HALVINGS = 20  # of one Newton step, before the solve is given up
 POSSIBLE_JUMP = 1e-3  # of the body's size: displacements that may be a jump; 1 % of the radius of a tube of this length

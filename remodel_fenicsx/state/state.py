@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
+import dolfinx.fem
 import numpy as np
 from numpy.typing import NDArray
 
+from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.loading import Loading
-from remodel_fenicsx.fem import jit
+from remodel_fenicsx.fem import assembly, jit
+from remodel_fenicsx.fem.assembly import Remembered
 from remodel_fenicsx.fem.formulations import FORMULATIONS, Formulation
 from remodel_fenicsx.fem.kinematics import Kinematics
+from remodel_fenicsx.fem.quadrature import Quadrature
+from remodel_fenicsx.model.energy import TURNED_OVER, Tissue
 from remodel_fenicsx.state.unit_cells import CellField, UnitCells
 
 
@@ -244,3 +249,209 @@ class State:
         except BaseException:
             self.restore(before)
             raise
+
+
+# ---------------------------------------------------------------- what somebody remembers of earlier steps
+# What somebody remembers of earlier steps: functions and numbers of the state, so that resumed runs have them too.
+
+Array = NDArray[np.float64]
+
+
+class Numbers:
+    """Numbers of the state under a name of their own: transactions restore them, checkpoints hold them.
+
+    Parameters
+    ----------
+    state
+        Whose `numbers` they are.
+    name
+        What all their keys begin with.
+    initial
+        Names of the numbers, and what they are at the start.
+    """
+
+    def __init__(self, state: State, name: str, initial: Mapping[str, float]):
+        self.state, self.name, self.initial = state, name, dict(initial)
+        self._keys = {key: f"{name}_{key}" for key in self.initial}  # steps ask often
+
+    def __getitem__(self, key: str) -> float:
+        return self.state.numbers.get(self._keys[key], self.initial[key])
+
+    def __setitem__(self, key: str, value: float) -> None:
+        """The same value on all ranks."""
+        self.state.numbers[self._keys[key]] = float(value)
+
+    def forget(self) -> None:
+        """As at the start."""
+        for key, value in self.initial.items():
+            self[key] = value
+
+
+class Occasions:
+    """When it is time to look again at what changes with the loads, and slowly without.
+
+    Parameters
+    ----------
+    state
+        Whose loads they are.
+    name
+        Of whoever looks.
+    """
+
+    STEPS = 10  # of unchanged loads, after which one looks all the same: cells remodel
+
+    def __init__(self, state: State, name: str):
+        self.state = state
+        self._loads = Numbers(state, f"{name}_loads", dict.fromkeys(state.loading.values, 0.0))
+        self._steps = Numbers(state, f"{name}_steps", {"since": self.STEPS})
+
+    def due(self) -> bool:
+        """Whether it is, asked once in each step."""
+        loads = self.state.loading.values
+        changed = [name for name, value in loads.items() if self._loads[name] != value]
+        for name in changed:
+            self._loads[name] = loads[name]
+        self._steps["since"] += 1
+        due = bool(changed) or self._steps["since"] >= self.STEPS
+        if due:
+            self._steps["since"] = 0
+        return due
+
+
+class Earlier:
+    """The last values of a field, as functions of the state.
+
+    Parameters
+    ----------
+    state
+        Which has them from now on.
+    name
+        What the names of the functions begin with.
+    make
+        Makes a dolfinx function.
+    count
+        How many values are kept.
+    """
+
+    def __init__(self, state: State, name: str, make: Callable[[], Any], count: int):
+        self._functions = []
+        for age in range(count):
+            function = make()
+            function.name = f"{name}_{age}"
+            state.remember(function, f"{name}_known")
+            self._functions.append(function)
+        self._arrays: list[Array] = [function.x.array for function in self._functions]
+        self._numbers = Numbers(state, name, {"known": 0})
+
+    @property
+    def known(self) -> int:
+        """How many values there are."""
+        return int(self._numbers["known"])
+
+    @property
+    def values(self) -> list[Array]:
+        """The newest first, the functions' own memory, ghosts included."""
+        return self._arrays[: self.known]
+
+    def push(self, values: Array) -> None:
+        """One value more, for owned unknowns and ghosts; the oldest goes."""
+        for age in range(len(self._arrays) - 1, 0, -1):
+            self._arrays[age][:] = self._arrays[age - 1]
+        self._arrays[0][:] = values
+        self._numbers["known"] = min(self.known + 1, len(self._arrays))
+
+    def push_owned(self, values: Array) -> None:
+        """The same without ghosts; collective."""
+        whole = np.zeros_like(self._arrays[0])
+        whole[: len(values)] = values
+        self.push(whole)
+        self._functions[0].x.scatter_forward()
+
+    def forget(self) -> None:
+        """There have been none."""
+        self._numbers.forget()
+
+
+# ---------------------------------------------------------------- the parameters of a tissue on a mesh as numbers
+# The parameters of a tissue on a mesh as numbers and arrays, made again only where one of them has changed.
+
+
+def on_mesh(tissue: Tissue, mesh: Any) -> Tissue:
+    """The tissue with Constants in place of numbers, so that other numbers compile nothing.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If a parameter is neither a number, nor a Constant, nor a DG0 Function of the mesh.
+    """
+    return tissue.map(lambda name, value: value if name in TURNED_OVER else assembly.coefficient(mesh, name, value))
+
+
+def at_points(tissue: Tissue, quadrature: Quadrature) -> Tissue:
+    """A tissue on a mesh with its parameters as arrays over the points in one row, (elements * points,)."""
+    return tissue.map(lambda name, value: assembly.point_values(value, quadrature).reshape(-1))
+
+
+def stress_rounding(numbers: Tissue, max_chain_extension: float) -> float:
+    """Rounding error of a stress in a body, from the stiffness of matrix and network at the largest r/L.
+
+    Parameters
+    ----------
+    numbers
+        The largest value of each parameter (`Parameters.largest`).
+    max_chain_extension
+        r/L.
+    """
+    length = numbers.end_to_end_length
+    if numbers.locking_length is not None:
+        length = max(length, max_chain_extension * numbers.locking_length)
+    return float(np.finfo(np.float64).eps * numbers.stiffness(length))
+
+
+def by_region(domain: Domain, values: Mapping[str, float]) -> Any:
+    """A DG0 Function with the value of each region of a domain by its name; "" is for those that have none."""
+    found = dolfinx.fem.Function(dolfinx.fem.functionspace(domain.mesh, ("DG", 0)))
+    places = found.function_space.dofmap.list.reshape(-1)
+    for name, number in domain.regions.items():
+        found.x.array[places[domain.element_region == number]] = values[name if name in values else ""]
+    return found
+
+
+class Parameters:
+    """What the live parameters of a tissue are at present.
+
+    Parameters
+    ----------
+    tissue
+        On the mesh: each parameter is a Constant or a DG0 Function (`on_mesh`).
+    quadrature
+        The points.
+    """
+
+    def __init__(self, tissue: Tissue, quadrature: Quadrature):
+        self.tissue, self.quadrature = tissue, quadrature
+        values: list[Any] = []
+
+        def found(name: str, value: Any) -> Any:
+            values.append(value)
+            return value
+
+        tissue.map(found)
+        self._largest: Remembered[Tissue] = Remembered(quadrature.mesh.comm, *values)
+        self._at_points: Remembered[Tissue] = Remembered(None, *values)
+
+    def largest(self) -> Tissue:
+        """The largest value of each in the body, numbers. Collective."""
+        return self._largest(lambda: self.tissue.map(lambda name, value: assembly.largest(value, self.quadrature.mesh)))
+
+    def at_points(self) -> Tissue:
+        """`at_points`; not to be written into."""
+        return self._at_points(lambda: at_points(self.tissue, self.quadrature))
+
+    def locking_length(self) -> Array:
+        """Length at which a chain locks at all points, (elements, points); infinite where nothing locks."""
+        length = self.at_points().locking_length
+        if length is None:
+            return np.full(self.quadrature.shape, np.inf)
+        at_all: Array = length.reshape(self.quadrature.shape)
+        return at_all

@@ -16,9 +16,9 @@ from remodel_fenicsx.body.reductions import only_for_means
 from remodel_fenicsx.scene.scene import Scene, SceneError, in_region
 from remodel_fenicsx.schema.times import same_time
 from remodel_fenicsx.results.run_lock import RunLock
-from remodel_fenicsx.results.words import unit_of, words
+from remodel_fenicsx.results.history import unit_of, words
 from remodel_fenicsx.studies.page import COLOURS, STYLE, Page, add_head
-from remodel_fenicsx.studies.runs import FEWEST_RUNS, Run, TooFewRuns, run_all, write_study
+from remodel_fenicsx.studies.study import FEWEST_RUNS, Run, TooFewRuns, run_all, write_study
 from remodel_fenicsx.system.children import cores
 from remodel_fenicsx.system.environment import versions
 

@@ -24,7 +24,7 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
 from remodel_fenicsx._version import __version__
-from remodel_fenicsx.system.regular_files import write_whole
+from remodel_fenicsx.system.files import write_whole
 
 MARK = "remodel_fenicsx figures"  # in every picture, and beside every table: what bears it may be drawn anew
 DOTS_PER_INCH = {"png": 200, "pdf": 300, "svg": 300}  # of pictures in space where all else is lines and letters

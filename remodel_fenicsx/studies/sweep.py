@@ -17,12 +17,12 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from remodel_fenicsx.results.run_lock import RunLock
-from remodel_fenicsx.results.words import unit_of, words
+from remodel_fenicsx.results.history import unit_of, words
 from remodel_fenicsx.scene.scene import Scene, SceneError
 from remodel_fenicsx.schema.tables import shown
 from remodel_fenicsx.studies.page import COLOURS, STYLE, Page, add_head
-from remodel_fenicsx.studies.runs import FEWEST_RUNS, Run, TooFewRuns, run_all, write_study
-from remodel_fenicsx.system.arguments import MOST_RUNS
+from remodel_fenicsx.studies.study import FEWEST_RUNS, Run, TooFewRuns, run_all, write_study
+from remodel_fenicsx.system.files import MOST_RUNS
 from remodel_fenicsx.system.children import cores
 from remodel_fenicsx.system.environment import versions
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 from rich.console import Console, RenderableType
 from rich.constrain import Constrain
-from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, Progress as RichProgress, ProgressColumn, Task, TextColumn, TimeElapsedColumn
 from rich.table import Column
 from rich.text import Text
 
@@ -15,7 +15,7 @@ from rich.text import Text
 _MARGIN = 3
 
 
-class Bar(Progress):
+class Bar(RichProgress):
     """A bar on stderr. What others print stands above it; what goes to a file stays there.
 
     Parameters

@@ -14,7 +14,7 @@ from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
-from remodel_fenicsx.system.regular_files import open_own
+from remodel_fenicsx.system.files import open_own
 
 SECONDS_TO_END = 30.0  # seconds
 SERVE = "serve"  # the command of a worker's process

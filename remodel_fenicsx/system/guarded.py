@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from remodel_fenicsx.system.children import environment_of_child
-from remodel_fenicsx.system.regular_files import read_regular
+from remodel_fenicsx.system.files import read_regular
 
 LARGEST_FILE = 2 * 10**9  # bytes; ten million hexahedra take 1.1 GB
 SECONDS, SECONDS_PER_MB = 20.0, 1.0  # of processor time

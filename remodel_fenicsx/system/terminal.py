@@ -17,7 +17,7 @@ from statistics import median_low
 from typing import Any, cast
 
 from remodel_fenicsx.system import NOTICE
-from remodel_fenicsx.system.regular_files import open_own
+from remodel_fenicsx.system.files import open_own
 
 LOGGER = "remodel_fenicsx"
 LOG_FORMAT = "%(asctime)s %(levelname)s %(message)s"

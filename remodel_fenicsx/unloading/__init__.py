@@ -10,7 +10,7 @@ from pathlib import Path
 from mpi4py import MPI
 
 from remodel_fenicsx.scene import Scene, SceneError
-from remodel_fenicsx.unloading.failure import NoUnloadedShape
+from remodel_fenicsx.unloading.search import NoUnloadedShape
 from remodel_fenicsx.system.temporary import temporary_folder
 
 log = logging.getLogger(__name__)
@@ -75,11 +75,11 @@ def unloaded(scene: Scene, comm: MPI.Intracomm = MPI.COMM_WORLD, folder: Path | 
     if not scene.geometry.is_loaded:
         return scene
     if scene.geometry.unloads_by_numbers:
-        from remodel_fenicsx.unloading.tube import unloaded_tube
+        from remodel_fenicsx.unloading.search import unloaded_tube
 
         return unloaded_tube(scene, comm)
     if folder is None:
         raise SceneError("geometry.is = 'loaded': a folder is needed for the unloaded mesh")
-    from remodel_fenicsx.unloading.mesh import unloaded_mesh
+    from remodel_fenicsx.unloading.search import unloaded_mesh
 
     return unloaded_mesh(scene, comm, folder)

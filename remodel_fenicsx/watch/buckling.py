@@ -9,13 +9,12 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from remodel_fenicsx.body.buckling import Strut
+from remodel_fenicsx.body.reductions import Strut
 from remodel_fenicsx.evolution.stepper import Step, Stepper
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.energy import Tissue
-from remodel_fenicsx.state.memory import Occasions
-from remodel_fenicsx.state.parameters import at_points
-from remodel_fenicsx.watch.once import WarnsOnce
+from remodel_fenicsx.state.state import Occasions, at_points
+from remodel_fenicsx.watch.warnings import WarnsOnce
 
 Array = NDArray[np.float64]
 STRAINS = {1: 1e-5, 2: 1e-3}  # of the differences of W that make stresses and moduli: these are right to about 1e-6

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from remodel_fenicsx.evolution.stepper import Step, Stepper
 from remodel_fenicsx.fem.assembly import over_ranks
 from remodel_fenicsx.model import tensors
-from remodel_fenicsx.state.memory import Earlier
-from remodel_fenicsx.watch.once import WarnsOnce
+from remodel_fenicsx.state.state import Earlier
+from remodel_fenicsx.watch.warnings import WarnsOnce
 
 Array = NDArray[np.float64]
 

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from remodel_fenicsx import Scene, SceneError, Simulation, preset_scene
-from remodel_fenicsx.model.closing import Layer, closing
-from remodel_fenicsx.model.cutting import cut
+from remodel_fenicsx.model.residual_stress import Layer, closing, cut
 
 
 def scene(preset: str = "consistent", kinematics: str = "radial", **changes: Any) -> Scene:
@@ -84,7 +83,7 @@ def test_no_equilibrium_of_the_cut_is_said(monkeypatch: pytest.MonkeyPatch, capl
     def fails(*parts: Any) -> None:
         raise ArithmeticError("out of balance by 0.1")
 
-    monkeypatch.setattr("remodel_fenicsx.model.cutting.cut", fails)
+    monkeypatch.setattr("remodel_fenicsx.model.residual_stress.cut", fails)
     with caplog.at_level(logging.WARNING):
         assert np.isnan(angles(scene(**{"time.end": 5.0})))[0]
     assert "no opening_angle: out of balance by 0.1" in caplog.text

@@ -17,7 +17,7 @@ from mpi4py import MPI
 from remodel_fenicsx import Scene, SceneError, Simulation, cli, read_scene, run, running
 from remodel_fenicsx.body import tube
 from remodel_fenicsx.model.cells import structure_tensor
-from remodel_fenicsx.model.fibres import cells_of, structure_tensors
+from remodel_fenicsx.model.axes import cells_of, structure_tensors
 from remodel_fenicsx.running import resume
 from tests.results.test_export import TUBE
 

@@ -17,8 +17,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from remodel_fenicsx.body.axis_fields import area, facets_of
-from remodel_fenicsx.body.local_axes import MOST_UNDEFINED, UndefinedAxes
+from remodel_fenicsx.body.axes import MOST_UNDEFINED, UndefinedAxes, area, facets_of
 from tests import own_bodies, parts
 from tests.own_bodies import KnownBody, apart, bent, elliptic, fork, found, ring, straight
 

@@ -17,8 +17,7 @@ import meshio
 import numpy as np
 import pytest
 
-from remodel_fenicsx.body.mesh_file import MeshFileError
-from remodel_fenicsx.body.mesh_reader import read_mesh
+from remodel_fenicsx.body.mesh_file import MeshFileError, read_mesh
 from remodel_fenicsx.system import guarded
 
 POINTS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], dtype=float)

@@ -12,7 +12,7 @@ import pytest
 from mpi4py import MPI
 
 from remodel_fenicsx import Recording, Scene, SceneError, Simulation, cli, read_scene, run, unloaded
-from remodel_fenicsx.body.mesh_reader import read_mesh
+from remodel_fenicsx.body.mesh_file import read_mesh
 from remodel_fenicsx.results.fields import NodalGather
 from remodel_fenicsx.unloading import NoUnloadedShape
 from tests.body.test_natural import scene

@@ -20,7 +20,7 @@ from remodel_fenicsx.results.fields import NodalGather
 from remodel_fenicsx.scene import scene_from_dict
 from remodel_fenicsx.settings import Support
 from remodel_fenicsx.simulation import Simulation
-from remodel_fenicsx.studies.ladder import ladder
+from remodel_fenicsx.studies.trade import ladder
 from tests.mesh_files import COUNTS, LENGTH, RADII, write_tube
 
 LOADS = {name: {"value": value, "ramp": [[0, 0], [2, 1]]} for name, value in (("pressure", 2.0), ("elongation", 0.1))}

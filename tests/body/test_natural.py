@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from remodel_fenicsx import Scene, SceneError, Simulation, preset_scene
-from remodel_fenicsx.model.closing import Closing, Layer, closing
+from remodel_fenicsx.model.residual_stress import Closing, Layer, closing
 from remodel_fenicsx.results.columns import Measurement
 from remodel_fenicsx.studies.page import read_table
 
@@ -81,7 +81,7 @@ def test_the_closing_of_a_thick_wall_follows_its_own_error(
     found = closing(layers, angle)
     if axial is not None:
         assert found.axial == pytest.approx(axial, abs=1e-7)
-    monkeypatch.setattr("remodel_fenicsx.model.closing.DEGREE", 34)
+    monkeypatch.setattr("remodel_fenicsx.model.residual_stress.DEGREE", 34)
     again = closing(layers, angle)
     assert found.axial == pytest.approx(again.axial, abs=1e-7)
     places = np.geomspace(1.0, ratio, 9)
@@ -278,7 +278,7 @@ def test_stretched_layers_make_a_step_of_the_angle(monkeypatch: pytest.MonkeyPat
         alone = closing([layer._replace(prestretch=(1.0, 1.0, 1.0)) for layer in of], angle)
         return alone._replace(layers=tuple(of))
 
-    monkeypatch.setattr("remodel_fenicsx.model.closing.closing", held)
+    monkeypatch.setattr("remodel_fenicsx.model.residual_stress.closing", held)
     for axial, here, known in zip((1.05, 1.1, 1.2), rested, ((19, 36), (18, 56), (18, 76)), strict=True):
         found = ends_of_layers(axial)
         assert found == pytest.approx(known, abs=0.6)

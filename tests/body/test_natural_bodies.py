@@ -11,7 +11,7 @@ from mpi4py import MPI
 
 from remodel_fenicsx import Simulation, cli
 from remodel_fenicsx.body.tube import whole_tube
-from remodel_fenicsx.model.closing import Layer, closing
+from remodel_fenicsx.model.residual_stress import Layer, closing
 from remodel_fenicsx.scene import scene_from_dict
 from tests.body.test_layers import write_layers
 from tests.body.test_natural import layers, scene

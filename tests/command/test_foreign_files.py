@@ -31,11 +31,10 @@ from remodel_fenicsx.results.checkpoint_file import CheckpointError, read_checkp
 from remodel_fenicsx.results.recording import RecordingError
 from remodel_fenicsx.results.run_folder import choose_folder
 from remodel_fenicsx.results.vtkhdf import check_file
-from remodel_fenicsx.running import resume
-from remodel_fenicsx.running import run as run_scene
+from remodel_fenicsx.running import resume, run as run_scene
 from remodel_fenicsx.scene import preset_scene, read_scene
 from remodel_fenicsx.schema.toml import LARGEST, MOST_PARTS
-from remodel_fenicsx.studies.runs import Run
+from remodel_fenicsx.studies.study import Run
 from tests.command.test_run import demo, run
 from tests.conftest import slowly
 from tests.parts import pulled_cube

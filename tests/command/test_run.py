@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from remodel_fenicsx import cli
-from remodel_fenicsx.body.columns import COLUMNS
+from remodel_fenicsx.body.shape import COLUMNS
 from remodel_fenicsx.results.recording import read_history
 from remodel_fenicsx.scene.scene import read_scene
 from tests.conftest import mpirun, slowly

@@ -13,9 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from remodel_fenicsx.system import terminal
-from remodel_fenicsx.system import NOTICE
-from remodel_fenicsx.system.arguments import typed
+from remodel_fenicsx.system import NOTICE, terminal
+from remodel_fenicsx.system.files import typed
 from remodel_fenicsx.system.terminal import Progress, hold_log, open_log
 from tests.forks import forked
 

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from remodel_fenicsx.evolution.implicit import Implicit
 from remodel_fenicsx.model.cells import UnitCell, structure_tensor
 from remodel_fenicsx import Recording
-from remodel_fenicsx.running import resume
-from remodel_fenicsx.running import run as record
+from remodel_fenicsx.running import resume, run as record
 from remodel_fenicsx.scene.scene import scene_from_dict
 from remodel_fenicsx.simulation import Simulation
 from tests.conftest import Case, slowly

@@ -13,8 +13,7 @@ from remodel_fenicsx import Recording, SceneError, Simulation, cli
 from remodel_fenicsx.evolution.coupling import Staggered
 from remodel_fenicsx.evolution.stepper import Step, Watcher
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
-from remodel_fenicsx.model.laws import Drive
-from remodel_fenicsx.model.load_cases import largest_tension, mean_target, mean_tensor
+from remodel_fenicsx.model.laws import Drive, largest_tension, mean_target, mean_tensor
 from remodel_fenicsx.model.tensor_law import Target, target
 from remodel_fenicsx.scene import scene_from_dict
 from remodel_fenicsx.solver.continuation import StepFailure

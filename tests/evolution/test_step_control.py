@@ -11,15 +11,15 @@ import pytest
 from mpi4py import MPI
 
 from remodel_fenicsx import Recording, SceneError, Simulation, cli
-from remodel_fenicsx.evolution import time_error
+from remodel_fenicsx.evolution import time_steps as time_error
 from remodel_fenicsx.evolution.stepper import Step, Watcher
-from remodel_fenicsx.evolution.time_error import Estimate
+from remodel_fenicsx.evolution.time_steps import Estimate
 from remodel_fenicsx.model.cells import UnitCell, angle_between
 from remodel_fenicsx.running import resume, run
 from remodel_fenicsx.scene.scene import Scene, scene_from_dict
 from remodel_fenicsx.settings import MOST_STEPS, Time
 from remodel_fenicsx.solver.continuation import StepFailure
-from remodel_fenicsx.solver.refusals import TOO_LARGE
+from remodel_fenicsx.solver.diagnosis import TOO_LARGE
 
 END = 40.0
 COUPLINGS = {
@@ -243,7 +243,7 @@ def test_a_run_that_goes_on_takes_the_same_steps(coupling: str, changes: dict[st
     rows = (whole / "history.csv").read_text().splitlines(keepends=True)
     part = tmp_path / "part"
     with pytest.MonkeyPatch.context() as patch:
-        from remodel_fenicsx.evolution import pause
+        from remodel_fenicsx.evolution import stepper as pause
         from remodel_fenicsx.system.interrupts import Paused
 
         def stops(self: pause.Pause, step: Step) -> None:

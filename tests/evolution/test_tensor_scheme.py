@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.body import Cube, LoadKind
 from remodel_fenicsx import Recording
-from remodel_fenicsx.running import resume
-from remodel_fenicsx.running import run as record
+from remodel_fenicsx.running import resume, run as record
 from remodel_fenicsx.scene.scene import SceneError, scene_from_dict
 from remodel_fenicsx.schema.units import FORCE
 from remodel_fenicsx.simulation import Simulation

@@ -15,11 +15,10 @@ import ufl
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from remodel_fenicsx import Scene, SceneError, Simulation
-from remodel_fenicsx.body.columns import Column
+from remodel_fenicsx import Recording, Scene, SceneError, Simulation
+from remodel_fenicsx.body.shape import Column
 from remodel_fenicsx.evolution.stepper import Step, Watcher
 from remodel_fenicsx.results.fields import Fields
-from remodel_fenicsx import Recording
 from remodel_fenicsx.results.run_folder import RunFolder
 from remodel_fenicsx.results.vtkhdf import TransientGrid
 from tests.parts import pulled_cube

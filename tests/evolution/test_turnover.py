@@ -11,7 +11,7 @@ import pytest
 
 from remodel_fenicsx import Recording, SceneError, Simulation, cli
 from remodel_fenicsx.body.tube import _opening_angle
-from remodel_fenicsx.model import closing
+from remodel_fenicsx.model import residual_stress as closing
 from remodel_fenicsx.model.chains import CHAINS
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.model.turnover import rates

@@ -17,7 +17,7 @@ from remodel_fenicsx.model.drivers import DRIVERS
 from remodel_fenicsx.model.energy import MATRICES, neo_hookean
 from remodel_fenicsx.scene import preset_scene
 from remodel_fenicsx.settings import Cells, Material
-from remodel_fenicsx.watch.locking import WARNED_SHARE, LockingWarning, PressureNoise
+from remodel_fenicsx.watch.warnings import WARNED_SHARE, LockingWarning, PressureNoise
 from tests import parts
 from tests.conftest import Case, slowly
 from tests.locking_bodies import EXACT_TUBE, bar_scene, membrane_scene, registered, thick_tube

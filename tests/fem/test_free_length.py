@@ -16,7 +16,7 @@ from remodel_fenicsx.body.reductions import AUTO, choice
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.running import resume, run
 from remodel_fenicsx.scene import scene_from_dict
-from remodel_fenicsx.solver.pointwise import PointStresses
+from remodel_fenicsx.solver.equilibrium import PointStresses
 from tests.conftest import Case
 from tests.parts import tube
 

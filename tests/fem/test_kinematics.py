@@ -276,7 +276,7 @@ def test_a_load_is_for_the_reductions_that_have_it(monkeypatch: pytest.MonkeyPat
 def test_axes_of_ones_own_may_have_no_symmetry(monkeypatch: pytest.MonkeyPatch) -> None:
     from remodel_fenicsx.body import Cube, Tube
     from remodel_fenicsx.model.cells import global_axes
-    from remodel_fenicsx.model.local_axes import AXES
+    from remodel_fenicsx.model.axes import AXES
 
     monkeypatch.setitem(AXES, "tilted", lambda points: np.roll(global_axes(points.coordinates), 1, axis=-1))
     for shape in (Cube, Tube):

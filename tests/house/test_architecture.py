@@ -23,22 +23,6 @@ ROOMS = ("_lazy", "_version", "system", "schema", "model", "fem", "kernels", "se
          "solver", "evolution", "watch", "results", "report", "simulation", "unloading", "running", "studies",
          "pictures", "recording", "cli",
          "parts", "extend")  # fmt: skip
-# imports that only the type checker follows: of what is there without dolfinx, to what is not
-TYPES_ONLY = {
-    "__init__": {"recording", "results.recording", "running", "scene", "simulation", "unloading"},
-    "body.columns": {"body.shape"},
-    "body.cube": {"body.domain", "body.loading"},
-    "body.layers": {"body.domain"},
-    "body.mesh_body": {"body.domain", "body.loading", "body.mesh_faces"},
-    "body.mesh_supports": {"body.loading", "body.mesh_domain"},
-    "body.natural": {"body.domain"},
-    "body.shape": {"body.domain", "body.loading", "fem.quadrature"},
-    "body.tendon": {"body.domain", "body.loading"},
-    "body.tube": {"body.domain", "body.loading"},
-    "body.walled": {"body.domain", "fem.quadrature"},
-    "extend": {"evolution.coupling", "solver.linear", "fem.jit", "results.columns"},
-    "results.recording": {"scene.scene"},
-}
 
 
 @dataclass(frozen=True)
@@ -182,14 +166,6 @@ def test_no_modules_import_each_other_in_a_circle() -> None:
 
     for module in modules():
         visit(module, ())
-
-
-def test_imports_for_the_type_checker_alone_are_these() -> None:
-    found: dict[str, set[str]] = {}
-    for arrow in arrows():
-        if arrow.when == "types":
-            found.setdefault(arrow.importer, set()).add(arrow.imported)
-    assert found == TYPES_ONLY
 
 
 @pytest.mark.parametrize(("inside", "never"), [

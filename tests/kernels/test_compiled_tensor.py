@@ -14,12 +14,11 @@ from scipy.spatial.transform import Rotation
 from remodel_fenicsx import SceneError, preset_scene
 from remodel_fenicsx.kernels.library import with_kernels
 from remodel_fenicsx.kernels.tensor import CompiledPoints, TensorKernels, condensed_points
-from remodel_fenicsx.model import energy
+from remodel_fenicsx.model import energy, implicit as condensed
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.chains import CHAINS, Chain
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES, Driver
-from remodel_fenicsx.model.implicit import condensed
-from remodel_fenicsx.model.implicit.condensed import CondensedPoints, Driving
+from remodel_fenicsx.model.implicit import CondensedPoints, Driving
 from remodel_fenicsx.model.laws import LAWS, Drive, Law, follow_tensor, tensor_target
 from tests.model.test_condensed import deformations, points
 from tests.model.test_tensor_law import cells_of, right_cauchy_green, structures

@@ -16,7 +16,7 @@ from mpi4py import MPI
 from remodel_fenicsx.kernels.tensor import TensorKernels, condensed_points
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.energy import REPULSIONS, Tissue
-from remodel_fenicsx.model.implicit.condensed import CondensedPoints
+from remodel_fenicsx.model.implicit import CondensedPoints
 from remodel_fenicsx.scene import preset_scene
 from remodel_fenicsx.scene.scene import Scene
 from remodel_fenicsx.simulation import Simulation

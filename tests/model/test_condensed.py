@@ -15,9 +15,15 @@ from remodel_fenicsx.model import spectral, tensors
 from remodel_fenicsx.model.cells import UnitCell, structure_tensor
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
 from remodel_fenicsx.model.energy import REPULSIONS, Tissue
-from remodel_fenicsx.model.implicit.condensed import CondensedPoints, LocalSolution
-from remodel_fenicsx.model.implicit.network import OrthotropicCells, Strain
-from remodel_fenicsx.model.implicit.responses import StepOfCells, jumps_by_rank, response
+from remodel_fenicsx.model.implicit import (
+    CondensedPoints,
+    LocalSolution,
+    OrthotropicCells,
+    StepOfCells,
+    Strain,
+    jumps_by_rank,
+    response,
+)
 from remodel_fenicsx.model.laws import LAWS, Drive
 from remodel_fenicsx.model.turnover import TurnoverRule, at_the_end, rates
 

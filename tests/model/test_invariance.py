@@ -13,8 +13,7 @@ import dolfinx.fem
 import dolfinx.mesh
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from mpi4py import MPI
 
 from remodel_fenicsx.body import Cube

@@ -6,7 +6,7 @@ import numpy as np
 
 from remodel_fenicsx.body import Tube
 from remodel_fenicsx.model.cells import cylindrical_axes, pitch_angle, radial_share
-from remodel_fenicsx.model.local_axes import LocalAxes
+from remodel_fenicsx.model.axes import LocalAxes
 from tests import parts
 
 

@@ -12,11 +12,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from remodel_fenicsx import cli
-from remodel_fenicsx.pictures import files, rendering
+from remodel_fenicsx import Recording, cli
+from remodel_fenicsx.pictures import files, bodies as rendering
 from remodel_fenicsx.pictures.bodies import coloured, scale_colours
-from remodel_fenicsx.results.drawing import ANGLE_COLOURS
-from remodel_fenicsx import Recording
+from remodel_fenicsx.results.recording import ANGLE_COLOURS
 from remodel_fenicsx.results.vtkhdf import TransientGrid
 from remodel_fenicsx.results.whole_body import WholeBody
 from tests.report.conftest import Recorded

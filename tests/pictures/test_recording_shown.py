@@ -18,7 +18,7 @@ import pytest
 from matplotlib.colors import to_rgb
 
 from remodel_fenicsx import Recording, RecordingError
-from remodel_fenicsx.results.drawing import ANGLE_COLOURS
+from remodel_fenicsx.results.recording import ANGLE_COLOURS
 from tests.report.conftest import DEMOS, Recorded
 
 NOTEBOOK = DEMOS / "artery.ipynb"

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from remodel_fenicsx.report import REPORT, write_report
-from remodel_fenicsx.results.drawing import ANGLE_COLOURS
+from remodel_fenicsx.results.recording import ANGLE_COLOURS
 from remodel_fenicsx import Recording
 from tests.browser import Browser, Pixels, browser_path
 from tests.report.conftest import RUNS, Recorded

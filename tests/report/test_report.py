@@ -19,17 +19,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from remodel_fenicsx import cli
+from remodel_fenicsx import Recording, cli
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.report import REPORT, page, write_report
-from remodel_fenicsx.report.packing import ANGLE_STEPS, NO_ANGLE, of_angles
-from remodel_fenicsx.report.story import Story
-from remodel_fenicsx.results.drawing import ANGLE_COLOURS
-from remodel_fenicsx.results.kept_times import kept_times
-from remodel_fenicsx import Recording
-from remodel_fenicsx.results.recording import HistoryColumns
+from remodel_fenicsx.report.card import ANGLE_STEPS, NO_ANGLE, of_angles
+from remodel_fenicsx.report.parts import Story
+from remodel_fenicsx.results.recording import ANGLE_COLOURS, HistoryColumns, kept_times
 from remodel_fenicsx.results.vtkhdf import TransientGrid
-from remodel_fenicsx.results.words import unit_of, with_unit
+from remodel_fenicsx.results.history import unit_of, with_unit
 from remodel_fenicsx.scene.scene import preset_scene
 from tests.forks import forked
 from tests.report.conftest import DEMOS, Recorded

@@ -9,7 +9,7 @@ import pytest
 from mpi4py import MPI
 
 from remodel_fenicsx.body import SHAPES
-from remodel_fenicsx.body.columns import PROFILE, columns_of
+from remodel_fenicsx.body.shape import PROFILE, columns_of
 from remodel_fenicsx.model.cells import cylindrical_axes
 from remodel_fenicsx.results.columns import Observer
 from remodel_fenicsx.results.fields import ElementFields

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from remodel_fenicsx.body.columns import COLUMNS
+from remodel_fenicsx.body.shape import COLUMNS
 from remodel_fenicsx.evolution.stepper import Step
 from remodel_fenicsx.results.history import History
 from remodel_fenicsx.results.recording import read_history

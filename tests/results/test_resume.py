@@ -26,7 +26,7 @@ from remodel_fenicsx.model.cells import structure_tensor
 from remodel_fenicsx.results.checkpoint import Checkpoints, gather_state, restore_state
 from remodel_fenicsx.results.checkpoint_file import Checkpoint, CheckpointError, _read, read_checkpoint, read_pointer
 from remodel_fenicsx.results.recording import RecordingError
-from remodel_fenicsx.system.arguments import typed
+from remodel_fenicsx.system.files import typed
 from remodel_fenicsx.results.run_lock import FolderTaken, RunLock, writer
 from remodel_fenicsx.results.status import status
 from remodel_fenicsx.running import resume, run
@@ -35,9 +35,9 @@ from remodel_fenicsx.settings import COUPLINGS, CouplingKind
 from remodel_fenicsx.solver.continuation import StepFailure, Work
 from remodel_fenicsx.state.state import State
 from remodel_fenicsx.system.interrupts import Paused
-from remodel_fenicsx.watch import equilibrium_stability, over_correction
-from remodel_fenicsx.watch.equilibrium_stability import EquilibriumStability
-from remodel_fenicsx.watch.locking import LockingWarning, Missing
+from remodel_fenicsx.watch import stability as equilibrium_stability, over_correction
+from remodel_fenicsx.watch.stability import EquilibriumStability
+from remodel_fenicsx.watch.warnings import LockingWarning, Missing
 from remodel_fenicsx.watch.over_correction import OverCorrection
 from tests.conftest import mpirun
 from tests.forks import forked

@@ -18,9 +18,8 @@ import numpy as np
 import pytest
 
 from remodel_fenicsx.results import vtkhdf
-from remodel_fenicsx.results.chain_lines import chain_displacement, chain_lines
-from remodel_fenicsx.results.staged_file import StagedFile
-from remodel_fenicsx.results.vtkhdf import LINE, TransientGrid, vtk_cells
+from remodel_fenicsx.results.turned import chain_displacement, chain_lines
+from remodel_fenicsx.results.vtkhdf import LINE, StagedFile, TransientGrid, vtk_cells
 from tests.forks import forked
 
 # In a process of its own, as users do. Steps are read forwards and backwards: VTK keeps the meshes of earlier steps.

@@ -14,10 +14,9 @@ from pathlib import Path
 
 import pytest
 
-from remodel_fenicsx import Recording, RecordingError, cli, preset_scene
-from remodel_fenicsx import run as run_scene
+from remodel_fenicsx import Recording, RecordingError, cli, preset_scene, run as run_scene
 from remodel_fenicsx.results.run_lock import RunLock
-from remodel_fenicsx.system.regular_files import write_new
+from remodel_fenicsx.system.files import write_new
 from remodel_fenicsx.system.temporary import temporary_folder
 
 # a command that is killed at its N-th write, rename or link that has to do with a file of this name
@@ -58,7 +57,7 @@ def test_revolve_that_was_killed_does_not_block_itself(quarter: Path) -> None:
 def test_a_new_file_is_whole_or_not_there(tmp_path: Path) -> None:
     """Killed before its name is given, and when it is there already."""
     path = tmp_path / "page.html"
-    program = "import os; from pathlib import Path; from remodel_fenicsx.system import regular_files as files\n"
+    program = "import os; from pathlib import Path; from remodel_fenicsx.system import files\n"
     program += f"os.link = lambda *_: os.kill(os.getpid(), 9)\nfiles.write_new(Path({str(path)!r}), b'x' * 10**6)"
     assert subprocess.run([sys.executable, "-c", program]).returncode == -signal.SIGKILL
     assert not path.exists()

@@ -25,8 +25,7 @@ from typing import Any
 
 import pytest
 import tomlkit
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, given, settings, strategies as st
 
 from remodel_fenicsx import Recording, Scene, SceneError, cli, running
 from remodel_fenicsx.body.domain import Domain

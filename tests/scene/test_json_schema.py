@@ -9,12 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, given, settings, strategies as st
 
 from remodel_fenicsx import SceneError, cli, read_scene
 from remodel_fenicsx.body import SHAPES
-from remodel_fenicsx.scene.json_schema import json_schema
+from remodel_fenicsx.scene.reference import json_schema
 from remodel_fenicsx.scene.presets import PRESETS
 from remodel_fenicsx.scene.scene import preset_scene, scene_from_dict
 from remodel_fenicsx.schema.toml import put

@@ -17,7 +17,7 @@ from remodel_fenicsx.scene import scene_from_dict
 from remodel_fenicsx.solver.continuation import Change, StepFailure
 from remodel_fenicsx.solver.equilibrium import Extension
 from remodel_fenicsx.solver.newton import GuardedNewton, SolveFailure
-from remodel_fenicsx.solver.refusals import diagnosed
+from remodel_fenicsx.solver.diagnosis import diagnosed
 from tests.locking_bodies import thick_tube
 
 LARGEST = 0.3018  # pressure of this tube: benchmarks/stability_map/tube_march.py, with the inner radius prescribed

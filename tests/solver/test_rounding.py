@@ -10,7 +10,7 @@ from remodel_fenicsx.scene import preset_scene
 from remodel_fenicsx.settings import Cells
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.solver.continuation import StepFailure
-from remodel_fenicsx.solver.convergence import Convergence
+from remodel_fenicsx.solver.newton import Convergence
 from tests import parts
 from tests.parts import cube
 from tests.reference.radial import RadialMaterial, Tube

@@ -22,11 +22,9 @@ from remodel_fenicsx.fem.solver_methods import (
 from remodel_fenicsx.kernels import factor as single
 from remodel_fenicsx.scene import SceneError, preset_scene
 from remodel_fenicsx.solver import linear, newton
-from remodel_fenicsx.solver.limits import Limits
-from remodel_fenicsx.solver.linear import KeptFactor, Lagged, worth
-from remodel_fenicsx.solver.newton import LoadPhase
-from remodel_fenicsx.solver.quasi_newton import Secants
-from remodel_fenicsx.watch.locking import VolumeResponse
+from remodel_fenicsx.solver.newton import Limits, LoadPhase
+from remodel_fenicsx.solver.linear import KeptFactor, Lagged, Secants, worth
+from remodel_fenicsx.watch.warnings import VolumeResponse
 from tests import parts
 from tests.parts import tube
 

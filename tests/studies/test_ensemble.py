@@ -20,7 +20,7 @@ from remodel_fenicsx.results.status import status
 from remodel_fenicsx.running import run
 from remodel_fenicsx.scene.scene import Scene, scene_from_dict
 from remodel_fenicsx.studies import ensemble as study
-from remodel_fenicsx.studies.runs import Run, TooFewRuns, run_all
+from remodel_fenicsx.studies.study import Run, TooFewRuns, run_all
 from remodel_fenicsx.system.interrupts import Paused
 from tests import forks
 from tests.conftest import forked_children

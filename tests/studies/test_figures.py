@@ -25,14 +25,14 @@ from PIL import Image
 
 import remodel_fenicsx
 from remodel_fenicsx import Recording, cli, run
-from remodel_fenicsx.body.columns import columns_of
-from remodel_fenicsx.pictures import bodies, rendering
+from remodel_fenicsx.body.shape import columns_of
+from remodel_fenicsx.pictures import bodies, bodies as rendering
 from remodel_fenicsx.results import vtkhdf
 from remodel_fenicsx.results.recording import RecordingError, steps_recorded
 from remodel_fenicsx.scene.scene import Scene, SceneError, scene_from_dict
 from remodel_fenicsx.studies import page
 from remodel_fenicsx.studies.page import FigureError
-from remodel_fenicsx.studies.runs import Run
+from remodel_fenicsx.studies.study import Run
 
 PACKAGE = Path(remodel_fenicsx.__file__).parent
 DOCS = PACKAGE.parent / "docs"

@@ -15,14 +15,12 @@ import pytest
 from mpi4py import MPI
 from PIL import Image
 
-from benchmarks.recovery import MOST, fitted, noisy, tables
-from benchmarks.recovery import TRUTH as RECOVERED
-from benchmarks.recovery import tube as tube_of_the_benchmark
+from benchmarks.recovery import MOST, TRUTH as RECOVERED, fitted, noisy, tables, tube as tube_of_the_benchmark
 from remodel_fenicsx import Scene, SceneError, Simulation, cli, preset_scene, read_scene
 from remodel_fenicsx.results.run_lock import FolderTaken, RunLock
 from remodel_fenicsx.settings import STRESS_UNITS
 from remodel_fenicsx.studies.fit import Problem, fit, minimised
-from remodel_fenicsx.studies.measured import read_measurements
+from remodel_fenicsx.studies.measurements import read_measurements
 
 ROOT = Path(__file__).parents[2]
 TRUTH = {"material.lame_mu": 3.0, "material.chain_density": 2e21, "remodeling.kappa": 0.05}

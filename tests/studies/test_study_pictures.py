@@ -12,8 +12,7 @@ from matplotlib.figure import Figure
 
 from remodel_fenicsx.scene.scene import Scene, preset_scene
 from remodel_fenicsx.studies import ensemble, stability, trade
-from remodel_fenicsx.studies.estimates import estimated
-from remodel_fenicsx.studies.ladder import ladder
+from remodel_fenicsx.studies.trade import estimated, ladder
 from remodel_fenicsx.studies.page import Page
 from tests.studies.test_trade import artery, made_up
 

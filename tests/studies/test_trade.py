@@ -13,16 +13,26 @@ import numpy as np
 import pytest
 
 from remodel_fenicsx import Recording, cli, read_scene
-from remodel_fenicsx.body.columns import PROFILE, PROFILE_PLACES, profile_weights
+from remodel_fenicsx.body.shape import PROFILE, PROFILE_PLACES, profile_weights
 from remodel_fenicsx.results.recording import HistoryColumns
 from remodel_fenicsx.results.status import status
 from remodel_fenicsx.scene.presets import PROFILES
 from remodel_fenicsx.scene.scene import Scene, preset_scene
-from remodel_fenicsx.studies import ladder as rungs
-from remodel_fenicsx.studies import trade as study
-from remodel_fenicsx.studies.estimates import Result, Trade, estimated, limit, pareto, typical
-from remodel_fenicsx.studies.ladder import Setting, compared_times, ladder
-from remodel_fenicsx.studies.trade import in_words, picture, write
+from remodel_fenicsx.studies import trade as rungs, trade as study
+from remodel_fenicsx.studies.trade import (
+    Result,
+    Setting,
+    Trade,
+    compared_times,
+    estimated,
+    in_words,
+    ladder,
+    limit,
+    pareto,
+    picture,
+    typical,
+    write,
+)
 from tests.conftest import forked_children
 from tests.reference.radial import solve_radial
 

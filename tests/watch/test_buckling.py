@@ -13,8 +13,7 @@ import pytest
 from mpi4py import MPI
 
 from remodel_fenicsx import Scene, Simulation
-from remodel_fenicsx.body.buckling import expected_thrust
-from remodel_fenicsx.body.reductions import choice, explained
+from remodel_fenicsx.body.reductions import choice, expected_thrust, explained
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.studies.stability import in_words, stability
 from remodel_fenicsx.watch.buckling import BucklingWarning

@@ -20,11 +20,10 @@ from remodel_fenicsx.results.recording import read_history
 from remodel_fenicsx.settings import Cells
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.solver.equilibrium import Extension
-from remodel_fenicsx.solver.inertia import Inertia
+from remodel_fenicsx.solver.diagnosis import Inertia, diagnosed
 from remodel_fenicsx.solver.newton import SolveFailure
-from remodel_fenicsx.solver.refusals import diagnosed
-from remodel_fenicsx.watch import equilibrium_stability
-from remodel_fenicsx.watch.equilibrium_stability import EquilibriumStability
+from remodel_fenicsx.watch import stability as equilibrium_stability
+from remodel_fenicsx.watch.stability import EquilibriumStability
 from tests import parts
 from tests.parts import cube, tube
 

@@ -14,7 +14,7 @@ from remodel_fenicsx import Simulation
 from remodel_fenicsx.body import SHAPES
 from remodel_fenicsx.scene import Scene, scene_from_dict
 from remodel_fenicsx.system import NOTICE
-from remodel_fenicsx.watch.tissue import VolumeLoss
+from remodel_fenicsx.watch.warnings import VolumeLoss
 from tests.conftest import Case, slowly
 
 SELF = MPI.COMM_SELF

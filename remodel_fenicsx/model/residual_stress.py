@@ -1,27 +1,95 @@
-"""The natural configuration of a tube: what closes and joins to a known ring, with or without loads.
-
-A ring that is cut opens to a sector, and its layers may be stretched before they are joined. In cylindrical axes
-
-    G = diag(k r/R, g_z, dr/dR) P,    k = 360/(360 - opening angle),
-
-where R(r) is the sector's radius of what lies at r in the ring, and P the prestretch of the layer. R and g_z are such
-that the ring is in equilibrium: as the unloaded tube without pressure and without axial force.
-"""
+"""Residual stress of a round wall: closed from a sector, or cut, on panels through its radius."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
 from remodel_fenicsx.model.cells import UnitCell
-from remodel_fenicsx.model.energy import Tissue
-from remodel_fenicsx.model.panels import Panels
+from remodel_fenicsx.model.energy import TURNED_OVER, Tissue
+
+
+# ---------------------------------------------------------------- functions of the radius on panels
+# Functions of the radius on panels: values at Chebyshev points, with derivative and integral.
+#  A panel is a layer or a part of one: within it a function is smooth, from one to the next its derivative may jump.
 
 Array = NDArray[np.float64]
+
+
+class Panels:
+    """Chebyshev points of one or more panels, and what is done with values there.
+
+    Parameters
+    ----------
+    edges
+        Radii at which the panels begin and end, one more than panels.
+    degree
+        Of the polynomials.
+
+    Attributes
+    ----------
+    places
+        Radii of the points, (panels, degree + 1), increasing; neighbours share their edge.
+    """
+
+    def __init__(self, edges: Sequence[float], degree: int):
+        self.edges, self.degree = np.asarray(edges, dtype=np.float64), degree
+        self._points = points = np.cos(np.pi * np.arange(degree, -1, -1) / degree)
+        self._half = np.diff(self.edges)[:, None] / 2
+        self.places: Array = self.edges[:-1, None] + self._half * (points + 1)
+        self.places[:, -1] = self.edges[1:]
+        self._coefficients = np.linalg.inv(chebyshev.chebvander(points, degree))
+        ones = np.eye(degree + 1)
+        slopes = np.stack([chebyshev.chebval(points, chebyshev.chebder(one)) for one in ones], axis=-1)
+        self._slope: Array = slopes @ self._coefficients
+        areas = np.array([chebyshev.chebval(1.0, chebyshev.chebint(one, lbnd=-1)) for one in ones])
+        self._weights: Array = areas @ self._coefficients
+
+    def derivative(self, values: Array) -> Array:
+        """By the radius, of values (panels, points)."""
+        found: Array = values @ self._slope.T / self._half
+        return found
+
+    def integral(self, values: Array) -> float:
+        """Over all panels."""
+        return float(np.sum(values * self._weights * self._half))
+
+    def jumps(self, values: Array) -> Array:
+        """From one panel to the next, (panels - 1,)."""
+        return values[1:, 0] - values[:-1, -1]
+
+    def of(self, radius: Array) -> NDArray[np.intp]:
+        """Number of the panel of each radius (...,); what is outside belongs to the nearest."""
+        return np.clip(np.searchsorted(self.edges, radius, side="right") - 1, 0, len(self.edges) - 2)
+
+    def missing(self, values: Array) -> Array:
+        """About what the polynomials leave out of values (panels, points), as shares of the largest; (panels,)."""
+        found: Array = np.abs(values @ self._coefficients.T)
+        return found[:, -2:].max(axis=1) / found.max()
+
+    def at(self, radius: Array, values: Array) -> Array:
+        """Of values (panels, points), at radii (...,)."""
+        panel = self.of(radius)
+        share = (radius - self.edges[panel]) / (2 * self._half[panel, 0]) * 2 - 1
+        found = np.empty_like(radius, dtype=np.float64)
+        for number, row in enumerate(values @ self._coefficients.T):
+            found[panel == number] = chebyshev.chebval(share[panel == number], row)
+        return found
+
+
+# ---------------------------------------------------------------- the natural configuration of a tube
+# The natural configuration of a tube: what closes and joins to a known ring, with or without loads.
+#  A ring that is cut opens to a sector, and its layers may be stretched before they are joined. In cylindrical axes
+#     G = diag(k r/R, g_z, dr/dR) P,    k = 360/(360 - opening angle),
+# where R(r) is the sector's radius of what lies at r in the ring, and P the prestretch of the layer. R and g_z are
+# such that the ring is in equilibrium: as the unloaded tube without pressure and without axial force.
+
 DEGREE = 24  # of R(r): the paper's artery at 160 degrees changes by less than 1e-8 from 16 to 32
 MISSING = 1e-8  # of dR/dr: a panel that leaves more of it out is halved; walls of 1 to 7 and thicker have some
 MOST_POLYNOMIALS = 8  # of one layer
@@ -255,3 +323,108 @@ def principal_stresses(tissue: Tissue, stretches: Array, dimensions: Array | Non
     ]
     found: Array = np.stack(slopes, axis=-1) / np.prod(stretches, axis=-1)[..., None]
     return found
+
+
+# ---------------------------------------------------------------- what a tube without loads does when it is cut
+# What a tube without loads does when it is cut along its length: it opens to a sector.
+#  The mesh's ring of radii R becomes a sector of radii rho(R), in cylindrical axes
+#     F = diag(k rho/R, e, drho/dR),    F_e = F G,
+# without pressure, axial force and bending moment; its opening angle is 360 (1 - k). The cells stay.
+
+CUT_DEGREE = 32  # of rho(R): angles of remodeled walls, whose cells have a front, change by less than 0.1 degrees to 48
+
+
+class Cut(NamedTuple):
+    """A ring that has been cut.
+
+    Attributes
+    ----------
+    opening_angle
+        Angle of the sector that is missing, in degrees; below 0 the ends overlap.
+    radii
+        Inner and outer radius of the sector.
+    axial
+        Its length over that of the ring.
+    """
+
+    opening_angle: float
+    radii: tuple[float, float]
+    axial: float
+
+
+class _Wall(NamedTuple):
+    """What is known of the ring: its layers' tissues, points, and G and l_I there, (panels, points, 3)."""
+
+    tissues: tuple[Tissue, ...]
+    panels: Panels
+    natural: Array
+    dimensions: Array
+
+
+def cut(layers: Sequence[Layer], closed: Closing | None, radius: Array, squared_dimensions: Array) -> Cut:
+    """Cut an unloaded tube.
+
+    Parameters
+    ----------
+    layers
+        Of the ring that is the mesh.
+    closed
+        Of what it was closed; None: the mesh is free of stress before any remodeling.
+    radius, squared_dimensions
+        Places through the wall (n,), increasing, and l_I^2 there around, along and across it, (n, 3); with
+        turnover also content and natural length, (n, 5).
+
+    Raises
+    ------
+    ArithmeticError
+        If no equilibrium is found.
+    """
+    panels = Panels([layers[0].radii[0], *(layer.radii[1] for layer in layers)], CUT_DEGREE)
+    squared = np.empty((*panels.places.shape, squared_dimensions.shape[1]))
+    panel = panels.of(radius)
+    for number, at in enumerate(panels.places):  # what lies in a layer says nothing of the next
+        here = panel == number
+        rows = radius[here], squared_dimensions[here]
+        squared[number] = np.stack([np.interp(at, rows[0], column) for column in rows[1].T], axis=-1)
+    squared, turned = squared[..., :3], np.moveaxis(squared[..., 3:], -1, 0)
+    natural, start = np.ones_like(squared), (panels.places.copy(), 1.0, 1.0)
+    if closed is not None:
+        fine = closed._replace(layers=tuple(layers), panels=panels, radius=closed.natural_radius(panels.places))
+        natural = fine.at_panels()
+        start = (fine.radius, 1 / closed.axial, 1 / closed.circumferential)  # what opens, were the cells as they were
+    tissues = []
+    for number, layer in enumerate(layers):
+        changes: dict[str, Any] = dict(zip(TURNED_OVER, turned[:, number], strict=False))  # none without turnover
+        tissues.append(replace(layer.tissue, **changes))
+    wall = _Wall(tuple(tissues), panels, natural, np.sqrt(np.maximum(squared, 0.0)))
+    values: Array = np.concatenate([start[0].ravel(), start[1:]])
+    scale: Array = np.concatenate([np.full(panels.places.size, panels.edges[-1]), [1.0, 1.0]])
+    stiffness = max(tissue.lame_lambda + 2 * tissue.lame_mu for tissue in tissues)
+    found = solved(partial(_residual_of_a_cut, wall, stiffness), values, scale, stiffness)
+    return Cut(360.0 * (1.0 - float(found[-1])), (float(found[0]), float(found[-3])), float(found[-2]))
+
+
+def _residual_of_a_cut(wall: _Wall, stiffness: float, values: Array) -> Array:
+    """Radial balance in the layers, what goes on between them, both faces, axial force and bending moment: stresses."""
+    panels, axial, k = wall.panels, values[-2], values[-1]
+    ring, half = panels.places, (panels.edges[-1] - panels.edges[0]) / 2
+    rho = values[:-2].reshape(ring.shape)
+    slope = panels.derivative(rho)
+    stretches = np.stack([k * rho / ring, np.full_like(rho, axial), slope], axis=-1) * wall.natural
+    stresses = [principal_stresses(t, stretches[n], wall.dimensions[n]) for n, t in enumerate(wall.tissues)]
+    hoop, along, radial = np.moveaxis(np.array(stresses), -1, 0)
+    balance = (panels.derivative(radial) + (radial - hoop) * slope / rho)[:, 1:-1] * half
+    between = panels.jumps(rho) / ring[0, 0] * stiffness
+    means = [panels.integral(density * rho * slope) / half / (rho[0, 0] + rho[-1, -1]) for density in (along, hoop)]
+    faces = [radial[0, 0], radial[-1, -1]]
+    return np.concatenate([balance.ravel(), faces, panels.jumps(radial), between, means])
+
+
+def means_through(radius: Array, values: Array, weights: Array, number: int) -> tuple[Array, Array]:
+    """Radius and values (n, 3) at points, averaged in as many layers of one thickness as hold a point, by weight."""
+    edges = np.linspace(radius.min(), radius.max() * (1 + 1e-12), number + 1)
+    layer = np.clip(np.searchsorted(edges, radius, side="right") - 1, 0, number - 1)
+    total = np.bincount(layer, weights, number)
+    some = total > 0
+    means = [np.bincount(layer, weights * column, number)[some] / total[some] for column in (radius, *values.T)]
+    return means[0], np.stack(means[1:], axis=-1)

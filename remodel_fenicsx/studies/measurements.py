@@ -17,7 +17,7 @@ from remodel_fenicsx.schema.csv_table import TableFileError, read_columns
 from remodel_fenicsx.schema.tables import shown
 from remodel_fenicsx.schema.toml import read_toml
 from remodel_fenicsx.schema.units import FORCE, LENGTH, LENGTH_UNIT, STRESS, STRESS_UNIT, factor_to_scene
-from remodel_fenicsx.system.regular_files import ForeignFileError, read_regular
+from remodel_fenicsx.system.files import ForeignFileError, read_regular
 
 Array = NDArray[np.float64]
 

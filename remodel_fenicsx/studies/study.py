@@ -1,38 +1,149 @@
-"""Several recorded runs, so many at a time: what is complete is not run again, what was stopped goes on.
-
-The one executor of `ensemble`, `trade` and `figures`. Each of its processes does one run after the other, for most of a
-short run is its start. The processes end with the command, even if that is killed.
-"""
+"""What studies share: runs in processes, the journal, folders of unloaded bodies, a look at the body."""
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
+import shutil
 import time as clock
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
 
+from remodel_fenicsx._version import __version__
+from remodel_fenicsx.fem.kinematics import KINEMATICS
+from remodel_fenicsx.fem.quadrature import Quadrature
+from remodel_fenicsx.results.export import write_vtu
+from remodel_fenicsx.results.fields import local_fields
 from remodel_fenicsx.results.recording import (
     HISTORY,
-    SCENE,
-    STUDY,
     HistoryColumns,
     RecordedRun,
     RecordingError,
+    SCENE,
+    STUDY,
     read_history,
     steps_recorded,
 )
 from remodel_fenicsx.results.run_lock import writer
-from remodel_fenicsx.scene.scene import Scene, SceneError
+from remodel_fenicsx.results.vtkhdf import vtk_cells
+from remodel_fenicsx.running import with_files_kept
+from remodel_fenicsx.scene import Scene
+from remodel_fenicsx.scene.scene import SceneError
 from remodel_fenicsx.schema.times import same_time
+from remodel_fenicsx.simulation import build, checked_domain, with_choices
+from remodel_fenicsx.studies.measurements import Measured, Unknown
 from remodel_fenicsx.system.children import Worker, wait_for_one
-from remodel_fenicsx.system.interrupts import PAUSE, PAUSED, Interrupted, StopRequest
-from remodel_fenicsx.system.regular_files import check_no_link, make_own_folder, refusal_in_words, write_whole
+from remodel_fenicsx.system.files import (
+    check_no_link,
+    make_own_folder,
+    part_of,
+    read_regular,
+    refusal_in_words,
+    write_whole,
+)
+from remodel_fenicsx.system.interrupts import Interrupted, PAUSE, PAUSED, StopRequest
+from remodel_fenicsx.system.temporary import temporary_folder
 from remodel_fenicsx.system.terminal import Line
+from remodel_fenicsx.unloading import unloaded
+
+
+# ---------------------------------------------------------------- what a fit has evaluated, line by line in a file
+# What a fit has evaluated, line by line in a file: the same fit called again asks the same, and goes on.
+
+Array = NDArray[np.float64]
+Point = tuple[float, ...]
+
+JOURNAL = "evaluations.jsonl"
+LARGEST_JOURNAL = 10**9  # bytes
+
+
+class Evaluation(NamedTuple):
+    """Residuals (n,) at a point, and their derivatives (n, k): NaN in columns that the model does not give."""
+
+    residuals: Array
+    jacobian: Array
+
+
+def fingerprint(scene: Scene, unknowns: Sequence[Unknown], tables: Sequence[Measured]) -> str:
+    """SHA-256 of all that a fit depends on but its starts."""
+    said = [[t.name, t.state, t.time, t.sd, t.scaled, {n: v.tolist() for n, v in t.columns.items()}] for t in tables]
+    text = json.dumps([__version__, scene.to_toml(), [list(vars(u).values()) for u in unknowns], said])
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def fingerprint_in(folder: Path) -> str | None:
+    """That of the fit in a folder; None where there is none.
+
+    Raises
+    ------
+    ForeignFileError, OSError
+        If the journal cannot be read.
+    """
+    lines = _lines(folder / JOURNAL)
+    return str(lines[0].get("fit")) if lines else None
+
+
+def _lines(path: Path) -> list[dict[str, object]]:
+    """Whole lines; the last one may have been cut off."""
+    if not path.exists():
+        return []
+    found = []
+    for line in read_regular(path, LARGEST_JOURNAL).decode(errors="replace").splitlines():
+        try:
+            found.append(json.loads(line))
+        except ValueError:
+            break
+    return [line for line in found if isinstance(line, dict)]
+
+
+class Journal:
+    """The file, open for more.
+
+    Parameters
+    ----------
+    folder
+        Of the fit; made if it is not there.
+    mark
+        `fingerprint`.
+
+    Attributes
+    ----------
+    known
+        What it holds: evaluations by logarithms of the unknowns.
+    """
+
+    def __init__(self, folder: Path, mark: str):
+        folder.mkdir(parents=True, exist_ok=True)
+        self._path = folder / JOURNAL
+        check_no_link(self._path)
+        lines = _lines(self._path)
+        self.known: dict[Point, Evaluation] = {}
+        for line in lines[1:]:
+            point, off, ways = (np.array(line[name], dtype=np.float64) for name in ("at", "residuals", "jacobian"))
+            self.known[tuple(map(float, point))] = Evaluation(off, ways)
+        # without a line that was cut off
+        text = "".join(json.dumps(line) + "\n" for line in (lines or [{"fit": mark}]))
+        self._path.write_text(text, encoding="utf-8")
+
+    def add(self, point: Point, evaluation: Evaluation) -> None:
+        """One line more, on the disk when this returns."""
+        values = {"residuals": evaluation.residuals.tolist(), "jacobian": evaluation.jacobian.tolist()}
+        with self._path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps({"at": list(point), **values}) + "\n")
+
+
+# ---------------------------------------------------------------- several recorded runs, so many at a time
+# Several recorded runs, so many at a time: what is complete is not run again, what was stopped goes on.
+#  The one executor of `ensemble`, `trade` and `figures`. Each of its processes does one run after the other, for most
+# of a short run is its start. The processes end with the command, even if that is killed.
 
 POLL = 0.1  # seconds
 FEWEST_RUNS = 2  # runs, or settings, without which nothing is compared
@@ -317,3 +428,96 @@ def _begin(worker: Worker, run: Run) -> None:
     scene = run.beside(".toml")
     write_whole(scene, run.scene.to_toml().encode())
     worker.begin(["run", str(scene), "-o", str(run.folder), "-q", "--no-report"], messages)
+
+
+# ---------------------------------------------------------------- the scene of an unloaded body in a folder of its
+# The scene of an unloaded body in a folder of its own.
+
+
+def write_unloaded(scene: Scene, folder: Path) -> str:
+    """Write scene.toml of the unloaded body into a new folder, with unloaded.msh of an own one; say what was found.
+
+    Raises
+    ------
+    SceneError, NoUnloadedShape
+        As `unloaded`.
+    FileExistsError
+        If the folder is there.
+    OSError
+        If it cannot be written.
+    """
+    if folder.exists():
+        raise FileExistsError(folder)
+    with temporary_folder() as temporary:
+        found = unloaded(scene, MPI.COMM_SELF, temporary)
+        kept, files = with_files_kept(found)
+        part = part_of(folder)
+        shutil.rmtree(part, ignore_errors=True)  # of one that was killed
+        part.mkdir(parents=True)
+        for name, data in files.items():
+            (part / name).write_bytes(data)
+        (part / "scene.toml").write_text(kept.to_toml(f"the unloaded body of {scene.name}"), encoding="utf-8")
+        part.rename(folder)
+        return "unloaded: " + _in_words(scene, found)
+
+
+def _in_words(scene: Scene, found: Scene) -> str:
+    numbers = found.geometry.model_dump()
+    lengths = {name: value for name, value in numbers.items() if isinstance(value, float)}
+    known = scene.geometry.model_dump()
+    words = [f"{name} {value:.6g} (loaded {known[name]:.6g})" for name, value in lengths.items()]
+    if words:
+        return ", ".join(words)
+    before, after = (one.geometry.checked(one.mesh)[0].points for one in (scene, found))  # type: ignore[attr-defined]
+    return f"{len(after)} nodes, moved by {np.linalg.norm(after - before, axis=1).max():.6g} at most"
+
+
+# ---------------------------------------------------------------- what a scene's body is, looked at before any solve
+# What a scene's body is, looked at before any solve: its local axes on its mesh.
+
+
+def write_axes(scene: Scene, path: Path, comm: MPI.Intracomm = MPI.COMM_WORLD) -> str:
+    """Write local axes, depth, station, thickness, and where the axes are undefined, by element. Collective.
+
+    Parameters
+    ----------
+    scene
+        Whose body it is; of a reduction the part that stands for it.
+    path
+        A new VTU file.
+    comm
+        Ranks that share the mesh.
+
+    Returns
+    -------
+    What was found, in words of one line.
+
+    Raises
+    ------
+    SceneError, GeometryError
+        If the body cannot be meshed or has no local axes.
+    FileExistsError
+        If the file is there.
+    """
+    scene = with_choices(scene)
+    domain, shape = checked_domain(build(scene, comm), scene), scene.geometry
+    mesh = domain.mesh
+    weight = KINEMATICS[scene.model.kinematics].on(mesh, shape).weight(mesh)
+    quadrature = Quadrature(mesh, scene.mesh.degree, weight)
+    local_axes = shape.local_axes(domain, quadrature)
+    fields = local_fields(local_axes, quadrature) | {"region": domain.element_region.astype(np.int64)}
+    words = [f"{domain.number_of_elements} elements"]
+    if local_axes.thickness is not None:
+        fields["thickness"] = quadrature.element_mean(local_axes.thickness)
+        least, most = quadrature.minimum(local_axes.thickness), quadrature.maximum(local_axes.thickness)
+        words.append(f"wall {least:.4g} to {most:.4g} thick")
+    if local_axes.undefined is not None:
+        undefined = local_axes.undefined.astype(np.float64)
+        fields["undefined"] = undefined.max(axis=1)
+        words.append(f"axes undefined in {100 * quadrature.mean(undefined):.2g} % of the wall")
+    gathered = {name: domain.gather_elements(values) for name, values in fields.items()}
+    points, elements = domain.gather_mesh()
+    if points is not None and elements is not None:
+        cell_type, cells = vtk_cells(mesh.topology.cell_name(), mesh.geometry.cmap.degree, elements)
+        write_vtu(path, points, cells, cell_type, {n: v for n, v in gathered.items() if v is not None})
+    return "; ".join(words)

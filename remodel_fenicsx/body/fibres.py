@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from remodel_fenicsx.body.exchange_file import read_exchange_file
-from remodel_fenicsx.model.fibres import MEASURED, SOURCES, fault_of_fibres
+from remodel_fenicsx.body.mesh_file import read_exchange_file
+from remodel_fenicsx.model.axes import MEASURED, SOURCES, fault_of_fibres
 from remodel_fenicsx.schema.csv_table import TableFileError, read_columns
+from remodel_fenicsx.system.files import read_regular
 from remodel_fenicsx.system.guarded import LARGEST_FILE, UnreadableFile
-from remodel_fenicsx.system.regular_files import read_regular
 
 Array = NDArray[np.float64]
 

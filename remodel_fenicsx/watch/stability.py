@@ -9,10 +9,9 @@ import numpy as np
 
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
 from remodel_fenicsx.solver.continuation import StepFailure
-from remodel_fenicsx.solver.inertia import FactorisationFailed, Inertia, Mode, of_the_unloaded_body
+from remodel_fenicsx.solver.diagnosis import FactorisationFailed, Inertia, Mode, UNSTABLE, of_the_unloaded_body
 from remodel_fenicsx.solver.linear import negative_pivots, uneven
-from remodel_fenicsx.solver.refusals import UNSTABLE
-from remodel_fenicsx.state.memory import Earlier, Numbers
+from remodel_fenicsx.state.state import Earlier, Numbers
 
 log = logging.getLogger(__name__)
 

@@ -1,0 +1,278 @@
+"""What shapes with a wall share: layers, depths, angles and columns."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any, ClassVar, NamedTuple, TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from remodel_fenicsx.body.gmsh_model import length_fault
+from remodel_fenicsx.body.shape import Column, Shape
+from remodel_fenicsx.model.axes import LocalAxes
+from remodel_fenicsx.model.cells import pitch_angle, radial_share
+from remodel_fenicsx.schema.tables import fault, shown
+from remodel_fenicsx.settings import CONSTANT_FIELDS, Region
+
+if TYPE_CHECKING:
+    from remodel_fenicsx.body.domain import Domain
+    from remodel_fenicsx.fem.quadrature import Quadrature
+
+
+# ---------------------------------------------------------------- layers of a round wall
+# Layers of a round wall: which regions lie where, and where elements begin and end so that none lies in two.
+
+Array = NDArray[np.float64]
+
+
+class Wall(NamedTuple):
+    """A wall and its elements in the direction of its thickness, from the lumen outwards.
+
+    Attributes
+    ----------
+    names
+        Of its layers; one without a name is the whole wall.
+    radii
+        Where layers begin and end: one more than layers.
+    counts
+        Elements through each layer; within one they are equally thick.
+    """
+
+    names: tuple[str, ...]
+    radii: tuple[float, ...]
+    counts: tuple[int, ...]
+
+    @classmethod
+    def of(cls, inner_radius: float, outer_radius: float, elements: int, regions: Mapping[str, Region]) -> Wall:
+        """The wall of a scene's regions with so many elements through it, as many as layers or more."""
+        order = sorted(regions, key=lambda name: _outer(regions[name], outer_radius)) or ["body"]
+        inside = [_outer(regions[name], outer_radius) for name in order[:-1]]
+        radii = (inner_radius, *inside, outer_radius)
+        return cls(tuple(order), radii, shared_out([b - a for a, b in itertools.pairwise(radii)], elements))
+
+    def nodes(self, degree: int) -> Array:
+        """Radii of the nodes of elements of this degree, equally spaced within a layer."""
+        return lattice(self.radii, self.counts, degree)
+
+    def shares(self, degree: int) -> Array:
+        """The same as shares of the way through the wall, from 0 to 1."""
+        inner, outer = self.radii[0], self.radii[-1]
+        inside = [(radius - inner) / (outer - inner) for radius in self.radii[1:-1]]
+        return lattice([0.0, *inside, 1.0], self.counts, degree)
+
+    def marked(self, domain: Domain) -> Domain:
+        """The domain with its layers as regions: an element is where the middle of its radii is."""
+        from remodel_fenicsx.fem import compat
+
+        nodes = domain.mesh.geometry.x[compat.geometry_dofmap(domain.mesh)]
+        radii = np.hypot(nodes[..., 0], nodes[..., 1])
+        layer = np.searchsorted(self.radii[1:-1], (radii.min(axis=1) + radii.max(axis=1)) / 2)
+        numbers = {name: number for number, name in enumerate(self.names, start=1)}
+        return dataclasses.replace(domain, regions=numbers, element_region=(layer + 1).astype(np.int32))
+
+
+def _outer(region: Region, outer_radius: float) -> float:
+    return outer_radius if region.outer_radius is None else region.outer_radius
+
+
+def shared_out(thicknesses: list[float], elements: int) -> tuple[int, ...]:
+    """Elements for each layer, one at least: the next one always where elements are thickest."""
+    counts = [1] * len(thicknesses)
+    for _ in range(elements - len(counts)):
+        counts[int(np.argmax(np.divide(thicknesses, counts)))] += 1
+    return tuple(counts)
+
+
+def lattice(ends: list[float] | tuple[float, ...], counts: tuple[int, ...], degree: int) -> Array:
+    """Places of nodes between the ends of layers, equally spaced in each."""
+    parts = [np.linspace(a, b, degree * n + 1) for (a, b), n in zip(itertools.pairwise(ends), counts, strict=True)]
+    return np.concatenate([parts[0], *(part[1:] for part in parts[1:])])
+
+
+def check_layers(inner_radius: float, outer_radius: float, elements: int, regions: Mapping[str, Region]) -> None:
+    """Refuse regions that are no layers of the wall between two radii with so many elements through it.
+
+    A layer is at least as thick as Gmsh can mesh (`length_fault`).
+
+    Raises
+    ------
+    PydanticCustomError
+        A `fault` that names the region's key.
+    """
+    seen: dict[float, str] = {}
+    for name, region in regions.items():
+        key, radius = f"regions.{name}.outer_radius", _outer(region, outer_radius)
+        if not inner_radius < radius <= outer_radius:
+            limits = f"geometry.inner_radius = {shown(inner_radius)}, at most outer_radius = {shown(outer_radius)}"
+            raise fault(f"must be greater than {limits}", key, radius)
+        if radius in seen:
+            rule = f"regions.{seen[radius]} ends at {shown(radius)} too; each layer has an outer radius of its own"
+            raise fault(rule, key, region.outer_radius)
+        seen[radius] = name
+    if regions and outer_radius not in seen:
+        last = seen[max(seen)]
+        rule = f"the outermost region ends at geometry.outer_radius = {shown(outer_radius)}, or leaves it out"
+        raise fault(rule, f"regions.{last}.outer_radius", max(seen))
+    if len(regions) > elements:
+        rule = f"{elements} elements through the wall; {len(regions)} regions need one each: a larger mesh.refinement"
+        raise fault(rule, "regions", None)
+    for inside, radius in itertools.pairwise([inner_radius, *sorted(seen)]):
+        key = f"regions.{seen[radius]}.outer_radius"
+        if (found := length_fault({key: radius - inside, "geometry.outer_radius": outer_radius})) is not None:
+            raise fault(f"the layer is {found[1]}", key, radius)
+
+
+# ---------------------------------------------------------------- bodies with a wall between an inner and an outer
+# Bodies with a wall between an inner and an outer face: what is measured in it, and its local axes on any mesh.
+
+AngleOf = Callable[[Any, Array], float]  # of a measurement and angles at its points
+NODES_AT_A_DEPTH = 1e-3  # layers of nodes of a regular mesh have their depth to 1e-4
+ANGLE_IN = "mean reference fibre angle (0 circumferential, 90 axial) of the chains in the wall, in the elements"
+
+
+CONFIGURATIONS = {
+    "unloaded": "measured in the unloaded body; it differs where the unloaded body has residual stress",
+    "deformed": "measured in the deformed body, in local axes that move with it",
+}
+"""Configurations, beside that of the cells, whose angles may be asked for, each with its words."""
+
+
+def _angle_at(face: str) -> AngleOf:
+    """Mean angle over the elements that have a facet on a face."""
+
+    def elements(m: Any) -> NDArray[np.bool_]:
+        from remodel_fenicsx.body.axes import cells_of, facets_of
+
+        found = np.zeros(m.quadrature.shape[0], dtype=np.bool_)
+        found[cells_of(m.domain.mesh, facets_of(m.domain, [face]))[0]] = True
+        return found
+
+    def value(m: Any, angle: Array) -> float:
+        chosen = m.tool(("elements at", face), lambda: elements(m))
+        return float(m.quadrature.mean_of_known(angle, chosen))
+
+    return value
+
+
+def _middle_angle(m: Any, angle: Array) -> float:
+    """Mean angle over the elements that are half-way through the wall; there are some in every mesh."""
+
+    def elements() -> NDArray[np.bool_]:
+        from remodel_fenicsx.fem.compat import geometry_dofmap
+
+        depths = m.state.cells.local_axes.nodal_depth[geometry_dofmap(m.domain.mesh)]
+        low, high = depths.min(axis=1) - NODES_AT_A_DEPTH, depths.max(axis=1) + NODES_AT_A_DEPTH
+        return np.asarray((low <= 0.5) & (high >= 0.5), dtype=np.bool_)
+
+    return float(m.quadrature.mean_of_known(angle, m.tool("middle elements", elements)))
+
+
+def angle_columns(means: Mapping[str, tuple[str, AngleOf]]) -> tuple[Column, ...]:
+    """Of the cells' own configuration.
+
+    Parameters
+    ----------
+    means
+        By where, "inner" say: which elements they are, in words, and the mean over them.
+    """
+    return tuple(
+        Column(
+            f"fibre_angle_{where}",
+            "degrees",
+            f"{ANGLE_IN} {words}",
+            partial(_of, mean, "fibre_angle"),
+            by_case=False,
+        )
+        for where, (words, mean) in means.items()
+    )
+
+
+def angle_columns_on_request(means: Mapping[str, tuple[str, AngleOf]]) -> tuple[Column, ...]:
+    """Of the other configurations."""
+    return tuple(
+        Column(
+            f"fibre_angle_{name}_{where}",
+            "degrees",
+            f"as `fibre_angle_{where}`, but {meaning}",
+            partial(_of, mean, f"fibre_angle_{name}"),
+        )
+        for name, meaning in CONFIGURATIONS.items()
+        for where, (_, mean) in means.items()
+    )
+
+
+def _of(mean: AngleOf, name: str, m: Any) -> float:
+    return mean(m, getattr(m, name))
+
+
+class Walled(Shape):
+    """A body with a wall: angles are those in it."""
+
+    columns_on_request: ClassVar[tuple[Column, ...]] = (
+        Column(
+            "radial_share",
+            "",
+            "share of the chains that points out of the wall, the volume mean of A_rr / tr A: 0 none, 1 all",
+            lambda m: m.quadrature.mean(m.radial_share),
+            by_case=False,
+        ),
+    )
+    angle_layers: ClassVar[dict[str, float]] = {
+        "fibre_angle_inner": 0.0,
+        "fibre_angle_middle": 0.5,
+        "fibre_angle_outer": 1.0,
+    }
+    has_a_wall: ClassVar[bool] = True
+    depth_in_words: ClassVar[tuple[str, str, str]] = ("through the wall", "inside", "outside")
+    angle_in_words: ClassVar[tuple[str, str]] = ("around", "along")
+
+    def fibre_angle(self, dimensions: Array, axes: Array, local: Array) -> Array:
+        """Angle of the chain direction in the wall, degrees, (...,): circumferential 0, axial 90, NaN across."""
+        return pitch_angle(dimensions, axes, local)
+
+    def radial_share(self, dimensions: Array, axes: Array, local: Array) -> Array:
+        """Share of the chains across the wall, A_rr / tr A, (...,)."""
+        return radial_share(dimensions, axes, local)
+
+
+MEANS_ON_A_MESH: dict[str, tuple[str, AngleOf]] = {
+    "inner": ("with a facet on the inner face", _angle_at("inner")),
+    "middle": ("half-way through the wall", _middle_angle),
+    "outer": ("with a facet on the outer face", _angle_at("outer")),
+}
+
+
+class WalledMesh(Walled):
+    """A body with a wall whose local axes are found on its mesh.
+
+    Faces "inner" and "outer" lie across the wall from each other, "inlet" and "outlet" across the body.
+    """
+
+    columns: ClassVar[tuple[Column, ...]] = angle_columns(MEANS_ON_A_MESH)
+    columns_on_request: ClassVar[tuple[Column, ...]] = (
+        *angle_columns_on_request(MEANS_ON_A_MESH),
+        *Walled.columns_on_request,
+    )
+    axis_kinds: ClassVar[tuple[str, ...]] = ("local", "global")
+    constant_fields: ClassVar[tuple[str, ...]] = CONSTANT_FIELDS
+    defaults: ClassVar[dict[str, Any]] = {"cells": {"axes": "local"}}
+
+    def local_axes(self, domain: Domain, quadrature: Quadrature) -> LocalAxes:
+        """Found on the mesh by a few linear solves. Collective.
+
+        Raises
+        ------
+        SceneError
+            If the wall has none.
+        """
+        from remodel_fenicsx.body.axes import found_axes
+
+        return found_axes(domain, quadrature)
+
+    def depth(self, coordinates: Array) -> Array:
+        """No function of the place: where it was not recorded all is one layer."""
+        return np.zeros(coordinates.shape[:-1])

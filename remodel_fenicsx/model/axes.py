@@ -1,0 +1,236 @@
+"""Directions in a body: local axes and depths at points, and the fibres that cells have there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from remodel_fenicsx.model.cells import by_component, cylindrical_axes, global_axes
+from remodel_fenicsx.model.spectral import principal
+
+
+# ---------------------------------------------------------------- local axes of a body
+# Local axes of a body: what is circumferential, axial and radial at its points, and how deep they lie.
+
+Array = NDArray[np.float64]
+Maker = Callable[[], Array]
+
+
+class LocalAxes:
+    """What a body knows of its points; its shape makes it once (`Shape.local_axes`).
+
+    Parameters
+    ----------
+    coordinates
+        Reference places of the points, (..., 3).
+    axes, depth, station, nodal_depth
+        Functions that make the attributes of these names; nothing is made that nobody asks for.
+    thickness, undefined
+        The attributes of these names, of axes that were found on a mesh (`body.local_axes`).
+
+    Attributes
+    ----------
+    coordinates
+        Reference places of the points, (..., 3).
+    axes
+        Circumferential, axial and radial unit vectors c, a, r as rows, (..., 3, 3); c x a = r.
+    depth
+        From 0 to 1 through the wall, or along a body without one, (...,).
+    station
+        Share of the length along the body, (...,).
+    nodal_depth
+        Depth of the local geometry nodes, ghosts included, (nodes,).
+    thickness
+        Of the wall at the points, (...,); None where the shape's keys say it.
+    undefined
+        Where the axes are those of the nearest point that has some, (...,); None where all have their own.
+
+    Examples
+    --------
+    Those of a tube at one place, half through its wall:
+
+    >>> import numpy as np
+    >>> from remodel_fenicsx import parts
+    >>> from remodel_fenicsx.extend import LocalAxes
+    >>> tube = parts.Tube(inner_radius=1.0, outer_radius=3.0, length=8.0)
+    >>> places = np.array([[2.0, 0.0, 4.0]])
+    >>> local = LocalAxes(places, axes=lambda: tube.axes_at(places), depth=lambda: tube.depth(places),
+    ...                   station=lambda: tube.station(places), nodal_depth=lambda: None)
+    >>> local.axes[0]  # circumferential, axial, radial
+    array([[-0.,  1.,  0.],
+           [ 0.,  0.,  1.],
+           [ 1.,  0.,  0.]])
+    >>> local.depth, local.station
+    (array([0.5]), array([0.5]))
+    """
+
+    def __init__(
+        self,
+        coordinates: Array,
+        axes: Maker,
+        depth: Maker,
+        station: Maker,
+        nodal_depth: Maker,
+        thickness: Array | None = None,
+        undefined: NDArray[np.bool_] | None = None,
+    ):
+        self.coordinates, self.thickness, self.undefined = coordinates, thickness, undefined
+        self._axes, self._depth, self._station, self._nodal_depth = axes, depth, station, nodal_depth
+
+    @cached_property
+    def axes(self) -> Array:
+        """Rows c, a, r, (..., 3, 3)."""
+        return self._axes()
+
+    @cached_property
+    def depth(self) -> Array:
+        """Of the points, (...,)."""
+        return self._depth()
+
+    @cached_property
+    def station(self) -> Array:
+        """Of the points, (...,)."""
+        return self._station()
+
+    @cached_property
+    def nodal_depth(self) -> Array:
+        """Of the local geometry nodes, (nodes,)."""
+        return self._nodal_depth()
+
+    def deformed(self, deformation_gradient: Array) -> Array:
+        """The axes in the deformed body: rows c', a', r', (..., 3, 3), with F (..., 3, 3).
+
+        ``c' = F c / |F c|`` follows a material line. ``r' = F^-T r / |F^-T r|`` stays normal to a material surface,
+        and is taken as F c x F a, which needs no inverse. a' = r' x c' lies in that surface, square to c'.
+
+        Parameters
+        ----------
+        deformation_gradient
+            F at the points, (..., 3, 3).
+        """
+        F, axes = by_component(deformation_gradient), by_component(self.axes)
+        circumferential, axial = (
+            [F[i, 0] * axes[k, 0] + F[i, 1] * axes[k, 1] + F[i, 2] * axes[k, 2] for i in range(3)] for k in (0, 1)
+        )
+        radial = _unit(_cross(circumferential, axial))
+        circumferential = _unit(circumferential)
+        rows = [circumferential, _cross(radial, circumferential), radial]
+        return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
+
+
+def _cross(one: list[Array], other: list[Array]) -> list[Array]:
+    """Of vectors by component."""
+    return [one[j] * other[k] - one[k] * other[j] for j, k in ((1, 2), (2, 0), (0, 1))]
+
+
+def _unit(vector: list[Array]) -> list[Array]:
+    length = np.sqrt(vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)
+    return [component / length for component in vector]
+
+
+AXES: dict[str, Callable[[LocalAxes], Array]] = {
+    "global": lambda points: global_axes(points.coordinates),
+    "cylindrical": lambda points: cylindrical_axes(points.coordinates),
+    "local": lambda points: points.axes,
+}
+"""Axes of the cells before the first pass by name: functions of a `LocalAxes`."""
+
+
+# ---------------------------------------------------------------- unit cells that follow from measured fibres
+# Unit cells that follow from measured fibres: structure tensors, fibre directions or fibre angles.
+
+# name of what is measured: numbers that a row of it may have
+MEASURED = {"structure_tensor": (9, 6), "fibre": (3,), "angle": (1,), "fibre_2": (3,), "weight": (1,)}
+SOURCES = ("structure_tensor", "fibre", "angle")  # one of these is needed
+SYMMETRIC = np.array([0, 3, 5, 3, 1, 4, 5, 4, 2])  # of xx, yy, zz, xy, yz, xz (VTK's order), row by row
+# eigenvalue below zero, over the trace, that may be rounding of files with 7 digits
+FILE_ROUNDING = 1e-6
+
+
+def fault_of_fibres(measured: Mapping[str, Array]) -> str | None:
+    """What keeps rows (n, columns) by name of `MEASURED` from being fibres, in words; None if nothing does."""
+    sources = [name for name in SOURCES if name in measured]
+    if len(sources) != 1:
+        return f"has {' and '.join(sources) or 'none'} of {', '.join(SOURCES)}; exactly one is needed"
+    for name, values in measured.items():
+        if values.shape[1] not in MEASURED[name]:
+            numbers = " or ".join(map(str, MEASURED[name]))
+            return f"{name} has {values.shape[1]} numbers in a row; allowed is {numbers}"
+        if not (fine := np.isfinite(values).all(axis=1)).all():
+            return _row(name, fine, "is not finite")
+    (source,) = sources
+    for name, of in (("fibre_2", ("fibre",)), ("weight", ("fibre", "angle"))):
+        if name in measured and source not in of:
+            return f"has {name} beside {source}; it belongs to {' or '.join(of)}"
+    for name in ("fibre", "fibre_2"):
+        if name in measured and not (fine := (measured[name] != 0).any(axis=1)).all():
+            return _row(name, fine, "is the zero vector")
+    weight = measured.get("weight", np.zeros((1, 1)))[:, 0]
+    if not (fine := (weight >= 0) & (weight <= 1)).all():
+        return _row("weight", fine, "is not from 0 to 1")
+    if source == "structure_tensor":
+        eigenvalues = np.linalg.eigvalsh(_tensors(measured[source]))
+        trace = eigenvalues.sum(axis=1)
+        if not (fine := (trace > 0) & (eigenvalues[:, 0] >= -FILE_ROUNDING * trace)).all():
+            return _row(source, fine, f"has eigenvalues {', '.join(f'{v:.3g}' for v in eigenvalues[~fine][0])}; "
+                        "none may be below 0, nor all be 0")  # fmt: skip
+    return None
+
+
+def _row(name: str, fine: Any, what: str) -> str:
+    return f"{name} of row {int(np.argmin(fine)) + 1} {what}"
+
+
+def structure_tensors(measured: Mapping[str, Array], axes: Array) -> Array:
+    """A of any size at points, (..., 3, 3); `cells_of` scales it.
+
+    Parameters
+    ----------
+    measured
+        Without a fault (`fault_of_fibres`), by name: (..., columns). `structure_tensor`: 9 numbers row by row, of which
+        the symmetric part is seen, or xx, yy, zz, xy, yz, xz. `fibre` and `fibre_2`: directions, of any length.
+        `angle`: degrees from circumferential towards axial. `weight`: share of the first fibres, the rest is that of
+        the second ones (1/2 without it), or where there are none, of fibres in all directions (nothing without it):
+        w f (x) f + (1 - w) I / 3.
+    axes
+        Circumferential, axial, radial, as rows, (..., 3, 3).
+    """
+    if "structure_tensor" in measured:
+        return _tensors(measured["structure_tensor"])
+    if "angle" in measured:
+        angle = np.radians(measured["angle"])
+        first = np.cos(angle) * axes[..., 0, :] + np.sin(angle) * axes[..., 1, :]
+    else:
+        first = measured["fibre"]
+    others = _along(measured["fibre_2"]) if "fibre_2" in measured else np.eye(3) / 3
+    usual = np.full((*first.shape[:-1], 1), 0.5 if "fibre_2" in measured else 1.0)
+    weight = measured.get("weight", usual)[..., None]
+    return weight * _along(first) + (1 - weight) * others
+
+
+def cells_of(tensors: Array, end_to_end_length: float, previous: Array) -> tuple[Array, Array]:
+    """l_I (..., 3), longest first, and n_I as rows (..., 3, 3) of cells with A = r0^2 T / tr T of tensors T.
+
+    Where tensors leave axes open (equal eigenvalues), they are those of `previous`, (..., 3, 3).
+    """
+    shape = tensors.shape[:-2]
+    values, axes = principal(tensors.reshape(-1, 3, 3), previous.reshape(-1, 3, 3))
+    values = np.maximum(values, 0.0)
+    lengths = end_to_end_length * np.sqrt(values / values.sum(axis=1, keepdims=True))
+    return lengths.reshape(*shape, 3), axes.reshape(*shape, 3, 3)
+
+
+def _tensors(rows: Array) -> Array:
+    """Symmetric (..., 3, 3) of rows of 9 or 6 numbers."""
+    full = rows if rows.shape[-1] == 9 else rows[..., SYMMETRIC]
+    tensors = full.reshape(*rows.shape[:-1], 3, 3)
+    return (tensors + np.swapaxes(tensors, -1, -2)) / 2
+
+
+def _along(vectors: Array) -> Array:
+    unit = vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return unit[..., :, None] * unit[..., None, :]

@@ -1,1 +1,0 @@
-"""Cells that answer within a solve: the local Newton method at each point, and the consistent tangent."""

@@ -1,0 +1,389 @@
+"""The search for an unloaded body: of a tube by its numbers, of a mesh by its nodes; what is said without one."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+import dolfinx.fem
+import dolfinx.fem.petsc
+import numpy as np
+import ufl
+from mpi4py import MPI
+from numpy.typing import NDArray
+from petsc4py import PETSc
+from ufl.algorithms.map_integrands import map_integrands
+
+from remodel_fenicsx.body.mesh_domain import gmsh_text
+from remodel_fenicsx.body.mesh_faces import jacobian_determinants
+from remodel_fenicsx.body.mesh_file import MeshFile
+from remodel_fenicsx.fem import jit
+from remodel_fenicsx.fem.assembly import assemble_matrix, create_matrix, over_ranks, second_derivative
+from remodel_fenicsx.model.residual_stress import Loads, closing
+from remodel_fenicsx.results.fields import NodalGather, dof_of_node
+from remodel_fenicsx.results.run_folder import agreed
+from remodel_fenicsx.scene import Scene, SceneError
+from remodel_fenicsx.settings import AS_GIVEN, EQUILIBRIUM, Natural
+from remodel_fenicsx.simulation import Simulation
+from remodel_fenicsx.solver.continuation import StepFailure
+from remodel_fenicsx.solver.equilibrium import mandel_vector
+from remodel_fenicsx.system.terminal import unsaid
+
+
+# ---------------------------------------------------------------- what is said where there is no unloaded shape, and
+# What is said where there is no unloaded shape, and the shares of the loads in which it is looked for.
+
+Found = TypeVar("Found")
+log = logging.getLogger(__name__)
+
+SHARES = (0.25, 0.5, 0.75, 1.0)  # of the loads, where they cannot be taken in one piece
+
+
+class NoUnloadedShape(RuntimeError):
+    """There is none that the loads bring to the given one; one line with the share of the loads, and why."""
+
+
+def in_shares(find: Callable[[float, Found], Found], start: Found) -> Found:
+    """What is found at all of the loads: in one piece, or in shares, each from the one before.
+
+    Parameters
+    ----------
+    find
+        Of a share of the loads and a start; ArithmeticError, StepFailure or SceneError where nothing is found.
+
+    Raises
+    ------
+    NoUnloadedShape
+        If a share has none.
+    """
+    refusals = (ArithmeticError, StepFailure, SceneError)
+    try:
+        return find(1.0, start)
+    except refusals as error:
+        log.info("unloading all loads at once failed (%s); they are now taken in parts", " ".join(str(error).split()))
+    done = 0.0
+    for share in SHARES:
+        try:
+            start = find(share, start)
+        except refusals as error:
+            reason = " ".join(str(error).split())
+            raise NoUnloadedShape(
+                f"geometry.is = 'loaded': no unloaded body was found at {100 * share:g} % of the loads, there is "
+                f"one at {100 * done:g} %: {reason}; try lower loads, or a stiffer tissue"
+            ) from error
+        done = share
+    return start
+
+
+# ---------------------------------------------------------------- the unloaded tube of a loaded one
+# The unloaded tube of a loaded one: radii and length.
+#  They are found by runs of the scene's own kinematics, so that the run that follows comes to the given numbers: a
+# fixed point in the targets of inverse elastostatics of one radius (`model.closing`).
+
+Array = NDArray[np.float64]
+
+LOADED_AGAIN = 1e-9  # of the largest length: how far the loaded numbers may be from those of the scene
+MOST_LOADINGS = 30  # runs for one share of the loads
+REMEMBERED = 5  # differences of earlier runs from which the next is guessed (Anderson 1965)
+LOAD_STEPS = 10  # of a run to the end of the ramps
+
+
+def unloaded_tube(scene: Scene, comm: MPI.Intracomm) -> Scene:
+    """By fixed-point iteration for the targets of inverse elastostatics, with Anderson's extrapolation."""
+    shape: Any = scene.geometry
+    names = sorted((n for n in scene.regions if scene.regions[n].outer_radius), key=lambda n: _outer(scene, n))
+    inside = [_outer(scene, name) for name in names if _outer(scene, name) < shape.outer_radius]
+    given = np.array([shape.inner_radius, *inside, shape.outer_radius, shape.length])
+    runs = 0
+
+    def find(share: float, start: Array) -> Array:
+        nonlocal runs
+        found, number = _found(scene, comm, given, share, start)
+        runs += number
+        return found
+
+    found = in_shares(find, given)
+    geometry = _with_numbers(scene, found)
+    unloaded, loaded = (f"radii {', '.join(f'{r:.6g}' for r in radii)}, length {l:.6g}" for *radii, l in (found, given))
+    log.info("unloaded: %s, so that under the loads it has the given %s (%d runs)", unloaded, loaded, runs)
+    return geometry
+
+
+def _outer(scene: Scene, name: str) -> float:
+    outer: Any = scene.regions[name].outer_radius
+    return float(outer)
+
+
+def _found(scene: Scene, comm: MPI.Intracomm, given: Array, share: float, start: Array) -> tuple[Array, int]:
+    """Radii and length that a share of the loads brings to the given ones, and how many runs that took.
+
+    Raises
+    ------
+    ArithmeticError, StepFailure, SceneError
+        If they are not found.
+    """
+    target, targets, errors = given.copy(), [], []
+    length = start[-1]
+    for number in range(1, MOST_LOADINGS + 1):
+        numbers = _inverse(scene, target, share, given[-1] / length)
+        found = _loaded(scene, comm, numbers, share)
+        length = numbers[-1] * given[-1] / found[-1]
+        error = given - found
+        if np.abs(error).max() <= LOADED_AGAIN * given.max():
+            return numbers, number
+        targets.append(target)
+        errors.append(error)
+        target = _extrapolated(targets[-REMEMBERED:], errors[-REMEMBERED:])
+    raise ArithmeticError(f"off by {np.abs(error).max():.2g} after {MOST_LOADINGS} runs")
+
+
+def _extrapolated(targets: list[Array], errors: list[Array]) -> Array:
+    """Where the error, were it linear in the target, would be least; then on by what is left of it."""
+    target, error = targets[-1], errors[-1]
+    if len(targets) == 1:
+        return target + error
+    steps = np.stack([target - earlier for earlier in targets[:-1]], axis=1)
+    changes = np.stack([error - earlier for earlier in errors[:-1]], axis=1)
+    weights = np.linalg.lstsq(changes, error, rcond=1e-10)[0]
+    found: Array = target + error - (steps + changes) @ weights
+    return found
+
+
+def _inverse(scene: Scene, target: Array, share: float, axial: float) -> Array:
+    """Unloaded radii and length of a tube with these loaded ones, whose mesh is free of stress; on one radius.
+
+    Raises
+    ------
+    ArithmeticError
+        If there are none.
+    """
+    loaded = _with_numbers(scene, target)
+    tissues = {name: properties.tissue for name, properties in scene.properties().items()}
+    layers = loaded.geometry.layers_of_tissue(Natural(), loaded.regions, tissues)
+    pressure = scene.loads["pressure"] if "pressure" in scene.loads else None
+    value = 0.0 if pressure is None else pressure.value * pressure.factor(scene.end_of_ramps) * share
+    radii = closing(layers, 0.0, Loads(value, None, axial)).natural_radius(target[:-1])
+    return np.append(radii, target[-1] / axial)
+
+
+def _loaded(scene: Scene, comm: MPI.Intracomm, numbers: Array, share: float) -> Array:
+    """Radii and length under a share of the loads, as a run has them."""
+    end = scene.end_of_ramps or 1.0
+    changes: dict[str, Any] = {"output.columns": [], "output.times": [], "output.fields": False}
+    if scene.natural.cells == AS_GIVEN:
+        changes |= {"remodeling.law": "none", "remodeling.coupling": "staggered", "remodeling.threshold": 0.0}
+        changes |= {"remodeling.turnover": {}}
+        changes |= {"remodeling.exponent": 2.0, "time.end": end, "time.step": end / LOAD_STEPS, "time.tolerance": None}
+    else:
+        changes |= {"time.end": EQUILIBRIUM}
+    changes |= {"solver.relative_tolerance": min(scene.solver.relative_tolerance, LOADED_AGAIN / 10)}
+    for name, load in scene.loads.items():
+        changes |= {f"loads.{name}.value": load.value * load.factor(end) * share}
+        changes |= {f"loads.{name}.ramp": [[0.0, 0.0], [end, 1.0]]}
+    simulation = Simulation(_with_numbers(scene, numbers).with_values(changes), comm)
+    try:
+        row = [step.row for step in simulation.steps()][-1]
+        domain = simulation.domain
+        places, moves = domain.gather_nodes(domain.mesh.geometry.x), NodalGather(domain, simulation.state)()
+    finally:
+        simulation.close()
+    radii = None
+    if places is not None and moves is not None:
+        before, after = (np.hypot(x[:, 0], x[:, 1]) for x in (places, places + moves))
+        radii = np.array([after[np.abs(before - radius) < 1e-6 * numbers.max()].mean() for radius in numbers[:-1]])
+    found: Array = comm.bcast(radii)
+    return np.append(found, numbers[-1] * (1 + row["axial_elongation"]))
+
+
+def _with_numbers(scene: Scene, numbers: Array) -> Scene:
+    """The scene of an unloaded tube of these radii, from the lumen outwards, and this length."""
+    changes: dict[str, Any] = {"geometry.is": "unloaded", "natural.cells": AS_GIVEN}
+    changes |= {"geometry.inner_radius": float(numbers[0]), "geometry.outer_radius": float(numbers[-2])}
+    changes |= {"geometry.length": float(numbers[-1])}
+    said = [name for name in scene.regions if scene.regions[name].outer_radius is not None]
+    for name, radius in zip(sorted(said, key=lambda n: _outer(scene, n)), numbers[1:-1], strict=False):
+        changes[f"regions.{name}.outer_radius"] = float(radius)
+    return scene.with_values(changes)
+
+
+# ---------------------------------------------------------------- the unloaded mesh of a loaded one
+# The unloaded mesh of a loaded one: the places of all nodes, by Newton's method.
+#  The residual is that of the unloaded body under its loads, displaced to the given places. Its derivative by the
+# places of the unloaded nodes is that of inverse elastostatics (Govindjee and Mihalic 1996): with X the unloaded
+# places, moved by w, and x = X + u the given ones,
+#     F = (1 + grad u) (1 + grad w)^-1,    dV = det(1 + grad w) dX,
+# derived by w at w = 0. A pressure stays as it is, for the loaded face does not move.
+
+UNLOADED_MESH = "unloaded.msh"
+LEAST_MOVE = 1e-10  # of the body's extent: the last change of a place
+MOST_MOVES = 20  # Newton iterations for one share of the loads
+LEAST_STEP = 1 / 64  # of a Newton step that keeps elements whole and chains shorter than their contour length
+
+
+def unloaded_mesh(scene: Scene, comm: MPI.Intracomm, folder: Path) -> Scene:
+    """The scene of the unloaded body, whose mesh is written into the folder. Collective.
+
+    Raises
+    ------
+    SceneError
+        If the mesh of the scene is none of a body with its faces.
+    NoUnloadedShape
+        If there is none.
+    """
+    shape: Any = scene.geometry
+    file, regions = agreed(comm, lambda: _read(scene) if comm.rank == 0 else None) or (None, None)
+    given: Array = comm.bcast(None if file is None else file.points)
+    path = folder / UNLOADED_MESH
+    changes: dict[str, Any] = {"geometry.is": "unloaded", "geometry.file": str(path), "mesh.refinement": 1}
+    changes |= {"geometry.file_unit": None, "geometry.tags": None, "geometry.sha256": None}
+    if shape.regions:
+        numbers: dict[str, int] = comm.bcast(regions)
+        changes["geometry.regions"] = {name: [numbers[name]] for name in shape.regions}
+    iterations = 0
+
+    def write(places: Array) -> None:
+        if file is not None:
+            path.write_text(gmsh_text(replace(file, points=places)), encoding="ascii")
+        comm.barrier()
+
+    def find(share: float, start: Array) -> Array:
+        nonlocal iterations
+        places, step, length = start, np.zeros_like(start), 1.0
+        for _ in range(MOST_MOVES):
+            iterations += 1
+            write(places)
+            with unsaid(), contextlib.closing(Simulation(scene.with_values(changes), comm)) as simulation:
+                found = _newton_step(simulation, given, share)
+            if found is None:  # too far: back to half of the way
+                length /= 2
+                if length < LEAST_STEP or not step.any():
+                    raise ArithmeticError("no admissible state on the path: r >= L or J <= 0")
+                places = places - length * step
+                continue
+            size, length = float(np.abs(found).max()), 1.0
+            while not comm.bcast(file is None or _is_whole(replace(file, points=places + length * found))):
+                length /= 2
+                if length < LEAST_STEP:
+                    raise ArithmeticError("elements would turn inside out")
+            step = found
+            places = places + length * step
+            if size <= LEAST_MOVE * float(np.ptp(given, axis=0).max()):
+                return places
+        raise ArithmeticError(f"nodes still move by {size:.2g} after {MOST_MOVES} iterations")
+
+    write(in_shares(find, given))
+    log.info("unloaded: %s, found in %d Newton iterations", UNLOADED_MESH, iterations)
+    return scene.with_values(changes)
+
+
+def _read(scene: Scene) -> tuple[MeshFile, dict[str, int]]:
+    shape: Any = scene.geometry
+    file, _, regions = shape.checked(scene.mesh)
+    return file, regions
+
+
+def _is_whole(file: MeshFile) -> bool:
+    """Whether no element is twisted."""
+    determinants = jacobian_determinants(file)
+    return bool((determinants * np.sign(determinants.mean()) > 0).all())
+
+
+def _newton_step(simulation: Simulation, given: Array, share: float) -> Array | None:
+    """How the unloaded nodes move, (nodes, 3) in the order of the file, on all ranks; None beyond the limits.
+
+    Parameters
+    ----------
+    simulation
+        Of the mesh as it is now.
+    given
+        Loaded places.
+    share
+        Of the loads.
+    """
+    domain, state, scene = simulation.domain, simulation.state, simulation.scene
+    equilibrium, unknown = simulation.stepper.coupling.equilibrium, simulation.unknown
+    loads = simulation.load_values(scene.end_of_ramps)
+    state.loading.set({name: share * value for name, value in loads.items()})
+    dofs = dof_of_node(domain, unknown.function_space)
+    unknown.x.array.reshape(-1, 3)[dofs] = given[domain.node_number] - domain.mesh.geometry.x
+    if not equilibrium.extension().admissible:
+        return None
+    move = dolfinx.fem.Function(unknown.function_space)
+    tangents = [jit.form(form) for form in _tangents(simulation, move)]
+    prescribed = equilibrium.prescribed_values()
+    held = dolfinx.fem.Function(unknown.function_space)
+    fixed = np.isfinite(prescribed)
+    held.x.array[fixed] = (unknown.x.array - prescribed)[fixed]
+    blocks = np.flatnonzero(fixed.reshape(-1, 3).all(axis=1)).astype(np.int32)
+    conditions = [dolfinx.fem.dirichletbc(held, blocks)]
+    matrix = create_matrix(tangents[0])
+    assemble_matrix(matrix, tangents, conditions)
+    right, external = unknown.x.petsc_vec.duplicate(), unknown.x.petsc_vec.duplicate()
+    equilibrium.assemble_internal(right)
+    equilibrium.assemble_external(external)
+    right.axpy(1.0, external)
+    right.scale(-1.0)
+    lift = right.duplicate()
+    with lift.localForm() as local:
+        local.set(0.0)
+    for tangent in tangents:
+        dolfinx.fem.petsc.apply_lifting(lift, [tangent], bcs=[conditions])
+    lift.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
+    right.axpy(1.0, lift)
+    dolfinx.fem.petsc.set_bc(right, conditions)
+    _solve(matrix, right, move.x.petsc_vec)
+    move.x.scatter_forward()
+    for thing in (matrix, right, external, lift):
+        thing.destroy()
+    if over_ranks(domain.comm, not np.isfinite(move.x.array).all(), MPI.LOR):
+        return None
+    found: Array = domain.comm.bcast(domain.gather_nodes(move.x.array.reshape(-1, 3)[dofs]))
+    return found
+
+
+def _tangents(simulation: Simulation, move: Any) -> list[Any]:
+    """Derivative of the residual by the unloaded places, UFL forms to be added up; `move` is zero.
+
+    Compiled one by one: in one kernel they take the compiler minutes.
+    """
+    state, unknown = simulation.state, simulation.unknown
+    equilibrium, kinematics, mesh = simulation.stepper.coupling.equilibrium, state.kinematics, simulation.domain.mesh
+    test, trial = ufl.TestFunction(move.function_space), ufl.TrialFunction(move.function_space)
+    back = ufl.Identity(3) - ufl.grad(move)  # (1 + grad w)^-1 and, below, det(1 + grad w), to first order
+    F = kinematics.elastic(ufl.dot(kinematics.deformation_gradient(unknown), back))
+    weight = kinematics.stress_free_weight(mesh)
+    energies = state.dilatation.energies(equilibrium.tissue, F, [state.cells.ufl_cell], weight)
+    forms = [second_derivative(energy, unknown, test, trial, move) for energy in energies]
+
+    def larger(density: Any) -> Any:
+        return ufl.derivative(density, unknown, test) * ufl.div(trial)
+
+    forms += [map_integrands(larger, energy) for energy in energies]
+    pointwise = equilibrium.pointwise
+    if pointwise is not None:
+        pointwise.update(stiffness=True)
+        virtual, increment = ufl.derivative(F, unknown, test), ufl.derivative(F, move, trial)
+        work = pointwise.residual(unknown, F, test)
+        strains = [mandel_vector(ufl.sym(ufl.dot(ufl.transpose(F), way))) for way in (increment, virtual)]
+        stiffness = ufl.inner(ufl.dot(pointwise.stiffness, strains[0]), strains[1])
+        changes = ufl.derivative(work, move, trial) + stiffness + work * ufl.div(trial)
+        forms.append(changes * weight * equilibrium.quadrature.dx)
+    supports = state.loading.residual_of_potentials(test)
+    if supports is not None:  # of fixed direction: u shrinks by what the unloaded place moves
+        forms.append(-ufl.derivative(supports, unknown, trial))
+    return forms
+
+
+def _solve(matrix: Any, right: Any, solution: Any) -> None:
+    """By factors: the matrix is not symmetric."""
+    solver = PETSc.KSP().create(matrix.comm)
+    solver.setType(PETSc.KSP.Type.PREONLY)
+    solver.getPC().setType(PETSc.PC.Type.LU)
+    solver.getPC().setFactorSolverType(PETSc.Mat.SolverType.MUMPS)
+    solver.setOperators(matrix)
+    solver.solve(right, solution)
+    solver.destroy()
