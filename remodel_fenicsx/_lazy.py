@@ -9,15 +9,7 @@ from typing import Any
 
 
 def on_demand(module: str, places: Mapping[str, str]) -> Callable[[str], Any]:
-    """The `__getattr__` of a module (PEP 562).
-
-    Parameters
-    ----------
-    module
-        Its name.
-    places
-        Module of the package, dotted, in which each name is.
-    """
+    """The `__getattr__` of a module (PEP 562)."""
 
     def imported(name: str) -> Any:
         if name not in places:

@@ -130,30 +130,7 @@ def resume(
     deadline: float | None = None,
     report: bool = True,
 ) -> Path:
-    """Go on with a recorded run from its last checkpoint, or from t = 0 where it has none yet.
-
-    Parameters
-    ----------
-    folder
-        The run's.
-    overrides
-        "KEY=VALUE": keys that may change are time.end, output, solver, and loads after the checkpoint.
-    comm, quiet, deadline, report
-        As for `run`; the number of ranks may be another one.
-
-    Returns
-    -------
-    The folder.
-
-    Raises
-    ------
-    FolderTaken
-        If it is not the folder of a run, or a run writes in it.
-    SceneError, CheckpointError, RecordingError
-        If the scene is another one, no checkpoint is whole, or history or fields are damaged.
-    StepFailure, Interrupted, Paused, OSError
-        As `run` does.
-    """
+    """Go on with a recorded run from its last checkpoint, or from t = 0 where it has none yet."""
     end_all_ranks_on_exception()
     place = Path(folder)
     with StopRequest() as stop, locked(place, comm, new=False):

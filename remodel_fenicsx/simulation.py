@@ -318,13 +318,7 @@ def unloaded_state(scene: Scene, unknown: Any, kinematics: Any, cells: UnitCells
 def from_natural(
     kinematics: Any, scene: Scene, quadrature: Quadrature, domain: Domain, local_axes: LocalAxes
 ) -> NaturalConfiguration:
-    """The kinematics of a body whose tissue is free of stress in another configuration than the mesh's.
-
-    Raises
-    ------
-    SceneError
-        If nothing closes to the tube, or a layer has a region that the body has not.
-    """
+    """The kinematics of a body whose tissue is free of stress in another configuration than the mesh's."""
     from remodel_fenicsx.body.natural import gradient, prestretch
     from remodel_fenicsx.model.residual_stress import closing
 
@@ -350,18 +344,7 @@ def from_natural(
 
 
 def measured_fibres(scene: Scene, domain: Domain) -> dict[str, dict[str, Any]]:
-    """Measured fibres by region and name, a row for each element of the mesh, on all ranks. Collective.
-
-    Parameters
-    ----------
-    scene, domain
-        What asks for them, and the mesh.
-
-    Raises
-    ------
-    SceneError
-        If a file cannot be read, is another one than in the run so far, or does not reach an element.
-    """
+    """Measured fibres by region and name, a row for each element of the mesh, on all ranks. Collective."""
     if not scene.measured_cells:
         return {}
     points, elements = domain.gather_mesh()
@@ -406,13 +389,7 @@ def _fibres_of(cells: Cells, region: str, corners: Any, chosen: Any) -> dict[str
 
 
 def check_files(scene: Scene) -> str:
-    """Refuse what a run would, of the files that a scene names; in words what was not looked at. For one rank.
-
-    Raises
-    ------
-    SceneError, GeometryError
-        As a run does.
-    """
+    """Refuse what a run would, of the files that a scene names; in words what was not looked at. For one rank."""
     large = []
     for name, cells in scene.measured_cells.items():
         file = Path(str(cells.fibres))
@@ -431,10 +408,7 @@ def check_files(scene: Scene) -> str:
 
 
 def parameters_of(properties: Mapping[str, Properties], domain: Domain) -> tuple[Tissue, Any]:
-    """Tissue and kappa of a scene's regions: numbers where these agree, DG0 Functions where they differ.
-
-    The parameters of a tissue are all of one kind, so that there are two kernels, not one for every choice of them.
-    """
+    """Tissue and kappa of a scene's regions: numbers where these agree, DG0 Functions where they differ."""
     tissues = {name: one.tissue for name, one in properties.items()}
     kappas = {name: one.kappa for name, one in properties.items()}
     tissue, kappa = next(iter(tissues.values())), next(iter(kappas.values()))
@@ -460,13 +434,7 @@ def build(scene: Scene, comm: MPI.Intracomm) -> Domain:
 
 
 def checked_domain(domain: Domain, scene: Scene) -> Domain:
-    """The domain, if it is a mesh of the scene's body and elements.
-
-    Raises
-    ------
-    SceneError
-        If it is not; one line that names the key.
-    """
+    """The domain, if it is a mesh of the scene's body and elements."""
     shape, mesh = scene.geometry, domain.mesh
     kind, degree = mesh.topology.cell_name(), mesh.geometry.cmap.degree
     if domain.shape != shape.name:

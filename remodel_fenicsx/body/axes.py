@@ -43,17 +43,7 @@ TINY = 1e-12  # of a squared length of about one: no direction is divided by zer
 
 @dataclass(frozen=True, eq=False)
 class AxisFields:
-    """Continuous functions on the mesh, of its degree.
-
-    Attributes
-    ----------
-    radial, axial
-        Vectors, near unit length where they are defined, not square to each other to the last digit.
-    from_inner, from_outer
-        Lengths along the radial direction from these faces.
-    from_inlet, from_outlet
-        Lengths along the axial direction from the ends.
-    """
+    """Continuous functions on the mesh, of its degree."""
 
     radial: Any
     axial: Any
@@ -66,22 +56,7 @@ class AxisFields:
 def axis_fields(
     domain: Domain, quadrature: Quadrature, inlets: Sequence[str] = ("inlet",), outlets: Sequence[str] = ("outlet",)
 ) -> AxisFields:
-    """Find them. Collective.
-
-    Parameters
-    ----------
-    domain
-        With faces "inner" and "outer".
-    quadrature
-        On its mesh, with the degree of its elements.
-    inlets, outlets
-        Names of the faces across the body. Chains that run from inlets to outlets go up the axial direction.
-
-    Raises
-    ------
-    SolveStopped
-        If a linear solve does not converge.
-    """
+    """Find them. Collective."""
     mesh, degree = domain.mesh, quadrature.element_degree
     inner, outer, starts, ends = (facets_of(domain, names) for names in (["inner"], ["outer"], inlets, outlets))
     thickness = 2 * quadrature.volume / (area(mesh, inner) + area(mesh, outer))
@@ -130,10 +105,8 @@ def _length(direction: Any, dx: Any, facets: Facets, sign: float) -> Any:
 
 
 def _potential(direction: Any, dx: Any, facets: Facets, sign: float) -> Any:
-    """The function, 0 on facets, whose gradient is nearest to a direction: a length of a bent body, of its middle.
-
-    Lengths along single lines, as through the wall, would differ over the section of a bend.
-    """
+    """The function, 0 on facets, whose gradient is nearest to a direction: a length of a bent body, of its middle."""
+    # Lengths along single lines, as through the wall, would differ over the section of a bend.
     found = _scalar(direction)
     _, test = _arguments(found)
     solve_positive(_stiffness(found, dx), _flux(direction, test, dx, sign), found, [_held(found, facets, 0.0)])
@@ -247,13 +220,7 @@ class UndefinedAxes(SceneError):
 def found_axes(
     domain: Domain, quadrature: Quadrature, inlets: Sequence[str] = ("inlet",), outlets: Sequence[str] = ("outlet",)
 ) -> LocalAxes:
-    """Local axes of a mesh with faces "inner" and "outer", and ends. Collective.
-
-    Raises
-    ------
-    UndefinedAxes
-        If a face is missing, if more than MOST_UNDEFINED of the volume has none, or if a linear solve stops; one line.
-    """
+    """Local axes of a mesh with faces "inner" and "outer", and ends. Collective."""
     missing = [face for face in ("inner", "outer", *inlets, *outlets) if face not in domain.faces]
     if missing:
         raise UndefinedAxes(f"geometry.faces: the local axes of a wall need a face {', '.join(map(repr, missing))}")

@@ -223,11 +223,7 @@ class _Order:
 
 
 class SymbolicMesh(ufl.Mesh):
-    """A `ufl.Mesh` that makes its cell once.
-
-    UFL asks for the cell thousands of times while it handles a form. What it asks, basix answers with a new cell each
-    time, and a hexahedron makes its faces and edges anew: a third of what a cached kernel costs.
-    """
+    """A `ufl.Mesh` that makes its cell once."""
 
     def __init__(self, coordinate_element: Any) -> None:
         super().__init__(coordinate_element)
@@ -244,22 +240,7 @@ class SymbolicMesh(ufl.Mesh):
 def build_domain(
     draw: Callable[[], None], shape: str, dimensions: dict[str, float], comm: MPI.Intracomm | None = None
 ) -> Domain:
-    """Draw and mesh on rank 0, then share the mesh. Collective.
-
-    Parameters
-    ----------
-    draw
-        Draws and meshes the body in the current Gmsh model, with physical groups for the volumes and the faces.
-    shape, dimensions
-        As in `Domain`.
-    comm
-        Ranks that share the mesh; default: all.
-
-    Raises
-    ------
-    GeometryError
-        On all ranks, if `draw` fails on rank 0.
-    """
+    """Draw and mesh on rank 0, then share the mesh. Collective."""
     comm = comm or MPI.COMM_WORLD
     # with several threads Scotch parts the same mesh differently from run to run
     os.environ.setdefault("SCOTCH_PTHREAD_NUMBER", "1")
@@ -304,21 +285,7 @@ def _domain_from_gmsh(
 
 @dataclass(frozen=True, eq=False)
 class MeshArrays:
-    """A mesh on rank 0.
-
-    Attributes
-    ----------
-    kind, degree
-        Of the elements.
-    points, cells
-        (nodes, 3), and their rows in dolfinx's order, (elements, nodes of one).
-    facets, facet_values
-        Corners in any order, (facets, corners), and the value of each in `Domain.facet_tags`.
-    cell_values
-        Value of each element in `Domain.element_region`.
-    faces, regions
-        As in `Domain`.
-    """
+    """A mesh on rank 0."""
 
     kind: str
     degree: int
@@ -334,17 +301,7 @@ class MeshArrays:
 def share_mesh(
     arrays: MeshArrays | None, shape: str, dimensions: dict[str, float], comm: MPI.Intracomm | None = None
 ) -> Domain:
-    """Share a mesh that rank 0 holds; elsewhere `arrays` is not looked at. Collective.
-
-    Parameters
-    ----------
-    arrays
-        The mesh.
-    shape, dimensions
-        As in `Domain`.
-    comm
-        Ranks that share the mesh; default: all.
-    """
+    """Share a mesh that rank 0 holds; elsewhere `arrays` is not looked at. Collective."""
     comm = comm or MPI.COMM_WORLD
     os.environ.setdefault("SCOTCH_PTHREAD_NUMBER", "1")  # as above
     told = arrays and (arrays.kind, arrays.degree, arrays.cells.shape[1], arrays.faces, arrays.regions)
@@ -397,21 +354,7 @@ def interval_domain(
     dimensions: dict[str, float],
     comm: MPI.Intracomm | None = None,
 ) -> Domain:
-    """Elements on a straight line. Collective.
-
-    Parameters
-    ----------
-    start, end
-        Of the line.
-    shares, degree
-        Where on it the nodes are, from 0 to 1, and degree of the elements' geometry.
-    faces
-        Name of a face of the body -> function of coordinates (3, n) that is true on its place on the line.
-    shape, dimensions
-        As in `Domain`.
-    comm
-        Ranks that share the mesh; default: all.
-    """
+    """Elements on a straight line. Collective."""
     points = (1.0 - shares[:, None]) * np.array(start) + shares[:, None] * np.array(end)
     elements = (len(shares) - 1) // degree
     return _domain_from_lattice("interval", degree, points, _lines(elements, degree), faces, shape, dimensions, comm)
@@ -427,17 +370,7 @@ def half_plane_domain(
     dimensions: dict[str, float],
     comm: MPI.Intracomm | None = None,
 ) -> Domain:
-    """Quadrilaterals on a rectangle of the half-plane y = 0, x > 0. Collective.
-
-    Parameters
-    ----------
-    radii
-        Where on the x axis the nodes are.
-    length, layers
-        Height along z, and number of equal layers of elements.
-    degree, faces, shape, dimensions, comm
-        As of `interval_domain`.
-    """
+    """Quadrilaterals on a rectangle of the half-plane y = 0, x > 0. Collective."""
     across, along = len(radii), degree * layers + 1
     z = np.linspace(0.0, length, along)
     points = np.stack([np.tile(radii, along), np.zeros(across * along), np.repeat(z, across)], axis=1)

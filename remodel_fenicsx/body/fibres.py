@@ -40,17 +40,7 @@ class FibreFileError(ValueError):
 
 @dataclass(frozen=True)
 class FibreFile:
-    """What a file of fibres holds.
-
-    Attributes
-    ----------
-    measured
-        By name of `model.fibres.MEASURED`, (rows, columns).
-    places
-        Middles of the file's elements, or its points, (rows, 3); None: rows are elements of the run's mesh.
-    data
-        The file itself.
-    """
+    """What a file of fibres holds."""
 
     measured: dict[str, Array]
     places: Array | None
@@ -62,21 +52,7 @@ class FibreFile:
         return hashlib.sha256(self.data).hexdigest()
 
     def rows_of(self, corners: Array, chosen: NDArray[np.bool_]) -> tuple[NDArray[np.int64], float | None]:
-        """The row for each element of a mesh, and how far the farthest is away; None where rows are elements.
-
-        Parameters
-        ----------
-        corners
-            Nodes of the elements, (elements, nodes of one, 3). What is farther from the middle of an element than the
-            element is wide says nothing about it.
-        chosen
-            Elements that need a row, (elements,); others get row 0.
-
-        Raises
-        ------
-        FibreFileError
-            If there is none.
-        """
+        """The row for each element of a mesh, and how far the farthest is away; None where rows are elements."""
         count, centres = len(next(iter(self.measured.values()))), corners.mean(axis=1)
         sizes = 2 * np.linalg.norm(corners - centres[:, None], axis=2).max(axis=1)
         if count == len(centres):
@@ -95,13 +71,7 @@ class FibreFile:
 
 
 def read_fibre_file(path: Path) -> FibreFile:
-    """Read measured fibres.
-
-    Raises
-    ------
-    FibreFileError
-        If the file is not there, is of another kind or damaged, or holds no fibres.
-    """
+    """Read measured fibres."""
     ending = path.suffix.lower()
     if ending not in FIBRE_ENDINGS:
         raise FibreFileError(f"allowed are files {', '.join(FIBRE_ENDINGS)}")

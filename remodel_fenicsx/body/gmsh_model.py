@@ -29,13 +29,7 @@ class GeometryError(RuntimeError):
 
 
 def length_fault(lengths: Mapping[str, float]) -> tuple[str, str] | None:
-    """What keeps a body from being meshed: the name of one of its lengths, and what is allowed; None if nothing does.
-
-    Parameters
-    ----------
-    lengths
-        Lengths, radii and wall thickness of the body by the key that decides each of them, in any unit.
-    """
+    """What keeps a body from being meshed: the name of one of its lengths, and what is allowed."""
     for name, length in lengths.items():
         if not SMALLEST_LENGTH <= length <= LARGEST_LENGTH:
             return name, f"a length of {length:g} here; allowed are {SMALLEST_LENGTH:g} to {LARGEST_LENGTH:g}"
@@ -80,16 +74,8 @@ class NamedGroups(NamedTuple):
 
 
 def named_groups() -> NamedGroups:
-    """Those of the current model, once it is sure that dolfinx can take the model. One without a name has its number.
-
-    dolfinx looks at these things on rank 0 only, where a failure would leave the other ranks waiting.
-
-    Raises
-    ------
-    GeometryError
-        If there is no named volume or face, more than one type of element, or a volume that is in no named one or in
-        several; if two groups have one name.
-    """
+    """Those of the current model, once it is sure that dolfinx can take the model."""
+    # dolfinx looks at these things on rank 0 only, where a failure would leave the other ranks waiting.
     import gmsh
 
     found = NamedGroups(_groups(2), _groups(3))
@@ -142,11 +128,9 @@ def points(coordinates: npt.NDArray[np.float64]) -> list[Point]:
 
 
 def line(start: Point, stop: Point, elements: int = 1) -> list[int]:
-    """Straight chain of equal curves of one element each.
-
-    So every node is given, as on the circles: the places that Gmsh finds along a curve are good to 1e-12 on straight
-    lines and to 1e-9 on arcs only.
-    """
+    """Straight chain of equal curves of one element each."""
+    # So every node is given, as on the circles: the places that Gmsh finds along a curve are good to 1e-12 on straight
+    # lines and to 1e-9 on arcs only.
     import gmsh
 
     geo = gmsh.model.geo
@@ -189,21 +173,7 @@ def extrude(
     sides: Mapping[str, Sequence[int]],
     ends: tuple[str, str] = ("bottom", "top"),
 ) -> None:
-    """Extrude a plane section along z, mesh it, and name the volume and the faces.
-
-    Parameters
-    ----------
-    section
-        Surfaces in the plane z = 0.
-    length, layers
-        Height, and number of equal element layers.
-    element
-        "hexahedron" or "tetrahedron".
-    sides
-        Name of a face -> the section's boundary curves that sweep it.
-    ends
-        Names of the faces z = 0 and z = length.
-    """
+    """Extrude a plane section along z, mesh it, and name the volume and the faces."""
     import gmsh
 
     made = gmsh.model.geo.extrude(
@@ -224,16 +194,7 @@ def extrude(
 
 
 def raise_degree(degree: int, bulge: Callable[[npt.NDArray[np.float64]], npt.NDArray[Any]]) -> None:
-    """Give the straight elements nodes between their corners, and curve them around the z axis.
-
-    Parameters
-    ----------
-    degree
-        1 leaves the mesh as it is.
-    bulge
-        A new node lies between the corners of an edge, a face or a cell. It goes outwards from their mean towards
-        their mean radius, by the fraction bulge(mean radius): 1 puts it on the circle, 0 leaves the edge straight.
-    """
+    """Give the straight elements nodes between their corners, and curve them around the z axis."""
     if degree == 1:
         return
     import gmsh

@@ -224,13 +224,7 @@ class MeshBody(WalledMesh):
         return shared(partial(self.checked, mesh), comm or MPI.COMM_WORLD)
 
     def checked(self, mesh: Mesh | None = None) -> tuple[MeshFile, Boundary, dict[str, int]]:
-        """The mesh, its boundary, and its regions' numbers by name; on rank 0.
-
-        Raises
-        ------
-        SceneError
-            If the file is no mesh of one body with these faces; one line.
-        """
+        """The mesh, its boundary, and its regions' numbers by name; on rank 0."""
         from remodel_fenicsx.body.mesh_faces import FaceError, boundary_of, likely_exchange
 
         file = self._with_regions(self._read())

@@ -50,19 +50,7 @@ def gmsh_text(file: MeshFile) -> str:
 
 @dataclass(frozen=True, eq=False)
 class MeshDomain(Domain):
-    """A domain that knows more of its faces.
-
-    Attributes
-    ----------
-    parts
-        The connected parts of all named faces, on every rank; their `facets` are rows of the first rank's list.
-    part_of_element
-        By name of a face: the number in `parts` of the part that a local element touches, or -1; (local elements,).
-    rims
-        On rank 0: the closed lines in which the inner face ends, as node numbers (`mesh_faces.rims`).
-    volume
-        Of the body, with plane faces.
-    """
+    """A domain that knows more of its faces."""
 
     parts: tuple[Face, ...] = ()
     part_of_element: Mapping[str, Integers] = field(default_factory=dict)
@@ -96,11 +84,9 @@ class MeshDomain(Domain):
         return 2 * self.volume / (self.area("inner") + self.area("outer"))
 
     def length(self) -> float:
-        """Of the body from inlet to outlet: volume over the integral of |grad psi|, psi harmonic from 0 to 1.
-
-        In a bend psi goes with the angle: the mean of |grad psi| is that at the distance at which the mean of 1/R is,
-        the line of the sections' centres. Collective; 0 for a body without one of the two.
-        """
+        """Of the body from inlet to outlet: volume over the integral of |grad psi|, psi harmonic from 0 to 1."""
+        # In a bend psi goes with the angle: the mean of |grad psi| is that at the distance at which the mean of 1/R is,
+        # the line of the sections' centres. Collective; 0 for a body without one of the two.
         if not {"inlet", "outlet"} <= set(self.faces):
             return 0.0
         mesh, degree = self.mesh, int(self.mesh.geometry.cmap.degree)
@@ -120,20 +106,7 @@ class MeshDomain(Domain):
 
 
 def shared(read: Callable[[], tuple[MeshFile, Boundary, dict[str, int]]], comm: MPI.Intracomm) -> MeshDomain:
-    """What rank 0 reads, on all ranks. Collective.
-
-    Parameters
-    ----------
-    read
-        Called on rank 0: the file with its points in the scene's unit, its boundary, and numbers of regions by name.
-    comm
-        Ranks that share it.
-
-    Raises
-    ------
-    SceneError
-        On all ranks, if `read` raises it.
-    """
+    """What rank 0 reads, on all ranks. Collective."""
     verdict, found = "", None
     if comm.rank == 0:
         try:

@@ -39,19 +39,7 @@ class FaceError(MeshFileError):
 
 @dataclass(frozen=True, eq=False)
 class Face:
-    """A connected part of a named face.
-
-    Attributes
-    ----------
-    name
-        Of the face.
-    facets
-        Rows of `Boundary.facets`.
-    places, normals
-        Middles of the facets, and their unit normals outwards, (facets, 3).
-    area, normal, centre
-        Of its plane facets: their area, and the mean of their outward normals (3,) and of their places (3,).
-    """
+    """A connected part of a named face."""
 
     name: str
     facets: Integers
@@ -64,19 +52,7 @@ class Face:
 
 @dataclass(frozen=True, eq=False)
 class Boundary:
-    """What bounds a body.
-
-    Attributes
-    ----------
-    facets
-        Corners, normals outwards, (facets, 3 or 4).
-    faces
-        The connected parts of its named faces.
-    cell
-        Element behind each facet, (facets,).
-    volume
-        Of the body, with plane faces.
-    """
+    """What bounds a body."""
 
     facets: Integers
     cell: Integers
@@ -93,22 +69,7 @@ class Boundary:
 
 
 def boundary_of(file: MeshFile, groups: Groups, open_boundary: bool) -> Boundary:
-    """Find the named faces on the boundary of the one body that a file holds.
-
-    Parameters
-    ----------
-    file
-        As it was read.
-    groups
-        Name of a face -> numbers of the groups of the file that it is made of.
-    open_boundary
-        Whether a part of the boundary may have no name.
-
-    Raises
-    ------
-    MeshFileError
-        One line.
-    """
+    """Find the named faces on the boundary of the one body that a file holds."""
     facets, cell, twice = _facets(file)
     places = file.points[facets]
     normals = _area_vectors(places)
@@ -171,11 +132,9 @@ def through_the_wall(boundary: Boundary) -> bool:
 
 
 def likely_exchange(points: Array, boundary: Boundary) -> tuple[str, str] | None:
-    """Which wall (inner or outer) and which end (inlet or outlet) have each other's name; None where none seem to.
-
-    Inner and outer touch only then: ends lie between them. It is one after whose exchange they touch no more, and of
-    these the pair in which the wall is the flatter.
-    """
+    """Which wall (inner or outer) and which end (inlet or outlet) have each other's name; None where none seem to."""
+    # Inner and outer touch only then: ends lie between them. It is one after whose exchange they touch no more, and of
+    # these the pair in which the wall is the flatter.
     walls = {"inner": "outer", "outer": "inner"}
 
     def touch(one: str, other: str) -> bool:
@@ -196,10 +155,8 @@ def likely_exchange(points: Array, boundary: Boundary) -> tuple[str, str] | None
 
 
 def rims(file: MeshFile, boundary: Boundary, face: str) -> list[Integers]:
-    """The closed lines in which a face ends, each as nodes of its edges, (edges, 2 or 3: start, end, middle).
-
-    They run so that the normal of a flat cap on one points out of what the face encloses.
-    """
+    """The closed lines in which a face ends, each as nodes of its edges, (edges, 2 or 3: start, end, middle)."""
+    # They run so that the normal of a flat cap on one points out of what the face encloses.
     rows = np.concatenate([np.empty(0, dtype=np.int64), *(part.facets for part in boundary.parts(face))])
     edges: dict[tuple[int, int], int] = {}
     for row, corners in zip(distinct(rows), as_rows(boundary.facets[rows]), strict=True):

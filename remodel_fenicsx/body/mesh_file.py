@@ -47,15 +47,7 @@ class ExchangeFile(NamedTuple):
 
 
 def read_exchange_file(path: Path) -> ExchangeFile:
-    """Read one; its ending is one of `ENDINGS`.
-
-    Raises
-    ------
-    UnreadableFile
-        If it is damaged, needs more time or memory than it may, or its numbers stand in another file.
-    OSError
-        If it cannot be opened.
-    """
+    """Read one; its ending is one of `ENDINGS`."""
     try:
         arrays, data = read_guarded(path, f"{__name__}:arrays_{path.suffix.lower()[1:]}")
     except UnreadableFile as error:
@@ -123,20 +115,7 @@ ORDERS = {
 
 
 def read_mesh(path: Path, tags: str | None = None) -> MeshFile:
-    """Read a mesh file.
-
-    Parameters
-    ----------
-    path
-        By Gmsh (.msh), or one of `exchange_file.ENDINGS`.
-    tags
-        Of the latter: name of the array with the numbers of faces and volumes; default: the first of `TAGS`.
-
-    Raises
-    ------
-    MeshFileError
-        If it is not there, is no such file, or is damaged: one line.
-    """
+    """Read a mesh file."""
     if path.suffix.lower() not in ENDINGS:
         return read_mesh_file(path)
     changed, size = found_file(path)
@@ -234,25 +213,7 @@ class MeshFileError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class MeshFile:
-    """What a mesh file holds.
-
-    Attributes
-    ----------
-    points
-        (nodes, 3), in the file's unit.
-    cells
-        Rows of `points`, (elements, nodes of one), in Gmsh's order.
-    cell_numbers, cell_groups
-        Number of each element in the file, and of its named volume, 0 for none, (elements,).
-    facets, facet_groups
-        Corners (facets, 3 or 4), and number of the named face; a facet of two faces is there twice.
-    kind, degree
-        "tetrahedron" or "hexahedron", of degree 1 or 2.
-    names
-        Name of a face (2) or of a volume (3) -> its number.
-    data, sha256
-        The file itself, and the SHA-256 of it in hexadecimal digits.
-    """
+    """What a mesh file holds."""
 
     points: Array
     cells: Integers
@@ -273,13 +234,7 @@ class MeshFile:
 
 
 def read_mesh_file(path: Path) -> MeshFile:
-    """Read a Gmsh file of format 2.2 or 4.1, text.
-
-    Raises
-    ------
-    MeshFileError
-        If it is not there, is no such file, or is damaged: one line, which names the line of the file.
-    """
+    """Read a Gmsh file of format 2.2 or 4.1, text."""
     changed, size = found_file(path)
     try:
         return _read(path, changed, size)
@@ -288,13 +243,7 @@ def read_mesh_file(path: Path) -> MeshFile:
 
 
 def found_file(path: Path) -> tuple[int, int]:
-    """When it changed last, in ns, and its size in bytes.
-
-    Raises
-    ------
-    MeshFileError
-        If there is no such file.
-    """
+    """When it changed last, in ns, and its size in bytes."""
     try:
         if path.is_dir():
             raise MeshFileError("is a folder; a mesh is a file")
@@ -567,24 +516,7 @@ def _nodes_of(kind: int, section: _Section, ahead: int = 0) -> int:
 def assembled(
     numbers: Integers, points: Array, blocks: list[Block], names: dict[int, dict[str, int]], data: bytes
 ) -> MeshFile:
-    """What a file of any kind holds.
-
-    Parameters
-    ----------
-    numbers, points
-        Of the nodes, (nodes,) and (nodes, 3).
-    blocks
-        Elements by type.
-    names
-        Of faces (2) and volumes (3): name -> number.
-    data
-        The file itself.
-
-    Raises
-    ------
-    MeshFileError
-        If they are no mesh; one line.
-    """
+    """What a file of any kind holds."""
     order = np.argsort(numbers, kind="stable")
     ordered = numbers[order]
     if len(ordered) > 1 and (np.diff(ordered) == 0).any():

@@ -11,22 +11,7 @@ GMSH_TYPES = {("tetrahedron", 1): (4, 2), ("hexahedron", 1): (5, 3)}  # of eleme
 
 
 def refined(file: MeshFile, refinement: int, degree: int) -> MeshFile:
-    """A mesh of plane elements, split into halves along each edge, as often as asked for.
-
-    Parameters
-    ----------
-    file
-        Elements of degree 1.
-    refinement
-        Parts of each edge: a power of 2.
-    degree
-        Of the elements that come out; those of degree 2 have straight edges.
-
-    Raises
-    ------
-    MeshFileError
-        If the elements are of degree 2: one line.
-    """
+    """A mesh of plane elements, split into halves along each edge, as often as asked for."""
     if (refinement, degree) == (1, file.degree):
         return file
     if file.degree != 1:

@@ -30,19 +30,7 @@ STILL = 1e-8  # smallest eigenvalue over the largest below which nothing holds a
 def add_support(
     loading: Loading, face: str, support: Support, stiffness: float, moves: tuple[str, float] | None
 ) -> None:
-    """Hold a face.
-
-    Parameters
-    ----------
-    loading
-        Of the body.
-    face, support
-        Name of the face, and how it is held.
-    stiffness
-        Where the support does not say it.
-    moves
-        Name of the load by which the face moves along its normal, and the way at 1; None: it stays.
-    """
+    """Hold a face."""
     _HOLD[support.kind](loading, face, support, support.stiffness or stiffness, moves)
 
 
@@ -123,13 +111,7 @@ def _of_parts(loading: Loading, face: str, name: str) -> Any:
 
 
 def check_supports(domain: MeshDomain, supports: Mapping[str, Support], elongated: bool) -> None:
-    """Refuse supports that leave the body free to move as a whole, or, where it is elongated, to evade that.
-
-    Raises
-    ------
-    SceneError
-        One line that names the motions.
-    """
+    """Refuse supports that leave the body free to move as a whole, or, where it is elongated, to evade that."""
     free = free_motions(domain.parts, supports)
     if free:
         kinds = ", ".join(f"{name} {support.kind!r}" for name, support in supports.items()) or "none"
@@ -155,15 +137,7 @@ def warn_of_twist(name: str, support: Support, comm: Any) -> None:
 
 
 def free_motions(parts: Sequence[Face], supports: Mapping[str, Support]) -> list[str]:
-    """Rigid motions of the body that no support holds, in words: of the 6 x 6 matrix of the supports over them.
-
-    Parameters
-    ----------
-    parts
-        Of the faces of the body.
-    supports
-        By name of the face.
-    """
+    """Rigid motions of the body that no support holds, in words: of the 6 x 6 matrix of the supports over them."""
     everywhere = np.concatenate([part.places for part in parts])
     middle = everywhere.mean(axis=0)
     size = float(np.linalg.norm(everywhere - middle, axis=1).max())

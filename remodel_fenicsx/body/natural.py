@@ -22,17 +22,7 @@ Array = NDArray[np.float64]
 
 
 def tube_layers(wall: Wall, natural: Natural, tissues: Mapping[str, Tissue]) -> list[Layer]:
-    """Of a round wall: where tissue or prestretch change.
-
-    Parameters
-    ----------
-    wall
-        With its regions.
-    natural
-        Its layers are shares of the wall, or regions.
-    tissues
-        By name of the region, "" for the whole wall; numbers.
-    """
+    """Of a round wall: where tissue or prestretch change."""
     inner, outer = wall.radii[0], wall.radii[-1]
     edges = set(wall.radii)
     for layer in natural.layers:

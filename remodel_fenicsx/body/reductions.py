@@ -113,24 +113,7 @@ WIDEST = 3.0  # radius, over the inner one at rest: a thin wall of unit mu bears
 
 @dataclass(frozen=True)
 class Strut:
-    """A body along z that thrust may bend, and suction make oval.
-
-    Attributes
-    ----------
-    length
-        In the reference.
-    end_factor
-        Length of the pin-ended column with the same Euler load over the body's: 1 where the ends cannot turn but one
-        of them moves sideways, 1/2 where neither moves, 2 where one is free.
-    directions
-        (n, 3, 3) at places (n, 3): columns are two directions across z and z; the stress has them as axes.
-    squared_distances
-        Mean of x^2 over all places of the body that those (n, 3) stand for, (n,).
-    radii
-        Inner and outer radius of a cavity along z that the load "pressure" fills; None without one.
-    capped
-        Whether that pressure acts on the ends too.
-    """
+    """A body along z that thrust may bend, and suction make oval."""
 
     length: float
     end_factor: float
@@ -145,12 +128,10 @@ class Strut:
 
 
 def expected_thrust(scene: Any) -> float:
-    """Largest thrust on the way over Euler's load, as far as the scene's numbers tell; 0 where nothing pushes.
-
-    The wall is taken as an incompressible neo-Hookean one of the tissue's small-strain modulus, a closed form, with
-    Lame's term for a compressible one beside it. Where a force is given, that and the lumen are all there is. Of
-    several regions it has the mean over the section. Euler's load is that of the inflated wall.
-    """
+    """Largest thrust on the way over Euler's load, as far as the scene's numbers tell; 0 where nothing pushes."""
+    # The wall is taken as an incompressible neo-Hookean one of the tissue's small-strain modulus, a closed form, with
+    # Lame's term for a compressible one beside it. Where a force is given, that and the lumen are all there is. Of
+    # several regions it has the mean over the section. Euler's load is that of the inflated wall.
     shape = scene.geometry
     strut = shape.strut(scene.supports.ends)
     if strut is None or strut.radii is None:
@@ -188,12 +169,11 @@ def _stiffness(tissue: Tissue) -> tuple[float, float, float]:
 
 
 def inflated(pressure: float, inner: float, outer: float, stretch: float, longest: float) -> tuple[float, float, float]:
-    """Inner radius, reduced axial force and bending stiffness of an incompressible neo-Hookean tube of unit mu.
-
-    p = int (t^2 - 1/(t z)^2) dr/r,  F = pi int (2 z^2 - 1/(t z)^2 - t^2) r dr,  EI = pi int E r^3 dr, t = r/R, z the
-    axial stretch, E the modulus along z at constant stress across. Chains of isotropic cells bound t: their mean
-    stretch stays below `longest`. What bears no such pressure has the radius at which it bears nearly all that it can.
-    """
+    """Inner radius, reduced axial force and bending stiffness of an incompressible neo-Hookean tube of unit mu."""
+    # p = int (t^2 - 1/(t z)^2) dr/r, F = pi int (2 z^2 - 1/(t z)^2 - t^2) r dr, EI = pi int E r^3 dr, t = r/R, z the
+    # axial stretch, E the modulus along z at constant stress across. Chains of isotropic cells bound t: their mean
+    # stretch stays below `longest`. What bears no such pressure has the radius at which it bears nearly all that it
+    # can.
     R2 = np.linspace(inner**2, outer**2, WALL_POINTS)
 
     def of(radius: float) -> tuple[float, float, float]:
@@ -272,26 +252,16 @@ class Reduction:
 
 @dataclass(frozen=True)
 class Choice:
-    """A kinematics for a scene.
-
-    Attributes
-    ----------
-    name
-        Of `KINEMATICS`.
-    objections
-        By name of each cheaper or other reduced kinematics of the shape: why it is not allowed; empty where it is.
-    """
+    """A kinematics for a scene."""
 
     name: str
     objections: dict[str, list[str]]
 
 
 def choice(scene: Any) -> Choice:
-    """The scene's kinematics, or the cheapest that it allows where it leaves the choice.
-
-    Under loads that press, or with a thrust near Euler's load, it chooses none that is reduced: what buckles leaves the
-    symmetry.
-    """
+    """The scene's kinematics, or the cheapest that it allows where it leaves the choice."""
+    # Under loads that press, or with a thrust near Euler's load, it chooses none that is reduced: what buckles leaves
+    # the symmetry.
     reductions = scene.geometry.reductions  # the cheapest first
     found = {name: objections(scene, name) for name in reductions}
     if scene.model.kinematics != AUTO:

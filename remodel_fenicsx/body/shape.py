@@ -854,17 +854,7 @@ def uniaxial_columns(top: str, length: str) -> tuple[Column, ...]:
 def homogeneous_bar(
     bottom: str, top: str, dimensions: Callable[[Any], dict[str, float]], whole: Callable[[Any], Body]
 ) -> Reduction:
-    """The reduction "point" of a body between two faces across z, the same strain everywhere: one bar beside the axis.
-
-    Parameters
-    ----------
-    bottom, top
-        Names of the faces.
-    dimensions
-        Function of the shape: the dimensions of its `Domain`.
-    whole
-        Function of the shape: the body for pictures.
-    """
+    """The reduction "point" of a body between two faces across z, the same strain everywhere."""
 
     def build(scene: Any, comm: Any = None) -> Domain:
         from remodel_fenicsx.body.domain import interval_domain

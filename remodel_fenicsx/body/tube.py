@@ -493,11 +493,10 @@ def whole_tube(
     comm: MPI.Intracomm | None = None,
     regions: Mapping[str, Region] | None = None,
 ) -> Domain:
-    """The mesh of a tube with so many elements around (a multiple of 4), through the wall and along. Collective.
-
-    The nodes lie exactly on the radii, equally spaced through each layer; some are on the positive and negative x and y
-    axes. Elements of degree 1 have plane faces: their inner and outer faces are regular prisms inside the cylinders.
-    """
+    """The mesh of a tube with so many elements around (a multiple of 4), through the wall and along. Collective."""
+    # The nodes lie exactly on the radii, equally spaced through each layer; some are on the positive and negative x and
+    # y axes. Elements of degree 1 have plane faces: their inner and outer faces are regular prisms inside the
+    # cylinders.
     from remodel_fenicsx.body.domain import build_domain
 
     around, through, along = counts

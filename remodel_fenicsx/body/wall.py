@@ -30,17 +30,7 @@ Array = NDArray[np.float64]
 
 
 class Wall(NamedTuple):
-    """A wall and its elements in the direction of its thickness, from the lumen outwards.
-
-    Attributes
-    ----------
-    names
-        Of its layers; one without a name is the whole wall.
-    radii
-        Where layers begin and end: one more than layers.
-    counts
-        Elements through each layer; within one they are equally thick.
-    """
+    """A wall and its elements in the direction of its thickness, from the lumen outwards."""
 
     names: tuple[str, ...]
     radii: tuple[float, ...]
@@ -94,15 +84,8 @@ def lattice(ends: list[float] | tuple[float, ...], counts: tuple[int, ...], degr
 
 
 def check_layers(inner_radius: float, outer_radius: float, elements: int, regions: Mapping[str, Region]) -> None:
-    """Refuse regions that are no layers of the wall between two radii with so many elements through it.
-
-    A layer is at least as thick as Gmsh can mesh (`length_fault`).
-
-    Raises
-    ------
-    PydanticCustomError
-        A `fault` that names the region's key.
-    """
+    """Refuse regions that are no layers of the wall between two radii with so many elements through it."""
+    # A layer is at least as thick as Gmsh can mesh (`length_fault`).
     seen: dict[float, str] = {}
     for name, region in regions.items():
         key, radius = f"regions.{name}.outer_radius", _outer(region, outer_radius)
@@ -172,13 +155,7 @@ def _middle_angle(m: Any, angle: Array) -> float:
 
 
 def angle_columns(means: Mapping[str, tuple[str, AngleOf]]) -> tuple[Column, ...]:
-    """Of the cells' own configuration.
-
-    Parameters
-    ----------
-    means
-        By where, "inner" say: which elements they are, in words, and the mean over them.
-    """
+    """Of the cells' own configuration."""
     return tuple(
         Column(
             f"fibre_angle_{where}",
@@ -262,13 +239,7 @@ class WalledMesh(Walled):
     defaults: ClassVar[dict[str, Any]] = {"cells": {"axes": "local"}}
 
     def local_axes(self, domain: Domain, quadrature: Quadrature) -> LocalAxes:
-        """Found on the mesh by a few linear solves. Collective.
-
-        Raises
-        ------
-        SceneError
-            If the wall has none.
-        """
+        """Found on the mesh by a few linear solves. Collective."""
         from remodel_fenicsx.body.axes import found_axes
 
         return found_axes(domain, quadrature)

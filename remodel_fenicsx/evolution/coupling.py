@@ -201,11 +201,9 @@ class Staggered:
 
     # ------------------------------------------------------------ in one piece: the paper's step
     def _solved_as_expected(self, step: LoadStep, loads: LoadValues, work: Work) -> bool:
-        """Solve from where the predictor expects the solution; if that fails, all is as before.
-
-        Where chains would be almost straight the forces are huge, and Newton's method comes back slowly: from the last
-        displacement it takes fewer iterations.
-        """
+        """Solve from where the predictor expects the solution; if that fails, all is as before."""
+        # Where chains would be almost straight the forces are huge, and Newton's method comes back slowly: from the
+        # last displacement it takes fewer iterations.
         unknown, loading = self.state.unknown.x.array, self.state.loading
         before, old_loads = unknown.copy(), dict(loading.values)
         loading.set(loads)  # what they prescribe is part of what is expected
@@ -239,10 +237,8 @@ class Staggered:
     def _solve_in_parts(
         self, time: float, old_loads: LoadValues, new_loads: LoadValues, work: Work, failure: SolveFailure | None
     ) -> None:
-        """First the change of the cells and of turnover, then that of the loads.
-
-        `failure`: that of the whole step, if it was tried.
-        """
+        """First the change of the cells and of turnover, then that of the loads."""
+        # `failure`: that of the whole step, if it was tried.
         loading, halvings = self.state.loading, self.settings.maximum_halvings
         loading.set(old_loads)
         if self.blend is not None and self._cells_changed():
@@ -293,10 +289,7 @@ def between(old: LoadValues, new: LoadValues, fraction: float) -> LoadValues:
 
 
 class Relaxed(Staggered):
-    """A share of each pass's change of the structure tensor: stable where the printed pass over-corrects.
-
-    The cells then lag by (1 - factor)/factor further steps (docs/theory.md, "The relaxed pass").
-    """
+    """A share of each pass's change of the structure tensor: stable where the printed pass over-corrects."""
 
     def __init__(self, state: State, tissue: Tissue, remodeling: RemodelingPass, settings: Solver):
         super().__init__(state, tissue, remodeling, settings)

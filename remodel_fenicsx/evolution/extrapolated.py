@@ -26,12 +26,7 @@ COUNTS = 0.01  # share of a target from which on it is one: what is less moves t
 
 
 class Extrapolated(Staggered):
-    """Remodel, then solve: sE + h/2 d(sE)/dt from the targets of the last two states, h the step (docs/theory.md).
-
-    Cells, stress and row belong together at the end of a step. A point that has had no target yet, or none for a while,
-    begins with the one at the end of its first step under tension: the step is solved, those points remodel over it,
-    and it is solved again. Before the first step that are all points. For laws with a `target`.
-    """
+    """Remodel, then solve: sE + h/2 d(sE)/dt from the targets of the last two states, h the step (docs/theory.md)."""
 
     order, accumulates, longest = 2, True, 0.5
 
@@ -61,13 +56,7 @@ class Extrapolated(Staggered):
         return Target(values[:, :9].reshape(-1, 3, 3), values[:, 9])
 
     def solve(self, time: float, loads: LoadValues) -> Work:
-        """New cells, and equilibrium at `time` with them.
-
-        Raises
-        ------
-        StepFailure
-            If no admissible equilibrium is found.
-        """
+        """New cells, and equilibrium at `time` with them."""
         cells = self.state.cells
         self._start = UnitCell(*(values.copy() for values in cells.point_cells[:2]))
         expected = self._extrapolated(time)

@@ -66,24 +66,7 @@ class Limit(Implicit):
 
 
 class Homeostasis:
-    """The way through ramps and held loads until the cells rest, as one step.
-
-    Parameters
-    ----------
-    way
-        Steps a stepper of its own, on the same state, to the same end.
-    remodeling
-        The pass.
-    held_from
-        Time from which on no load changes.
-    limit
-        Makes the last part of the way; None where cells cannot answer within a solve: then all of it is gone.
-
-    Attributes
-    ----------
-    steps
-        How many steps the way had, the last one to the limit included.
-    """
+    """The way through ramps and held loads until the cells rest, as one step."""
 
     order, accumulates, longest, share, better = 1, True, math.inf, 1.0, None
     others: Sequence[Any] = ()  # its way solves further load cases
@@ -106,13 +89,7 @@ class Homeostasis:
         self._held: Snapshot | None = None  # the first state on the way under held loads
 
     def solve(self, time: float, loads: LoadValues) -> Work:
-        """Equilibrium of forces and of cells.
-
-        Raises
-        ------
-        StepFailure
-            If a step on the way is not solved.
-        """
+        """Equilibrium of forces and of cells."""
         state, work = self.state, Work()
         start, number, self.steps = state.time, state.number, 0
         self._held = None
@@ -131,11 +108,9 @@ class Homeostasis:
         return work
 
     def _go(self, time: float, loads: LoadValues, held: float, loosens: bool, work: Work) -> None:
-        """From where the state is until the cells rest; loads are held from a time on, from which the way may loosen.
-
-        The error of a row that lags leaves nothing once the cells rest, unless they come to rest elsewhere. Where
-        collagen comes to rest depends on the way.
-        """
+        """From where the state is until the cells rest."""
+        # The error of a row that lags leaves nothing once the cells rest, unless they come to rest elsewhere. Where
+        # collagen comes to rest depends on the way.
         state, self.near, self.tries, self._slowing = self.state, NEAR, TRIES, Slowing(dict(Slowing.INITIAL))
         self.way.tolerance = self.tolerance
         for step in self.way.march():
@@ -252,10 +227,8 @@ class Homeostasis:
         return quadrature.maximum(np.linalg.norm(change, axis=(-1, -2)) / r0**2)
 
     def _largest_jump(self) -> tuple[float, NDArray[np.float64]]:
-        """Largest difference of A over r0^2 between a point and its nearest ones, and the middle of the two.
-
-        Collective: a neighbour may belong to another rank.
-        """
+        """Largest difference of A over r0^2 between a point and its nearest ones, and the middle of the two."""
+        # Collective: a neighbour may belong to another rank.
         from scipy.spatial import cKDTree  # only runs that end in an equilibrium need it
 
         quadrature = self.state.cells.quadrature

@@ -50,31 +50,7 @@ JUMP = 0.02
 
 
 class AnsweringCells:
-    """The cells at the end of a step as a function of the unknowns, at all points of this rank in one row.
-
-    Parameters
-    ----------
-    state
-        Its cells are those at the start of the step.
-    tissue
-        On the mesh.
-    remodeling
-        Driver, law, frame and speed.
-
-    Attributes
-    ----------
-    stress, tangent
-        P (3, 3) and dP/dF (9, 9), row by row: dolfinx functions that belong to the last `update`.
-    frozen
-        Cells of all points where none answers: those at the start of the step, or those of a pass.
-    held
-        Points whose cells answer no more in this solve.
-    may_hold
-        Whether points where the law jumps (`responses.jumps_by_rank`) may be held; otherwise a state with points that
-        have no solution is refused.
-    accepted
-        The driving tensor of the last accepted state, from which the next solve starts.
-    """
+    """The cells at the end of a step as a function of the unknowns, at all points of this rank in one row."""
 
     def __init__(self, state: State, tissue: Tissue, remodeling: RemodelingPass):
         self.state, self.tissue, self.remodeling = state, tissue, remodeling
@@ -227,15 +203,7 @@ class AnsweringCells:
 
 
 class AnsweringEquilibrium(Equilibrium):
-    """Equilibrium whose stress and tangent come from `AnsweringCells`.
-
-    Parameters
-    ----------
-    state, tissue
-        As for `Equilibrium`.
-    answering
-        The cells.
-    """
+    """Equilibrium whose stress and tangent come from `AnsweringCells`."""
 
     def __init__(self, state: State, tissue: Tissue, answering: AnsweringCells):
         self.answering = answering
@@ -283,11 +251,9 @@ class AnsweringNewton(GuardedNewton):
         self._patient = False  # whether shorter steps are looked for where cells have no solution
 
     def solve(self, origin: Array | None = None) -> Solution:
-        """As of `GuardedNewton`; at first no cells are held.
-
-        Where Newton's method fails, or some cells have no solution at its deformations, it starts again from the
-        equilibrium to which passes with frozen cells come: it often is near.
-        """
+        """As of `GuardedNewton`; at first no cells are held."""
+        # Where Newton's method fails, or some cells have no solution at its deformations, it starts again from the
+        # equilibrium to which passes with frozen cells come: it often is near.
         start, accepted = self.unknown.x.array.copy(), self.answering.accepted
         try:
             return self._solved(origin)
@@ -328,10 +294,8 @@ class AnsweringNewton(GuardedNewton):
             self._patient = False
 
     def _pass(self, work: SolveFailure) -> bool:
-        """Passes with frozen cells, each with its equilibrium, up to one that changes nothing; adds what they cost.
-
-        Returns whether they come nearer to each other.
-        """
+        """Passes with frozen cells, each with its equilibrium, up to one that changes nothing; adds what they cost."""
+        # Returns whether they come nearer to each other.
         answering, values, share = self.answering, self.unknown.x.array, 1.0
         ways: list[float] = []  # of the unknowns, over each pass
         try:
@@ -383,13 +347,7 @@ MOST_SOLVES = 20  # of all Newton iterations that one may have, for a step with 
 
 
 class Implicit:
-    """Newton's method on the unknowns with cells that follow at each point (`evolution.condensed`).
-
-    A step that does not converge in one piece, with cells that belong to their stress at all points, is made in parts
-    of its time and loads, each from the cells at its start: the end is that of the whole step. Where that fails too,
-    points whose law jumps may keep other cells; a warning says in which share of the body. The first step, before which
-    there is no stress, is first solved with the cells as they are. Cells, stress and row belong together at the end.
-    """
+    """Newton's method on the unknowns with cells that follow at each point (`evolution.condensed`)."""
 
     order, accumulates, longest = 1, True, math.inf
 
@@ -408,13 +366,7 @@ class Implicit:
         self._numbers = Numbers(state, "implicit", {"held": 0.0})  # the largest share that a warning has named
 
     def solve(self, time: float, loads: LoadValues) -> Work:
-        """Equilibrium at `time` with the cells that belong to it.
-
-        Raises
-        ------
-        StepFailure
-            If none is found.
-        """
+        """Equilibrium at `time` with the cells that belong to it."""
         work, start = Work(), self.state.elastic_gradient()
         self.answering.begin(time, self.state.numbers[RESIDUAL])
         if self.turnover is not None:

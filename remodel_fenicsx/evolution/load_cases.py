@@ -17,23 +17,7 @@ from remodel_fenicsx.state.state import State
 
 
 class OtherCase:
-    """A load case beside the first: solved after it in each step, and asked for its drive before the pass.
-
-    To those who measure or watch it is a stepper: it has `state`, `coupling`, `remodeling` and `tissue`.
-
-    Parameters
-    ----------
-    number
-        2 for the second one, and so on.
-    state
-        Its unknowns and loads, and the cells of all cases.
-    load_values
-        Magnitudes of its loads by time.
-    stepper
-        Whose tissue and remodeling it has.
-    solver, kappa
-        As the stepper's.
-    """
+    """A load case beside the first: solved after it in each step, and asked for its drive before the pass."""
 
     def __init__(
         self,
@@ -52,13 +36,7 @@ class OtherCase:
         self.cases: Sequence[OtherCase] = ()
 
     def solve(self, time: float) -> Work:
-        """Equilibrium at `time` with the present cells.
-
-        Raises
-        ------
-        StepFailure
-            If no admissible equilibrium is found.
-        """
+        """Equilibrium at `time` with the present cells."""
         try:
             return self.coupling.solve(time, self.load_values(time))
         except StepFailure as failure:
@@ -75,15 +53,7 @@ class OtherCase:
 
 
 class OtherCaseWatcher(Watcher):
-    """A watcher of the states of another load case: it sees each step as it is there.
-
-    Parameters
-    ----------
-    case
-        The load case.
-    watcher
-        Made for it, as for a stepper.
-    """
+    """A watcher of the states of another load case: it sees each step as it is there."""
 
     def __init__(self, case: OtherCase, watcher: Watcher):
         self.case, self.watcher = case, watcher
@@ -109,17 +79,7 @@ class OtherCaseWatcher(Watcher):
 
 
 def join(stepper: Stepper, cases: Sequence[OtherCase], weights: Sequence[float]) -> None:
-    """From now on the stepper solves these cases too, and its pass follows the mean of all.
-
-    Parameters
-    ----------
-    stepper
-        Of the first case.
-    cases
-        The others.
-    weights
-        Shares of time, the first case's first.
-    """
+    """From now on the stepper solves these cases too, and its pass follows the mean of all."""
     stepper.coupling.others = list(cases)
     stepper.state.others = [case.state for case in cases]
     follow(stepper, cases, weights)

@@ -59,18 +59,7 @@ class NoPredictor:
 
 
 class Autoregressive:
-    """The next increment as a combination of the last three: d_n = sum_j a_j d_(n-j).
-
-    The weights a are those with which the last two increments follow best from the three before each (least squares
-    over all unknowns). So they know a trend, and the part of a staggered pass that alternates from step to step, which
-    polynomials only make worse. With fewer increments the last one is expected again. Increments of steps of another
-    length count as at their own speed over the next one. Where the rate of a load changes, what was is forgotten.
-
-    Parameters
-    ----------
-    state
-        The last increments are part of it from now on.
-    """
+    """The next increment as a combination of the last three: d_n = sum_j a_j d_(n-j)."""
 
     def __init__(self, state: State):
         self.state = state
@@ -123,19 +112,7 @@ class Autoregressive:
 
 
 class Responsive:
-    """The next increment as that combination of the last ones that makes up what the step asks for.
-
-    For steps of all lengths. The cells with which a step is solved are known before: their change since the last row,
-    and the change of the loads, are written as a combination of those of the steps before (least squares over the
-    body). The body answers small changes linearly, so that the same combination of its increments is expected. How
-    long the steps were and how the pass lags behind is in the changes themselves. Where the rate of a load changes,
-    what was is forgotten.
-
-    Parameters
-    ----------
-    state
-        The last increments, and what they answer, are part of it from now on.
-    """
+    """The next increment as that combination of the last ones that makes up what the step asks for."""
 
     def __init__(self, state: State):
         self.state, self.quadrature = state, state.cells.quadrature

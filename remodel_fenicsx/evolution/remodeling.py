@@ -39,41 +39,14 @@ AWAKE = 0.5  # of the speed of remodeling under tension alone
 
 
 class Noise(NamedTuple):
-    """Size up to which a principal value of the driving tensor may be an error, in its unit.
-
-    Attributes
-    ----------
-    size
-        Of all errors: rounding, and the equilibrium as it was accepted.
-    rounding
-        Of the rounding of a stress at given F.
-    """
+    """Size up to which a principal value of the driving tensor may be an error, in its unit."""
 
     size: float
     rounding: float
 
 
 class RemodelingPass:
-    """Updates the unit cells of a solved state.
-
-    Parameters
-    ----------
-    state
-        Unknowns and cells; the cells are what it updates.
-    tissue
-        Parameters of matrix and chains.
-    settings
-        Driver, law, frame, pairing, kappa and rotation time.
-    kappa
-        In place of that of the settings: a number, a Constant or a DG0 Function as it is now.
-
-    Attributes
-    ----------
-    kappa
-        Speed of remodeling: a number, or of all points in one row (n,).
-    slowest, fastest
-        The smallest one above 0 and the largest one in the body; 0 where all are.
-    """
+    """Updates the unit cells of a solved state."""
 
     def __init__(self, state: State, tissue: Tissue, settings: Remodeling, kappa: Any = None):
         self.state, self.settings = state, settings
@@ -124,10 +97,8 @@ class RemodelingPass:
         return self._known(evaluated)
 
     def drive(self, residual: float = 0.0) -> Drive:
-        """What acts on the cells in the present state, which was accepted with this norm of out-of-balance forces.
-
-        With several load cases: in all of their states.
-        """
+        """What acts on the cells in the present state, which was accepted with this norm of out-of-balance forces."""
+        # With several load cases: in all of their states.
         if not self.others:
             return self._own_drive(residual)
         return MEANS_OF_CASES[self.settings.mean].drive(self._drives(residual), self.weights)
@@ -161,18 +132,9 @@ class RemodelingPass:
         return carried_axes(F, axes) if not self.driver.material and self.frame.carries_axes else axes
 
     def noise(self, F: Array, tensor: Array, residual: float) -> Noise:
-        """Up to which size a principal value may be an error: of rounding, or of the equilibrium as it was accepted.
-
-        The residual is one number for the whole body, of which nobody knows what stress it means at a point. However
-        loose the tolerance is, it must not decide that nothing remodels: it counts as a small share of the stress.
-
-        Parameters
-        ----------
-        F, tensor
-            Deformation gradient and driving tensor at all points in one row, (n, 3, 3).
-        residual
-            Norm of the out-of-balance nodal forces, in the unit of force.
-        """
+        """Up to which size a principal value may be an error: of rounding, or of the equilibrium as it was accepted."""
+        # The residual is one number for the whole body, of which nobody knows what stress it means at a point. However
+        # loose the tolerance is, it must not decide that nothing remodels: it counts as a small share of the stress.
         if not self.driver.is_stress:
             return Noise(spectral.ROUNDING, spectral.ROUNDING)
         rounding = STRESS_ROUNDINGS * stress_rounding(self.parameters.largest(), self._max_chain_extension(F))
@@ -200,10 +162,8 @@ class RemodelingPass:
         return noise
 
     def weakness(self) -> float:
-        """Tension of which half counts, over the stress of the body when that was largest; 0 of what nothing loads.
-
-        Laws that follow a target by its share are slower there (`tensor_law.floor_above`).
-        """
+        """Tension of which half counts, over the stress of the body when that was largest; 0 of what nothing loads."""
+        # Laws that follow a target by its share are slower there (`tensor_law.floor_above`).
         if not self.law.remodels or self.law.target is None or not self.driver.is_stress:
             return 0.0
         stress, floor = self._numbers["stress"], self._numbers["floor"]
@@ -219,10 +179,8 @@ class RemodelingPass:
     def updated_cells(
         self, time_old: float, time_new: float, residual: float = 0.0, cells: UnitCell | None = None
     ) -> tuple[UnitCell, Array]:
-        """What the present stress makes of the present cells, or of others, in one row, and F (n, 3, 3).
-
-        Changes nothing.
-        """
+        """What the present stress makes of the present cells, or of others, in one row, and F (n, 3, 3)."""
+        # Changes nothing.
         cells = self.state.cells.point_cells if cells is None else cells
         if self._averages_targets:
             followed = self.followed(self.target(residual), time_new - time_old, cells)
@@ -276,17 +234,10 @@ class RemodelingPass:
         return self._change[1] if self.law.remodels and self._change is not None else None
 
     def apply(self, time_old: float, time_new: float, residual: float = 0.0, factor: float = 1.0) -> float:
-        """Remodel over a step with the stress of the solved state at time_new; returns the power of remodeling.
-
-        The power is the stored energy that the pass releases at frozen deformation, per time, to first order
-        (`Tissue.energy_increment`; Remark 6). A principal stress counts as tension beyond `noise`. Of the change
-        of the cells a share `factor` is made (`Law.share`).
-
-        Raises
-        ------
-        FloatingPointError
-            If the driving tensor is not finite anywhere.
-        """
+        """Remodel over a step with the stress of the solved state at time_new; returns the power of remodeling."""
+        # The power is the stored energy that the pass releases at frozen deformation, per time, to first order
+        # (`Tissue.energy_increment`; Remark 6). A principal stress counts as tension beyond `noise`. Of the change of
+        # the cells a share `factor` is made (`Law.share`).
         asked, F = self.updated_cells(time_old, time_new, residual)
         return self.replace(asked, F, time_new - time_old, factor)
 
@@ -321,10 +272,8 @@ class RemodelingPass:
         return np.asarray(increment)
 
     def residual(self) -> float:
-        """max |A_pass - A| of the last pass over all points, A those of the solved state, in squared link lengths.
-
-        How far the solved state is from one whose cells belong to its own stress; NaN before the first pass.
-        """
+        """max |A_pass - A| of the last pass over all points, A those of the solved state, in squared link lengths."""
+        # How far the solved state is from one whose cells belong to its own stress; NaN before the first pass.
         if not self.law.remodels or self._change is None:
             return float("nan")
         before, after = (structure_tensor(*cells[:2]) for cells in self._change)

@@ -39,17 +39,7 @@ _JACOBIAN_STEP = 1e-5  # of a logarithm of an unknown: errors of 1e-10, from the
 
 
 class Directions(NamedTuple):
-    """How the numbers of a run change with k unknowns.
-
-    Attributes
-    ----------
-    tissue
-        By name of a parameter of `Tissue`, (k,).
-    kappa
-        (k,).
-    loads
-        Magnitudes of loads at a time by name, (k,).
-    """
+    """How the numbers of a run change with k unknowns."""
 
     tissue: Mapping[str, Array]
     kappa: Array
@@ -78,15 +68,7 @@ def axes_lie_along(axes: Array) -> bool:
 
 # ---------------------------------------------------------------- a solved state
 def along_constants(expression: Any, ways: Mapping[Any, Any]) -> Any:
-    """Derivative of UFL, a form or an expression, by its Constants, each in the direction that belongs to it; or None.
-
-    Parameters
-    ----------
-    expression
-        What is differentiated.
-    ways
-        Directions, Constants too, by Constant. Those that the expression does not have are left out.
-    """
+    """Derivative of UFL, a form or an expression, by its Constants, each in the direction that belongs to it."""
     there = set(expression.constants() if isinstance(expression, ufl.Form) else extract_constants(expression))
     variables = {constant: ufl.variable(constant) for constant in ways if constant in there}
     if not variables:
@@ -101,17 +83,7 @@ def _sum(terms: list[Any]) -> Any:
 
 
 class LinearisedEquilibrium:
-    """K du = -(R_theta dtheta + R_l dl) and the change of the driving tensor's principal values, compiled; serial.
-
-    Parameters
-    ----------
-    equilibrium
-        Whose forms are differentiated.
-    remodeling
-        Whose driver.
-    names
-        Parameters of the tissue that change.
-    """
+    """K du = -(R_theta dtheta + R_l dl) and the change of the driving tensor's principal values, compiled; serial."""
 
     def __init__(self, equilibrium: Equilibrium, remodeling: RemodelingPass, names: tuple[str, ...]):
         self.equilibrium, self.state, self.names = equilibrium, equilibrium.state, names
@@ -185,15 +157,7 @@ class LinearisedEquilibrium:
         return ufl.as_vector([total[i, i] for i in range(3)])
 
     def solve(self, directions: Directions, time: float, dimensions: Array) -> tuple[Array, Array]:
-        """Of the present state: du (k, unknowns), and the change of the driver's principal values (k, n, 3).
-
-        Parameters
-        ----------
-        directions, time
-            What changes, and when.
-        dimensions
-            dl of the cells that the state is solved with, (k, elements, points, 3).
-        """
+        """Of the present state: du (k, unknowns), and the change of the driver's principal values (k, n, 3)."""
         matrix, held = self._matrix, ~np.isnan(self.equilibrium.prescribed_values())
         self.equilibrium.assemble_tangent(matrix)
         tangent = csr_matrix(matrix.getValuesCSR()[::-1], shape=matrix.getSize()).toarray()
@@ -292,19 +256,7 @@ def target_changes(drive: Drive, values: Array) -> Changes:
 def followed_changes(
     structure: Array, changes: Array, target: Target, of_target: Changes, squared: Array, rate: Array, of_rate: Array
 ) -> Array:
-    """Change (k, n, 3) of the diagonal of `tensor_law.follow`.
-
-    Parameters
-    ----------
-    structure, changes
-        Diagonal of A at the start (n, 3), and its change (k, n, 3).
-    target, of_target
-        What A follows, and its change.
-    squared
-        r0^2, (n,).
-    rate, of_rate
-        kappa times the time (n,), and its change (k,).
-    """
+    """Change (k, n, 3) of the diagonal of `tensor_law.follow`."""
     left = np.exp(-rate * target.share)
     towards = squared[:, None] * diagonal(target.direction)
     of_exponent = of_rate[:, None] * target.share + rate * of_target.share
@@ -319,21 +271,7 @@ def followed_changes(
 def ranked_changes(
     law: RankedFunction, drive: Drive, values: Array, times: tuple[float, float], old: Array, changes: Any, kappa: Array
 ) -> Array:
-    """Change (k, n, 3) of the lengths of a law by rank.
-
-    Parameters
-    ----------
-    values
-        Principal values of the driving tensor where their dimension of the cell stands, (n, 3).
-    times
-        Of the step.
-    old
-        Lengths at the start (n, 3).
-    changes
-        Of `old` and of `values`, (k, n, 3) each.
-    kappa
-        Change of kappa, (k,).
-    """
+    """Change (k, n, 3) of the lengths of a law by rank."""
     of_old, of_values = changes
     e, active = drive.kernels.positive_direction(values, threshold=drive.threshold)
     size = np.linalg.norm(np.where(e > 0, values, 0.0), axis=1)
@@ -352,15 +290,7 @@ def ranked_changes(
 
 # ---------------------------------------------------------------- couplings
 class StaggeredDerivatives(Staggered):
-    """`Staggered` with the derivatives of its unknowns and cells.
-
-    Attributes
-    ----------
-    unknowns
-        du of the solved state, (k, unknowns).
-    dimensions
-        dl of the present cells, (k, elements, points, 3).
-    """
+    """`Staggered` with the derivatives of its unknowns and cells."""
 
     directions: Directions
     unknowns: Array

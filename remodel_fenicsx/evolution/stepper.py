@@ -345,19 +345,7 @@ REASONS = {BY_SIGNAL: "stopped by SIGUSR1", BY_CLOCK: "stopped before --max-wall
 
 
 class Pause(Watcher):
-    """Raises `Paused` after a step, on all ranks, if somebody asked for it or the next step would come too late.
-
-    Parameters
-    ----------
-    comm
-        Communicator; the clock is that of rank 0.
-    folder
-        Where the run is kept.
-    asked
-        Whether this rank was asked to stop.
-    deadline
-        `time.monotonic` at which the run must have ended; None: never.
-    """
+    """Raises `Paused` after a step, on all ranks, if somebody asked for it or the next step would come too late."""
 
     def __init__(self, comm: Any, folder: Path, asked: Callable[[], bool], deadline: float | None = None):
         self.comm, self.folder, self.asked, self.deadline = comm, folder, asked, deadline

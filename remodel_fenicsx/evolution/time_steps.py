@@ -32,20 +32,7 @@ COMPONENTS = (len(tensors.MANDEL),)
 
 @dataclass(frozen=True)
 class Estimate:
-    """Of one step, in degrees.
-
-    The larger of two errors: that of the direction of the chains in space (`angle_between`), root mean square over the
-    body, and the largest error of a length in the body, relative to this length, as an angle in radians. A strain of
-    this size turns lines of the body by up to this angle. With turnover the errors of content and natural length count
-    like those of lengths.
-
-    Attributes
-    ----------
-    controlled
-        What a tolerance holds down: the error that the row would end with if all steps were like this one.
-    row
-        The row's own: where the errors of steps add up, with what is left of those before.
-    """
+    """Of one step, in degrees."""
 
     controlled: float
     row: float
@@ -59,25 +46,7 @@ class Remodeled(NamedTuple):
 
 
 class TimeError:
-    """Compares each row with a better one, which the coupling has from the same step (docs/theory.md).
-
-    Rows of some couplings lag nothing, but their cells follow a target that changes within the step: better is one that
-    goes from that of its start to that of its end. Each step then adds an error, and kappa forgets it: it ends at the
-    error of a step over 1 - exp(-kappa dt), if all steps are alike. Cells forget with kappa, but the stress follows the
-    cells, so that body and cells together forget more slowly: with the rate at which they slow down under loads that
-    are held, which is measured. With time an error grows by kappa over it. Those of turnover are forgotten with 1/T.
-
-    A staggered row is solved with cells that lag a step behind: those that its own pass makes are better. But the
-    stress, to which the pass answers, lags too: the better cells are those that a pass makes with the stress of a body
-    that has the better cells. They are found by one such pass at each step, from what the error was at the last one.
-
-    How the body answers other cells is one solution with the tangent of its last Newton iteration.
-
-    Parameters
-    ----------
-    stepper
-        Whose steps are estimated; what is remembered of them is part of its state.
-    """
+    """Compares each row with a better one, which the coupling has from the same step (docs/theory.md)."""
 
     def __init__(self, stepper: Stepper):
         self.stepper, self.state = stepper, stepper.state
@@ -228,10 +197,8 @@ class TimeError:
         return float(np.sqrt(self.quadrature.mean(apart**2)))
 
     def _strain(self, step: Step, remodeled: Remodeled) -> tuple[float, bool]:
-        """Let the body answer what has remodeled: the largest change of a length, and whether that is a state.
-
-        In all load cases.
-        """
+        """Let the body answer what has remodeled: the largest change of a length, and whether that is a state."""
+        # In all load cases.
         shape, cases, cells = self.quadrature.shape, self.stepper.cases, remodeled.cells
         before = [case.state.elastic_gradient() for case in (self.stepper, *cases)]
         self.state.cells.set(cells.dimensions.reshape(*shape, 3), cells.axes.reshape(*shape, 3, 3))
@@ -293,34 +260,7 @@ class StepTooLongError(Exception):
 
 
 class StepControl:
-    """Marches a stepper to the last of some times, which are hit exactly, in steps of an error below a tolerance.
-
-    Steps are kept as they are: to the next stop in equal parts, and until another length is worth it, one and a half
-    times as long, or until the error would pass the tolerance, to which its own trend is added (a predictive
-    controller: Gustafsson, ACM Trans. Math. Softw. 20 (1994)). The cost of a given mean error hardly depends on how
-    errors are distributed in time, but Newton's method starts better where steps are alike, and steps that are
-    neither refused nor cut waste nothing (Hairer and Wanner, Solving ODEs II, IV.8, keep them for their factors). The
-    other length is h (AIM/e)^(1/p), e the estimate of `TimeError` over the tolerance, p the order of the coupling, and
-    h the step that belongs to e: with a pass that lags behind, of the last step and of those before it.
-
-    What it remembers is part of the state: runs that go on take the same steps. Where the error does not fall with the
-    step (random cells turn over in the first pass, however short it is; a pass that over-corrects swings) no step is
-    shorter than what chains need that turn by `FASTEST` degrees in the shortest time of the scene: 1/kappa, the law's
-    rotation time, the time to the next stop. Such steps are accepted with their error, and a warning says so. After
-    `IN_VAIN` of them in such a time steps go on that are as long as those before, whatever their error, until it is
-    below the tolerance again or some time has passed.
-
-    Parameters
-    ----------
-    stepper
-        What is advanced.
-    tolerance
-        In degrees, above 0; of `time_error.Estimate`.
-    first
-        The first step.
-    stops
-        Times that are hit, increasing; the last one is the end.
-    """
+    """Marches a stepper to the last of some times, which are hit exactly, in steps of an error below a tolerance."""
 
     def __init__(self, stepper: Stepper, tolerance: float, first: float, stops: Sequence[float]):
         self.stepper, self.state, self.tolerance = stepper, stepper.state, tolerance
@@ -374,13 +314,7 @@ class StepControl:
 
     # ------------------------------------------------------------ within the step's transaction
     def _judge(self, step: Step) -> None:
-        """Accept a step and choose the next one, or raise.
-
-        Raises
-        ------
-        StepTooLongError
-            If the error is too large and a shorter step makes it smaller.
-        """
+        """Accept a step and choose the next one, or raise."""
         error, duration = self.error.measure(step).controlled / self.tolerance, step.time - self.state.time
         numbers, shortest = self._numbers, self._shortest()
         longer = self._longer_with_the_same(error, duration)
@@ -396,10 +330,9 @@ class StepControl:
         numbers["before"], numbers["effective"] = max(error, TELLING_ERROR), self._effective(duration)
 
     def _longer_with_the_same(self, error: float, duration: float) -> float:
-        """Length of a much longer step that was refused for about the same error, now or before a few accepted ones.
-
-        It is that of something that happens at once, now or soon; shorter steps would only come nearer to it. 0: none.
-        """
+        """Length of a much longer step that was refused for about the same error, now or before a few accepted ones."""
+        # It is that of something that happens at once, now or soon; shorter steps would only come nearer to it. 0:
+        # none.
         if error <= 1 or duration > SHORT * self._fastest_time():
             return 0.0
         refused = [(rejected.duration, rejected.error) for rejected in self._rejected]

@@ -37,15 +37,7 @@ def changed(start: Array, rates: Array, duration: float) -> Array:
 
 
 class Slowing:
-    """Whether rates fall faster than 1/t: told from what they were after a quarter to a half of the time.
-
-    Those of what comes to rest fall exponentially. The integral of rates that fall no faster than 1/t has no bound.
-
-    Parameters
-    ----------
-    numbers
-        What is remembered, at first `INITIAL`.
-    """
+    """Whether rates fall faster than 1/t: told from what they were after a quarter to a half of the time."""
 
     INITIAL = dict.fromkeys(("early_time", "early_rate", "late_time", "late_rate"), 0.0)
 
@@ -62,29 +54,7 @@ class Slowing:
 
 
 class TurnoverPass:
-    """Changes content and natural length with the lengths of solved states, as the coupling asks.
-
-    They are always those of the last solved state. Where rows lag (`lag`), a row has them from the rates of the rows
-    before it, as the cells of a staggered pass. Otherwise (`extrapolate`) they are those of the end of the row's step,
-    from the rates that the last two states let expect for its middle (Adams and Bashforth's second-order rule).
-    Implicit steps find them together with the state (`take`).
-
-    Parameters
-    ----------
-    state
-        Unknowns and the cells in equilibrium with them.
-    tissue
-        Of `turned_over`.
-    settings
-        Time, stretch of deposition and gain.
-
-    Attributes
-    ----------
-    slowest, fastest
-        Rates of rho and m: 1/T, and the larger one of 1/T and k/T, in 1/time.
-    row, better
-        ln m and ln rho of the last row, and what a better rule gives for it, (2, n); known after its step.
-    """
+    """Changes content and natural length with the lengths of solved states, as the coupling asks."""
 
     def __init__(self, state: State, tissue: Tissue, settings: Turnover):
         assert settings.time is not None

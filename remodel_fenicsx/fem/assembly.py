@@ -37,24 +37,8 @@ class SolveStopped(ArithmeticError):
 
 
 def solve_positive(bilinear: Any, linear: Any, unknown: Any, conditions: Sequence[Any] = ()) -> None:
-    """Solve bilinear(unknown, v) = linear(v) for all v. Collective.
-
-    Conjugate gradients with Jacobi's preconditioner: the same numbers each time, and no memory for factors.
-
-    Parameters
-    ----------
-    bilinear, linear
-        UFL forms; `linear` may be None for zero.
-    unknown
-        dolfinx function; its values where no condition holds are where the iterations start.
-    conditions
-        dolfinx Dirichlet conditions on its space.
-
-    Raises
-    ------
-    SolveStopped
-        If they do not converge.
-    """
+    """Solve bilinear(unknown, v) = linear(v) for all v. Collective."""
+    # Conjugate gradients with Jacobi's preconditioner: the same numbers each time, and no memory for factors.
     tangent = jit.form(bilinear)
     for condition in conditions:
         condition.set(unknown.x.array)
@@ -94,10 +78,8 @@ T = TypeVar("T")
 
 
 def over_ranks(comm: MPI.Intracomm, value: Any, operation: MPI.Op) -> Any:
-    """The operation over the values of all ranks, on all ranks. Collective.
-
-    A run of one rank makes some ten of these in a Newton iteration, and a small problem has no time for them.
-    """
+    """The operation over the values of all ranks, on all ranks. Collective."""
+    # A run of one rank makes some ten of these in a Newton iteration, and a small problem has no time for them.
     return value if comm.size == 1 else comm.allreduce(value, operation)
 
 
@@ -110,26 +92,7 @@ def of_all_ranks(comm: MPI.Intracomm, value: Any) -> list[Any]:
 
 
 def coefficient(mesh: Any, name: str, value: Any) -> Any:
-    """The value as forms take it, so that another value compiles nothing.
-
-    Parameters
-    ----------
-    mesh
-        dolfinx mesh of the forms.
-    name
-        Of the parameter, for errors.
-    value
-        A number, which becomes a Constant; a scalar dolfinx Constant, or a scalar DG0 Function of this mesh, which stay
-        the user's: what is returned shares their memory. It is an object of its own, because UFL numbers constants and
-        functions by their age, and kernels are found again by these numbers.
-
-    Raises
-    ------
-    TypeError
-        If it is anything else.
-    ValueError
-        If a value is not finite, or a Constant or Function belongs to another mesh or has another shape.
-    """
+    """The value as forms take it, so that another value compiles nothing."""
     if isinstance(value, Real) and not isinstance(value, (bool, np.bool_)):
         if not np.isfinite(float(value)):
             raise ValueError(f"{name} = {value}: must be finite")
@@ -194,16 +157,7 @@ def largest(value: Any, mesh: Any) -> float:
 
 
 class Remembered(Generic[T]):
-    """The last value, as long as nothing has changed that it depends on.
-
-    Parameters
-    ----------
-    comm
-        Ranks that must agree on whether something has changed: collective, as what it spares may be. None where each
-        rank has values of its own.
-    expressions
-        UFL: the value depends on their functions and constants, and on nothing else.
-    """
+    """The last value, as long as nothing has changed that it depends on."""
 
     def __init__(self, comm: MPI.Intracomm | None, *expressions: Any):
         self._comm = comm
@@ -250,22 +204,10 @@ def _same(one: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
 
 
 def second_derivative(energy: Any, unknown: Any, test: Any, trial: Any, other: Any = None) -> Any:
-    """Derivative of an energy by its unknowns, twice; its kernel takes a third of the time.
-
-    An energy W(I_1, I_2, ...) of scalar invariants of F has sum_m W_m D(d I_m) + sum_mn W_mn d I_m D I_n. Left to
-    itself UFL puts test and trial function through every operation of W, and each of these is then 81 at a point in
-    three dimensions. Here they are operations on numbers, and each pair of invariants that W couples has one dyad.
-
-    Parameters
-    ----------
-    energy
-        UFL form without arguments.
-    unknown, test, trial
-        What it is differentiated by, and the directions.
-    other
-        What it is differentiated by the second time, if that is not the unknown: a function on which the invariants
-        depend, and nothing else does.
-    """
+    """Derivative of an energy by its unknowns, twice; its kernel takes a third of the time."""
+    # An energy W(I_1, I_2, ...) of scalar invariants of F has sum_m W_m D(d I_m) + sum_mn W_mn d I_m D I_n. Left to
+    # itself UFL puts test and trial function through every operation of W, and each of these is then 81 at a point in
+    # three dimensions. Here they are operations on numbers, and each pair of invariants that W couples has one dyad.
     other = unknown if other is None else other
     return map_integrands(lambda density: _of_density(density, unknown, test, trial, other), energy)
 
@@ -288,10 +230,8 @@ def _of_density(density: Any, unknown: Any, test: Any, trial: Any, other: Any) -
 
 
 def invariants(density: Any, unknown: Any) -> list[Any]:
-    """Scalar products, determinants, traces and squared lengths through which alone a density depends on the unknown.
-
-    The outermost ones; none at all where it depends on the unknown in another way too.
-    """
+    """Scalar products, determinants."""
+    # The outermost ones; none at all where it depends on the unknown in another way too.
     depends: set[Any] = set()
     for part in unique_post_traversal(density):  # operands come before what is made of them
         if part == unknown or any(operand in depends for operand in part.ufl_operands):
@@ -319,12 +259,10 @@ SHARED = "dolfinx"  # attribute of a PETSc matrix: dolfinx's own, with the start
 
 
 def create_matrix(form: Any) -> Any:
-    """An empty PETSc matrix with the pattern of a compiled bilinear form. Collective.
-
-    Forms are assembled into a `dolfinx.la.MatrixCSR`. On one rank its memory is that of the matrix; on several ranks
-    the matrix takes its values as a whole. Either way none goes through PETSc's insertion, which takes as long as the
-    kernels.
-    """
+    """An empty PETSc matrix with the pattern of a compiled bilinear form. Collective."""
+    # Forms are assembled into a `dolfinx.la.MatrixCSR`. On one rank its memory is that of the matrix; on several ranks
+    # the matrix takes its values as a whole. Either way none goes through PETSc's insertion, which takes as long as the
+    # kernels.
     shared = dolfinx.fem.create_matrix(form, dolfinx.la.BlockMode.expanded)
     block, matrix = form.function_spaces[0].dofmap.index_map_bs, PETSc.Mat()
     rows, columns = (shared.index_map(axis) for axis in (0, 1))

@@ -8,10 +8,8 @@ from mpi4py import MPI
 
 
 def mesh_from_gmsh(model: Any, comm: MPI.Intracomm) -> tuple[Any, Any, Any]:
-    """The dolfinx mesh, its cell tags and its facet tags of the Gmsh model that rank 0 holds.
-
-    Tags are the numbers of physical groups; `model` is not looked at on other ranks.
-    """
+    """The dolfinx mesh, its cell tags and its facet tags of the Gmsh model that rank 0 holds."""
+    # Tags are the numbers of physical groups; `model` is not looked at on other ranks.
     try:
         from dolfinx.io import gmsh as reader  # type: ignore[attr-defined]  # 0.10 and later
     except ImportError:
@@ -28,19 +26,7 @@ def geometry_dofmap(mesh: Any) -> Any:
 
 
 def space_with_dofs(space: Any, size: int, ghosts: Any, owners: Any, dofs: Any) -> Any:
-    """A function space like another one whose elements have other degrees of freedom, of block size 1.
-
-    Parameters
-    ----------
-    space
-        Its mesh, element and layout stay.
-    size
-        Number of those that this rank owns.
-    ghosts, owners
-        Global numbers of the others that it knows, int64, and their ranks, int32.
-    dofs
-        Local numbers in each local element, (elements, dofs), int32.
-    """
+    """A function space like another one whose elements have other degrees of freedom, of block size 1."""
     import dolfinx.cpp
     import dolfinx.fem
     import dolfinx.graph

@@ -19,13 +19,7 @@ Array = NDArray[np.float64]
 
 
 class Dilatation:
-    """A formulation on a mesh: the energy's integral, and stresses and J to go with it; here J at all points.
-
-    Attributes
-    ----------
-    jacobian
-        dolfinx function of the J that `stresses` takes in place of that of F; None where it takes none.
-    """
+    """A formulation on a mesh: the energy's integral, and stresses and J to go with it; here J at all points."""
 
     jacobian: Any = None
 
@@ -33,15 +27,8 @@ class Dilatation:
         self.quadrature = quadrature
 
     def energies(self, tissue: Any, deformation_gradient: Any, cells: Any, weight: Any) -> list[Any]:
-        """UFL forms whose sum is the integral of W over the body; `weight` is the body's volume per unit of mesh.
-
-        They are compiled one by one: FFCx mixes up values of two quadrature rules that meet in one kernel.
-
-        Parameters
-        ----------
-        tissue
-            Whose energy it is (`model.energy.Tissue`), cells as it takes them.
-        """
+        """UFL forms whose sum is the integral of W over the body; `weight` is the body's volume per unit of mesh."""
+        # They are compiled one by one: FFCx mixes up values of two quadrature rules that meet in one kernel.
         return [tissue.strain_energy(deformation_gradient, cells) * weight * self.quadrature.dx]
 
     def stresses(self, tissue: Any, deformation_gradient: Any, cells: Any) -> Any:

@@ -78,11 +78,9 @@ def compiled_kernels() -> tuple[str, ...]:
 
 @functools.cache
 def cache_folder() -> Path:
-    """Folder of compiled kernels: per processor type, because -march=native code must not meet another processor.
-
-    Below XDG_CACHE_HOME or ~/.cache; where that cannot be written or is another user's, in a private temporary folder,
-    with a warning.
-    """
+    """Folder of compiled kernels: per processor type, because -march=native code must not meet another processor."""
+    # Below XDG_CACHE_HOME or ~/.cache; where that cannot be written or is another user's, in a private temporary
+    # folder, with a warning.
     base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
@@ -104,10 +102,8 @@ def cache_folder() -> Path:
 
 
 def _read_users_options() -> None:
-    """Let dolfinx and FFCx read the options of the user's own folder, once, and none of the working folder.
-
-    That may be somebody else's; its files would choose libraries to load and change numbers.
-    """
+    """Let dolfinx and FFCx read the options of the user's own folder, once, and none of the working folder."""
+    # That may be somebody else's; its files would choose libraries to load and change numbers.
     here = os.open(".", os.O_RDONLY)
     os.chdir("/")
     try:
@@ -195,20 +191,7 @@ def expression(ufl_expression: Any, points: Any, name: str | None = None) -> Poi
 
 
 class PointValues:
-    """An expression at reference points of elements, compiled in parts of some components each (`expression`).
-
-    Parameters
-    ----------
-    parts, sizes
-        dolfinx's expressions, of one vector each, and their numbers of components.
-    points
-        Their number.
-
-    Attributes
-    ----------
-    components
-        Of the whole expression.
-    """
+    """An expression at reference points of elements, compiled in parts of some components each (`expression`)."""
 
     def __init__(self, parts: list[Any], sizes: list[int], points: int):
         self._parts, self._sizes, self._points = parts, sizes, points
@@ -232,24 +215,7 @@ def library(
     include: Path | None = None,
     libraries: tuple[str, ...] = (),
 ) -> Any:
-    """Compile C functions of our own, or take them from the cache. Collective; says and raises what `form` does.
-
-    Parameters
-    ----------
-    comm
-        Its first rank compiles.
-    declarations, source
-        What can be called, and the code; for every architecture, in ISO C.
-    what, seconds
-        What is being compiled, and about how long it takes, for people.
-    include, libraries
-        A folder of headers, and names of libraries that the code calls.
-
-    Returns
-    -------
-    module
-        cffi's: `module.lib` has the functions, `module.ffi` makes pointers.
-    """
+    """Compile C functions of our own, or take them from the cache. Collective; says and raises what `form` does."""
     text = "\0".join([declarations, source, *LIBRARY_FLAGS, cffi.__version__, sysconfig.get_python_version()])
     name = f"libremodel_{hashlib.sha256(text.encode()).hexdigest()[:40]}"
     failure: BaseException | None = None
@@ -289,11 +255,7 @@ def _loaded(name: str) -> ModuleType:
 
 
 class _OwnLabels(MultiFunction):
-    """Numbers the variables (`ufl.variable`) of an expression from 0.
-
-    UFL numbers them through the life of a process, and FFCx takes these numbers into the kernel's name: without this
-    the second problem of a process compiles the same expression again.
-    """
+    """Numbers the variables (`ufl.variable`) of an expression from 0."""
 
     expr = MultiFunction.reuse_if_untouched
 
@@ -308,13 +270,11 @@ class _OwnLabels(MultiFunction):
 
 @contextmanager
 def _compiler_watched(comm: MPI.Intracomm, what: str, seconds: int) -> Iterator[None]:
-    """Within, what is not in the cache is compiled, each kernel by one process, and said.
-
-    FFCx computes a kernel's name and looks for it by `get_cached_module`: nothing else knows without doing that work
-    twice whether the compiler is going to run. So this stands before that function. What is in the cache passes at
-    once: no lock, no waiting, and no list of the cache's thousands of files, which FFCx makes at every look. Of several
-    ranks the first compiles; the others ask when it is done.
-    """
+    """Within, what is not in the cache is compiled, each kernel by one process, and said."""
+    # FFCx computes a kernel's name and looks for it by `get_cached_module`: nothing else knows without doing that work
+    # twice whether the compiler is going to run. So this stands before that function. What is in the cache passes at
+    # once: no lock, no waiting, and no list of the cache's thousands of files, which FFCx makes at every look. Of
+    # several ranks the first compiles; the others ask when it is done.
     look_up: Callable[..., Any] = ffcx.codegeneration.jit.get_cached_module
     with ExitStack() as until_compiled:
 
@@ -396,12 +356,10 @@ def _remove(kernel: str) -> None:
 
 @contextmanager
 def _alone(kernel: str) -> Iterator[None]:
-    """Only one process compiles a kernel, so that whatever is unfinished of it was cut off before: it is removed.
-
-    FFCx itself would wait for it: its .c file is the lock, and stays when a process is killed. The lock here is the
-    operating system's, which ends with its process; the file holds the number of that process. Other kernels have
-    other locks: several runs, or tests, compile at the same time.
-    """
+    """Only one process compiles a kernel, so that whatever is unfinished of it was cut off before: it is removed."""
+    # FFCx itself would wait for it: its .c file is the lock, and stays when a process is killed. The lock here is the
+    # operating system's, which ends with its process; the file holds the number of that process. Other kernels have
+    # other locks: several runs, or tests, compile at the same time.
     folder = cache_folder() / "locks"
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / kernel).open("a+") as lock:

@@ -224,10 +224,7 @@ class _Reduced(Kinematics):
 
 
 class AxisymmetricKinematics(_Reduced):
-    """A body of revolution about z that does not twist: u_r and u_z on the half-plane y = 0, x > 0.
-
-    F = I + grad d + u_r/x e_y (x) e_y with d = u_r e_x + u_z e_z.
-    """
+    """A body of revolution about z that does not twist: u_r and u_z on the half-plane y = 0, x > 0."""
 
     name = "axisymmetric"
     meaning = "u_r and u_z over radius and length of a tube that stays a body of revolution"
@@ -263,10 +260,7 @@ class AxisymmetricKinematics(_Reduced):
 
 
 class RadialKinematics(_Reduced):
-    """A tube whose sections stay round, plane and alike: u_r on the x axis, and one axial stretch.
-
-    F = diag(1 + du_r/dr, 1 + u_r/r, 1 + axial strain). The axial strain is prescribed.
-    """
+    """A tube whose sections stay round, plane and alike: u_r on the x axis, and one axial stretch."""
 
     name = "radial"
     meaning = "u_r over the radius of a tube whose sections stay round, plane and alike"
@@ -316,11 +310,7 @@ class RadialKinematics(_Reduced):
 
 
 class PointKinematics(_Reduced):
-    """A body with the same strain everywhere: three numbers u, F = I + diag(u)/length.
-
-    Number i is the displacement along axis i at a distance of the body's length, so that it and its force have the same
-    units as everywhere. The mesh is one bar along z as long as the body.
-    """
+    """A body with the same strain everywhere: three numbers u, F = I + diag(u)/length."""
 
     name = "point"
     meaning = "three numbers, for a cube or tendon with the same strain everywhere"
@@ -389,19 +379,7 @@ KINEMATICS: dict[str, Kinematics] = {
 
 
 class NaturalConfiguration:
-    """A body whose tissue is free of stress in another configuration, from which G leads to the mesh: F_e = F G.
-
-    Loads, caps and columns of shape ask for F and `weight`; what the tissue feels is F_e, per volume dV / det G.
-
-    Parameters
-    ----------
-    kinematics
-        On a mesh; what is not said here it answers itself.
-    gradient
-        G at the quadrature points, a dolfinx function.
-    closing
-        Where it is from.
-    """
+    """A body whose tissue is free of stress in another configuration, from which G leads to the mesh: F_e = F G."""
 
     def __init__(self, kinematics: Any, gradient: Any, closing: Any = None):
         self.field, self.gradient, self.closing = kinematics, gradient, closing
@@ -432,18 +410,7 @@ class NaturalConfiguration:
 
 
 class FreeLength:
-    """A body whose length is one more unknown: the axial force is given, or a pressure acts on caps at its ends.
-
-    The field of any other kinematics keeps u_z = 0 at both ends; all of it is stretched by one number e, the change of
-    the length: u + e z/length e_z. The number belongs to all elements, so its row of the tangent is full.
-
-    Parameters
-    ----------
-    kinematics
-        On a mesh; what is not said here it answers itself.
-    body
-        Whose length it is.
-    """
+    """A body whose length is one more unknown: the axial force is given, or a pressure acts on caps at its ends."""
 
     suits_multigrid = False  # GMRES with GAMG does not converge where a row is full
 
@@ -525,10 +492,8 @@ class FreeLength:
 
 
 def with_one_value(space: Any, component: int) -> Any:
-    """A mixed space in which a component, constant in each element, has one value for the whole mesh. Collective.
-
-    The first rank with elements owns it, for all others it is a ghost.
-    """
+    """A mixed space in which a component, constant in each element, has one value for the whole mesh. Collective."""
+    # The first rank with elements owns it, for all others it is a ghost.
     import dolfinx.la
     from mpi4py import MPI
 

@@ -21,17 +21,7 @@ _petsc = ctypes.CDLL(PETSc.__file__)  # for the one question that petsc4py canno
 
 
 class ProblemOptions:
-    """The options of one problem in PETSc's database, from its making to `close`.
-
-    They stay there meanwhile because a factorisation reads its own at the first solve.
-
-    Parameters
-    ----------
-    own
-        The method's (`solver_methods.method_options`).
-    options
-        The scene's: names without the leading '-'; True for a flag, False to leave one of the method's away.
-    """
+    """The options of one problem in PETSc's database, from its making to `close`."""
 
     def __init__(self, own: Mapping[str, Any], options: Mapping[str, Any]):
         self.prefix = f"{USERS_PREFIX}{next(_numbers)}_"
@@ -50,13 +40,7 @@ class ProblemOptions:
         return {*self._given, *_users_options()}
 
     def apply(self, snes: Any) -> None:
-        """Give them to SNES, or to another of PETSc's solvers.
-
-        Raises
-        ------
-        SceneError
-            If PETSc refuses one.
-        """
+        """Give them to SNES, or to another of PETSc's solvers."""
         snes.setOptionsPrefix(self.prefix)
         try:
             snes.setFromOptions()

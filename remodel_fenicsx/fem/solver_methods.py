@@ -138,21 +138,7 @@ def is_small(unknowns: int, reduced: bool) -> bool:
 
 
 def chosen(method: str, unknowns: int, ranks: int, reduced: bool, multigrid: bool = True, held: bool = False) -> str:
-    """The method that `auto` stands for.
-
-    Parameters
-    ----------
-    method
-        The scene's; any other than `auto` is taken.
-    unknowns, ranks
-        How many there are.
-    reduced
-        Whether the kinematics is.
-    multigrid
-        Whether that solves for these unknowns.
-    held
-        Whether the loads of the last step are held: a factor then serves for many steps.
-    """
+    """The method that `auto` stands for."""
     if method != AUTO:
         return method
     if multigrid and unknowns > (LARGE if ranks == 1 or held else LARGE_ON_RANKS):
@@ -199,13 +185,7 @@ _FILE_OR_TERMINAL = re.compile(r"_print_subdomains$", re.IGNORECASE)  # a value 
 
 
 def fault_of_option(name: str, value: str | float | bool) -> str | None:
-    """Why a scene may not give this PETSc option; None where it may.
-
-    Parameters
-    ----------
-    name, value
-        As in `solver.petsc_options`, the name without the leading '-'.
-    """
+    """Why a scene may not give this PETSc option; None where it may."""
     words = re.split(r"[,.]", value.lower()) if isinstance(value, str) else []
     if not _SOLVERS.fullmatch(name):
         return "not an option of a solver; allowed are snes_..., ksp_..., pc_... and mat_..."

@@ -40,18 +40,7 @@ def is_available() -> bool:
 
 
 class SingleFactor:
-    """A factor L L^T of sparse symmetric matrices of one pattern, with seven digits.
-
-    Parameters
-    ----------
-    starts, columns
-        The pattern by rows, as SciPy and PETSc have it: int32, (n + 1,) and (entries,).
-
-    Raises
-    ------
-    MemoryError
-        If there is not enough for it.
-    """
+    """A factor L L^T of sparse symmetric matrices of one pattern, with seven digits."""
 
     def __init__(self, starts: NDArray[np.int32], columns: NDArray[np.int32]):
         self._call = Library(

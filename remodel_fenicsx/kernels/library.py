@@ -25,10 +25,8 @@ NO_NUMBERS: Mapping[str, float] = MappingProxyType({})
 
 
 def source(name: str, numbers: Mapping[str, float] = NO_NUMBERS) -> str:
-    """A C file with the files that it includes in it, after a #define for each number.
-
-    One text with everything that decides the machine code: by it the library is found in the cache.
-    """
+    """A C file with the files that it includes in it, after a #define for each number."""
+    # One text with everything that decides the machine code: by it the library is found in the cache.
 
     def included(found: re.Match[str]) -> str:
         following = found.string.count("\n", 0, found.end()) + 1
@@ -58,21 +56,7 @@ def _say_so() -> None:
 
 
 class Library:
-    """The functions of a C file, which can be called with arrays.
-
-    Parameters
-    ----------
-    comm
-        Its ranks compile, or load, together.
-    name
-        Of the file.
-    what, seconds
-        As for `jit.library`.
-    numbers
-        As for `source`.
-    include, libraries
-        As for `jit.library`.
-    """
+    """The functions of a C file, which can be called with arrays."""
 
     def __init__(
         self,

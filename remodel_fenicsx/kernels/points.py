@@ -39,19 +39,7 @@ class PointKernels:
         return both[:, 0], (both[:, 1] + np.swapaxes(both[:, 1], 1, 2)) / 2
 
     def extension(self, states: Array, length: Array) -> tuple[Array, int, float]:
-        """How far points are from their limits: r/L (n,), the number of the largest, and the smallest J.
-
-        Parameters
-        ----------
-        states
-            r^2, J and F of n points (n, 11), as `Equilibrium.states` has them.
-        length
-            L (n,).
-
-        Returns
-        -------
-        r/L is infinite where it is no finite number; J is minus infinity if one is none, and infinity without points.
-        """
+        """How far points are from their limits: r/L (n,), the number of the largest, and the smallest J."""
         with np.errstate(invalid="ignore"):
             stretch = np.sqrt(states[:, 0]) / length
         stretch[~np.isfinite(stretch)] = np.inf
@@ -59,10 +47,8 @@ class PointKernels:
         return stretch, int(np.argmax(stretch)) if stretch.size else 0, float(smallest)
 
     def may_turn(self, before: Array, after: Array) -> NDArray[np.intp]:
-        """Which points `operators.passes_through_zero` has to be asked for, by number; states (n, 11) of both ends.
-
-        |F^-1| <= F:F / (2 det F), and nearer than its inverse nothing is singular.
-        """
+        """Which points `operators.passes_through_zero` has to be asked for, by number; states (n, 11) of both ends."""
+        # |F^-1| <= F:F / (2 det F), and nearer than its inverse nothing is singular.
         F, J, change = before[:, 2:], before[:, 1], after[:, 2:] - before[:, 2:]
         reach = np.sqrt((change**2).sum(axis=1)) * (F**2).sum(axis=1)
         return np.flatnonzero((J <= 0.0) | (reach >= 2.0 * J))
@@ -74,13 +60,7 @@ class PointKernels:
 
 
 class CompiledPointKernels(PointKernels):
-    """The same in C. `PointKernels` says what goes in and comes out, and does what C leaves open.
-
-    Parameters
-    ----------
-    comm
-        Its ranks compile, or load, together.
-    """
+    """The same in C. `PointKernels` says what goes in and comes out, and does what C leaves open."""
 
     def __init__(self, comm: MPI.Intracomm):
         self._call = Library(comm, "spectral.c", "the pass")

@@ -47,13 +47,7 @@ NUMBERS = {
 
 
 class TensorKernels:
-    """Functions in C on arrays of n points.
-
-    Parameters
-    ----------
-    comm
-        Its ranks compile, or load, together.
-    """
+    """Functions in C on arrays of n points."""
 
     def __init__(self, comm: MPI.Intracomm):
         self.call = Library(comm, "tensor.c", "the law for the structure tensor", 5, NUMBERS)

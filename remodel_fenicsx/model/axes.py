@@ -186,19 +186,7 @@ def _row(name: str, fine: Any, what: str) -> str:
 
 
 def structure_tensors(measured: Mapping[str, Array], axes: Array) -> Array:
-    """A of any size at points, (..., 3, 3); `cells_of` scales it.
-
-    Parameters
-    ----------
-    measured
-        Without a fault (`fault_of_fibres`), by name: (..., columns). `structure_tensor`: 9 numbers row by row, of which
-        the symmetric part is seen, or xx, yy, zz, xy, yz, xz. `fibre` and `fibre_2`: directions, of any length.
-        `angle`: degrees from circumferential towards axial. `weight`: share of the first fibres, the rest is that of
-        the second ones (1/2 without it), or where there are none, of fibres in all directions (nothing without it):
-        w f (x) f + (1 - w) I / 3.
-    axes
-        Circumferential, axial, radial, as rows, (..., 3, 3).
-    """
+    """A of any size at points, (..., 3, 3); `cells_of` scales it."""
     if "structure_tensor" in measured:
         return _tensors(measured["structure_tensor"])
     if "angle" in measured:
@@ -213,10 +201,8 @@ def structure_tensors(measured: Mapping[str, Array], axes: Array) -> Array:
 
 
 def cells_of(tensors: Array, end_to_end_length: float, previous: Array) -> tuple[Array, Array]:
-    """l_I (..., 3), longest first, and n_I as rows (..., 3, 3) of cells with A = r0^2 T / tr T of tensors T.
-
-    Where tensors leave axes open (equal eigenvalues), they are those of `previous`, (..., 3, 3).
-    """
+    """l_I (..., 3), longest first, and n_I as rows (..., 3, 3) of cells with A = r0^2 T / tr T of tensors T."""
+    # Where tensors leave axes open (equal eigenvalues), they are those of `previous`, (..., 3, 3).
     shape = tensors.shape[:-2]
     values, axes = principal(tensors.reshape(-1, 3, 3), previous.reshape(-1, 3, 3))
     values = np.maximum(values, 0.0)

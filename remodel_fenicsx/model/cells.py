@@ -120,11 +120,9 @@ IN_THE_WALL = 1e-6  # of tr A: of less a rounded A has no direction, and a chain
 
 
 def pitch_angle(dimensions: Array, axes: Array, local: Array) -> Array:
-    """Angle in degrees of the chain direction in the wall, from circumferential (0) to axial (90).
-
-    atan sqrt(A_aa / A_cc) with the structure tensor A and local axes c, a, r as rows (..., 3, 3); NaN where chains
-    point out of the wall, A_aa + A_cc < IN_THE_WALL tr A.
-    """
+    """Angle in degrees of the chain direction in the wall, from circumferential (0) to axial (90)."""
+    # atan sqrt(A_aa / A_cc) with the structure tensor A and local axes c, a, r as rows (..., 3, 3); NaN where chains
+    # point out of the wall, A_aa + A_cc < IN_THE_WALL tr A.
     circumferential, axial, radial = _local_components(dimensions, axes, local)
     inside = circumferential**2 + axial**2
     angle: Array = np.degrees(np.arctan2(axial, circumferential))
@@ -153,13 +151,11 @@ def by_component(values: Array, rank: int = 2) -> Array:
 
 
 def angle_between(first: UnitCell, second: UnitCell) -> Array:
-    """Angle in degrees between the directions of the chains of two cells, of n points: (n,) in [0, 90].
-
-    Of chains along one axis it is the angle between the axes; of two cells with the same axes that of the directions
-    sum_I l_I n_I. So it is at least the change of the angle to any axis (`angle_to_axis`), and of the pitch times the
-    cosine of the angle out of the wall, which it counts too. To first order in the change it is Bures' angle between
-    A/tr A of both, ds^2 = sum_IJ dA_IJ^2 / (a_I + a_J) / 2 in the axes of A with the principal values a.
-    """
+    """Angle in degrees between the directions of the chains of two cells, of n points: (n,) in [0, 90]."""
+    # Of chains along one axis it is the angle between the axes; of two cells with the same axes that of the directions
+    # sum_I l_I n_I. So it is at least the change of the angle to any axis (`angle_to_axis`), and of the pitch times the
+    # cosine of the angle out of the wall, which it counts too. To first order in the change it is Bures' angle between
+    # A/tr A of both, ds^2 = sum_IJ dA_IJ^2 / (a_I + a_J) / 2 in the axes of A with the principal values a.
     share = first.dimensions / _norm(first.dimensions)[:, None]  # the roots of a_I
     scaled = second.axes * (second.dimensions / _norm(second.dimensions)[:, None])[:, :, None]
     root = np.swapaxes(second.axes, 1, 2) @ scaled

@@ -13,29 +13,14 @@ BOLTZMANN_CONSTANT = 1.381e-23  # J/K, as printed in the paper
 
 
 def wormlike_energy(end_to_end_length: Any, contour_length: Any) -> Any:
-    """Energy of a wormlike chain over k theta / A_p (eq. 1).
-
-    Parameters
-    ----------
-    end_to_end_length
-        r, 0 <= r < L, in link lengths: number, array or UFL expression.
-    contour_length
-        L, in link lengths.
-
-    Returns
-    -------
-    L (2 x^2 + 1/(1-x) - x) / 4 with x = r/L, in link lengths; times the network modulus c = k theta n / (4 A_p) it is
-    the W_chn whose derivative is eq. (7b): a quarter of the printed eq. (4b), see docs/theory.md, erratum 1.
-    """
+    """Energy of a wormlike chain over k theta / A_p (eq. 1)."""
     x = end_to_end_length / contour_length
     return contour_length / 4 * (2 * x**2 + 1 / (1 - x) - x)
 
 
 def wormlike_stiffness(end_to_end_length: Any, contour_length: Any) -> Any:
-    """Secant stiffness g(r) = 1/L + 1/(4 r (1-r/L)^2) - 1/(4 r) of eq. (7): d(wormlike_energy)/dr = g r.
-
-    Written with the pole at r = 0 cancelled, so that short chains lose no digits.
-    """
+    """Secant stiffness g(r) = 1/L + 1/(4 r (1-r/L)^2) - 1/(4 r) of eq. (7): d(wormlike_energy)/dr = g r."""
+    # Written with the pole at r = 0 cancelled, so that short chains lose no digits.
     x = end_to_end_length / contour_length
     return (1 + (2 - x) / (4 * (1 - x) ** 2)) / contour_length
 

@@ -109,10 +109,8 @@ def spatial_frame(F: Array, spatial_axes: Array) -> Array:
 
 
 def material_frame(F: Array, spatial_axes: Array) -> Array:
-    """n_1 = F^-1 m_1 normalised, n_2 = F^-1 m_2 orthogonalised against n_1, n_3 = n_1 x n_2. Objective.
-
-    n_1 is the fibre that the deformation carries onto the first principal direction. F (n, 3, 3); rows (n, 3, 3).
-    """
+    """n_1 = F^-1 m_1 normalised, n_2 = F^-1 m_2 orthogonalised against n_1, n_3 = n_1 x n_2. Objective."""
+    # n_1 is the fibre that the deformation carries onto the first principal direction. F (n, 3, 3); rows (n, 3, 3).
     pulled_back = np.swapaxes(np.linalg.solve(F, np.swapaxes(spatial_axes, -1, -2)), -1, -2)
     first = _unit(pulled_back[:, 0])
     second = pulled_back[:, 1] - np.sum(pulled_back[:, 1] * first, axis=-1, keepdims=True) * first

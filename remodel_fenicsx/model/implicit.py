@@ -42,22 +42,7 @@ SAME_LENGTH = 1e-9  # over r0: lengths of isotropic cells, but for rounding
 
 
 class StepOfCells(NamedTuple):
-    """What points know of their cells in a step, in the global basis.
-
-    Attributes
-    ----------
-    law
-        Of the registry.
-    drive
-        What acts, with the driver's parameters; its deformation and tensor are those at the start. Down to its
-        `rounding` the driving tensor is solved for: what is missing here is missing in the balance of forces.
-    cells, structure
-        At the start of the step: lengths (n, 3) and axes (n, 3, 3), and A (n, 3, 3).
-    time_old, time_new
-        Of the step.
-    turnover
-        How content and natural length change over it; None where they stay.
-    """
+    """What points know of their cells in a step, in the global basis."""
 
     law: Law
     drive: Drive
@@ -98,23 +83,15 @@ class Response(NamedTuple):
 
 
 def response(step: StepOfCells, strain: Strain, tensor: Array, derivatives: bool) -> Response:
-    """Of a law with a target (`Law.target`) or with dimensions by rank (`Law.dimensions`).
-
-    Parameters
-    ----------
-    tensor
-        X, (n, 3, 3).
-    """
+    """Of a law with a target (`Law.target`) or with dimensions by rank (`Law.dimensions`)."""
     respond = ranked_response if step.law.dimensions is not None else tensor_response
     return respond(step, strain, tensor, derivatives)
 
 
 def jumps_by_rank(step: StepOfCells) -> NDArray[np.bool_]:
-    """Where cells jump when principal values cross, (n,): where equal targets leave the ranks different lengths.
-
-    There the equations of an implicit step may have no solution. Elsewhere cells are continuous in the driving tensor:
-    from isotropic cells eq. (11) never jumps, and the law for A nowhere.
-    """
+    """Where cells jump when principal values cross, (n,): where equal targets leave the ranks different lengths."""
+    # There the equations of an implicit step may have no solution. Elsewhere cells are continuous in the driving
+    # tensor: from isotropic cells eq. (11) never jumps, and the law for A nowhere.
     if step.law.dimensions is None:
         return np.zeros(len(step.structure), dtype=bool)
     r0 = np.asarray(step.drive.end_to_end_length)
@@ -206,12 +183,10 @@ def _turns_by_tensor(step: StepOfCells, found: Ranked) -> Array:
 
 
 def _pulled_back(step: StepOfCells, found: Ranked, strain: Strain) -> tuple[Array, Array]:
-    """Turns of the cells' axes n by those of the axes m of X, (n, 3, 3), and by the Mandel components of dU (n, 3, 6).
-
-    n are the rows m U^-1, orthonormalised in the frame's order (`drivers.material_frame`): m U^-1 = L n, L lower
-    triangular in that order. With dm = W m it follows that dn = V n, V_ij = (L^-1 W L - n dU U^-1 n^T)_ij where n_i
-    comes before n_j.
-    """
+    """Turns of the axes n of cells by those of the axes m of X and by the Mandel components of dU, each (n, 3, 3)."""
+    # n are the rows m U^-1, orthonormalised in the frame's order (`drivers.material_frame`): m U^-1 = L n, L lower
+    # triangular in that order. With dm = W m it follows that dn = V n, V_ij = (L^-1 W L - n dU U^-1 n^T)_ij where n_i
+    # comes before n_j.
     m, n, u = found.axes, found.cells.axes, strain.stretches[:, None, :]
     carried = n / u
     L, inverse = m @ np.swapaxes(carried, 1, 2), (n * u) @ np.swapaxes(m, 1, 2)
@@ -260,17 +235,7 @@ def put(points: Any, chosen: Any, better: Any) -> None:
 
 
 class Strain(NamedTuple):
-    """Deformation of n points in the eigenbasis of C.
-
-    Attributes
-    ----------
-    gradient
-        F in the global basis, (n, 3, 3).
-    squared
-        Eigenvalues of C, (n, 3).
-    basis
-        Its eigenvectors as columns, (n, 3, 3).
-    """
+    """Deformation of n points in the eigenbasis of C."""
 
     gradient: Array
     squared: Array
@@ -436,10 +401,7 @@ TERMS: dict[Repulsion, Callable[[Strain, LocalCells, Array, bool], Terms]] = {
 
 
 class Stress(NamedTuple):
-    """S (n, 3, 3) in the eigenbasis of C, r/L (n,), and derivatives of S by y and by C, (n, 6, 6).
-
-    With turnover r/(rho L), and ln m and ln rho (n, 2).
-    """
+    """S (n, 3, 3) in the eigenbasis of C, r/L (n,), and derivatives of S by y and by C, (n, 6, 6)."""
 
     value: Array
     extension: Array
@@ -486,17 +448,7 @@ def stress(
     derivatives: bool,
     turned_over: Callable[[Tissue, Array], TurnedOver] | None = None,
 ) -> Stress:
-    """S of points whose parameters are arrays (n,).
-
-    Parameters
-    ----------
-    tissue
-        Its matrix energy has `derivatives`, its parameters are arrays (n,).
-    terms
-        Of its repulsion, of `TERMS`.
-    turned_over
-        Content and natural length from the tissue and r, where they change within the step.
-    """
+    """S of points whose parameters are arrays (n,)."""
     matrix, A = tissue.matrix.derivatives, cells.structure  # type: ignore[attr-defined]
     r = np.sqrt(np.einsum("nii,ni->n", A, strain.squared))
     chains = moduli(tissue, r, None if turned_over is None else turned_over(tissue, r))
@@ -616,27 +568,7 @@ def refused(law: Law, driver: Driver, frame: Frame, matrix: Any, repulsion: Repu
 
 
 class LocalSolution(NamedTuple):
-    """Points whose cells belong to their stress, in the global basis.
-
-    Attributes
-    ----------
-    gradient
-        F, (n, 3, 3).
-    driving_tensor
-        D, (n, 3, 3).
-    structure
-        A, (n, 3, 3).
-    first_piola_kirchhoff
-        P = F S, (n, 3, 3).
-    squared_lengths
-        r^2 = A : C, (n,); with turnover over (rho/rho_0)^2, rho_0 at the start: chains lock where it is rho_0^2 L^2.
-    converged
-        Whether the cells are those of D and D that of the stress, (n,); where not, cells belong to the last D.
-    cells
-        Lengths and axes of laws by rank.
-    turnover
-        ln m and ln rho at the end of the step, (n, 2), where they change.
-    """
+    """Points whose cells belong to their stress, in the global basis."""
 
     gradient: Array
     driving_tensor: Array
@@ -649,10 +581,7 @@ class LocalSolution(NamedTuple):
 
 
 class Trial(NamedTuple):
-    """A driving tensor D (n, 3, 3) in the eigenbasis of C, with the cells and the stress that it makes.
-
-    `missing`: the left side of eq. (i1), (n, 3, 3); `converged`: whether that is nothing, and r < L, (n,).
-    """
+    """A driving tensor D (n, 3, 3) in the eigenbasis of C, with the cells and the stress that it makes."""
 
     tensor: Array
     cells: LocalCells
@@ -678,15 +607,7 @@ class Linearised(NamedTuple):
 
 @dataclass(frozen=True)
 class CondensedPoints:
-    """Tissue and step of n points.
-
-    Attributes
-    ----------
-    tissue
-        Parameters as arrays (n,).
-    step
-        The cells at its start, and what they follow.
-    """
+    """Tissue and step of n points."""
 
     tissue: Tissue
     step: StepOfCells
@@ -699,17 +620,7 @@ class CondensedPoints:
     def solve(
         self, F: Array, start: Array, held: Flags | None = None, before: LocalSolution | None = None
     ) -> LocalSolution:
-        """Cells that belong to the stress at F.
-
-        Parameters
-        ----------
-        F
-            Deformation gradients with det F > 0, (n, 3, 3).
-        start
-            D from which to start, in the global basis, (n, 3, 3).
-        held, before
-            Points (n,) that have the cells of an earlier solution instead.
-        """
+        """Cells that belong to the stress at F."""
         strain = Strain.of(F)
         held = np.zeros(len(F), dtype=bool) if held is None else held
         if self.step.drive.driver.is_stress:

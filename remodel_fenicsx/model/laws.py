@@ -217,17 +217,7 @@ def ranked(function: RankedFunction, has_limit: bool = False, of_absolute_time: 
 
 
 class Ranked(NamedTuple):
-    """What a law by rank makes of cells, and of what; arrays of n points.
-
-    Attributes
-    ----------
-    values, axes
-        Principal values (n, 3) and axes of the driving tensor, each where its dimension of the cell stands.
-    target, active
-        r0 e (n, 3), and whether any value is positive (n,): otherwise cells stay.
-    cells
-        The new ones.
-    """
+    """What a law by rank makes of cells, and of what; arrays of n points."""
 
     values: Array
     axes: Array
@@ -262,12 +252,10 @@ def principal_directions(drive: Drive, previous: Array, pairing: spectral.Pairin
 
 
 def framed(drive: Drive, axes: Array, dimensions: Array | None = None) -> Array:
-    """Axes of the cells from the drive's principal directions, by rank or in an order of their own.
-
-    A frame may treat its axes in their order (the material one takes the first as it is). By rank it is the largest
-    principal value that comes first. With `dimensions` it is the largest dimension: where two of them change their
-    order they are equal, so that A does not depend on which is first, and does not jump.
-    """
+    """Axes of the cells from the drive's principal directions, by rank or in an order of their own."""
+    # A frame may treat its axes in their order (the material one takes the first as it is). By rank it is the largest
+    # principal value that comes first. With `dimensions` it is the largest dimension: where two of them change their
+    # order they are equal, so that A does not depend on which is first, and does not jump.
     if drive.driver.material:
         return axes
     if dimensions is None:
@@ -293,14 +281,13 @@ def relaxation(l: Array, l0: Array, target: Array, kappa: Any, time_old: float, 
 
 
 def rotation(cells: UnitCell, drive: Drive, time_old: float, time_new: float) -> UnitCell:
-    """Remark 5: the fibre turns gradually towards the largest tension, the other axes turn along, dimensions stay.
-
-    n <- exp(dt [omega]) n with omega = n_new x n_max / tau (tau: `Drive.rotation_time`, n_new: at the end of the step).
-    The fibre n is the axis of the largest dimension (the first of equal ones). n_max is the principal direction of the
-    largest value, a line: of its two senses the one nearer to n. Where n is orthogonal to it within
-    `spectral.DECISIVE`, both are as near, and the one nearer to the next of the cell's axes is taken. Where the largest
-    values agree, n_max is the direction of their plane that is nearest to n. Points without tension keep their cells.
-    """
+    """Remark 5: the fibre turns gradually towards the largest tension, the other axes turn along, dimensions stay."""
+    # n <- exp(dt [omega]) n with omega = n_new x n_max / tau (tau: `Drive.rotation_time`, n_new: at the end of the
+    # step). The fibre n is the axis of the largest dimension (the first of equal ones). n_max is the principal
+    # direction of the largest value, a line: of its two senses the one nearer to n. Where n is orthogonal to it within
+    # `spectral.DECISIVE`, both are as near, and the one nearer to the next of the cell's axes is taken. Where the
+    # largest values agree, n_max is the direction of their plane that is nearest to n. Points without tension keep
+    # their cells.
     order = (np.argmax(cells.dimensions, axis=1)[:, None] + np.arange(3)) % 3
     axes = np.take_along_axis(cells.axes, order[:, :, None], axis=1)
     values, towards = principal_directions(drive, axes, spectral.principal)
@@ -320,16 +307,9 @@ def _turn_towards(fibre: Array, goal: Array, relative_step: float) -> Array:
 
 
 def angle_left(angle: Array, relative_step: float) -> Array:
-    """The root a of a + (dt/tau) sin a = angle: what an implicit step leaves of angles (n,) in [0, pi/2], radians.
-
-    Newton's method from angle / (1 + dt/tau), which is below the root: the left side is increasing and concave, so each
-    iterate comes nearer from below.
-
-    Raises
-    ------
-    FloatingPointError
-        If an angle is not finite.
-    """
+    """The root a of a + (dt/tau) sin a = angle: what an implicit step leaves of angles (n,) in [0, pi/2], radians."""
+    # Newton's method from angle / (1 + dt/tau), which is below the root: the left side is increasing and concave, so
+    # each iterate comes nearer from below.
     left = np.asarray(angle / (1.0 + relative_step), dtype=np.float64)
     for _ in range(50):
         missing = angle - left - relative_step * np.sin(left)
@@ -380,10 +360,8 @@ def tensor_target(drive: Drive) -> tensor_law.Target:
 def follow_tensor(
     cells: UnitCell, target: tensor_law.Target, end_to_end_length: Array | float, rate: Array | float
 ) -> UnitCell:
-    """Cells whose structure tensor is `tensor_law.follow`; where its eigenvalues agree, the axes stay.
-
-    Lengths are NaN where the target, extrapolated, makes the tensor indefinite by more than rounding.
-    """
+    """Cells whose structure tensor is `tensor_law.follow`; where its eigenvalues agree, the axes stay."""
+    # Lengths are NaN where the target, extrapolated, makes the tensor indefinite by more than rounding.
     structure = tensor_law.follow(structure_tensor(*cells[:2]), target, end_to_end_length, rate)
     squared, axes = spectral.continued(structure, cells.axes)
     rounding = spectral.ROUNDING * np.abs(squared).max(axis=-1, keepdims=True)
@@ -465,17 +443,7 @@ def _weighted(values: Sequence[Any], weights: Weights) -> Any:
 
 @dataclass(frozen=True)
 class Mean:
-    """What becomes of several drives.
-
-    Attributes
-    ----------
-    meaning
-        For docs/scene.md.
-    drive
-        One drive of all, from (drives, weights).
-    of_targets
-        Whether a law's targets are averaged in place of the drives.
-    """
+    """What becomes of several drives."""
 
     meaning: str
     drive: Callable[[Drives, Weights], Drive] = mean_tensor

@@ -23,20 +23,7 @@ Array = NDArray[np.float64]
 
 
 class Panels:
-    """Chebyshev points of one or more panels, and what is done with values there.
-
-    Parameters
-    ----------
-    edges
-        Radii at which the panels begin and end, one more than panels.
-    degree
-        Of the polynomials.
-
-    Attributes
-    ----------
-    places
-        Radii of the points, (panels, degree + 1), increasing; neighbours share their edge.
-    """
+    """Chebyshev points of one or more panels, and what is done with values there."""
 
     def __init__(self, edges: Sequence[float], degree: int):
         self.edges, self.degree = np.asarray(edges, dtype=np.float64), degree
@@ -106,17 +93,7 @@ UNSTRETCHED = (1.0, 1.0, 1.0)
 
 
 class Layer(NamedTuple):
-    """A layer of a ring.
-
-    Attributes
-    ----------
-    radii
-        Where it begins and ends in the ring.
-    tissue
-        Its parameters are numbers.
-    prestretch
-        Circumferential, axial and radial: from its natural state to what is joined.
-    """
+    """A layer of a ring."""
 
     radii: tuple[float, float]
     tissue: Tissue
@@ -124,17 +101,7 @@ class Layer(NamedTuple):
 
 
 class Loads(NamedTuple):
-    """What acts on the ring.
-
-    Attributes
-    ----------
-    pressure
-        On its inner face.
-    force
-        Of the wall along the axis; None where the axial stretch is prescribed.
-    axial
-        The axial stretch, where it is prescribed.
-    """
+    """What acts on the ring."""
 
     pressure: float = 0.0
     force: float | None = 0.0
@@ -142,19 +109,7 @@ class Loads(NamedTuple):
 
 
 class Closing(NamedTuple):
-    """What closes to a ring.
-
-    Attributes
-    ----------
-    layers
-        Of the ring, from the lumen outwards.
-    panels
-        One for each layer, which is a part of one where a polynomial does not follow it.
-    radius
-        R at the panels' points.
-    circumferential, axial
-        k and g_z.
-    """
+    """What closes to a ring."""
 
     layers: tuple[Layer, ...]
     panels: Panels
@@ -184,22 +139,7 @@ class Closing(NamedTuple):
 
 
 def closing(layers: Sequence[Layer], opening_angle: float, loads: Loads = Loads()) -> Closing:
-    """What closes to a ring in equilibrium: of a tissue with isotropic cells.
-
-    Parameters
-    ----------
-    layers
-        Of the ring, from the lumen outwards.
-    opening_angle
-        Angle of the sector that is missing, in degrees (Fung's opening angle is half of it).
-    loads
-        Of the ring; default: none, the unloaded tube.
-
-    Raises
-    ------
-    ArithmeticError
-        If no equilibrium is found.
-    """
+    """What closes to a ring in equilibrium: of a tissue with isotropic cells."""
     whole = 360.0 / (360.0 - opening_angle)
     panels = Panels([layers[0].radii[0], *(layer.radii[1] for layer in layers)], DEGREE)
     turns = np.linspace(1.0, whole, 1 + max(1, int(np.ceil((whole - 1.0) / LARGEST_TURN))))[1:]
@@ -238,22 +178,7 @@ def _balanced(near: Closing, loads: Loads) -> Closing:
 
 
 def solved(function: Callable[[Array], Array], values: Array, scale: Array, stiffness: float) -> Array:
-    """Newton with differences, halved where a step leaves what has an energy.
-
-    Parameters
-    ----------
-    function
-        Stresses that shall vanish, of the values.
-    values, scale
-        A start, and sizes of the values.
-    stiffness
-        Of which the stresses are shares.
-
-    Raises
-    ------
-    ArithmeticError
-        If no solution is found.
-    """
+    """Newton with differences, halved where a step leaves what has an energy."""
 
     def residual(trial: Array) -> Array:
         with np.errstate(all="ignore"):
@@ -297,17 +222,7 @@ def _residual(layers: tuple[Layer, ...], panels: Panels, k: float, loads: Loads,
 
 
 def principal_stresses(tissue: Tissue, stretches: Array, dimensions: Array | None = None) -> Array:
-    """Principal Cauchy stresses (..., 3) along stretches (..., 3), which are the axes of the cells.
-
-    Parameters
-    ----------
-    tissue
-        Its parameters are numbers.
-    stretches
-        F_e.
-    dimensions
-        l_I along them (..., 3), in link lengths; default: isotropic cells.
-    """
+    """Principal Cauchy stresses (..., 3) along stretches (..., 3), which are the axes of the cells."""
     shape = stretches.shape[:-1]
     length = np.full((*shape, 3), tissue.end_to_end_length / np.sqrt(3.0)) if dimensions is None else dimensions
     cell = UnitCell(length, np.broadcast_to(np.eye(3), (*shape, 3, 3)))
@@ -335,17 +250,7 @@ CUT_DEGREE = 32  # of rho(R): angles of remodeled walls, whose cells have a fron
 
 
 class Cut(NamedTuple):
-    """A ring that has been cut.
-
-    Attributes
-    ----------
-    opening_angle
-        Angle of the sector that is missing, in degrees; below 0 the ends overlap.
-    radii
-        Inner and outer radius of the sector.
-    axial
-        Its length over that of the ring.
-    """
+    """A ring that has been cut."""
 
     opening_angle: float
     radii: tuple[float, float]
@@ -362,23 +267,7 @@ class _Wall(NamedTuple):
 
 
 def cut(layers: Sequence[Layer], closed: Closing | None, radius: Array, squared_dimensions: Array) -> Cut:
-    """Cut an unloaded tube.
-
-    Parameters
-    ----------
-    layers
-        Of the ring that is the mesh.
-    closed
-        Of what it was closed; None: the mesh is free of stress before any remodeling.
-    radius, squared_dimensions
-        Places through the wall (n,), increasing, and l_I^2 there around, along and across it, (n, 3); with
-        turnover also content and natural length, (n, 5).
-
-    Raises
-    ------
-    ArithmeticError
-        If no equilibrium is found.
-    """
+    """Cut an unloaded tube."""
     panels = Panels([layers[0].radii[0], *(layer.radii[1] for layer in layers)], CUT_DEGREE)
     squared = np.empty((*panels.places.shape, squared_dimensions.shape[1]))
     panel = panels.of(radius)

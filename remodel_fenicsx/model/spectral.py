@@ -85,23 +85,13 @@ def principal(
 def continued(
     tensors: npt.ArrayLike, previous: npt.ArrayLike, tolerance: float = AGREEMENT, threshold: npt.ArrayLike = 0.0
 ) -> tuple[Array, Array]:
-    """Return the principal values and axes of symmetric tensors in the order of the previous axes.
-
-    Each principal axis takes the place of the previous axis that it continues: of the six ways to pair them, the one
-    with the largest sum of squared cosines. So values that cross do not exchange their places. Where values agree,
-    their common eigenspace counts as a whole, and the previous axes that it is paired with are kept in it as by
-    `principal`. Of ways whose sums agree within ``DECISIVE`` the first in lexicographic order is taken, so that
-    rounding does not choose.
-
-    Parameters and errors are those of `principal`.
-
-    Returns
-    -------
-    values : (n, 3)
-        In the order of the previous axes, no longer descending.
-    axes : (n, 3, 3)
-        Rows are orthonormal, row I belongs to value I and continues previous axis I.
-    """
+    """Return the principal values and axes of symmetric tensors in the order of the previous axes."""
+    # Each principal axis takes the place of the previous axis that it continues: of the six ways to pair them, the one
+    # with the largest sum of squared cosines. So values that cross do not exchange their places. Where values agree,
+    # their common eigenspace counts as a whole, and the previous axes that it is paired with are kept in it as by
+    # `principal`. Of ways whose sums agree within ``DECISIVE`` the first in lexicographic order is taken, so that
+    # rounding does not choose.
+    # Parameters and errors are those of `principal`.
     values, axes, reference = _decomposed(tensors, previous)
     upper, lower = _agreeing(values, tolerance, threshold)
     place = _places(axes, reference, upper, lower)
@@ -117,28 +107,7 @@ PAIRINGS: dict[str, Pairing] = {"sorted": principal, "continuous": continued}
 
 
 def positive_direction(values: npt.ArrayLike, threshold: npt.ArrayLike = 0.0) -> tuple[Array, npt.NDArray[np.bool_]]:
-    """Return the direction e = lambda^+ / |lambda^+| of the positive principal values (eqs. 9 to 11).
-
-    Parameters
-    ----------
-    values : (n, 3)
-        Principal values of the driving tensor, any unit.
-    threshold : float or (n,)
-        A value up to this size, in the unit of the driving tensor, or within rounding of the largest absolute value at
-        its point, is not positive.
-
-    Returns
-    -------
-    direction : (n, 3)
-        Unit vectors with non-negative components; zero where nothing is positive.
-    active : (n,) bool
-        False where no value is positive: nothing remodels there.
-
-    Raises
-    ------
-    FloatingPointError
-        If a value is NaN or infinite; names the first point.
-    """
+    """Return the direction e = lambda^+ / |lambda^+| of the positive principal values (eqs. 9 to 11)."""
     values = np.asarray(values, dtype=np.float64)
     _require_finite(values, "set of principal values")
     largest = _largest(values)
@@ -151,20 +120,9 @@ def positive_direction(values: npt.ArrayLike, threshold: npt.ArrayLike = 0.0) ->
 
 
 def without_noise(tensors: Array, axes: Array, noise: npt.ArrayLike) -> Array:
-    """Return the symmetric tensors with the given axes as principal axes, where they are so within the tensors' error.
-
-    Where two principal values are close, an error of the tensor turns its axes by far more than its own size. What
-    decides is therefore what the tensor has across the given axes: up to `noise` it is taken for zero.
-
-    Parameters
-    ----------
-    tensors : (n, 3, 3)
-        Symmetric.
-    axes : (n, 3, 3)
-        Rows are independent vectors; they are orthonormalised in their order.
-    noise : float or (n,)
-        Error of a component, in the unit of the tensors.
-    """
+    """Return the symmetric tensors with the given axes as principal axes."""
+    # Where two principal values are close, an error of the tensor turns its axes by far more than its own size. What
+    # decides is therefore what the tensor has across the given axes: up to `noise` it is taken for zero.
     first = _normalised(axes[:, 0])
     second = _normalised(axes[:, 1] - np.einsum("na,na->n", axes[:, 1], first)[:, None] * first)
     frame = np.stack([first, second, np.cross(first, second)], axis=1)
@@ -256,10 +214,8 @@ def _candidates(reference: Array, rank: int) -> list[Array]:
 
 
 def _project(normal: Array, candidates: list[Array]) -> Array:
-    """Return the first candidate that is not along the normal, projected onto the plane across it, normalised.
-
-    normal: (n, 3) unit vectors, or zero vectors for the whole space instead of a plane.
-    """
+    """Return the first candidate that is not along the normal, projected onto the plane across it, normalised."""
+    # normal: (n, 3) unit vectors, or zero vectors for the whole space instead of a plane.
     chosen = np.zeros_like(normal)
     open_points = np.ones(len(normal), dtype=bool)
     for candidate in candidates:

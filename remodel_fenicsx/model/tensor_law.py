@@ -27,40 +27,22 @@ method sees a smooth function."""
 
 
 def floor_above(noise: Any, rounding: Any) -> Any:
-    """Tension at which the switch is one half, where there is no compression.
-
-    What the solver's tolerance leaves out of balance counts as it is: multiplied like the rounding, it would be stress.
-
-    Parameters
-    ----------
-    noise
-        Size up to which a principal value may be an error: of rounding, or of the equilibrium as it was accepted.
-    rounding
-        The part of it that the rounding of a stress at given F is.
-    """
+    """Tension at which the switch is one half, where there is no compression."""
+    # What the solver's tolerance leaves out of balance counts as it is: multiplied like the rounding, it would be
+    # stress.
     return ABOVE_ROUNDING * rounding + noise
 
 
 class Target(NamedTuple):
-    """What A tends to, and how much of it.
-
-    Attributes
-    ----------
-    direction
-        E, (n, 3, 3), trace one (zero where nothing is positive).
-    share
-        s, (n,), between 0 and 1.
-    """
+    """What A tends to, and how much of it."""
 
     direction: Array
     share: Array
 
     def towards(self, other: Target, weight: Array | float) -> Target:
-        """sE + weight (s'E' - sE), of another target s'E'; weights below 0 or above 1 extrapolate.
-
-        What acts on A is kappa (r0^2 sE - sA): it is sE that changes linearly, and s is its trace. So a target that
-        does not count takes no part, and E has trace one. An s below 0 is 0, one above 1 is 1.
-        """
+        """sE + weight (s'E' - sE), of another target s'E'; weights below 0 or above 1 extrapolate."""
+        # What acts on A is kappa (r0^2 sE - sA): it is sE that changes linearly, and s is its trace. So a target that
+        # does not count takes no part, and E has trace one. An s below 0 is 0, one above 1 is 1.
         ends = (self.share[:, None, None] * self.direction, other.share[:, None, None] * other.direction)
         changed = ends[0] + np.reshape(weight, (-1, 1, 1)) * (ends[1] - ends[0])
         share = np.einsum("nii->n", changed)
@@ -76,17 +58,7 @@ class Target(NamedTuple):
 
 
 def target(tensor: Array, floor: Array | float, exponent: float = 2.0) -> Target:
-    """E and s of driving tensors in material space.
-
-    Parameters
-    ----------
-    tensor
-        D, symmetric, (n, 3, 3), any unit.
-    floor
-        Tension below which next to nothing remodels (`floor_above`), in the same unit; (n,) or a number.
-    exponent
-        n of N = (D+)^n: 2 is eq. (9), l_I = r0 e_I; 1 is netting analysis, tan^2 a = s_2/s_1.
-    """
+    """E and s of driving tensors in material space."""
     values, vectors = np.linalg.eigh(tensor)
     largest = np.abs(values).max(axis=1)
     unit = np.where(largest > 0, largest, 1.0)
@@ -104,27 +76,16 @@ def target(tensor: Array, floor: Array | float, exponent: float = 2.0) -> Target
 
 
 def awake(tensor: Array, least_tension: float) -> Array:
-    """Share of kappa that acts: max(0, 1 - s0/s) with the largest principal value s; (n,).
-
-    A lazy zone, as in models of the adaptation of bone; Hypothesis I of the paper says "within a range".
-
-    Parameters
-    ----------
-    tensor
-        The driving tensor, (n, 3, 3).
-    least_tension
-        s0, in the same unit.
-    """
+    """Share of kappa that acts: max(0, 1 - s0/s) with the largest principal value s; (n,)."""
+    # A lazy zone, as in models of the adaptation of bone; Hypothesis I of the paper says "within a range".
     largest = np.linalg.eigvalsh(tensor)[:, -1]
     return np.where(largest > least_tension, 1 - least_tension / np.where(largest > 0, largest, 1.0), 0.0)
 
 
 def weight_of_the_end(rate: Array | float) -> Array:
-    """Weight of the target at the end of a step in the one that acts, if targets change linearly over it; rate (n,).
-
-    A forgets: A(h) = (1 - w) A(0) + w (E_0 + weight (E_1 - E_0)), w = 1 - exp(-z), weight = 1/w - 1/z, z = kappa h:
-    one half for short steps, one for long ones.
-    """
+    """Weight of the target at the end of a step in the one that acts, if targets change linearly over it; rate (n,)."""
+    # A forgets: A(h) = (1 - w) A(0) + w (E_0 + weight (E_1 - E_0)), w = 1 - exp(-z), weight = 1/w - 1/z, z = kappa h:
+    # one half for short steps, one for long ones.
     z = np.asarray(rate, dtype=np.float64)
     short = z < 1e-3
     long = np.where(short, 1.0, z)
@@ -132,11 +93,9 @@ def weight_of_the_end(rate: Array | float) -> Array:
 
 
 def target_derivatives(tensor: Array, floor: Array | float) -> tuple[Array, Array]:
-    """dE/dD as Mandel matrices (n, 6, 6) and ds/dD as Mandel vectors (n, 6); arguments as for `target`.
-
-    With v the principal values of D, N = (D+)^2 changes across two of its axes by v_i + v_j, where both are positive,
-    by v+^2 / |v_i - v_j| where one is: no difference of nearly equal numbers, and continuous where they agree.
-    """
+    """dE/dD as Mandel matrices (n, 6, 6) and ds/dD as Mandel vectors (n, 6); arguments as for `target`."""
+    # With v the principal values of D, N = (D+)^2 changes across two of its axes by v_i + v_j, where both are positive,
+    # by v+^2 / |v_i - v_j| where one is: no difference of nearly equal numbers, and continuous where they agree.
     values, vectors = np.linalg.eigh(tensor)
     largest = np.abs(values).max(axis=1)
     unit = np.where(largest > 0, largest, 1.0)
@@ -164,19 +123,7 @@ def target_derivatives(tensor: Array, floor: Array | float) -> tuple[Array, Arra
 
 
 def follow(structure: Array, towards: Target, end_to_end_length: Array | float, rate: Array | float) -> Array:
-    """A after a time in which the target does not change: exact.
-
-    Parameters
-    ----------
-    structure
-        A, (n, 3, 3), in squared link lengths.
-    towards
-        E and s.
-    end_to_end_length
-        r0, (n,) or a number.
-    rate
-        kappa times the time, (n,) or a number.
-    """
+    """A after a time in which the target does not change: exact."""
     squared = np.reshape(np.asarray(end_to_end_length, dtype=np.float64) ** 2, (-1, 1, 1))
     weight = -np.expm1(-rate * towards.share)[:, None, None]
     change: Array = weight * (squared * towards.direction - structure)

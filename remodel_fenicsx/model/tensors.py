@@ -156,11 +156,9 @@ _last: list[tuple[Array, Array, Array]] = []  # tensors, values, vectors of the 
 
 
 def eigen(tensors: Array) -> tuple[Array, Array]:
-    """Eigenvalues (n, 3), ascending, and eigenvectors as columns (n, 3, 3) of symmetric tensors (n, 3, 3), read-only.
-
-    The last answer is kept: residual, tangent, driving stress, energy and power ask one after the other for the same
-    tensors, and the decomposition is half of their work.
-    """
+    """Eigenvalues (n, 3), ascending, and eigenvectors as columns (n, 3, 3) of symmetric tensors (n, 3, 3)."""
+    # The last answer is kept: residual, tangent, driving stress, energy and power ask one after the other for the same
+    # tensors, and the decomposition is half of their work.
     for known, *answer in _last:
         if np.array_equal(known, tensors):
             return answer[0], answer[1]
@@ -232,15 +230,7 @@ def second_divided_differences(values: Array) -> Array:
 
 
 def second_derivative(values: Array, components: Array) -> Array:
-    """Mandel matrix (n, 6, 6) of H -> D^2 ln(C)[A, H] in the eigenbasis of C; symmetric.
-
-    Parameters
-    ----------
-    values
-        Eigenvalues of C, ascending, (n, 3).
-    components
-        A in the eigenbasis, (n, 3, 3).
-    """
+    """Mandel matrix (n, 6, 6) of H -> D^2 ln(C)[A, H] in the eigenbasis of C; symmetric."""
     f, A = second_divided_differences(values), components
     result = np.empty((len(values), 6, 6))
     for row, (i, j) in enumerate(MANDEL):
@@ -261,20 +251,8 @@ def determinant(tensors: Any) -> Any:
 
 
 def passes_through_zero(before: Any, after: Any) -> Any:
-    """Where det((1 - s) F + s G) is not positive for an s between 0 and 1: the straight way turns the body inside out.
-
-    Both ends may be in order all the same, for two axes can turn at once. Exact: the determinant is a cubic in s.
-
-    Parameters
-    ----------
-    before, after
-        F and G, (n, 3, 3), with positive determinants.
-
-    Returns
-    -------
-    ndarray
-        (n,), bool; False where an entry is not finite.
-    """
+    """Where det((1 - s) F + s G) is not positive for an s between 0 and 1."""
+    # Both ends may be in order all the same, for two axes can turn at once. Exact: the determinant is a cubic in s.
     change = after - before
     crossing = np.zeros(len(before), dtype=bool)
     # |F^-1| <= F:F / (2 det F): nearer than its inverse nothing is singular, and the cubic need not be asked
@@ -303,11 +281,9 @@ def cofactor(tensors: Any) -> Any:
 
 
 def largest_change_of_length(before: Any, after: Any) -> Any:
-    """By what share the lengths at points change most between two deformation gradients (n, 3, 3), to first order.
-
-    sqrt(2/3) |E| with E the symmetric part of G F^-1 - 1: the largest |e_I| of a bar, 2/sqrt(3) of it in pure shear,
-    where the volume stays.
-    """
+    """By what share the lengths at points change most between two deformation gradients (n, 3, 3), to first order."""
+    # sqrt(2/3) |E| with E the symmetric part of G F^-1 - 1: the largest |e_I| of a bar, 2/sqrt(3) of it in pure shear,
+    # where the volume stays.
     change = after @ np.linalg.inv(before) - np.eye(3)
     strain = 0.5 * (change + np.swapaxes(change, 1, 2))
     return np.sqrt(2 / 3 * np.einsum("nij,nij->n", strain, strain))

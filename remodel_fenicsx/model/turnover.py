@@ -41,15 +41,7 @@ class TurnoverRule(NamedTuple):
     gain: float
 
     def rates(self, tissue: Tissue, stretch: Any) -> TurnoverRates:
-        """Where chains have a stretch lambda_e (n,); complex for a derivative by a complex step.
-
-        Parameters
-        ----------
-        tissue
-            With chains; content and natural length are arrays over points.
-        stretch
-            r/(rho r0), below L/r0.
-        """
+        """Where chains have a stretch lambda_e (n,); complex for a derivative by a complex step."""
         chain, r0, contour = tissue.chain, tissue.end_to_end_length, tissue.contour_length
         assert chain is not None
 
@@ -64,15 +56,7 @@ class TurnoverRule(NamedTuple):
 
 
 class TurnedOver(NamedTuple):
-    """Content and natural length at the end of a step as functions of r at its end; arrays (n,).
-
-    Attributes
-    ----------
-    content, natural_length
-        m and rho.
-    content_slope, natural_length_slope
-        d ln m / d ln r and d ln rho / d ln r.
-    """
+    """Content and natural length at the end of a step as functions of r at its end; arrays (n,)."""
 
     content: Array
     natural_length: Array
@@ -81,43 +65,18 @@ class TurnedOver(NamedTuple):
 
 
 def rates(tissue: Tissue, length: Array, time: float, deposition_stretch: float, gain: float) -> TurnoverRates:
-    """How fast content and natural length change where chains have a length.
-
-    Parameters
-    ----------
-    tissue
-        With chains; content and natural length are arrays over points.
-    length
-        r, in link lengths (n,), below rho L.
-    time, deposition_stretch, gain
-        T, lambda_h and k.
-    """
+    """How fast content and natural length change where chains have a length."""
     stretch = tissue.relative(length) / tissue.end_to_end_length
     return TurnoverRule(time, deposition_stretch, gain).rates(tissue, stretch)
 
 
 def at_the_end(rule: TurnoverRule, tissue: Tissue, length: Array, duration: float) -> TurnedOver:
-    """m and rho after a step with the rates at its end (backward Euler), where r there is `length`.
-
-    One number at each point: y = ln lambda_e with
-
-        ln(r/r0) - y - ln rho_0 = duration (d ln rho / dt)(y),    ln rho = ln(r/r0) - y.
-
-    The left side falls and the right side rises with y. The solution lies between the stretch with rho_0, and
-    lambda_h, where the right side is zero. Where it were beyond the locking stretch there is none: then rho is such
-    that r/(rho L) >= 1.
-
-    Parameters
-    ----------
-    rule
-        Time, stretch of deposition and gain.
-    tissue
-        With content and natural length at the start of the step.
-    length
-        r at its end, (n,).
-    duration
-        Of the step.
-    """
+    """m and rho after a step with the rates at its end (backward Euler), where r there is `length`."""
+    # One number at each point: y = ln lambda_e with
+    # ln(r/r0) - y - ln rho_0 = duration (d ln rho / dt)(y), ln rho = ln(r/r0) - y.
+    # The left side falls and the right side rises with y. The solution lies between the stretch with rho_0, and
+    # lambda_h, where the right side is zero. Where it were beyond the locking stretch there is none: then rho is such
+    # that r/(rho L) >= 1.
     assert tissue.chain is not None
     start = np.log(length / (tissue.end_to_end_length * tissue.natural_length))
     deposited = np.full_like(start, np.log(rule.deposition_stretch))

@@ -55,20 +55,7 @@ SAMPLES = 2  # pictures are drawn this much larger and made smaller: smooth edge
 
 @dataclass(frozen=True)
 class Patch:
-    """Quadrilaterals or triangles in space.
-
-    Attributes
-    ----------
-    corners
-        (m, 4 or 3, 3), counter-clockwise where they are seen from outside.
-    colours
-        One of each, (m, 3) in 0..1.
-    edges
-        Whether their edges are drawn.
-    lies_on
-        0 for a surface. For what lies on one: how far it is moved towards the eye so that the surface does not cover
-        it. In a parallel view that moves nothing in the picture. Where it is seen from behind, it is left out.
-    """
+    """Quadrilaterals or triangles in space."""
 
     corners: Array
     colours: Array
@@ -96,13 +83,7 @@ class Picture:
 
 
 def render(pictures: list[Picture]) -> list[Pixels]:
-    """Draw pictures off-screen, each (rows, columns, 3).
-
-    Raises
-    ------
-    FigureError
-        If the child process could not draw (exit code 5: the environment).
-    """
+    """Draw pictures off-screen, each (rows, columns, 3)."""
     with temporary_folder() as folder:
         job = folder / "job"
         job.write_bytes(pickle.dumps(pictures))
@@ -136,20 +117,7 @@ def main(job: str) -> None:
 
 
 def add_patches(plotter: Any, patches: list[Patch], direction: Array | None, line_width: float = 1.0) -> None:
-    """Put patches into a PyVista plotter whose light is a headlight.
-
-    Parameters
-    ----------
-    plotter
-        A `pyvista.Plotter`.
-    patches
-        What is seen.
-    direction
-        Unit vector from the body towards the eye, (3,): what lies on a surface is moved that way. None: it is moved
-        along its own normal, for a body that will be turned.
-    line_width
-        Of the edges, in half pixels.
-    """
+    """Put patches into a PyVista plotter whose light is a headlight."""
     import pyvista
 
     for patch in patches:
@@ -216,18 +184,7 @@ _FACES = {
 
 @dataclass(frozen=True)
 class DrawnBody:
-    """A body of hexahedra or tetrahedra at one time.
-
-    Attributes
-    ----------
-    time
-    points, displacement
-        Reference coordinates and displacements of the nodes, (nodes, 3).
-    elements
-        Corners of the elements in VTK's order, (elements, 8 or 4).
-    fields
-        Means over the elements, by name (docs/commands.md): (elements,) or (elements, n).
-    """
+    """A body of hexahedra or tetrahedra at one time."""
 
     time: float
     points: Array
@@ -237,33 +194,12 @@ class DrawnBody:
 
     @classmethod
     def of(cls, run: RecordedRun, time: float) -> DrawnBody:
-        """The solved state of a run at a recorded time.
-
-        Raises
-        ------
-        RecordingError
-            If there is none.
-        """
+        """The solved state of a run at a recorded time."""
         return cls.at(WholeBody(run), time)
 
     @classmethod
     def at(cls, whole: WholeBody, time: float, names: Collection[str] | None = None) -> DrawnBody:
-        """The same of a body that is looked at several times; without displacements it is the reference body.
-
-        Parameters
-        ----------
-        whole
-            The body.
-        time
-            As recorded.
-        names
-            Fields that are read; default: all.
-
-        Raises
-        ------
-        RecordingError
-            If there are none at this time.
-        """
+        """The same of a body that is looked at several times; without displacements it is the reference body."""
         displacement, fields = whole.fields(time, names)
         moved = np.zeros_like(whole.points) if displacement is None else displacement
         return cls(time, whole.points, whole.elements, moved, fields)
@@ -318,17 +254,7 @@ def scale_colours() -> Array:
 
 
 def body(snapshot: DrawnBody, shown: Shown = ALL, chains_everywhere: bool = False) -> list[Patch]:
-    """The surface of the shown elements in the deformed configuration, and chains on its faces.
-
-    Parameters
-    ----------
-    snapshot
-        The body.
-    shown
-        Which elements, (elements,).
-    chains_everywhere
-        On all faces, where cells were recorded; else on those that look away from the z axis.
-    """
+    """The surface of the shown elements in the deformed configuration, and chains on its faces."""
     faces, elements, normal = outer_faces(snapshot, shown)
     surface = Patch(snapshot.deformed[faces], coloured(snapshot.fields[ANGLE][elements]), edges=True)
     if not set(OF_RIBBONS) <= set(snapshot.fields):
@@ -350,19 +276,7 @@ def outer_faces(snapshot: DrawnBody, shown: Shown = ALL) -> tuple[NDArray[np.int
 
 
 def chains(snapshot: DrawnBody, faces: NDArray[np.int64], elements: NDArray[np.int64]) -> Patch:
-    """The four chains of each element, deformed, projected on one of its faces: narrow ribbons.
-
-    They stay in their face and clear of its edge, so that those of neighbours do not read as one line.
-
-    Parameters
-    ----------
-    snapshot
-        The body.
-    faces
-        Nodes of the faces, (m, 4 or 3).
-    elements
-        The element of each, (m,).
-    """
+    """The four chains of each element, deformed, projected on one of its faces: narrow ribbons."""
     fields, reference, deformed = snapshot.fields, snapshot.points[faces], snapshot.deformed[faces]
     centres, middle = reference.mean(axis=1), deformed.mean(axis=1)
     axes = np.stack([fields[f"axis_{i + 1}"][elements] for i in range(3)], axis=1)
@@ -446,18 +360,7 @@ ASPECT = (0.28, 2.2)  # least and largest width over height of a view
 
 @dataclass(frozen=True)
 class Viewing:
-    """How a body is looked at.
-
-    Attributes
-    ----------
-    layers
-        How many are shown, from the inside of a tube and from the bottom of other bodies; None: all.
-    cut
-        One of `CUTS`, or None: elements whose centre lies in front of the middle are left out, or only those of them
-        to the right.
-    view
-        "front", "above" or X,Y,Z: where the eye is, from the middle of the body.
-    """
+    """How a body is looked at."""
 
     layers: int | None = None
     cut: str | None = None
@@ -465,13 +368,7 @@ class Viewing:
 
     @property
     def direction(self) -> tuple[float, float, float]:
-        """Towards the eye.
-
-        Raises
-        ------
-        FigureError
-            If the view is none.
-        """
+        """Towards the eye."""
         if self.view in VIEWS:
             return VIEWS[self.view]
         try:
@@ -485,13 +382,7 @@ class Viewing:
 
 
 def shown_elements(whole: WholeBody, viewing: Viewing) -> NDArray[np.bool_]:
-    """Which elements are neither peeled nor cut off, (elements,).
-
-    Raises
-    ------
-    FigureError
-        If there are no such layers, or nothing to cut off, with exit code 2.
-    """
+    """Which elements are neither peeled nor cut off, (elements,)."""
     layers, count = viewing.layers, len(whole.depth)
     if layers is not None and not 1 <= layers <= count:
         start = whole.recording.scene.geometry.depth_in_words[1]
@@ -513,27 +404,7 @@ def _cut_off(whole: WholeBody, cut: str | None) -> NDArray[np.bool_]:
 
 
 class Sight:
-    """A run's body and what of it is seen.
-
-    Parameters
-    ----------
-    recording
-        The run, finished or not.
-    viewing
-        How it is looked at.
-
-    Attributes
-    ----------
-    shown
-        Which elements, (elements,).
-
-    Raises
-    ------
-    FigureError
-        If nothing of the kind can be drawn, with exit code 2.
-    RecordingError
-        If the folder is damaged.
-    """
+    """A run's body and what of it is seen."""
 
     def __init__(self, recording: RecordedRun, viewing: Viewing):
         self.recording, self.viewing, self.direction = recording, viewing, viewing.direction
@@ -555,13 +426,7 @@ class Sight:
         return self.recording.history
 
     def times(self, wanted: Sequence[float] | None) -> list[float]:
-        """The recorded times nearest to these, each once; the last one where none are wanted.
-
-        Raises
-        ------
-        FigureError
-            If one lies outside of what is recorded, with exit code 2.
-        """
+        """The recorded times nearest to these, each once; the last one where none are wanted."""
         recorded = self.recording.times
         first, last = float(recorded[0]), float(recorded[-1])
         for time in wanted or ():
@@ -597,13 +462,7 @@ class Sight:
         return View(tuple(axes[2]), (x, y, z), VIEW_MARGIN * max(tall, wide / aspect), pixels, tuple(up))
 
     def images(self, snapshots: Sequence[DrawnBody], view: View) -> list[Pixels]:
-        """What is seen at these times, each (rows, columns, 3).
-
-        Raises
-        ------
-        FigureError
-            If nothing can be drawn, with exit code 5.
-        """
+        """What is seen at these times, each (rows, columns, 3)."""
         return render([Picture(view, body(snapshot, self.shown, True)) for snapshot in snapshots])
 
     def loads(self, time: float) -> list[str]:

@@ -35,33 +35,7 @@ def draw_picture(
     folder: str | os.PathLike[str], times: Sequence[float] | None = None, viewing: Viewing | None = None,
     path: Path | None = None,
 ) -> Path:  # fmt: skip
-    """Draw the body of a run at some of its times, beside each other.
-
-    Parameters
-    ----------
-    folder
-        Of the run.
-    times
-        The nearest recorded ones are taken; default: the last.
-    viewing
-        How it is looked at.
-    path
-        A new file, of one of `PICTURES`: in SVG and PDF the body is an image, all else is lines and letters. Default:
-        NAME-tTIME.png in the folder, numbered when taken.
-
-    Returns
-    -------
-    The file.
-
-    Raises
-    ------
-    FigureError
-        One line and the exit code of the command: bad input 2, nothing can be drawn 5.
-    RecordingError
-        If it is no folder of a run, or damaged.
-    OSError
-        If the file cannot be written.
-    """
+    """Draw the body of a run at some of its times, beside each other."""
     _check_new(path, PICTURES)
     sight = Sight(RecordedRun(folder), viewing or Viewing())
     shown = sight.times(times)
@@ -81,29 +55,7 @@ def draw_picture(
 def draw_animation(
     folder: str | os.PathLike[str], frames: int = FRAMES, viewing: Viewing | None = None, path: Path | None = None
 ) -> Path:
-    """Draw the body of a run as it moves through time.
-
-    Parameters
-    ----------
-    folder
-        Of the run.
-    frames
-        So many of the recorded times, as `kept_times` chooses them; all where there are no more.
-    viewing
-        How it is looked at.
-    path
-        A new file, of one of `ANIMATIONS`; mp4 wants ffmpeg. Default: NAME-tFIRST-tLAST.gif in the folder, numbered
-        when taken.
-
-    Returns
-    -------
-    The file.
-
-    Raises
-    ------
-    FigureError, RecordingError, OSError
-        As of `draw_picture`.
-    """
+    """Draw the body of a run as it moves through time."""
     _check_new(path, ANIMATIONS)
     if not FEWEST_FRAMES <= frames <= MOST_FRAMES:
         raise FigureError(f"--frames {frames}: allowed is a whole number from {FEWEST_FRAMES} to {MOST_FRAMES}", 2)
@@ -143,13 +95,7 @@ Encoder = Callable[[list[Image.Image], About], bytes]
 
 
 def _encoder(ending: str) -> Encoder:
-    """The one for a kind of file.
-
-    Raises
-    ------
-    FigureError
-        If the environment cannot write it, with exit code 5.
-    """
+    """The one for a kind of file."""
     if ending == ".mp4" and shutil.which("ffmpeg") is None:
         raise FigureError("mp4 needs ffmpeg, which is not there; .webp needs nothing", 5)
     if ending == ".webp" and not features.check("webp"):
@@ -202,13 +148,7 @@ def _mp4(frames: list[Image.Image], about: About) -> bytes:
 
 # ---------------------------------------------------------------- names
 def _check_new(path: Path | None, endings: Sequence[str]) -> None:
-    """Before anything is drawn.
-
-    Raises
-    ------
-    FigureError
-        Exit code 2.
-    """
+    """Before anything is drawn."""
     if path is None:
         return
     if path.suffix.lower() not in endings:

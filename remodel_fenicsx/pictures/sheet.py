@@ -115,23 +115,7 @@ TRIAD = 0.17  # length of an axis that is seen from the side
 
 
 class Sheet:
-    """A figure with one panel for each time.
-
-    Parameters
-    ----------
-    sight
-        What is seen.
-    times
-        Of the panels.
-    images
-        Of the panels, one size, drawn with `view` at `dots` an inch.
-    view
-        Of all of them.
-    dots
-        Pixels an inch.
-    has_clock
-        Whether a line below the panel shows how far the time is: of an animation.
-    """
+    """A figure with one panel for each time."""
 
     def __init__(
         self, sight: Sight, times: Sequence[float], images: Sequence[Pixels], view: View, dots: float, has_clock: bool

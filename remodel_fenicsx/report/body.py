@@ -20,23 +20,7 @@ NAMES = ("displacement", "deformation_gradient", "fibre_angle_deformed", "chain_
 
 @dataclass(frozen=True)
 class ShownBody:
-    """A body over time.
-
-    Attributes
-    ----------
-    whole
-        The body, (n) points and (m) elements.
-    times
-        That are shown, (t,).
-    volume
-        Of each element in the reference body, as a share of all, (m,).
-    position
-        Of the points, (t, n, 3).
-    angle, extension, edges
-        Deformed fibre angle in degrees (t, m), largest r/L (t, m), l_I F n_I (t, m, 3, 3); None if not recorded.
-    is_deformed
-        Whether displacements were recorded.
-    """
+    """A body over time."""
 
     whole: WholeBody
     times: Numbers
@@ -49,13 +33,7 @@ class ShownBody:
 
     @classmethod
     def of(cls, whole: WholeBody, times: Numbers) -> ShownBody:
-        """What a run has recorded at these times.
-
-        Raises
-        ------
-        RecordingError
-            If the fields are damaged.
-        """
+        """What a run has recorded at these times."""
         rows: dict[str, list[NDArray[np.float32]]] = {name: [] for name in ("position", "angle", "extension", "edges")}
         is_deformed = True
         with whole.recording.kept_open():

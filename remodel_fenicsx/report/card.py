@@ -71,15 +71,7 @@ def of_vectors(vectors: NDArray[np.float32]) -> tuple[NDArray[np.int8], float]:
 
 @dataclass(frozen=True)
 class Array:
-    """Numbers that the page unpacks into a typed array.
-
-    Attributes
-    ----------
-    values
-        Of a type that JavaScript has: (...,).
-    differences
-        Whether each row along the first axis is stored as its difference to the row before, modulo the type's range.
-    """
+    """Numbers that the page unpacks into a typed array."""
 
     values: NDArray[Any]
     differences: bool = False
@@ -87,19 +79,7 @@ class Array:
 
 @dataclass(frozen=True)
 class Card:
-    """A part of the page.
-
-    Attributes
-    ----------
-    name
-        The script's part of this name, if there is one, is called with data and arrays.
-    html
-        What stands on the page.
-    data
-        JSON.
-    arrays
-        By name.
-    """
+    """A part of the page."""
 
     name: str
     html: str

@@ -35,30 +35,7 @@ class ReportError(ValueError):
 
 
 def write_report(folder: str | os.PathLike[str], path: Path | None = None, size: float = PAGE_SIZE) -> Path:
-    """Make the report of a run, finished or not, from its folder.
-
-    Parameters
-    ----------
-    folder
-        Of a run; it may still be under way.
-    path
-        Where the page goes; a report.html in the run's folder is replaced, any other file must be new.
-    size
-        MB (10^6 bytes) that it may have: fewer times are kept where all would be more, never fewer elements.
-
-    Returns
-    -------
-    The file.
-
-    Raises
-    ------
-    RecordingError
-        If it is no folder of a run, or damaged.
-    ReportError
-        If the file is there already, or a report.html that this command has not made.
-    OSError
-        If it cannot be read or written.
-    """
+    """Make the report of a run, finished or not, from its folder."""
     recording = RecordedRun(folder)
     if path is not None:
         try:

@@ -58,17 +58,7 @@ _RANKS = re.compile(r"scene .* on (\d+) ranks?, results in ")
 
 @dataclass
 class Warned:
-    """A warning of a run, with others that differ from it in numbers alone.
-
-    Attributes
-    ----------
-    text
-        The first one's.
-    count
-        How many.
-    time
-        Of the last step before the first; "" before any.
-    """
+    """A warning of a run, with others that differ from it in numbers alone."""
 
     text: str
     count: int
@@ -77,25 +67,7 @@ class Warned:
 
 @dataclass(frozen=True)
 class Story:
-    """How a run went.
-
-    Attributes
-    ----------
-    state
-        "finished", "running", "failed" or "stopped".
-    words
-        Where it is or why it has ended; "" where the state says it all.
-    history
-        Its rows so far.
-    began, ended
-        The first and the last line of its log, "YYYY-MM-DD hh:mm:ss".
-    ranks
-        Of the last start.
-    warnings
-        In the order of the log.
-    unloaded
-        What the body was found from, where a loaded one was given.
-    """
+    """How a run went."""
 
     state: str
     words: str
@@ -108,13 +80,7 @@ class Story:
 
     @classmethod
     def of(cls, recording: RecordedRun) -> Story:
-        """The story of a run's folder.
-
-        Raises
-        ------
-        RecordingError, OSError
-            If the folder is damaged or cannot be read.
-        """
+        """The story of a run's folder."""
         lives = writer(recording.path)[1]
         history = recording.history
         lines = list(_log(recording.path))
@@ -183,17 +149,7 @@ LAST = ("min_jacobian", "newton_iterations", "linear_iterations", "substeps", "s
 
 @dataclass(frozen=True)
 class ReportedRun:
-    """All that a part may ask of a run.
-
-    Attributes
-    ----------
-    recording
-        Its folder, read back.
-    story
-        How it went.
-    body
-        The body at the times that are kept; None without fields.
-    """
+    """All that a part may ask of a run."""
 
     recording: RecordedRun
     story: Story

@@ -26,21 +26,7 @@ LARGEST_SHARE = 0.04  # of the time of a run, that checkpoints chosen by time ma
 
 
 class Checkpoints(Watcher):
-    """Writes a checkpoint of the state now and then, and of the last step always.
-
-    Parameters
-    ----------
-    folder
-        The run's.
-    state
-        What is kept: it must be that of the last committed step whenever something is written.
-    scene_text
-        The scene as run.
-    every
-        Steps between two; 0: only at the end; None: chosen by time.
-    before
-        Called on every rank before one is written: what it builds on, the rows of its steps, must be on the disk.
-    """
+    """Writes a checkpoint of the state now and then, and of the last step always."""
 
     def __init__(
         self,
@@ -80,13 +66,7 @@ class Checkpoints(Watcher):
 
     # ------------------------------------------------------------ writing
     def write(self) -> None:
-        """Write the state, unless the newest checkpoint is of this step. Collective.
-
-        Raises
-        ------
-        OSError
-            On rank 0, if it cannot be written (disk full); the one before still counts.
-        """
+        """Write the state, unless the newest checkpoint is of this step. Collective."""
         if self.state.number == self._number:
             return
         start = clock.monotonic()
@@ -115,10 +95,7 @@ def mesh_arrays(domain: Domain) -> dict[str, Array] | None:
 
 
 def gather_state(state: State) -> dict[str, Array] | None:
-    """Every function of a state by name, (elements, values of one) in input order, on rank 0. Collective.
-
-    The values of an element stand in the element's own order, which no partition changes.
-    """
+    """Every function of a state by name, (elements, values of one) in input order, on rank 0. Collective."""
     domain, gathered = state.loading.domain, {}
     for name, function in state.functions().items():
         places = _places(function)
@@ -127,20 +104,7 @@ def gather_state(state: State) -> dict[str, Array] | None:
 
 
 def restore_state(state: State, checkpoint: Checkpoint | None) -> None:
-    """Bring a state to a checkpoint. Collective.
-
-    Parameters
-    ----------
-    state
-        Of the same scene, on any number of ranks.
-    checkpoint
-        On rank 0; elsewhere it is not looked at.
-
-    Raises
-    ------
-    CheckpointError
-        If it does not belong to this mesh or to these functions; on all ranks, and nothing has changed.
-    """
+    """Bring a state to a checkpoint. Collective."""
     domain, comm = state.loading.domain, state.comm
     mesh, first = mesh_arrays(domain), comm.rank == 0
     agreed(comm, lambda: _check(state, domain, cast(Checkpoint, checkpoint), mesh or {}) if first else None)

@@ -56,23 +56,7 @@ class _Pointer(_Model):
 
 
 class Checkpoint(_Model):
-    """A state by the input mesh's numbering.
-
-    Attributes
-    ----------
-    time, number
-        Time of the last committed step, and how many there were.
-    scene
-        The scene as run (TOML).
-    versions
-        Versions of package and libraries.
-    loads, numbers
-        As the state has them.
-    functions
-        Names of the state's functions.
-    arrays
-        ``function/NAME``: the values of a function, (elements, values of one); ``points``, ``elements``: the mesh.
-    """
+    """A state by the input mesh's numbering."""
 
     format: int = Field(default=FORMAT, ge=1, le=FORMAT)
     time: float = Field(ge=0)
@@ -86,13 +70,7 @@ class Checkpoint(_Model):
 
 
 def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
-    """Write a checkpoint over the older generation, then the pointer.
-
-    Raises
-    ------
-    OSError
-        If it cannot be written (disk full); the newest one before it still counts.
-    """
+    """Write a checkpoint over the older generation, then the pointer."""
     text = np.frombuffer(checkpoint.model_dump_json().encode(), dtype=np.uint8)
     whole = io.BytesIO()
     np.savez(whole, **{_HEADER: text}, **checkpoint.arrays)  # type: ignore[arg-type]
@@ -111,15 +89,7 @@ def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
 
 
 def read_pointer(folder: Path) -> list[Generation]:
-    """What checkpoint.json names, the newest first; nothing if there is none.
-
-    Raises
-    ------
-    CheckpointError
-        If it is damaged or of another kind.
-    OSError
-        If it cannot be read.
-    """
+    """What checkpoint.json names, the newest first; nothing if there is none."""
     path = folder / POINTER
     try:
         data = read_regular(path, LARGEST_POINTER)
@@ -135,15 +105,7 @@ def read_pointer(folder: Path) -> list[Generation]:
 
 
 def read_checkpoint(folder: Path) -> Checkpoint | None:
-    """The newest checkpoint that is whole, with a warning where it is not the newest; None where there never was one.
-
-    Raises
-    ------
-    CheckpointError
-        If none is whole.
-    OSError
-        If one cannot be read.
-    """
+    """The newest checkpoint that is whole, with a warning where it is not the newest."""
     generations, faults = read_pointer(folder), []
     for generation in generations:
         try:

@@ -314,10 +314,7 @@ class _FaceIntegral:
 
 
 class _LumenVolume:
-    """-1/3 integral of x . cof(F) N over the inner face, and the cones over flat caps on its rims.
-
-    x is the place beside the middle of that face: digits of a place far away would be those of the volume.
-    """
+    """-1/3 integral of x . cof(F) N over the inner face, and the cones over flat caps on its rims."""
 
     def __init__(self, observer: Observer):
         domain, state = observer.domain, observer.state
@@ -341,28 +338,14 @@ class _LumenVolume:
 
 
 class EndForce(NamedTuple):
-    """What a virtual lengthening v = z/L e_z of a tube does, per unit of its displacement of the end z = L.
-
-    Attributes
-    ----------
-    internal
-        Work of the stresses, integral of P_zz over the body over L: a force.
-    inward
-        Flux of v through the deformed inner face, out of the wall: an area. It is 0 where the lumen is a cylinder.
-    lumen
-        Change of the volume between the inner face and plane caps: the lumen's area, at the end z = L, less `inward`.
-    """
+    """What a virtual lengthening v = z/L e_z of a tube does, per unit of its displacement of the end z = L."""
 
     internal: float
     inward: float
     lumen: float
 
     def of_the_wall(self, pressure: float) -> float:
-        """The force that the wall carries through its section at z = L, with a pressure on the inner face.
-
-        v is 0 at the bottom, and the body is in equilibrium: the work of the end is that of the stresses less that of
-        the pressure on the inner face.
-        """
+        """The force that the wall carries through its section at z = L, with a pressure on the inner face."""
         return self.internal + pressure * self.inward
 
     def reduced(self, pressure: float) -> float:
@@ -371,10 +354,7 @@ class EndForce(NamedTuple):
 
 
 class _EndForceForms:
-    """The forms of `EndForce`, in any kinematics and formulation.
-
-    The work is that of the residual to the last digit: of the formulation and the repulsion, with their quadrature.
-    """
+    """The forms of `EndForce`, in any kinematics and formulation."""
 
     def __init__(self, equilibrium: Equilibrium, face: str, length: float):
         state, mesh = equilibrium.state, equilibrium.quadrature.mesh

@@ -35,28 +35,7 @@ def write_vtu(
     cell_data: Mapping[str, ArrayLike],
     point_data: Mapping[str, ArrayLike] = MappingProxyType({}),
 ) -> None:
-    """Write a new file.
-
-    Parameters
-    ----------
-    path
-        That does not exist.
-    points
-        (points, 3).
-    cells
-        Node numbers of each cell in VTK's order, (cells, nodes).
-    cell_type
-        VTK's number, one for all cells.
-    cell_data, point_data
-        Arrays by name: scalars (n,), vectors (n, 3), tensors (n, 9).
-
-    Raises
-    ------
-    FileExistsError
-        If the path is taken.
-    OSError
-        If it cannot be written.
-    """
+    """Write a new file."""
     places = np.asarray(points, dtype=np.float64)
     offsets = cells.shape[1] * np.arange(1, len(cells) + 1)
     topology = {"connectivity": cells.ravel(), "offsets": offsets, "types": np.full(len(cells), cell_type, np.uint8)}
@@ -123,20 +102,7 @@ ELEMENTS = {
 
 @dataclass(frozen=True)
 class Fibres:
-    """The mean cells of the elements of a body.
-
-    Attributes
-    ----------
-    points
-        Reference coordinates of the nodes, (nodes, 3).
-    elements
-        Numbers of their nodes in VTK's order, from 0, (elements, nodes of one).
-    dimensions, axes
-        l_I in link lengths, longest first, (elements, 3), and n_I as rows, (elements, 3, 3): of the mean structure
-        tensor.
-    displacement
-        Of the nodes, (nodes, 3); None where it was not recorded.
-    """
+    """The mean cells of the elements of a body."""
 
     points: Array
     elements: NDArray[np.int64]
@@ -156,30 +122,7 @@ class Fibres:
 
 
 def export(folder: Path | str, kind: str, path: Path | None = None, time: float | None = None) -> Path:
-    """Write the mean structure tensor of each element with its axes and dimensions into a new file.
-
-    Parameters
-    ----------
-    folder
-        Of a run; it may still be under way.
-    kind
-        A key of `FIBRE_FORMATS`.
-    path
-        A file that does not exist; None: `fibres` in the folder, with the format's ending.
-    time
-        A recorded one; None: the last.
-
-    Returns
-    -------
-    The file.
-
-    Raises
-    ------
-    RecordingError
-        If it is no run of a whole body with its cells, or the file is there already.
-    OSError
-        If it cannot be written.
-    """
+    """Write the mean structure tensor of each element with its axes and dimensions into a new file."""
     ending, write = FIBRE_FORMATS[kind]
     fibres = recorded_fibres(RecordedRun(folder), time)
     path = Path(folder) / f"fibres{ending}" if path is None else path
@@ -191,13 +134,7 @@ def export(folder: Path | str, kind: str, path: Path | None = None, time: float 
 
 
 def recorded_fibres(recording: RecordedRun, time: float | None = None) -> Fibres:
-    """The cells of a run at a recorded time, the last one where None is given.
-
-    Raises
-    ------
-    RecordingError
-        If it is a reduction, or cells or this time were not recorded.
-    """
+    """The cells of a run at a recorded time, the last one where None is given."""
     kinematics = recording.scene.model.kinematics
     if KINEMATICS[kinematics].reduced:
         remedy = "revolve writes the fields of the whole body, model.kinematics = 'full' runs it"

@@ -37,10 +37,7 @@ def field_names(
     lacking: Collection[str] = (REGION, UNLOADED, *TURNED_OVER),
     constant: Sequence[str] = (),
 ) -> tuple[str, ...]:
-    """The fields that a scene's `output.fields` asks for; where it says all, without those that it lacks.
-
-    `constant` are those that its shape has beside (`Shape.constant_fields`).
-    """
+    """The fields that a scene's `output.fields` asks for; where it says all, without those that it lacks."""
     if isinstance(asked, bool):
         return (*(name for name in FIELDS_BY_NAME if name not in lacking), *constant) if asked else ()
     return tuple(asked)
@@ -55,17 +52,7 @@ def local_fields(local_axes: LocalAxes, quadrature: Quadrature) -> dict[str, Arr
 
 
 class ElementFields:
-    """Element means for pictures.
-
-    Parameters
-    ----------
-    shape
-        Says what the fibre angle is.
-    stepper
-        Its state and tissue; nothing here changes them.
-    names
-        Which of OF_ELEMENTS are wanted; nothing else is computed.
-    """
+    """Element means for pictures."""
 
     def __init__(self, shape: Shape, stepper: Stepper, names: Sequence[str] = OF_ELEMENTS):
         self.shape, self.state, self.names = shape, stepper.state, tuple(names)
@@ -85,14 +72,7 @@ class ElementFields:
         self._state = None if self._shared else jit.expression(stacked, self.quadrature.points)
 
     def __call__(self) -> dict[str, Array]:
-        """By name, one row per local element.
-
-        `deformation_gradient` and `cauchy_stress` (9, row by row); `cell_dimensions` (3) and `axis_1..3`: the cell
-        whose structure tensor is the element's mean, longest first; `fibre_angle`, `fibre_angle_unloaded` and
-        `fibre_angle_deformed` (degrees, to the load axis, or in a tube from circumferential to axial; NaN where no
-        chain has one); `chain_extension` (largest r/L in the element; 0 where no chain locks); with turnover `content`
-        and `natural_length`; `region` (its number, `Domain.regions`).
-        """
+        """By name, one row per local element."""
         values = self._values()
         F = values[..., :9].reshape(*values.shape[:2], 3, 3)
         elastic = self.state.elastic(F)

@@ -63,26 +63,7 @@ class LastStep(NamedTuple):
 
 
 class History:
-    """history.csv: one row per accepted step, in the file as soon as the step is accepted.
-
-    That is enough for whoever reads it, and whatever happens to the process. To be there after a power cut a row must
-    also be flushed to the disk, which costs more than a small problem's step: that happens at most twice a second, at
-    `flush` and at the end.
-
-    Parameters
-    ----------
-    path
-        A new file, or the one to go on with.
-    after
-        Where a run goes on: the rows of later steps are cut off.
-
-    Raises
-    ------
-    FileExistsError, OSError
-        If a new file is there already, or the file cannot be opened or written.
-    RecordingError
-        If it has not the columns and rows to go on with; nothing has changed then.
-    """
+    """history.csv: one row per accepted step, in the file as soon as the step is accepted."""
 
     def __init__(self, path: Path, after: LastStep | None = None):
         size = 0 if after is None else size_of_rows(path, after)
@@ -94,15 +75,7 @@ class History:
         self._cut()
 
     def append(self, row: dict[str, float]) -> None:
-        """Write one row; the first one decides the columns.
-
-        Raises
-        ------
-        OSError
-            If the row could not be written (disk full); the file then ends with the row before.
-        ValueError
-            If the row has other columns than the first one.
-        """
+        """Write one row; the first one decides the columns."""
         text = io.StringIO(newline="")
         writer = csv.DictWriter(text, fieldnames=self._columns or list(row), lineterminator="\n")
         if not self._sizes[-1]:
@@ -126,13 +99,7 @@ class History:
         self._sizes = [self._sizes[-1], self._sizes[-1] + len(data)]
 
     def flush(self) -> None:
-        """Bring all rows to the disk.
-
-        Raises
-        ------
-        OSError
-            If that fails (disk full), or somebody has deleted the file.
-        """
+        """Bring all rows to the disk."""
         if not self._is_flushed:
             os.fsync(self._file.fileno())
             if os.fstat(self._file.fileno()).st_nlink == 0:
@@ -159,15 +126,7 @@ class History:
 
 
 def size_of_rows(path: Path, after: LastStep) -> int:
-    """Bytes of a history's head and of its rows up to a step.
-
-    Raises
-    ------
-    RecordingError
-        If it has not these columns and rows.
-    OSError
-        If it cannot be read.
-    """
+    """Bytes of a history's head and of its rows up to a step."""
     rows = after.number + 1
     lines = read_regular(path, LARGEST_HISTORY).splitlines(keepends=True)[: rows + 1]
     try:

@@ -48,17 +48,7 @@ Numbers = NDArray[np.float64]
 
 
 def kept_times(history: HistoryColumns, times: Numbers, most: int) -> Numbers:
-    """So many of the recorded times, the first and the last among them: spaced evenly, half in time, half in change.
-
-    Parameters
-    ----------
-    history
-        What changes: each column over its range.
-    times
-        That are recorded, (n,).
-    most
-        How many are kept, at least 2; all where there are no more.
-    """
+    """So many of the recorded times, the first and the last among them: spaced evenly, half in time, half in change."""
     if len(times) <= most:
         return times
     rows = np.stack([np.interp(times, history["time"], column) for column in history.values()])
@@ -97,13 +87,7 @@ class HistoryColumns(dict[str, Array]):
     """The columns of a history by name, each (rows,); a value that was not computed is NaN."""
 
     def frame(self) -> Any:
-        """The columns as a pandas DataFrame, one row per recorded step.
-
-        Raises
-        ------
-        ImportError
-            If there is no pandas.
-        """
+        """The columns as a pandas DataFrame, one row per recorded step."""
         try:
             import pandas
         except ImportError as error:
@@ -325,13 +309,7 @@ class RecordedRun:
 
 
 def scene_as_run(folder: Path) -> Scene:
-    """The scene of a run's folder (this alone imports pydantic).
-
-    Raises
-    ------
-    RecordingError
-        If its scene.toml is damaged.
-    """
+    """The scene of a run's folder (this alone imports pydantic)."""
     from remodel_fenicsx.scene.scene import SceneError, read_scene
 
     path = folder / SCENE
@@ -351,13 +329,7 @@ def steps_recorded(folder: str | os.PathLike[str]) -> int:
 
 
 def read_history(folder: str | os.PathLike[str]) -> HistoryColumns:
-    """The columns of a folder's history.csv by name, arrays over its rows; before the first step only `time`, empty.
-
-    Raises
-    ------
-    RecordingError
-        If there is none or it is damaged.
-    """
+    """The columns of a folder's history.csv by name, arrays over its rows; before the first step only `time`, empty."""
     path = Path(folder) / HISTORY
     try:
         text = read_regular(path, LARGEST_HISTORY).decode()

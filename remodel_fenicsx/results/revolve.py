@@ -18,24 +18,7 @@ BODY, BODY_CHAINS = "fields_body.vtkhdf", "fields_body_chains.vtkhdf"
 
 
 def revolve(folder: Path | str) -> list[Path]:
-    """Write the recorded fields of a reduced run on the mesh of the whole body that its scene asks for. One process.
-
-    `TurnedFields` says how.
-
-    Parameters
-    ----------
-    folder
-        Of a run; it may still be under way.
-
-    Returns
-    -------
-    The files: fields_body.vtkhdf, and fields_body_chains.vtkhdf where the cells were recorded.
-
-    Raises
-    ------
-    RecordingError
-        If it is no run of a reduced kinematics with fields, or the files are there already.
-    """
+    """Write the recorded fields of a reduced run on the mesh of the whole body that its scene asks for. One process."""
     recording = RecordedRun(folder)
     name = recording.scene.model.kinematics
     if name not in KINEMATICS or not KINEMATICS[name].reduced:

@@ -39,17 +39,7 @@ def agreed(comm: MPI.Intracomm, make: Callable[[], T]) -> T:
 
 
 def choose_folder(requested: Path | None, name: str) -> Path:
-    """The folder of a run: the one asked for, which must be new or empty, or the first free results/NAME[-2, -3, ...].
-
-    The one asked for is not made yet; a default one is, so that two runs started at once take two.
-
-    Raises
-    ------
-    FolderTaken
-        If the requested folder is not empty or is no folder.
-    OSError
-        If the default folder cannot be made.
-    """
+    """The folder of a run: the one asked for, which must be new or empty, or the first free results/NAME."""
     if requested is not None:
         if len(requested.parts) > DEEPEST:
             raise FolderTaken(f"folder {requested}: lies in more than {DEEPEST} folders")
@@ -105,25 +95,7 @@ def chosen_folder(requested: Path | str | None, name: str, comm: MPI.Intracomm) 
 
 @contextmanager
 def locked(folder: Path, comm: MPI.Intracomm, new: bool) -> Iterator[None]:
-    """Within, this run alone writes in the folder. Collective.
-
-    Parameters
-    ----------
-    folder
-        The folder of a run; a new one is made.
-    comm
-        Communicator.
-    new
-        Whether the run is new to it, or goes on.
-
-    Raises
-    ------
-    FolderTaken
-        If another one writes there, or there is a run where there must be none, or none where there must be one; on
-        all ranks.
-    OSError
-        On rank 0, if the folder cannot be made or written.
-    """
+    """Within, this run alone writes in the folder. Collective."""
     lock = agreed(comm, lambda: _lock(folder, comm.size, new) if comm.rank == 0 else nullcontext())
     with lock:
         yield
@@ -140,26 +112,7 @@ def _lock(folder: Path, ranks: int, new: bool) -> RunLock:
 
 
 def check_before_resuming(folder: Path, after: LastStep | None, fields: bool) -> None:
-    """Look at all that a run goes on with, before anything is changed.
-
-    Parameters
-    ----------
-    folder
-        The run's.
-    after
-        Where it goes on; None: at the start, with nothing but its log.
-    fields
-        Whether it goes on with its fields too.
-
-    Raises
-    ------
-    RecordingError
-        If the history does not hold the steps that were done, or a file of fields is damaged or foreign.
-    OSError
-        If one cannot be read.
-    ForeignFileError
-        If one is a link or no regular file.
-    """
+    """Look at all that a run goes on with, before anything is changed."""
     for name in (LOG, HISTORY):
         with suppress(FileNotFoundError):
             os.close(open_own(folder / name, os.O_RDONLY))
@@ -174,13 +127,7 @@ def check_before_resuming(folder: Path, after: LastStep | None, fields: bool) ->
 
 
 def forget_steps(folder: Path) -> None:
-    """Take away what a run has kept that was killed before its first checkpoint: it starts again.
-
-    Raises
-    ------
-    OSError
-        If that cannot be done.
-    """
+    """Take away what a run has kept that was killed before its first checkpoint: it starts again."""
     for name in (HISTORY, FIELDS, CHAIN_LINES):
         (folder / name).unlink(missing_ok=True)
 

@@ -33,22 +33,7 @@ class FolderTaken(ValueError):
 
 
 class RunLock:
-    """This process writes alone in a folder, as long as it lives: the system gives back a lock of a killed process.
-
-    Parameters
-    ----------
-    folder
-        It is made with its parents if it is not there.
-    ranks
-        How many write together; this process is the first of them.
-
-    Raises
-    ------
-    FolderTaken
-        If another process writes in the folder; it is named.
-    OSError
-        If the folder cannot be made or written, or the lock is a link or no regular file.
-    """
+    """This process writes alone in a folder, as long as it lives: the system gives back a lock of a killed process."""
 
     def __init__(self, folder: Path, ranks: int = 1):
         self._path = folder / LOCK
@@ -85,13 +70,7 @@ class RunLock:
 
 
 def writer(folder: Path) -> tuple[str | None, bool]:
-    """The process that writes in a folder, or wrote in it when it was killed, in words; and whether it lives.
-
-    Raises
-    ------
-    OSError
-        If that cannot be found out.
-    """
+    """The process that writes in a folder, or wrote in it when it was killed, in words; and whether it lives."""
     try:
         descriptor = open_own(folder / LOCK, os.O_RDONLY)
     except FileNotFoundError:
@@ -107,12 +86,6 @@ def writer(folder: Path) -> tuple[str | None, bool]:
 
 
 def is_vacant(folder: Path) -> bool:
-    """Whether a folder is empty, or holds only what a process leaves that is killed before its scene has its name.
-
-    Raises
-    ------
-    OSError
-        If that cannot be found out.
-    """
+    """Whether a folder is empty, or holds only what a process leaves that is killed before its scene has its name."""
     left = {LOCK, part_of(Path(SCENE)).name}
     return {entry.name for entry in folder.iterdir()} <= left and not writer(folder)[1]

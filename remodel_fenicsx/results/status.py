@@ -36,15 +36,7 @@ SHOWN = 5  # runs of a study that have failed and are named
 
 
 def status(folder: Path) -> list[str]:
-    """Lines for people: where the run is, whether it is alive, its rate, its checkpoint; or what a study's runs do.
-
-    Raises
-    ------
-    RecordingError, CheckpointError
-        If it is no folder of a run or of a study, or damaged.
-    OSError
-        If it cannot be read.
-    """
+    """Lines for people: where the run is, whether it is alive, its rate, its checkpoint; or what a study's runs do."""
     if (folder / STUDY).is_file():
         return _of_study(folder)
     holder, lives = writer(folder)

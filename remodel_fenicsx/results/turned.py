@@ -23,20 +23,7 @@ AT_ONCE = 1_000_000  # distances that are compared at a time
 
 
 class TurnedFields:
-    """Which node and element of a reduction stands for each of a body's own, and its fields there.
-
-    Every element of the body takes the values of the element that stands for it, turned to its place; a node takes
-    d = Q (d_0 + (F - I)(Q^T X - X_0)), X_0 the nearest node of the reduction, F of its element, Q the turn.
-
-    Parameters
-    ----------
-    points, elements
-        Of the body, (nodes, 3) and (elements, nodes of one).
-    own_points, own_elements
-        The same of the reduction.
-    turn
-        Of the `Reduction`.
-    """
+    """Which node and element of a reduction stands for each of a body's own, and its fields there."""
 
     def __init__(
         self, points: Array, elements: NDArray[np.int64], own_points: Array, own_elements: NDArray[np.int64], turn: Turn
@@ -94,28 +81,7 @@ OF_CHAINS = (
 def chain_lines(
     centres: ArrayLike, lengths: ArrayLike, axes: ArrayLike, scale: float
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """The four chains of unit cells, +-l_1 n_1 +-l_2 n_2 +-l_3 n_3 through each centre (paper, Fig. 2).
-
-    Eight corners do not depend on the order or the sign of the axes. Where l_3 = 0 the four lines lie on two.
-
-    Parameters
-    ----------
-    centres
-        Reference coordinates, shape (m, 3).
-    lengths
-        l_I in link lengths, shape (m, 3).
-    axes
-        n_I as rows, shape (m, 3, 3).
-    scale
-        Length in the mesh's unit that one link length is drawn with; a line is 2 |l| scale long.
-
-    Returns
-    -------
-    points
-        Ends, shape (8 m, 3): element by element, line by line, the two ends of a line after one another.
-    lines
-        Numbers of the two ends, shape (4 m, 2). Data of the elements go with `numpy.repeat(values, 4, axis=0)`.
-    """
+    """The four chains of unit cells, +-l_1 n_1 +-l_2 n_2 +-l_3 n_3 through each centre (paper, Fig. 2)."""
     middle = np.asarray(centres, dtype=np.float64)
     edges = np.asarray(lengths, dtype=np.float64)[:, :, None] * np.asarray(axes, dtype=np.float64)
     signs = np.array([(1.0, 1, 1), (1, 1, -1), (1, -1, 1), (1, -1, -1)])
@@ -127,10 +93,7 @@ def chain_lines(
 def chain_displacement(
     points: ArrayLike, centres: ArrayLike, displacement: ArrayLike, deformation_gradient: ArrayLike
 ) -> NDArray[np.float64]:
-    """Displacement of the ends that `chain_lines` gives, shape (8 m, 3): u + (F - I)(X_end - X_centre).
-
-    With u (m, 3) and F (m, 3, 3) of the centres. ParaView's "Warp By Vector" then shows the deformed chains.
-    """
+    """Displacement of the ends that `chain_lines` gives, shape (8 m, 3): u + (F - I)(X_end - X_centre)."""
     ends = np.asarray(points, dtype=np.float64).reshape(-1, 8, 3) - np.asarray(centres)[:, None, :]
     gradient = np.asarray(deformation_gradient) - np.eye(3)
     return (np.asarray(displacement)[:, None, :] + ends @ np.swapaxes(gradient, 1, 2)).reshape(-1, 3)
@@ -144,10 +107,7 @@ def append_chains(
     displacement: NDArray[np.float64],
     fields: Mapping[str, NDArray[np.float64]],
 ) -> TransientGrid:
-    """Add a step to a file of chain lines; it is made at its first step, where `grid` is still its path.
-
-    With the displacement (m, 3) at the centres of the elements (m, 3), and their fields `OF_CHAINS`.
-    """
+    """Add a step to a file of chain lines; it is made at its first step, where `grid` is still its path."""
     axes = np.stack([fields[name] for name in AXIS_FIELDS], axis=1)
     points, lines = chain_lines(centres, fields["cell_dimensions"], axes, scale)
     moved = chain_displacement(points, centres, displacement, fields["deformation_gradient"].reshape(-1, 3, 3))

@@ -39,8 +39,7 @@ _MARK = b"remodel1"
 
 @contextmanager
 def signals_held_back() -> Iterator[None]:
-    """Let Python's signal handlers (Ctrl-C, termination) run after the block: an exception inside a call-back that
-    HDF5 makes into `StagedFile` would crash it."""
+    """Let Python's signal handlers (Ctrl-C, termination) run after the block."""
     caught: list[int] = []
     handlers = {int(number): signal.getsignal(number) for number in signal.valid_signals()}
     if threading.current_thread() is not threading.main_thread():  # handlers run in the main thread only
@@ -58,27 +57,7 @@ def signals_held_back() -> Iterator[None]:
 
 
 class StagedFile(io.RawIOBase):
-    """The file below h5py: keeps what HDF5 writes in memory until `commit`, which first writes what is new at the end.
-
-    HDF5 spoils a file when the disk fills up, or the process is killed, between its own writes. Here the disk can only
-    be full while the new end is written, which nothing refers to yet; then the few changed bytes of the old part follow
-    (those of the headers and chunk indices), in HDF5's order. HDF5 itself never meets an error.
-
-    Whoever is killed between two of these changes leaves a file that can be read, but perhaps not be written any more.
-    So the changes stand behind the new end until all are made; who opens the file again makes them to the end.
-
-    Parameters
-    ----------
-    path
-        The file.
-    existing
-        Open a file that is there; without, make a new one.
-
-    Raises
-    ------
-    FileExistsError, FileNotFoundError, OSError
-        If it is there, is not there, or cannot be opened.
-    """
+    """The file below h5py: keeps what HDF5 writes in memory until `commit`."""
 
     def __init__(self, path: Path, existing: bool = False):
         self._descriptor = -1
@@ -225,28 +204,7 @@ _COMPRESSION: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "s
 
 
 class TransientGrid:
-    """A time series on one grid; the file is whole after the constructor and after every `append`.
-
-    Parameters
-    ----------
-    path
-        A new file (suffix .vtkhdf, or readers will not know it).
-    points
-        Reference coordinates, shape (points, 3).
-    cells
-        Node numbers of each cell in VTK's order, shape (cells, nodes): see `vtk_cells`.
-    cell_type
-        VTK's number, one for all cells.
-    point_dtype
-        How coordinates are stored; float32 makes sense where they move (`append`).
-
-    Raises
-    ------
-    FileExistsError
-        If `path` exists: nothing is overwritten.
-    OSError
-        If the file cannot be written (disk full, no permission).
-    """
+    """A time series on one grid; the file is whole after the constructor and after every `append`."""
 
     def __init__(
         self,
@@ -266,15 +224,7 @@ class TransientGrid:
 
     @classmethod
     def continued(cls, path: Path, time: float) -> TransientGrid:
-        """Open a file again, to append after its steps up to `time`; later ones are dropped.
-
-        Raises
-        ------
-        OSError
-            If it cannot be opened or written.
-        RecordingError
-            If it is damaged or of another kind; one line.
-        """
+        """Open a file again, to append after its steps up to `time`; later ones are dropped."""
         grid = cls.__new__(cls)
         with damage_named(path), grid._opened(path, "r+"):
             grid._root = grid._file["VTKHDF"]
@@ -319,26 +269,7 @@ class TransientGrid:
         points: ArrayLike | None = None,
         constant: Fields | None = None,
     ) -> None:
-        """Add one step and bring it to the disk.
-
-        Parameters
-        ----------
-        time
-            Later than the step before.
-        point_data, cell_data
-            Arrays by name: scalars (n,), vectors (n, 3), tensors (n, 9), rows first; the same names at every step. They
-            are stored with 7 digits: 150 steps of the artery's 1,536 cells take 34 MB.
-        points
-            Coordinates from this step on, shape (points, 3), if they move.
-        constant
-            Cell data that are the same at every step, and stand in the file once.
-
-        Raises
-        ------
-        OSError
-            If the step could not be written (disk full). The file then ends with the step before, and is whole; the
-            next `append`, or `close`, tries to write this step again.
-        """
+        """Add one step and bring it to the disk."""
         step = self.number_of_steps
         with signals_held_back():
             for kind, fields in (("PointData", point_data or {}), ("CellData", cell_data or {})):
@@ -396,13 +327,7 @@ class TransientGrid:
         steps.attrs.modify("NSteps", np.int64(number))
 
     def close(self) -> None:
-        """Write what is not yet on the disk and close; more than once does no harm.
-
-        Raises
-        ------
-        OSError
-            If a step that `append` could not write cannot be written now either.
-        """
+        """Write what is not yet on the disk and close; more than once does no harm."""
         if self._staged.closed:
             return
         with signals_held_back():
@@ -458,10 +383,7 @@ class _Rows:
         self.trailing = tuple(dataset.shape[1:])
 
     def write(self, number: int, block: ArrayLike) -> None:
-        """Write block `number` of a dataset whose blocks have this one's length; a number is a block of one row.
-
-        By HDF5's own functions: for a few numbers h5py's selections cost ten times as much.
-        """
+        """Write block `number` of a dataset whose blocks have this one's length; a number is a block of one row."""
         import h5py
 
         rows = np.ascontiguousarray(block, self.dtype).reshape(-1, *self.trailing)
@@ -479,19 +401,7 @@ def _create(group: h5py.Group, name: str, dtype: DTypeLike, chunk: tuple[int, ..
 
 
 def vtk_cells(cell_name: str, degree: int, elements: NDArray[np.int64]) -> tuple[int, NDArray[np.int64]]:
-    """VTK's cell type, and the elements with their nodes in VTK's order.
-
-    The orders differ from degree 1 on for hexahedra: dolfinx counts nodes like a tensor product, VTK goes round.
-
-    Parameters
-    ----------
-    cell_name
-        A key of `CELL_TYPES`.
-    degree
-        Of the geometry, 1 or more.
-    elements
-        Node numbers in dolfinx's order, shape (elements, nodes).
-    """
+    """VTK's cell type, and the elements with their nodes in VTK's order."""
     # here and not above: whoever reads or writes lines alone need not wait for dolfinx
     from dolfinx import cpp
     from dolfinx.mesh import to_type
@@ -517,20 +427,7 @@ def damage_named(path: Path) -> Iterator[None]:
 
 
 def check_file(path: Path) -> None:
-    """Read a file of `TransientGrid` as a whole, so that damage and what is foreign are noticed. Nothing is changed.
-
-    HDF5 keeps a check sum of every block of values (since version 0.3.0), and compares it whenever the block is read.
-    Times and places of the blocks have none, but can be told from the numbers of nodes and elements.
-
-    Raises
-    ------
-    OSError
-        If it cannot be read.
-    ForeignFileError
-        If it is no regular file, is a link, or has other names.
-    RecordingError
-        If it is damaged or of another kind, or refers to other files; one line.
-    """
+    """Read a file of `TransientGrid` as a whole, so that damage and what is foreign are noticed. Nothing is changed."""
     import h5py
 
     os.close(open_own(path, os.O_RDONLY))

@@ -21,30 +21,7 @@ FEW_LAYERS = 8
 
 
 class WholeBody:
-    """The body whose fields a run has recorded.
-
-    Parameters
-    ----------
-    recording
-        Of a run for which `has_a_body` is true.
-
-    Attributes
-    ----------
-    recording
-    points
-        Of the reference body, (n, 3): nodes that are corners.
-    elements
-        Corners in VTK's order, (m, 8 or 4).
-    layer, depth
-        Number of each element's layer, (m,); mean depth of each layer, from 0 to 1.
-    is_turned
-        Whether a reduction was solved.
-
-    Raises
-    ------
-    RecordingError
-        If the folder is damaged.
-    """
+    """The body whose fields a run has recorded."""
 
     def __init__(self, recording: RecordedRun):
         scene = recording.scene
@@ -70,20 +47,7 @@ class WholeBody:
         return known["depth"] if "depth" in known else shape.depth(self.points[self.elements].mean(axis=1))
 
     def fields(self, time: float, names: Collection[str] | None = None) -> Fields:
-        """Displacement of the points, where it was recorded, and fields of the elements, at a recorded time.
-
-        Parameters
-        ----------
-        time
-            As recorded.
-        names
-            Read no others than these; turned tensors and displacements want `deformation_gradient`.
-
-        Raises
-        ------
-        RecordingError
-            If there are none, or the fields are damaged.
-        """
+        """Displacement of the points, where it was recorded, and fields of the elements, at a recorded time."""
         fields = self.recording.fields(time, names)
         displacement, found = self._turned(fields) if self._turned else (fields.pop("displacement", None), fields)
         return None if displacement is None else displacement[self._used], found
@@ -97,11 +61,7 @@ def has_a_body(recording: RecordedRun) -> bool:
 
 
 def _layers(depth: Numbers, elements: NDArray[np.int64]) -> tuple[NDArray[np.int64], Numbers]:
-    """Number of each element's layer and the mean depth of each: those of the mesh, or equal parts of the way.
-
-    There are as many as elements lie behind one another. Tetrahedra have more depths than that: each part of the way
-    takes all that lie between the same faces, for they differ in kind.
-    """
+    """Number of each element's layer and the mean depth of each: those of the mesh, or equal parts of the way."""
     nodes = np.bincount(elements.ravel(), weights=np.repeat(depth, elements.shape[1])) / np.bincount(elements.ravel())
     extent = np.ptp(nodes[elements], axis=1).mean()
     number = max(1, round(float(np.ptp(nodes) / extent))) if extent > 0 else 1

@@ -25,10 +25,7 @@ _METHODS: dict[str, dict[str, dict[str, Any]]] = {
 
 
 def default_method(values: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """What lies under the keys of a scene without a preset: the law, and what goes with the law that it has.
-
-    It is what measures best (docs/couplings.md); a scene that names another law has the defaults of the tables.
-    """
+    """What lies under the keys of a scene without a preset: the law, and what goes with the law that it has."""
     remodeling = values.get("remodeling")
     law = remodeling.get("law", DEFAULT_LAW) if isinstance(remodeling, Mapping) else DEFAULT_LAW
     return _METHODS.get(law, {}) if isinstance(law, str) else {}
@@ -147,22 +144,7 @@ EXACT = "implicit"  # coupling
 
 @dataclass(frozen=True)
 class Profile:
-    """How much accuracy a run shall have: settings, with the error and cost that were measured on the artery.
-
-    Attributes
-    ----------
-    values
-        Over those of the preset, by dotted key.
-    degrees, percent, seconds
-        Error of the fibre angle, root mean square, and of the radii, and time of the processor in the steps, as
-        measured on the paper's artery.
-    cells
-        Of the cells of that artery; of random ones the error is that of means over seeds.
-    takes_exact_coupling
-        Whether the coupling is `EXACT` too where that leaves no error in time (`Scene.has_exact_coupling`).
-    is_for_means
-        Whether the kinematics is a part of the body that stands for it in means over seeds, where there is one.
-    """
+    """How much accuracy a run shall have: settings, with the error and cost that were measured on the artery."""
 
     values: dict[str, Any]
     degrees: float
@@ -253,18 +235,7 @@ class _NotThere(Exception):
 
 
 def aligned_stiffness(chain: Chain, end_to_end_length: float, contour_length: float) -> float:
-    """Stiffness of the network along aligned chains at stretch 1, over the network modulus c.
-
-    Chains and repulsion have the nominal stress P = c r0 (g r - g(r0) r0 / lambda) with r = lambda r0 (eqs. 4, 7), so
-    dP/dlambda = c r0^2 (d(g r)/dr + g) at r0.
-
-    Parameters
-    ----------
-    chain
-        The law of a chain.
-    end_to_end_length, contour_length
-        r0 and L, in link lengths.
-    """
+    """Stiffness of the network along aligned chains at stretch 1, over the network modulus c."""
     r0 = end_to_end_length
     ahead = complex(r0, _COMPLEX_STEP)
     slope = (chain.stiffness(ahead, contour_length) * ahead).imag / _COMPLEX_STEP
@@ -293,19 +264,7 @@ def _kappa(half_life: float, others: Others) -> float:
 
 
 class Experiment(NamedTuple):
-    """A number of an experiment.
-
-    Attributes
-    ----------
-    table, key
-        Under which a scene has it.
-    replaces
-        The model's own key of the same table.
-    lowest
-        The number is above it.
-    own
-        The model's own number, of this one and of other values.
-    """
+    """A number of an experiment."""
 
     table: str
     key: str
@@ -322,18 +281,7 @@ EXPERIMENTS = (  # in this order: the density asks for the contour length
 
 
 def check_exclusive(own: Values) -> None:
-    """Refuse a number of an experiment beside what it replaces.
-
-    Parameters
-    ----------
-    own
-        What the scene itself says, without what lies under it.
-
-    Raises
-    ------
-    SceneError
-        One line that names both keys.
-    """
+    """Refuse a number of an experiment beside what it replaces."""
     for name, part in _parts(own):
         place = _place(name)
         for table, key, replaces, *_ in EXPERIMENTS:
@@ -345,15 +293,7 @@ def check_exclusive(own: Values) -> None:
 
 
 def with_own_numbers(values: Values) -> dict[str, Any]:
-    """The values with the model's own numbers in place of those of experiments.
-
-    What cannot be counted with, here or in the values that are asked for, stays: its table refuses it.
-
-    Parameters
-    ----------
-    values
-        Of a whole scene, without units.
-    """
+    """The values with the model's own numbers in place of those of experiments."""
     found = {**values}
     for name, part in _parts(values):
         for experiment in EXPERIMENTS:
@@ -366,15 +306,7 @@ def with_own_numbers(values: Values) -> dict[str, Any]:
 
 
 def without_replaced(values: dict[str, Any], changed: Iterable[str]) -> None:
-    """Take out of the values what changed numbers of experiments replace.
-
-    Parameters
-    ----------
-    values
-        Every value of a scene, changed in place.
-    changed
-        Dotted keys that have been set.
-    """
+    """Take out of the values what changed numbers of experiments replace."""
     changed = set(changed)
     for name, part in _parts(values):
         place = _place(name)

@@ -77,17 +77,7 @@ TEMPERATURES = (250.0, 400.0)  # K: of what is neither ice nor cooked
 def doubts(
     material: Material, geometry: Shape, loads: Mapping[str, Load], end_to_end_length: float, end: float
 ) -> list[str]:
-    """Lines on what is hardly meant; none on bodies of plausible tissue.
-
-    Parameters
-    ----------
-    material, geometry, loads
-        Of the scene.
-    end_to_end_length
-        r0, in link lengths.
-    end
-        Last time.
-    """
+    """Lines on what is hardly meant; none on bodies of plausible tissue."""
     network = chain_stress(material, end_to_end_length)
     found, kinds = [*_of_material(material, network), *_of_lengths(geometry)], geometry.loads_on(faces_of(loads))
     for name, load in loads.items():
@@ -903,13 +893,7 @@ def _plain(value: Any, every_value: bool = False) -> Any:
 
 
 def scene_from_dict(values: Mapping[str, Any]) -> Scene:
-    """A scene from nested dicts with the keys of the TOML file.
-
-    Raises
-    ------
-    SceneError
-        One line: key, value, what is allowed.
-    """
+    """A scene from nested dicts with the keys of the TOML file."""
     if not isinstance(values, Mapping) or not all(isinstance(name, str) for name in values):
         raise SceneError(f"scene = {shown(values)}: must be a table")
     return Scene(**values)
@@ -1013,15 +997,7 @@ SAME_LOAD = 1e-12  # relative difference of two loads that are the same
 
 
 def check_continuation(old: Scene, new: Scene, time: float) -> None:
-    """Check that the physics of a scene is that of the run so far, until `time`.
-
-    End time, output, solver and the loads after `time` may change.
-
-    Raises
-    ------
-    SceneError
-        One line: the first key that differs, and what it was.
-    """
+    """Check that the physics of a scene is that of the run so far, until `time`."""
     rule = f"a resumed run may change time.end, output, solver, and loads after its checkpoint at {time:g}"
     before, now = (dict(_physics(scene.model_dump(mode="json"))) for scene in (old, new))
     for key in [*before, *(key for key in now if key not in before)]:

@@ -28,27 +28,7 @@ def read_columns(
     spellings: Mapping[str, str] | None = None,
     unused: Iterable[str] = (),
 ) -> dict[str, NDArray[np.float64]]:
-    """Columns of numbers by name, (rows,); a line of the log says how they were written.
-
-    Between columns stand tabs, semicolons, commas or spaces, or what a first line `sep=;` says. Numbers may have
-    decimal commas. Lines that begin with # and empty rows are skipped, and so are empty cells at the ends of rows.
-
-    Parameters
-    ----------
-    data, file
-        What the file holds, and its name.
-    allowed
-        Names of columns, found whatever their capitals.
-    spellings
-        Other names of them, in small letters.
-    unused
-        Names of columns that may be there and are left out; the log says so.
-
-    Raises
-    ------
-    TableFileError
-        If it is no such table, or if a column is not allowed or there twice.
-    """
+    """Columns of numbers by name, (rows,); a line of the log says how they were written."""
     names, rows, written = _cells(data)
     allowed, unused = list(allowed), set(unused)
     known = {name.lower(): name for name in (*allowed, *unused)}

@@ -85,17 +85,7 @@ def _of_python(value: Any) -> Any:
 
 @dataclass(frozen=True)
 class OneOf:
-    """Annotation of a field whose value is one of a registry's keys, those registered later included.
-
-    Attributes
-    ----------
-    registry
-        Its keys are allowed.
-    also
-        Allowed too.
-    removed
-        Names of earlier versions, with what to say of each.
-    """
+    """Annotation of a field whose value is one of a registry's keys, those registered later included."""
 
     registry: Collection[Any]
     also: tuple[Any, ...] = ()
@@ -119,15 +109,7 @@ class OneOf:
 
 @dataclass(frozen=True)
 class VariantOf:
-    """Annotation of a field that is one of several tables, those registered later included.
-
-    Attributes
-    ----------
-    registry
-        Table class by name; each has a field `tag` with that name.
-    tag
-        The key that tells them apart.
-    """
+    """Annotation of a field that is one of several tables, those registered later included."""
 
     registry: Mapping[str, type[BaseModel]]
     tag: str
@@ -153,17 +135,7 @@ class VariantOf:
 
 
 def fault(rule: str, key: str = "", value: Any = _MISSING) -> PydanticCustomError:
-    """Error to raise in a validator.
-
-    Parameters
-    ----------
-    rule
-        What is allowed.
-    key
-        The key at fault, relative to the table or field that is validated (dotted; "[2]" for an entry).
-    value
-        Its value, where that is not what is validated.
-    """
+    """Error to raise in a validator."""
     context = {"rule": rule, "key": key} | ({} if value is _MISSING else {"value": value})
     return PydanticCustomError("fault", "{rule}", context)
 

@@ -26,13 +26,7 @@ _DECIMAL = re.compile(r"(?<![\w.])[+-]?\d[\d_]*\.\d[\d_]*(?:[eE][+-]?\d+)?(?![\w
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """The nested dicts of a TOML file.
-
-    Raises
-    ------
-    SceneError
-        If it cannot be read; one line with the file and, where it is not TOML, the line in it.
-    """
+    """The nested dicts of a TOML file."""
     try:
         text = read_regular(path, LARGEST).decode("utf-8-sig")
     except FileNotFoundError:
@@ -67,13 +61,7 @@ def _depth_exceeds(value: Any, most: int) -> bool:
 
 
 def parse_override(text: str) -> tuple[str, Any]:
-    """Dotted key and value of "KEY=VALUE"; VALUE is TOML, or a string: a bare word, a number with a unit.
-
-    Raises
-    ------
-    SceneError
-        If there is no '=', the key has an empty part or the value is none of these.
-    """
+    """Dotted key and value of "KEY=VALUE"; VALUE is TOML, or a string: a bare word, a number with a unit."""
     key, equals, value = (part.strip() for part in text.partition("="))
     if not equals:
         raise SceneError(f"--set {shown(text)}: must be KEY=VALUE, as in cells.seed=2")

@@ -95,27 +95,7 @@ def in_units(
     key: str = "",
     dimensions: Mapping[str, Dimension | None] | None = None,
 ) -> Any:
-    """The values of a table and of the tables in it, where "5 mm" has become a number.
-
-    Parameters
-    ----------
-    values
-        The keys as they were read. Anything that is no table, and text without a number where no unit is allowed, is
-        left as it is: the fields refuse it.
-    table
-        Their table class. Tables in it are done too, but for those that have variants or free names.
-    units
-        The scene's unit by the key that chooses it; None where none is chosen.
-    key
-        Dotted key of the table.
-    dimensions
-        Of fields of this table, where the annotation does not tell.
-
-    Raises
-    ------
-    PydanticCustomError
-        A `fault`, at the first value whose unit is unknown, not allowed there or of another dimension.
-    """
+    """The values of a table and of the tables in it, where "5 mm" has become a number."""
     if not isinstance(values, Mapping):
         return values
     result = dict(values)
@@ -150,22 +130,7 @@ def keys_with_units(table: type[BaseModel]) -> Iterator[tuple[str, Dimension]]:
 
 
 def factor_to_scene(unit: str, dimension: Dimension, units: Mapping[str, str | None]) -> float:
-    """How many of the scene's units one of another unit is.
-
-    Parameters
-    ----------
-    unit
-        As "mmHg".
-    dimension
-        What it must measure.
-    units
-        The scene's unit by the key that chooses it; None where none is chosen.
-
-    Raises
-    ------
-    ValueError
-        If it is no unit of that dimension, or the scene has no unit to go to.
-    """
+    """How many of the scene's units one of another unit is."""
     try:
         return float(_number(f"1 {unit}", FieldInfo(annotation=float), dimension, units, "units"))
     except PydanticCustomError as error:

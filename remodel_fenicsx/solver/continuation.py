@@ -108,25 +108,7 @@ def failure_text(time: float, stage: str, fraction: float, cause: SolveFailure) 
 
 @dataclass
 class Change:
-    """A change of the problem that can be applied in parts.
-
-    Attributes
-    ----------
-    time, stage
-        Time of the step and name of the change, for messages.
-    set_fraction
-        Applies a fraction of it, 0 to 1.
-    newton
-        Solves the problem with what is applied.
-    maximum_halvings
-        How often the whole is halved before it has failed.
-    largest_part
-        Largest further part from a fraction on, where there is a bound.
-    roughly
-        Whether all parts but the last may be solved coarsely. Not near a limit of the load: it would be passed.
-    most_iterations
-        Newton iterations in `work` above which no further part is tried.
-    """
+    """A change of the problem that can be applied in parts."""
 
     time: float
     stage: str
@@ -140,25 +122,9 @@ class Change:
     _direction: NDArray[np.float64] | None = field(default=None, init=False)  # of the unknowns over the last part
 
     def advance(self, work: Work, failure: SolveFailure | None = None, part: float = 1.0) -> None:
-        """Go from 0 to 1.
-
-        A part that ends far from where its tangent points to is halved like one that fails. If it is the smallest, the
-        way ends here: this is said, and the change goes on beyond the jump.
-
-        Parameters
-        ----------
-        work
-            What the parts add theirs to.
-        failure
-            That of the whole, if it was tried.
-        part
-            The first part.
-
-        Raises
-        ------
-        StepFailure
-            If the smallest part fails.
-        """
+        """Go from 0 to 1."""
+        # A part that ends far from where its tangent points to is halved like one that fails. If it is the smallest,
+        # the way ends here: this is said, and the change goes on beyond the jump.
         done = 0.0
         if failure is not None:
             part = self._halved(part, done, failure, work)
@@ -197,11 +163,10 @@ class Change:
                 self.newton.convergence.intermediate = False
 
     def _started(self, wanted: float, done: float, work: Work) -> float:
-        """The next part, with the unknowns that it starts from.
-
-        Where the bound at the present unknowns is smaller than what is wanted, they go on as over the last part: along
-        that way chains keep about their length, and parts can be larger. Every point keeps its reserve there too.
-        """
+        """The next part, with the unknowns that it starts from."""
+        # Where the bound at the present unknowns is smaller than what is wanted, they go on as over the last part:
+        # along that way chains keep about their length, and parts can be larger. Every point keeps its reserve there
+        # too.
         bound = min(wanted, self.largest_part(done))
         if bound >= wanted:
             return bound
@@ -227,8 +192,7 @@ class Change:
         return bound
 
     def look_back(self, before: NDArray[np.float64], work: Work) -> bool:
-        """After a step: look into one that has ended far from its tangent or from the step before, or that took many
-        tangents, as from a start that leads astray; whether it did."""
+        """After a step: look into one that has ended far from its tangent or from the step before."""
         unknown, jumps = self.newton.unknown.x.array, self._jumps
         moved, last = self._size(unknown - before), jumps["moved"]
         least = POSSIBLE_JUMP * self.newton.equilibrium.state.loading.domain.size
@@ -243,11 +207,9 @@ class Change:
         return looked
 
     def confirm(self, before: NDArray[np.float64], work: Work) -> None:
-        """Go the way again in parts, from the unknowns before it, where the whole was solved far from its tangent.
-
-        Where there is no such way, the solution stays, and a warning says so. Where it leads to another solution, this
-        one is taken: the body comes to it.
-        """
+        """Go the way again in parts, from the unknowns before it, where the whole was solved far from its tangent."""
+        # Where there is no such way, the solution stays, and a warning says so. Where it leads to another solution,
+        # this one is taken: the body comes to it.
         unknown = self.newton.unknown.x.array
         found, parts = unknown.copy(), Work()
         unknown[:] = before
@@ -319,11 +281,7 @@ class Change:
 
 
 class Blend:
-    """Equilibrium with (1 - theta) old + theta new cells in r^2 and in W_rep: the old and the new model at the ends.
-
-    Old are the cells with which the unknowns are in equilibrium, new the state's present ones. Everything is compiled
-    at once; PETSc's objects are made when they are first needed.
-    """
+    """Equilibrium with (1 - theta) old + theta new cells in r^2 and in W_rep: the old and the new model at the ends."""
 
     def __init__(self, state: State, tissue: Tissue, settings: Solver):
         self.settings = settings
@@ -354,10 +312,8 @@ class Blend:
         self.theta.value = fraction
 
     def largest_part(self, done: float) -> float:
-        """Largest further part of theta that keeps KEPT_RESERVE of 1 - r/L at every point of the present unknowns.
-
-        r^2 is linear in theta at a frozen deformation, so the bound is in closed form.
-        """
+        """Largest further part of theta that keeps KEPT_RESERVE of 1 - r/L at every point of the present unknowns."""
+        # r^2 is linear in theta at a frozen deformation, so the bound is in closed form.
         equilibrium, quadrature = self.equilibrium, self.equilibrium.quadrature
         length = quadrature.owned(equilibrium.locking_length())
         self.theta.value = done

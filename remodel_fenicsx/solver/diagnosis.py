@@ -30,17 +30,7 @@ MOST_SHIFTS = 40
 
 @dataclass(frozen=True)
 class Mode:
-    """The lowest eigenvalue, and its mode.
-
-    Attributes
-    ----------
-    eigenvalue
-        Of the tangent's symmetric part, in its unit: it depends on the mesh, so compare it with one of the same mesh.
-    place
-        Reference coordinates of the node where the mode's displacement is largest.
-    displacement
-        The unknowns of the mode on this rank, ghosts included; of unit length over all ranks.
-    """
+    """The lowest eigenvalue, and its mode."""
 
     eigenvalue: float
     place: tuple[float, float, float]
@@ -52,17 +42,7 @@ class FactorisationFailed(ArithmeticError):
 
 
 class Inertia:
-    """Of the symmetric part of an equilibrium's tangent on the free unknowns, at the present unknowns, cells and loads.
-
-    CHOLMOD, three times as fast, takes it if none is negative. Otherwise MUMPS factorises it as L D L^T (SYM = 2), and
-    by Sylvester's law D has as many negative eigenvalues as the matrix.
-    Prescribed unknowns do not count: only motions that the supports allow are asked about.
-
-    Parameters
-    ----------
-    equilibrium
-        Whose tangent it is. PETSc's objects are made at the first question and kept until `close`.
-    """
+    """Of the symmetric part of an equilibrium's tangent on the free unknowns, at the present unknowns."""
 
     def __init__(self, equilibrium: Equilibrium):
         self.equilibrium = equilibrium
@@ -82,13 +62,7 @@ class Inertia:
 
     # ------------------------------------------------------------ questions
     def negative_eigenvalues(self) -> int:
-        """How many there are.
-
-        Raises
-        ------
-        FactorisationFailed
-            If MUMPS gives up.
-        """
+        """How many there are."""
         self._assemble()
         kept = self._symmetric.getSize()[0] <= LARGE  # of larger ones MUMPS on all ranks takes less time and memory
         if kept and self._definite.is_definite(self._symmetric):
@@ -96,13 +70,7 @@ class Inertia:
         return self._negative_of(self._symmetric)
 
     def lowest(self) -> Mode:
-        """The lowest eigenvalue and its mode, by Krylov-Schur iterations (SLEPc) with the inverse about a lower bound.
-
-        Raises
-        ------
-        FactorisationFailed
-            If MUMPS gives up, or no eigenvalue is found.
-        """
+        """The lowest eigenvalue and its mode."""
         from slepc4py import SLEPc
 
         self._assemble()
@@ -247,17 +215,7 @@ LOOSEST = 1e-4  # residual over the forces at the nodes that is worth going on w
 
 @dataclass(frozen=True)
 class Refusal:
-    """Why there is no further step.
-
-    Attributes
-    ----------
-    kind
-        What it is called; empty where no cause is seen.
-    advice
-        What helps against it.
-    finding
-        By what it was recognised in this case.
-    """
+    """Why there is no further step."""
 
     kind: str
     advice: str
@@ -301,17 +259,7 @@ UNSTABLE = Refusal("lost stability", 'lower the load, or go on beyond it with so
 def diagnosed(
     newton: GuardedNewton, failure: SolveFailure | None, direction: NDArray[np.float64] | None = None
 ) -> Refusal:
-    """The kind of refusal, from the present state: the last one that was solved.
-
-    Parameters
-    ----------
-    newton
-        What could not solve further; loads and cells of its equilibrium are those of the present unknowns.
-    failure
-        How the smallest part failed; None if it was solved, but far from here.
-    direction
-        Change of the unknowns over the last part that was solved, where there was one.
-    """
+    """The kind of refusal, from the present state: the last one that was solved."""
     extension = newton.equilibrium.extension()
     if not extension.admissible:
         return TOO_LARGE

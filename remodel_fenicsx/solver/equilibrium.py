@@ -38,24 +38,7 @@ Shares = Callable[[], Sequence[UnitCell]]
 
 
 class PointwiseRepulsion:
-    """Second Piola-Kirchhoff stress of the repulsion and its derivative, as quadrature functions that forms take.
-
-    They belong to the unknowns with which `update` was called last.
-
-    Parameters
-    ----------
-    state
-        Unknowns and kinematics.
-    tissue
-        With a repulsion that has derivatives of its own; its parameters are Constants or DG0 Functions.
-    shares
-        Function that gives the cells at all points in one row, arrays, with numbers for weights.
-
-    Attributes
-    ----------
-    stress, stiffness
-        S (3, 3), and 2 dS/dC as a Mandel matrix (6, 6), dolfinx functions.
-    """
+    """Second Piola-Kirchhoff stress of the repulsion and its derivative, as quadrature functions that forms take."""
 
     def __init__(self, state: State, tissue: Tissue, shares: Shares):
         self.state, self.shares = state, shares
@@ -121,20 +104,7 @@ class PointwiseRepulsion:
 
 
 class PointStresses:
-    """Stresses at the quadrature points as the residual has them: with what the formulation and the repulsion add.
-
-    Parameters
-    ----------
-    state
-        Unknowns, cells and formulation.
-    tissue
-        Its parameters are Constants or DG0 Functions.
-
-    Attributes
-    ----------
-    ufl
-        The stresses as expressions, for those who compile them. They belong to the last `refresh`.
-    """
+    """Stresses at the quadrature points as the residual has them: with what the formulation and the repulsion add."""
 
     def __init__(self, state: State, tissue: Tissue):
         self._dilatation, self._repulsion = state.dilatation, pointwise_repulsion(state, tissue)
@@ -164,10 +134,7 @@ def pointwise_repulsion(state: State, tissue: Tissue, shares: Shares | None = No
 
 @dataclass(frozen=True)
 class Extension:
-    """How far a state is from its limits: the largest r/L and the smallest J, and where r/L is largest (reference).
-
-    `stop_signal` is the largest signal number that any rank has received, 0 for none: it travels with this reduction.
-    """
+    """How far a state is from its limits: the largest r/L and the smallest J, and where r/L is largest (reference)."""
 
     max_chain_extension: float
     min_jacobian: float
@@ -181,17 +148,7 @@ class Extension:
 
 
 class Look(NamedTuple):
-    """At a state: how far it is from its limits.
-
-    Attributes
-    ----------
-    extension
-        Over all points of all ranks.
-    stretches
-        r/L at the points of this rank's own elements, (elements, points); infinite where it is no finite number.
-    states
-        `Equilibrium.states` of these points, in one row.
-    """
+    """At a state: how far it is from its limits."""
 
     extension: Extension
     stretches: Array
@@ -199,23 +156,7 @@ class Look(NamedTuple):
 
 
 class Equilibrium:
-    """The balance of internal forces and loads, compiled; it changes nothing but `state.unknown`, and that on request.
-
-    Parameters
-    ----------
-    state
-        Unknowns, cells and loads.
-    tissue
-        Its parameters; numbers become Constants of the mesh.
-    shares, point_shares
-        The cells as the energy takes them, when not simply the state's (a blend of two), and a function that gives them
-        as arrays.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If a parameter is neither a number, nor a Constant, nor a DG0 Function of the mesh.
-    """
+    """The balance of internal forces and loads, compiled."""
 
     def __init__(
         self,
@@ -291,13 +232,7 @@ class Equilibrium:
         return Look(extension, stretch.reshape(shape), states)
 
     def keeps_reserve(self, before: Any, after: Any, share: float, nearer_than: float = 0.0) -> bool:
-        """Whether every point of all ranks keeps a share of its 1 - r/L; `nearer_than`: only those with r/L above it.
-
-        Parameters
-        ----------
-        before, after
-            r/L at the points, `Look.stretches`.
-        """
+        """Whether every point of all ranks keeps a share of its 1 - r/L."""
         lost = bool(np.any((after > nearer_than) & (1 - after < share * (1 - before))))
         return not over_ranks(self.comm, lost, MPI.LOR)
 

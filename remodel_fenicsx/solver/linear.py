@@ -40,12 +40,7 @@ class _Pair:
 
 
 class Secants:
-    """Betters the steps of a kept factor by what earlier steps have shown of the present tangent.
-
-    The two loops of L-BFGS around H r, the step that the kept factor gives. It needs H times the remembered changes of
-    the residual as well; these are differences of steps that have been there already, so nothing is solved for them.
-    Pairs stay valid from solve to solve, until the factor is another one.
-    """
+    """Betters the steps of a kept factor by what earlier steps have shown of the present tangent."""
 
     def __init__(self) -> None:
         self._pairs: deque[_Pair] = deque()
@@ -66,15 +61,7 @@ class Secants:
         self._last = None
 
     def improve(self, x: Any, residual: Any, step: Any) -> bool:
-        """Better the step H r (trial: x - step) in place; whether it was changed.
-
-        Parameters
-        ----------
-        x, residual
-            The unknowns, and the residual there.
-        step
-            H r.
-        """
+        """Better the step H r (trial: x - step) in place; whether it was changed."""
         self._learn(x, residual, step)
         self._last = (x.copy(), residual.copy(), step.copy())
         if not self._pairs:
@@ -120,19 +107,13 @@ MOST_RENEWALS = 6  # of one solve: what needs more is no matter of old factors; 
 
 
 def worth(unknowns: int) -> float:
-    """Iterations that a new factor must save, for it costs about as much: measured 11 at 5,616 unknowns, 25 at 40,800.
-
-    Smaller bodies gain nothing from fewer: the time of 150 steps of 1,881 unknowns is flat between 9 and 16.
-    """
+    """Iterations that a new factor must save, for it costs about as much."""
+    # Smaller bodies gain nothing from fewer: the time of 150 steps of 1,881 unknowns is flat between 9 and 16.
     return 12.0 * max(1.0, unknowns / 5616) ** 0.4
 
 
 class KeptFactor:
-    """Factors of an earlier tangent, which PETSc takes as a preconditioner of Python's.
-
-    CHOLMOD takes definite tangents only, and then raises; so factors are made here, outside SNES, and MUMPS follows.
-    The first choice is CHOLMOD in single precision, for half of the time: quasi-Newton steps make up for the digits.
-    """
+    """Factors of an earlier tangent, which PETSc takes as a preconditioner of Python's."""
 
     comm: Any = PETSc.COMM_SELF
 
@@ -256,15 +237,7 @@ class KeptFactor:
 
 
 class GatheredFactor:
-    """The same on several ranks: the first one has the whole tangent and its factors.
-
-    A factor that is kept is made seldom, and CHOLMOD on one rank solves with it sooner than MUMPS on two.
-
-    Parameters
-    ----------
-    comm
-        The ranks.
-    """
+    """The same on several ranks: the first one has the whole tangent and its factors."""
 
     def __init__(self, comm: Any):
         self.comm, self.first = comm, KeptFactor()
@@ -446,11 +419,7 @@ class Multigrid(EveryTangent):
 
 
 class Lagged(EveryTangent):
-    """Modified Newton with quasi-Newton steps: the tangent is renewed where that costs less than going on without.
-
-    The factor of an earlier tangent serves many iterations, and L-BFGS improves its steps. Where the user names a
-    preconditioner, that one is kept in place of the factor.
-    """
+    """Modified Newton with quasi-Newton steps: the tangent is renewed where that costs less than going on without."""
 
     keeps = True
     _begins_anew = False  # whether each solve has factors of its own, renewed as soon as one iteration says so
@@ -510,10 +479,8 @@ class Lagged(EveryTangent):
         return self.secants.improve(x, residual, step)
 
     def ended(self, iterations: int) -> None:
-        """The next step starts with a new factor after a slow one, or one dearer than those on this factor on average.
-
-        The mean cost of a step, its share of the factor included, is least where the next step would cost more.
-        """
+        """The next step starts with a new factor after a slow one."""
+        # The mean cost of a step, its share of the factor included, is least where the next step would cost more.
         self._spent, self._solves = self._spent + iterations, self._solves + 1
         self._due = self._always or iterations > SLOW_STEP * self.worth or iterations * self._solves > self._spent
 
@@ -521,11 +488,9 @@ class Lagged(EveryTangent):
         return None if self._always else ("with new factors in every iteration", self._anew())
 
     def _costs_more(self, tolerance: float) -> bool:
-        """Whether the iterations that are left cost more than new factors; also where the residual rises.
-
-        The first iteration with a factor tells whether the problem is near linear. The second one often is worse, and
-        L-BFGS makes up for it: only three of them tell more.
-        """
+        """Whether the iterations that are left cost more than new factors; also where the residual rises."""
+        # The first iteration with a factor tells whether the problem is near linear. The second one often is worse, and
+        # L-BFGS makes up for it: only three of them tell more.
         since = len(self._norms) - 1
         if since == 0 or (1 < since < OVER and not self._begins_anew):
             return False

@@ -41,26 +41,7 @@ NEARLY_STRAIGHT, COARSE, STAGNATION = 0.99, 1e-8, 0.25
 
 
 class Convergence:
-    """|R| <= absolute_tolerance + relative_tolerance |nodal forces|, not below the rounding of assembled forces.
-
-    Parameters
-    ----------
-    equilibrium
-        Whose residual it is.
-    settings
-        The tolerances.
-
-    Attributes
-    ----------
-    force_scale
-        Norm of the nodal forces, reactions included, at the present state: a scale that does not vanish in a hold.
-    prescribed_gap
-        Largest distance of a prescribed value from its target, relative to the body's size.
-    max_chain_extension, displacement
-        r/L and the largest unknown of the last admissible state.
-    intermediate
-        Whether the solution is only the start of a further one: then it may be coarser.
-    """
+    """|R| <= absolute_tolerance + relative_tolerance |nodal forces|, not below the rounding of assembled forces."""
 
     def __init__(self, equilibrium: Equilibrium, settings: Solver):
         self.equilibrium, self.settings = equilibrium, settings
@@ -83,11 +64,9 @@ class Convergence:
         self._stress_rounding = stress_rounding(self._largest, max_chain_extension)
 
     def reached(self, norm: float, previous: float) -> bool:
-        """Whether a residual of this norm is accepted; `previous`: that of the iteration before, infinite at first.
-
-        Near L the rounding of the worst point may be far above that of all others, and the largest displacement is not
-        that of all elements. What is below such a rounding is accepted only when it goes no further down.
-        """
+        """Whether a residual of this norm is accepted; `previous`: that of the iteration before, infinite at first."""
+        # Near L the rounding of the worst point may be far above that of all others, and the largest displacement is
+        # not that of all elements. What is below such a rounding is accepted only when it goes no further down.
         if self.prescribed_gap > PRESCRIBED_TOLERANCE:
             return False
         if self.intermediate and norm <= INTERMEDIATE_TOLERANCE * self.force_scale:
@@ -106,10 +85,8 @@ class Convergence:
         return max(coarse, self.tolerance())
 
     def tolerance(self, rounded_strains: float = ROUNDED_STRAINS) -> float:
-        """In the unit of force: relative to the nodal forces, not below the rounding of forces that cancel there.
-
-        Stresses are rounded, and so are displacements: over a thin element that is a strain of eps |u|/h.
-        """
+        """In the unit of force: relative to the nodal forces, not below the rounding of forces that cancel there."""
+        # Stresses are rounded, and so are displacements: over a thin element that is a strain of eps |u|/h.
         relative = self.settings.relative_tolerance * self.force_scale
         area = FORCE_ROUNDINGS * self._area + rounded_strains * self.displacement * self._area_of_gradients
         return self.settings.absolute_tolerance + max(relative, self._stress_rounding * area)
@@ -124,16 +101,7 @@ NEAR_LIMIT, RESERVE = 0.95, 0.3  # a Newton step that ends above this r/L keeps 
 
 
 class Limits:
-    """How far from their limits r < L and J > 0 the states of one solve are; each is evaluated once.
-
-    Parameters
-    ----------
-    equilibrium
-        Whose states they are.
-    bounded
-        Whether a bound may stand for a look: |dF| <= G max |du|, |dr| <= |l| |dF|, and J > 0 while |dF| < 2 J / (F:F).
-        It needs displacements for unknowns, and J at the quadrature points alone.
-    """
+    """How far from their limits r < L and J > 0 the states of one solve are; each is evaluated once."""
 
     def __init__(self, equilibrium: Equilibrium, bounded: bool):
         self.equilibrium, state = equilibrium, equilibrium.state
@@ -167,13 +135,7 @@ class Limits:
         return not self.equilibrium.turns_inside_out(before.states, after.states)
 
     def certainly_allow(self, largest_displacement: float) -> bool:
-        """Whether a further step is admissible by the bound, without a look at its end; it then counts as made.
-
-        Parameters
-        ----------
-        largest_displacement
-            Bound of the change of a node's displacement, over all ranks.
-        """
+        """Whether a further step is admissible by the bound, without a look at its end; it then counts as made."""
         further = self._travelled + self._gain * largest_displacement
         if not further < self._room:
             return False
@@ -236,19 +198,7 @@ class Counted:
 
 @dataclass
 class Solution(Counted):
-    """A solve that has ended well.
-
-    Attributes
-    ----------
-    newton_iterations, linear_iterations, tangents
-        Its work.
-    residual
-        Norm of the out-of-balance nodal forces that was accepted.
-    extension
-        How far the solution is from the limits r < L and J > 0.
-    reach
-        Distance of the solution from the origin over that of the first iterate; 0 where it is too short to matter.
-    """
+    """A solve that has ended well."""
 
     newton_iterations: int
     linear_iterations: int
@@ -259,23 +209,12 @@ class Solution(Counted):
 
     @property
     def is_far(self) -> bool:
-        """Whether it may lie on another branch: much farther than the tangent at the start points, or much nearer after
-        many iterations, as from a start at which the tangent is almost singular."""
+        """Whether it may lie on another branch."""
         return self.reach > FAR or (0.0 < self.reach < NEAR and self.newton_iterations > MANY)
 
 
 class SolveFailure(Counted, RuntimeError):
-    """SNES did not find an admissible equilibrium; the unknowns before the call are restored.
-
-    Attributes
-    ----------
-    reason
-        In words.
-    extension
-        How far the state at which it stopped is from the limits.
-    residual_over_tolerance, relative_residual
-        Norm of the residual there over the tolerance, and over that of the nodal forces.
-    """
+    """SNES did not find an admissible equilibrium; the unknowns before the call are restored."""
 
     def __init__(
         self,
@@ -295,21 +234,7 @@ class SolveFailure(Counted, RuntimeError):
 
 @dataclass
 class _Solve:
-    """What is known within one solve.
-
-    Attributes
-    ----------
-    origin
-        Unknowns at which the way to the solution begins.
-    first_iterate
-        Its distance from the origin.
-    norm
-        Norm of the residual in the last iteration.
-    inadmissible
-        Whether the present state violates r < L or J > 0, or a signal has asked for the end.
-    bounded
-        Whether the present trial state is admissible by the bound of `Limits` alone.
-    """
+    """What is known within one solve."""
 
     origin: Array
     first_iterate: float | None = None
@@ -338,13 +263,7 @@ def failure_text(reason: int, iterations: int, extension: Extension) -> str:
 
 
 class LoadPhase:
-    """Tells whether the loads are held: those of this step are those of the step before.
-
-    Parameters
-    ----------
-    state
-        With the loads, and the number of the last accepted step.
-    """
+    """Tells whether the loads are held: those of this step are those of the step before."""
 
     def __init__(self, state: State):
         self._state, self._step = state, state.number
@@ -360,22 +279,7 @@ class LoadPhase:
 
 
 class GuardedNewton:
-    """Solves an equilibrium from the present unknowns; use `close` (or `with`) when it is needed no more.
-
-    Parameters
-    ----------
-    equilibrium
-        Residual, tangent and limits.
-    settings
-        Method, tolerances, limits and PETSc options.
-    robust
-        Let `lagged` keep no factor from solve to solve: for problems whose tangents change much.
-
-    Attributes
-    ----------
-    method
-        Name of the method, where the settings leave it open.
-    """
+    """Solves an equilibrium from the present unknowns; use `close` (or `with`) when it is needed no more."""
 
     def __init__(self, equilibrium: Equilibrium, settings: Solver, robust: bool = False):
         self.equilibrium, self.settings, self._robust = equilibrium, settings, robust
@@ -451,21 +355,7 @@ class GuardedNewton:
         self.close()
 
     def solve(self, origin: Array | None = None) -> Solution:
-        """Solve from the present unknowns; on success they are the solution.
-
-        Parameters
-        ----------
-        origin
-            Unknowns at which the way to it begins, where the present ones are only what is expected.
-
-        Raises
-        ------
-        SolveFailure
-            If SNES diverges or stops, or where it would stop at a state with r >= L or J <= 0. The unknowns are then
-            what they were before.
-        Interrupted
-            If a signal asked for the end; the unknowns are restored.
-        """
+        """Solve from the present unknowns; on success they are the solution."""
         self._suit_phase()
         try:
             return self._attempt(origin, self._linear.more_iterations)
@@ -489,13 +379,7 @@ class GuardedNewton:
         return False
 
     def may_start(self, last_extension: float) -> bool:
-        """Whether the present unknowns, from which `solve` is to start, are admissible and not too near to locking.
-
-        Parameters
-        ----------
-        last_extension
-            Largest r/L of the last solution.
-        """
+        """Whether the present unknowns, from which `solve` is to start, are admissible and not too near to locking."""
         self.limits.forget()
         extension = self.limits.look().extension
         self._start_is_known = extension.admissible and reserved(last_extension, extension.max_chain_extension)
@@ -544,15 +428,7 @@ class GuardedNewton:
         return float(np.sqrt(over_ranks(self.equilibrium.comm, float(change @ change), MPI.SUM)))
 
     def tangent_direction(self, set_fraction: Callable[[float], None], done: float, distance: float) -> Any:
-        """Change of the unknowns per fraction of a change of the problem, at a solved state; one linear solve.
-
-        Parameters
-        ----------
-        set_fraction, done
-            Applies a fraction of the change; the one that is solved. It is applied at the end.
-        distance
-            Fraction over which the residual's slope is taken.
-        """
+        """Change of the unknowns per fraction of a change of the problem, at a solved state; one linear solve."""
         self._pull(self._x)
         slope = self._x.duplicate()
         set_fraction(done + distance)
@@ -568,10 +444,8 @@ class GuardedNewton:
         return values
 
     def answer(self, equilibrium: Equilibrium, tangents: int) -> Any:
-        """Change of a solved state's unknowns with which the residual of `equilibrium` vanishes; one linear system.
-
-        `tangents` were assembled for that state: the last one counts, or where there is none a new one.
-        """
+        """Change of a solved state's unknowns with which the residual of `equilibrium` vanishes; one linear system."""
+        # `tangents` were assembled for that state: the last one counts, or where there is none a new one.
         self._pull(self._x)
         equilibrium.assemble_internal(self._residual)
         equilibrium.assemble_external(self._external)
@@ -621,10 +495,9 @@ class GuardedNewton:
             self._values[:] = local.array_r
 
     def _assemble_residual(self, snes: Any, x: Any, residual: Any) -> None:
-        """R = internal forces - loads, zero where displacements are prescribed and met.
-
-        Fills R with NaN where the state is not admissible: line searches that know NaN shorten their step, others stop.
-        """
+        """R = internal forces - loads, zero where displacements are prescribed and met."""
+        # Fills R with NaN where the state is not admissible: line searches that know NaN shorten their step, others
+        # stop.
         self._push(x)
         equilibrium, loading = self.equilibrium, self.equilibrium.state.loading
         equilibrium.assemble_internal(residual)
@@ -655,12 +528,10 @@ class GuardedNewton:
         self._linear.tangent(self._present.norm, self.convergence.goal())
 
     def _keep_admissible(self, x: Any, step: Any) -> bool:
-        """Halve the Newton step until r < L and J > 0 everywhere (trial: x - step). True when it changed the step.
-
-        J > 0 all the way there: a step that turns two axes of an element has J > 0 at its end again.
-        Near L each point also keeps a share of its 1 - r/L: from a point much too near, where forces are huge, Newton's
-        method comes back only by a factor of 1.5 an iteration.
-        """
+        """Halve the Newton step until r < L and J > 0 everywhere (trial: x - step). True when it changed the step."""
+        # J > 0 all the way there: a step that turns two axes of an element has J > 0 at its end again. Near L each
+        # point also keeps a share of its 1 - r/L: from a point much too near, where forces are huge, Newton's method
+        # comes back only by a factor of 1.5 an iteration.
         met, present = self.convergence.prescribed_gap <= PRESCRIBED_ROUNDING, self._present
         improved = self._linear.improve(x, self._snes.getFunction()[0], step, met)
         if present.first_iterate is None:

@@ -24,10 +24,7 @@ from remodel_fenicsx.state.unit_cells import CellField, UnitCells
 
 @dataclass(frozen=True)
 class Snapshot:
-    """Values of a state: arrays by the names of its functions, loads, time, number of steps, further numbers.
-
-    `others` are those of further load cases.
-    """
+    """Values of a state: arrays by the names of its functions, loads, time, number of steps, further numbers."""
 
     arrays: dict[str, NDArray[np.float64]]
     loads: dict[str, float]
@@ -258,17 +255,7 @@ Array = NDArray[np.float64]
 
 
 class Numbers:
-    """Numbers of the state under a name of their own: transactions restore them, checkpoints hold them.
-
-    Parameters
-    ----------
-    state
-        Whose `numbers` they are.
-    name
-        What all their keys begin with.
-    initial
-        Names of the numbers, and what they are at the start.
-    """
+    """Numbers of the state under a name of their own: transactions restore them, checkpoints hold them."""
 
     def __init__(self, state: State, name: str, initial: Mapping[str, float]):
         self.state, self.name, self.initial = state, name, dict(initial)
@@ -288,15 +275,7 @@ class Numbers:
 
 
 class Occasions:
-    """When it is time to look again at what changes with the loads, and slowly without.
-
-    Parameters
-    ----------
-    state
-        Whose loads they are.
-    name
-        Of whoever looks.
-    """
+    """When it is time to look again at what changes with the loads, and slowly without."""
 
     STEPS = 10  # of unchanged loads, after which one looks all the same: cells remodel
 
@@ -319,19 +298,7 @@ class Occasions:
 
 
 class Earlier:
-    """The last values of a field, as functions of the state.
-
-    Parameters
-    ----------
-    state
-        Which has them from now on.
-    name
-        What the names of the functions begin with.
-    make
-        Makes a dolfinx function.
-    count
-        How many values are kept.
-    """
+    """The last values of a field, as functions of the state."""
 
     def __init__(self, state: State, name: str, make: Callable[[], Any], count: int):
         self._functions = []
@@ -377,13 +344,7 @@ class Earlier:
 
 
 def on_mesh(tissue: Tissue, mesh: Any) -> Tissue:
-    """The tissue with Constants in place of numbers, so that other numbers compile nothing.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If a parameter is neither a number, nor a Constant, nor a DG0 Function of the mesh.
-    """
+    """The tissue with Constants in place of numbers, so that other numbers compile nothing."""
     return tissue.map(lambda name, value: value if name in TURNED_OVER else assembly.coefficient(mesh, name, value))
 
 
@@ -393,15 +354,7 @@ def at_points(tissue: Tissue, quadrature: Quadrature) -> Tissue:
 
 
 def stress_rounding(numbers: Tissue, max_chain_extension: float) -> float:
-    """Rounding error of a stress in a body, from the stiffness of matrix and network at the largest r/L.
-
-    Parameters
-    ----------
-    numbers
-        The largest value of each parameter (`Parameters.largest`).
-    max_chain_extension
-        r/L.
-    """
+    """Rounding error of a stress in a body, from the stiffness of matrix and network at the largest r/L."""
     length = numbers.end_to_end_length
     if numbers.locking_length is not None:
         length = max(length, max_chain_extension * numbers.locking_length)
@@ -418,15 +371,7 @@ def by_region(domain: Domain, values: Mapping[str, float]) -> Any:
 
 
 class Parameters:
-    """What the live parameters of a tissue are at present.
-
-    Parameters
-    ----------
-    tissue
-        On the mesh: each parameter is a Constant or a DG0 Function (`on_mesh`).
-    quadrature
-        The points.
-    """
+    """What the live parameters of a tissue are at present."""
 
     def __init__(self, tissue: Tissue, quadrature: Quadrature):
         self.tissue, self.quadrature = tissue, quadrature

@@ -33,23 +33,7 @@ PANELS = 6
 
 @dataclass(frozen=True)
 class Ensemble:
-    """Columns of the history over the seeds.
-
-    Attributes
-    ----------
-    time
-        (rows,).
-    columns
-        Values by name, (seeds, rows).
-    isotropic
-        The same of the model with isotropic cells, (rows,); empty if it has failed.
-    failed
-        Last words of runs that have failed, by name.
-    extremes
-        Columns of a largest or smallest value: isotropic cells, the same everywhere, have no such values to compare.
-    note
-        What the deviations are not, of a kinematics that is right for means alone.
-    """
+    """Columns of the history over the seeds."""
 
     time: Array
     columns: dict[str, Array]
@@ -88,13 +72,7 @@ class Ensemble:
 
 
 def members_of(scene: Scene, folder: Path, seeds: int) -> list[Run]:
-    """A run for each seed from the scene's own on, and one with isotropic cells.
-
-    Raises
-    ------
-    SceneError
-        If the scene has no random cells.
-    """
+    """A run for each seed from the scene's own on, and one with isotropic cells."""
     if not scene.has_random_cells:
         raise SceneError(f"cells.initial = {scene.cells.initial!r}: an ensemble needs 'random' cells")
     if scene.time.tolerance is not None and not scene.time.is_equilibrium:
@@ -113,37 +91,7 @@ def members_of(scene: Scene, folder: Path, seeds: int) -> list[Run]:
 def ensemble(
     scene: Scene, folder: Path | str | None = None, seeds: int = 32, jobs: int | None = None, quiet: bool = True
 ) -> tuple[Path, Ensemble]:
-    """Run a scene with many seeds, and with isotropic cells.
-
-    Parameters
-    ----------
-    scene
-        With random cells.
-    folder
-        Default: results/NAME-ensemble. What is recorded there of the same scene is not run again; runs that have
-        stopped go on.
-    seeds
-        At least 2: the scene's own seed and those after it.
-    jobs
-        Runs at a time; default: the number of cores.
-    quiet
-        No progress.
-
-    Returns
-    -------
-    The folder with ensemble.csv, ensemble.png and the runs; and what they hold.
-
-    Raises
-    ------
-    SceneError
-        If the scene has no random cells, or if a folder holds another one.
-    TooFewRuns
-        If fewer than two seeds reach the end.
-    Interrupted
-        If a signal asked for the end, SIGUSR1 after the steps under way; the same call goes on from there.
-    OSError
-        If a file cannot be written.
-    """
+    """Run a scene with many seeds, and with isotropic cells."""
     place = Path(folder or Path("results") / f"{scene.name}-{NAME}")
     members = members_of(scene, place, seeds)
     checked = partial(write_study, place, NAME, scene.name, members)
@@ -155,13 +103,7 @@ def ensemble(
 
 
 def gathered(members: list[Run], failed: dict[str, str]) -> Ensemble:
-    """The histories of all that have not failed.
-
-    Raises
-    ------
-    TooFewRuns
-        If fewer than two seeds have reached the end.
-    """
+    """The histories of all that have not failed."""
     histories = {member.name: member.history() for member in members if member.name not in failed}
     isotropic = dict(histories.pop(ISOTROPIC, {}))
     if len(histories) < FEWEST_RUNS:

@@ -50,17 +50,7 @@ STATE_CHANGE = 1e-5  # of logarithms, for columns of a state: central difference
 
 
 class Slopes(NamedTuple):
-    """Derivatives of the numbers of a scene by the logarithms of k unknowns.
-
-    Attributes
-    ----------
-    tissue, loads, scales
-        By name of a parameter, a load (its `value`) and a scaled column, (k,).
-    kappa
-        (k,).
-    exact
-        Which unknowns change these numbers and nothing else, (k,).
-    """
+    """Derivatives of the numbers of a scene by the logarithms of k unknowns."""
 
     tissue: Mapping[str, Array]
     loads: Mapping[str, Array]
@@ -99,17 +89,7 @@ def without_derivatives(scene: Scene, table: Measured) -> str | None:
 
 # ---------------------------------------------------------------- numbers of a scene
 def slopes(at: Callable[[Array], Scene], logarithms: Array, scales: Mapping[str, tuple[int, float]]) -> Slopes:
-    """Derivatives of a scene's numbers.
-
-    Parameters
-    ----------
-    at
-        The scene with unknowns that have these logarithms.
-    logarithms
-        Of the k unknowns.
-    scales
-        Number among the unknowns and present value of each scale, by column.
-    """
+    """Derivatives of a scene's numbers."""
     count, base = len(logarithms), at(logarithms)
     is_scale = {number for number, _ in scales.values()}
     tissue = {name: np.zeros(count) for name in OF_TISSUE}
@@ -148,20 +128,7 @@ def _apart_from_numbers(scene: Scene) -> Any:
 
 # ---------------------------------------------------------------- tables
 def model_of(scene: Scene, table: Measured, scales: Mapping[str, float], ways: Slopes | None = None) -> Modelled:
-    """What a scene says where a table has measurements, by column.
-
-    Parameters
-    ----------
-    scene, table, scales
-        Scene, table, and factors on columns of loads.
-    ways
-        With them the derivatives too; not where `without_derivatives` has a word.
-
-    Raises
-    ------
-    StepFailure
-        If a state has no equilibrium.
-    """
+    """What a scene says where a table has measurements, by column."""
     scene = _with_columns(scene, table)
     if table.state == "history":
         measured = table.columns["time"]
@@ -229,19 +196,7 @@ def _passive_loads(scene: Scene, table: Measured, ways: Slopes | None) -> Loads 
 
 # ---------------------------------------------------------------- runs
 class _Run:
-    """A run whose measured columns are kept.
-
-    Parameters
-    ----------
-    scene, table
-        What is run, and whose columns.
-    ways
-        With them: derivatives.
-    loads
-        Those of the loads, where they are not those of the scene's ramps.
-    cells, dimensions
-        To begin with: values of cells, and dl (k, elements, points, 3).
-    """
+    """A run whose measured columns are kept."""
 
     def __init__(
         self,
@@ -282,19 +237,7 @@ class _Run:
 
 
 class RowChanges(Watcher):
-    """Derivatives of measured columns: of the state as the coupling has them, of the columns by central differences.
-
-    Parameters
-    ----------
-    simulation
-        Its coupling carries derivatives.
-    directions
-        What changes.
-    table
-        Whose columns.
-    wanted
-        At which times; elsewhere they are zero.
-    """
+    """Derivatives of measured columns: of the state as the coupling has them, of the columns by central differences."""
 
     def __init__(
         self, simulation: Simulation, directions: Directions, table: Measured, wanted: Callable[[float], bool]
@@ -387,17 +330,7 @@ KNOWN_GROUPS: list[tuple[set[str], str]] = [
 
 @dataclass(frozen=True)
 class LikelihoodProfile:
-    """Smallest sums of squares with one unknown held.
-
-    Attributes
-    ----------
-    values
-        Of the unknown, ascending, (n,).
-    increases
-        Of the sum of squares above the minimum, (n,).
-    lower, upper
-        Where the increase is that of a 95 % band, 3.84; NaN where it is not reached in `PROFILE_REACH`.
-    """
+    """Smallest sums of squares with one unknown held."""
 
     values: Array
     increases: Array
@@ -407,29 +340,7 @@ class LikelihoodProfile:
 
 @dataclass(frozen=True)
 class Fit:
-    """What a fit has found.
-
-    Attributes
-    ----------
-    unknowns
-        As they were asked for.
-    values, lower, upper
-        Fitted numbers and their 95 % bands, (unknowns,).
-    correlations
-        Of the logarithms, (unknowns, unknowns).
-    misfit
-        Root mean square of the residuals over their standard deviations: about one where model and bands are right.
-    minima
-        Sum of squares that each start has reached.
-    evaluations
-        How often the solver asked for residuals, by start; derivatives not counted.
-    modelled
-        Columns of each table at the fit.
-    scene
-        With the fitted numbers.
-    profiles
-        By key of each unknown whose correlation with another one is above `CORRELATED`.
-    """
+    """What a fit has found."""
 
     unknowns: list[Unknown]
     values: Array
@@ -446,15 +357,7 @@ class Fit:
 
 # ---------------------------------------------------------------- least squares
 class Problem:
-    """Residuals over their standard deviations as a function of the logarithms of the unknowns.
-
-    Attributes
-    ----------
-    exact
-        Which unknowns have derivatives of the model, (k,); those of the others are differences of runs.
-    reason
-        Why there are others.
-    """
+    """Residuals over their standard deviations as a function of the logarithms of the unknowns."""
 
     def __init__(self, scene: Scene, unknowns: Sequence[Unknown], tables: Sequence[Measured]):
         self.scene, self.unknowns, self.tables = scene, list(unknowns), list(tables)
@@ -499,13 +402,7 @@ class Problem:
         return slopes(self.scene_of, logarithms, scales)
 
     def models(self, logarithms: Array, derivatives: bool = False) -> list[Modelled]:
-        """What the model says of each table, with derivatives on request.
-
-        Raises
-        ------
-        StepFailure
-            If a state has no equilibrium.
-        """
+        """What the model says of each table, with derivatives on request."""
         scene, scales = self.scene_of(logarithms), self.scales_of(logarithms)
         ways = self._slopes(logarithms) if derivatives else None
         return [model_of(scene, table, scales, ways) for table in self.tables]
@@ -559,13 +456,7 @@ class Problem:
         return found
 
     def check_tells_apart(self, jacobian: Array) -> None:
-        """Refuse unknowns of which the data say nothing.
-
-        Raises
-        ------
-        SceneError
-            One line that names them.
-        """
+        """Refuse unknowns of which the data say nothing."""
         _, singular, directions = np.linalg.svd(jacobian, full_matrices=False)
         if singular[-1] > (BLIND_EXACT if self.exact.all() else BLIND) * singular[0]:
             return
@@ -593,38 +484,7 @@ def fit(
     quiet: bool = True,
     profiles: bool = True,
 ) -> tuple[Path, Fit]:
-    """Fit numbers of a scene to measurements.
-
-    Parameters
-    ----------
-    scene
-        All that is not fitted.
-    data
-        A TOML file with `[unknowns]` and `[[measured]]` (docs/fit.md).
-    folder
-        New or empty, or that of the same fit, which goes on; default: results/NAME-fit, numbered when taken.
-    starts
-        How many: the given one, and others at random within a factor of two.
-    quiet
-        No progress.
-    profiles
-        Whether unknowns that go together have profiles.
-
-    Returns
-    -------
-    The folder with fit.csv, correlations.csv, scene.toml, fit.png, fit.html and fit.log; and what they hold.
-
-    Raises
-    ------
-    SceneError
-        If a key, a unit or a number is not allowed, or if the data cannot tell the unknowns apart.
-    StepFailure
-        If the scene has no equilibrium where the fit starts.
-    FolderTaken
-        If the folder is not empty.
-    OSError
-        If a file cannot be written.
-    """
+    """Fit numbers of a scene to measurements."""
     if scene.cases:
         raise SceneError("cases: a fit takes one load case; leave out [[cases]]")
     with hold_log(quiet=quiet) as held:
@@ -689,19 +549,7 @@ def minimised(
     held: int | None = None,
     enough: float = ENOUGH,
 ) -> Any:
-    """SciPy's least squares from a start, logarithms; `said` gets each misfit.
-
-    Parameters
-    ----------
-    held
-        Number of an unknown that stays at its start.
-    enough
-        Relative change of the sum of squares, or of the unknowns, at which it ends.
-
-    Returns
-    -------
-    SciPy's result; its `x` are the unknowns that are not held.
-    """
+    """SciPy's least squares from a start, logarithms; `said` gets each misfit."""
     from scipy.optimize import least_squares
 
     free = np.array([number != held for number in range(len(start))])
@@ -730,13 +578,7 @@ def minimised(
 
 
 def profile(problem: Problem, best: Array, covariance: Array, number: int) -> LikelihoodProfile:
-    """Of an unknown, from the minimum outwards until the band ends: the others are fitted again at each value.
-
-    Parameters
-    ----------
-    best, covariance
-        Of the logarithms, at the minimum.
-    """
+    """Of an unknown, from the minimum outwards until the band ends: the others are fitted again at each value."""
     least, deviation = float(np.sum(problem.residuals(best) ** 2)), float(np.sqrt(covariance[number, number]))
     unknown, points, ends = problem.unknowns[number], [(float(best[number]), 0.0)], []
     for side in (-1.0, 1.0):
@@ -761,13 +603,7 @@ def profile(problem: Problem, best: Array, covariance: Array, number: int) -> Li
 
 
 def result_of(problem: Problem, found: Sequence[Any]) -> Fit:
-    """The best of several minima, with bands.
-
-    Raises
-    ------
-    SceneError
-        If the data cannot tell the unknowns apart there.
-    """
+    """The best of several minima, with bands."""
     logarithms: Array = min(found, key=lambda one: float(one.cost)).x
     jacobian = problem.jacobian(logarithms, central=True)
     problem.check_tells_apart(jacobian)

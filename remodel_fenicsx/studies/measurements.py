@@ -35,17 +35,7 @@ FROM_EDGE = 5e-4  # of a logarithm, from the end of a key's range: derivatives l
 
 @dataclass(frozen=True)
 class Unknown:
-    """A number that is fitted, in logarithms.
-
-    Attributes
-    ----------
-    key
-        Dotted key of the scene, or `scale.NAME`.
-    start, lower, upper
-        Positive, lower <= start <= upper.
-    prior, prior_sd
-        What is known of it before, and the standard deviation of its logarithm; None: nothing.
-    """
+    """A number that is fitted, in logarithms."""
 
     key: str
     start: float
@@ -57,25 +47,7 @@ class Unknown:
 
 @dataclass(frozen=True)
 class Measured:
-    """A table of measurements in the scene's units.
-
-    Attributes
-    ----------
-    name
-        Of its file.
-    state
-        One of `STATES`.
-    time
-        Until when the tissue has remodeled before a passive test ("after").
-    columns
-        Loads, `time` and columns of the history by name, (rows,).
-    loads
-        Names of the columns that are loads.
-    sd
-        Standard deviation by measured column.
-    scaled
-        Columns with a factor that is fitted too.
-    """
+    """A table of measurements in the scene's units."""
 
     name: str
     state: str
@@ -92,13 +64,7 @@ class Measured:
 
 
 def read_measurements(path: Path, scene: Scene) -> tuple[list[Unknown], list[Measured]]:
-    """Unknowns and tables of DATA.toml, checked against a scene.
-
-    Raises
-    ------
-    SceneError
-        One line: key, value and what is allowed.
-    """
+    """Unknowns and tables of DATA.toml, checked against a scene."""
     values = read_toml(path)
     _only(values, ("unknowns", "measured"), "")
     tables = values.get("measured")

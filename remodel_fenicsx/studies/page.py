@@ -58,19 +58,7 @@ class FigureError(ValueError):
 
 
 class Page:
-    """Collects the picture and the tables of one figure, and writes them.
-
-    Parameters
-    ----------
-    folder
-        Where they go.
-    name
-        Name of the figure: NAME.png, NAME.csv, NAME-PART.csv, and NAME.json with what is to be said of the tables.
-    title, caption
-        What the figure is, and what is to be known to read it: in the file of the picture, not in the picture.
-    colours
-        Colours (n, 3) in 0..1 that the picture must show as they are.
-    """
+    """Collects the picture and the tables of one figure, and writes them."""
 
     def __init__(
         self,
@@ -186,17 +174,7 @@ def _left_end(axes: Axes) -> float:
 
 
 class Palette:
-    """256 colours, with which a picture is a quarter as large: some as they are, the rest chosen for a picture.
-
-    Pillow alone takes neighbours on the scale for one colour, and looks for the nearest colour only roughly.
-
-    Parameters
-    ----------
-    picture
-        For which colours are chosen.
-    colours
-        Those that are kept, (n, 3) in 0..1.
-    """
+    """256 colours, with which a picture is a quarter as large: some as they are, the rest chosen for a picture."""
 
     def __init__(self, picture: Image.Image, colours: NDArray[np.float64]):
         kept = np.rint(255 * colours).astype(np.uint8)

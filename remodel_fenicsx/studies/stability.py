@@ -39,33 +39,7 @@ def stability(
     comm: MPI.Intracomm = MPI.COMM_WORLD,
     quiet: bool = True,
 ) -> tuple[Path, Table, str]:
-    """Run a scene and analyse the stability of its passes on the way.
-
-    Parameters
-    ----------
-    scene
-        The validated scene.
-    folder
-        New or empty folder; default: results/NAME-stability, numbered when taken.
-    number
-        How many times of the run are analysed, spread evenly, the last one among them.
-    comm
-        MPI communicator.
-    quiet
-        No progress on the terminal.
-
-    Returns
-    -------
-    The folder with stability.csv, stability.png, history.csv, scene.toml and run.log; the columns of stability.csv; and
-    what the kinematics cannot see, in a sentence, nothing where it sees all.
-
-    Raises
-    ------
-    SceneError
-        If nothing remodels.
-    FolderTaken, StepFailure, Interrupted, OSError
-        As `running.run` does.
-    """
+    """Run a scene and analyse the stability of its passes on the way."""
     if not LAWS[scene.remodeling.law].remodels:
         raise SceneError(f"remodeling.law = {scene.remodeling.law!r}: nothing remodels, so there is no pass to analyse")
     if scene.cases[1:]:

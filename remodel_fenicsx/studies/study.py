@@ -80,13 +80,7 @@ def fingerprint(scene: Scene, unknowns: Sequence[Unknown], tables: Sequence[Meas
 
 
 def fingerprint_in(folder: Path) -> str | None:
-    """That of the fit in a folder; None where there is none.
-
-    Raises
-    ------
-    ForeignFileError, OSError
-        If the journal cannot be read.
-    """
+    """That of the fit in a folder; None where there is none."""
     lines = _lines(folder / JOURNAL)
     return str(lines[0].get("fit")) if lines else None
 
@@ -105,20 +99,7 @@ def _lines(path: Path) -> list[dict[str, object]]:
 
 
 class Journal:
-    """The file, open for more.
-
-    Parameters
-    ----------
-    folder
-        Of the fit; made if it is not there.
-    mark
-        `fingerprint`.
-
-    Attributes
-    ----------
-    known
-        What it holds: evaluations by logarithms of the unknowns.
-    """
+    """The file, open for more."""
 
     def __init__(self, folder: Path, mark: str):
         folder.mkdir(parents=True, exist_ok=True)
@@ -150,13 +131,7 @@ FEWEST_RUNS = 2  # runs, or settings, without which nothing is compared
 
 
 class TooFewRuns(Exception):  # noqa: N818 - what is recorded is whole, and the same call goes on
-    """Fewer than `FEWEST_RUNS` have reached the end, so that there is no answer yet.
-
-    Attributes
-    ----------
-    failed
-        Last words of runs that have failed, by name; empty where the study was only stopped early.
-    """
+    """Fewer than `FEWEST_RUNS` have reached the end, so that there is no answer yet."""
 
     def __init__(self, reached: str, failed: Mapping[str, str], advice: str = "the same command goes on"):
         super().__init__(f"{reached}, at least {FEWEST_RUNS} are needed; all that is recorded is kept, {advice}")
@@ -165,17 +140,7 @@ class TooFewRuns(Exception):  # noqa: N818 - what is recorded is whole, and the 
 
 @dataclass(frozen=True)
 class Run:
-    """One of several runs.
-
-    Attributes
-    ----------
-    name
-        Unique among them; what is said of the run.
-    scene
-        What is run.
-    folder
-        Where its record is.
-    """
+    """One of several runs."""
 
     name: str
     scene: Scene
@@ -200,15 +165,7 @@ class Run:
         return self.folder.is_dir() and writer(self.folder)[1]
 
     def is_complete(self) -> bool:
-        """Whether this very scene is recorded to its end.
-
-        Raises
-        ------
-        SceneError
-            If the folder holds another scene.
-        RecordingError
-            If it is damaged, so that the run could not go on.
-        """
+        """Whether this very scene is recorded to its end."""
         if not (self.folder / SCENE).exists() or not (self.folder / HISTORY).exists():
             return False
         recording = RecordedRun(self.folder)
@@ -259,22 +216,7 @@ def _same(recording: RecordedRun, wanted: Scene) -> bool:
 
 
 def write_study(folder: Path, name: str, scene: str, runs: Sequence[Run]) -> None:
-    """Say in the folder of a study what it is: `remodel-fenicsx status` reads it.
-
-    Parameters
-    ----------
-    folder
-        Where all runs are; made if it is not there.
-    name, scene
-        Of the command, and of the user's scene.
-    runs
-        All of them.
-
-    Raises
-    ------
-    OSError
-        If it cannot be written.
-    """
+    """Say in the folder of a study what it is: `remodel-fenicsx status` reads it."""
     folder.mkdir(parents=True, exist_ok=True)
     text = json.dumps({"study": name, "scene": scene, "runs": [run.name for run in runs]}, indent=1)
     write_whole(folder / STUDY, (text + "\n").encode())
@@ -290,35 +232,7 @@ def run_all(
     ended: Callable[[], None] = lambda: None,
     checked: Callable[[], None] = lambda: None,
 ) -> dict[str, str]:
-    """Run what is not complete; returns the last words of those that have failed or are damaged, by name.
-
-    Parameters
-    ----------
-    runs
-        In the order in which they begin. One that another process has under way is waited for.
-    jobs
-        Runs at a time.
-    title, quiet
-        Of the line that shows the progress; no such line.
-    deadline
-        `time.monotonic` at which runs are stopped; what they have recorded stays.
-    fits
-        Asked before a run begins: whether it shall.
-    ended
-        Called when a run has ended. Where it raises, all others are stopped.
-    checked
-        Called before anything is written, when no folder holds another scene.
-
-    Raises
-    ------
-    SceneError
-        If a folder holds another scene.
-    Interrupted
-        If a signal asked for the end, SIGUSR1 after the steps under way: what is recorded stays, and the same call
-        goes on from there.
-    OSError
-        If a folder cannot be written.
-    """
+    """Run what is not complete; returns the last words of those that have failed or are damaged, by name."""
     executor = _Executor(runs, jobs, fits)
     checked()
     line, failed, pausing = Line(title), executor.failed, False
@@ -435,17 +349,7 @@ def _begin(worker: Worker, run: Run) -> None:
 
 
 def write_unloaded(scene: Scene, folder: Path) -> str:
-    """Write scene.toml of the unloaded body into a new folder, with unloaded.msh of an own one; say what was found.
-
-    Raises
-    ------
-    SceneError, NoUnloadedShape
-        As `unloaded`.
-    FileExistsError
-        If the folder is there.
-    OSError
-        If it cannot be written.
-    """
+    """Write scene.toml of the unloaded body into a new folder, with unloaded.msh of an own one; say what was found."""
     if folder.exists():
         raise FileExistsError(folder)
     with temporary_folder() as temporary:
@@ -477,28 +381,7 @@ def _in_words(scene: Scene, found: Scene) -> str:
 
 
 def write_axes(scene: Scene, path: Path, comm: MPI.Intracomm = MPI.COMM_WORLD) -> str:
-    """Write local axes, depth, station, thickness, and where the axes are undefined, by element. Collective.
-
-    Parameters
-    ----------
-    scene
-        Whose body it is; of a reduction the part that stands for it.
-    path
-        A new VTU file.
-    comm
-        Ranks that share the mesh.
-
-    Returns
-    -------
-    What was found, in words of one line.
-
-    Raises
-    ------
-    SceneError, GeometryError
-        If the body cannot be meshed or has no local axes.
-    FileExistsError
-        If the file is there.
-    """
+    """Write local axes, depth, station, thickness, and where the axes are undefined, by element. Collective."""
     scene = with_choices(scene)
     domain, shape = checked_domain(build(scene, comm), scene), scene.geometry
     mesh = domain.mesh

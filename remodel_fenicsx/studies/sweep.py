@@ -39,19 +39,7 @@ RANGE_RULE = "must be KEY=a:b with --latin, as in loads.pressure.value=2:6"
 
 @dataclass(frozen=True)
 class Sweep:
-    """Ends of the runs.
-
-    Attributes
-    ----------
-    values
-        Numbers of the scene by dotted key, (runs,).
-    columns
-        Last rows of the histories by name, (runs,); NaN where a run has failed.
-    names
-        Of the runs.
-    failed
-        Last words of runs that have failed, by name.
-    """
+    """Ends of the runs."""
 
     values: dict[str, Array]
     columns: dict[str, Array]
@@ -81,13 +69,7 @@ def _rounded(number: float) -> float:
 
 
 def read_axis(text: str, samples: int | None = None) -> tuple[str, list[Number]]:
-    """Key and numbers of "KEY=a:b:n" or "KEY=a,b,..."; of "KEY=a:b", with samples, the two ends.
-
-    Raises
-    ------
-    SceneError
-        If it is none of these.
-    """
+    """Key and numbers of "KEY=a:b:n" or "KEY=a,b,..."; of "KEY=a:b", with samples, the two ends."""
     key, equals, given = (part.strip() for part in text.partition("="))
     rule = RULE if samples is None else RANGE_RULE
     if not equals or not re.fullmatch(r"[\w-]+(\.[\w-]+)+", key):
@@ -130,15 +112,7 @@ def _spaced(text: str, given: list[Number]) -> list[Number]:
 def members_of(
     scene: Scene, points: Sequence[Mapping[str, Number]], folder: Path, sampled: bool = False
 ) -> tuple[list[str], list[Run], dict[str, str]]:
-    """Names of the points, runs, and why points that were drawn have none: nobody has typed their numbers.
-
-    A name has the numbers, so that a finer sweep uses what is there.
-
-    Raises
-    ------
-    SceneError
-        If a key is none of the scene, a number is not allowed, or there are too many or too few.
-    """
+    """Names of the points, runs, and why points that were drawn have none: nobody has typed their numbers."""
     if not FEWEST_RUNS <= len(points) <= MOST_RUNS:
         raise SceneError(f"sweep: {len(points)} runs; allowed are {FEWEST_RUNS} to {MOST_RUNS}")
     names, members, refused = [], [], {}
@@ -173,38 +147,7 @@ def sweep(
     quiet: bool = True,
     sampled: bool = False,
 ) -> tuple[Path, Sweep]:
-    """Run a scene with other numbers, several runs at a time.
-
-    Parameters
-    ----------
-    scene
-        The numbers that are not swept.
-    points
-        Numbers by dotted key, for each run: `grid` or `latin_hypercube` make them.
-    folder
-        Default: results/SWEEP-sweep. What is recorded there is not run again; runs that have stopped go on.
-    jobs
-        Runs at a time; default: the number of cores.
-    quiet
-        No progress.
-    sampled
-        Whether the points were drawn: those whose numbers are not allowed, or not together, count as failed.
-
-    Returns
-    -------
-    The folder with sweep.csv, sweep.png and the runs; and what they hold.
-
-    Raises
-    ------
-    SceneError
-        If a key or a number is not allowed, or if a folder holds another scene.
-    TooFewRuns
-        If fewer than two runs reach the end.
-    Interrupted
-        If a signal asked for the end, SIGUSR1 after the steps under way; the same call goes on from there.
-    OSError
-        If a file cannot be written.
-    """
+    """Run a scene with other numbers, several runs at a time."""
     place = Path(folder or Path("results") / f"{scene.name}-{SWEEP}")
     names, members, refused = members_of(scene, points, place, sampled)
     checked = partial(write_study, place, SWEEP, scene.name, members)
@@ -218,13 +161,7 @@ def sweep(
 def gathered(
     every: list[str], members: Sequence[Run], points: Sequence[Mapping[str, Number]], failed: dict[str, str]
 ) -> Sweep:
-    """The last rows of all that have not failed.
-
-    Raises
-    ------
-    TooFewRuns
-        If fewer than two have reached the end.
-    """
+    """The last rows of all that have not failed."""
     ends = {
         member.name: {name: float(values[-1]) for name, values in member.history().items()}
         for member in members

@@ -53,23 +53,7 @@ TIME, MESH, BOTH, KINEMATIC = "time", "mesh", "both", "kinematics"
 
 @dataclass(frozen=True)
 class Setting:
-    """One row of the table.
-
-    Attributes
-    ----------
-    name
-        Of its files.
-    factor
-        What it varies: TIME, MESH, BOTH or KINEMATIC.
-    changes
-        Values over the scene by dotted key.
-    scene
-        The user's scene with them.
-    seeds
-        Of its runs; one where cells are not random or are the same.
-    profile
-        Name of the profile that it is.
-    """
+    """One row of the table."""
 
     name: str
     factor: str
@@ -118,13 +102,7 @@ class Setting:
 
 
 def ladder(scene: Scene) -> list[Setting]:
-    """All settings that the scene allows, each once: sweeps of one factor from the cheapest kinematics, then both.
-
-    Raises
-    ------
-    SceneError
-        If steps of the scene's own length do not hit its corners and its end: with a tolerance they need not.
-    """
+    """All settings that the scene allows, each once: sweeps of one factor from the cheapest kinematics, then both."""
     solved = choice(scene).name
     # without its profile, which would choose the steps of every row; what the profile has set stays
     base = scene.with_values({"model.kinematics": _cheapest(scene), "time.tolerance": None, "profile": None})
@@ -244,17 +222,7 @@ ALIGNED = 0.5  # cosine of the angle between two differences, as vectors, that s
 # ---------------------------------------------------------------- an order, and what is left with it
 @dataclass(frozen=True)
 class SweepLimit:
-    """What a sweep of one factor tends to.
-
-    Attributes
-    ----------
-    beyond
-        What is left from its finest member to the limit; zero where no order shows.
-    order
-        Power of the step or of the size of the elements; NaN where none shows.
-    last
-        Difference of the finest two.
-    """
+    """What a sweep of one factor tends to."""
 
     beyond: Array
     order: float
@@ -267,11 +235,7 @@ class SweepLimit:
 
 
 def limit(results: Sequence[Array]) -> SweepLimit:
-    """The limit of results of settings that are each half of the one before, the finest last.
-
-    Differences d of results Q fall by a ratio q = 2^p from halving to halving; what is left is d / (q - 1). An order
-    shows where the differences shrink along one way: by a ratio in RATIOS, ALIGNED.
-    """
+    """The limit of results of settings that are each half of the one before, the finest last."""
     if len(results) < 3:
         last = results[-1] - results[-2] if len(results) == 2 else np.full_like(results[-1], np.nan)
         return SweepLimit(np.zeros_like(results[-1]), np.nan, last)
@@ -303,25 +267,7 @@ def pareto(costs: Sequence[float], errors: Sequence[float]) -> list[bool]:
 # ---------------------------------------------------------------- the table
 @dataclass(frozen=True)
 class Result:
-    """What a setting gives: means over its seeds.
-
-    Attributes
-    ----------
-    setting
-        Which.
-    angles
-        Fibre angles through the body at the times that are compared, (times, places), degrees.
-    lengths
-        Radii or stretch there, (times, columns).
-    seconds
-        Of the processor in the steps of one run.
-    wall_seconds
-        That have passed in them.
-    noise
-        Standard error of the mean of the angles over the seeds, root mean square; 0 of one seed.
-    single
-        Angles and lengths of the first seed alone.
-    """
+    """What a setting gives: means over its seeds."""
 
     setting: Setting
     angles: Array
@@ -334,21 +280,7 @@ class Result:
 
 @dataclass(frozen=True)
 class Row:
-    """A row of the table.
-
-    Attributes
-    ----------
-    result
-        The setting and what it gives.
-    angle_error
-        Estimated error of the fibre angle, degrees, root mean square over places and times.
-    length_error
-        The same of radii or stretch: the largest relative one.
-    on_front
-        Whether no other row is as good for less.
-    doubt
-        Why the estimate is not to be trusted; empty where it is.
-    """
+    """A row of the table."""
 
     result: Result
     angle_error: float
@@ -359,19 +291,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Trade:
-    """The table, and what it rests on.
-
-    Attributes
-    ----------
-    rows
-        The cheapest first.
-    notes
-        Sentences on what was seen: orders, doubts.
-    left_out
-        Names of settings that the budget was too small for.
-    failed
-        Last words of runs that failed, by name.
-    """
+    """The table, and what it rests on."""
 
     rows: list[Row]
     notes: list[str]
@@ -381,19 +301,7 @@ class Trade:
 
 @dataclass(frozen=True)
 class _Guess:
-    """Of the exact result: what settings of one coupling tend to.
-
-    Attributes
-    ----------
-    angles, lengths
-        As in `Result`.
-    unknown
-        Degrees that stay unknown where a sweep shows no order; infinite where a factor was not varied.
-    beyond
-        Degrees from the finest setting to it.
-    notes
-        What it rests on.
-    """
+    """Of the exact result: what settings of one coupling tend to."""
 
     angles: Array
     lengths: Array
@@ -403,11 +311,7 @@ class _Guess:
 
 
 def estimated(results: Sequence[Result]) -> tuple[list[Row], list[str]]:
-    """Rows with errors against the best guess of the exact result, and what it rests on.
-
-    Settings of each coupling make a guess; the best one has the least before it, and the least unknown. What is not
-    known of it, where a sweep shows no order, counts as an error too.
-    """
+    """Rows with errors against the best guess of the exact result, and what it rests on."""
     notes = _about_steps_on_the_same_cells(results)
     results = _on_the_mean(results)
     fixed = [result for result in results if result.setting.step is not None]
@@ -606,37 +510,7 @@ def trade(
     jobs: int | None = None,
     say: Callable[[str], None] | None = None,
 ) -> tuple[Path, Trade]:
-    """Run a scene with a ladder of settings, and estimate the error of each.
-
-    Parameters
-    ----------
-    scene
-        The user's.
-    folder
-        Default: results/NAME-trade. What is recorded there of the same scene is not run again; runs that were stopped
-        go on.
-    budget
-        Wall time in seconds for the runs of this call: cheap ones first; what would take longer is left out.
-    jobs
-        Runs at a time; default: the number of cores.
-    say
-        Takes a line whenever a setting is done.
-
-    Returns
-    -------
-    The folder with trade.csv, trade.png, a scene of each row in rows/, and the runs; and the table.
-
-    Raises
-    ------
-    SceneError
-        If a folder holds another scene.
-    TooFewRuns
-        If fewer than two settings reach the end; it says what a budget for two would be.
-    Interrupted
-        If a signal asked for the end, SIGUSR1 after the steps under way: the same call goes on from there.
-    OSError
-        If a file cannot be written.
-    """
+    """Run a scene with a ladder of settings, and estimate the error of each."""
     place = Path(folder or Path("results") / f"{scene.name}-{TRADE}")
     settings = ladder(scene)
     times = compared_times(scene, settings)
@@ -834,10 +708,7 @@ def _scene_file(row: Row) -> str:
 
 
 def picture(rows: list[Row]) -> Figure:
-    """Cost against error; points of the front have numbers, and beside the axes stands what they are.
-
-    Of points that would cover each other the cheapest has one.
-    """
+    """Cost against error; points of the front have numbers, and beside the axes stands what they are."""
     shown = [row for row in rows if row.angle_error > 0]
     kinds = dict(zip(dict.fromkeys(row.result.setting.way for row in shown), COLOURS, strict=False))
     figure = Figure(figsize=(7.2, 4.2), layout="constrained")

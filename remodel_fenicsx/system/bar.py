@@ -16,15 +16,7 @@ _MARGIN = 3
 
 
 class Bar(RichProgress):
-    """A bar on stderr. What others print stands above it; what goes to a file stays there.
-
-    Parameters
-    ----------
-    title
-        Name of the run.
-    total, done
-        Number of the last step, and how many were done before.
-    """
+    """A bar on stderr. What others print stands above it; what goes to a file stays there."""
 
     def __init__(self, title: str, total: int, done: float):
         self._stderr = Console(stderr=True)

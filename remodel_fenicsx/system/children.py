@@ -21,11 +21,7 @@ SERVE = "serve"  # the command of a worker's process
 
 
 class Worker:
-    """A process that does commands one after the other: what it has imported and compiled serves all of them.
-
-    It ends with the process that has started it, even if that is killed (with setpriv). One thread, as there are jobs
-    for the cores.
-    """
+    """A process that does commands one after the other: what it has imported and compiled serves all of them."""
 
     def __init__(self) -> None:
         pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True, "bufsize": 1}
@@ -34,13 +30,7 @@ class Worker:
         self.is_at_work = False
 
     def begin(self, arguments: Sequence[str], messages: Path) -> None:
-        """Begin a command, with a file for all that it says.
-
-        Raises
-        ------
-        OSError
-            If the file cannot be written.
-        """
+        """Begin a command, with a file for all that it says."""
         _emptied(messages).close()
         self.messages, self.is_at_work = messages, True
         assert self.process.stdin is not None
@@ -84,13 +74,7 @@ def wait_for_one(workers: Collection[Worker], seconds: float) -> bool:
 
 
 def serve(command: Callable[[Sequence[str]], int]) -> int:
-    """Do what a `Worker` asks for until it asks no more: the other end of its pipes.
-
-    Parameters
-    ----------
-    command
-        What does the words of a command line; returns the exit code.
-    """
+    """Do what a `Worker` asks for until it asks no more: the other end of its pipes."""
     with os.fdopen(os.dup(1), "w") as answers:
         for line in sys.stdin:
             words, messages = json.loads(line)

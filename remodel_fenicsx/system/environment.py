@@ -42,13 +42,7 @@ def versions() -> dict[str, str]:
 
 
 def kernels() -> str:
-    """What computes at the points: "C", or "numpy" where REMODEL_FENICSX_KERNELS says so.
-
-    Raises
-    ------
-    ValueError
-        If it says anything else.
-    """
+    """What computes at the points: "C", or "numpy" where REMODEL_FENICSX_KERNELS says so."""
     name = os.environ.get(KERNELS, "C")
     if name not in ("C", "numpy"):
         raise ValueError(f"{KERNELS} = {name!r}: allowed are 'C' and 'numpy'")

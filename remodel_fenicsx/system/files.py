@@ -40,22 +40,7 @@ def refusal_in_words(error: OSError) -> str:
 
 
 def read_regular(path: Path, most: int) -> bytes:
-    """All of a regular file; links to one are followed.
-
-    Parameters
-    ----------
-    path
-        The file.
-    most
-        Bytes that it may have.
-
-    Raises
-    ------
-    OSError
-        If it cannot be read.
-    ForeignFileError
-        If it is no regular file, or larger.
-    """
+    """All of a regular file; links to one are followed."""
     descriptor = _opened(path, os.O_RDONLY)
     try:
         size = _check_regular(descriptor, path).st_size
@@ -76,22 +61,7 @@ def check_regular(path: Path) -> None:
 
 
 def open_own(path: Path, flags: int) -> int:
-    """Descriptor of a file that is written in place: a regular one of this name alone.
-
-    Parameters
-    ----------
-    path
-        The file.
-    flags
-        As of `os.open`; what is made is readable by all that the user's mask allows.
-
-    Raises
-    ------
-    OSError
-        If it cannot be opened.
-    ForeignFileError
-        If it is no regular file, is a link, or has other names.
-    """
+    """Descriptor of a file that is written in place: a regular one of this name alone."""
     descriptor = _opened(path, flags | os.O_NOFOLLOW)
     try:
         if _check_regular(descriptor, path).st_nlink > 1:
@@ -103,15 +73,7 @@ def open_own(path: Path, flags: int) -> int:
 
 
 def make_own_folder(path: Path) -> None:
-    """Make a folder inside of another one, if it is not there.
-
-    Raises
-    ------
-    OSError
-        If it cannot be made.
-    ForeignFileError
-        If a link stands in its place.
-    """
+    """Make a folder inside of another one, if it is not there."""
     path.mkdir(parents=True, exist_ok=True)
     check_no_link(path)
 
@@ -128,29 +90,13 @@ def part_of(path: Path) -> Path:
 
 
 def write_whole(path: Path, data: bytes) -> None:
-    """Make or replace a file: written beside it, brought to the disk, then renamed. A link in its place is replaced.
-
-    The file is there whole or not at all, whenever the process is killed or the disk fills up.
-
-    Raises
-    ------
-    OSError
-        If it cannot be written (disk full); the old file, if there was one, is still there.
-    """
+    """Make or replace a file: written beside it, brought to the disk, then renamed. A link in its place is replaced."""
     with _written_beside(path, data) as part:
         part.replace(path)
 
 
 def write_new(path: Path, data: bytes) -> None:
-    """Make a file that is not there; it is there whole or not at all, whenever the process is killed.
-
-    Raises
-    ------
-    FileExistsError
-        If there is anything of this name, a link that leads nowhere too.
-    OSError
-        If it cannot be written.
-    """
+    """Make a file that is not there; it is there whole or not at all, whenever the process is killed."""
     with _written_beside(path, data) as part:
         try:
             os.link(part, path)  # unlike a rename it replaces nothing
@@ -202,13 +148,7 @@ def _check_regular(descriptor: int, path: Path) -> os.stat_result:
 
 
 def wall_time(text: str) -> float:
-    """Seconds of a time such as 90s, 30min, 2h.
-
-    Raises
-    ------
-    ArgumentTypeError
-        If it is none.
-    """
+    """Seconds of a time such as 90s, 30min, 2h."""
     found = re.fullmatch(r"([0-9]{1,9}(?:\.[0-9]{1,9})?)\s*(s|min|h|d)", text)
     seconds = float(found[1]) * {"s": 1, "min": 60, "h": 3600, "d": 86400}[found[2]] if found else 0.0
     if seconds <= 0:
@@ -222,13 +162,7 @@ MOST_RUNS = (
 
 
 def positive(text: str) -> int:
-    """A whole number from 1 to `MOST_RUNS`.
-
-    Raises
-    ------
-    ArgumentTypeError
-        If it is none.
-    """
+    """A whole number from 1 to `MOST_RUNS`."""
     number = int(text)
     if not 1 <= number <= MOST_RUNS:
         raise argparse.ArgumentTypeError(f"{text}: allowed is a whole number from 1 to {MOST_RUNS}")
@@ -239,13 +173,7 @@ MOST_MEGABYTES = 1000.0  # of a page: browsers open no larger one
 
 
 def megabytes(text: str) -> float:
-    """A number above 0, up to `MOST_MEGABYTES`.
-
-    Raises
-    ------
-    ArgumentTypeError
-        If it is none.
-    """
+    """A number above 0, up to `MOST_MEGABYTES`."""
     try:
         number = float(text)
     except ValueError:

@@ -42,23 +42,7 @@ class UnreadableFile(ValueError):  # noqa: N818
 
 
 def read_guarded(path: Path, reader: str) -> tuple[dict[str, NDArray[Any]], bytes]:
-    """What a reader makes of a file, and the file: the bytes that it has read, and no others.
-
-    Parameters
-    ----------
-    path
-        The file; it is read once.
-    reader
-        "module:function". It gets the path of an open file and returns arrays of numbers by name. In its process XML is
-        parsed by the rules of this module, and no other file can be opened.
-
-    Raises
-    ------
-    UnreadableFile
-        If the reader refuses it or warns of anything, or needs more time or memory than a file of this size may.
-    OSError
-        If it cannot be opened.
-    """
+    """What a reader makes of a file, and the file: the bytes that it has read, and no others."""
     data = read_regular(path, LARGEST_FILE)
     seconds, memory = SECONDS + SECONDS_PER_MB * len(data) / 1e6, MEMORY + MEMORY_PER_BYTE * len(data)
     with os.fdopen(os.memfd_create("read"), "wb") as source, os.fdopen(os.memfd_create("found"), "rb") as found:

@@ -34,17 +34,7 @@ def _exit_code(number: int) -> int:
 
 
 class Interrupted(Exception):  # noqa: N818 - no error: somebody asked for it
-    """The run was asked to stop; the step under way is dropped.
-
-    Attributes
-    ----------
-    exit_code
-        128 and the number of the signal; `PAUSED` for SIGUSR1.
-    on_all_ranks
-        Whether it is raised on every rank; if not, others wait for this one and must be ended.
-    kept
-        What is left of the run, in words.
-    """
+    """The run was asked to stop; the step under way is dropped."""
 
     def __init__(self, number: int, on_all_ranks: bool = True):
         super().__init__(signal.Signals(number).name)
@@ -54,15 +44,7 @@ class Interrupted(Exception):  # noqa: N818 - no error: somebody asked for it
 
 
 class Paused(Exception):  # noqa: N818 - no error: somebody asked for it
-    """The run stopped on purpose between two steps, on all ranks, and can go on.
-
-    Attributes
-    ----------
-    time
-        Of the last step.
-    folder
-        Where all is kept.
-    """
+    """The run stopped on purpose between two steps, on all ranks, and can go on."""
 
     def __init__(self, reason: str, time: float, folder: Path):
         super().__init__(reason)
@@ -70,12 +52,7 @@ class Paused(Exception):  # noqa: N818 - no error: somebody asked for it
 
 
 def take_back_signals() -> None:
-    """Load MPI and PETSc, where nobody has yet, so that signals stay what Python has set.
-
-    A closed pipe is then a BrokenPipeError, and an ignored signal is ignored. PETSc reads no `.petscrc` of the working
-    folder. While the libraries are loaded signals wait: PETSc's handlers would abort the process, and UCX, below MPI,
-    has one for SIGHUP that swallows it.
-    """
+    """Load MPI and PETSc, where nobody has yet, so that signals stay what Python has set."""
     with blocked(*SIGNALS, PAUSE):  # the libraries' threads inherit it, and never take one
         import mpi4py.MPI  # noqa: F401
         import petsc4py
@@ -155,11 +132,7 @@ def _print_and_abort(kind: type[BaseException], error: BaseException, trace: Tra
 
 @contextmanager
 def ending_at_once() -> Iterator[None]:
-    """Within, a signal ends the process with one line and its exit code, wherever no `StopRequest` waits for it.
-
-    No exception: out of half-imported libraries that would be pages of traceback. A signal that is ignored, or that
-    somebody else handles, is left alone.
-    """
+    """Within, a signal ends the process with one line and its exit code, wherever no `StopRequest` waits for it."""
     before: dict[int, object] = {}
     if _is_main_thread():
         for number in (*SIGNALS, PAUSE):
@@ -184,13 +157,7 @@ def _end(number: int, frame: FrameType | None) -> None:
 
 
 class StopRequest:
-    """Context that turns the first SIGINT, SIGTERM or SIGHUP into a request; a second one stops at once.
-
-    SIGUSR1 sets `pause`; one that came to a request around this one counts too.
-
-    PETSc must not see an exception from a callback, so a handler that raises is not enough: the solver asks `number`.
-    Elsewhere see `stopping_at_once`. A signal that is ignored (a background job of a script, nohup) stays ignored.
-    """
+    """Context that turns the first SIGINT, SIGTERM or SIGHUP into a request; a second one stops at once."""
 
     def __init__(self) -> None:
         self.number = 0
@@ -228,15 +195,7 @@ _requests: list[StopRequest] = []  # those that are waiting for signals; the las
 
 @contextmanager
 def stopping_at_once() -> Iterator[None]:
-    """Within, a request to stop is an exception at once; programs that were started (a compiler) are ended first.
-
-    For places that take long and are not called by PETSc. Without a `StopRequest` nothing changes.
-
-    Raises
-    ------
-    Interrupted
-        Where the signal comes, also in place of the error that it led to elsewhere; at the start if it came before.
-    """
+    """Within, a request to stop is an exception at once; programs that were started (a compiler) are ended first."""
     if not _requests:
         yield
         return

@@ -26,23 +26,7 @@ LINE_EVERY = 10.0  # seconds, of lines that stay
 
 
 class Progress:
-    """The progress of a run on stderr: a bar on a terminal, otherwise a plain line now and then.
-
-    Use it in a `with` statement: the terminal is put right again however the run ends, by Ctrl-C too.
-
-    Parameters
-    ----------
-    total_steps
-        Number of the last step.
-    title
-        Name of the run.
-    comm_rank
-        Rank of this process; all but 0 are silent.
-    interval
-        Seconds between plain lines, at least. The first and the last step always get one.
-    done
-        Steps that were done before.
-    """
+    """The progress of a run on stderr: a bar on a terminal, otherwise a plain line now and then."""
 
     def __init__(self, total_steps: int, title: str, comm_rank: int = 0, *, interval: float = 60.0, done: float = 0):
         self._total, self._title, self._done = total_steps, title, done
@@ -80,21 +64,7 @@ class Progress:
         message: str | None = None,
         count: str | None = None,
     ) -> None:
-        """Step `index` (1 to total_steps) is done; of steps that are no whole ones, 0 to total_steps.
-
-        Parameters
-        ----------
-        index, time
-            Number and time of the step.
-        load_text
-            The loads as they stand, such as "pressure 2.40, stretch 0.05".
-        newton_iterations
-            Iterations of this step.
-        message
-            Something out of the ordinary; it gets a line of its own at once and stays.
-        count
-            How far that is; default: "index/total_steps".
-        """
+        """Step `index` (1 to total_steps) is done; of steps that are no whole ones, 0 to total_steps."""
         if self._silent:
             return
         if message is not None:
@@ -184,27 +154,7 @@ def open_log(
     quiet: bool = True,
     held: Sequence[logging.LogRecord] = (),
 ) -> Iterator[logging.Logger]:
-    """Write what the package logs, with times, to the end of `path`, and warnings to the terminal too.
-
-    Python's warnings go the same way. Without this, logging is as the calling script has set it up. On ranks other
-    than 0 nothing is written or shown.
-
-    Parameters
-    ----------
-    path
-        The log file.
-    comm_rank
-        Rank of this process.
-    quiet
-        No notices on the terminal, warnings only.
-    held
-        What was logged before there was a file (`hold_log`): it goes first.
-
-    Raises
-    ------
-    OSError
-        If the file cannot be opened; later, out of the logging call, if it cannot be written (disk full).
-    """
+    """Write what the package logs, with times, to the end of `path`, and warnings to the terminal too."""
     handlers: list[logging.Handler] = []
     if comm_rank == 0:
         file = _LogFile(path, encoding="utf-8")
@@ -266,10 +216,7 @@ class _Early(logging.Handler):
 
 
 class _Screen(logging.Handler):
-    """Lines on what is stderr at that moment: under a bar rich has put a stream there that prints above it.
-
-    Notices are sentences; only what is wrong says how wrong.
-    """
+    """Lines on what is stderr at that moment: under a bar rich has put a stream there that prints above it."""
 
     def __init__(self, quiet: bool):
         super().__init__(logging.WARNING if quiet else NOTICE)

@@ -20,13 +20,7 @@ __all__ = ["NoUnloadedShape", "as_unloaded", "unloaded"]
 
 @contextmanager
 def as_unloaded(scene: Scene, comm: MPI.Intracomm) -> Iterator[Scene]:
-    """The scene itself, or that of its unloaded body, whose mesh is there as long as this context. Collective.
-
-    Raises
-    ------
-    SceneError, NoUnloadedShape
-        As `unloaded`.
-    """
+    """The scene itself, or that of its unloaded body, whose mesh is there as long as this context. Collective."""
     if not scene.geometry.is_loaded:
         yield scene
         return

@@ -48,18 +48,7 @@ class NoUnloadedShape(RuntimeError):
 
 
 def in_shares(find: Callable[[float, Found], Found], start: Found) -> Found:
-    """What is found at all of the loads: in one piece, or in shares, each from the one before.
-
-    Parameters
-    ----------
-    find
-        Of a share of the loads and a start; ArithmeticError, StepFailure or SceneError where nothing is found.
-
-    Raises
-    ------
-    NoUnloadedShape
-        If a share has none.
-    """
+    """What is found at all of the loads: in one piece, or in shares, each from the one before."""
     refusals = (ArithmeticError, StepFailure, SceneError)
     try:
         return find(1.0, start)
@@ -119,13 +108,7 @@ def _outer(scene: Scene, name: str) -> float:
 
 
 def _found(scene: Scene, comm: MPI.Intracomm, given: Array, share: float, start: Array) -> tuple[Array, int]:
-    """Radii and length that a share of the loads brings to the given ones, and how many runs that took.
-
-    Raises
-    ------
-    ArithmeticError, StepFailure, SceneError
-        If they are not found.
-    """
+    """Radii and length that a share of the loads brings to the given ones, and how many runs that took."""
     target, targets, errors = given.copy(), [], []
     length = start[-1]
     for number in range(1, MOST_LOADINGS + 1):
@@ -154,13 +137,7 @@ def _extrapolated(targets: list[Array], errors: list[Array]) -> Array:
 
 
 def _inverse(scene: Scene, target: Array, share: float, axial: float) -> Array:
-    """Unloaded radii and length of a tube with these loaded ones, whose mesh is free of stress; on one radius.
-
-    Raises
-    ------
-    ArithmeticError
-        If there are none.
-    """
+    """Unloaded radii and length of a tube with these loaded ones, whose mesh is free of stress; on one radius."""
     loaded = _with_numbers(scene, target)
     tissues = {name: properties.tissue for name, properties in scene.properties().items()}
     layers = loaded.geometry.layers_of_tissue(Natural(), loaded.regions, tissues)
@@ -225,15 +202,7 @@ LEAST_STEP = 1 / 64  # of a Newton step that keeps elements whole and chains sho
 
 
 def unloaded_mesh(scene: Scene, comm: MPI.Intracomm, folder: Path) -> Scene:
-    """The scene of the unloaded body, whose mesh is written into the folder. Collective.
-
-    Raises
-    ------
-    SceneError
-        If the mesh of the scene is none of a body with its faces.
-    NoUnloadedShape
-        If there is none.
-    """
+    """The scene of the unloaded body, whose mesh is written into the folder. Collective."""
     shape: Any = scene.geometry
     file, regions = agreed(comm, lambda: _read(scene) if comm.rank == 0 else None) or (None, None)
     given: Array = comm.bcast(None if file is None else file.points)
@@ -293,17 +262,7 @@ def _is_whole(file: MeshFile) -> bool:
 
 
 def _newton_step(simulation: Simulation, given: Array, share: float) -> Array | None:
-    """How the unloaded nodes move, (nodes, 3) in the order of the file, on all ranks; None beyond the limits.
-
-    Parameters
-    ----------
-    simulation
-        Of the mesh as it is now.
-    given
-        Loaded places.
-    share
-        Of the loads.
-    """
+    """How the unloaded nodes move, (nodes, 3) in the order of the file, on all ranks; None beyond the limits."""
     domain, state, scene = simulation.domain, simulation.state, simulation.scene
     equilibrium, unknown = simulation.stepper.coupling.equilibrium, simulation.unknown
     loads = simulation.load_values(scene.end_of_ramps)
@@ -346,10 +305,8 @@ def _newton_step(simulation: Simulation, given: Array, share: float) -> Array | 
 
 
 def _tangents(simulation: Simulation, move: Any) -> list[Any]:
-    """Derivative of the residual by the unloaded places, UFL forms to be added up; `move` is zero.
-
-    Compiled one by one: in one kernel they take the compiler minutes.
-    """
+    """Derivative of the residual by the unloaded places, UFL forms to be added up; `move` is zero."""
+    # Compiled one by one: in one kernel they take the compiler minutes.
     state, unknown = simulation.state, simulation.unknown
     equilibrium, kinematics, mesh = simulation.stepper.coupling.equilibrium, state.kinematics, simulation.domain.mesh
     test, trial = ufl.TestFunction(move.function_space), ufl.TrialFunction(move.function_space)

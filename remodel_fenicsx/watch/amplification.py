@@ -40,20 +40,7 @@ class NotFound(RuntimeError):
 
 @dataclass(frozen=True)
 class PassMode:
-    """A change of the cells that a pass multiplies by a factor.
-
-    Attributes
-    ----------
-    factor
-        By what; where the pair is complex, its real part.
-    place
-        Reference place where the change is largest.
-    volume_share
-        Share of the body that takes part: the inverse participation ratio of |dA|^2.
-    shares
-        What the change is, by `SHARE_NAMES`, shares of |dA|^2: turns in the planes of two of the cell's axes (1 has the
-        largest principal value), and changes of length.
-    """
+    """A change of the cells that a pass multiplies by a factor."""
 
     factor: float
     place: tuple[float, float, float]
@@ -62,19 +49,7 @@ class PassMode:
 
 
 class LinearPass:
-    """The derivative of one pass with respect to the cells at the solved state, as a map of fields of tensors.
-
-    Everything is restored after each application; `close` (or `with`) frees PETSc's objects.
-
-    Parameters
-    ----------
-    stepper
-        Whose state is the solved one: unknowns in equilibrium with its cells, before the pass.
-    time
-        That of the pass; the state's own time is that of the step before.
-    residual
-        Norm of the out-of-balance forces with which the state was accepted.
-    """
+    """The derivative of one pass with respect to the cells at the solved state, as a map of fields of tensors."""
 
     def __init__(self, stepper: Stepper, time: float, residual: float = 0.0):
         self.state, self.remodeling = stepper.state, stepper.remodeling
@@ -170,13 +145,7 @@ class LinearPass:
 
     # ------------------------------------------------------------ its eigenvalues
     def extreme(self, end: str) -> PassMode:
-        """The mode with the most negative factor ("reversing") or with the largest ("growing").
-
-        Raises
-        ------
-        NotFound
-            If SLEPc has not found it.
-        """
+        """The mode with the most negative factor ("reversing") or with the largest ("growing")."""
         rows = 6 * self.owned
         total = self.equilibrium.comm.allreduce(rows, MPI.SUM)
         operator = PETSc.Mat().createPython(((rows, total), (rows, total)), _Shell(self), self.equilibrium.comm)
@@ -255,20 +224,7 @@ class Amplification:
 
 
 class AmplificationWatcher(Watcher):
-    """Computes the extreme modes of the pass of chosen steps.
-
-    Parameters
-    ----------
-    stepper
-        What steps.
-    chosen
-        Whether to look at a step.
-
-    Attributes
-    ----------
-    found
-        What was found, in the order of the steps.
-    """
+    """Computes the extreme modes of the pass of chosen steps."""
 
     def __init__(self, stepper: Stepper, chosen: Callable[[Step], bool]):
         self.stepper, self.chosen = stepper, chosen

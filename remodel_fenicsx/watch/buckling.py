@@ -25,20 +25,7 @@ _SIGNS = {1: np.array([[1.0], [-1.0]]), 2: np.array([[1.0, 1.0], [1.0, -1.0], [-
 
 
 class BucklingWarning(WarnsOnce):
-    """Says once that the whole body would buckle, where a reduced kinematics cannot.
-
-    Nothing that a reduction can do tells of a column that bends, so its eigenvalues do not. What it carries and how
-    stiff it is does. With W's derivatives by logarithmic strains along z and across, at the present state and cells,
-    the thrust p pi r_i^2 - int sigma_zz da is held against Euler's load pi^2 EI / (k l)^2, EI = int E x^2 da, E the
-    modulus along z at constant stress across; and suction in a cavity against 3 EI'/R^3 of its wall as a ring.
-
-    Parameters
-    ----------
-    stepper
-        Whose states are looked at.
-    strut
-        What of the body buckles.
-    """
+    """Says once that the whole body would buckle, where a reduced kinematics cannot."""
 
     def __init__(self, stepper: Stepper, strut: Strut):
         super().__init__(stepper, "buckling")

@@ -36,10 +36,8 @@ RESUMED_CHANGE = 0.03
 
 
 def _difference(values: Sequence[Any], times: Sequence[float]) -> Any:
-    """The difference of order ORDER over passes, the newest value first: a - 3 b + 3 c - d.
-
-    Of passes that are not equally far from each other it is the divided difference, made as large.
-    """
+    """The difference of order ORDER over passes, the newest value first: a - 3 b + 3 c - d."""
+    # Of passes that are not equally far from each other it is the divided difference, made as large.
     used = range(ORDER + 1)
     weights = [prod(1.0 / (times[age] - times[other]) for other in used if other != age) for age in used]
     total = sum(map(abs, weights))
@@ -48,19 +46,7 @@ def _difference(values: Sequence[Any], times: Sequence[float]) -> Any:
 
 @dataclass(frozen=True)
 class Swing:
-    """The part of a step's change that the pass before had made the other way round.
-
-    Attributes
-    ----------
-    cells
-        Root mean square over the body of the swing of A, over r0^2.
-    cells_factor
-        By what the last pass has multiplied it: negative.
-    body
-        Norm of the swing of the unknowns over their norm.
-    body_factor
-        By what the last pass has multiplied it.
-    """
+    """The part of a step's change that the pass before had made the other way round."""
 
     cells: float
     cells_factor: float
@@ -69,24 +55,7 @@ class Swing:
 
 
 class OverCorrection(WarnsOnce):
-    """Warns, once, when the cells swing to and fro from pass to pass so that results suffer.
-
-    The solve takes the cells as they are, the pass replaces them: where the stress answers a change of the cells by
-    more than the change, every pass goes too far, and the next one back (docs/theory.md, "Stability of the pass"). Such
-    a swing has the period of two passes. The third difference over the passes, A_k - 3 A_(k-1) + 3 A_(k-2) - A_(k-3),
-    magnifies it by eight and leaves nearly nothing of a smooth course; the ratio of two of them in a row is the factor
-    of a pass. Passes at which the loads themselves jump say nothing.
-
-    Parameters
-    ----------
-    stepper
-        Whose state is followed; what is remembered of the passes before is part of it from now on.
-
-    Attributes
-    ----------
-    swing
-        That of the last pass; None before there have been enough.
-    """
+    """Warns, once, when the cells swing to and fro from pass to pass so that results suffer."""
 
     def __init__(self, stepper: Stepper):
         times = {f"time_{age}": 0.0 for age in range(ORDER + 1)}
@@ -232,20 +201,7 @@ def _ratio(value: float, size: float) -> float:
 
 
 class RestedCells(WarnsOnce):
-    """Warns, once, when cells that had rested change in one pass as much as if they had remodeled all the time.
-
-    A pass leaves cells as they are where no principal value of the driver is positive. The law `explicit` (eq. 11)
-    gives the cells of a time, not their rate: if tension comes back there, the next pass makes up for all that have
-    been left out. Where remodeling itself takes the tension away and brings it back, as under weak loads with a strong
-    network, when it stops and goes on depends on the step, and so does the result.
-
-    Parameters
-    ----------
-    stepper
-        Whose state is followed; where cells have moved is part of it from now on.
-    passes
-        Remembers the cells of the passes before; it watches the same steps, and is asked first.
-    """
+    """Warns, once, when cells that had rested change in one pass as much as if they had remodeled all the time."""
 
     def __init__(self, stepper: Stepper, passes: OverCorrection):
         super().__init__(stepper, "rested_cells")

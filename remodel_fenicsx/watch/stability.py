@@ -22,21 +22,7 @@ FIRST_INVERSE_ITERATIONS = 3  # later steps go on from the vector of the step be
 
 
 class EquilibriumStability(Watcher):
-    """Knows the number of negative eigenvalues of the tangent at solved states, and says when it changes.
-
-    A count costs about as much as a Newton iteration. So it is made where somebody wants it in every row, at the last
-    step, after ITERATIONS_BETWEEN_LOOKS, and at once where `Signs` speak of a negative eigenvalue that is not known.
-    With more than MOST_UNKNOWNS it is made on request only.
-
-    Parameters
-    ----------
-    stepper
-        What is watched; nothing here changes its state, but what is remembered is part of it from now on.
-    unstable
-        "warn": the run goes on; "stop": an equilibrium with more negative eigenvalues than before ends it.
-    every_step
-        Count in every step, whatever the signs say.
-    """
+    """Knows the number of negative eigenvalues of the tangent at solved states, and says when it changes."""
 
     def __init__(self, stepper: Stepper, unstable: str = "warn", every_step: bool = False):
         self.stepper, self.state = stepper, stepper.state
@@ -59,13 +45,7 @@ class EquilibriumStability(Watcher):
             step.negative_eigenvalues = self._count()
 
     def solved(self, step: Step) -> None:
-        """Count, if it is time.
-
-        Raises
-        ------
-        StepFailure
-            If the equilibrium is unstable and the run is to stop there.
-        """
+        """Count, if it is time."""
         known = int(self._numbers["known"])
         work = step.work
         effort = work.tangents + OLD_FACTOR * max(0, work.newton_iterations - work.tangents)
@@ -130,18 +110,7 @@ class EquilibriumStability(Watcher):
 
 
 class Signs:
-    """What the factors of Newton's last tangent tell for nothing, or for one substitution, about its eigenvalues.
-
-    - How many pivots are negative: of a symmetric tangent as many as eigenvalues (Sylvester). They are news where the
-      first one comes, the last one goes, or their number turns odd or even; of some factors only the latter is known.
-    - The curvature w.K w / w.w of w = K^-1 v. From step to step this is inverse iteration: v turns to the mode of the
-      eigenvalue that is nearest to zero, so that it is there when one passes through. It sees pairs as well.
-
-    Parameters
-    ----------
-    stepper
-        Whose solver it asks. One that does not factorise tells nothing.
-    """
+    """What the factors of Newton's last tangent tell for nothing, or for one substitution, about its eigenvalues."""
 
     def __init__(self, stepper: Stepper):
         self.newton, self.equilibrium = stepper.coupling.newton, stepper.coupling.equilibrium

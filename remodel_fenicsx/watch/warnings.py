@@ -33,17 +33,7 @@ log = logging.getLogger(__name__)
 
 
 class WarnsOnce(Watcher):
-    """Says one thing about a run, once; resumed runs know whether it was said.
-
-    Parameters
-    ----------
-    stepper
-        Whose states are looked at; what is remembered of them is part of its state.
-    name
-        What the names of all that is remembered begin with.
-    initial
-        Numbers to be remembered beside "said", and what they are at the start.
-    """
+    """Says one thing about a run, once; resumed runs know whether it was said."""
 
     def __init__(self, stepper: Stepper, name: str, initial: Mapping[str, float] | None = None):
         self.stepper, self.state = stepper, stepper.state
@@ -113,32 +103,7 @@ class Missing(NamedTuple):
 
 
 class LockingWarning(WarnsOnce):
-    """Says once that elements hold the body back, as soon as a solved state shows it.
-
-    What an element cannot represent costs work. Two integrals over the body estimate how much,
-
-        volume = int lambda/2 (ln J - ln J_e)^2 dV / (f . u / 2),    J_e the element's,
-        shape  = int mu |F - F_e|^2 dV / (f . u / 2),                F_e the element's,
-
-    f the internal nodal forces: ln J_e is the mean of ln J over the element, F_e the polynomial through F of one
-    degree less than the displacement. An element that cannot keep its volume spends all of `volume` in vain. Of the
-    strain that it cannot follow, `shape` counts twice what it has: about as much again is what it lacks (in a thick
-    tube the radial strain, constant in an element, beside the circumferential one). Their sum is about the part of its
-    way that the body lacks. (The stored energy is no scale: chains have some without any load.)
-
-    The work is no scale either where an elongation is prescribed: that work drives the free part of the motion only in
-    part. So `VolumeResponse` asks the tangent how the body would move if changes of volume inside elements cost
-    nothing. That answer bounds `volume`, and it counts by itself against the work of the free unknowns.
-
-    Parameters
-    ----------
-    stepper
-        Whose states are looked at.
-    locks
-        Whether differences of J inside an element cost energy (`Formulation.locks`).
-    remedy
-        What the scene may set against it, in words.
-    """
+    """Says once that elements hold the body back, as soon as a solved state shows it."""
 
     def __init__(self, stepper: Stepper, locks: bool, remedy: str = REMEDY):
         super().__init__(stepper, "locking", {"energy": 0, "vain": 0})
@@ -195,12 +160,10 @@ class LockingWarning(WarnsOnce):
         return first, second, third
 
     def _followed(self, shape: Array, F: Array) -> Array:
-        """Which part of `shape` counts, by element: strain that linear elements do follow has no jumps between them.
-
-        The strain of a twisted bar varies inside its elements, which have it exactly. What elements of degree 1 lack
-        jumps between them by as much as it varies. Elements of degree 2 err alike where they meet, and a linear strain
-        is none that they could lack.
-        """
+        """Which part of `shape` counts, by element: strain that linear elements do follow has no jumps between them."""
+        # The strain of a twisted bar varies inside its elements, which have it exactly. What elements of degree 1 lack
+        # jumps between them by as much as it varies. Elements of degree 2 err alike where they meet, and a linear
+        # strain is none that they could lack.
         quadrature = self.quadrature
         if quadrature.element_degree > 1 or quadrature.shape[1] == 1:
             return np.ones(len(F))
@@ -211,10 +174,8 @@ class LockingWarning(WarnsOnce):
         return np.asarray(np.minimum(1.0, jumps / np.maximum(inside, np.finfo(float).tiny)))
 
     def work(self) -> tuple[float, float]:
-        """Half of the internal nodal forces times the unknowns: the work of loads and supports if all were linear.
-
-        The second number is that of the unknowns alone that nothing prescribes, the work of forces.
-        """
+        """Half of the internal nodal forces times the unknowns: the work of loads and supports if all were linear."""
+        # The second number is that of the unknowns alone that nothing prescribes, the work of forces.
         state, equilibrium = self.stepper.state, self.stepper.coupling.equilibrium
         unknowns = state.unknown.x.array
         free = np.where(np.isnan(equilibrium.prescribed_values()), unknowns, 0.0)
@@ -258,20 +219,7 @@ class LockingWarning(WarnsOnce):
 
 
 class PressureNoise(WarnsOnce):
-    """Says once that the pressure inside elements, not that of the body, decides where the cells turn.
-
-    lambda ln J varies inside an element by more than a displacement of its degree k can follow: what no polynomial of
-    degree k - 1 has is noise. Displacements hardly see it, for it has no mean. Cells take the stress at each point.
-    The sensor takes the noise out of the driving stress and measures by how much that turns the principal tensions
-    (s_1, s_2, s_3), those below 0 being none.
-
-    Parameters
-    ----------
-    stepper
-        Whose passes take the stress.
-    remedy
-        What the scene may set against it, in words.
-    """
+    """Says once that the pressure inside elements, not that of the body, decides where the cells turn."""
 
     def __init__(self, stepper: Stepper, remedy: str = REMEDY):
         super().__init__(stepper, "pressure_noise")
@@ -314,29 +262,15 @@ class PressureNoise(WarnsOnce):
 
 
 class VolumeResponse:
-    """How the body would move on if changes of volume inside its elements cost nothing.
-
-    The stress P = lambda (ln J - ln J_e) F^-T of these changes has the nodal forces r. Without them the body moves on
-    by (K - C)^-1 r, with the tangent K and the derivative C of r by the unknowns. That is about d / (1 - s): d = K^-1 r
-    is the answer of the present tangent, and s = d.C d / d.r is the share of the stiffness along d which C makes.
-
-    Parameters
-    ----------
-    stepper
-        Whose states are looked at, and whose factors of the tangent, perhaps of an earlier state, are used.
-    stiffness
-        lambda at the points of this rank's elements, (elements, points).
-    """
+    """How the body would move on if changes of volume inside its elements cost nothing."""
 
     def __init__(self, stepper: Stepper, stiffness: Array):
         self.stepper, self.state, self.stiffness = stepper, stepper.state, stiffness
         self.quadrature = stepper.state.cells.quadrature
 
     def __call__(self) -> float | None:
-        """Which part of its way the body lacks, from 0 to 1.
-
-        None where it is not known: the solver keeps no factors, or elements of a single point have nothing inside.
-        """
+        """Which part of its way the body lacks, from 0 to 1."""
+        # None where it is not known: the solver keeps no factors, or elements of a single point have nothing inside.
         factors = self.stepper.coupling.newton.factorisation()
         if factors is None or self.quadrature.shape[1] == 1 or not factors.getOperators()[0].assembled:
             return None
@@ -456,10 +390,7 @@ FRONT_ANGLE, FRONT_SHARE = 45.0, 0.5
 
 
 class VolumeLoss(WarnsOnce):
-    """Warns, once, where the tissue loses much of its volume, and says at the end how much it has lost at most.
-
-    Where the formulation takes J at points of its own, J is that: at the others nothing holds it.
-    """
+    """Warns, once, where the tissue loses much of its volume, and says at the end how much it has lost at most."""
 
     def __init__(self, stepper: Stepper):
         initial = {"mean": 1.0, "mean_time": 0.0, "least": 1.0, "least_time": 0.0}
@@ -498,13 +429,7 @@ class VolumeLoss(WarnsOnce):
 
 
 class WeakTension(WarnsOnce):
-    """Says at the end that stresses were never far above those that count as rounding: cells turned too slowly.
-
-    Parameters
-    ----------
-    stepper
-        Whose passes take the stress.
-    """
+    """Says at the end that stresses were never far above those that count as rounding: cells turned too slowly."""
 
     def __init__(self, stepper: Stepper):
         super().__init__(stepper, "weak_tension")
@@ -520,18 +445,7 @@ class WeakTension(WarnsOnce):
 
 
 class GrowthWithoutRest(WarnsOnce):
-    """Warns at the end where turnover goes on, and its rates do not fall as those do that come to rest (`Slowing`).
-
-    Growth without bound is the mechanobiological instability (Latorre and Humphrey 2019). How much the tissue has grown
-    tells nothing of that: it is a notice.
-
-    Parameters
-    ----------
-    stepper
-        Whose rates are looked at.
-    held_from
-        Time from which on no load changes.
-    """
+    """Warns at the end where turnover goes on, and its rates do not fall as those do that come to rest (`Slowing`)."""
 
     def __init__(self, stepper: Stepper, held_from: float):
         super().__init__(stepper, "growth", {"noticed": 0} | Slowing.INITIAL)
@@ -576,17 +490,7 @@ class GrowthWithoutRest(WarnsOnce):
 
 
 class RadialChains(WarnsOnce):
-    """Says once that more than half of the chains point out of the wall: the columns' angles are those of the others.
-
-    A notice and no warning: the results are right, they have to be read otherwise.
-
-    Parameters
-    ----------
-    stepper
-        Whose solved states are looked at.
-    radial_share
-        Of dimensions, axes and local axes, as `Shape.radial_share`.
-    """
+    """Says once that more than half of the chains point out of the wall."""
 
     def __init__(self, stepper: Stepper, radial_share: Callable[[Array, Array, Array], Array]):
         super().__init__(stepper, "radial_chains", {"share": 0.0})
@@ -612,18 +516,7 @@ class RadialChains(WarnsOnce):
 
 
 class FrontsInLayers(Watcher):
-    """Warns at the end where a layer's mean fibre angle is one of two families, with a front between them.
-
-    Inside of an element a front lies between two points, wherever it would be: the mean over the element moves by steps
-    with the mesh. What is no mean over a single layer of elements hardly notices.
-
-    Parameters
-    ----------
-    stepper
-        Whose last state is looked at.
-    shape
-        With the layers (`Shape.angle_layers`) and the angles.
-    """
+    """Warns at the end where a layer's mean fibre angle is one of two families, with a front between them."""
 
     def __init__(self, stepper: Stepper, shape: Shape):
         self.state, self.shape, self._found = stepper.state, shape, list[tuple[str, float, float]]()
