@@ -10,6 +10,7 @@ from remodel_fenicsx._version import __version__
 __all__ = [
     "Recording",
     "RecordingError",
+    "RemodelError",
     "Scene",
     "SceneError",
     "Simulation",
@@ -21,6 +22,7 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
+    from remodel_fenicsx.errors import RemodelError
     from remodel_fenicsx.recording import Recording
     from remodel_fenicsx.results.recording import RecordingError
     from remodel_fenicsx.running import run
@@ -34,6 +36,7 @@ __getattr__ = on_demand(
     {
         "Recording": "recording",
         "RecordingError": "results.recording",
+        "RemodelError": "errors",
         "run": "running",
         **dict.fromkeys(("Scene", "SceneError", "preset_scene", "read_scene"), "scene"),
         "Simulation": "simulation",

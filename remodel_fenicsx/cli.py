@@ -8,56 +8,42 @@ import json
 import math
 import os
 import re
-import shlex
 import sys
 import time as clock
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
 from remodel_fenicsx._version import __version__
 from remodel_fenicsx.body.reductions import explained
-from remodel_fenicsx.results.recording import RecordingError
+from remodel_fenicsx.errors import BAD_ENVIRONMENT, BAD_INPUT, PAUSED, RemodelError, SOLVE_FAILED
 from remodel_fenicsx.scene.presets import PRESETS, PROFILES, profile_for
 from remodel_fenicsx.scene.scene import Scene, SceneError, preset_scene, read_scene
 from remodel_fenicsx.schema.tables import printable, shortened
 from remodel_fenicsx.system import interrupts
 from remodel_fenicsx.system.files import (
-    ForeignFileError,
     MOST_RUNS,
     megabytes,
     positive,
     refusal_in_words,
-    typed,
     wall_time,
     write_new,
 )
 from remodel_fenicsx.system.children import SERVE, serve
-from remodel_fenicsx.system.environment import kernels, reason_undrawable, reason_unusable, versions
+from remodel_fenicsx.system.environment import check_usable, kernels, reason_undrawable, reason_unusable, versions
 
-BAD_INPUT, SOLVE_FAILED, STOPPED, BAD_ENVIRONMENT = 2, 3, interrupts.PAUSED, 5
 OPTIONS = {"folder": "-o", "path": "-o", "times": "--time", "layers": "--layers", "cut": "--cut", "view": "--view"}
-STUDY_STOPPED = "stopped; all that is recorded is kept, the same command goes on"
 EXIT_CODES = {
     0: "finished",
     BAD_INPUT: "bad input",
     SOLVE_FAILED: "the solve failed",
-    STOPPED: "stopped on purpose",
+    PAUSED: "stopped on purpose",
     BAD_ENVIRONMENT: "environment not usable",
     129: "hung up",
     130: "interrupted",
     143: "terminated",
 }
-
-
-class _UnusableEnvironment(Exception):  # noqa: N818
-    """What a command needs is missing; the text says what."""
-
-
-def _check(reason: str | None) -> None:
-    if reason is not None:
-        raise _UnusableEnvironment(reason)
 
 
 class _Parser(argparse.ArgumentParser):
@@ -295,24 +281,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with interrupts.ending_at_once():
         if list(sys.argv[1:] if arguments is None else arguments)[:1] == ["figures"]:
             return _fail("figures: is a script now: ./with-fenicsx python3 demos/figures.py fig8", BAD_INPUT)
-        options = _parsed(arguments)
-        try:
-            kernels()  # not after minutes, when they are asked for
-        except ValueError as error:
-            return _fail(str(error), BAD_INPUT)
-        try:
-            code = COMMANDS[options.command](options)
-            sys.stdout.flush()
-            return code
-        except (SceneError, RecordingError) as error:
-            return _fail(_as_typed(error), BAD_INPUT)
-        except _UnusableEnvironment as error:
-            return _fail(f"the environment is not usable: {error}; run through ./with-fenicsx", BAD_ENVIRONMENT)
-        except OSError as error:  # all others are caught where files are written
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python will flush once more
-            if isinstance(error, BrokenPipeError):  # whoever read the output has seen enough
-                return 0
-            return _fail(f"cannot write to the standard output: {error.strerror}", BAD_ENVIRONMENT)
+        return _done(_parsed(arguments))
+
+
+def _done(options: argparse.Namespace) -> int:
+    """Do a command; returns its exit code. What ends it is said in one line."""
+    output = getattr(options, "output", None)
+    try:
+        kernels()  # not after minutes, when they are asked for
+        return COMMANDS[options.command](options)
+    except RemodelError as error:
+        return _fail(_as_typed(error, output), error.exit_code, error.on_all_ranks)
+    except OSError as error:
+        if output and isinstance(error, (FileExistsError, NotADirectoryError)):  # lies in a file, or just taken
+            text = f"-o {output}: {error.filename}: {error.strerror}; allowed is a new or an empty folder"
+            return _fail(text, BAD_INPUT, on_all_ranks=False)
+        text = "cannot read the run" if options.command == "status" else "cannot write the results"
+        return _fail(f"{text}: {refusal_in_words(error)}", BAD_ENVIRONMENT, on_all_ranks=False)
+    except Exception:
+        traceback.print_exc()
+        return _fail("stopped by a defect of the program, see above", 1, on_all_ranks=False)
 
 
 def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -325,17 +313,21 @@ def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
         return parser().parse_args(arguments)
 
 
-def _rank() -> int:
-    try:
-        from mpi4py import MPI
-    except ImportError:  # then there is one process, and what is missing is about to be said
-        return 0
-    return MPI.COMM_WORLD.rank
-
-
 def _say(text: str) -> None:
-    if _rank() == 0:
-        print(text)
+    if not interrupts.is_first_rank():
+        return
+    try:
+        print(text, flush=True)
+    except OSError as error:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python will flush once more
+        if not isinstance(error, BrokenPipeError):  # whoever read the output has seen enough
+            raise OutputError(f"cannot write to the standard output: {error.strerror}") from error
+
+
+class OutputError(RemodelError):
+    """What a command says cannot be written."""
+
+    exit_code = BAD_ENVIRONMENT
 
 
 def _complain(message: str) -> None:
@@ -343,23 +335,20 @@ def _complain(message: str) -> None:
         print(f"remodel-fenicsx: {shortened(printable(message))}", file=sys.stderr, flush=True)
 
 
-def _fail(message: str, code: int) -> int:
-    if _rank() == 0:
+def _fail(message: str, code: int, on_all_ranks: bool = True) -> int:
+    """Say what has ended the command; an error on one of several ranks would leave the others waiting for ever."""
+    if interrupts.is_first_rank() or not on_all_ranks:
         _complain(message)
+    mpi = sys.modules.get("mpi4py.MPI")
+    if not on_all_ranks and mpi is not None and mpi.COMM_WORLD.size > 1:
+        mpi.COMM_WORLD.Abort(code)
     return code
 
 
-def _as_typed(refusal: Exception) -> str:
+def _as_typed(error: RemodelError, output: Path | None) -> str:
     """In one line; where it begins with an argument of Python's, that is the option which was typed."""
-    line = " ".join(str(refusal).split())
-    return re.sub(r"^\w+(?=[ :])", lambda name: OPTIONS.get(name[0], name[0]), line)
-
-
-def _refused(error: OSError, what: str) -> int:
-    """The system does not let it, or something that no run has made stands in the place of a file."""
-    if isinstance(error, ForeignFileError):
-        return _fail(refusal_in_words(error), BAD_INPUT)
-    return _fail(f"{what}: {refusal_in_words(error)}", BAD_ENVIRONMENT)
+    line = re.sub(r"^\w+(?=[ :])", lambda name: OPTIONS.get(name[0], name[0]), error.in_words())
+    return f"-o {line}" if output is not None and line.startswith(f"{output}: ") else line
 
 
 def _run(options: argparse.Namespace, task: Callable[..., Path] | None = None) -> int:
@@ -371,51 +360,22 @@ def _run(options: argparse.Namespace, task: Callable[..., Path] | None = None) -
             f"{'-o' if options.output else '--profile'}: a run goes on in its own folder, with its own settings",
             BAD_INPUT,
         )
-    _check(reason_unusable())
+    check_usable(reason_unusable())
     interrupts.take_back_signals()
-    from remodel_fenicsx.body import GeometryError
-    from remodel_fenicsx.results.checkpoint_file import CheckpointError
-    from remodel_fenicsx.results.run_folder import FolderTaken
     from remodel_fenicsx.running import resume, run
-    from remodel_fenicsx.solver.continuation import StepFailure
-    from remodel_fenicsx.unloading import NoUnloadedShape
 
-    try:
-        if scene is None:
-            folder = resume(options.resume, options.set, **wishes)
-        elif task is not None:
-            folder = task(scene, options.output, quiet=options.quiet)
-        else:
-            folder = run(scene, options.output, **wishes)
-    except (FolderTaken, SceneError, GeometryError, CheckpointError, RecordingError) as error:
-        return _fail(_as_typed(error), BAD_INPUT)
-    except NoUnloadedShape as failure:
-        return _fail(str(failure), SOLVE_FAILED)
-    except StepFailure as failure:
-        way = "" if task is not None else ", and run --resume goes on from there"
-        return _fail(f"{failure}. {failure.refusal}; every finished step is kept{way}", SOLVE_FAILED)
-    except interrupts.Paused as pause:
-        way = f"it goes on with: {typed()} run --resume {shlex.quote(str(pause.folder))}"
-        return _fail(f"{pause}: all is kept up to time {pause.time:g}; {way}", STOPPED)
-    except interrupts.Interrupted as interruption:
-        end = _fail if interruption.on_all_ranks else _end_all
-        return end(f"stopped by {interruption}; {interruption.kept}", interruption.exit_code)
-    except OSError as error:
-        if options.output and isinstance(error, (FileExistsError, NotADirectoryError)):  # lies in a file, or just taken
-            text = f"-o {options.output}: {error.filename}: {error.strerror}; allowed is a new or an empty folder"
-            return _end_all(text, BAD_INPUT)
-        if isinstance(error, ForeignFileError):
-            return _end_all(f"{error.filename}: {error.strerror}", BAD_INPUT)
-        return _end_all(f"cannot write the results: {refusal_in_words(error)}", BAD_ENVIRONMENT)
-    except Exception:
-        traceback.print_exc()
-        return _end_all("stopped by a defect of the program, see above", 1)
+    if scene is None:
+        folder = resume(options.resume, options.set, **wishes)
+    elif task is not None:
+        folder = task(scene, options.output, quiet=options.quiet)
+    else:
+        folder = run(scene, options.output, **wishes)
     _say(f"results in {folder}")
     return 0
 
 
 def _stability(options: argparse.Namespace) -> int:
-    _check(reason_undrawable())
+    check_usable(reason_undrawable())
 
     def analyse(scene: Scene, folder: Path | None, quiet: bool) -> Path:
         from remodel_fenicsx.studies.stability import in_words, stability
@@ -430,29 +390,30 @@ def _stability(options: argparse.Namespace) -> int:
 def _study(options: argparse.Namespace, task: Callable[[Scene], tuple[Path, str, dict[str, str]]]) -> int:
     """Several runs that answer one question: `task` makes the folder, the answer in words, and what has failed."""
     scene = read_scene(options.scene, options.set, options.profile)
-    _check(reason_unusable() or reason_undrawable())
-    from remodel_fenicsx.results.run_lock import FolderTaken
-    from remodel_fenicsx.studies.page import FigureError
+    check_usable(reason_unusable() or reason_undrawable())
     from remodel_fenicsx.studies.study import TooFewRuns
 
     try:
-        with interrupts.StopRequest(), interrupts.stopping_at_once():
+        with _stopping("all that is recorded is kept, the same command goes on"):
             folder, words, failed = task(scene)
     except TooFewRuns as early:
         _complain_of(early.failed)
-        return _fail(str(early), SOLVE_FAILED if early.failed else STOPPED)
-    except FolderTaken as error:  # another such study is at work in it
-        return _fail(" ".join(str(error).split()), BAD_INPUT)
-    except FigureError as refusal:  # a picture or a table of somebody else's stands in its place
-        return _fail(_as_typed(refusal), refusal.exit_code)
-    except interrupts.Interrupted as interruption:
-        return _fail(STUDY_STOPPED, interruption.exit_code)
-    except OSError as error:
-        return _refused(error, "cannot write the results")
+        raise
     _say(words)
     _say(f"results in {folder}")
     _complain_of(failed)
     return SOLVE_FAILED if failed else 0
+
+
+@contextlib.contextmanager
+def _stopping(kept: str) -> Iterator[None]:
+    """Within, a signal ends the command at once, which says what is kept."""
+    try:
+        with interrupts.StopRequest(), interrupts.stopping_at_once():
+            yield
+    except interrupts.Interrupted as interruption:
+        interruption.kept = kept
+        raise
 
 
 def _complain_of(failed: Mapping[str, str]) -> None:
@@ -513,54 +474,31 @@ def _fit(options: argparse.Namespace) -> int:
                 scene, options.data, options.output, options.starts, options.quiet, options.profiles
             )
         except StepFailure as failure:
-            raise _NoStart(f"at the start of the fit {failure}. {failure.refusal}; choose other starts") from failure
+            raise NoStart(f"at the start of the fit {failure}. {failure.refusal}; choose other starts") from failure
         return folder, study.in_words(found), {}
 
-    try:
-        return _study(options, task)
-    except _NoStart as failure:
-        return _fail(str(failure), SOLVE_FAILED)
+    return _study(options, task)
 
 
-class _NoStart(Exception):  # noqa: N818
+class NoStart(RemodelError):  # noqa: N818
     """A fit starts where the scene has no equilibrium."""
 
-
-def _end_all(message: str, code: int) -> int:
-    """End the run on all ranks: an error on one of them leaves the others waiting for ever."""
-    from mpi4py import MPI
-
-    _complain(message)
-    if MPI.COMM_WORLD.size > 1:
-        MPI.COMM_WORLD.Abort(code)
-    return code
+    exit_code = SOLVE_FAILED
 
 
 def _status(options: argparse.Namespace) -> int:
-    from remodel_fenicsx.results.checkpoint_file import CheckpointError
     from remodel_fenicsx.results.status import status
 
-    try:
-        lines = status(options.folder)
-    except CheckpointError as error:
-        return _fail(str(error), BAD_INPUT)
-    except OSError as error:
-        return _refused(error, "cannot read the run")
-    _say("\n".join(map(printable, lines)))
+    _say("\n".join(map(printable, status(options.folder))))
     return 0
 
 
 def _report(options: argparse.Namespace) -> int:
     if not interrupts.is_first_rank():  # the work of one process
         return 0
-    from remodel_fenicsx.report import ReportError, write_report
+    from remodel_fenicsx.report import write_report
 
-    try:
-        written = write_report(options.folder, options.output, options.size)
-    except ReportError as error:
-        return _fail(_as_typed(error), BAD_INPUT)
-    except OSError as error:
-        return _refused(error, "cannot write the report")
+    written = write_report(options.folder, options.output, options.size)
     _say(str(written))
     size = written.stat().st_size / 1e6
     if size > options.size:
@@ -575,38 +513,28 @@ def _report(options: argparse.Namespace) -> int:
 
 def _drawing(options: argparse.Namespace) -> int:
     """A picture or an animation."""
-    _check(reason_undrawable())
+    check_usable(reason_undrawable())
     if not interrupts.is_first_rank():  # the work of one process
         return 0
     from remodel_fenicsx.pictures.files import draw_animation, draw_picture
     from remodel_fenicsx.pictures.bodies import Viewing
-    from remodel_fenicsx.studies.page import FigureError
 
     viewing = Viewing(options.layers, options.cut, options.view)
-    try:
-        if options.command == "picture":
-            written = draw_picture(options.folder, options.time, viewing, options.output)
-        else:
-            written = draw_animation(options.folder, options.frames, viewing, options.output)
-    except FigureError as refusal:
-        return _fail(_as_typed(refusal), refusal.exit_code)
-    except OSError as error:
-        return _refused(error, "cannot write the picture")
+    if options.command == "picture":
+        written = draw_picture(options.folder, options.time, viewing, options.output)
+    else:
+        written = draw_animation(options.folder, options.frames, viewing, options.output)
     _say(str(written))
     return 0
 
 
 def _revolve(options: argparse.Namespace) -> int:
-    _check(reason_unusable())
+    check_usable(reason_unusable())
     if not interrupts.is_first_rank():  # the work of one process
         return 0
     from remodel_fenicsx.results.revolve import revolve
 
-    try:
-        written = revolve(options.folder)
-    except OSError as error:
-        return _refused(error, "cannot write the fields")
-    _say("\n".join(map(str, written)))
+    _say("\n".join(map(str, revolve(options.folder))))
     return 0
 
 
@@ -615,24 +543,20 @@ def _export(options: argparse.Namespace) -> int:
         return 0
     from remodel_fenicsx.results.export import export
 
-    try:
-        written = export(options.folder, options.format, options.output, options.time)
-    except OSError as error:
-        return _refused(error, "cannot write the fibres")
-    _say(str(written))
+    _say(str(export(options.folder, options.format, options.output, options.time)))
     return 0
 
 
 def _validate(options: argparse.Namespace) -> int:
     scene, unseen = read_scene(options.scene, options.set, options.profile), ""
-    if _rank() == 0 and (scene.measured_cells or scene.geometry.kept_files()[1]):
+    if interrupts.is_first_rank() and (scene.measured_cells or scene.geometry.kept_files()[1]):
         unseen = _unseen_files(scene)
     _say(f"{options.scene}: a valid scene ({scene.geometry.name}, {scene.time.in_words()})")
     _say(scene.summary())
     _say("\n".join([*explained(scene), scene.formulation_in_words()]))
     if scene.profile is not None:
         _say(profile_for(scene.profile, scene).in_words(scene.profile))
-    if _rank() == 0:
+    if interrupts.is_first_rank():
         for warning in scene.warnings():
             _complain(f"warning: {warning}")
     if unseen:
@@ -644,56 +568,34 @@ def _unseen_files(scene: Scene) -> str:
     """What was not looked at of the files that it names; raises `SceneError` where a run would refuse one."""
     if (reason := reason_unusable()) is not None:
         return f"the files that it names; {reason}"
-    from remodel_fenicsx.body import GeometryError
     from remodel_fenicsx.simulation import check_files
 
-    try:
-        return check_files(scene)
-    except GeometryError as error:
-        raise SceneError(str(error)) from error
+    return check_files(scene)
 
 
 def _axes(options: argparse.Namespace) -> int:
     scene = read_scene(options.scene, options.set, options.profile)
-    _check(reason_unusable())
+    check_usable(reason_unusable())
     from remodel_fenicsx.studies.study import write_axes
 
     path = options.output or Path(f"{scene.name}-axes.vtu")
-    return _written(lambda: write_axes(scene, path), path, "file", f"local axes in {path}")
+    with _stopping("nothing is written"):
+        words = write_axes(scene, path)
+    _say(f"{words}\nlocal axes in {path}")
+    return 0
 
 
 def _unload(options: argparse.Namespace) -> int:
     scene = read_scene(options.scene, options.set, options.profile)
     if not scene.geometry.is_loaded:
         return _fail("geometry.is = 'unloaded': the body is unloaded already; allowed is 'loaded'", BAD_INPUT)
-    _check(reason_unusable())
+    check_usable(reason_unusable())
     from remodel_fenicsx.studies.study import write_unloaded
-    from remodel_fenicsx.unloading import NoUnloadedShape
 
     place = options.output or Path(f"{scene.name}-unloaded")
-    said = f"scene of the unloaded body in {place / 'scene.toml'}"
-    try:
-        return _written(lambda: write_unloaded(scene, place), place, "folder", said)
-    except NoUnloadedShape as failure:
-        return _fail(str(failure), SOLVE_FAILED)
-
-
-def _written(write: Callable[[], str], place: Path, kind: str, said: str) -> int:
-    """Say what write() found and where it is, or why there is nothing; `place` must be new, a `kind`."""
-    from remodel_fenicsx.body import GeometryError
-
-    try:
-        with interrupts.StopRequest(), interrupts.stopping_at_once():
-            words = write()
-    except (SceneError, GeometryError) as error:
-        return _fail(" ".join(str(error).split()), BAD_INPUT)
-    except interrupts.Interrupted as interruption:
-        return _fail(f"stopped by {interruption}", interruption.exit_code)
-    except FileExistsError:
-        return _end_all(f"-o {place}: exists; allowed is a {kind} that does not", BAD_INPUT)
-    except OSError as error:
-        return _end_all(f"-o {place}: cannot be written: {error.strerror}", BAD_ENVIRONMENT)
-    _say(f"{words}\n{said}")
+    with _stopping("nothing is written"):
+        words = write_unloaded(scene, place)
+    _say(f"{words}\nscene of the unloaded body in {place / 'scene.toml'}")
     return 0
 
 
@@ -712,18 +614,13 @@ def _schema(options: argparse.Namespace) -> int:
         return 0
     if not interrupts.is_first_rank():  # the work of one process
         return 0
-    try:
-        write_new(options.output, f"{text}\n".encode())
-    except FileExistsError:
-        return _fail(f"-o {options.output}: exists; allowed is a file that does not", BAD_INPUT)
-    except OSError as error:
-        return _fail(f"-o {options.output}: cannot be written: {error.strerror}", BAD_ENVIRONMENT)
+    write_new(options.output, f"{text}\n".encode())
     _say(f"JSON Schema in {options.output}")
     return 0
 
 
 def _info(options: argparse.Namespace) -> int:
-    _check(reason_unusable())
+    check_usable(reason_unusable())
     from remodel_fenicsx.fem.jit import has_simd_logarithm
     from remodel_fenicsx.fem.solver_methods import SOLVER_METHODS
     from remodel_fenicsx.kernels.factor import is_available

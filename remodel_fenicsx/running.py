@@ -21,7 +21,6 @@ from remodel_fenicsx.results.checkpoint_file import Checkpoint, CheckpointError,
 from remodel_fenicsx.results.fields import Fields, field_names
 from remodel_fenicsx.results.recording import LOG, SCENE, RecordingError, scene_as_run
 from remodel_fenicsx.results.run_folder import (
-    FolderTaken,
     LastStep,
     RunFolder,
     agreed,
@@ -217,11 +216,8 @@ def _closing(simulation: Simulation) -> Iterator[None]:
     """Close it at the end, if all ranks come there: the others would wait for ever."""
     try:
         yield
-    except (StepFailure, Interrupted, Paused, FolderTaken, SceneError, CheckpointError, RecordingError):
-        simulation.close()
-        raise
-    except BaseException:
-        if simulation.domain.comm.size == 1:
+    except BaseException as error:
+        if simulation.domain.comm.size == 1 or getattr(error, "on_all_ranks", False):
             simulation.close()
         raise
     simulation.close()
@@ -286,9 +282,10 @@ def _record(
         except (StepFailure, Interrupted, Paused) as reason:
             if isinstance(reason, StepFailure):
                 log.info(FAILED + "%s. %s", reason, reason.refusal)
+                reason.kept += ", and run --resume goes on from there"
             else:
                 log.info(STOPPED + "%s", reason)
-            if getattr(reason, "on_all_ranks", True):
+            if reason.on_all_ranks:
                 checkpoints.write()
             if not isinstance(reason, (Interrupted, Paused)):  # these shall end soon
                 leave_report()

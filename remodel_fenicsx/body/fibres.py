@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from remodel_fenicsx.body.mesh_file import read_exchange_file
+from remodel_fenicsx.errors import RemodelError
 from remodel_fenicsx.model.axes import MEASURED, SOURCES, fault_of_fibres
 from remodel_fenicsx.schema.csv_table import TableFileError, read_columns
 from remodel_fenicsx.system.files import read_regular
@@ -34,7 +35,7 @@ SPELLINGS |= {f"points{mark}{n}": c for n, c in enumerate("xyz") for mark in ":_
 EXPORTED = [f"cell_dimension_{i}" for i in (1, 2, 3)] + [f"axis_{i}_{c}" for i in (1, 2, 3) for c in "xyz"]
 
 
-class FibreFileError(ValueError):
+class FibreFileError(RemodelError, ValueError):
     """What is wrong with a file of fibres; one line."""
 
 

@@ -9,11 +9,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from remodel_fenicsx.errors import RemodelError
+
 # Gmsh takes points that are closer than 1e-8 for one, and crashes on much longer or flatter bodies
 SMALLEST_LENGTH, LARGEST_LENGTH, LARGEST_LENGTH_RATIO = 1e-6, 1e6, 1e4
 
 
-class GeometryError(RuntimeError):
+class GeometryError(RemodelError, RuntimeError):
     """Gmsh could not build or read a mesh; raised on all ranks.
 
     Examples

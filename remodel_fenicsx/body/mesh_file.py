@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from remodel_fenicsx.errors import RemodelError
 from remodel_fenicsx.system.files import read_regular
 from remodel_fenicsx.system.guarded import DAMAGED, LARGEST_FILE, UnreadableFile, read_guarded
 
@@ -207,7 +208,7 @@ def distinct(values: Integers) -> list[int]:
     return list(dict.fromkeys(listed))
 
 
-class MeshFileError(ValueError):
+class MeshFileError(RemodelError, ValueError):
     """What is wrong with a mesh file: one line, with its line in the file where there is one."""
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from remodel_fenicsx._version import __version__
+from remodel_fenicsx.errors import RemodelError
 from remodel_fenicsx.report.body import ShownBody
 from remodel_fenicsx.report.card import Card, packed
 from remodel_fenicsx.report.parts import ASSETS, ReportedRun, Story, cards, data_of
@@ -30,7 +31,7 @@ BEST_RATIO = 0.15  # of deflated to plain bytes of fields: none was smaller, so 
 TRIES = 4
 
 
-class ReportError(ValueError):
+class ReportError(RemodelError, ValueError):
     """No report for a reason that its one line names."""
 
 

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
+from remodel_fenicsx.errors import RemodelError
 from remodel_fenicsx.system.files import ForeignFileError, read_regular, write_whole
 
 log = logging.getLogger(__name__)
@@ -31,7 +32,7 @@ _HEADER = "header"  # name of the array that holds the JSON
 LARGEST, LARGEST_POINTER = 10**11, 10**6  # bytes
 
 
-class CheckpointError(ValueError):
+class CheckpointError(RemodelError, ValueError):
     """A checkpoint is damaged or does not belong to the run; one line."""
 
 

@@ -14,6 +14,7 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from remodel_fenicsx.errors import RemodelError
 from remodel_fenicsx.schema.times import same_time
 from remodel_fenicsx.system.files import check_regular, read_regular
 
@@ -70,7 +71,7 @@ TRIES, BETWEEN_TRIES = 5, 0.1  # seconds: a step is written in a few millisecond
 LARGEST_HISTORY = 10**9  # bytes: the million steps that a scene may have, of a thousand characters each
 
 
-class RecordingError(ValueError):
+class RecordingError(RemodelError, ValueError):
     """A folder is no recorded run, is damaged, or does not hold what was asked for; one line says which.
 
     Examples

@@ -8,6 +8,7 @@ import re
 import socket
 from pathlib import Path
 
+from remodel_fenicsx.errors import RemodelError
 from remodel_fenicsx.results.recording import SCENE
 from remodel_fenicsx.system.files import open_own, part_of
 
@@ -15,7 +16,7 @@ LOCK = "run.lock"
 _WRITER = re.compile(r"process \d+ on [\w.-]+( \(\d+ ranks\))?")
 
 
-class FolderTaken(ValueError):
+class FolderTaken(RemodelError, ValueError):
     """The folder asked for holds something already, or a run writes in it.
 
     Examples

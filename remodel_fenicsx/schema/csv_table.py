@@ -11,13 +11,14 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from remodel_fenicsx.errors import RemodelError
 from remodel_fenicsx.schema.tables import shown
 
 log = logging.getLogger(__name__)
 DELIMITERS = {"\t": "tabs", ";": "semicolons", ",": "commas", " ": "spaces"}
 
 
-class TableFileError(ValueError):
+class TableFileError(RemodelError, ValueError):
     """What is wrong with a table; one line."""
 
 

@@ -18,13 +18,15 @@ from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, ValidationErro
 from pydantic.fields import FieldInfo
 from pydantic_core import CoreSchema, ErrorDetails, PydanticCustomError, PydanticUndefined, core_schema
 
+from remodel_fenicsx.errors import RemodelError
+
 LONGEST_VALUE = 60  # characters of a value in an error
 LONGEST_MESSAGE = 2000  # characters: all columns of a shape are a thousand
 PAGE_WIDTH = 98  # characters of a line of a page
 _MISSING = object()
 
 
-class SceneError(ValueError):
+class SceneError(RemodelError, ValueError):
     """Bad input. Its text is one line: the dotted key, the value, what is allowed.
 
     Parameters

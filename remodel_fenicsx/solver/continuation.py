@@ -13,6 +13,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
+from remodel_fenicsx.errors import RemodelError, SOLVE_FAILED
 from remodel_fenicsx.fem.assembly import over_ranks
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.energy import Tissue
@@ -55,7 +56,7 @@ class Work(Counted):
             self.is_far = done.is_far
 
 
-class StepFailure(RuntimeError):
+class StepFailure(RemodelError, RuntimeError):
     """A step cannot be solved, or is not wanted; the state is that of the last accepted step.
 
     Parameters
@@ -73,6 +74,8 @@ class StepFailure(RuntimeError):
         Of the step.
     refusal
         Why, and what helps.
+    kept
+        What of the run is on the disk.
 
     Examples
     --------
@@ -91,9 +94,21 @@ class StepFailure(RuntimeError):
     try a smaller time.step, a slower ramp or lower loads
     """
 
+    exit_code = SOLVE_FAILED
+
     def __init__(self, time: float, text: str, refusal: Refusal):
         super().__init__(text)
-        self.time, self.refusal = time, refusal
+        self.time, self.refusal, self.kept = time, refusal, "every finished step is kept"
+
+    def in_words(self) -> str:
+        """Where it stops and why, what helps, and what is kept.
+
+        Returns
+        -------
+        str
+            One line.
+        """
+        return f"{self}. {self.refusal}; {self.kept}"
 
 
 def failure_text(time: float, stage: str, fraction: float, cause: SolveFailure) -> str:

@@ -24,6 +24,7 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
 from remodel_fenicsx._version import __version__
+from remodel_fenicsx.errors import RemodelError
 from remodel_fenicsx.system.files import write_whole
 
 MARK = "remodel_fenicsx figures"  # in every picture, and beside every table: what bears it may be drawn anew
@@ -49,7 +50,7 @@ STYLE: dict[str, Any] = {
 COLOURS = ("#1b4f9c", "#d1495b", "#2a9d6f", "#e09f3e", "#6c4f9c")  # apart in lightness too
 
 
-class FigureError(ValueError):
+class FigureError(RemodelError, ValueError):
     """No figure for a reason that its one line names; `exit_code` is the command's."""
 
     def __init__(self, message: str, exit_code: int):

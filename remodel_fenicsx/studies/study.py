@@ -18,6 +18,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from remodel_fenicsx._version import __version__
+from remodel_fenicsx.errors import PAUSED, RemodelError, SOLVE_FAILED
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.results.export import write_vtu
@@ -46,10 +47,11 @@ from remodel_fenicsx.system.files import (
     make_own_folder,
     part_of,
     read_regular,
+    TakenError,
     refusal_in_words,
     write_whole,
 )
-from remodel_fenicsx.system.interrupts import Interrupted, PAUSE, PAUSED, StopRequest
+from remodel_fenicsx.system.interrupts import Interrupted, PAUSE, StopRequest
 from remodel_fenicsx.system.temporary import temporary_folder
 from remodel_fenicsx.system.terminal import Line
 from remodel_fenicsx.unloading import unloaded
@@ -130,12 +132,12 @@ POLL = 0.1  # seconds
 FEWEST_RUNS = 2  # runs, or settings, without which nothing is compared
 
 
-class TooFewRuns(Exception):  # noqa: N818 - what is recorded is whole, and the same call goes on
+class TooFewRuns(RemodelError):  # noqa: N818 - what is recorded is whole, and the same call goes on
     """Fewer than `FEWEST_RUNS` have reached the end, so that there is no answer yet."""
 
     def __init__(self, reached: str, failed: Mapping[str, str], advice: str = "the same command goes on"):
         super().__init__(f"{reached}, at least {FEWEST_RUNS} are needed; all that is recorded is kept, {advice}")
-        self.failed = dict(failed)
+        self.failed, self.exit_code = dict(failed), SOLVE_FAILED if failed else PAUSED
 
 
 @dataclass(frozen=True)
@@ -351,7 +353,7 @@ def _begin(worker: Worker, run: Run) -> None:
 def write_unloaded(scene: Scene, folder: Path) -> str:
     """Write scene.toml of the unloaded body into a new folder, with unloaded.msh of an own one; say what was found."""
     if folder.exists():
-        raise FileExistsError(folder)
+        raise TakenError(folder, "folder")
     with temporary_folder() as temporary:
         found = unloaded(scene, MPI.COMM_SELF, temporary)
         kept, files = with_files_kept(found)

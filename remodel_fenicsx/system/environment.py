@@ -12,11 +12,28 @@ import shutil
 from pathlib import Path
 
 from remodel_fenicsx._version import __version__
+from remodel_fenicsx.errors import BAD_ENVIRONMENT, RemodelError
 from remodel_fenicsx.system.interrupts import take_back_signals
 
 OLDEST_DOLFINX = (0, 9)
 KERNELS = "REMODEL_FENICSX_KERNELS"  # what computes at points: C, or numpy for a debugger
 NEEDED = ("basix", "dolfinx", "gmsh", "h5py", "mpi4py", "petsc4py", "pint", "rich", "ufl")
+
+
+class UnusableEnvironment(RemodelError):  # noqa: N818
+    """What a command needs is missing; the text says what."""
+
+    exit_code = BAD_ENVIRONMENT
+
+    def in_words(self) -> str:
+        """With what to do."""
+        return f"the environment is not usable: {self}; run through ./with-fenicsx"
+
+
+def check_usable(reason: str | None) -> None:
+    """Refuse to go on in an environment that is not usable for a reason, if there is one."""
+    if reason is not None:
+        raise UnusableEnvironment(reason)
 
 
 def versions() -> dict[str, str]:
@@ -45,7 +62,7 @@ def kernels() -> str:
     """What computes at the points: "C", or "numpy" where REMODEL_FENICSX_KERNELS says so."""
     name = os.environ.get(KERNELS, "C")
     if name not in ("C", "numpy"):
-        raise ValueError(f"{KERNELS} = {name!r}: allowed are 'C' and 'numpy'")
+        raise RemodelError(f"{KERNELS} = {name!r}: allowed are 'C' and 'numpy'")
     return name
 
 

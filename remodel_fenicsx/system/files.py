@@ -14,6 +14,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from remodel_fenicsx.errors import RemodelError
+
 
 # ---------------------------------------------------------------- files that somebody else may have put there
 # Files that somebody else may have put there: only regular files are read, no link is written through.
@@ -28,8 +30,21 @@ LINK = "is a link; nothing is written through one"
 FOREIGN = {errno.ELOOP: LINK, errno.EISDIR: "is a folder, not a file", errno.EEXIST: LINK}
 
 
-class ForeignFileError(OSError):
+class ForeignFileError(RemodelError, OSError):
     """Under a name that a run uses there is something that no run has made: a link, a pipe, a file without end."""
+
+    on_all_ranks = False
+
+    def in_words(self) -> str:
+        """Which file, and what it is."""
+        return refusal_in_words(self)
+
+
+class TakenError(ForeignFileError, FileExistsError):
+    """What was to be made is there already."""
+
+    def __init__(self, path: Path, kind: str = "file"):
+        super().__init__(errno.EEXIST, f"is there already; allowed is a new {kind}", str(path))
 
 
 def refusal_in_words(error: OSError) -> str:
@@ -102,7 +117,7 @@ def write_new(path: Path, data: bytes) -> None:
             os.link(part, path)  # unlike a rename it replaces nothing
         except OSError:
             if os.path.lexists(path):
-                raise
+                raise TakenError(path) from None
             part.rename(path)  # a file system without hard links
 
 

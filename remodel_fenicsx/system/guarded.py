@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from remodel_fenicsx.errors import RemodelError
 from remodel_fenicsx.system.children import environment_of_child
 from remodel_fenicsx.system.files import read_regular
 
@@ -37,7 +38,7 @@ _LINES = re.compile(
 )
 
 
-class UnreadableFile(ValueError):  # noqa: N818
+class UnreadableFile(RemodelError, ValueError):  # noqa: N818
     """What is wrong with a file; one line."""
 
 

@@ -7,6 +7,7 @@ Importing this module changes nothing; an application calls what it wants.
 from __future__ import annotations
 
 import os
+import shlex
 import signal
 import sys
 import threading
@@ -17,10 +18,12 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType, TracebackType
 
+from remodel_fenicsx.errors import PAUSED, RemodelError
+from remodel_fenicsx.system.files import typed
+
 SIGNALS: tuple[int, ...] = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # ask a process to end
 
 PAUSE = signal.SIGUSR1  # asks a run to end with the step under way; batch systems send it before they kill
-PAUSED = 4  # exit code
 
 _ONE_SIGNAL = 0.2  # seconds: timeout, for one, sends its signal to the process, and then to the group that this is in
 
@@ -33,7 +36,7 @@ def _exit_code(number: int) -> int:
     return PAUSED if number == PAUSE else 128 + number
 
 
-class Interrupted(Exception):  # noqa: N818 - no error: somebody asked for it
+class Interrupted(RemodelError):  # noqa: N818 - no error: somebody asked for it
     """The run was asked to stop; the step under way is dropped."""
 
     def __init__(self, number: int, on_all_ranks: bool = True):
@@ -42,13 +45,24 @@ class Interrupted(Exception):  # noqa: N818 - no error: somebody asked for it
         self.exit_code = _exit_code(number)
         self.kept = "every finished step is kept"
 
+    def in_words(self) -> str:
+        """What has stopped it, and what is kept."""
+        return f"stopped by {self}; {self.kept}"
 
-class Paused(Exception):  # noqa: N818 - no error: somebody asked for it
+
+class Paused(RemodelError):  # noqa: N818 - no error: somebody asked for it
     """The run stopped on purpose between two steps, on all ranks, and can go on."""
+
+    exit_code = PAUSED
 
     def __init__(self, reason: str, time: float, folder: Path):
         super().__init__(reason)
         self.time, self.folder = time, folder
+
+    def in_words(self) -> str:
+        """Why it stopped, how far it is, and how to go on."""
+        way = f"{typed()} run --resume {shlex.quote(str(self.folder))}"
+        return f"{self}: all is kept up to time {self.time:g}; it goes on with: {way}"
 
 
 def take_back_signals() -> None:
@@ -93,7 +107,10 @@ def _is_main_thread() -> bool:
 
 def is_first_rank() -> bool:
     """Whether this process is the one that speaks, without starting MPI."""
-    return (os.environ.get("OMPI_COMM_WORLD_RANK") or os.environ.get("PMI_RANK") or "0") == "0"
+    rank = os.environ.get("OMPI_COMM_WORLD_RANK") or os.environ.get("PMI_RANK")
+    if rank is None and "mpi4py.MPI" in sys.modules:  # of another MPI
+        rank = str(sys.modules["mpi4py.MPI"].COMM_WORLD.rank)
+    return rank in (None, "0")
 
 
 def end_all_ranks_on_exception() -> None:

@@ -21,6 +21,7 @@ from ufl.algorithms.map_integrands import map_integrands
 from remodel_fenicsx.body.mesh_domain import gmsh_text
 from remodel_fenicsx.body.mesh_faces import jacobian_determinants
 from remodel_fenicsx.body.mesh_file import MeshFile
+from remodel_fenicsx.errors import RemodelError, SOLVE_FAILED
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.assembly import assemble_matrix, create_matrix, over_ranks, second_derivative
 from remodel_fenicsx.model.residual_stress import Loads, closing
@@ -43,8 +44,10 @@ log = logging.getLogger(__name__)
 SHARES = (0.25, 0.5, 0.75, 1.0)  # of the loads, where they cannot be taken in one piece
 
 
-class NoUnloadedShape(RuntimeError):
+class NoUnloadedShape(RemodelError, RuntimeError):
     """There is none that the loads bring to the given one; one line with the share of the loads, and why."""
+
+    exit_code = SOLVE_FAILED
 
 
 def in_shares(find: Callable[[float, Found], Found], start: Found) -> Found:

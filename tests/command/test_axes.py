@@ -58,7 +58,7 @@ def test_the_file_of_the_command(
     assert np.unique(np.round(fields["depth"], 9)).size == 8 and 0.0 < fields["depth"].min()
     before = Path("found.vtu").read_bytes()
     assert cli.main(["axes", "short.toml", "-o", "found.vtu"]) == 2
-    assert "-o found.vtu: exists; allowed is a file that does not" in capsys.readouterr().err
+    assert "-o found.vtu: is there already; allowed is a new file" in capsys.readouterr().err
     assert Path("found.vtu").read_bytes() == before
     assert cli.main(["axes", "short.toml"]) == 0 and Path("short-axes.vtu").read_bytes() == before
 

@@ -144,4 +144,4 @@ def test_the_command_and_the_file_of_the_docs(tmp_path: Path, capsys: pytest.Cap
     assert cli.main(["schema", "-o", str(tmp_path / "s.json")]) == 0
     assert (tmp_path / "s.json").read_text(encoding="utf-8") == printed
     assert cli.main(["schema", "-o", str(tmp_path / "s.json")]) == 2
-    assert "exists; allowed is a file that does not" in capsys.readouterr().err
+    assert "is there already; allowed is a new file" in capsys.readouterr().err

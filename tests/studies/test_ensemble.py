@@ -195,7 +195,7 @@ def test_a_signal_ends_all_runs(
     monkeypatch.setattr(Run, "steps_done", property(then_stop))
     code = cli.main(["ensemble", str(path), "-o", str(out), "--seeds", "2", "--jobs", "1"])
     assert code == 128 + signal.SIGTERM
-    assert "stopped; all that is recorded is kept, the same command goes on" in capsys.readouterr().err
+    assert "stopped by SIGTERM; all that is recorded is kept, the same command goes on" in capsys.readouterr().err
     members = study.members_of(read_scene(path), out, 2)
     assert any(asked(member) for member in members) and not any(member.is_complete() for member in members)
 
