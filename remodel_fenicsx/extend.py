@@ -76,6 +76,7 @@ from remodel_fenicsx.model.energy import (
 from remodel_fenicsx.model.laws import LAWS, Drive, Law, ranked
 from remodel_fenicsx.model.axes import AXES, LocalAxes
 from remodel_fenicsx.model.spectral import PAIRINGS, principal
+from remodel_fenicsx.schema.settings import COUPLINGS, CouplingKind
 from remodel_fenicsx.schema.tables import markdown_reference
 from remodel_fenicsx.schema.units import (
     AREA,
@@ -88,7 +89,6 @@ from remodel_fenicsx.schema.units import (
     TEMPERATURE,
     Dimension,
 )
-from remodel_fenicsx.settings import COUPLINGS, CouplingKind
 
 if TYPE_CHECKING:
     from remodel_fenicsx.evolution.coupling import Coupling, Staggered

@@ -22,7 +22,7 @@ from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.results.columns import Observer
 from remodel_fenicsx.results.fields import Fields
 from remodel_fenicsx.results.run_folder import FolderTaken, RunFolder, chosen_folder
-from remodel_fenicsx.settings import Cells, Material, Mesh, Remodeling, Solver
+from remodel_fenicsx.schema.settings import Cells, Material, Mesh, Remodeling, Solver
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.state.state import State
 from remodel_fenicsx.state.unit_cells import UnitCells

@@ -27,7 +27,7 @@ from remodel_fenicsx.results.columns import Observer
 from remodel_fenicsx.results.run_folder import agreed
 from remodel_fenicsx.scene import Scene, SceneError
 from remodel_fenicsx.scene.scene import in_region
-from remodel_fenicsx.settings import Cells, Properties, Solver
+from remodel_fenicsx.schema.settings import Cells, Properties, Solver
 from remodel_fenicsx.state.state import State, by_region
 from remodel_fenicsx.state.unit_cells import UnitCells
 from remodel_fenicsx.system.files import typed

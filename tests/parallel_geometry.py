@@ -9,7 +9,7 @@ import numpy as np
 from mpi4py import MPI
 
 from remodel_fenicsx.body import GeometryError, domain
-from remodel_fenicsx.settings import Mesh, Region
+from remodel_fenicsx.schema.settings import Mesh, Region
 from tests import parts
 
 LAYERED = parts.Tube(inner_radius=1.0, outer_radius=3.0, length=8.0)

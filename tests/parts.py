@@ -20,7 +20,7 @@ from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.fem.kinematics import FullKinematics
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.scene.scene import Mesh, Scene, Solver
-from remodel_fenicsx.settings import Cells, Material, Remodeling
+from remodel_fenicsx.schema.settings import Cells, Material, Remodeling
 from remodel_fenicsx.solver.equilibrium import Equilibrium
 from remodel_fenicsx.solver.newton import GuardedNewton, Solution
 from remodel_fenicsx.state.state import State

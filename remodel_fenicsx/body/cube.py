@@ -10,8 +10,8 @@ from pydantic import Field, model_validator
 from remodel_fenicsx.body import gmsh_model as model
 from remodel_fenicsx.body.shape import Column, LoadKind, Shape, check_lengths, homogeneous_bar, uniaxial_columns
 from remodel_fenicsx.body.reductions import Reduction, box
+from remodel_fenicsx.schema.settings import Mesh
 from remodel_fenicsx.schema.units import FORCE, LENGTH
-from remodel_fenicsx.settings import Mesh
 
 if TYPE_CHECKING:
     from mpi4py import MPI

@@ -18,9 +18,9 @@ from remodel_fenicsx.body.shape import Column, LoadKind
 from remodel_fenicsx.body.gmsh_model import LARGEST_LENGTH, SMALLEST_LENGTH
 from remodel_fenicsx.body.mesh_file import ENDINGS, MeshFile, MeshFileError, TAGS, read_mesh
 from remodel_fenicsx.body.wall import WalledMesh
+from remodel_fenicsx.schema.settings import LARGEST_MESH, Load, Mesh, Support, faces_of
 from remodel_fenicsx.schema.tables import SceneError, fault, shown
 from remodel_fenicsx.schema.units import LENGTH_UNITS, STRESS
-from remodel_fenicsx.settings import LARGEST_MESH, Load, Mesh, Support, faces_of
 
 if TYPE_CHECKING:
     from mpi4py import MPI

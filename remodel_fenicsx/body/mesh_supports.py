@@ -10,8 +10,8 @@ import numpy as np
 
 from remodel_fenicsx.body.mesh_faces import Face
 from remodel_fenicsx.body.mesh_file import Array
+from remodel_fenicsx.schema.settings import Support
 from remodel_fenicsx.schema.tables import SceneError
-from remodel_fenicsx.settings import Support
 
 if TYPE_CHECKING:
     from remodel_fenicsx.body.loading import Loading

@@ -13,7 +13,7 @@ from remodel_fenicsx.body.wall import Wall
 from remodel_fenicsx.model.residual_stress import UNSTRETCHED, Layer
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.model.axes import LocalAxes
-from remodel_fenicsx.settings import Natural
+from remodel_fenicsx.schema.settings import Natural
 
 if TYPE_CHECKING:
     from remodel_fenicsx.body.domain import Domain

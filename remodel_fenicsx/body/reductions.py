@@ -19,8 +19,8 @@ from remodel_fenicsx.fem.solver_methods import AUTO
 from remodel_fenicsx.model.cells import cylindrical_axes, global_axes
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.model.laws import LAWS
+from remodel_fenicsx.schema.settings import LARGEST_MESH
 from remodel_fenicsx.schema.tables import fault
-from remodel_fenicsx.settings import LARGEST_MESH
 
 
 # ---------------------------------------------------------------- whole bodies for pictures, from the meshes of

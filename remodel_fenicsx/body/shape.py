@@ -27,9 +27,9 @@ from remodel_fenicsx.body.reductions import (
 from remodel_fenicsx.model.axes import LocalAxes
 from remodel_fenicsx.model.cells import angle_to_axis
 from remodel_fenicsx.model.energy import Tissue
+from remodel_fenicsx.schema.settings import Load, Mesh, Natural, Region, Support, faces_of
 from remodel_fenicsx.schema.tables import Table, fault
 from remodel_fenicsx.schema.units import Dimension, LengthUnit
-from remodel_fenicsx.settings import Load, Mesh, Natural, Region, Support, faces_of
 
 if TYPE_CHECKING:
     from mpi4py import MPI

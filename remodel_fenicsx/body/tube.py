@@ -36,9 +36,9 @@ from remodel_fenicsx.body.shape import Array, Column, LoadKind, check_lengths
 from remodel_fenicsx.body.wall import AngleOf, Wall, Walled, angle_columns, angle_columns_on_request, check_layers
 from remodel_fenicsx.model.cells import cylindrical_axes, structure_tensor
 from remodel_fenicsx.model.energy import TURNED_OVER, Tissue
+from remodel_fenicsx.schema.settings import Load, Mesh, Natural, Region, Support
 from remodel_fenicsx.schema.tables import fault, shown
 from remodel_fenicsx.schema.units import FORCE, LENGTH, STRESS
-from remodel_fenicsx.settings import Load, Mesh, Natural, Region, Support
 
 if TYPE_CHECKING:
     from mpi4py import MPI

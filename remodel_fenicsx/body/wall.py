@@ -15,8 +15,8 @@ from remodel_fenicsx.body.gmsh_model import length_fault
 from remodel_fenicsx.body.shape import Column, Shape
 from remodel_fenicsx.model.axes import LocalAxes
 from remodel_fenicsx.model.cells import pitch_angle, radial_share
+from remodel_fenicsx.schema.settings import CONSTANT_FIELDS, Region
 from remodel_fenicsx.schema.tables import fault, shown
-from remodel_fenicsx.settings import CONSTANT_FIELDS, Region
 
 if TYPE_CHECKING:
     from remodel_fenicsx.body.domain import Domain

@@ -15,7 +15,7 @@ from remodel_fenicsx.evolution.predictor import PREDICTORS, LoadStep
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.energy import Tissue
-from remodel_fenicsx.settings import Solver
+from remodel_fenicsx.schema.settings import Solver
 from remodel_fenicsx.solver.continuation import Blend, Change, Work
 from remodel_fenicsx.solver.equilibrium import Equilibrium
 from remodel_fenicsx.solver.newton import GuardedNewton, SolveFailure

@@ -13,7 +13,7 @@ from remodel_fenicsx.evolution.remodeling import RemodelingPass
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.model.tensor_law import Target, weight_of_the_end
-from remodel_fenicsx.settings import Solver
+from remodel_fenicsx.schema.settings import Solver
 from remodel_fenicsx.solver.continuation import Work
 from remodel_fenicsx.state.state import State
 

@@ -25,7 +25,7 @@ from remodel_fenicsx.model.laws import relaxed
 from remodel_fenicsx.model.tensor_law import weight_of_the_end
 from remodel_fenicsx.model.tensors import determinant
 from remodel_fenicsx.model.turnover import TurnoverRule
-from remodel_fenicsx.settings import Solver
+from remodel_fenicsx.schema.settings import Solver
 from remodel_fenicsx.solver.continuation import Change, StepFailure, Work
 from remodel_fenicsx.solver.equilibrium import Equilibrium, Look
 from remodel_fenicsx.solver.newton import GuardedNewton, Solution, SolveFailure

@@ -11,7 +11,7 @@ from remodel_fenicsx.evolution.coupling import Staggered
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
 from remodel_fenicsx.model.laws import Drive
-from remodel_fenicsx.settings import Solver
+from remodel_fenicsx.schema.settings import Solver
 from remodel_fenicsx.solver.continuation import StepFailure, Work
 from remodel_fenicsx.state.state import State
 

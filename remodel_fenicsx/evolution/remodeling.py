@@ -21,7 +21,7 @@ from remodel_fenicsx.model.drivers import DRIVERS, FRAMES, carried_axes
 from remodel_fenicsx.model.energy import Tissue, axes_sum
 from remodel_fenicsx.model.laws import Drive, LAWS, MEANS_OF_CASES, mean_target, tensor_target
 from remodel_fenicsx.model.tensor_law import ABOVE_ROUNDING, Target, floor_above
-from remodel_fenicsx.settings import Remodeling
+from remodel_fenicsx.schema.settings import Remodeling
 from remodel_fenicsx.solver.equilibrium import PointStresses
 from remodel_fenicsx.state.state import Numbers, Parameters, State, on_mesh, stress_rounding
 

@@ -27,7 +27,7 @@ from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.energy import Stresses, Tissue
 from remodel_fenicsx.model.laws import Drive, Law, RankedFunction, tensor_target
 from remodel_fenicsx.model.tensor_law import Target
-from remodel_fenicsx.settings import Remodeling, Solver
+from remodel_fenicsx.schema.settings import Remodeling, Solver
 from remodel_fenicsx.solver.continuation import Work
 from remodel_fenicsx.solver.equilibrium import Equilibrium, mandel_vector
 from remodel_fenicsx.state.state import State

@@ -16,7 +16,7 @@ from remodel_fenicsx.body.loading import LoadValues
 from remodel_fenicsx.evolution.coupling import Coupling, Maker
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
 from remodel_fenicsx.model.energy import Tissue
-from remodel_fenicsx.settings import COUPLINGS, Remodeling, Solver
+from remodel_fenicsx.schema.settings import COUPLINGS, Remodeling, Solver
 from remodel_fenicsx.solver.continuation import Work
 from remodel_fenicsx.solver.equilibrium import Extension
 from remodel_fenicsx.state.state import State, on_mesh

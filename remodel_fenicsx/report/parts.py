@@ -40,9 +40,9 @@ from remodel_fenicsx.results.recording import (
 from remodel_fenicsx.results.run_lock import writer
 from remodel_fenicsx.results.status import FAILED, STOPPED, how_it_ended
 from remodel_fenicsx.scene.scene import Scene
+from remodel_fenicsx.schema.settings import Load, Properties
 from remodel_fenicsx.schema.tables import Table
 from remodel_fenicsx.schema.times import same_time
-from remodel_fenicsx.settings import Load, Properties
 from remodel_fenicsx.system.files import read_regular, typed
 from remodel_fenicsx.system.terminal import duration
 

@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 
 from remodel_fenicsx.body.reductions import AUTO, for_means
 from remodel_fenicsx.model.chains import BOLTZMANN_CONSTANT, CHAINS, Chain
+from remodel_fenicsx.schema.settings import Cells, Material, Remodeling, STRESS_UNITS
 from remodel_fenicsx.schema.tables import fault, is_number, quoted
 from remodel_fenicsx.schema.toml import put
-from remodel_fenicsx.settings import Cells, Material, Remodeling, STRESS_UNITS
 
 # ---------------------------------------------------------------- without a preset
 

@@ -12,6 +12,7 @@ from pydantic.fields import FieldInfo
 from remodel_fenicsx.body import SHAPES, Shape
 from remodel_fenicsx.scene.presets import PRESETS, PRESET_NOTES, PROFILES, RANDOM_CELLS
 from remodel_fenicsx.scene.scene import FORMAT, Scene
+from remodel_fenicsx.schema.settings import Load, Supports
 from remodel_fenicsx.schema.tables import (
     choices,
     free_names,
@@ -23,7 +24,6 @@ from remodel_fenicsx.schema.tables import (
 )
 from remodel_fenicsx.schema.toml import merged
 from remodel_fenicsx.schema.units import Dimension, QUANTITY, STRESS, dimension_of, keys_with_units
-from remodel_fenicsx.settings import Load, Supports
 
 
 # ---------------------------------------------------------------- a JSON Schema of scenes

@@ -35,10 +35,7 @@ from remodel_fenicsx.scene.presets import (
     with_own_numbers,
     without_replaced,
 )
-from remodel_fenicsx.schema.tables import SceneError, Table, VariantOf, allowed, fault, quoted, shown
-from remodel_fenicsx.schema.toml import merged, parse_override, put, read_toml, toml_text
-from remodel_fenicsx.schema.units import FORCE, LENGTH_UNIT, LENGTH_UNITS, STRESS, STRESS_UNIT, in_units
-from remodel_fenicsx.settings import (
+from remodel_fenicsx.schema.settings import (
     AS_GIVEN,
     COUPLINGS,
     Cells,
@@ -63,6 +60,9 @@ from remodel_fenicsx.settings import (
     nearest_multiples,
     tables_of,
 )
+from remodel_fenicsx.schema.tables import SceneError, Table, VariantOf, allowed, fault, quoted, shown
+from remodel_fenicsx.schema.toml import merged, parse_override, put, read_toml, toml_text
+from remodel_fenicsx.schema.units import FORCE, LENGTH_UNIT, LENGTH_UNITS, STRESS, STRESS_UNIT, in_units
 
 
 # ---------------------------------------------------------------- what a scene may say but hardly means

@@ -17,7 +17,7 @@ from remodel_fenicsx.errors import RemodelError, SOLVE_FAILED
 from remodel_fenicsx.fem.assembly import over_ranks
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.energy import Tissue
-from remodel_fenicsx.settings import Solver
+from remodel_fenicsx.schema.settings import Solver
 from remodel_fenicsx.solver.equilibrium import Equilibrium, Extension
 from remodel_fenicsx.solver.newton import MANY, POSSIBLE_JUMP, Counted, GuardedNewton, Solution, SolveFailure
 from remodel_fenicsx.solver.diagnosis import BIFURCATION, LIMIT_POINT, SEVERAL_SOLUTIONS, Refusal, diagnosed

@@ -14,7 +14,7 @@ from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.kernels.points import PointKernels, point_kernels
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.axes import AXES, LocalAxes, cells_of, structure_tensors
-from remodel_fenicsx.settings import MEASURED_CELLS, Cells
+from remodel_fenicsx.schema.settings import MEASURED_CELLS, Cells
 
 Array = NDArray[np.float64]
 

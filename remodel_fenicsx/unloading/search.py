@@ -28,7 +28,7 @@ from remodel_fenicsx.model.residual_stress import Loads, closing
 from remodel_fenicsx.results.fields import NodalGather, dof_of_node
 from remodel_fenicsx.results.run_folder import agreed
 from remodel_fenicsx.scene import Scene, SceneError
-from remodel_fenicsx.settings import AS_GIVEN, EQUILIBRIUM, Natural
+from remodel_fenicsx.schema.settings import AS_GIVEN, EQUILIBRIUM, Natural
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.solver.equilibrium import mandel_vector

@@ -18,7 +18,7 @@ from remodel_fenicsx.body.tube import whole_tube
 from remodel_fenicsx.results.columns import Measurement
 from remodel_fenicsx.results.fields import NodalGather
 from remodel_fenicsx.scene import scene_from_dict
-from remodel_fenicsx.settings import Support
+from remodel_fenicsx.schema.settings import Support
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.studies.trade import ladder
 from tests.mesh_files import COUNTS, LENGTH, RADII, write_tube

@@ -14,7 +14,7 @@ from remodel_fenicsx.body import SHAPES, Tube
 from remodel_fenicsx.body.domain import Domain, build_domain
 from remodel_fenicsx.body.gmsh_model import GeometryError
 from remodel_fenicsx.body.wall import shared_out
-from remodel_fenicsx.settings import Mesh, Region
+from remodel_fenicsx.schema.settings import Mesh, Region
 from remodel_fenicsx.simulation import Simulation, build, checked_domain
 
 SELF = MPI.COMM_SELF

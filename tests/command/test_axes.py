@@ -13,7 +13,7 @@ from mpi4py import MPI
 from remodel_fenicsx import Recording, Scene, cli, run
 from remodel_fenicsx.results.revolve import BODY, revolve
 from remodel_fenicsx.results.vtkhdf import check_file
-from remodel_fenicsx.settings import CONSTANT_FIELDS
+from remodel_fenicsx.schema.settings import CONSTANT_FIELDS
 
 AXES = ("axis_c", "axis_a", "axis_r")
 

@@ -20,7 +20,7 @@ from remodel_fenicsx.fem import assembly, jit
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.results import history
 from remodel_fenicsx.scene import scene_from_dict
-from remodel_fenicsx.settings import FIELDS_BY_NAME
+from remodel_fenicsx.schema.settings import FIELDS_BY_NAME
 from remodel_fenicsx.solver.continuation import Blend, Work
 from remodel_fenicsx.solver.equilibrium import Equilibrium
 from remodel_fenicsx.watch.warnings import LockingWarning

@@ -15,7 +15,7 @@ from mpi4py import MPI
 from remodel_fenicsx import Scene, SceneError
 from remodel_fenicsx.model.cells import structure_tensor
 from remodel_fenicsx.model.laws import LAWS
-from remodel_fenicsx.settings import COUPLINGS
+from remodel_fenicsx.schema.settings import COUPLINGS
 from remodel_fenicsx.simulation import Simulation
 
 PAIRS = [

@@ -17,7 +17,7 @@ from remodel_fenicsx.evolution.time_steps import Estimate
 from remodel_fenicsx.model.cells import UnitCell, angle_between
 from remodel_fenicsx.running import resume, run
 from remodel_fenicsx.scene.scene import Scene, scene_from_dict
-from remodel_fenicsx.settings import MOST_STEPS, Time
+from remodel_fenicsx.schema.settings import MOST_STEPS, Time
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.solver.diagnosis import TOO_LARGE
 

@@ -11,7 +11,7 @@ from mpi4py import MPI
 
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
 from remodel_fenicsx.scene.scene import scene_from_dict
-from remodel_fenicsx.settings import Cells, Load
+from remodel_fenicsx.schema.settings import Cells, Load
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.solver.equilibrium import Extension
 from remodel_fenicsx.state.state import State

@@ -16,7 +16,7 @@ from remodel_fenicsx import Scene, SceneError, Simulation
 from remodel_fenicsx.model.drivers import DRIVERS
 from remodel_fenicsx.model.energy import MATRICES, neo_hookean
 from remodel_fenicsx.scene import preset_scene
-from remodel_fenicsx.settings import Cells, Material
+from remodel_fenicsx.schema.settings import Cells, Material
 from remodel_fenicsx.watch.warnings import WARNED_SHARE, LockingWarning, PressureNoise
 from tests import parts
 from tests.conftest import Case, slowly

@@ -17,7 +17,7 @@ from remodel_fenicsx import Scene, SceneError, Simulation
 from remodel_fenicsx.evolution.stepper import Stepper
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.model.energy import Tissue
-from remodel_fenicsx.settings import Cells, Remodeling
+from remodel_fenicsx.schema.settings import Cells, Remodeling
 from tests import parts
 from tests.parts import cube, tube
 

@@ -11,7 +11,7 @@ from mpi4py import MPI
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.kinematics import FullKinematics
 from remodel_fenicsx.fem.quadrature import Quadrature
-from remodel_fenicsx.settings import Cells
+from remodel_fenicsx.schema.settings import Cells
 from tests import parts
 from tests.parts import cube, tube
 

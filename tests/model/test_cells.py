@@ -14,7 +14,7 @@ from remodel_fenicsx.model.cells import (
     pitch_angle,
     structure_tensor,
 )
-from remodel_fenicsx.settings import Cells
+from remodel_fenicsx.schema.settings import Cells
 from tests import parts
 
 R0 = 1.3

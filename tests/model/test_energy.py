@@ -14,7 +14,7 @@ from mpi4py import MPI
 
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.model.cells import UnitCell
-from remodel_fenicsx.settings import Cells, Material
+from remodel_fenicsx.schema.settings import Cells, Material
 from remodel_fenicsx.solver.continuation import shares
 from remodel_fenicsx.solver.equilibrium import Equilibrium
 from tests import parts

@@ -13,7 +13,7 @@ from remodel_fenicsx.body.shape import PROFILE, columns_of
 from remodel_fenicsx.model.cells import cylindrical_axes
 from remodel_fenicsx.results.columns import Observer
 from remodel_fenicsx.results.fields import ElementFields
-from remodel_fenicsx.settings import Cells
+from remodel_fenicsx.schema.settings import Cells
 from tests import parts
 from tests.parts import cube, tube
 

@@ -15,7 +15,7 @@ from remodel_fenicsx.evolution.stepper import Step
 from remodel_fenicsx.model.cells import cylindrical_axes, structure_tensor
 from remodel_fenicsx.results.fields import ElementFields, Fields
 from remodel_fenicsx.scene.scene import scene_from_dict
-from remodel_fenicsx.settings import Cells
+from remodel_fenicsx.schema.settings import Cells
 from remodel_fenicsx.simulation import Simulation
 from tests import parts
 from tests.parts import tube

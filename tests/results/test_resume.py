@@ -26,12 +26,12 @@ from remodel_fenicsx.model.cells import structure_tensor
 from remodel_fenicsx.results.checkpoint import Checkpoints, gather_state, restore_state
 from remodel_fenicsx.results.checkpoint_file import Checkpoint, CheckpointError, _read, read_checkpoint, read_pointer
 from remodel_fenicsx.results.recording import RecordingError
+from remodel_fenicsx.schema.settings import COUPLINGS, CouplingKind
 from remodel_fenicsx.system.files import typed
 from remodel_fenicsx.results.run_lock import FolderTaken, RunLock, writer
 from remodel_fenicsx.results.status import status
 from remodel_fenicsx.running import resume, run
 from remodel_fenicsx.scene import preset_scene
-from remodel_fenicsx.settings import COUPLINGS, CouplingKind
 from remodel_fenicsx.solver.continuation import StepFailure, Work
 from remodel_fenicsx.state.state import State
 from remodel_fenicsx.system.interrupts import Paused

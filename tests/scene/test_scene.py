@@ -18,8 +18,8 @@ from remodel_fenicsx.model.laws import LAWS
 from remodel_fenicsx.scene.presets import PRESET_NOTES, PRESETS
 from remodel_fenicsx.scene.reference import scene_reference
 from remodel_fenicsx.scene.scene import FORMAT, RENAMED, Scene, preset_scene, read_scene, scene_from_dict
+from remodel_fenicsx.schema.settings import Cells, Load, Material, Remodeling, Solver, Time
 from remodel_fenicsx.schema.tables import SceneError, is_table, sections
-from remodel_fenicsx.settings import Cells, Load, Material, Remodeling, Solver, Time
 
 ROOT = Path(__file__).resolve().parents[2]
 DEMOS = sorted((ROOT / "demos").glob("*.toml"))

@@ -11,7 +11,7 @@ import ufl
 
 from remodel_fenicsx.fem import jit, quadrature
 from remodel_fenicsx.model.tensors import passes_through_zero
-from remodel_fenicsx.settings import Cells, Material
+from remodel_fenicsx.schema.settings import Cells, Material
 from remodel_fenicsx.solver.equilibrium import Extension, Look
 from remodel_fenicsx.solver.newton import SolveFailure
 from remodel_fenicsx.system.interrupts import Interrupted

@@ -7,7 +7,7 @@ import pytest
 from mpi4py import MPI
 
 from remodel_fenicsx.scene import preset_scene
-from remodel_fenicsx.settings import Cells
+from remodel_fenicsx.schema.settings import Cells
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.solver.newton import Convergence

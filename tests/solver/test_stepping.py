@@ -9,7 +9,7 @@ import pytest
 
 from remodel_fenicsx.evolution.stepper import Stepper, times
 from remodel_fenicsx.scene.scene import Load, preset_scene
-from remodel_fenicsx.settings import Cells
+from remodel_fenicsx.schema.settings import Cells
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.solver.continuation import KEPT_RESERVE, Blend, Change, StepFailure, Work
 from remodel_fenicsx.solver.equilibrium import Extension

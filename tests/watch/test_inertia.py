@@ -17,7 +17,7 @@ from remodel_fenicsx.fem.petsc_options import ProblemOptions
 from remodel_fenicsx.fem.solver_methods import SYMMETRIC, factor_options, method_options
 from remodel_fenicsx.results.history import History
 from remodel_fenicsx.results.recording import read_history
-from remodel_fenicsx.settings import Cells
+from remodel_fenicsx.schema.settings import Cells
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.solver.equilibrium import Extension
 from remodel_fenicsx.solver.diagnosis import Inertia, diagnosed
