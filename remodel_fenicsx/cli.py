@@ -22,6 +22,7 @@ from remodel_fenicsx.scene.presets import PRESETS, PROFILES, profile_for
 from remodel_fenicsx.scene.scene import Scene, SceneError, preset_scene, read_scene
 from remodel_fenicsx.schema.tables import printable, shortened
 from remodel_fenicsx.system import interrupts
+from remodel_fenicsx.system.extensions import EXTENSIONS, load_extensions
 from remodel_fenicsx.system.files import (
     MOST_RUNS,
     megabytes,
@@ -61,6 +62,7 @@ def parser() -> argparse.ArgumentParser:
         epilog=MAIN_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+    _add_extensions(main_parser)
     main_parser.add_argument("--version", action="version", version=__version__, help="Print the version and end.")
     commands = _Commands(main_parser.add_subparsers(dest="command", required=True, metavar="COMMAND"))
     _add_runs(commands)
@@ -70,6 +72,18 @@ def parser() -> argparse.ArgumentParser:
     commands.found.add_parser(SERVE)  # of the processes of a study; not listed
     commands.add("info", "Print the versions of the program and its libraries, the solvers and the BLAS.", "info")
     return main_parser
+
+
+def _extensions_parser() -> argparse.ArgumentParser:
+    """Of what may stand anywhere, and is done before the rest is looked at."""
+    found = _Parser(prog="remodel-fenicsx", add_help=False, allow_abbrev=False)
+    _add_extensions(found)
+    return found
+
+
+def _add_extensions(found: argparse.ArgumentParser) -> None:
+    text = f"Run this Python file first, whose parts scenes may then name; anywhere, repeatable (or {EXTENSIONS})."
+    found.add_argument("--with", action="append", dest="extensions", metavar="FILE.py", help=text)
 
 
 MAIN_EPILOG = (
@@ -96,6 +110,7 @@ class _Commands:
         added: argparse.ArgumentParser = self.found.add_parser(
             name, help=text.replace("%", "%%"), description=text, epilog=epilog, formatter_class=raw
         )
+        _add_extensions(added)
         return added
 
     def add_for_scene(self, name: str, text: str, *examples: str) -> argparse.ArgumentParser:
@@ -279,15 +294,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.open(os.devnull, os.O_RDWR)
     sys.stdout, sys.stderr = sys.stdout or open(os.devnull, "w"), sys.stderr or open(os.devnull, "w")
     with interrupts.ending_at_once():
-        if list(sys.argv[1:] if arguments is None else arguments)[:1] == ["figures"]:
-            return _fail("figures: is a script now: ./with-fenicsx python3 demos/figures.py fig8", BAD_INPUT)
-        return _done(_parsed(arguments))
+        return _done(list(sys.argv[1:] if arguments is None else arguments))
 
 
-def _done(options: argparse.Namespace) -> int:
+def _done(arguments: list[str]) -> int:
     """Do a command; returns its exit code. What ends it is said in one line."""
-    output = getattr(options, "output", None)
+    options, output = argparse.Namespace(command=None), None
     try:
+        with _only_the_first_rank_speaks():
+            first, rest = _extensions_parser().parse_known_args(arguments)
+            load_extensions(first.extensions or ())
+            if rest[:1] == ["figures"]:
+                raise RemodelError("figures: is a script now: ./with-fenicsx python3 demos/figures.py fig8")
+            options = parser().parse_args(arguments)
+        output = getattr(options, "output", None)
         kernels()  # not after minutes, when they are asked for
         return COMMANDS[options.command](options)
     except RemodelError as error:
@@ -303,14 +323,14 @@ def _done(options: argparse.Namespace) -> int:
         return _fail("stopped by a defect of the program, see above", 1, on_all_ranks=False)
 
 
-def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """The options; of several ranks only the first says what is wrong with them."""
+@contextlib.contextmanager
+def _only_the_first_rank_speaks() -> Iterator[None]:
     with contextlib.ExitStack() as stack:
         if not interrupts.is_first_rank():
             silence = stack.enter_context(open(os.devnull, "w"))
             stack.enter_context(contextlib.redirect_stdout(silence))
             stack.enter_context(contextlib.redirect_stderr(silence))
-        return parser().parse_args(arguments)
+        yield
 
 
 def _say(text: str) -> None:

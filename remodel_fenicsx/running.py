@@ -19,7 +19,7 @@ from remodel_fenicsx.fem.solver_methods import WORTH_RANKS
 from remodel_fenicsx.results.checkpoint import Checkpoints, restore_state
 from remodel_fenicsx.results.checkpoint_file import Checkpoint, CheckpointError, read_checkpoint
 from remodel_fenicsx.results.fields import Fields, field_names
-from remodel_fenicsx.results.recording import LOG, SCENE, RecordingError, scene_as_run
+from remodel_fenicsx.results.recording import LOG, SCENE, RecordingError, scene_as_run, versions_as_run
 from remodel_fenicsx.results.run_folder import (
     LastStep,
     RunFolder,
@@ -37,6 +37,7 @@ from remodel_fenicsx.schema.toml import read_toml
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.system.environment import versions
+from remodel_fenicsx.system.extensions import check_extensions
 from remodel_fenicsx.system.guarded import LARGEST_FILE
 from remodel_fenicsx.system.interrupts import (
     Interrupted,
@@ -149,6 +150,8 @@ def _kept(place: Path, overrides: Sequence[str], comm: MPI.Intracomm) -> tuple[S
     """Scene, and checkpoint on rank 0, of a run that goes on; or the refusal on all ranks."""
 
     def read() -> tuple[Scene, Checkpoint | None]:
+        begun = versions_as_run(place)
+        check_extensions(begun, place)
         try:
             scene = read_scene(place / SCENE, overrides)
         except SceneError:
@@ -160,7 +163,9 @@ def _kept(place: Path, overrides: Sequence[str], comm: MPI.Intracomm) -> tuple[S
         else:
             check_continuation(_scene_of(checkpoint), scene, checkpoint.time)
             _check_whole(read_toml(place / SCENE), tomllib.loads(checkpoint.scene), place)
-            _say_where(checkpoint)
+            log.info("goes on from the checkpoint of time %g, step %d", checkpoint.time, checkpoint.number)
+            begun = checkpoint.versions
+        _say_changes(begun, versions())
         return scene, checkpoint
 
     scene, checkpoint = agreed(comm, lambda: read() if comm.rank == 0 else (None, None))
@@ -182,10 +187,8 @@ def _scene_of(checkpoint: Checkpoint) -> Scene:
         raise CheckpointError(f"the checkpoint's scene is not TOML: {error}") from error
 
 
-def _say_where(checkpoint: Checkpoint) -> None:
-    log.info("goes on from the checkpoint of time %g, step %d", checkpoint.time, checkpoint.number)
-    now = versions()
-    for name, version in checkpoint.versions.items():
+def _say_changes(begun: dict[str, str], now: dict[str, str]) -> None:
+    for name, version in begun.items():
         if now.get(name) != version:
             log.warning("goes on with %s %s, the run was begun with %s", name, now.get(name), version)
 

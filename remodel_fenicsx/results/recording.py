@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.errors import RemodelError
 from remodel_fenicsx.schema.times import same_time
+from remodel_fenicsx.system.extensions import check_extensions
 from remodel_fenicsx.system.files import check_regular, read_regular
 
 if TYPE_CHECKING:
@@ -164,14 +165,8 @@ class RecordedRun:
 
     @cached_property
     def versions(self) -> dict[str, str]:
-        """Versions of package and libraries that the run wrote on top of its scene, by name."""
-        found = {}
-        for line in (self.path / SCENE).read_text(encoding="utf-8").splitlines()[1:]:
-            if not line.startswith("#"):
-                break
-            name, _, version = line[1:].strip().partition(" ")
-            found[name] = version
-        return found
+        """Versions of package and libraries, and sums of extensions, that the run wrote on top of its scene."""
+        return versions_as_run(self.path)
 
     # ------------------------------------------------------------ history
     @cached_property
@@ -317,7 +312,20 @@ def scene_as_run(folder: Path) -> Scene:
     try:
         return read_scene(path)
     except SceneError as error:  # about the file, or about a key of this one
+        check_extensions(versions_as_run(folder), folder)
         raise RecordingError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
+
+
+def versions_as_run(folder: Path) -> dict[str, str]:
+    """What stands on top of the scene of a run's folder, by name."""
+    path, found = folder / SCENE, dict[str, str]()
+    text = read_regular(path, LARGEST_HISTORY).decode(errors="replace") if path.is_file() else ""
+    for line in text.splitlines()[1:]:
+        if not line.startswith("#"):
+            break
+        name, _, version = line[1:].strip().partition(" ")
+        found[name] = version
+    return found
 
 
 def steps_recorded(folder: str | os.PathLike[str]) -> int:

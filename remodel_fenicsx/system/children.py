@@ -14,6 +14,7 @@ from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
+from remodel_fenicsx.system.extensions import extensions_for_children
 from remodel_fenicsx.system.files import open_own
 
 SECONDS_TO_END = 30.0  # seconds
@@ -109,9 +110,10 @@ def _process(arguments: Sequence[str], **streams: Any) -> subprocess.Popen[Any]:
 
 
 def environment_of_child() -> dict[str, str]:
-    """With this very package, wherever it was imported from; one thread, as there are jobs for the cores."""
+    """With this very package, and parts of one's own; one thread, as there are jobs for the cores."""
     paths = [str(Path(__file__).parents[2]), *filter(None, [os.environ.get("PYTHONPATH")])]
-    return os.environ | {"PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"}
+    own = {"PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"}
+    return os.environ | own | extensions_for_children()
 
 
 def _emptied(messages: Path) -> TextIO:

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from remodel_fenicsx._version import __version__
 from remodel_fenicsx.errors import BAD_ENVIRONMENT, RemodelError
+from remodel_fenicsx.system.extensions import extensions
 from remodel_fenicsx.system.interrupts import take_back_signals
 
 OLDEST_DOLFINX = (0, 9)
@@ -37,7 +38,7 @@ def check_usable(reason: str | None) -> None:
 
 
 def versions() -> dict[str, str]:
-    """Names and versions of everything that the numbers depend on."""
+    """Names and versions of everything that the numbers depend on; of extensions their SHA-256."""
     import dolfinx
     import numpy
     from mpi4py import MPI
@@ -55,7 +56,7 @@ def versions() -> dict[str, str]:
         "MPI": MPI.Get_library_version().split(",")[0].strip(),
         "BLAS": blas_library(),
         "system": platform.platform(),
-    }
+    } | extensions()
 
 
 def kernels() -> str:

@@ -1,0 +1,127 @@
+"""Parts of one's own: --with and REMODEL_FENICSX_EXTENSIONS, for all commands, ranks and children."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import os
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from remodel_fenicsx.results.recording import read_history
+from remodel_fenicsx.system.extensions import EXTENSIONS
+from tests.command.test_run import PROJECT, run
+from tests.forks import forked
+
+DEMO = PROJECT / "demos" / "extensions" / "shear_column.py"
+DRIVER = """from remodel_fenicsx.extend import DRIVERS, Driver
+DRIVERS["mine"] = Driver(lambda F, stresses: stresses.cauchy, material=False)
+"""
+
+
+SCENE = """preset = "kuhl-holzapfel-2007"
+geometry.shape = "cube"
+model.kinematics = "point"
+loads.force.value = 10.0
+remodeling.driver = "mine"
+time.end = 2.0
+"""
+
+
+@pytest.fixture
+def place(tmp_path: Path) -> Path:
+    """A folder with a scene that names a driver of mine.py, which is there too."""
+    (tmp_path / "cube.toml").write_text(SCENE)
+    (tmp_path / "mine.py").write_text(DRIVER)
+    return tmp_path
+
+
+def test_the_demo_of_a_column(tmp_path: Path) -> None:
+    """Of a cube that is pulled uniformly; both extensions of a line are run, in any place of it."""
+    (tmp_path / "other.py").write_text("print('the other one')\n")
+    words = ["--with", DEMO, "run", PROJECT / "demos" / "cube.toml", "-q", "-o", tmp_path / "run", "--set=time.end=2"]
+    done = run(*words, f"--with={tmp_path / 'other.py'}")
+    assert (done.returncode, done.stderr) == (0, "") and done.stdout.startswith("the other one\n")
+    history = read_history(tmp_path / "run")
+    assert history["max_shear_strain"][0] == 0.0 and history["max_shear_strain"][2] > 0.05
+    across = np.sqrt(history["min_jacobian"] / history["mean_stretch"])
+    strain = (history["mean_stretch"] ** 2 - across**2) / 2
+    np.testing.assert_allclose(history["max_shear_strain"], strain, rtol=1e-6, atol=1e-12)
+    header = (tmp_path / "run" / "scene.toml").read_text().split("\n\n")[0]
+    for path in (DEMO, tmp_path / "other.py"):
+        assert f"# {path.name} sha256:{hashlib.sha256(path.read_bytes()).hexdigest()}\n" in f"{header}\n"
+    assert len(DEMO.read_text().splitlines()) < 60
+
+
+def test_every_command_knows_it(place: Path) -> None:
+    """By the option or the variable; without it a scene that needs it is refused."""
+    refused = run("validate", "cube.toml", cwd=place)
+    assert refused.returncode == 2 and "remodeling.driver = 'mine'" in refused.stderr
+    variables = {**os.environ, EXTENSIONS: str(place / "mine.py")}
+    assert forked("remodel-fenicsx", "validate", "cube.toml", cwd=place, variables=variables).returncode == 0
+    for words in ("validate cube.toml", "run cube.toml -q -o run", "report run", "picture run -o run.png", "info"):
+        done = run(*words.split(), "--with", "mine.py", cwd=place)
+        assert (done.returncode, done.stderr) == (0, ""), words
+    assert "mine.py" in (place / "run" / "report.html").read_text()
+    without = run("report", "run", cwd=place)
+    assert without.returncode == 2 and without.stderr.count("\n") == 1 and "mine.py" in without.stderr
+
+
+def test_the_runs_of_a_study_know_it(place: Path) -> None:
+    """They are processes of their own, in folders of their own."""
+    words = "sweep cube.toml loads.force.value=5:10:2 -q -o sweep --with mine.py"
+    done = run(*words.split(), "--with", DEMO, cwd=place)
+    assert done.returncode == 0, done.stderr
+    with (place / "sweep" / "sweep.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [float(row["max_shear_strain"]) > 0.01 for row in rows] == [True, True]
+
+
+def test_both_ranks_know_it(place: Path) -> None:
+    done = run("run", "cube.toml", "--with", "mine.py", "-q", "-o", "run", ranks=2, cwd=place)
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_run_goes_on_with_it(place: Path) -> None:
+    assert run("run", "cube.toml", "--with", "mine.py", "-q", "-o", "run", cwd=place).returncode == 0
+    before = (place / "run" / "scene.toml").read_bytes()
+    without = run("run", "--resume", "run", "--set=time.end=3", cwd=place)
+    assert without.returncode == 2 and without.stderr.count("\n") == 1 and "extension mine.py" in without.stderr
+    assert (place / "run" / "scene.toml").read_bytes() == before
+    (place / "mine.py").write_text(f"{DRIVER}\n")
+    other = run("--with", "mine.py", "run", "--resume", "run", "--set=time.end=3", "-q", cwd=place)
+    assert other.returncode == 0 and re.search(r"goes on with mine.py sha256:\w+, the run was begun with", other.stderr)
+    assert list(read_history(place / "run")["time"]) == [0.0, 1.0, 2.0, 3.0]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (None, "No such file"),
+        ("x = 1\ny = )\n", "line 2: SyntaxError"),
+        ("def f():\n    return g\n\nf()\n", "line 2: NameError: name 'g'"),
+        ("import sys\nsys.exit(0)\n", "line 2: SystemExit"),
+        ("import json\njson.loads('{')\n", "line 2: JSONDecodeError"),
+        ("\0", "SyntaxError"),
+    ],
+)
+def test_a_file_that_cannot_be_run_is_bad_input(text: str | None, said: str, tmp_path: Path) -> None:
+    if text is not None:
+        (tmp_path / "bad.py").write_text(text)
+    done = run("run", PROJECT / "demos" / "cube.toml", "--with", "bad.py", cwd=tmp_path)
+    assert done.returncode == 2 and done.stderr.count("\n") == 1, done.stderr
+    assert "bad.py" in done.stderr and said in done.stderr
+    assert not (tmp_path / "results").exists()
+
+
+def test_two_of_one_name_are_refused_and_one_is_run_once(tmp_path: Path) -> None:
+    for folder in ("a", "b"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "mine.py").write_text("print('hello')\n")
+    done = run("info", "--with", "a/mine.py", "--with", "./a/mine.py", cwd=tmp_path)
+    assert done.returncode == 0 and done.stdout.count("hello") == 1 and "mine.py          sha256:" in done.stdout
+    done = run("info", "--with", "a/mine.py", "--with", "b/mine.py", cwd=tmp_path)
+    assert done.returncode == 2 and "b/mine.py" in done.stderr
