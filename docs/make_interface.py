@@ -24,7 +24,7 @@ import remodel_fenicsx
 from remodel_fenicsx import Scene, cli, extend, parts
 from remodel_fenicsx.body.shape import columns_of, columns_on_request
 from remodel_fenicsx.scene.presets import PRESETS, PROFILES
-from remodel_fenicsx.schema.tables import Table, sections
+from remodel_fenicsx.schema.tables import Table, description, sections
 
 PAGE = Path(__file__).with_name("interface.md")
 HEAD = """# The public interface
@@ -146,7 +146,7 @@ def _listed(what: str, names: Iterable[str]) -> str:
 def _keys() -> Iterator[str]:
     for key, variant, table in sections(Scene):
         what = (f"`[{key}]`" if key else "top of the file") + (f" of shape `{variant}`" if variant else "")
-        yield _listed(what, (name for name, field in table.model_fields.items() if field.description))
+        yield _listed(what, (name for name in table.model_fields if description(table, name)))
     for shape, kind in extend.SHAPES.items():
         yield _listed(f"`[loads]` of shape `{shape}`", kind.loads)
     yield _listed("presets", PRESETS)

@@ -75,27 +75,20 @@ class Mesh(Table):
     remodel_fenicsx.schema.tables.SceneError: refinement = 0: must be a whole number at least 1
     """
 
-    refinement: int = Field(
-        default=1,
-        ge=1,
-        description=(
-            "Multiplies the paper's number of elements in every direction; 1 is the paper's mesh. More "
-            "than 10 million hexahedra, or as many split into tetrahedra, are refused."
-        ),
-    )
-    element: Literal["hexahedron", "tetrahedron"] = Field(default="hexahedron", description="Shape of the elements.")
-    degree: Annotated[int, OneOf((1, 2))] = Field(
-        default=1, description="Polynomial degree of the displacement in an element: 1, as in the paper, or 2."
-    )
+    refinement: int = Field(default=1, ge=1)
+    """Multiplies the paper's number of elements in every direction; 1 is the paper's mesh. More than 10 million
+    hexahedra, or as many split into tetrahedra, are refused."""
+    element: Literal["hexahedron", "tetrahedron"] = "hexahedron"
+    """Shape of the elements."""
+    degree: Annotated[int, OneOf((1, 2))] = 1
+    """Polynomial degree of the displacement in an element: 1, as in the paper, or 2."""
     formulation: Annotated[str, OneOf(FORMULATIONS, (AUTO,))] = Field(
         default=AUTO,
-        description=(
-            f"How elements treat the change of volume. 'auto' takes {NOT_LOCKING!r} where lambda/mu is above "
-            f"{STIFF_BULK['hexahedron']:g} (tetrahedra of degree 2: {STIFF_BULK['tetrahedron']:g}) and nothing of the "
-            "scene needs 'displacement'; the scene as run has its name. "
-            + ". ".join(f"{name!r}: {formulation.meaning}" for name, formulation in FORMULATIONS.items())
-            + "."
-        ),
+        description=f"How elements treat the change of volume. 'auto' takes {NOT_LOCKING!r} where lambda/mu is above "
+        f"{STIFF_BULK['hexahedron']:g} (tetrahedra of degree 2: {STIFF_BULK['tetrahedron']:g}) and nothing of the "
+        "scene needs 'displacement'; the scene as run has its name. "
+        + ". ".join(f"{name!r}: {formulation.meaning}" for name, formulation in FORMULATIONS.items())
+        + ".",
     )
 
     @model_validator(mode="after")
@@ -113,11 +106,9 @@ class Model(Table):
 
     kinematics: Annotated[str, OneOf(KINEMATICS, (AUTO,))] = Field(
         default=AUTO,
-        description=(
-            "'auto' takes the cheapest one that is exact for the scene; the scene as run has its name. "
-            + ". ".join(f"{name!r}: {kinematics.meaning}" for name, kinematics in KINEMATICS.items())
-            + ". One that would be wrong for the scene is refused with the reason (docs/kinematics.md)."
-        ),
+        description="'auto' takes the cheapest one that is exact for the scene; the scene as run has its name. "
+        + ". ".join(f"{name!r}: {kinematics.meaning}" for name, kinematics in KINEMATICS.items())
+        + ". One that would be wrong for the scene is refused with the reason (docs/kinematics.md).",
     )
 
 
@@ -129,35 +120,17 @@ class Support(Table):
     outlet are guided and all other faces are free. A tube has `[supports.outer]` alone, for what surrounds it.
     """
 
-    kind: Literal["guided", "sliding", "held", "elastic", "free"] = Field(
-        default="guided",
-        description=(
-            "'guided': the face stays in its plane and its circle stays centred, but may grow. "
-            "'sliding': the face stays in its plane. 'held': the face does not move, except along N as "
-            "loads.elongation says. 'elastic': springs of fixed direction hold the face, like the "
-            "tissue around a vessel. 'free': nothing holds the face."
-        ),
-    )
-    stiffness: Annotated[float | None, FOUNDATION] = Field(
-        default=None,
-        gt=0,
-        description=(
-            "Force per area and displacement, in stress_unit over the scene's unit of length. 'elastic'"
-            " needs it. For 'guided' and 'sliding' the default is 1000 (lame_lambda + 2 lame_mu) over "
-            "the wall's thickness. With it a plane moves by a thousandth of what the wall's own "
-            "compression does."
-        ),
-        json_schema_extra={"allowed": "a finite number greater than 0"},
-    )
-    tangential: float = Field(
-        default=1.0,
-        ge=0,
-        le=1,
-        description=(
-            "For 'elastic': stiffness across N over stiffness along N. Below 0.5 a wall that has grown "
-            "may twist. With 0 a tube may be solved on one radius, which cannot twist."
-        ),
-    )
+    kind: Literal["guided", "sliding", "held", "elastic", "free"] = "guided"
+    """'guided': the face stays in its plane and its circle stays centred, but may grow. 'sliding': the face stays in
+    its plane. 'held': the face does not move, except along N as loads.elongation says. 'elastic': springs of fixed
+    direction hold the face, like the tissue around a vessel. 'free': nothing holds the face."""
+    stiffness: Annotated[float | None, FOUNDATION] = Field(default=None, gt=0)
+    """Force per area and displacement, in stress_unit over the scene's unit of length. 'elastic' needs it. For 'guided'
+    and 'sliding' the default is 1000 (lame_lambda + 2 lame_mu) over the wall's thickness. With it a plane moves by a
+    thousandth of what the wall's own compression does."""
+    tangential: float = Field(default=1.0, ge=0, le=1)
+    """For 'elastic': stiffness across N over stiffness along N. Below 0.5 a wall that has grown may twist. With 0 a
+    tube may be solved on one radius, which cannot twist."""
 
     @model_validator(mode="after")
     def _springs_have_a_stiffness(self) -> Support:
@@ -175,15 +148,9 @@ class Supports(Table):
     model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, Support] = Field(init=False)
 
-    ends: str = Field(
-        default="free",
-        description=(
-            "What holds the ends of a tube. 'free': they stay in their planes and may move radially. "
-            "'clamped': they also keep their circles. 'closed': they are free and have caps on which "
-            "the pressure acts; the length is then an unknown."
-        ),
-        json_schema_extra={"allowed": "'free', for a tube also 'clamped' and 'closed'"},
-    )
+    ends: str = Field(default="free", json_schema_extra={"allowed": "'free', for a tube also 'clamped' and 'closed'"})
+    """What holds the ends of a tube. 'free': they stay in their planes and may move radially. 'clamped': they also keep
+    their circles. 'closed': they are free and have caps on which the pressure acts; the length is then an unknown."""
 
     @property
     def faces(self) -> dict[str, Support]:
@@ -219,75 +186,40 @@ class Material(Table):
     2.125
     """
 
-    lame_lambda: Annotated[float, STRESS] = Field(
-        default=27.293, ge=0, description="First Lame constant lambda of the matrix, in stress_unit."
-    )
-    lame_mu: Annotated[float, STRESS] = Field(
-        default=3.103, gt=0, description="Second Lame constant mu of the matrix, in stress_unit."
-    )
-    chain_density: Annotated[float, NUMBER_DENSITY] = Field(
-        default=2.0e21, ge=0, description="Number n_chn of chains per volume, in 1/m^3. 0 means no chains."
-    )
-    contour_length: float = Field(
-        default=1.594,
-        gt=0,
-        description=(
-            "Contour length L of a chain, its length when pulled straight, in link lengths. The chain locks there."
-        ),
-    )
-    persistence_length: float = Field(
-        default=1.365,
-        gt=0,
-        description="Persistence length A_p of a chain, in link lengths: its bending stiffness over k theta.",
-    )
-    initial_stiffness: Annotated[float | None, STRESS] = Field(
-        default=None,
-        gt=0,
-        description=(
-            "In place of chain_density: the slope of a measured curve at stretch 1, nominal stress of "
-            "the network over stretch along aligned chains, in stress_unit. It is c r0^2 (d(g r)/dr + "
-            "g) at r0. The scene as run has chain_density (docs/which_numbers.md)."
-        ),
-        json_schema_extra={"allowed": "a finite number greater than 0"},
-    )
-    locking_stretch: float | None = Field(
-        default=None,
-        gt=1,
-        description=(
-            "In place of contour_length: the stretch L / r0 along aligned chains at which they lock. "
-            "The scene as run has contour_length (docs/which_numbers.md)."
-        ),
-        json_schema_extra={"allowed": "a finite number greater than 1"},
-    )
-    temperature: Annotated[float, TEMPERATURE] = Field(
-        default=310.0, gt=0, description="Absolute temperature theta, in K."
-    )
-    energy_factor: Annotated[int, OneOf((1, 4))] = Field(
-        default=1,
-        description=(
-            "Factor omega of the chain energy. 1 gives the stress as printed (eq. 7) and reproduces "
-            "Fig. 6. 4 gives the energy as printed (eq. 4b)."
-        ),
-    )
-    matrix: Annotated[str, OneOf(MATRICES)] = Field(default="neo-hookean", description="Energy of the matrix.")
-    chain: Annotated[str, OneOf(CHAINS)] = Field(default="wormlike", description="Force law of a single chain.")
-    repulsion: Annotated[str, OneOf(REPULSIONS)] = Field(
-        default="axes",
-        description=(
-            "Form of the repulsive energy that makes the reference state free of stress. 'axes' is the "
-            "paper's, in the stretches along the three cell axes. 'log' depends on the structure tensor"
-            " alone (A : ln C); it equals 'axes' where both have the same axes, and suits the law "
-            "'tensor'. 'length' depends on the length of the chains alone. Where neither scene nor "
-            "preset names one, the law 'tensor' has 'log'."
-        ),
-    )
-    stress_unit: Literal["Pa", "kPa", "MPa"] = Field(
-        default="Pa",
-        description=(
-            "Unit of every stress, pressure and Lame constant of the scene. Forces are in this unit "
-            "times the unit of length squared."
-        ),
-    )
+    lame_lambda: Annotated[float, STRESS] = Field(default=27.293, ge=0)
+    """First Lame constant lambda of the matrix, in stress_unit."""
+    lame_mu: Annotated[float, STRESS] = Field(default=3.103, gt=0)
+    """Second Lame constant mu of the matrix, in stress_unit."""
+    chain_density: Annotated[float, NUMBER_DENSITY] = Field(default=2.0e21, ge=0)
+    """Number n_chn of chains per volume, in 1/m^3. 0 means no chains."""
+    contour_length: float = Field(default=1.594, gt=0)
+    """Contour length L of a chain, its length when pulled straight, in link lengths. The chain locks there."""
+    persistence_length: float = Field(default=1.365, gt=0)
+    """Persistence length A_p of a chain, in link lengths: its bending stiffness over k theta."""
+    initial_stiffness: Annotated[float | None, STRESS] = Field(default=None, gt=0)
+    """In place of chain_density: the slope of a measured curve at stretch 1, nominal stress of the network over stretch
+    along aligned chains, in stress_unit. It is c r0^2 (d(g r)/dr + g) at r0. The scene as run has chain_density
+    (docs/which_numbers.md)."""
+    locking_stretch: float | None = Field(default=None, gt=1)
+    """In place of contour_length: the stretch L / r0 along aligned chains at which they lock. The scene as run has
+    contour_length (docs/which_numbers.md)."""
+    temperature: Annotated[float, TEMPERATURE] = Field(default=310.0, gt=0)
+    """Absolute temperature theta, in K."""
+    energy_factor: Annotated[int, OneOf((1, 4))] = 1
+    """Factor omega of the chain energy. 1 gives the stress as printed (eq. 7) and reproduces Fig. 6. 4 gives the energy
+    as printed (eq. 4b)."""
+    matrix: Annotated[str, OneOf(MATRICES)] = "neo-hookean"
+    """Energy of the matrix."""
+    chain: Annotated[str, OneOf(CHAINS)] = "wormlike"
+    """Force law of a single chain."""
+    repulsion: Annotated[str, OneOf(REPULSIONS)] = "axes"
+    """Form of the repulsive energy that makes the reference state free of stress. 'axes' is the paper's, in the
+    stretches along the three cell axes. 'log' depends on the structure tensor alone (A : ln C); it equals 'axes' where
+    both have the same axes, and suits the law 'tensor'. 'length' depends on the length of the chains alone. Where
+    neither scene nor preset names one, the law 'tensor' has 'log'."""
+    stress_unit: Literal["Pa", "kPa", "MPa"] = "Pa"
+    """Unit of every stress, pressure and Lame constant of the scene. Forces are in this unit times the unit of length
+    squared."""
 
     @property
     def network_modulus(self) -> float:
@@ -357,11 +289,12 @@ class Prestretch(Table):
     Stretches that are left out keep the volume; two that are left out are equal.
     """
 
-    circumferential: float | None = Field(
-        default=None, gt=0, description="Stretch around the body.", json_schema_extra=POSITIVE
-    )
-    axial: float | None = Field(default=None, gt=0, description="Stretch along the body.", json_schema_extra=POSITIVE)
-    radial: float | None = Field(default=None, gt=0, description="Stretch across the wall.", json_schema_extra=POSITIVE)
+    circumferential: float | None = Field(default=None, gt=0)
+    """Stretch around the body."""
+    axial: float | None = Field(default=None, gt=0)
+    """Stretch along the body."""
+    radial: float | None = Field(default=None, gt=0)
+    """Stretch across the wall."""
 
     @model_validator(mode="after")
     def _says_one(self) -> Prestretch:
@@ -392,11 +325,10 @@ _Share: Any = create_model("_Share", __base__=Table, **_share)
 class NaturalLayer(_Share):  # type: ignore[misc]
     """A part of the wall that was stretched before it was joined to the rest (docs/natural.md)."""
 
-    region: str | None = Field(
-        default=None, min_length=1, description="Name of a region, in place of `from` and `to`.",
-        json_schema_extra={"allowed": "the name of a region"},
-    )  # fmt: skip
-    prestretch: Prestretch = Field(description="Stretches from the layer's natural state to the unloaded body.")
+    region: str | None = Field(default=None, min_length=1, json_schema_extra={"allowed": "the name of a region"})
+    """Name of a region, in place of `from` and `to`."""
+    prestretch: Prestretch
+    """Stretches from the layer's natural state to the unloaded body."""
 
     @model_validator(mode="after")
     def _is_somewhere(self) -> NaturalLayer:
@@ -419,36 +351,20 @@ AS_GIVEN: Literal["as-given"] = "as-given"
 class Natural(Table):
     """The configuration in which the tissue is free of stress, if that is not the mesh (docs/natural.md)."""
 
-    opening_angle: float = Field(
-        default=0.0,
-        ge=0,
-        le=180,
-        description=(
-            "For a tube: how far a cut ring opens, as the angle of the missing sector in degrees (360 "
-            "less the angle of the sector). Fung's opening angle, between the lines from the middle of "
-            "the inner arc to its ends, is half of it. 0 means that the tissue of the mesh is free of "
-            "stress."
-        ),
-    )
+    opening_angle: float = Field(default=0.0, ge=0, le=180)
+    """For a tube: how far a cut ring opens, as the angle of the missing sector in degrees (360 less the angle of the
+    sector). Fung's opening angle, between the lines from the middle of the inner arc to its ends, is half of it. 0
+    means that the tissue of the mesh is free of stress."""
     layers: Annotated[tuple[NaturalLayer, ...], tables_of("natural.layers")] = Field(
-        default=(),
-        description=(
-            "Parts of the wall that were stretched before they were joined, a table "
-            "`[[natural.layers]]` each. A tube of such layers is closed so that it is in equilibrium "
-            "without loads. A body of your own moves when it is let go."
-        ),
-        json_schema_extra={"allowed": "a list of tables"},
+        default=(), json_schema_extra={"allowed": "a list of tables"}
     )
+    """Parts of the wall that were stretched before they were joined, a table `[[natural.layers]]` each. A tube of such
+    layers is closed so that it is in equilibrium without loads. A body of your own moves when it is let go."""
 
-    cells: Literal["as-given", "equilibrium"] = Field(
-        default=AS_GIVEN,
-        description=(
-            "Cells of a tube whose geometry is the loaded one (geometry.is). 'as-given': those of "
-            "[cells]. 'equilibrium': those that remodeling comes to under these loads, as in a vessel "
-            "that was scanned. The run then begins with [cells] and comes to the given tube at its end;"
-            " it needs time.end = 'equilibrium'."
-        ),
-    )
+    cells: Literal["as-given", "equilibrium"] = AS_GIVEN
+    """Cells of a tube whose geometry is the loaded one (geometry.is). 'as-given': those of [cells]. 'equilibrium':
+    those that remodeling comes to under these loads, as in a vessel that was scanned. The run then begins with [cells]
+    and comes to the given tube at its end; it needs time.end = 'equilibrium'."""
 
     @property
     def is_of_the_mesh(self) -> bool:
@@ -496,12 +412,6 @@ class Cells(Table):
 
     initial: Annotated[str | tuple[float, float, float], BeforeValidator(_initial_cells)] = Field(
         default="random",
-        description=(
-            "Cell dimensions l_I at t = 0, with |l| = end_to_end_length. 'random': one draw per "
-            "element, uniform on the positive octant of the sphere. 'isotropic': three equal ones. "
-            "'aligned': all of it along aligned_axis. 'fibres': those of the file cells.fibres; naming "
-            "the file is enough. [l1, l2, l3]: these, in link lengths."
-        ),
         json_schema_extra={
             "allowed": "'random', 'isotropic', 'aligned', 'fibres' or three lengths [l1, l2, l3]",
             "anyOf": [
@@ -510,58 +420,34 @@ class Cells(Table):
             ],
         },
     )
+    """Cell dimensions l_I at t = 0, with |l| = end_to_end_length. 'random': one draw per element, uniform on the
+    positive octant of the sphere. 'isotropic': three equal ones. 'aligned': all of it along aligned_axis. 'fibres':
+    those of the file cells.fibres; naming the file is enough. [l1, l2, l3]: these, in link lengths."""
     fibres: str | None = Field(
-        default=None,
-        min_length=1,
-        description=(
-            "File of measured fibres (.vtu, .xdmf or .csv, relative to the scene). It gives axes and "
-            "dimensions of the cells at t = 0 (docs/own_body.md, Fibres in and out). The run keeps a "
-            "copy in its folder."
-        ),
-        json_schema_extra={"allowed": "the name of a file .vtu, .xdmf or .csv"},
+        default=None, min_length=1, json_schema_extra={"allowed": "the name of a file .vtu, .xdmf or .csv"}
     )
+    """File of measured fibres (.vtu, .xdmf or .csv, relative to the scene). It gives axes and dimensions of the cells
+    at t = 0 (docs/own_body.md, Fibres in and out). The run keeps a copy in its folder."""
     fibres_sha256: str | None = Field(
-        default=None,
-        pattern="^[0-9a-f]{64}$",
-        description="SHA-256 of that file. A scene as run has it, and refuses another file.",
-        json_schema_extra={"allowed": "64 hexadecimal digits"},
+        default=None, pattern="^[0-9a-f]{64}$", json_schema_extra={"allowed": "64 hexadecimal digits"}
     )
-    axes: Annotated[str, OneOf(AXES)] = Field(
-        default="global",
-        description=(
-            "Cell axes n_I before the first pass. 'global': x, y, z. 'cylindrical': circumferential, "
-            "axial, radial, about the z axis. 'local': the same, found on a mesh (docs/own_body.md). "
-            "Where neither scene nor preset names them, a tube has 'cylindrical'."
-        ),
-    )
-    aligned_axis: Annotated[int, OneOf((1, 2, 3))] = Field(
-        default=3,
-        description=(
-            "Number of the axis that 'aligned' cells lie along. With global axes 3 is z, the load axis "
-            "of cube and tendon. With cylindrical axes 1 is circumferential, 2 axial and 3 radial."
-        ),
-    )
-    seed: int = Field(
-        default=1,
-        ge=0,
-        description=("Seed of the random cells. The same seed and mesh give the same cells on any number of ranks."),
-    )
-    antithetic: bool = Field(
-        default=False,
-        description=(
-            "Random cells only. Seeds 1 to 3, 4 to 6 and so on have the same draws, with l_1, l_2 and l_3 in "
-            "turn (antithetic variates). Each seed alone is as random as without. Means over whole threes "
-            "scatter less, mostly by far (docs/speed.md)."
-        ),
-    )
-    end_to_end_length: float = Field(
-        default=1.0,
-        gt=0,
-        description=(
-            "Length r0 of a chain at t = 0, in link lengths, smaller than material.contour_length. It "
-            "is a material constant: the repulsive energy keeps this value while the cells remodel."
-        ),
-    )
+    """SHA-256 of that file. A scene as run has it, and refuses another file."""
+    axes: Annotated[str, OneOf(AXES)] = "global"
+    """Cell axes n_I before the first pass. 'global': x, y, z. 'cylindrical': circumferential, axial, radial, about the
+    z axis. 'local': the same, found on a mesh (docs/own_body.md). Where neither scene nor preset names them, a tube has
+    'cylindrical'."""
+    aligned_axis: Annotated[int, OneOf((1, 2, 3))] = 3
+    """Number of the axis that 'aligned' cells lie along. With global axes 3 is z, the load axis of cube and tendon.
+    With cylindrical axes 1 is circumferential, 2 axial and 3 radial."""
+    seed: int = Field(default=1, ge=0)
+    """Seed of the random cells. The same seed and mesh give the same cells on any number of ranks."""
+    antithetic: bool = False
+    """Random cells only. Seeds 1 to 3, 4 to 6 and so on have the same draws, with l_1, l_2 and l_3 in turn (antithetic
+    variates). Each seed alone is as random as without. Means over whole threes scatter less, mostly by far
+    (docs/speed.md)."""
+    end_to_end_length: float = Field(default=1.0, gt=0)
+    """Length r0 of a chain at t = 0, in link lengths, smaller than material.contour_length. It is a material constant:
+    the repulsive energy keeps this value while the cells remodel."""
 
     @model_validator(mode="after")
     def _length_of_the_chain(self) -> Cells:
@@ -685,23 +571,12 @@ class Turnover(Table):
     For the law `tensor`.
     """
 
-    time: float | None = Field(
-        default=None,
-        gt=0,
-        description="Time T in which collagen is turned over. Without it there is no turnover.",
-        json_schema_extra={"allowed": "a finite number greater than 0"},
-    )
-    deposition_stretch: float = Field(
-        default=1.1, gt=1, description="Stretch lambda_h, over r0, under which new chains are deposited."
-    )
-    gain: float = Field(
-        default=1.0,
-        ge=0,
-        description=(
-            "Gain k: how fast the amount of collagen follows the tension of the chains. 0 means that "
-            "the amount stays."
-        ),
-    )
+    time: float | None = Field(default=None, gt=0)
+    """Time T in which collagen is turned over. Without it there is no turnover."""
+    deposition_stretch: float = Field(default=1.1, gt=1)
+    """Stretch lambda_h, over r0, under which new chains are deposited."""
+    gain: float = Field(default=1.0, ge=0)
+    """Gain k: how fast the amount of collagen follows the tension of the chains. 0 means that the amount stays."""
 
     @property
     def is_on(self) -> bool:
@@ -737,105 +612,52 @@ class Remodeling(Table):
     remodel_fenicsx.schema.tables.SceneError: driver = 'heat': allowed are 'cauchy', 'pk2', 'finger'
     """
 
-    driver: Annotated[str, OneOf(DRIVERS)] = Field(
-        default="cauchy",
-        description=(
-            "Tensor whose positive eigenvalues the cells follow. 'cauchy': the Cauchy stress. 'pk2': "
-            "the second Piola-Kirchhoff stress. 'finger': the Finger tensor b; it remodels even a body "
-            "without load, and l_3 does not vanish."
-        ),
-    )
-    law: Annotated[str, OneOf(LAWS)] = Field(
-        default="explicit",
-        description=(
-            "How the cells change in time. 'explicit' is eq. (11), in absolute time. 'rate' integrates "
-            "eq. (10). 'relaxation' is dl/dt = kappa (r0 e - l), right for changing loads. 'rotation' "
-            "(Remark 5) turns the axis of the largest dimension gradually and keeps the dimensions. "
-            "'tensor' is 'relaxation' for the structure tensor as a whole, without ranks and axes. "
-            "'none' leaves the cells as they are. Where neither scene nor preset names one, it is "
-            "'tensor'."
-        ),
-    )
-    frame: Annotated[str, OneOf(FRAMES)] = Field(
-        default="material",
-        description=(
-            "Axes of the remodeled cells, for the drivers 'cauchy' and 'finger'. 'material': the fibres"
-            " that the deformation carries onto the principal directions (objective). 'spatial': the "
-            "principal directions themselves, as printed. The driver 'pk2' has material eigenvectors of"
-            " its own."
-        ),
-    )
-    pairing: Annotated[str, OneOf(PAIRINGS)] = Field(
-        default="sorted",
-        description=(
-            "Which cell dimension follows which principal value. 'sorted': by rank, as printed; where "
-            "two values cross, the cell turns by 90 degrees at once. 'continuous': by axis; each "
-            "principal direction continues the axis that it overlaps most. The law 'rotation' does not "
-            "use it."
-        ),
-    )
+    driver: Annotated[str, OneOf(DRIVERS)] = "cauchy"
+    """Tensor whose positive eigenvalues the cells follow. 'cauchy': the Cauchy stress. 'pk2': the second
+    Piola-Kirchhoff stress. 'finger': the Finger tensor b; it remodels even a body without load, and l_3 does not
+    vanish."""
+    law: Annotated[str, OneOf(LAWS)] = "explicit"
+    """How the cells change in time. 'explicit' is eq. (11), in absolute time. 'rate' integrates eq. (10). 'relaxation'
+    is dl/dt = kappa (r0 e - l), right for changing loads. 'rotation' (Remark 5) turns the axis of the largest dimension
+    gradually and keeps the dimensions. 'tensor' is 'relaxation' for the structure tensor as a whole, without ranks and
+    axes. 'none' leaves the cells as they are. Where neither scene nor preset names one, it is 'tensor'."""
+    frame: Annotated[str, OneOf(FRAMES)] = "material"
+    """Axes of the remodeled cells, for the drivers 'cauchy' and 'finger'. 'material': the fibres that the deformation
+    carries onto the principal directions (objective). 'spatial': the principal directions themselves, as printed. The
+    driver 'pk2' has material eigenvectors of its own."""
+    pairing: Annotated[str, OneOf(PAIRINGS)] = "sorted"
+    """Which cell dimension follows which principal value. 'sorted': by rank, as printed; where two values cross, the
+    cell turns by 90 degrees at once. 'continuous': by axis; each principal direction continues the axis that it
+    overlaps most. The law 'rotation' does not use it."""
     coupling: Annotated[str, OneOf(COUPLINGS)] = Field(
         default="staggered",
-        description=(
-            "In which order a step solves and remodels. "
-            + ". ".join(f"{name!r}: {kind.meaning}" for name, kind in COUPLINGS.items())
-            + ". Where neither scene nor preset names one, the law 'tensor' has 'extrapolated'."
-        ),
+        description="In which order a step solves and remodels. "
+        + ". ".join(f"{name!r}: {kind.meaning}" for name, kind in COUPLINGS.items())
+        + ". Where neither scene nor preset names one, the law 'tensor' has 'extrapolated'.",
     )
-    relaxation_factor: float = Field(
-        default=0.5,
-        gt=0,
-        le=1,
-        description=(
-            "For the coupling 'relaxed': the share theta of a pass's change of the structure tensor "
-            "that is made. With 1 it is 'staggered'."
-        ),
-    )
-    kappa: float = Field(
-        default=0.025, ge=0, description="Speed of remodeling, in 1/time. A difference fades like exp(-kappa t)."
-    )
-    half_life: float | None = Field(
-        default=None,
-        gt=0,
-        description=(
-            "In place of kappa: the time after which half of a difference is left, ln 2 / kappa. The "
-            "scene as run has kappa (docs/which_numbers.md)."
-        ),
-        json_schema_extra={"allowed": "a finite number greater than 0"},
-    )
-    threshold: Annotated[float, STRESS] = Field(
-        default=0.0,
-        ge=0,
-        description=(
-            "Lazy zone: the principal stress s0 up to which a point does not remodel. Above it kappa "
-            "has the factor max(0, 1 - s0/s), where s is the largest principal stress. For the law "
-            "'tensor' and drivers that are stresses (docs/laws.md)."
-        ),
-    )
-    exponent: float = Field(
-        default=2.0,
-        gt=0,
-        le=16,
-        description=(
-            "Exponent n of the target (D+)^n over its trace: 2 is the paper's, 1 that of netting "
-            "analysis. For the law 'tensor' (docs/laws.md)."
-        ),
-    )
+    relaxation_factor: float = Field(default=0.5, gt=0, le=1)
+    """For the coupling 'relaxed': the share theta of a pass's change of the structure tensor that is made. With 1 it is
+    'staggered'."""
+    kappa: float = Field(default=0.025, ge=0)
+    """Speed of remodeling, in 1/time. A difference fades like exp(-kappa t)."""
+    half_life: float | None = Field(default=None, gt=0)
+    """In place of kappa: the time after which half of a difference is left, ln 2 / kappa. The scene as run has kappa
+    (docs/which_numbers.md)."""
+    threshold: Annotated[float, STRESS] = Field(default=0.0, ge=0)
+    """Lazy zone: the principal stress s0 up to which a point does not remodel. Above it kappa has the factor max(0, 1 -
+    s0/s), where s is the largest principal stress. For the law 'tensor' and drivers that are stresses (docs/laws.md).
+    """
+    exponent: float = Field(default=2.0, gt=0, le=16)
+    """Exponent n of the target (D+)^n over its trace: 2 is the paper's, 1 that of netting analysis. For the law
+    'tensor' (docs/laws.md)."""
     mean: Annotated[str, OneOf(MEANS_OF_CASES)] = Field(
         default="tensor",
-        description=(
-            "What the cells follow where there are several load cases ([[cases]]). "
-            + ". ".join(f"{name!r}: {mean.meaning}" for name, mean in MEANS_OF_CASES.items())
-            + " (docs/cycles.md)."
-        ),
+        description="What the cells follow where there are several load cases ([[cases]]). "
+        + ". ".join(f"{name!r}: {mean.meaning}" for name, mean in MEANS_OF_CASES.items())
+        + " (docs/cycles.md).",
     )
-    rotation_time: float = Field(
-        default=40.0,
-        gt=0,
-        description=(
-            "For the law 'rotation': a small angle between fibre and tension fades like exp(-t / rotation_time)."
-        ),
-    )
+    rotation_time: float = Field(default=40.0, gt=0)
+    """For the law 'rotation': a small angle between fibre and tension fades like exp(-t / rotation_time)."""
 
     turnover: Turnover = Turnover()
 
@@ -950,15 +772,9 @@ class Region(Table):
     `material.chain_density = 4e21` in `[regions.media]`.
     """
 
-    outer_radius: Annotated[float | None, LENGTH] = Field(
-        default=None,
-        gt=0,
-        description=(
-            "For a tube: the outer radius of the layer, in the scene's unit of length. The layer begins"
-            " where the one inside of it ends. The outermost layer may leave it out."
-        ),
-        json_schema_extra={"allowed": "a finite number greater than 0"},
-    )
+    outer_radius: Annotated[float | None, LENGTH] = Field(default=None, gt=0)
+    """For a tube: the outer radius of the layer, in the scene's unit of length. The layer begins where the one inside
+    of it ends. The outermost layer may leave it out."""
     material: RegionMaterial = RegionMaterial()
     cells: RegionCells = RegionCells()
     remodeling: RegionRemodeling = RegionRemodeling()
@@ -1005,35 +821,20 @@ class Load(Table):
     `elongation`; its length is then an unknown.
     """
 
-    value: float = Field(
-        description=(
-            "Full value, at factor 1. A force is in stress_unit times length squared, a pressure in "
-            "stress_unit. An elongation has no unit and is above -1."
-        )
-    )
+    value: float
+    """Full value, at factor 1. A force is in stress_unit times length squared, a pressure in stress_unit. An elongation
+    has no unit and is above -1."""
     ramp: Annotated[tuple[tuple[float, float], ...], BeforeValidator(_ramp)] = Field(
-        description=(
-            "Factor on the value over time: pairs [time, factor] with increasing times. The factor is "
-            "linear between pairs, and constant before the first and after the last. Times up to "
-            "time.end must be multiples of time.step; with time.tolerance a step ends at each."
-        ),
-        json_schema_extra={"allowed": "a list of pairs [time, factor] with increasing times"},
+        json_schema_extra={"allowed": "a list of pairs [time, factor] with increasing times"}
     )
+    """Factor on the value over time: pairs [time, factor] with increasing times. The factor is linear between pairs,
+    and constant before the first and after the last. Times up to time.end must be multiples of time.step; with
+    time.tolerance a step ends at each."""
 
-    kind: Literal["pressure"] | None = Field(
-        default=None,
-        description=(
-            "For a further load of a body of your own: 'pressure' acts against the outward normal of "
-            "the deformed face."
-        ),
-        json_schema_extra={"allowed": "'pressure'"},
-    )
-    face: str | None = Field(
-        default=None,
-        min_length=1,
-        description="For a further load of a body of your own: the face that it acts on.",
-        json_schema_extra={"allowed": "the name of a face"},
-    )
+    kind: Literal["pressure"] | None = Field(default=None, json_schema_extra={"allowed": "'pressure'"})
+    """For a further load of a body of your own: 'pressure' acts against the outward normal of the deformed face."""
+    face: str | None = Field(default=None, min_length=1, json_schema_extra={"allowed": "the name of a face"})
+    """For a further load of a body of your own: the face that it acts on."""
 
     @model_validator(mode="after")
     def _kind_and_face(self) -> Load:
@@ -1068,14 +869,12 @@ class LoadCase(Table):
     with their number, such as `inner_radius@2`.
     """
 
-    weight: float = Field(gt=0, le=1, description="Share of the time. The weights of all cases sum to 1.")
+    weight: float = Field(gt=0, le=1)
+    """Share of the time. The weights of all cases sum to 1."""
     loads: dict[str, float] = Field(
-        default_factory=dict,
-        description=(
-            "Factor on each load by its name, beside the factor of its ramp. Loads that are not named have 1."
-        ),
-        json_schema_extra={"allowed": "a table of numbers by the names of loads"},
+        default_factory=dict, json_schema_extra={"allowed": "a table of numbers by the names of loads"}
     )
+    """Factor on each load by its name, beside the factor of its ramp. Loads that are not named have 1."""
 
 
 def faces_of(loads: Mapping[str, Any]) -> dict[str, str]:
@@ -1105,31 +904,22 @@ class Time(Table):
 
     # a number for all who step through time; those who take the word ask `is_equilibrium` first
     end: Annotated[Any, BeforeValidator(_end)] = Field(
-        description=(
-            "Last time, a whole number of steps; with a tolerance any time. 'equilibrium' goes at once "
-            "to the state that remodeling comes to under the loads at the end of their ramps "
-            "(docs/theory.md, Equilibrium at once)."
-        ),
         json_schema_extra={
             "allowed": "a finite number greater than 0, or 'equilibrium'",
             "anyOf": [{"type": "number", "exclusiveMinimum": 0}, {"const": EQUILIBRIUM}],
-        },
+        }
     )
-    step: float = Field(
-        default=1.0, gt=0, description="Time between two remodeling passes. With a tolerance it is the first step."
-    )
+    """Last time, a whole number of steps; with a tolerance any time. 'equilibrium' goes at once to the state that
+    remodeling comes to under the loads at the end of their ramps (docs/theory.md, Equilibrium at once)."""
+    step: float = Field(default=1.0, gt=0)
+    """Time between two remodeling passes. With a tolerance it is the first step."""
     tolerance: float | None = Field(
-        default=None,
-        gt=0,
-        description=(
-            "Lets the program choose the steps: as long as the estimated error in time stays below this"
-            " angle, in degrees. The error is that of chain directions (root mean square over the body)"
-            " and that of lengths (relative; 1 degree stands for 1.7 %). A step ends at each time of a "
-            "ramp and of output.times. On the way to an equilibrium steps are always chosen so; the "
-            "default there is 3 degrees, or 0.5 where a load falls."
-        ),
-        json_schema_extra={"allowed": "a number greater than 0, in degrees"},
+        default=None, gt=0, json_schema_extra={"allowed": "a number greater than 0, in degrees"}
     )
+    """Lets the program choose the steps: as long as the estimated error in time stays below this angle, in degrees. The
+    error is that of chain directions (root mean square over the body) and that of lengths (relative; 1 degree stands
+    for 1.7 %). A step ends at each time of a ramp and of output.times. On the way to an equilibrium steps are always
+    chosen so; the default there is 3 degrees, or 0.5 where a load falls."""
 
     @model_validator(mode="after")
     def _whole_number_of_steps(self) -> Time:
@@ -1222,63 +1012,33 @@ class Solver(Table):
 
     method: Annotated[str, OneOf(SOLVER_METHODS, (AUTO,), REMOVED)] = Field(
         default=AUTO,
-        description=(
-            f"How the equations of each step are solved. 'auto' takes 'direct' up to {SMALL_BODY} "
-            f"unknowns ({SMALL_REDUCTION} of a reduction), then 'lagged', and above {LARGE} (on several "
-            f"ranks {LARGE_ON_RANKS} while loads change) 'iterative'. "
-            + ". ".join(f"{name!r}: {method.meaning}" for name, method in SOLVER_METHODS.items())
-            + " (docs/speed.md)."
-        ),
+        description=f"How the equations of each step are solved. 'auto' takes 'direct' up to {SMALL_BODY} "
+        f"unknowns ({SMALL_REDUCTION} of a reduction), then 'lagged', and above {LARGE} (on several "
+        f"ranks {LARGE_ON_RANKS} while loads change) 'iterative'. "
+        + ". ".join(f"{name!r}: {method.meaning}" for name, method in SOLVER_METHODS.items())
+        + " (docs/speed.md).",
     )
-    predictor: Literal["none", "autoregressive", "with-tolerance"] = Field(
-        default="autoregressive",
-        description=(
-            "Where Newton's method starts a step. 'none': at the displacement of the step before. "
-            "'autoregressive': at what the increments of the last steps predict. 'with-tolerance': as "
-            "predicted where steps are chosen (time.tolerance), otherwise as 'none'. The solutions are "
-            "the same to the tolerance."
-        ),
-    )
-    absolute_tolerance: Annotated[float, FORCE] = Field(
-        default=0.0,
-        ge=0,
-        description=(
-            "A step is solved when |R| <= absolute_tolerance + relative_tolerance |nodal forces|, where"
-            " R has the out-of-balance nodal forces. It is a force, so it depends on the units of the "
-            "scene."
-        ),
-    )
-    relative_tolerance: float = Field(
-        default=1e-10,
-        ge=0,
-        lt=1,
-        description=(
-            "See absolute_tolerance. It is relative to the norm of the internal nodal forces, which "
-            "stays when the load is held."
-        ),
-    )
-    maximum_iterations: int = Field(
-        default=25, ge=1, description="Newton iterations after which a step counts as failed."
-    )
-    maximum_halvings: int = Field(
-        default=12, ge=0, description="How often a failed step is halved before the run ends with an error."
-    )
-    unstable: Literal["warn", "stop"] = Field(
-        default="warn",
-        description=(
-            "What to do at an equilibrium that the body would leave: one with more negative eigenvalues"
-            " of the tangent than before. 'warn': say where, and go on. 'stop': look for it in every "
-            "step, and end the run after the last stable step (exit code 3)."
-        ),
-    )
-    petsc_options: Annotated[dict[str, Any], BeforeValidator(_petsc_options)] = Field(
-        default_factory=dict,
-        description=(
-            "PETSc options that replace the method's, without the leading '-': snes_..., ksp_..., "
-            "pc_... and mat_.... Options that run code or write files are refused. Options of the "
-            "variable PETSC_OPTIONS are not looked at."
-        ),
-    )
+    predictor: Literal["none", "autoregressive", "with-tolerance"] = "autoregressive"
+    """Where Newton's method starts a step. 'none': at the displacement of the step before. 'autoregressive': at what
+    the increments of the last steps predict. 'with-tolerance': as predicted where steps are chosen (time.tolerance),
+    otherwise as 'none'. The solutions are the same to the tolerance."""
+    absolute_tolerance: Annotated[float, FORCE] = Field(default=0.0, ge=0)
+    """A step is solved when |R| <= absolute_tolerance + relative_tolerance |nodal forces|, where R has the
+    out-of-balance nodal forces. It is a force, so it depends on the units of the scene."""
+    relative_tolerance: float = Field(default=1e-10, ge=0, lt=1)
+    """See absolute_tolerance. It is relative to the norm of the internal nodal forces, which stays when the load is
+    held."""
+    maximum_iterations: int = Field(default=25, ge=1)
+    """Newton iterations after which a step counts as failed."""
+    maximum_halvings: int = Field(default=12, ge=0)
+    """How often a failed step is halved before the run ends with an error."""
+    unstable: Literal["warn", "stop"] = "warn"
+    """What to do at an equilibrium that the body would leave: one with more negative eigenvalues of the tangent than
+    before. 'warn': say where, and go on. 'stop': look for it in every step, and end the run after the last stable step
+    (exit code 3)."""
+    petsc_options: Annotated[dict[str, Any], BeforeValidator(_petsc_options)] = Field(default_factory=dict)
+    """PETSc options that replace the method's, without the leading '-': snes_..., ksp_..., pc_... and mat_.... Options
+    that run code or write files are refused. Options of the variable PETSC_OPTIONS are not looked at."""
 
     @model_validator(mode="after")
     def _has_a_tolerance(self) -> Solver:
@@ -1330,44 +1090,28 @@ class Output(Table):
 
     fields: Annotated[bool | tuple[str, ...], BeforeValidator(_fields)] = Field(
         default=True,
-        description=(
-            "Fields to write for ParaView: true for all, false for none, or a list of names "
-            "(docs/commands.md). 'chains' stands for the chain lines. Fields that are not asked for are"
-            " not computed."
-        ),
         json_schema_extra={
             "allowed": "true, false or a list of names of fields",
             "anyOf": [{"type": "boolean"}, {"type": "array", "items": {"enum": [*FIELDS_BY_NAME, *CONSTANT_FIELDS]}}],
         },
     )
+    """Fields to write for ParaView: true for all, false for none, or a list of names (docs/commands.md). 'chains'
+    stands for the chain lines. Fields that are not asked for are not computed."""
     columns: Annotated[tuple[str, ...], BeforeValidator(_columns)] = Field(
-        default=(),
-        description=(
-            "Columns of the history. Those that are there only on request ('pass_residual', "
-            "'negative_eigenvalues' and others, docs/commands.md) are added. Where any others are "
-            "named, only those are measured, with time and loads."
-        ),
-        json_schema_extra={"allowed": "a list of names of columns"},
+        default=(), json_schema_extra={"allowed": "a list of names of columns"}
     )
-    every: int = Field(default=1, ge=1, description="Write the fields of every n-th step, and of the last one.")
+    """Columns of the history. Those that are there only on request ('pass_residual', 'negative_eigenvalues' and others,
+    docs/commands.md) are added. Where any others are named, only those are measured, with time and loads."""
+    every: int = Field(default=1, ge=1)
+    """Write the fields of every n-th step, and of the last one."""
     times: Annotated[tuple[float, ...], BeforeValidator(_times)] = Field(
-        default=(),
-        description=(
-            "Times up to time.end that have a row and fields in any case. They must be multiples of "
-            "time.step; with time.tolerance a step ends at each."
-        ),
-        json_schema_extra={"allowed": "a list of increasing times above 0"},
+        default=(), json_schema_extra={"allowed": "a list of increasing times above 0"}
     )
-    report: bool = Field(
-        default=True, description="Make a page of the run for a browser, report.html, at its end (docs/report.md)."
-    )
-    checkpoint: int | None = Field(
-        default=None,
-        ge=0,
-        description=(
-            "Number of steps between two checkpoints, from which a run can be resumed; 0 means only at "
-            "the end. Without it time decides: at most 10 minutes are lost, and checkpoints cost less "
-            "than 5 % of the run. There is always one at the end, however the run ends."
-        ),
-        json_schema_extra={"allowed": "a whole number at least 0"},
-    )
+    """Times up to time.end that have a row and fields in any case. They must be multiples of time.step; with
+    time.tolerance a step ends at each."""
+    report: bool = True
+    """Make a page of the run for a browser, report.html, at its end (docs/report.md)."""
+    checkpoint: int | None = Field(default=None, ge=0)
+    """Number of steps between two checkpoints, from which a run can be resumed; 0 means only at the end. Without it
+    time decides: at most 10 minutes are lost, and checkpoints cost less than 5 % of the run. There is always one at the
+    end, however the run ends."""

@@ -5,16 +5,20 @@ A leaf: it knows no key of any scene. `parameters` and `scene` declare the keys.
 
 from __future__ import annotations
 
+import ast
 import difflib
+import functools
 import inspect
+import itertools
 import math
 import re
+import sys
 import textwrap
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args, get_origin
 
-from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, ValidationError
+from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import CoreSchema, ErrorDetails, PydanticCustomError, PydanticUndefined, core_schema
 
@@ -64,6 +68,23 @@ class Table(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
+    def check_with(self, scene: Any, key: str) -> None:
+        """Refuse what does not go with the rest of a scene, in which this table stands at a key: raise a `fault`."""
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        """With the meaning of each key, and without what scripts alone need."""
+        found = handler(schema)
+        table = handler.resolve_ref_schema(found)
+        table.pop("title", None)
+        table["description"] = meaning(cls)
+        for name, entry in table["properties"].items():
+            entry.pop("allowed", None)
+            entry |= {"description": text} if (text := description(cls, name)) else {}
+        if cls.further is not None:
+            table["additionalProperties"] = handler(cls.further.__pydantic_core_schema__)
+        return found
+
     if not TYPE_CHECKING:  # the type checker reads the arguments from the fields
 
         def __init__(self, /, **values):
@@ -101,6 +122,9 @@ class OneOf:
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         return core_schema.no_info_after_validator_function(self._check, handler(source))
 
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        return {"enum": self.choices}
+
     def _check(self, value: Any) -> Any:
         if self.removed and value in self.removed:
             raise fault(self.removed[value])
@@ -119,17 +143,21 @@ class VariantOf:
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         return core_schema.no_info_before_validator_function(self._table, handler(source))
 
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        """The keys of any variant, which an editor completes, and those that each has."""
+        known: dict[str, Any] = {}
+        chosen = []
+        for tag, table in self.registry.items():
+            known |= {name: {"description": description(table, name)} for name in table.model_fields}
+            keys = handler(table.__pydantic_core_schema__)
+            chosen.append({"if": {"properties": {self.tag: {"const": tag}}}, "then": keys})
+        known[self.tag]["enum"] = list(self.registry)
+        return {"type": "object", "properties": known, "required": [self.tag], "allOf": chosen}
+
     def _table(self, value: Any) -> Any:
-        if isinstance(value, BaseModel):
-            return value
         if not isinstance(value, Mapping):
-            raise fault("must be a table")
-        listed = f"allowed {'is' if len(self.registry) == 1 else 'are'} " + ", ".join(map(shown, self.registry))
-        if self.tag not in value:
-            raise fault(f"missing; {listed}", self.tag, None)
+            return value
         name = value[self.tag]
-        if not isinstance(name, str) or name not in self.registry:
-            raise fault(listed, self.tag, name)
         try:
             return self.registry[name].model_validate(dict(value))
         except ValidationError as error:
@@ -140,6 +168,11 @@ def fault(rule: str, key: str = "", value: Any = _MISSING) -> PydanticCustomErro
     """Error to raise in a validator."""
     context = {"rule": rule, "key": key} | ({} if value is _MISSING else {"value": value})
     return PydanticCustomError("fault", "{rule}", context)
+
+
+def named(registry: Mapping[str, Any], fits: Callable[[Any], Any]) -> str:
+    """The names in a registry of the parts that fit, for an error."""
+    return ", ".join(repr(name) for name, part in registry.items() if fits(part))
 
 
 def is_number(value: Any) -> bool:
@@ -167,19 +200,16 @@ def shortened(text: str, most: int = LONGEST_MESSAGE) -> str:
 
 def one_line(error: ValidationError, table: type[BaseModel]) -> str:
     """`key = value: what is allowed` of the first fault, with the number of further ones."""
-    # a mistyped key is also a missing key: the mistyped one says more
-    details = sorted(_details(error), key=lambda detail: detail["type"] != "extra_forbidden")
-    mistyped = {_meant(detail["loc"], table) for detail in details if detail["type"] == "extra_forbidden"}
-    faults = [detail for detail in details if detail["type"] != "missing" or detail["loc"] not in mistyped]
-    text, more = _describe(faults[0], table), len(faults) - 1
+    faults: dict[str, ErrorDetails] = {}  # where several kinds of values are allowed there is one for each kind
+    for detail in sorted(_details(error), key=lambda detail: detail["type"] != "extra_forbidden"):
+        faults.setdefault(locate(table, detail["loc"])[0], detail)
+    for detail in [detail for detail in faults.values() if detail["type"] == "extra_forbidden"]:
+        key, owner, _ = locate(table, detail["loc"])
+        meant = _nearest_key(key, owner)  # a mistyped key is also a missing key: the mistyped one says more
+        if meant in faults and faults[meant]["type"] == "missing":
+            del faults[meant]
+    text, more = _describe(next(iter(faults.values())), table), len(faults) - 1
     return f"{text} (and {more} more fault{'s' if more > 1 else ''})" if more else text
-
-
-def _meant(location: tuple[int | str, ...], table: type[BaseModel]) -> tuple[int | str, ...]:
-    """Where the key nearest to an unknown one is, in the same table; the place itself if none is near."""
-    _, owner, _ = locate(table, location)
-    near = _nearest(str(location[-1]), owner.model_fields)
-    return (*location[:-1], *near) if near else location
 
 
 def _details(error: ValidationError) -> list[ErrorDetails]:
@@ -206,8 +236,6 @@ def _describe(detail: ErrorDetails, table: type[BaseModel]) -> str:
         renamed: Mapping[str, str] = getattr(table, "renamed", {})
         rule = f"is now {renamed[key]}" if key in renamed else f"unknown key; {_suggestion(key, owner, table)}"
         return f"{key} = {shown(value)}: {rule}"
-    if field is not None and kind == "missing" and (variant := variant_of_field(field)):
-        return f"{key}.{variant.tag}: missing; {allowed(field)}"
     rule = detail["msg"] if field is None else allowed(field)
     return f"{key}: missing; {rule}" if kind == "missing" else f"{key} = {shown(value)}: {rule}"
 
@@ -215,26 +243,33 @@ def _describe(detail: ErrorDetails, table: type[BaseModel]) -> str:
 def locate(table: type[BaseModel], location: tuple[int | str, ...]) -> tuple[str, type[BaseModel], FieldInfo | None]:
     """Dotted key of a place in a table, the table class that owns it, and its field (None where there is none)."""
     key, owner, field = "", table, None
-    annotation: Any = table
+    inside: type[BaseModel] | None = table  # the table of which the next item is a key
     items = list(location)
     while items:
         item = items.pop(0)
-        key = _joined(key, f"[{item}]" if isinstance(item, int) else quoted(item))
-        if is_table(annotation):
-            further = free_names(annotation)
-            owner, field = annotation, annotation.model_fields.get(str(item))
-            annotation = None if field is None else field.annotation
-            if field is None and further is not None:
-                annotation, owner, field = further, further, FieldInfo.from_annotation(further)
-            if field is not None and items and (variant := variant_of_field(field)):
-                annotation = variant.registry[str(items.pop(0))]
-        elif (listed := listed_tables(annotation)) is not None:
-            annotation, owner, field = listed, listed, FieldInfo.from_annotation(listed)
-        elif get_origin(annotation) is dict:
-            annotation = get_args(annotation)[1]
-            if is_table(annotation):
-                owner, field = annotation, FieldInfo.from_annotation(annotation)
+        if inside is None:
+            if isinstance(item, str) and (field is None or get_origin(field.annotation) is not dict):
+                break  # pydantic's name of a kind of value that the key may have
+            key = _joined(key, _step(item))
+            continue
+        key, owner, field = _joined(key, _step(item)), inside, inside.model_fields.get(str(item))
+        if field is None:
+            inside = free_names(owner)
+            if inside is not None:
+                owner, field = inside, FieldInfo.from_annotation(inside)
+            continue
+        several = {tag: (suffix, kind) for suffix, tag, kind in tables_in(field)}
+        suffix, inside = several.get("", ("", None))
+        if several and "" not in several and items:
+            inside = several[str(items.pop(0))][1]
+        elif suffix and items and inside is not None:
+            key, owner, field = _joined(key, _step(items.pop(0))), inside, FieldInfo.from_annotation(inside)
     return key, owner, field
+
+
+def _step(item: int | str) -> str:
+    """One part of a dotted key."""
+    return f"[{item}]" if isinstance(item, int) else quoted(item)
 
 
 def _joined(key: str, rest: str) -> str:
@@ -274,17 +309,21 @@ def _nearest(name: str, known: Iterable[str], cutoff: float = 0.6) -> list[str]:
     return difflib.get_close_matches(name, known, n=1, cutoff=cutoff)
 
 
+def _nearest_key(key: str, owner: type[BaseModel]) -> str:
+    """The key of the same table that is most like an unknown one, or nothing."""
+    parent, _, name = key.rpartition(".")
+    return "".join(_joined(parent, near) for near in _nearest(name, owner.model_fields))
+
+
 def _suggestion(key: str, owner: type[BaseModel], table: type[BaseModel]) -> str:
     """The nearest key of the same table, else a key of the same name in another one, else all keys of the table."""
     parent, _, name = key.rpartition(".")
-    near = _nearest(name, owner.model_fields)
-    if near:
-        return f"did you mean {_joined(parent, near[0])}?"
+    if near := _nearest_key(key, owner):
+        return f"did you mean {near}?"
     others = [(other, inner) for other, _, inner in sections(table) if other != parent]
     elsewhere = {known: _joined(other, known) for other, inner in others for known in inner.model_fields}
-    near = _nearest(name, elsewhere, cutoff=0.8)
-    if near:
-        return f"did you mean {elsewhere[near[0]]}?"
+    if names := _nearest(name, elsewhere, cutoff=0.8):
+        return f"did you mean {elsewhere[names[0]]}?"
     return "allowed are " + ", ".join(_joined(parent, known) for known in owner.model_fields)
 
 
@@ -294,12 +333,6 @@ def _suggestion(key: str, owner: type[BaseModel], table: type[BaseModel]) -> str
 def is_table(annotation: Any) -> bool:
     """Whether an annotation is a table class."""
     return isinstance(annotation, type) and issubclass(annotation, BaseModel)
-
-
-def listed_tables(annotation: Any) -> type[BaseModel] | None:
-    """The class of the tables in a list of tables, or None."""
-    entries = get_args(annotation) if get_origin(annotation) is tuple else ()
-    return entries[0] if entries and is_table(entries[0]) else None
 
 
 def free_names(table: Any) -> type[BaseModel] | None:
@@ -333,10 +366,20 @@ def allowed(field: FieldInfo) -> str:
         required = [name for name, inner in fields.items() if inner.is_required()]
         return "must be a table" + (f" with {', '.join(required)}" if required else "")
     nouns: dict[Any, str] = {float: "a finite number", int: "a whole number", bool: "true or false", str: "a string"}
+    noun = next(nouns[kind] for kind in (field.annotation, *get_args(field.annotation)) if kind in nouns)
     words = {"gt": "greater than", "ge": "at least", "lt": "less than", "le": "at most"}
     limits = [(word, getattr(entry, name, None)) for entry in field.metadata for name, word in words.items()]
     bounds = [f"{word} {limit}" for word, limit in limits if limit is not None]
-    return " ".join(filter(None, [f"must be {nouns[field.annotation]}", " and ".join(bounds)]))
+    return " ".join(filter(None, [f"must be {noun}", " and ".join(bounds)]))
+
+
+def tables_in(field: FieldInfo) -> Iterator[tuple[str, str, type[BaseModel]]]:
+    """Of a field: what stands after its key for a table in it, the variant, the class; NAME stands for a free name."""
+    if several := variant_of_field(field):
+        yield from (("", tag, kind) for tag, kind in several.registry.items())
+        return
+    suffix = {dict: ".NAME", tuple: "[]"}.get(get_origin(field.annotation) or str, "")
+    yield from ((suffix, "", kind) for kind in (field.annotation, *get_args(field.annotation)) if is_table(kind))
 
 
 def sections(table: type[BaseModel], key: str = "", variant: str = "") -> Iterator[tuple[str, str, type[BaseModel]]]:
@@ -345,19 +388,34 @@ def sections(table: type[BaseModel], key: str = "", variant: str = "") -> Iterat
     if (kind := free_names(table)) is not None:
         yield from sections(kind, _joined(key, "NAME"))
     for name, field in table.model_fields.items():
-        path = _joined(key, name)
-        if several := variant_of_field(field):
-            for tag, inner in several.registry.items():
-                yield from sections(inner, path, tag)
-        elif is_table(field.annotation):
-            yield from sections(field.annotation, path)  # type: ignore[arg-type]
-        elif (listed := listed_tables(field.annotation)) is not None:
-            yield from sections(listed, f"{path}[]")
-        elif get_origin(field.annotation) is dict and is_table(get_args(field.annotation)[1]):
-            yield from sections(get_args(field.annotation)[1], f"{path}.NAME")
+        for suffix, tag, inner in tables_in(field):
+            yield from sections(inner, _joined(key, name) + suffix, tag)
 
 
 # ---------------------------------------------------------------- documentation
+
+
+@functools.cache
+def _texts_below_fields(module: str) -> dict[tuple[str, str], str]:
+    """Of the classes of a module: the text that stands below a field, by names of class and field."""
+    try:
+        tree = ast.parse(inspect.getsource(sys.modules[module]))
+    except (OSError, TypeError):  # a console has no source
+        return {}
+    found = {}
+    for table in (node for node in ast.walk(tree) if isinstance(node, ast.ClassDef)):
+        for field, text in itertools.pairwise(table.body):
+            if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant):
+                found[table.name, ast.unparse(field.target)] = " ".join(str(text.value.value).split())
+    return found
+
+
+def description(table: type[BaseModel], name: str) -> str:
+    """What a field means: its own description, or the text below it (pydantic would read the source at each start)."""
+    if own := table.model_fields[name].description:
+        return own
+    found = (_texts_below_fields(owner.__module__).get((owner.__name__, name), "") for owner in table.__mro__)
+    return next(filter(None, found), "")
 
 
 def meaning(table: type[BaseModel]) -> str:
@@ -392,9 +450,9 @@ def _section(key: str, variant: str, table: type[BaseModel]) -> str:
     name = f"[[{key[:-2]}]]" if key.endswith("[]") else f"[{key}]"
     title = f"## `{name}`" + (f" of shape `{variant!r}`" if variant else "") if key else "## Top of the file"
     rows = [
-        " | ".join([f"| `{name}`", _default(field), _cell(allowed(field)), _cell(field.description) + " |"])
+        " | ".join([f"| `{name}`", _default(field), _cell(allowed(field)), _cell(text) + " |"])
         for name, field in table.model_fields.items()
-        if field.description
+        if (text := description(table, name))
     ]
     head = ["| key | default | allowed | meaning |", "|---|---|---|---|"]
     return "\n".join([title, "", *paragraphs(meaning(table)), "", *head, *rows, ""])

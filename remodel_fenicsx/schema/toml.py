@@ -15,7 +15,7 @@ from typing import Any
 import tomlkit
 from pydantic import BaseModel
 
-from remodel_fenicsx.schema.tables import SceneError, printable, shown
+from remodel_fenicsx.schema.tables import SceneError, description, printable, shown
 from remodel_fenicsx.schema.units import is_quantity
 from remodel_fenicsx.system.files import read_regular
 
@@ -130,7 +130,8 @@ def _fill(container: Any, table: BaseModel | Mapping[str, Any]) -> None:
             if len(inner) or not fields:  # an empty table says nothing, but a name does
                 container.add(name, inner)
         elif value is not None:
-            for line in textwrap.wrap((name in fields and fields[name].description) or "", COMMENT_WIDTH):
+            text = description(type(table), name) if isinstance(table, BaseModel) and name in fields else ""
+            for line in textwrap.wrap(text, COMMENT_WIDTH):
                 container.add(tomlkit.comment(line))
             container.add(name, value)
 

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from fractions import Fraction
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, Field, GetJsonSchemaHandler
 from pydantic.fields import FieldInfo
-from pydantic_core import PydanticCustomError
+from pydantic_core import CoreSchema, PydanticCustomError
 
 from remodel_fenicsx.schema.tables import allowed, fault, free_names, is_table, quoted, sections, shown
 
@@ -71,6 +71,14 @@ class Dimension:
     name: str
     example: str
     powers: tuple[tuple[str, int], ...]
+
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        return {"anyOf": [handler(schema), schema_with_unit(self)]}
+
+
+def schema_with_unit(dimension: Dimension) -> dict[str, Any]:
+    """JSON schema of a number with a unit."""
+    return {"type": "string", "pattern": rf"^\s*{QUANTITY}\s*$", "examples": [dimension.example]}
 
 
 STRESS = Dimension("stress", "2.4 kPa", ((STRESS_UNIT, 1),))
