@@ -40,16 +40,16 @@ _MARK = b"remodel1"
 @contextmanager
 def signals_held_back() -> Iterator[None]:
     """Let Python's signal handlers run after the block: an exception below HDF5 would crash the process."""
-    in_main_thread = threading.current_thread() is threading.main_thread()  # where handlers run
-    handlers = {number: signal.getsignal(number) for number in signal.valid_signals() if in_main_thread}
+    numbers = signal.valid_signals() if threading.current_thread() is threading.main_thread() else ()
+    handlers = {int(number): handler for number in numbers if callable(handler := signal.getsignal(number))}
     caught: list[int] = []
     try:
-        for number in filter(lambda number: callable(handlers[number]), handlers):
+        for number in handlers:
             signal.signal(number, lambda number, _: caught.append(number))
         yield
     finally:
-        for number in filter(lambda number: callable(handlers[number]), handlers):
-            signal.signal(number, handlers[number])
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
         for number in caught:
             signal.raise_signal(number)
 
