@@ -108,8 +108,8 @@ def _refusal(folder: Path, faults: list[str]) -> CheckpointError:
 
 def read_file(path: Path, with_arrays: bool = True) -> Checkpoint:
     """A checkpoint, or its header alone."""
+    check_regular(path)
     try:
-        check_regular(path)
         with np.load(path, allow_pickle=False) as file, zipfile.ZipFile(path) as archive:
             # what is compressed may be of any size: a checkpoint is not
             if any(entry.compress_type != zipfile.ZIP_STORED for entry in archive.infolist()):
