@@ -219,6 +219,14 @@ def angle_scale(figure: Figure, place: tuple[float, float, float, float], label:
 # ---------------------------------------------------------------- bodies in space
 
 
+class Shown(NamedTuple):
+    """A run at a time, and which of its elements are seen: all where None is given."""
+
+    run: Recording
+    time: float | None = None
+    elements: Any = None
+
+
 @contextmanager
 def display() -> Iterator[None]:
     """A screen that nobody sees, for a VTK that needs one and where there is none."""
@@ -237,23 +245,17 @@ def display() -> Iterator[None]:
             server.terminate()
 
 
-def drawn(grids: Sequence[Any], eye: Sequence[float], middle: float, height: float, pixels: Sequence[int]) -> list:
+def drawn(shown: Sequence[Shown], eye: Sequence[float], middle: float, height: float, pixels: Sequence[int]) -> list:
     """Pictures of deformed bodies, seen from `eye`, at one scale: `height` from top to bottom, z = `middle` inside."""
     import pyvista
 
-    towards, images = np.array(eye) / np.linalg.norm(eye), []
-    for grid in grids:
-        plotter: Any = pyvista.Plotter(off_screen=True, window_size=[2 * n for n in pixels], lighting="none")
-        plotter.set_background("white")
-        plotter.add_light(pyvista.Light(light_type="headlight"))
-        plotter.add_mesh(
-            grid.warp_by_vector("displacement"), scalars="fibre_angle_deformed", cmap=ANGLES, clim=(0, 90),
-            n_colors=LEVELS, show_edges=True, edge_color="#777777", ambient=0.8, diffuse=0.2, show_scalar_bar=False,
-        )  # fmt: skip
-        plotter.add_mesh(chains(grid, towards), color="#141419", lighting=False, line_width=2.4)
-        plotter.camera.focal_point = (0.0, 0.0, middle)
-        plotter.camera.position = tuple(np.array([0.0, 0.0, middle]) + 10 * height * towards)
-        plotter.camera.up = (0.0, 0.0, 1.0)
+    pyvista.OFF_SCREEN = True
+    place, images = np.array([0.0, 0.0, middle]), []
+    for run, time, elements in shown:
+        plotter: Any = run.plot(time, elements=elements, show_scalar_bar=False)
+        plotter.window_size = [2 * n for n in pixels]
+        plotter.camera.focal_point, plotter.camera.up = place, (0.0, 0.0, 1.0)
+        plotter.camera.position = tuple(place + 10 * height * np.array(eye) / np.linalg.norm(eye))
         plotter.camera.parallel_projection, plotter.camera.parallel_scale = True, height / 2
         plotter.reset_camera_clipping_range()
         images.append(np.asarray(plotter.screenshot(return_img=True)))
@@ -261,51 +263,16 @@ def drawn(grids: Sequence[Any], eye: Sequence[float], middle: float, height: flo
     return images
 
 
-def chains(grid: Any, towards: np.ndarray) -> Any:
-    """The four chains of each element on those of its outer faces that are seen: F . (+-l_1 n_1 +-l_2 n_2 +-l_3 n_3).
-
-    They are projected on the deformed face, end before its edge, and are moved a little towards the eye.
-    """
-    import pyvista
-
-    surface = grid.extract_surface(pass_pointid=False)
-    corners = surface.points[surface.faces.reshape(-1, 5)[:, 1:]]
-    moved = corners + surface.point_data["displacement"][surface.faces.reshape(-1, 5)[:, 1:]]
-    normal, outward = (unit(np.cross(x[:, 2] - x[:, 0], x[:, 3] - x[:, 1])) for x in (corners, moved))
-    centre = corners.mean(axis=1)[:, :2]
-    seen = (np.sum(normal[:, :2] * centre, axis=1) > 0.5 * np.linalg.norm(centre, axis=1)) & (outward @ towards > 0)
-    corners, moved, outward = corners[seen], moved[seen], outward[seen, None]
-    fields = {name: surface.cell_data[name][seen] for name in surface.cell_data}
-    lengths, axes = fields["cell_dimensions"], np.stack([fields[f"axis_{i}"] for i in (1, 2, 3)], axis=1)
-    signs = np.array([(1, 1, 1), (1, 1, -1), (1, -1, 1), (1, -1, -1)])
-    size = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).min(axis=1)[:, None, None]
-    gradient = fields["deformation_gradient"].reshape(-1, 3, 3)
-    arms = 0.39 * size * (signs @ (lengths[..., None] * axes)) @ np.swapaxes(gradient, 1, 2)
-    arms -= np.sum(arms * outward, axis=2, keepdims=True) * outward
-    middle = moved.mean(axis=1, keepdims=True)
-    across = np.cross(np.roll(moved, -1, axis=1) - moved, outward)  # of each edge, in the face
-    reach = np.abs(np.sum(across * (moved - middle), axis=2))[:, None] / (
-        np.abs(np.einsum("mei,mki->mke", across, arms)) + 1e-30
-    )
-    arms *= np.minimum(1.0, 0.78 * reach.min(axis=2))[..., None]
-    ends = np.stack([middle - arms, middle + arms], axis=2) + 0.2 * np.median(size) * towards
-    return pyvista.line_segments_from_points(ends.reshape(-1, 3))
-
-
-def unit(vectors: np.ndarray) -> np.ndarray:
-    """Vectors (..., 3) of length one."""
-    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
-
-
 def top(grid: Any) -> float:
     """The deformed length of a body that stands on z = 0."""
     return float((grid.points + grid.point_data["displacement"])[:, 2].max())
 
 
-def peeled(grid: Any) -> Any:
-    """The elements that stay when each layer of the wall but the innermost is cut shorter than the one inside it."""
+def peeled(run: Recording) -> Shown:
+    """At the end, each layer of the wall but the innermost cut shorter than the one inside it."""
+    grid = run.grid()
     row = np.unique(np.round(grid.cell_centers().points[:, 2], 6), return_inverse=True)[1]
-    return grid.extract_cells(row < row.max() + 1 - grid.cell_data["layer"])
+    return Shown(run, None, row < row.max() + 1 - grid.cell_data["layer"])
 
 
 def show(axes: Axes, image: np.ndarray, below: str = "") -> None:
@@ -316,7 +283,7 @@ def show(axes: Axes, image: np.ndarray, below: str = "") -> None:
     axes.text(0.5, -0.015, below, transform=axes.transAxes, ha="center", va="top", fontsize=7, color="0.35")
 
 
-def tubes(figure: Figure, grids: Sequence[Any], shown: Sequence[Any], below: Sequence[str]) -> list[Axes]:
+def tubes(figure: Figure, grids: Sequence[Any], shown: Sequence[Shown], below: Sequence[str]) -> list[Axes]:
     """Five tubes beside each other, on one scale."""
     tallest = max(top(grid) for grid in grids)
     panels = []
@@ -453,7 +420,9 @@ def draw_tendon(runs: Runs, page: Page) -> None:
     axes.plot(TENDON_TIMES, marks, "o", ms=4, color=COLOURS[0], clip_on=False)
     axes.set(xlabel="time", ylabel="stretch", xlim=(0, run.scene.time.end), ylim=(1.0, None))
     axes.legend(loc="upper right")
-    images = drawn(grids, (0.3, -1.0, 0.14), 0.495 * longest, 1.1 * longest, (270, 1000))
+    images = drawn(
+        [Shown(run, time) for time in TENDON_TIMES], (0.3, -1.0, 0.14), 0.495 * longest, 1.1 * longest, (270, 1000)
+    )
     for number, (time, image) in enumerate(zip(TENDON_TIMES, images, strict=True)):
         panels.append(figure.add_axes((0.45 + 0.109 * number, 0.145, 0.109, 0.795)))
         show(panels[-1], image)
@@ -495,7 +464,9 @@ def draw_artery(runs: Runs, page: Page) -> None:
     grids = [run.grid(time) for time in ARTERY_TIMES]
     loads = [(run.value("axial_elongation", time), run.value("pressure", time)) for time in ARTERY_TIMES]
     figure = Figure(figsize=(8.2, 3.5))
-    panels = tubes(figure, grids, grids, [loads_in_words(*pair) for pair in loads])
+    panels = tubes(
+        figure, grids, [Shown(run, time) for time in ARTERY_TIMES], [loads_in_words(*pair) for pair in loads]
+    )
     for axes, time in zip(panels, ARTERY_TIMES, strict=True):
         axes.set_title(f"$t$ = {time:g}")
     angle_scale(figure, (0.25, 0.125, 0.5, 0.026), IN_WALL.format(""))
@@ -510,9 +481,9 @@ def draw_artery(runs: Runs, page: Page) -> None:
 
 def draw_layers(runs: Runs, page: Page) -> None:
     """Fig. 8: three layers of the wall apart."""
-    grid = runs["artery"].grid()
+    run, grid = runs["artery"], runs["artery"].grid()
     table, tallest = layer_table(grid), top(grid)
-    layers = [grid.extract_cells(grid.cell_data["layer"] == k) for k in WALL_LAYERS.values()]
+    layers = [Shown(run, None, grid.cell_data["layer"] == k) for k in WALL_LAYERS.values()]
     images = drawn(layers, ABOVE, tallest / 2, 1.27 * tallest, (440, 600))
     figure, panels = Figure(figsize=(6.4, 3.95)), []
     for number, ((name, k), image) in enumerate(zip(WALL_LAYERS.items(), images, strict=True)):
@@ -528,9 +499,10 @@ def draw_layers(runs: Runs, page: Page) -> None:
 
 def draw_load_cases(runs: Runs, page: Page) -> None:
     """Fig. 9: the ends of five load cases."""
-    grids = [runs[case_name(*case)].grid() for case in LOAD_CASES]
+    cases = [runs[case_name(*case)] for case in LOAD_CASES]
+    grids = [run.grid() for run in cases]
     figure = Figure(figsize=(8.2, 3.4))
-    panels = tubes(figure, grids, [peeled(grid) for grid in grids], [loads_in_words(*case) for case in LOAD_CASES])
+    panels = tubes(figure, grids, list(map(peeled, cases)), [loads_in_words(*case) for case in LOAD_CASES])
     angle_scale(figure, (0.25, 0.125, 0.5, 0.026), AT_END)
     lettered(panels)
     page.save(figure)
@@ -554,7 +526,7 @@ def draw_drivers(runs: Runs, page: Page) -> None:
     profiles(panels[0], {f"{words[driver]} {symbols[driver]}": table for driver, table in tables.items()})
     panels[0].legend(loc="upper left", title="driven by", alignment="left")
     tallest = max(map(top, ends.values()))
-    images = drawn([peeled(grid) for grid in ends.values()], ABOVE, tallest / 2, 1.25 * tallest, (390, 560))
+    images = drawn(list(map(peeled, pair.values())), ABOVE, tallest / 2, 1.25 * tallest, (390, 560))
     for number, (driver, image) in enumerate(zip(ends, images, strict=True)):
         panels.append(figure.add_axes((0.50 + 0.245 * number, 0.215, 0.24, 0.72)))
         show(panels[-1], image)

@@ -12,6 +12,7 @@ from remodel_fenicsx.results.recording import RecordedRun, RecordingError
 
 if TYPE_CHECKING:
     import pyvista
+    from numpy.typing import ArrayLike
 
 NOTEBOOK_SIZE = 5.0  # MB that a page has at most in a notebook, which is saved with all of them
 FRAME_STYLE = "width: 100%; height: 48em; border: 1px solid #888"
@@ -110,13 +111,14 @@ class Recording(RecordedRun):
         ImportError
             If there is no PyVista.
         """
-        from remodel_fenicsx.pictures.sheet import grid
+        from remodel_fenicsx.pictures.bodies import grid, whole_body
 
-        return grid(self, self._time(time))
+        return grid(whole_body(self), self._time(time))
 
     def plot(
         self, time: float | None = None, name: str = "fibre_angle_deformed", *, layers: int | None = None,
-        cut: str | None = None, chains: bool = True, plotter: pyvista.Plotter | None = None, **options: Any,
+        cut: str | None = None, elements: ArrayLike | None = None, chains: bool = True,
+        plotter: pyvista.Plotter | None = None, **options: Any,
     ) -> pyvista.Plotter:  # fmt: skip
         """Put the deformed body at a recorded time into a plotter of PyVista: `recording.plot().show()`.
 
@@ -131,6 +133,8 @@ class Recording(RecordedRun):
             Show so many, from the inside of a tube, from the bottom of others; default: all.
         cut
             "half" or "quarter": leave out what is in front.
+        elements
+            Show of these alone: which ones of `grid()`, a mask (elements,).
         chains
             Whether the four chains of each element are drawn on the faces that are seen, where cells were recorded.
         plotter
@@ -148,14 +152,13 @@ class Recording(RecordedRun):
         RecordingError
             If the field, or any, was not recorded at this time.
         FigureError
-            If there are no such layers, or nothing is left by the cut; a ValueError.
+            If there are no such layers or elements, or nothing is left by the cut; a ValueError.
         ImportError
             If there is no PyVista.
         """
-        from remodel_fenicsx.pictures.sheet import plot
-        from remodel_fenicsx.pictures.bodies import Viewing
+        from remodel_fenicsx.pictures.bodies import Viewing, plot
 
-        return plot(self, self._time(time), name, Viewing(layers, cut), chains, plotter, options)
+        return plot(self, self._time(time), name, Viewing(layers, cut), elements, chains, plotter, options)
 
     def screenshot(
         self, path: str | os.PathLike[str] | None = None, times: Sequence[float] | None = None, *,

@@ -1,24 +1,30 @@
-"""Pictures and animations as files: of which kind, under which name; nothing is ever overwritten."""
+"""Pictures and animations as files: sheets of bodies at some times, with scale and axes; nothing is overwritten."""
 
 from __future__ import annotations
 
 import io
 import itertools
+import math
 import os
 import shutil
 import subprocess
+import textwrap
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import matplotlib
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
+from matplotlib.lines import Line2D
+from matplotlib.text import Text
 from PIL import Image, features
 
 from remodel_fenicsx._version import __version__
-from remodel_fenicsx.pictures.bodies import Pixels, Sight, Viewing, scale_colours
-from remodel_fenicsx.pictures.sheet import ONE, SEVERAL, Sheet
+from remodel_fenicsx.pictures.bodies import Pixels, Sight, View, Viewing, angle_scale, render, scale_colours
 from remodel_fenicsx.results.recording import RecordedRun, kept_times
 from remodel_fenicsx.studies.page import DOTS_PER_INCH, STYLE, About, FigureError, Palette, as_file
 from remodel_fenicsx.system.files import write_new
@@ -43,9 +49,9 @@ def draw_picture(
         raise FigureError(f"times: {len(shown)} times; allowed are {MOST_PANELS} in a picture (animate shows more)", 2)
     ending = path.suffix.lower() if path else ".png"
     dots = DOTS_PER_INCH[ending[1:]]
-    snapshots = sight.snapshots(shown)
-    view = sight.view(snapshots, SEVERAL if len(shown) > 1 else ONE, dots)
-    images = sight.images(snapshots, view)
+    grids = sight.grids(shown)
+    view = sight.view(grids, SEVERAL if len(shown) > 1 else ONE, dots)
+    images = render(grids, view)
     with matplotlib.rc_context(STYLE):
         sheet = Sheet(sight, shown, images, view, dots, has_clock=False)
         data = as_file(sheet.figure, ending[1:], _about(sight, "picture"), scale_colours())
@@ -65,9 +71,9 @@ def draw_animation(
     if len(sight.recording.times) < FEWEST_FRAMES:
         raise FigureError(f"{sight.recording.path}: fields of one time alone are recorded, so nothing moves", 2)
     times = [float(time) for time in kept_times(sight.history, sight.recording.times, frames)]
-    snapshots = sight.snapshots(times)
-    view = sight.view(snapshots, ONE, FRAME_DOTS)
-    images = sight.images(snapshots, view)
+    grids = sight.grids(times)
+    view = sight.view(grids, ONE, FRAME_DOTS)
+    images = render(grids, view)
     with matplotlib.rc_context(STYLE):
         drawn = _drawn(Sheet(sight, times[:1], images[:1], view, FRAME_DOTS, has_clock=True), times, images)
     return _write(path, sight, [times[0], times[-1]], ending, encode(drawn, _about(sight, "animate")))
@@ -88,6 +94,119 @@ def _about(sight: Sight, command: str) -> About:
     made_with = "; ".join(f"{name} {version}" for name, version in versions.items())
     title, caption = f"{scene.name}: angle of the collagen", " ".join(sight.notes())
     return About(f"remodel_fenicsx {__version__}", title, caption, made_with, f"remodel-fenicsx {command}")
+
+
+# ---------------------------------------------------------------- a sheet with a body at one or several times
+# A sheet with a body at one or several times: all letters, the scale and the axes stand outside of the body.
+
+# inches
+ONE, SEVERAL = (5.0, 4.4), (2.5, 3.0)  # room for a body alone, and for each of several
+NARROWEST, WIDEST = 4.4, 9.0  # sheets
+NARROWEST_PANEL = 1.25  # its letters want that
+HEAD, PANEL_TITLE, LOAD_LINE, FOOT, NOTE_LINE, EDGE = 0.34, 0.22, 0.14, 0.68, 0.125, 0.08
+LETTER, NOTE_LETTER = 0.092, 0.049  # mean width in the head and in the notes
+TRIAD = 0.17  # length of an axis that is seen from the side
+
+
+class Sheet:
+    """A figure with one panel for each time."""
+
+    def __init__(
+        self, sight: Sight, times: Sequence[float], images: Sequence[Pixels], view: View, dots: float, has_clock: bool
+    ):
+        self.sight = sight
+        self.panel = view.pixels[0] / dots, view.pixels[1] / dots
+        cell = max(self.panel[0], NARROWEST_PANEL) + EDGE
+        columns = max(1, min(len(times), int(WIDEST / cell)))
+        rows = math.ceil(len(times) / columns)
+        self.width = max(columns * cell, NARROWEST)
+        notes = [line for note in sight.notes() for line in textwrap.wrap(note, int(self.width / NOTE_LETTER))]
+        self.stacked = len(times) > 1
+        loads = LOAD_LINE * (len(sight.recording.scene.loads) if self.stacked else 1)
+        row = PANEL_TITLE + self.panel[1] + loads + 0.06
+        self.height = HEAD + rows * row + FOOT + NOTE_LINE * len(notes) + EDGE
+        self.figure = Figure(figsize=(self.width, self.height), dpi=dots)
+        self._head()
+        margin = (self.width - columns * cell) / 2
+        self.panels = [
+            self._panel(image, margin + (number % columns + 0.5) * cell, HEAD + number // columns * row)
+            for number, image in enumerate(images)
+        ]
+        for number, time in enumerate(times):
+            self._label(number, time)
+        self._foot(view, NOTE_LINE * len(notes) + EDGE)
+        for number, note in enumerate(notes):
+            y = (EDGE + NOTE_LINE * (len(notes) - number - 0.8)) / self.height
+            self.figure.text(0.5, y, note, fontsize=6.5, color="0.35", ha="center", parse_math=False)
+        self.clock = self._clock(NOTE_LINE * len(notes) + EDGE + FOOT) if has_clock else None
+
+    def _head(self) -> None:
+        title = textwrap.shorten(self.sight.recording.scene.name, max(8, int(self.width / LETTER)), placeholder=" …")
+        self.figure.text(0.5, 1 - 0.22 / self.height, title, fontsize=10, fontweight="bold", ha="center",
+                         parse_math=False)  # fmt: skip
+
+    def _panel(self, image: Pixels, middle: float, top: float) -> tuple[AxesImage, Text, Text]:
+        """A body with its middle at, and its title below, places in inches from the left and from the top."""
+        wide, tall = self.panel
+        bottom = self.height - top - PANEL_TITLE - tall
+        place = ((middle - wide / 2) / self.width, bottom / self.height, wide / self.width, tall / self.height)
+        axes: Axes = self.figure.add_axes(place)
+        axes.set_axis_off()
+        shown = axes.imshow(image, interpolation="nearest", aspect="auto")
+        title = self.figure.text(middle / self.width, (bottom + tall + 0.06) / self.height, "", fontsize=9, ha="center")
+        loads = self.figure.text(middle / self.width, (bottom - 0.03) / self.height, "", fontsize=7.5, color="0.25",
+                                 ha="center", va="top", parse_math=False)  # fmt: skip
+        return shown, title, loads
+
+    def _label(self, number: int, time: float) -> None:
+        _, title, loads = self.panels[number]
+        title.set_text(f"$t$ = {time:g}")
+        loads.set_text(("\n" if self.stacked else ",  ").join(self.sight.loads(time)))
+
+    def _foot(self, view: View, bottom: float) -> None:
+        """Scale of the angles in the middle, a length to its left, the axes to its right."""
+        along, across = self.sight.recording.scene.geometry.angle_in_words
+        place = (0.24, (bottom + 0.42) / self.height, 0.56, 0.1 / self.height)
+        angle_scale(self.figure, place, f"angle of the collagen, deformed: 0° {along}, 90° {across}")
+        inches = view.pixels[1] / self.figure.dpi / view.height  # of a unit of length
+        length = _round_length(0.13 * self.width / inches)
+        start, y = 0.035, (bottom + 0.47) / self.height
+        end = start + length * inches / self.width
+        self.figure.add_artist(Line2D((start, end), (y, y), color="0.2", lw=1.6, solid_capstyle="butt"))
+        unit = self.sight.recording.scene.geometry.length_unit
+        label = f"{length:g} {unit}" if unit else f"length {length:g}"
+        self.figure.text((start + end) / 2, y - 0.06 / self.height, label, fontsize=7.5, ha="center", va="top")
+        self._triad(0.895 * self.width, bottom + 0.38)
+
+    def _triad(self, x: float, y: float) -> None:
+        right, up, _ = self.sight.axes()
+        for name, across, along in zip("xyz", right, up, strict=True):
+            ends = (x, x + TRIAD * across), (y, y + TRIAD * along)
+            line = np.array(ends) / np.array([[self.width], [self.height]])
+            self.figure.add_artist(Line2D(*line, color="0.2", lw=1.0))
+            if math.hypot(across, along) > 0.15:
+                tip = (x + 1.55 * TRIAD * across) / self.width, (y + 1.55 * TRIAD * along) / self.height
+                self.figure.text(*tip, name, fontsize=7.5, ha="center", va="center")
+
+    def _clock(self, bottom: float) -> Line2D:
+        y = bottom / self.height
+        self.figure.add_artist(Line2D((0.24, 0.80), (y, y), color="0.85", lw=1.5))
+        line = Line2D((0.24, 0.24), (y, y), color="0.2", lw=1.5)
+        self.figure.add_artist(line)
+        return line
+
+    def show(self, time: float, image: Pixels, share: float) -> None:
+        """Another time in the first panel; `share` is how far it is through the animation."""
+        self.panels[0][0].set_data(image)
+        self._label(0, time)
+        if self.clock is not None:
+            self.clock.set_xdata((0.24, 0.24 + 0.56 * share))
+
+
+def _round_length(most: float) -> float:
+    """The largest of 1, 2, 5, 10, ... that is not longer."""
+    power = 10.0 ** math.floor(math.log10(most))
+    return power * next(factor for factor in (5, 2, 1) if factor * power <= most * (1 + 1e-9))
 
 
 # ---------------------------------------------------------------- kinds of animations

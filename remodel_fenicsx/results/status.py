@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from remodel_fenicsx.results.checkpoint_file import read_pointer
+from remodel_fenicsx.results.checkpoint_file import time_of_checkpoint
 from remodel_fenicsx.results.recording import (
     HISTORY,
     LARGEST_HISTORY,
@@ -73,8 +73,8 @@ def status(folder: Path) -> list[str]:
             lines[-1] += f"; {reason if reason.startswith('stopped') else f'stopped by {reason}'}"
     if rate:
         lines.append(f"{rate:.3g} s a step (mean of the last {len(seconds)})")
-    generations = read_pointer(folder)
-    kept = f"checkpoint at time {generations[0].time:g}" if generations else "no checkpoint yet"
+    time_kept = time_of_checkpoint(folder)
+    kept = "no checkpoint yet" if time_kept is None else f"checkpoint at time {time_kept:g}"
     lines.append(kept if lives or done else f"{kept}; it goes on with: {typed()} run --resume {folder}")
     return lines
 

@@ -15,7 +15,6 @@ import threading
 import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from functools import cached_property
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
@@ -29,8 +28,9 @@ if TYPE_CHECKING:
     import h5py
 
 
-# ---------------------------------------------------------------- a file below h5py that a full disk or a killed
-# A file below h5py that a full disk or a killed process cannot spoil.
+# ---------------------------------------------------------------- a file that a full disk or a kill cannot spoil
+# HDF5 changes a few bytes in the middle of a file at each step. They stand behind its end before they are changed, in
+# this format since 0.1.0: a run that was killed meanwhile goes on.
 
 _CHANGE = struct.Struct("<QQ")  # offset and length, before the bytes
 _END = struct.Struct("<QI8s")  # length and check sum of the changes before it
@@ -39,12 +39,10 @@ _MARK = b"remodel1"
 
 @contextmanager
 def signals_held_back() -> Iterator[None]:
-    """Let Python's signal handlers (Ctrl-C, termination) run after the block."""
+    """Let Python's signal handlers run after the block: an exception below HDF5 would crash the process."""
+    numbers = signal.valid_signals() if threading.current_thread() is threading.main_thread() else ()
+    handlers = {int(number): handler for number in numbers if callable(handler := signal.getsignal(number))}
     caught: list[int] = []
-    handlers = {int(number): signal.getsignal(number) for number in signal.valid_signals()}
-    if threading.current_thread() is not threading.main_thread():  # handlers run in the main thread only
-        handlers = {}
-    handlers = {number: handler for number, handler in handlers.items() if callable(handler)}
     try:
         for number in handlers:
             signal.signal(number, lambda number, _: caught.append(number))
@@ -57,7 +55,7 @@ def signals_held_back() -> Iterator[None]:
 
 
 class StagedFile(io.RawIOBase):
-    """The file below h5py: keeps what HDF5 writes in memory until `commit`."""
+    """The file below h5py: what HDF5 writes waits in memory until `commit`."""
 
     def __init__(self, path: Path, existing: bool = False):
         self._descriptor = -1
@@ -65,9 +63,8 @@ class StagedFile(io.RawIOBase):
         self._descriptor = open_own(path, os.O_RDWR | (0 if existing else os.O_CREAT | os.O_EXCL))
         if existing:
             self._finish_changes()
-        self._committed = os.fstat(self._descriptor).st_size  # bytes on the disk
-        self._changes: list[tuple[int, bytes]] = []  # to write over these, in order
-        self._tail = bytearray()  # to write after these
+        self._committed = self._end = os.fstat(self._descriptor).st_size
+        self._writes: list[tuple[int, bytes]] = []  # what waits, in order
         self._position = 0
 
     def readable(self) -> bool:
@@ -79,59 +76,52 @@ class StagedFile(io.RawIOBase):
     def seekable(self) -> bool:
         return True
 
-    def tell(self) -> int:
-        return self._position
-
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        base = {os.SEEK_SET: 0, os.SEEK_CUR: self._position, os.SEEK_END: self._committed + len(self._tail)}[whence]
-        self._position = base + offset
+        self._position = offset + {os.SEEK_SET: 0, os.SEEK_CUR: self._position, os.SEEK_END: self._end}[whence]
         return self._position
 
     def readinto(self, buffer: Any) -> int:
-        start, size = self._position, len(buffer)
-        data = bytearray(os.pread(self._descriptor, max(0, min(size, self._committed - start)), start))
-        for offset, change in self._changes:
-            low, high = max(start, offset), min(start + len(data), offset + len(change))
+        start, size = self._position, max(0, min(len(buffer), self._end - self._position))
+        data = bytearray(os.pread(self._descriptor, size, start).ljust(size, b"\0"))
+        for offset, change in self._writes:
+            low, high = max(start, offset), min(start + size, offset + len(change))
             if low < high:
                 data[low - start : high - start] = change[low - offset : high - offset]
-        from_tail = max(0, start - self._committed)
-        data += self._tail[from_tail : from_tail + size - len(data)]
-        buffer[: len(data)] = data
-        self._position += len(data)
-        return len(data)
+        buffer[:size] = data
+        self._position += size
+        return size
 
     def write(self, buffer: Any) -> int:
         data = bytes(buffer)
-        old = max(0, min(len(data), self._committed - self._position))
-        if old:
-            self._changes.append((self._position, data[:old]))
-        if old < len(data):
-            start = self._position + old - self._committed
-            self._tail.extend(bytes(max(0, start - len(self._tail))))
-            self._tail[start : start + len(data) - old] = data[old:]
+        self._writes.append((self._position, data))
         self._position += len(data)
+        self._end = max(self._end, self._position)
         return len(data)
 
     def truncate(self, size: int | None = None) -> int:
-        size = self._position if size is None else size
         # a file that is longer than its header says is valid: what is on the disk stays
-        wanted = max(0, size - self._committed)
-        self._tail[wanted:] = bytes(max(0, wanted - len(self._tail)))
-        return size
+        self._end = max(self._committed, self._position if size is None else size)
+        return self._end
 
     def commit(self) -> None:
         """Bring everything to the disk, or raise OSError and keep it for the next time."""
+        changes: list[tuple[int, bytes]] = []
+        tail = bytearray(self._end - self._committed)
+        for offset, data in self._writes:
+            old = max(0, min(len(data), self._committed - offset))
+            changes += [(offset, data[:old])] if old else []
+            start = offset + old - self._committed
+            tail[start : start + len(data) - old] = data[old:]
         # HDF5's superblock, at offset 0, says how long the file is: first, for chunk indices will name the new end
-        changes = sorted(self._changes, key=lambda item: item[0] > 0)
-        end = self._committed + len(self._tail)
+        changes.sort(key=lambda change: change[0] > 0)
         try:
-            self._write_all(self._committed, self._tail + _journal(changes))
+            self._write_all(self._committed, tail + _journal(changes))
             os.fdatasync(self._descriptor)  # some file systems find out only now that they are full
         except OSError:
             os.ftruncate(self._descriptor, self._committed)
             raise
-        self._make_changes(changes, end)
-        self._committed, self._tail, self._changes = end, bytearray(), []
+        self._make_changes(changes, self._end)
+        self._committed, self._writes = self._end, []
 
     def _make_changes(self, changes: list[tuple[int, bytes]], end: int) -> None:
         """Write over the old part, and only then forget what was to be written, which stands behind `end`."""
@@ -215,12 +205,8 @@ class TransientGrid:
         *,
         point_dtype: DTypeLike = np.float64,
     ):
-        coordinates, connectivity = np.asarray(points, dtype=point_dtype), np.asarray(cells, dtype=np.int64)
         with self._opened(path, "w"):
-            self._root = self._file.create_group("VTKHDF")
-            self._write_mesh(coordinates, connectivity, cell_type)
-            self._create_steps()
-            self._count(0)
+            self._make(np.asarray(points, dtype=point_dtype), np.asarray(cells, dtype=np.int64), cell_type)
 
     @classmethod
     def continued(cls, path: Path, time: float) -> TransientGrid:
@@ -237,9 +223,7 @@ class TransientGrid:
         """Within, a file that was just opened is filled or looked at; it stays open unless that fails."""
         import h5py
 
-        self.path = path
-        self._datasets: dict[str, _Rows] = {}
-        self.number_of_steps, self.last_time, self._point_blocks = 0, -np.inf, 1
+        self.path, self.number_of_steps, self.last_time = path, 0, -np.inf
         with signals_held_back():
             self._staged = StagedFile(path, existing=mode == "r+")
             # a file that is no HDF5 stays open where this fails: h5py still flushes it when it lets go of it
@@ -269,62 +253,56 @@ class TransientGrid:
         points: ArrayLike | None = None,
         constant: Fields | None = None,
     ) -> None:
-        """Add one step and bring it to the disk."""
+        """Add one step and bring it to the disk; points are given at every step or at none."""
         step = self.number_of_steps
+        blocks = {f"PointData/{name}": np.asarray(values) for name, values in (point_data or {}).items()}
+        blocks |= {f"CellData/{name}": np.asarray(values) for name, values in (cell_data or {}).items()}
+        once = {f"CellData/{name}": np.asarray(values) for name, values in (constant or {}).items()}
         with signals_held_back():
-            for kind, fields in (("PointData", point_data or {}), ("CellData", cell_data or {})):
-                for name, values in fields.items():
-                    block = np.asarray(values)
-                    self._rows_of_field(kind, name, block).write(step, block)
-                    self._rows(f"Steps/{kind}Offsets/{name}").write(step, step * len(block))
-            for name, values in (constant or {}).items():
-                if f"CellData/{name}" not in self._datasets:
-                    self._rows_of_field("CellData", name, np.asarray(values)).write(0, np.asarray(values))
-                self._rows(f"Steps/CellDataOffsets/{name}").write(step, 0)
-            if points is not None:
-                self._rows("Points").write(self._point_blocks, np.asarray(points))
-                self._point_blocks += 1
-            # offsets that stay 0 say that the mesh is the one of the first step
-            numbers = {
-                "Values": time,
-                "PartOffsets": 0,
-                "NumberOfParts": 1,
-                "CellOffsets": 0,
-                "ConnectivityIdOffsets": 0,
-            }
-            numbers["PointOffsets"] = (self._point_blocks - 1) * self._number_of_points
-            for name, value in numbers.items():
-                self._rows(f"Steps/{name}").write(step, value)
+            for name, block in (blocks | once).items():
+                if name not in self._root:  # a chunk is a step, which readers take as a whole
+                    _create(self._root, name, np.float32, block.shape, fletcher32=True)
+                    _create(self._root, _offsets(name), np.int64, (_STEPS_PER_CHUNK,))
+            for name, block in blocks.items():
+                _write(self._root[name], step, block)
+            for name, block in once.items():
+                _write(self._root[name], 0, block)
+            if points is not None:  # block 0 is the reference configuration
+                _write(self._root["Points"], step + 1, np.asarray(points))
+            if len(self._root["Steps/PartOffsets"]) <= step:
+                lengths = {_offsets(name): len(block) for name, block in blocks.items()}
+                self._number_steps(lengths | dict.fromkeys(map(_offsets, once), 0), moves=points is not None)
+            _write(self._root["Steps/Values"], step, np.array([time]))
             self._file.flush()
             # the number of steps comes last: until then a reader sees the series without this step
             self.number_of_steps, self.last_time = step + 1, time
-            self._steps.modify("NSteps", np.int64(step + 1))
+            self._root["Steps"].attrs.modify("NSteps", np.int64(step + 1))
             self._file.flush()
             self._staged.commit()
+
+    def _number_steps(self, lengths: Mapping[str, int], moves: bool) -> None:
+        """Where the blocks of the next steps are; offsets that stay 0 say that the mesh is the one of the first."""
+        tables = {name: (0, length) for name, length in lengths.items()}
+        tables |= {f"Steps/{name}": (0, 0) for name in ("PartOffsets", "CellOffsets", "ConnectivityIdOffsets")}
+        points = int(self._root["NumberOfPoints"][0]) * moves
+        tables |= {"Steps/NumberOfParts": (1, 0), "Steps/PointOffsets": (points, points)}
+        numbers = np.arange(self.number_of_steps, self.number_of_steps + _STEPS_PER_CHUNK)
+        for name, (first, length) in tables.items():
+            table = self._root[name]
+            table.resize(self.number_of_steps + len(numbers), axis=0)
+            table[self.number_of_steps :] = (first + length * numbers).reshape(-1, *table.shape[1:])
 
     def drop_last(self) -> None:
         """Take the last step back; the next `append`, or `close`, brings that to the disk."""
         with signals_held_back():
             self._count(self.number_of_steps - 1)
 
-    @cached_property
-    def _number_of_points(self) -> int:
-        return int(self._root["NumberOfPoints"][0])
-
-    @cached_property
-    def _steps(self) -> Any:
-        """The group with the attribute that says how many steps there are."""
-        return self._root["Steps"].attrs
-
     def _count(self, number: int) -> None:
-        """The file has so many steps from now on, whatever stands behind them."""
+        """The file has so many steps from now on."""
         steps = self._root["Steps"]
-        self.number_of_steps = number
-        self.last_time = float(steps["Values"][number - 1]) if number else -np.inf
-        # block 0 of Points is the reference configuration
-        blocks = int(steps["PointOffsets"][number - 1]) // self._number_of_points if number else 0
-        self._point_blocks = 1 + blocks
+        steps["Values"].resize(number, axis=0)  # VTK takes as many as stand there
         steps.attrs.modify("NSteps", np.int64(number))
+        self.number_of_steps, self.last_time = number, float(steps["Values"][-1]) if number else -np.inf
 
     def close(self) -> None:
         """Write what is not yet on the disk and close; more than once does no harm."""
@@ -337,67 +315,45 @@ class TransientGrid:
             finally:
                 self._staged.close()
 
-    def _write_mesh(self, points: Array, cells: Array, cell_type: int) -> None:
-        root = self._root
+    def _make(self, points: Array, cells: Array, cell_type: int) -> None:
+        """Write the mesh, and no steps."""
+        self._root = root = self._file.create_group("VTKHDF")
         root.attrs["Version"] = np.array(VERSION, dtype=np.int64)
         root.attrs["Type"] = np.bytes_("UnstructuredGrid")  # VTK takes fixed-length ASCII only
         for name, number in {"Points": len(points), "Cells": len(cells), "ConnectivityIds": cells.size}.items():
             root[f"NumberOf{name}"] = np.array([number], dtype=np.int64)
         _create(root, "Points", points.dtype, points.shape, fletcher32=True)
-        self._rows("Points").write(0, points)
+        _write(root["Points"], 0, points)
         root.create_dataset("Connectivity", data=cells.ravel(), **_COMPRESSION)
         root.create_dataset("Offsets", data=cells.shape[1] * np.arange(len(cells) + 1), **_COMPRESSION)
         root.create_dataset("Types", data=np.full(len(cells), cell_type, dtype=np.uint8), **_COMPRESSION)
-
-    def _create_steps(self) -> None:
         for group in ("PointData", "CellData", "Steps/PointDataOffsets", "Steps/CellDataOffsets"):
-            self._root.create_group(group)
+            root.create_group(group)
         # no check sum: these chunks are written over, and a reader must find the file whole between two writes
-        steps, one = self._root["Steps"], (_STEPS_PER_CHUNK,)
-        _create(steps, "Values", np.float64, one)
+        _create(root, "Steps/Values", np.float64, (_STEPS_PER_CHUNK,))
         for name in ("PartOffsets", "NumberOfParts", "PointOffsets"):
-            _create(steps, name, np.int64, one)
+            _create(root, f"Steps/{name}", np.int64, (_STEPS_PER_CHUNK,))
         for name in ("CellOffsets", "ConnectivityIdOffsets"):
-            _create(steps, name, np.int64, (*one, 1))  # one column for each kind of topology
-        steps.attrs["NSteps"] = np.int64(0)
-
-    def _rows_of_field(self, kind: str, name: str, block: Array) -> _Rows:
-        """The dataset of a field, made at the first step: a chunk is a step, which readers take as a whole."""
-        if f"{kind}/{name}" not in self._datasets and name not in self._root[kind]:
-            _create(self._root[kind], name, np.float32, block.shape, fletcher32=True)
-            _create(self._root[f"Steps/{kind}Offsets"], name, np.int64, (_STEPS_PER_CHUNK,))
-        return self._rows(f"{kind}/{name}")
-
-    def _rows(self, path: str) -> _Rows:
-        """Found once: looking for it costs as much as writing a few numbers."""
-        if path not in self._datasets:
-            self._datasets[path] = _Rows(self._root[path])
-        return self._datasets[path]
+            _create(root, f"Steps/{name}", np.int64, (_STEPS_PER_CHUNK, 1))  # one column for each kind of topology
+        root["Steps"].attrs["NSteps"] = np.int64(0)
 
 
-class _Rows:
-    """A dataset that grows by blocks of rows, with what h5py would look for at each of them."""
-
-    def __init__(self, dataset: h5py.Dataset):
-        self._id, self.dtype = dataset.id, dataset.dtype
-        self.trailing = tuple(dataset.shape[1:])
-
-    def write(self, number: int, block: ArrayLike) -> None:
-        """Write block `number` of a dataset whose blocks have this one's length; a number is a block of one row."""
-        import h5py
-
-        rows = np.ascontiguousarray(block, self.dtype).reshape(-1, *self.trailing)
-        start = number * len(rows)
-        self._id.set_extent((start + len(rows), *self.trailing))
-        place = self._id.get_space()
-        place.select_hyperslab((start, *(0 for _ in self.trailing)), rows.shape)
-        self._id.write(h5py.h5s.create_simple(rows.shape), place, rows)
+def _offsets(field: str) -> str:
+    """Where the offsets of a field stand."""
+    return "Steps/" + field.replace("/", "Offsets/", 1)
 
 
 def _create(group: h5py.Group, name: str, dtype: DTypeLike, chunk: tuple[int, ...], fletcher32: bool = False) -> None:
     """An empty dataset that grows by rows; with `fletcher32` every chunk has a check sum."""
     shape = (0, *chunk[1:]), dtype
     group.create_dataset(name, *shape, maxshape=(None, *chunk[1:]), chunks=chunk, fletcher32=fletcher32)
+
+
+def _write(dataset: h5py.Dataset, number: int, block: Array) -> None:
+    """Write a block of rows, the last one of a dataset whose blocks have this one's length."""
+    start = number * len(block)
+    dataset.resize(start + len(block), axis=0)
+    dataset[start:] = block
 
 
 def vtk_cells(cell_name: str, degree: int, elements: NDArray[np.int64]) -> tuple[int, NDArray[np.int64]]:

@@ -17,7 +17,6 @@ import h5py
 import numpy as np
 import pytest
 
-from remodel_fenicsx.results import vtkhdf
 from remodel_fenicsx.results.turned import chain_displacement, chain_lines
 from remodel_fenicsx.results.vtkhdf import LINE, StagedFile, TransientGrid, vtk_cells
 from tests.forks import forked
@@ -188,14 +187,16 @@ def test_reader_finds_moving_chains(tmp_path):
     with TransientGrid(path, points, lines, LINE, point_dtype=np.float32) as grid:
         grid.append(0.0, {"displacement": 0 * points}, {"angle": np.zeros(12)}, points=points)
         grid.append(1.0, {"displacement": 1 * points}, {"angle": np.ones(12)}, points=series[1][0])
-        grid.append(2.0, {"displacement": 2 * points}, {"angle": np.full(12, 2.0)})  # the points stay
+        grid.append(2.0, {"displacement": 2 * points}, {"angle": np.full(12, 2.0)}, points=series[2][0])
         grid.append(3.0, {"displacement": 3 * points}, {"angle": np.full(12, 3.0)}, points=series[3][0])
+        grid.append(4.0, {"displacement": points}, {"angle": np.zeros(12)}, points=points)
+        grid.drop_last()  # VTK writes over its memory where there are more times than steps
     found = read(path)
     assert found["steps"] == 4
-    for k, of in enumerate((0, 1, 1, 3)):
+    for k in range(4):
         assert found[f"{k} time"] == k
         assert found[f"{k} points"].dtype == np.float32
-        assert np.array_equal(found[f"{k} points"], series[of][0].astype(np.float32))
+        assert np.array_equal(found[f"{k} points"], series[k][0].astype(np.float32))
         assert np.array_equal(found[f"{k} cells"], lines.ravel()) and set(found[f"{k} types"]) == {LINE}
         assert np.array_equal(found[f"{k} point displacement"], (k * points).astype(np.float32))
         assert np.array_equal(found[f"{k} cell angle"], np.full(12, k))
@@ -410,7 +411,6 @@ def test_fields_of_a_run_that_began_with_filters_go_on(tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         filters = {"compression": "gzip", "shuffle": True}
         patch.setattr(h5py.Group, "create_dataset", lambda self, *a, **k: create(self, *a, **(filters | k)))
-        patch.setattr(vtkhdf._Rows, "write", lambda self, n, block: _through_h5py(h5py.Dataset(self._id), n, block))
         with TransientGrid(path, CUBE, VTK_CUBE, 12) as grid:
             for k in range(3):
                 grid.append(k, {"u": field[k]}, {"c": np.full(1, k)}, points=CUBE + k)
@@ -421,12 +421,6 @@ def test_fields_of_a_run_that_began_with_filters_go_on(tmp_path, monkeypatch):
         assert file["VTKHDF/PointData/u"].compression == "gzip"
     np.testing.assert_array_equal(raw_series(path, "u", 8), field)
     assert [float(points[0, 0]) for points in read_points(path)] == [CUBE[0, 0] + k for k in (0, 0, 1, 2, 3)]
-
-
-def _through_h5py(dataset, number, block):
-    block = np.reshape(block, (-1, *dataset.shape[1:]))
-    dataset.resize((number + 1) * len(block), axis=0)
-    dataset[number * len(block) :] = block
 
 
 def read_points(path: Path) -> np.ndarray:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import importlib.util
 import math
 import os
@@ -19,6 +18,7 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
+import pyvista
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
@@ -26,7 +26,7 @@ from PIL import Image
 import remodel_fenicsx
 from remodel_fenicsx import Recording, cli, run
 from remodel_fenicsx.body.shape import columns_of
-from remodel_fenicsx.pictures import bodies, bodies as rendering
+from remodel_fenicsx.pictures import bodies
 from remodel_fenicsx.results import vtkhdf
 from remodel_fenicsx.results.recording import RecordingError, steps_recorded
 from remodel_fenicsx.scene.scene import Scene, SceneError, scene_from_dict
@@ -429,52 +429,39 @@ def test_valid_runs_are_used_again_and_own_figures_drawn_anew(drawn: Path, monke
 # ---------------------------------------------------------------- pictures in space
 
 
-def two_hexahedra() -> bodies.DrawnBody:
-    """Two unit cubes side by side in x, beginning at x = 1; all chains along z, stretched to twice in z."""
+def two_hexahedra(F: np.ndarray, cell: list[float]) -> pyvista.UnstructuredGrid:
+    """Two unit cubes side by side in x, beginning at x = 1; l_1, l_2, l_3 along z, x and y."""
     x, y, z = np.meshgrid([1.0, 2.0, 3.0], [-0.5, 0.5], [0.0, 1.0], indexing="ij")
     points = np.stack([x, y, z], axis=-1).reshape(-1, 3)
     first = np.array([0, 4, 6, 2, 1, 5, 7, 3])  # VTK's order, node number 4 i + 2 j + k
-    fields = {
-        "cell_dimensions": np.tile([1.0, 0.0, 0.0], (2, 1)),
-        "axis_1": np.tile([0.0, 0.0, 1.0], (2, 1)),
-        "axis_2": np.tile([1.0, 0.0, 0.0], (2, 1)),
-        "axis_3": np.tile([0.0, 1.0, 0.0], (2, 1)),
-        "deformation_gradient": np.tile(np.diag([1.0, 1.0, 2.0]).ravel(), (2, 1)),
-        "fibre_angle_deformed": np.array([0.0, 90.0]),
-    }
-    return bodies.DrawnBody(0.0, points, np.array([first, first + 4]), points * [0.0, 0.0, 1.0], fields)
+    grid = pyvista.UnstructuredGrid({pyvista.CellType.HEXAHEDRON: np.array([first, first + 4])}, points)
+    grid.point_data["displacement"] = points @ (F - np.eye(3)).T
+    fields = {"cell_dimensions": cell, "axis_1": [0, 0, 1], "axis_2": [1, 0, 0], "axis_3": [0, 1, 0]}
+    for name, values in (fields | {"deformation_gradient": F.ravel()}).items():
+        grid.cell_data[name] = np.tile(np.asarray(values, dtype=float), (2, 1))
+    return grid
 
 
-def test_exterior_has_the_faces_that_no_other_element_covers() -> None:
-    snapshot = two_hexahedra()
-    faces, elements = snapshot.exterior()
-    assert len(faces) == 10 and np.array_equal(np.bincount(elements), [5, 5])
-    centres = snapshot.points[faces].mean(axis=1)
-    assert not np.any(np.all(np.isclose(centres, [2.0, 0.0, 0.5]), axis=1))
-    alone, _ = snapshot.exterior(np.array([True, False]))
-    assert len(alone) == 6
+def ribbons(F: np.ndarray, cell: list[float]) -> np.ndarray:
+    """Corners (4, 4, 3) of those on the face x = 3."""
+    corners = np.asarray(bodies.chains(two_hexahedra(F, cell), None).points).reshape(10, 4, 4, 3)
+    (found,) = corners[np.all(corners[..., 0] > 3.0, axis=(1, 2))]
+    return found
 
 
 def test_chains_lie_on_the_deformed_face_along_their_deformed_direction() -> None:
-    snapshot = two_hexahedra()
-    surface, ribbons = bodies.body(snapshot)
-    assert len(surface.corners) == 10
-    np.testing.assert_allclose(surface.corners[..., 2].max(), 2.0)
-    # of the faces only the one at x = 3 looks away from the z axis
-    assert len(ribbons.corners) == 4
-    ends = np.stack([ribbons.corners[:, [0, 3]].mean(axis=1), ribbons.corners[:, [1, 2]].mean(axis=1)], axis=1)
-    np.testing.assert_allclose(ends.mean(axis=1)[:, 1:], [[0.0, 1.0]] * 4, atol=1e-12)
+    corners = ribbons(np.diag([1.0, 1.0, 2.0]), [1.0, 0.0, 0.0])
+    ends = np.stack([corners[:, [0, 3]].mean(axis=1), corners[:, [1, 2]].mean(axis=1)], axis=1)
+    np.testing.assert_allclose(ends.mean(axis=1)[:, 1:], [[0.0, 1.0]] * 4, atol=1e-6)
     lengths = np.abs(ends[:, 1] - ends[:, 0])
-    np.testing.assert_allclose(lengths, [[0.0, 0.0, 2 * 2 * bodies.CHAIN_REACH]] * 4, atol=1e-12)
-    np.testing.assert_allclose(ribbons.corners[..., 0], 3.0, atol=1e-12)
-    assert ribbons.lies_on > 0
+    np.testing.assert_allclose(lengths, [[0.0, 0.0, 2 * 2 * bodies.CHAIN_REACH]] * 4, atol=1e-6)
+    np.testing.assert_allclose(corners[..., 0], corners[0, 0, 0], atol=1e-6)
 
 
-def outline(snapshot: bodies.DrawnBody) -> tuple[np.ndarray, np.ndarray]:
-    """Of the ribbons on the face x = 3 the places (n, 2) in the undeformed face, a square, and the lengths."""
-    corners = bodies.body(snapshot)[1].corners
-    gradient = snapshot.fields["deformation_gradient"][0].reshape(3, 3)
-    flat = (corners.reshape(-1, 3) @ np.linalg.inv(gradient).T)[:, 1:] - [0.0, 0.5]
+def outline(F: np.ndarray, cell: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of the same ribbons the places (n, 2) in the undeformed face, a square, and the lengths."""
+    corners = ribbons(F, list(cell))
+    flat = (corners.reshape(-1, 3) @ np.linalg.inv(F).T)[:, 1:] - [0.0, 0.5]
     return flat, np.linalg.norm(corners[:, 1] - corners[:, 0], axis=1)
 
 
@@ -482,19 +469,14 @@ def outline(snapshot: bodies.DrawnBody) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("sheared", [0.0, 1.5])
 def test_chains_of_neighbours_do_not_join(angle: float, sheared: float) -> None:
     """Whatever their direction and however long, they end before the edge of their face."""
-    body, direction = two_hexahedra(), np.radians(angle)
-    cell = np.tile([np.cos(direction), np.sin(direction), 0.0], (2, 1))
+    cell = np.array([np.cos(np.radians(angle)), np.sin(np.radians(angle)), 0.0])
     gradient = np.eye(3)
     gradient[1, 2] = sheared
-    fields = body.fields | {"cell_dimensions": cell, "deformation_gradient": np.tile(gradient.ravel(), (2, 1))}
-    body = dataclasses.replace(body, fields=fields, displacement=body.points @ (gradient - np.eye(3)).T)
-    places, lengths = outline(body)
+    places, lengths = outline(gradient, cell)
     assert np.abs(places).max() < 0.44
-    long = dataclasses.replace(body, fields=fields | {"cell_dimensions": 3 * cell})
-    places, cut = outline(long)
+    places, cut = outline(gradient, 3 * cell)
     assert np.abs(places).max() < 0.44 and np.all(cut > 0.9 * lengths)
-    short = dataclasses.replace(body, fields=fields | {"cell_dimensions": 0.2 * cell})
-    np.testing.assert_allclose(outline(short)[1], lengths * 0.2, rtol=0.2 if sheared else 1e-9)
+    np.testing.assert_allclose(outline(gradient, 0.2 * cell)[1], lengths * 0.2, rtol=0.2 if sheared else 1e-5)
 
 
 def test_colours_go_from_red_along_to_blue_across() -> None:
@@ -528,56 +510,43 @@ def test_a_recording_gives_back_what_was_run(tiny_run: Recording) -> None:
     assert tiny_run.scene == tiny()
     assert tiny_run.value("force", 2.0) == pytest.approx(50.0)
     with pytest.raises(RecordingError, match="no fields at time 7"):
-        bodies.DrawnBody.of(tiny_run, 7.0)
-    snapshot = bodies.DrawnBody.of(tiny_run, 2.0)
-    assert snapshot.elements.shape == (480, 8)
-    top = snapshot.points[:, 2] > 10.0 - 1e-9
-    assert np.all(snapshot.displacement[snapshot.points[:, 2] < 1e-9, 2] == 0)
+        tiny_run.grid(7.0)
+    grid = tiny_run.grid(2.0)
+    displacement, height = grid.point_data["displacement"], grid.points[:, 2]
+    assert grid.n_cells == 480 and np.all(displacement[height < 1e-9, 2] == 0)
     # nodes stand for unequal areas: the means agree roughly
-    assert 1 + snapshot.displacement[top, 2].mean() / 10 == pytest.approx(tiny_run.value("mean_stretch", 2.0), abs=0.02)
-    assert np.all(snapshot.fields["cell_dimensions"][:, 0] >= snapshot.fields["cell_dimensions"][:, 1])
+    stretch = 1 + displacement[height > 10.0 - 1e-9, 2].mean() / 10
+    assert stretch == pytest.approx(tiny_run.value("mean_stretch", 2.0), abs=0.02)
+    assert np.all(grid.cell_data["cell_dimensions"][:, 0] >= grid.cell_data["cell_dimensions"][:, 1])
 
 
-@pytest.fixture(scope="module")
-def pictures(tiny_run: Recording) -> list[np.ndarray]:
-    """Of the tendon with and without chains, of chains on the near side and on the far one; drawn by one process."""
-    snapshot = bodies.DrawnBody.of(tiny_run, 2.0)
-    middle = (0.0, 0.0, snapshot.deformed[:, 2].max() / 2)
-    view = rendering.View((0.3, -1.0, 0.14), middle, 14.0, (120, 320))
-    patches = bodies.body(snapshot)
-    _, ribbons = bodies.body(two_hexahedra())  # on the face x = 3
-    sides = [rendering.View((side, 0.0, 0.0), (3.0, 0.0, 1.0), 2.0, (160, 160)) for side in (1.0, -1.0)]
-    wanted = [(view, patches), (view, patches[:1]), *((side, [ribbons]) for side in sides)]
-    return rendering.render([rendering.Picture(*one) for one in wanted])
-
-
-def test_a_snapshot_is_really_drawn(tiny_run: Recording, pictures: list[np.ndarray]) -> None:
-    both, bare, *_ = pictures
-    length = bodies.DrawnBody.of(tiny_run, 2.0).deformed[:, 2].max()
+def test_a_body_is_really_drawn(tiny_run: Recording) -> None:
+    """Of the tendon with and without chains; seen nearly from the side."""
+    grid = tiny_run.grid(2.0)
+    without = grid.copy()
+    without.cell_data.remove("cell_dimensions")
+    length = float((grid.points + grid.point_data["displacement"])[:, 2].max())
+    view = bodies.View((0.3, -1.0, 0.14), (0.0, 0.0, length / 2), 14.0, (120, 320))
+    both, bare = bodies.render([grid, without], view)
     assert both.shape == bare.shape == (320, 120, 3)
     assert np.all(both[0, 0] == 255)
     body = np.any(bare < 245, axis=2)
-    # length along z of the body over the height of the picture, its width over the same; seen nearly from the side
+    # length along z of the body over the height of the picture, its width over the same
     rows, columns = np.flatnonzero(body.any(axis=1)), np.flatnonzero(body.any(axis=0))
     assert np.ptp(rows) / 320 == pytest.approx(length / 14.0, abs=0.06)
     assert np.ptp(columns) / 320 == pytest.approx(2 * math.sqrt(10 / math.pi) / 14.0, abs=0.03)
     red, green, blue = np.moveaxis(bare[body].astype(int), -1, 0)
     assert np.mean(red - blue > 60) > 0.1 and np.mean(blue - red > 40) > 0.1
-    # no chain shows beyond the outline
+    # no chain shows beyond the outline, where those of the far side would
     assert not np.any(np.any(both < 245, axis=2) & np.all(bare == 255, axis=2))
     dark = np.all(both < 70, axis=2)
     assert 0.02 < dark.sum() / body.sum() < 0.4 and not np.any(np.all(bare < 70, axis=2))
 
 
-def test_chains_on_the_far_side_are_not_drawn(pictures: list[np.ndarray]) -> None:
-    *_, front, behind = pictures
-    assert front.min() < 70 and np.all(behind == 255)
-
-
-def test_what_the_child_says_reaches_the_user(monkeypatch: pytest.MonkeyPatch) -> None:
-    view = rendering.View((1.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0, (10, 10))
+def test_what_the_child_says_reaches_the_user() -> None:
+    view = bodies.View((1.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0, (10, 10))
     with pytest.raises(FigureError, match="no picture in space: pyvista ended with 1: .*boom") as failure:
-        rendering.render([dataclasses.replace(rendering.Picture(view), patches=[Boom()])])  # type: ignore[list-item]
+        bodies.render([Boom()], view)  # type: ignore[list-item]
     assert failure.value.exit_code == 5
 
 
