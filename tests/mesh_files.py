@@ -15,6 +15,7 @@ from remodel_fenicsx.body.tube import draw_tube
 NAMES = {"bottom": "inlet", "top": "outlet", "inner": "inner", "outer": "outer"}
 COUNTS = (8, 2, 3)
 RADII, LENGTH = (1.0, 2.0), 3.0
+TUBE = Path(__file__).parent / "body" / "files" / "tube.msh"  # of `write_tube` in format 2.2, a line for each
 
 
 def write_tube(
@@ -50,10 +51,11 @@ def write_tube(
     return path
 
 
-def edited(source: Path, target: Path, section: str, edit: Any) -> Path:
-    """A copy of a file in which the lines of a section went through a function."""
-    lines = source.read_text().splitlines()
-    first, last = lines.index(f"${section}") + 1, lines.index(f"$End{section}")
-    lines[first:last] = edit(lines[first:last])
-    target.write_text("\n".join(lines) + "\n")
+def changed(target: Path, *changes: tuple[str, str], source: Path = TUBE) -> Path:
+    """A copy of a file with other words in it."""
+    text = source.read_text()
+    for old, new in changes:
+        assert text.count(old) == 1, old
+        text = text.replace(old, new)
+    target.write_text(text)
     return target

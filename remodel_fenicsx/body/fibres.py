@@ -135,7 +135,7 @@ def _of_mesh(path: Path) -> tuple[dict[str, Array], Array, bytes]:
     """Arrays of the solid elements, or else of the points; and the file."""
     try:
         mesh = read_exchange_file(path)
-        solid = [n for n, block in enumerate(mesh.cells) if block.type.startswith(("tetra", "hexa", "wedge"))]
+        solid = [n for n, (kind, _) in enumerate(mesh.cells) if kind.startswith(("tetra", "hexa", "wedge"))]
         of_cells = {
             name: np.concatenate([_columns(blocks[n]) for n in solid])
             for name, blocks in mesh.cell_data.items()
@@ -144,7 +144,7 @@ def _of_mesh(path: Path) -> tuple[dict[str, Array], Array, bytes]:
         of_points = {name: _columns(values) for name, values in mesh.point_data.items() if name in MEASURED}
         points = np.asarray(mesh.points, dtype=np.float64)
         points = np.pad(points, [(0, 0), (0, 3 - points.shape[1])])
-        centres = [points[mesh.cells[n].data].mean(axis=1) for n in solid]
+        centres = [points[mesh.cells[n][1]].mean(axis=1) for n in solid]
     except UnreadableFile as error:
         raise FibreFileError(str(error)) from None
     except (ValueError, TypeError, IndexError) as error:

@@ -1,16 +1,18 @@
-"""Meshes of one's own: a Gmsh file read line by line, as data. Nothing in it is ever run; without Gmsh and dolfinx.
+"""Meshes of one's own, read as data: nothing in a file is ever run. Without Gmsh and dolfinx.
 
 Gmsh itself runs a file that is a script under whatever name, so it never sees one. MSH 2.2 and 4.1 as text:
-https://gmsh.info/doc/texinfo/gmsh.html#MSH-file-format
+https://gmsh.info/doc/texinfo/gmsh.html#MSH-file-format. VTU, VTK and XDMF are read by meshio in a child process with
+limits. It would read MSH too, but three to eight times slower, and without second groups of a part.
 """
 
 from __future__ import annotations
 
 import functools
 import hashlib
+import importlib
 import json
 import re
-from collections.abc import Sequence
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,26 +24,129 @@ from remodel_fenicsx.errors import RemodelError
 from remodel_fenicsx.system.files import read_regular
 from remodel_fenicsx.system.guarded import DAMAGED, LARGEST_FILE, UnreadableFile, read_guarded
 
+Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
 
-# ---------------------------------------------------------------- meshes with arrays in formats of other programs
-# Meshes with arrays in formats of other programs: VTU, VTK, XDMF, by meshio in a child process with limits.
+
+class ElementType(NamedTuple):
+    """A type of element: Gmsh's number of it, its dimension and its nodes."""
+
+    number: int
+    dimension: int
+    corners: int
+    nodes: int
+
+
+TYPES = {  # by meshio's name
+    "vertex": ElementType(15, 0, 1, 1),
+    "line": ElementType(1, 1, 2, 2),
+    "line3": ElementType(8, 1, 2, 3),
+    "line4": ElementType(26, 1, 2, 4),
+    "line5": ElementType(27, 1, 2, 5),
+    "line6": ElementType(28, 1, 2, 6),
+    "triangle": ElementType(2, 2, 3, 3),
+    "quad": ElementType(3, 2, 4, 4),
+    "triangle6": ElementType(9, 2, 3, 6),
+    "quad8": ElementType(16, 2, 4, 8),
+    "quad9": ElementType(10, 2, 4, 9),
+    "tetra": ElementType(4, 3, 4, 4),
+    "hexahedron": ElementType(5, 3, 8, 8),
+    "tetra10": ElementType(11, 3, 4, 10),
+    "hexahedron27": ElementType(12, 3, 8, 27),
+}
+BY_NUMBER = {kind.number: kind for kind in TYPES.values()}
+# Gmsh's number of a type of element of a body -> what it is
+VOLUMES = {4: ("tetrahedron", 1), 5: ("hexahedron", 1), 11: ("tetrahedron", 2), 12: ("hexahedron", 2)}
+ALLOWED_ELEMENTS = "tetrahedra of 4 or 10 nodes, hexahedra of 8 or 27"
+
+
+class MeshFileError(RemodelError, ValueError):
+    """What is wrong with a mesh file: one line."""
+
+
+@dataclass(frozen=True, eq=False)
+class MeshFile:
+    """What a mesh file holds."""
+
+    points: Array
+    cells: Integers
+    cell_numbers: Integers
+    cell_groups: Integers
+    facets: Integers
+    facet_groups: Integers
+    kind: str
+    degree: int
+    names: dict[int, dict[str, int]]
+    data: bytes
+    sha256: str
+
+    @property
+    def corners(self) -> Integers:
+        """Of the elements, (elements, 4 or 8)."""
+        return self.cells[:, : 4 if self.kind == "tetrahedron" else 8]
+
+
+@dataclass(frozen=True)
+class Block:
+    """Elements of one type: numbers, groups (one row per group), nodes as numbered in the file, in Gmsh's order."""
+
+    type: ElementType
+    numbers: Integers
+    groups: Integers
+    nodes: Integers
+
+
+def read_mesh(path: Path, tags: str | None = None) -> MeshFile:
+    """Read a mesh file."""
+    try:
+        found = path.stat()
+        if path.is_dir():
+            raise MeshFileError("is a folder; a mesh is a file")
+        return _read(path, tags, found.st_mtime_ns, found.st_size)
+    except FileNotFoundError:
+        raise MeshFileError(f"no such file: {path}") from None
+    except OSError as error:
+        raise MeshFileError(f"cannot be read: {error.strerror or error}") from None
+
+
+@functools.lru_cache(maxsize=1)
+def _read(path: Path, tags: str | None, _changed: int, _size: int) -> MeshFile:
+    return _read_exchanged(path, tags) if path.suffix.lower() in ENDINGS else _read_gmsh(path)
+
+
+def as_rows(table: Integers) -> list[tuple[int, ...]]:
+    """Rows of a table as tuples."""
+    listed: Any = table.tolist()
+    return [tuple(row) for row in listed]
+
+
+def distinct(values: Integers) -> list[int]:
+    """Different ones of a list of numbers, in its order."""
+    listed: Any = values.tolist()
+    return list(dict.fromkeys(listed))
+
+
+# ---------------------------------------------------------------- formats of other programs, by meshio
 
 ENDINGS = (".vtu", ".vtk", ".xdmf")
 SAVED_OTHERWISE = "; save it as VTU with data mode ASCII (ParaView: File, Save Data), or as .msh"
-
-
-class ElementBlock(NamedTuple):
-    """Elements of a type, by meshio's name of it: rows of nodes."""
-
-    type: str
-    data: NDArray[Any]
+TAGS = ("gmsh:physical", "CellEntityIds", "medit:ref")
+"""Arrays of numbers of faces and volumes: as meshio, VMTK and Medit call them."""
+# Gmsh's order of nodes, as places in VTK's
+# https://gmsh.info/doc/texinfo/gmsh.html#Node-ordering, https://vtk.org/doc/nightly/html (vtkTriQuadraticHexahedron)
+ORDERS = {
+    "tetra10": (0, 1, 2, 3, 4, 5, 6, 7, 9, 8),
+    "hexahedron27": (
+        0, 1, 2, 3, 4, 5, 6, 7, 8, 11, 16, 9, 17, 10, 18, 19, 12, 15, 13, 14, 24, 22, 20, 21, 23, 25, 26
+    ),
+}  # fmt: skip
 
 
 class ExchangeFile(NamedTuple):
-    """What such a file holds: as a `meshio.Mesh`, and the file itself."""
+    """What such a file holds: types of the elements by block with their rows of nodes, arrays, and the file itself."""
 
     points: NDArray[Any]
-    cells: list[ElementBlock]
+    cells: list[tuple[str, NDArray[Any]]]
     point_data: dict[str, NDArray[Any]]
     cell_data: dict[str, list[NDArray[Any]]]
     data: bytes
@@ -56,35 +161,15 @@ def read_exchange_file(path: Path) -> ExchangeFile:
     types, points, cells = json.loads(arrays["names"].tobytes())
     return ExchangeFile(
         arrays["points"],
-        [ElementBlock(kind, arrays[f"cells{n}"]) for n, kind in enumerate(types)],
+        [(kind, arrays[f"cells{n}"]) for n, kind in enumerate(types)],
         {name: arrays[f"point_data{n}"] for n, name in enumerate(points)},
         {name: [arrays[f"cell_data{n}_{m}"] for m in range(len(types))] for n, name in enumerate(cells)},
         data,
     )
 
 
-def arrays_vtu(file: str) -> dict[str, Any]:
-    """Of a VTU file; in the child."""
-    from meshio import vtu
-
-    return _arrays(vtu.read(file))
-
-
-def arrays_vtk(file: str) -> dict[str, Any]:
-    """Of a VTK file; in the child."""
-    from meshio import vtk
-
-    return _arrays(vtk.read(file))
-
-
-def arrays_xdmf(file: str) -> dict[str, Any]:
-    """Of an XDMF file; in the child."""
-    from meshio import xdmf
-
-    return _arrays(xdmf.read(file))
-
-
-def _arrays(mesh: Any) -> dict[str, Any]:
+def _arrays(kind: str, file: str) -> dict[str, Any]:
+    mesh = importlib.import_module(f"meshio.{kind}").read(file)
     names = [[block.type for block in mesh.cells], [*mesh.point_data], [*mesh.cell_data]]
     found = {"names": np.frombuffer(json.dumps(names).encode(), np.uint8), "points": mesh.points}
     found |= {f"cells{n}": block.data for n, block in enumerate(mesh.cells)}
@@ -93,41 +178,11 @@ def _arrays(mesh: Any) -> dict[str, Any]:
     return found | {f"cell_data{n}_{m}": values for n, listed in blocks for m, values in enumerate(listed)}
 
 
-# ---------------------------------------------------------------- a mesh of one's own from a file of any kind that
-# A mesh of one's own from a file of any kind that is known: by Gmsh, or in a format of other programs.
-
-TAGS = ("gmsh:physical", "CellEntityIds", "medit:ref")
-"""Arrays of numbers of faces and volumes: as meshio, VMTK and Medit call them."""
-# meshio's name of a type of element -> Gmsh's number of it
-TYPES = {
-    "tetra": 4, "hexahedron": 5, "tetra10": 11, "hexahedron27": 12,
-    "triangle": 2, "quad": 3, "triangle6": 9, "quad9": 10, "quad8": 16,
-}  # fmt: skip
-SOLIDS = ("tetra", "hexahedron", "tetra10", "hexahedron27")
-LINES_AND_POINTS = ("vertex", "line", "line3", "line4")
-# Gmsh's order of nodes, as places in VTK's
-# https://gmsh.info/doc/texinfo/gmsh.html#Node-ordering, https://vtk.org/doc/nightly/html (vtkTriQuadraticHexahedron)
-ORDERS = {
-    "tetra10": (0, 1, 2, 3, 4, 5, 6, 7, 9, 8),
-    "hexahedron27": (
-        0, 1, 2, 3, 4, 5, 6, 7, 8, 11, 16, 9, 17, 10, 18, 19, 12, 15, 13, 14, 24, 22, 20, 21, 23, 25, 26
-    ),
-}  # fmt: skip
+# what the child calls, without the modules of other formats
+arrays_vtu, arrays_vtk, arrays_xdmf = (functools.partial(_arrays, ending[1:]) for ending in ENDINGS)
 
 
-def read_mesh(path: Path, tags: str | None = None) -> MeshFile:
-    """Read a mesh file."""
-    if path.suffix.lower() not in ENDINGS:
-        return read_mesh_file(path)
-    changed, size = found_file(path)
-    try:
-        return _read_exchanged(path, tags, changed, size)
-    except OSError as error:
-        raise MeshFileError(f"cannot be read: {error.strerror or error}") from None
-
-
-@functools.lru_cache(maxsize=1)
-def _read_exchanged(path: Path, tags: str | None, _changed: int, _size: int) -> MeshFile:
+def _read_exchanged(path: Path, tags: str | None) -> MeshFile:
     try:
         mesh = read_exchange_file(path)
     except UnreadableFile as error:
@@ -135,7 +190,13 @@ def _read_exchanged(path: Path, tags: str | None, _changed: int, _size: int) -> 
     points = np.asarray(mesh.points, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
         raise MeshFileError(f"its nodes have {points.shape[-1]} coordinates; needed are three")
-    blocks = _blocks(mesh.cells, _tags(mesh.cell_data, tags))
+    blocks, number = [], 1
+    for (kind, rows), groups in zip(mesh.cells, _tags(mesh.cell_data, tags), strict=True):
+        if kind not in TYPES:
+            raise MeshFileError(f"elements of type {kind!r}; allowed are {ALLOWED_ELEMENTS}")
+        nodes, numbers = np.asarray(rows, dtype=np.int64), np.arange(number, number + len(rows))
+        number += len(rows)
+        blocks.append(Block(TYPES[kind], numbers, groups, nodes[:, ORDERS[kind]] if kind in ORDERS else nodes))
     return assembled(np.arange(len(points)), points, blocks, {2: {}, 3: {}}, mesh.data)
 
 
@@ -158,360 +219,176 @@ def _tags(arrays: dict[str, Any], asked: str | None) -> list[Integers]:
     return found
 
 
-def _blocks(cells: Sequence[Any], tags: Sequence[Integers]) -> list[Block]:
-    """As Gmsh would number and order them."""
-    found, number = [], 1
-    for block, groups in zip(cells, tags, strict=True):
-        nodes, kind = np.asarray(block.data, dtype=np.int64), str(block.type)
-        numbers = np.arange(number, number + len(nodes))
-        number += len(nodes)
-        if kind in LINES_AND_POINTS:
-            continue
-        if kind not in TYPES:
-            raise MeshFileError(f"elements of type {kind!r}; allowed are {ALLOWED_ELEMENTS}")
-        nodes = nodes[:, ORDERS[kind]] if kind in ORDERS else nodes
-        found.append(Block(TYPES[kind], 3 if kind in SOLIDS else 2, 0 * numbers, numbers, groups, nodes))
+# ---------------------------------------------------------------- Gmsh's own format
+
+FORMATS = (b"2.2", b"4.1")
+READ = (b"MeshFormat", b"PhysicalNames", b"Entities", b"Nodes", b"Elements")
+IGNORED = tuple(b"Comments Periodic NodeData ElementData ElementNodeData InterpolationScheme Parametrizations".split())
+_HEAD = re.compile(rb"\s*\$(\w+)[ \t\r]*\n")
+_NAME = re.compile(r'([0-3])\s+(\d{1,9})\s+"([^"\x00-\x1f]{0,127})"')
+_NO_NUMBER = re.compile(rb"\S*[^-+.\deE\s]\S*")
+
+
+def _read_gmsh(path: Path) -> MeshFile:
+    data = read_regular(path, LARGEST_FILE)
+    if not data.startswith(b"$MeshFormat"):
+        raise MeshFileError("not a mesh by Gmsh: it must begin with $MeshFormat")
+    sections = _sections(data)
+    version, binary, *_ = [*sections[b"MeshFormat"].split(), b"", b""]
+    if version not in FORMATS or binary != b"0":
+        rule = "allowed are 2.2 and 4.1 as text (in Gmsh: Mesh.Binary = 0)"
+        raise MeshFileError(f"format {_shown(sections[b'MeshFormat'])}; {rule}")
+    for needed in (b"Nodes", b"Elements"):
+        if needed not in sections:
+            raise MeshFileError(f"the file ends without ${needed.decode()}")
+    numbers, points, blocks = (_read_22 if version == b"2.2" else _read_41)(sections)
+    return assembled(numbers.astype(np.int64), points, blocks, _physical_names(sections), data)
+
+
+def _sections(data: bytes) -> dict[bytes, bytes]:
+    """The text of each section by name: each is closed, nothing stands between them, those that are read come once."""
+    found: dict[bytes, bytes] = {}
+    at = 0
+    while head := _HEAD.match(data, at):
+        name, end = head[1], data.find(b"$End" + head[1], head.end())
+        if name not in (*READ, *IGNORED):
+            known = ", ".join(f"${section.decode()}" for section in (*READ, *IGNORED))
+            raise MeshFileError(f"unknown section {_shown(b'$' + name)}; known are {known}")
+        if end < 0:
+            raise MeshFileError(f"the file ends within ${name.decode()}")
+        if name in READ and name in found:
+            raise MeshFileError(f"a second ${name.decode()}")
+        found[name] = data[head.end() : end]
+        at = end + len(b"$End" + name)
+    if rest := data[at : at + 1000].strip():
+        raise MeshFileError(f"{_shown(rest)} between two sections")
     return found
 
 
-Array = NDArray[np.float64]
-Integers = NDArray[np.int64]
-
-VERSIONS = (b"2.2", b"4.1")
-# Gmsh's number of a type of element -> what it is
-VOLUMES = {4: ("tetrahedron", 1), 5: ("hexahedron", 1), 11: ("tetrahedron", 2), 12: ("hexahedron", 2)}
-NODES = {("tetrahedron", 1): 4, ("hexahedron", 1): 8, ("tetrahedron", 2): 10, ("hexahedron", 2): 27}
-CORNERS_OF_FACET = {2: 3, 3: 4, 9: 3, 10: 4, 16: 4}
-OF_LINES_AND_POINTS = (1, 8, 15, 26, 27, 28)
-IGNORED = (
-    b"Comments",
-    b"Periodic",
-    b"NodeData",
-    b"ElementData",
-    b"ElementNodeData",
-    b"InterpolationScheme",
-    b"Parametrizations",
-)
-READ = (b"MeshFormat", b"PhysicalNames", b"Entities", b"Nodes", b"Elements")
-ALLOWED_ELEMENTS = "tetrahedra of 4 or 10 nodes, hexahedra of 8 or 27"
+def _shown(text: bytes) -> str:
+    return repr(b" ".join(text[:1000].split())[:40].decode("ascii", "replace"))
 
 
-def as_rows(table: Integers) -> list[tuple[int, ...]]:
-    """Rows of a table as tuples."""
-    listed: Any = table.tolist()
-    return [tuple(row) for row in listed]
+def _physical_names(sections: dict[bytes, bytes]) -> dict[int, dict[str, int]]:
+    """Numbers by name of the faces (2) and the volumes (3)."""
+    names: dict[int, dict[str, int]] = {2: {}, 3: {}}
+    lines = sections.get(b"PhysicalNames", b"0").decode("utf-8", "replace").split("\n")
+    number, *named = [line.strip() for line in lines if line.strip()] or [""]
+    if number != str(len(named)):
+        raise MeshFileError(f"$PhysicalNames announces {number[:20]!r} groups and has {len(named)}")
+    for line in named:
+        found = _NAME.fullmatch(line)
+        if found is None or found[3] in names.get(int(found[1]), ()):
+            raise MeshFileError(f"$PhysicalNames: {line[:40]!r} where dimension, number and a new name should be")
+        names.setdefault(int(found[1]), {})[found[3]] = int(found[2])
+    return {dimension: names[dimension] for dimension in (2, 3)}
 
 
-def distinct(values: Integers) -> list[int]:
-    """Different ones of a list of numbers, in its order."""
-    listed: Any = values.tolist()
-    return list(dict.fromkeys(listed))
+class _Numbers:
+    """The numbers of a section, taken row by row."""
 
-
-class MeshFileError(RemodelError, ValueError):
-    """What is wrong with a mesh file: one line, with its line in the file where there is one."""
-
-
-@dataclass(frozen=True, eq=False)
-class MeshFile:
-    """What a mesh file holds."""
-
-    points: Array
-    cells: Integers
-    cell_numbers: Integers
-    cell_groups: Integers
-    facets: Integers
-    facet_groups: Integers
-    kind: str
-    degree: int
-    names: dict[int, dict[str, int]]
-    data: bytes
-    sha256: str
-
-    @property
-    def corners(self) -> Integers:
-        """Of the elements, (elements, 4 or 8)."""
-        return self.cells[:, : NODES[self.kind, 1]]
-
-
-def read_mesh_file(path: Path) -> MeshFile:
-    """Read a Gmsh file of format 2.2 or 4.1, text."""
-    changed, size = found_file(path)
-    try:
-        return _read(path, changed, size)
-    except OSError as error:
-        raise MeshFileError(f"cannot be read: {error.strerror or error}") from None
-
-
-def found_file(path: Path) -> tuple[int, int]:
-    """When it changed last, in ns, and its size in bytes."""
-    try:
-        if path.is_dir():
-            raise MeshFileError("is a folder; a mesh is a file")
-        found = path.stat()
-        return found.st_mtime_ns, found.st_size
-    except FileNotFoundError:
-        raise MeshFileError(f"no such file: {path}") from None
-    except OSError as error:
-        raise MeshFileError(f"cannot be read: {error.strerror or error}") from None
-
-
-@functools.lru_cache(maxsize=1)
-def _read(path: Path, _changed: int, _size: int) -> MeshFile:
-    data = read_regular(path, LARGEST_FILE)
-    sections = _sections(data)
-    groups = _physical_names(sections.get(b"PhysicalNames"))
-    numbers, points, elements = (_read_22 if sections[b"MeshFormat"].version == b"2.2" else _read_41)(sections)
-    return assembled(numbers, points, elements, groups, data)
-
-
-# ---------------------------------------------------------------- lines
-
-
-class _Section:
-    """The lines between $Name and $EndName."""
-
-    def __init__(self, name: bytes, first: int, lines: Sequence[bytes]):
-        self.name, self.first, self.lines, self.at = name.decode(), first, lines, 0
-        self.version = b""
-
-    def fault(self, rule: str, back: int = 1) -> MeshFileError:
-        """About the line that was read last, or the one that is missing (0)."""
-        return MeshFileError(f"line {self.first + self.at - back + 1}: {rule}")
-
-    def numbers(self, least: int, words: str) -> list[int]:
-        """The whole numbers at the start of the next line, as many as `least`; what follows may be anything."""
-        fields = self.fields(least, words)
-        try:
-            return [int(field) for field in fields[:least]]
-        except ValueError:
-            raise self.fault(f"{_shown(fields)} where {words} should be") from None
-
-    def fields(self, least: int, words: str) -> list[bytes]:
-        """The next line, of `least` fields or more."""
-        if self.at >= len(self.lines):
-            raise self.fault(f"${self.name} ends where {words} should be", back=0)
-        fields = self.lines[self.at].split()
-        self.at += 1
-        if len(fields) < least:
-            raise self.fault(f"{_shown(fields)} where {words} should be")
-        return fields
-
-    def count(self, fields: int, column: int, words: str) -> int:
-        """A number of lines that follow, no more than there are."""
-        number = self.numbers(fields, words)[column]
-        if not 0 <= number <= len(self.lines) - self.at:
-            left = len(self.lines) - self.at
-            raise self.fault(f"{number} of {words}, but ${self.name} has {left} more line{'' if left == 1 else 's'}")
-        return number
-
-    def table(self, rows: int, kind: Any, columns: int, words: str) -> NDArray[Any]:
-        """The next lines as numbers, (rows, columns or more)."""
-        if rows == 0:
-            return np.empty((0, columns), dtype=kind)
-        if rows > len(self.lines) - self.at:
-            self.at = len(self.lines)
-            raise self.fault(f"${self.name} ends within {words}", back=0)
-        try:
-            lines = [line.decode("ascii") for line in self.lines[self.at : self.at + rows]]
-            table: NDArray[Any] = np.loadtxt(lines, dtype=kind, comments=None, ndmin=2)
-            good = len(table) == rows and table.shape[1] >= columns
-        except (ValueError, OverflowError, UnicodeDecodeError):
-            good = False
-        if not good:
-            raise self._first_bad(rows, kind, columns, words)
-        self.at += rows
-        return table
-
-    def _first_bad(self, rows: int, kind: Any, columns: int, words: str) -> MeshFileError:
-        width = None
-        for _ in range(rows):
-            fields = self.fields(0, words)
+    def __init__(self, name: bytes, sections: dict[bytes, bytes], kind: Any = np.float64):
+        self.name, self.at = name.decode(), 0
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # NumPy reads up to what is no number, and warns
             try:
-                np.array([field.decode("ascii") for field in fields]).astype(kind)
-                good = len(fields) >= columns and (width is None or len(fields) == width)
-            except (ValueError, OverflowError):
-                good = False
-            if not good:
-                break
-            width = len(fields)
-        return self.fault(f"{_shown(self.lines[self.at - 1].split())} where {words} should be")
+                self.values = np.fromstring(sections[name], dtype=kind, sep=" ")
+            except (ValueError, DeprecationWarning):
+                odd = _NO_NUMBER.search(sections[name])
+                raise MeshFileError(f"${self.name} has {_shown(odd[0] if odd else b'.')} among its numbers") from None
+
+    def take(self, rows: int, columns: int) -> Any:
+        """The next rows, (rows, columns)."""
+        left = len(self.values) - self.at
+        if not 0 <= rows * columns <= left:
+            raise MeshFileError(f"${self.name} announces {rows * columns} more numbers, but has {left}")
+        start, self.at = self.at, self.at + rows * columns
+        return self.values[start : self.at].reshape(rows, columns)
+
+    def row(self, columns: int) -> list[int]:
+        """The next row, of whole numbers."""
+        found: list[int] = self.take(1, columns)[0].astype(np.int64).tolist()
+        return found
 
     def end(self) -> None:
         """Nothing may follow."""
-        if any(line.strip() for line in self.lines[self.at :]):
-            self.at += 1
-            raise self.fault(f"more lines in ${self.name} than it announces")
+        if left := len(self.values) - self.at:
+            raise MeshFileError(f"${self.name} has {left} numbers more than it announces")
 
 
-def _shown(fields: Sequence[bytes]) -> str:
-    text = b" ".join(fields)[:40].decode("ascii", "replace")
-    return repr(text) if text else "nothing"
-
-
-def _sections(data: bytes) -> dict[bytes, _Section]:
-    """The file's sections by name: each closed, none twice, nothing between or behind them."""
-    if not data.startswith(b"$MeshFormat"):
-        raise MeshFileError("line 1: not a mesh by Gmsh: it must begin with $MeshFormat")
-    lines = data.splitlines()
-    if len(lines) < 3:
-        raise MeshFileError("line 2: the file ends within $MeshFormat")
-    version = lines[1].split()
-    if len(version) != 3 or version[0] not in VERSIONS:
-        written = f"format {version[0].decode('ascii', 'replace')[:20]}" if version else "no number of a format"
-        raise MeshFileError(f"line 2: {written}; allowed are 2.2 and 4.1")
-    if version[1] != b"0":
-        raise MeshFileError("line 2: a binary file; allowed is text (in Gmsh: Mesh.Binary = 0)")
-    found: dict[bytes, _Section] = {}
-    at = 0
-    heads = [number for number, line in enumerate(lines) if line.startswith(b"$")] + [len(lines)]
-    for head, tail in zip(heads[::2], [*heads[1::2], len(lines)], strict=False):
-        for number in range(at, head):
-            if lines[number].strip():
-                raise MeshFileError(f"line {number + 1}: {_shown(lines[number].split())} between two sections")
-        if head == len(lines):
-            break
-        name = lines[head].strip()[1:]
-        if name not in (*READ, *IGNORED):
-            known = ", ".join(f"${section.decode()}" for section in (*READ, *IGNORED))
-            raise MeshFileError(f"line {head + 1}: unknown section {_shown([b'$' + name])}; known are {known}")
-        if tail == len(lines):
-            raise MeshFileError(f"line {len(lines)}: the file ends within ${name.decode()}")
-        if lines[tail].strip() != b"$End" + name:
-            raise MeshFileError(f"line {tail + 1}: {_shown(lines[tail].split())} within ${name.decode()}")
-        if name in READ and name in found:
-            raise MeshFileError(f"line {head + 1}: a second ${name.decode()}")
-        found[name] = _Section(name, head + 1, lines[head + 1 : tail])
-        at = tail + 1
-    for needed in (b"Nodes", b"Elements"):
-        if needed not in found:
-            raise MeshFileError(f"line {len(lines)}: the file ends without ${needed.decode()}")
-    found[b"MeshFormat"].version = version[0]
-    return found
-
-
-def _physical_names(section: _Section | None) -> dict[int, dict[str, int]]:
-    """Numbers by name of the faces (2) and the volumes (3)."""
-    names: dict[int, dict[str, int]] = {2: {}, 3: {}}
-    if section is None:
-        return names
-    for _ in range(section.count(1, 0, "named groups")):
-        line = b" ".join(section.fields(3, "dimension, number and name of a group")).decode("utf-8", "replace")
-        found = re.fullmatch(r'([0-3]) (\d{1,9}) "([^"\x00-\x1f]{0,127})"', line)
-        if found is None:
-            raise section.fault(f"{line[:40]!r} where dimension, number and name of a group should be")
-        dimension, number, name = int(found[1]), int(found[2]), found[3]
-        if dimension in names:
-            if name in names[dimension]:
-                raise section.fault(f"a second group {name!r}")
-            names[dimension][name] = number
-    section.end()
-    return names
-
-
-# ---------------------------------------------------------------- the two formats
-
-
-@dataclass(frozen=True)
-class Block:
-    """Elements of one type: lines (0: none), numbers, groups (one row per group), nodes as numbered in the file."""
-
-    type: int
-    dimension: int
-    lines: Integers
-    numbers: Integers
-    groups: Integers
-    nodes: Integers
-
-
-def _read_41(sections: dict[bytes, _Section]) -> tuple[Integers, Array, list[Block]]:
-    groups_of = _entities(sections.get(b"Entities"))
-    nodes = sections[b"Nodes"]
-    numbers, points = [], []
-    for _ in range(nodes.count(4, 0, "blocks of nodes")):
-        count = nodes.count(4, 3, "nodes")
-        numbers.append(nodes.table(count, np.int64, 1, "the number of a node")[:, 0])
-        points.append(nodes.table(count, np.float64, 3, "the place of a node")[:, :3])
+def _read_22(sections: dict[bytes, bytes]) -> tuple[Array, Array, list[Block]]:
+    nodes, elements = _Numbers(b"Nodes", sections), _Numbers(b"Elements", sections, np.int64)
+    table = nodes.take(nodes.row(1)[0], 4)
     nodes.end()
-    elements, blocks = sections[b"Elements"], []
-    for _ in range(elements.count(4, 0, "blocks of elements")):
-        dimension, entity, kind = elements.numbers(4, "dimension, entity, type and number of elements")[:3]
-        elements.at -= 1
-        count = elements.count(4, 3, "elements")
-        if dimension in (2, 3):
-            columns = 1 + _nodes_of(kind, elements)
-            first = elements.first + elements.at
-            rows = elements.table(count, np.int64, columns, f"an element of {columns - 1} nodes")
-            groups = groups_of.get((dimension, entity), [])
-            for group in groups or [0]:
-                parts = np.arange(first, first + count) + 1, rows[:, 0], np.full(count, group), rows[:, 1:columns]
-                blocks.append(Block(kind, dimension, *parts))
-        else:
-            elements.at += count
-    elements.end()
-    return np.concatenate([np.empty(0, dtype=np.int64), *numbers]), np.concatenate([np.empty((0, 3)), *points]), blocks
-
-
-def _entities(section: _Section | None) -> dict[tuple[int, int], list[int]]:
-    """Numbers of the groups of faces and volumes by dimension and number."""
-    found: dict[tuple[int, int], list[int]] = {}
-    if section is None:
-        return found
-    counts = section.numbers(4, "numbers of points, curves, surfaces and volumes")
-    for dimension, count in enumerate(counts):
-        box = 4 if dimension == 0 else 7
+    values: Any = elements.values.tolist()
+    starts: dict[tuple[int, int], list[int]] = {}
+    (count,), at = elements.row(1), 1
+    elements.take(count, 4)  # at least
+    try:
         for _ in range(count):
-            fields = section.fields(box + 1, "an entity")
-            try:
-                many = int(fields[box])
-                groups = [abs(int(field)) for field in fields[box + 1 : box + 1 + many]]
-                found[dimension, int(fields[0])] = groups
-                good = many == len(groups)
-            except ValueError:
-                good = False
-            if not good:
-                raise section.fault(f"{_shown(fields)} where an entity should be")
-    section.end()
+            kind, tags = values[at + 1], values[at + 2]
+            starts.setdefault((kind, tags), []).append(at)
+            at += _width(kind, tags)
+    except IndexError:
+        at = len(values) + 1
+    elements.at = 1
+    elements.take(1, at - 1)
+    elements.end()
+    blocks = []
+    for (kind, tags), first in starts.items():
+        rows = elements.values[np.array(first)[:, None] + np.arange(_width(kind, tags))]
+        groups = rows[:, 3] if tags else np.zeros(len(rows), dtype=np.int64)
+        blocks.append(Block(_type(kind), rows[:, 0], groups, rows[:, 3 + tags :]))
+    return table[:, 0], table[:, 1:], blocks
+
+
+def _width(kind: int, tags: int) -> int:
+    """Numbers of an element: its own, its type, how many tags it has, these and its nodes."""
+    if tags < 0:
+        raise MeshFileError(f"$Elements has an element with {tags} tags")
+    return 3 + tags + _type(kind).nodes
+
+
+def _read_41(sections: dict[bytes, bytes]) -> tuple[Array, Array, list[Block]]:
+    groups_of = _entities(sections)
+    nodes, elements = _Numbers(b"Nodes", sections), _Numbers(b"Elements", sections, np.int64)
+    numbers, points, blocks = [np.empty((0, 1))], [np.empty((0, 3))], []
+    for _ in range(nodes.row(4)[0]):
+        dimension, _, is_parametric, count = nodes.row(4)
+        numbers.append(nodes.take(count, 1))
+        points.append(nodes.take(count, 3 + (dimension if is_parametric else 0))[:, :3])
+    nodes.end()
+    for _ in range(elements.row(4)[0]):
+        dimension, entity, kind, count = elements.row(4)
+        rows = elements.take(count, 1 + _type(kind).nodes)
+        for group in groups_of.get((dimension, entity)) or [0]:
+            blocks.append(Block(_type(kind), rows[:, 0], np.full(count, group), rows[:, 1:]))
+    elements.end()
+    return np.concatenate(numbers)[:, 0], np.concatenate(points), blocks
+
+
+def _entities(sections: dict[bytes, bytes]) -> dict[tuple[int, int], list[int]]:
+    """Numbers of the groups of points, curves, faces and volumes, by dimension and number."""
+    found: dict[tuple[int, int], list[int]] = {}
+    if b"Entities" not in sections:
+        return found
+    entities = _Numbers(b"Entities", sections)
+    for dimension, count in enumerate(entities.row(4)):
+        for _ in range(count):
+            entity = entities.row(7 if dimension else 4)[0]  # with the box around it
+            found[dimension, entity] = [abs(group) for group in entities.row(entities.row(1)[0])]
+            entities.row(entities.row(1)[0] if dimension else 0)  # what bounds it
+    entities.end()
     return found
 
 
-def _read_22(sections: dict[bytes, _Section]) -> tuple[Integers, Array, list[Block]]:
-    nodes, elements = sections[b"Nodes"], sections[b"Elements"]
-    table = nodes.table(nodes.count(1, 0, "nodes"), np.float64, 4, "number and place of a node")
-    nodes.end()
-    rows: dict[int, list[list[int]]] = {}
-    for _ in range(elements.count(1, 0, "elements")):
-        number, kind, tags = elements.numbers(3, "number, type and number of tags of an element")
-        elements.at -= 1
-        if kind not in OF_LINES_AND_POINTS:
-            columns = 3 + tags + _nodes_of(kind, elements, 1)
-            words = f"an element with {tags} tags and {columns - 3 - tags} nodes"
-            row = elements.numbers(columns, words) if 0 < tags < 1000 else [0]
-            if len(row) != columns:
-                raise elements.fault(f"{tags} tags of an element")
-            rows.setdefault(kind, []).append([elements.first + elements.at, number, row[3], *row[3 + tags :]])
-        else:
-            elements.at += 1
-    elements.end()
-    tables = {kind: np.array(found, dtype=np.int64) for kind, found in rows.items()}
-    blocks = [
-        Block(kind, 3 if kind in VOLUMES else 2, found[:, 0], found[:, 1], found[:, 2], found[:, 3:])
-        for kind, found in tables.items()
-    ]
-    return table[:, 0].astype(np.int64), table[:, 1:4], blocks
+def _type(kind: int) -> ElementType:
+    if kind not in BY_NUMBER:
+        raise MeshFileError(f"elements of Gmsh's type {kind}; allowed are {ALLOWED_ELEMENTS}")
+    return BY_NUMBER[kind]
 
 
-def _nodes_of(kind: int, section: _Section, ahead: int = 0) -> int:
-    """Nodes of an element of this type."""
-    if kind in CORNERS_OF_FACET:
-        return {2: 3, 3: 4, 9: 6, 10: 9, 16: 8}[kind]
-    if kind not in VOLUMES:
-        rule = f"elements of Gmsh's type {kind}; allowed are {ALLOWED_ELEMENTS}"
-        raise section.fault(rule, back=1 - ahead)
-    return NODES[VOLUMES[kind]]
-
-
-# ---------------------------------------------------------------- what both lead to
+# ---------------------------------------------------------------- what all lead to
 
 
 def assembled(
@@ -520,8 +397,8 @@ def assembled(
     """What a file of any kind holds."""
     order = np.argsort(numbers, kind="stable")
     ordered = numbers[order]
-    if len(ordered) > 1 and (np.diff(ordered) == 0).any():
-        raise MeshFileError(f"node {ordered[:-1][np.diff(ordered) == 0][0]} is there twice")
+    if len(twice := ordered[1:][np.diff(ordered) == 0]):
+        raise MeshFileError(f"node {twice[0]} is there twice")
     bad = ~np.isfinite(points).all(axis=1)
     if bad.any():
         raise MeshFileError(f"node {numbers[bad][0]} is at {tuple(points[bad][0].tolist())}: its place must be finite")
@@ -533,12 +410,11 @@ def assembled(
         if lost.any():
             row, column = np.argwhere(lost)[0]
             rule = f"element {block.numbers[row]} has the node {nodes[row, column]}, which is not in $Nodes"
-            line = f"line {block.lines[row]}: " if block.lines[row] else ""
-            raise MeshFileError(line + rule)
+            raise MeshFileError(rule)
         return order[place]
 
-    solid = [block for block in blocks if block.dimension == 3 and len(block.numbers)]
-    kinds = sorted({block.type for block in solid})
+    solid = [block for block in blocks if block.type.dimension == 3 and len(block.numbers)]
+    kinds = sorted({block.type.number for block in solid})
     if not kinds:
         raise MeshFileError("no elements of a volume; in Gmsh: a physical volume, and Mesh 3D")
     if len(kinds) > 1:
@@ -546,7 +422,7 @@ def assembled(
         raise MeshFileError(f"elements of several types: {listed}; allowed is one")
     kind, degree = VOLUMES[kinds[0]]
     corners = 3 if kind == "tetrahedron" else 4
-    flat = [block for block in blocks if block.dimension == 2 and CORNERS_OF_FACET[block.type] == corners]
+    flat = [block for block in blocks if block.type.dimension == 2 and block.type.corners == corners]
     facets = [np.empty((0, corners), dtype=np.int64), *(rows_of(block, corners) for block in flat)]
     cells = np.concatenate([rows_of(block) for block in solid])
     used, rows = np.unique(cells, return_inverse=True)  # Gmsh also writes nodes that no element of the body has

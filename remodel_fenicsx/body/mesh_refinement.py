@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from remodel_fenicsx.body.gmsh_model import gmsh_model
-from remodel_fenicsx.body.mesh_file import Block, MeshFile, MeshFileError, assembled, distinct
+from remodel_fenicsx.body.mesh_file import BY_NUMBER, Block, MeshFile, MeshFileError, assembled, distinct
 
 GMSH_TYPES = {("tetrahedron", 1): (4, 2), ("hexahedron", 1): (5, 3)}  # of elements and facets
 
@@ -39,8 +39,8 @@ def refined(file: MeshFile, refinement: int, degree: int) -> MeshFile:
             for number, entity in by_number.items():
                 for kind, elements, nodes in zip(*gmsh.model.mesh.getElements(dimension, entity), strict=True):
                     rows = np.asarray(nodes, dtype=np.int64).reshape(len(elements), -1)
-                    ones = np.ones(len(elements), dtype=np.int64)
-                    blocks.append(Block(int(kind), dimension, 0 * ones, np.asarray(elements), number * ones, rows))
+                    groups = np.full(len(elements), number, dtype=np.int64)
+                    blocks.append(Block(BY_NUMBER[int(kind)], np.asarray(elements), groups, rows))
     order = np.argsort(tags)
     points = np.asarray(places, dtype=np.float64).reshape(-1, 3)[order]
     return assembled(np.asarray(tags, dtype=np.int64)[order], points, blocks, file.names, file.data)

@@ -10,23 +10,15 @@ import pytest
 import tomlkit
 
 from remodel_fenicsx import cli, simulation
-from tests.body.test_mesh_file import of_type
-from tests.mesh_files import edited, write_tube
+from tests.mesh_files import changed
 
 
 @pytest.fixture(scope="module")
 def tube(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """48 hexahedra with fibres beside them: a row for each element, and some that are far away."""
     folder = tmp_path_factory.mktemp("tube")
-    file = write_tube(folder / "tube.msh", version=2.2)
-
-    def in_two_faces(lines: list[str]) -> list[str]:
-        row = next(row for row in of_type(lines, 3) if lines[row].split()[3] == "1")
-        words = lines[row].split()
-        words[3] = "2"
-        return [str(int(lines[0]) + 1), *lines[1:], " ".join(["9999", *words[1:]])]
-
-    edited(file, folder / "twice.msh", "Elements", in_two_faces)
+    file = changed(folder / "tube.msh")
+    changed(folder / "twice.msh", ("$Elements\n128\n", "$Elements\n129\n9999 3 2 2 1 1 17 81 2\n"))
     (folder / "fibres.txt").write_text("angle\n30\n")
     (folder / "short.csv").write_text("angle\n30\n")
     (folder / "broken.vtu").write_text("<VTKFile>")
