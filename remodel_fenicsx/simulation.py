@@ -413,7 +413,7 @@ def parameters_of(properties: Mapping[str, Properties], domain: Domain) -> tuple
     kappas = {name: one.kappa for name, one in properties.items()}
     tissue, kappa = next(iter(tissues.values())), next(iter(kappas.values()))
     if any(other != tissue for other in tissues.values()):
-        tissue = tissue.map(lambda key, _: by_region(domain, {name: getattr(t, key) for name, t in tissues.items()}))
+        tissue = tissue.map(lambda key, _: by_region(domain, {name: t.parameters[key] for name, t in tissues.items()}))
     return tissue, kappa if len(set(kappas.values())) == 1 else by_region(domain, kappas)
 
 

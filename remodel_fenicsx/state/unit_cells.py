@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.fem.quadrature import Quadrature
-from remodel_fenicsx.kernels.points import PointKernels, point_kernels
+from remodel_fenicsx.kernels.kernels import PointKernels, point_kernels
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.axes import AXES, LocalAxes, cells_of, structure_tensors
 from remodel_fenicsx.schema.settings import MEASURED_CELLS, Cells

@@ -1,19 +1,117 @@
-"""What a pass and its limits compute at every point: in numpy, and in C (spectral.c)."""
+"""The C files of this folder: compiled like the forms (`fem.jit.library`) and called with arrays."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import functools
+import logging
+import re
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
 from numpy.typing import ArrayLike, NDArray
 
-from remodel_fenicsx.kernels.library import Library, in_numpy
+from remodel_fenicsx.fem import jit
 from remodel_fenicsx.model import cells, energy, spectral
 from remodel_fenicsx.model.cells import UnitCell
+from remodel_fenicsx.model.energy import Tissue
+from remodel_fenicsx.system import NOTICE, environment
+
+log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
+
+FOLDER = Path(__file__).parent
+NO_NUMBERS: Mapping[str, float] = MappingProxyType({})
+
+
+def source(name: str, numbers: Mapping[str, float] = NO_NUMBERS) -> str:
+    """A C file with the files that it includes in it, after a #define for each number."""
+    # One text with everything that decides the machine code: by it the library is found in the cache.
+
+    def included(found: re.Match[str]) -> str:
+        following = found.string.count("\n", 0, found.end()) + 1
+        return f'{source(found[1])}#line {following} "{name}"\n'
+
+    text = re.sub(r'^#include "(.+)"\n', included, (FOLDER / name).read_text(encoding="utf-8"), flags=re.MULTILINE)
+    return "".join(f"#define {key} {value!r}\n" for key, value in numbers.items()) + f'#line 1 "{name}"\n{text}'
+
+
+def declarations(text: str) -> list[str]:
+    """Of the functions in C that are not static, and of what it numbers."""
+    return re.findall(r"^((?!static)\w+ \w+\([^)]*\)(?=\n\{)|enum \{[^}]*\}(?=;))", text, flags=re.MULTILINE)
+
+
+def in_numpy() -> bool:
+    """Whether Python's functions run in place of C's; says so, once."""
+    if environment.kernels() == "numpy":
+        _say_so()
+        return True
+    return False
+
+
+@functools.cache
+def _say_so() -> None:
+    if MPI.COMM_WORLD.rank == 0:
+        log.log(NOTICE, "%s=numpy: numpy computes what C does otherwise, for a debugger; slower", environment.KERNELS)
+
+
+class Library:
+    """The functions of a C file, which can be called with arrays."""
+
+    def __init__(
+        self,
+        comm: MPI.Intracomm,
+        name: str,
+        what: str,
+        seconds: int = 2,
+        numbers: Mapping[str, float] = NO_NUMBERS,
+        include: Path | None = None,
+        libraries: tuple[str, ...] = (),
+    ):
+        text = source(name, numbers)
+        called = "".join(f"{line};\n" for line in declarations(text))
+        module = jit.library(comm, called, text, what, seconds, include, libraries)
+        self._functions, self._ffi = module.lib, module.ffi
+
+    def __call__(self, name: str, *arguments: Any) -> Any:
+        """What a function returns. Arrays that it writes to are contiguous; None is a null pointer."""
+        return getattr(self._functions, name)(*map(self._argument, arguments))
+
+    def number(self, name: str) -> int | None:
+        """Of a part of the model that the file knows by this name; None where it does not."""
+        found = getattr(self._functions, name, None) if name else None
+        return found if isinstance(found, int) else None
+
+    def _argument(self, value: Any) -> Any:
+        if isinstance(value, np.ndarray):
+            if value.dtype in (np.bool_, np.uint8):
+                return self._ffi.from_buffer("uint8_t[]", value)
+            if value.dtype == np.int32:
+                return self._ffi.from_buffer("int32_t[]", np.ascontiguousarray(value))
+            return self._ffi.from_buffer("double[]", np.ascontiguousarray(value, np.float64))
+        return self._ffi.NULL if value is None else value
+
+
+def with_kernels(tissue: Tissue, comm: MPI.Intracomm) -> Tissue:
+    """The tissue with its repulsion in C, where it is `log`."""
+    if tissue.chain is None or tissue.repulsion.compiled != "LOG" or in_numpy():
+        return tissue
+    from remodel_fenicsx.kernels.tensor import TensorKernels  # with the law `tensor`: most runs need neither
+
+    kernels = TensorKernels(comm)
+    return replace(
+        tissue, repulsion=replace(tissue.repulsion, sum=kernels.log_sum, derivatives=kernels.log_derivatives)
+    )
+
+
+# ---------------------------------------------------------------- what a pass and its limits compute at every point
 
 NOT_FINITE = 2  # mark of a point with NaN or infinity
 
@@ -132,3 +230,53 @@ class CompiledPointKernels(PointKernels):
 def point_kernels(comm: MPI.Intracomm) -> PointKernels:
     """In C, or in numpy where that is asked for. Collective."""
     return PointKernels() if in_numpy() else CompiledPointKernels(comm)
+
+
+# ---------------------------------------------------------------- factors in single precision, where CHOLMOD 5 is
+
+HEADER = "suitesparse/cholmod.h"
+FIRST = 5  # CHOLMOD's version that has single precision
+
+
+@functools.cache
+def include_folder() -> Path | None:
+    """Where CHOLMOD's header is; None, and a line in the log, where no version with single precision is."""
+    for folder in (Path(sys.prefix) / "include", Path("/usr/include"), Path("/usr/local/include")):
+        path = folder / HEADER
+        if path.is_file():
+            version = re.search(r"define CHOLMOD_MAIN_VERSION\s+(\d+)", path.read_text(encoding="utf-8"))
+            if version and int(version[1]) >= FIRST:
+                return folder
+    log.info("kept factors have double precision, for twice the time: no header of CHOLMOD %d or later is here", FIRST)
+    return None
+
+
+def is_available() -> bool:
+    """Whether such factors can be made here."""
+    return include_folder() is not None and not in_numpy()
+
+
+class SingleFactor:
+    """A factor L L^T of sparse symmetric matrices of one pattern, with seven digits."""
+
+    def __init__(self, starts: NDArray[np.int32], columns: NDArray[np.int32]):
+        self._call = Library(
+            MPI.COMM_SELF, "factor.c", "factors in single precision", include=include_folder(), libraries=("cholmod",)
+        )
+        self._handle: Any = self._call("factor_new", len(starts) - 1, starts, columns)
+        if not self._handle:
+            raise MemoryError("no memory for a factor in single precision")
+
+    def renew(self, values: Array) -> bool:
+        """Factorise the matrix with these values (entries,); whether it is positive definite to single precision."""
+        return bool(self._call("factor_renew", self._handle, values))
+
+    def solve(self, right: Array, answer: Array) -> bool:
+        """Write the answer (n,) to a right-hand side (n,); whether both are finite."""
+        return bool(self._call("factor_solve", self._handle, right, answer))
+
+    def close(self) -> None:
+        """Free its memory."""
+        if self._handle:
+            self._call("factor_free", self._handle)
+        self._handle = None
