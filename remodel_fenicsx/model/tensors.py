@@ -43,6 +43,11 @@ def ln(value: Any) -> Any:
     value
         A number, an array or UFL.
 
+    Returns
+    -------
+    number, array or UFL
+        As given.
+
     Examples
     --------
     >>> from remodel_fenicsx.extend import ln
