@@ -12,7 +12,7 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from remodel_fenicsx.kernels.kernels import Library, in_numpy
+from remodel_fenicsx.kernels import Library, in_numpy
 from remodel_fenicsx.model import implicit as condensed, tensor_law, tensors
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.drivers import rotated_back

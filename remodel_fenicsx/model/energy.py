@@ -223,8 +223,7 @@ def log_sum(deformation_gradient: Array, cells: Sequence[UnitCell], end_to_end_l
 
 def whole_structure_tensor(cells: Sequence[UnitCell]) -> Array:
     """A of a cell, or of its shares with numbers for weights, (n, 3, 3)."""
-    total: Array = sum(cell.weight * structure_tensor(cell.dimensions, cell.axes) for cell in cells)  # type: ignore
-    return total
+    return sum(cell.weight * structure_tensor(cell.dimensions, cell.axes) for cell in cells)  # type: ignore
 
 
 def log_derivatives(C: Array, A: Array, second: bool = True) -> tuple[Array, Array | None]:

@@ -153,8 +153,7 @@ def _lengths_by_values(step: StepOfCells, found: Ranked) -> Array:
     e = found.target / r0
     size = np.linalg.norm(np.where(e > 0, found.values, 0.0), axis=1)
     steepness = slope * (r0 / np.where(found.active, size, 1.0)[:, None])
-    by_values: Array = steepness[:, :, None] * (np.eye(3) - e[:, :, None] * e[:, None, :]) * (e > 0)[:, None, :]
-    return by_values
+    return steepness[:, :, None] * (np.eye(3) - e[:, :, None] * e[:, None, :]) * (e > 0)[:, None, :]
 
 
 def _turns_by_tensor(step: StepOfCells, found: Ranked) -> Array:
@@ -239,8 +238,7 @@ class Strain(NamedTuple):
     def rotation(self) -> Array:
         """R of F = R U in the eigenbasis."""
         turned = tensors.rotated(self.gradient, self.basis)
-        quotient: Array = turned / self.stretches[:, None, :]
-        return quotient
+        return turned / self.stretches[:, None, :]
 
     @property
     def by_gradient(self) -> Array:
@@ -248,8 +246,7 @@ class Strain(NamedTuple):
         carried, Q = self.gradient @ self.basis, self.basis
         both = _dyads_of_columns(carried, Q, tensors.ROWS, tensors.COLUMNS)
         both += _dyads_of_columns(carried, Q, tensors.COLUMNS, tensors.ROWS)
-        found: Array = tensors.FACTORS[:, None] * both
-        return found
+        return tensors.FACTORS[:, None] * both
 
     @property
     def turn_by_gradient(self) -> Array:
@@ -257,8 +254,7 @@ class Strain(NamedTuple):
         u, (i, j) = self.stretches, np.transpose(tensors.PAIRS)
         axes = self.gradient @ self.basis / u[:, None, :]  # R Q
         both = _dyads_of_columns(axes, self.basis, i, j) - _dyads_of_columns(axes, self.basis, j, i)
-        found: Array = both / (u[:, i] + u[:, j])[:, :, None]
-        return found
+        return both / (u[:, i] + u[:, j])[:, :, None]
 
     @property
     def stretch_by_strain(self) -> Array:
@@ -312,8 +308,7 @@ class OrthotropicCells(NamedTuple):
         entries[:, :3] = 2 * lengths
         for row, (i, j) in enumerate(tensors.PAIRS, start=3):
             entries[:, row] = np.sqrt(2) * (lengths[:, i] ** 2 - lengths[:, j] ** 2)
-        columns: Array = self.to_axes() * entries[:, None, :]
-        return columns
+        return self.to_axes() * entries[:, None, :]
 
 
 LocalCells = StructureCells | OrthotropicCells
@@ -529,8 +524,7 @@ class Linearised(NamedTuple):
     @property
     def left(self) -> Array:
         """1 - D_S S_y y_D of eq. (i2)."""
-        left: Array = IDENTITY - self.by_stress @ self.answer
-        return left
+        return IDENTITY - self.by_stress @ self.answer
 
 
 @dataclass(frozen=True)
@@ -639,8 +633,7 @@ class CondensedPoints:
         if not self.step.is_spatial:
             return tensor
         R = strain.rotation
-        turned: Array = R @ tensor @ np.swapaxes(R, 1, 2)
-        return turned
+        return R @ tensor @ np.swapaxes(R, 1, 2)
 
     def _trial(self, strain: Strain, tensor: Array) -> Trial:
         cells = self._respond(strain, tensor, derivatives=False).cells

@@ -49,7 +49,7 @@ class Drive(NamedTuple):
     rotation_time
         Time in which the law `rotation` turns a small angle to 1/e of it.
     kernels
-        Whose `principal` and `positive_direction` are called: those of `spectral`, or of C (`kernels.kernels`).
+        Whose `principal` and `positive_direction` are called: those of `spectral`, or of C (`kernels`).
     rounding
         The part of the threshold that is the rounding of a stress, in its unit; (n,) or a number.
     exponent, least_tension
@@ -96,8 +96,7 @@ class Drive(NamedTuple):
     @property
     def floor(self) -> Array | float:
         """Tension below which a principal value counts as none, (n,) or a number, in the unit of the tensor."""
-        floor: Array | float = tensor_law.floor_above(self.threshold, self.rounding)
-        return floor
+        return tensor_law.floor_above(self.threshold, self.rounding)
 
 
 def relaxed(old: UnitCell, new: UnitCell, factor: Array | float) -> UnitCell:

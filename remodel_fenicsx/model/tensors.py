@@ -119,8 +119,7 @@ FACTORS = np.where(ROWS == COLUMNS, 1.0, np.sqrt(2.0))
 
 def to_mandel(tensors: Array) -> Array:
     """Mandel components (..., 6) of symmetric tensors (..., 3, 3)."""
-    found: Array = FACTORS * tensors[..., ROWS, COLUMNS]
-    return found
+    return FACTORS * tensors[..., ROWS, COLUMNS]
 
 
 def from_mandel(components: Array) -> Array:
@@ -177,8 +176,7 @@ def congruence(X: Array) -> Array:
 
 def dyads(left: Array, right: Array) -> Array:
     """Matrix (n, 6, 6) of H -> a (b : H), from Mandel components (n, 6)."""
-    found: Array = left[:, :, None] * right[:, None, :]
-    return found
+    return left[:, :, None] * right[:, None, :]
 
 
 def on_diagonal(values: Array) -> Array:

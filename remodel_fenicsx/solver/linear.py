@@ -12,9 +12,8 @@ from typing import Any
 import numpy as np
 from petsc4py import PETSc
 
-from remodel_fenicsx.fem.petsc_options import ProblemOptions
-from remodel_fenicsx.fem.solver_methods import DEFINITE, GENERAL, SINGLE, SYMMETRIC, factor_options
-from remodel_fenicsx.kernels import kernels
+from remodel_fenicsx import kernels
+from remodel_fenicsx.fem.solver_methods import DEFINITE, GENERAL, ProblemOptions, SINGLE, SYMMETRIC, factor_options
 from remodel_fenicsx.solver.equilibrium import Equilibrium
 
 

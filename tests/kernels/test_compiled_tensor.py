@@ -12,7 +12,7 @@ from mpi4py import MPI
 from scipy.spatial.transform import Rotation
 
 from remodel_fenicsx import SceneError, preset_scene
-from remodel_fenicsx.kernels.kernels import with_kernels
+from remodel_fenicsx.kernels import with_kernels
 from remodel_fenicsx.kernels.tensor import CompiledPoints, TensorKernels, condensed_points
 from remodel_fenicsx.model import energy, implicit as condensed
 from remodel_fenicsx.model.cells import UnitCell

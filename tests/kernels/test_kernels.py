@@ -20,8 +20,10 @@ from setuptools import Distribution
 
 import remodel_fenicsx.kernels
 from remodel_fenicsx import cli
+from remodel_fenicsx.errors import RemodelError
 from remodel_fenicsx.fem import jit
-from remodel_fenicsx.kernels import kernels, tensor
+from remodel_fenicsx import kernels
+from remodel_fenicsx.kernels import tensor
 from remodel_fenicsx.model.cells import structure_tensor
 from remodel_fenicsx.scene import preset_scene
 from remodel_fenicsx.simulation import Simulation
@@ -71,6 +73,7 @@ def test_there_is_no_warning(name: str, tmp_path: Path) -> None:
 SANITIZED = """
 import sys
 import pytest
+from remodel_fenicsx.errors import RemodelError
 from remodel_fenicsx.fem import jit
 jit.LIBRARY_FLAGS += ["-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
 files = ["tests/kernels/test_compiled.py", "tests/kernels/test_compiled_tensor.py"]
@@ -169,5 +172,5 @@ def test_what_the_setting_allows(monkeypatch: pytest.MonkeyPatch, capsys: pytest
     monkeypatch.setenv(KERNELS, "c")
     assert cli.main(["run", "no-such-scene.toml"]) == 2
     assert capsys.readouterr().err == f"remodel-fenicsx: {KERNELS} = 'c': allowed are 'C' and 'numpy'\n"
-    with pytest.raises(ValueError, match=KERNELS):
+    with pytest.raises(RemodelError, match=KERNELS):
         kernels.point_kernels(MPI.COMM_SELF)
