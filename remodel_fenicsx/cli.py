@@ -643,7 +643,7 @@ def _info(options: argparse.Namespace) -> int:
     check_usable(reason_unusable())
     from remodel_fenicsx.fem.jit import has_simd_logarithm
     from remodel_fenicsx.fem.solver_methods import SOLVER_METHODS
-    from remodel_fenicsx.kernels.factor import is_available
+    from remodel_fenicsx.kernels import is_available
 
     for name, version in versions().items():
         _say(f"{name:16} {version}")

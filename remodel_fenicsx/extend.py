@@ -61,7 +61,7 @@ from remodel_fenicsx.fem.formulations import FORMULATIONS, Formulation, Selectiv
 from remodel_fenicsx.fem.kinematics import KINEMATICS, FullKinematics, Kinematics
 from remodel_fenicsx.fem.solver_methods import SOLVER_METHODS, SolverMethod
 from remodel_fenicsx.model.cells import UnitCell, angle_to_axis
-from remodel_fenicsx.model.chains import CHAINS, Chain
+from remodel_fenicsx.model.chains import CHAINS, Chain, Parameter
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES, Driver, Frame
 from remodel_fenicsx.model.energy import (
     MATRICES,
@@ -76,6 +76,7 @@ from remodel_fenicsx.model.energy import (
 from remodel_fenicsx.model.laws import LAWS, Drive, Law, ranked
 from remodel_fenicsx.model.axes import AXES, LocalAxes
 from remodel_fenicsx.model.spectral import PAIRINGS, principal
+from remodel_fenicsx.model.tensors import linear_map, ln
 from remodel_fenicsx.schema.settings import COUPLINGS, CouplingKind
 from remodel_fenicsx.schema.tables import markdown_reference
 from remodel_fenicsx.schema.units import (
@@ -131,6 +132,7 @@ __all__ = [
     "Measurement",
     "NUMBER_DENSITY",
     "PAIRINGS",
+    "Parameter",
     "REPULSIONS",
     "Reduction",
     "Repulsion",
@@ -148,6 +150,8 @@ __all__ = [
     "angle_to_axis",
     "axes_sum",
     "form",
+    "linear_map",
+    "ln",
     "markdown_reference",
     "neo_hookean",
     "principal",

@@ -25,7 +25,7 @@ from remodel_fenicsx.results.run_folder import FolderTaken, RunFolder, chosen_fo
 from remodel_fenicsx.schema.settings import Cells, Material, Mesh, Remodeling, Solver
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.state.state import State
-from remodel_fenicsx.state.unit_cells import UnitCells
+from remodel_fenicsx.state.state import UnitCells
 from remodel_fenicsx.system.interrupts import end_all_ranks_on_exception
 
 __all__ = [

@@ -29,7 +29,7 @@ from remodel_fenicsx.scene import Scene, SceneError
 from remodel_fenicsx.scene.scene import in_region
 from remodel_fenicsx.schema.settings import Cells, Properties, Solver
 from remodel_fenicsx.state.state import State, by_region
-from remodel_fenicsx.state.unit_cells import UnitCells
+from remodel_fenicsx.state.state import UnitCells
 from remodel_fenicsx.system.files import typed
 from remodel_fenicsx.system.interrupts import take_back_signals
 from remodel_fenicsx.watch.stability import EquilibriumStability
@@ -413,7 +413,7 @@ def parameters_of(properties: Mapping[str, Properties], domain: Domain) -> tuple
     kappas = {name: one.kappa for name, one in properties.items()}
     tissue, kappa = next(iter(tissues.values())), next(iter(kappas.values()))
     if any(other != tissue for other in tissues.values()):
-        tissue = tissue.map(lambda key, _: by_region(domain, {name: getattr(t, key) for name, t in tissues.items()}))
+        tissue = tissue.map(lambda key, _: by_region(domain, {name: t.parameters[key] for name, t in tissues.items()}))
     return tissue, kappa if len(set(kappas.values())) == 1 else by_region(domain, kappas)
 
 

@@ -18,6 +18,7 @@ from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.fem.solver_methods import AUTO
 from remodel_fenicsx.model.cells import cylindrical_axes, global_axes
 from remodel_fenicsx.model.energy import Tissue
+from remodel_fenicsx.model.drivers import DRIVERS
 from remodel_fenicsx.model.laws import LAWS
 from remodel_fenicsx.schema.settings import LARGEST_MESH
 from remodel_fenicsx.schema.tables import fault
@@ -209,7 +210,6 @@ POINTS_OF_THE_REST = 60.0  # what a step costs whatever the mesh, in quadrature 
 # Thrust over Euler's load from which on `auto` takes the whole body. Up to Euler's load the scene's numbers are right
 # to 10 % (docs/theory.md, Buckling); remodeling, which they do not know, may add to it
 AT_RISK = 0.7
-OVER_CORRECTED = ("pk2", "finger")  # drivers with which the staggered pass leaves the symmetric solution
 
 
 @dataclass(frozen=True)
@@ -391,9 +391,9 @@ def _leaves_symmetry(scene: Any) -> str:
     remodeling = scene.remodeling
     if remodeling.coupling != "staggered" or scene.geometry.axis_kinds == ("global",):
         return ""
-    if remodeling.driver in OVER_CORRECTED and LAWS[remodeling.law].remodels:
+    if DRIVERS[remodeling.driver].over_corrects and LAWS[remodeling.law].remodels:
         return f"remodeling.driver = {remodeling.driver!r}"
-    return f"remodeling.law = {remodeling.law!r}" if remodeling.law == "rate" else ""
+    return f"remodeling.law = {remodeling.law!r}" if LAWS[remodeling.law].over_corrects else ""
 
 
 # ---------------------------------------------------------------- where the body's places are in the reduction

@@ -23,7 +23,7 @@ from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.model.implicit import StepOfCells, jumps_by_rank
 from remodel_fenicsx.model.laws import relaxed
 from remodel_fenicsx.model.tensor_law import weight_of_the_end
-from remodel_fenicsx.model.tensors import determinant
+from remodel_fenicsx.model.tensors import det
 from remodel_fenicsx.model.turnover import TurnoverRule
 from remodel_fenicsx.schema.settings import Solver
 from remodel_fenicsx.solver.continuation import Change, StepFailure, Work
@@ -169,7 +169,7 @@ class AnsweringCells:
 
     def _solved(self, F: Array) -> condensed.LocalSolution:
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            F = np.where((determinant(F) > 0)[:, None, None], F, np.eye(3))
+            F = np.where((det(F) > 0)[:, None, None], F, np.eye(3))
             if self.frozen is not None:
                 return self._points.with_cells(F, self.frozen)
             before = self._found if self.held.any() else None

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.assembly import Remembered, coefficient, over_ranks, point_values
-from remodel_fenicsx.kernels.library import with_kernels
+from remodel_fenicsx.kernels import with_kernels
 from remodel_fenicsx.model import spectral
 from remodel_fenicsx.model.cells import UnitCell, structure_tensor
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES, carried_axes
@@ -124,6 +124,7 @@ class RemodelingPass:
             rounding,
             self.settings.exponent,
             self.settings.threshold,
+            self.settings.own_parameters,
         )
 
     def _steady_axes(self, F: Array) -> Array:

@@ -173,8 +173,7 @@ class FullKinematics(Kinematics):
 
     def nodal_displacement(self, unknown: Any) -> Array:
         """The unknown's own memory, (nodes, 3)."""
-        values: Array = unknown.x.array.reshape(-1, 3)
-        return values
+        return unknown.x.array.reshape(-1, 3)
 
 
 # ---------------------------------------------------------------- a part of the body that stands for all of it

@@ -180,8 +180,7 @@ class Quadrature:
         )
         slopes = np.asarray(element.tabulate(1, self.points))[1:, :, :, 0]  # by reference coordinate, point and node
         sums = np.linalg.norm(slopes, axis=0).sum(axis=-1)
-        largest: NDArray[np.float64] = np.max(sums / self.smallest_lengths, axis=1, initial=0.0)
-        return largest
+        return np.max(sums / self.smallest_lengths, axis=1, initial=0.0)
 
     @cached_property
     def largest_gradient(self) -> float:
@@ -206,8 +205,7 @@ class Quadrature:
     @cached_property
     def _shares(self) -> NDArray[np.float64]:
         """Of the points in the volume of their element, (elements, points)."""
-        shares: NDArray[np.float64] = self.volumes / self.volumes.sum(axis=1, keepdims=True)
-        return shares
+        return self.volumes / self.volumes.sum(axis=1, keepdims=True)
 
     def beyond(self, degree: int, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """What of values (owned elements, points, n) no polynomial of a degree has in an element, by least squares.
@@ -223,8 +221,7 @@ class Quadrature:
             roots = np.sqrt(self.weights)[:, None]
             fit = polynomials @ (np.linalg.pinv(roots * polynomials) * roots.T)
             self._complements[degree] = np.eye(self.shape[1]) - fit
-        complement: NDArray[np.float64] = self._complements[degree] @ values
-        return complement
+        return self._complements[degree] @ values
 
     def jumps(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """How far values (owned elements, points, n) lie from their neighbours': a mean square, (owned elements,).
@@ -232,8 +229,7 @@ class Quadrature:
         They are continued to the element's nodes, and compared with the mean over all elements there.
         """
         continued = self._continuation @ values
-        squares: NDArray[np.float64] = np.square(continued - self._means_at_nodes(continued)).sum(axis=-1).mean(axis=-1)
-        return squares
+        return np.square(continued - self._means_at_nodes(continued)).sum(axis=-1).mean(axis=-1)
 
     @cached_property
     def _continuation(self) -> NDArray[np.float64]:
@@ -273,8 +269,7 @@ class Quadrature:
         if owned.size:
             point = self.coordinates[np.unravel_index(int(np.argmax(owned)), owned.shape)]
             local = (float(owned.max()), (float(point[0]), float(point[1]), float(point[2])))
-        place: tuple[float, float, float] = max(of_all_ranks(self.mesh.comm, local), key=lambda found: found[0])[1]
-        return place
+        return max(of_all_ranks(self.mesh.comm, local), key=lambda found: found[0])[1]
 
     def minimum(self, values: NDArray[np.float64]) -> float:
         """Smallest of values (elements, ...) over all ranks."""

@@ -1,13 +1,16 @@
-"""Solver methods by name. A leaf without PETSc, so that scenes can be checked anywhere."""
+"""Solver methods by name, and options of PETSc, which is imported when it is needed: scenes are read without it."""
 
 from __future__ import annotations
 
+import ctypes
+import itertools
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 from remodel_fenicsx._lazy import resolved
+from remodel_fenicsx.schema.tables import SceneError
 
 AUTO = "auto"
 LAGGED = "lagged"  # whose factor may be of an earlier tangent (`solver.linear`)
@@ -196,3 +199,71 @@ def fault_of_option(name: str, value: str | float | bool) -> str | None:
     if isinstance(value, str) and (not _PLAIN.fullmatch(value) or any(word.endswith(_VIEWERS) for word in words)):
         return "names a file or a viewer; allowed are names, numbers, true (then PETSc prints) and false"
     return None
+
+
+# ---------------------------------------------------------------- options of one problem in PETSc's database
+# The method's, the scene's over them, the user's own `-remodel_...` over both. Every problem has a prefix of its own:
+# two problems of one process never see each other's options.
+USERS_PREFIX = "remodel_"
+
+_numbers = itertools.count(1)
+
+
+class ProblemOptions:
+    """The options of one problem in PETSc's database, from its making to `close`."""
+
+    def __init__(self, own: Mapping[str, Any], options: Mapping[str, Any]):
+        from petsc4py import PETSc
+
+        self.prefix, self._given = f"{USERS_PREFIX}{next(_numbers)}_", dict(options)
+        self._petsc, self._database = PETSc, PETSc.Options()
+        self._names: set[str] = set()
+        for key, value in {**own, **options, **self._users_options()}.items():
+            if value is not False:
+                self._database.setValue(self.prefix + key, None if value is True else value)
+                self._names.add(key)
+        for key in own.keys() - options.keys():
+            self._database.hasName(self.prefix + key)  # asked for: PETSc does not call it left over
+
+    def apply(self, snes: Any) -> None:
+        """Give them to SNES, or to another of PETSc's solvers."""
+        snes.setOptionsPrefix(self.prefix)
+        try:
+            snes.setFromOptions()
+        except self._petsc.Error as error:
+            self.close()
+            given = ", ".join(f"{key} = {value!r}" for key, value in self._given.items())
+            raise SceneError(
+                f"solver.petsc_options: {given or 'those of PETSC_OPTIONS'}: PETSc refuses them (error {error.ierr}); "
+                "allowed are the options of its manual pages"
+            ) from error
+
+    @property
+    def given(self) -> set[str]:
+        """Names of those that are not the method's."""
+        return {*self._given, *self._users_options()}
+
+    def unused(self) -> list[str]:
+        """The scene's and the user's options that PETSc has not asked for: misspelt, or without effect so far."""
+        return sorted(key for key in self._names & self.given if not self._was_used(self.prefix + key))
+
+    def close(self) -> None:
+        """Take them out of PETSc's database."""
+        for key in self._names:
+            self._database.delValue(self.prefix + key)
+        self._names.clear()
+
+    def _users_options(self) -> dict[str, str]:
+        """What the command line or PETSC_OPTIONS say under `remodel_`, without it; problems' own prefixes aside."""
+        found = {}
+        for name, value in self._database.getAll().items():
+            key = name.removeprefix(USERS_PREFIX)
+            if key != name and not key[:1].isdigit():
+                self._database.hasName(name)  # asked for: PETSc does not call it left over
+                found[key] = value
+        return found
+
+    def _was_used(self, name: str) -> bool:
+        answer = ctypes.c_int(0)  # the one question that petsc4py cannot ask
+        ctypes.CDLL(self._petsc.__file__).PetscOptionsUsed(None, name.encode(), ctypes.byref(answer))
+        return bool(answer.value)

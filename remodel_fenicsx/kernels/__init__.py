@@ -1,7 +1,7 @@
 """What is computed at every quadrature point, in C: compiled like the forms, held against Python by tests.
 
-`library` compiles the C files and calls them; `points` and `tensor` have a method for each function. Most stand for a
-function of the package: it is the reference, decides where C leaves a point open, and runs in its place with
+`Library` compiles the C files and calls them; there is a method for each function, here or in `tensor`. Most stand for
+a function of the package: it is the reference, decides where C leaves a point open, and runs in its place with
 ``REMODEL_FENICSX_KERNELS=numpy`` in the environment, for a debugger. Those of `factor`, which calls CHOLMOD, stand for
 none: without them factors are PETSc's, in double precision.
 
@@ -12,19 +12,300 @@ principal           model.spectral.principal
 positive_direction  model.spectral.positive_direction
 without_noise       model.spectral.without_noise
 stretches           model.energy.squared_end_to_end_length, model.energy.axes_sum
-parts               kernels.points.PointKernels.gradient_and_driver
+parts               kernels.PointKernels.gradient_and_driver
 structure           model.cells.structure_tensor
-extension           kernels.points.PointKernels.extension
-may_turn            kernels.points.PointKernels.may_turn
-room                kernels.points.PointKernels.room
+extension           kernels.PointKernels.extension
+may_turn            kernels.PointKernels.may_turn
+room                kernels.PointKernels.room
 log_sum             model.energy.log_sum
 log_derivatives     model.energy.log_derivatives
 target              model.laws.tensor_target
 solve               model.implicit.CondensedPoints.solve
 tangent             model.implicit.CondensedPoints.tangent
-factor_new          kernels.factor.SingleFactor
-factor_renew        kernels.factor.SingleFactor.renew
-factor_solve        kernels.factor.SingleFactor.solve
-factor_free         kernels.factor.SingleFactor.close
+factor_new          kernels.SingleFactor
+factor_renew        kernels.SingleFactor.renew
+factor_solve        kernels.SingleFactor.solve
+factor_free         kernels.SingleFactor.close
 =================== =====================================================================================
 """
+
+from __future__ import annotations
+
+import functools
+import logging
+import re
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import ArrayLike, NDArray
+
+from remodel_fenicsx.fem import jit
+from remodel_fenicsx.model import cells, energy, spectral
+from remodel_fenicsx.model.cells import UnitCell
+from remodel_fenicsx.model.energy import Tissue
+from remodel_fenicsx.system import NOTICE, environment
+
+log = logging.getLogger(__name__)
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+FOLDER = Path(__file__).parent
+NO_NUMBERS: Mapping[str, float] = MappingProxyType({})
+
+
+def source(name: str, numbers: Mapping[str, float] = NO_NUMBERS) -> str:
+    """A C file with the files that it includes in it, after a #define for each number."""
+    # One text with everything that decides the machine code: by it the library is found in the cache.
+
+    def included(found: re.Match[str]) -> str:
+        following = found.string.count("\n", 0, found.end()) + 1
+        return f'{source(found[1])}#line {following} "{name}"\n'
+
+    text = re.sub(r'^#include "(.+)"\n', included, (FOLDER / name).read_text(encoding="utf-8"), flags=re.MULTILINE)
+    return "".join(f"#define {key} {value!r}\n" for key, value in numbers.items()) + f'#line 1 "{name}"\n{text}'
+
+
+def declarations(text: str) -> list[str]:
+    """Of the functions in C that are not static, and of what it numbers."""
+    return re.findall(r"^((?!static)\w+ \w+\([^)]*\)(?=\n\{)|enum \{[^}]*\}(?=;))", text, flags=re.MULTILINE)
+
+
+def in_numpy() -> bool:
+    """Whether Python's functions run in place of C's; says so, once."""
+    if environment.kernels() == "numpy":
+        _say_so()
+        return True
+    return False
+
+
+@functools.cache
+def _say_so() -> None:
+    if MPI.COMM_WORLD.rank == 0:
+        log.log(NOTICE, "%s=numpy: numpy computes what C does otherwise, for a debugger; slower", environment.KERNELS)
+
+
+class Library:
+    """The functions of a C file, which can be called with arrays."""
+
+    def __init__(
+        self,
+        comm: MPI.Intracomm,
+        name: str,
+        what: str,
+        seconds: int = 2,
+        numbers: Mapping[str, float] = NO_NUMBERS,
+        include: Path | None = None,
+        libraries: tuple[str, ...] = (),
+    ):
+        text = source(name, numbers)
+        called = "".join(f"{line};\n" for line in declarations(text))
+        module = jit.library(comm, called, text, what, seconds, include, libraries)
+        self._functions, self._ffi = module.lib, module.ffi
+
+    def __call__(self, name: str, *arguments: Any) -> Any:
+        """What a function returns. Arrays that it writes to are contiguous; None is a null pointer."""
+        return getattr(self._functions, name)(*map(self._argument, arguments))
+
+    def number(self, name: str) -> int | None:
+        """Of a part of the model that the file knows by this name; None where it does not."""
+        found = getattr(self._functions, name, None) if name else None
+        return found if isinstance(found, int) else None
+
+    def _argument(self, value: Any) -> Any:
+        if isinstance(value, np.ndarray):
+            if value.dtype in (np.bool_, np.uint8):
+                return self._ffi.from_buffer("uint8_t[]", value)
+            if value.dtype == np.int32:
+                return self._ffi.from_buffer("int32_t[]", np.ascontiguousarray(value))
+            return self._ffi.from_buffer("double[]", np.ascontiguousarray(value, np.float64))
+        return self._ffi.NULL if value is None else value
+
+
+def with_kernels(tissue: Tissue, comm: MPI.Intracomm) -> Tissue:
+    """The tissue with its repulsion in C, where it is `log`."""
+    if tissue.chain is None or tissue.repulsion.compiled != "LOG" or in_numpy():
+        return tissue
+    from remodel_fenicsx.kernels.tensor import TensorKernels  # with the law `tensor`: most runs need neither
+
+    kernels = TensorKernels(comm)
+    return replace(
+        tissue, repulsion=replace(tissue.repulsion, sum=kernels.log_sum, derivatives=kernels.log_derivatives)
+    )
+
+
+# ---------------------------------------------------------------- what a pass and its limits compute at every point
+
+NOT_FINITE = 2  # mark of a point with NaN or infinity
+
+
+class PointKernels:
+    """Functions on arrays of n points, in numpy: what they are in C stands for these."""
+
+    principal: spectral.Pairing = staticmethod(spectral.principal)
+    positive_direction: Callable[..., tuple[Array, Flags]] = staticmethod(spectral.positive_direction)
+    without_noise: Callable[..., Array] = staticmethod(spectral.without_noise)
+    structure_tensor: Callable[..., Array] = staticmethod(cells.structure_tensor)
+
+    def squared_length(self, F: Array, cell: UnitCell) -> Array:
+        """`energy.squared_end_to_end_length` of one whole cell."""
+        return np.asarray(energy.squared_end_to_end_length(F, [cell]))
+
+    def squared_length_and_sum(self, F: Array, cell: UnitCell) -> tuple[Array, Array]:
+        """The same, and `energy.axes_sum`."""
+        return self.squared_length(F, cell), np.asarray(energy.axes_sum(F, [cell], 1.0))
+
+    def gradient_and_driver(self, both: Array) -> tuple[Array, Array]:
+        """F and the symmetric part of the driving tensor, (n, 3, 3) each, from both (n, 2, 3, 3)."""
+        return both[:, 0], (both[:, 1] + np.swapaxes(both[:, 1], 1, 2)) / 2
+
+    def extension(self, states: Array, length: Array) -> tuple[Array, int, float]:
+        """How far points are from their limits: r/L (n,), the number of the largest, and the smallest J."""
+        with np.errstate(invalid="ignore"):
+            stretch = np.sqrt(states[:, 0]) / length
+        stretch[~np.isfinite(stretch)] = np.inf
+        smallest = states[:, 1].min(initial=np.inf) if np.isfinite(states[:, 1]).all() else -np.inf
+        return stretch, int(np.argmax(stretch)) if stretch.size else 0, float(smallest)
+
+    def may_turn(self, before: Array, after: Array) -> NDArray[np.intp]:
+        """Which points `operators.passes_through_zero` has to be asked for, by number; states (n, 11) of both ends."""
+        # |F^-1| <= F:F / (2 det F), and nearer than its inverse nothing is singular.
+        F, J, change = before[:, 2:], before[:, 1], after[:, 2:] - before[:, 2:]
+        reach = np.sqrt((change**2).sum(axis=1)) * (F**2).sum(axis=1)
+        return np.flatnonzero((J <= 0.0) | (reach >= 2.0 * J))
+
+    def room(self, states: Array, stretch: Array, chain: Array, far: float) -> float:
+        """Largest |dF| at which J > 0 and r/L < far at all points; chain: |l|/L (n,)."""
+        volume = 2.0 * states[:, 1] / (states[:, 2:] ** 2).sum(axis=1)
+        return float(np.minimum(volume, (far - stretch) / chain).min(initial=np.inf))
+
+
+class CompiledPointKernels(PointKernels):
+    """The same in C. `PointKernels` says what goes in and comes out, and does what C leaves open."""
+
+    def __init__(self, comm: MPI.Intracomm):
+        self._call = Library(comm, "spectral.c", "the pass")
+
+    def principal(
+        self, tensors: ArrayLike, previous: ArrayLike, tolerance: float = spectral.AGREEMENT, threshold: ArrayLike = 0.0
+    ) -> tuple[Array, Array]:
+        """By Jacobi's method where the tensor decides."""
+        tensors, previous = np.asarray(tensors), np.asarray(previous)
+        n, limit = len(tensors), np.broadcast_to(threshold, len(tensors))
+        values, axes, left_open = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty(n, np.uint8)
+        given = tensors, previous, tolerance, limit, spectral.DECISIVE
+        if self._call("principal", n, *given, values, axes, left_open):
+            if np.any(left_open == NOT_FINITE):  # for the words that name the first one
+                return super().principal(tensors, previous, tolerance, threshold)
+            at = np.flatnonzero(left_open)
+            values[at], axes[at] = super().principal(tensors[at], previous[at], tolerance, limit[at])
+        return values, axes
+
+    def positive_direction(self, values: ArrayLike, threshold: ArrayLike = 0.0) -> tuple[Array, Flags]:
+        values = np.asarray(values)
+        n, limit = len(values), np.broadcast_to(threshold, len(values))
+        direction, active = np.empty((n, 3)), np.empty(n, np.bool_)
+        if self._call("positive_direction", n, values, limit, spectral.ROUNDING, direction, active):
+            return super().positive_direction(values, threshold)  # for the words that name the first one
+        return direction, active
+
+    def without_noise(self, tensors: Array, axes: Array, noise: ArrayLike) -> Array:
+        n, steady = len(tensors), np.empty(tensors.shape)
+        self._call("without_noise", n, tensors, axes, np.broadcast_to(noise, n), steady)
+        return steady
+
+    def structure_tensor(self, dimensions: Array, axes: Array) -> Array:
+        tensor = np.empty(axes.shape)
+        self._call("structure", axes.size // 9, dimensions, axes, tensor)
+        return tensor
+
+    def squared_length(self, F: Array, cell: UnitCell) -> Array:
+        return self._stretches(F, cell, None)
+
+    def squared_length_and_sum(self, F: Array, cell: UnitCell) -> tuple[Array, Array]:
+        logarithms = np.empty(len(F))
+        return self._stretches(F, cell, logarithms), logarithms
+
+    def _stretches(self, F: Array, cell: UnitCell, logarithms: Array | None) -> Array:
+        squared = np.empty(len(F))
+        self._call("stretches", len(F), F, cell.dimensions, cell.axes, squared, logarithms)
+        return squared
+
+    def gradient_and_driver(self, both: Array) -> tuple[Array, Array]:
+        F, driver = np.empty((2, len(both), 3, 3))
+        self._call("parts", len(both), both, F, driver)
+        return F, driver
+
+    def extension(self, states: Array, length: Array) -> tuple[Array, int, float]:
+        stretch, smallest = np.empty(len(length)), np.empty(1)
+        worst = self._call("extension", len(length), states, length, stretch, smallest)
+        return stretch, worst, smallest.item()
+
+    def may_turn(self, before: Array, after: Array) -> NDArray[np.intp]:
+        found = np.empty(len(before), np.bool_)
+        count = self._call("may_turn", len(before), before, after, found)
+        return np.flatnonzero(found) if count else np.empty(0, np.intp)
+
+    def room(self, states: Array, stretch: Array, chain: Array, far: float) -> float:
+        return float(self._call("room", len(stretch), states, stretch, chain, far))
+
+
+def point_kernels(comm: MPI.Intracomm) -> PointKernels:
+    """In C, or in numpy where that is asked for. Collective."""
+    return PointKernels() if in_numpy() else CompiledPointKernels(comm)
+
+
+# ---------------------------------------------------------------- factors in single precision, where CHOLMOD 5 is
+
+HEADER = "suitesparse/cholmod.h"
+FIRST = 5  # CHOLMOD's version that has single precision
+
+
+@functools.cache
+def include_folder() -> Path | None:
+    """Where CHOLMOD's header is; None, and a line in the log, where no version with single precision is."""
+    for folder in (Path(sys.prefix) / "include", Path("/usr/include"), Path("/usr/local/include")):
+        path = folder / HEADER
+        if path.is_file():
+            version = re.search(r"define CHOLMOD_MAIN_VERSION\s+(\d+)", path.read_text(encoding="utf-8"))
+            if version and int(version[1]) >= FIRST:
+                return folder
+    log.info("kept factors have double precision, for twice the time: no header of CHOLMOD %d or later is here", FIRST)
+    return None
+
+
+def is_available() -> bool:
+    """Whether such factors can be made here."""
+    return include_folder() is not None and not in_numpy()
+
+
+class SingleFactor:
+    """A factor L L^T of sparse symmetric matrices of one pattern, with seven digits."""
+
+    def __init__(self, starts: NDArray[np.int32], columns: NDArray[np.int32]):
+        self._call = Library(
+            MPI.COMM_SELF, "factor.c", "factors in single precision", include=include_folder(), libraries=("cholmod",)
+        )
+        self._handle: Any = self._call("factor_new", len(starts) - 1, starts, columns)
+        if not self._handle:
+            raise MemoryError("no memory for a factor in single precision")
+
+    def renew(self, values: Array) -> bool:
+        """Factorise the matrix with these values (entries,); whether it is positive definite to single precision."""
+        return bool(self._call("factor_renew", self._handle, values))
+
+    def solve(self, right: Array, answer: Array) -> bool:
+        """Write the answer (n,) to a right-hand side (n,); whether both are finite."""
+        return bool(self._call("factor_solve", self._handle, right, answer))
+
+    def close(self) -> None:
+        """Free its memory."""
+        if self._handle:
+            self._call("factor_free", self._handle)
+        self._handle = None

@@ -4,6 +4,12 @@
 #include <float.h>
 #include "algebra.h"
 
+/* What is known here of the parts of the model, by the names that they have for it (`compiled`). Python asks for their
+   numbers; a point with another one is marked as not solved. */
+enum {
+    WORMLIKE = 1, NEO_HOOKEAN, TENSOR, CAUCHY, PK2, FINGER, LOG, LENGTH
+};
+
 /* tensors.first_divided_difference. */
 static inline double first_difference(double a, double b)
 {
@@ -133,7 +139,7 @@ static void stress(point *p, state *s, matrix *by_cells, matrix *by_strain)
     const double steep = q[NETWORK_MODULUS] * slope / (2 * r);
     tensor quotients;
     if (p->repulsion == LOG) first_differences(p->c, quotients);
-    else ALL(i) ALL(j) quotients[i][j] = r0 * r0 / squared;
+    else ALL(i) ALL(j) quotients[i][j] = p->repulsion == LENGTH ? r0 * r0 / squared : NAN;
     s->squared = squared;
     ALL(i) ALL(j) s->S[i][j] = (along - against * quotients[i][j]) * s->A[i][j];
     ALL(i) s->S[i][i] += volumetric / p->c[i] + q[LAME_MU];
@@ -246,10 +252,11 @@ static void cells_by_tensor(point *p, state *s, matrix result)
     }
 }
 
-/* condensed.DRIVING_TENSORS: what a stress makes of D, and the factors of its derivative by the stress. */
+/* Driver.derivatives: what a stress makes of D, and the factors of its derivative by the stress. */
 static inline double by_stress(point *p, int i, int j)
 {
-    return p->driver == CAUCHY ? p->u[i] * p->u[j] / p->J : p->driver == PK2;
+    if (p->driver == CAUCHY) return p->u[i] * p->u[j] / p->J;
+    return p->driver == PK2 ? 1 : p->driver == FINGER ? 0 : NAN;
 }
 
 static void drive(point *p, tensor S, tensor D)

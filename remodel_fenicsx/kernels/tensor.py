@@ -12,14 +12,13 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from remodel_fenicsx.kernels.library import Library, in_numpy
+from remodel_fenicsx.kernels import Library, in_numpy
 from remodel_fenicsx.model import implicit as condensed, tensor_law, tensors
 from remodel_fenicsx.model.cells import UnitCell
-from remodel_fenicsx.model.chains import WORMLIKE
-from remodel_fenicsx.model.drivers import CAUCHY, FINGER, PK2, Driver, rotated_back
-from remodel_fenicsx.model.energy import BY_LENGTH, BY_LOG, Repulsion, Tissue, neo_hookean, whole_structure_tensor
+from remodel_fenicsx.model.drivers import rotated_back
+from remodel_fenicsx.model.energy import PARAMETERS, Tissue, whole_structure_tensor
 from remodel_fenicsx.model.implicit import CondensedPoints, LocalSolution, StepOfCells, at, put
-from remodel_fenicsx.model.laws import Drive, tensor_target
+from remodel_fenicsx.model.laws import Drive
 from remodel_fenicsx.model.tensor_law import Target
 
 log = logging.getLogger(__name__)
@@ -27,14 +26,7 @@ log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-# what tensor.c knows, and the numbers that it has there; of chains WORMLIKE, of matrices neo_hookean, of laws the
-# one with tensor_target. A part that is not here, though it has derivatives, is numpy's
-COMPILED_DRIVERS: dict[Driver, int] = {CAUCHY: 0, PK2: 1, FINGER: 2}
-COMPILED_REPULSIONS: dict[Repulsion, int] = {BY_LOG: 0, BY_LENGTH: 1}
-PARAMETERS = ("lame_lambda", "lame_mu", "network_modulus", "contour_length", "end_to_end_length")
 NUMBERS = {
-    **dict(zip(("CAUCHY", "PK2", "FINGER"), COMPILED_DRIVERS.values(), strict=True)),
-    **dict(zip(("LOG", "LENGTH"), COMPILED_REPULSIONS.values(), strict=True)),
     **{name.upper(): i for i, name in enumerate(PARAMETERS)},
     "PARAMETERS": len(PARAMETERS),
     "ITERATIONS": condensed.LOCAL_ITERATIONS,
@@ -43,7 +35,7 @@ NUMBERS = {
     "CLOSE": tensors.CLOSE_EIGENVALUES,
     "COMPRESSION": tensor_law.COMPRESSION,
 }
-"""What tensor.c takes from Python: the numbers of drivers, repulsions and parameters, and those that tune."""
+"""What tensor.c takes from Python: the places of parameters, and the numbers that tune."""
 
 
 class TensorKernels:
@@ -84,18 +76,18 @@ def condensed_points(kernels: TensorKernels | None, tissue: Tissue, step: StepOf
     """Tissue and step of n points: in C, where that knows all of its parts."""
     if kernels is None:
         return CondensedPoints(tissue, step)
-    known = {
-        "law": step.law.target is tensor_target,
-        "driver": step.drive.driver in COMPILED_DRIVERS,
-        "frame": not step.is_spatial,
-        "turnover": step.turnover is None,
-        "chain": tissue.chain == WORMLIKE,
-        "matrix": tissue.matrix is neo_hookean,
-        "repulsion": tissue.repulsion in COMPILED_REPULSIONS,
+    parts: dict[str, Any] = {
+        "law": step.law,
+        "driver": step.drive.driver,
+        "chain": tissue.chain,
+        "matrix": tissue.matrix,
+        "repulsion": tissue.repulsion,
     }
-    if all(known.values()):
+    unknown = [name for name, part in parts.items() if kernels.call.number(getattr(part, "compiled", "")) is None]
+    unknown += ["frame"] * step.is_spatial + ["turnover"] * (step.turnover is not None)
+    if not unknown:
         return CompiledPoints(tissue, step, kernels)
-    _say_of_tensor(", ".join(part for part, is_known in known.items() if not is_known))
+    _say_of_tensor(", ".join(unknown))
     return CondensedPoints(tissue, step)
 
 
@@ -113,7 +105,7 @@ class CompiledPoints(CondensedPoints):
     def _call(self, name: str, F: Array, tensor: Array, *results: Array | Flags) -> None:
         """A function in C with F, D, the cells at the start, parameters, and what else it takes of tissue and step."""
         drive, tissue = self.step.drive, self.tissue
-        numbers = COMPILED_DRIVERS[drive.driver], COMPILED_REPULSIONS[tissue.repulsion]
+        numbers = (self.kernels.call.number(part.compiled) for part in (drive.driver, tissue.repulsion))
         parameters = np.stack([getattr(tissue, name) for name in PARAMETERS])
         rate = np.broadcast_to(self.step.rate, len(F))
         given = self.step.structure, parameters, drive.floor, drive.rounding, rate, *numbers

@@ -5,9 +5,13 @@ Pure arithmetic on numbers, arrays or UFL expressions. All lengths are in link l
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import partial
+from types import MappingProxyType
+from typing import Any, ClassVar, Self
+
+from remodel_fenicsx._lazy import resolved
 
 BOLTZMANN_CONSTANT = 1.381e-23  # J/K, as printed in the paper
 
@@ -26,7 +30,57 @@ def wormlike_stiffness(end_to_end_length: Any, contour_length: Any) -> Any:
 
 
 @dataclass(frozen=True)
-class Chain:
+class Parameter:
+    """A number of a part's own: a key of the table in which a scene names the part.
+
+    Attributes
+    ----------
+    default
+        What it is where a scene does not say it.
+    meaning
+        In one sentence.
+    above
+        It must be greater than this; None: any finite number will do.
+
+    Examples
+    --------
+    >>> from remodel_fenicsx.extend import Parameter
+    >>> Parameter(0.5, "Length of a link, in those of the paper.", above=0.0).default
+    0.5
+    """
+
+    default: float
+    meaning: str
+    above: float | None = None
+
+
+NO_PARAMETERS: Mapping[str, Parameter] = MappingProxyType({})
+NO_VALUES: Mapping[str, Any] = MappingProxyType({})
+
+
+class WithParameters:
+    """A part whose functions may take parameters of its own, by keyword; their values come from `of`."""
+
+    functions: ClassVar[tuple[str, ...]]
+    parameters: Mapping[str, Parameter]
+
+    def of(self, values: Mapping[str, Any]) -> Self:
+        """The part with these values of its parameters: numbers, arrays or UFL.
+
+        Parameters
+        ----------
+        values
+            By the names of `parameters`.
+        """
+        if not values:
+            return self
+        functions = {name: getattr(self, name) for name in self.functions}
+        bound = {name: partial(resolved(function), **values) for name, function in functions.items() if function}
+        return replace(self, values=values, **bound)  # type: ignore[type-var]
+
+
+@dataclass(frozen=True)
+class Chain(WithParameters):
     """A law of a single chain: its energy and force (paper, eq. 2).
 
     Both functions take numbers, arrays or UFL; lengths are in link lengths.
@@ -39,6 +93,12 @@ class Chain:
         Its secant stiffness g(r, L): d(energy)/dr = g r.
     locks
         Whether a chain cannot become longer than L. Where it can, nothing is held below L, and r0 may be above it.
+    parameters
+        Numbers of its own, keys of `[material]`. Both functions take them by their names.
+    compiled
+        Under which name tensor.c has the law; "": numpy computes what others do in C.
+    values
+        Of its parameters (`of`).
 
     Examples
     --------
@@ -57,6 +117,10 @@ class Chain:
     energy: Callable[[Any, Any], Any]
     stiffness: Callable[[Any, Any], Any]
     locks: bool = True
+    parameters: Mapping[str, Parameter] = field(default=NO_PARAMETERS, compare=False)
+    compiled: str = ""
+    values: Mapping[str, Any] = field(default=NO_VALUES, compare=False)
+    functions = ("energy", "stiffness")
 
     def force(self, end_to_end_length: Any, contour_length: Any, persistence_length: Any, k_theta: Any = 1.0) -> Any:
         """Force that holds the ends of one chain apart: k theta / A_p times the derivative of its energy (eq. 2).
@@ -71,5 +135,4 @@ class Chain:
         return k_theta / persistence_length * self.stiffness(end_to_end_length, contour_length) * end_to_end_length
 
 
-WORMLIKE = Chain(wormlike_energy, wormlike_stiffness)
-CHAINS: dict[str, Chain] = {"wormlike": WORMLIKE}
+CHAINS: dict[str, Chain] = {"wormlike": Chain(wormlike_energy, wormlike_stiffness, compiled="WORMLIKE")}

@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from remodel_fenicsx.model import tensors
 from remodel_fenicsx.model.energy import Stresses
-from remodel_fenicsx.model.tensors import eigen
 
 Array = NDArray[np.float64]
+Derivatives = tuple[Array, Any, Any]  # D, and as Mandel matrices dD/dS and dD/dC or None
 
 
 @dataclass(frozen=True)
@@ -28,6 +29,15 @@ class Driver:
     is_stress
         Whether it is a stress, zero up to the rounding of stresses and to the residual that was accepted; else it is a
         number near one, zero up to its own rounding.
+    derivatives
+        For the coupling "implicit": the driver in material space, a spatial one as R^T t R with F = R U, and its
+        derivatives, from (eigenvalues of C (n, 3), S (n, 3, 3), whether derivatives are asked for), all in the
+        eigenbasis of C: D (n, 3, 3), dD/dS and dD/dC (`linear_map`; (1, 6, 6) where all points have the same), None
+        where they are not asked for.
+    compiled
+        Under which name tensor.c has it; "": numpy computes what others do in C.
+    over_corrects
+        Whether the coupling "staggered" may leave a symmetric solution with it.
 
     Examples
     --------
@@ -45,6 +55,9 @@ class Driver:
     tensor: Callable[[Any, Stresses], Any]
     material: bool
     is_stress: bool = True
+    derivatives: Callable[[Array, Array, bool], Derivatives] | None = None
+    compiled: str = ""
+    over_corrects: bool = False
 
 
 def finger_tensor(deformation_gradient: Any, stresses: Stresses) -> Any:
@@ -54,15 +67,54 @@ def finger_tensor(deformation_gradient: Any, stresses: Stresses) -> Any:
     return ufl.dot(deformation_gradient, deformation_gradient.T)
 
 
-CAUCHY = Driver(lambda F, s: s.cauchy, material=False)
-PK2 = Driver(lambda F, s: s.second_piola_kirchhoff, material=True)
-FINGER = Driver(finger_tensor, material=False, is_stress=False)
-DRIVERS: dict[str, Driver] = {"cauchy": CAUCHY, "pk2": PK2, "finger": FINGER}
+def cauchy_derivatives(squared: Array, stress: Array, second: bool) -> Derivatives:
+    """U S U / J."""
+    u = np.sqrt(squared)
+    jacobian = u.prod(axis=1)[:, None, None]
+    scales = u[:, :, None] * u[:, None, :] / jacobian
+    D = scales * stress
+    if not second:
+        return D, None, None
+    # dD = 2 sym(dU S U) / J - D C^-1 : dC / 2
+    by_stretch = 2 * tensors.linear_map(lambda H: H @ (stress * u[:, None, :] / jacobian))
+    by_volume = tensors.dyads(tensors.to_mandel(D), tensors.on_diagonal(1 / squared / 2))
+    stretch_by_strain = tensors.diagonal(1 / (u[:, :, None] + u[:, None, :]))
+    return D, tensors.diagonal(scales), by_stretch @ stretch_by_strain - by_volume
+
+
+def pk2_derivatives(squared: Array, stress: Array, second: bool) -> Derivatives:
+    """S."""
+    return stress, np.eye(6)[None], np.zeros((1, 6, 6))
+
+
+def finger_derivatives(squared: Array, stress: Array, second: bool) -> Derivatives:
+    """C: R^T b R."""
+    return squared[:, :, None] * np.eye(3), np.zeros((1, 6, 6)), np.eye(6)[None]
+
+
+DRIVERS: dict[str, Driver] = {
+    "cauchy": Driver(lambda F, s: s.cauchy, material=False, derivatives=cauchy_derivatives, compiled="CAUCHY"),
+    "pk2": Driver(
+        lambda F, s: s.second_piola_kirchhoff,
+        material=True,
+        derivatives=pk2_derivatives,
+        compiled="PK2",
+        over_corrects=True,
+    ),
+    "finger": Driver(
+        finger_tensor,
+        material=False,
+        is_stress=False,
+        derivatives=finger_derivatives,
+        compiled="FINGER",
+        over_corrects=True,
+    ),
+}
 
 
 def rotated_back(F: Array, spatial_tensor: Array) -> Array:
     """R^T t R (n, 3, 3) with the rotation R of F = R U: objective. For t = sigma it is U S U / J, for t = b it is C."""
-    squared, basis = eigen(np.swapaxes(F, 1, 2) @ F)
+    squared, basis = tensors.eigen(np.swapaxes(F, 1, 2) @ F)
     R = F @ (basis / np.sqrt(squared)[:, None, :]) @ np.swapaxes(basis, 1, 2)  # F U^-1
     back: Array = np.swapaxes(R, 1, 2) @ spatial_tensor @ R
     return (back + np.swapaxes(back, 1, 2)) / 2
@@ -80,6 +132,8 @@ class Frame:
         Whether the cells' axes move with the material, so that F n_I are the previous axes in space.
     tensor
         A spatial tensor as one in material space, from (F (n, 3, 3), tensor (n, 3, 3)): for laws that need no axes.
+    has_derivatives
+        Whether the coupling "implicit" knows those of `axes`: of the frames of the package it does.
 
     Examples
     --------
@@ -101,6 +155,7 @@ class Frame:
     axes: Callable[[Array, Array], Array]
     carries_axes: bool
     tensor: Callable[[Array, Array], Array] = rotated_back
+    has_derivatives: bool = False
 
 
 def spatial_frame(F: Array, spatial_axes: Array) -> Array:
@@ -118,9 +173,10 @@ def material_frame(F: Array, spatial_axes: Array) -> Array:
     return np.stack([first, second, np.cross(first, second)], axis=1)
 
 
-MATERIAL = Frame(material_frame, carries_axes=True)
-SPATIAL = Frame(spatial_frame, carries_axes=False, tensor=lambda F, tensor: tensor)
-FRAMES: dict[str, Frame] = {"material": MATERIAL, "spatial": SPATIAL}
+FRAMES: dict[str, Frame] = {
+    "material": Frame(material_frame, carries_axes=True, has_derivatives=True),
+    "spatial": Frame(spatial_frame, carries_axes=False, tensor=lambda F, tensor: tensor, has_derivatives=True),
+}
 
 
 def carried_axes(F: Array, axes: Array) -> Array:

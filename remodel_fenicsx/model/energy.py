@@ -10,8 +10,10 @@ Stresses, drivers, residual and tangent follow by differentiation. Per reference
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+import copy
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,11 +21,11 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.model import tensors
 from remodel_fenicsx.model.cells import UnitCell, structure_tensor
-from remodel_fenicsx.model.chains import CHAINS, Chain
+from remodel_fenicsx.model.chains import CHAINS, Chain, NO_PARAMETERS, NO_VALUES, Parameter, WithParameters
 from remodel_fenicsx.model.tensors import component, det, is_array, ln, sqrt, squared_norm
 
 Array = NDArray[np.float64]
-Term = Callable[[Any, Any, Any], Any]
+Term = Callable[..., Any]  # of F or J, lambda and mu; those of a matrix with parameters of its own take them too
 
 
 class Matrix:
@@ -41,6 +43,10 @@ class Matrix:
     derivatives
         S and dS/dC of the whole energy at points, from (eigenvalues of C (n, 3), lambda, mu, whether dS/dC is asked
         for), in the eigenbasis of C: tensors (n, 3, 3) and Mandel matrices (n, 6, 6). The coupling "implicit" needs it.
+    parameters
+        Numbers of its own, keys of `[material]`. All of its functions take them by their names.
+    compiled
+        Under which name tensor.c has it; "": numpy computes what others do in C.
 
     Examples
     --------
@@ -54,8 +60,30 @@ class Matrix:
     >>> del MATRICES["quadratic"]
     """
 
-    def __init__(self, volumetric: Term, *others: Term, derivatives: Callable[..., tuple[Any, Any]] | None = None):
+    def __init__(
+        self,
+        volumetric: Term,
+        *others: Term,
+        derivatives: Callable[..., tuple[Any, Any]] | None = None,
+        parameters: Mapping[str, Parameter] = NO_PARAMETERS,
+        compiled: str = "",
+    ):
         self.volumetric, self.others, self.derivatives = volumetric, others, derivatives
+        self.parameters, self.compiled, self.values = parameters, compiled, NO_VALUES
+
+    def of(self, values: Mapping[str, Any]) -> Matrix:
+        """The matrix with these values of its parameters.
+
+        Parameters
+        ----------
+        values
+            By the names of `parameters`: numbers, arrays or UFL.
+        """
+        found = copy.copy(self)
+        found.values, found.volumetric = values, partial(self.volumetric, **values)
+        found.others = tuple(partial(term, **values) for term in self.others)
+        found.derivatives = self.derivatives and partial(self.derivatives, **values)
+        return found
 
     def __call__(self, deformation_gradient: Any, lame_lambda: Any, lame_mu: Any) -> Any:
         """The whole energy."""
@@ -101,6 +129,7 @@ neo_hookean = Matrix(
     lambda F, lame_lambda, lame_mu: lame_mu / 2 * (squared_norm(F) - 3),
     lambda F, lame_lambda, lame_mu: -(lame_mu * ln(det(F))),
     derivatives=neo_hookean_derivatives,
+    compiled="NEO_HOOKEAN",
 )
 """W_iso = lambda/2 ln^2 J + mu/2 (tr C - 3) - mu ln J (eq. 4a)."""
 
@@ -194,8 +223,7 @@ def log_sum(deformation_gradient: Array, cells: Sequence[UnitCell], end_to_end_l
 
 def whole_structure_tensor(cells: Sequence[UnitCell]) -> Array:
     """A of a cell, or of its shares with numbers for weights, (n, 3, 3)."""
-    total: Array = sum(cell.weight * structure_tensor(cell.dimensions, cell.axes) for cell in cells)  # type: ignore
-    return total
+    return sum(cell.weight * structure_tensor(cell.dimensions, cell.axes) for cell in cells)  # type: ignore
 
 
 def log_derivatives(C: Array, A: Array, second: bool = True) -> tuple[Array, Array | None]:
@@ -211,7 +239,7 @@ def log_derivatives(C: Array, A: Array, second: bool = True) -> tuple[Array, Arr
 
 
 @dataclass(frozen=True)
-class Repulsion:
+class Repulsion(WithParameters):
     """A form of the repulsive energy.
 
     Attributes
@@ -221,6 +249,19 @@ class Repulsion:
     derivatives
         Where M is no closed expression for UFL: dM/dC (n, 3, 3) and, on request, d^2M/dC^2 as Mandel matrices (n, 6, 6)
         from (C, A, second), arrays.
+    terms
+        For the coupling "implicit": G = dM/dC (n, 3, 3) and its derivatives by the cells and by C, (n, 6, 6), from
+        (eigenvalues of C (n, 3), cells, r0 (n,), whether derivatives are asked for; else None stands for them), in
+        the eigenbasis of C. The cells have `structure`, A (n, 3, 3), and `structure_by_cells()`, dA/dy (n, 6, 6). A
+        function, or its dotted name.
+    sees_axes
+        Whether `terms` are of cells with axes alone, not of a structure tensor.
+    parameters
+        Numbers of its own, keys of `[material]`. All of its functions take them by their names.
+    compiled
+        Under which name tensor.c has it; "": numpy computes what others do in C.
+    values
+        Of its parameters (`of`).
 
     Examples
     --------
@@ -236,10 +277,20 @@ class Repulsion:
 
     sum: Callable[[Any, Sequence[UnitCell], Any], Any]
     derivatives: Callable[..., tuple[Array, Array | None]] | None = None
+    terms: Callable[..., Any] | str | None = None
+    sees_axes: bool = False
+    parameters: Mapping[str, Parameter] = field(default=NO_PARAMETERS, compare=False)
+    compiled: str = ""
+    values: Mapping[str, Any] = field(default=NO_VALUES, compare=False)
+    functions = ("sum", "derivatives", "terms")
 
 
-BY_AXES, BY_LOG, BY_LENGTH = Repulsion(axes_sum), Repulsion(log_sum, log_derivatives), Repulsion(length_sum)
-REPULSIONS: dict[str, Repulsion] = {"axes": BY_AXES, "log": BY_LOG, "length": BY_LENGTH}
+IMPLICIT = "remodel_fenicsx.model.implicit"  # which most runs do not import
+REPULSIONS: dict[str, Repulsion] = {
+    "axes": Repulsion(axes_sum, terms=f"{IMPLICIT}.axes_terms", sees_axes=True),
+    "log": Repulsion(log_sum, log_derivatives, terms=f"{IMPLICIT}.log_terms", compiled="LOG"),
+    "length": Repulsion(length_sum, terms=f"{IMPLICIT}.length_terms", compiled="LENGTH"),
+}
 
 
 # ---------------------------------------------------------------- the tissue
@@ -290,6 +341,7 @@ class Stresses(NamedTuple):
 
 
 TURNED_OVER = ("content", "natural_length")  # what turnover changes at every point
+PARAMETERS = ("lame_lambda", "lame_mu", "network_modulus", "contour_length", "end_to_end_length")  # of every tissue
 
 
 @dataclass(frozen=True)
@@ -382,11 +434,29 @@ class Tissue:
         slope = ((r + h) * g(r + h, L) - (r - h) * g(r - h, L)) / (2 * h)
         return matrix + self.present_modulus * (r**2 * slope + g(r0, L) * r0**2)
 
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """Every parameter by its name: of all tissues, of turnover where there is any, and those that parts have."""
+        turned_over = [name for name in TURNED_OVER if getattr(self, name) is not None]
+        found = {name: getattr(self, name) for name in (*PARAMETERS, *turned_over)}
+        for part in self._own_parameters.values():
+            found |= part
+        return found
+
+    @property
+    def _own_parameters(self) -> dict[str, Mapping[str, Any]]:
+        """Of chain, matrix and repulsion, where they have any."""
+        values = {name: getattr(getattr(self, name), "values", None) for name in ("chain", "matrix", "repulsion")}
+        return {name: own for name, own in values.items() if own}
+
     def map(self, function: Callable[[str, Any], Any]) -> Tissue:
         """The same tissue with function(name, value) for every parameter."""
-        names: tuple[str, ...] = ("lame_lambda", "lame_mu", "network_modulus", "contour_length", "end_to_end_length")
-        names += tuple(name for name in TURNED_OVER if getattr(self, name) is not None)
-        return replace(self, **{name: function(name, getattr(self, name)) for name in names})
+        found = {name: function(name, value) for name, value in self.parameters.items()}
+        own = {
+            part: getattr(self, part).of({name: found[name] for name in names})
+            for part, names in self._own_parameters.items()
+        }
+        return replace(self, **{name: found[name] for name in found if name in PARAMETERS + TURNED_OVER}, **own)
 
     def strain_energy(self, deformation_gradient: Any, cells: Sequence[UnitCell]) -> Any:
         """W per reference volume (eqs. 3 and 4 with errata 1 and 2), in the unit of the Lame constants.

@@ -2,29 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from remodel_fenicsx._lazy import resolved
 from remodel_fenicsx.model import spectral, tensor_law, tensors
 from remodel_fenicsx.model.cells import UnitCell, structure_tensor
-from remodel_fenicsx.model.drivers import (
-    CAUCHY,
-    DRIVERS,
-    Driver,
-    FINGER,
-    FRAMES,
-    Frame,
-    MATERIAL,
-    PK2,
-    SPATIAL,
-    carried_axes,
-)
-from remodel_fenicsx.model.energy import BY_AXES, BY_LENGTH, BY_LOG, Matrix, REPULSIONS, Repulsion, Tissue
-from remodel_fenicsx.model.laws import Drive, LAWS, Law, Ranked, by_rank, tensor_target
+from remodel_fenicsx.model.drivers import DRIVERS, Derivatives, Driver, FRAMES, Frame, carried_axes
+from remodel_fenicsx.model.energy import Matrix, REPULSIONS, Repulsion, Tissue
+from remodel_fenicsx.model.laws import Drive, LAWS, Law, Ranked, by_rank
 from remodel_fenicsx.model.turnover import TurnedOver, TurnoverRule, at_the_end
 
 
@@ -80,12 +70,6 @@ class Response(NamedTuple):
     cells: LocalCells
     by_tensor: Array | None = None
     by_stretch: Array | None = None
-
-
-def response(step: StepOfCells, strain: Strain, tensor: Array, derivatives: bool) -> Response:
-    """Of a law with a target (`Law.target`) or with dimensions by rank (`Law.dimensions`)."""
-    respond = ranked_response if step.law.dimensions is not None else tensor_response
-    return respond(step, strain, tensor, derivatives)
 
 
 def jumps_by_rank(step: StepOfCells) -> NDArray[np.bool_]:
@@ -169,8 +153,7 @@ def _lengths_by_values(step: StepOfCells, found: Ranked) -> Array:
     e = found.target / r0
     size = np.linalg.norm(np.where(e > 0, found.values, 0.0), axis=1)
     steepness = slope * (r0 / np.where(found.active, size, 1.0)[:, None])
-    by_values: Array = steepness[:, :, None] * (np.eye(3) - e[:, :, None] * e[:, None, :]) * (e > 0)[:, None, :]
-    return by_values
+    return steepness[:, :, None] * (np.eye(3) - e[:, :, None] * e[:, None, :]) * (e > 0)[:, None, :]
 
 
 def _turns_by_tensor(step: StepOfCells, found: Ranked) -> Array:
@@ -255,8 +238,7 @@ class Strain(NamedTuple):
     def rotation(self) -> Array:
         """R of F = R U in the eigenbasis."""
         turned = tensors.rotated(self.gradient, self.basis)
-        quotient: Array = turned / self.stretches[:, None, :]
-        return quotient
+        return turned / self.stretches[:, None, :]
 
     @property
     def by_gradient(self) -> Array:
@@ -264,8 +246,7 @@ class Strain(NamedTuple):
         carried, Q = self.gradient @ self.basis, self.basis
         both = _dyads_of_columns(carried, Q, tensors.ROWS, tensors.COLUMNS)
         both += _dyads_of_columns(carried, Q, tensors.COLUMNS, tensors.ROWS)
-        found: Array = tensors.FACTORS[:, None] * both
-        return found
+        return tensors.FACTORS[:, None] * both
 
     @property
     def turn_by_gradient(self) -> Array:
@@ -273,8 +254,7 @@ class Strain(NamedTuple):
         u, (i, j) = self.stretches, np.transpose(tensors.PAIRS)
         axes = self.gradient @ self.basis / u[:, None, :]  # R Q
         both = _dyads_of_columns(axes, self.basis, i, j) - _dyads_of_columns(axes, self.basis, j, i)
-        found: Array = both / (u[:, i] + u[:, j])[:, :, None]
-        return found
+        return both / (u[:, i] + u[:, j])[:, :, None]
 
     @property
     def stretch_by_strain(self) -> Array:
@@ -328,8 +308,7 @@ class OrthotropicCells(NamedTuple):
         entries[:, :3] = 2 * lengths
         for row, (i, j) in enumerate(tensors.PAIRS, start=3):
             entries[:, row] = np.sqrt(2) * (lengths[:, i] ** 2 - lengths[:, j] ** 2)
-        columns: Array = self.to_axes() * entries[:, None, :]
-        return columns
+        return self.to_axes() * entries[:, None, :]
 
 
 LocalCells = StructureCells | OrthotropicCells
@@ -343,37 +322,35 @@ class Terms(NamedTuple):
     by_strain: Array | None
 
 
-def log_terms(strain: Strain, cells: LocalCells, r0: Array, derivatives: bool) -> Terms:
+def log_terms(squared: Array, cells: LocalCells, r0: Array, derivatives: bool) -> Terms:
     """Of M = A : ln C."""
-    values, A = strain.squared, cells.structure
-    quotients = tensors.first_divided_differences(values)
+    A, quotients = cells.structure, tensors.first_divided_differences(squared)
     if not derivatives:
         return Terms(quotients * A, None, None)
     by_cells = quotients[:, tensors.ROWS, tensors.COLUMNS][:, :, None] * cells.structure_by_cells()
-    return Terms(quotients * A, by_cells, tensors.second_derivative(values, A))
+    return Terms(quotients * A, by_cells, tensors.second_derivative(squared, A))
 
 
-def length_terms(strain: Strain, cells: LocalCells, r0: Array, derivatives: bool) -> Terms:
+def length_terms(squared: Array, cells: LocalCells, r0: Array, derivatives: bool) -> Terms:
     """Of M = r0^2 ln(A : C / r0^2)."""
     A, scale = cells.structure, r0[:, None, None] ** 2
-    squared = np.einsum("nii,ni->n", A, strain.squared)[:, None, None]
+    length = np.einsum("nii,ni->n", A, squared)[:, None, None]  # r^2
     if not derivatives:
-        return Terms(scale * A / squared, None, None)
+        return Terms(scale * A / length, None, None)
     a, by_cells = tensors.to_mandel(A), cells.structure_by_cells()
-    c = tensors.on_diagonal(strain.squared)
-    across = tensors.dyads(a, np.einsum("na,nab->nb", c, by_cells))
+    across = tensors.dyads(a, np.einsum("na,nab->nb", tensors.on_diagonal(squared), by_cells))
     return Terms(
-        scale * A / squared,
-        scale * (by_cells / squared - across / squared**2),
-        -scale * tensors.dyads(a, a) / squared**2,
+        scale * A / length,
+        scale * (by_cells / length - across / length**2),
+        -scale * tensors.dyads(a, a) / length**2,
     )
 
 
-def axes_terms(strain: Strain, cells: LocalCells, r0: Array, derivatives: bool) -> Terms:
+def axes_terms(squared: Array, cells: LocalCells, r0: Array, derivatives: bool) -> Terms:
     """Of M = sum_I l_I^2 ln(n_I . C n_I); for cells with axes."""
     assert isinstance(cells, OrthotropicCells)
     lengths, axes = cells.cell.dimensions, cells.cell.axes
-    C = (axes * strain.squared[:, None, :]) @ np.swapaxes(axes, 1, 2)  # in the cell's axes
+    C = (axes * squared[:, None, :]) @ np.swapaxes(axes, 1, 2)  # in the cell's axes
     stretches = np.einsum("nii->ni", C)
     entries = lengths**2 / stretches
     value = np.swapaxes(axes, 1, 2) @ (entries[:, :, None] * axes)
@@ -390,14 +367,6 @@ def axes_terms(strain: Strain, cells: LocalCells, r0: Array, derivatives: bool) 
     to_axes = cells.to_axes()
     along = to_axes * tensors.on_diagonal(steepness)[:, None, :]
     return Terms(value, to_axes @ changes, along @ np.swapaxes(to_axes, 1, 2))
-
-
-TERMS: dict[Repulsion, Callable[[Strain, LocalCells, Array, bool], Terms]] = {
-    BY_AXES: axes_terms,
-    BY_LOG: log_terms,
-    BY_LENGTH: length_terms,
-}
-"""Of the repulsions themselves: another of the same name has others."""
 
 
 class Stress(NamedTuple):
@@ -442,7 +411,6 @@ def moduli(tissue: Tissue, r: Array, turned_over: TurnedOver | None) -> Moduli:
 
 def stress(
     tissue: Tissue,
-    terms: Callable[..., Terms],
     strain: Strain,
     cells: LocalCells,
     derivatives: bool,
@@ -452,7 +420,8 @@ def stress(
     matrix, A = tissue.matrix.derivatives, cells.structure  # type: ignore[attr-defined]
     r = np.sqrt(np.einsum("nii,ni->n", A, strain.squared))
     chains = moduli(tissue, r, None if turned_over is None else turned_over(tissue, r))
-    repulsion = terms(strain, cells, tissue.end_to_end_length, derivatives)
+    terms = resolved(tissue.repulsion.terms)  # type: ignore[arg-type]
+    repulsion = Terms(*terms(strain.squared, cells, tissue.end_to_end_length, derivatives))
     of_matrix, by_strain = matrix(strain.squared, tissue.lame_lambda, tissue.lame_mu, derivatives)
     g, g0 = chains.chains[:, None, None], chains.repulsion[:, None, None]
     value = of_matrix + g * A - g0 * repulsion.value
@@ -495,72 +464,25 @@ TOLERANCE = 1e-12  # of D: where the local Newton method stops
 IDENTITY = np.eye(6)
 
 
-# ---------------------------------------------------------------- drivers
-
-
-class Driving(NamedTuple):
-    """D in material space (n, 3, 3), and D_S and D_C as Mandel matrices (n or 1, 6, 6) where they are asked for."""
-
-    tensor: Array
-    by_stress: Any = None
-    by_strain: Any = None
-
-
-def _cauchy(strain: Strain, stress: Array, derivatives: bool) -> Driving:
-    """U S U / J."""
-    u = strain.stretches
-    jacobian = u.prod(axis=1)[:, None, None]
-    scales = u[:, :, None] * u[:, None, :] / jacobian
-    D = scales * stress
-    if not derivatives:
-        return Driving(D)
-    inverse: Any = 1 / strain.squared  # dD = 2 sym(dU S U) / J - D C^-1 : dC / 2
-    across = np.swapaxes(stress * u[:, None, :], 1, 2) / jacobian
-    by_stretch = 2 * tensors.congruence(np.broadcast_to(np.eye(3), D.shape), across)
-    by_volume = tensors.dyads(tensors.to_mandel(D), tensors.on_diagonal(inverse / 2))
-    return Driving(D, tensors.diagonal(scales), by_stretch @ strain.stretch_by_strain - by_volume)
-
-
-def _second_piola_kirchhoff(strain: Strain, stress: Array, derivatives: bool) -> Driving:
-    """S."""
-    return Driving(stress, IDENTITY[None], np.zeros((1, 6, 6)))
-
-
-def _right_cauchy_green(strain: Strain, stress: Array, derivatives: bool) -> Driving:
-    """C: R^T b R."""
-    C = np.zeros_like(stress)
-    C[:, range(3), range(3)] = strain.squared
-    return Driving(C, np.zeros((1, 6, 6)), IDENTITY[None])
-
-
-DRIVING_TENSORS: dict[Driver, Callable[..., Driving]] = {
-    CAUCHY: _cauchy,
-    PK2: _second_piola_kirchhoff,
-    FINGER: _right_cauchy_green,
-}
-"""D in material space of the drivers themselves: another of the same name has another."""
-
-
-def _known(registry: Mapping[str, Any], table: Container[Any]) -> str:
-    """Names of the parts that a table has."""
-    return ", ".join(repr(name) for name, part in registry.items() if part in table)
-
-
 def refused(law: Law, driver: Driver, frame: Frame, matrix: Any, repulsion: Repulsion) -> str | None:
     """What a condensed step would need, where a part of the model has no derivatives for it; None where all have."""
-    laws = [other for other in LAWS.values() if other.dimensions or other.target is tensor_target]
-    if law not in laws:
-        return f"a remodeling.law towards a target: {_known(LAWS, laws)}"
-    if driver not in DRIVING_TENSORS:
-        return f"a remodeling.driver with derivatives: {_known(DRIVERS, DRIVING_TENSORS)}"
-    if frame not in (MATERIAL, SPATIAL):
-        return f"a remodeling.frame with derivatives: {_known(FRAMES, (MATERIAL, SPATIAL))}"
+
+    def those_with(what: str, registry: Mapping[str, Any]) -> str:
+        return ", ".join(repr(name) for name, part in registry.items() if getattr(part, what))
+
+    if law.response is None:
+        return f"a remodeling.law towards a target: {those_with('response', LAWS)}"
+    if driver.derivatives is None:
+        return f"a remodeling.driver with derivatives: {those_with('derivatives', DRIVERS)}"
+    if not frame.has_derivatives:
+        return f"a remodeling.frame with derivatives: {those_with('has_derivatives', FRAMES)}"
     if not isinstance(matrix, Matrix) or matrix.derivatives is None:
         return "a material.matrix that is a Matrix with derivatives"
-    if repulsion not in TERMS:
-        return f"a material.repulsion with derivatives: {_known(REPULSIONS, TERMS)}"
-    if repulsion == BY_AXES and law.dimensions is None:
-        return "a material.repulsion that does not depend on axes, like its law: 'log', 'length'"
+    if repulsion.terms is None:
+        return f"a material.repulsion with derivatives: {those_with('terms', REPULSIONS)}"
+    if repulsion.sees_axes and law.dimensions is None:
+        blind = {name: part for name, part in REPULSIONS.items() if not part.sees_axes}
+        return f"a material.repulsion that does not depend on axes, like its law: {those_with('terms', blind)}"
     return None
 
 
@@ -591,18 +513,18 @@ class Trial(NamedTuple):
 
 
 class Linearised(NamedTuple):
-    """S and D with their derivatives at a driving tensor, `answer` S_y y_D, and S_y y_U where there is one."""
+    """S with its derivatives at a driving tensor, D_S and D_C, `answer` S_y y_D, and S_y y_U where there is one."""
 
     stress: Stress
-    driving: Driving
+    by_stress: Array
+    by_strain: Array
     answer: Array
     answer_to_stretch: Array | None
 
     @property
     def left(self) -> Array:
         """1 - D_S S_y y_D of eq. (i2)."""
-        left: Array = IDENTITY - self.driving.by_stress @ self.answer
-        return left
+        return IDENTITY - self.by_stress @ self.answer
 
 
 @dataclass(frozen=True)
@@ -631,7 +553,7 @@ class CondensedPoints:
             if lost.size and self.step.law.dimensions is None:  # by rank there are states without a solution
                 put(trial, lost, self.at(lost)._followed(at(strain, lost)))
         else:  # D does not depend on the stress
-            trial = self._trial(strain, self._driving(strain, np.zeros_like(F)).tensor)
+            trial = self._trial(strain, self._driving(strain, np.zeros_like(F)))
             trial.converged[:] = np.isfinite(trial.stress.value).all(axis=(1, 2))
         found = self._solution(strain, trial)
         if held.any():
@@ -644,7 +566,7 @@ class CondensedPoints:
         strain = Strain.of(F)
         inside = self._cells(strain, structure_tensor(*cells[:2]), cells)
         stress = self._stress(strain, inside)
-        tensor = self._driving(strain, stress.value).tensor
+        tensor = self._driving(strain, stress.value)
         trial = Trial(tensor, inside, stress, np.zeros_like(F), np.ones(len(F), dtype=bool))
         return self._solution(strain, trial)
 
@@ -690,38 +612,48 @@ class CondensedPoints:
     # ------------------------------------------------------------ the functions of eq. (i1)
     def _stress(self, strain: Strain, cells: LocalCells, derivatives: bool = False) -> Stress:
         """S with these cells."""
-        terms = TERMS[self.tissue.repulsion]
-        return stress(self.tissue, terms, strain, cells, derivatives, self.step.turned_over)
+        return stress(self.tissue, strain, cells, derivatives, self.step.turned_over)
 
-    def _driving(self, strain: Strain, stress: Array, derivatives: bool = False) -> Driving:
+    def _driving(self, strain: Strain, stress: Array) -> Array:
         """D of S."""
-        return DRIVING_TENSORS[self.step.drive.driver](strain, stress, derivatives)
+        return self._driver(strain.squared, stress, False)[0]
+
+    def _respond(self, strain: Strain, tensor: Array, derivatives: bool) -> Response:
+        """Of the cells to D."""
+        law: Callable[..., Response] = resolved(self.step.law.response)  # type: ignore[arg-type]
+        return law(self.step, strain, self._place(strain, tensor), derivatives)
+
+    @property
+    def _driver(self) -> Callable[[Array, Array, bool], Derivatives]:
+        assert self.step.drive.driver.derivatives is not None
+        return self.step.drive.driver.derivatives
 
     def _place(self, strain: Strain, tensor: Array) -> Array:
         """X of D in the eigenbasis of C (`responses`)."""
         if not self.step.is_spatial:
             return tensor
         R = strain.rotation
-        turned: Array = R @ tensor @ np.swapaxes(R, 1, 2)
-        return turned
+        return R @ tensor @ np.swapaxes(R, 1, 2)
 
     def _trial(self, strain: Strain, tensor: Array) -> Trial:
-        cells = response(self.step, strain, self._place(strain, tensor), derivatives=False).cells
+        cells = self._respond(strain, tensor, derivatives=False).cells
         stress = self._stress(strain, cells)
-        missing = self._driving(strain, stress.value).tensor - tensor
+        missing = self._driving(strain, stress.value) - tensor
         accuracy = TOLERANCE * np.linalg.norm(tensor, axis=(1, 2)) + self.step.drive.rounding
         converged = (np.linalg.norm(missing, axis=(1, 2)) <= accuracy) & (stress.extension < 1.0)
         return Trial(tensor, cells, stress, missing, converged)
 
     def _linearised(self, strain: Strain, tensor: Array) -> Linearised:
-        cells, by_tensor, by_stretch = response(self.step, strain, self._place(strain, tensor), derivatives=True)
+        cells, by_tensor, by_stretch = self._respond(strain, tensor, derivatives=True)
         stress = self._stress(strain, cells, derivatives=True)
         assert by_tensor is not None and stress.by_cells is not None
         answer = stress.by_cells @ by_tensor
         if self.step.is_spatial:
             answer = answer @ tensors.congruence(strain.rotation)
-        driving = self._driving(strain, stress.value, derivatives=True)
-        return Linearised(stress, driving, answer, None if by_stretch is None else stress.by_cells @ by_stretch)
+        _, by_stress, by_strain = self._driver(strain.squared, stress.value, True)
+        return Linearised(
+            stress, by_stress, by_strain, answer, None if by_stretch is None else stress.by_cells @ by_stretch
+        )
 
     # ------------------------------------------------------------ Newton's method
     def _iterate(self, strain: Strain, trial: Trial) -> None:
@@ -776,11 +708,11 @@ class CondensedPoints:
         strain = Strain.of(found.gradient)
         tensor, C_F = strain.inside(found.driving_tensor), strain.by_gradient
         linear, frozen = self._linearised(strain, tensor), held | ~found.converged
-        left, stress, driving = linear.left, linear.stress, linear.driving
+        left, stress = linear.left, linear.stress
         assert stress.by_strain is not None
         left[frozen] = IDENTITY
         at_fixed_tensor = stress.by_strain @ C_F + self._answer_to_deformation(strain, linear, tensor)
-        right = driving.by_strain @ C_F + driving.by_stress @ at_fixed_tensor
+        right = linear.by_strain @ C_F + linear.by_stress @ at_fixed_tensor
         by_gradient = at_fixed_tensor + linear.answer @ np.linalg.solve(left, right)
         if frozen.any():  # their cells need not be those of D
             put((stress.value, by_gradient), frozen, self.at(frozen)._frozen(at(strain, frozen), at(found, frozen)))

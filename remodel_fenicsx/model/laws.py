@@ -8,8 +8,8 @@ the dimensions stay.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,7 +17,9 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.model import spectral, tensor_law
 from remodel_fenicsx.model.cells import UnitCell, structure_tensor
+from remodel_fenicsx.model.chains import NO_PARAMETERS, NO_VALUES, Parameter
 from remodel_fenicsx.model.drivers import Driver, Frame, carried_axes
+from remodel_fenicsx.model.energy import IMPLICIT
 from remodel_fenicsx.model.tensor_law import Target
 
 Array = NDArray[np.float64]
@@ -47,11 +49,13 @@ class Drive(NamedTuple):
     rotation_time
         Time in which the law `rotation` turns a small angle to 1/e of it.
     kernels
-        Whose `principal` and `positive_direction` are called: those of `spectral`, or of C (`kernels.points`).
+        Whose `principal` and `positive_direction` are called: those of `spectral`, or of C (`kernels`).
     rounding
         The part of the threshold that is the rounding of a stress, in its unit; (n,) or a number.
     exponent, least_tension
         Of `tensor_law.target` and `tensor_law.awake`.
+    parameters
+        Values of the law's own (`Law.parameters`) by their names.
 
     Examples
     --------
@@ -82,6 +86,7 @@ class Drive(NamedTuple):
     rounding: Array | float = 0.0
     exponent: float = 2.0
     least_tension: float = 0.0
+    parameters: Mapping[str, float] = NO_VALUES
 
     @property
     def kappas(self) -> Array | float:
@@ -91,8 +96,7 @@ class Drive(NamedTuple):
     @property
     def floor(self) -> Array | float:
         """Tension below which a principal value counts as none, (n,) or a number, in the unit of the tensor."""
-        floor: Array | float = tensor_law.floor_above(self.threshold, self.rounding)
-        return floor
+        return tensor_law.floor_above(self.threshold, self.rounding)
 
 
 def relaxed(old: UnitCell, new: UnitCell, factor: Array | float) -> UnitCell:
@@ -139,6 +143,17 @@ class Law:
         Whether kappa = 0 means that cells never change, so that there is no pass at all.
     share
         Cells that have made a share of a change, from (old, new, factor); `relaxed` where the law has none of its own.
+    response
+        For the coupling "implicit": cells at a strain and a driving tensor with their derivatives, as
+        `model.implicit.tensor_response`; a function, or its dotted name.
+    over_corrects
+        Whether the coupling "staggered" may leave a symmetric solution with it.
+    parameters
+        Numbers of its own, keys of `[remodeling]`: `speed` takes them by their names, and the drive has them.
+    speed
+        The kappa that acts, from (kappa of the scene, temperature in K), where it is another.
+    compiled
+        Under which name tensor.c has it; "": numpy computes what others do in C.
 
     Examples
     --------
@@ -169,6 +184,11 @@ class Law:
     share: Callable[[UnitCell, UnitCell, float], UnitCell] = relaxed
     keeps_symmetry: bool = False
     asks_kappa: bool = False
+    response: Callable[..., Any] | str | None = None
+    over_corrects: bool = False
+    parameters: Mapping[str, Parameter] = field(default=NO_PARAMETERS, compare=False)
+    speed: Callable[..., float] | None = None
+    compiled: str = ""
 
 
 def ranked(function: RankedFunction, has_limit: bool = False, of_absolute_time: bool = False) -> Law:
@@ -213,6 +233,7 @@ def ranked(function: RankedFunction, has_limit: bool = False, of_absolute_time: 
         dimensions=function,
         keeps_symmetry=True,
         asks_kappa=True,
+        response=f"{IMPLICIT}.ranked_response",
     )
 
 
@@ -375,10 +396,17 @@ def tensor(cells: UnitCell, drive: Drive, time_old: float, time_new: float) -> U
 
 LAWS: dict[str, Law] = {
     "explicit": ranked(explicit, has_limit=True, of_absolute_time=True),
-    "rate": ranked(rate),
+    "rate": replace(ranked(rate), over_corrects=True),
     "relaxation": ranked(relaxation, has_limit=True),
     "tensor": Law(
-        tensor, has_limit=True, target=tensor_target, follow=follow_tensor, keeps_symmetry=True, asks_kappa=True
+        tensor,
+        has_limit=True,
+        target=tensor_target,
+        follow=follow_tensor,
+        keeps_symmetry=True,
+        asks_kappa=True,
+        response=f"{IMPLICIT}.tensor_response",
+        compiled="TENSOR",
     ),
     "rotation": Law(rotation, share=turned_in_part),
     "none": Law(keep, remodels=False, keeps_symmetry=True),

@@ -40,8 +40,7 @@ class Panels:
 
     def derivative(self, values: Array) -> Array:
         """By the radius, of values (panels, points)."""
-        found: Array = values @ self._slope.T / self._half
-        return found
+        return values @ self._slope.T / self._half
 
     def integral(self, values: Array) -> float:
         """Over all panels."""
@@ -236,8 +235,7 @@ def principal_stresses(tissue: Tissue, stretches: Array, dimensions: Array | Non
     slopes = [
         (8 * (energy(i, h) - energy(i, -h)) - (energy(i, 2 * h) - energy(i, -2 * h))) / (12 * h) for i in range(3)
     ]
-    found: Array = np.stack(slopes, axis=-1) / np.prod(stretches, axis=-1)[..., None]
-    return found
+    return np.stack(slopes, axis=-1) / np.prod(stretches, axis=-1)[..., None]
 
 
 # ---------------------------------------------------------------- what a tube without loads does when it is cut

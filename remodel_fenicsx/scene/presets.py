@@ -225,7 +225,7 @@ def profile_for(name: str, scene: Any) -> Profile:
 #  A scene may say either, never both; the scene as run has the model's own (docs/which_numbers.md).
 
 Values = Mapping[str, Any]
-Others = Callable[[str, str], Any]  # value of a table's key, where it is one that can be counted with
+Others = Callable[..., Any]  # value of a table's key (or a default), where it is one that can be counted with
 _TABLES = {"material": Material, "cells": Cells, "remodeling": Remodeling}
 _COMPLEX_STEP = 1e-30  # its square vanishes beside 1: the derivative is exact to rounding
 
@@ -254,7 +254,8 @@ def _chain_density(initial_stiffness: float, others: Others) -> float:
     r0, contour_length = number("end_to_end_length", "cells"), number("contour_length")
     if name not in CHAINS or unit not in STRESS_UNITS or r0 >= contour_length:
         raise _NotThere
-    modulus = initial_stiffness * STRESS_UNITS[unit] / aligned_stiffness(CHAINS[name], r0, contour_length)
+    chain = CHAINS[name].of({key: others("material", key, own.default) for key, own in CHAINS[name].parameters.items()})
+    modulus = initial_stiffness * STRESS_UNITS[unit] / aligned_stiffness(chain, r0, contour_length)
     k_theta = BOLTZMANN_CONSTANT * number("temperature")
     return 4 * number("persistence_length") * modulus / (number("energy_factor") * k_theta)
 
@@ -340,8 +341,10 @@ def _with_own_number(experiment: Experiment, part: Values, body: Values) -> Valu
     if not is_number(value) or value <= lowest:
         return part
 
-    def others(table: str, key: str) -> Any:
-        said = (_of(part, table, key), _of(body, table, key), _TABLES[table].model_fields[key].default)
+    def others(table: str, key: str, default: Any = None) -> Any:
+        if default is None:
+            default = _TABLES[table].model_fields[key].default
+        said = (_of(part, table, key), _of(body, table, key), default)
         found = next(value for value in said if value is not None)
         if not isinstance(found, str) and not (is_number(found) and found > 0):
             raise _NotThere

@@ -60,7 +60,7 @@ from remodel_fenicsx.schema.settings import (
     nearest_multiples,
     tables_of,
 )
-from remodel_fenicsx.schema.tables import SceneError, Table, VariantOf, allowed, fault, quoted, shown
+from remodel_fenicsx.schema.tables import KeysOfParts, SceneError, Table, VariantOf, allowed, fault, quoted, shown
 from remodel_fenicsx.schema.toml import merged, parse_override, put, read_toml, toml_text
 from remodel_fenicsx.schema.units import FORCE, LENGTH_UNIT, LENGTH_UNITS, STRESS, STRESS_UNIT, in_units
 
@@ -151,6 +151,7 @@ def _times(ratio: float) -> str:
 
 
 NAME = r"[A-Za-z][A-Za-z0-9_]{0,39}"  # of a region or a further load: part of the name of a column
+PARTS_OF_MATERIAL = {"chain": CHAINS, "matrix": MATRICES, "repulsion": REPULSIONS}  # which may bring keys of [material]
 FORMAT = 2  # of recorded scenes: raised where a reader of the one before would not understand them
 RENAMED = {"mesh.cell": "mesh.element", "loads.stretch": "loads.elongation", "solver.profile": "solver.method"}
 """Dotted key of an earlier format -> the key that has taken its place, for the error."""
@@ -234,7 +235,7 @@ class Scene(Table):
     geometry: Annotated[SerializeAsAny[Shape], VariantOf(SHAPES, "shape")]
     mesh: Mesh = Mesh()
     model: Model = Model()
-    material: Material = Material()
+    material: Annotated[SerializeAsAny[Material], KeysOfParts(PARTS_OF_MATERIAL)] = Material()
     cells: Cells = Cells()
     supports: Supports = Supports()
     natural: Natural = Natural()
@@ -245,7 +246,7 @@ class Scene(Table):
         description="Load cases of a cycle, a table `[[cases]]` each. Without them the loads act all the time.",
         json_schema_extra={"allowed": "a list of tables"},
     )
-    remodeling: Remodeling = Remodeling()
+    remodeling: Annotated[SerializeAsAny[Remodeling], KeysOfParts({"law": LAWS})] = Remodeling()
     time: Time
     solver: Solver = Solver()
     output: Output = Output()
@@ -454,7 +455,8 @@ class Scene(Table):
             raise fault(rule, f"{region}material.chain_density", material.chain_density)
         self._check_turnover(region, properties)
         law = LAWS[self.remodeling.law]
-        if properties.kappa != self.remodeling.kappa and law.remodels and not law.asks_kappa:
+        plain = self.remodeling.speed(self.remodeling.kappa, material.temperature)
+        if properties.kappa != plain and law.remodels and not law.asks_kappa:
             raise fault(f"the law {self.remodeling.law!r} has no kappa", f"{region}remodeling.kappa", properties.kappa)
 
     def _check_turnover(self, region: str, properties: Properties) -> None:
@@ -510,8 +512,11 @@ class Scene(Table):
     def properties(self) -> dict[str, Properties]:
         """What holds in each region by its name, and under "" what holds beside them, where there may be anything."""
         body = Properties(self.material, self.cells, self.remodeling.kappa)
-        found = {name: region.over(body) for name, region in self.regions.items()}
-        return found if found and self.geometry.is_filled_by_regions else {"": body} | found
+        found = {"": body} | {name: region.over(body) for name, region in self.regions.items()}
+        if self.regions and self.geometry.is_filled_by_regions:
+            del found[""]
+        speed = self.remodeling.speed
+        return {name: one._replace(kappa=speed(one.kappa, one.material.temperature)) for name, one in found.items()}
 
     @property
     def has_random_cells(self) -> bool:

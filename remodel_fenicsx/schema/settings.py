@@ -241,10 +241,15 @@ class Material(Table):
             self.network_modulus,
             self.contour_length,
             end_to_end_length,
-            CHAINS[self.chain] if self.chain_density > 0 else None,
-            MATRICES[self.matrix],
-            REPULSIONS[self.repulsion],
+            self._part(CHAINS[self.chain]) if self.chain_density > 0 else None,
+            self._part(MATRICES[self.matrix]),
+            self._part(REPULSIONS[self.repulsion]),
         )
+
+    def _part(self, part: Any) -> Any:
+        """With the values of its own keys."""
+        own = getattr(part, "parameters", None)
+        return part.of({name: getattr(self, name) for name in own}) if own else part
 
     def summary(self, loads: Mapping[str, float]) -> str:
         """Stiffness of network and matrix and the loads, in one unit and on one line.
@@ -670,6 +675,22 @@ class Remodeling(Table):
             f"remodeling.coupling = {self.coupling!r} makes a share of {share:g} of each pass, and the law "
             f"{self.law!r} does not make up for the rest: cells remodel at about {share:g} times the speed"
         ]
+
+    @property
+    def own_parameters(self) -> dict[str, float]:
+        """Values of the law's own keys."""
+        return {name: getattr(self, name) for name in LAWS[self.law].parameters}
+
+    def speed(self, kappa: float, temperature: float) -> float:
+        """The kappa that acts, of one of a region and its temperature.
+
+        Parameters
+        ----------
+        kappa, temperature
+            Of the region, in 1/time and K.
+        """
+        speed = LAWS[self.law].speed
+        return kappa if speed is None else float(speed(kappa, temperature, **self.own_parameters))
 
     @property
     def has_set_point(self) -> bool:

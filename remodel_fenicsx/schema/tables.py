@@ -18,7 +18,15 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args, get_origin
 
-from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationError
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    GetCoreSchemaHandler,
+    GetJsonSchemaHandler,
+    ValidationError,
+    create_model,
+)
 from pydantic.fields import FieldInfo
 from pydantic_core import CoreSchema, ErrorDetails, PydanticCustomError, PydanticUndefined, core_schema
 
@@ -164,6 +172,40 @@ class VariantOf:
             raise PydanticCustomError("inner", "faults in {name}", {"name": name, "error": error}) from None
 
 
+@dataclass(frozen=True)
+class KeysOfParts:
+    """Annotation of a field that is a table: with the keys too that the parts chosen in it bring (`parameters`)."""
+
+    registries: Mapping[str, Mapping[str, Any]]  # by the key that names the part
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return core_schema.no_info_before_validator_function(functools.partial(self._table, source), handler(source))
+
+    def _table(self, table: type[Table], value: Any) -> Any:
+        if not isinstance(value, Mapping):
+            return value
+        chosen = {key: value.get(key, table.model_fields[key].default) for key in self.registries}
+        parts = [self.registries[key].get(name) for key, name in chosen.items() if isinstance(name, str)]
+        own = {name: number for part in parts for name, number in getattr(part, "parameters", {}).items()}
+        if not own:
+            return value
+        wide = _widened(table, tuple(own.items()))
+        try:
+            return wide.model_validate(dict(value))
+        except ValidationError as error:
+            raise PydanticCustomError("worded", "{text}", {"text": one_line(error, wide)}) from None
+
+
+@functools.cache
+def _widened(table: type[Table], own: tuple[tuple[str, Any], ...]) -> type[Table]:
+    """A table with further numbers: one class, so that scenes with them can be equal."""
+    fields: dict[str, Any] = {
+        name: (float, Field(default=number.default, gt=number.above, description=number.meaning))
+        for name, number in own
+    }
+    return create_model(table.__name__, __base__=table, __doc__=table.__doc__, **fields)
+
+
 def fault(rule: str, key: str = "", value: Any = _MISSING) -> PydanticCustomError:
     """Error to raise in a validator."""
     context = {"rule": rule, "key": key} | ({} if value is _MISSING else {"value": value})
@@ -232,6 +274,8 @@ def _describe(detail: ErrorDetails, table: type[BaseModel]) -> str:
         key, rule = _joined(key, context["key"]), context["rule"]
         value = context.get("value", value)
         return f"{key}: {rule}" if value is None else f"{key} = {shown(value)}: {rule}"
+    if kind == "worded":
+        return _joined(key, context["text"])
     if kind == "extra_forbidden":
         renamed: Mapping[str, str] = getattr(table, "renamed", {})
         rule = f"is now {renamed[key]}" if key in renamed else f"unknown key; {_suggestion(key, owner, table)}"

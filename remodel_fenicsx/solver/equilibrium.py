@@ -23,7 +23,7 @@ from remodel_fenicsx.fem.assembly import (
     over_ranks,
     second_derivative,
 )
-from remodel_fenicsx.kernels.library import with_kernels
+from remodel_fenicsx.kernels import with_kernels
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.energy import Stresses, Tissue, squared_end_to_end_length, whole_structure_tensor
 from remodel_fenicsx.model.tensors import MANDEL, passes_through_zero

@@ -12,9 +12,8 @@ from typing import Any
 import numpy as np
 from petsc4py import PETSc
 
-from remodel_fenicsx.fem.petsc_options import ProblemOptions
-from remodel_fenicsx.fem.solver_methods import DEFINITE, GENERAL, SINGLE, SYMMETRIC, factor_options
-from remodel_fenicsx.kernels import factor
+from remodel_fenicsx import kernels
+from remodel_fenicsx.fem.solver_methods import DEFINITE, GENERAL, ProblemOptions, SINGLE, SYMMETRIC, factor_options
 from remodel_fenicsx.solver.equilibrium import Equilibrium
 
 
@@ -121,8 +120,8 @@ class KeptFactor:
         self.preconditioner: Any = None
         self._options: ProblemOptions | None = None
         self._kind = ""
-        self._takes_single = factor.is_available()
-        self._single: factor.SingleFactor | None = None
+        self._takes_single = kernels.is_available()
+        self._single: kernels.SingleFactor | None = None
         self._soft: Any = None  # the softest motion that is known: a vector of length one
 
     def apply(self, _: Any, x: Any, y: Any) -> None:
@@ -187,7 +186,7 @@ class KeptFactor:
         starts, columns, values = matrix.getValuesCSR()
         looks = 1
         if self._single is None:
-            self._single, self._soft = factor.SingleFactor(starts, columns), uneven(matrix.createVecRight())
+            self._single, self._soft = kernels.SingleFactor(starts, columns), uneven(matrix.createVecRight())
             looks = 2
         if not self._single.renew(values):
             log.info("the tangent cannot be factorised as %s", SINGLE)

@@ -14,8 +14,15 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from remodel_fenicsx.fem.assembly import over_ranks
-from remodel_fenicsx.fem.petsc_options import ProblemOptions
-from remodel_fenicsx.fem.solver_methods import AUTO, LAGGED, SOLVER_METHODS, chosen, is_small, method_options
+from remodel_fenicsx.fem.solver_methods import (
+    AUTO,
+    LAGGED,
+    ProblemOptions,
+    SOLVER_METHODS,
+    chosen,
+    is_small,
+    method_options,
+)
 from remodel_fenicsx.schema.settings import Solver
 from remodel_fenicsx.solver.equilibrium import Equilibrium, Extension, Look
 from remodel_fenicsx.solver.linear import EveryTangent

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property
+from types import MappingProxyType
 from typing import Any
 
 import dolfinx.fem
@@ -18,8 +20,141 @@ from remodel_fenicsx.fem.assembly import Remembered
 from remodel_fenicsx.fem.formulations import FORMULATIONS, Formulation
 from remodel_fenicsx.fem.kinematics import Kinematics
 from remodel_fenicsx.fem.quadrature import Quadrature
+from remodel_fenicsx.kernels import PointKernels, point_kernels
+from remodel_fenicsx.model.axes import AXES, LocalAxes, cells_of, structure_tensors
+from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.energy import TURNED_OVER, Tissue
-from remodel_fenicsx.state.unit_cells import CellField, UnitCells
+from remodel_fenicsx.schema.settings import Cells, MEASURED_CELLS
+
+
+Array = NDArray[np.float64]
+
+
+# ---------------------------------------------------------------- the unit cells at the quadrature points
+
+
+class CellField:
+    """Cell dimensions and axes as quadrature functions.
+
+    Attributes
+    ----------
+    dimensions, axes
+        dolfinx quadrature functions of shape (3,) and (3, 3); row I of `axes` is n_I.
+    dimension_values, axis_values
+        l_I (cells, points, 3), and n_I as rows (cells, points, 3, 3): the functions' own memory.
+    point_cells
+        The cells of all points in one row, (cells * points, ...): the functions' own memory.
+    """
+
+    def __init__(self, quadrature: Quadrature, name: str):
+        self.quadrature = quadrature
+        self.dimensions = quadrature.function(f"{name}_dimensions", (3,))
+        self.axes = quadrature.function(f"{name}_axes", (3, 3))
+        self.dimension_values: Array = quadrature.values(self.dimensions, (3,))
+        self.axis_values: Array = quadrature.values(self.axes, (3, 3))
+        self.point_cells = UnitCell(self.dimension_values.reshape(-1, 3), self.axis_values.reshape(-1, 3, 3))
+
+    @property
+    def ufl_cell(self) -> UnitCell:
+        """The cell as the energy takes it."""
+        return UnitCell(self.dimensions, self.axes)
+
+    def set(self, dimensions: Array, axes: Array) -> None:
+        """Replace all dimensions (cells, points, 3) and axes (cells, points, 3, 3)."""
+        self.dimension_values[:] = dimensions
+        self.axis_values[:] = axes
+
+    def equals(self, other: CellField) -> bool:
+        """Whether all values of this rank are the same numbers."""
+        mine, others = (self.dimensions, self.axes), (other.dimensions, other.axes)
+        return all(np.array_equal(a.x.array, b.x.array) for a, b in zip(mine, others, strict=True))
+
+    @cached_property
+    def kernels(self) -> PointKernels:
+        """What a pass computes at points. Collective, the first time."""
+        return point_kernels(self.quadrature.mesh.comm)
+
+    def structure_tensor(self) -> Array:
+        """A = sum_I l_I^2 n_I (x) n_I, shape (cells, points, 3, 3), in squared link lengths. Collective at first."""
+        return self.kernels.structure_tensor(self.dimension_values, self.axis_values)
+
+
+class UnitCells(CellField):
+    """Orthotropic unit cells at the quadrature points (paper, Fig. 2).
+
+    Parameters
+    ----------
+    quadrature
+        The points.
+    domain
+        With the numbers of its elements in the mesh file's order, which are the seed's index: random cells do not
+        depend on the number of ranks.
+    settings
+        Initial dimensions, axes, seed, r0.
+    local_axes
+        Of the body at the points (`Shape.local_axes`).
+    regions
+        Initial dimensions and r0 of regions where they are others, by name.
+    fibres
+        Measured fibres of all elements, (number_of_elements, columns) by name of `model.fibres.MEASURED`, by region;
+        "" is the whole body.
+
+    Attributes
+    ----------
+    local_axes
+        As given.
+    initial_dimensions
+        l0_I by rank (not by direction), shape (cells, points, 3), in link lengths.
+
+    Examples
+    --------
+    >>> from remodel_fenicsx import Simulation, preset_scene
+    >>> simulation = Simulation(preset_scene("kuhl-holzapfel-2007", "cube"))
+    >>> cells = simulation.cells
+    >>> cells.dimension_values.shape, cells.axis_values.shape  # (elements, points, 3) and (elements, points, 3, 3)
+    ((1, 8, 3), (1, 8, 3, 3))
+    >>> cells.structure_tensor()[0, 0].round(4)
+    array([[0.3333, 0.    , 0.    ],
+           [0.    , 0.3333, 0.    ],
+           [0.    , 0.    , 0.3333]])
+    """
+
+    def __init__(
+        self,
+        quadrature: Quadrature,
+        domain: Domain,
+        settings: Cells,
+        local_axes: LocalAxes,
+        regions: Mapping[str, Cells] = MappingProxyType({}),
+        fibres: Mapping[str, Mapping[str, Array]] = MappingProxyType({}),
+    ):
+        super().__init__(quadrature, "cell")
+        self.settings, self.local_axes = settings, local_axes
+        self.axis_values[:] = axes = self.initial_axes()
+        everywhere = np.ones(len(domain.element_number), dtype=np.bool_)
+        for name, cells in {"": settings, **regions}.items():
+            chosen = domain.element_region == domain.regions[name] if name else everywhere
+            if name in fibres:
+                measured = {key: values[domain.element_number[chosen]] for key, values in fibres[name].items()}
+                self._take(measured, chosen, axes[chosen], cells.end_to_end_length)
+            elif cells.initial != MEASURED_CELLS:
+                drawn = cells.dimensions(domain.number_of_elements)
+                self.dimension_values[chosen] = drawn[domain.element_number[chosen]][:, None, :]
+                self.axis_values[chosen] = axes[chosen]
+        self.initial_dimensions: Array = self.dimension_values.copy()
+
+    def _take(self, measured: Mapping[str, Array], chosen: NDArray[np.bool_], axes: Array, length: float) -> None:
+        """Cells of measured fibres in the chosen elements; `axes` where these leave some open."""
+        at_points = {name: values[:, None, :] for name, values in measured.items()}
+        tensors = np.broadcast_to(structure_tensors(at_points, self.local_axes.axes[chosen]), axes.shape)
+        self.dimension_values[chosen], self.axis_values[chosen] = cells_of(tensors, length, axes)
+
+    def initial_axes(self) -> Array:
+        """n_I before the first pass, rows, (cells, points, 3, 3)."""
+        return AXES[self.settings.axes](self.local_axes)
+
+
+# ---------------------------------------------------------------- the state
 
 
 @dataclass(frozen=True)
@@ -127,8 +262,7 @@ class State:
         """F_e of F at all points, (elements, points, 3, 3): F itself where the mesh is free of stress."""
         if self._natural is None:
             return deformation_gradient
-        found: NDArray[np.float64] = deformation_gradient @ self.cells.quadrature.values(self._natural, (3, 3))
-        return found
+        return deformation_gradient @ self.cells.quadrature.values(self._natural, (3, 3))
 
     def elastic_axes(
         self, axes: NDArray[np.float64], deformation_gradient: NDArray[np.float64] | None = None
@@ -140,8 +274,7 @@ class State:
             gradient = self.cells.quadrature.values(self._natural, (3, 3))
         else:
             gradient = self.elastic(deformation_gradient)
-        found: NDArray[np.float64] = axes @ np.swapaxes(gradient, -1, -2)
-        return found
+        return axes @ np.swapaxes(gradient, -1, -2)
 
     def elastic_gradient(self) -> NDArray[np.float64]:
         """F_e of the present unknowns at all points in one row, (elements * points, 3, 3)."""
@@ -154,8 +287,7 @@ class State:
         values = values.reshape(quadrature.shape)
         if self._natural is None:
             return values
-        shares: NDArray[np.float64] = values / np.linalg.det(quadrature.values(self._natural, (3, 3)))
-        return shares
+        return values / np.linalg.det(quadrature.values(self._natural, (3, 3)))
 
     def functions(self) -> dict[str, Any]:
         """Every dolfinx function of the state by its name, those of further load cases with their mark ("@2")."""
@@ -249,9 +381,7 @@ class State:
 
 
 # ---------------------------------------------------------------- what somebody remembers of earlier steps
-# What somebody remembers of earlier steps: functions and numbers of the state, so that resumed runs have them too.
-
-Array = NDArray[np.float64]
+# Functions and numbers of the state, so that resumed runs have them too.
 
 
 class Numbers:
@@ -398,5 +528,4 @@ class Parameters:
         length = self.at_points().locking_length
         if length is None:
             return np.full(self.quadrature.shape, np.inf)
-        at_all: Array = length.reshape(self.quadrature.shape)
-        return at_all
+        return length.reshape(self.quadrature.shape)

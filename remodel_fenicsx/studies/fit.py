@@ -103,7 +103,7 @@ def slopes(at: Callable[[Array], Scene], logarithms: Array, scales: Mapping[str,
             ways[k] = _slope([getattr(one.properties()[""].tissue, name) for one in around])
         for name, ways in loads.items():
             ways[k] = _slope([one.loads[name].value for one in around])
-        kappa[k] = _slope([one.remodeling.kappa for one in around])
+        kappa[k] = _slope([one.properties()[""].kappa for one in around])
         exact[k] = _apart_from_numbers(around[-1]) == _apart_from_numbers(base)
     of_scales = {name: value * np.eye(count)[number] for name, (number, value) in scales.items()}
     return Slopes(tissue, loads, of_scales, kappa, exact)

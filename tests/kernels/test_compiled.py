@@ -7,7 +7,7 @@ import pytest
 from mpi4py import MPI
 
 from remodel_fenicsx.evolution.stepper import Step, Watcher
-from remodel_fenicsx.kernels.points import CompiledPointKernels, PointKernels
+from remodel_fenicsx.kernels import CompiledPointKernels, PointKernels
 from remodel_fenicsx.model import energy, spectral
 from remodel_fenicsx.model.cells import UnitCell, structure_tensor
 from remodel_fenicsx.model.tensors import passes_through_zero

@@ -12,13 +12,13 @@ from mpi4py import MPI
 from scipy.spatial.transform import Rotation
 
 from remodel_fenicsx import SceneError, preset_scene
-from remodel_fenicsx.kernels.library import with_kernels
+from remodel_fenicsx.kernels import with_kernels
 from remodel_fenicsx.kernels.tensor import CompiledPoints, TensorKernels, condensed_points
 from remodel_fenicsx.model import energy, implicit as condensed
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.chains import CHAINS, Chain
-from remodel_fenicsx.model.drivers import DRIVERS, FRAMES, Driver
-from remodel_fenicsx.model.implicit import CondensedPoints, Driving
+from remodel_fenicsx.model.drivers import DRIVERS, FRAMES, Driver, Frame, cauchy_derivatives
+from remodel_fenicsx.model.implicit import CondensedPoints
 from remodel_fenicsx.model.laws import LAWS, Drive, Law, follow_tensor, tensor_target
 from tests.model.test_condensed import deformations, points
 from tests.model.test_tensor_law import cells_of, right_cauchy_green, structures
@@ -139,11 +139,10 @@ def test_held_points_have_the_tangent_of_their_cells(kernels: TensorKernels, sha
 def test_parts_that_the_kernel_does_not_know_are_numpys(kernels: TensorKernels) -> None:
     """Another law, frame or chain: no silent stand-in."""
     some = points("tensor", "log", "cauchy", "material", 2)
-    chain = replace(CHAINS["wormlike"], locks=False)
     for tissue, step in (
         (some.tissue, points("explicit", "log", "cauchy", "material", 2).step),
         (some.tissue, points("tensor", "log", "cauchy", "spatial", 2).step),
-        (replace(some.tissue, chain=chain), some.step),
+        (replace(some.tissue, chain=SPRING), some.step),
     ):
         assert type(condensed_points(kernels, tissue, step)) is CondensedPoints
     assert type(condensed_points(None, some.tissue, some.step)) is CondensedPoints
@@ -159,11 +158,10 @@ SOFTER = energy.Matrix(
 )
 
 
-def kirchhoff(strain: Any, stress: np.ndarray, derivatives: bool) -> Driving:
+def kirchhoff(squared: np.ndarray, stress: np.ndarray, second: bool) -> Any:
     """J times Cauchy's stress; Newton's method needs no better slope."""
-    cauchy = condensed.DRIVING_TENSORS[DRIVERS["cauchy"]](strain, stress, derivatives)
-    J = strain.stretches.prod(axis=1)[:, None, None]
-    return Driving(J * cauchy.tensor, *(None if part is None else J * part for part in cauchy[1:]))
+    J = np.sqrt(squared.prod(axis=1))[:, None, None]
+    return [None if part is None else J * part for part in cauchy_derivatives(squared, stress, second)]
 
 
 @pytest.mark.parametrize(
@@ -186,13 +184,14 @@ def test_a_part_under_a_name_that_c_knows_is_numpys(
     assert np.abs(of_c.structure - expected.structure).max() > 1e-3
 
 
+@pytest.mark.parametrize("compiled", ["", "KIRCHHOFF", "solve", "WORMLIKE"])
 def test_a_driver_with_derivatives_that_c_does_not_know_is_numpys(
-    kernels: TensorKernels, monkeypatch: pytest.MonkeyPatch
+    kernels: TensorKernels, monkeypatch: pytest.MonkeyPatch, compiled: str
 ) -> None:
-    """J times Cauchy's stress has the same target: the same cells."""
-    mine = Driver(lambda F, s: ufl.det(F) * s.cauchy, material=False)
+    """J times Cauchy's stress has the same target: the same cells, whatever it says that it is called in C."""
+    tensor = lambda F, s: ufl.det(F) * s.cauchy  # noqa: E731
+    mine = Driver(tensor, material=False, derivatives=kirchhoff, compiled=compiled)
     monkeypatch.setitem(DRIVERS, "kirchhoff", mine)
-    monkeypatch.setitem(condensed.DRIVING_TENSORS, mine, kirchhoff)
     F = deformations(COUNT, np.random.default_rng(3))
     found = {}
     for name in ("cauchy", "kirchhoff"):
@@ -205,7 +204,7 @@ def test_a_driver_with_derivatives_that_c_does_not_know_is_numpys(
 
 @pytest.mark.parametrize("registry, name, part", [
     (DRIVERS, "cauchy", Driver(lambda F, s: -s.cauchy, material=False)),
-    (FRAMES, "material", replace(FRAMES["material"], axes=lambda F, axes: axes)),
+    (FRAMES, "material", Frame(lambda F, axes: axes, carries_axes=True)),
     (energy.REPULSIONS, "log", energy.Repulsion(energy.length_sum, energy.log_derivatives)),
     (LAWS, "tensor", Law(LAWS["tensor"].update, target=lambda drive: tensor_target(drive), follow=follow_tensor)),
 ])  # fmt: skip
@@ -225,3 +224,17 @@ def test_another_repulsion_under_a_known_name_is_not_replaced_by_c(monkeypatch: 
     monkeypatch.setitem(energy.REPULSIONS, "log", part)
     tissue = replace(points("tensor", "length", "cauchy", "material", 2).tissue, repulsion=part)
     assert with_kernels(tissue, MPI.COMM_SELF).repulsion is part
+
+
+def test_c_solves_no_point_with_a_part_that_it_does_not_know(kernels: TensorKernels) -> None:
+    """Should a number that it does not know come to it all the same, no cell and no tangent are zero for it."""
+    some, F = points("tensor", "log", "cauchy", "material", 2), deformations(2, np.random.default_rng(3))
+    for unknown in ({"driver": replace(DRIVERS["cauchy"], compiled="LOG")}, {}):
+        step = some.step._replace(drive=some.step.drive._replace(**unknown))
+        tissue = some.tissue if unknown else replace(some.tissue, repulsion=replace(LOG, compiled="CAUCHY"))
+        empty, converged = [np.empty((2, 3, 3)) for _ in range(3)], np.empty(2, np.bool_)
+        CompiledPoints(tissue, step, kernels)._call("solve", F, np.ones((2, 3, 3)), *empty, np.empty(2), converged)
+        assert not converged.any()
+
+
+LOG = energy.REPULSIONS["log"]

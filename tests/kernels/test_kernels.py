@@ -20,23 +20,25 @@ from setuptools import Distribution
 
 import remodel_fenicsx.kernels
 from remodel_fenicsx import cli
+from remodel_fenicsx.errors import RemodelError
 from remodel_fenicsx.fem import jit
-from remodel_fenicsx.kernels import factor, library, points, tensor
+from remodel_fenicsx import kernels
+from remodel_fenicsx.kernels import tensor
 from remodel_fenicsx.model.cells import structure_tensor
 from remodel_fenicsx.scene import preset_scene
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.system.environment import KERNELS, versions
 
 ROOT = Path(__file__).parents[2]
-NUMBERS = {"factor.c": library.NO_NUMBERS, "spectral.c": library.NO_NUMBERS, "tensor.c": tensor.NUMBERS}
+NUMBERS = {"factor.c": kernels.NO_NUMBERS, "spectral.c": kernels.NO_NUMBERS, "tensor.c": tensor.NUMBERS}
 CC = shlex.split(os.environ.get("CC", "cc"))
 
 
 def test_the_table_has_all_functions_and_names_what_is_there() -> None:
-    assert sorted(NUMBERS) == sorted(path.name for path in library.FOLDER.glob("*.c"))
+    assert sorted(NUMBERS) == sorted(path.name for path in kernels.FOLDER.glob("*.c"))
     text = str(remodel_fenicsx.kernels.__doc__)
     rows = [line.split(None, 1) for line in text.split("\n=")[2].splitlines()[1:]]
-    declared = [line for name in NUMBERS for line in library.declarations(library.source(name, NUMBERS[name]))]
+    declared = [line for name in NUMBERS for line in kernels.declarations(kernels.source(name, NUMBERS[name]))]
     assert sorted(name for name, _ in rows) == sorted(re.findall(r" (\w+)\(", " ".join(declared)))
     for name in (name for _, names in rows for name in names.split(", ")):
         assert callable(pkgutil.resolve_name(f"remodel_fenicsx.{name}"))
@@ -45,9 +47,9 @@ def test_the_table_has_all_functions_and_names_what_is_there() -> None:
 @pytest.mark.parametrize("name", NUMBERS)
 def test_there_is_no_warning(name: str, tmp_path: Path) -> None:
     """All that the compiler sees when it optimises."""
-    if name == "factor.c" and not factor.is_available():
+    if name == "factor.c" and not kernels.is_available():
         pytest.skip("no header of CHOLMOD 5 (SuiteSparse 7) is here")
-    folder = f"-I{factor.include_folder() or ROOT}"
+    folder = f"-I{kernels.include_folder() or ROOT}"
     command = [
         *CC,
         *jit.LIBRARY_FLAGS,
@@ -62,7 +64,7 @@ def test_there_is_no_warning(name: str, tmp_path: Path) -> None:
         "-o",
         tmp_path / "object",
     ]
-    text = library.source(name, NUMBERS[name])
+    text = kernels.source(name, NUMBERS[name])
     done = subprocess.run(command, input=text, capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
     assert not {"-w", "-Wno-all"} & set(jit.LIBRARY_FLAGS)
@@ -71,6 +73,7 @@ def test_there_is_no_warning(name: str, tmp_path: Path) -> None:
 SANITIZED = """
 import sys
 import pytest
+from remodel_fenicsx.errors import RemodelError
 from remodel_fenicsx.fem import jit
 jit.LIBRARY_FLAGS += ["-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
 files = ["tests/kernels/test_compiled.py", "tests/kernels/test_compiled_tensor.py"]
@@ -94,25 +97,25 @@ def test_memory_and_arithmetic_under_the_sanitizers() -> None:
 
 def test_a_change_of_any_file_or_number_is_another_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """By its text it is found in the cache."""
-    before = library.source("tensor.c", tensor.NUMBERS)
-    assert library.source("tensor.c", tensor.NUMBERS) == before
-    assert library.source("tensor.c", {**tensor.NUMBERS, "TOLERANCE": 1e-11}) != before
+    before = kernels.source("tensor.c", tensor.NUMBERS)
+    assert kernels.source("tensor.c", tensor.NUMBERS) == before
+    assert kernels.source("tensor.c", {**tensor.NUMBERS, "TOLERANCE": 1e-11}) != before
     copy = tmp_path / "kernels"
-    shutil.copytree(library.FOLDER, copy)
-    monkeypatch.setattr(library, "FOLDER", copy)
-    assert library.source("tensor.c", tensor.NUMBERS) == before
+    shutil.copytree(kernels.FOLDER, copy)
+    monkeypatch.setattr(kernels, "FOLDER", copy)
+    assert kernels.source("tensor.c", tensor.NUMBERS) == before
     for name in ("tensor.c", "algebra.h"):
         text = (copy / name).read_text()
         (copy / name).write_text(text + "/* more */\n")
-        assert library.source("tensor.c", tensor.NUMBERS) != before
+        assert kernels.source("tensor.c", tensor.NUMBERS) != before
         (copy / name).write_text(text)
 
 
 def test_the_compiler_names_file_and_line(tmp_path: Path) -> None:
     """After an included file too."""
-    text = library.source("tensor.c", tensor.NUMBERS).replace("static inline double stiffness(", "nonsense stiffness(")
+    text = kernels.source("tensor.c", tensor.NUMBERS).replace("static inline double stiffness(", "nonsense stiffness(")
     done = subprocess.run([*CC, "-fsyntax-only", "-x", "c", "-"], input=text, capture_output=True, text=True)
-    lines = (library.FOLDER / "tensor.c").read_text().splitlines()
+    lines = (kernels.FOLDER / "tensor.c").read_text().splitlines()
     number = next(i for i, line in enumerate(lines, start=1) if "double stiffness(" in line)
     assert f"tensor.c:{number}:" in done.stderr
 
@@ -129,7 +132,7 @@ def test_a_wheel_has_the_files(monkeypatch: pytest.MonkeyPatch) -> None:
     command: Any = distribution.get_command_obj("build_py")
     command.ensure_finalized()
     listed = {Path(package.replace(".", "/"), name) for package, _, _, names in command.data_files for name in names}
-    assert {path.relative_to(ROOT) for path in library.FOLDER.glob("*.[ch]")} <= listed
+    assert {path.relative_to(ROOT) for path in kernels.FOLDER.glob("*.[ch]")} <= listed
 
 
 # ---------------------------------------------------------------- numpy in their place
@@ -143,17 +146,17 @@ def test_numpy_does_the_same_and_no_c_runs(
     """A radial artery, which says what computes."""
     values = {"model.kinematics": "radial", "cells.initial": "isotropic", "time.end": 2.0} | changes
     scene, found = preset_scene("kuhl-holzapfel-2007", "tube").with_values(values), []
-    for kernels in ("C", "numpy"):
-        monkeypatch.setenv(KERNELS, kernels)
-        assert versions()["kernels"] == kernels
-        if kernels == "numpy":
-            library._say_so.cache_clear()
+    for where in ("C", "numpy"):
+        monkeypatch.setenv(KERNELS, where)
+        assert versions()["kernels"] == where
+        if where == "numpy":
+            kernels._say_so.cache_clear()
             monkeypatch.setattr(jit, "library", None)
         with caplog.at_level(logging.INFO):
             simulation = Simulation(scene, MPI.COMM_SELF)
             for _ in simulation.steps():
                 pass
-        wanted = points.CompiledPointKernels if kernels == "C" else points.PointKernels
+        wanted = kernels.CompiledPointKernels if where == "C" else kernels.PointKernels
         assert type(simulation.cells.kernels) is wanted
         found.append(structure_tensor(*simulation.cells.point_cells[:2]))
         simulation.close()
@@ -164,10 +167,10 @@ def test_numpy_does_the_same_and_no_c_runs(
 def test_what_the_setting_allows(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """One line, before anything is read."""
     monkeypatch.setenv(KERNELS, "numpy")
-    assert type(points.point_kernels(MPI.COMM_SELF)) is points.PointKernels
+    assert type(kernels.point_kernels(MPI.COMM_SELF)) is kernels.PointKernels
     assert tensor.tensor_kernels(MPI.COMM_SELF) is None
     monkeypatch.setenv(KERNELS, "c")
     assert cli.main(["run", "no-such-scene.toml"]) == 2
     assert capsys.readouterr().err == f"remodel-fenicsx: {KERNELS} = 'c': allowed are 'C' and 'numpy'\n"
-    with pytest.raises(ValueError, match=KERNELS):
-        points.point_kernels(MPI.COMM_SELF)
+    with pytest.raises(RemodelError, match=KERNELS):
+        kernels.point_kernels(MPI.COMM_SELF)

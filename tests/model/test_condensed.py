@@ -22,7 +22,7 @@ from remodel_fenicsx.model.implicit import (
     StepOfCells,
     Strain,
     jumps_by_rank,
-    response,
+    ranked_response,
 )
 from remodel_fenicsx.model.laws import LAWS, Drive
 from remodel_fenicsx.model.turnover import TurnoverRule, at_the_end, rates
@@ -116,7 +116,7 @@ def test_points_without_tension_answer_nothing() -> None:
     some = replace(some, step=some.step._replace(cells=cells))
     strain = Strain.of(np.diag([1.2, 1.1, 1.0])[None])
     with np.errstate(all="raise"):
-        found = response(some.step, strain, strain.inside(np.diag([-3.0, -2.0, -1.0])[None]), derivatives=True)
+        found = ranked_response(some.step, strain, strain.inside(np.diag([-3.0, -2.0, -1.0])[None]), derivatives=True)
     assert not np.any(found.by_tensor) and not np.any(found.by_stretch)
 
 
@@ -146,7 +146,7 @@ def test_cells_by_rank_answer_to_the_driving_tensor_and_to_the_stretch(frame: st
     X = np.swapaxes(R, 1, 2) @ ((rng.uniform(0.8, 1.2, (30, 3)) * [6.0, 3.0, 1.0])[:, :, None] * R)
     U, changes = np.tile(np.diag([0.8, 1.1, 1.3]), (30, 1, 1)), rng.standard_normal((30, 3, 3))
     H, strain = changes + np.swapaxes(changes, 1, 2), Strain.of(U)
-    found = response(step, strain, strain.inside(X), derivatives=True)
+    found = ranked_response(step, strain, strain.inside(X), derivatives=True)
     assert found.by_tensor is not None and (found.by_stretch is not None) == (frame == "material")
     for derivative, by_stretch in ((found.by_tensor, False), (found.by_stretch, True)):
         if derivative is None:
@@ -160,7 +160,7 @@ def test_cells_by_rank_answer_to_the_driving_tensor_and_to_the_stretch(frame: st
 def outside(step: StepOfCells, U: Array, X: Array) -> UnitCell:
     """The cells that X makes at U, in the global basis."""
     strain = Strain.of(U)
-    cells = response(step, strain, strain.inside(X), derivatives=False).cells
+    cells = ranked_response(step, strain, strain.inside(X), derivatives=False).cells
     assert isinstance(cells, OrthotropicCells)
     return UnitCell(cells.cell.dimensions, cells.cell.axes @ np.swapaxes(strain.basis, 1, 2))
 
@@ -263,7 +263,7 @@ def test_where_a_law_by_rank_jumps(law: str) -> None:
         some = points(law, "axes", "finger", "material", 6, initial)
         strain = Strain.of(np.tile(np.eye(3), (6, 1, 1)))
         sides = [np.tile(np.diag([2.0, 2.0 + h, 1.5]), (6, 1, 1)) for h in (1e-6, -1e-6)]
-        A = [response(some.step, strain, X, derivatives=False).cells.structure for X in sides]
+        A = [ranked_response(some.step, strain, X, derivatives=False).cells.structure for X in sides]
         apart = np.abs(A[0] - A[1]).max(axis=(1, 2)) > 1e-4
         assert np.all(apart == (initial == "random")) and np.all(jumps_by_rank(some.step) == apart)
     assert not jumps_by_rank(points("tensor", "log", "cauchy", "material", 6, "random").step).any()

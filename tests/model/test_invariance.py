@@ -27,7 +27,7 @@ from remodel_fenicsx.model.cells import angle_to_axis, structure_tensor
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES, material_frame, spatial_frame
 from remodel_fenicsx.schema.settings import Cells, Remodeling
 from remodel_fenicsx.state.state import State
-from remodel_fenicsx.state.unit_cells import UnitCells
+from remodel_fenicsx.state.state import UnitCells
 from tests import parts
 from tests.parts import cube
 

@@ -19,7 +19,7 @@ from remodel_fenicsx.fem.solver_methods import (
     SOLVER_METHODS,
     chosen,
 )
-from remodel_fenicsx.kernels import factor as single
+from remodel_fenicsx import kernels as single
 from remodel_fenicsx.scene import SceneError, preset_scene
 from remodel_fenicsx.solver import linear, newton
 from remodel_fenicsx.solver.newton import Limits, LoadPhase

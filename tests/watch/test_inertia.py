@@ -13,7 +13,7 @@ from petsc4py import PETSc
 
 from remodel_fenicsx import Scene, Simulation, read_scene
 from remodel_fenicsx.evolution.stepper import Step
-from remodel_fenicsx.fem.petsc_options import ProblemOptions
+from remodel_fenicsx.fem.solver_methods import ProblemOptions
 from remodel_fenicsx.fem.solver_methods import SYMMETRIC, factor_options, method_options
 from remodel_fenicsx.results.history import History
 from remodel_fenicsx.results.recording import read_history

@@ -1,0 +1,135 @@
+"""The parts in demos/extensions: closed forms, derivatives, and keys of their own in a scene."""
+
+from __future__ import annotations
+
+import runpy
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from remodel_fenicsx import Scene, SceneError, Simulation, preset_scene, read_scene
+from remodel_fenicsx.extend import CHAINS, DRIVERS, LAWS
+from remodel_fenicsx.model.implicit import CondensedPoints
+from tests.model.test_condensed import deformations, difference_quotient, points, solved
+
+FOLDER = Path(__file__).parents[2] / "demos" / "extensions"
+
+
+@pytest.fixture(autouse=True)
+def parts() -> Iterator[None]:
+    """Those of the files, as the command line loads them."""
+    before = [(registry, dict(registry)) for registry in (CHAINS, DRIVERS, LAWS)]
+    for name in ("freely_jointed_chain", "mandel_driver", "kappa_by_temperature"):
+        assert len((FOLDER / f"{name}.py").read_text().splitlines()) < 60
+        runpy.run_path(str(FOLDER / f"{name}.py"))
+    yield
+    for registry, parts in before:
+        registry.clear()
+        registry.update(parts)
+
+
+def scene(preset: str = "kuhl-holzapfel-2007", **changes: Any) -> Scene:
+    values = {"time.end": 3.0, **{key.replace("__", "."): value for key, value in changes.items()}}
+    return preset_scene(preset, "cube").with_values(values)
+
+
+def rows(scene: Scene, name: str = "mean_fibre_angle") -> list[float]:
+    return [step.row[name] for step in Simulation(scene).steps()]
+
+
+FREELY_JOINTED = {"material__chain": "freely-jointed", "material__links_per_persistence_length": 0.6}
+
+
+def test_the_force_is_the_slope_of_the_energy() -> None:
+    """Of a freely jointed chain: beta = x (3 - x^2)/(1 - x^2)."""
+    chain, r = CHAINS["freely-jointed"].of({"links_per_persistence_length": 0.6}), np.linspace(0.05, 1.5, 9)
+    slope = (chain.energy(r + 1e-6, 1.6) - chain.energy(r - 1e-6, 1.6)) / 2e-6
+    x = r / 1.6
+    np.testing.assert_allclose(slope, chain.force(r, 1.6, 1.0), rtol=1e-8)
+    np.testing.assert_allclose(slope, 0.6 * x * (3 - x**2) / (1 - x**2), rtol=1e-8)
+
+
+def test_a_key_of_a_chain_is_one_of_the_scene(tmp_path: Path) -> None:
+    """It is written, read again, counts in the solution, and has its default."""
+    found = scene(**FREELY_JOINTED)
+    (tmp_path / "scene.toml").write_text(found.to_toml())
+    assert read_scene(tmp_path / "scene.toml") == found
+    stretch = rows(found, "mean_stretch")[-1]
+    other = rows(scene(material__chain="freely-jointed"), "mean_stretch")[-1]
+    assert abs(other / stretch - 1) > 1e-4
+    assert scene(material__chain="freely-jointed").material.links_per_persistence_length == 0.5  # type: ignore
+
+
+@pytest.mark.parametrize(("changes", "line"), [
+    ({**FREELY_JOINTED, "material__links_per_persistence_length": -1.0},
+     "material.links_per_persistence_length = -1.0: must be a finite number greater than 0"),
+    ({"material__links_per_persistence_length": 0.6}, "material.links_per_persistence_length = 0.6: unknown key; "),
+    ({**FREELY_JOINTED, "material__lame_mu": -1.0}, "material.lame_mu = -1.0: must be a finite number greater than 0"),
+    ({"remodeling__activation_energy": 1.0}, "remodeling.activation_energy = 1.0: unknown key; "),
+])  # fmt: skip
+def test_what_is_refused(changes: dict[str, Any], line: str) -> None:
+    with pytest.raises(SceneError) as refused:
+        scene(**changes)
+    assert str(refused.value).startswith(line)
+
+
+def test_a_stiffness_of_an_experiment_is_that_of_the_chain() -> None:
+    """A chain with twice the links has twice the stiffness: half of the density has the measured slope."""
+    densities = []
+    for links in (0.5, 1.0):
+        material = {"chain": "freely-jointed", "links_per_persistence_length": links, "initial_stiffness": 2.0}
+        found = Scene(geometry={"shape": "cube"}, material=material, time={"end": 1.0})
+        densities.append(found.material.chain_density)
+    assert densities[0] == pytest.approx(2 * densities[1])
+
+
+@pytest.mark.parametrize("repulsion, law", [("log", "tensor"), ("axes", "explicit")])
+def test_the_derivatives_of_the_mandel_stress(repulsion: str, law: str) -> None:
+    """Of cells across C too, where S and C have other axes."""
+    rng = np.random.default_rng(7)
+    some, F = points(law, repulsion, "mandel", "material", 40, "random"), deformations(40, rng)
+    found = solved(some, F, some.with_cells(F, some.step.cells).driving_tensor)
+    C, stress = np.swapaxes(F, 1, 2) @ F, np.linalg.solve(F, found.first_piola_kirchhoff)
+    mandel, ok = (C @ stress + stress @ C) / 2, found.converged
+    np.testing.assert_allclose(found.driving_tensor[ok], mandel[ok], atol=1e-9 * np.abs(mandel).max())
+    H, tangent = rng.standard_normal((40, 3, 3)), some.tangent(found, np.zeros(40, dtype=bool))
+    expected = difference_quotient(some, F, H, 1e-6, found.driving_tensor)
+    error = np.linalg.norm(np.einsum("niJkL,nkL->niJ", tangent, H) - expected, axis=(1, 2))
+    assert ok.sum() > 20 and np.median(error[ok] / np.linalg.norm(expected[ok], axis=(1, 2))) < 1e-7
+
+
+@pytest.mark.parametrize("coupling", ["implicit", "extrapolated", "staggered"])
+def test_the_mandel_stress_is_taken_by_every_coupling(coupling: str) -> None:
+    """In a pulled cube it has the axes of Cauchy's stress, and so the same target."""
+    driven = [
+        scene("consistent", remodeling__driver=name, remodeling__coupling=coupling) for name in ("mandel", "cauchy")
+    ]
+    np.testing.assert_allclose(*map(rows, driven), atol=1e-9)
+
+
+def test_a_chain_with_a_key_of_its_own_is_taken_by_the_implicit_coupling() -> None:
+    some, F = points("tensor", "log", "cauchy", "material", 20), deformations(20, np.random.default_rng(2))
+    chain = CHAINS["freely-jointed"].of({"links_per_persistence_length": np.linspace(0.4, 0.8, 20)})
+    some = CondensedPoints(replace(some.tissue, chain=chain), some.step)
+    found, H = solved(some, F), np.random.default_rng(3).standard_normal((20, 3, 3))
+    expected = difference_quotient(some, F, H, 1e-6, found.driving_tensor)
+    tangent = np.einsum("niJkL,nkL->niJ", some.tangent(found, np.zeros(20, dtype=bool)), H)
+    assert found.converged.all()
+    np.testing.assert_allclose(tangent, expected, rtol=1e-4, atol=1e-4)
+
+
+def test_kappa_depends_on_the_temperature_of_each_region() -> None:
+    """exp(-E/R (1/theta - 1/theta_0)); cells remodel by it."""
+    warm = scene(remodeling__law="arrhenius", material__temperature=320.0, remodeling__activation_energy=6e4)
+    kappa = warm.remodeling.kappa * np.exp(-6e4 / 8.314 * (1 / 320 - 1 / 310))
+    assert warm.properties()[""].kappa == pytest.approx(kappa, rel=1e-12)
+    plain = scene(material__temperature=320.0, remodeling__kappa=kappa)
+    np.testing.assert_allclose(rows(warm), rows(plain), atol=1e-12)
+    layers = {"a": {"outer_radius": 2.0, "material": {"temperature": 300.0}}, "b": {}}
+    tube = preset_scene("kuhl-holzapfel-2007", "tube").with_values({"remodeling.law": "arrhenius", "regions": layers})
+    cool, usual = (one.kappa for one in tube.properties().values())
+    assert cool < usual == tube.remodeling.kappa
