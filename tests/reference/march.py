@@ -1,22 +1,28 @@
 """Bodies of one dimension through time, their axes fixed: references of the map and of random scenes.
 
-Typed from docs/theory.md on top of `point` and tests/reference/radial.py, which share no code with the package. A cube
-or bar is one point, a tube is divided along its radius; cells are three squares l_d^2 by direction.
+Typed from docs/theory.md on top of tests/reference/radial.py, which shares no code with the package. A cube or bar is
+one point, a tube is divided along its radius; cells are three squares l_d^2 by direction.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
+from scipy.optimize import root
 
-from benchmarks.stability_map.point import Array, NoEquilibrium, advance
+from tests.reference.point import COMPRESSION
 from tests.reference.radial import (
+    AXIAL,
+    CIRCUMFERENTIAL,
+    Array,
     RadialMaterial,
     Tube,
     cauchy_stress,
     driving_values,
+    first_piola_kirchhoff,
     remodel,
     stress_noise,
 )
@@ -25,8 +31,11 @@ Scene = dict[str, Any]
 BOLTZMANN = 1.381e-23
 STRESS_UNITS = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6}
 COUNTS = 0.01  # a target with a smaller share is none to go on from
-COMPRESSION = 0.1
 SETTLED, PASSES = 1e-10, 300  # of an implicit step by repeated passes: change of the squares over r0^2; how many
+
+
+class NoEquilibrium(RuntimeError):
+    """The reference finds none from the state before."""
 
 
 # ---------------------------------------------------------------- what a scene asks for
@@ -96,9 +105,50 @@ class Bar:
         """Nominal stresses (3)."""
         return nominal_stress(self.scene, np.array([time]))[0]
 
-    def solve(self, unknown: Array, old: tuple[Array, Any], new: tuple[Array, Any]) -> Array:
-        """Equilibrium with other squares and loads."""
-        return advance(unknown, old, new, self.material)
+    def solve(self, stretches: Array, old: tuple[Array, Array], new: tuple[Array, Array]) -> Array:
+        """Equilibrium with new squares and load, in parts where one Newton solve fails."""
+        found = self.equilibrium(stretches, *new)
+        if found is not None:
+            return found
+        middle = (new[0], old[1])
+        for start, end in ((old, middle), (middle, new)):
+            done, part = 0.0, 0.5
+            while done < 1.0:
+                at = min(1.0, done + part)
+                found = self.equilibrium(stretches, *((1 - at) * a + at * b for a, b in zip(start, end, strict=True)))
+                if found is not None:
+                    stretches, done, part = found, at, 2 * part
+                elif (part := part / 2) < 1e-10:
+                    raise NoEquilibrium(f"nothing beyond a share {done:.4g} of the step")
+        return stretches
+
+    def admissible(self, stretches: Array, squares: Array) -> bool:
+        """r < L and every stretch positive."""
+        length = np.sqrt(np.sum(squares * stretches**2))
+        return bool(np.all(stretches > 0) and length < self.material.contour_length)
+
+    def equilibrium(self, stretches: Array, squares: Array, load: Array) -> Array | None:
+        """Newton's method on P_d = load_d with complex steps, kept where r < L; None where it finds nothing."""
+        if not self.admissible(stretches, squares):
+            return None
+
+        def residual(values: Array) -> Array:
+            return first_piola_kirchhoff(values[None], squares, self.material)[0] - load
+
+        smallest = np.inf
+        for _ in range(300):
+            tangent = np.stack([residual(stretches + 1e-30j * axis).imag / 1e-30 for axis in np.eye(3)], axis=1)
+            step = -np.linalg.solve(tangent, residual(stretches).real)
+            while not self.admissible(stretches + step, squares):
+                step = step / 2
+                if np.max(np.abs(step)) < 1e-14:
+                    return None
+            stretches = stretches + step
+            size = float(np.max(np.abs(step) / stretches))
+            if size < 1e-12 or (size < 1e-9 and size >= smallest):
+                return stretches
+            smallest = min(size, smallest)
+        return None
 
     def stretches(self, unknown: Array, loads: Any) -> Array:
         """(1, 3)"""
@@ -111,8 +161,9 @@ class Wall:
     unloaded = (0.0, 1.0)
 
     def __init__(self, scene: Scene, elements: int = 40):
-        self.scene, self.tube = scene, tube_of(scene, elements)
-        self.start, self.points = self.tube.nodes.copy(), len(self.tube.points)
+        geometry = scene["geometry"]
+        self.tube = Tube(geometry["inner_radius"], geometry["outer_radius"], elements, material(scene))
+        self.scene, self.start, self.points = scene, self.tube.nodes.copy(), len(self.tube.points)
 
     def loads(self, time: float) -> tuple[float, float]:
         """Pressure and axial stretch."""
@@ -130,19 +181,37 @@ class Wall:
         return self.tube.stretches(unknown, loads[1])
 
 
-def tube_of(scene: Scene, elements: int = 40) -> Tube:
-    """The scene's wall."""
-    geometry = scene["geometry"]
-    return Tube(geometry["inner_radius"], geometry["outer_radius"], elements, material(scene))
-
-
 # ---------------------------------------------------------------- through time
-class Row(NamedTuple):
-    """A solved state: unknown of the body, squares (points, 3) of its cells."""
+@dataclass
+class Path:
+    """What a body does: its unknown and the squares (points, 3) of its cells by solved state; why it ends early."""
 
-    time: float
-    unknown: Array
-    squares: Array
+    times: list[float] = field(default_factory=list)
+    unknowns: list[Array] = field(default_factory=list)
+    squares: list[Array] = field(default_factory=list)
+    ended: str = ""
+
+    def angle(self, direction: int = 2) -> Array:
+        """Degrees between a bar's chains and a direction, by step."""
+        squares = np.array(self.squares)[:, 0]
+        across = squares.sum(axis=1) - squares[:, direction]
+        return np.degrees(np.arctan2(np.sqrt(across), np.sqrt(squares[:, direction])))
+
+    def faces(self) -> tuple[Array, Array]:
+        """Inner and outer radius of a wall, by step."""
+        radii = np.array(self.unknowns)
+        return radii[:, 0], radii[:, -1]
+
+    def at(self, times: Array) -> Array:
+        """Numbers of the steps that end at these times."""
+        return np.array([int(np.argmin(np.abs(np.array(self.times) - time))) for time in times])
+
+    def mean_angle(self, tube: Tube, inside: float, outside: float, row: int) -> float:
+        """Volume mean of the fibre angle between two radii of a wall, degrees."""
+        chain = np.sqrt(self.squares[row])
+        angle = np.degrees(np.arctan2(chain[:, AXIAL], chain[:, CIRCUMFERENTIAL]))
+        layer = (tube.points > inside) & (tube.points < outside)
+        return float(np.average(angle[layer], weights=tube.areas[layer]))
 
 
 class Pass:
@@ -169,18 +238,19 @@ class Pass:
         values, noise = self.values(stretches, squares)
         tension, compression = np.maximum(values, 0) ** 2, np.minimum(values, 0) ** 2
         total = tension.sum(axis=1) + COMPRESSION**2 * compression.sum(axis=1) + (100 * noise) ** 2
-        return np.asarray(tension / total[:, None])
+        return np.divide(tension, total[:, None], out=np.zeros_like(tension), where=total[:, None] > 0)
 
-    def followed(self, squares: Array, target: Array, rate: float) -> Array:
+    def followed(self, squares: Array, target: Array, step: float) -> Array:
         """dA/dt = kappa (r0^2 sE - s A) with sE kept."""
         share = np.clip(target.sum(axis=1, keepdims=True), 0.0, 1.0)
         direction = target / np.where(share > 0, target.sum(axis=1, keepdims=True), 1.0)
-        return np.where(share > 0, squares + (self.r0**2 * direction - squares) * -np.expm1(-rate * share), squares)
+        done = -np.expm1(-self.r["kappa"] * step * share)
+        return np.where(share > 0, squares + (self.r0**2 * direction - squares) * done, squares)
 
     def after(self, stretches: Array, squares: Array, old: Array, time: float, step: float) -> tuple[Array, Any]:
         """Squares that a pass makes of `old` under the stress of a state, and what to keep if it is the last one."""
         if self.law == "tensor":
-            asked = self.followed(old, self.target(stretches, squares), self.r["kappa"] * step)
+            asked = self.followed(old, self.target(stretches, squares), step)
             return old + self.share * (asked - old), (self.ranked, self.ranks)
         values, noise = self.values(stretches, squares)
         ranked, ranks = remodel(
@@ -205,50 +275,99 @@ class Pass:
         return now + np.where(self.begun[:, None], 0.0, slope * (now - earlier[0][1]))
 
 
-def march(
-    scene: Scene, body: Bar | Wall, times: Iterable[float] | None = None, coupling: str = ""
-) -> tuple[list[Row], str]:
-    """The rows, and why there are no more; times and coupling are the scene's where none are given."""
+def march(scene: Scene, body: Bar | Wall, times: Iterable[float] | None = None, coupling: str = "") -> Path:
+    """The way of a body; times and coupling are the scene's where none are given."""
     coupling = coupling or scene["remodeling"]["coupling"]
-    cells = Pass(scene, body.points, coupling)
-    unknown, squares, rows, before = body.start, cells.start**2, [], 0.0
+    cells, path = Pass(scene, body.points, coupling), Path()
+    unknown, squares, before = body.start, cells.start**2, 0.0
     solved, loads = squares, body.unloaded  # of the last state: the way to the next one begins there
     for time in map(float, step_times(scene) if times is None else times):
         new: Any = body.loads(time)
         step, start = time - before, squares
+        expected = np.zeros_like(squares)
         if coupling == "extrapolated" and cells.targets:
             expected = cells.ahead(time)
-            squares = cells.followed(start, expected, cells.r["kappa"] * step)
+            squares = cells.followed(start, expected, step)
             if np.any(squares < 0):
-                return rows, "unknown: an extrapolated target makes A indefinite"
+                path.ended = "unknown: an extrapolated target makes A indefinite"
+                return path
         try:
             unknown = body.solve(unknown, (solved, loads), (squares, new))
-            for number in range(PASSES if coupling == "implicit" else 0):
-                other, kept = cells.after(body.stretches(unknown, new), squares, start, time, step)
-                change = np.abs(other - squares).max() / cells.r0**2
-                unknown, squares = body.solve(unknown, (squares, new), (other, new)), other
-                if change < SETTLED:
-                    cells.ranked, cells.ranks = kept
-                    break
-                if number == PASSES - 1:
-                    return rows, "unknown: repeated passes do not settle"
+            if coupling == "implicit":
+                unknown, squares = _settled(body, cells, unknown, squares, start, new, time, step)
             if coupling == "extrapolated":
                 found = cells.target(body.stretches(unknown, new), squares)
                 had = cells.targets[0][1] if cells.targets else np.zeros_like(found)
                 cells.begun = (had.sum(axis=1) < COUNTS) & (found.sum(axis=1) >= COUNTS)
                 if cells.begun.any():
-                    mixed = np.where(cells.begun[:, None], found, expected if cells.targets else 0.0)
-                    other = cells.followed(start, mixed, cells.r["kappa"] * step)
+                    other = cells.followed(start, np.where(cells.begun[:, None], found, expected), step)
                     unknown, squares = body.solve(unknown, (squares, new), (other, new)), other
                     found = cells.target(body.stretches(unknown, new), squares)
                 cells.targets = [(time, found), *cells.targets[:1]]
         except NoEquilibrium as error:
-            return rows, f"no equilibrium at t = {time:g}: {error}"
-        rows.append(Row(time, unknown, squares))
-        solved = squares
+            path.ended = str(error) if str(error).startswith("unknown") else f"no equilibrium at t = {time:g}: {error}"
+            return path
+        path.times.append(time)
+        path.unknowns.append(unknown)
+        path.squares.append(squares)
+        solved, loads, before = squares, new, time
         if coupling in ("staggered", "relaxed"):
-            squares, (cells.ranked, cells.ranks) = cells.after(
-                body.stretches(unknown, new), squares, squares, time, step
-            )
-        loads, before = new, time
-    return rows, ""
+            stretches = body.stretches(unknown, new)
+            squares, (cells.ranked, cells.ranks) = cells.after(stretches, squares, squares, time, step)
+    return path
+
+
+def _settled(
+    body: Bar | Wall, cells: Pass, unknown: Array, squares: Array, start: Array, loads: Any, time: float, step: float
+) -> tuple[Array, Array]:
+    """An implicit step by repeated passes."""
+    for _ in range(PASSES):
+        other, kept = cells.after(body.stretches(unknown, loads), squares, start, time, step)
+        change = np.abs(other - squares).max() / cells.r0**2
+        unknown, squares = body.solve(unknown, (squares, loads), (other, loads)), other
+        if change < SETTLED:
+            cells.ranked, cells.ranks = kept
+            return unknown, squares
+    raise NoEquilibrium("unknown: repeated passes do not settle")
+
+
+# ---------------------------------------------------------------- how far a pressure can be raised
+WIDER = 0.02  # of the inner radius, from one state of the curve to the next
+WIDEST = 5.0
+
+
+def pressure_curve(scene: Scene, elements: int = 6) -> tuple[Array, Array]:
+    """Inner radii and pressures of a tube that does not remodel, its inner radius raised step by step.
+
+    Where the pressure falls again it has had its largest value: a limit point, however it was loaded. The curve ends
+    there. With closed ends the axial stretch is found with the radii, from the thrust p pi r_i^2 on the ends.
+    """
+    tube = Wall(scene, elements).tube
+    residual = _of_given_inner_radius(tube, initial(scene) ** 2, scene.get("supports", {}).get("ends") == "closed")
+    unknown, found = np.concatenate([[0.0, 1.0], tube.nodes[1:]]), [(tube.inner_radius, 0.0)]
+    for inner in tube.inner_radius * np.arange(1 + WIDER, WIDEST, WIDER):
+        unknown[2:] = np.sqrt(unknown[2:] ** 2 + inner**2 - found[-1][0] ** 2)  # a start that keeps areas
+        solved = root(residual, unknown, (inner,), tol=1e-12)
+        if not np.abs(residual(solved.x, inner)).max() < 1e-9:  # NaN too: chains as long as they can be
+            break
+        unknown = solved.x
+        found.append((inner, float(unknown[0])))
+        if found[-1][1] < found[-2][1]:
+            break
+    radii, pressures = np.array(found).T
+    return radii, pressures
+
+
+def _of_given_inner_radius(tube: Tube, squares: Array, closed: bool) -> Callable[[Array, float], Array]:
+    """Residual of pressure, axial stretch and the other radii."""
+    cells = np.tile(squares, (len(tube.points), 1))
+
+    def residual(unknown: Array, inner: float) -> Array:
+        radii = np.concatenate([[inner], unknown[2:]])
+        pressure, axial = unknown[0], unknown[1]
+        forces = tube.residual(radii, cells, pressure, axial)
+        stress = first_piola_kirchhoff(tube.stretches(radii, axial), cells, tube.material)
+        thrust = float(stress[:, AXIAL] @ tube.areas) - pressure * inner**2 / 2
+        return np.concatenate([forces, [thrust if closed else axial - 1]])
+
+    return residual
