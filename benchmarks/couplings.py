@@ -22,7 +22,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from mpi4py import MPI
 
-from docs.pages import DOCS, FIGURES, by_column, filled, markdown
+from docs.making.pages import DOCS, FIGURES, by_column, filled, markdown
 from remodel_fenicsx import Simulation, read_scene
 from remodel_fenicsx.body.tube import Tube, whole_tube
 from remodel_fenicsx.studies.page import COLOURS, STYLE, Page, panel_letters, read_table

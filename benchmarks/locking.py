@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from mpi4py import MPI
 
-from docs.pages import DOCS, filled, made_with, markdown
+from docs.making.pages import DOCS, filled, made_with, markdown
 from remodel_fenicsx import Scene, Simulation
 from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.scene.presets import PROFILES

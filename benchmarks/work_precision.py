@@ -26,7 +26,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.precision import chosen, places, tendon, whole
 from benchmarks.precision.kept import EVERY_TANGENT, Array, Found, Kept
-from docs.pages import DOCS, FIGURES, filled, lines, made_with
+from docs.making.pages import DOCS, FIGURES, filled, lines, made_with
 from remodel_fenicsx.body.shape import profile_weights
 from remodel_fenicsx.scene.presets import PROFILES
 from remodel_fenicsx.scene.scene import Scene, preset_scene

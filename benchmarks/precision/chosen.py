@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.precision.kept import EVERY_TANGENT, Found, Kept, Run, measured
-from docs.pages import lines
+from docs.making.pages import lines
 from remodel_fenicsx.scene.scene import Scene, preset_scene
 
 Changes = Mapping[str, Any]

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.precision.kept import EVERY_TANGENT, Kept
-from docs.pages import lines
+from docs.making.pages import lines
 from remodel_fenicsx.scene.scene import preset_scene
 
 TIMES = [12.0, 24.0, 48.0, 72.0, 96.0, 120.0, 132.0, 150.0]

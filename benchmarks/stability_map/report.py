@@ -12,7 +12,7 @@ from textwrap import shorten
 from benchmarks.stability_map.cases import Case
 from benchmarks.stability_map.judging import OUTCOMES
 from benchmarks.stability_map.running import Record, digest, read_records
-from docs.pages import DOCS, FIGURES, filled, markdown
+from docs.making.pages import DOCS, FIGURES, filled, markdown
 
 PAGES = ("stability", "appendix_stability")  # docs/NAME.md from docs/NAME.template.md
 EXTRA = ("false alarms", "refused, no cause")

@@ -288,9 +288,10 @@ def march(scene: Scene, body: Bar | Wall, times: Iterable[float] | None = None, 
         if coupling == "extrapolated" and cells.targets:
             expected = cells.ahead(time)
             squares = cells.followed(start, expected, step)
-            if np.any(squares < 0):
-                path.ended = "unknown: an extrapolated target makes A indefinite"
-                return path
+            indefinite = np.any(squares < 0, axis=1, keepdims=True)
+            if indefinite.any():  # there the last target itself counts
+                expected = np.where(indefinite, cells.targets[0][1], expected)
+                squares = cells.followed(start, expected, step)
         try:
             unknown = body.solve(unknown, (solved, loads), (squares, new))
             if coupling == "implicit":
