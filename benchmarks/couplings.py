@@ -22,11 +22,11 @@ import numpy as np
 from matplotlib.figure import Figure
 from mpi4py import MPI
 
+from docs.making.pages import DOCS, FIGURES, by_column, filled, markdown
 from remodel_fenicsx import Simulation, read_scene
 from remodel_fenicsx.body.tube import Tube, whole_tube
 from remodel_fenicsx.studies.page import COLOURS, STYLE, Page, panel_letters, read_table
 
-DOCS = Path(__file__).parents[1] / "docs"
 ARTERY = Path(__file__).parents[1] / "demos" / "artery.toml"
 END, STEPS = 40.0, (5.0, 2.5, 1.25, 0.625)
 TUBE = Tube(inner_radius=1.0, outer_radius=3.0, length=0.5)
@@ -95,17 +95,10 @@ def errors() -> Iterator[dict[str, Any]]:
                 tensor, unknown, spent, iterations = layer(scheme, cells, step, scheme.coupling)
                 apart = np.linalg.norm(tensor - limits[key][0], axis=(-1, -2))
                 moved = np.linalg.norm(unknown - limits[key][1]) / np.linalg.norm(limits[key][1])
-                row = {
-                    "cells": cells,
-                    "scheme": name,
-                    "step": step,
-                    "error_A": float(np.sqrt(np.mean(apart**2))),
-                    "error_u": float(moved),
-                    "seconds": spent,
-                    "newton_iterations": iterations,
-                }
-                print(row, flush=True)
-                yield row
+                yield {
+                    "cells": cells, "scheme": name, "step": step, "error_A": float(np.sqrt(np.mean(apart**2))),
+                    "error_u": float(moved), "seconds": spent, "newton_iterations": iterations,
+                }  # fmt: skip
 
 
 # ---------------------------------------------------------------- cost
@@ -120,35 +113,22 @@ def cost(number: int) -> Iterator[dict[str, Any]]:
         frame = {"remodeling.frame": "spatial"} if name == "printed-staggered" else {}  # the preset
         changes = {"output.fields": False, "remodeling.coupling": scheme.coupling, "time.end": float(number)}
         runs[name] = Simulation(read_scene(ARTERY).with_values(scheme.values | changes | frame)).steps()
-    spent, iterations, parts = (dict.fromkeys(runs, 0) for _ in range(3))
-    first: dict[str, float] = {}
+    rows = {
+        name: {"scheme": name, "steps": number, "newton_iterations": 0, "in_parts": 0, "seconds": 0.0} for name in runs
+    }
     for at in range(number):
         for name, steps in runs.items():
             start = clock.process_time()
             work = next(steps).work
-            seconds = clock.process_time() - start
-            first.setdefault(name, seconds)
-            spent[name] += seconds  # type: ignore[assignment]
-            iterations[name] += work.newton_iterations
-            parts[name] += work.substeps > 1
-        print(f"step {at + 1}: {({name: round(value, 1) for name, value in spent.items()})}", flush=True)
-    for name in runs:
-        yield {
-            "scheme": name,
-            "steps": number,
-            "newton_iterations": iterations[name],
-            "in_parts": parts[name],
-            "seconds": spent[name],
-            "ratio": spent[name] / spent["printed-staggered"],
-        }
+            rows[name]["seconds"] += clock.process_time() - start
+            rows[name]["newton_iterations"] += work.newton_iterations
+            rows[name]["in_parts"] += work.substeps > 1
+        print(f"step {at + 1}: {({name: round(row['seconds'], 1) for name, row in rows.items()})}", flush=True)
+    for row in rows.values():
+        yield row | {"ratio": row["seconds"] / rows["printed-staggered"]["seconds"]}
 
 
 # ---------------------------------------------------------------- the page
-def numbers(name: str) -> Columns:
-    """A table of the page."""
-    return read_table(DOCS / "figures" / f"{name}.csv")
-
-
 def draw(table: Columns) -> Figure:
     """Error of A against processor time."""
     figure = Figure(figsize=(7.2, 3.2))
@@ -189,28 +169,23 @@ def rows_of(table: Columns) -> Iterator[list[str]]:
 
 def cost_table() -> str:
     """What a step of the whole artery costs, where it has been measured."""
-    if not (DOCS / "figures" / "couplings-cost.csv").is_file():
+    if not (FIGURES / "couplings-cost.csv").is_file():
         return "(Not measured for this page.)"
-    costs = numbers("couplings-cost")
-    lines = [["law, coupling", "steps", "Newton iterations", "processor time over that of the preset"], ["---"] * 4]
-    for i, name in enumerate(costs["scheme"]):
-        counts = f"{costs['steps'][i]:.0f}", f"{costs['newton_iterations'][i]:.0f}"
-        lines.append([SCHEMES[name].label, *counts, f"{costs['ratio'][i]:.2f}"])
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    costs = read_table(FIGURES / "couplings-cost.csv")
+    shown = (costs[key] for key in ("scheme", "steps", "newton_iterations", "ratio"))
+    rows = [[SCHEMES[name].label, f"{steps:.0f}", f"{newton:.0f}", f"{ratio:.2f}"]
+            for name, steps, newton, ratio in zip(*shown, strict=True)]  # fmt: skip
+    return markdown(["law, coupling", "steps", "Newton iterations", "processor time over that of the preset"], rows)
 
 
 def page() -> str:
     """docs/couplings.md from the tables."""
-    table = numbers("couplings")
     head = ["law, coupling", "cells", "error of A", "of u", "order in A", "in u", "seconds"]
-    lines = [head, ["---"] * len(head), *rows_of(table)]
-    text = (Path(__file__).parent / "couplings.template.md").read_text(encoding="utf-8")
-    return text.format(
-        table="\n".join("| " + " | ".join(line) + " |" for line in lines),
-        caption=fill(f"*{CAPTION[1]}*", 100),
-        steps_of_error=f"{END / 1.25:.0f}",
-        cost=cost_table(),
-    )
+    words = {
+        "table": markdown(head, rows_of(read_table(FIGURES / "couplings.csv"))),
+        "caption": fill(f"*{CAPTION[1]}*", 100), "steps_of_error": f"{END / 1.25:.0f}", "cost": cost_table(),
+    }  # fmt: skip
+    return filled(Path(__file__).with_suffix(".template.md"), words)
 
 
 def main() -> None:
@@ -219,14 +194,12 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=40, help="of the cost on the whole artery")
     parser.add_argument("--page", action="store_true", help="measure nothing")
     options = parser.parse_args()
-    source = ["benchmarks/couplings.py"]
+    source = "benchmarks/couplings.py"
     if not options.page:
         for name, measured in (("couplings", errors()), ("couplings-cost", cost(options.steps))):
-            rows = list(measured)
-            columns = {key: [row[key] for row in rows] for key in rows[0]}
-            Page(DOCS / "figures", name, *CAPTION).save_table(columns, source)
+            Page(FIGURES, name, *CAPTION).save_table(by_column(measured), [source])
     with matplotlib.rc_context(STYLE):
-        Page(DOCS / "figures", "couplings", *CAPTION).save_figure(draw(numbers("couplings")), source[0])
+        Page(FIGURES, "couplings", *CAPTION).save_figure(draw(read_table(FIGURES / "couplings.csv")), source)
     (DOCS / "couplings.md").write_text(page(), encoding="utf-8")
 
 

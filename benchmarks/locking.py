@@ -11,26 +11,25 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import product
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from mpi4py import MPI
 
+from docs.making.pages import DOCS, filled, made_with, markdown
 from remodel_fenicsx import Scene, Simulation
 from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.scene.presets import PROFILES
 from remodel_fenicsx.scene.scene import scene_from_dict
 from remodel_fenicsx.solver.continuation import StepFailure
-from remodel_fenicsx.system.environment import versions
 from remodel_fenicsx.watch.warnings import LockingWarning, PressureNoise
 from tests.locking_bodies import EXACT_TUBE, bar_scene, membrane_scene, registered, thick_tube
 from tests.reference.radial import RadialMaterial, solve_radial
 from tests.parts import tube
 
-PAGE = Path(__file__).parents[1] / "docs" / "locking.md"
 TIP = 4.17  # mm; S. Land et al. 2015, problem 1
 HEXAHEDRA, TETRAHEDRA = "hexahedron", "tetrahedron"
 DIRECT = {"solver.method": "direct"}  # a new tangent in each iteration: their number tells how hard a step is
@@ -48,12 +47,18 @@ class Result(NamedTuple):
     elements: int
 
     def error(self, exact: float) -> str:
+        """In per cent, and what the run says is missing."""
+        return f"{self.off(exact)} ({100 * self.missing:.3g} %)"
+
+    def off(self, exact: float) -> str:
         """In per cent."""
         return "no equilibrium" if self.value is None else f"{100 * (self.value / exact - 1):+.2f} %"
 
 
-def result(scene: Scene, column: str, divisions: tuple[int, int, int] | None = None) -> Result:
-    """Run a scene."""
+def result(
+    scene: Scene, column: str = "inner_radius", divisions: tuple[int, int, int] | None = None, start: float = 1.0
+) -> Result:
+    """Run a scene: by how much its column differs from its start."""
     mesh, domain = scene.mesh, None
     if divisions is not None:
         domain = tube(1.0, 3.0, 1.0, 1, mesh.element, mesh.degree, MPI.COMM_SELF, divisions)
@@ -62,7 +67,7 @@ def result(scene: Scene, column: str, divisions: tuple[int, int, int] | None = N
     try:
         for step in simulation.steps():
             rows.append(step.row)
-        value: float | None = rows[-1][column]
+        value: float | None = rows[-1][column] - start
     except StepFailure:
         value = None
     missing = sum(LockingWarning(simulation.stepper, FORMULATIONS[mesh.formulation].locks).missing())
@@ -86,9 +91,8 @@ def tube_rows(largest: int) -> Iterator[list[str]]:
             cells = []
             for ratio in (1e2, 1e3, 1e4):
                 scene = thick_tube(ratio, name).with_values({"mesh.element": element, "mesh.degree": degree})
-                found = result(scene, "inner_radius", (around, through, 1))
-                moved = found._replace(value=None if found.value is None else found.value - 1)
-                cells.append(f"{moved.error(EXACT_TUBE)} ({100 * found.missing:.3g} %), {found.iterations}")
+                found = result(scene, divisions=(around, through, 1))
+                cells.append(f"{found.error(EXACT_TUBE)}, {found.iterations}")
             yield [f"{element} {degree}", f"{around} x {through}", name, *cells]
 
 
@@ -98,12 +102,9 @@ def network_rows() -> Iterator[list[str]]:
         cells = []
         for ratio in (1e2, 1e3, 1e4):
             fine = thick_tube(ratio, "selective-integration", pressure, chain_density=density)
-            exact = result(fine.with_values({"mesh.degree": 2}), "inner_radius", (8, 4, 1)).value
+            exact = result(fine.with_values({"mesh.degree": 2}), divisions=(8, 4, 1)).value or np.nan
             for name in FORMULATIONS:
-                found = result(fine.with_values({"mesh.formulation": name}), "inner_radius", (16, 8, 1))
-                moved = None if found.value is None else found.value - 1
-                error = found._replace(value=moved).error((exact or 0.0) - 1)
-                cells.append(f"{error} ({100 * found.missing:.3g} %)")
+                cells.append(result(fine.with_values({"mesh.formulation": name}), divisions=(16, 8, 1)).error(exact))
         yield [f"{density:g}", f"{fine.material.network_modulus / 3.103:.3g}", f"{pressure:g}", *cells]
 
 
@@ -118,9 +119,7 @@ def radial_rows() -> Iterator[list[str]]:
                 for ratio in RATIOS:
                     changes = {"geometry.outer_radius": radius, "model.kinematics": "radial", "mesh.degree": degree}
                     scene = thick_tube(ratio, "displacement", pressure).with_values(changes)
-                    found = result(scene, "inner_radius")
-                    moved = found._replace(value=None if found.value is None else found.value - 1)
-                    cells.append(f"{moved.error(exact[ratio])} ({100 * found.missing:.3g} %)")
+                    cells.append(result(scene).error(exact[ratio]))
                 yield [f"{radius:g}", f"{part:g}", str(degree), *cells]
 
 
@@ -199,7 +198,7 @@ def membrane_rows(largest: int) -> Iterator[list[str]]:
                     cells.append("")
                     continue
                 scene = membrane_scene(formulation=name, degree=degree, refinement=refinement).with_values(DIRECT)
-                found = result(scene, "tip")
+                found = result(scene, "tip", start=0.0)
                 cells.append("no equilibrium" if found.value is None else f"{found.value:.3f}, {found.iterations}")
             yield [f"hexahedron {degree}", name, *cells]
 
@@ -212,111 +211,18 @@ def bar_rows(largest: int) -> Iterator[list[str]]:
             continue
         for name in FORMULATIONS:
             scene = bar_scene(formulation=name, degree=degree, refinement=refinement).with_values(DIRECT)
-            found = result(scene, "tip")
+            found = result(scene, "tip", start=0.0)
             value = "no equilibrium" if found.value is None else f"{found.value:.3f}"
-            yield [f"hexahedron {degree}", str(elements), name, value, found.error(TIP), str(found.iterations)]
+            yield [f"hexahedron {degree}", str(elements), name, value, found.off(TIP), str(found.iterations)]
 
 
-def table(head: list[str], rows: Iterator[list[str]]) -> str:
+def table(head: Sequence[str], rows: Iterator[list[str]]) -> str:
     """As Markdown; says each row as it comes."""
-    lines = ["| " + " | ".join(head) + " |", "|" + " --- |" * len(head)]
+    made = []
     for row in rows:
-        lines.append("| " + " | ".join(row) + " |")
-        print(lines[-1], flush=True)
-    return "\n".join(lines)
-
-
-PAGE_TEXT = """# Elements that lock, and elements that do not
-
-A material that hardly changes its volume may be too much for its elements: they keep the volume
-only by not deforming at all. This page measures which elements do so, on bodies whose answer is
-known. docs/theory.md, Volumetric locking, has the formulation. docs/appendix_elements.md says how a
-run sees it by itself.
-
-## What to take
-
-| body | take |
-|---|---|
-| any body without a preset, or with a profile | the default, `mesh.formulation = "auto"` |
-| a preset's body with lambda/mu above 10 | `mesh.formulation = "auto"`: presets have the paper's elements |
-| tetrahedra | degree 2. Linear ones have no remedy, and a run says so |
-| large lambda/mu with the coupling `implicit` or an opening angle | degree 2, and elements so small that no run warns |
-
-`auto` takes `selective-integration` where lambda/mu is above 10 (quadratic tetrahedra: 300), unless
-the coupling `implicit`, a natural configuration or a matrix of one's own needs `displacement`. The
-log and the scene as run have the name.
-
-## Cells that turn
-
-The cells take the stress at each quadrature point. In a stiff bulk the pressure there, lambda ln J,
-is noise: displacements hardly see it, for its mean over an element is right, and the tensions that
-turn the cells are wrong. Radii follow the cells.
-
-Tubes of isotropic cells under pressure (1.2, 3 and 4.8) and an elongation of 0.1 remodel by the law
-`tensor` for a time of 2/kappa, on eight elements through the wall. The columns are lambda/mu. Each
-entry has the largest error of the three angles and that of the radii, against 200 quadratic
-elements of a reference that shares no code.
-
-In parentheses stands the angle by which the run itself finds the tensions turned by noise. A run
-warns above 2 degrees, where lambda/mu is above 10.
-
-{turning}
-
-The profiles on the thickest of these tubes. The seconds are of the processor, with building the
-simulation.
-
-{profiles}
-
-## Thick tube
-
-Radii 1 and 3, plane strain, no chains, pressure 2 in four steps, mu = 3.103. The table has three
-numbers for each mesh, formulation and lambda/mu:
-
-1. the error of the inner displacement against {exact}, that of the incompressible tube (at
-   lambda/mu = 100 the body itself moves {compressible} % more);
-2. in parentheses what the run itself says is missing; the warning comes above 5 %;
-3. the Newton iterations of all four steps.
-
-{tube}
-
-**With chains** (isotropic cells that do not remodel), on 16 x 8 linear hexahedra, against quadratic
-ones on 8 x 4 with `selective-integration`. c is the network modulus.
-
-{network}
-
-The stiffer the network, the less the same lambda/mu locks. The estimate of a run knows this,
-lambda/mu does not. (Sixteen plane sides are 2 % off by themselves.)
-
-## What a run says of itself
-
-Tubes of inner radius 1 and outer radius R_o, no chains, length held, kinematics `radial` with its
-eight elements through the wall. The pressure is the given part of mu ln R_o, the one that bursts an
-incompressible tube. The table has the error of the inner displacement against 400 quadratic
-elements of `tests/reference/radial.py`, and in parentheses what the run says is missing.
-
-{radial}
-
-## Cook's membrane
-
-A slab in plane strain is clamped on the left. 100 of dead force pull it upwards on the right;
-mu = 80.194, lambda/mu = 1e4. The table has the rise of the upper right corner by elements on a
-side, and the Newton iterations of all four steps.
-
-{membrane}
-
-## The bar of the cardiac mechanics benchmark
-
-S. Land et al., Proc. R. Soc. A 471 (2015) 20150641, problem 1. The bar is 10 x 1 x 1 mm and clamped
-at x = 0. Its law is transversely isotropic and exponential, with fibres along the bar;
-lambda/C = 1e3. A pressure of 0.004 kPa acts on the deformed bottom. The participants of the
-benchmark agree on a tip at z = {tip} mm.
-
-The matrix energy and the shape are given from outside of the package (`tests/locking_bodies.py`).
-
-{bar}
-
-Made by `./with-fenicsx benchmarks/locking.py` with {versions}.
-"""
+        made.append(row)
+        print(" | ".join(row), flush=True)
+    return markdown(head, made)
 
 
 def main() -> None:
@@ -326,36 +232,24 @@ def main() -> None:
     largest = parser.parse_args().largest
     ratios = ["1e2", "1e3", "1e4"]
     both = [f"{name.split('-')[0]}, {ratio}" for ratio in ratios for name in FORMULATIONS]
+    over = [f"lambda/mu = {ratio}" for ratio in ratios]
     slab = thick_tube(1e2, "selective-integration").with_values({"mesh.degree": 2})
-    compressible = (result(slab, "inner_radius", (8, 4, 1)).value or 0.0) - 1
-    tables: dict[str, Any] = {
-        "tube": table(
-            ["elements", "around x through", "formulation", *(f"lambda/mu = {r}" for r in ratios)], tube_rows(largest)
-        ),
+    compressible = result(slab, divisions=(8, 4, 1)).value or np.nan
+    words = {
+        "tube": table(["elements", "around x through", "formulation", *over], tube_rows(largest)),
         "radial": table(["R_o", "pressure", "degree", *(f"lambda/mu = {ratio:g}" for ratio in RATIOS)], radial_rows()),
-        "turning": table(
-            ["R_o", "degree", "formulation", *(f"{ratio:g}" for ratio in RATIOS_OF_CELLS)], turning_rows()
-        ),
+        "turning": table(["R_o", "degree", "formulation", *map("{:g}".format, RATIOS_OF_CELLS)], turning_rows()),
         "profiles": table(["profile", "lambda/mu", "as run", "off by", "seconds"], profile_rows()),
         "network": table(["chains per m^3", "c/mu", "pressure", *both], network_rows()),
-    }
+        "exact": f"{EXACT_TUBE}", "tip": f"{TIP}", "versions": made_with(),
+        "compressible": f"{100 * (compressible / EXACT_TUBE - 1):.2f}",
+    }  # fmt: skip
     with registered():
-        tables["membrane"] = table(["elements", "formulation", "4", "8", "16", "32"], membrane_rows(largest))
-        tables["bar"] = table(
-            ["elements", "number", "formulation", "tip (mm)", "error", "iterations"], bar_rows(largest)
-        )
-    made_by = ", ".join(
-        f"{name} {version}" for name, version in versions().items() if name in ("remodel_fenicsx", "dolfinx")
-    )
-    text = PAGE_TEXT.format(
-        versions=made_by,
-        exact=EXACT_TUBE,
-        tip=TIP,
-        compressible=f"{100 * (compressible / EXACT_TUBE - 1):.2f}",
-        **tables,
-    )
+        words["membrane"] = table(["elements", "formulation", "4", "8", "16", "32"], membrane_rows(largest))
+        head = ["elements", "number", "formulation", "tip (mm)", "error", "iterations"]
+        words["bar"] = table(head, bar_rows(largest))
     if largest == 10**9:
-        PAGE.write_text(text)
+        (DOCS / "locking.md").write_text(filled(Path(__file__).with_suffix(".template.md"), words), encoding="utf-8")
 
 
 if __name__ == "__main__":

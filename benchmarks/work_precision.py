@@ -15,7 +15,7 @@ appendix and picture; --only makes no page, --report makes it from what is there
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from textwrap import fill
@@ -23,29 +23,24 @@ from textwrap import fill
 import numpy as np
 from matplotlib import rc_context
 from matplotlib.figure import Figure
-from mpi4py import MPI
-from numpy.typing import NDArray
 
 from benchmarks.precision import chosen, places, tendon, whole
-from remodel_fenicsx.body.shape import PROFILE, profile_weights
+from benchmarks.precision.kept import EVERY_TANGENT, Array, Found, Kept
+from docs.making.pages import DOCS, FIGURES, filled, lines, made_with
+from remodel_fenicsx.body.shape import profile_weights
 from remodel_fenicsx.scene.presets import PROFILES
 from remodel_fenicsx.scene.scene import Scene, preset_scene
-from remodel_fenicsx.schema.times import same_time
-from remodel_fenicsx.simulation import Simulation
-from remodel_fenicsx.studies.page import COLOURS, STYLE, Page
 from remodel_fenicsx.studies import trade as rungs
-from remodel_fenicsx.studies.trade import pareto, typical
-from remodel_fenicsx.system.environment import versions
+from remodel_fenicsx.studies.page import COLOURS, STYLE, Page
+from remodel_fenicsx.studies.trade import pareto
 from tests.reference.radial import solve_radial
 
-DOCS = Path(__file__).parents[1] / "docs"
 PICTURE = "speed_and_accuracy"
 PAGES = {"work_precision": "speed_and_accuracy", "work_precision_appendix": "appendix_speed_and_accuracy"}  # templates
 PARTS = ("artery", "end", "paper", "whole", "hold", "tendon")
 COARSE = (8.0, 4.0)  # tolerances, degrees
 TIMES = chosen.TO_THE_END
 REFERENCE = {"explicit": (150, 1 / 8, 1 / 16), "tensor": (60, 1 / 2, 1 / 4)}  # elements and steps, by law
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -72,11 +67,7 @@ class Point:
     method: str
     name: str
     words: str
-    seconds: float
-    degrees: float
-    largest: float
-    percent: float
-    iterations: int
+    found: Found
 
     @property
     def is_whole(self) -> bool:
@@ -87,7 +78,7 @@ class Point:
 def scene(method: Method) -> Scene:
     """The artery of isotropic cells."""
     changes = {"cells.initial": "isotropic", "remodeling.coupling": method.coupling}
-    return preset_scene(method.preset, "tube").with_values(whole.EVERY_TANGENT | changes)
+    return preset_scene(method.preset, "tube").with_values(EVERY_TANGENT | changes)
 
 
 def settings(method: Method) -> list[rungs.Setting]:
@@ -117,16 +108,14 @@ def coarse(base: Scene) -> list[rungs.Setting]:
     return found
 
 
-def reference(law: str, folder: Path) -> tuple[Array, Array]:
+def reference(law: str, kept: Kept) -> tuple[Array, Array]:
     """Angles and radii of the reference at the compared times, with what is left of steps extrapolated."""
-    kept = folder / f"reference-{law}.npz"
-    if not kept.exists():
-        folder.mkdir(parents=True, exist_ok=True)
+    name = f"reference-{law}"
+    if name not in kept:
         elements, *steps = REFERENCE[law]
         (angles, radii), (finer_angles, finer_radii) = (_reference(law, step, int(elements)) for step in steps)
-        np.savez(kept, angles=2 * finer_angles - angles, radii=2 * finer_radii - radii)
-    with np.load(kept) as found:
-        return found["angles"], found["radii"]
+        kept.keep(name, {"angles": 2 * finer_angles - angles, "radii": 2 * finer_radii - radii})
+    return kept[name]["angles"], kept[name]["radii"]
 
 
 def _reference(law: str, step: float, elements: int) -> tuple[Array, Array]:
@@ -138,159 +127,109 @@ def _reference(law: str, step: float, elements: int) -> tuple[Array, Array]:
     return angles, np.stack([history.inner_radii[rows], history.outer_radii[rows]], axis=1)
 
 
-def run(folder: Path, parts: Sequence[str], budget: float) -> None:
+def run(kept: Kept, parts: Sequence[str], budget: float) -> None:
     """What is asked for and not kept yet."""
     if "artery" in parts:
-        run_artery(folder, budget, paper=False)
+        run_artery(kept, budget, paper=False)
     for part in ("end", "hold"):
         if part in parts:
-            chosen.run(folder, measured, part)
+            chosen.run(kept, part)
     if "paper" in parts:
-        places.run(scene(METHODS["printed"]), folder)
-        run_artery(folder, 0.0, paper=True)
+        places.run(scene(METHODS["printed"]), kept)
+        run_artery(kept, 0.0, paper=True)
     if "whole" in parts:
         for name, method in METHODS.items():
             for setting in whole.settings(name, scene(method)):
-                run_one(folder, name, setting)
+                kept.measure(f"{name}-{setting.name}", setting.scene, TIMES)
     if "tendon" in parts:
-        tendon.run(folder, measured)
+        tendon.run(kept)
 
 
-def run_artery(folder: Path, budget: float, paper: bool) -> None:
+def run_artery(kept: Kept, budget: float, paper: bool) -> None:
     """All settings of a few expected seconds and the profiles, or the paper's own."""
     for name, method in METHODS.items():
         for setting in sorted(settings(method), key=lambda setting: not setting.name.startswith("profile")):
             own = paper and name == "printed" and setting.mesh[0] == "full"
             asked = own or (setting.name.startswith("profile") and not paper)
             if setting.expected_seconds < budget or asked:
-                run_one(folder, name, setting)
+                kept.measure(f"{name}-{setting.name}", setting.scene, TIMES)
 
 
-def run_one(folder: Path, method: str, setting: rungs.Setting) -> None:
-    """If it is not kept yet."""
-    if not _kept(folder, method, setting).exists():
-        found = measured(setting.scene, TIMES)
-        np.savez(_kept(folder, method, setting), **found)
-        print(f"{method:12} {setting.in_words()}: {float(found['seconds']):.2g} s", flush=True)
-
-
-def measured(scene: Scene, times: list[float]) -> dict[str, Array]:
-    """Angles and lengths at the compared times, seconds of the processor, rows and Newton iterations of a run."""
-    setting = rungs.Setting("run", rungs.BOTH, {}, scene, (1,))
-    compared = rungs.as_run(setting, 1, times)
-    columns = [*compared.output.columns, "newton_iterations"]
-    simulation = Simulation(compared.with_values({"output.columns": columns}), MPI.COMM_SELF)
-    rows = [step.row for step in simulation.steps()]
-    simulation.close()
-    asked = [next(row for row in rows if same_time(row["time"], time)) for time in times]
-    lengths = [name for name in ("inner_radius", "outer_radius", "mean_stretch") if name in rows[0]]
-    return {
-        "angles": np.array([[row[name] for name in PROFILE] for row in asked]),
-        "lengths": np.array([[row[name] for name in lengths] for row in asked]),
-        "seconds": np.array(sum(row["processor_seconds"] for row in rows)),
-        "rows": np.array(len(rows)),
-        "iterations": np.array(sum(row["newton_iterations"] for row in rows)),
-    }
-
-
-def _kept(folder: Path, method: str, setting: rungs.Setting) -> Path:
-    return folder / f"{method}-{setting.name}.npz"
-
-
-def points(folder: Path) -> list[Point]:
+def points(kept: Kept) -> Iterator[Point]:
     """All that is kept."""
-    found = []
     for name, method in METHODS.items():
-        angles, radii = reference(method.law, folder)
+        exact = reference(method.law, kept)
         for setting in [*settings(method), *whole.settings(name, scene(method))]:
-            if not _kept(folder, name, setting).exists():
-                continue
-            with np.load(_kept(folder, name, setting)) as kept:
-                error, largest = typical(kept["angles"] - angles), float(np.max(np.abs(kept["angles"] - angles)))
-                off = 100 * float(np.max(np.abs(kept["lengths"] / radii - 1)))
+            if (file := f"{name}-{setting.name}") in kept:
                 words = setting.name if setting.name.startswith("profile") else " ".join(setting.in_words().split())
-                words += (
-                    ", every tangent factorised" if setting.name.startswith("full") else whole.other_words(setting.name)
-                )
-                numbers = float(kept["seconds"]), error, largest, off, int(kept["iterations"])
-                found.append(Point(name, setting.name, words, *numbers))
-    return found
+                every = setting.name.startswith("full")
+                words += ", every tangent factorised" if every else whole.other_words(setting.name)
+                yield Point(name, setting.name, words, kept.found(file, *exact))
 
 
-def report(folder: Path) -> None:
+def report(kept: Kept) -> None:
     """Write the page, its appendix and its picture."""
-    found = sorted(points(folder), key=lambda point: point.seconds)
-    best = {id(p) for p, on in zip(found, _front(found), strict=True) if on}
-    rows = [_row(p, id(p) in best) for p in found]
-    made = ", ".join(f"{name} {version}" for name, version in versions().items() if name != "BLAS")
-    parts = {"rows": "\n".join(rows), "whole": whole_rows(found), "hold": chosen.hold_rows(folder),
-             "end": chosen.end_rows(folder), "tendon": tendon.rows(folder), "made": fill(f"Made with {made}.", 100),
-             "paper": paper_rows(found), "places": places.words(folder)}  # fmt: skip
+    found = sorted(points(kept), key=lambda point: point.found.seconds)
+    parts = {"rows": rows_of(found), "whole": rows_of([p for p in found if p.is_whole]),
+             "hold": chosen.hold_rows(kept), "end": chosen.end_rows(kept), "tendon": tendon.rows(kept),
+             "made": fill(f"Made with {made_with()}.", 100), "paper": paper_rows(found),
+             "places": places.words(kept)}  # fmt: skip
     for template, page in PAGES.items():
-        text = Path(__file__).with_name(f"{template}.template.md").read_text(encoding="utf-8")
-        for name, words in parts.items():
-            text = text.replace(f"{{{name}}}", words)
+        text = filled(Path(__file__).with_name(f"{template}.template.md"), parts)
         (DOCS / f"{page}.md").write_text(text, encoding="utf-8")
-    _draw(found, made)
+    _draw(found)
 
 
-def _row(p: Point, is_best: bool) -> str:
-    mark = "**" if is_best else ""
-    numbers = f"{p.degrees:.2g} | {p.largest:.2g} | {p.percent:.2g}"
-    seconds = f"{p.seconds:.2g}" if p.seconds < 99.5 else f"{p.seconds:.0f}"
-    return f"| {mark}{seconds}{mark} | {numbers} | {METHODS[p.method].words} | {p.words} |"
+def rows_of(found: Sequence[Point]) -> str:
+    """Settings, the cheapest first; those on their front stand out."""
+    return lines(_row(point, on) for point, on in zip(found, _front(found), strict=True))
 
 
-def whole_rows(found: Sequence[Point]) -> str:
-    """The whole tube in three dimensions, with a front of its own."""
-    mine = [p for p in found if p.is_whole]
-    return "\n".join(_row(p, on) for p, on in zip(mine, _front(mine), strict=True))
+def _row(p: Point, is_best: bool) -> list[str]:
+    seconds = f"{p.found.seconds:.2g}" if p.found.seconds < 99.5 else f"{p.found.seconds:.0f}"
+    errors = (f"{value:.2g}" for value in (p.found.typical, p.found.anywhere, p.found.percent))
+    return [f"**{seconds}**" if is_best else seconds, *errors, METHODS[p.method].words, p.words]
 
 
 def paper_rows(found: Sequence[Point]) -> str:
     """The paper's own setting beside the wall alone on the same elements."""
-    printed = {point.name: point for point in found if point.method == "printed"}
+    printed = {point.name: point.found for point in found if point.method == "printed"}
     whole, wall = printed["full-1-degree-1-step-1"], printed["radial-1-degree-1-step-1"]
-    own = f"| the whole tube | {whole.seconds:.3g} | {whole.degrees:.2g} | {whole.largest:.2g} |"
-    return f"{own}\n| the wall alone on the same elements | {wall.seconds:.1g} | {wall.degrees:.2g} | |"
+    own = ["the whole tube", f"{whole.seconds:.3g}", f"{whole.typical:.2g}", f"{whole.anywhere:.2g}"]
+    return lines([own, ["the wall alone on the same elements", f"{wall.seconds:.1g}", f"{wall.typical:.2g}", ""]])
 
 
 def _front(found: Sequence[Point]) -> list[bool]:
-    return pareto([p.seconds for p in found], [p.degrees for p in found])
+    return pareto([p.found.seconds for p in found], [p.found.typical for p in found])
 
 
-def _draw(found: Sequence[Point], made: str) -> None:
-    page = Page(
-        DOCS / "figures",
-        PICTURE,
-        "The artery: error against time of the processor",
-        "Filled: the front of all. Squares: the whole tube in three dimensions.",
-    )
+def _draw(found: Sequence[Point]) -> None:
+    title = "The artery: error against time of the processor"
+    page = Page(FIGURES, PICTURE, title, "Filled: the front of all. Squares: the whole tube in three dimensions.")
     front = _front(found)
     with rc_context(STYLE):
         figure = Figure(figsize=(6.6, 4.4), layout="constrained")
         axes = figure.subplots()
         mine = [p for p in found if p.is_whole]
-        best = [(p.seconds, p.degrees) for p, on in zip(mine, _front(mine), strict=True) if on]
+        best = [(p.found.seconds, p.found.typical) for p, on in zip(mine, _front(mine), strict=True) if on]
         axes.plot(*zip(*best, strict=True), "-", color="0.7", linewidth=0.8, zorder=0, label="front of the whole tube")
         for (name, method), colour in zip(METHODS.items(), COLOURS, strict=False):
             axes.plot([], [], "o", color=colour, label=method.words)
             for point, on in zip(found, front, strict=True):
                 if point.method == name:
                     marker = "D" if point.name.startswith("profile") else "s" if point.is_whole else "o"
-                    face = colour if on else "white"
-                    axes.plot(point.seconds, point.degrees, marker, color=colour, markerfacecolor=face)
+                    at, face = (point.found.seconds, point.found.typical), colour if on else "white"
+                    axes.plot(*at, marker, color=colour, markerfacecolor=face)
                     if marker == "D" or point.name.startswith("full"):
                         text = point.name.removeprefix("profile-") if marker == "D" else "the paper's mesh and step"
                         side = {"xytext": (5, 3 if marker == "D" else -3)}
-                        at = (point.seconds, point.degrees)
                         axes.annotate(text, at, textcoords="offset points", fontsize=6.5, color="0.3", **side)
         axes.set(xscale="log", yscale="log", xlabel="seconds of the processor")
         axes.set(ylabel="error of the fibre angle, degrees")
         for axis in (axes.xaxis, axes.yaxis):
             axis.set_major_formatter("{x:g}")
         axes.legend()
-        page.save_figure(figure, made)
+        page.save_figure(figure, made_with())
 
 
 def main() -> None:
@@ -303,11 +242,11 @@ def main() -> None:
     )
     parser.add_argument("--report", action="store_true", help="make the page from what is there")
     options = parser.parse_args()
-    options.folder.mkdir(parents=True, exist_ok=True)
+    kept = Kept(options.folder)
     if not options.report:
-        run(options.folder, options.only, options.budget)
+        run(kept, options.only, options.budget)
     if options.report or options.only is PARTS:  # the page needs all parts
-        report(options.folder)
+        report(kept)
 
 
 if __name__ == "__main__":

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
 import sys
 from collections import Counter
 from dataclasses import asdict, replace
-from pathlib import Path
+from functools import partial
 from random import Random
 
 import numpy as np
@@ -17,8 +16,16 @@ from benchmarks.fuzzing.relations import Other
 from benchmarks.fuzzing.scenes import Values, cost, made
 from benchmarks.stability_map.cases import Case, Finding, Run
 from benchmarks.stability_map.judging import BAD_INPUT, NO_END, SOLVE_FAILED, Verdict, judged
-from benchmarks.stability_map.report import read_records
-from benchmarks.stability_map.running import PROJECT, Record, Runner, file_of, measure, mine, parser_of, source_of
+from benchmarks.stability_map.running import (
+    Record,
+    Runner,
+    file_of,
+    judges,
+    measure,
+    parser_of,
+    read_records,
+    source_of,
+)
 
 
 def main(description: str | None, arguments: list[str] | None = None) -> int:
@@ -30,34 +37,20 @@ def main(description: str | None, arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     if options.only is not None:
         return _one(options.only, options.limit)
-    source, seeds = f"{source_of()} by {judges()}", range(options.seed, options.seed + options.count)
+    by, seeds = judges("fuzzing", "stability_map")[:10], range(options.seed, options.seed + options.count)
+    source = f"{source_of()} by {by}"
     file = file_of(options, source)
     there = {} if options.again else {r["seed"]: r for r in read_records(file) if r["source"] == source}
     done = {seed: there[seed] for seed in seeds if seed in there}
     # the cheap ones first: what is stopped has seen as many as it could
     missing = sorted((seed for seed in seeds if seed not in done), key=lambda seed: cost(made(seed)[0]))
     print(f"{source}: {len(seeds)} scenes, {len(missing)} to run; {file}", file=sys.stderr)
-    done |= measure(missing, evaluate, said, source, options)
+    done |= measure({seed: partial(evaluated, seed, source=source) for seed in missing}, said, source, options)
     print(summary([done[seed] for seed in seeds if seed in done]))
     return int(any(record["outcome"] == "wrong" for record in done.values()))
 
 
-def evaluate(seed: int) -> Record:
-    """A seed, in a process of the pool."""
-    runner, source = mine()
-    return evaluated(seed, runner) | {"source": source}
-
-
-def judges() -> str:
-    """Hash of what makes the scenes and judges them: with other scenes a seed is another one."""
-    files = [
-        path for room in ("fuzzing", "stability_map") for path in sorted(Path(__file__).parents[1].glob(f"{room}/*.py"))
-    ]
-    files.append(PROJECT / "tests" / "reference" / "radial.py")
-    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:10]
-
-
-def evaluated(seed: int, runner: Runner) -> Record:
+def evaluated(seed: int, runner: Runner, source: str = "") -> Record:
     """The scene of a seed, run twice and judged."""
     scene, counts = made(seed)
     other = relations.chosen(scene, Random(seed))
@@ -66,7 +59,7 @@ def evaluated(seed: int, runner: Runner) -> Record:
     again = Run(NO_END, run.said) if run.code in (NO_END, BAD_INPUT) else runner.run(asked)
     verdict = verdict_on(scene, other, run, again)
     return {
-        "seed": seed, **asdict(verdict), "other": other.name, "reference": references.known(scene),
+        "seed": seed, "source": source, **asdict(verdict), "other": other.name, "reference": references.known(scene),
         "body": f"{scene['geometry']['shape']} {scene['model']['kinematics']}", "warnings": len(run.warnings),
         "seconds": round(run.seconds + again.seconds, 2),
     }  # fmt: skip

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from benchmarks.fuzzing.scenes import STIFF_NAME, Values
-from benchmarks.stability_map.cases import Finding, Run
-from benchmarks.stability_map.march import Bar, Wall, factor, march
+from benchmarks.stability_map.cases import Finding, Run, farthest
+from tests.reference.march import Bar, Wall, factor, march, slowed
 
 POINT_TOLERANCE, ROUNDING = 1e-5, 1e-9  # of stretches; of radii
 # Of the largest displacement. That elements lack more than 5 % of it is warned of, by an estimate; eight linear ones
@@ -19,7 +21,7 @@ def known(scene: Values) -> bool:
     if scene.get("name") == STIFF_NAME:  # its elements have noise of its own in a bulk as stiff as that
         return False
     r, g, time = scene["remodeling"], scene["geometry"]["shape"], scene["time"]
-    lags = r["coupling"] == "relaxed" and r["law"] in ("rate", "relaxation")  # slower than its law says
+    lags = slowed(scene)
     # across a bar two values agree: which of them has which rank matters where the old cells tell x from y, and stay
     lags |= r["coupling"] == "relaxed" and g != "tube" and scene["cells"]["initial"] != "isotropic"
     return (
@@ -36,27 +38,25 @@ def known(scene: Values) -> bool:
 def compared(scene: Values, run: Run) -> Finding:
     """A run held against the reference, as far as both go."""
     tube = scene["geometry"]["shape"] == "tube"
-    rows, ended = march(scene, Wall(scene) if tube else Bar(scene))
-    number = min(len(rows), len(run.column("time")))
+    path = march(scene, Wall(scene) if tube else Bar(scene))
+    number, ended = min(len(path.times), len(run.column("time"))), path.ended
     if number == 0 or ended.startswith("unknown"):
         return Finding(np.nan, ended or "no row", solvable=not ended)
     off = {}
     if tube:
-        radii = np.array([row.unknown[[0, -1]] for row in rows[:number]])
+        radii = np.stack(path.faces(), axis=1)[:number]
         start = np.array([scene["geometry"]["inner_radius"], scene["geometry"]["outer_radius"]])
         moved = np.abs(radii - start).max() + ROUNDING * start[1]
         allowed = POLYGON_TOLERANCE if scene["model"]["kinematics"] in ("sector", "full") else WALL_TOLERANCE
         for i, name in enumerate(("inner_radius", "outer_radius")):
             off[name] = np.abs(run.column(name)[:number] - radii[:, i]).max() / moved / allowed
     else:
-        stretch, squares = (np.array([row[i] for row in rows[:number]]) for i in (1, 2))
-        off["mean_stretch"] = np.abs(run.column("mean_stretch")[:number] / stretch[:, 2] - 1).max() / POINT_TOLERANCE
-        across = np.sqrt(squares[:, 0, :2].sum(axis=1))
-        angle = np.degrees(np.arctan2(across, np.sqrt(squares[:, 0, 2])))
-        off["mean_fibre_angle"] = np.abs(run.column("mean_fibre_angle")[:number] - angle).max() / POINT_TOLERANCE / 100
-    name = max(off, key=lambda key: off[key])
-    ratio = np.inf if ended and run.code == 0 else off[name]
-    return Finding(float(ratio), f"reference: {name} off by {off[name]:.3g} tolerances {ended}", None, not ended)
+        stretch = np.array(path.unknowns)[:number, 2]
+        off["mean_stretch"] = np.abs(run.column("mean_stretch")[:number] / stretch - 1).max() / POINT_TOLERANCE
+        turned = np.abs(run.column("mean_fibre_angle")[:number] - path.angle()[:number]).max()
+        off["mean_fibre_angle"] = turned / POINT_TOLERANCE / 100
+    found = farthest(off, "reference: ", solvable=not ended)
+    return replace(found, ratio=np.inf) if ended and run.code == 0 else found
 
 
 # ---------------------------------------------------------------- what must hold in every row
@@ -86,7 +86,7 @@ def broken(scene: Values, run: Run) -> list[str]:
         if np.nanmax(np.abs(column - asked)[1:], initial=0.0) > near * max(map(abs, asked)):
             found.append(f"{name} is not its ramp")
     r0 = scene["cells"]["end_to_end_length"]
-    if run.fields.get("cell_dimensions"):
+    if "cell_dimensions" in run.fields:
         trace = np.sum(np.array(run.fields["cell_dimensions"]) ** 2, axis=1) / r0**2
         exact = scene["remodeling"]["law"] in ("tensor", "none", "rotation")
         bounded = scene["remodeling"]["law"] != "rate"  # eq. (10) adds up whatever its targets were

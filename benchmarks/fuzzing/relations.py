@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.fuzzing.scenes import STIFF_NAME, Values, has_free_length
-from benchmarks.stability_map.cases import Finding, Run
+from benchmarks.stability_map.cases import Finding, Run, farthest
 
 EXACT, SOLVED = 1e-6, 1e-4  # relative tolerance of lengths: of the same arithmetic; of another way to the same solution
 DEGREES = 100.0  # degrees for a relative error of one
@@ -252,8 +252,7 @@ def compared(other: Other, run: Run, again: Run) -> Finding:
             else np.nanmax(np.abs(a), initial=0.0)
         )
         off[name] = np.nanmax(np.abs(a - b), initial=0.0) / (scale or 1.0) / allowed
-    name = max(off, key=lambda key: off[key])
-    return Finding(float(off[name]), f"{other.name}: {name} off by {off[name]:.3g} tolerances")
+    return farthest(off, f"{other.name}: ")
 
 
 def _allowed(name: str, other: Other) -> float | None:

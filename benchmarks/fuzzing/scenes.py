@@ -6,7 +6,7 @@ import math
 from random import Random
 from typing import Any
 
-from benchmarks.stability_map.march import BOLTZMANN, STRESS_UNITS
+from tests.reference.march import BOLTZMANN, STRESS_UNITS
 from tests.reference.radial import secant_stiffness
 
 Values = dict[str, Any]

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from benchmarks.precision.whole import EVERY_TANGENT
+from benchmarks.precision.kept import EVERY_TANGENT, Found, Kept, Run, measured
+from docs.making.pages import lines
 from remodel_fenicsx.scene.scene import Scene, preset_scene
-from remodel_fenicsx.studies.trade import typical
 
-Array = NDArray[np.float64]
-Measured = Callable[[Scene, list[float]], dict[str, Array]]
 Changes = Mapping[str, Any]
 
 TO_THE_END = [5.0, 25.0, 45.0, 65.0, 85.0, 105.0, 125.0, 145.0, 150.0]
@@ -111,74 +107,37 @@ EQUAL = {"implicit": "printed"}  # whose equal steps the chosen ones are held ag
 
 
 # ---------------------------------------------------------------- runs
-def run(folder: Path, measured: Measured, part: str) -> None:
+def run(kept: Kept, part: str) -> None:
     """What is not kept yet of `end` or `hold`."""
-    for name, way in _ways(part).items():
+    for name, way in ways(part).items():
         exact = {f"reference {number}": changes for number, changes in enumerate(way.exact.runs)}
-        missing = {words: changes for words, changes in {**way.runs, **exact}.items()
-                   if not _kept(folder, name, words).exists()}  # fmt: skip
-        found: dict[str, dict[str, Array]] = {}
+        asked = {words: changes for words, changes in (way.runs | exact).items() if f"{name}-{words}" not in kept}
+        best: dict[str, Run] = {}
         for turn in range(way.turns):
-            for words, changes in missing.items():
+            for words, changes in asked.items():
                 if turn and words in exact:  # nobody asks what it costs
                     continue
                 one = measured(way.scene(changes), way.times)
-                if words not in found or one["seconds"] < found[words]["seconds"]:
-                    found[words] = one
-        for words, one in found.items():
-            np.savez(_kept(folder, name, words), **one)
-            print(f"{name} {words}: {float(one['seconds']):.2g} s", flush=True)
+                if words not in best or one["seconds"] < best[words]["seconds"]:
+                    best[words] = one
+        for words, one in best.items():
+            kept.keep(f"{name}-{words}", one)
 
 
-def _ways(part: str) -> dict[str, Way]:
+def ways(part: str) -> dict[str, Way]:
+    """Of a part, by the beginning of their files' names."""
     if part == "hold":
         return {f"hold-{name}": way for name, way in HOLDS.items()}
     return {f"end-{name}-{mesh[0]}-degree-{mesh[1]}-{predictor}": way for (name, mesh, predictor), way in ENDED.items()}
 
 
-def _kept(folder: Path, name: str, words: str) -> Path:
-    return folder / f"{name}-{words.replace(' ', '-')}.npz"
-
-
-@dataclass(frozen=True)
-class Found:
-    """One run.
-
-    Attributes
-    ----------
-    seconds, rows, iterations
-        Of the processor; steps; Newton iterations.
-    typical, largest
-        Error of the fibre angle, degrees: root mean square over places and times, and over places at the worst time.
-    percent
-        Largest relative error of the radii.
-    """
-
-    seconds: float
-    rows: int
-    iterations: int
-    typical: float
-    largest: float
-    percent: float
-
-
-def found(folder: Path, part: str) -> list[dict[str, Found]]:
+def found(kept: Kept, part: str) -> Iterator[dict[str, Found]]:
     """All runs of each way."""
-    return [_found(folder, name, way) for name, way in _ways(part).items()]
-
-
-def _found(folder: Path, name: str, way: Way) -> dict[str, Found]:
-    parts = [np.load(_kept(folder, name, f"reference {number}")) for number in range(len(way.exact.runs))]
-    angles, lengths = (sum(weight * part[key] for weight, part in zip(way.exact.weights, parts, strict=True))
-                       for key in ("angles", "lengths"))  # fmt: skip
-    results = {}
-    for words in way.runs:
-        with np.load(_kept(folder, name, words)) as kept:
-            apart = kept["angles"] - angles
-            percent = 100 * float(np.max(np.abs(kept["lengths"] / lengths - 1)))
-            work = float(kept["seconds"]), int(kept["rows"]), int(kept["iterations"])
-            results[words] = Found(*work, typical(apart), max(map(typical, apart)), percent)
-    return results
+    for name, way in ways(part).items():
+        parts = [kept[f"{name}-reference {number}"] for number in range(len(way.exact.runs))]
+        weighted = list(zip(way.exact.weights, parts, strict=True))
+        angles, lengths = (sum(weight * run[key] for weight, run in weighted) for key in ("angles", "lengths"))
+        yield {words: kept.found(f"{name}-{words}", np.asarray(angles), np.asarray(lengths)) for words in way.runs}
 
 
 # ---------------------------------------------------------------- the tables
@@ -192,36 +151,40 @@ def share(one: Found, equal: Mapping[str, Found], error: str, cost: str) -> floa
     return float(getattr(one, cost) / np.exp(costs[k] + slope * (place - errors[k])))
 
 
-def end_rows(folder: Path) -> str:
+def end_rows(kept: Kept) -> str:
     """Of the page: without the predictor and with it; chosen steps over equal ones: predicted alone, both, neither."""
-    lines, results = [], dict(zip(ENDED, found(folder, "end"), strict=True))
-    for (name, mesh, predictor), way in ENDED.items():
+    return lines(_end_rows(dict(zip(ENDED, found(kept, "end"), strict=True))))
+
+
+def _end_rows(results: Mapping[Any, dict[str, Found]]) -> Iterator[list[str]]:
+    for name, mesh, predictor in results:
         if predictor != PREDICTORS[0]:
             continue
         plain, predicted = (results[name, mesh, predictor] for predictor in PREDICTORS)
-        for number, words in enumerate(plain):
-            cells = ["" if number else way.words, words, str(predicted[words].rows), f"{predicted[words].typical:.2g}"]
-            cells += [f"{one.iterations} | {one.seconds:.2g}" for one in (plain[words], predicted[words])]
-            pairs = ((predicted, plain), (predicted, predicted), (plain, plain))
-            cells += ["" if words[0].isdigit() else ", ".join(
-                f"{share(mine[words], equal, 'typical', cost):.2f}" for cost in ("seconds", "iterations")
-            ) for mine, equal in pairs]  # fmt: skip
-            lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+        pairs = ((predicted, plain), (predicted, predicted), (plain, plain))
+        for number, (words, one) in enumerate(predicted.items()):
+            cells = ["" if number else ENDED[name, mesh, predictor].words, words, str(one.rows), f"{one.typical:.2g}"]
+            for each in (plain[words], one):
+                cells += [str(each.iterations), f"{each.seconds:.2g}"]
+            for mine, equal in pairs:
+                both = [f"{share(mine[words], equal, 'typical', cost):.2f}" for cost in ("seconds", "iterations")]
+                cells.append("" if words[0].isdigit() else ", ".join(both))
+            yield cells
 
 
-def hold_rows(folder: Path) -> str:
+def hold_rows(kept: Kept) -> str:
     """Of the page."""
-    lines, results = [], dict(zip(HOLDS, found(folder, "hold"), strict=True))
-    for name, way in HOLDS.items():
+    return lines(_hold_rows(dict(zip(HOLDS, found(kept, "hold"), strict=True))))
+
+
+def _hold_rows(results: Mapping[str, dict[str, Found]]) -> Iterator[list[str]]:
+    for name, runs_of in results.items():
         equal = results[EQUAL.get(name, name)]
-        for number, (words, one) in enumerate(results[name].items()):
+        for number, (words, one) in enumerate(runs_of.items()):
             errors = [one.typical, one.largest, one.percent] if one.largest > SMALL else [0, 0, 0]
-            cells = ["" if number else way.words, words, str(one.rows), str(one.iterations), f"{one.seconds:.2g}"]
-            cells += [f"{error:.2g}" for error in errors]
-            cells += [_of_equal_error(one, words, equal, error) for error in ("typical", "largest")]
-            lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+            cells = ["" if number else HOLDS[name].words, words, str(one.rows), str(one.iterations)]
+            cells += [f"{value:.2g}" for value in (one.seconds, *errors)]
+            yield cells + [_of_equal_error(one, words, equal, error) for error in ("typical", "largest")]
 
 
 def _of_equal_error(one: Found, words: str, equal: Mapping[str, Found], error: str) -> str:

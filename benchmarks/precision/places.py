@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 from mpi4py import MPI
-from numpy.typing import NDArray
 
+from benchmarks.precision.kept import Kept
 from remodel_fenicsx.scene.scene import Scene
 from remodel_fenicsx.simulation import Simulation
 from tests.reference.radial import solve_radial
 
-Array = NDArray[np.float64]
 
-
-def run(scene: Scene, folder: Path) -> None:
+def run(scene: Scene, kept: Kept) -> None:
     """Errors of the fibre angle in degrees at the end, by radius, against the reference with the scene's own steps."""
-    kept = folder / "places.npz"
-    if kept.exists():
+    if "places" in kept:
         return
     simulation = Simulation(scene.with_values({"model.kinematics": "sector", "output.fields": False}), MPI.COMM_SELF)
     for _ in simulation.steps():
@@ -29,12 +24,11 @@ def run(scene: Scene, folder: Path) -> None:
     simulation.close()
     exact = solve_radial(end=scene.time.end, step=scene.time.step)
     error = np.abs(angles - np.interp(radii, exact.points, exact.fibre_angle()))
-    np.savez(kept, radii=radii, error=error)
+    kept.keep("places", {"radii": radii, "error": error})
 
 
-def words(folder: Path) -> str:
+def words(kept: Kept) -> str:
     """What the page says of it."""
-    with np.load(folder / "places.npz") as kept:
-        radii, error = kept["radii"], kept["error"]
+    radii, error = (kept["places"][name] for name in ("radii", "error"))
     worst = radii[error.argmax()]
     return f"{error.mean():.1f} degrees in the mean over the points, {error.max():.1f} in the front, at R = {worst:.2g}"

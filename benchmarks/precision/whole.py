@@ -5,9 +5,6 @@ from __future__ import annotations
 from remodel_fenicsx.scene.scene import Scene
 from remodel_fenicsx.studies import trade as rungs
 
-EVERY_TANGENT = {"solver.method": "direct", "solver.predictor": "with-tolerance"}
-"""How the tables of docs/speed_and_accuracy.md were measured: the presets named this up to 0.2.0."""
-
 # as a user would solve them
 SOLVED = {"model.kinematics": "full", "solver.method": "auto", "solver.predictor": "autoregressive"}
 # refinement, degree, and steps or tolerances of the steps in degrees

@@ -72,6 +72,12 @@ class Finding:
 Check = Callable[["Case", Run], Finding]
 
 
+def farthest(off: Mapping[str, float], where: str = "", **more: Any) -> Finding:
+    """What is off by most of its tolerances."""
+    words, ratio = max(off.items(), key=lambda pair: pair[1])
+    return Finding(float(ratio), f"{where}{words} off by {ratio:.3g} tolerances", **more)
+
+
 @dataclass(frozen=True)
 class Case:
     """A point of the map.

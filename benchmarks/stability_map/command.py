@@ -5,11 +5,21 @@ from __future__ import annotations
 import argparse
 import sys
 from collections import Counter
+from functools import partial
 from pathlib import Path
 
 from benchmarks.stability_map import report
 from benchmarks.stability_map.cases import FAMILIES, Case, all_cases
-from benchmarks.stability_map.running import Record, digest, evaluate, file_of, measure, parser_of, source_of
+from benchmarks.stability_map.running import (
+    Record,
+    digest,
+    evaluated,
+    file_of,
+    measure,
+    parser_of,
+    read_records,
+    source_of,
+)
 
 
 def main(description: str | None, arguments: list[str] | None = None) -> int:
@@ -23,7 +33,7 @@ def main(description: str | None, arguments: list[str] | None = None) -> int:
     parser.add_argument("--report", action="store_true", help="write docs/stability.md and its picture, run nothing")
     options = parser.parse_args(arguments)
     if options.report:
-        return report.write(options.results, all_cases(), source_of(), digest)
+        return report.write(options.results, all_cases(), source_of())
     cases = chosen(options, parser)
     if options.list:
         print("\n".join(f"{case.key}\n    {case.command}" for case in cases.values()))
@@ -32,11 +42,12 @@ def main(description: str | None, arguments: list[str] | None = None) -> int:
     file = file_of(options, source)
     done = {} if options.again else measured(file, source, cases, options.limit)
     if options.judge:
-        known = {record["key"] for record in report.read_records(file) if record["source"] == source}
+        known = {record["key"] for record in read_records(file) if record["source"] == source}
         cases = {key: case for key, case in cases.items() if key in known}
     missing = spread([key for key in cases if key not in done], cases)
     print(f"{source}: {len(cases)} cases, {len(missing)} to run with {options.jobs} processes; {file}", file=sys.stderr)
-    done |= measure(missing, evaluate, said, source, options)
+    jobs = {key: partial(evaluated, cases[key], source=source) for key in missing}
+    done |= measure(jobs, said, source, options)
     records = [done[key] for key in cases if key in done]
     print(report.table(records))
     for record in records:
@@ -67,7 +78,7 @@ def chosen(options: argparse.Namespace, parser: argparse.ArgumentParser) -> dict
 def measured(file: Path, source: str, cases: dict[str, Case], limit: float = 0.0) -> dict[str, Record]:
     """What has been measured of these cases with this package, by key; the last one of each."""
     found = {}
-    for record in report.read_records(file):
+    for record in read_records(file):
         case = cases.get(record["key"])
         if case is not None and record["source"] == source and record["digest"] == digest(case):
             found[record["key"]] = record

@@ -9,7 +9,7 @@ import numpy as np
 
 from benchmarks.stability_map.cases import Case, Finding, Run
 
-OUTCOMES = ("right", "refused", "unstable", "warned", "wrong", "unchecked", "not there")
+OUTCOMES = ("right", "refused", "unstable", "warned", "wrong", "unchecked")
 # what a refusal must say to be one with a cause
 CAUSES = re.compile(
     r"limit point|bifurcation|kinematic locking|chain locking|chains? lock|solver tolerance|eigenvalue", re.I

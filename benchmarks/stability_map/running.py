@@ -1,37 +1,160 @@
-"""Cases to records, of the map and of random scenes: each process that judges owns one that runs scenes."""
+"""Cases to records, of the map and of random scenes: scenes run by the command line, many in one process."""
 
 from __future__ import annotations
 
 import argparse
-import gzip
+import contextlib
+import csv
 import hashlib
+import importlib
+import io
 import json
+import math
 import multiprocessing
 import os
-import select
+import pickle
+import re
 import subprocess
 import sys
 import tempfile
 import time as clock
-from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+import traceback
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import asdict
 from functools import lru_cache
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any
 
 import numpy as np
+import tomlkit
 
-from benchmarks.stability_map.cases import Case, Run, all_cases
+from benchmarks.stability_map.cases import Case, Run
 from benchmarks.stability_map.judging import CRASHED, NO_END, judged
+from remodel_fenicsx import Recording
 from remodel_fenicsx._version import __version__
 
 PROJECT = Path(__file__).resolve().parents[2]
-RUNNER = Path(__file__).with_name("runner.py")
+WANTED_FIELDS = ("deformation_gradient", "cauchy_stress", "cell_dimensions", "axis_1", "axis_2", "axis_3")
 Record = dict[str, Any]
 ENDED = (0, 1, 2, 3)  # a run that was killed, or went on for too long, may end otherwise another time
 
 
+# ---------------------------------------------------------------- one scene, in the process that runs scenes
+def run_request(request: dict[str, Any]) -> Run:
+    """Run one scene as a user does.
+
+    Parameters
+    ----------
+    request
+        `scene`: nested tables; `counts`: {module: {constant: value}}, numbers of elements that scenes cannot ask for;
+        `extended`: whether it needs the loads and bodies of `extensions`.
+        Ways to run it that must change nothing: `ranks`; `stop`, a time at which it ends and is resumed; `recorded`:
+        the scene.toml that it leaves is what is run.
+    """
+    if request.get("extended"):
+        importlib.import_module("benchmarks.stability_map.extensions").register()
+    start, said = clock.perf_counter(), io.StringIO()
+    with tempfile.TemporaryDirectory(prefix="remodel-fenicsx-stability-") as name:
+        folder = Path(name)
+        scene, results = folder / "scene.toml", folder / "run"
+        tables = {"model": {"kinematics": "full"}, **request["scene"]}  # without it they take the cheapest kinematics
+        scene.write_text(tomlkit.dumps(tables), encoding="utf-8")
+        command = ["run", str(scene), "-o", str(results), "-q"]
+        with (
+            element_counts(request.get("counts", {})), contextlib.redirect_stderr(said),
+            contextlib.redirect_stdout(io.StringIO()),
+        ):  # fmt: skip
+            if "ranks" in request:
+                code = on_ranks(request, command, said)
+            elif "stop" in request:
+                code = commanded([*command, "--set", f"time.end={request['stop']!r}"], said)
+                if code == 0:
+                    end = f"time.end={tables['time']['end']!r}"
+                    code = commanded(["run", "--resume", str(results), "--set", end, "-q"], said)
+            else:
+                code = commanded(command, said)
+            if code == 0 and request.get("recorded"):
+                recorded, results = results / "scene.toml", folder / "again"
+                code = commanded(["run", str(recorded), "-o", str(results), "-q"], said)
+        return Run(code, said.getvalue()[-2000:], clock.perf_counter() - start, **read_results(results))
+
+
+def commanded(command: list[str], said: io.StringIO) -> Any:
+    """The exit code of a command line in this process."""
+    try:
+        return importlib.import_module("remodel_fenicsx.cli").main(command)
+    except SystemExit as error:  # the command line's own words for its arguments
+        return error.code
+    except Exception:  # a defect of the program is an outcome of the map, with its traceback
+        said.write(traceback.format_exc())
+        return 1
+
+
+ON_RANKS = """import json, sys
+from benchmarks.stability_map.running import element_counts
+from remodel_fenicsx.cli import main
+with element_counts(json.loads(sys.argv[1])):
+    code = main(sys.argv[2:])
+sys.exit(code)
+"""
+
+
+def on_ranks(request: dict[str, Any], command: list[str], said: io.StringIO) -> int:
+    """The exit code of a command line in processes of its own, each with the request's numbers of elements."""
+    words = ["mpirun", "--allow-run-as-root", "--oversubscribe", "-n", str(request["ranks"]), sys.executable, "-c"]
+    words += [ON_RANKS, json.dumps(request.get("counts", {})), *command]
+    environment = os.environ | {"PYTHONPATH": str(PROJECT)}
+    done = subprocess.run(
+        words, capture_output=True, text=True, timeout=300, cwd=tempfile.gettempdir(), env=environment
+    )
+    said.write(done.stderr)
+    return done.returncode
+
+
+@contextlib.contextmanager
+def element_counts(counts: dict[str, dict[str, Any]]) -> Iterator[None]:
+    """Numbers of elements other than the paper's, where meshes are made."""
+    before = []
+    for name, constants in counts.items():
+        module = importlib.import_module(f"remodel_fenicsx.body.{name}")
+        for key, value in constants.items():
+            before.append((module, key, getattr(module, key)))
+            setattr(module, key, tuple(value) if isinstance(value, list) else value)
+    try:
+        yield
+    finally:
+        for module, key, value in before:
+            setattr(module, key, value)
+
+
+def read_results(folder: Path) -> dict[str, Any]:
+    """Warnings, history and last fields of a run's folder, as far as it came."""
+    found: dict[str, Any] = {"warnings": [], "history": {}, "fields": {}}
+    if (folder / "run.log").exists():
+        lines = (folder / "run.log").read_text(encoding="utf-8").splitlines()
+        found["warnings"] = [re.sub(r"^.*? WARNING ", "", line) for line in lines if " WARNING " in line]
+    if (folder / "history.csv").exists():
+        with (folder / "history.csv").open(encoding="utf-8") as file:
+            rows = csv.DictReader(file)
+            values = [[value_of(entry) for entry in row.values()] for row in rows]
+        names = rows.fieldnames or []
+        found["history"] = {name: [row[i] for row in values] for i, name in enumerate(names)}
+    if (folder / "fields.vtkhdf").exists():
+        recording = Recording(folder)
+        last = recording.times[-1:]
+        found["fields"] = recording.fields(last[0], WANTED_FIELDS) if len(last) else {}
+        found["fields"]["time"] = float(last[0]) if len(last) else None
+    return found
+
+
+def value_of(entry: str) -> float:
+    """An entry of history.csv: empty is nan, and what says nan is none that a row may have."""
+    return float("nan") if not entry else float("inf") if math.isnan(float(entry)) else float(entry)
+
+
+# ---------------------------------------------------------------- who asks for it
 class Runner:
     """A process that runs scenes.
 
@@ -45,58 +168,63 @@ class Runner:
 
     def __init__(self, limit: float, store: Path | None = None):
         self.limit, self.store = limit, store
-        self._process: subprocess.Popen[str] | None = None
+        self._process: Any = None
 
     def run(self, request: dict[str, Any]) -> Run:
         """One scene, from the store if it is there."""
         if self.store is None:
             return self._run(request)
         text = json.dumps(request, sort_keys=True, default=plain)
-        kept = self.store / f"{hashlib.sha256(text.encode()).hexdigest()[:20]}.json.gz"
+        kept = self.store / f"{hashlib.sha256(text.encode()).hexdigest()[:20]}.pickle"
         if kept.exists():
-            return Run(**json.loads(gzip.decompress(kept.read_bytes())))
+            return pickle.loads(kept.read_bytes())
         run = self._run(request)
         if run.code in ENDED:
             self.store.mkdir(parents=True, exist_ok=True)
-            part = kept.with_suffix(f".{os.getpid()}")
-            part.write_bytes(gzip.compress(json.dumps(asdict(run)).encode()))
+            part = kept.with_suffix(f".{id(self)}")
+            part.write_bytes(pickle.dumps(run))
             part.rename(kept)
         return run
 
     def _run(self, request: dict[str, Any]) -> Run:
         """One scene; `CRASHED` or `NO_END` with words where there is no answer."""
-        process = self._process = self._process or self._started()
-        assert process.stdin is not None and process.stdout is not None
+        if self._process is None:
+            os.environ["OMP_NUM_THREADS"] = "1"
+            started = multiprocessing.get_context("spawn")
+            self._pipe, other = started.Pipe()
+            self._process = started.Process(target=serve, args=(other,), daemon=True)
+            self._process.start()
+            other.close()
+        end = processor_seconds(self._process.pid) + self.limit
         try:
-            process.stdin.write(json.dumps(request, default=plain) + "\n")
-            process.stdin.flush()
-            end = processor_seconds(process.pid) + self.limit
-            while not (ready := select.select([process.stdout], [], [], 0.5)[0]):
-                if processor_seconds(process.pid) > end:
-                    break
-            line = process.stdout.readline() if ready else ""
-        except BrokenPipeError:
-            ready, line = [process], ""
-        if not line:
+            self._pipe.send(request)
+            while not self._pipe.poll(0.5):
+                if processor_seconds(self._process.pid) > end:
+                    self.close()
+                    return Run(NO_END, f"no end within {self.limit:g} s", self.limit)
+            return self._pipe.recv()
+        except (EOFError, OSError):
+            self._process.join()
+            code = self._process.exitcode
             self.close()
-            why = f"the program has crashed ({process.returncode})" if ready else f"no end within {self.limit:g} s"
-            return Run(CRASHED if ready else NO_END, why, self.limit)
-        return Run(**json.loads(line))
-
-    def _started(self) -> subprocess.Popen[str]:
-        environment = {**os.environ, "PYTHONPATH": str(PROJECT), "OMP_NUM_THREADS": "1"}
-        log = tempfile.TemporaryFile("w")
-        return subprocess.Popen(
-            [sys.executable, str(RUNNER)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, text=True,
-            env=environment, cwd=tempfile.gettempdir(),
-        )  # fmt: skip
+            return Run(CRASHED, f"the program has crashed ({code})", self.limit)
 
     def close(self) -> None:
         """End the process."""
         if self._process is not None:
             self._process.kill()
-            self._process.communicate()
+            self._process.join()
             self._process = None
+
+
+def serve(pipe: Any) -> None:
+    """Answer requests until there are no more; what libraries print goes nowhere."""
+    nowhere = os.open(os.devnull, os.O_RDWR)
+    os.dup2(nowhere, 1)
+    os.dup2(nowhere, 2)
+    with contextlib.suppress(EOFError):
+        while True:
+            pipe.send(run_request(pipe.recv()))
 
 
 def processor_seconds(process: int) -> float:
@@ -108,6 +236,7 @@ def processor_seconds(process: int) -> float:
     return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
 
 
+# ---------------------------------------------------------------- a case to its record
 def evaluated(case: Case, runner: Runner, source: str) -> Record:
     """Run a case and its companion, judge it."""
     start = clock.perf_counter()
@@ -132,16 +261,17 @@ def plain(value: Any) -> Any:
 def digest(case: Case) -> str:
     """Of everything that makes its result, references included: what changes is judged again."""
     scenes = [case.scene, case.companion, dict(case.counts), dict(case.options), case.check.__name__]
-    text = json.dumps(scenes, sort_keys=True, default=plain) + references()
+    text = json.dumps(scenes, sort_keys=True, default=plain) + judges("stability_map")
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
 @lru_cache
-def references() -> str:
-    """Hash of what judges."""
-    files = [PROJECT / "tests" / "reference" / "radial.py"]
-    files += [path for path in sorted(RUNNER.parent.glob("*.py")) if path.stem not in ("command", "report", "running")]
-    return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()
+def judges(*rooms: str) -> str:
+    """Hash of what makes scenes and judges them."""
+    files = sorted(PROJECT.glob("tests/reference/*.py"))
+    files += [path for room in rooms for path in sorted(PROJECT.glob(f"benchmarks/{room}/*.py"))]
+    apart = ("command", "report", "running")
+    return hashlib.sha256(b"".join(path.read_bytes() for path in files if path.stem not in apart)).hexdigest()
 
 
 def source_of() -> str:
@@ -153,48 +283,50 @@ def source_of() -> str:
 
 
 # ---------------------------------------------------------------- many of them
-_mine: dict[str, Any] = {}
-
-
 def parser_of(description: str | None, limit: float, results: str) -> argparse.ArgumentParser:
     """The options that both commands have; seconds and the name of the results' folder are their defaults."""
     parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--again", action="store_true", help="run also what has been measured")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, metavar="N", help="at a time (all cores)")
-    parser.add_argument(
-        "--limit", type=float, default=limit, metavar="SECONDS", help=f"of processor time for one scene ({limit:g})"
-    )
+    words = f"of processor time for one scene ({limit:g})"
+    parser.add_argument("--limit", type=float, default=limit, metavar="SECONDS", help=words)
     parser.add_argument("--results", type=Path, default=PROJECT / "results" / results, help="folder of the results")
     return parser
 
 
 def measure(
-    keys: Sequence[Any], evaluate: Callable[[Any], Record], said: Callable[[Record], str], source: str,
+    jobs: Mapping[Any, Callable[[Runner], Record]], said: Callable[[Record], str], source: str,
     options: argparse.Namespace,
 ) -> dict[Any, Record]:  # fmt: skip
-    """Run and judge, in processes; each record is a line of the file of the version as soon as it is there."""
+    """Do jobs, several at a time; each record is a line of the file of the version as soon as it is there."""
     found: dict[Any, Record] = {}
-    if not keys:
-        return found
     options.results.mkdir(parents=True, exist_ok=True)
     start, store = clock.monotonic(), None if options.again else options.results / "runs" / source.partition(" ")[0]
-    with (
-        file_of(options, source).open("a", encoding="utf-8") as out,
-        ProcessPoolExecutor(
-            options.jobs, multiprocessing.get_context("spawn"), _set_up, (options.limit, source, store)
-        ) as pool,
-    ):  # fmt: skip
-        waiting = {pool.submit(evaluate, key): key for key in keys}
+    runners, free = [Runner(options.limit, store) for _ in range(options.jobs)], SimpleQueue[Runner]()
+    for runner in runners:
+        free.put(runner)
+
+    def done(job: Callable[[Runner], Record]) -> Record:
+        runner = free.get()
+        try:
+            return job(runner)
+        finally:
+            free.put(runner)
+
+    with file_of(options, source).open("a", encoding="utf-8") as out, ThreadPoolExecutor(options.jobs) as pool:
+        waiting = {pool.submit(done, job): key for key, job in jobs.items()}
         try:
             for number, future in enumerate(as_completed(waiting), start=1):
                 record = found[waiting[future]] = future.result()
                 out.write(json.dumps(record) + "\n")
                 out.flush()
-                left = (clock.monotonic() - start) / number * (len(keys) - number)
-                print(f"[{number}/{len(keys)}, {left / 60:.0f} min left] {said(record)}", file=sys.stderr, flush=True)
+                left = (clock.monotonic() - start) / number * (len(jobs) - number)
+                print(f"[{number}/{len(jobs)}, {left / 60:.0f} min left] {said(record)}", file=sys.stderr, flush=True)
         except KeyboardInterrupt:
             pool.shutdown(wait=False, cancel_futures=True)
             print("stopped; what has been measured is kept, the same command goes on", file=sys.stderr)
+    for runner in runners:
+        runner.close()
     return found
 
 
@@ -203,19 +335,9 @@ def file_of(options: argparse.Namespace, source: str) -> Path:
     return Path(options.results / f"{source.partition('+')[0]}.jsonl")
 
 
-def _set_up(limit: float, source: str, store: Path | None) -> None:
-    os.environ["OMP_NUM_THREADS"] = "1"
-    _mine.update(runner=Runner(limit, store), source=source)
-
-
-def mine() -> tuple[Runner, str]:
-    """Of a process of the pool: what runs scenes there, and the source that its records name."""
-    return _mine["runner"], _mine["source"]
-
-
-def evaluate(key: str) -> Record:
-    """A case by its key, in a process of the pool."""
-    return evaluated(_cases()[key], *mine())
-
-
-_cases = lru_cache(all_cases)
+def read_records(file: Path) -> list[Record]:
+    """All lines of a file of results; one that was cut off at the end is left out."""
+    if not file.exists():
+        return []
+    lines = file.read_text(encoding="utf-8").splitlines(keepends=True)
+    return [json.loads(line) for line in lines if line.endswith("\n")]

@@ -6,11 +6,11 @@ from functools import partial
 from typing import Any
 
 from benchmarks.stability_map.bodies import (
+    LONG,
     MESHES,
     RATIOS,
     check_half_step,
-    check_long,
-    ring,
+    long,
     tendon_case,
     thick_wall,
     tube_case,
@@ -25,7 +25,7 @@ HEXAHEDRA = [name for name in MESHES if name.startswith("hex")]
 table("selective integration", thick_wall, {"mesh": HEXAHEDRA, "lambda/mu": RATIOS}, SELECTIVE)
 table(
     "selective integration", tube_case, {"chains": ("yes",), "lambda/mu": (0.1, 8.8, 100.0, 1e3, 1e4)},
-    {**SELECTIVE, "loads.pressure.value": 2.4, "mesh.degree": 1}, more={"counts": ring(16, 8), "check": check_long},
+    {**SELECTIVE, "loads.pressure.value": 2.4, "mesh.degree": 1}, more=LONG,
 )  # fmt: skip
 table(
     "selective integration", cube_case,
@@ -60,7 +60,7 @@ table(
 table(
     "stopped where unstable", tube_case, {"body": ("tube",), "pressure": (2.4, -4.8)},
     {**STOP, "loads.elongation.value": 0.0, "mesh.degree": 1},
-    more=lambda p: {"counts": ring(16, 8), "check": check_long, "options": {"unstable": p["pressure"] < 0}},
+    more=lambda p: long(unstable=p["pressure"] < 0),
 )  # fmt: skip
 table(
     "stopped where unstable", tendon_case, {"body": ("tendon",), "force": (300.0, -10.0)},

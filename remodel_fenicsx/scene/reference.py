@@ -99,12 +99,10 @@ def _required(table: type[BaseModel]) -> Schema:
 
 
 # ---------------------------------------------------------------- the page docs/scene.md, made from the code
-# The page docs/scene.md, made from the code: ``python3 -m remodel_fenicsx.scene.reference`` prints it.
 
 _REFERENCE = """# Keys of a scene
 
-This page is made from the code:
-`./with-fenicsx python3 -m remodel_fenicsx.scene.reference > docs/scene.md`.
+This page is made from the code: `./with-fenicsx docs/make scene`.
 
 A scene is a TOML file that says what to compute: a body, its tissue, its loads, and how the
 collagen remodels. This page lists every key with its default, what is allowed and what it means.
@@ -215,7 +213,3 @@ def _load_rows() -> Iterator[str]:
         for name, kind in table.loads.items():
             unit = f", in the unit of {kind.dimension.name}" if kind.dimension else ""
             yield f"| `{name}` | `{shape}` | {kind.meaning}{unit} |"
-
-
-if __name__ == "__main__":
-    print(scene_reference(), end="")

@@ -1,6 +1,6 @@
 """Start, tutorials and how-to pages: each command and each file of a page, in its order, with short times.
 
-What a page says that a command prints is compared, all but the numbers. docs/make_tutorials.py runs the same pages in
+What a page says that a command prints is compared, all but the numbers. `docs/make tutorials` runs the same pages in
 full and brings numbers and pictures up to date. NOT_RUN lists the commands that are shown and not run, and why.
 docs/fit.md is run by tests/studies/test_fit.py, docs/my_own_vessel.md by tests/body/test_my_own_vessel.py.
 """
@@ -8,7 +8,6 @@ docs/fit.md is run by tests/studies/test_fit.py, docs/my_own_vessel.md by tests/
 from __future__ import annotations
 
 import re
-import runpy
 import shlex
 import shutil
 import subprocess
@@ -17,12 +16,11 @@ from pathlib import Path
 
 import pytest
 
+from docs.making.tutorials import BLOCK, keep, printed_as
 from remodel_fenicsx import cli, read_scene
 
 ROOT = Path(__file__).parents[2]
 TUBE = "tutorial_tube"
-MADE = runpy.run_path(str(ROOT / "docs" / "make_tutorials.py"))
-keep, printed_as = MADE["keep"], MADE["printed_as"]
 SHORT = {  # a test's times for those of the page
     "end = 100.0": "end = 2.0",
     "time.end=120": "time.end=3",
@@ -76,7 +74,7 @@ def blocks(page: str) -> list[tuple[str, str]]:
     text = (ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8")
     for long, short in SHORT.items():
         text = text.replace(long, short)
-    return [(str(language), str(block)) for language, block in MADE["BLOCK"].findall(text)]
+    return [(str(language), str(block)) for language, block in BLOCK.findall(text)]
 
 
 def is_left_out(line: str) -> bool:

@@ -426,4 +426,4 @@ def test_the_bundle_is_the_one_that_is_named() -> None:
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("npm") is None, reason="no npm: the bundle cannot be made anew")
 def test_the_bundle_is_what_its_packages_give() -> None:
-    subprocess.run(["python3", "docs/make_bundle.py", "--check"], cwd=DEMOS.parent, check=True)
+    subprocess.run(["python3", "docs/make", "--check", "bundle"], cwd=DEMOS.parent, check=True)

@@ -20,7 +20,7 @@ from remodel_fenicsx.solver.newton import GuardedNewton, SolveFailure
 from remodel_fenicsx.solver.diagnosis import diagnosed
 from tests.locking_bodies import thick_tube
 
-LARGEST = 0.3018  # pressure of this tube: benchmarks/stability_map/tube_march.py, with the inner radius prescribed
+LARGEST = 0.3018  # pressure of this tube: tests/reference/march.py, with the inner radius prescribed
 
 
 def thin_tube(pressure: float = 0.5, end: float = 1.0, **values: Any) -> Scene:

@@ -2,32 +2,20 @@
 
 from __future__ import annotations
 
-import importlib.util
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 
-DOCS = Path(__file__).resolve().parents[2] / "docs"
+from docs.making import measurements as compare
+from docs.making.pages import DOCS
 
 
-@pytest.fixture(scope="module")
-def compare() -> Any:
-    spec = importlib.util.spec_from_file_location("compare_measurements", DOCS / "compare_measurements.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-def test_the_page_is_what_its_table_says(compare: Any) -> None:
+def test_the_page_is_what_its_table_says() -> None:
     """Whoever makes the runs anew and forgets the page, or edits a number by hand, is told."""
     assert compare.page_text() == (DOCS / "against_measurements.md").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize(("mean", "width"), [(0.7, 3.4), (20.0, 1.5)])
-def test_angles_of_second_moments(compare: Any, mean: float, width: float) -> None:
+def test_angles_of_second_moments(mean: float, width: float) -> None:
     """By the moments of the densities on a fine grid."""
     angle = np.radians(np.arange(-89.975, 90, 0.05))
     m = np.radians(mean)
@@ -42,7 +30,7 @@ def test_angles_of_second_moments(compare: Any, mean: float, width: float) -> No
         assert np.degrees(np.arcsin(np.sqrt(across))) == pytest.approx(found, abs=1e-6)
 
 
-def test_a_row_of_the_table_is_run_again(compare: Any) -> None:
+def test_a_row_of_the_table_is_run_again() -> None:
     """The sheet, and the thin wall with residual stress."""
     found = compare.read_table(DOCS / "figures" / "measurements.csv")
     assert compare.sheet(found["kappa"][-1]) == pytest.approx(found[compare.BANDS[0]][-1], rel=1e-6)

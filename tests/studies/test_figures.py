@@ -624,11 +624,11 @@ def test_the_figures_show_what_the_design_says(everything: Path) -> None:
 @pytest.fixture(scope="module")
 def make_verification() -> Any:
     """The program that makes the page, as a module."""
-    return loaded(DOCS / "make_verification.py")
+    return importlib.import_module("docs.making.verification")
 
 
 def test_the_verification_page_is_what_its_data_says(make_verification: Any) -> None:
-    """Whoever draws anew and forgets the page, or edits it by hand, is told: run docs/make_verification.py."""
+    """Whoever draws anew and forgets the page, or edits it by hand, is told: run docs/make verification."""
     text = (DOCS / "verification.md").read_text(encoding="utf-8")
     assert make_verification.page() == text  # every number again, from the tables beside the pictures
     appendix = make_verification.page(template="appendix_verification")

@@ -14,9 +14,9 @@ from benchmarks.fuzzing import references, relations
 from benchmarks.fuzzing.command import evaluated, said, verdict_on
 from benchmarks.fuzzing.scenes import made
 from benchmarks.stability_map.cases import Run
-from benchmarks.stability_map.march import factor
 from benchmarks.stability_map.running import Runner
 from remodel_fenicsx.scene import scene_from_dict
+from tests.reference.march import factor
 
 ALL = range(1, 301)
 QUICK = (  # half a second or less with what they are held against

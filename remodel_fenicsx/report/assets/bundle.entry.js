@@ -1,4 +1,4 @@
-// What of other people's code the report uses; docs/make_bundle.py makes report.bundle.js and report.bundle.css of it.
+// What of other people's code the report uses; `python3 docs/make bundle` makes report.bundle.js and report.bundle.css of it.
 export {
   AmbientLight, BufferAttribute, BufferGeometry, ColorManagement, DirectionalLight, DoubleSide, LinearSRGBColorSpace,
   LineBasicMaterial, LineSegments, Mesh, MeshBasicMaterial, MeshLambertMaterial, OrthographicCamera, Scene,

@@ -1,56 +1,40 @@
-"""Makes docs/verification.md, its appendix and docs/figures/ anew:
+"""docs/verification.md, its appendix and docs/figures/.
 
-    ./with-fenicsx python3 docs/make_verification.py [--keep]
-
-Draws every figure, solves the independent radial reference of tests/, makes the studies of verification_studies.py, and
-keeps the pictures and the small tables in docs/figures/. The page is make_verification.template.md, the appendix
+Draws every figure, solves the independent radial reference of tests/, makes the studies of docs/making/studies.py, and
+keeps the pictures and the small tables in docs/figures/. The page is verification.template.md, the appendix
 appendix_verification.template.md. Each {name} in them is computed from the tables in docs/figures/, so that a test can
 do the same without a run.
-
-All runs are made anew. --keep uses runs and tables that are there: after a stop, or where results have not changed.
 """
 
 from __future__ import annotations
 
 import shutil
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from textwrap import fill
 from typing import Any
 
-import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
-DOCS = Path(__file__).resolve().parent
-sys.path[:0] = [str(DOCS), str(DOCS.parent / "demos"), str(DOCS.parent)]
+from demos import figures
+from docs.making.consistent import page_values
+from docs.making.pages import DOCS, EDGES, FIGURES, Columns, drawn, markdown, rows_of
+from docs.making.studies import study
+from remodel_fenicsx.studies.page import COLOURS, Page, read_notes, read_table
+from remodel_fenicsx.system.children import cores
+from tests.reference.radial import RadialHistory, solve_radial
 
-import figures  # noqa: E402
-from compare_consistent import page_values  # noqa: E402
-from verification_studies import study  # noqa: E402
-
-from remodel_fenicsx.system.children import cores  # noqa: E402
-from remodel_fenicsx.studies.page import COLOURS, STYLE, Page, read_notes, read_table  # noqa: E402
-from tests.reference.radial import RadialHistory, solve_radial  # noqa: E402
-
-KEPT = DOCS / "figures"
 MORE_TABLES = ("fig6-snapshots", "fig7-history", "fig10-history", "fig11-history", "radial-reference-radii")
-EDGES = np.linspace(1.0, 3.0, 9)  # of the eight element layers
 REFERENCE = {
-    "cauchy": {"driver": "cauchy"},
-    "pk2": {"driver": "pk2"},
-    "finger": {"driver": "finger"},
-    "rate": {"law": "rate"},
-}
+    "cauchy": {"driver": "cauchy"}, "pk2": {"driver": "pk2"}, "finger": {"driver": "finger"}, "rate": {"law": "rate"},
+}  # fmt: skip
 CASES = tuple((100 * elongation, pressure) for elongation, pressure in figures.LOAD_CASES)
 REFERENCE_CAPTION = (
     "The artery against the independent radial reference",
     "Reference fibre angle at t = 150 by driver and law. Points: means of the layers of elements, random cells; "
     "lines: the radial reference, isotropic cells.",
 )
-
-Columns = dict[str, np.ndarray]
 
 
 # ---------------------------------------------------------------- the independent reference
@@ -65,7 +49,8 @@ def radial_reference(page: Page) -> None:
     middle = (EDGES[1:] + EDGES[:-1]) / 2
     table = {"layer": np.arange(1, 9), "radius": middle}
     table |= {name: layer_means(history) for name, history in histories.items()}
-    _draw_reference(page, curves, middle)
+    made = f"{_made_with(page.folder)}; tests/reference/radial.py"
+    drawn(page, draw_reference, layer_angles(page.folder), curves, middle, made=made)
     page.save_table(table, ["tests/reference/radial.py: means over the element layers at t = 150, degrees"])
     inner, outer = (np.array([getattr(history, f"{face}_radii")[-1] for history in histories.values()])
                     for face in ("inner", "outer"))  # fmt: skip
@@ -78,8 +63,8 @@ def layer_means(history: RadialHistory) -> np.ndarray:
     return np.array([history.mean_fibre_angle(a, b, -2) for a, b in zip(EDGES, EDGES[1:], strict=False)])
 
 
-def _draw_reference(page: Page, curves: dict[str, tuple[np.ndarray, np.ndarray]], middle: np.ndarray) -> None:
-    runs = layer_angles(page.folder)
+def draw_reference(runs: Columns, curves: dict[str, tuple[np.ndarray, np.ndarray]], middle: np.ndarray) -> Figure:
+    """Points: means of layers; lines: the reference."""
     figure = Figure(figsize=(5.4, 3.6))
     axes = figure.add_axes((0.11, 0.14, 0.86, 0.83))
     labels = {"cauchy": r"$\sigma$, eq. (11)", "pk2": "$S$, eq. (11)", "finger": "$b$, eq. (11)",
@@ -92,18 +77,13 @@ def _draw_reference(page: Page, curves: dict[str, tuple[np.ndarray, np.ndarray]]
     axes.set_ylim(-2, 92)
     axes.set_yticks(range(0, 91, 15))
     axes.legend(loc="upper left")
-    page.save_figure(figure, f"{made_with(page.folder)}; tests/reference/radial.py")
+    return figure
 
 
 def layer_angles(folder: Path) -> Columns:
     """Layer means of the runs at t = 150 by driver or law."""
-    second, strain, rate = (read_table(folder / f"{name}.csv") for name in ("fig10", "fig11", "rate"))
-    return {
-        "cauchy": second["fibre_angle_cauchy"],
-        "pk2": second["fibre_angle_pk2"],
-        "finger": strain["fibre_angle_finger"],
-        "rate": rate["fibre_angle_rate"],
-    }
+    files = {"cauchy": "fig10", "pk2": "fig10", "finger": "fig11", "rate": "rate"}
+    return {name: read_table(folder / f"{file}.csv")[f"fibre_angle_{name}"] for name, file in files.items()}
 
 
 # ---------------------------------------------------------------- the numbers on the page
@@ -277,25 +257,16 @@ def _energy(folder: Path) -> dict[str, str]:
 # ---------------------------------------------------------------- tables
 
 
-def markdown(header: list[str], rows: list[list[str]]) -> str:
-    """A table in Markdown."""
-    lines = [header, ["---"] * (" | ".join(header).count("|") + 1), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
-
-
 def layer_table(folder: Path) -> str:
     """Runs against the reference, layer by layer."""
     runs, reference = layer_angles(folder), read_table(folder / "radial-reference.csv")
-    header = ["layer", "R"]
-    for label in ("σ, eq. (11)", "S, eq. (11)", "b, eq. (11)", "σ, eq. (10)"):
-        header += [label, "reference"]
-    rows = []
-    for k in range(8):
-        row = [str(k + 1), f"{reference['radius'][k]:g}"]
-        for name in REFERENCE:
-            row += [f"{runs[name][k]:.1f}", f"{reference[name][k]:.1f}"]
-        rows.append(row)
-    return markdown(header, rows)
+    head, columns = ["layer", "R"], []
+    for name, label in zip(REFERENCE, ("σ, eq. (11)", "S, eq. (11)", "b, eq. (11)", "σ, eq. (10)"), strict=True):
+        head += [label, "reference"]
+        columns += [runs[name], reference[name]]
+    return markdown(head, [
+        [str(k + 1), f"{reference['radius'][k]:g}", *(f"{column[k]:.1f}" for column in columns)] for k in range(8)
+    ])  # fmt: skip
 
 
 def case_table(folder: Path) -> str:
@@ -327,12 +298,6 @@ def percent(value: float) -> str:
 def degrees(value: float) -> str:
     """Two digits, or what is rounding."""
     return "< 10⁻⁶°" if value < 1e-6 else f"{value:.2f}°" if value >= 0.01 else f"{value:.1g}°"
-
-
-def rows_of(path: Path) -> list[dict[str, Any]]:
-    """Rows of a table, numbers where they are."""
-    columns = read_table(path)
-    return [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
 
 
 def elements_of(row: dict[str, Any]) -> str:
@@ -384,12 +349,12 @@ def small(value: float) -> str:
 RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
-def made_with(folder: Path) -> str:
+def _made_with(folder: Path) -> str:
     """The line of Fig. 7 that says what it was made with."""
     return read_notes(folder, "fig7")["fig7.csv"][0].split(";")[0]
 
 
-def page(kept: Path = KEPT, template: str = "make_verification") -> str:
+def page(kept: Path = FIGURES, template: str = "verification") -> str:
     """docs/verification.md, or the page of another template, from the tables in docs/figures."""
     values = all_numbers(kept) | page_values(kept) | {
         "table_layers": layer_table(kept),
@@ -400,7 +365,7 @@ def page(kept: Path = KEPT, template: str = "make_verification") -> str:
         "table_meshes": mesh_table(kept),
         "table_turned": invariance_table(kept, "deformed body"),
         "table_everything": invariance_table(kept, "everything"),
-        "made_with": made_with(kept),
+        "made_with": _made_with(kept),
         **{f"caption_{name}": figure.caption for name, figure in figures.FIGURES.items()},
         "caption_reference": REFERENCE_CAPTION[1],
     }  # fmt: skip
@@ -410,28 +375,20 @@ def page(kept: Path = KEPT, template: str = "make_verification") -> str:
 
 def write_pages() -> None:
     """Both, from what is there."""
-    (DOCS / "verification.md").write_text(page(), encoding="utf-8")
-    (DOCS / "appendix_verification.md").write_text(page(template="appendix_verification"), encoding="utf-8")
+    for name in ("verification", "appendix_verification"):
+        (DOCS / f"{name}.md").write_text(page(template=name), encoding="utf-8")
 
 
-def main() -> None:
+def make(keep: bool) -> None:
     """Draw, compare, keep, write."""
-    keep, drawn, runs = sys.argv[1:] == ["--keep"], Path("figures"), Path("results/verification-runs")
+    folder, runs = Path("figures"), Path("results/verification-runs")
     if not keep:
         shutil.rmtree(runs, ignore_errors=True)
-    figures.draw(list(figures.FIGURES), drawn, runs, cores())
-    with matplotlib.rc_context(STYLE):
-        radial_reference(Page(drawn, "radial-reference", *REFERENCE_CAPTION))
-    studies = study(drawn, keep)
-    KEPT.mkdir(exist_ok=True)
+    figures.draw(list(figures.FIGURES), folder, runs, cores())
+    radial_reference(Page(folder, "radial-reference", *REFERENCE_CAPTION))
+    studies = study(folder, keep)
     pictures = (*figures.FIGURES, "radial-reference")
-    for name in pictures:
-        for ending in ("png", "json"):
-            shutil.copyfile(drawn / f"{name}.{ending}", KEPT / f"{name}.{ending}")
-    for name in (*pictures, *MORE_TABLES, *studies):
-        shutil.copyfile(drawn / f"{name}.csv", KEPT / f"{name}.csv")
+    files = [f"{name}.{ending}" for name in pictures for ending in ("png", "json")]
+    for file in (*files, *(f"{name}.csv" for name in (*pictures, *MORE_TABLES, *studies))):
+        shutil.copyfile(folder / file, FIGURES / file)
     write_pages()
-
-
-if __name__ == "__main__":
-    main()

@@ -1,33 +1,24 @@
 """The consistent law beside the paper's on Figs. 5 to 11, for docs/verification.md.
 
-    ./with-fenicsx python3 docs/compare_consistent.py [--page]
-
 Runs the preset `consistent` with the paper's kappa and with twice of it, and the printed method, where a reduced model
 is exact (cube: a point; artery with isotropic cells: a ray); the tendon of Fig. 6 with its random cells is whole, and
-the printed one is that of docs/figures/fig6.csv. Tables and picture go to docs/figures/; then the page is made again
-from what is there. `--page`: only that, without a run. A few minutes.
+the printed one is that of docs/figures/fig6.csv. A few minutes.
 """
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from mpi4py import MPI
 
-DOCS = Path(__file__).resolve().parent
-sys.path[:0] = [str(DOCS), str(DOCS.parent)]
-
-from remodel_fenicsx import Simulation  # noqa: E402
-from remodel_fenicsx.studies.page import COLOURS, STYLE, Page, panel_letters, read_table  # noqa: E402
-from remodel_fenicsx.results.columns import Measurement  # noqa: E402
-from remodel_fenicsx.scene import preset_scene  # noqa: E402
+from docs.making.pages import EDGES, FIGURES, Columns, drawn, markdown, rows_and_last, simulated
+from remodel_fenicsx.results.columns import Measurement
+from remodel_fenicsx.scene import preset_scene
+from remodel_fenicsx.studies.page import COLOURS, Page, panel_letters, read_table
 
 END, KAPPA = 150.0, 0.025
 VARIANTS: dict[str, tuple[str, float, str, str]] = {
@@ -36,15 +27,8 @@ VARIANTS: dict[str, tuple[str, float, str, str]] = {
     "twice": ("consistent", 2.0, r"consistent, $2\kappa$", COLOURS[2]),
 }
 KAPPAS = (0.01, 0.025, 0.05, 0.1)  # of Fig. 5
-LOADS = {
-    "10_0": (0.1, 0.0),
-    "10_2.4": (0.1, 2.4),
-    "10_4.8": (0.1, 4.8),
-    "5_4.8": (0.05, 4.8),
-    "0_4.8": (0.0, 4.8),
-}
+LOADS = {"10_0": (0.1, 0.0), "10_2.4": (0.1, 2.4), "10_4.8": (0.1, 4.8), "5_4.8": (0.05, 4.8), "0_4.8": (0.0, 4.8)}
 DRIVERS = ("pk2", "finger")
-EDGES = np.linspace(1.0, 3.0, 9)  # of the layers
 CAPTION = (
     "The consistent law beside the paper's",
     "Lines by law. (a) Mean angle to the load in the cube of Fig. 5; (b) stretch of the tendon of Fig. 6; (c) "
@@ -52,30 +36,22 @@ CAPTION = (
     "radius at t = 150, Fig. 8; (e) the same for the other loads of Fig. 9; (f) for the drivers S (full lines) "
     "and b (dashed), Figs. 10 and 11.",
 )
-Columns = dict[str, np.ndarray]
 
 
 # ---------------------------------------------------------------- runs
-def run(variant: str, shape: str, kinematics: str, **values: Any) -> tuple[list[dict[str, float]], np.ndarray]:
-    """Rows, and means over the layers of the wall of the fibre angle at the end (of a tube)."""
+def run(variant: str, shape: str, kinematics: str, **values: Any) -> tuple[Columns, np.ndarray]:
+    """Columns, and means over the layers of the wall of the fibre angle at the end (of a tube)."""
     preset, factor, *_ = VARIANTS[variant]
     kappa = factor * values.pop("remodeling.kappa", KAPPA)
     changes = {"model.kinematics": kinematics, "output.fields": False, "time.end": END, "remodeling.kappa": kappa}
-    simulation = Simulation(preset_scene(preset, shape).with_values(changes | values), MPI.COMM_SELF)
-    steps = list(simulation.steps())
-    means = np.zeros(0)
-    if shape == "tube":
-        angle, volume = Measurement(simulation.observer, steps[-1]).fibre_angle, simulation.quadrature.volumes
-        radius = simulation.quadrature.coordinates[..., 0]
-        inside = [(radius > a) & (radius < b) for a, b in zip(EDGES, EDGES[1:], strict=False)]
-        means = np.array([np.average(angle[at], weights=volume[at]) for at in inside])
-    simulation.close()
     print(variant, shape, values, flush=True)
-    return [step.row for step in steps], means
-
-
-def column(rows: Sequence[dict[str, float]], name: str) -> np.ndarray:
-    return np.array([row[name] for row in rows])
+    with simulated(preset_scene(preset, shape).with_values(changes | values)) as simulation:
+        columns, last = rows_and_last(simulation)
+        if shape != "tube":
+            return columns, np.zeros(0)
+        angle, volume = Measurement(simulation.observer, last).fibre_angle, simulation.quadrature.volumes
+        layer = np.digitize(simulation.quadrature.coordinates[..., 0], EDGES) - 1
+    return columns, np.array([np.average(angle[layer == k], weights=volume[layer == k]) for k in range(8)])
 
 
 def histories() -> Columns:
@@ -83,10 +59,10 @@ def histories() -> Columns:
     table: Columns = {"time": np.arange(1.0, END + 1)}
     for variant in VARIANTS:
         for kappa in KAPPAS:
-            rows, _ = run(variant, "cube", "point", **{"remodeling.kappa": kappa})
-            table[f"cube_{kappa:g}_{variant}"] = column(rows, "mean_fibre_angle")
+            columns, _ = run(variant, "cube", "point", **{"remodeling.kappa": kappa})
+            table[f"cube_{kappa:g}_{variant}"] = columns["mean_fibre_angle"]
         if variant != "paper":
-            table[f"tendon_{variant}"] = column(run(variant, "tendon", "full")[0], "mean_stretch")
+            table[f"tendon_{variant}"] = run(variant, "tendon", "full")[0]["mean_stretch"]
     return table
 
 
@@ -98,9 +74,9 @@ def artery() -> tuple[Columns, Columns]:
     for variant in VARIANTS:
         for case, (elongation, pressure) in LOADS.items():
             loads = {"loads.elongation.value": elongation, "loads.pressure.value": pressure}
-            rows, layers[f"{case}_{variant}"] = run(variant, "tube", "radial", **ray, **loads)
+            columns, layers[f"{case}_{variant}"] = run(variant, "tube", "radial", **ray, **loads)
             if case == "10_4.8":
-                history |= {f"{face}_{variant}": column(rows, f"{face}_radius") for face in ("inner", "outer")}
+                history |= {f"{face}_{variant}": columns[f"{face}_radius"] for face in ("inner", "outer")}
         for driver in DRIVERS:
             layers[f"{driver}_{variant}"] = run(variant, "tube", "radial", **ray, **{"remodeling.driver": driver})[1]
     return history, layers
@@ -187,29 +163,21 @@ def layer_table(layers: Columns) -> str:
     """Angles of Figs. 8, 10 and 11, layer by layer."""
     cases = {"σ": "10_4.8", "S": "pk2", "b": "finger"}
     short = {"paper": "the paper's", "once": "κ", "twice": "2κ"}
-    lines = [["layer", *(f"{symbol}, {short[variant]}" for symbol in cases for variant in VARIANTS)]]
-    lines.append(["---"] * len(lines[0]))
-    for k in range(8):
-        angles = (layers[f"{case}_{variant}"][k] for case in cases.values() for variant in VARIANTS)
-        lines.append([str(k + 1), *(f"{angle:.1f}" for angle in angles)])
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    head = ["layer", *(f"{symbol}, {short[variant]}" for symbol in cases for variant in VARIANTS)]
+    columns = [layers[f"{case}_{variant}"] for case in cases.values() for variant in VARIANTS]
+    return markdown(head, [[str(k + 1), *(f"{angles[k]:.1f}" for angles in columns)] for k in range(8)])
 
 
-def main() -> None:
+def make(keep: bool) -> None:
     """Run, draw, write the page."""
-    from make_verification import KEPT, write_pages
+    from docs.making.verification import write_pages
 
-    if "--page" not in sys.argv[1:]:
+    page, source = Page(FIGURES, "consistent", *CAPTION), "docs/making/consistent.py"
+    if not keep:
         table = histories()
         history, layers = artery()
-        source = ["docs/compare_consistent.py"]
-        Page(KEPT, "consistent", *CAPTION).save_table(table | history, source)
-        Page(KEPT, "consistent").save_table(layers, source, "layers")
-    tables = (read_table(KEPT / f"{name}.csv") for name in ("consistent", "consistent-layers", "fig6"))
-    with matplotlib.rc_context(STYLE):
-        Page(KEPT, "consistent", *CAPTION).save_figure(draw(*tables), "docs/compare_consistent.py")
+        page.save_table(table | history, [source])
+        page.save_table(layers, [source], "layers")
+    tables = (read_table(FIGURES / f"{name}.csv") for name in ("consistent", "consistent-layers", "fig6"))
+    drawn(page, draw, *tables, made=source)
     write_pages()
-
-
-if __name__ == "__main__":
-    main()

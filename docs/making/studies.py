@@ -1,4 +1,4 @@
-"""What docs/make_verification.py computes beside the figures: comparisons with the radial reference, invariance.
+"""What docs/verification.md shows beside the figures: comparisons with the radial reference, invariance.
 
 Each study is a table, NAME.csv. They take minutes; a table may be used again where versions and the files below stay.
 """
@@ -12,31 +12,26 @@ import os
 import sys
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(ROOT / "demos"), str(ROOT)]
-
-from figures import scenes  # noqa: E402
-
-from remodel_fenicsx import __version__  # noqa: E402
-from remodel_fenicsx.evolution.remodeling import RemodelingPass  # noqa: E402
-from remodel_fenicsx.evolution.stepper import Step, Watcher  # noqa: E402
-from remodel_fenicsx.model.spectral import positive_direction  # noqa: E402
-from remodel_fenicsx.results.columns import Measurement  # noqa: E402
-from remodel_fenicsx.simulation import Simulation  # noqa: E402
-from remodel_fenicsx.studies.page import Page, read_notes, read_table  # noqa: E402
-from remodel_fenicsx.system.children import cores  # noqa: E402
+from demos.figures import scenes
+from docs.making.pages import DOCS, by_column, simulated
+from remodel_fenicsx import __version__
+from remodel_fenicsx.evolution.remodeling import RemodelingPass
+from remodel_fenicsx.evolution.stepper import Step, Watcher
+from remodel_fenicsx.model.spectral import positive_direction
+from remodel_fenicsx.results.columns import Measurement
+from remodel_fenicsx.studies.page import Page, read_notes, read_table
+from remodel_fenicsx.system.children import cores
 
 Row = dict[str, Any]
 LIBRARIES = ("fenics-dolfinx", "fenics-ufl", "fenics-ffcx", "petsc4py", "gmsh", "numpy")
 USED_BY_STUDIES = (
     "demos/figures.py",
-    "docs/verification_studies.py",
+    "docs/making/studies.py",
     "tests/radial_comparison.py",
     "tests/reference/radial.py",
     "tests/model/test_invariance.py",
@@ -52,23 +47,15 @@ def comparison(setting: Any) -> Row:
     from tests import radial_comparison
 
     found = radial_comparison.errors(setting)
+    angles = {f"angle_{name}": getattr(found, name) for name in ("mean", "largest", "mean_outside", "outside")}
     return {
-        "stretch": setting.stretch,
-        "pressure": setting.pressure,
-        "driver": setting.driver,
-        "law": setting.law,
-        "supports": "symmetry planes" if setting.planes else "the scene's",
-        "degree": setting.degree,
-        "around": setting.divisions[0],
-        "through": setting.divisions[1],
-        "end": setting.end,
-        "front_from": setting.front[0],
-        "front_to": setting.front[1],
-        "radii_percent": 100 * max(found.inner_radius, found.outer_radius),
-        **{f"angle_{name}": value for name, value in asdict(found).items() if name in _ANGLES},
-        "inner_radius_error": found.inner_radius,
-        "outer_radius_error": found.outer_radius,
-    }
+        "stretch": setting.stretch, "pressure": setting.pressure, "driver": setting.driver, "law": setting.law,
+        "supports": "symmetry planes" if setting.planes else "the scene's", "degree": setting.degree,
+        "around": setting.divisions[0], "through": setting.divisions[1], "end": setting.end,
+        "front_from": setting.front[0], "front_to": setting.front[1],
+        "radii_percent": 100 * max(found.inner_radius, found.outer_radius), **angles,
+        "inner_radius_error": found.inner_radius, "outer_radius_error": found.outer_radius,
+    }  # fmt: skip
 
 
 def layer_mean(setting: Any) -> Row:
@@ -80,24 +67,6 @@ def layer_mean(setting: Any) -> Row:
     mean = float(np.average(run.angle[layer], weights=run.volume[layer]))
     return {"around": setting.divisions[0], "through": setting.divisions[1], "degree": setting.degree,
             "fibre_angle_4": mean, "reference_4": exact.mean_fibre_angle(1.75, 2.0)}  # fmt: skip
-
-
-_ANGLES = ("mean", "largest", "mean_outside", "outside")
-
-
-def comparison_jobs() -> dict[str, list[tuple[Callable[[Any], Row], Any]]]:
-    """By table, what gives its rows."""
-    from tests import radial_comparison as compared
-
-    meshes = [setting for settings in compared.CONVERGENCE.values() for setting in settings]
-    # Fig. 9's pure pressure on the paper's mesh, in one layer along z, and on one twice as fine
-    coarse, fine = (compared.Setting(0.0, 4.8, divisions=(12 * n, 8 * n, 1), degree=1) for n in (1, 2))
-    return {
-        "comparison-cases": [(comparison, setting) for setting in compared.LOAD_CASES],
-        "comparison-drivers": [(comparison, setting) for setting in compared.DRIVERS],
-        "pressure-meshes": [(layer_mean, setting) for setting in (coarse, fine)],
-        "comparison-meshes": [(comparison, setting) for setting in meshes],
-    }
 
 
 # ---------------------------------------------------------------- invariance
@@ -133,13 +102,6 @@ def invariance(case: tuple[str, str, str]) -> Row:
     }
 
 
-def invariance_jobs() -> dict[str, list[tuple[Callable[[Any], Row], Any]]]:
-    """All drivers and frames: the deformed body turned by 90 degrees, and everything turned about an oblique axis."""
-    cases = [(driver, frame, turned) for turned in ("deformed body", "everything")
-             for frame in ("material", "spatial") for driver in ("cauchy", "pk2", "finger")]  # fmt: skip
-    return {"invariance": [(invariance, case) for case in cases]}
-
-
 # ---------------------------------------------------------------- single runs
 
 
@@ -166,11 +128,10 @@ def stopped_points(name: str, **changes: Any) -> list[Row]:
 
     `passes`: in how many passes the point did remodel before.
     """
-    simulation = Simulation(scenes()[name].with_values({"output.fields": False, **changes}))
-    passes = Passes(simulation.stepper.remodeling)
-    *_, last = simulation.steps([passes])
-    x, angle = simulation.quadrature.coordinates, Measurement(simulation.observer, last).fibre_angle
-    simulation.close()
+    with simulated(scenes()[name].with_values({"output.fields": False, **changes})) as simulation:
+        passes = Passes(simulation.stepper.remodeling)
+        *_, last = simulation.steps([passes])
+        x, angle = simulation.quadrature.coordinates, Measurement(simulation.observer, last).fibre_angle
     return [
         {"element": element, "radius": np.hypot(*x[element, point, :2]), "passes": passes.number[element, point],
          "largest_stress": passes.largest[element, point], "fibre_angle": angle[element, point]}
@@ -181,35 +142,54 @@ def stopped_points(name: str, **changes: Any) -> list[Row]:
 def stiff_tendon(name: str, **changes: Any) -> list[Row]:
     """The tendon with four times the energy of its chains (erratum 1): its stretch at the end."""
     scene = scenes()[name].with_values({"output.fields": False, "material.energy_factor": 4, **changes})
-    *_, last = Simulation(scene).steps()
+    with simulated(scene) as simulation:
+        *_, last = simulation.steps()
     return [{"time": last.time, "mean_stretch": last.row["mean_stretch"]}]
 
 
 # ---------------------------------------------------------------- all of them
+Job = tuple[Callable[[Any], Any], Any]
 
 
-def _called(job: tuple[Callable[[Any], Any], Any]) -> Any:
-    return job[0](job[1])
+def jobs() -> dict[str, list[Job]]:
+    """By table, what gives its rows."""
+    from tests import radial_comparison as compared
+
+    meshes = [setting for settings in compared.CONVERGENCE.values() for setting in settings]
+    # Fig. 9's pure pressure on the paper's mesh, in one layer along z, and on one twice as fine
+    coarse, fine = (compared.Setting(0.0, 4.8, divisions=(12 * n, 8 * n, 1), degree=1) for n in (1, 2))
+    # the deformed body turned by 90 degrees, and everything turned about an oblique axis
+    turned = [(driver, frame, what) for what in ("deformed body", "everything")
+              for frame in ("material", "spatial") for driver in ("cauchy", "pk2", "finger")]  # fmt: skip
+    return {
+        "stopped-points": [(stopped_points, "artery-0-4.8")],
+        "stiff-tendon": [(stiff_tendon, "tendon")],
+        "comparison-cases": [(comparison, setting) for setting in compared.LOAD_CASES],
+        "comparison-drivers": [(comparison, setting) for setting in compared.DRIVERS],
+        "pressure-meshes": [(layer_mean, setting) for setting in (coarse, fine)],
+        "comparison-meshes": [(comparison, setting) for setting in meshes],
+        "invariance": [(invariance, case) for case in turned],
+    }
+
+
+def called(job: Job) -> list[Row]:
+    """Rows of a job, in a process of its own."""
+    found = job[0](job[1])
+    return found if isinstance(found, list) else [found]
 
 
 def study(folder: Path, keep: bool) -> list[str]:
     """Write the tables, or with `keep` only those not there or no longer valid; returns the names of all."""
-    key = f"key {_key()}"
-    single = {"stopped-points": (stopped_points, "artery-0-4.8"), "stiff-tendon": (stiff_tendon, "tendon")}
-    tables: dict[str, Any] = {**single, **comparison_jobs(), **invariance_jobs()}
-    wanted = [name for name in tables if not (keep and _is_valid(folder / f"{name}.csv", key))]
+    key, tables = f"key {_key()}", jobs()
+    wanted = {name: of for name, of in tables.items() if not (keep and _is_valid(folder / f"{name}.csv", key))}
     os.environ["OMP_NUM_THREADS"] = "1"  # of the processes below, one for each core
     pool = ProcessPoolExecutor(cores(), multiprocessing.get_context("spawn"))
     try:
-        pending = {
-            name: [pool.submit(_called, job) for job in ([single[name]] if name in single else tables[name])]
-            for name in wanted
-        }
-        for name, jobs in pending.items():
+        pending = {name: [pool.submit(called, job) for job in of] for name, of in wanted.items()}
+        for name, futures in pending.items():
             print(f"verification: {name}", file=sys.stderr, flush=True)
-            rows = jobs[0].result() if name in single else [job.result() for job in jobs]
-            columns = {column: [row[column] for row in rows] for column in rows[0]}
-            Page(folder, name).save_table(columns, ["docs/verification_studies.py", key])
+            rows = [row for future in futures for row in future.result()]
+            Page(folder, name).save_table(by_column(rows), ["docs/making/studies.py", key])
     finally:
         pool.shutdown(cancel_futures=True)  # after a failure the rest is not waited for
     return list(tables)
@@ -220,7 +200,7 @@ def _key() -> str:
     digest = hashlib.sha256(str([importlib.metadata.version(name) for name in LIBRARIES]).encode())
     digest.update(__version__.encode())
     for name in USED_BY_STUDIES:
-        digest.update((ROOT / name).read_bytes())
+        digest.update((DOCS.parent / name).read_bytes())
     return digest.hexdigest()[:12]
 
 

@@ -1,9 +1,9 @@
-"""Make report.bundle.js and report.bundle.css, the code of others in reports, anew from their npm packages.
+"""report.bundle.js and report.bundle.css, the code of others in reports, anew from their npm packages.
 
-    python3 docs/make_bundle.py            # writes both, and their check sums into VENDOR.toml
-    python3 docs/make_bundle.py --check    # says whether they are what VENDOR.toml's packages give, byte for byte
+    python3 docs/make bundle            # writes both, and their check sums into VENDOR.toml
+    python3 docs/make --check bundle    # says whether they are what VENDOR.toml's packages give, byte for byte
 
-It needs npm (x86-64), and nothing of this project.
+It needs npm (x86-64), and nothing of this project or its environment.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import tempfile
 import tomllib
 from pathlib import Path
 
-ASSETS = Path(__file__).parents[1] / "remodel_fenicsx" / "report" / "assets"
+ASSETS = Path(__file__).parents[2] / "remodel_fenicsx" / "report" / "assets"
 VENDOR = ASSETS / "VENDOR.toml"
 BUNDLES = ("report.bundle.js", "report.bundle.css")
 OPTIONS = ("--bundle", "--minify", "--format=iife", "--global-name=LIBRARIES", "--target=es2022", "--log-level=warning")
@@ -53,19 +53,18 @@ def built(folder: Path) -> dict[str, bytes]:
     return {name: (folder / name).read_bytes() for name in BUNDLES}
 
 
-def main() -> None:
-    """Build, then write or compare."""
+def check() -> bool:
+    """Whether the bundles are what the packages give."""
     with tempfile.TemporaryDirectory() as folder:
-        found = built(Path(folder))
-    if "--check" in sys.argv[1:]:
-        differs = [name for name, data in found.items() if data != (ASSETS / name).read_bytes()]
-        sys.exit(f"not what the packages give: {', '.join(differs)}" if differs else 0)
+        return all(data == (ASSETS / name).read_bytes() for name, data in built(Path(folder)).items())
+
+
+def make(keep: bool) -> None:
+    """Both, and their check sums; there is nothing to keep."""
     text = VENDOR.read_text(encoding="utf-8")
-    for name, data in found.items():
-        (ASSETS / name).write_bytes(data)
-        text = re.sub(rf'^"{name}" = .*$', f'"{name}" = "{hashlib.sha256(data).hexdigest()}"', text, flags=re.MULTILINE)
+    with tempfile.TemporaryDirectory() as folder:
+        for name, data in built(Path(folder)).items():
+            (ASSETS / name).write_bytes(data)
+            line = f'"{name}" = "{hashlib.sha256(data).hexdigest()}"'
+            text = re.sub(rf'^"{name}" = .*$', line, text, flags=re.MULTILINE)
     VENDOR.write_text(text, encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()

@@ -1,5 +1,4 @@
-#!/usr/bin/env python3
-"""Makes the table of sizes in docs/architecture.md: ``./with-fenicsx python3 docs/make_architecture.py``."""
+"""Prints the table of sizes in docs/architecture.md: a process of its own, which has imported nothing before."""
 
 from __future__ import annotations
 
@@ -9,9 +8,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-PAGE = Path(__file__).with_name("architecture.md")
-PACKAGE = PAGE.parents[1] / "remodel_fenicsx"
-MARKS = "<!-- sizes: ./with-fenicsx python3 docs/make_architecture.py -->\n\n", "\n<!-- end of sizes -->"
+PACKAGE = Path(__file__).resolve().parents[2] / "remodel_fenicsx"
 STEP = 4  # by which nothing is made for the first time
 
 
@@ -26,7 +23,7 @@ def tens(files: Sized) -> int:
 
 
 def table() -> str:
-    """In a process that has imported nothing of the package before."""
+    """Of the package, of what a simulation imports, of what a step calls."""
     sys.path.insert(0, str(PACKAGE.parent))
     from remodel_fenicsx import Simulation, preset_scene
 
@@ -50,15 +47,9 @@ def table() -> str:
         "| | modules | lines |\n|---|---|---|\n"
         f"| the package | {tens(all_files)} | {lines(all_files):,} |\n"
         f"| imported by `Simulation` | {tens(imported)} | {lines(imported):,} |\n"
-        f"| whose functions the fourth step calls | {tens(called & set(all_files))} | |\n"
+        f"| whose functions the fourth step calls | {tens(called & set(all_files))} | |"
     )
 
 
-def page_text(made: str) -> str:
-    """The page with this table."""
-    before, rest = PAGE.read_text(encoding="utf-8").split(MARKS[0])
-    return before + MARKS[0] + made + MARKS[1] + rest.split(MARKS[1])[1]
-
-
 if __name__ == "__main__":
-    PAGE.write_text(page_text(table()), encoding="utf-8")
+    print(table())

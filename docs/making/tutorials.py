@@ -1,17 +1,13 @@
-#!/usr/bin/env python3
-"""Runs the pages of the manual as they stand, and brings the outputs and pictures that they show up to date:
+"""Outputs and pictures that start and the tutorials show: the pages are run as they stand.
 
-    ./with-fenicsx python3 docs/make_tutorials.py [PAGE...] [-o FOLDER]
-
-About five minutes for all. Without PAGE: start and the tutorials. A block of `output` after a command shows some of
-its lines, `...` stands for others; their numbers are replaced by those of the run. A line that the command does not
-print ends the script: the page is then to be changed by hand. tests/command/test_pages.py does the same with short
-times, and compares all but the numbers.
+About five minutes for all. A block of `output` after a command shows some of its lines, `...` stands for others; their
+numbers are replaced by those of the run. A line that the command does not print ends the script: the page is then to be
+changed by hand. tests/command/test_pages.py does the same with short times, and compares all but the numbers.
 """
 
 from __future__ import annotations
 
-import argparse
+import os
 import re
 import shlex
 import shutil
@@ -22,7 +18,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-DOCS = Path(__file__).resolve().parent
+DOCS = Path(__file__).resolve().parents[1]
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 NAMED = re.compile(r"# (\w+\.(?:toml|py))\n")
 NUMBER = re.compile(r"(?<![\w.])-?\d[\d.,:]*(?:e[+-]?\d+)?(?!\w)")
@@ -93,29 +89,15 @@ def brought_up_to_date(text: str) -> str:
     return "".join(pieces) + text[end:]
 
 
-def main() -> None:
-    """All pages in one folder: they use each other's files."""
-    import os
-
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("pages", nargs="*", metavar="PAGE", help="such as tutorial_tube")
-    parser.add_argument("-o", dest="folder", type=Path, help="where to work; default: a folder that is removed")
-    options = parser.parse_args()
+def make(keep: bool) -> None:
+    """All pages in one folder: they use each other's files. There is nothing to keep."""
     order = re.findall(r"\((tutorial_\w+)\.md\)", (DOCS / "tutorials.md").read_text(encoding="utf-8"))
-    pages = options.pages or ["start", *order]
-    with tempfile.TemporaryDirectory() as temporary:
-        folder = (options.folder or Path(temporary)).resolve()
-        folder.mkdir(exist_ok=True)
+    with tempfile.TemporaryDirectory() as folder:
         os.chdir(folder)
-        if not Path("demos").exists():
-            Path("demos").symlink_to(DOCS.parent / "demos")
-        for page in pages:
+        Path("demos").symlink_to(DOCS.parent / "demos")
+        for page in ("start", *order):
             path = DOCS / f"{page}.md"
             text = path.read_text(encoding="utf-8")
             path.write_text(brought_up_to_date(text), encoding="utf-8")
             for name in re.findall(r"figures/(tutorial-[\w-]+\.png)", text):
                 shutil.copy(PICTURES[name], DOCS / "figures" / name)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,9 +1,6 @@
-#!/usr/bin/env python3
-"""Writes docs/interface.md, the list of everything that is public:
+"""docs/interface.md, the list of everything that is public, and the table of columns in docs/commands.md.
 
-    ./with-fenicsx python3 docs/make_interface.py
-
-tests/house/test_interface.py compares the page with the code: a change of the interface is a change of this page.
+A change of the interface is a change of that page: `./with-fenicsx docs/make interface`, and CHANGELOG.md says so.
 """
 
 from __future__ import annotations
@@ -14,7 +11,6 @@ import inspect
 import re
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping
-from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -22,15 +18,15 @@ from mpi4py import MPI
 
 import remodel_fenicsx
 from remodel_fenicsx import Scene, cli, extend, parts
-from remodel_fenicsx.body.shape import columns_of, columns_on_request
+from docs.making.pages import markdown
+from remodel_fenicsx.body.shape import COLUMNS_ON_REQUEST, Column, Shape, columns_of
 from remodel_fenicsx.scene.presets import PRESETS, PROFILES
 from remodel_fenicsx.schema.tables import Table, description, sections
 
-PAGE = Path(__file__).with_name("interface.md")
 HEAD = """# The public interface
 
-This page is made from the code: `./with-fenicsx python3 docs/make_interface.py`. A test compares
-the two, so that nothing here changes unnoticed.
+This page is made from the code: `./with-fenicsx docs/make interface`. A test compares the
+two, so that nothing here changes unnoticed.
 
 What stands here is public: the names of three modules with their parameters, the keys of scenes,
 the columns of histories, the commands with their options, and the exit codes. Scripts, scenes and
@@ -71,7 +67,7 @@ def _module(module: ModuleType, seen: dict[int, str]) -> Iterator[str]:
         if where != module.__name__:
             yield f"{name}  # that of {where}"
         elif inspect.isclass(value):
-            yield from _class(value)
+            yield from described(value)
         elif callable(value):
             yield name + _parameters(value if inspect.isfunction(value) else type(value).__call__)
         elif isinstance(value, Mapping):
@@ -80,7 +76,7 @@ def _module(module: ModuleType, seen: dict[int, str]) -> Iterator[str]:
             yield f"{name}: {type(value).__name__}"
 
 
-def _class(kind: type) -> Iterator[str]:
+def described(kind: type) -> Iterator[str]:
     """How it is made, its attributes and methods without those of a public base."""
     public = {value for module in MODULES for name in module.__all__ if inspect.isclass(value := getattr(module, name))}
     lineage = [base for base in kind.__mro__ if base.__module__.startswith("remodel_fenicsx.") and base is not Table]
@@ -154,14 +150,9 @@ def _keys() -> Iterator[str]:
 
 
 def _columns() -> Iterator[str]:
-    by_shape: dict[str, dict[str, list[str]]] = {"": {}, " on request": {}}
-    for shape, kind in extend.SHAPES.items():
-        freed = [load.column_name(name) for name, load in kind.loads.items() if load.frees_length]
-        by_shape[""][shape] = [
-            column.name for column in columns_of(kind, loads=(), regions=["NAME"] if kind.has_regions else [])
-        ]
-        by_shape[" on request"][shape] = [*freed, *columns_on_request(kind)]
-    for when, columns in by_shape.items():
+    for number, when in enumerate(("", " on request")):
+        columns = {shape: [column.name for column in of_shape(kind)[number]] for shape, kind in extend.SHAPES.items()}
+        columns = {shape: names + list(COLUMNS_ON_REQUEST) * number for shape, names in columns.items()}
         common = [name for name in columns["cube"] if all(name in names for names in columns.values())]
         yield _listed("every shape" + when, common)
         for shape, names in columns.items():
@@ -186,5 +177,27 @@ def _arguments(parser: argparse.ArgumentParser) -> Iterator[str]:
         yield text if action.required and action.nargs != "*" else f"[{text}]"
 
 
-if __name__ == "__main__":
-    PAGE.write_text(page(), encoding="utf-8")
+# ---------------------------------------------------------------- columns
+def of_shape(kind: type[Shape]) -> tuple[list[Column], list[Column]]:
+    """Columns that a shape always has, and those of its own that it has on request."""
+    regions = ["NAME"] if kind.has_regions else []
+    always = columns_of(kind, loads=(), regions=regions)
+    known = {column.name for column in always}
+    of_loads = [column for column in columns_of(kind, regions=regions) if column.name not in known]
+    return list(always), [*of_loads, *kind.columns_on_request]
+
+
+def columns_table() -> str:
+    """Every column with the shapes that have it: those of all shapes first, then those on request."""
+    found: list[dict[tuple[str, str, str], list[str]]] = [{}, {}]
+    for shape, kind in extend.SHAPES.items():
+        for having, columns in zip(found, of_shape(kind), strict=True):
+            for column in columns:
+                having.setdefault((column.name, column.unit, column.meaning), []).append(shape)
+    everywhere = list(extend.SHAPES)
+    always = sorted(found[0].items(), key=lambda item: item[1] != everywhere)
+    rows = [(key, "all" if shapes == everywhere else ", ".join(shapes)) for key, shapes in always]
+    rows += [(key, f"{', '.join(shapes)}, on request") for key, shapes in found[1].items()]
+    rows += [((column.name, column.unit, column.meaning), "on request") for column in COLUMNS_ON_REQUEST.values()]
+    cells = ([f"`{name}`", of, unit, meaning] for (name, unit, meaning), of in rows)
+    return markdown(["column", "of", "unit", "meaning"], cells)

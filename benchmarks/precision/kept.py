@@ -1,0 +1,105 @@
+"""Runs of benchmarks/work_precision.py that have been measured, and how far they are from what is exact."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from remodel_fenicsx.body.shape import PROFILE
+from remodel_fenicsx.scene.scene import Scene
+from remodel_fenicsx.schema.times import same_time
+from remodel_fenicsx.simulation import Simulation
+from remodel_fenicsx.studies import trade as rungs
+
+Array = NDArray[np.float64]
+Run = Mapping[str, Array]
+EVERY_TANGENT = {"solver.method": "direct", "solver.predictor": "with-tolerance"}
+"""How the tables of docs/speed_and_accuracy.md were measured: the presets named this up to 0.2.0."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """One run.
+
+    Attributes
+    ----------
+    seconds, rows, iterations
+        Of the processor; steps; Newton iterations.
+    typical, largest
+        Error of the fibre angle, degrees: root mean square over places and times, and over places at the worst time.
+    anywhere
+        Its largest one.
+    percent
+        Largest relative error of the lengths.
+    """
+
+    seconds: float
+    rows: int
+    iterations: int
+    typical: float
+    largest: float
+    anywhere: float
+    percent: float
+
+
+class Kept:
+    """A folder with a file for each run."""
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+        folder.mkdir(parents=True, exist_ok=True)
+
+    def path(self, name: str) -> Path:
+        """Of a run."""
+        return self.folder / f"{name.replace(' ', '-')}.npz"
+
+    def __contains__(self, name: str) -> bool:
+        return self.path(name).exists()
+
+    def __getitem__(self, name: str) -> Run:
+        with np.load(self.path(name)) as found:
+            return dict(found)
+
+    def keep(self, name: str, run: Run) -> None:
+        """A file."""
+        np.savez(self.path(name), **run)  # type: ignore[arg-type]
+        if "seconds" in run:
+            print(f"{name}: {float(run['seconds']):.2g} s", flush=True)
+
+    def measure(self, name: str, scene: Scene, times: list[float]) -> None:
+        """A run that is not kept yet."""
+        if name not in self:
+            self.keep(name, measured(scene, times))
+
+    def found(self, name: str, angles: Array, lengths: Array) -> Found:
+        """A run against exact angles and lengths; where there are no angles along the body, none are compared."""
+        run = self[name]
+        apart = (run["angles"] - angles)[:, np.isfinite(angles).all(axis=0)]
+        errors = (
+            [rungs.typical(apart), max(map(rungs.typical, apart)), np.abs(apart).max()] if apart.size else [np.nan] * 3
+        )
+        percent = 100 * float(np.max(np.abs(run["lengths"] / lengths - 1)))
+        return Found(float(run["seconds"]), int(run["rows"]), int(run["iterations"]), *map(float, errors), percent)
+
+
+def measured(scene: Scene, times: list[float]) -> Run:
+    """Angles and lengths at the compared times, seconds of the processor, rows and Newton iterations of a run."""
+    compared = rungs.as_run(rungs.Setting("run", rungs.BOTH, {}, scene, (1,)), 1, times)
+    columns = [*compared.output.columns, "newton_iterations"]
+    simulation = Simulation(compared.with_values({"output.columns": columns}), MPI.COMM_SELF)
+    rows = [step.row for step in simulation.steps()]
+    simulation.close()
+    asked = [next(row for row in rows if same_time(row["time"], time)) for time in times]
+    lengths = [name for name in ("inner_radius", "outer_radius", "mean_stretch") if name in rows[0]]
+    return {
+        "angles": np.array([[row[name] for name in PROFILE] for row in asked]),
+        "lengths": np.array([[row[name] for name in lengths] for row in asked]),
+        "seconds": np.array(sum(row["processor_seconds"] for row in rows)),
+        "rows": np.array(len(rows)),
+        "iterations": np.array(sum(row["newton_iterations"] for row in rows)),
+    }

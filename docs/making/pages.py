@@ -1,0 +1,110 @@
+"""What all scripts that make pages share: tables in Markdown, texts between marks, templates, runs, pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.figure import Figure
+from mpi4py import MPI
+
+from remodel_fenicsx import Scene, Simulation
+from remodel_fenicsx.studies.page import STYLE, Page, read_table
+from remodel_fenicsx.system.environment import versions
+
+DOCS = Path(__file__).resolve().parents[1]
+FIGURES = DOCS / "figures"
+EDGES = np.linspace(1.0, 3.0, 9)  # of the eight layers of elements in the paper's artery
+Columns = dict[str, np.ndarray]
+
+
+# ---------------------------------------------------------------- texts
+def lines(rows: Iterable[Sequence[str]]) -> str:
+    """Rows of a table, whose head is in a template."""
+    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+
+
+def markdown(head: Iterable[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table; cells may hold several, parted by bars."""
+    first = lines([list(head)])
+    found = lines(rows)
+    return "\n".join([first, "|" + " --- |" * (first.count("|") - 1), *([found] if found else [])])
+
+
+def between_marks(text: str, name: str, made: str) -> str:
+    """A page with another text between the two comments of this name."""
+    start, end = f"<!-- {name}: ./with-fenicsx docs/make ", f"\n<!-- end of {name} -->"
+    before, rest = text.split(start)
+    command, rest = rest.split("\n", 1)
+    return f"{before}{start}{command}\n\n{made.strip()}\n{end}{rest.split(end)[1]}"
+
+
+def filled(template: Path, words: Mapping[str, str]) -> str:
+    """A template with its {{names}} replaced."""
+    text = template.read_text(encoding="utf-8")
+    for name, value in words.items():
+        text = text.replace("{{" + name + "}}", value)
+    return text
+
+
+def made_with() -> str:
+    """Versions of what counts."""
+    return ", ".join(f"{name} {version}" for name, version in versions().items() if name != "BLAS")
+
+
+# ---------------------------------------------------------------- tables
+def by_column(rows: Iterable[Mapping[str, Any]]) -> dict[str, list[Any]]:
+    """Rows as columns; says each row as it comes."""
+    found: dict[str, list[Any]] = {}
+    for row in rows:
+        print(row, flush=True)
+        for name, value in row.items():
+            found.setdefault(name, []).append(value)
+    return found
+
+
+def rows_of(path: Path) -> list[dict[str, Any]]:
+    """Rows of a table, numbers where they are."""
+    columns = read_table(path)
+    return [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
+
+
+# ---------------------------------------------------------------- runs
+@contextmanager
+def simulated(scene: Scene, domain: Any = None) -> Iterator[Simulation]:
+    """A simulation in this process alone, which ends with the block."""
+    simulation = Simulation(scene, MPI.COMM_SELF, domain)
+    try:
+        yield simulation
+    finally:
+        simulation.close()
+
+
+def rows_and_last(simulation: Simulation) -> tuple[Columns, Any]:
+    """Columns of all steps, and the last step."""
+    steps = list(simulation.steps())
+    return {name: np.array([step.row[name] for step in steps]) for name in steps[0].row}, steps[-1]
+
+
+def through_the_wall(simulation: Simulation) -> Columns:
+    """Radius without load, depth, hoop stress and fibre angle at the points of a tube as it is, by radius."""
+    cells, local = simulation.cells, simulation.cells.local_axes
+    found = {
+        "radius": local.coordinates[..., 0],
+        "depth": local.depth,
+        "stress": simulation.stepper.remodeling.driving_tensor()[1][:, 1, 1],
+        "angle": simulation.scene.geometry.fibre_angle(cells.dimension_values, cells.axis_values, local.axes),
+    }
+    order = np.argsort(found["radius"].reshape(-1))
+    return {name: values.reshape(-1)[order] for name, values in found.items()}
+
+
+# ---------------------------------------------------------------- pictures
+def drawn(page: Page, draw: Callable[..., Figure], *tables: Any, made: str = "", **style: Any) -> None:
+    """Save what a function draws of tables."""
+    with rc_context(STYLE | style):
+        page.save_figure(draw(*tables), made or made_with())
