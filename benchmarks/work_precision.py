@@ -85,11 +85,11 @@ def settings(method: Method) -> list[rungs.Setting]:
     """Those of the ladder, and the profiles."""
     base = scene(method)
     profiles = [
-        rungs.Setting(f"profile-{name}", rungs.BOTH, profile.values, base.with_values(profile.values), (1,))
+        whole.Named(profile.values, base.with_values(profile.values), (1,), title=f"profile-{name}")
         for name, profile in PROFILES.items()
     ]
     resolved = [
-        rungs.Setting(one.name, one.factor, one.changes, one.scene.with_values({"model.kinematics": "radial"}), (1,))
+        whole.Named(one.changes, one.scene.with_values({"model.kinematics": "radial"}), (1,), title=one.name)
         for one in profiles
     ]
     same = [one for one in rungs.ladder(base) if not one.profile and rungs.COUPLING not in one.changes]
@@ -98,13 +98,13 @@ def settings(method: Method) -> list[rungs.Setting]:
     return [one for one in every if one.step is None or one.step >= base.time.step or not exact]
 
 
-def coarse(base: Scene) -> list[rungs.Setting]:
+def coarse(base: Scene) -> list[whole.Named]:
     """Below what a study asks for: steps as long as the compared times allow, on the coarsest elements."""
     found = []
     for tolerance in COARSE:
         values = {"model.kinematics": "radial", "time.tolerance": tolerance}
         name = f"radial-1-degree-1-tolerance-{tolerance:g}"
-        found.append(rungs.Setting(name, rungs.TIME, values, base.with_values(values), (1,)))
+        found.append(whole.Named(values, base.with_values(values), (1,), title=name))
     return found
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
-import math
 import os
 import re
 import sys
@@ -19,12 +18,11 @@ from remodel_fenicsx._version import __version__
 from remodel_fenicsx.body.reductions import explained
 from remodel_fenicsx.errors import BAD_ENVIRONMENT, BAD_INPUT, PAUSED, RemodelError, SOLVE_FAILED
 from remodel_fenicsx.scene.presets import PRESETS, PROFILES, profile_for
-from remodel_fenicsx.scene.scene import Scene, SceneError, preset_scene, read_scene
+from remodel_fenicsx.scene.scene import Scene, preset_scene, read_scene
 from remodel_fenicsx.schema.tables import printable, shortened
 from remodel_fenicsx.system import interrupts
 from remodel_fenicsx.system.extensions import EXTENSIONS, load_extensions
 from remodel_fenicsx.system.files import (
-    MOST_RUNS,
     megabytes,
     positive,
     refusal_in_words,
@@ -398,31 +396,31 @@ def _stability(options: argparse.Namespace) -> int:
     check_usable(reason_undrawable())
 
     def analyse(scene: Scene, folder: Path | None, quiet: bool) -> Path:
-        from remodel_fenicsx.studies.stability import in_words, stability
+        from remodel_fenicsx.studies.stability import stability
 
-        place, table, unseen = stability(scene, folder, options.times, quiet=quiet)
-        _say(in_words(table, unseen))
+        place, found = stability(scene, folder, options.times, quiet=quiet)
+        _say(found.in_words())
         return place
 
     return _run(options, analyse)
 
 
-def _study(options: argparse.Namespace, task: Callable[[Scene], tuple[Path, str, dict[str, str]]]) -> int:
-    """Several runs that answer one question: `task` makes the folder, the answer in words, and what has failed."""
+def _study(options: argparse.Namespace, task: Callable[[Scene], tuple[Path, Any]]) -> int:
+    """Several runs that answer one question: `task` makes the folder and the answer."""
     scene = read_scene(options.scene, options.set, options.profile)
     check_usable(reason_unusable() or reason_undrawable())
     from remodel_fenicsx.studies.study import TooFewRuns
 
     try:
         with _stopping("all that is recorded is kept, the same command goes on"):
-            folder, words, failed = task(scene)
+            folder, found = task(scene)
     except TooFewRuns as early:
         _complain_of(early.failed)
         raise
-    _say(words)
+    _say(found.in_words())
     _say(f"results in {folder}")
-    _complain_of(failed)
-    return SOLVE_FAILED if failed else 0
+    _complain_of(found.failed)
+    return SOLVE_FAILED if found.failed else 0
 
 
 @contextlib.contextmanager
@@ -442,68 +440,42 @@ def _complain_of(failed: Mapping[str, str]) -> None:
 
 
 def _ensemble(options: argparse.Namespace) -> int:
-    def task(scene: Scene) -> tuple[Path, str, dict[str, str]]:
-        from remodel_fenicsx.studies import ensemble as study
+    def task(scene: Scene) -> tuple[Path, Any]:
+        from remodel_fenicsx.studies.sweep import ensemble
 
-        if options.seeds < 2:
-            raise SceneError(f"--seeds {options.seeds}: allowed is a whole number at least 2")
-        folder, found = study.ensemble(scene, options.output, options.seeds, options.jobs, options.quiet)
-        return folder, study.in_words(found, study.chosen_times(scene)), found.failed
+        return ensemble(scene, options.output, options.seeds, options.jobs, options.quiet)
 
     return _study(options, task)
 
 
 def _trade(options: argparse.Namespace) -> int:
-    def task(scene: Scene) -> tuple[Path, str, dict[str, str]]:
-        from remodel_fenicsx.studies import trade as study
+    def task(scene: Scene) -> tuple[Path, Any]:
+        from remodel_fenicsx.studies.trade import trade
 
-        say = None if options.quiet else _say
-        folder, found = study.trade(scene, options.output, options.budget, options.jobs, say)
-        return folder, study.in_words(found), found.failed
+        return trade(scene, options.output, options.budget, options.jobs, None if options.quiet else _say)
 
     return _study(options, task)
 
 
 def _sweep(options: argparse.Namespace) -> int:
-    def task(scene: Scene) -> tuple[Path, str, dict[str, str]]:
+    def task(scene: Scene) -> tuple[Path, Any]:
         from remodel_fenicsx.studies import sweep as study
 
-        axes: dict[str, Any] = {}
-        for text in options.axes:
-            key, numbers = study.read_axis(text, options.latin)
-            if key in axes:
-                raise SceneError(f"sweep {key}: this key is given twice")
-            axes[key] = numbers
-        if math.prod(map(len, axes.values())) > MOST_RUNS:
-            raise SceneError(f"sweep: {math.prod(map(len, axes.values()))} runs; allowed are at most {MOST_RUNS}")
-        sampled = options.latin is not None
-        points = study.latin_hypercube(axes, options.latin, options.seed) if sampled else study.grid(axes)
-        folder, found = study.sweep(scene, points, options.output, options.jobs, options.quiet, sampled)
-        return folder, study.in_words(found, scene), found.failed
+        is_sampled = options.latin is not None
+        axes = study.read_axes(options.axes, is_sampled)
+        points = study.latin_hypercube(axes, options.latin, options.seed) if is_sampled else study.grid(axes)
+        return study.sweep(scene, points, options.output, options.jobs, options.quiet, is_sampled)
 
     return _study(options, task)
 
 
 def _fit(options: argparse.Namespace) -> int:
-    def task(scene: Scene) -> tuple[Path, str, dict[str, str]]:
-        from remodel_fenicsx.solver.continuation import StepFailure
-        from remodel_fenicsx.studies import fit as study
+    def task(scene: Scene) -> tuple[Path, Any]:
+        from remodel_fenicsx.studies.fit import fit
 
-        try:
-            folder, found = study.fit(
-                scene, options.data, options.output, options.starts, options.quiet, options.profiles
-            )
-        except StepFailure as failure:
-            raise NoStart(f"at the start of the fit {failure}. {failure.refusal}; choose other starts") from failure
-        return folder, study.in_words(found), {}
+        return fit(scene, options.data, options.output, options.starts, options.quiet, options.profiles)
 
     return _study(options, task)
-
-
-class NoStart(RemodelError):  # noqa: N818
-    """A fit starts where the scene has no equilibrium."""
-
-    exit_code = SOLVE_FAILED
 
 
 def _status(options: argparse.Namespace) -> int:
@@ -596,7 +568,7 @@ def _unseen_files(scene: Scene) -> str:
 def _axes(options: argparse.Namespace) -> int:
     scene = read_scene(options.scene, options.set, options.profile)
     check_usable(reason_unusable())
-    from remodel_fenicsx.studies.study import write_axes
+    from remodel_fenicsx.studies.preparation import write_axes
 
     path = options.output or Path(f"{scene.name}-axes.vtu")
     with _stopping("nothing is written"):
@@ -610,7 +582,7 @@ def _unload(options: argparse.Namespace) -> int:
     if not scene.geometry.is_loaded:
         return _fail("geometry.is = 'unloaded': the body is unloaded already; allowed is 'loaded'", BAD_INPUT)
     check_usable(reason_unusable())
-    from remodel_fenicsx.studies.study import write_unloaded
+    from remodel_fenicsx.studies.preparation import write_unloaded
 
     place = options.output or Path(f"{scene.name}-unloaded")
     with _stopping("nothing is written"):

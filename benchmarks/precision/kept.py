@@ -89,7 +89,7 @@ class Kept:
 
 def measured(scene: Scene, times: list[float]) -> Run:
     """Angles and lengths at the compared times, seconds of the processor, rows and Newton iterations of a run."""
-    compared = rungs.as_run(rungs.Setting("run", rungs.BOTH, {}, scene, (1,)), 1, times)
+    compared = rungs.as_run(rungs.Setting({}, scene, (1,)), 1, times)
     columns = [*compared.output.columns, "newton_iterations"]
     simulation = Simulation(compared.with_values({"output.columns": columns}), MPI.COMM_SELF)
     rows = [step.row for step in simulation.steps()]

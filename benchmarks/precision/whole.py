@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from remodel_fenicsx.scene.scene import Scene
 from remodel_fenicsx.studies import trade as rungs
 
@@ -23,6 +25,18 @@ OTHERS = {
     "method iterative": {"solver.method": "iterative"},
     "no predictor": {"solver.predictor": "none"},
 }
+
+
+@dataclass(frozen=True)
+class Named(rungs.Setting):
+    """A setting whose row has a name of its own."""
+
+    title: str = ""
+
+    @property
+    def name(self) -> str:
+        """Of its row."""
+        return self.title
 
 
 def settings(method: str, base: Scene) -> list[rungs.Setting]:
@@ -50,4 +64,4 @@ def _slug(words: str) -> str:
 def _setting(base: Scene, refinement: int, degree: int, steps: str, time: dict[str, float]) -> rungs.Setting:
     values = SOLVED | {"mesh.refinement": refinement, "mesh.degree": degree} | time
     name = f"whole-{refinement}-degree-{degree}-{_slug(steps)}"
-    return rungs.Setting(name, rungs.BOTH, values, base.with_values(values), (1,))
+    return Named(values, base.with_values(values), (1,), title=name)

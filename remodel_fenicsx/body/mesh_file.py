@@ -225,7 +225,7 @@ FORMATS = (b"2.2", b"4.1")
 READ = (b"MeshFormat", b"PhysicalNames", b"Entities", b"Nodes", b"Elements")
 IGNORED = tuple(b"Comments Periodic NodeData ElementData ElementNodeData InterpolationScheme Parametrizations".split())
 _HEAD = re.compile(rb"\s*\$(\w+)[ \t\r]*\n")
-_NAME = re.compile(r'([0-3])\s+(\d{1,9})\s+"([^"\x00-\x1f]{0,127})"')
+_GROUP_NAME = re.compile(r'([0-3])\s+(\d{1,9})\s+"([^"\x00-\x1f]{0,127})"')
 _NO_NUMBER = re.compile(rb"\S*[^-+.\deE\s]\S*")
 
 
@@ -277,7 +277,7 @@ def _physical_names(sections: dict[bytes, bytes]) -> dict[int, dict[str, int]]:
     if number != str(len(named)):
         raise MeshFileError(f"$PhysicalNames announces {number[:20]!r} groups and has {len(named)}")
     for line in named:
-        found = _NAME.fullmatch(line)
+        found = _GROUP_NAME.fullmatch(line)
         if found is None or found[3] in names.get(int(found[1]), ()):
             raise MeshFileError(f"$PhysicalNames: {line[:40]!r} where dimension, number and a new name should be")
         names.setdefault(int(found[1]), {})[found[3]] = int(found[2])

@@ -25,7 +25,7 @@ from remodel_fenicsx.system.files import check_regular, write_whole
 log = logging.getLogger(__name__)
 Array = NDArray[Any]
 
-FORMAT = 1
+CHECKPOINT_FORMAT = 1
 FILES = ("checkpoint-a.npz", "checkpoint-b.npz")
 _HEADER = "header"  # name of the array that holds the JSON
 # what numpy, zipfile and pydantic raise of a file that somebody has changed: encrypted, too deep, no literal, ...
@@ -44,7 +44,7 @@ class Checkpoint(BaseModel):
 
     model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, arbitrary_types_allowed=True)
 
-    format: int = Field(default=FORMAT, ge=1, le=FORMAT)
+    format: int = Field(default=CHECKPOINT_FORMAT, ge=1, le=CHECKPOINT_FORMAT)
     time: float = Field(ge=0)
     number: int = Field(ge=0)
     scene: str
@@ -115,7 +115,7 @@ def read_file(path: Path, with_arrays: bool = True) -> Checkpoint:
             if any(entry.compress_type != zipfile.ZIP_STORED for entry in archive.infolist()):
                 raise ValueError("compressed")
             header = file[_HEADER].tobytes()
-            if json.loads(header)["format"] > FORMAT:
+            if json.loads(header)["format"] > CHECKPOINT_FORMAT:
                 raise CheckpointError(f"{path}: was written by a newer version")
             checkpoint = Checkpoint.model_validate_json(header)
             if with_arrays:

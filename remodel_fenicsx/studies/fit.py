@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import base64
+import hashlib
 import io
+import json
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from html import escape
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,6 +21,8 @@ from matplotlib.figure import Figure
 from mpi4py import MPI
 from numpy.typing import NDArray
 
+from remodel_fenicsx._version import __version__
+from remodel_fenicsx.errors import RemodelError, SOLVE_FAILED
 from remodel_fenicsx.evolution.sensitivity import Directions, axes_lie_along, refused, with_derivatives
 from remodel_fenicsx.evolution.stepper import Step, Watcher
 from remodel_fenicsx.fem.kinematics import KINEMATICS
@@ -25,25 +30,22 @@ from remodel_fenicsx.model.laws import LAWS
 from remodel_fenicsx.report.card import Card, folded, section, table as card_table
 from remodel_fenicsx.report.page import page_with
 from remodel_fenicsx.results.columns import Measurement
-from remodel_fenicsx.results.history import unit_of, words
 from remodel_fenicsx.results.run_folder import chosen_folder
 from remodel_fenicsx.results.run_lock import RunLock
 from remodel_fenicsx.scene.scene import Scene, SceneError
 from remodel_fenicsx.simulation import Simulation, with_choices
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.studies.measurements import Measured, Unknown, doubts, read_measurements
-from remodel_fenicsx.studies.page import COLOURS, DOTS_PER_INCH, Page, STYLE, add_head
-from remodel_fenicsx.studies.study import Evaluation, Journal, Point, fingerprint, fingerprint_in
-from remodel_fenicsx.system.environment import versions
-from remodel_fenicsx.system.files import refusal_in_words, write_whole
+from remodel_fenicsx.studies.page import COLOURS, DOTS_PER_INCH, STYLE, Answer, Page, label, made_with, panels
+from remodel_fenicsx.system.files import check_no_link, read_regular, write_whole
 from remodel_fenicsx.system.terminal import Line, hold_log, open_log, unsaid
 
-
-# ---------------------------------------------------------------- what a scene says where a table has measurements,
-# What a scene says where a table has measurements, with its derivatives by the unknowns where the model has them.
+log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 
+
+# ---------------------------------------------------------------- numbers of a scene, and their derivatives
 OF_TISSUE = ("lame_lambda", "lame_mu", "network_modulus", "contour_length")  # of a tissue: those with derivatives
 NUMBERS_CHANGE = 1e-4  # of logarithms, for closed formulas: with four points the error is 1e-16, that of rounding 1e-12
 STATE_CHANGE = 1e-5  # of logarithms, for columns of a state: central differences err by 1e-10
@@ -87,7 +89,6 @@ def without_derivatives(scene: Scene, table: Measured) -> str | None:
     return None if table.state == "virgin" else refused(settings, LAWS[settings.law], settings.coupling)
 
 
-# ---------------------------------------------------------------- numbers of a scene
 def slopes(at: Callable[[Array], Scene], logarithms: Array, scales: Mapping[str, tuple[int, float]]) -> Slopes:
     """Derivatives of a scene's numbers."""
     count, base = len(logarithms), at(logarithms)
@@ -126,28 +127,27 @@ def _apart_from_numbers(scene: Scene) -> Any:
     return values, rest
 
 
-# ---------------------------------------------------------------- tables
+# ---------------------------------------------------------------- what a scene says where a table has measurements
 def model_of(scene: Scene, table: Measured, scales: Mapping[str, float], ways: Slopes | None = None) -> Modelled:
     """What a scene says where a table has measurements, by column."""
     scene = _with_columns(scene, table)
     if table.state == "history":
-        measured = table.columns["time"]
-        end = float(scene.time.step * np.ceil(measured.max() / scene.time.step - 1e-9))
-        run = _Run(scene.with_values({"time.end": max(end, scene.time.step)}), table, ways)
-        found = run.rows(lambda time: bool(np.abs(measured - time).min() < scene.time.step))
+        measured, step = table.columns["time"], scene.time.step
+        end = max(float(step * np.ceil(measured.max() / step - 1e-9)), step)
+        scene = scene.with_values({"time.end": end})
+        found, _ = _run(scene, table, _directions(scene, ways), lambda time: bool(np.abs(measured - time).min() < step))
         at = found.columns["time"]
         return Modelled(
             {name: np.interp(measured, at, found.columns[name]) for name in table.sd},
             {name: np.array([np.interp(measured, at, row) for row in rows]) for name, rows in found.changes.items()},
         )
-    cells, dimensions = None, None
+    start = None
     if table.state == "after":
         scene = with_choices(scene)
-        before = _Run(scene.with_values({"time.end": table.time}), table, ways)
-        before.rows(lambda time: False)
-        cells, dimensions = before.cells, before.dimensions
-    run = _Run(_passive(scene, table, scales), table, ways, _passive_loads(scene, table, ways), cells, dimensions)
-    found = run.rows(lambda time: True)
+        before = scene.with_values({"time.end": table.time})
+        _, start = _run(before, table, _directions(before, ways), lambda time: False)
+    passive = _passive(scene, table, scales)
+    found, _ = _run(passive, table, _directions(scene, ways, table), lambda time: True, start)
     chosen = found.columns["time"] > 0
     return Modelled(
         {name: found.columns[name][chosen] for name in table.sd},
@@ -177,63 +177,56 @@ def _passive(scene: Scene, table: Measured, scales: Mapping[str, float]) -> Scen
     return scene.with_values(changes)
 
 
-Loads = Callable[[float], Mapping[str, Array]]
-
-
-def _passive_loads(scene: Scene, table: Measured, ways: Slopes | None) -> Loads | None:
-    """Derivatives of the loads of `_passive` at its times."""
+def _directions(scene: Scene, ways: Slopes | None, test: Measured | None = None) -> Directions | None:
+    """Derivatives under the scene's own loads, or those of `_passive`."""
     if ways is None:
         return None
     known, nothing = ways, np.zeros(len(ways.kappa))
 
     def loads(time: float) -> dict[str, Array]:
-        found = {name: known.loads[name] * load.factor(scene.last_time) for name, load in scene.loads.items()}
-        row = max(round(time) - 1, 0)
-        return found | {name: known.scales.get(name, nothing) * table.columns[name][row] for name in table.loads}
+        when = time if test is None else scene.last_time
+        found = {name: known.loads[name] * load.factor(when) for name, load in scene.loads.items()}
+        if test is not None:
+            row = max(round(time) - 1, 0)
+            found |= {name: known.scales.get(name, nothing) * test.columns[name][row] for name in test.loads}
+        return found
 
-    return loads
+    return Directions(ways.tissue, ways.kappa, loads)
 
 
-# ---------------------------------------------------------------- runs
-class _Run:
-    """A run whose measured columns are kept."""
+class Start(NamedTuple):
+    """Cells as a run leaves them, and the derivatives of their lengths."""
 
-    def __init__(
-        self,
-        scene: Scene,
-        table: Measured,
-        ways: Slopes | None,
-        loads: Loads | None = None,
-        cells: tuple[Array, Array] | None = None,
-        dimensions: Array | None = None,
-    ):
-        self.scene, self.table, self.cells, self.dimensions = scene, table, cells, dimensions
-        self.directions: Directions | None = None
-        if ways is not None:
-            self.directions = Directions(ways.tissue, ways.kappa, loads or self._ramped(ways))
+    dimensions: Array
+    axes: Array
+    changes: Array | None
 
-    def _ramped(self, ways: Slopes) -> Loads:
-        return lambda time: {name: ways.loads[name] * load.factor(time) for name, load in self.scene.loads.items()}
 
-    def rows(self, wanted: Callable[[float], bool]) -> Modelled:
-        """Columns and `time` of all steps; their derivatives where the time is wanted, zero elsewhere."""
-        coupling = None
-        if self.directions is not None:
-            coupling = with_derivatives(self.scene.remodeling.coupling, self.directions, self.dimensions)
-        simulation = Simulation(self.scene, MPI.COMM_SELF, coupling=coupling)
-        watcher = None if self.directions is None else RowChanges(simulation, self.directions, self.table, wanted)
-        try:
-            if self.cells is not None:
-                simulation.cells.set(*self.cells)
-                simulation.state.settle_cells()
-            rows = [step.row for step in simulation.steps([watcher] if watcher else [])]
-            self.cells = simulation.cells.dimension_values.copy(), simulation.cells.axis_values.copy()
-            self.dimensions = getattr(simulation.stepper.coupling, "dimensions", None)
-        finally:
-            simulation.close()
-        names = ("time", *self.table.sd)
-        columns = {name: np.array([row[name] for row in rows]) for name in names}
-        return Modelled(columns, {} if watcher is None else watcher.changes())
+def _run(
+    scene: Scene,
+    table: Measured,
+    directions: Directions | None,
+    wanted: Callable[[float], bool],
+    start: Start | None = None,
+) -> tuple[Modelled, Start]:
+    """Columns and `time` of all steps, their derivatives where they are wanted and zero elsewhere; cells at the end."""
+    coupling = None
+    if directions is not None:
+        coupling = with_derivatives(scene.remodeling.coupling, directions, start.changes if start else None)
+    simulation = Simulation(scene, MPI.COMM_SELF, coupling=coupling)
+    watchers = [] if directions is None else [RowChanges(simulation, directions, table, wanted)]
+    cells = simulation.cells
+    try:
+        if start is not None:
+            cells.set(start.dimensions, start.axes)
+            simulation.state.settle_cells()
+        rows = [step.row for step in simulation.steps(watchers)]
+        changes = getattr(simulation.stepper.coupling, "dimensions", None)
+        end = Start(cells.dimension_values.copy(), cells.axis_values.copy(), changes)
+    finally:
+        simulation.close()
+    columns = {name: np.array([row[name] for row in rows]) for name in ("time", *table.sd)}
+    return Modelled(columns, watchers[0].changes() if watchers else {}), end
 
 
 class RowChanges(Watcher):
@@ -290,9 +283,65 @@ def rotated_cells(scene: Scene) -> bool:
         simulation.close()
 
 
-log = logging.getLogger(__name__)
+# ---------------------------------------------------------------- what was evaluated, a line each in a file
+JOURNAL = "evaluations.jsonl"
+LARGEST_JOURNAL = 10**9  # bytes
 
-FIT = "fit"
+Point = tuple[float, ...]
+
+
+class Evaluation(NamedTuple):
+    """Residuals (n,) at a point, and their derivatives (n, k): NaN in columns that the model does not give."""
+
+    residuals: Array
+    jacobian: Array
+
+
+class Journal:
+    """The file in the folder of a fit, from which the same fit goes on; its first line says which fit it is."""
+
+    def __init__(self, folder: Path):
+        self._path = folder / JOURNAL
+        self._lines: list[dict[str, Any]] = []
+        text = read_regular(self._path, LARGEST_JOURNAL).decode(errors="replace") if self._path.exists() else ""
+        with suppress(ValueError):  # the last line may have been cut off
+            for line in text.splitlines():
+                self._lines.append(json.loads(line))
+
+    @property
+    def mark(self) -> str | None:
+        """Of the fit in the folder; None where there is none."""
+        return str(self._lines[0].get("fit")) if self._lines else None
+
+    def known(self) -> dict[Point, Evaluation]:
+        """All evaluations by their point."""
+        found = {}
+        for line in self._lines[1:]:
+            point, off, ways = (np.array(line[name], dtype=np.float64) for name in ("at", "residuals", "jacobian"))
+            found[tuple(map(float, point))] = Evaluation(off, ways)
+        return found
+
+    def begin(self, mark: str) -> None:
+        """Open the file for more, without a line that was cut off."""
+        self._lines = self._lines or [{"fit": mark}]
+        check_no_link(self._path)
+        self._path.write_text("".join(json.dumps(line) + "\n" for line in self._lines), encoding="utf-8")
+
+    def add(self, point: Point, evaluation: Evaluation) -> None:
+        """One line more, on the disk when this returns."""
+        values = {"residuals": evaluation.residuals.tolist(), "jacobian": evaluation.jacobian.tolist()}
+        with self._path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps({"at": list(point), **values}) + "\n")
+
+
+def fingerprint(scene: Scene, unknowns: Sequence[Unknown], tables: Sequence[Measured]) -> str:
+    """SHA-256 of all that a fit depends on but its starts."""
+    said = [[t.name, t.state, t.time, t.sd, t.scaled, {n: v.tolist() for n, v in t.columns.items()}] for t in tables]
+    text = json.dumps([__version__, scene.to_toml(), [list(vars(u).values()) for u in unknowns], said])
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+# ---------------------------------------------------------------- least squares
 SCALE = "scale."  # what keys of factors on columns begin with
 LOGARITHM_CHANGE = 1e-3  # of a logarithm: central differences err by 1e-6, the solves' tolerance of 1e-10 by 1e-7
 BLIND = 1e-5  # smallest singular value over the largest, below which the data say nothing: what differences err by
@@ -306,7 +355,6 @@ CORRELATED = 0.9  # of two unknowns, from which on their profiles are made
 PROFILE_STEP, PROFILE_REACH = 1.0, 4.0  # standard deviations of the straight line
 ROUGHLY = 1e-4  # as ENOUGH, of a profile's fits: they start where a straight line has their end
 NORMAL_95 = 1.959963984540054  # standard deviations on each side, normal distribution
-
 
 _MODULI = ("lame_lambda", "lame_mu", "chain_density", "initial_stiffness", "persistence_length", "temperature")
 KNOWN_GROUPS: list[tuple[set[str], str]] = [
@@ -328,34 +376,6 @@ KNOWN_GROUPS: list[tuple[set[str], str]] = [
 """Unknowns that go together, and why; the first group that has all of them counts."""
 
 
-@dataclass(frozen=True)
-class LikelihoodProfile:
-    """Smallest sums of squares with one unknown held."""
-
-    values: Array
-    increases: Array
-    lower: float
-    upper: float
-
-
-@dataclass(frozen=True)
-class Fit:
-    """What a fit has found."""
-
-    unknowns: list[Unknown]
-    values: Array
-    lower: Array
-    upper: Array
-    correlations: Array
-    misfit: float
-    minima: list[float]
-    evaluations: list[int]
-    modelled: list[dict[str, Array]]
-    scene: Scene
-    profiles: dict[str, LikelihoodProfile] = field(default_factory=dict)
-
-
-# ---------------------------------------------------------------- least squares
 class Problem:
     """Residuals over their standard deviations as a function of the logarithms of the unknowns."""
 
@@ -372,9 +392,10 @@ class Problem:
 
     def keep(self, journal: Journal) -> None:
         """From now on each evaluation is in the journal, and what that has is not evaluated again."""
-        for point in self._known.keys() - journal.known.keys():
+        known = journal.known()
+        for point in self._known.keys() - known.keys():
             journal.add(point, self._known[point])
-        self._known |= journal.known
+        self._known |= known
         self._journal = journal
 
     def how(self) -> str:
@@ -476,6 +497,12 @@ def _reason(keys: Sequence[str]) -> str:
     return next((f" ({words})" for group, words in KNOWN_GROUPS if set(keys) <= group and len(set(keys)) > 1), "")
 
 
+class NoStart(RemodelError):  # noqa: N818
+    """A fit starts where the scene has no equilibrium."""
+
+    exit_code = SOLVE_FAILED
+
+
 def fit(
     scene: Scene,
     data: Path | str,
@@ -487,59 +514,74 @@ def fit(
     """Fit numbers of a scene to measurements."""
     if scene.cases:
         raise SceneError("cases: a fit takes one load case; leave out [[cases]]")
+    line = Line(f"{scene.name} fit")
+
+    def show(text: str) -> None:
+        if not quiet:
+            line.show(text)
+
     with hold_log(quiet=quiet) as held:
         unknowns, tables = read_measurements(Path(data), scene)
         mark = fingerprint(scene, unknowns, tables)
-        place = _place(folder, f"{scene.name}-{FIT}", mark)
-        problem, line = Problem(scene, unknowns, tables), Line(f"{scene.name} {FIT}")
-        first = np.log([unknown.start for unknown in unknowns])
+        place, journal = _place(folder, f"{scene.name}-fit", mark)
+        problem, first = Problem(scene, unknowns, tables), np.log([unknown.start for unknown in unknowns])
         log.info("%s", problem.how())
-        at_start = problem.models(first)  # what has no equilibrium here says so
+        try:
+            at_start = problem.models(first)
+        except StepFailure as failure:
+            raise NoStart(f"at the start of the fit {failure}. {failure.refusal}; choose other starts") from failure
         for doubt in doubts(tables, [modelled.columns for modelled in at_start], scene):
             log.warning("%s", doubt)
         problem.check_tells_apart(problem.jacobian(first, central=True))
-
-    def announced(key: str) -> None:
-        if not quiet:
-            line.show(f"profile of {key}")
-
-    random = np.random.default_rng(1)
-    found = []
+    random, found = np.random.default_rng(1), []
     with ExitStack() as stack:
         stack.enter_context(RunLock(place))
-        problem.keep(Journal(place, mark))
-        stack.enter_context(open_log(place / f"{FIT}.log", quiet=quiet, held=held))
+        journal.begin(mark)
+        problem.keep(journal)
+        stack.enter_context(open_log(place / "fit.log", quiet=quiet, held=held))
         stack.callback(line.end)
-        for number in range(starts):
-            start = first + (random.uniform(-START_SPREAD, START_SPREAD, len(first)) if number else 0.0)
-
-            def said(misfit: float, number: int = number) -> None:
-                if not quiet:
-                    line.show(f"start {number + 1} of {starts}, misfit {misfit:.4g}")
-
-            found.append(minimised(problem, start, said))
-            log.info("start %d: sum of squares %.6g, %d evaluations", number + 1, 2 * found[-1].cost, found[-1].nfev)
+        for number in range(1, starts + 1):
+            start = first + (random.uniform(-START_SPREAD, START_SPREAD, len(first)) if number > 1 else 0.0)
+            found.append(minimised(problem, start, partial(_show_misfit, show, f"start {number} of {starts}")))
+            log.info("start %d: sum of squares %.6g, %d evaluations", number, 2 * found[-1].cost, found[-1].nfev)
         result = result_of(problem, found)
         if profiles:
-            result = with_profiles(problem, result, announced)
-        log.info("%s", verdict(result))
+            result = with_profiles(problem, result, lambda key: show(f"profile of {key}"))
+        log.info("%s", result.verdict())
         write_whole(place / "scene.toml", result.scene.to_toml(f"fitted to {Path(data).name}").encode())
-        _draw(result, tables, place)
+        result.write(place)
     return place, result
 
 
-def _place(folder: Path | str | None, name: str, mark: str) -> Path:
+def _show_misfit(show: Callable[[str], None], where: str, misfit: float) -> None:
+    show(f"{where}, misfit {misfit:.4g}")
+
+
+def _place(folder: Path | str | None, name: str, mark: str) -> tuple[Path, Journal]:
     """The folder of the same fit, or a new one."""
     wanted = Path(folder or Path("results") / name)
-    try:
-        there = fingerprint_in(wanted)
-    except OSError as error:
-        raise SceneError(f"folder {wanted}: {refusal_in_words(error)}") from error
-    if there == mark:
-        return wanted
-    if there is not None and folder is not None:
+    journal = Journal(wanted)
+    if journal.mark == mark:
+        return wanted, journal
+    if journal.mark is not None and folder is not None:
         raise SceneError(f"folder {wanted}: holds a fit of another scene, data or version; choose another folder")
-    return chosen_folder(folder, name, MPI.COMM_SELF)
+    place = chosen_folder(folder, name, MPI.COMM_SELF)
+    return place, Journal(place)
+
+
+@dataclass(frozen=True)
+class LikelihoodProfile:
+    """Smallest sums of squares with one unknown held."""
+
+    values: Array
+    increases: Array
+    lower: float
+    upper: float
+
+    def in_words(self) -> str:
+        """Its ends."""
+        ends = ["beyond what was tried" if np.isnan(end) else f"{end:.5g}" for end in (self.lower, self.upper)]
+        return " to ".join(ends)
 
 
 def minimised(
@@ -621,6 +663,7 @@ def result_of(problem: Problem, found: Sequence[Any]) -> Fit:
         [int(one.nfev) for one in found],
         [modelled.columns for modelled in problem.models(logarithms)],
         problem.scene_of(logarithms),
+        problem.tables,
     )
 
 
@@ -634,114 +677,117 @@ def with_profiles(problem: Problem, found: Fit, said: Callable[[str], object] = 
     return replace(found, profiles=profiles)
 
 
-# ---------------------------------------------------------------- words and picture
-def in_words(found: Fit) -> str:
-    """A table for a terminal; then how good the fit is, in a sentence."""
-    width = max(len(unknown.key) for unknown in found.unknowns)
-    lines = [f"{'':{width}} {'fitted':>12} {'95 % from':>12} {'to':>12} {'start':>12}"]
-    for number, u in enumerate(found.unknowns):
-        row = (found.values[number], found.lower[number], found.upper[number], u.start)
-        lines.append(f"{u.key:{width}} {' '.join(f'{value:12.5g}' for value in row)}")
-    lines += [
-        f"profile of {key}: 95 % from {_end(one.lower)} to {_end(one.upper)}" for key, one in found.profiles.items()
-    ]
-    return "\n".join([*lines, verdict(found)])
+# ---------------------------------------------------------------- the answer
+@dataclass(frozen=True)
+class Fit(Answer):
+    """What a fit has found."""
 
+    unknowns: list[Unknown]
+    values: Array
+    lower: Array
+    upper: Array
+    correlations: Array
+    misfit: float
+    minima: list[float]
+    evaluations: list[int]
+    modelled: list[dict[str, Array]]
+    scene: Scene
+    tables: list[Measured]
+    profiles: dict[str, LikelihoodProfile] = field(default_factory=dict)
 
-def _end(value: float) -> str:
-    return "beyond what was tried" if np.isnan(value) else f"{value:.5g}"
+    name = "fit"
+    caption = "Points: measured, with one standard deviation; lines: the fitted model."
 
+    @property
+    def title(self) -> str:
+        """Of the picture."""
+        return f"{self.scene.name}: measured and fitted"
 
-def verdict(found: Fit) -> str:
-    """How far the model is off, how many starts agree, and which unknowns go together."""
-    least = min(found.minima)
-    same = sum(one - least <= SAME_MINIMUM * max(least, 1.0) for one in found.minima)
-    text = f"The model is off by {found.misfit:.2g} standard deviations (root mean square); "
-    text += f"{same} of {len(found.minima)} starts end in this minimum."
-    pairs = np.argwhere(np.triu(np.abs(found.correlations) > CORRELATED, 1))
-    keys = [unknown.key for unknown in found.unknowns]
-    together = [f"{keys[i]} and {keys[j]} ({found.correlations[i, j]:+.2f})" for i, j in pairs]
-    if together:
-        text += f" Correlated above {CORRELATED:g}, so that profiles count, not bands: {', '.join(together)}."
-    edges = [
-        u.key
-        for u, v in zip(found.unknowns, found.values, strict=True)
-        if min(abs(np.log(v / u.lower)), abs(np.log(v / u.upper))) < 1e-3
-    ]
-    return text + (f" At the edge of what is allowed: {', '.join(edges)}." if edges else "")
+    @property
+    def keys(self) -> list[str]:
+        """Of the unknowns."""
+        return [unknown.key for unknown in self.unknowns]
 
+    def table(self) -> dict[str, Any]:
+        """A row for each unknown."""
+        table = {"key": self.keys, "value": self.values, "lower": self.lower, "upper": self.upper}
+        for end in ("lower", "upper"):
+            table[f"profile_{end}"] = [getattr(self.profiles.get(key), end, np.nan) for key in self.keys]
+        return table | {"start": [unknown.start for unknown in self.unknowns]}
 
-def _label(name: str, units: Mapping[str, str]) -> str:
-    return words(name) + (f", {units[name]}" if units.get(name) else "")
+    def lines(self) -> list[str]:
+        """A row for each unknown, and its profile."""
+        width = max(len(key) for key in self.keys)
+        lines = [f"{'':{width}} {'fitted':>12} {'95 % from':>12} {'to':>12} {'start':>12}"]
+        for u, *row in zip(self.unknowns, self.values, self.lower, self.upper, strict=True):
+            lines.append(f"{u.key:{width}} {' '.join(f'{value:12.5g}' for value in (*row, u.start))}")
+        return lines + [f"profile of {key}: 95 % from {one.in_words()}" for key, one in self.profiles.items()]
 
+    def verdict(self) -> str:
+        """How far the model is off, how many starts agree, and which unknowns go together."""
+        least, keys = min(self.minima), self.keys
+        same = sum(one - least <= SAME_MINIMUM * max(least, 1.0) for one in self.minima)
+        text = f"The model is off by {self.misfit:.2g} standard deviations (root mean square); "
+        text += f"{same} of {len(self.minima)} starts end in this minimum."
+        pairs = np.argwhere(np.triu(np.abs(self.correlations) > CORRELATED, 1))
+        together = [f"{keys[i]} and {keys[j]} ({self.correlations[i, j]:+.2f})" for i, j in pairs]
+        if together:
+            text += f" Correlated above {CORRELATED:g}, so that profiles count, not bands: {', '.join(together)}."
+        ends = np.log([[u.lower, u.upper] for u in self.unknowns]) - np.log(self.values)[:, None]
+        edges = [key for key, away in zip(keys, np.abs(ends).min(axis=1), strict=True) if away < 1e-3]
+        return text + (f" At the edge of what is allowed: {', '.join(edges)}." if edges else "")
 
-def _draw(found: Fit, tables: Sequence[Measured], folder: Path) -> None:
-    """Write fit.csv, correlations.csv and fit.png."""
-    title = f"{found.scene.name}: measured and fitted"
-    page = Page(folder, FIT, title, "Points: measured, with one standard deviation; lines: the fitted model.")
-    made_with = ", ".join(f"{name} {version}" for name, version in versions().items() if name != "BLAS")
-    keys = [unknown.key for unknown in found.unknowns]
-    table = {"value": found.values, "lower": found.lower, "upper": found.upper}
-    for end in ("lower", "upper"):
-        table[f"profile_{end}"] = np.array([getattr(found.profiles.get(key), end, np.nan) for key in keys])
-    page.save_table({"key": keys, **table, "start": [u.start for u in found.unknowns]}, [title, made_with])
-    if found.profiles:
-        rows_of = [
-            (k, v, i) for k, one in found.profiles.items() for v, i in zip(one.values, one.increases, strict=True)
-        ]
-        columns = dict(zip(("key", "value", "increase"), zip(*rows_of, strict=True), strict=True))
-        Page(folder, "profiles", title, "").save_table(columns, [title, made_with])
-    correlations = Page(folder, "correlations", title, "")
-    correlations.save_table({"key": keys, **dict(zip(keys, found.correlations, strict=True))}, [title, made_with])
-    panels = [(number, name) for number, one in enumerate(tables) for name in one.sd]
-    units = {column.name: unit_of(found.scene, column.unit) for column in found.scene.columns()}
-    kinds = found.scene.load_kinds
-    units |= {name: unit_of(found.scene, kind.dimension.name) for name, kind in kinds.items() if kind.dimension}
-    scales = {u.key: value for u, value in zip(found.unknowns, found.values, strict=True)}
-    with rc_context(STYLE):
-        rows = -(-len(panels) // 2)
-        figure = Figure(figsize=(7.2, 2.4 * rows + 0.4), layout="constrained")
-        grid = figure.subplots(rows, 2, squeeze=False).ravel()
-        for axes, (number, name) in zip(grid, panels, strict=False):
-            one = tables[number]
-            along = one.loads[0] if one.loads else "time"
-            x = scales.get(f"scale.{along}", 1.0) * one.columns[along]
-            y, order = scales.get(f"scale.{name}", 1.0) * one.columns[name], np.argsort(x)
-            axes.errorbar(x, y, yerr=one.sd[name], fmt="o", color=COLOURS[1], label="measured")
-            axes.plot(x[order], found.modelled[number][name][order], color=COLOURS[0], label="fitted model")
-            axes.set(xlabel=_label(along, units), ylabel=_label(name, units))
-            axes.set_title(f"{one.name} ({one.state})", fontsize=8)
+    def write(self, folder: Path) -> None:
+        """Write tables, picture and page."""
+        super().write(folder)
+        notes = [self.title, made_with()]
+        if self.profiles:
+            rows = [
+                (k, *row) for k, one in self.profiles.items() for row in zip(one.values, one.increases, strict=True)
+            ]
+            columns = dict(zip(("key", "value", "increase"), zip(*rows, strict=True), strict=True))
+            Page(folder, "profiles").save_table(columns, notes)
+        correlations = dict(zip(self.keys, self.correlations, strict=True))
+        Page(folder, "correlations").save_table({"key": self.keys, **correlations}, notes)
+        write_whole(folder / "fit.html", page_with(self._cards()).encode())
+
+    def figure(self) -> Figure:
+        """Each measured column over the load, or time, that was prescribed."""
+        shown = [(*pair, name) for pair in zip(self.tables, self.modelled, strict=True) for name in pair[0].sd]
+        figure, grid = panels(len(shown), 2.4)
+        for axes, (table, modelled, name) in zip(grid, shown, strict=True):
+            self._draw(axes, table, name, modelled[name])
         grid[0].legend()
-        for axes in grid[len(panels) :]:
-            axes.set_axis_off()
-        figure.savefig(plain := io.BytesIO(), dpi=DOTS_PER_INCH["png"])  # the page has title and verdict as text
-        add_head(figure, title, verdict(found))
-        page.save_figure(figure, made_with)
-    picture = base64.b64encode(plain.getvalue()).decode("ascii")
-    write_whole(folder / f"{FIT}.html", _web_page(found, title, picture, made_with).encode())
+        return figure
 
+    def _draw(self, axes: Any, table: Measured, name: str, modelled: Array) -> None:
+        scales, along = dict(zip(self.keys, self.values, strict=True)), table.loads[0] if table.loads else "time"
+        x, y = (scales.get(f"{SCALE}{one}", 1.0) * table.columns[one] for one in (along, name))
+        order = np.argsort(x)
+        axes.errorbar(x, y, yerr=table.sd[name], fmt="o", color=COLOURS[1], label="measured")
+        axes.plot(x[order], modelled[order], color=COLOURS[0], label="fitted model")
+        axes.set(xlabel=label(self.scene, along), ylabel=label(self.scene, name))
+        axes.set_title(f"{table.name} ({table.state})", fontsize=8)
 
-def _web_page(found: Fit, title: str, picture: str, made_with: str) -> str:
-    """All that a fit has found, as a page like a run's report."""
-    head = f'<header class="whole"><h1>{escape(title)}</h1><p class="note">{escape(verdict(found))}</p></header>'
-    image = f'<img alt="measured and fitted" width="100%" src="data:image/png;base64,{picture}">'
-    numbers = []
-    for number, u in enumerate(found.unknowns):
-        one = found.profiles.get(u.key)
-        more = f"; profile {_end(one.lower)} to {_end(one.upper)}" if one else ""
-        band = f"{found.values[number]:.5g} (95 %: {found.lower[number]:.5g} to {found.upper[number]:.5g}{more})"
-        numbers.append((u.key, band))
-    pairs = [
-        (f"{a.key}, {b.key}", f"{found.correlations[i, j]:+.2f}")
-        for i, a in enumerate(found.unknowns)
-        for j, b in enumerate(found.unknowns[:i])
-    ]
-    cards = [
-        Card("head", head, {"name": title}),
-        Card("picture", section("Measured and fitted", image, "whole", "points with one standard deviation; lines")),
-        Card("numbers", section("Fitted numbers", card_table(numbers))),
-        Card("pairs", section("Correlations of the logarithms", card_table(pairs))),
-        Card("scene", folded("The scene with these numbers", f"<pre>{escape(found.scene.to_toml())}</pre>")),
-        Card("made", folded("Made with", f"<p>{escape(made_with)}</p>")),
-    ]
-    return page_with(cards)
+    def _cards(self) -> list[Card]:
+        """All that was found, for a page like a run's report: it has title and verdict as text."""
+        with rc_context(STYLE):
+            self.figure().savefig(plain := io.BytesIO(), dpi=DOTS_PER_INCH["png"])
+        picture = base64.b64encode(plain.getvalue()).decode("ascii")
+        image = f'<img alt="measured and fitted" width="100%" src="data:image/png;base64,{picture}">'
+        note = f'<p class="note">{escape(self.verdict())}</p>'
+        numbers, pairs = [], []
+        for i, (key, value, low, high) in enumerate(zip(self.keys, self.values, self.lower, self.upper, strict=True)):
+            more = f"; profile {self.profiles[key].in_words()}" if key in self.profiles else ""
+            numbers.append((key, f"{value:.5g} (95 %: {low:.5g} to {high:.5g}{more})"))
+            pairs += [(f"{key}, {self.keys[j]}", f"{self.correlations[i, j]:+.2f}") for j in range(i)]
+        return [
+            Card("head", f'<header class="whole"><h1>{escape(self.title)}</h1>{note}</header>', {"name": self.title}),
+            Card(
+                "picture", section("Measured and fitted", image, "whole", "points with one standard deviation; lines")
+            ),
+            Card("numbers", section("Fitted numbers", card_table(numbers))),
+            Card("pairs", section("Correlations of the logarithms", card_table(pairs))),
+            Card("scene", folded("The scene with these numbers", f"<pre>{escape(self.scene.to_toml())}</pre>")),
+            Card("made", folded("Made with", f"<p>{escape(made_with())}</p>")),
+        ]

@@ -9,6 +9,7 @@ import csv
 import io
 import json
 import textwrap
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,15 +17,19 @@ from typing import Any
 
 import matplotlib
 import numpy as np
+from matplotlib import rc_context
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
+from scipy.spatial import KDTree
 
 from remodel_fenicsx._version import __version__
 from remodel_fenicsx.errors import RemodelError
+from remodel_fenicsx.results.history import unit_of, words
+from remodel_fenicsx.scene.scene import Scene
+from remodel_fenicsx.system.environment import versions
 from remodel_fenicsx.system.files import write_whole
 
 MARK = "remodel_fenicsx figures"  # in every picture, and beside every table: what bears it may be drawn anew
@@ -50,6 +55,10 @@ STYLE: dict[str, Any] = {
 COLOURS = ("#1b4f9c", "#d1495b", "#2a9d6f", "#e09f3e", "#6c4f9c")  # apart in lightness too
 
 
+LETTER_PLACE = (-28.0, STYLE["axes.titlepad"])  # points, from the corner of a panel
+NO_COLOURS = np.zeros((0, 3))
+
+
 class FigureError(RemodelError, ValueError):
     """No figure for a reason that its one line names; `exit_code` is the command's."""
 
@@ -61,23 +70,14 @@ class FigureError(RemodelError, ValueError):
 class Page:
     """Collects the picture and the tables of one figure, and writes them."""
 
-    def __init__(
-        self,
-        folder: Path,
-        name: str,
-        title: str = "",
-        caption: str = "",
-        colours: NDArray[np.float64] | None = None,
-    ):
+    def __init__(self, folder: Path, name: str, title: str = "", caption: str = ""):
         self.folder, self.name, self.title, self.caption = folder, name, title, caption
-        self.colours = np.zeros((0, 3)) if colours is None else colours
-        self.written: list[Path] = []
 
     def save_figure(self, figure: Figure, made_with: str) -> None:
         """Write NAME.png; title, caption and what it was made with stand in the file."""
         made_with = f"{made_with}; matplotlib {matplotlib.__version__}"
         about = About(f"{MARK} {__version__}", self.title, self.caption, made_with, self.name)
-        self._write(f"{self.name}.png", as_file(figure, "png", about, self.colours))
+        self._write(f"{self.name}.png", as_file(figure, "png", about))
 
     def save_table(self, columns: Mapping[str, ArrayLike], notes: Sequence[str], part: str = "") -> None:
         """Write NAME.csv or NAME-PART.csv, columns of one length under their names; the notes go into NAME.json."""
@@ -97,7 +97,80 @@ class Page:
         _check_ours(path, self.name)
         self.folder.mkdir(parents=True, exist_ok=True)
         write_whole(path, content)
-        self.written += [path] if path not in self.written else []
+
+
+class Answer(ABC):
+    """What a study has found: `verdict` says it in a sentence, and stands over the picture and below the table."""
+
+    name: str  # of its files
+    caption: str  # of its picture
+    scene: Scene  # that was asked for
+    failed: Mapping[str, str] = {}
+    notes: Sequence[str] = ()
+
+    @property
+    @abstractmethod
+    def title(self) -> str:
+        """Of the picture."""
+
+    @abstractmethod
+    def table(self) -> Mapping[str, ArrayLike]:
+        """Columns of NAME.csv."""
+
+    @abstractmethod
+    def lines(self) -> list[str]:
+        """The table for a terminal."""
+
+    @abstractmethod
+    def verdict(self) -> str:
+        """The answer in a sentence."""
+
+    @abstractmethod
+    def figure(self) -> Figure:
+        """The picture, without its head."""
+
+    def in_words(self) -> str:
+        """For a terminal."""
+        return "\n".join([*self.lines(), self.verdict(), *self.notes])
+
+    def write(self, folder: Path) -> None:
+        """Write the table and the picture."""
+        page = Page(folder, self.name, self.title, self.caption)
+        page.save_table(self.table(), [self.title, *self.notes, made_with()])
+        with rc_context(STYLE):
+            figure = self.figure()
+            add_head(figure, self.title, self.verdict())
+            page.save_figure(figure, made_with())
+
+
+def aligned(table: Mapping[str, ArrayLike], least: int, digits: int) -> list[str]:
+    """Columns of numbers under their names, each `least` wide or more."""
+    widths = [max(least, len(name)) for name in table]
+    rows = [list(table), *([f"{number:.{digits}g}" for number in row] for row in zip(*table.values(), strict=True))]
+    return [" ".join(f"{cell:>{width}}" for cell, width in zip(row, widths, strict=True)) for row in rows]
+
+
+def panels(number: int, height: float) -> tuple[Figure, list[Axes]]:
+    """A figure of so many panels, two beside each other, of this height in inches."""
+    rows = -(-number // 2)
+    figure = Figure(figsize=(7.2, height * rows + 0.4), layout="constrained")
+    grid = list(figure.subplots(rows, 2, squeeze=False).ravel())
+    for axes in grid[number:]:
+        axes.set_axis_off()
+    return figure, grid[:number]
+
+
+def made_with() -> str:
+    """The libraries of this process."""
+    return ", ".join(f"{name} {version}" for name, version in versions().items() if name != "BLAS")
+
+
+def label(scene: Scene, name: str) -> str:
+    """A column of the history in words, or a load, with its unit where the scene says it."""
+    loads = {load: kind.dimension.name for load, kind in scene.load_kinds.items() if kind.dimension}
+    dimensions = loads | {column.name: column.unit for column in scene.columns()}
+    unit = unit_of(scene, dimensions.get(name, ""))
+    return words(name) + (f", {unit}" if unit else "")
 
 
 @dataclass(frozen=True)
@@ -111,7 +184,7 @@ class About:
     comment: str
 
 
-def as_file(figure: Figure, ending: str, about: About, colours: NDArray[np.float64]) -> bytes:
+def as_file(figure: Figure, ending: str, about: About, colours: NDArray[np.float64] = NO_COLOURS) -> bytes:
     """A figure as png, pdf or svg; a PNG has 256 colours, these (n, 3) in 0..1 as they are."""
     common = {"Title": about.title, "Creator": about.made_by}
     notes: dict[str, dict[str, Any]] = {
@@ -154,24 +227,10 @@ def add_head(figure: Figure, title: str, verdict: str) -> None:
         figure.text(0.08 / wide, place, line, fontsize=8, color="0.25", **common)
 
 
-def panel_letters(*panels: Axes) -> None:
-    """Letter the panels of a figure a, b, c, ...: bold, on the line of the titles, where their column begins."""
-    lefts = [_left_end(axes) for axes in panels]
-    for letter, axes in zip("abcdefgh", panels, strict=False):
-        start = axes.get_position().x0
-        left = min(end for end, other in zip(lefts, panels, strict=True) if abs(other.get_position().x0 - start) < 1e-6)
-        axes.annotate(letter, (left, 1.0), (0.0, STYLE["axes.titlepad"]), xycoords=("figure fraction", "axes fraction"),
-                      textcoords="offset points", fontsize=10, fontweight="bold", ha="left", va="baseline",
-                      annotation_clip=False)  # fmt: skip
-
-
-def _left_end(axes: Axes) -> float:
-    """Where axes with all their labels begin, over the width of the figure."""
-    figure = axes.get_figure()
-    assert isinstance(figure, Figure)
-    place = axes.get_tightbbox(FigureCanvasAgg(figure).get_renderer())
-    assert place is not None
-    return float(figure.transFigure.inverted().transform((place.x0, 0.0))[0])
+def panel_letters(*axes_of_panels: Axes) -> None:
+    """Letter the panels of a figure a, b, c, ...: bold, on the line of the titles, left of the axes."""
+    for letter, axes in zip("abcdefgh", axes_of_panels, strict=False):
+        axes.annotate(letter, (0, 1), LETTER_PLACE, "axes fraction", "offset points", fontsize=10, fontweight="bold")
 
 
 class Palette:
@@ -182,21 +241,14 @@ class Palette:
         how: dict[str, Any] = {"method": Image.Quantize.MAXCOVERAGE, "kmeans": 2, "dither": Image.Dither.NONE}
         chosen = picture.quantize(256 - len(kept), **how).getpalette()
         self.colours = np.concatenate([kept, np.array(chosen, dtype=np.uint8).reshape(-1, 3)[: 256 - len(kept)]])
-        self._known = np.zeros(1 << 24, dtype=bool)
-        self._nearest = np.zeros(1 << 24, dtype=np.uint8)  # of every colour that was met
+        self._nearest = KDTree(self.colours.astype(float))
 
     def __call__(self, picture: Image.Image) -> Image.Image:
         """A picture in these colours."""
-        numbers = np.asarray(picture) @ np.array([1 << 16, 1 << 8, 1])
-        seen = np.zeros(1 << 24, dtype=bool)
-        seen[numbers] = True
-        new = np.flatnonzero(seen & ~self._known)
-        self._nearest[new] = np.concatenate([
-            np.abs(part[:, None] - self.colours.astype(int)).sum(axis=2).argmin(axis=1)
-            for part in np.array_split(new[:, None] >> [16, 8, 0] & 255, 1 + len(new) // 5000)
-        ])  # fmt: skip
-        self._known |= seen
-        result = Image.fromarray(self._nearest[numbers], mode="P")
+        pixels = np.asarray(picture)
+        numbers, places = np.unique(pixels @ np.array([1 << 16, 1 << 8, 1]), return_inverse=True)
+        nearest = self._nearest.query(numbers[:, None] >> [16, 8, 0] & 255, p=1)[1].astype(np.uint8)
+        result = Image.fromarray(nearest[places].reshape(pixels.shape[:2]), mode="P")
         result.putpalette(self.colours.tobytes())
         return result
 

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import logging
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib import rc_context
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from mpi4py import MPI
 
@@ -18,15 +17,13 @@ from remodel_fenicsx.model.laws import LAWS
 from remodel_fenicsx.results.run_folder import RunFolder, chosen_folder, locked
 from remodel_fenicsx.scene import Scene, SceneError
 from remodel_fenicsx.simulation import Simulation
-from remodel_fenicsx.studies.page import COLOURS, STYLE, Page, add_head
-from remodel_fenicsx.system.environment import versions
+from remodel_fenicsx.studies.page import COLOURS, Answer, aligned
 from remodel_fenicsx.system.interrupts import PAUSE, StopRequest, end_all_ranks_on_exception
 from remodel_fenicsx.system.terminal import Progress, hold_log, open_log
 from remodel_fenicsx.watch.amplification import SHARE_NAMES, AmplificationWatcher, PassMode
 
 log = logging.getLogger(__name__)
 
-STABILITY = "stability"
 GROWS = 1.001  # factor: changes that no pass touches, where tension is missing, keep their size to what was iterated
 LONG_SCALE = -12.0  # lowest factor that is drawn on a linear scale
 Table = dict[str, list[float]]
@@ -38,7 +35,7 @@ def stability(
     number: int = 10,
     comm: MPI.Intracomm = MPI.COMM_WORLD,
     quiet: bool = True,
-) -> tuple[Path, Table, str]:
+) -> tuple[Path, Analysis]:
     """Run a scene and analyse the stability of its passes on the way."""
     if not LAWS[scene.remodeling.law].remodels:
         raise SceneError(f"remodeling.law = {scene.remodeling.law!r}: nothing remodels, so there is no pass to analyse")
@@ -50,60 +47,54 @@ def stability(
     with hold_log(comm.rank, quiet=quiet) as held:
         simulation = Simulation(scene, comm)
     scene = simulation.scene  # with the kinematics that was chosen
-    place = chosen_folder(folder, f"{scene.name}-{STABILITY}", comm)
+    place = chosen_folder(folder, f"{scene.name}-stability", comm)
     steps, share = scene.time.number_of_steps, simulation.stepper.coupling.share
     chosen = {round(steps * (index + 1) / number) for index in range(number)}
-    analysis = AmplificationWatcher(simulation.stepper, lambda step: step.number in chosen)
+    watcher = AmplificationWatcher(simulation.stepper, lambda step: step.number in chosen)
+
+    def say(*message: Any) -> None:
+        if comm.rank == 0:
+            log.info(*message)
+
     with ExitStack() as stack:
         stop = stack.enter_context(StopRequest())
         simulation.stepper.stop_signal = lambda: stop.number or (PAUSE if stop.pause else 0)
         stack.enter_context(locked(place, comm, new=True))
         record = stack.enter_context(RunFolder(place, scene.to_toml("as analysed: all values"), comm.rank))
         stack.enter_context(open_log(place / "run.log", comm.rank, quiet=quiet, held=held))
-        _say(
-            comm,
-            "analysing %s at %d of %d steps, kinematics %r",
-            scene.name,
-            len(chosen),
-            steps,
-            scene.model.kinematics,
-        )
-        if unseen := unseen_by(scene):
-            _say(comm, "%s", unseen)
-        progress = stack.enter_context(Progress(steps, f"{scene.name} {STABILITY}", -1 if quiet else comm.rank))
+        kinematics = scene.model.kinematics
+        say("analysing %s at %d of %d steps, kinematics %r", scene.name, len(chosen), steps, kinematics)
+        for unseen in unseen_by(scene):
+            say("%s", unseen)
+        progress = stack.enter_context(Progress(steps, f"{scene.name} stability", -1 if quiet else comm.rank))
         try:
-            for step in simulation.steps([analysis, record]):
+            for step in simulation.steps([watcher, record]):
                 progress.step(step.number, step.time, "", step.work.newton_iterations, None)
                 if step.number in chosen:
-                    found = _factor(analysis.found[-1].reversing)
-                    _say(comm, "time %g: a pass multiplies the worst small change by %.3g", step.time, found)
+                    found = _factor(watcher.found[-1].reversing)
+                    say("time %g: a pass multiplies the worst small change by %.3g", step.time, found)
         finally:
-            if comm.rank == 0 and analysis.found:  # of a run that ends early too
-                draw(as_table(analysis, share), place, scene, share)
+            if comm.rank == 0 and watcher.found:  # of a run that ends early too
+                Analysis(scene, as_table(watcher, share), share).write(place)
         simulation.close()
-    return place, as_table(analysis, share), unseen
+    return place, Analysis(scene, as_table(watcher, share), share)
 
 
-def unseen_by(scene: Scene) -> str:
+def unseen_by(scene: Scene) -> list[str]:
     """What an analysis on the scene's kinematics does not see, in a sentence; nothing where it sees all."""
     name = scene.model.kinematics
     if not KINEMATICS[name].reduced:
-        return ""
-    return (
+        return []
+    return [
         f"kinematics {name!r} sees changes that keep its symmetry only: passes of the whole body may multiply others "
         "by more, and the body may buckle; model.kinematics = 'full' sees all"
-    )
+    ]
 
 
-def _say(comm: MPI.Intracomm, *message: Any) -> None:
-    if comm.rank == 0:
-        log.info(*message)
-
-
-def as_table(analysis: AmplificationWatcher, share: float) -> Table:
+def as_table(watcher: AmplificationWatcher, share: float) -> Table:
     """Columns of stability.csv, one row per time that was analysed; NaN where a mode was not found."""
-    table: Table = {"time": [found.time for found in analysis.found]}
-    reversing = [found.reversing for found in analysis.found]
+    table: Table = {"time": [found.time for found in watcher.found]}
+    reversing = [found.reversing for found in watcher.found]
     factors = np.array([_factor(mode) for mode in reversing])
     table["factor"] = list(factors)
     table["factor_of_coupling"] = list(1 - share * (1 - factors))
@@ -113,7 +104,7 @@ def as_table(analysis: AmplificationWatcher, share: float) -> Table:
     table["volume_share"] = [np.nan if mode is None else mode.volume_share for mode in reversing]
     for name in SHARE_NAMES:
         table[name] = [np.nan if mode is None else mode.shares[name] for mode in reversing]
-    table["growing_factor"] = [_factor(found.growing) for found in analysis.found]
+    table["growing_factor"] = [_factor(found.growing) for found in watcher.found]
     return table
 
 
@@ -121,13 +112,57 @@ def _factor(mode: PassMode | None) -> float:
     return np.nan if mode is None else mode.factor
 
 
-def in_words(table: Table, unseen: str = "") -> str:
-    """The table for a terminal, and what the analysis does not see."""
-    names = ("time", "factor", "factor_of_coupling", "stable_share", "x", "y", "z", "volume_share", *SHARE_NAMES)
-    lines = [" ".join(f"{name:>{max(8, len(name))}}" for name in names)]
-    for row in range(len(table["time"])):
-        lines.append(" ".join(f"{table[name][row]:{max(8, len(name))}.3g}" for name in names))
-    return "\n".join([*lines, verdict(table), *([unseen] if unseen else [])])
+# ---------------------------------------------------------------- the answer
+@dataclass(frozen=True)
+class Analysis(Answer):
+    """Factors of the passes, by column of stability.csv; the coupling makes a share of each pass."""
+
+    scene: Scene
+    columns: Table
+    share: float
+
+    name = "stability"
+    caption = "Factor by which one pass multiplies the worst small change of the cells; below -1 it swings and grows."
+
+    @property
+    def title(self) -> str:
+        """Of the picture."""
+        how = self.scene.remodeling
+        return f"{self.scene.name}: driver {how.driver}, frame {how.frame}, coupling {how.coupling}"
+
+    def table(self) -> Table:
+        """A row for each time."""
+        return self.columns
+
+    def lines(self) -> list[str]:
+        """A row for each time."""
+        return aligned({name: v for name, v in self.columns.items() if name != "growing_factor"}, 8, 3)
+
+    def verdict(self) -> str:
+        """Whether passes with the scene's coupling make small changes smaller; and what the analysis does not see."""
+        unseen = "".join(f" But {words}." for words in unseen_by(self.scene))
+        return verdict(self.columns) + unseen
+
+    def figure(self) -> Figure:
+        """Factors over time."""
+        figure = Figure(figsize=(5.2, 3.4), layout="constrained")
+        axes, table = figure.add_subplot(), self.columns
+        axes.axhspan(-1, 1, color=COLOURS[2], alpha=0.12, linewidth=0, label="stable: from −1 to 1")
+        axes.plot(table["time"], table["factor"], "o-", markersize=4, color=COLOURS[1], label="whole pass")
+        if self.share != 1.0:
+            words = f"the share {self.share:g} of it that is made"
+            axes.plot(table["time"], table["factor_of_coupling"], "s-", markersize=4, color=COLOURS[0], label=words)
+        lowest = np.nanmin([*table["factor"], -1.6])
+        if lowest < LONG_SCALE:
+            axes.set_yscale("symlog", linthresh=2, linscale=1.0)
+            ticks = [1, 0, -1, -2, *(t for t in (-5, -10, -20, -50, -100, -200, -500, -1000) if t > 1.3 * lowest)]
+            axes.set_yticks(ticks, [f"{tick:d}".replace("-", "−") for tick in ticks])
+            axes.set_yticks([], minor=True)
+        axes.set(ylim=(1.3 * lowest, 1.2), xlabel="time")
+        axes.set(ylabel="factor of one pass on the\nworst small change of the cells")
+        axes.set_xlim(left=0)
+        figure.legend(loc="outside lower center", ncols=2)
+        return figure
 
 
 def verdict(table: Table) -> str:
@@ -153,36 +188,3 @@ def verdict(table: Table) -> str:
     return (
         f"Stable: at all {len(times)} times a pass makes small changes of the cells smaller, or keeps them as they are."
     )
-
-
-def draw(table: Table, folder: Path, scene: Scene, share: float) -> None:
-    """Write stability.csv and stability.png."""
-    remodeling = scene.remodeling
-    title = f"{scene.name}: driver {remodeling.driver}, frame {remodeling.frame}, coupling {remodeling.coupling}"
-    caption = "Factor by which one pass multiplies the worst small change of the cells; below -1 it swings and grows."
-    page = Page(folder, STABILITY, title, caption)
-    made_with = ", ".join(f"{name} {version}" for name, version in versions().items() if name != "BLAS")
-    page.save_table(table, [title, made_with])
-    with rc_context(STYLE):
-        figure = Figure(figsize=(5.2, 3.4), layout="constrained")
-        FigureCanvasAgg(figure)
-        axes = figure.add_subplot()
-        axes.axhspan(-1, 1, color=COLOURS[2], alpha=0.12, linewidth=0, label="stable: from −1 to 1")
-        axes.plot(table["time"], table["factor"], "o-", markersize=4, color=COLOURS[1], label="whole pass")
-        if share != 1.0:
-            label = f"the share {share:g} of it that is made"
-            axes.plot(table["time"], table["factor_of_coupling"], "s-", markersize=4, color=COLOURS[0], label=label)
-        lowest = np.nanmin([*table["factor"], -1.6])
-        if lowest < LONG_SCALE:
-            axes.set_yscale("symlog", linthresh=2, linscale=1.0)
-            ticks = [1, 0, -1, -2, *(t for t in (-5, -10, -20, -50, -100, -200, -500, -1000) if t > 1.3 * lowest)]
-            axes.set_yticks(ticks, [f"{tick:d}".replace("-", "−") for tick in ticks])
-            axes.set_yticks([], minor=True)
-        axes.set_ylim(1.3 * lowest, 1.2)
-        axes.set_xlim(left=0)
-        axes.set_xlabel("time")
-        axes.set_ylabel("factor of one pass on the\nworst small change of the cells")
-        figure.legend(loc="outside lower center", ncols=2)
-        unseen = unseen_by(scene)
-        add_head(figure, title, verdict(table) + (f" But {unseen}." if unseen else ""))
-        page.save_figure(figure, made_with)

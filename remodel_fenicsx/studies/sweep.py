@@ -1,4 +1,4 @@
-"""`remodel-fenicsx sweep SCENE KEY=a:b:n ...`: how the end of a run depends on numbers of its scene."""
+"""`remodel-fenicsx sweep SCENE KEY=a:b:n ...` and `ensemble SCENE`: runs of a scene with other numbers, or seeds."""
 
 from __future__ import annotations
 
@@ -6,54 +6,41 @@ import itertools
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib import rc_context
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from remodel_fenicsx.results.run_lock import RunLock
-from remodel_fenicsx.results.history import unit_of, words
-from remodel_fenicsx.scene.scene import Scene, SceneError
+from remodel_fenicsx.body.reductions import only_for_means
+from remodel_fenicsx.results.recording import HistoryColumns
+from remodel_fenicsx.scene.scene import Scene, SceneError, in_region
 from remodel_fenicsx.schema.tables import shown
-from remodel_fenicsx.studies.page import COLOURS, STYLE, Page, add_head
-from remodel_fenicsx.studies.study import FEWEST_RUNS, Run, TooFewRuns, run_all, write_study
+from remodel_fenicsx.schema.times import same_time
+from remodel_fenicsx.studies.page import COLOURS, Answer, aligned, label, panels
+from remodel_fenicsx.studies.study import FEWEST_RUNS, Study, TooFewRuns
 from remodel_fenicsx.system.files import MOST_RUNS
-from remodel_fenicsx.system.children import cores
-from remodel_fenicsx.system.environment import versions
 
 Array = NDArray[np.float64]
 Number = int | float
 
-SWEEP = "sweep"
-NOT_SHOWN = ("time", "seconds", "newton_iterations", "linear_iterations", "substeps")
-PANEL_COLUMNS, PANEL_KEYS = 5, 3  # of the picture: what fits on a page
-MOST_LINES = 6  # in a panel; where there are more combinations of the other keys, points are drawn
+OF_THE_SOLVER = ("time", "seconds", "newton_iterations", "linear_iterations", "substeps")
 RULE = "must be KEY=a:b:n (n numbers from a to b) or KEY=a,b,..., as in natural.opening_angle=0:160:5"
 RANGE_RULE = "must be KEY=a:b with --latin, as in loads.pressure.value=2:6"
 
 
-@dataclass(frozen=True)
-class Sweep:
-    """Ends of the runs."""
-
-    values: dict[str, Array]
-    columns: dict[str, Array]
-    names: list[str]
-    failed: dict[str, str]
-
-
-# ---------------------------------------------------------------- which runs
+# ---------------------------------------------------------------- which points
 def grid(axes: Mapping[str, Sequence[Number]]) -> list[dict[str, Number]]:
     """All combinations, the last key fastest."""
+    if (number := math.prod(map(len, axes.values()))) > MOST_RUNS:
+        raise SceneError(f"sweep: {number} runs; allowed are at most {MOST_RUNS}")
     return [dict(zip(axes, numbers, strict=True)) for numbers in itertools.product(*axes.values())]
 
 
-def latin_hypercube(ranges: Mapping[str, tuple[float, float]], samples: int, seed: int = 1) -> list[dict[str, Number]]:
+def latin_hypercube(ranges: Mapping[str, Sequence[Number]], samples: int, seed: int = 1) -> list[dict[str, Number]]:
     """Points of which each `samples`-th part of each range has one, at a random place in it (McKay et al. 1979)."""
     random = np.random.default_rng(seed)
     shares = {key: (random.permutation(samples) + random.random(samples)) / samples for key in ranges}
@@ -68,77 +55,150 @@ def _rounded(number: float) -> float:
     return float(f"{number:.6g}")
 
 
-def read_axis(text: str, samples: int | None = None) -> tuple[str, list[Number]]:
-    """Key and numbers of "KEY=a:b:n" or "KEY=a,b,..."; of "KEY=a:b", with samples, the two ends."""
+def read_axes(texts: Sequence[str], are_ranges: bool = False) -> dict[str, list[Number]]:
+    """Numbers by key of "KEY=a:b:n" or "KEY=a,b,..."; the two ends of "KEY=a:b" of ranges."""
+    axes: dict[str, list[Number]] = {}
+    for text in texts:
+        key, numbers = _axis(text, are_ranges)
+        if key in axes:
+            raise SceneError(f"sweep {key}: this key is given twice")
+        axes[key] = numbers
+    return axes
+
+
+def _axis(text: str, is_range: bool) -> tuple[str, list[Number]]:
     key, equals, given = (part.strip() for part in text.partition("="))
-    rule = RULE if samples is None else RANGE_RULE
+    refusal = f"sweep {shown(text)}: {RANGE_RULE if is_range else RULE}"
+    has_ends = ":" in given
+    try:
+        numbers = [_number(part) for part in given.split(":" if has_ends else ",")]
+    except ValueError:
+        raise SceneError(refusal) from None
     if not equals or not re.fullmatch(r"[\w-]+(\.[\w-]+)+", key):
-        raise SceneError(f"sweep {shown(text)}: {rule}")
-    parts = given.split(":") if ":" in given else given.split(",")
-    numbers = [_number(part) for part in parts]
-    if any(number is None or not math.isfinite(number) for number in numbers):
-        raise SceneError(f"sweep {shown(text)}: {rule}")
-    found = [number for number in numbers if number is not None]
-    if samples is not None:
-        if ":" not in given or len(found) != 2 or not found[0] < found[1]:
-            raise SceneError(f"sweep {shown(text)}: {rule}")
-        return key, found
-    if ":" in given:
-        found = _spaced(text, found)
-    if len(set(found)) < len(found):
+        raise SceneError(refusal)
+    if is_range:
+        if not has_ends or len(numbers) != 2 or not numbers[0] < numbers[1]:
+            raise SceneError(refusal)
+        return key, numbers
+    if has_ends:
+        low, high, count = (*numbers, 0, 0, 0)[:3]
+        if len(numbers) != 3 or not isinstance(count, int) or not 2 <= count <= MOST_RUNS or low == high:
+            raise SceneError(f"{refusal}; n is a whole number from 2 to {MOST_RUNS}")
+        numbers = _spaced(low, high, count)
+    if len(set(numbers)) < len(numbers):
         raise SceneError(f"sweep {shown(text)}: a number is there twice")
-    return key, found
+    return key, numbers
 
 
-def _number(text: str) -> Number | None:
-    for kind in (int, float):
-        try:
-            return kind(text)
-        except ValueError:
-            continue
-    return None
+def _number(text: str) -> Number:
+    """A finite number; a whole one stays whole."""
+    if not math.isfinite(value := float(text)):
+        raise ValueError(text)
+    return int(text) if re.fullmatch(r"\s*[+-]?\d+\s*", text) else value
 
 
-def _spaced(text: str, given: list[Number]) -> list[Number]:
-    """n numbers from a to b; whole ones where a, b and their distance are."""
-    if len(given) != 3 or not isinstance(given[2], int) or not 2 <= given[2] <= MOST_RUNS or given[0] == given[1]:
-        raise SceneError(f"sweep {shown(text)}: {RULE}; n is a whole number from 2 to {MOST_RUNS}")
-    (low, high), count = given[:2], int(given[2])
+def _spaced(low: Number, high: Number, count: int) -> list[Number]:
+    """Whole numbers where both ends and their distance are."""
     if isinstance(low, int) and isinstance(high, int) and (high - low) % (count - 1) == 0:
         return [low + (high - low) // (count - 1) * number for number in range(count)]
     return [_rounded(float(number)) for number in np.linspace(low, high, count)]
 
 
-def members_of(
-    scene: Scene, points: Sequence[Mapping[str, Number]], folder: Path, sampled: bool = False
-) -> tuple[list[str], list[Run], dict[str, str]]:
-    """Names of the points, runs, and why points that were drawn have none: nobody has typed their numbers."""
-    if not FEWEST_RUNS <= len(points) <= MOST_RUNS:
-        raise SceneError(f"sweep: {len(points)} runs; allowed are {FEWEST_RUNS} to {MOST_RUNS}")
-    names, members, refused = [], [], {}
-    for point in points:
-        names.append(name := "_".join(f"{key}-{value:.10g}" for key, value in point.items()))
-        try:
-            changed = scene.with_values({**point, "output.fields": False})
-        except SceneError as error:
-            refused[name] = str(error)
-            if not sampled or len(refused) > len(points) - FEWEST_RUNS:
-                raise
-            continue
-        if any(value != _value_of(changed, key) for key, value in point.items()):
-            raise SceneError(f"sweep {', '.join(point)}: one of these keys does not take a number")
-        members.append(Run(name, changed, folder / name))
-    return names, members, refused
+# ---------------------------------------------------------------- a sweep: the last rows over the numbers
+PANEL_COLUMNS, PANEL_KEYS = 5, 3  # of the picture: what fits on a page
+MOST_LINES = 6  # in a panel; where there are more combinations of the other keys, points are drawn
 
 
-def _value_of(scene: Scene, key: str) -> Any:
-    found: Any = scene
-    for part in key.split("."):
-        found = found[part] if isinstance(found, Mapping) else getattr(found, part)
-    return found
+@dataclass(frozen=True)
+class Sweep(Answer):
+    """Ends of the runs: what has failed is NaN."""
+
+    scene: Scene
+    points: dict[str, Mapping[str, Number]]
+    histories: dict[str, HistoryColumns]
+    failed: dict[str, str] = field(default_factory=dict)
+
+    name = "sweep"
+    caption = "Each point is the end of one run; lines join runs whose other numbers are equal."
+
+    @property
+    def title(self) -> str:
+        """Of the picture."""
+        return f"{self.scene.name}: the last row of {len(self.points)} runs"
+
+    @cached_property
+    def values(self) -> dict[str, Array]:
+        """Numbers of the runs by key."""
+        points = list(self.points.values())
+        return {key: np.array([point[key] for point in points], dtype=np.float64) for key in points[0]}
+
+    @cached_property
+    def columns(self) -> dict[str, Array]:
+        """Last rows of the runs by column."""
+        ends = {run: {name: float(v[-1]) for name, v in history.items()} for run, history in self.histories.items()}
+        names = next(iter(ends.values()))
+        return {name: np.array([ends.get(run, {}).get(name, np.nan) for run in self.points]) for name in names}
+
+    @cached_property
+    def shown(self) -> list[str]:
+        """Columns that differ between the runs, the shape's own first."""
+        own = [column.name for column in self.scene.geometry.columns]
+        spread = {name: np.nanmax(v) - np.nanmin(v) for name, v in self.columns.items() if np.isfinite(v).any()}
+        varying = [name for name, width in spread.items() if width > 0 and name not in OF_THE_SOLVER]
+        return sorted(varying, key=lambda name: own.index(name) if name in own else len(own))[:PANEL_COLUMNS]
+
+    def table(self) -> dict[str, Array]:
+        """The keys, then the last row of each history."""
+        return self.values | self.columns
+
+    def lines(self) -> list[str]:
+        """A row for each run."""
+        return aligned(self.values | {name: self.columns[name] for name in self.shown}, 12, 6)
+
+    def verdict(self) -> str:
+        """Between which ends the columns lie, and where."""
+        parts = []
+        for name in self.shown[:2]:
+            ends = self.columns[name]
+            least, most = (f"{ends[run]:.4g} ({self._at(run)})" for run in (np.nanargmin(ends), np.nanargmax(ends)))
+            parts.append(f"{name} from {least} to {most}")
+        if not parts:
+            return "No column of the last row differs between the runs."
+        return f"At the end of {len(self.histories)} runs: {'; '.join(parts)}."
+
+    def _at(self, run: Any) -> str:
+        return ", ".join(f"{key} {numbers[run]:g}" for key, numbers in self.values.items())
+
+    def figure(self) -> Figure:
+        """Columns over keys."""
+        keys, rows = list(self.values)[:PANEL_KEYS], max(1, len(self.shown))
+        figure = Figure(figsize=(7.2, 2.2 * rows + 0.4), layout="constrained")
+        grid = figure.subplots(rows, len(keys), squeeze=False, sharey="row", sharex="col")
+        for row, name in zip(grid, self.shown, strict=False):
+            row[0].set(ylabel=label(self.scene, name))
+            for axes, key in zip(row, keys, strict=True):
+                self._draw(axes, name, key)
+        for axes, key in zip(grid[-1], keys, strict=True):
+            axes.set(xlabel=key)
+        for axes in grid[0]:
+            if axes.get_legend_handles_labels()[0]:
+                axes.legend(loc="lower left", bbox_to_anchor=(0, 1), fontsize=7)
+        return figure
+
+    def _draw(self, axes: Any, name: str, key: str) -> None:
+        """A column over a key: a line for each combination of the other keys, points where these are many."""
+        x, y, others = self.values[key], self.columns[name], [other for other in self.values if other != key]
+        groups: dict[str, list[int]] = {}
+        for run in range(len(x)):
+            groups.setdefault(", ".join(f"{other} {self.values[other][run]:g}" for other in others), []).append(run)
+        if len(groups) > MOST_LINES or len(groups) == len(x):
+            axes.plot(x, y, "o", color=COLOURS[0])
+            return
+        for number, (words, runs) in enumerate(groups.items()):
+            order = sorted(runs, key=lambda run: float(x[run]))
+            axes.plot(x[order], y[order], "o-", color=COLOURS[number % len(COLOURS)], label=words or None)
 
 
-# ---------------------------------------------------------------- runs
 def sweep(
     scene: Scene,
     points: Sequence[Mapping[str, Number]],
@@ -147,111 +207,223 @@ def sweep(
     quiet: bool = True,
     sampled: bool = False,
 ) -> tuple[Path, Sweep]:
-    """Run a scene with other numbers, several runs at a time."""
-    place = Path(folder or Path("results") / f"{scene.name}-{SWEEP}")
-    names, members, refused = members_of(scene, points, place, sampled)
-    checked = partial(write_study, place, SWEEP, scene.name, members)
-    with RunLock(place):
-        failed = refused | run_all(members, jobs or cores(), f"{scene.name} {SWEEP}", quiet, checked=checked)
-        found = gathered(names, members, points, failed)
-        draw(found, place, scene)
-    return place, found
+    """Run a scene with other numbers; of points that were drawn those that are no scenes have failed."""
+    if not FEWEST_RUNS <= len(points) <= MOST_RUNS:
+        raise SceneError(f"sweep: {len(points)} runs; allowed are {FEWEST_RUNS} to {MOST_RUNS}")
+    named = {"_".join(f"{key}-{value:.10g}" for key, value in point.items()): point for point in points}
+    scenes, refused = {}, {}
+    for name, point in named.items():
+        try:
+            scenes[name] = _changed(scene, point)
+        except SceneError as error:
+            refused[name] = str(error)
+            if not sampled or len(refused) > len(points) - FEWEST_RUNS:
+                raise
+    study = Study("sweep", scene, folder, scenes, jobs, quiet)
+    study.failed |= refused
+
+    def answer() -> Sweep:
+        histories = study.histories()
+        if len(histories) < FEWEST_RUNS:
+            raise TooFewRuns(f"{len(histories)} of {len(points)} runs reached the end", study.failed)
+        return Sweep(scene, named, histories, study.failed)
+
+    return study.answered(answer)
 
 
-def gathered(
-    every: list[str], members: Sequence[Run], points: Sequence[Mapping[str, Number]], failed: dict[str, str]
-) -> Sweep:
-    """The last rows of all that have not failed."""
-    ends = {
-        member.name: {name: float(values[-1]) for name, values in member.history().items()}
-        for member in members
-        if member.name not in failed
-    }
-    if len(ends) < FEWEST_RUNS:
-        raise TooFewRuns(f"{len(ends)} of {len(every)} runs reached the end", failed)
-    values = {key: np.array([point[key] for point in points], dtype=np.float64) for key in points[0]}
-    names = next(iter(ends.values()))
-    columns = {name: np.array([ends.get(one, {}).get(name, np.nan) for one in every]) for name in names}
-    return Sweep(values, columns, every, failed)
+def _changed(scene: Scene, point: Mapping[str, Number]) -> Scene:
+    """With the numbers of a point; some keys take them and mean something else."""
+    found = scene.with_values({**point, "output.fields": False})
+    for key, value in point.items():
+        there: Any = found
+        for part in key.split("."):
+            there = there[part] if isinstance(there, Mapping) else getattr(there, part)
+        if there != value:
+            raise SceneError(f"sweep {key}: this key does not take a number")
+    return found
 
 
-# ---------------------------------------------------------------- words and picture
-def shown_columns(found: Sweep, scene: Scene) -> list[str]:
-    """Columns that differ between the runs, the shape's own first."""
-    own = [column.name for column in scene.geometry.columns]
-    spread = {name: np.ptp(ends[np.isfinite(ends)]) for name, ends in found.columns.items() if name not in NOT_SHOWN}
-    varying = [name for name, width in spread.items() if width > 0]
-    return sorted(varying, key=lambda name: own.index(name) if name in own else len(own))[:PANEL_COLUMNS]
+# ---------------------------------------------------------------- an ensemble: a sweep of seeds, and isotropic cells
+ISOTROPIC = "isotropic"
+WITHIN = 2.0  # standard deviations
+KNOWN = 6  # seeds from which on a deviation is known to a third: its relative error is 1 / sqrt(2 (seeds - 1))
+PANELS = 6
 
 
-def in_words(found: Sweep, scene: Scene) -> str:
-    """A table for a terminal; then the answer in a sentence."""
-    columns = shown_columns(found, scene)
-    heads = [*found.values, *columns]
-    widths = [max(len(head), 11) for head in heads]
-    lines = ["  ".join(f"{head:>{width}}" for head, width in zip(heads, widths, strict=True))]
-    for number in range(len(found.names)):
-        row = [ends[number] for ends in (*found.values.values(), *(found.columns[name] for name in columns))]
-        lines.append("  ".join(f"{value:>{width}.6g}" for value, width in zip(row, widths, strict=True)))
-    return "\n".join([*lines, verdict(found, scene)])
+@dataclass(frozen=True)
+class Ensemble(Answer):
+    """Columns of the history over the seeds, each (seeds, rows), and those of isotropic cells, (rows,)."""
+
+    scene: Scene
+    time: Array
+    columns: dict[str, Array]
+    isotropic: dict[str, Array]
+    failed: dict[str, str] = field(default_factory=dict)
+
+    name = "ensemble"
+    caption = "Lines: means over the seeds; dark: mean and one standard deviation; light: least and most of all seeds."
+
+    @property
+    def title(self) -> str:
+        """Of the picture."""
+        return f"{self.scene.name}: {self.seeds} seeds of random cells, and isotropic cells"
+
+    @property
+    def seeds(self) -> int:
+        """How many there are."""
+        return len(next(iter(self.columns.values())))
+
+    @property
+    def knows_deviations(self) -> bool:
+        """Whether the seeds are enough for them."""
+        return self.seeds >= KNOWN
+
+    @cached_property
+    def extremes(self) -> set[str]:
+        """Columns that are not compared: with random cells they grow with the number of cells."""
+        return {column.name for column in self.scene.columns() if column.extreme}
+
+    def statistics(self, name: str) -> dict[str, Array]:
+        """Of a column over the seeds, at each time."""
+        values = self.columns[name]
+        spread = {"least": values.min(axis=0), "most": values.max(axis=0)}
+        return {"mean": values.mean(axis=0), "deviation": values.std(axis=0, ddof=1)} | spread
+
+    def table(self) -> dict[str, Array]:
+        """Of each column mean, standard deviation, least, most, and isotropic cells."""
+        found = {"time": self.time}
+        for name in self.columns:
+            found |= {f"{name}_{kind}": values for kind, values in self.statistics(name).items()}
+            if name in self.isotropic:
+                found[f"{name}_isotropic"] = self.isotropic[name]
+        return found
+
+    def away(self, name: str, row: int) -> float:
+        """By how many standard deviations isotropic cells miss the mean; NaN where that is not to be compared."""
+        mean, deviation = (float(self.statistics(name)[kind][row]) for kind in ("mean", "deviation"))
+        if name not in self.isotropic or name in self.extremes or not self.knows_deviations or deviation == 0:
+            return np.nan
+        return (float(self.isotropic[name][row]) - mean) / deviation
+
+    def varying(self, row: int) -> list[str]:
+        """Columns that are no load."""
+        return [name for name, values in self.columns.items() if np.ptp(values[:, row]) != 0]
+
+    def lines(self) -> list[str]:
+        """The columns that differ between seeds, at some times."""
+        width, lines = max(len(name) for name in self.columns), []
+        for time in chosen_times(self.scene):
+            row = next(row for row, recorded in enumerate(self.time) if same_time(float(recorded), time))
+            lines.append(f"time {time:g}, {self.seeds} seeds")
+            lines.append(f"{'':{width}} {'mean':>11} {'deviation':>11} {'least':>11} {'most':>11} {ISOTROPIC:>11}")
+            for name in self.varying(row):
+                cells = {kind: f"{values[row]:11.5g}" for kind, values in self.statistics(name).items()}
+                if not self.knows_deviations:
+                    cells["deviation"] = f"{'not known':>11}"
+                lines.append(f"{name:{width}} {' '.join(cells.values())} {self._beside(name, row)}")
+        return lines
+
+    def _beside(self, name: str, row: int) -> str:
+        """Isotropic cells, and by how many standard deviations they miss the mean."""
+        if name not in self.isotropic:
+            return f"{'failed':>11}"
+        value, away = f"{float(self.isotropic[name][row]):11.5g}", self.away(name, row)
+        if name in self.extremes:
+            return f"{value}  an extreme: not compared"
+        if not np.isfinite(away):
+            return value
+        return f"{value}  {away:+.1f} deviations: {'within the spread' if abs(away) <= WITHIN else 'outside of it'}"
+
+    def verdict(self) -> str:
+        """Whether isotropic cells say what random ones do."""
+        time, row = f"At time {self.time[-1]:g}", len(self.time) - 1
+        if not self.isotropic:
+            return "Not known: the run with isotropic cells has failed, so there is nothing to compare."
+        if not self.knows_deviations:
+            return (
+                f"Not known: {self.seeds} seeds are too few for a standard deviation; {KNOWN} tell it to a third. The "
+                f"same command with --seeds {KNOWN} or more goes on from these."
+            )
+        away = {name: number for name in self.varying(row) if np.isfinite(number := self.away(name, row))}
+        outside = [f"{name} ({number:+.1f} deviations)" for name, number in away.items() if abs(number) > WITHIN]
+        if not away:
+            return f"{time} no column differs between the seeds: there is nothing to compare."
+        if outside:
+            words = f"do not stand for random ones: outside of the spread are {', '.join(outside)}."
+        else:
+            words = (
+                f"lie within {WITHIN:g} deviations of the mean of {self.seeds} seeds in all {len(away)} columns: they "
+                "say what one sample of random cells would."
+            )
+        means = "; ".join(only_for_means(self.scene))
+        note = f" The deviations are not those of the whole body: {means}." if means else ""
+        return f"{time} isotropic cells {words}{note}"
+
+    def figure(self) -> Figure:
+        """Columns that vary over time, the shape's own first."""
+        own = {column.name for column in self.scene.geometry.columns}
+        varying = [name for name, values in self.columns.items() if np.nanmax(np.ptp(values, axis=0)) > 0]
+        shown = sorted(varying, key=lambda name: name not in own)[:PANELS]
+        figure, grid = panels(len(shown), 2.2)
+        for axes, name in zip(grid, shown, strict=True):
+            self._draw(axes, name)
+        known = {words: line for axes in grid for line, words in zip(*axes.get_legend_handles_labels(), strict=True)}
+        figure.legend(list(known.values()), list(known), loc="outside lower center", ncols=2)
+        return figure
+
+    def _draw(self, axes: Any, name: str) -> None:
+        mean, deviation, least, most = self.statistics(name).values()
+        band: dict[str, Any] = {"color": COLOURS[0], "linewidth": 0}
+        axes.plot(self.time, mean, color=COLOURS[0], label="random cells, mean over the seeds")
+        if self.knows_deviations:
+            words = "mean and one standard deviation"
+            axes.fill_between(self.time, mean - deviation, mean + deviation, alpha=0.35, label=words, **band)
+        axes.fill_between(self.time, least, most, alpha=0.15, label="least to most of all seeds", **band)
+        if name in self.isotropic and name not in self.extremes:
+            axes.plot(self.time, self.isotropic[name], "--", color=COLOURS[1], label="isotropic cells")
+        axes.set(xlabel="time", ylabel=label(self.scene, name), xlim=(0, self.time[-1]))
 
 
-def verdict(found: Sweep, scene: Scene) -> str:
-    """Between which ends the columns lie, and where, in a sentence."""
-    parts = []
-    for name in shown_columns(found, scene)[:2]:
-        ends = found.columns[name]
-        least, most = int(np.nanargmin(ends)), int(np.nanargmax(ends))
-        parts.append(f"{name} from {ends[least]:.4g} ({_at(found, least)}) to {ends[most]:.4g} ({_at(found, most)})")
-    if not parts:
-        return "No column of the last row differs between the runs."
-    return f"At the end of {len(found.names) - len(found.failed)} runs: {'; '.join(parts)}."
+def chosen_times(scene: Scene) -> list[float]:
+    """The end of the last ramp, and the end."""
+    step, end = scene.time.step, scene.last_time
+    if scene.time.is_equilibrium:
+        return [end]
+    last = step * round(scene.end_of_ramps / step)
+    return [last, end] if step <= last < end else [end]
 
 
-def _at(found: Sweep, run: int) -> str:
-    return ", ".join(f"{key} {numbers[run]:g}" for key, numbers in found.values.items())
+def ensemble(
+    scene: Scene, folder: Path | str | None = None, seeds: int = 32, jobs: int | None = None, quiet: bool = True
+) -> tuple[Path, Ensemble]:
+    """Run a scene with many seeds, and with isotropic cells."""
+    study = Study("ensemble", scene, folder, scenes_of_seeds(scene, seeds), jobs, quiet)
+
+    def answer() -> Ensemble:
+        histories = study.histories()
+        isotropic = dict(histories.pop(ISOTROPIC, {}))
+        if len(histories) < FEWEST_RUNS:
+            raise TooFewRuns(f"{len(histories)} of {seeds} seeds reached the end", study.failed)
+        first = next(iter(histories.values()))
+        names = [name for name in first if name not in OF_THE_SOLVER]
+        columns = {name: np.stack([history[name] for history in histories.values()]) for name in names}
+        same = {name: isotropic[name] for name in names if name in isotropic}
+        return Ensemble(scene, first["time"], columns, same, study.failed)
+
+    return study.answered(answer)
 
 
-def draw(found: Sweep, folder: Path, scene: Scene) -> None:
-    """Write sweep.csv and sweep.png."""
-    title = f"{scene.name}: the last row of {len(found.names)} runs"
-    page = Page(
-        folder, SWEEP, title, "Each point is the end of one run; lines join runs whose other numbers are equal."
-    )
-    made_with = ", ".join(f"{name} {version}" for name, version in versions().items() if name != "BLAS")
-    page.save_table({**found.values, **found.columns}, [title, made_with])
-    columns, keys = shown_columns(found, scene), list(found.values)[:PANEL_KEYS]
-    units = {column.name: unit_of(scene, column.unit) for column in scene.columns()}
-    with rc_context(STYLE):
-        figure = Figure(figsize=(7.2, 2.2 * max(1, len(columns)) + 0.4), layout="constrained")
-        panels = figure.subplots(max(1, len(columns)), len(keys), squeeze=False, sharey="row", sharex="col")
-        for row, name in enumerate(columns):
-            unit = units.get(name)
-            panels[row, 0].set(ylabel=words(name) + (f", {unit}" if unit else ""))
-            for axes, key in zip(panels[row], keys, strict=True):
-                _draw_panel(axes, found, name, key)
-        for axes, key in zip(panels[-1], keys, strict=True):
-            axes.set(xlabel=key)
-        for axes in panels[0]:
-            if axes.get_legend_handles_labels()[0]:
-                axes.legend(loc="lower left", bbox_to_anchor=(0, 1), fontsize=7)
-        add_head(figure, title, verdict(found, scene))
-        page.save_figure(figure, made_with)
-
-
-def _draw_panel(axes: Any, found: Sweep, name: str, key: str) -> None:
-    """A column over a key: a line for each combination of the other keys, points where these are many."""
-    x, y = found.values[key], found.columns[name]
-    others = [tuple(row) for row in zip(*(v for k, v in found.values.items() if k != key), strict=True)] or [()] * len(
-        x
-    )
-    groups = list(dict.fromkeys(others))
-    if len(groups) > MOST_LINES or len(groups) == len(x):
-        axes.plot(x, y, "o", color=COLOURS[0])
-        return
-    for number, group in enumerate(groups):
-        chosen = np.array([one == group for one in others])
-        order = np.argsort(x[chosen])
-        label = ", ".join(f"{k} {v:g}" for k, v in zip((k for k in found.values if k != key), group, strict=True))
-        line = {"color": COLOURS[number % len(COLOURS)], "label": label or None}
-        axes.plot(x[chosen][order], y[chosen][order], "o-", **line)
+def scenes_of_seeds(scene: Scene, seeds: int) -> dict[str, Scene]:
+    """A scene for each seed from its own on, and one with isotropic cells."""
+    if seeds < FEWEST_RUNS:
+        raise SceneError(f"--seeds {seeds}: allowed is a whole number at least {FEWEST_RUNS}")
+    if not scene.has_random_cells:
+        raise SceneError(f"cells.initial = {scene.cells.initial!r}: an ensemble needs 'random' cells")
+    if scene.time.tolerance is not None and not scene.time.is_equilibrium:
+        raise SceneError(f"time.tolerance = {scene.time.tolerance:g}: each seed would have other steps; leave it out")
+    numbers = range(scene.cells.seed, scene.cells.seed + seeds)
+    every: dict[str, dict[str, Any]] = {f"seed-{number}": {"cells.seed": number} for number in numbers}
+    random = [name for name, properties in scene.properties().items() if properties.cells.initial == "random"]
+    isotropic = {f"{in_region(name)}cells.initial": ISOTROPIC for name in random}
+    every[ISOTROPIC] = isotropic | {"profile": None}  # of isotropic cells it has steps of a tolerance, not the seeds'
+    return {name: scene.with_values({"output.fields": False, "name": name, **change}) for name, change in every.items()}

@@ -19,8 +19,9 @@ from remodel_fenicsx.evolution.coupling import Staggered
 from remodel_fenicsx.results.status import status
 from remodel_fenicsx.running import run
 from remodel_fenicsx.scene.scene import Scene, scene_from_dict
-from remodel_fenicsx.studies import ensemble as study
-from remodel_fenicsx.studies.study import Run, TooFewRuns, run_all
+from remodel_fenicsx.studies import sweep as study
+from remodel_fenicsx.studies.page import Answer
+from remodel_fenicsx.studies.study import Run, Study, TooFewRuns
 from remodel_fenicsx.system.interrupts import Paused
 from tests import forks
 from tests.conftest import forked_children
@@ -32,6 +33,11 @@ END = 5.0
 def scene(**tables: object) -> Scene:
     """The pulled cube."""
     return pulled_cube(END, **tables)
+
+
+def runs_of(scene: Scene, folder: Path, seeds: int) -> list[Run]:
+    """Those of an ensemble."""
+    return [Run(name, one, folder / name) for name, one in study.scenes_of_seeds(scene, seeds).items()]
 
 
 @pytest.fixture(scope="module")
@@ -48,8 +54,11 @@ def test_one_that_fails_loses_only_itself(made: tuple[Path, study.Ensemble]) -> 
     folder, found = made
     assert list(found.failed) == ["seed-2"] and "seed-2" in found.failed["seed-2"]
     assert (folder / "seed-2").read_text() == "a file of the user's\n"
-    assert found.extremes == {"max_chain_extension", "min_jacobian", "min_stretch", "max_stretch"}
     assert found.seeds == 2 and found.time.tolist() == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
+    said = status(folder)
+    assert len(said) == 3 and said[0] == f"{folder}: ensemble of scene, 4 runs: 3 finished, 1 failed"
+    assert said[1].startswith(f"seed-2 has failed: -o {folder / 'seed-2'}: is a file")
+    assert said[2].startswith(f"its answer: {folder / 'ensemble.csv'}; the same command goes on: ")
 
 
 def test_the_table_is_that_of_the_runs(made: tuple[Path, study.Ensemble]) -> None:
@@ -67,15 +76,6 @@ def test_the_table_is_that_of_the_runs(made: tuple[Path, study.Ensemble]) -> Non
     assert isotropic.scene.cells.initial == "isotropic"
     assert float(rows[-1]["mean_stretch_isotropic"]) == pytest.approx(isotropic.history["mean_stretch"][-1], rel=1e-6)
     assert (folder / "ensemble.png").stat().st_size > 10_000
-
-
-def test_status_says_what_the_folder_is(made: tuple[Path, study.Ensemble]) -> None:
-    folder, _ = made
-    said = status(folder)
-    assert said[0] == f"{folder}: ensemble of scene, 4 runs: 3 finished, 1 failed"
-    assert said[1].startswith(f"seed-2 has failed: -o {folder / 'seed-2'}: is a file")
-    assert said[2].startswith(f"its answer: {folder / 'ensemble.csv'}; the same command goes on: ")
-    assert len(said) == 3
 
 
 def test_what_is_there_is_not_run_again(made: tuple[Path, study.Ensemble]) -> None:
@@ -107,7 +107,7 @@ def test_the_command_says_whose_run_has_failed_or_was_stopped(
         return subprocess.CompletedProcess(words, code, "", f"remodel-fenicsx: {said}\n")
 
     monkeypatch.setattr(forks, "forked", ended)
-    monkeypatch.setattr(study, "draw", lambda *of: None)
+    monkeypatch.setattr(Answer, "write", lambda *of: None)
     path = tmp_path / "scene.toml"
     path.write_text(scene().to_toml())
     with forked_children():
@@ -116,19 +116,21 @@ def test_the_command_says_whose_run_has_failed_or_was_stopped(
     assert "time 5, 2 seeds" in written.out and f"seed-2 has failed: {said}" in written.err
 
 
-def test_two_seeds_are_needed(made: tuple[Path, study.Ensemble]) -> None:
+def test_two_seeds_are_needed(tmp_path: Path) -> None:
     """Runs that have failed are no bad input."""
-    members = study.members_of(scene(), made[0], 3)
-    with pytest.raises(TooFewRuns, match="1 of 3 seeds reached the end, at least 2 are needed; .* is kept") as too_few:
-        study.gathered(members, {"seed-2": "why", "seed-3": "why not"})
-    assert too_few.value.failed == {"seed-2": "why", "seed-3": "why not"}
+    for seed in (2, 3):
+        (tmp_path / f"seed-{seed}").write_text("a file of the user's\n")
+    with forked_children(), pytest.raises(TooFewRuns, match="1 of 3 seeds reached the end, .* is kept") as too_few:
+        study.ensemble(pulled_cube(1.0), tmp_path, seeds=3)
+    assert list(too_few.value.failed) == ["seed-2", "seed-3"] and too_few.value.exit_code == 3
 
 
 def test_what_was_stopped_goes_on(
     tmp_path: Path, made: tuple[Path, study.Ensemble], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """At a step of its own choice; the same command goes on to the same end."""
-    (member,) = [member for member in study.members_of(scene(), tmp_path, 3) if member.name == "seed-3"]
+    both = Study("ensemble", scene(), tmp_path, {"seed-3": study.scenes_of_seeds(scene(), 3)["seed-3"]}, jobs=1)
+    (member,) = both.runs
     solve = Staggered.solve
 
     def signalled(coupling: Staggered, time: float, loads: Any) -> Any:
@@ -141,8 +143,8 @@ def test_what_was_stopped_goes_on(
         run(member.scene, member.folder, MPI.COMM_SELF)
     assert member.steps_done == 2 and not member.is_complete()
     with forked_children():
-        assert run_all([member], 1, "test", quiet=True) == {}
-    assert member.is_complete()
+        both.do()
+    assert both.failed == {} and member.is_complete()
     whole = Recording(made[0] / "seed-3").history
     np.testing.assert_array_equal(member.history()["mean_stretch"], whole["mean_stretch"])
 
@@ -167,7 +169,7 @@ def test_a_member_killed_before_its_scene_is_run_again(
     """In the folder that the study takes by itself."""
     monkeypatch.chdir(tmp_path)
     short = pulled_cube(1.0)
-    member = study.members_of(short, Path("results", f"{short.name}-ensemble"), 2)[0]
+    member = runs_of(short, Path("results", f"{short.name}-ensemble"), 2)[0]
     Path("scene.toml").write_text(member.scene.to_toml())
     done = forks.forked("python", DIES, moment, "scene.toml", member.folder.absolute(), cwd=tmp_path)
     assert done.returncode == -signal.SIGKILL, done.stderr
@@ -195,43 +197,41 @@ def test_a_signal_ends_all_runs(
     monkeypatch.setattr(Run, "steps_done", property(then_stop))
     code = cli.main(["ensemble", str(path), "-o", str(out), "--seeds", "2", "--jobs", "1"])
     assert code == 128 + signal.SIGTERM
-    assert "stopped by SIGTERM; all that is recorded is kept, the same command goes on" in capsys.readouterr().err
-    members = study.members_of(read_scene(path), out, 2)
+    assert "all that is recorded is kept, the same command goes on" in capsys.readouterr().err
+    members = runs_of(read_scene(path), out, 2)
     assert any(asked(member) for member in members) and not any(member.is_complete() for member in members)
 
 
 def eight_seeds(last: float) -> study.Ensemble:
     """Stretches of mean 3 and standard deviation 1 at the end, and an extreme; `last` of isotropic cells."""
     ends = np.array([-1.0, 1.0] * 4) * np.sqrt(7 / 8) + 3.0
-    values = {"stretch": np.stack([np.ones(8), ends], axis=1), "force": np.ones((8, 2))}
-    values["least"] = values["stretch"] / 2
-    isotropic = {name: np.array([1.0, last]) for name in ("stretch", "least")}
-    return study.Ensemble(np.array([0.0, 1.0]), values, isotropic, {}, frozenset({"least"}))
+    values = {"mean_stretch": np.stack([np.ones(8), ends], axis=1), "force": np.ones((8, 2))}
+    values["min_stretch"] = values["mean_stretch"] / 2
+    isotropic = {name: np.array([1.0, last]) for name in ("mean_stretch", "min_stretch")}
+    return study.Ensemble(pulled_cube(1.0), np.array([0.0, 1.0]), values, isotropic)
 
 
 def test_words_say_whether_the_cheap_model_is_enough() -> None:
     """Extremes are not compared: isotropic cells have none."""
-    text = study.in_words(eight_seeds(3.4), [1.0])
+    text = eight_seeds(3.4).in_words()
     assert "+0.4 deviations: within the spread" in text and "force" not in text
     assert "3.4  an extreme: not compared" in text
     assert text.splitlines()[-1] == (
         "At time 1 isotropic cells lie within 2 deviations of the mean of 8 seeds in all 1 columns: they say what one "
         "sample of random cells would."
     )
-    text = study.in_words(eight_seeds(30.0), [1.0])
+    text = eight_seeds(30.0).in_words()
     assert "+27.0 deviations: outside of it" in text
-    assert text.splitlines()[-1].endswith("outside of the spread are stretch (+27.0 deviations).")
+    assert text.splitlines()[-1].endswith("outside of the spread are mean_stretch (+27.0 deviations).")
 
 
 def test_a_deviation_of_few_seeds_is_not_known() -> None:
     """Five say it to 35 %."""
     found = eight_seeds(30.0)
     few = replace(found, columns={name: values[:5] for name, values in found.columns.items()})
-    text = study.in_words(few, [1.0])
-    assert "deviations:" not in text and text.count("not known") == 2
-    assert text.splitlines()[-1].startswith("Not known: 5 seeds are too few")
-    alone = study.in_words(replace(found, isotropic={}), [1.0])
-    assert alone.splitlines()[-1].startswith("Not known: the run with isotropic cells has failed")
+    assert "deviations:" not in few.in_words() and few.in_words().count("not known") == 2
+    assert few.verdict().startswith("Not known: 5 seeds are too few")
+    assert replace(found, isotropic={}).verdict().startswith("Not known: the run with isotropic cells has failed")
 
 
 def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -247,13 +247,11 @@ def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
 def test_seeds_of_a_quarter_have_its_means_and_isotropic_cells_its_steps(tmp_path: Path) -> None:
     """A profile has other steps for isotropic cells: these must not come back when the scene is read again."""
     tube = {"preset": "kuhl-holzapfel-2007", "profile": "balanced", "geometry": {"shape": "tube"}}
-    members = study.members_of(scene_from_dict(tube), tmp_path, 2)
-    for member in members:
+    whole = scene_from_dict(tube)
+    for member in runs_of(whole, tmp_path, 2):
         path = tmp_path / f"{member.name}.toml"
         path.write_text(member.scene.to_toml())
         assert read_scene(path) == member.scene and member.scene.time.tolerance is None
         assert member.scene.model.kinematics == "sector"
-    found = study.Ensemble(
-        np.arange(2.0), {"stretch": np.eye(6)[:, :2]}, {"stretch": np.zeros(2)}, {}, note=" Mirrored."
-    )
-    assert study.verdict(found, 1.0).endswith("Mirrored.")
+    found = study.Ensemble(whole, np.arange(2.0), {"outer_radius": np.eye(6)[:, :2]}, {"outer_radius": np.zeros(2)})
+    assert "The deviations are not those of the whole body: 'sector': " in found.verdict()

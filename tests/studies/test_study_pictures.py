@@ -10,50 +10,33 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from remodel_fenicsx.scene.scene import Scene, preset_scene
-from remodel_fenicsx.studies import ensemble, stability, trade
-from remodel_fenicsx.studies.trade import estimated, ladder
-from remodel_fenicsx.studies.page import Page
+from remodel_fenicsx.scene.scene import preset_scene
+from remodel_fenicsx.studies.page import Answer, Page
+from remodel_fenicsx.studies.stability import Analysis
+from remodel_fenicsx.studies.sweep import Ensemble
+from remodel_fenicsx.studies.trade import Row, Trade, estimated, ladder
 from tests.studies.test_trade import artery, made_up
 
 
-def an_ensemble(seeds: int) -> tuple[ensemble.Ensemble, Scene]:
+def the_ensemble(seeds: int) -> Answer:
     scene = preset_scene("kuhl-holzapfel-2007", "tube").with_values({"geometry.length_unit": "mm"})
     time, rng = np.arange(0.0, 151.0), np.random.default_rng(1)
     names = ("inner_radius", "outer_radius", "fibre_angle_inner", "fibre_angle_outer", "max_chain_extension")
     columns = {name: 1 + rng.normal(0, 0.1, (seeds, 1)) * time for name in names}
-    isotropic = {name: 1 + 0.01 * time for name in names}
-    return ensemble.Ensemble(time, columns, isotropic, {}, frozenset({"max_chain_extension"})), scene
+    return Ensemble(scene, time, columns, {name: 1 + 0.01 * time for name in names})
 
 
-def an_analysis(factor: float) -> stability.Table:
-    count = 10
-    table = {name: [1.0] * count for name in ("time", "factor", "factor_of_coupling", "growing_factor", "stable_share")}
-    return table | {
-        "time": list(np.linspace(15.0, 150.0, count)),
-        "factor": list(np.linspace(0.0, factor, count)),
-        "factor_of_coupling": list(np.linspace(0.0, 0.5 + factor / 2, count)),
-    }
-
-
-def the_ensemble(folder: Path, seeds: int) -> str:
-    found, scene = an_ensemble(seeds)
-    ensemble.draw(found, folder, scene)
-    return ensemble.verdict(found, 150.0)
-
-
-def the_analysis(folder: Path, factor: float) -> str:
+def the_analysis(factor: float) -> Answer:
     scene = preset_scene("kuhl-holzapfel-2007", "tube").with_values(
         {"cells.initial": "isotropic", "model.kinematics": "radial"}
     )
-    stability.draw(an_analysis(factor), folder, scene, 0.5)
-    return stability.verdict(an_analysis(factor))
+    table = {name: [1.0] * 10 for name in ("growing_factor", "stable_share")}
+    table |= {"time": list(np.linspace(15.0, 150.0, 10)), "factor": list(np.linspace(0.0, factor, 10))}
+    return Analysis(scene, table | {"factor_of_coupling": list(np.linspace(0.0, 0.5 + factor / 2, 10))}, 0.5)
 
 
-def the_trade(folder: Path, noise: float) -> str:
-    rows, notes = estimated([made_up(setting, noise=noise) for setting in ladder(artery())])
-    trade.write(trade.Trade(rows, notes, [], {}), folder, artery())
-    return trade.verdict(rows)
+def the_trade(noise: float) -> Answer:
+    return Trade(artery(), *estimated([made_up(setting, noise=noise) for setting in ladder(artery())]))
 
 
 @pytest.mark.parametrize(("study", "value", "labels"), [
@@ -65,7 +48,7 @@ def the_trade(folder: Path, noise: float) -> str:
     (the_trade, 0.3, {"seconds of the processor"}),
 ])  # fmt: skip
 def test_a_picture_says_its_answer_and_every_word_can_be_read(
-    study: Callable[[Path, float], str], value: float, labels: set[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    study: Callable[[float], Answer], value: float, labels: set[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     found: list[tuple[Page, Figure]] = []
     save = Page.save_figure
@@ -76,10 +59,11 @@ def test_a_picture_says_its_answer_and_every_word_can_be_read(
         found.append((page, figure))
 
     monkeypatch.setattr(Page, "save_figure", saved)
-    verdict = study(tmp_path, value)
+    answer = study(value)
+    answer.write(tmp_path)
     ((page, figure),) = found
     words = [text.get_text() for text in figure.texts]
-    assert words[0] == page.title and " ".join(words[1:]).startswith(verdict)
+    assert words[0] == page.title and " ".join(words[1:]).startswith(answer.verdict())
     said = {text for axes in figure.axes for text in (axes.get_xlabel(), axes.get_ylabel())}
     assert labels <= said and not any("_" in text for text in said)
     boxes = [text.get_window_extent() for text in figure.texts]
@@ -94,15 +78,18 @@ def test_a_picture_says_its_answer_and_every_word_can_be_read(
 
 def test_the_verdict_on_settings_is_that_of_trusted_ones() -> None:
     rows, _ = estimated([made_up(setting) for setting in ladder(artery())])
+
+    def verdict(of: list[Row]) -> str:
+        return Trade(artery(), of).verdict()
+
     good = [row for row in rows if row.angle_error <= 1.0 and not row.doubt]
     cheapest = min(good, key=lambda row: (row.result.seconds, row.angle_error))
     assert cheapest.on_front
     said = f"{cheapest.result.seconds:.2g} s of the processor for an error of {cheapest.angle_error:.2g} degrees."
-    assert trade.verdict(rows).startswith("The cheapest setting within 1 degree is ")
-    assert trade.verdict(rows).endswith(said)
+    assert verdict(rows).startswith("The cheapest setting within 1 degree is ") and verdict(rows).endswith(said)
     others = [dataclasses.replace(row, doubt="noise") if row is cheapest else row for row in rows]
-    assert not trade.verdict(others).endswith(said)
+    assert not verdict(others).endswith(said)
     coarse = [row for row in rows if row.angle_error > 1.0]
-    assert trade.verdict(coarse).startswith("No setting is known to be within 1 degree; the closest is ")
+    assert verdict(coarse).startswith("No setting is known to be within 1 degree; the closest is ")
     doubted = [dataclasses.replace(row, doubt="noise") for row in rows]
-    assert trade.verdict(doubted) == f"Not known: all {len(rows)} errors are doubted; trade.csv says why."
+    assert verdict(doubted) == f"Not known: all {len(rows)} errors are doubted; trade.csv says why."

@@ -16,8 +16,7 @@ from remodel_fenicsx import cli, preset_scene
 from remodel_fenicsx.results.run_lock import FolderTaken, RunLock
 from remodel_fenicsx.results.status import status
 from remodel_fenicsx.studies import stability
-from remodel_fenicsx.studies.ensemble import ensemble
-from remodel_fenicsx.studies.sweep import latin_hypercube, read_axis
+from remodel_fenicsx.studies.sweep import ensemble, latin_hypercube, read_axes
 from remodel_fenicsx.studies.trade import trade
 from tests.conftest import forked_children
 from tests.parts import pulled_cube
@@ -152,8 +151,9 @@ def test_each_part_of_each_range_has_one_point() -> None:
 
 
 def test_whole_numbers_stay_whole() -> None:
-    assert read_axis("mesh.refinement=1:3:3") == ("mesh.refinement", [1, 2, 3])
-    assert read_axis("remodeling.kappa=0.1:0.3:3") == ("remodeling.kappa", [0.1, 0.2, 0.3])
+    found = read_axes(["mesh.refinement=1:3:3", "remodeling.kappa=0.1:0.3:3"])
+    assert found == {"mesh.refinement": [1, 2, 3], "remodeling.kappa": [0.1, 0.2, 0.3]}
+    assert all(isinstance(number, int) for number in found["mesh.refinement"])
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from mpi4py import MPI
 from remodel_fenicsx import Scene, Simulation
 from remodel_fenicsx.body.reductions import choice, expected_thrust, explained
 from remodel_fenicsx.solver.continuation import StepFailure
-from remodel_fenicsx.studies.stability import in_words, stability
+from remodel_fenicsx.studies.stability import stability, unseen_by
 from remodel_fenicsx.watch.buckling import BucklingWarning
 from tests.parts import tube
 
@@ -173,11 +173,12 @@ def test_the_analysis_of_a_reduction_says_what_it_does_not_see(tmp_path: Path) -
         "geometry.length": 8.0,
     }
     scene = slender("radial", 0.5, **changes).with_values({"time.end": 2.0})
-    place, table, unseen = stability(scene, tmp_path / "radial", 1, MPI.COMM_SELF)
+    place, found = stability(scene, tmp_path / "radial", 1, MPI.COMM_SELF)
     log = (place / "run.log").read_text()
+    (unseen,) = unseen_by(found.scene)
     assert "kinematics 'radial' sees changes that keep its symmetry only" in unseen
-    assert unseen in log and unseen in in_words(table, unseen)
-    assert f"time 2: a pass multiplies the worst small change by {table['factor'][0]:.3g}" in log
+    assert unseen in log and unseen in found.in_words()
+    assert f"time 2: a pass multiplies the worst small change by {found.columns['factor'][0]:.3g}" in log
 
 
 # ---------------------------------------------------------------- near and beyond a limit load
