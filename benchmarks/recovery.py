@@ -80,9 +80,7 @@ def filled(scene: Scene, empty: list[Measured]) -> list[Measured]:
     problem = Problem(scene, unknowns(np.ones(len(TRUTH))), empty)
     said = problem.models(np.log(list(TRUTH.values())))
     return [
-        replace(
-            one, columns=one.columns | modelled.columns, sd={name: _sd(name, modelled.columns[name]) for name in one.sd}
-        )
+        replace(one, columns=one.columns | modelled, sd={name: _sd(name, modelled[name]) for name in one.sd})
         for one, modelled in zip(empty, said, strict=True)
     ]
 

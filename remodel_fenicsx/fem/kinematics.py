@@ -35,8 +35,6 @@ class Kinematics(ABC):
         Faces of the mesh that are planes of symmetry, and the component of the displacement that is zero there.
     homogeneous
         Whether the strain is the same everywhere: then no mesh changes what is found.
-    turns_nothing
-        Whether F is diagonal in the coordinates of the mesh: cells along them stay along them.
     suits_multigrid
         Whether algebraic multigrid solves for these unknowns.
     closing
@@ -58,7 +56,6 @@ class Kinematics(ABC):
     moves_rigidly: ClassVar[bool] = False
     symmetry_planes: ClassVar[Mapping[str, int]] = {}
     homogeneous: ClassVar[bool] = False
-    turns_nothing: ClassVar[bool] = False
     suits_multigrid: ClassVar[bool] = True
     cost: ClassVar[float] = 1.0
     closing: Any = None
@@ -265,7 +262,6 @@ class RadialKinematics(_Reduced):
     meaning = "u_r over the radius of a tube whose sections stay round, plane and alike"
     element_kind = "interval"
     components = (None, None, None)
-    turns_nothing = True
     cost = 0.2
 
     def __init__(self, mesh: Any = None, body: Any = None):
@@ -316,7 +312,6 @@ class PointKinematics(_Reduced):
     element_kind = "interval"
     components = (None, None, None)
     homogeneous = True
-    turns_nothing = True
     cost = 0.2
 
     def unknown(self, mesh: Any, degree: int) -> Any:

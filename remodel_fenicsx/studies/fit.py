@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from html import escape
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from matplotlib import rc_context
@@ -23,13 +23,8 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx._version import __version__
 from remodel_fenicsx.errors import RemodelError, SOLVE_FAILED
-from remodel_fenicsx.evolution.sensitivity import Directions, axes_lie_along, refused, with_derivatives
-from remodel_fenicsx.evolution.stepper import Step, Watcher
-from remodel_fenicsx.fem.kinematics import KINEMATICS
-from remodel_fenicsx.model.laws import LAWS
 from remodel_fenicsx.report.card import Card, folded, section, table as card_table
 from remodel_fenicsx.report.page import page_with
-from remodel_fenicsx.results.columns import Measurement
 from remodel_fenicsx.results.run_folder import chosen_folder
 from remodel_fenicsx.results.run_lock import RunLock
 from remodel_fenicsx.scene.scene import Scene, SceneError
@@ -45,114 +40,24 @@ log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 
 
-# ---------------------------------------------------------------- numbers of a scene, and their derivatives
-OF_TISSUE = ("lame_lambda", "lame_mu", "network_modulus", "contour_length")  # of a tissue: those with derivatives
-NUMBERS_CHANGE = 1e-4  # of logarithms, for closed formulas: with four points the error is 1e-16, that of rounding 1e-12
-STATE_CHANGE = 1e-5  # of logarithms, for columns of a state: central differences err by 1e-10
-
-
-class Slopes(NamedTuple):
-    """Derivatives of the numbers of a scene by the logarithms of k unknowns."""
-
-    tissue: Mapping[str, Array]
-    loads: Mapping[str, Array]
-    scales: Mapping[str, Array]
-    kappa: Array
-    exact: NDArray[np.bool_]
-
-
-class Modelled(NamedTuple):
-    """Columns of a table by name, (rows,), and their derivatives (k, rows); none where they were not asked for."""
-
-    columns: dict[str, Array]
-    changes: dict[str, Array]
-
-
-def without_derivatives(scene: Scene, table: Measured) -> str | None:
-    """Why the model of a table has no derivatives but differences, in words; None where it has."""
-    scene = with_choices(scene)
-    if not KINEMATICS[scene.model.kinematics].turns_nothing:
-        return f"model.kinematics = {scene.model.kinematics!r}"
-    for key, there in (
-        ("regions", bool(scene.regions)),
-        ("cases", bool(scene.cases)),
-        ("natural.opening_angle", bool(scene.natural.opening_angle)),
-        ("time.tolerance", scene.time.tolerance is not None or scene.time.is_equilibrium),
-        ("cells.fibres", bool(scene.measured_cells)),
-    ):
-        if there:
-            return key
-    late = [column.name for column in _with_columns(scene, table).columns() if column.after_pass]
-    if own := sorted(set(late) & set(table.sd)):
-        return f"the column {own[0]}"
-    settings = scene.remodeling
-    return None if table.state == "virgin" else refused(settings, LAWS[settings.law], settings.coupling)
-
-
-def slopes(at: Callable[[Array], Scene], logarithms: Array, scales: Mapping[str, tuple[int, float]]) -> Slopes:
-    """Derivatives of a scene's numbers."""
-    count, base = len(logarithms), at(logarithms)
-    is_scale = {number for number, _ in scales.values()}
-    tissue = {name: np.zeros(count) for name in OF_TISSUE}
-    loads = {name: np.zeros(count) for name in base.loads}
-    kappa, exact = np.zeros(count), np.ones(count, dtype=np.bool_)
-    for k in range(count):
-        if k in is_scale:
-            continue
-        around = [at(logarithms + step * NUMBERS_CHANGE * np.eye(count)[k]) for step in (-2, -1, 1, 2)]
-        for name, ways in tissue.items():
-            ways[k] = _slope([getattr(one.properties()[""].tissue, name) for one in around])
-        for name, ways in loads.items():
-            ways[k] = _slope([one.loads[name].value for one in around])
-        kappa[k] = _slope([one.properties()[""].kappa for one in around])
-        exact[k] = _apart_from_numbers(around[-1]) == _apart_from_numbers(base)
-    of_scales = {name: value * np.eye(count)[number] for name, (number, value) in scales.items()}
-    return Slopes(tissue, loads, of_scales, kappa, exact)
-
-
-def _slope(values: list[float]) -> float:
-    """From values at -2, -1, 1 and 2 changes of a logarithm."""
-    far, near, ahead, farther = values
-    return (8 * (ahead - near) - (farther - far)) / (12 * NUMBERS_CHANGE)
-
-
-def _apart_from_numbers(scene: Scene) -> Any:
-    """What of a scene has no derivative."""
-    values = scene.model_dump()
-    rest = scene.properties()[""].tissue.map(lambda name, value: 0.0 if name in OF_TISSUE else value)
-    values.pop("material")
-    values["remodeling"].pop("kappa")
-    for load in values["loads"].values():
-        load.pop("value")
-    return values, rest
-
-
 # ---------------------------------------------------------------- what a scene says where a table has measurements
-def model_of(scene: Scene, table: Measured, scales: Mapping[str, float], ways: Slopes | None = None) -> Modelled:
-    """What a scene says where a table has measurements, by column."""
-    scene = _with_columns(scene, table)
+PRECISE = {"solver.relative_tolerance": 1e-13}  # what differences of runs divide by a small change is rounding alone
+
+
+def model_of(scene: Scene, table: Measured, scales: Mapping[str, float]) -> dict[str, Array]:
+    """What a scene says where a table has measurements, by column, (rows,)."""
+    scene = _with_columns(scene.with_values(PRECISE), table)
     if table.state == "history":
         measured, step = table.columns["time"], scene.time.step
         end = max(float(step * np.ceil(measured.max() / step - 1e-9)), step)
-        scene = scene.with_values({"time.end": end})
-        found, _ = _run(scene, table, _directions(scene, ways), lambda time: bool(np.abs(measured - time).min() < step))
-        at = found.columns["time"]
-        return Modelled(
-            {name: np.interp(measured, at, found.columns[name]) for name in table.sd},
-            {name: np.array([np.interp(measured, at, row) for row in rows]) for name, rows in found.changes.items()},
-        )
+        found, _ = _run(scene.with_values({"time.end": end}), table)
+        return {name: np.interp(measured, found["time"], found[name]) for name in table.sd}
     start = None
     if table.state == "after":
         scene = with_choices(scene)
-        before = scene.with_values({"time.end": table.time})
-        _, start = _run(before, table, _directions(before, ways), lambda time: False)
-    passive = _passive(scene, table, scales)
-    found, _ = _run(passive, table, _directions(scene, ways, table), lambda time: True, start)
-    chosen = found.columns["time"] > 0
-    return Modelled(
-        {name: found.columns[name][chosen] for name in table.sd},
-        {name: rows[:, chosen] for name, rows in found.changes.items()},
-    )
+        _, start = _run(scene.with_values({"time.end": table.time}), table)
+    found, _ = _run(_passive(scene, table, scales), table, start)
+    return {name: found[name][found["time"] > 0] for name in table.sd}
 
 
 def _with_columns(scene: Scene, table: Measured) -> Scene:
@@ -177,110 +82,21 @@ def _passive(scene: Scene, table: Measured, scales: Mapping[str, float]) -> Scen
     return scene.with_values(changes)
 
 
-def _directions(scene: Scene, ways: Slopes | None, test: Measured | None = None) -> Directions | None:
-    """Derivatives under the scene's own loads, or those of `_passive`."""
-    if ways is None:
-        return None
-    known, nothing = ways, np.zeros(len(ways.kappa))
-
-    def loads(time: float) -> dict[str, Array]:
-        when = time if test is None else scene.last_time
-        found = {name: known.loads[name] * load.factor(when) for name, load in scene.loads.items()}
-        if test is not None:
-            row = max(round(time) - 1, 0)
-            found |= {name: known.scales.get(name, nothing) * test.columns[name][row] for name in test.loads}
-        return found
-
-    return Directions(ways.tissue, ways.kappa, loads)
-
-
-class Start(NamedTuple):
-    """Cells as a run leaves them, and the derivatives of their lengths."""
-
-    dimensions: Array
-    axes: Array
-    changes: Array | None
-
-
 def _run(
-    scene: Scene,
-    table: Measured,
-    directions: Directions | None,
-    wanted: Callable[[float], bool],
-    start: Start | None = None,
-) -> tuple[Modelled, Start]:
-    """Columns and `time` of all steps, their derivatives where they are wanted and zero elsewhere; cells at the end."""
-    coupling = None
-    if directions is not None:
-        coupling = with_derivatives(scene.remodeling.coupling, directions, start.changes if start else None)
-    simulation = Simulation(scene, MPI.COMM_SELF, coupling=coupling)
-    watchers = [] if directions is None else [RowChanges(simulation, directions, table, wanted)]
+    scene: Scene, table: Measured, start: tuple[Array, Array] | None = None
+) -> tuple[dict[str, Array], tuple[Array, Array]]:
+    """Columns and `time` of all steps; dimensions and axes of the cells at the end."""
+    simulation = Simulation(scene, MPI.COMM_SELF)
     cells = simulation.cells
     try:
         if start is not None:
-            cells.set(start.dimensions, start.axes)
+            cells.set(*start)
             simulation.state.settle_cells()
-        rows = [step.row for step in simulation.steps(watchers)]
-        changes = getattr(simulation.stepper.coupling, "dimensions", None)
-        end = Start(cells.dimension_values.copy(), cells.axis_values.copy(), changes)
+        rows = [step.row for step in simulation.steps()]
+        end = cells.dimension_values.copy(), cells.axis_values.copy()
     finally:
         simulation.close()
-    columns = {name: np.array([row[name] for row in rows]) for name in ("time", *table.sd)}
-    return Modelled(columns, watchers[0].changes() if watchers else {}), end
-
-
-class RowChanges(Watcher):
-    """Derivatives of measured columns: of the state as the coupling has them, of the columns by central differences."""
-
-    def __init__(
-        self, simulation: Simulation, directions: Directions, table: Measured, wanted: Callable[[float], bool]
-    ):
-        self.simulation, self.directions, self.wanted = simulation, directions, wanted
-        self.columns = [column for column in simulation.observer.columns if column.name in table.sd]
-        self._rows: list[dict[str, Array]] = []
-
-    def solved(self, step: Step) -> None:
-        """Measure the state a little ahead and behind in each direction."""
-        count = len(self.directions.kappa)
-        row: dict[str, Array] = {column.name: np.zeros(count) for column in self.columns}
-        if self.wanted(step.time):
-            for k in range(count):
-                ahead, behind = (self._measured(step, k, way) for way in (STATE_CHANGE, -STATE_CHANGE))
-                for column in self.columns:
-                    row[column.name][k] = (ahead[column.name] - behind[column.name]) / (2 * STATE_CHANGE)
-        self._rows.append(row)
-
-    def _measured(self, step: Step, k: int, way: float) -> dict[str, float]:
-        state, coupling = self.simulation.state, self.simulation.stepper.coupling
-        tissue, loads = self.simulation.tissue, self.directions.loads(step.time)
-        with state.tentative():
-            state.unknown.x.array[:] += way * coupling.unknowns[k]  # type: ignore[attr-defined]
-            state.cells.dimension_values[:] += way * coupling.dimensions[k]  # type: ignore[attr-defined]
-            state.loading.set({**step.loads, **{name: step.loads[name] + way * by[k] for name, by in loads.items()}})
-            before = {name: float(getattr(tissue, name).value) for name in self.directions.tissue}
-            for name, value in before.items():
-                getattr(tissue, name).value = value + way * self.directions.tissue[name][k]
-            try:
-                extension = coupling.equilibrium.extension()
-                moved = replace(step, loads=dict(state.loading.values), extension=extension)
-                at = Measurement(self.simulation.observer, moved)
-                return {column.name: column.value(at) for column in self.columns}
-            finally:
-                for name, value in before.items():
-                    getattr(tissue, name).value = value
-
-    def changes(self) -> dict[str, Array]:
-        """By column, (k, steps)."""
-        return {column.name: np.array([row[column.name] for row in self._rows]).T for column in self.columns}
-
-
-def rotated_cells(scene: Scene) -> bool:
-    """Whether cells do not lie along the coordinates of the mesh, so that there are no derivatives."""
-    simulation = Simulation(with_choices(scene), MPI.COMM_SELF)
-    try:
-        return not axes_lie_along(simulation.cells.point_cells.axes)
-    finally:
-        simulation.close()
+    return {name: np.array([row[name] for row in rows]) for name in ("time", *table.sd)}, end
 
 
 # ---------------------------------------------------------------- what was evaluated, a line each in a file
@@ -288,13 +104,6 @@ JOURNAL = "evaluations.jsonl"
 LARGEST_JOURNAL = 10**9  # bytes
 
 Point = tuple[float, ...]
-
-
-class Evaluation(NamedTuple):
-    """Residuals (n,) at a point, and their derivatives (n, k): NaN in columns that the model does not give."""
-
-    residuals: Array
-    jacobian: Array
 
 
 class Journal:
@@ -313,13 +122,9 @@ class Journal:
         """Of the fit in the folder; None where there is none."""
         return str(self._lines[0].get("fit")) if self._lines else None
 
-    def known(self) -> dict[Point, Evaluation]:
-        """All evaluations by their point."""
-        found = {}
-        for line in self._lines[1:]:
-            point, off, ways = (np.array(line[name], dtype=np.float64) for name in ("at", "residuals", "jacobian"))
-            found[tuple(map(float, point))] = Evaluation(off, ways)
-        return found
+    def known(self) -> dict[Point, Array]:
+        """Residuals (n,) of all points."""
+        return {tuple(map(float, line["at"])): np.array(line["residuals"], np.float64) for line in self._lines[1:]}
 
     def begin(self, mark: str) -> None:
         """Open the file for more, without a line that was cut off."""
@@ -327,11 +132,10 @@ class Journal:
         check_no_link(self._path)
         self._path.write_text("".join(json.dumps(line) + "\n" for line in self._lines), encoding="utf-8")
 
-    def add(self, point: Point, evaluation: Evaluation) -> None:
+    def add(self, point: Point, residuals: Array) -> None:
         """One line more, on the disk when this returns."""
-        values = {"residuals": evaluation.residuals.tolist(), "jacobian": evaluation.jacobian.tolist()}
         with self._path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps({"at": list(point), **values}) + "\n")
+            file.write(json.dumps({"at": list(point), "residuals": residuals.tolist()}) + "\n")
 
 
 def fingerprint(scene: Scene, unknowns: Sequence[Unknown], tables: Sequence[Measured]) -> str:
@@ -343,9 +147,8 @@ def fingerprint(scene: Scene, unknowns: Sequence[Unknown], tables: Sequence[Meas
 
 # ---------------------------------------------------------------- least squares
 SCALE = "scale."  # what keys of factors on columns begin with
-LOGARITHM_CHANGE = 1e-3  # of a logarithm: central differences err by 1e-6, the solves' tolerance of 1e-10 by 1e-7
-BLIND = 1e-5  # smallest singular value over the largest, below which the data say nothing: what differences err by
-BLIND_EXACT = 1e-8  # the same where all derivatives are exact: columns are differentiated with errors of 1e-10
+LOGARITHM_CHANGE = 1e-4  # of a logarithm: central differences err by 1e-8, those to one side by 1e-4
+BLIND = 1e-7  # smallest singular value over the largest, below which the data say nothing: what differences err by
 NAMED = 0.1  # share of a blind direction from which on an unknown is named
 UNSOLVED = 1e3  # standard deviations, of all rows of a state that has no equilibrium
 START_SPREAD = np.log(2.0)  # of further starts, to both sides
@@ -381,14 +184,8 @@ class Problem:
 
     def __init__(self, scene: Scene, unknowns: Sequence[Unknown], tables: Sequence[Measured]):
         self.scene, self.unknowns, self.tables = scene, list(unknowns), list(tables)
-        self._known: dict[Point, Evaluation] = {}
+        self._known: dict[Point, Array] = {}
         self._journal: Journal | None = None
-        first = np.log([unknown.start for unknown in unknowns])
-        words = [reason for table in tables if (reason := without_derivatives(scene, table)) is not None]
-        if not words and rotated_cells(scene):
-            words = [f"cells.axes = {scene.cells.axes!r}"]
-        self.exact: NDArray[np.bool_] = np.zeros(len(first), dtype=np.bool_) if words else self._slopes(first).exact
-        self.reason = words[0] if words else "the model has no derivative by them"
 
     def keep(self, journal: Journal) -> None:
         """From now on each evaluation is in the journal, and what that has is not evaluated again."""
@@ -397,15 +194,6 @@ class Problem:
             journal.add(point, self._known[point])
         self._known |= known
         self._journal = journal
-
-    def how(self) -> str:
-        """Which derivatives are exact, in words."""
-        keys = [unknown.key for unknown in self.unknowns]
-        exact = [key for key, known in zip(keys, self.exact, strict=True) if known]
-        others = [key for key in keys if key not in exact]
-        parts = [f"exact by {', '.join(exact)}"] if exact else []
-        parts += [f"by differences of runs for {', '.join(others)} ({self.reason})"] if others else []
-        return f"derivatives: {'; '.join(parts)}"
 
     def scene_of(self, logarithms: Array) -> Scene:
         """The scene with these numbers."""
@@ -417,69 +205,51 @@ class Problem:
         pairs = zip(self.unknowns, logarithms, strict=True)
         return {u.key.removeprefix(SCALE): float(np.exp(x)) for u, x in pairs if u.key.startswith(SCALE)}
 
-    def _slopes(self, logarithms: Array) -> Slopes:
-        names = {u.key.removeprefix(SCALE): k for k, u in enumerate(self.unknowns) if u.key.startswith(SCALE)}
-        scales = {name: (k, float(np.exp(logarithms[k]))) for name, k in names.items()}
-        return slopes(self.scene_of, logarithms, scales)
-
-    def models(self, logarithms: Array, derivatives: bool = False) -> list[Modelled]:
-        """What the model says of each table, with derivatives on request."""
+    def models(self, logarithms: Array) -> list[dict[str, Array]]:
+        """What the model says of each table."""
         scene, scales = self.scene_of(logarithms), self.scales_of(logarithms)
-        ways = self._slopes(logarithms) if derivatives else None
-        return [model_of(scene, table, scales, ways) for table in self.tables]
+        return [model_of(scene, table, scales) for table in self.tables]
 
     def residuals(self, logarithms: Array) -> Array:
         """Model less measurement over standard deviation, table by table; then the priors."""
-        return self.at(logarithms).residuals
-
-    def at(self, logarithms: Array, derivatives: bool = True) -> Evaluation:
-        """Residuals, and those derivatives that are exact, where they are asked for."""
         key = tuple(map(float, logarithms))
-        if key not in self._known or (derivatives and self.exact.any() and np.isnan(self._known[key].jacobian).all()):
+        if key not in self._known:
             with unsaid():
-                self._known[key] = self._evaluated(np.array(logarithms), derivatives and bool(self.exact.any()))
+                self._known[key] = self._evaluated(np.array(logarithms))
             if self._journal is not None:
                 self._journal.add(key, self._known[key])
         return self._known[key]
 
-    def _evaluated(self, x: Array, derivatives: bool) -> Evaluation:
-        scales, parts, slopes_ = self.scales_of(x), [], []
-        models: list[Modelled] | None = None
+    def _evaluated(self, x: Array) -> Array:
+        scales = self.scales_of(x)
+        parts: list[Array] = []
+        models: list[dict[str, Array]] | None = None
         with suppress(StepFailure, SceneError):  # numbers that do not go together have no equilibrium either
-            models = self.models(x, derivatives)
+            models = self.models(x)
         for number, table in enumerate(self.tables):
             for name, sd in table.sd.items():
-                measured = scales.get(name, 1.0) * table.columns[name]
-                off = models[number].columns[name] - measured if models else np.full(table.rows, UNSOLVED * sd)
-                parts.append(off / sd)
-                by_scale = np.array([u.key == SCALE + name for u in self.unknowns], dtype=np.float64)
-                ways: Array = np.zeros((table.rows, len(x)))
-                if models and derivatives:
-                    ways = models[number].changes[name].T - measured[:, None] * by_scale
-                slopes_.append(ways / sd)
-        for number, (unknown, value) in enumerate(zip(self.unknowns, x, strict=True)):
+                off = models[number][name] - scales.get(name, 1.0) * table.columns[name] if models else UNSOLVED * sd
+                parts.append(np.full(table.rows, off / sd))
+        for unknown, value in zip(self.unknowns, x, strict=True):
             if unknown.prior is not None and unknown.prior_sd is not None:
                 parts.append(np.array([(value - np.log(unknown.prior)) / unknown.prior_sd]))
-                slopes_.append(np.eye(len(x))[[number]] / unknown.prior_sd)
-        known = self.exact if derivatives else np.zeros_like(self.exact)
-        return Evaluation(np.concatenate(parts), np.where(known, np.concatenate(slopes_), np.nan))
+        return np.concatenate(parts)
 
     def jacobian(self, logarithms: Array, central: bool = False) -> Array:
-        """Derivatives, (residuals, unknowns): of the model where it has them, else by differences of runs."""
-        found, step = self.at(logarithms).jacobian.copy(), LOGARITHM_CHANGE * (1.0 if central else 0.1)
+        """Derivatives, (residuals, unknowns), by differences of runs."""
         ends = [np.log([getattr(unknown, end) for unknown in self.unknowns]) for end in ("lower", "upper")]
-        for k in np.flatnonzero(~self.exact):
-            ahead, behind = (np.clip(logarithms + way * np.eye(len(logarithms))[k], *ends) for way in (step, -step))
+        columns = []
+        for k, way in enumerate(LOGARITHM_CHANGE * np.eye(len(logarithms))):
+            ahead, behind = (np.clip(logarithms + side * way, *ends) for side in (1, -1))
             if not central:
                 behind, ahead = (logarithms, ahead) if ahead[k] > logarithms[k] else (behind, logarithms)
-            off = self.at(ahead, False).residuals - self.at(behind, False).residuals
-            found[:, k] = off / (ahead[k] - behind[k])
-        return found
+            columns.append((self.residuals(ahead) - self.residuals(behind)) / (ahead[k] - behind[k]))
+        return np.transpose(columns)
 
     def check_tells_apart(self, jacobian: Array) -> None:
         """Refuse unknowns of which the data say nothing."""
         _, singular, directions = np.linalg.svd(jacobian, full_matrices=False)
-        if singular[-1] > (BLIND_EXACT if self.exact.all() else BLIND) * singular[0]:
+        if singular[-1] > BLIND * singular[0]:
             return
         blind = directions[-1] * np.sign(directions[-1][np.abs(directions[-1]).argmax()])
         pairs = [(u.key, part) for u, part in zip(self.unknowns, blind, strict=True) if abs(part) > NAMED]
@@ -525,12 +295,11 @@ def fit(
         mark = fingerprint(scene, unknowns, tables)
         place, journal = _place(folder, f"{scene.name}-fit", mark)
         problem, first = Problem(scene, unknowns, tables), np.log([unknown.start for unknown in unknowns])
-        log.info("%s", problem.how())
         try:
             at_start = problem.models(first)
         except StepFailure as failure:
             raise NoStart(f"at the start of the fit {failure}. {failure.refusal}; choose other starts") from failure
-        for doubt in doubts(tables, [modelled.columns for modelled in at_start], scene):
+        for doubt in doubts(tables, at_start, scene):
             log.warning("%s", doubt)
         problem.check_tells_apart(problem.jacobian(first, central=True))
     random, found = np.random.default_rng(1), []
@@ -661,7 +430,7 @@ def result_of(problem: Problem, found: Sequence[Any]) -> Fit:
         float(np.sqrt(np.mean(off**2))),
         [2 * float(one.cost) for one in found],
         [int(one.nfev) for one in found],
-        [modelled.columns for modelled in problem.models(logarithms)],
+        problem.models(logarithms),
         problem.scene_of(logarithms),
         problem.tables,
     )

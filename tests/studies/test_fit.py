@@ -134,11 +134,11 @@ def test_a_fit_goes_on_where_it_was_killed(folder: Path, monkeypatch: pytest.Mon
     made: list[int] = []
     allowed = [10**6]
 
-    def counted(self: Problem, x: Any, derivatives: bool) -> Any:
+    def counted(self: Problem, x: Any) -> Any:
         if len(made) >= allowed[0]:
             raise KeyboardInterrupt
         made.append(1)
-        return evaluated(self, x, derivatives)
+        return evaluated(self, x)
 
     monkeypatch.setattr(Problem, "_evaluated", counted)
     fit(scene, folder / "data.toml", folder / "whole", starts=1, profiles=False)
@@ -237,52 +237,28 @@ time = 10.0
 sd = { inner_radius = 0.01, reduced_axial_force = 0.1 }
 """
 
-MODELS = (
-    {},
-    {"remodeling.law": "explicit"},
-    {"remodeling.coupling": "extrapolated", "material.repulsion": "log"},
-    {"mesh.formulation": "selective-integration"},
-)
+MODELS = {
+    "tensor": {},
+    "explicit": {"remodeling.law": "explicit"},
+    "extrapolated": {"remodeling.coupling": "extrapolated", "material.repulsion": "log"},
+    "exponent": {"remodeling.exponent": 1.0},
+}
 
 
-@pytest.mark.parametrize("changes", MODELS, ids=["tensor", "explicit", "extrapolated", "selective-integration"])
-def test_derivatives_are_exact(folder: Path, changes: dict[str, Any]) -> None:
-    """Taylor remainders fall by four where the step is halved; central differences of runs are the same numbers."""
+@pytest.mark.parametrize("changes", MODELS.values(), ids=MODELS)
+def test_derivatives_are_those_of_the_model(folder: Path, changes: dict[str, Any]) -> None:
+    """Taylor remainders fall by four where the step is halved."""
     (folder / "after.csv").write_text("pressure,inner_radius,reduced_axial_force\n0.6,1.2,0.5\n1.2,1.3,0.1\n")
     (folder / "every.toml").write_text(EVERY)
-    scene = tube(**changes, **{"solver.relative_tolerance": 1e-13, "time.end": 40.0})
+    scene = tube(**changes)
     problem = Problem(scene, *read_measurements(folder / "every.toml", scene))
-    assert problem.exact.all(), problem.how()
     x = np.log([unknown.start for unknown in problem.unknowns])
-    found, way = problem.jacobian(x), np.random.default_rng(2).normal(size=len(x)) / 3
+    found, way = problem.jacobian(x, central=True), np.random.default_rng(2).normal(size=len(x)) / 3
     present = problem.residuals(x)
-    remainders = []
-    for size in (0.04, 0.02, 0.01, 0.005):
-        change = problem.at(x + size * way, False).residuals - present
-        remainders.append(np.linalg.norm(change - size * found @ way))
+    sizes = (0.04, 0.02, 0.01, 0.005)
+    remainders = [np.linalg.norm(problem.residuals(x + h * way) - present - h * found @ way) for h in sizes]
     ratios = np.divide(remainders[:-1], remainders[1:])
     assert np.abs(ratios[1:] - 4.0).max() < 0.1, ratios
-    for k in range(len(x)):
-        step = 1e-4 * np.eye(len(x))[k]
-        ends = [problem.at(x + side * step, False).residuals for side in (1, -1)]
-        differences = (ends[0] - ends[1]) / 2e-4
-        np.testing.assert_allclose(found[:, k], differences, atol=2e-6 * np.abs(differences).max())
-
-
-def test_what_is_not_exact_is_said(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """Numbers of the cells and of the body go by differences, and so does a model without derivatives."""
-    (folder / "data.toml").write_text(
-        DATA.replace('"material.lame_mu" = { start = 4.0 }', '"geometry.inner_radius" = { start = 1.01 }')
-    )
-    scene = read_scene(folder / "scene.toml")
-    problem = Problem(scene, *read_measurements(folder / "data.toml", scene))
-    assert problem.how() == (
-        "derivatives: exact by material.chain_density, remodeling.kappa; by differences of runs for "
-        "geometry.inner_radius (the model has no derivative by them)"
-    )
-    full = scene.with_values({"remodeling.exponent": 1.0})
-    problem = Problem(full, *read_measurements(folder / "data.toml", full))
-    assert not problem.exact.any() and "threshold and remodeling.exponent have no derivative" in problem.how()
 
 
 def test_bands_have_the_width_of_the_noise(folder: Path) -> None:
@@ -505,23 +481,18 @@ def test_numbers_of_another_kind_are_doubted(
     assert len(warned) == bool(said) and all(f"{path.name}, {name}: " in line and said in line for line in warned)
     log = (folder / "o" / "fit.log").read_text()
     assert all(line.removeprefix("WARNING: ") in log for line in warned)
-    assert "derivatives: exact by material.lame_mu" in log and f"{path.name}: {len(table) - 1} rows of " in log
+    assert f"{path.name}: {len(table) - 1} rows of " in log
 
 
 def test_loads_that_a_scene_has_not_are_zero(tmp_path: Path) -> None:
-    """Without [loads.elongation] the state still has one; derivatives are those of differences."""
+    """Without [loads.elongation] the state still has one."""
     demo = ROOT / "demos" / "fit"
     text = (demo / "scene.toml").read_text()
     (tmp_path / "scene.toml").write_text(text[: text.index("[loads.elong")] + text[text.index("[remodeling]") :])
     scene = read_scene(tmp_path / "scene.toml")
     assert list(scene.loads) == ["pressure"]
     problem = Problem(scene, *read_measurements(demo / "inflation.toml", scene))
-    assert problem.exact.all()
-    x = np.log([unknown.start for unknown in problem.unknowns])
-    found = problem.jacobian(x)
-    for k, step in enumerate(1e-4 * np.eye(len(x))):
-        ends = [problem.at(x + side * step, False).residuals for side in (1, -1)]
-        np.testing.assert_allclose(found[:, k], (ends[0] - ends[1]) / 2e-4, atol=2e-6 * np.abs(found[:, k]).max())
+    assert np.abs(problem.residuals(np.log([unknown.start for unknown in problem.unknowns]))).max() < 100
 
 
 def test_virgin_tissue_whose_collagen_will_be_turned_over(tmp_path: Path) -> None:
@@ -551,39 +522,3 @@ def tube_without_turnover(scene: Scene) -> Scene:
     return scene.with_values(
         {"remodeling.turnover": {}, "output.columns": [], "output.fields": True, "time.end": 40.0, "time.step": 4.0}
     )
-
-
-def test_derivatives_of_one_point_are_exact(tmp_path: Path) -> None:
-    """A tendon as three numbers, pulled by a force: as central differences of runs."""
-    scene = preset_scene("consistent", "tendon").with_values(
-        {
-            "cells.initial": "isotropic",
-            "model.kinematics": "point",
-            "time.end": 20.0,
-            "solver.relative_tolerance": 1e-13,
-        }
-    )
-    (load,) = (name for name, one in scene.loads.items() if one.value)
-    (tmp_path / "history.csv").write_text("time,max_chain_extension,min_jacobian\n10,0.5,1\n20,0.5,1\n")
-    (tmp_path / "data.toml").write_text(
-        f"""
-[unknowns]
-"material.lame_mu" = {{ start = {scene.material.lame_mu} }}
-"material.chain_density" = {{ start = {scene.material.chain_density} }}
-"remodeling.kappa" = {{ start = 0.05 }}
-"loads.{load}.value" = {{ start = {scene.loads[load].value} }}
-
-[[measured]]
-file = "history.csv"
-state = "history"
-sd = {{ max_chain_extension = 0.1, min_jacobian = 0.1 }}
-"""
-    )
-    problem = Problem(scene, *read_measurements(tmp_path / "data.toml", scene))
-    assert problem.exact.all(), problem.how()
-    x = np.log([unknown.start for unknown in problem.unknowns])
-    found = problem.jacobian(x)
-    for k in range(len(x)):
-        step = 1e-4 * np.eye(len(x))[k]
-        ends = [problem.at(x + side * step, False).residuals for side in (1, -1)]
-        np.testing.assert_allclose(found[:, k], (ends[0] - ends[1]) / 2e-4, atol=2e-6 * np.abs(found[:, k]).max())
