@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args, get_origin
 
 from pydantic import (
     BaseModel,
+    BeforeValidator,
     ConfigDict,
     Field,
     GetCoreSchemaHandler,
@@ -35,6 +36,8 @@ from remodel_fenicsx.errors import RemodelError
 LONGEST_VALUE = 60  # characters of a value in an error
 LONGEST_MESSAGE = 2000  # characters: all columns of a shape are a thousand
 PAGE_WIDTH = 98  # characters of a line of a page
+# annotation of a tuple: what is a list in TOML becomes one
+IN_A_LIST = BeforeValidator(lambda value: tuple(value) if isinstance(value, list) else value)
 _MISSING = object()
 
 
@@ -212,6 +215,13 @@ def fault(rule: str, key: str = "", value: Any = _MISSING) -> PydanticCustomErro
     return PydanticCustomError("fault", "{rule}", context)
 
 
+def refuse(key: str, value: Any, reasons: Mapping[str, Any]) -> None:
+    """Raise the fault of the first reason that holds, if one does."""
+    for reason, holds in reasons.items():
+        if holds:
+            raise fault(reason, key, value)
+
+
 def named(registry: Mapping[str, Any], fits: Callable[[Any], Any]) -> str:
     """The names in a registry of the parts that fit, for an error."""
     return ", ".join(repr(name) for name, part in registry.items() if fits(part))
@@ -292,9 +302,10 @@ def locate(table: type[BaseModel], location: tuple[int | str, ...]) -> tuple[str
     while items:
         item = items.pop(0)
         if inside is None:
-            if isinstance(item, str) and (field is None or get_origin(field.annotation) is not dict):
-                break  # pydantic's name of a kind of value that the key may have
-            key = _joined(key, _step(item))
+            if isinstance(item, int) or (field is not None and get_origin(field.annotation) is dict):
+                key = _joined(key, _step(item))
+            if isinstance(item, str):
+                break  # what follows is pydantic's name of a kind of value that the key may have
             continue
         key, owner, field = _joined(key, _step(item)), inside, inside.model_fields.get(str(item))
         if field is None:
