@@ -524,7 +524,7 @@ def _revolve(options: argparse.Namespace) -> int:
     check_usable(reason_unusable())
     if not interrupts.is_first_rank():  # the work of one process
         return 0
-    from remodel_fenicsx.results.revolve import revolve
+    from remodel_fenicsx.results.whole_body import revolve
 
     _say("\n".join(map(str, revolve(options.folder))))
     return 0

@@ -40,8 +40,7 @@ from remodel_fenicsx.results.recording import (
     RecordingError,
     VIEWS,
 )
-from remodel_fenicsx.results.turned import AXIS_FIELDS, chain_lines
-from remodel_fenicsx.results.whole_body import WholeBody, has_a_body
+from remodel_fenicsx.results.whole_body import AXIS_FIELDS, WholeBody, chain_lines, has_a_body
 from remodel_fenicsx.schema.times import same_time
 from remodel_fenicsx.studies.page import FigureError
 from remodel_fenicsx.system.temporary import temporary_folder

@@ -18,8 +18,7 @@ import numpy as np
 from remodel_fenicsx._version import __version__
 from remodel_fenicsx.body.shape import Column, columns_of_region
 from remodel_fenicsx.fem.kinematics import KINEMATICS
-from remodel_fenicsx.report.body import ShownBody
-from remodel_fenicsx.report.card import Array, Card, folded, section, table
+from remodel_fenicsx.report.card import Array, Card, ShownBody, folded, section, table
 from remodel_fenicsx.results.history import unit_of, with_unit, words
 from remodel_fenicsx.results.recording import (
     AMBIENT,
