@@ -406,7 +406,7 @@ def _animate(options: argparse.Namespace) -> None:
 @command("revolve", ["revolve artery"], RUN_FOLDER, needs=COMPUTES, alone=True)
 def _revolve(options: argparse.Namespace) -> None:
     """Write the fields of a reduced run in DIR on the whole body, for ParaView."""
-    from remodel_fenicsx.results.revolve import revolve
+    from remodel_fenicsx.results.whole_body import revolve
 
     _say("\n".join(map(str, revolve(options.folder))))
 
