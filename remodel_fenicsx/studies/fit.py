@@ -130,28 +130,24 @@ def _apart_from_numbers(scene: Scene) -> Any:
 # ---------------------------------------------------------------- what a scene says where a table has measurements
 def model_of(scene: Scene, table: Measured, scales: Mapping[str, float], ways: Slopes | None = None) -> Modelled:
     """What a scene says where a table has measurements, by column."""
-    scene = _with_columns(scene, table)
+    scene, start, test = _with_columns(scene, table), None, None
     if table.state == "history":
-        measured, step = table.columns["time"], scene.time.step
-        end = max(float(step * np.ceil(measured.max() / step - 1e-9)), step)
-        scene = scene.with_values({"time.end": end})
-        found, _ = _run(scene, table, _directions(scene, ways), lambda time: bool(np.abs(measured - time).min() < step))
-        at = found.columns["time"]
-        return Modelled(
-            {name: np.interp(measured, at, found.columns[name]) for name in table.sd},
-            {name: np.array([np.interp(measured, at, row) for row in rows]) for name, rows in found.changes.items()},
-        )
-    start = None
-    if table.state == "after":
-        scene = with_choices(scene)
-        before = scene.with_values({"time.end": table.time})
-        _, start = _run(before, table, _directions(before, ways), lambda time: False)
-    passive = _passive(scene, table, scales)
-    found, _ = _run(passive, table, _directions(scene, ways, table), lambda time: True, start)
-    chosen = found.columns["time"] > 0
+        places, step = table.columns["time"], scene.time.step
+        end = max(float(step * np.ceil(places.max() / step - 1e-9)), step)
+        run = scene.with_values({"time.end": end})
+    else:
+        places, step, test = np.arange(table.rows, dtype=np.float64) + 1, 1.0, table
+        if table.state == "after":
+            scene = with_choices(scene)
+            before = scene.with_values({"time.end": table.time})
+            _, start = _run(before, table, _directions(before, ways), lambda time: False)
+        run = _passive(scene, table, scales)
+    directions = _directions(scene, ways, test)
+    found, _ = _run(run, table, directions, lambda time: bool(np.abs(places - time).min() < step), start)
+    at = found.columns["time"]
     return Modelled(
-        {name: found.columns[name][chosen] for name in table.sd},
-        {name: rows[:, chosen] for name, rows in found.changes.items()},
+        {name: np.interp(places, at, found.columns[name]) for name in table.sd},
+        {name: np.array([np.interp(places, at, row) for row in rows]) for name, rows in found.changes.items()},
     )
 
 

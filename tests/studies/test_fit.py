@@ -55,21 +55,26 @@ def inflated() -> list[dict[str, float]]:
     return rows(tube(**changes, **{"loads.elongation.ramp": [[0.0, 0.0], [1.0, 1.0]]}))
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Scene, tables of the model's own rows, and what is to be fitted, from starts that are off by a third."""
-    (tmp_path / "scene.toml").write_text(tube().to_toml())
-    with (tmp_path / "virgin.csv").open("w") as file:
-        out = csv.writer(file)
-        out.writerow(["pressure", "outer_radius"])
-        out.writerows([p * PER_MMHG, row["outer_radius"]] for p, row in zip(PRESSURES, inflated(), strict=True))
-    with (tmp_path / "history.csv").open("w") as file:
-        out = csv.writer(file)
-        out.writerow(["time", "fibre_angle_outer", "inner_radius"])
-        kept = [row for row in rows(tube()) if row["time"] in (10.0, 20.0, 30.0, 40.0)]
-        out.writerows([row["time"], row["fibre_angle_outer"], row["inner_radius"]] for row in kept)
-    (tmp_path / "data.toml").write_text(DATA)
-    return tmp_path
+    folder = tmp_path_factory.mktemp("made")
+    (folder / "scene.toml").write_text(tube().to_toml())
+    virgin = [[p * PER_MMHG, row["outer_radius"]] for p, row in zip(PRESSURES, inflated(), strict=True)]
+    kept = [row for row in rows(tube()) if row["time"] in (10.0, 20.0, 30.0, 40.0)]
+    names = ["time", "fibre_angle_outer", "inner_radius"]
+    tables = {"virgin": [["pressure", "outer_radius"], *virgin]}
+    tables["history"] = [names, *([row[name] for name in names] for row in kept)]
+    for name, table in tables.items():
+        (folder / f"{name}.csv").write_text("".join(",".join(map(str, row)) + "\n" for row in table))
+    (folder / "data.toml").write_text(DATA)
+    return folder
+
+
+@pytest.fixture
+def folder(made: Path, tmp_path: Path) -> Path:
+    """The same, for a test to change."""
+    return Path(shutil.copytree(made, tmp_path, dirs_exist_ok=True))
 
 
 def written(folder: Path, starts: dict[str, float], file: str, sd: str, state: str = "state = 'virgin'") -> Path:
