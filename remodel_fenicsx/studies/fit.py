@@ -10,7 +10,6 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
-from functools import partial
 from html import escape
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -538,7 +537,11 @@ def fit(
         stack.callback(line.end)
         for number in range(1, starts + 1):
             start = first + (random.uniform(-START_SPREAD, START_SPREAD, len(first)) if number > 1 else 0.0)
-            found.append(minimised(problem, start, partial(_show_misfit, show, f"start {number} of {starts}")))
+
+            def said(misfit: float, words: str = f"start {number} of {starts}, misfit") -> None:
+                show(f"{words} {misfit:.4g}")
+
+            found.append(minimised(problem, start, said))
             log.info("start %d: sum of squares %.6g, %d evaluations", number, 2 * found[-1].cost, found[-1].nfev)
         result = result_of(problem, found)
         if profiles:
@@ -547,10 +550,6 @@ def fit(
         write_whole(place / "scene.toml", result.scene.to_toml(f"fitted to {Path(data).name}").encode())
         result.write(place)
     return place, result
-
-
-def _show_misfit(show: Callable[[str], None], where: str, misfit: float) -> None:
-    show(f"{where}, misfit {misfit:.4g}")
 
 
 def _place(folder: Path | str | None, name: str, mark: str) -> tuple[Path, Journal]:

@@ -287,6 +287,10 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     assert len(before) == 4  # the three, and 'implicit'
     assert cli.main(["trade", str(path), "-o", str(out), "-q"]) == 0
     assert {file: file.stat().st_mtime_ns for file in out.glob("*/history.csv")} == before
+    with monkeypatch.context() as patch:
+        patch.setattr(rungs, "TOLERANCES", (0.5,))
+        assert cli.main(["trade", str(path), "-o", str(out), "--budget", "0.001s", "-q"]) == 0
+    assert "left out, over the budget: point-1-degree-1-tolerance-0.5" in capsys.readouterr().out
     assert cli.main(["trade", str(path), "-o", str(tmp_path / "none"), "--budget", "0.001s", "-q"]) == 4
     said = capsys.readouterr().err
     assert said.startswith("remodel-fenicsx: 0 of 4 settings reached the end within the budget of 0.001 s, at least 2")
