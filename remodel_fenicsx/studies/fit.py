@@ -10,7 +10,6 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
-from functools import partial
 from html import escape
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -130,28 +129,24 @@ def _apart_from_numbers(scene: Scene) -> Any:
 # ---------------------------------------------------------------- what a scene says where a table has measurements
 def model_of(scene: Scene, table: Measured, scales: Mapping[str, float], ways: Slopes | None = None) -> Modelled:
     """What a scene says where a table has measurements, by column."""
-    scene = _with_columns(scene, table)
+    scene, start, test = _with_columns(scene, table), None, None
     if table.state == "history":
-        measured, step = table.columns["time"], scene.time.step
-        end = max(float(step * np.ceil(measured.max() / step - 1e-9)), step)
-        scene = scene.with_values({"time.end": end})
-        found, _ = _run(scene, table, _directions(scene, ways), lambda time: bool(np.abs(measured - time).min() < step))
-        at = found.columns["time"]
-        return Modelled(
-            {name: np.interp(measured, at, found.columns[name]) for name in table.sd},
-            {name: np.array([np.interp(measured, at, row) for row in rows]) for name, rows in found.changes.items()},
-        )
-    start = None
-    if table.state == "after":
-        scene = with_choices(scene)
-        before = scene.with_values({"time.end": table.time})
-        _, start = _run(before, table, _directions(before, ways), lambda time: False)
-    passive = _passive(scene, table, scales)
-    found, _ = _run(passive, table, _directions(scene, ways, table), lambda time: True, start)
-    chosen = found.columns["time"] > 0
+        places, step = table.columns["time"], scene.time.step
+        end = max(float(step * np.ceil(places.max() / step - 1e-9)), step)
+        run = scene.with_values({"time.end": end})
+    else:
+        places, step, test = np.arange(table.rows, dtype=np.float64) + 1, 1.0, table
+        if table.state == "after":
+            scene = with_choices(scene)
+            before = scene.with_values({"time.end": table.time})
+            _, start = _run(before, table, _directions(before, ways), lambda time: False)
+        run = _passive(scene, table, scales)
+    directions = _directions(scene, ways, test)
+    found, _ = _run(run, table, directions, lambda time: bool(np.abs(places - time).min() < step), start)
+    at = found.columns["time"]
     return Modelled(
-        {name: found.columns[name][chosen] for name in table.sd},
-        {name: rows[:, chosen] for name, rows in found.changes.items()},
+        {name: np.interp(places, at, found.columns[name]) for name in table.sd},
+        {name: np.array([np.interp(places, at, row) for row in rows]) for name, rows in found.changes.items()},
     )
 
 
@@ -542,7 +537,11 @@ def fit(
         stack.callback(line.end)
         for number in range(1, starts + 1):
             start = first + (random.uniform(-START_SPREAD, START_SPREAD, len(first)) if number > 1 else 0.0)
-            found.append(minimised(problem, start, partial(_show_misfit, show, f"start {number} of {starts}")))
+
+            def said(misfit: float, words: str = f"start {number} of {starts}, misfit") -> None:
+                show(f"{words} {misfit:.4g}")
+
+            found.append(minimised(problem, start, said))
             log.info("start %d: sum of squares %.6g, %d evaluations", number, 2 * found[-1].cost, found[-1].nfev)
         result = result_of(problem, found)
         if profiles:
@@ -551,10 +550,6 @@ def fit(
         write_whole(place / "scene.toml", result.scene.to_toml(f"fitted to {Path(data).name}").encode())
         result.write(place)
     return place, result
-
-
-def _show_misfit(show: Callable[[str], None], where: str, misfit: float) -> None:
-    show(f"{where}, misfit {misfit:.4g}")
 
 
 def _place(folder: Path | str | None, name: str, mark: str) -> tuple[Path, Journal]:
