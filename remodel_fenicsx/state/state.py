@@ -505,13 +505,7 @@ class Parameters:
 
     def __init__(self, tissue: Tissue, quadrature: Quadrature):
         self.tissue, self.quadrature = tissue, quadrature
-        values: list[Any] = []
-
-        def found(name: str, value: Any) -> Any:
-            values.append(value)
-            return value
-
-        tissue.map(found)
+        values = list(tissue.parameters.values())
         self._largest: Remembered[Tissue] = Remembered(quadrature.mesh.comm, *values)
         self._at_points: Remembered[Tissue] = Remembered(None, *values)
 
