@@ -25,8 +25,7 @@ from ufl.corealg.traversal import traverse_unique_terminals, unique_post_travers
 from remodel_fenicsx.fem import jit
 
 
-# ---------------------------------------------------------------- one linear equation with a symmetric, positive
-# One linear equation with a symmetric, positive definite form.
+# ---------------------------------------------------------------- a linear equation with a positive definite form
 
 TOLERANCE = 1e-12  # relative, of the linear solve: what comes of it has ten digits on any number of ranks
 ITERATION_LIMIT = 20_000  # lines of a thousand elements need some thousands

@@ -470,7 +470,7 @@ class Earlier:
 
 
 # ---------------------------------------------------------------- the parameters of a tissue on a mesh as numbers
-# The parameters of a tissue on a mesh as numbers and arrays, made again only where one of them has changed.
+# Numbers and arrays are made again only where a parameter has changed.
 
 
 def on_mesh(tissue: Tissue, mesh: Any) -> Tissue:
