@@ -347,7 +347,7 @@ MOST_SOLVES = 20  # of all Newton iterations that one may have, for a step with 
 
 
 class Implicit:
-    """Newton's method on the unknowns with cells that follow at each point (`evolution.condensed`)."""
+    """Newton's method on the unknowns with cells that follow at each point (`model.implicit`)."""
 
     order, accumulates, longest = 1, True, math.inf
 

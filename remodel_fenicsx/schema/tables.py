@@ -68,6 +68,8 @@ class Table(BaseModel):
 
     Attributes
     ----------
+    widened
+        Where parts have brought keys: the class without these, and they.
     renamed
         Of the outermost table: dotted keys of earlier versions, each with the one that has taken its place.
     further
@@ -76,6 +78,7 @@ class Table(BaseModel):
 
     renamed: ClassVar[Mapping[str, str]] = {}
     further: ClassVar[type[BaseModel] | None] = None
+    widened: ClassVar[Any] = None
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
@@ -95,6 +98,11 @@ class Table(BaseModel):
         if cls.further is not None:
             table["additionalProperties"] = handler(cls.further.__pydantic_core_schema__)
         return found
+
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        if self.widened is None:
+            return super().__reduce_ex__(protocol)
+        return _unpickled, (self.widened, self.__getstate__())
 
     if not TYPE_CHECKING:  # the type checker reads the arguments from the fields
 
@@ -206,7 +214,17 @@ def _widened(table: type[Table], own: tuple[tuple[str, Any], ...]) -> type[Table
         name: (float, Field(default=number.default, gt=number.above, description=number.meaning))
         for name, number in own
     }
-    return create_model(table.__name__, __base__=table, __doc__=table.__doc__, **fields)
+    wide = create_model(table.__name__, __base__=table, __doc__=table.__doc__, **fields)
+    wide.widened = table, own
+    return wide
+
+
+def _unpickled(widened: tuple[type[Table], tuple[tuple[str, Any], ...]], state: Any) -> Table:
+    """A table whose class is made, and so has no place from which it could be imported."""
+    kind = _widened(*widened)
+    made = kind.__new__(kind)
+    made.__setstate__(state)
+    return made
 
 
 def fault(rule: str, key: str = "", value: Any = _MISSING) -> PydanticCustomError:
