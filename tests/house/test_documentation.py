@@ -137,20 +137,6 @@ def script(program: list[str], folder: Path) -> str:
     return done.stdout
 
 
-def test_the_benchmark_says_where_the_time_goes(tmp_path: Path) -> None:
-    mesh = COARSE.replace("(8, 4, 1)", "(24, 6, 4)")  # large enough for times of two digits
-    program = f"{mesh}import runpy; runpy.run_path({str(ROOT / 'benchmarks' / 'artery.py')!r}, run_name='__main__')"
-    done = forked("python", program, "--steps", "2", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr[-2000:]
-    printed = done.stdout
-    (total,) = re.findall(r"^artery: 2 steps, \d+ Newton iterations, ([\d.]+) s$", printed, re.MULTILINE)
-    parts = dict(re.findall(r"^(\w[\w ]*?) +([\d.]+) s +[\d.]+ %$", printed, re.MULTILINE))
-    assert set(parts) == {"tangent", "residual", "linear solve", "guards and the rest of SNES", "remodeling",
-                          "columns", "record", "the rest"}  # fmt: skip
-    assert sum(map(float, parts.values())) == pytest.approx(float(total), abs=0.1)
-    assert all(float(parts[name]) > 0 for name in ("tangent", "linear solve", "remodeling", "record"))
-
-
 STUDIES = """
 from docs.making import studies
 (row,) = studies.stiff_tendon("tendon", **{"time.end": 1.0, "material.energy_factor": 1})
