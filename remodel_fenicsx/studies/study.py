@@ -39,7 +39,7 @@ from remodel_fenicsx.running import with_files_kept
 from remodel_fenicsx.scene import Scene
 from remodel_fenicsx.scene.scene import SceneError
 from remodel_fenicsx.schema.times import same_time
-from remodel_fenicsx.simulation import build, checked_domain, with_choices
+from remodel_fenicsx.simulation import checked_domain, mesh_of, with_choices
 from remodel_fenicsx.studies.measurements import Measured, Unknown
 from remodel_fenicsx.system.children import Worker, wait_for_one
 from remodel_fenicsx.system.files import (
@@ -385,7 +385,7 @@ def _in_words(scene: Scene, found: Scene) -> str:
 def write_axes(scene: Scene, path: Path, comm: MPI.Intracomm = MPI.COMM_WORLD) -> str:
     """Write local axes, depth, station, thickness, and where the axes are undefined, by element. Collective."""
     scene = with_choices(scene)
-    domain, shape = checked_domain(build(scene, comm), scene), scene.geometry
+    domain, shape = checked_domain(mesh_of(scene, comm), scene), scene.geometry
     mesh = domain.mesh
     weight = KINEMATICS[scene.model.kinematics].on(mesh, shape).weight(mesh)
     quadrature = Quadrature(mesh, scene.mesh.degree, weight)
