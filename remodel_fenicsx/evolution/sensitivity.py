@@ -18,8 +18,7 @@ from scipy.sparse import csr_matrix
 from ufl.algorithms.analysis import extract_constants
 
 from remodel_fenicsx.body.loading import LoadValues
-from remodel_fenicsx.evolution.coupling import Maker, Staggered
-from remodel_fenicsx.evolution.extrapolated import Extrapolated
+from remodel_fenicsx.evolution.coupling import Extrapolated, Maker, Staggered
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.model import tensor_law

@@ -615,7 +615,7 @@ COUPLINGS = {
     "relaxed": CouplingKind(
         "as 'staggered', but only the share relaxation_factor of each change is made; one half is stable for every "
         "driver and frame except under weak loads, while 'staggered' over-corrects with 'pk2' and 'finger'",
-        "remodel_fenicsx.evolution.coupling:Relaxed",
+        "remodel_fenicsx.evolution.coupling:Staggered",
         makes_a_share=True,
         takes_cases=True,
         takes_turnover=True,
@@ -623,7 +623,7 @@ COUPLINGS = {
     "extrapolated": CouplingKind(
         "first remodel towards the stress of the middle of the step, extrapolated from the two steps before, then "
         "solve; of second order, for the law 'tensor'",
-        "remodel_fenicsx.evolution.extrapolated:Extrapolated",
+        "remodel_fenicsx.evolution.coupling:Extrapolated",
         needs_a_target=True,
         takes_cases=True,
         takes_turnover=True,

@@ -231,6 +231,8 @@ class State:
         self._deformation_gradient = jit.expression(F, cells.quadrature.points)
         self.equilibrium_cells = CellField(cells.quadrature, "equilibrium_cell")
         self.others: Sequence[State] = ()
+        # asked on each rank in every solve: the signal (SIGINT, SIGTERM) that should end it, or 0
+        self.stop_signal: Callable[[], int] = lambda: 0
         self.settle_cells()
         solved = self.equilibrium_cells
         self._functions: dict[str, Any] = {}

@@ -47,13 +47,13 @@ def stability(
         simulation = Simulation(scene, comm)
     scene = simulation.scene  # with the kinematics that was chosen
     place = chosen_folder(folder, f"{scene.name}-stability", comm)
-    steps, share = scene.time.number_of_steps, simulation.stepper.coupling.share
+    steps, share = scene.time.number_of_steps, simulation.stepper.remodeling.share
     chosen = {round(steps * (index + 1) / number) for index in range(number)}
     watcher = AmplificationWatcher(simulation.stepper, lambda step: step.number in chosen)
 
     with ExitStack() as stack:
         stop = stack.enter_context(StopRequest())
-        simulation.stepper.stop_signal = lambda: stop.number or (PAUSE if stop.pause else 0)
+        simulation.state.stop_signal = lambda: stop.number or (PAUSE if stop.pause else 0)
         stack.enter_context(locked(place, comm, new=True))
         record = stack.enter_context(RunFolder(place, scene.to_toml("as analysed: all values"), comm.rank))
         stack.enter_context(open_log(place / "run.log", comm.rank, quiet=quiet, held=held))
