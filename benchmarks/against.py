@@ -35,15 +35,20 @@ def checkout(commit: str, into: Path) -> Path:
     return into
 
 
+def processor_seconds(command: list[str], core: int, *paths: Path, folder: Path | None = None) -> float:
+    """Of a command on one core with these paths of Python, which must succeed."""
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, paths)), "OMP_NUM_THREADS": "1"}
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    subprocess.run(["taskset", "--cpu-list", str(core), *command], check=True, env=environment, cwd=folder)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
 def run(state: Path, scene: str, settings: list[str], folder: Path, core: int) -> float:
     """Processor seconds of a recorded run."""
     command = [sys.executable, "-m", "remodel_fenicsx.cli", "run", str(state / scene), "-o", str(folder), "-q"]
-    command += [word for setting in settings for word in ("--set", setting)]
-    environment = os.environ | {"PYTHONPATH": str(state), "OMP_NUM_THREADS": "1"}
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    subprocess.run(["taskset", "--cpu-list", str(core), *command], check=True, env=environment, cwd=state)
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    changes = [word for setting in settings for word in ("--set", setting)]
+    return processor_seconds([*command, *changes], core, state, folder=state)
 
 
 def history(folder: Path) -> dict[float, dict[str, float]]:
@@ -83,22 +88,18 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as temporary:
         states = {"there": checkout(options.commit, Path(temporary) / "state"), "here": PROJECT}
         settings = {"there": options.set + options.set_there, "here": options.set + options.set_here}
-        seconds: dict[str, list[float]] = {"there": [], "here": []}
-        starts: dict[str, list[float]] = {"there": [], "here": []}
-        rows = {}
-        one_step = [word.split("=")[1] for word in options.set if word.startswith("time.step=")] or ["1.0"]
+        seconds, starts, rows = dict[str, list[float]](), dict[str, list[float]](), {}
+        step = ["1.0", *(word.split("=")[1] for word in options.set if word.startswith("time.step="))][-1]
         for pair in range(options.pairs + 1):  # the first fills the caches
             for name, state in states.items():
                 folder = Path(temporary) / f"{name}-{pair}"
-                common = (state, options.scene, [*settings[name], f"time.end={one_step[-1]}"], folder, options.core)
-                start = run(*common)
-                if pair == 0:
-                    continue
-                whole = folder.with_name(folder.name + "-whole")
-                total = run(state, options.scene, [*settings[name], f"time.end={options.steps}"], whole, options.core)
-                starts[name].append(start)
-                seconds[name].append(total - start)
-                rows[name] = history(whole)
+                start = run(state, options.scene, [*settings[name], f"time.end={step}"], folder / "one", options.core)
+                if pair:
+                    asked = [*settings[name], f"time.end={options.steps}"]
+                    total = run(state, options.scene, asked, folder / "all", options.core)
+                    starts.setdefault(name, []).append(start)
+                    seconds.setdefault(name, []).append(total - start)
+                    rows[name] = history(folder / "all")
     ratios = [here / there for here, there in zip(seconds["here"], seconds["there"], strict=True)]
     print(f"{options.scene} to t = {options.steps:g}, against {options.commit}: processor seconds without the start")
     for name in ("there", "here"):

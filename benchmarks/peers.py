@@ -16,9 +16,6 @@ mesh, forms from the cache. Radii have to agree to 1e-3. `--set` changes ours.
 from __future__ import annotations
 
 import argparse
-import os
-import resource
-import subprocess
 import sys
 import tempfile
 from pathlib import Path
@@ -27,28 +24,17 @@ import numpy as np
 from mpi4py import MPI
 from scipy.spatial import cKDTree
 
+from benchmarks.against import PROJECT, processor_seconds, run
 from remodel_fenicsx import Recording, Scene, Simulation
 
-PROJECT = Path(__file__).resolve().parents[1]
 TO_VTK = [0, 1, 3, 2, 4, 5, 7, 6]  # nodes of a hexahedron
 OWN = ("solver.method=auto", "solver.predictor=autoregressive")
 
 
-def processor_seconds(command: list[str], core: int, paths: list[Path]) -> float:
-    """Of a command on one core, which must succeed."""
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, paths)), "OMP_NUM_THREADS": "1"}
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    subprocess.run(["taskset", "--cpu-list", str(core), *command], check=True, env=environment)
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-
-
 def own(steps: int, folder: Path, options: argparse.Namespace) -> float:
     """Processor seconds of a run of ours."""
-    command = [sys.executable, "-m", "remodel_fenicsx.cli", "run", str(PROJECT / "demos" / "artery.toml"), "-q"]
     changes = [*OWN, f"solver.relative_tolerance={options.tolerance}", *options.set, f"time.end={steps}"]
-    command += ["-o", str(folder), *(word for change in changes for word in ("--set", change))]
-    return processor_seconds(command, options.core, [PROJECT])
+    return run(PROJECT, "demos/artery.toml", changes, folder, options.core)
 
 
 def other(steps: int, problem: Path, result: Path, options: argparse.Namespace) -> float:
@@ -56,7 +42,7 @@ def other(steps: int, problem: Path, result: Path, options: argparse.Namespace) 
     script = PROJECT / "benchmarks" / "peer_felupe.py"
     command = [sys.executable, str(script), str(problem), str(steps), str(options.tolerance)]
     command += [str(result), options.parts]
-    return processor_seconds(command, options.core, [options.packages.resolve()])
+    return processor_seconds(command, options.core, options.packages.resolve())
 
 
 def write_problem(scene: Scene, path: Path) -> None:

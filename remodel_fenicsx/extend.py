@@ -1,6 +1,6 @@
 """Registries, and what is put into them: a scene then knows the name. CONTRIBUTING.md says which to use for what.
 
-Importing this needs no dolfinx; asking for couplings, measurements, linear solvers or `form` does.
+Importing this needs no dolfinx; asking for couplings, measurements, linear solvers, `WarnsOnce` or `form` does.
 
 Attributes
 ----------
@@ -33,6 +33,8 @@ SHAPES
     Bodies by name (`geometry.shape`): subclasses of `Shape`.
 SOLVER_METHODS
     How the nonlinear problem is solved, by name (`solver.method`): `SolverMethod`.
+WATCHERS
+    Who looks on and warns in every run, by name: `WatcherKind`, most often of a `WarnsOnce`.
 neo_hookean
     The paper's matrix, W = lambda/2 ln^2 J + mu/2 (tr C - 3) - mu ln J (eq. 4a): a `Matrix`.
 AREA, FORCE, LENGTH, NUMBER_DENSITY, STRESS, TEMPERATURE
@@ -90,12 +92,14 @@ from remodel_fenicsx.schema.units import (
     TEMPERATURE,
     Dimension,
 )
+from remodel_fenicsx.watch import WATCHERS, WatcherKind
 
 if TYPE_CHECKING:
-    from remodel_fenicsx.evolution.coupling import Coupling, Staggered
+    from remodel_fenicsx.evolution.coupling import Coupling, Staggered, Traits
     from remodel_fenicsx.fem.jit import form
     from remodel_fenicsx.results.columns import Measurement
     from remodel_fenicsx.solver.linear import EveryTangent
+    from remodel_fenicsx.watch.warnings import WarnsOnce
 
 __all__ = [
     "AREA",
@@ -146,7 +150,11 @@ __all__ = [
     "Staggered",
     "Stresses",
     "TEMPERATURE",
+    "Traits",
     "UnitCell",
+    "WATCHERS",
+    "WarnsOnce",
+    "WatcherKind",
     "angle_to_axis",
     "axes_sum",
     "form",
@@ -163,9 +171,10 @@ __all__ = [
 __getattr__ = on_demand(
     __name__,
     {
-        **dict.fromkeys(("Coupling", "Staggered"), "evolution.coupling"),
+        **dict.fromkeys(("Coupling", "Staggered", "Traits"), "evolution.coupling"),
         "EveryTangent": "solver.linear",
         "Measurement": "results.columns",
+        "WarnsOnce": "watch.warnings",
         "form": "fem.jit",
     },
 )

@@ -60,6 +60,7 @@ def run(
     quiet: bool = True,
     deadline: float | None = None,
     report: bool = True,
+    watchers: Sequence[Watcher] = (),
 ) -> Path:
     """Run a scene and record it.
 
@@ -77,6 +78,8 @@ def run(
         `time.monotonic` before which it shall stop, between two steps; None: never.
     report
         Whether it leaves report.html at its end, if the scene does not say otherwise (`output.report`).
+    watchers
+        Who else follows the steps, before they are recorded; those of every run are in `extend.WATCHERS`.
 
     Returns
     -------
@@ -118,7 +121,7 @@ def run(
             simulation = _built(_with_sums(scene, comm), comm)
             place = place or chosen_folder(None, scene.name, comm)
         with _closing(simulation), locked(place, comm, new=True):
-            _record(simulation, place, stop, held, quiet, deadline, report)
+            _record(simulation, place, stop, held, quiet, deadline, report, watchers=watchers)
     return place
 
 
@@ -235,6 +238,7 @@ def _record(
     deadline: float | None,
     report: bool,
     resumes: bool = False,
+    watchers: Sequence[Watcher] = (),
 ) -> None:
     """March through time in the folder; `held` is what was logged before the run had one."""
     scene, comm, state = simulation.scene, simulation.domain.mesh.comm, simulation.state
@@ -267,20 +271,20 @@ def _record(
             log.info("%d unknowns: one rank is faster than %d (docs/speed.md, Ranks)", unknowns, comm.size)
         for warning in simulation.scene.warnings():  # the one whose files have places
             log.warning("%s", warning)
-        watchers: list[Watcher] = []
+        followers = list(watchers)
         if scene.output.fields:
             names = field_names(scene.output.fields, scene.lacking_fields, scene.geometry.constant_fields)
             parts = place, scene.geometry, simulation.stepper, scene.output.every, after and after.time, names
             times = scene.output.times
-            watchers.append(stack.enter_context(agreed(comm, lambda: Fields(*parts, times))))
+            followers.append(stack.enter_context(agreed(comm, lambda: Fields(*parts, times))))
         checkpoints = Checkpoints(place, state, text, scene.output.checkpoint, record.flush)
         pause = Pause(comm, place, lambda: stop.pause, deadline)
-        watchers += [record, _Report(scene, progress), checkpoints, pause]
+        followers += [record, _Report(scene, progress), checkpoints, pause]
         leave_report = partial(_leave_report, place) if wants_report else lambda: None
-        simulation.stepper.stop_signal = lambda: stop.number
+        simulation.state.stop_signal = lambda: stop.number
         try:
             with _options_blamed(scene):
-                for _ in simulation.steps(watchers):
+                for _ in simulation.steps(followers):
                     pass
         except (StepFailure, Interrupted, Paused) as reason:
             if isinstance(reason, StepFailure):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,8 +15,7 @@ from mpi4py import MPI
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.loading import Loading, LoadValues
 from remodel_fenicsx.body.reductions import AUTO, choice, explained, only_for_means
-from remodel_fenicsx.evolution.coupling import Coupling, Maker
-from remodel_fenicsx.evolution.remodeling import RemodelingPass
+from remodel_fenicsx.evolution.coupling import Maker
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher, times
 from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.fem.kinematics import KINEMATICS, FreeLength, NaturalConfiguration
@@ -27,23 +27,13 @@ from remodel_fenicsx.results.columns import Observer
 from remodel_fenicsx.results.run_folder import agreed
 from remodel_fenicsx.scene import Scene, SceneError
 from remodel_fenicsx.scene.scene import in_region
-from remodel_fenicsx.schema.settings import Cells, Properties, Solver
+from remodel_fenicsx.schema.settings import Cells, Properties
 from remodel_fenicsx.state.state import State, by_region
 from remodel_fenicsx.state.state import UnitCells
 from remodel_fenicsx.system.files import typed
 from remodel_fenicsx.system.interrupts import take_back_signals
+from remodel_fenicsx.watch import WATCHERS
 from remodel_fenicsx.watch.stability import EquilibriumStability
-from remodel_fenicsx.watch.warnings import (
-    FrontsInLayers,
-    GrowthWithoutRest,
-    LockingWarning,
-    PressureNoise,
-    REMEDY,
-    RadialChains,
-    VolumeLoss,
-    WeakTension,
-)
-from remodel_fenicsx.watch.over_correction import OverCorrection, RestedCells
 
 log = logging.getLogger(__name__)
 
@@ -72,9 +62,9 @@ class Simulation:
         The parts, each usable by itself (see demos/).
     control
         Chooses the steps, where the scene has a tolerance.
-    stability, warnings
-        Watchers of the stability of equilibria, and of over-correction, locking, volume, and chains that point out of
-        the wall; what they remember is part of the state.
+    watchers
+        Who follows its steps, in their order: the stability of equilibria, the observer, and those of
+        `extend.WATCHERS`; what they remember is part of the state.
 
     Raises
     ------
@@ -109,153 +99,16 @@ class Simulation:
                 f"not a Scene: {scene!r}; read_scene(PATH) makes one of a file, preset_scene one of a preset"
             )
         take_back_signals()
-        if scene.geometry.is_loaded:
-            raise SceneError(
-                f"geometry.is = 'loaded': the unloaded body is needed; {typed()} unload SCENE writes its scene"
-            )
-        if domain is None and comm.rank == 0:
-            for line in explained(scene) if scene.model.kinematics == AUTO else only_for_means(scene):
-                log.info("%s", line)
-        if scene.mesh.formulation == AUTO and comm.rank == 0:
-            log.info("%s", scene.formulation_in_words())
-        self.scene = scene = with_choices(scene, domain)
-        self._loads = [case.loads for case in scene.each_case()]
-        shape = scene.geometry
-        self.domain = domain = checked_domain(build(scene, comm) if domain is None else domain, scene)
-        mesh = domain.mesh
-        # a state for each load case; made in the order of those of the first, so that all have the same kernels
-        made = [on_mesh_alone(scene, domain) for _ in self._loads]
-        unknowns = [one.unknown(mesh, scene.mesh.degree) for one in made]
-        kinematics, self.unknown = made[0], unknowns[0]
-        self.quadrature = Quadrature(mesh, scene.mesh.degree, kinematics.weight(mesh))
-        properties, local_axes = scene.properties(), shape.local_axes(domain, self.quadrature)
-        own = {name: properties[name].cells for name in scene.regions}
-        if not scene.natural.is_of_the_mesh:
-            natural = from_natural(kinematics, scene, self.quadrature, domain, local_axes)
-            made = [NaturalConfiguration(one, natural.gradient, natural.closing) for one in made]
-        fibres = measured_fibres(scene, domain)
-        self.cells = UnitCells(self.quadrature, domain, scene.cells, local_axes, own, fibres)
-        self.state, *others = (
-            unloaded_state(scene, u, k, self.cells, domain) for u, k in zip(unknowns, made, strict=True)
-        )
-        self.loading = self.state.loading
-        tissue, kappa = parameters_of(properties, domain)
-        if scene.remodeling.turnover.is_on:
-            from remodel_fenicsx.evolution.turnover import turned_over
-
-            tissue = turned_over(tissue, self.state)
-        self._cases: list[Any] = []  # further ones (`OtherCase`)
-        at_once = scene.time.is_equilibrium
-        predictor: str = scene.solver.predictor
-        if (at_once or scene.time.tolerance is not None) and predictor != "none":
-            predictor = "responsive"  # steps have all lengths
-        solver = scene.solver.model_copy(update={"predictor": predictor})
-        parts = self.state, tissue, scene.remodeling, solver, self.load_values
-        if others and coupling is not None:
-            raise SceneError("cases: a coupling of your own solves one load case; leave out [[cases]]")
-        make = self._at_once(tissue, solver, kappa, others) if at_once else coupling
-        self.stepper = Stepper(*parts, make, kappa)
-        self.tissue = self.stepper.tissue
-        if others:
-            self._join_cases(self.stepper, others, solver, kappa)
-        counted = "negative_eigenvalues" in scene.output.columns
-        self.stability = EquilibriumStability(self.stepper, scene.solver.unstable, every_step=counted)
-        self._closing = [self.stability]
-        more: list[str] = []
-        self.control: Any = None  # `StepControl`
-        if scene.time.tolerance is not None and not at_once:
-            from remodel_fenicsx.evolution.time_steps import StepControl
-
-            settings = scene.time.tolerance, scene.time.step, scene.stops()
-            self.control = StepControl(self.stepper, *settings)
-            more += [TIME_ERROR] if TIME_ERROR not in scene.output.columns else []
-        elif TIME_ERROR in scene.output.columns:
-            from remodel_fenicsx.evolution.time_steps import TimeError
-
-            self.stepper.judge = TimeError(self.stepper).measure
-        self.observer = Observer(shape, self.stepper, scene.columns(more))
-        self.warnings = self._of_the_state(self.stepper)
-        remodeling, locks = self.stepper.remodeling, FORMULATIONS[scene.mesh.formulation].locks
-        if locks and remodeling.law.remodels and remodeling.driver.is_stress and not kinematics.homogeneous:
-            self.warnings.append(PressureNoise(self.stepper, remedy(scene)))
-        self.warnings += [
-            WeakTension(self.stepper),
-            RadialChains(self.stepper, shape.radial_share),
-            FrontsInLayers(self.stepper, shape),
-        ]
-        if self.stepper.turnover is not None:
-            self.warnings.append(GrowthWithoutRest(self.stepper, scene.end_of_ramps))
-        if self._cases:
-            from remodel_fenicsx.evolution.load_cases import OtherCaseWatcher
-
-            looked_at = [(case, EquilibriumStability(case, scene.solver.unstable)) for case in self._cases]
-            self._closing += [stability for _, stability in looked_at]
-            self.warnings += [
-                OtherCaseWatcher(case, one) for case, own in looked_at for one in (own, *self._of_the_state(case))
-            ]
-        if self.stepper.remodeling.law.remodels and not at_once:
-            over_correction = OverCorrection(self.stepper)
-            self.warnings.insert(0, over_correction)
-            if self.stepper.remodeling.law.of_absolute_time:
-                self.warnings.append(RestedCells(self.stepper, over_correction))
-
-    def _of_the_state(self, stepper: Any) -> list[Watcher]:
-        """What is said of solved states, whatever the cells do: of a stepper's, or another load case's."""
-        scene = self.scene
-        found: list[Watcher] = [
-            LockingWarning(stepper, FORMULATIONS[scene.mesh.formulation].locks, remedy(scene)),
-            VolumeLoss(stepper),
-        ]
-        strut = scene.geometry.strut(scene.supports.ends) if stepper.state.kinematics.reduced else None
-        if strut is not None:  # a whole body buckles by itself
-            from remodel_fenicsx.watch.buckling import BucklingWarning
-
-            found.insert(1, BucklingWarning(stepper, strut))
-        return found
-
-    def _at_once(self, tissue: Tissue, solver: Solver, kappa: Any, others: Sequence[State]) -> Maker:
-        """The coupling that goes to the equilibrium, with the steps of a stepper of its own on the same state."""
-        from remodel_fenicsx.evolution import homeostasis
-        from remodel_fenicsx.evolution.time_steps import StepControl
-
-        scene, stops = self.scene, self.scene.stops()
-        settings, tolerance = scene.remodeling, scene.time.tolerance
-        if tolerance is None:
-            falls = any(load.falls for load in scene.loads.values())
-            tolerance = homeostasis.UNLOADING if falls else homeostasis.TOLERANCE
-        if scene.has_random_cells and LAWS[settings.law].dimensions is not None:
-            # cells that jump from rank to rank: no step is short enough, and passes swing
-            settings, tolerance = settings.model_copy(update={"coupling": "relaxed"}), homeostasis.COARSE
-        way = Stepper(self.state, tissue, settings, solver, self.load_values, kappa=kappa)
-        if others:
-            self._join_cases(way, others, solver, kappa)
-        way.coupling.longest = min(way.coupling.longest, homeostasis.LONGEST)
-        control = StepControl(way, tolerance, scene.time.step, stops)
-        until = scene.solver.model_copy(update={"maximum_iterations": homeostasis.LIMIT_ITERATIONS})
-
-        def make(state: State, tissue: Tissue, remodeling: RemodelingPass, solver: Solver) -> Coupling:
-            has_limit = scene.missing_for_implicit() is None
-            limit = homeostasis.Limit(state, tissue, remodeling, until) if has_limit else None
-            return homeostasis.Homeostasis(control, remodeling, max(stops[:-1], default=0.0), limit)
-
-        return make
+        parts = build(scene, comm, domain, coupling)
+        self.scene, self.domain, self.stepper, self.observer = parts.scene, parts.domain, parts.stepper, parts.observer
+        self.state, self.control, self.rest = parts.stepper.state, parts.control, parts.rest
+        self.unknown, self.cells, self.loading = self.state.unknown, self.state.cells, self.state.loading
+        self.quadrature, self.tissue = self.cells.quadrature, self.stepper.tissue
+        self.watchers = watchers(self.scene, parts)
 
     def load_values(self, time: float, case: int = 0) -> LoadValues:
         """Magnitude of every load at a time, in a load case; the first is 0."""
-        loads = self._loads[case].items()
-        return {name: load.value * load.factor(time) for name, load in loads}
-
-    def _join_cases(self, stepper: Stepper, states: Sequence[State], solver: Solver, kappa: Any) -> None:
-        """Further load cases, on the same cells: the stepper follows them too, and the first that comes solves them."""
-        from remodel_fenicsx.evolution.load_cases import OtherCase, follow, join
-
-        weights = [case.weight for case in self.scene.cases]
-        if self._cases:
-            return follow(stepper, self._cases, weights)
-        values = [partial(self.load_values, case=index) for index in range(1, len(self._loads))]
-        parts = zip(states, values, strict=True)
-        self._cases = [OtherCase(n, *part, stepper, solver, kappa) for n, part in enumerate(parts, start=2)]
-        join(stepper, self._cases, weights)
+        return values_of_loads(list(self.scene.each_case())[case].loads, time)
 
     def steps(self, watchers: Sequence[Watcher] = ()) -> Iterator[Step]:
         """Solve and remodel step by step, from where the state is; what is yielded has been accepted.
@@ -273,7 +126,9 @@ class Simulation:
         StepFailure
             If a step has no admissible equilibrium.
         """
-        watchers = [self.stability, self.observer, *self.warnings, *watchers]
+        watchers = [*self.watchers, *watchers]
+        if self.rest is not None:
+            return self.rest.march(self.scene.last_time, watchers)
         if self.control is not None:
             return self.control.march(watchers)
         return self.stepper.march(self.remaining(), watchers)
@@ -287,16 +142,135 @@ class Simulation:
 
     def close(self) -> None:
         """Free PETSc's objects and options."""
-        for stability in self._closing:
-            stability.close()
-        self.stepper.close()
+        for part in (*self.watchers, self.rest, self.stepper):
+            if part is not None:
+                part.close()
 
 
-def remedy(scene: Scene) -> str:
-    """What a scene may set whose elements lock, in words."""
-    if needs := scene.needs_all_points():
-        return f"set mesh.degree = 2 or a larger mesh.refinement, for {needs} needs mesh.formulation = 'displacement'"
-    return REMEDY
+@dataclass(frozen=True)
+class Parts:
+    """What a scene needs: its choices made, the mesh, and who goes through time; the state is the stepper's."""
+
+    scene: Scene
+    domain: Domain
+    stepper: Stepper
+    observer: Observer
+    control: Any  # `StepControl`, where there is a tolerance
+    rest: Any  # `Homeostasis`, where the way ends at rest
+
+
+def build(scene: Scene, comm: MPI.Intracomm, domain: Domain | None = None, coupling: Maker | None = None) -> Parts:
+    """The parts of a scene in their order. Collective."""
+    scene, domain = _meshed(scene, comm, domain)
+    state, *others = _states(scene, domain)
+    if others and coupling is not None:
+        raise SceneError("cases: a coupling of your own solves one load case; leave out [[cases]]")
+    tissue, kappa = parameters_of(scene.properties(), domain)
+    if scene.remodeling.turnover.is_on:
+        from remodel_fenicsx.evolution.turnover import turned_over
+
+        tissue = turned_over(tissue, state)
+    at_once, solver, settings = scene.time.is_equilibrium, scene.solver, scene.remodeling
+    if (at_once or scene.time.tolerance is not None) and solver.predictor != "none":
+        solver = solver.model_copy(update={"predictor": "responsive"})  # steps have all lengths
+    if at_once and _jump_by_rank(scene):  # no step is short enough, and passes swing
+        settings = settings.model_copy(update={"coupling": "relaxed"})
+    first, *more = (partial(values_of_loads, case.loads) for case in scene.each_case())
+    stepper = Stepper(state, tissue, settings, solver, first, coupling, kappa)
+    if others:
+        from remodel_fenicsx.evolution.load_cases import OtherCase
+
+        given = enumerate(zip(others, more, strict=True), start=2)
+        cases = [OtherCase(number, *part, stepper, solver, kappa) for number, part in given]
+        stepper.remodeling.join(cases, [case.weight for case in scene.cases])
+    control, rest = None, None
+    if at_once:
+        rest = _way_to_rest(scene, stepper)
+    elif scene.time.tolerance is not None:
+        from remodel_fenicsx.evolution.time_steps import StepControl
+
+        control = StepControl(stepper, scene.time.tolerance, scene.time.step, scene.stops())
+    elif TIME_ERROR in scene.output.columns:
+        from remodel_fenicsx.evolution.time_steps import TimeError
+
+        stepper.judge = TimeError(stepper).measure
+    estimated = [TIME_ERROR] if control is not None and TIME_ERROR not in scene.output.columns else []
+    observer = Observer(scene.geometry, stepper, scene.columns(estimated))
+    return Parts(scene, domain, stepper, observer, control, rest)
+
+
+def watchers(scene: Scene, parts: Parts) -> list[Watcher]:
+    """Who follows the steps, in their order: a row has the eigenvalues, and warnings come after it."""
+    stepper, unstable = parts.stepper, scene.solver.unstable
+    counted = "negative_eigenvalues" in scene.output.columns
+    found = [EquilibriumStability(stepper, unstable, every_step=counted), parts.observer]
+    found += [kind.make(scene, stepper) for kind in WATCHERS.values()]
+    for case in stepper.remodeling.cases:
+        own = [EquilibriumStability(case, unstable)]
+        own += [kind.make(scene, case) for kind in WATCHERS.values() if kind.each_case]
+        found += [case.watched_by(watcher) for watcher in own if watcher is not None]
+    return [watcher for watcher in found if watcher is not None]
+
+
+def values_of_loads(loads: Mapping[str, Any], time: float) -> LoadValues:
+    """Magnitude of every load at a time."""
+    return {name: load.value * load.factor(time) for name, load in loads.items()}
+
+
+# ---------------------------------------------------------------- parts, in their order
+
+
+def _meshed(scene: Scene, comm: MPI.Intracomm, domain: Domain | None) -> tuple[Scene, Domain]:
+    """The scene with its choices made, which are said, and the mesh."""
+    if scene.geometry.is_loaded:
+        raise SceneError(
+            f"geometry.is = 'loaded': the unloaded body is needed; {typed()} unload SCENE writes its scene"
+        )
+    if domain is None and comm.rank == 0:
+        for line in explained(scene) if scene.model.kinematics == AUTO else only_for_means(scene):
+            log.info("%s", line)
+    if scene.mesh.formulation == AUTO and comm.rank == 0:
+        log.info("%s", scene.formulation_in_words())
+    scene = with_choices(scene, domain)
+    return scene, checked_domain(mesh_of(scene, comm) if domain is None else domain, scene)
+
+
+def _states(scene: Scene, domain: Domain) -> list[State]:
+    """One for each load case; made in the order of those of the first, so that all have the same kernels."""
+    made = [on_mesh_alone(scene, domain) for _ in scene.each_case()]
+    unknowns = [one.unknown(domain.mesh, scene.mesh.degree) for one in made]
+    quadrature = Quadrature(domain.mesh, scene.mesh.degree, made[0].weight(domain.mesh))
+    properties, local_axes = scene.properties(), scene.geometry.local_axes(domain, quadrature)
+    own = {name: properties[name].cells for name in scene.regions}
+    if not scene.natural.is_of_the_mesh:
+        natural = from_natural(made[0], scene, quadrature, domain, local_axes)
+        made = [NaturalConfiguration(one, natural.gradient, natural.closing) for one in made]
+    cells = UnitCells(quadrature, domain, scene.cells, local_axes, own, measured_fibres(scene, domain))
+    return [unloaded_state(scene, u, k, cells, domain) for u, k in zip(unknowns, made, strict=True)]
+
+
+def _jump_by_rank(scene: Scene) -> bool:
+    """Whether cells are random, and jump from rank to rank."""
+    return scene.has_random_cells and LAWS[scene.remodeling.law].dimensions is not None
+
+
+def _way_to_rest(scene: Scene, stepper: Stepper) -> Any:
+    """What goes with the stepper until the cells rest."""
+    from remodel_fenicsx.evolution import homeostasis
+    from remodel_fenicsx.evolution.time_steps import StepControl
+
+    stops, tolerance = scene.stops(), scene.time.tolerance
+    if tolerance is None:
+        falls = any(load.falls for load in scene.loads.values())
+        tolerance = homeostasis.UNLOADING if falls else homeostasis.TOLERANCE
+    if _jump_by_rank(scene):
+        tolerance = homeostasis.COARSE
+    control = StepControl(stepper, tolerance, scene.time.step, stops, homeostasis.LONGEST)
+    limit = None
+    if scene.missing_for_implicit() is None:
+        until = scene.solver.model_copy(update={"maximum_iterations": homeostasis.LIMIT_ITERATIONS})
+        limit = homeostasis.Limit(stepper.state, stepper.tissue, stepper.remodeling, until)
+    return homeostasis.Homeostasis(control, max(stops[:-1], default=0.0), limit)
 
 
 def on_mesh_alone(scene: Scene, domain: Domain) -> Any:
@@ -401,7 +375,7 @@ def check_files(scene: Scene) -> str:
     if large or number > ELEMENTS_OF_A_LOOK:
         return f"{', '.join([*large, f'how files fit the body of {number} elements'])}; the run does"
     scene = with_choices(scene)
-    domain = checked_domain(build(scene, MPI.COMM_SELF), scene)
+    domain = checked_domain(mesh_of(scene, MPI.COMM_SELF), scene)
     scene.geometry.check_faces(domain, scene.supports.faces, scene.loads)
     measured_fibres(scene, domain)
     return ""
@@ -425,7 +399,7 @@ def with_choices(scene: Scene, domain: Domain | None = None) -> Scene:
     return scene.with_values({"model.kinematics": name, "mesh.formulation": scene.formulation})
 
 
-def build(scene: Scene, comm: MPI.Intracomm) -> Domain:
+def mesh_of(scene: Scene, comm: MPI.Intracomm) -> Domain:
     """The mesh of a scene: of its body, or of the part that stands for it. Collective."""
     if KINEMATICS[scene.model.kinematics].reduced:
         domain: Domain = scene.geometry.reductions[scene.model.kinematics].build(scene, comm)

@@ -7,12 +7,16 @@ import subprocess
 import time
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 COMPILER, TICKS = "cc1", 2  # its name, and hundredths of a second of work after which it has read its source
 
 
-def session_members(session: int) -> dict[int, str]:
-    """Number and name of every process of a session that has not ended."""
+GROUP, SESSION = 2, 3  # which of the numbers of a process, behind its state
+
+
+def members(number: int, kind: int = SESSION) -> dict[int, str]:
+    """Number and name of every process of a session, or of a group, that has not ended."""
     found = {}
     for folder in Path("/proc").glob("[0-9]*"):
         try:
@@ -20,8 +24,8 @@ def session_members(session: int) -> dict[int, str]:
             front, _, rest = (folder / "stat").read_text().rpartition(")")
         except OSError:  # it has ended meanwhile
             continue
-        state, _, _, its_session = rest.split()[:4]
-        if int(its_session) == session and state not in "ZX":
+        state, *numbers = rest.split()[:4]
+        if int(numbers[kind - 1]) == number and state not in "ZX":
             found[int(folder.name)] = front.partition("(")[2]
     return found
 
@@ -29,9 +33,17 @@ def session_members(session: int) -> dict[int, str]:
 def all_end(session: int, timeout: float = 60) -> bool:
     """Whether all processes of a session end by themselves: what was killed does so in its own time."""
     deadline = time.monotonic() + timeout
-    while session_members(session) and time.monotonic() < deadline:
+    while members(session) and time.monotonic() < deadline:
         time.sleep(0.02)
-    return not session_members(session)
+    return not members(session)
+
+
+def wait_for_rows(process: subprocess.Popen[Any], folder: Path, rows: int, timeout: float = 200) -> None:
+    """Wait until a run has recorded so many rows, its head among them."""
+    history, deadline = folder / "history.csv", time.monotonic() + timeout
+    while time.monotonic() < deadline and not (history.exists() and history.read_text().count("\n") >= rows):
+        time.sleep(0.02)
+        assert process.poll() is None, process.communicate()
 
 
 def wait_for_compiler(process: subprocess.Popen[str], program: str = COMPILER, timeout: float = 120) -> int:
@@ -41,7 +53,7 @@ def wait_for_compiler(process: subprocess.Popen[str], program: str = COMPILER, t
     """
     deadline = time.monotonic() + timeout
     while time.monotonic() < deadline:
-        for number, name in session_members(process.pid).items():
+        for number, name in members(process.pid).items():
             if name == program:
                 with suppress(OSError):  # it has ended meanwhile
                     numbers = Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()

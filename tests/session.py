@@ -136,10 +136,9 @@ class LauncherTests:
 def launcher_key() -> str:
     """Hash of what these tests look at."""
     files = ["with-fenicsx", "Dockerfile", "bin/remodel-fenicsx", ".ci/run", "tests/run", "tests/container/run"]
-    files += [
-        f"tests/launcher/{LAUNCHER_TEST}",
-        *(f"environment/{path.name}" for path in (PROJECT / "environment").iterdir()),
-    ]
+    files += ["tests/processes.py", f"tests/launcher/{LAUNCHER_TEST}"]
+    for folder in ("environment", "tests/launcher/stand_ins"):
+        files += [f"{folder}/{path.name}" for path in (PROJECT / folder).iterdir()]
     key = hashlib.sha256(f"{platform.platform()} {os.getuid()} {os.environ.get('REMODEL_FENICSX_ROOT')}".encode())
     for name in sorted(files):
         path = PROJECT / name

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.fuzzing.scenes import STIFF_NAME, Values, has_free_length
-from benchmarks.stability_map.cases import Finding, Run, farthest
+from benchmarks.stability_map.cases import Finding, Run, farthest, with_values
 
 EXACT, SOLVED = 1e-6, 1e-4  # relative tolerance of lengths: of the same arithmetic; of another way to the same solution
 DEGREES = 100.0  # degrees for a relative error of one
@@ -37,6 +37,9 @@ class Other:
     degrees: float | None = None  # allowed of angles, where it is no rounding
     last_only: bool = False
     in_numbers: Values | None = None  # the other scene, where that one has words
+
+
+Relation = Callable[[Values, Random], Other | None]
 
 
 def in_units(scene: Values, stress: float = 1.0, length: float = 1.0, time: float = 1.0, chain: float = 1.0) -> Values:
@@ -69,24 +72,17 @@ def in_units(scene: Values, stress: float = 1.0, length: float = 1.0, time: floa
     return s
 
 
-def _stress(scene: Values, random: Random) -> Other:
-    by = 10 ** random.uniform(-4, 4)
-    return Other("in another unit of stress", in_units(scene, stress=by), units=(by, 1.0, 1.0))
+def _unit(of: str, decades: float) -> Relation:
+    def relation(scene: Values, random: Random) -> Other:
+        by = 10 ** random.uniform(-decades, decades)
+        units = tuple(by if each == of else 1.0 for each in ("stress", "length", "time"))
+        return Other(f"in another unit of {of}", in_units(scene, **{of: by}), units=units)
 
-
-def _length(scene: Values, random: Random) -> Other:
-    by = 10 ** random.uniform(-2, 2)
-    return Other("in another unit of length", in_units(scene, length=by), units=(1.0, by, 1.0))
-
-
-def _time(scene: Values, random: Random) -> Other:
-    by = 10 ** random.uniform(-3, 3)
-    return Other("in another unit of time", in_units(scene, time=by), units=(1.0, 1.0, by))
+    return relation
 
 
 def _chain(scene: Values, random: Random) -> Other:
-    by = random.choice((1e-9, 1e-3, 92.4, 1e6))
-    return Other("chain lengths in another unit", in_units(scene, chain=by))
+    return Other("chain lengths in another unit", in_units(scene, chain=random.choice((1e-9, 1e-3, 92.4, 1e6))))
 
 
 def _said(scene: Values, random: Random) -> Other | None:
@@ -138,92 +134,80 @@ KINDS = {"cube": ("point", "full"), "tendon": ("point", "full"), "tube": ("radia
 
 
 def _kinematics(scene: Values, random: Random) -> Other | None:
-    s, shape = deepcopy(scene), scene["geometry"]["shape"]
-    kinds = KINDS[shape]
-    chosen = s["model"]["kinematics"]
-    if chosen not in kinds or scene["cells"]["initial"] == "random" or scene["remodeling"]["law"] == "rotation":
+    kinds, chosen, cells = KINDS[scene["geometry"]["shape"]], scene["model"]["kinematics"], scene["cells"]
+    if chosen not in kinds or cells["initial"] == "random" or scene["remodeling"]["law"] == "rotation":
         return None
     if scene["solver"].get("unstable") or scene["time"]["end"] == "equilibrium" and chosen == "full":
         return None
     # a polygon is no circle: radius and half-plane agree, and the quarter and the whole
-    other = {"point": "full", "radial": "axisymmetric", "sector": "full"}
-    other |= {value: key for key, value in other.items()} | {"full": "point" if shape != "tube" else "sector"}
-    s["model"]["kinematics"] = other[chosen]
-    if other[chosen] in ("radial", "sector") and (
-        scene["supports"]["ends"] == "clamped" or "axial_force" in s["loads"]
-    ):
+    other = kinds[kinds.index(chosen) ^ 1]
+    pulled = scene["supports"]["ends"] == "clamped" or "axial_force" in scene["loads"]
+    if other in ("radial", "sector") and pulled or other == "sector" and cells["axes"] == "global":
         return None
-    if other[chosen] == "sector" and scene["cells"]["axes"] == "global":
-        return None
-    return Other(f"kinematics {other[chosen]}", s, tolerance=SOLVED)
+    return Other(f"kinematics {other}", with_values(scene, {"model.kinematics": other}), tolerance=SOLVED)
 
 
 def _solver(scene: Values, random: Random) -> Other:
-    s, method = deepcopy(scene), random.choice(("direct", "lagged", "iterative"))
-    s["solver"] = {
+    method = random.choice(("direct", "lagged", "iterative"))
+    solver = {
         "method": "lagged" if method == "iterative" and has_free_length(scene) else method, "relative_tolerance": 1e-10,
         "predictor": random.choice(("none", "autoregressive")),
     }  # fmt: skip
     loose = 1e-3 if scene["solver"]["relative_tolerance"] > 1e-9 else SOLVED
-    return Other(f"another solver {s['solver']}", s, tolerance=loose)
+    return Other(f"another solver {solver}", scene | {"solver": solver}, tolerance=loose)
 
 
 def _tolerance(scene: Values, random: Random) -> Other | None:
-    s, asked = deepcopy(scene), scene["time"].get("tolerance")
+    asked = scene["time"].get("tolerance")
     if asked is None or scene["time"]["end"] == "equilibrium":
         return None
-    s["time"]["tolerance"] = asked / 4
-    return Other(f"a quarter of time.tolerance {asked:g}", s, tolerance=1.3 * np.radians(asked), degrees=1.3 * asked)
+    finer, allowed = with_values(scene, {"time.tolerance": asked / 4}), 1.3 * asked
+    return Other(f"a quarter of time.tolerance {asked:g}", finer, tolerance=float(np.radians(allowed)), degrees=allowed)
 
 
 def _half(scene: Values, random: Random) -> Other | None:
     """The coupling `extrapolated` is of second order, and eq. (11) solved with its cells has no error in time."""
-    s, r, t = deepcopy(scene), scene["remodeling"], scene["time"]
+    r, t = scene["remodeling"], scene["time"]
     rate = r["kappa"] * t["step"]
     second = r["coupling"] == "extrapolated" and rate < 0.1
     exact = (r["coupling"], r["law"]) == ("implicit", "explicit") and scene["cells"]["initial"] == "isotropic"
     if t["end"] == "equilibrium" or "tolerance" in t or not (second or exact):
         return None
-    t = s["time"]
-    t["step"] /= 2
-    error = 20 * rate**2 if second else SOLVED
     # a step in which tension comes or goes is off by up to kappa dt
-    error = max(error, rate) if second else error
-    return Other("half of the step", s, tolerance=error, degrees=60 * error, last_only=True)
+    error = max(20 * rate**2, rate) if second else SOLVED
+    finer = with_values(scene, {"time.step": t["step"] / 2})
+    return Other("half of the step", finer, tolerance=error, degrees=60 * error, last_only=True)
 
 
 def _equilibrium(scene: Values, random: Random) -> Other | None:
-    s = deepcopy(scene)
     if scene["time"]["end"] != "equilibrium":
         return None
-    last = max(load["ramp"][-1][0] for load in s["loads"].values())
-    s["time"] |= {"end": last + 40 / s["remodeling"]["kappa"], "tolerance": 1.0}
-    return Other("in time", s, tolerance=5e-3, degrees=0.5, last_only=True)
+    last = max(load["ramp"][-1][0] for load in scene["loads"].values())
+    long = with_values(scene, {"time.end": last + 40 / scene["remodeling"]["kappa"], "time.tolerance": 1.0})
+    return Other("in time", long, tolerance=5e-3, degrees=0.5, last_only=True)
 
 
-def _elements(scene: Values, random: Random) -> Other | None:
-    s = deepcopy(scene)
+def _elements(scene: Values) -> Other | None:
     if scene.get("name") != STIFF_NAME:
         return None
-    s["mesh"] |= {"formulation": "selective-integration", "element": "hexahedron"}
+    changes = {"mesh.formulation": "selective-integration", "mesh.element": "hexahedron"}
     implicit = scene["remodeling"].get("coupling") == "implicit"
     if implicit:  # it needs the other formulation, and has no error in time
-        s["remodeling"]["coupling"] = "extrapolated"
-        s["time"]["step"] /= 8
+        changes |= {"remodeling.coupling": "extrapolated", "time.step": scene["time"]["step"] / 8}
     last = implicit or "profile" in scene
-    return Other("by selective integration", s, tolerance=5e-3, degrees=1.0, last_only=last)
+    return Other("by selective integration", with_values(scene, changes), tolerance=5e-3, degrees=1.0, last_only=last)
 
 
-Relation = Callable[[Values, Random], Other | None]
 RELATIONS: tuple[tuple[int, Relation], ...] = (
-    (3, _stress), (3, _length), (3, _time), (3, _chain), (3, _said), (2, _ramp), (2, _recorded), (4, _resumed),
+    (3, _unit("stress", 4)), (3, _unit("length", 2)), (3, _unit("time", 3)), (3, _chain), (3, _said), (2, _ramp),
+    (2, _recorded), (4, _resumed),
     (2, _ranks), (6, _kinematics), (4, _solver), (30, _tolerance), (4, _half), (60, _equilibrium),
 )  # fmt: skip
 
 
 def chosen(scene: Values, random: Random) -> Other:
     """One that the scene allows."""
-    if (elements := _elements(scene, random)) is not None:
+    if (elements := _elements(scene)) is not None:
         return elements
     found = [(weight, other) for weight, relation in RELATIONS if (other := relation(scene, random)) is not None]
     return random.choices([other for _, other in found], [weight for weight, _ in found])[0]

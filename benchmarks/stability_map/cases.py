@@ -152,7 +152,7 @@ def with_values(scene: Mapping[str, Any], changes: Mapping[str, Any]) -> Values:
     return copy
 
 
-MODULES = ("homogeneous", "bodies", "prescribed", "consistent", "variants", "instant", "ray")
+MODULES = ("homogeneous", "bodies", "variants", "ray")
 Place = dict[str, Any]
 OfPlace = Mapping[str, Any] | Callable[[Place], Mapping[str, Any]]
 FAMILIES: dict[str, list[Callable[[], Iterator[Case]]]] = {}

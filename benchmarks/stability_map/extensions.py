@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -36,83 +37,97 @@ class Block(Cube):
 
     def build(self, mesh: Any, comm: Any = None) -> Domain:
         """The cube's mesh, moved."""
-        return distorted(super().build(mesh, comm), self.shape, self.side, self.distortion, self.aspect)
+        domain = super().build(mesh, comm)
+        x = domain.mesh.geometry.x
+        inside = np.linalg.norm(x - self.side / 2, axis=1) < 1e-9 * self.side
+        x[inside] += self.distortion * self.side / 6  # the node at the centre, along the diagonal
+        x[:, 0] /= self.aspect
+        return replace(domain, shape=self.shape)
 
 
-def distorted(domain: Domain, shape: str, side: float, distortion: float, aspect: float = 1.0) -> Domain:
-    """The mesh with the node at its centre moved along the diagonal, then flattened along x."""
-    x = domain.mesh.geometry.x
-    inside = np.linalg.norm(x - side / 2, axis=1) < 1e-9 * side
-    x[inside] += distortion * side / 6
-    x[:, 0] /= aspect
-    return replace(domain, shape=shape)
+class Value:
+    """Stands for a Constant where a load is a field: what `Loading.set` sets goes to a function."""
+
+    def __init__(self, loading: Any, name: str, take: Callable[[float], None]):
+        self._value, self._take = 0.0, take
+        loading.magnitude(name)
+        loading._magnitudes[name] = [(self, 1.0)]
+
+    @property
+    def value(self) -> float:
+        """As it was set."""
+        return self._value
+
+    @value.setter
+    def value(self, value: float) -> None:
+        self._value = value
+        self._take(value)
 
 
-class Affine:
-    """A displacement u = H X of all boundary nodes, that loads are entries of."""
-
-    def __init__(self, loading: Any):
-        self.gradient, self.loading = np.zeros((3, 3)), loading
-        self.values = dolfinx.fem.Function(loading.space)
-        mesh = loading.domain.mesh
-        facets = loading.domain.facet_tags.indices
-        dofs = dolfinx.fem.locate_dofs_topological(loading.space, mesh.topology.dim - 1, facets)
-        loading.boundary_conditions.append(dolfinx.fem.dirichletbc(self.values, dofs))
-
-    def entry(self, name: str, i: int, j: int) -> None:
-        """The load of this name is the entry H_ij."""
-        affine = self
-
-        class Entry:
-            """What `Loading.set` sets."""
-
-            @property
-            def value(self) -> float:
-                return float(affine.gradient[i, j])
-
-            @value.setter
-            def value(self, value: float) -> None:
-                affine.gradient[i, j] = value
-                affine.values.interpolate(lambda x: affine.gradient @ x)
-
-        self.loading.magnitude(name)
-        self.loading._magnitudes[name] = [(Entry(), 1.0)]  # a Constant cannot be a field
+def prescribed(loading: Any, face: str | None = None, component: int | None = None) -> Any:
+    """A function whose values all or one component of a face, or of the whole boundary, take."""
+    tags = loading.domain.facet_tags
+    facets = tags.indices if face is None else tags.find(loading.domain.faces[face])
+    dimension, space = loading.domain.mesh.topology.dim - 1, loading.space
+    if component is None:
+        values = dolfinx.fem.Function(space)
+        condition = dolfinx.fem.dirichletbc(values, dolfinx.fem.locate_dofs_topological(space, dimension, facets))
+    else:
+        part = space.sub(component)
+        values = dolfinx.fem.Function(part.collapse()[0])
+        dofs = dolfinx.fem.locate_dofs_topological((part, values.function_space), dimension, facets)
+        condition = dolfinx.fem.dirichletbc(values, dofs, part)
+    loading.boundary_conditions.append(condition)
+    return values
 
 
-class Driven(Cube):
+def entry_of_gradient(i: int, j: int) -> LoadKind:
+    """H_ij of u = H X on the whole boundary."""
+
+    def add(shape: Any, loading: Any, name: str) -> None:
+        if not hasattr(loading, "affine"):  # one for all loads of a body
+            loading.affine = np.zeros((3, 3)), prescribed(loading)
+        gradient, values = loading.affine
+
+        def take(value: float) -> None:
+            gradient[i, j] = value
+            values.interpolate(lambda x: gradient @ x)
+
+        Value(loading, name, take)
+
+    return LoadKind(add, f"H_{'xyz'[i]}{'xyz'[j]} of the boundary")
+
+
+class Driven(Block):
     """A block whose whole boundary has a given deformation gradient F = I + H: a patch test that remodels."""
 
     loads: ClassVar[dict[str, LoadKind]] = {
-        f"h_{a}{b}": LoadKind(
-            lambda shape, loading, name, i=i, j=j: shape.affine(loading).entry(name, i, j), f"H_{a}{b} of the boundary"
-        )
-        for i, a in enumerate("xyz")
-        for j, b in enumerate("xyz")
+        f"h_{a}{b}": entry_of_gradient(i, j) for i, a in enumerate("xyz") for j, b in enumerate("xyz")
     }
     columns: ClassVar[tuple[Column, ...]] = uniaxial_columns("z1", "side")[-1:]
     shape: Literal["driven"] = Field(default="driven", description="Which body it is.")
-    distortion: float = Field(default=0.0, ge=0, description="Of the node inside: 1 flattens the Jacobian to zero.")
-
-    def affine(self, loading: Any) -> Affine:
-        """One for all loads of a body."""
-        found = getattr(loading, "affine", None)
-        if found is None:
-            found = loading.affine = Affine(loading)
-        return found
 
     def hold(self, loading: Any) -> None:
         """The loads hold all of it."""
 
-    def build(self, mesh: Any, comm: Any = None) -> Domain:
-        """The cube's mesh, moved."""
-        return distorted(super().build(mesh, comm), self.shape, self.side, self.distortion)
+
+def turn_top(shape: Any, loading: Any, name: str) -> None:
+    """Prescribe x and y of the top: a rotation by the load of this name."""
+    along, across = (prescribed(loading, "top", component) for component in (0, 1))
+
+    def take(angle: float) -> None:
+        c, s = np.cos(angle) - 1, np.sin(angle)
+        along.interpolate(lambda x: c * x[0] - s * x[1])
+        across.interpolate(lambda x: s * x[0] + c * x[1])
+
+    Value(loading, name, take)
 
 
 class Twisted(Tendon):
     """A tendon that is clamped at its bottom, while its top is turned about z and lifted as a rigid plate."""
 
     loads: ClassVar[dict[str, LoadKind]] = {
-        "twist": LoadKind(lambda shape, loading, name: turn_top(loading, name), "angle of the top in radians"),
+        "twist": LoadKind(turn_top, "angle of the top in radians"),
         "elongation": LoadKind(
             lambda shape, loading, name: loading.add_prescribed_elongation(name, "top", 2, shape.length),
             "engineering strain of the length",
@@ -129,36 +144,6 @@ class Twisted(Tendon):
         """The bottom, wholly."""
         for component in range(3):
             loading.hold_face("bottom", component)
-
-
-def turn_top(loading: Any, name: str) -> None:
-    """Prescribe x and y of the top: a rotation by the load of this name."""
-    facets = loading.domain.facet_tags.find(loading.domain.faces["top"])
-    parts = []
-    for component in (0, 1):
-        space = loading.space.sub(component)
-        collapsed = space.collapse()[0]
-        parts.append(dolfinx.fem.Function(collapsed))
-        dofs = dolfinx.fem.locate_dofs_topological((space, collapsed), 2, facets)
-        loading.boundary_conditions.append(dolfinx.fem.dirichletbc(parts[-1], dofs, space))
-
-    class Angle:
-        """What `Loading.set` sets."""
-
-        _value = 0.0
-
-        @property
-        def value(self) -> float:
-            return self._value
-
-        @value.setter
-        def value(self, angle: float) -> None:
-            self._value, c, s = angle, np.cos(angle) - 1, np.sin(angle)
-            parts[0].interpolate(lambda x: c * x[0] - s * x[1])
-            parts[1].interpolate(lambda x: s * x[0] + c * x[1])
-
-    loading.magnitude(name)
-    loading._magnitudes[name] = [(Angle(), 1.0)]  # a Constant cannot be a field
 
 
 def register() -> None:

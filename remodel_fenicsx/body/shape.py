@@ -27,8 +27,8 @@ from remodel_fenicsx.body.reductions import (
 from remodel_fenicsx.model.axes import LocalAxes
 from remodel_fenicsx.model.cells import angle_to_axis
 from remodel_fenicsx.model.energy import Tissue
-from remodel_fenicsx.schema.settings import Load, Mesh, Natural, Region, Support, faces_of
-from remodel_fenicsx.schema.tables import Table, fault
+from remodel_fenicsx.schema.settings import TURNOVER_POWER, Load, Mesh, Natural, Region, Support, faces_of, in_region
+from remodel_fenicsx.schema.tables import Table, fault, refuse
 from remodel_fenicsx.schema.units import Dimension, LengthUnit
 
 if TYPE_CHECKING:
@@ -221,7 +221,6 @@ def _turned_over(name: str, m: Any) -> float:
     return float(m.observer.stepper.turnover.mean(name))
 
 
-TURNOVER_POWER = "turnover_power"
 COLUMNS_ON_REQUEST: dict[str, Column] = {
     column.name: column
     for column in (
@@ -769,6 +768,24 @@ class Shape(_Is):  # type: ignore[misc]
     def kept_files(self) -> tuple[dict[str, Any], dict[str, bytes]]:
         """Values that a scene as run has in place of its own, by dotted key, and files beside it by name."""
         return {}, {}
+
+    def check_with(self, scene: Any, key: str) -> None:
+        """Mesh and regions that the shape can have; where it is the loaded one, whether the unloaded can be found."""
+        self.check_size(scene.mesh)
+        self.check_regions(scene.regions, scene.mesh)
+        if not self.is_loaded:
+            return
+        measured = [f"{in_region(name)}cells.fibres" for name in scene.measured_cells]
+        reasons = {
+            f"allowed for the shapes {scene.shapes_that(lambda kind: kind.unloads)}": not self.unloads,
+            "not allowed with supports.ends = 'clamped': the loaded tube would not have one radius": (
+                scene.supports.ends == "clamped"
+            ),
+            f"not allowed with {', '.join(measured)}: its rows belong to places, which unloading moves": measured,
+            "not allowed with [[cases]]: the loaded body belongs to one set of loads; remodel-fenicsx unload SCENE, "
+            "with those alone, writes the scene of the unloaded one, to which [[cases]] may be added": scene.cases,
+        }
+        refuse(f"{key}.is", "loaded", reasons)
 
     def check_size(self, mesh: Mesh) -> None:
         """Refuse a mesh that the shape cannot have, whatever its size: raise a `fault` that names the key."""

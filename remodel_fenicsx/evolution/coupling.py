@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from collections.abc import Callable
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from remodel_fenicsx.evolution.predictor import PREDICTORS, LoadStep
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.energy import Tissue
+from remodel_fenicsx.model.tensor_law import Target, weight_of_the_end
 from remodel_fenicsx.schema.settings import Solver
 from remodel_fenicsx.solver.continuation import Blend, Change, Work
 from remodel_fenicsx.solver.equilibrium import Equilibrium
@@ -22,7 +23,35 @@ from remodel_fenicsx.solver.newton import GuardedNewton, SolveFailure
 from remodel_fenicsx.state.state import Numbers, State
 
 Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
 log = logging.getLogger(__name__)
+
+NEVER = -1.0  # time of a target that there has not been
+COUNTS = 0.01  # share of a target from which on it is one: what is less moves the cells less than a step is off
+
+
+class Traits(NamedTuple):
+    """Of a coupling's errors in time: how steps are chosen for a tolerance.
+
+    Attributes
+    ----------
+    order
+        Power of the step with which they fall.
+    accumulates
+        Whether those of steps add up; where not, a row lags behind.
+    longest
+        kappa times the longest step that may be chosen for its error: longer ones of an explicit rule swing.
+
+    Examples
+    --------
+    >>> from remodel_fenicsx.extend import Traits
+    >>> Traits(order=2, accumulates=True).longest
+    inf
+    """
+
+    order: int
+    accumulates: bool
+    longest: float = math.inf
 
 
 class Coupling(Protocol):
@@ -34,20 +63,8 @@ class Coupling(Protocol):
         The forms of the solved state.
     newton
         What solved it.
-    share
-        Share of a pass's change of the cells that is made.
-    order
-        Power of the step with which the error in time falls.
-    accumulates
-        Whether the errors in time of steps add up; where not, a row lags behind.
-    longest
-        kappa times the longest step that may be chosen for its error: longer ones of an explicit rule swing.
-    compares
-        Whether `better` is wanted; set it before the first step.
-    others
-        Further load cases, solved with the same cells after the state itself (`load_cases.OtherCase`).
-    turnover
-        Content and natural length of the collagen (`turnover.TurnoverPass`), which it changes; None where they stay.
+    traits
+        What is known of its errors in time.
 
     Examples
     --------
@@ -55,19 +72,13 @@ class Coupling(Protocol):
 
     >>> from remodel_fenicsx import Simulation, preset_scene
     >>> coupling = Simulation(preset_scene("kuhl-holzapfel-2007", "cube")).stepper.coupling
-    >>> coupling.order, coupling.accumulates
-    (1, False)
+    >>> coupling.traits
+    Traits(order=1, accumulates=False, longest=inf)
     """
 
     equilibrium: Equilibrium
     newton: GuardedNewton
-    share: float
-    order: int
-    accumulates: bool
-    longest: float
-    compares: bool
-    others: Sequence[Any]
-    turnover: Any
+    traits: Traits
 
     @property
     def better(self) -> UnitCell | None:
@@ -125,7 +136,7 @@ class Staggered:
     'Staggered'
     """
 
-    order, accumulates, longest = 1, False, math.inf
+    traits = Traits(order=1, accumulates=False)
 
     def __init__(self, state: State, tissue: Tissue, remodeling: RemodelingPass, settings: Solver):
         self.state, self.remodeling, self.settings = state, remodeling, settings
@@ -134,16 +145,12 @@ class Staggered:
         self.newton = GuardedNewton(self.equilibrium, settings)
         self.predictor = PREDICTORS[settings.predictor](state)
         self._last = Numbers(state, "last_solution", {"extension": 0.0})  # its largest r/L
-        self.share, self.compares, self.residual = 1.0, False, 0.0
-        self.others: Sequence[Any] = ()
-        self.turnover: Any = None
+        self.turnover = remodeling.turnover
+        self.residual = 0.0
         self.tangents = 0  # that were assembled in the last solve of the state itself
         self.blend: Blend | None = None
-        if (
-            remodeling.law.remodels or remodeling.settings.turnover.is_on
-        ):  # now, for no form is compiled in the middle of a run
+        if remodeling.law.remodels or self.turnover is not None:  # now: no form is compiled in the middle of a run
             self.blend = Blend(state, tissue, settings)
-            self.blend.equilibrium.stop_signal = lambda: self.equilibrium.stop_signal()
 
     def solve(self, time: float, loads: LoadValues) -> Work:
         """Equilibrium at `time` with the present cells.
@@ -153,7 +160,7 @@ class Staggered:
         StepFailure
             If no admissible equilibrium is found.
         """
-        if self.turnover is not None and not self.accumulates:
+        if self.turnover is not None and not self.traits.accumulates:
             self.turnover.lag(time)
         work, before, old_loads = Work(), self.state.unknown.x.array.copy(), dict(self.state.loading.values)
         step = LoadStep.between(self.state.time, old_loads, time, loads)
@@ -173,7 +180,7 @@ class Staggered:
         work.extension = work.extension or self.equilibrium.extension()
         self._last["extension"] = work.extension.max_chain_extension
         self.tangents = work.tangents
-        for case in self.others:
+        for case in self.remodeling.cases:
             work.count(case.solve(time))
         return work
 
@@ -181,7 +188,7 @@ class Staggered:
         """The pass with the solved state."""
         power = 0.0
         if self.remodeling.law.remodels:
-            power = self.remodeling.apply(self.state.time, time, self.residual, self.share)
+            power = self.remodeling.apply(self.state.time, time, self.residual)
         if self.turnover is not None:
             self.turnover.complete(time)
         return power
@@ -194,7 +201,7 @@ class Staggered:
     def close(self) -> None:
         """Free PETSc's objects."""
         self.newton.close()
-        for case in self.others:
+        for case in self.remodeling.cases:
             case.coupling.close()
         if self.blend is not None:
             self.blend.close()
@@ -288,12 +295,102 @@ def between(old: LoadValues, new: LoadValues, fraction: float) -> LoadValues:
     return new if fraction == 1.0 else {name: old[name] + fraction * (new[name] - old[name]) for name in new}
 
 
-class Relaxed(Staggered):
-    """A share of each pass's change of the structure tensor: stable where the printed pass over-corrects."""
+class Extrapolated(Staggered):
+    """Remodel, then solve: sE + h/2 d(sE)/dt from the targets of the last two states, h the step (docs/theory.md)."""
+
+    traits = Traits(order=2, accumulates=True, longest=0.5)
 
     def __init__(self, state: State, tissue: Tissue, remodeling: RemodelingPass, settings: Solver):
         super().__init__(state, tissue, remodeling, settings)
-        self.share = remodeling.settings.relaxation_factor
+        self._targets = state.cells.quadrature.function("targets", (2, 11))  # the last first: E, s, its time
+        self._values[..., 10] = NEVER
+        state.remember(self._targets)
+        self._power = 0.0
+        self._start: UnitCell  # the cells at the start of the step
+        self._found: Target  # of the solved state
+        self._begins: Flags  # points whose first step with a target this is
+        self._duration = 0.0  # of the step
+
+    @property
+    def better(self) -> UnitCell:
+        """The cells that the targets at both ends give together; where a point begins, the target of its end."""
+        weight = weight_of_the_end(self.remodeling.kappa * self._duration)
+        mean = self._known(1).towards(self._found, weight).where(self._begins, self._found)
+        return self.remodeling.followed(mean, self._duration, self._start)
+
+    @property
+    def _values(self) -> Array:
+        return self.state.cells.quadrature.values(self._targets, (2, 11))
+
+    def _known(self, age: int) -> Target:
+        """The last target (0) or the one before (1) of all points in one row; zero where there was none."""
+        values = self._values.reshape(-1, 2, 11)[:, age]
+        return Target(values[:, :9].reshape(-1, 3, 3), values[:, 9])
+
+    def solve(self, time: float, loads: LoadValues) -> Work:
+        """New cells, and equilibrium at `time` with them."""
+        cells = self.state.cells
+        self._start = UnitCell(*(values.copy() for values in cells.point_cells[:2]))
+        expected = self._extrapolated(time)
+        self._follow(expected, time)
+        if self.turnover is not None:
+            self.turnover.extrapolate(time)
+        work = super().solve(time, loads)
+        self._found = self.remodeling.target(self.residual)
+        self._begins = (self._known(0).share < COUNTS) & (self._found.share >= COUNTS)
+        if not self._anywhere(self._begins):
+            return work
+        shape = cells.quadrature.shape
+        cells.set(self._start.dimensions.reshape(*shape, 3), self._start.axes.reshape(*shape, 3, 3))
+        self._follow(expected.where(self._begins, self._found), time)
+        again = super().solve(time, loads)
+        self._found = self.remodeling.target(self.residual)
+        again.substeps += work.substeps - 1
+        again.count(work)
+        return again
+
+    def remodel(self, time: float) -> float:
+        """Remember the target of the solved state; the cells are those of the row."""
+        target, values = self._found, self._values
+        self._duration = time - self.state.time
+        values[:, :, 1] = values[:, :, 0]
+        values[:, :, 1, 10][self._begins.reshape(values.shape[:2])] = NEVER  # its step had the target of its end
+        values[:, :, 0, :9] = target.direction.reshape(*values.shape[:2], 9)
+        values[:, :, 0, 9] = target.share.reshape(values.shape[:2])
+        values[:, :, 0, 10] = time
+        if self.turnover is not None:
+            self.turnover.complete(time)
+        return self._power
+
+    def _extrapolated(self, time: float) -> Target:
+        return self._known(0).towards(self._known(1), -self._back(time))
+
+    def _back(self, time: float) -> Array:
+        """Minus the weight of the target before in the extrapolated one, (n,)."""
+        times = self._values.reshape(-1, 2, 11)[:, :, 10]
+        back, known = np.zeros(len(times)), times[:, 1] != NEVER
+        back[known] = (time - times[known, 0]) / 2 / (times[known, 0] - times[known, 1])
+        return back
+
+    def _follow(self, target: Target, time: float) -> None:
+        """Cells after the step; where an extrapolated target would make A indefinite, the last target itself counts."""
+        duration = time - self.state.time
+        self._power = 0.0
+        if not self._anywhere(target.share != 0.0):
+            return
+        asked = self.remodeling.followed(target, duration)
+        lost = ~np.isfinite(asked.dimensions).all(axis=-1)
+        if lost.any():
+            asked = self.remodeling.followed(target.where(lost, self._known(0)), duration)
+        points = self._anywhere(lost)
+        if points and self.state.comm.rank == 0:
+            log.info("time %g: %d points follow the last stress, not the extrapolated one", time, points)
+        self._power = self.remodeling.replace(asked, self.state.elastic_gradient(), duration)
+
+    def _anywhere(self, points: Flags) -> int:
+        """How many there are on all ranks."""
+        quadrature = self.state.cells.quadrature
+        return int(self.state.comm.allreduce(int(quadrature.owned(points.reshape(quadrature.shape)).sum())))
 
 
 Maker = Callable[[State, Tissue, RemodelingPass, Solver], Coupling]

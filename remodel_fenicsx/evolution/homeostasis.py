@@ -9,23 +9,20 @@ once").
 from __future__ import annotations
 
 import logging
-import math
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from remodel_fenicsx.body.loading import LoadValues
 from remodel_fenicsx.evolution.implicit import RESIDUAL, Implicit
-from remodel_fenicsx.evolution.remodeling import RemodelingPass
+from remodel_fenicsx.evolution.stepper import Step, Watcher
 from remodel_fenicsx.evolution.time_steps import StepControl
 from remodel_fenicsx.evolution.turnover import MUCH, Slowing
 from remodel_fenicsx.fem import assembly
 from remodel_fenicsx.model.cells import structure_tensor
 from remodel_fenicsx.solver.continuation import Work
-from remodel_fenicsx.solver.equilibrium import Equilibrium
-from remodel_fenicsx.solver.newton import GuardedNewton, SolveFailure
+from remodel_fenicsx.solver.newton import SolveFailure
 from remodel_fenicsx.state.state import Snapshot
 from remodel_fenicsx.system import NOTICE
 
@@ -66,36 +63,35 @@ class Limit(Implicit):
 
 
 class Homeostasis:
-    """The way through ramps and held loads until the cells rest, as one step."""
+    """The way through ramps and held loads until the cells rest, as one step of a stepper."""
 
-    order, accumulates, longest, share, better = 1, True, math.inf, 1.0, None
-    others: Sequence[Any] = ()  # its way solves further load cases
-
-    def __init__(self, way: StepControl, remodeling: RemodelingPass, held_from: float, limit: Limit | None):
-        self.way, self.remodeling, self.held_from, self.limit = way, remodeling, held_from, limit
-        self.state = way.state
-        self.tolerance, self.coupling = way.tolerance, way.stepper.coupling
-        self.turnover: Any = way.stepper.turnover
-        self.equilibrium: Equilibrium = self.coupling.equilibrium
-        self.newton: GuardedNewton = self.coupling.newton
-        if limit is not None:
-            limit.turnover = self.turnover
-            limit.equilibrium.stop_signal = lambda: self.equilibrium.stop_signal()
-        self.compares, self.steps, self._residual = False, 0, 0.0
-        way.level = (
-            logging.INFO
-        )  # no row of the way is a result; where points turn over at once, the end tells of fronts
-        self.near, self.tries = NEAR, TRIES
+    def __init__(self, control: StepControl, held_from: float, limit: Limit | None):
+        self.control, self.held_from, self.limit = control, held_from, limit
+        self.stepper, self.state, self.tolerance = control.stepper, control.state, control.tolerance
+        self.remodeling, self.turnover = self.stepper.remodeling, self.stepper.turnover
+        self.quadrature = self.state.cells.quadrature
+        control.level = logging.INFO  # no row of the way is a result; of points that turn over at once fronts tell
+        self.steps, self._residual = 0, 0.0
         self._held: Snapshot | None = None  # the first state on the way under held loads
+
+    def march(self, time: float, watchers: Sequence[Watcher] = ()) -> Iterator[Step]:
+        """The state at rest, as the step to a time; what is yielded is committed."""
+        self.stepper.start(watchers)
+        if self.state.time < time:
+            yield self.stepper.advance(time, watchers, is_last=True, way=self)
+
+    def close(self) -> None:
+        """Free PETSc's objects."""
+        if self.limit is not None:
+            self.limit.close()
 
     def solve(self, time: float, loads: LoadValues) -> Work:
         """Equilibrium of forces and of cells."""
         state, work = self.state, Work()
-        start, number, self.steps = state.time, state.number, 0
-        self._held = None
-        loosens = not self.coupling.accumulates and self.tolerance < COARSE and self.turnover is None
-        self._go(time, loads, max(start, self.held_from), loosens, work)
-        if loosens and self._held is not None and self._largest_jump()[0] > FRONT:
+        start, number, self.steps, self._held = state.time, state.number, 0, None
+        coarsens = not self.stepper.coupling.traits.accumulates and self.tolerance < COARSE and self.turnover is None
+        self._go(time, loads, max(start, self.held_from), coarsens, work)
+        if coarsens and self._held is not None and self._largest_jump()[0] > FRONT:
             log.info(
                 "the cells have a front, whose place depends on the path: the path is followed again with the tolerance"
             )
@@ -107,13 +103,13 @@ class Homeostasis:
         self._residual = work.residual
         return work
 
-    def _go(self, time: float, loads: LoadValues, held: float, loosens: bool, work: Work) -> None:
+    def _go(self, time: float, loads: LoadValues, held: float, coarsens: bool, work: Work) -> None:
         """From where the state is until the cells rest."""
         # The error of a row that lags leaves nothing once the cells rest, unless they come to rest elsewhere. Where
         # collagen comes to rest depends on the way.
         state, self.near, self.tries, self._slowing = self.state, NEAR, TRIES, Slowing(dict(Slowing.INITIAL))
-        self.way.tolerance = self.tolerance
-        for step in self.way.march():
+        self.control.tolerance = self.tolerance
+        for step in self.control.march():
             self.steps += 1
             work.add(step.work)
             work.substeps += step.work.substeps
@@ -121,26 +117,26 @@ class Homeostasis:
             log.info("on the path: time %g, %d Newton iterations", step.time, step.work.newton_iterations)
             if state.time < self.held_from:
                 continue
-            if loosens:
-                self.way.tolerance = COARSE
+            if coarsens:
+                self.control.tolerance = COARSE
             ahead, solved = state.snapshot(), state.equilibrium_cells
             self._held = self._held or ahead
             state.cells.set(solved.dimension_values, solved.axis_values)  # those that the stress belongs to
-            if self._is_over(time, loads, self.way.stepper.slowest * (state.time - held), work):
+            if self._is_over(time, loads, self.stepper.slowest * (state.time - held), work):
                 return
             state.restore(ahead)
 
     def _is_over(self, time: float, loads: LoadValues, waiting: float, work: Work) -> bool:
         """Whether the cells rest, or the rest of the way was made in one step."""
-        towards, quadrature = self._change_by_a_pass(time, work.residual), self.state.cells.quadrature
-        towards[self.remodeling.without_tension(work.residual).reshape(quadrature.shape)] = 0.0
+        towards = self._change_by_a_pass(time, work.residual)
+        towards[self.remodeling.without_tension(work.residual).reshape(self.quadrature.shape)] = 0.0
         rest = self._largest(towards)
         far = max(rest, self._growth())
         if self.limit is not None and self.tries and far <= self.near:
             self.near, self.tries = AGAIN * far, self.tries - 1
             if self._arrived(self.limit, time, loads, towards, work):
                 return True
-        soon = self.state.time + 1 / self.way.stepper.slowest
+        soon = self.state.time + 1 / self.stepper.slowest
         if max(self._largest(self._change_by_a_pass(soon, work.residual)), self._growth()) <= REST:
             return True
         if self._grows_on(waiting):
@@ -148,35 +144,38 @@ class Homeostasis:
                 "growth does not come to rest, its rates fall no faster than 1/t (docs/turnover.md): the state is that "
                 "of time %g, on the path"
             )
-            self._warn(text, self.state.time)
+            self._say(logging.WARNING, text, self.state.time)
             return True
         if waiting > LONGEST_HOLD:
-            self._warn(
+            self._say(
+                logging.WARNING,
                 "the cells do not come to rest: a pass to its limit changes the structure tensor A by up to %.2g r0^2",
                 rest,
             )
             if self.turnover is not None:
-                self._warn("content or natural length change by up to %.2g in a time of T", self._growth())
+                self._say(
+                    logging.WARNING, "content or natural length change by up to %.2g in a time of T", self._growth()
+                )
         return waiting > LONGEST_HOLD
 
     def _growth(self) -> float:
         """Largest relative change of content or natural length in the time in which `REST` is asked for."""
         if self.turnover is None:
             return 0.0
-        return self.state.cells.quadrature.maximum(self.turnover.fastest_changes()) / self.way.stepper.slowest
+        return self.quadrature.maximum(self.turnover.fastest_changes()) / self.stepper.slowest
 
     def _grows_on(self, waiting: float) -> bool:
         """Whether the natural length has grown much, and its rates do not fall as those do that come to rest."""
         if self.turnover is None:
             return False
         goes_on = self._slowing.goes_on(waiting, self._growth())
-        return goes_on and self.state.cells.quadrature.maximum(self.turnover.factors("natural_length")) > MUCH
+        return goes_on and self.quadrature.maximum(self.turnover.factors("natural_length")) > MUCH
 
     def _arrived(self, limit: Limit, time: float, loads: LoadValues, towards: Array, work: Work) -> bool:
         """Make the rest of the way in one step; if it is not solved or leads elsewhere, all is as before."""
         state, before, residual = self.state, self.state.snapshot(), work.residual
-        growth = np.zeros(1) if self.turnover is None else self.turnover.rates()
-        structure, grown = state.cells.structure_tensor(), self._grown()
+        structure = state.cells.structure_tensor()
+        grown = None if self.turnover is None else (self.turnover.logarithms(), self.turnover.rates())
         state.numbers[RESIDUAL] = residual
         try:
             found = limit.solve(time, loads)
@@ -187,7 +186,7 @@ class Homeostasis:
             return False
         work.add(found)
         leads_on = self._is_along(state.cells.structure_tensor() - structure, towards)
-        if not leads_on or not self._grows_along(self._grown() - grown, growth):
+        if not leads_on or (grown is not None and not self._grows_along(*grown)):
             work.residual = residual
             log.info("one step for the rest of the path led to another state; it is not used")
             state.restore(before)
@@ -201,38 +200,30 @@ class Homeostasis:
         aside = (change * towards).sum(axis=(-1, -2)) < SAME_WAY * size * pass_size
         return self._largest(np.where((aside | (pass_size == 0.0))[..., None, None], change, 0.0)) <= NO_CHANGE
 
-    def _grown(self) -> Array:
-        """ln m and ln rho."""
-        found: Array = np.zeros(1) if self.turnover is None else self.turnover.logarithms()
-        return found
-
-    def _grows_along(self, change: Array, rates: Array) -> bool:
-        """Whether ln m and ln rho change as their rates do, at all points where it counts."""
-        if self.turnover is None:
-            return True
+    def _grows_along(self, before: Array, rates: Array) -> bool:
+        """Whether ln m and ln rho have changed as their rates did, at all points where it counts."""
+        change = self.turnover.logarithms() - before
         against = np.where(change * rates < 0.0, np.abs(change), 0.0).max(axis=0)
-        quadrature = self.state.cells.quadrature
-        return quadrature.maximum(against.reshape(quadrature.shape)) <= NO_CHANGE
+        return self.quadrature.maximum(against.reshape(self.quadrature.shape)) <= NO_CHANGE
 
     def _change_by_a_pass(self, time: float, residual: float) -> Array:
         """Of A up to a time, at all points."""
         asked, _ = self.remodeling.updated_cells(self.state.time, time, residual)
-        shape = self.state.cells.quadrature.shape
-        return np.asarray(structure_tensor(*asked[:2]).reshape(*shape, 3, 3) - self.state.cells.structure_tensor())
+        found = structure_tensor(*asked[:2]).reshape(*self.quadrature.shape, 3, 3)
+        return np.asarray(found - self.state.cells.structure_tensor())
 
     def _largest(self, change: Array) -> float:
         """Over r0^2, of all points."""
-        quadrature = self.state.cells.quadrature
-        r0 = assembly.point_values(self.equilibrium.tissue.end_to_end_length, quadrature)
-        return quadrature.maximum(np.linalg.norm(change, axis=(-1, -2)) / r0**2)
+        r0 = assembly.point_values(self.stepper.tissue.end_to_end_length, self.quadrature)
+        return self.quadrature.maximum(np.linalg.norm(change, axis=(-1, -2)) / r0**2)
 
     def _largest_jump(self) -> tuple[float, NDArray[np.float64]]:
         """Largest difference of A over r0^2 between a point and its nearest ones, and the middle of the two."""
         # Collective: a neighbour may belong to another rank.
         from scipy.spatial import cKDTree  # only runs that end in an equilibrium need it
 
-        quadrature = self.state.cells.quadrature
-        r0 = assembly.point_values(self.equilibrium.tissue.end_to_end_length, quadrature)
+        quadrature = self.quadrature
+        r0 = assembly.point_values(self.stepper.tissue.end_to_end_length, quadrature)
         tensors = self.state.cells.structure_tensor() / r0[..., None, None] ** 2
         found = [quadrature.owned(values) for values in (quadrature.coordinates, tensors)]
         all_ranks = zip(*assembly.of_all_ranks(quadrature.mesh.comm, found), strict=True)
@@ -246,21 +237,21 @@ class Homeostasis:
         point, other = np.unravel_index(int(jumps.argmax()), jumps.shape)
         return float(jumps.max()), (places[point] + places[near[point, other]]) / 2
 
-    def _warn(self, text: str, value: float) -> None:
+    def _say(self, level: int, text: str, *values: float) -> None:
         if self.state.comm.rank == 0:
-            log.warning(text, value)
+            log.log(level, text, *values)
 
     def remodel(self, time: float) -> float:
         """Nothing is left to do but to say how far the state is from the cells of its own stress."""
         self.remodeling.look_ahead(time, self._residual)
-        quadrature, r0 = self.state.cells.quadrature, self.equilibrium.tissue.end_to_end_length
-        left = self.remodeling.residual() / float(assembly.largest(r0, quadrature.mesh)) ** 2
-        share = quadrature.mean(self.remodeling.without_tension(self._residual).reshape(quadrature.shape).astype(float))
-        if self.state.comm.rank == 0:
-            log.log(NOTICE, "cells and stress agree to |A_pass - A| = %.2g r0^2, after %d steps", left, self.steps)
+        quadrature, r0 = self.quadrature, float(
+            assembly.largest(self.stepper.tissue.end_to_end_length, self.quadrature.mesh)
+        )
+        left = self.remodeling.residual() / r0**2
+        self._say(NOTICE, "cells and stress agree to |A_pass - A| = %.2g r0^2, after %d steps", left, self.steps)
         jump, place = self._largest_jump()
-        if jump > FRONT and self.state.comm.rank == 0:
-            log.log(
+        if jump > FRONT:
+            self._say(
                 NOTICE,
                 "the cells have a front near %.4g, %.4g, %.4g: the structure tensor A differs by %.2g r0^2 between "
                 "neighbouring points. The front might rest at another place: its place depends on the path, and is as "
@@ -268,17 +259,12 @@ class Homeostasis:
                 *place,
                 jump,
             )
-        if share and self.state.comm.rank == 0:
-            log.log(
+        slack = self.remodeling.without_tension(self._residual).reshape(quadrature.shape)
+        if share := quadrature.mean(slack.astype(float)):
+            self._say(
                 NOTICE,
                 "%.3g %% of the body has no tension at rest, or hardly any beside compression. The cells there stay as "
                 "the path has left them, and depend on it (docs/theory.md, Equilibrium at once)",
                 100 * share,
             )
         return 0.0
-
-    def close(self) -> None:
-        """Free PETSc's objects."""
-        self.coupling.close()
-        if self.limit is not None:
-            self.limit.close()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 from dataclasses import replace
 from typing import Any
 
@@ -13,6 +12,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from remodel_fenicsx.body.loading import LoadValues
+from remodel_fenicsx.evolution.coupling import Traits
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
 from remodel_fenicsx.fem.assembly import over_ranks
 from remodel_fenicsx.fem.solver_methods import AUTO
@@ -109,6 +109,11 @@ class AnsweringCells:
         """The present state is a solved one."""
         self.update()
         self.accepted = self._found.driving_tensor
+
+    @property
+    def step(self) -> StepOfCells:
+        """The one that has begun."""
+        return self._points.step
 
     @property
     def asked(self) -> UnitCell:
@@ -347,9 +352,9 @@ MOST_SOLVES = 20  # of all Newton iterations that one may have, for a step with 
 
 
 class Implicit:
-    """Newton's method on the unknowns with cells that follow at each point (`evolution.condensed`)."""
+    """Newton's method on the unknowns with cells that follow at each point (`model.implicit`)."""
 
-    order, accumulates, longest = 1, True, math.inf
+    traits = Traits(order=1, accumulates=True)
 
     def __init__(self, state: State, tissue: Tissue, remodeling: RemodelingPass, settings: Solver):
         self.state, self.remodeling, self.settings = state, remodeling, settings
@@ -357,11 +362,8 @@ class Implicit:
         self.equilibrium.compile_energy()
         self.answering = AnsweringCells(state, self.equilibrium.tissue, remodeling)
         solved = AnsweringEquilibrium(state, tissue, self.answering)
-        solved.stop_signal = lambda: self.equilibrium.stop_signal()
         self.newton: GuardedNewton = AnsweringNewton(solved, settings)
-        self.share, self.compares, self._power = 1.0, False, 0.0
-        self.turnover: Any = None
-        self._better: UnitCell | None = None
+        self.turnover, self._power = remodeling.turnover, 0.0
         state.numbers[RESIDUAL] = 0.0
         self._numbers = Numbers(state, "implicit", {"held": 0.0})  # the largest share that a warning has named
 
@@ -374,11 +376,7 @@ class Implicit:
         if self.state.number == 0:
             self._solve(time, loads, work, answering=False)
             self.answering.begin(time, work.residual)
-        from_start = self._from_start(time, work.residual if self.state.number == 0 else self.state.numbers[RESIDUAL])
         self._solve(time, loads, work, answering=True)
-        if from_start is not None:
-            weight = weight_of_the_end(self.remodeling.kappa * (time - self.state.time))
-            self._better = relaxed(from_start, self.answering.asked, weight)
         work.substeps -= int(self.state.number == 0)
         self.state.numbers[RESIDUAL] = work.residual
         work.held_points = self.answering.held_points()
@@ -399,14 +397,12 @@ class Implicit:
     @property
     def better(self) -> UnitCell | None:
         """What the stresses at both ends of the step ask for together; eq. (11) asks for the end alone."""
-        return self._better
-
-    def _from_start(self, time: float, residual: float) -> UnitCell | None:
-        """What the stress at the start of a step asks for, where somebody compares, and the law has errors in time."""
-        if not self.compares or self.remodeling.law.of_absolute_time:
+        law, step = self.remodeling.law, self.answering.step
+        if law.of_absolute_time:
             return None
-        cells, _ = self.remodeling.updated_cells(self.state.time, time, residual)
-        return cells
+        from_start = law.update(step.cells, step.drive, step.time_old, step.time_new)
+        weight = weight_of_the_end(self.remodeling.kappa * (step.time_new - step.time_old))
+        return relaxed(from_start, self.answering.asked, weight)
 
     def _say(self, time: float, share: float) -> None:
         """Warn of cells that do not belong to their stress; again where they are much more."""

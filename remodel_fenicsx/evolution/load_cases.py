@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -11,7 +11,7 @@ from remodel_fenicsx.evolution.coupling import Staggered
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
 from remodel_fenicsx.model.laws import Drive
-from remodel_fenicsx.schema.settings import Solver
+from remodel_fenicsx.schema.settings import Solver, Turnover
 from remodel_fenicsx.solver.continuation import StepFailure, Work
 from remodel_fenicsx.state.state import State
 
@@ -30,10 +30,10 @@ class OtherCase:
     ):
         self.number, self.state, self.load_values = number, state, load_values
         self.tissue = stepper.tissue
-        self.remodeling = RemodelingPass(state, stepper.tissue, stepper.remodeling.settings, kappa)
+        settings = stepper.remodeling.settings.model_copy(update={"turnover": Turnover()})  # the first case makes it
+        self.remodeling = RemodelingPass(state, stepper.tissue, settings, kappa)
         self.coupling = Staggered(state, stepper.tissue, self.remodeling, solver)
-        self.coupling.equilibrium.stop_signal = lambda: stepper.coupling.equilibrium.stop_signal()
-        self.cases: Sequence[OtherCase] = ()
+        state.stop_signal = lambda: stepper.state.stop_signal()
 
     def solve(self, time: float) -> Work:
         """Equilibrium at `time` with the present cells."""
@@ -50,6 +50,10 @@ class OtherCase:
         """A step as it is in this case."""
         extension = self.coupling.equilibrium.extension()
         return replace(step, loads=dict(self.state.loading.values), extension=extension, case=self.number)
+
+    def watched_by(self, watcher: Watcher) -> Watcher:
+        """The watcher of this case as one of all steps."""
+        return OtherCaseWatcher(self, watcher)
 
 
 class OtherCaseWatcher(Watcher):
@@ -77,19 +81,5 @@ class OtherCaseWatcher(Watcher):
     def committed(self, step: Step) -> None:
         self.watcher.committed(self.case.seen(step))
 
-
-def join(stepper: Stepper, cases: Sequence[OtherCase], weights: Sequence[float]) -> None:
-    """From now on the stepper solves these cases too, and its pass follows the mean of all."""
-    stepper.coupling.others = list(cases)
-    stepper.state.others = [case.state for case in cases]
-    follow(stepper, cases, weights)
-
-
-def follow(stepper: Stepper, cases: Sequence[OtherCase], weights: Sequence[float]) -> None:
-    """The stepper's pass follows the mean of these cases too, whoever solves them."""
-    stepper.cases = list(cases)
-    if stepper.turnover is not None:
-        stepper.turnover.weights = tuple(weights)
-    if stepper.remodeling.law.remodels:
-        stepper.remodeling.others = [case.drive for case in cases]
-        stepper.remodeling.weights = tuple(weights)
+    def close(self) -> None:
+        self.watcher.close()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from numbers import Real
 from typing import Any, NamedTuple
 
@@ -21,7 +21,7 @@ from remodel_fenicsx.model.drivers import DRIVERS, FRAMES, carried_axes
 from remodel_fenicsx.model.energy import Tissue, axes_sum
 from remodel_fenicsx.model.laws import Drive, LAWS, MEANS_OF_CASES, mean_target, tensor_target
 from remodel_fenicsx.model.tensor_law import ABOVE_ROUNDING, Target, floor_above
-from remodel_fenicsx.schema.settings import Remodeling
+from remodel_fenicsx.schema.settings import COUPLINGS, Remodeling
 from remodel_fenicsx.solver.equilibrium import PointStresses
 from remodel_fenicsx.state.state import Numbers, Parameters, State, on_mesh, stress_rounding
 
@@ -51,8 +51,15 @@ class RemodelingPass:
     def __init__(self, state: State, tissue: Tissue, settings: Remodeling, kappa: Any = None):
         self.state, self.settings = state, settings
         self.quadrature = state.cells.quadrature
-        self.others: Sequence[Callable[[], Drive]] = ()  # drives of further load cases (`load_cases`)
+        self.cases: Sequence[Any] = ()  # further load cases (`load_cases.OtherCase`), which drive the cells too
         self.weights: Sequence[float] = (1.0,)  # of all cases, this one first
+        self.turnover: Any = None  # `TurnoverPass`, which changes content and natural length
+        if settings.turnover.is_on:
+            from remodel_fenicsx.evolution.turnover import TurnoverPass
+
+            self.turnover = TurnoverPass(state, tissue, settings.turnover)
+        # of a pass's change of the cells that is made
+        self.share = settings.relaxation_factor if COUPLINGS[settings.coupling].makes_a_share else 1.0
         self.tissue = with_kernels(on_mesh(tissue, self.quadrature.mesh), state.comm)
         self.parameters = Parameters(self.tissue, self.quadrature)
         self.driver, self.law, self.frame = DRIVERS[settings.driver], LAWS[settings.law], FRAMES[settings.frame]
@@ -72,6 +79,13 @@ class RemodelingPass:
         self.stacked = ufl.as_vector([t[i, j] for t in (F, tensor) for i in range(3) for j in range(3)])
         self._expression = jit.expression(self.stacked, self.quadrature.points)
         self._known: Remembered[Array] = Remembered(state.comm, self.stacked)
+
+    def join(self, cases: Sequence[Any], weights: Sequence[float]) -> None:
+        """From now on further load cases drive the cells too, with these weights: of the first case, and of them."""
+        self.cases, self.weights = list(cases), tuple(weights)
+        self.state.others = [case.state for case in cases]
+        if self.turnover is not None:
+            self.turnover.weights = self.weights
 
     def _set_kappa(self, kappa: Any) -> None:
         self.kappa: Any = kappa
@@ -99,12 +113,12 @@ class RemodelingPass:
     def drive(self, residual: float = 0.0) -> Drive:
         """What acts on the cells in the present state, which was accepted with this norm of out-of-balance forces."""
         # With several load cases: in all of their states.
-        if not self.others:
+        if not self.cases:
             return self._own_drive(residual)
         return MEANS_OF_CASES[self.settings.mean].drive(self._drives(residual), self.weights)
 
     def _drives(self, residual: float) -> list[Drive]:
-        return [self._own_drive(residual), *(drive() for drive in self.others)]
+        return [self._own_drive(residual), *(case.drive() for case in self.cases)]
 
     def _own_drive(self, residual: float) -> Drive:
         F, tensor = self.driving_tensor()
@@ -197,7 +211,7 @@ class RemodelingPass:
 
     @property
     def _averages_targets(self) -> bool:
-        return bool(self.others) and MEANS_OF_CASES[self.settings.mean].of_targets
+        return bool(self.cases) and MEANS_OF_CASES[self.settings.mean].of_targets
 
     def _target_of(self, drive: Drive) -> Target:
         target = self.law.target
@@ -219,7 +233,7 @@ class RemodelingPass:
 
     def asleep_share(self) -> float:
         """Share of the body's volume in which no principal value is above `remodeling.threshold`."""
-        tensor = self.drive().tensor if self.others else self.driving_tensor()[1]
+        tensor = self.drive().tensor if self.cases else self.driving_tensor()[1]
         asleep = np.linalg.eigvalsh(tensor)[:, -1] <= self.settings.threshold
         return float(self.quadrature.mean(asleep.reshape(self.quadrature.shape).astype(float)))
 
@@ -234,13 +248,13 @@ class RemodelingPass:
         """What the last pass has asked for, whatever share of it was made; None before it."""
         return self._change[1] if self.law.remodels and self._change is not None else None
 
-    def apply(self, time_old: float, time_new: float, residual: float = 0.0, factor: float = 1.0) -> float:
+    def apply(self, time_old: float, time_new: float, residual: float = 0.0) -> float:
         """Remodel over a step with the stress of the solved state at time_new; returns the power of remodeling."""
         # The power is the stored energy that the pass releases at frozen deformation, per time, to first order
         # (`Tissue.energy_increment`; Remark 6). A principal stress counts as tension beyond `noise`. Of the change of
-        # the cells a share `factor` is made (`Law.share`).
+        # the cells `share` is made (`Law.share`).
         asked, F = self.updated_cells(time_old, time_new, residual)
-        return self.replace(asked, F, time_new - time_old, factor)
+        return self.replace(asked, F, time_new - time_old, self.share)
 
     def replace(self, asked: UnitCell, F: Array, duration: float, factor: float = 1.0) -> float:
         """Give the state other cells, or a share of the change; returns the power of remodeling at frozen F."""

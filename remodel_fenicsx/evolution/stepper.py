@@ -125,6 +125,9 @@ class Watcher:
     def committed(self, step: Step) -> None:
         """The step is accepted."""
 
+    def close(self) -> None:
+        """Free what PETSc has made for it."""
+
 
 class Stepper:
     """Advances a state in time; a step is all or nothing.
@@ -181,18 +184,9 @@ class Stepper:
             )
         make = coupling or COUPLINGS[name].make
         self.coupling: Coupling = make(state, self.tissue, self.remodeling, solver)
-        # `TurnoverPass`; there already where the coupling's way is another stepper's
-        self.turnover: Any = getattr(self.coupling, "turnover", None)
-        self.cases: Sequence[Any] = ()  # further load cases (`load_cases.OtherCase`)
-        if remodeling.turnover.is_on and self.turnover is None:
-            from remodel_fenicsx.evolution.turnover import TurnoverPass
-
-            self.turnover = self.coupling.turnover = TurnoverPass(state, self.tissue, remodeling.turnover)
+        self.turnover = self.remodeling.turnover
         self._closed = False
-        # asked on each rank in every solve: the signal (SIGINT, SIGTERM) that should end it, or 0
-        self.stop_signal: Callable[[], int] = lambda: 0
-        self.coupling.equilibrium.stop_signal = lambda: self.stop_signal()
-        # asked when a step's pass is done; what it raises takes the step back (`step_control`)
+        # asked when a step's pass is done; what it raises takes the step back (`time_steps`)
         self.judge: Callable[[Step], object] = lambda step: None
 
     @property
@@ -222,7 +216,12 @@ class Stepper:
         return step
 
     def advance(
-        self, time: float, watchers: Sequence[Watcher] = (), is_last: bool = False, rejected: Step | None = None
+        self,
+        time: float,
+        watchers: Sequence[Watcher] = (),
+        is_last: bool = False,
+        rejected: Step | None = None,
+        way: Any = None,
     ) -> Step:
         """One step: equilibrium with the loads of `time`, and remodeling.
 
@@ -235,6 +234,8 @@ class Stepper:
         rejected
             The last attempt at it that was taken back: its work and seconds, which have those of the attempts before
             it, belong to the step.
+        way
+            Solves and remodels in place of the coupling, and nobody judges its step (`homeostasis.Homeostasis`).
 
         Raises
         ------
@@ -253,7 +254,7 @@ class Stepper:
         if time <= state.time:
             raise ValueError(f"time {time!r} does not come after {state.time!r}, that of the last step")
         with state.transaction():
-            work = self.coupling.solve(time, self.load_values(time))
+            work = (way or self.coupling).solve(time, self.load_values(time))
             extension = work.extension or self.coupling.equilibrium.extension()
             if rejected is not None:
                 work.add(rejected.work)
@@ -262,13 +263,14 @@ class Stepper:
             with undone_by_all(watchers, step):
                 for watcher in watchers:
                     watcher.solved(step)
-                step.remodeling_power = self.coupling.remodel(time)
+                step.remodeling_power = (way or self.coupling).remodel(time)
                 step.seconds = clock.perf_counter() - start
                 step.processor_seconds = clock.process_time() - processor_start
                 if rejected is not None:
                     step.seconds += rejected.seconds
                     step.processor_seconds += rejected.processor_seconds
-                self.judge(step)
+                if way is None:
+                    self.judge(step)
                 state.reach(time, step.number)
                 for watcher in watchers:
                     watcher.completed(step)

@@ -52,7 +52,6 @@ class TimeError:
         self.stepper, self.state = stepper, stepper.state
         self.quadrature, self.kappa = stepper.state.cells.quadrature, stepper.remodeling.slowest
         self.turnover = stepper.turnover
-        stepper.coupling.compares = True
         initial = {"row": 0.0, "speed": 0.0, "duration": 0.0, "fading": self.kappa, "answer": 1.0, "turnover": 0.0}
         self._numbers = Numbers(stepper.state, "time_error", initial)
         # of structure tensors: with rows that lag the last error, with others the last row
@@ -65,7 +64,7 @@ class TimeError:
         """The estimate of a step whose pass is done, within its transaction."""
         duration = step.time - self.state.time
         row, better = self._row_and_better()
-        if self.stepper.coupling.accumulates:
+        if self.stepper.coupling.traits.accumulates:
             found = self._added_up(step, row, better, duration)
         elif better is None:
             found = Estimate(0.0, 0.0)
@@ -176,7 +175,7 @@ class TimeError:
         """Whether no load has changed over the step."""
         time = self.state.time
         return _same(self.stepper.load_values(time), step.loads) and all(
-            _same(case.load_values(time), case.state.loading.values) for case in self.stepper.cases
+            _same(case.load_values(time), case.state.loading.values) for case in self.stepper.remodeling.cases
         )
 
     # ------------------------------------------------------------ distances
@@ -199,7 +198,7 @@ class TimeError:
     def _strain(self, step: Step, remodeled: Remodeled) -> tuple[float, bool]:
         """Let the body answer what has remodeled: the largest change of a length, and whether that is a state."""
         # In all load cases.
-        shape, cases, cells = self.quadrature.shape, self.stepper.cases, remodeled.cells
+        shape, cases, cells = self.quadrature.shape, self.stepper.remodeling.cases, remodeled.cells
         before = [case.state.elastic_gradient() for case in (self.stepper, *cases)]
         self.state.cells.set(cells.dimensions.reshape(*shape, 3), cells.axes.reshape(*shape, 3, 3))
         if remodeled.turnover is not None:
@@ -234,19 +233,15 @@ def _same(before: Mapping[str, float], loads: Mapping[str, float]) -> bool:
 log = logging.getLogger(__name__)
 
 AIM = 0.85  # share of the tolerance that another length aims at
-NEARLY_THE_TOLERANCE = 0.97  # where steps as they are would come above it, the next one is shorter
-WORTHWHILE = 1.5  # ratio from which on steps are lengthened
+KEPT, WORTHWHILE = 0.9, 1.5  # best lengths over the present one between which steps stay as they are
 GROWTH, SHRINKAGE = 2.0, 0.1  # limits of the ratio of two steps
-LATEST = 0.5  # share of the last step in an error that lags behind; the rest is of those before
 STRETCHED = 1.05  # so much longer steps are allowed to be where they are one fewer to a stop
-SHORTER, MUCH_SHORTER = 0.8, 0.5  # a step that was too long is at most this long at the next attempt, and at others
 SMALLEST = 2.0**-12  # of the first step: shorter ones are not tried where steps cannot be solved
 FASTEST = 360.0  # degrees by which chains turn, at most, while cells remodel or loads go from one corner to the next
 FALLS, LONGER = 0.8, 2.0  # an error within this share of that of so much a longer step does not come from the step
 SHORT = 0.3  # of such a time: longer steps may have an error that has saturated
 IN_VAIN = 20  # steps above the tolerance in such a time that shorter ones would not help, until longer ones go on
-AGAIN = 0.5  # share of these that is left when shorter steps are tried again
-NEAR = 4.0  # tolerances: below such an error they are tried at once
+NEAR = 4.0  # tolerances: below such an error shorter steps are tried again
 FAILED_STEPS = 3  # steps in a row that could not be solved, each a quarter of the one before
 TELLING_ERROR = 1e-4  # of the tolerance: smaller errors say nothing about the next step
 
@@ -262,14 +257,16 @@ class StepTooLongError(Exception):
 class StepControl:
     """Marches a stepper to the last of some times, which are hit exactly, in steps of an error below a tolerance."""
 
-    def __init__(self, stepper: Stepper, tolerance: float, first: float, stops: Sequence[float]):
+    def __init__(
+        self, stepper: Stepper, tolerance: float, first: float, stops: Sequence[float], longest: float = math.inf
+    ):
         self.stepper, self.state, self.tolerance = stepper, stepper.state, tolerance
         self.first, self.stops = first, list(stops)
+        self.longest = min(longest, stepper.coupling.traits.longest)  # times kappa
         self.error = TimeError(stepper)
         self.level = logging.WARNING  # of what is said of steps above the tolerance
-        initial = {"wanted": first, "effective": 0.0, "before": 1.0, "said": 0.0}
-        initial |= {"usual": first, "in_vain": 0.0, "goes_on": 0.0}
-        initial |= {"refused": 0.0, "refused_error": 0.0}  # a longer step, since which all have been shorter
+        # "before": error of the last step; "usual": length of steps within the tolerance
+        initial = {"wanted": first, "before": 1.0, "usual": first, "in_vain": 0.0, "said": 0.0}
         self._numbers = Numbers(stepper.state, "step_control", initial)
         self._rejected: list[StepTooLongError] = []  # attempts at the step under way
         stepper.judge = self._judge
@@ -295,9 +292,7 @@ class StepControl:
             except StepTooLongError as rejected:
                 log.debug("time %g: %s, taken back", time, rejected)
                 self._rejected.append(rejected)
-                ratio = AIM * rejected.error ** (-1 / self.stepper.coupling.order)
-                most = MUCH_SHORTER if before else SHORTER
-                duration = max(rejected.duration * min(most, max(SHRINKAGE, ratio)), self._shortest())
+                duration = max(self._best(rejected.error, rejected.duration, GROWTH), self._shortest())
             except StepFailure as failure:
                 failures += 1
                 duration = (time - self.state.time) / 4
@@ -316,37 +311,57 @@ class StepControl:
     def _judge(self, step: Step) -> None:
         """Accept a step and choose the next one, or raise."""
         error, duration = self.error.measure(step).controlled / self.tolerance, step.time - self.state.time
-        numbers, shortest = self._numbers, self._shortest()
+        numbers, shortest, goes_on = self._numbers, self._shortest(), self._numbers["in_vain"] > IN_VAIN
         longer = self._longer_with_the_same(error, duration)
-        in_vain = duration <= (1 + 1e-9) * STRETCHED * shortest or longer or numbers["goes_on"]
-        if error > 1 and not in_vain:
+        if error > 1 and not (goes_on or longer or duration <= (1 + 1e-9) * STRETCHED * shortest):
             raise StepTooLongError(step, duration, error)
         wanted = longer or self._next(error, duration)
-        self._remember_refused(duration)
-        self._count(step, error, duration)
-        wanted = max(numbers["usual"] if numbers["goes_on"] else wanted, shortest)
+        goes_on = self._count(error, duration)
+        if step.time_error > self.tolerance and error > 1 and numbers["said"] < 1 + goes_on:
+            numbers["said"] = 1.0 + goes_on
+            self._say(step, goes_on)
         fastest = self.stepper.fastest
-        numbers["wanted"] = min(wanted, self.stepper.coupling.longest / fastest if fastest else wanted)
-        numbers["before"], numbers["effective"] = max(error, TELLING_ERROR), self._effective(duration)
+        wanted = max(numbers["usual"] if goes_on else wanted, shortest)
+        numbers["wanted"] = min(wanted, self.longest / fastest if fastest else wanted)
+        numbers["before"] = max(error, TELLING_ERROR)
 
+    def _best(self, error: float, duration: float, most: float) -> float:
+        """Length of a step with the error that is aimed at."""
+        ratio = (AIM / max(error, TELLING_ERROR)) ** (1 / self.stepper.coupling.traits.order)
+        return duration * min(most, max(SHRINKAGE, ratio))
+
+    def _next(self, error: float, duration: float) -> float:
+        """Length of the next steps: as they are, or another one where it is worth it."""
+        if self._rejected:
+            return self._best(error, duration, 1.0)
+        # an error that lags behind rises once more after a longer step, by as much
+        present = self._numbers["wanted"]
+        best = self._best(error + max(0.0, error - self._numbers["before"]), duration, GROWTH * present / duration)
+        return present if KEPT * present <= best < WORTHWHILE * present else best
+
+    # ------------------------------------------------------------ steps in vain
     def _longer_with_the_same(self, error: float, duration: float) -> float:
-        """Length of a much longer step that was refused for about the same error, now or before a few accepted ones."""
-        # It is that of something that happens at once, now or soon; shorter steps would only come nearer to it. 0:
-        # none.
+        """Length of a much longer attempt that was refused for about the same error: not for its length. 0: none."""
         if error <= 1 or duration > SHORT * self._fastest_time():
             return 0.0
-        refused = [(rejected.duration, rejected.error) for rejected in self._rejected]
-        refused.append((self._numbers["refused"], self._numbers["refused_error"]))
-        same = [length for length, its in refused if length >= LONGER * duration and FALLS < error / its < 1 / FALLS]
-        return max(same, default=0.0)
+        same = [refused.duration for refused in self._rejected if FALLS < error / refused.error < 1 / FALLS]
+        return max((length for length in same if length >= LONGER * duration), default=0.0)
 
-    def _remember_refused(self, duration: float) -> None:
-        """For the steps to come; the first step, before which there is no stress, has an error of another kind."""
-        numbers = self._numbers
-        if self._rejected and self.state.number:
-            numbers["refused"], numbers["refused_error"] = self._rejected[0].duration, self._rejected[0].error
-        elif duration >= numbers["refused"]:
-            numbers["refused"] = numbers["refused_error"] = 0.0
+    def _count(self, error: float, duration: float) -> bool:
+        """Steps above the tolerance that could not be made shorter: whether they are so many that longer ones go on."""
+        numbers, faded = self._numbers, math.exp(-duration / self._fastest_time())
+        numbers["in_vain"] *= faded
+        if error <= 1:
+            numbers["usual"] = max(duration, faded * numbers["usual"])
+        elif numbers["in_vain"] <= IN_VAIN:
+            numbers["in_vain"] += 1
+        if error <= NEAR:
+            numbers["in_vain"] = min(numbers["in_vain"], IN_VAIN)
+        return numbers["in_vain"] > IN_VAIN
+
+    def _shortest(self) -> float:
+        """Length below which no step is cut for its error."""
+        return max(self.tolerance / FASTEST * self._fastest_time(), SMALLEST * self.first)
 
     def _fastest_time(self) -> float:
         """In which chains may turn by `FASTEST` degrees."""
@@ -357,49 +372,9 @@ class StepControl:
             return min(after - before, remodeling.settings.rotation_time)
         return min(after - before, 1 / fastest) if fastest else after - before
 
-    def _shortest(self) -> float:
-        """Length below which no step is cut for its error."""
-        return max(self.tolerance / FASTEST * self._fastest_time(), SMALLEST * self.first)
-
-    def _count(self, step: Step, error: float, duration: float) -> None:
-        """Steps above the tolerance that could not be made shorter, and how long steps were that could."""
-        numbers, faded = self._numbers, math.exp(-duration / self._fastest_time())
-        numbers["in_vain"] *= faded
-        if error <= 1:
-            numbers["usual"] = max(duration, faded * numbers["usual"])
-        elif not numbers["goes_on"]:
-            numbers["in_vain"] += 1
-        if numbers["goes_on"]:
-            numbers["goes_on"] = float(error > NEAR and numbers["in_vain"] > AGAIN * IN_VAIN)
-        elif numbers["in_vain"] > IN_VAIN:
-            numbers["goes_on"] = 1.0
-        said = float(error > 1 and step.time_error > self.tolerance) * (1.0 + numbers["goes_on"])
-        if said > numbers["said"]:
-            self._say(step)
-            numbers["said"] = said
-
-    def _effective(self, duration: float) -> float:
-        """Length of steps that would, one after another, have this step's error."""
-        before = self._numbers["effective"]
-        if self.stepper.coupling.accumulates or not before:
-            return duration
-        return LATEST * duration + (1 - LATEST) * before
-
-    def _next(self, error: float, duration: float) -> float:
-        """Length of the next steps: as they are, or another one where it is worth it."""
-        numbers, order = self._numbers, self.stepper.coupling.order
-        wanted = duration if self._rejected else numbers["wanted"]
-        settled = max(error, TELLING_ERROR) * (wanted / self._effective(duration)) ** order  # of steps as they are
-        rising = max(0.0, error - numbers["before"]) if numbers["effective"] else 0.0
-        ratio = (AIM / settled) ** (1 / order)
-        if settled + rising > NEARLY_THE_TOLERANCE:
-            return wanted * min(1.0, max(SHRINKAGE, ratio))
-        return wanted * min(GROWTH, ratio) if ratio >= WORTHWHILE and not self._rejected else wanted
-
-    def _say(self, step: Step) -> None:
+    def _say(self, step: Step, goes_on: bool) -> None:
         if self.state.comm.rank:
             return
-        goes_on = f". The run goes on with steps of {self._numbers['usual']:.3g}" if self._numbers["goes_on"] else ""
         log.log(
             self.level,
             "time %g: the estimated error in time, %.3g degrees, does not fall to time.tolerance = %g with steps of "
@@ -409,5 +384,5 @@ class StepControl:
             step.time_error,
             self.tolerance,
             step.time - self.state.time,
-            goes_on,
+            f". The run goes on with steps of {self._numbers['usual']:.3g}" if goes_on else "",
         )

@@ -25,8 +25,7 @@ from ufl.corealg.traversal import traverse_unique_terminals, unique_post_travers
 from remodel_fenicsx.fem import jit
 
 
-# ---------------------------------------------------------------- one linear equation with a symmetric, positive
-# One linear equation with a symmetric, positive definite form.
+# ---------------------------------------------------------------- a linear equation with a positive definite form
 
 TOLERANCE = 1e-12  # relative, of the linear solve: what comes of it has ten digits on any number of ranks
 ITERATION_LIMIT = 20_000  # lines of a thousand elements need some thousands
@@ -94,44 +93,28 @@ def of_all_ranks(comm: MPI.Intracomm, value: Any) -> list[Any]:
 def coefficient(mesh: Any, name: str, value: Any) -> Any:
     """The value as forms take it, so that another value compiles nothing."""
     if isinstance(value, Real) and not isinstance(value, (bool, np.bool_)):
-        if not np.isfinite(float(value)):
-            raise ValueError(f"{name} = {value}: must be finite")
-        return dolfinx.fem.Constant(mesh, PETSc.ScalarType(float(value)))
-    if isinstance(value, dolfinx.fem.Constant):
-        _require_this_mesh(mesh, name, value.ufl_domain())
-        if value.ufl_shape != ():
-            raise ValueError(f"{name}: a Constant of shape {value.ufl_shape}; must be a scalar")
-        if not np.all(np.isfinite(value.value)):
-            raise ValueError(f"{name} = {value.value}: must be finite")
-        own = dolfinx.fem.Constant(mesh, PETSc.ScalarType(value.value))
-        own._cpp_object = value._cpp_object
-        return own
-    if isinstance(value, dolfinx.fem.Function):
-        space = value.function_space
-        _require_this_mesh(mesh, name, space.mesh.ufl_domain())
-        element = space.ufl_element()
-        if element.degree != 0 or not element.discontinuous or value.ufl_shape != ():
-            raise ValueError(f"{name}: {_described(value)}; must be a scalar DG0 Function, one value an element")
-        finite = bool(np.all(np.isfinite(value.x.array)))
-        if not mesh.comm.allreduce(finite, MPI.LAND):
-            raise ValueError(f"{name}: a Function with values that are not finite; every one must be")
-        return dolfinx.fem.Function(space, value.x, name=name)
-    raise TypeError(
-        f"{name} = {value!r:.60}: must be a number, a dolfinx Constant or a DG0 Function of this mesh, "
-        f"not a {type(value).__name__}"
-    )
-
-
-def _described(function: Any) -> str:
-    """What a Function is, on one line."""
-    element = function.function_space.ufl_element()
-    family, shape = getattr(element, "family_name", "quadrature"), function.ufl_shape
-    return f"a Function of {family} elements of degree {element.degree}" + (f" and shape {shape}" if shape else "")
-
-
-def _require_this_mesh(mesh: Any, name: str, domain: Any) -> None:
+        value = dolfinx.fem.Constant(mesh, PETSc.ScalarType(float(value)))
+    if not isinstance(value, (dolfinx.fem.Constant, dolfinx.fem.Function)):
+        raise TypeError(
+            f"{name} = {value!r:.60}: must be a number, a dolfinx Constant or a DG0 Function of this mesh, "
+            f"not a {type(value).__name__}"
+        )
+    domain = value.ufl_domain()
     if domain is None or domain.ufl_cargo() is not mesh.ufl_domain().ufl_cargo():
         raise ValueError(f"{name}: belongs to another mesh; must be of this one")
+    is_function = isinstance(value, dolfinx.fem.Function)
+    element = value.function_space.ufl_element() if is_function else None
+    if value.ufl_shape != () or (element and not (element.degree == 0 and element.discontinuous)):
+        words = f"a {type(value).__name__} of shape {value.ufl_shape}" + (f", {element}" if element else "")
+        raise ValueError(f"{name}: {words}; must be one number, or a scalar DG0 Function, one value an element")
+    numbers = value.x.array if is_function else value.value
+    if not mesh.comm.allreduce(bool(np.all(np.isfinite(numbers))), MPI.LAND):
+        raise ValueError(f"{name} = {value if is_function else value.value}: must be finite everywhere")
+    if is_function:
+        return dolfinx.fem.Function(value.function_space, value.x, name=name)
+    own = dolfinx.fem.Constant(mesh, PETSc.ScalarType(value.value))
+    own._cpp_object = value._cpp_object
+    return own
 
 
 def point_values(value: Any, quadrature: Any) -> NDArray[np.float64]:

@@ -17,7 +17,7 @@ import sysconfig
 import tempfile
 import time as clock
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, chdir, contextmanager, suppress
 from pathlib import Path
 from types import ModuleType
 from typing import IO, Any
@@ -101,20 +101,11 @@ def cache_folder() -> Path:
     return other / name
 
 
-def _read_users_options() -> None:
-    """Let dolfinx and FFCx read the options of the user's own folder, once, and none of the working folder."""
-    # That may be somebody else's; its files would choose libraries to load and change numbers.
-    here = os.open(".", os.O_RDONLY)
-    os.chdir("/")
-    try:
-        dolfinx.jit.get_options()
-        ffcx.options.get_options()
-    finally:
-        os.fchdir(here)
-        os.close(here)
-
-
-_read_users_options()
+# dolfinx and FFCx read the options of the user's own folder, once, and none of the working folder: that may be somebody
+# else's, and its files would choose libraries to load and change numbers
+with chdir("/"):
+    dolfinx.jit.get_options()
+    ffcx.options.get_options()
 
 
 @functools.cache
@@ -314,7 +305,10 @@ def _compiling(kernel: str, what: str, seconds: int) -> Iterator[None]:
         spent = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - before
         elapsed = clock.monotonic() - start
         log.info("compiled %s in %.1f s, %.1f s of processor time in the compiler: %s", what, elapsed, spent, kernel)
-        _count(kernel)
+        _compiled.append(kernel)
+        if os.environ.get(COMPILED):
+            with open(os.environ[COMPILED], "a") as file:
+                file.write(f"{kernel}\n")
 
 
 def _raise_if_killed(error: BaseException | None) -> None:
@@ -327,13 +321,6 @@ def _raise_if_killed(error: BaseException | None) -> None:
         if isinstance(cause, subprocess.CalledProcessError) and -cause.returncode in SIGNALS:
             raise Interrupted(-cause.returncode, on_all_ranks=False) from error
         cause = cause.__cause__ or cause.__context__
-
-
-def _count(kernel: str) -> None:
-    _compiled.append(kernel)
-    if os.environ.get(COMPILED):
-        with open(os.environ[COMPILED], "a") as file:
-            file.write(f"{kernel}\n")
 
 
 # ---------------------------------------------------------------- the cache
@@ -365,7 +352,9 @@ def _alone(kernel: str) -> Iterator[None]:
     with (folder / kernel).open("a+") as lock:
         try:
             _take(lock)
-            _remove_unfinished(kernel)
+            if not _is_cached(kernel) and any(path.exists() for path in _files(kernel)):
+                log.info("removing a compilation that was cut off: %s", kernel)
+                _remove(kernel)
         except OSError as error:  # some network file systems have no locks
             log.warning(
                 "%s cannot be locked (%s): several runs at a time may wait for each other", lock.name, error.strerror
@@ -389,10 +378,3 @@ def _take(lock: IO[str]) -> None:
     lock.truncate(0)
     lock.write(f"{os.getpid()}\n")
     lock.flush()
-
-
-def _remove_unfinished(kernel: str) -> None:
-    """Remove what a killed compilation left: a .c file (FFCx's lock) without end mark or library, or one of these."""
-    if not _is_cached(kernel) and any(path.exists() for path in _files(kernel)):
-        log.info("removing a compilation that was cut off: %s", kernel)
-        _remove(kernel)

@@ -357,14 +357,8 @@ class PointKinematics(_Reduced):
 
 
 KINEMATICS: dict[str, Kinematics] = {
-    kinematics.name: kinematics
-    for kinematics in (
-        FullKinematics(),
-        SectorKinematics(),
-        AxisymmetricKinematics(),
-        RadialKinematics(),
-        PointKinematics(),
-    )
+    kind.name: kind()
+    for kind in (FullKinematics, SectorKinematics, AxisymmetricKinematics, RadialKinematics, PointKinematics)
 }
 """Kinematics by the name that a scene gives them."""
 
@@ -372,16 +366,22 @@ KINEMATICS: dict[str, Kinematics] = {
 # ---------------------------------------------------------------- tissue that is free of stress elsewhere
 
 
-class NaturalConfiguration:
-    """A body whose tissue is free of stress in another configuration, from which G leads to the mesh: F_e = F G."""
+class _Around:
+    """Kinematics as those of another field, `field`, but for what the class says."""
 
-    def __init__(self, kinematics: Any, gradient: Any, closing: Any = None):
-        self.field, self.gradient, self.closing = kinematics, gradient, closing
+    field: Any
 
     def __getattr__(self, name: str) -> Any:
         if name == "field":  # while it is copied it has none
             raise AttributeError(name)
         return getattr(self.field, name)
+
+
+class NaturalConfiguration(_Around):
+    """A body whose tissue is free of stress in another configuration, from which G leads to the mesh: F_e = F G."""
+
+    def __init__(self, kinematics: Any, gradient: Any, closing: Any = None):
+        self.field, self.gradient, self.closing = kinematics, gradient, closing
 
     def elastic(self, deformation_gradient: Any) -> Any:
         """F G."""
@@ -403,7 +403,7 @@ class NaturalConfiguration:
 # ---------------------------------------------------------------- the length as an unknown
 
 
-class FreeLength:
+class FreeLength(_Around):
     """A body whose length is one more unknown: the axial force is given, or a pressure acts on caps at its ends."""
 
     suits_multigrid = False  # GMRES with GAMG does not converge where a row is full
@@ -411,16 +411,10 @@ class FreeLength:
     def __init__(self, kinematics: Kinematics, body: Any):
         self.field, self.body = kinematics, body
 
-    def __getattr__(self, name: str) -> Any:
-        if name == "field":  # while it is copied it has none
-            raise AttributeError(name)
-        return getattr(self.field, name)
-
     def unknown(self, mesh: Any, degree: int) -> Any:
         """(u, e), zero."""
         import basix.ufl
         import dolfinx.fem
-        from petsc4py import PETSc
 
         element = self.field.unknown(mesh, degree).function_space.ufl_element()
         number = basix.ufl.element("DG", mesh.topology.cell_name(), 0)
@@ -428,8 +422,7 @@ class FreeLength:
         unknown = dolfinx.fem.Function(with_one_value(space, 1), name="displacement")
         nodes, self._dofs = unknown.function_space.sub(0).collapse()
         self._nodal = dolfinx.fem.Function(nodes)
-        length: Any = PETSc.ScalarType(self.body.axial_length)  # type: ignore[attr-defined]
-        self._length = dolfinx.fem.Constant(mesh, length)
+        self._length = _constant(mesh, self.body.axial_length)
         return unknown
 
     def change_of_length(self, unknown: Any) -> Any:
@@ -451,10 +444,7 @@ class FreeLength:
         import ufl
 
         u, change = ufl.split(unknown)
-        stretch = change / self._length
-        return self.field.deformation_gradient(u) + ufl.as_tensor(
-            [[stretch if i == j == 2 else 0.0 for j in range(3)] for i in range(3)]
-        )
+        return self.field.deformation_gradient(u) + _along(2, change / self._length)
 
     def elastic_gradient(self, unknown: Any) -> Any:
         """Of the field and the length together."""

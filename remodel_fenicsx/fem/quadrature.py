@@ -90,7 +90,9 @@ class Quadrature:
         self.volumes: NDArray[np.float64] = lengths.prod(axis=2) * self.weights
         number = mesh.topology.index_map(mesh.topology.dim).size_global
         self.extent = float((self.integral(np.ones(self.shape)) / number) ** (1 / mesh.topology.dim))
-        self.volumes = self.volumes * self._values_of(weight)
+        if not isinstance(weight, (int, float)):
+            weight = self.evaluate(jit.expression(weight, self.points, "the volume of the body per unit of mesh"), ())
+        self.volumes = self.volumes * weight
         self.smallest_lengths: NDArray[np.float64] = np.asarray(lengths[..., -1], dtype=np.float64)
         self.largest_areas: NDArray[np.float64] = (self.volumes / lengths[..., -1]).sum(axis=1)
         self.smallest_areas: NDArray[np.float64] = (self.volumes / lengths[..., 0]).sum(axis=1)
@@ -103,12 +105,6 @@ class Quadrature:
         places = np.einsum("pk,nki->npi", functions[0], nodes)
         jacobians = np.einsum("dpk,nki->npid", functions[1:], nodes)
         return places, np.linalg.svd(jacobians, compute_uv=False)
-
-    def _values_of(self, weight: Any) -> Any:
-        """A number, or UFL at the points."""
-        if isinstance(weight, (int, float)):
-            return weight
-        return self.evaluate(jit.expression(weight, self.points, "the volume of the body per unit of mesh"), ())
 
     @property
     def dx(self) -> ufl.Measure:
@@ -213,7 +209,7 @@ class Quadrature:
         Elements of a single point have nothing inside: theirs is the distance from the mean over their neighbours.
         """
         if self.shape[1] == 1:
-            return values - self._mean_of_neighbours(values[:, 0])[:, None]
+            return values - self._means_at_nodes(values).mean(axis=1, keepdims=True)
         if degree not in self._complements:
             kind = basix.CellType[self.element_kind]
             element = basix.create_element(basix.ElementFamily.P, kind, degree, discontinuous=True)
@@ -240,17 +236,11 @@ class Quadrature:
         )
         return np.asarray(np.linalg.pinv(np.asarray(element.tabulate(0, self.points))[0, :, :, 0]))
 
-    def _mean_of_neighbours(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Of values (owned elements, n): means over all elements at each node, averaged over an element's nodes."""
-        return np.asarray(self._means_at_nodes(values[:, None]).mean(axis=1))
-
     def _means_at_nodes(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Of values at an element's nodes, or the same at all, (owned elements, nodes or 1, n): means by volume."""
         nodes, number = geometry_dofmap(self.mesh)[: self.number_of_owned_elements], values.shape[-1] + 1
         sums = dolfinx.la.vector(self.mesh.geometry.index_map(), number, dtype=np.float64)
-        volumes = np.broadcast_to(
-            self.owned(self.volumes).sum(axis=1)[:, None, None], (*nodes.shape, 1)
-        )  # fmt: skip
+        volumes = np.ones((*nodes.shape, 1)) * self.owned(self.volumes).sum(axis=1)[:, None, None]
         at_nodes = sums.array.reshape(-1, number)
         np.add.at(at_nodes, nodes, np.concatenate([values * volumes, volumes], axis=-1))
         sums.scatter_reverse(dolfinx.la.InsertMode.add)

@@ -154,20 +154,16 @@ def method_options(method: str, ranks: int, small: bool = False) -> dict[str, An
     options = dict(SOLVER_METHODS[method].options)
     if small and ranks == 1 and options.get("pc_factor_mat_solver_type") == "mumps":
         options |= {"pc_factor_mat_solver_type": "petsc", "mat_mumps_icntl_33": False}
-    return _on_ranks(options, method, ranks)
-
-
-def factor_options(kind: str) -> dict[str, Any]:
-    """PETSc options of a preconditioner that factorises on one rank, a key of `FACTOR_OPTIONS`."""
-    return {name: value for name, value in FACTOR_OPTIONS[kind].items() if name.startswith(("pc_", "mat_"))}
-
-
-def _on_ranks(options: dict[str, Any], method: str, ranks: int) -> dict[str, Any]:
     if ranks > 1:
         options |= SOLVER_METHODS[method].on_several_ranks
         if options.get("pc_type") == "telescope":
             options["pc_telescope_reduction_factor"] = ranks
     return options
+
+
+def factor_options(kind: str) -> dict[str, Any]:
+    """PETSc options of a preconditioner that factorises on one rank, a key of `FACTOR_OPTIONS`."""
+    return {name: value for name, value in FACTOR_OPTIONS[kind].items() if name.startswith(("pc_", "mat_"))}
 
 
 # ---------------------------------------------------------------- options that a scene may give

@@ -127,7 +127,7 @@ static inline double stiffness(double r, double L, double *slope)
     return (1 + (2 - x) / (4 * left * left)) / L;
 }
 
-/* network.stress with energy.neo_hookean_derivatives; the derivatives by A and by C may be null. */
+/* implicit.stress with energy.neo_hookean_derivatives; the derivatives by A and by C may be null. */
 static void stress(point *p, state *s, matrix *by_cells, matrix *by_strain)
 {
     const double *q = p->parameter, L = q[CONTOUR_LENGTH], r0 = q[END_TO_END_LENGTH];
@@ -215,7 +215,7 @@ static void cells(point *p, state *s)
     ALL(i) ALL(j) s->A[i][j] = p->old[i][j] + weight * (squared * direction[i][j] - p->old[i][j]);
 }
 
-/* responses.tensor_response with tensor_law.target_derivatives: dA/dD at a state that is there. */
+/* implicit.tensor_response with tensor_law.target_derivatives: dA/dD at a state that is there. */
 static void cells_by_tensor(point *p, state *s, matrix result)
 {
     const double squared = p->parameter[END_TO_END_LENGTH] * p->parameter[END_TO_END_LENGTH];
@@ -286,7 +286,7 @@ static void drive_by_strain(point *p, tensor S, matrix result)
     }
 }
 
-/* condensed.CondensedPoints._trial: all that D says. */
+/* implicit.CondensedPoints._trial: all that D says. */
 static void evaluate(point *p, state *s)
 {
     tensor D;
@@ -310,7 +310,7 @@ static void equation(point *p, state *s, matrix result, matrix answers, matrix d
     MANDEL(a) MANDEL(b) result[a][b] = (a == b) - by_stress(p, ROW[a], COLUMN[a]) * answers[a][b];
 }
 
-/* condensed.CondensedPoints._better: a step not longer than D, halved where it leads to r >= L. */
+/* implicit.CondensedPoints._better: a step not longer than D, halved where it leads to r >= L. */
 static void iterate(point *p, state *s)
 {
     matrix left, answers, direct;
@@ -332,7 +332,7 @@ static void iterate(point *p, state *s)
     *s = next;
 }
 
-/* condensed.CondensedPoints.solve, from start; all results in the global basis. */
+/* implicit.CondensedPoints.solve, from start; all results in the global basis. */
 void solve(int64_t n, const double *F, const double *start, const double *old, const double *parameters,
            double floor, double solved, const double *rate, int driver, int repulsion, double *tensors, double *structure,
            double *stresses, double *squared, uint8_t *converged)
@@ -362,7 +362,7 @@ void solve(int64_t n, const double *F, const double *start, const double *old, c
     }
 }
 
-/* condensed._first_by_gradient: dP/dF (9, 9) = dC/dF^T dS/dC dC/dF / 2, and S, with both in the eigenbasis of C. */
+/* implicit._first_by_gradient: dP/dF (9, 9) = dC/dF^T dS/dC dC/dF / 2, and S, with both in the eigenbasis of C. */
 static void by_gradient(point *p, tensor S, matrix by_strain, double *result)
 {
     double carried[3][3], strain[6][9], stress[6][9];   /* F Q, dC/dF, dS/dF */
@@ -386,7 +386,7 @@ static void by_gradient(point *p, tensor S, matrix by_strain, double *result)
         }
 }
 
-/* condensed.CondensedPoints.tangent at solved points. */
+/* implicit.CondensedPoints.tangent at solved points. */
 void tangent(int64_t n, const double *F, const double *tensors, const double *old, const double *parameters,
              double floor, double solved, const double *rate, int driver, int repulsion, double *result)
 {

@@ -14,7 +14,7 @@ from remodel_fenicsx.model.spectral import principal
 
 
 # ---------------------------------------------------------------- local axes of a body
-# Local axes of a body: what is circumferential, axial and radial at its points, and how deep they lie.
+# What is circumferential, axial and radial at its points, and how deep they lie.
 
 Array = NDArray[np.float64]
 Maker = Callable[[], Array]
@@ -141,7 +141,7 @@ AXES: dict[str, Callable[[LocalAxes], Array]] = {
 
 
 # ---------------------------------------------------------------- unit cells that follow from measured fibres
-# Unit cells that follow from measured fibres: structure tensors, fibre directions or fibre angles.
+# Structure tensors, fibre directions or fibre angles.
 
 # name of what is measured: numbers that a row of it may have
 MEASURED = {"structure_tensor": (9, 6), "fibre": (3,), "angle": (1,), "fibre_2": (3,), "weight": (1,)}

@@ -18,11 +18,10 @@ from remodel_fenicsx.model.laws import Drive, LAWS, Law, Ranked, by_rank
 from remodel_fenicsx.model.turnover import TurnedOver, TurnoverRule, at_the_end
 
 
-# ---------------------------------------------------------------- what cells a driving tensor makes at the end of a
-# What cells a driving tensor makes at the end of a step, with the derivative: the laws, for Newton's method.
-#  Everything is in the eigenbasis of C (`network`). The tensor X lives where the law looks for its eigenvectors: in
-# material space, or, for a spatial driver and the frame `spatial`, in space. The cells themselves are those of
-# `laws`.
+# ---------------------------------------------------------------- the laws, for Newton's method
+# What cells a driving tensor makes at the end of a step, with the derivative. Everything is in the eigenbasis of C
+# . The tensor X lives where the law looks for its eigenvectors: in material space, or, for a spatial driver
+# and the frame `spatial`, in space. The cells themselves are those of `laws`.
 
 Array = NDArray[np.float64]
 
@@ -190,11 +189,11 @@ def _pulled_back(step: StepOfCells, found: Ranked, strain: Strain) -> tuple[Arra
     return np.where(before, by_turns(i, j), -by_turns(j, i)), np.where(before, by_stretch(i, j), -by_stretch(j, i))
 
 
-# ---------------------------------------------------------------- stress of matrix and network on arrays, with its
-# Stress of matrix and network on arrays, with its derivatives by strain and by cells: what a condensed tangent needs.
-#  Everything is in the eigenbasis of C, where C is diagonal. Symmetric tensors are Mandel vectors, derivatives 6 x 6
-# matrices (`tensors`). Cells are given by six numbers y of their own: the structure tensor itself, or the three
-# lengths and the three turns of an orthotropic cell.
+# ---------------------------------------------------------------- stress of matrix and network on arrays
+# With its derivatives by strain and by cells: what a condensed tangent needs. Everything is in the eigenbasis of C,
+# where C is diagonal. Symmetric tensors are Mandel vectors, derivatives 6 x 6 matrices (`tensors`). Cells are given by
+# six numbers y of their own: the structure tensor itself, or the three lengths and the three turns of an orthotropic
+# cell.
 #     S = S_matrix + c (g(r) A - g(r0) G),    r^2 = A : C,    G = dM/dC
 # With turnover it is m c (g(r/rho)/rho^2 A - g(r0) G), m and rho those at the end of a step as functions of r.
 # Points are named tuples of arrays, one entry of each array a point: `at` takes some of them, `put` puts some into
@@ -439,26 +438,24 @@ def stress(
     return Stress(value, chains.extension, by_cells, by_strain, chains.turnover)
 
 
-# ---------------------------------------------------------------- cells that belong to the stress of the same step,
-# Cells that belong to the stress of the same step, at each point: local Newton method and consistent tangent.
-#  At a point the cells at the end of a step are a function of F. The unknown is the driving tensor D in material
-# space (U S U / J for `cauchy`, S for `pk2`, C for `finger`), six numbers:
+# ---------------------------------------------------------------- cells that belong to the stress of the same step
+# At each point: local Newton method and consistent tangent. At a point the cells at the end of a step are a function of
+# F. The unknown is the driving tensor D in material space (U S U / J for `cauchy`, S for `pk2`, C for `finger`), six
+# numbers:
 #     D(C, S(C, y)) - D = 0,    y = y(F, D)                                        (i1)
-# with six numbers y of the cells (`network`). With turnover, S has in it content and natural length at the end of the
+# with six numbers y of the cells. With turnover, S has in it content and natural length at the end of the
 # step, which are functions of r(C, y) (`model.turnover.at_the_end`). A change of F at a solution, with indices for
 # derivatives, has
-#     (1 - D_S S_y y_D) dD = D_C dC + D_S dS|_D,    dS|_D = S_C dC + S_y y_F dF    (i2)     dP = dF S + F dS,    dS =
-# dS|_D + S_y y_D dD                                 (i3)
+#     (1 - D_S S_y y_D) dD = D_C dC + D_S dS|_D,    dS|_D = S_C dC + S_y y_F dF    (i2)
+#     dP = dF S + F dS,    dS = dS|_D + S_y y_D dD                                 (i3)
 # which is not symmetric (docs/theory.md, "Implicit coupling"). Plain arrays of n points in, arrays out.
 
 Flags = NDArray[np.bool_]
 
 LOCAL_ITERATIONS = 25  # of the local Newton method
 PARTS = 8  # of a step where the method does not find its end at once, each twice as long as what is before it
-STALLED_ITERATIONS = (
-    3  # of them in a row that do not leave PROGRESS times the residual: without a solution they go in a circle
-)
-PROGRESS = 0.9
+# of them in a row that do not leave PROGRESS times the residual: without a solution they go in a circle
+STALLED_ITERATIONS, PROGRESS = 3, 0.9
 LOCAL_HALVINGS = 12  # of one of its steps, where it would lead to r >= L
 TOLERANCE = 1e-12  # of D: where the local Newton method stops
 IDENTITY = np.eye(6)
@@ -629,7 +626,7 @@ class CondensedPoints:
         return self.step.drive.driver.derivatives
 
     def _place(self, strain: Strain, tensor: Array) -> Array:
-        """X of D in the eigenbasis of C (`responses`)."""
+        """X of D in the eigenbasis of C."""
         if not self.step.is_spatial:
             return tensor
         R = strain.rotation

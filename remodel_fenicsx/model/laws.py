@@ -414,8 +414,8 @@ LAWS: dict[str, Law] = {
 
 
 # ---------------------------------------------------------------- means over load cases
-# Means over load cases: what cells follow that are in several states by turns. Pure functions on arrays.
-#  With weights w_i, the shares of time, and the states' F_i = R_i U_i: D = sum_i w_i R_i^T sigma_i R_i, which takes
+# What cells follow that are in several states by turns. Pure functions on arrays.
+# With weights w_i, the shares of time, and the states' F_i = R_i U_i: D = sum_i w_i R_i^T sigma_i R_i, which takes
 # each driving tensor to material space. Remodeling takes days and a cycle a second, so that cells see the mean of
 # many cycles.
 

@@ -16,8 +16,8 @@ from remodel_fenicsx.model.energy import TURNED_OVER, Tissue
 
 
 # ---------------------------------------------------------------- functions of the radius on panels
-# Functions of the radius on panels: values at Chebyshev points, with derivative and integral.
-#  A panel is a layer or a part of one: within it a function is smooth, from one to the next its derivative may jump.
+# Values at Chebyshev points, with derivative and integral.
+# A panel is a layer or a part of one: within it a function is smooth, from one to the next its derivative may jump.
 
 Array = NDArray[np.float64]
 
@@ -70,8 +70,8 @@ class Panels:
 
 
 # ---------------------------------------------------------------- the natural configuration of a tube
-# The natural configuration of a tube: what closes and joins to a known ring, with or without loads.
-#  A ring that is cut opens to a sector, and its layers may be stretched before they are joined. In cylindrical axes
+# What closes and joins to a known ring, with or without loads.
+# A ring that is cut opens to a sector, and its layers may be stretched before they are joined. In cylindrical axes
 #     G = diag(k r/R, g_z, dr/dR) P,    k = 360/(360 - opening angle),
 # where R(r) is the sector's radius of what lies at r in the ring, and P the prestretch of the layer. R and g_z are
 # such that the ring is in equilibrium: as the unloaded tube without pressure and without axial force.
@@ -79,9 +79,7 @@ class Panels:
 DEGREE = 24  # of R(r): the paper's artery at 160 degrees changes by less than 1e-8 from 16 to 32
 MISSING = 1e-8  # of dR/dr: a panel that leaves more of it out is halved; walls of 1 to 7 and thicker have some
 MOST_POLYNOMIALS = 8  # of one layer
-LARGEST_TURN = (
-    0.5  # of k: walls of 1 to 1.05 ... 3 close at 180 degrees (k = 2) in one piece too, and this is half of it
-)
+LARGEST_TURN = 0.5  # of k: walls of 1 to 1.05 ... 3 close at 180 degrees (k = 2) in one piece too; half of it
 ITERATIONS = 30
 CLOSED = 1e-9  # of the residual over lambda + 2 mu; the differences of the energy are good to about 1e-11
 # of a value, for the tangent: rho(R) has slopes of some 1000 times it near the faces, and bending of a thin wall is so
@@ -239,8 +237,8 @@ def principal_stresses(tissue: Tissue, stretches: Array, dimensions: Array | Non
 
 
 # ---------------------------------------------------------------- what a tube without loads does when it is cut
-# What a tube without loads does when it is cut along its length: it opens to a sector.
-#  The mesh's ring of radii R becomes a sector of radii rho(R), in cylindrical axes
+# It is cut along its length, and opens to a sector. The mesh's ring of radii R becomes a sector of radii rho(R), in
+# cylindrical axes
 #     F = diag(k rho/R, e, drho/dR),    F_e = F G,
 # without pressure, axial force and bending moment; its opening angle is 360 (1 - k). The cells stay.
 

@@ -25,9 +25,9 @@ from numpy.typing import NDArray
 
 
 # ---------------------------------------------------------------- the few tensor operations of the model, on UFL
-# The few tensor operations of the model, on UFL expressions and on arrays alike.
-#  Arrays have shape (..., 3, 3) for tensors and (..., 3) for vectors; what is in front are points. What is neither
-# number nor array is UFL, which is imported only then: scenes are read, and points computed, without it.
+# On UFL expressions and on arrays alike. Arrays have shape (..., 3, 3) for tensors and (..., 3) for vectors; what is in
+# front are points. What is neither number nor array is UFL, which is imported only then: scenes are read, and points
+# computed, without it.
 
 
 def is_array(value: Any) -> bool:

@@ -40,8 +40,7 @@ from remodel_fenicsx.results.recording import (
     RecordingError,
     VIEWS,
 )
-from remodel_fenicsx.results.turned import AXIS_FIELDS, chain_lines
-from remodel_fenicsx.results.whole_body import WholeBody, has_a_body
+from remodel_fenicsx.results.whole_body import AXIS_FIELDS, WholeBody, chain_lines, has_a_body
 from remodel_fenicsx.schema.times import same_time
 from remodel_fenicsx.studies.page import FigureError
 from remodel_fenicsx.system.temporary import temporary_folder
@@ -101,19 +100,19 @@ def angle_scale(figure: Figure, place_at: tuple[float, float, float, float], lab
 
 
 def grid(
-    whole: WholeBody, time: float, shown: NDArray[np.bool_] | slice = slice(None), names: Collection[str] | None = None
+    whole: WholeBody, time: float, shown: NDArray[np.bool_] | None = None, names: Collection[str] | None = None
 ) -> pyvista.UnstructuredGrid:
     """The elements that are shown of the reference body, with the fields of a recorded time."""
     import pyvista
 
     displacement, fields = whole.fields(time, names)
     kind = {8: pyvista.CellType.HEXAHEDRON, 4: pyvista.CellType.TETRA}[whole.elements.shape[1]]
-    found = pyvista.UnstructuredGrid({kind: whole.elements[shown]}, whole.points)
+    found = pyvista.UnstructuredGrid({kind: whole.elements}, whole.points)
     if displacement is not None:
         found.point_data["displacement"] = displacement
     for name, values in {"layer": whole.layer, **fields}.items():
-        found.cell_data[name] = values[shown]
-    return found
+        found.cell_data[name] = values
+    return found if shown is None else found.extract_cells(shown)
 
 
 def whole_body(recording: RecordedRun) -> WholeBody:
@@ -385,9 +384,8 @@ class Sight:
 
     def view(self, grids: Sequence[pyvista.UnstructuredGrid], box: tuple[float, float], dots: float) -> View:
         """All of what is seen, at all of these times, as large as a box (width, height) in inches holds it."""
-        axes, used = self.axes(), np.unique(self.whole.elements[self.shown])
-        moved = [found.point_data.get("displacement", 0 * self.whole.points) for found in grids]
-        places = np.concatenate([(self.whole.points + displacement)[used] @ axes.T for displacement in moved])
+        axes, moved = self.axes(), [found.point_data.get("displacement", 0.0) for found in grids]
+        places = np.concatenate([(found.points + by) @ axes.T for found, by in zip(grids, moved, strict=True)])
         low, high = places.min(axis=0), places.max(axis=0)
         wide, tall, _ = high - low
         aspect = float(np.clip(wide / max(tall, 1e-9 * wide), *ASPECT))

@@ -13,8 +13,7 @@ from typing import Any
 
 from remodel_fenicsx._version import __version__
 from remodel_fenicsx.errors import RemodelError
-from remodel_fenicsx.report.body import ShownBody
-from remodel_fenicsx.report.card import Card, packed
+from remodel_fenicsx.report.card import Card, ShownBody, packed
 from remodel_fenicsx.report.parts import ASSETS, ReportedRun, Story, cards, data_of
 from remodel_fenicsx.results.recording import RecordedRun, kept_times
 from remodel_fenicsx.results.whole_body import WholeBody, has_a_body

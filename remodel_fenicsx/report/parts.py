@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from html import escape
@@ -18,8 +17,7 @@ import numpy as np
 from remodel_fenicsx._version import __version__
 from remodel_fenicsx.body.shape import Column, columns_of_region
 from remodel_fenicsx.fem.kinematics import KINEMATICS
-from remodel_fenicsx.report.body import ShownBody
-from remodel_fenicsx.report.card import Array, Card, folded, section, table
+from remodel_fenicsx.report.card import Array, Card, ShownBody, folded, section, table
 from remodel_fenicsx.results.history import unit_of, with_unit, words
 from remodel_fenicsx.results.recording import (
     AMBIENT,
@@ -32,13 +30,12 @@ from remodel_fenicsx.results.recording import (
     HISTORY,
     HistoryColumns,
     LARGEST_HISTORY,
-    LOG,
     RecordedRun,
     SCENE,
     VIEWS,
 )
 from remodel_fenicsx.results.run_lock import writer
-from remodel_fenicsx.results.status import FAILED, STOPPED, how_it_ended
+from remodel_fenicsx.results.status import FAILED, STOPPED, how_it_ended, log_entries
 from remodel_fenicsx.scene.scene import Scene
 from remodel_fenicsx.schema.settings import Load, Properties
 from remodel_fenicsx.schema.tables import Table
@@ -50,7 +47,6 @@ from remodel_fenicsx.system.terminal import duration
 # ---------------------------------------------------------------- how a run went, from its folder
 # How a run went, from its folder: whether it has ended and why, what it warned of.
 
-_LINE = re.compile(r"(\d{4}-\d\d-\d\d \d\d:\d\d:\d\d)\S* ([A-Z]+) (.*)")
 _STEP = re.compile(r"time (\S+?), ")
 SAID_UNLOADED = "unloaded: "  # as logs say it
 _RANKS = re.compile(r"scene .* on (\d+) ranks?, results in ")
@@ -83,30 +79,12 @@ class Story:
         """The story of a run's folder."""
         lives = writer(recording.path)[1]
         history = recording.history
-        lines = list(_log(recording.path))
+        lines = log_entries(recording.path)
         stamps = [stamp for stamp, _, _ in lines] or [""]
         ranks = [found[1] for _, _, text in lines if (found := _RANKS.match(text))] or [""]
         unloaded = [text for _, _, text in lines if text.startswith(SAID_UNLOADED)] or [""]
         state, words = _state(recording, history, lives)
         return cls(state, words, history, stamps[0], stamps[-1], ranks[-1], _warnings(lines), unloaded[-1])
-
-
-def _log(folder: Path) -> Iterator[tuple[str, str, str]]:
-    """Stamp, level and text of each entry of the log, which may have several lines."""
-    text = ""
-    with suppress(FileNotFoundError):
-        text = read_regular(folder / LOG, LARGEST_HISTORY).decode(errors="replace")
-    entry: tuple[str, str, str] | None = None
-    for line in text.splitlines():
-        found = _LINE.fullmatch(line)
-        if found is None:
-            entry = entry and (*entry[:2], f"{entry[2]}\n{line}")
-            continue
-        if entry is not None:
-            yield entry
-        entry = found[1], found[2], found[3]
-    if entry is not None:
-        yield entry
 
 
 def _warnings(lines: list[tuple[str, str, str]]) -> list[Warned]:

@@ -62,7 +62,7 @@ class Observer(Watcher):
         self.quadrature: Quadrature = self.state.cells.quadrature
         self.domain: Domain = self.state.loading.domain
         self.tools: dict[Any, Any] = {}
-        self.others = [Observer(shape, case, ()) for case in stepper.cases]
+        self.others = [Observer(shape, case, ()) for case in stepper.remodeling.cases]
 
     # ------------------------------------------------------------ as a watcher
     def started(self, step: Step) -> None:

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import base64
-import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
-from xml.sax.saxutils import quoteattr
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,14 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.model.cells import structure_tensor
 from remodel_fenicsx.results.recording import RecordedRun, RecordingError
-from remodel_fenicsx.results.turned import AXIS_FIELDS
+from remodel_fenicsx.results.whole_body import AXIS_FIELDS
 from remodel_fenicsx.system.files import write_new
-
-
-# ---------------------------------------------------------------- one unstructured grid as a VTU file, which
-# One unstructured grid as a VTU file, which ParaView, PyVista, VMTK, SimVascular and meshio read.
-
-_TYPES = {"f": ("Float64", np.float64), "i": ("Int64", np.int64), "u": ("UInt8", np.uint8), "b": ("UInt8", np.uint8)}
+from remodel_fenicsx.system.temporary import temporary_folder
 
 
 def write_vtu(
@@ -35,35 +27,15 @@ def write_vtu(
     cell_data: Mapping[str, ArrayLike],
     point_data: Mapping[str, ArrayLike] = MappingProxyType({}),
 ) -> None:
-    """Write a new file."""
-    places = np.asarray(points, dtype=np.float64)
-    offsets = cells.shape[1] * np.arange(1, len(cells) + 1)
-    topology = {"connectivity": cells.ravel(), "offsets": offsets, "types": np.full(len(cells), cell_type, np.uint8)}
-    text = [
-        '<?xml version="1.0"?>',
-        '<VTKFile type="UnstructuredGrid" version="1.0" byte_order="LittleEndian" header_type="UInt64" '
-        'compressor="vtkZLibDataCompressor">',
-        f'<UnstructuredGrid><Piece NumberOfPoints="{len(places)}" NumberOfCells="{len(cells)}">',
-        *("<Points>", _array("Points", places), "</Points>"),
-        *("<Cells>", *(_array(name, values) for name, values in topology.items()), "</Cells>"),
-        *("<PointData>", *(_array(name, values) for name, values in point_data.items()), "</PointData>"),
-        *("<CellData>", *(_array(name, values) for name, values in cell_data.items()), "</CellData>"),
-        "</Piece></UnstructuredGrid></VTKFile>",
-    ]
-    write_new(path, "\n".join(text).encode())
+    """Write a new file of one unstructured grid."""
+    import meshio
+    from meshio._vtk_common import vtk_to_meshio_type
 
-
-def _array(name: str, values: ArrayLike) -> str:
-    """One array: a header of four numbers (blocks, size of one, of the last, compressed size), then a zlib block."""
-    block = np.asarray(values)
-    kind, dtype = _TYPES[block.dtype.kind]
-    data = np.ascontiguousarray(block, dtype=np.dtype(dtype).newbyteorder("<")).tobytes()
-    packed = zlib.compress(data, 1)
-    header = np.array([1, len(data), 0, len(packed)], dtype="<u8").tobytes()
-    inside = (base64.b64encode(part).decode() for part in (header, packed))
-    columns = f' NumberOfComponents="{block.shape[1]}"' if block.ndim > 1 else ""
-    start = f'<DataArray type="{kind}" Name={quoteattr(name)}{columns} format="binary">'
-    return f"{start}{''.join(inside)}</DataArray>"
+    of_elements = {name: [np.asarray(values)] for name, values in cell_data.items()}
+    mesh = meshio.Mesh(points, [(vtk_to_meshio_type[cell_type], cells)], dict(point_data), of_elements)
+    with temporary_folder() as folder:
+        meshio.write(folder / "grid.vtu", mesh)
+        write_new(path, (folder / "grid.vtu").read_bytes())
 
 
 # ---------------------------------------------------------------- the cells of a recorded run as fibres of other

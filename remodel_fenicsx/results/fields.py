@@ -18,7 +18,7 @@ from remodel_fenicsx.fem import compat, jit
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.model.energy import TURNED_OVER
 from remodel_fenicsx.model.axes import LocalAxes
-from remodel_fenicsx.results.turned import AXIS_FIELDS, OF_CHAINS, append_chains
+from remodel_fenicsx.results.whole_body import AXIS_FIELDS, OF_CHAINS, append_chains
 from remodel_fenicsx.results.recording import CHAIN_LINES, FIELDS
 from remodel_fenicsx.results.vtkhdf import TransientGrid, vtk_cells
 from remodel_fenicsx.schema.settings import CONSTANT_FIELDS, FIELDS_BY_NAME, REGION, UNLOADED

@@ -341,30 +341,28 @@ def read_history(folder: str | os.PathLike[str]) -> HistoryColumns:
     """The columns of a folder's history.csv by name, arrays over its rows; before the first step only `time`, empty."""
     path = Path(folder) / HISTORY
     try:
-        text = read_regular(path, LARGEST_HISTORY).decode()
+        return _columns(read_regular(path, LARGEST_HISTORY).decode())
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise RecordingError(f"{path}: cannot be read: {error}") from error
+    except (ValueError, csv.Error) as error:
+        raise RecordingError(f"{path}: {error}") from error
+
+
+def _columns(text: str) -> HistoryColumns:
+    """Those of a history's text, or ValueError."""
     if not text:
         return HistoryColumns(time=np.zeros(0))
     if not text.endswith("\n"):
-        raise RecordingError(f"{path}: ends in the middle of a row")
-    try:
-        names, *rows = csv.reader(text.splitlines())
-    except csv.Error as error:
-        raise RecordingError(f"{path}: {error}") from error
+        raise ValueError("ends in the middle of a row")
+    names, *rows = csv.reader(text.splitlines())
     if "time" not in names:
-        raise RecordingError(f"{path}: is not the history of a run, it has no column 'time'")
+        raise ValueError("is not the history of a run, it has no column 'time'")
     for number, row in enumerate(rows, start=2):
         if len(row) != len(names):
-            raise RecordingError(f"{path}, line {number}: {len(row)} values, but there are {len(names)} columns")
-    try:
-        values = np.array([[float(cell) if cell else np.nan for cell in row] for row in rows]).reshape(-1, len(names))
-    except ValueError as error:
-        raise RecordingError(f"{path}: {error}") from error
+            raise ValueError(f"line {number} has {len(row)} values, but there are {len(names)} columns")
+    values = np.array([[float(cell) if cell else np.nan for cell in row] for row in rows]).reshape(-1, len(names))
     if np.isinf(values).any() or np.isnan(values[:, names.index("time")]).any():
-        raise RecordingError(f"{path}: has numbers that are not finite")  # what was not computed is not there
+        raise ValueError("has numbers that are not finite")  # what was not computed is not there
     return HistoryColumns(zip(names, values.T, strict=True))
 
 

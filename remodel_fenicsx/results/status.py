@@ -31,7 +31,7 @@ _NAME = re.compile(r"\w[\w.+ -]{0,199}")  # as scenes have: of one file, in no f
 LARGEST_STUDY = 10**7  # bytes: ten thousand names of runs
 RECENT = 20  # steps whose mean is the rate
 BEGUN, FAILED, STOPPED = "scene ", "failed: ", "ended: "  # how lines of run.log on a run's beginning and end begin
-LOG_LINE = re.compile(r"[\d-]+ [\d:,]+ [A-Z]+ (.*)")
+_LOG_LINE = re.compile(r"(\d{4}-\d\d-\d\d \d\d:\d\d:\d\d)\S* ([A-Z]+) (.*)")
 SHOWN = 5  # runs of a study that have failed and are named
 
 
@@ -79,16 +79,24 @@ def status(folder: Path) -> list[str]:
     return lines
 
 
+def log_entries(folder: Path) -> list[tuple[str, str, str]]:
+    """Stamp, level and text of each entry of run.log, which may have several lines."""
+    entries: list[tuple[str, str, str]] = []
+    text = read_regular(folder / LOG, LARGEST_HISTORY).decode(errors="replace") if (folder / LOG).exists() else ""
+    for line in text.splitlines():
+        found = _LOG_LINE.fullmatch(line)
+        if found:
+            entries.append((found[1], found[2], found[3]))
+        elif entries:
+            entries[-1] = (*entries[-1][:2], f"{entries[-1][2]}\n{line}")
+    return entries
+
+
 def how_it_ended(folder: Path) -> str:
     """What run.log says of a run's end since it last began, beginning with `FAILED` or `STOPPED`; or nothing."""
-    words = ""
-    with suppress(FileNotFoundError):
-        for line in read_regular(folder / LOG, LARGEST_HISTORY).decode(errors="replace").splitlines():
-            found = LOG_LINE.fullmatch(line)
-            said = found[1] if found else ""
-            if said.startswith((BEGUN, FAILED, STOPPED)):
-                words = "" if said.startswith(BEGUN) else said
-    return words
+    said = [text.partition("\n")[0] for _, _, text in log_entries(folder)]
+    last = next((text for text in reversed(said) if text.startswith((BEGUN, FAILED, STOPPED))), BEGUN)
+    return "" if last.startswith(BEGUN) else last
 
 
 def _of_study(folder: Path) -> list[str]:

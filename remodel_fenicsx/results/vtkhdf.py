@@ -184,6 +184,8 @@ CELL_TYPES = {
 }
 LINE = 3
 _STEPS_PER_CHUNK = 256
+_OF_TOPOLOGY = ("Steps/CellOffsets", "Steps/ConnectivityIdOffsets")
+_ALWAYS_0 = ("Steps/PartOffsets", *_OF_TOPOLOGY)  # of each step
 _LARGEST_RATIO = 1100  # deflate makes nothing smaller than a 1032nd: a block that claims more is not there
 _ROWS_AT_ONCE = 10**6  # values that are read together where a whole file is checked
 # with these bounds HDF5 sets no "open for writing" mark, which a killed process would leave for ever
@@ -224,6 +226,7 @@ class TransientGrid:
         import h5py
 
         self.path, self.number_of_steps, self.last_time = path, 0, -np.inf
+        self._datasets: dict[str, h5py.Dataset] = {}
         with signals_held_back():
             self._staged = StagedFile(path, existing=mode == "r+")
             # a file that is no HDF5 stays open where this fails: h5py still flushes it when it lets go of it
@@ -260,19 +263,25 @@ class TransientGrid:
         once = {f"CellData/{name}": np.asarray(values) for name, values in (constant or {}).items()}
         with signals_held_back():
             for name, block in (blocks | once).items():
-                if name not in self._root:  # a chunk is a step, which readers take as a whole
+                if (
+                    name not in self._datasets and name not in self._root
+                ):  # a chunk is a step, which readers take as a whole
                     _create(self._root, name, np.float32, block.shape, fletcher32=True)
                     _create(self._root, _offsets(name), np.int64, (_STEPS_PER_CHUNK,))
             for name, block in blocks.items():
-                _write(self._root[name], step, block)
+                _write(self._dataset(name), step, block)
             for name, block in once.items():
-                _write(self._root[name], 0, block)
+                _write(self._dataset(name), 0, block)
             if points is not None:  # block 0 is the reference configuration
-                _write(self._root["Points"], step + 1, np.asarray(points))
-            if len(self._root["Steps/PartOffsets"]) <= step:
-                lengths = {_offsets(name): len(block) for name, block in blocks.items()}
-                self._number_steps(lengths | dict.fromkeys(map(_offsets, once), 0), moves=points is not None)
-            _write(self._root["Steps/Values"], step, np.array([time]))
+                _write(self._dataset("Points"), step + 1, points)
+            # offsets that stay 0 say that the mesh is the one of the first step
+            numbers: dict[str, float] = {_offsets(name): step * len(block) for name, block in blocks.items()}
+            numbers |= dict.fromkeys([*map(_offsets, once), *_ALWAYS_0], 0)
+            moved = 0 if points is None else (step + 1) * len(np.asarray(points))
+            numbers |= {"Steps/NumberOfParts": 1, "Steps/PointOffsets": moved, "Steps/Values": time}
+            for name, number in numbers.items():
+                columns = (1,) if name in _OF_TOPOLOGY else ()  # one for each kind of topology
+                _write(self._dataset(name), step, np.full((1, *columns), number))
             self._file.flush()
             # the number of steps comes last: until then a reader sees the series without this step
             self.number_of_steps, self.last_time = step + 1, time
@@ -280,17 +289,9 @@ class TransientGrid:
             self._file.flush()
             self._staged.commit()
 
-    def _number_steps(self, lengths: Mapping[str, int], moves: bool) -> None:
-        """Where the blocks of the next steps are; offsets that stay 0 say that the mesh is the one of the first."""
-        tables = {name: (0, length) for name, length in lengths.items()}
-        tables |= {f"Steps/{name}": (0, 0) for name in ("PartOffsets", "CellOffsets", "ConnectivityIdOffsets")}
-        points = int(self._root["NumberOfPoints"][0]) * moves
-        tables |= {"Steps/NumberOfParts": (1, 0), "Steps/PointOffsets": (points, points)}
-        numbers = np.arange(self.number_of_steps, self.number_of_steps + _STEPS_PER_CHUNK)
-        for name, (first, length) in tables.items():
-            table = self._root[name]
-            table.resize(self.number_of_steps + len(numbers), axis=0)
-            table[self.number_of_steps :] = (first + length * numbers).reshape(-1, *table.shape[1:])
+    def _dataset(self, name: str) -> h5py.Dataset:
+        """Found once: looking for it costs as much as writing a few numbers."""
+        return self._datasets.get(name) or self._datasets.setdefault(name, self._root[name])
 
     def drop_last(self) -> None:
         """Take the last step back; the next `append`, or `close`, brings that to the disk."""
@@ -331,10 +332,9 @@ class TransientGrid:
             root.create_group(group)
         # no check sum: these chunks are written over, and a reader must find the file whole between two writes
         _create(root, "Steps/Values", np.float64, (_STEPS_PER_CHUNK,))
-        for name in ("PartOffsets", "NumberOfParts", "PointOffsets"):
-            _create(root, f"Steps/{name}", np.int64, (_STEPS_PER_CHUNK,))
-        for name in ("CellOffsets", "ConnectivityIdOffsets"):
-            _create(root, f"Steps/{name}", np.int64, (_STEPS_PER_CHUNK, 1))  # one column for each kind of topology
+        for name in ("Steps/NumberOfParts", "Steps/PointOffsets", *_ALWAYS_0):
+            columns = (1,) if name in _OF_TOPOLOGY else ()
+            _create(root, name, np.int64, (_STEPS_PER_CHUNK, *columns))
         root["Steps"].attrs["NSteps"] = np.int64(0)
 
 
@@ -349,11 +349,17 @@ def _create(group: h5py.Group, name: str, dtype: DTypeLike, chunk: tuple[int, ..
     group.create_dataset(name, *shape, maxshape=(None, *chunk[1:]), chunks=chunk, fletcher32=fletcher32)
 
 
-def _write(dataset: h5py.Dataset, number: int, block: Array) -> None:
+def _write(dataset: h5py.Dataset, number: int, block: ArrayLike) -> None:
     """Write a block of rows, the last one of a dataset whose blocks have this one's length."""
-    start = number * len(block)
-    dataset.resize(start + len(block), axis=0)
-    dataset[start:] = block
+    import h5py
+
+    # by HDF5's own calls: h5py's are twice as slow, with thirty numbers and blocks at each step
+    rows = np.ascontiguousarray(block, dataset.dtype)
+    start, others = number * len(rows), rows.shape[1:]
+    dataset.id.set_extent((start + len(rows), *others))
+    place = dataset.id.get_space()
+    place.select_hyperslab((start, *(0 for _ in others)), rows.shape)
+    dataset.id.write(h5py.h5s.create_simple(rows.shape), place, rows)
 
 
 def vtk_cells(cell_name: str, degree: int, elements: NDArray[np.int64]) -> tuple[int, NDArray[np.int64]]:

@@ -1,23 +1,134 @@
-"""The body of a run as it is shown: what is recorded, of reductions turned into the whole body. It needs no dolfinx."""
+"""The body of a run as it is shown: what is recorded, of reductions turned into the whole body. It needs no dolfinx.
+
+`revolve` alone does: it writes the fields of a reduced run on the mesh of the whole body that its scene asks for.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
+from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from remodel_fenicsx.body.reductions import Turn
 from remodel_fenicsx.body.shape import Shape
 from remodel_fenicsx.fem.kinematics import KINEMATICS
-from remodel_fenicsx.results.recording import RecordedRun
-from remodel_fenicsx.results.turned import TurnedFields
+from remodel_fenicsx.results.recording import RecordedRun, RecordingError
+from remodel_fenicsx.results.vtkhdf import LINE, TransientGrid, vtk_cells
+from remodel_fenicsx.system.files import part_of
 
-Numbers = NDArray[np.float64]
-Fields = tuple[Numbers | None, dict[str, Numbers]]
+Array = NDArray[np.float64]
+Fields = tuple[Array | None, dict[str, Array]]
 
 CORNERS = {"interval": 2, "quadrilateral": 4, "tetrahedron": 4, "hexahedron": 8}
 MOST_LAYERS = 40  # of a mesh in layers; others are divided into FEW_LAYERS
 FEW_LAYERS = 8
+
+
+# ---------------------------------------------------------------- fields of a reduction, turned to their places
+
+DIRECTION_FIELDS = ("axis_c", "axis_a", "axis_r")
+TENSOR_FIELDS = ("deformation_gradient", "cauchy_stress")
+AT_ONCE = 1_000_000  # distances that are compared at a time
+
+
+class TurnedFields:
+    """Which node and element of a reduction stands for each of a body's own, and its fields there."""
+
+    def __init__(
+        self, points: Array, elements: NDArray[np.int64], own_points: Array, own_elements: NDArray[np.int64], turn: Turn
+    ):
+        self.turns = turn(points)
+        back = np.einsum("nji,nj->ni", self.turns, points)  # Q^T X
+        self.nodes = nearest(back, own_points)
+        self.offsets = back - own_points[self.nodes]
+        owner = np.zeros(len(own_points), dtype=np.int64)
+        owner[own_elements.reshape(-1)] = np.repeat(np.arange(len(own_elements)), own_elements.shape[1])
+        self.owners = owner[self.nodes]
+        self.centres = points[elements].mean(axis=1)
+        self.element_turns = turn(self.centres)
+        # the mean of nodes that were turned back each by itself: chords of a coarse mesh lie inside of their circles
+        self.sources = nearest(back[elements].mean(axis=1), own_points[own_elements].mean(axis=1))
+
+    def __call__(self, fields: dict[str, Array]) -> tuple[Array | None, dict[str, Array]]:
+        """Displacement of the body's nodes, where it was recorded, and fields of its elements."""
+        found = {name: values[self.sources] for name, values in fields.items() if name != "displacement"}
+        for name in set(found) & {*AXIS_FIELDS, *DIRECTION_FIELDS}:
+            found[name] = np.einsum("nij,nj->ni", self.element_turns, found[name])
+        for name in set(found) & set(TENSOR_FIELDS):
+            tensors = found[name].reshape(-1, 3, 3)
+            turned = self.element_turns @ tensors @ np.swapaxes(self.element_turns, 1, 2)
+            found[name] = turned.reshape(-1, 9)
+        if not {"displacement", "deformation_gradient"} <= set(fields):
+            return None, found
+        gradient = fields["deformation_gradient"].reshape(-1, 3, 3)[self.owners] - np.eye(3)
+        moved = fields["displacement"][self.nodes] + np.einsum("nij,nj->ni", gradient, self.offsets)
+        return np.einsum("nij,nj->ni", self.turns, moved), found
+
+
+def nearest(places: Array, candidates: Array) -> NDArray[np.int64]:
+    """Number of the candidate (m, 3) that is nearest to each place (n, 3)."""
+    found = np.empty(len(places), dtype=np.int64)
+    rows = max(1, AT_ONCE // len(candidates))
+    for start in range(0, len(places), rows):
+        distances = np.linalg.norm(places[start : start + rows, None] - candidates, axis=-1)
+        found[start : start + rows] = distances.argmin(axis=1)
+    return found
+
+
+# ---------------------------------------------------------------- chains of unit cells as lines, and a file of them
+
+AXIS_FIELDS = ("axis_1", "axis_2", "axis_3")
+OF_CHAINS = (
+    "cell_dimensions",
+    *AXIS_FIELDS,
+    "deformation_gradient",
+    "fibre_angle",
+)  # fields that the lines are made of
+
+
+def chain_lines(
+    centres: ArrayLike, lengths: ArrayLike, axes: ArrayLike, scale: float
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """The four chains of unit cells, +-l_1 n_1 +-l_2 n_2 +-l_3 n_3 through each centre (paper, Fig. 2)."""
+    middle = np.asarray(centres, dtype=np.float64)
+    edges = np.asarray(lengths, dtype=np.float64)[:, :, None] * np.asarray(axes, dtype=np.float64)
+    signs = np.array([(1.0, 1, 1), (1, 1, -1), (1, -1, 1), (1, -1, -1)])
+    half = scale * (signs @ edges)
+    ends = middle[:, None, None, :] + np.stack([half, -half], axis=2)
+    return ends.reshape(-1, 3), np.arange(8 * len(middle)).reshape(-1, 2)
+
+
+def chain_displacement(
+    points: ArrayLike, centres: ArrayLike, displacement: ArrayLike, deformation_gradient: ArrayLike
+) -> NDArray[np.float64]:
+    """Displacement of the ends that `chain_lines` gives, shape (8 m, 3): u + (F - I)(X_end - X_centre)."""
+    ends = np.asarray(points, dtype=np.float64).reshape(-1, 8, 3) - np.asarray(centres)[:, None, :]
+    gradient = np.asarray(deformation_gradient) - np.eye(3)
+    return (np.asarray(displacement)[:, None, :] + ends @ np.swapaxes(gradient, 1, 2)).reshape(-1, 3)
+
+
+def append_chains(
+    grid: TransientGrid | Path,
+    time: float,
+    centres: NDArray[np.float64],
+    scale: float,
+    displacement: NDArray[np.float64],
+    fields: Mapping[str, NDArray[np.float64]],
+) -> TransientGrid:
+    """Add a step to a file of chain lines; it is made at its first step, where `grid` is still its path."""
+    axes = np.stack([fields[name] for name in AXIS_FIELDS], axis=1)
+    points, lines = chain_lines(centres, fields["cell_dimensions"], axes, scale)
+    moved = chain_displacement(points, centres, displacement, fields["deformation_gradient"].reshape(-1, 3, 3))
+    if isinstance(grid, Path):
+        grid = TransientGrid(grid, points, lines, LINE, point_dtype=np.float32)
+    angle = np.repeat(fields["fibre_angle"], len(lines) // len(centres))
+    grid.append(time, {"displacement": moved}, {"fibre_angle": angle}, points=points)
+    return grid
+
+
+# ---------------------------------------------------------------- the body
 
 
 class WholeBody:
@@ -40,7 +151,7 @@ class WholeBody:
         self.points, self.elements = points[self._used], corners.reshape(elements.shape)
         self.layer, self.depth = _layers(self._depths(shape), self.elements)
 
-    def _depths(self, shape: Shape) -> Numbers:
+    def _depths(self, shape: Shape) -> Array:
         """Of the elements, (m,): as recorded, or by their places."""
         recording = self.recording
         known = {} if self.is_turned else recording.fields(float(recording.times[0]), {"depth"})
@@ -60,7 +171,7 @@ def has_a_body(recording: RecordedRun) -> bool:
     return bool(len(recording.times)) and (reduction is None or reduction.whole is not None)
 
 
-def _layers(depth: Numbers, elements: NDArray[np.int64]) -> tuple[NDArray[np.int64], Numbers]:
+def _layers(depth: Array, elements: NDArray[np.int64]) -> tuple[NDArray[np.int64], Array]:
     """Number of each element's layer and the mean depth of each: those of the mesh, or equal parts of the way."""
     nodes = np.bincount(elements.ravel(), weights=np.repeat(depth, elements.shape[1])) / np.bincount(elements.ravel())
     extent = np.ptp(nodes[elements], axis=1).mean()
@@ -74,9 +185,64 @@ def _layers(depth: Numbers, elements: NDArray[np.int64]) -> tuple[NDArray[np.int
     return layer, np.bincount(layer, weights=depth) / counts
 
 
-def rank_of(values: Numbers) -> NDArray[np.int64]:
+def rank_of(values: Array) -> NDArray[np.int64]:
     """Number of each value among the distinct ones, ascending, from 0: layers, rows or columns of a regular mesh."""
     ordered = np.sort(values)
     size = np.ptp(ordered) or 1.0  # of one layer there is no range
     starts = np.concatenate([[True], np.diff(ordered) > 1e-6 * size])
     return np.searchsorted(ordered[starts], values + 1e-7 * size) - 1
+
+
+# ---------------------------------------------------------------- files of the whole body
+
+BODY, BODY_CHAINS = "fields_body.vtkhdf", "fields_body_chains.vtkhdf"
+
+
+def revolve(folder: Path | str) -> list[Path]:
+    """Write the recorded fields of a reduced run on the mesh of the whole body that its scene asks for. One process."""
+    recording = RecordedRun(folder)
+    name = recording.scene.model.kinematics
+    if name not in KINEMATICS or not KINEMATICS[name].reduced:
+        raise RecordingError(f"{recording.path}: its kinematics are {name!r}: the fields are those of the body already")
+    paths = [recording.path / file for file in (BODY, BODY_CHAINS)]
+    for path in paths:
+        if path.exists():
+            raise RecordingError(f"{path}: is there already; nothing is overwritten")
+    if not len(recording.times):
+        raise RecordingError(f"{recording.path}: the run recorded no fields")
+    image = _Image(recording, recording.scene.geometry.reductions[name].turn)
+    parts = [part_of(path) for path in paths]
+    for part in parts:
+        part.unlink(missing_ok=True)  # of one that was killed
+    with TransientGrid(parts[0], image.points, image.cells, image.cell_type) as grid:
+        chains: TransientGrid | None = None
+        for time in recording.times:
+            displacement, fields = image(recording.fields(float(time)))
+            grid.append(float(time), {} if displacement is None else {"displacement": displacement}, fields)
+            if displacement is not None and set(OF_CHAINS) <= set(fields):
+                middle = displacement[image.elements].mean(axis=1)
+                chains = append_chains(chains or parts[1], float(time), image.centres, image.scale, middle, fields)
+        if chains is not None:
+            chains.close()
+    written = [path for part, path in zip(parts, paths, strict=True) if part.exists()]
+    for path in reversed(written):  # the body last: where it is, all are
+        part_of(path).rename(path)
+    return written
+
+
+class _Image(TurnedFields):
+    """The body's mesh, and the fields on it."""
+
+    def __init__(self, recording: RecordedRun, turn: Turn):
+        from mpi4py import MPI  # late, as dolfinx: who shows a body needs neither
+
+        scene = recording.scene
+        domain = scene.geometry.build_with(scene.regions, scene.mesh, MPI.COMM_SELF)
+        points, elements = domain.gather_mesh()
+        assert points is not None and elements is not None
+        super().__init__(points, elements, recording.points, recording.elements, turn)
+        self.points, self.elements = points, elements
+        kind = domain.mesh.topology.cell_name()
+        self.cell_type, self.cells = vtk_cells(kind, domain.mesh.geometry.cmap.degree, elements)
+        extents = np.ptp(points, axis=0)
+        self.scale = 0.4 * float(np.prod(extents) / len(elements)) ** (1 / 3)

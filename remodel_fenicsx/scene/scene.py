@@ -17,15 +17,14 @@ from pydantic import BaseModel, BeforeValidator, Field, ModelWrapValidatorHandle
 
 from remodel_fenicsx.body import LoadKind, SHAPES, Shape
 from remodel_fenicsx.body.reductions import AUTO, check_number, choice, objections
-from remodel_fenicsx.body.shape import Column, TURNOVER_POWER, columns_of, columns_of_region, columns_on_request
+from remodel_fenicsx.body.shape import Column, columns_of, columns_on_request
 from remodel_fenicsx.fem.formulations import FORMULATIONS, NOT_LOCKING
 from remodel_fenicsx.fem.kinematics import KINEMATICS
-from remodel_fenicsx.fem.solver_methods import SOLVER_METHODS
 from remodel_fenicsx.model.chains import CHAINS
-from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
-from remodel_fenicsx.model.energy import MATRICES, Matrix, REPULSIONS, TURNED_OVER
-from remodel_fenicsx.model.laws import LAWS, MEANS_OF_CASES
+from remodel_fenicsx.model.energy import MATRICES, REPULSIONS, TURNED_OVER
+from remodel_fenicsx.model.laws import LAWS
 from remodel_fenicsx.scene.presets import (
+    EXACT,
     PRESETS,
     PROFILES,
     check_exclusive,
@@ -45,6 +44,7 @@ from remodel_fenicsx.schema.settings import (
     Material,
     Mesh,
     Model,
+    NAME,
     Natural,
     Output,
     Properties,
@@ -57,10 +57,20 @@ from remodel_fenicsx.schema.settings import (
     Time,
     UNLOADED,
     faces_of,
-    nearest_multiples,
-    tables_of,
+    in_region,
 )
-from remodel_fenicsx.schema.tables import KeysOfParts, SceneError, Table, VariantOf, allowed, fault, quoted, shown
+from remodel_fenicsx.schema.tables import (
+    IN_A_LIST,
+    KeysOfParts,
+    SceneError,
+    Table,
+    VariantOf,
+    allowed,
+    fault,
+    named,
+    quoted,
+    shown,
+)
 from remodel_fenicsx.schema.toml import merged, parse_override, put, read_toml, toml_text
 from remodel_fenicsx.schema.units import FORCE, LENGTH_UNIT, LENGTH_UNITS, STRESS, STRESS_UNIT, in_units
 
@@ -150,12 +160,10 @@ def _times(ratio: float) -> str:
     return f"{float(f'{factor:.2g}'):g} times ({math.log10(factor):.1f} decades)"
 
 
-NAME = r"[A-Za-z][A-Za-z0-9_]{0,39}"  # of a region or a further load: part of the name of a column
 PARTS_OF_MATERIAL = {"chain": CHAINS, "matrix": MATRICES, "repulsion": REPULSIONS}  # which may bring keys of [material]
 FORMAT = 2  # of recorded scenes: raised where a reader of the one before would not understand them
 RENAMED = {"mesh.cell": "mesh.element", "loads.stretch": "loads.elongation", "solver.profile": "solver.method"}
 """Dotted key of an earlier format -> the key that has taken its place, for the error."""
-SUM_OF_WEIGHTS = 1e-9  # how far from 1 the weights of load cases may sum: rounding, and 1/3 with ten digits
 FORGOTTEN_AFTER = (
     1000.0  # times 1/kappa after which nothing is left of a start, of cells under a hundredth of a tension too
 )
@@ -241,10 +249,10 @@ class Scene(Table):
     natural: Natural = Natural()
     regions: dict[str, Region] = {}
     loads: dict[str, Load] = {}
-    cases: Annotated[tuple[LoadCase, ...], tables_of("cases")] = Field(
+    cases: Annotated[tuple[LoadCase, ...], IN_A_LIST] = Field(
         default=(),
         description="Load cases of a cycle, a table `[[cases]]` each. Without them the loads act all the time.",
-        json_schema_extra={"allowed": "a list of tables"},
+        json_schema_extra={"allowed": "a list of tables, each [[cases]]"},
     )
     remodeling: Annotated[SerializeAsAny[Remodeling], KeysOfParts({"law": LAWS})] = Remodeling()
     time: Time
@@ -284,62 +292,38 @@ class Scene(Table):
 
     @model_validator(mode="after")
     def _tables_fit_together(self) -> Scene:
-        cells, material, geometry = self.cells, self.material, self.geometry
-        self._check_regions()
-        ends = self.supports.ends
-        for key, name, names in (
-            ("cells.axes", cells.axes, geometry.axis_kinds),
-            ("supports.ends", ends, geometry.ends),
-        ):
-            if name not in names:
-                raise fault(f"allowed for shape {geometry.name!r} is {', '.join(map(repr, names))}", key, name)
-        for name, support in self.supports.faces.items():
-            if not geometry.holds_faces and name not in geometry.surrounded_faces:
-                springs = " or ".join(f"supports.{face} of kind 'elastic'" for face in geometry.surrounded_faces)
-                rule = f"a {geometry.name} is held by supports.ends" + (
-                    f"; allowed beside is {springs}" if springs else ""
-                )
-                raise fault(rule, f"supports.{quoted(name)}", None)
-            if not geometry.holds_faces and support.kind != "elastic":
-                raise fault("allowed here is 'elastic'", f"supports.{quoted(name)}.kind", support.kind)
-        formulation = self.mesh.formulation
-        if formulation != AUTO and FORMULATIONS[formulation].takes_parts and not self._tells_volume_apart:
-            rule = (
-                f"needs a material.matrix with a known volumetric part, made as a Matrix; {material.matrix!r} has none"
-            )
-            raise fault(rule, "mesh.formulation", formulation)
-        missing = self.missing_for_implicit() if self.remodeling.coupling == "implicit" else None
-        if missing is not None:
-            raise fault(f"needs {missing}", "remodeling.coupling", "implicit")
-        if self.time.is_equilibrium and (missing := self._missing_for_equilibrium()) is not None:
-            raise fault(missing, "time.end", self.time.end)
-        geometry.check_size(self.mesh)
-        for name, load in self.loads.items():
-            self._check_load(name, load)
-        self._check_output_times()
-        for field, reason in self.lacking_fields.items():
-            if field in _listed(self.output.fields):
-                raise fault(reason, "output.fields", field)
-        self._check_columns()
-        self._check_length()
-        self._check_natural()
-        self._check_loaded_shape()
-        self._check_cases()
-        if self.model.kinematics != AUTO and (reasons := objections(self, self.model.kinematics)):
-            raise fault("; ".join(reasons), "model.kinematics", self.model.kinematics)
-        if geometry.refines:
+        for key, table in self._tables():
+            table.check_with(self, key)
+        if self.geometry.refines:
             check_number(self)
         return self
+
+    def _tables(self) -> Iterator[tuple[str, Table | Properties]]:
+        """All of them with their keys; regions first, and last the one whose rules are of scenes that fit together."""
+        for name in sorted(type(self).model_fields, key=lambda name: (name == "model", name != "regions")):
+            value = getattr(self, name)
+            if isinstance(value, Table):
+                yield name, value
+            elif isinstance(value, dict):
+                yield from ((f"{name}.{quoted(inner)}", table) for inner, table in value.items())
+            elif isinstance(value, tuple):
+                yield from ((f"{name}[{index}]", table) for index, table in enumerate(value))
+            if name == "regions":
+                yield from ((in_region(inner), properties) for inner, properties in self.properties().items())
+
+    def shapes_that(self, fit: Callable[[type[Shape]], bool]) -> str:
+        """The names of the shapes that can something, for an error."""
+        return named(SHAPES, fit)
+
+    def objections(self, kinematics: str) -> list[str]:
+        """Why these kinematics would be wrong for it."""
+        return objections(self, kinematics)
 
     @property
     def _stiffness_ratio(self) -> float:
         """Largest lambda/mu of its regions."""
         materials = [one.material for one in self.properties().values()]
         return max(material.lame_lambda / material.lame_mu for material in materials)
-
-    @property
-    def _tells_volume_apart(self) -> bool:
-        return isinstance(MATRICES[self.material.matrix], Matrix)
 
     @property
     def formulation(self) -> str:
@@ -354,11 +338,11 @@ class Scene(Table):
 
     def needs_all_points(self) -> str:
         """What keeps "auto" from the formulation that does not lock, in words; nothing where nothing does."""
-        if self.remodeling.coupling == "implicit":
-            return "remodeling.coupling = 'implicit'"
+        if COUPLINGS[self.remodeling.coupling].solves_cells:
+            return f"remodeling.coupling = {self.remodeling.coupling!r}"
         if not self.natural.is_of_the_mesh:
             return "[natural]"
-        if not self._tells_volume_apart:
+        if not self.material.tells_volume_apart:
             return f"material.matrix = {self.material.matrix!r}"
         return "a body of one F" if KINEMATICS[choice(self).name].homogeneous else ""
 
@@ -370,19 +354,7 @@ class Scene(Table):
 
     def missing_for_implicit(self) -> str | None:
         """What the scene lacks for the coupling "implicit"; None where it lacks nothing."""
-        from remodel_fenicsx.model.implicit import refused  # six modules that most runs need not load
-
-        material, remodeling = self.material, self.remodeling
-        if self.formulation != "displacement":
-            return "mesh.formulation = 'displacement': in the others the stress at a point depends on its whole element"
-        if not material.chain_density:
-            return "chains: material.chain_density above 0"
-        if self.cases[1:]:
-            return "a scene without [[cases]]: it finds the cells for the stress of one load case"
-        if remodeling.has_set_point:
-            return "remodeling.exponent = 2 and remodeling.threshold = 0: derivatives of other targets are not known"
-        parts = LAWS[remodeling.law], DRIVERS[remodeling.driver], FRAMES[remodeling.frame]
-        return refused(*parts, MATRICES[material.matrix], REPULSIONS[material.repulsion])
+        return COUPLINGS[EXACT].missing(self)
 
     @property
     def has_exact_coupling(self) -> bool:
@@ -393,20 +365,6 @@ class Scene(Table):
         """
         depends_on_now = LAWS[self.remodeling.law].of_absolute_time and not self.has_random_cells
         return depends_on_now and self.missing_for_implicit() is None
-
-    def _missing_for_equilibrium(self) -> str | None:
-        """Why there is no equilibrium of the cells, or one that depends on the way there; None where neither is so."""
-        law, laws = self.remodeling.law, ", ".join(repr(name) for name, law in LAWS.items() if law.has_limit)
-        if not LAWS[law].has_limit:
-            return f"remodeling.law = {law!r} has no limit that is the same on every path; allowed are the laws {laws}"
-        if self.remodeling.threshold:
-            return "remodeling.threshold is above 0: where cells rest depends on the path; set time.end to a late time"
-        if self.remodeling.has_set_point:
-            return "remodeling.exponent is not 2: derivatives of its target are not known; set time.end to a late time"
-        for name, properties in self.properties().items():
-            if properties.kappa == 0:
-                return f"{in_region(name)}remodeling.kappa = 0: the cells never change"
-        return None if self.material.chain_density else "needs chains: material.chain_density above 0"
 
     @property
     def end_of_ramps(self) -> float:
@@ -422,54 +380,6 @@ class Scene(Table):
         rates += [1 / self.remodeling.turnover.time] if self.remodeling.turnover.time else []
         return self.end_of_ramps + FORGOTTEN_AFTER / min(rates)
 
-    def _check_regions(self) -> None:
-        shape, columns = self.geometry, {column.name for column in columns_of(self.geometry)}
-        columns |= set(columns_on_request(shape))
-        for name in self.regions:
-            key = f"regions.{quoted(name)}"
-            if not shape.has_regions:
-                able = ", ".join(repr(other) for other, kind in SHAPES.items() if kind.has_regions)
-                raise fault(f"a {shape.name} has no regions; shapes with regions: {able}", key, None)
-            if not re.fullmatch(NAME, name):
-                raise fault(
-                    "the name of a region must be a letter, then letters, digits and _, at most 40 in all", key, None
-                )
-            if taken := columns.intersection(column.name for column in columns_of_region(name)):
-                raise fault(f"the column {min(taken)!r} has another meaning; choose another name", key, None)
-        shape.check_regions(self.regions, self.mesh)
-        for name, properties in self.properties().items():
-            self._check_properties(in_region(name), properties)
-
-    def _check_properties(self, region: str, properties: Properties) -> None:
-        """What the keys of a region say together with those of the whole body."""
-        material, cells = properties.material, properties.cells
-        if CHAINS[material.chain].locks and cells.end_to_end_length >= material.contour_length:
-            rule = f"must be smaller than {region}material.contour_length = {shown(material.contour_length)}"
-            raise fault(rule, f"{region}cells.end_to_end_length", cells.end_to_end_length)
-        if (length := cells.fault_of_length()) is not None:
-            raise fault(length, f"{region}cells.initial", cells.initial)
-        if cells.initial == MEASURED_CELLS and cells.fibres is None:
-            raise fault("needs cells.fibres, the name of a file", f"{region}cells.initial", cells.initial)
-        if bool(material.chain_density) != bool(self.material.chain_density):
-            rule = "must be above 0 in every region, or 0 in all of the body (material.chain_density)"
-            raise fault(rule, f"{region}material.chain_density", material.chain_density)
-        self._check_turnover(region, properties)
-        law = LAWS[self.remodeling.law]
-        plain = self.remodeling.speed(self.remodeling.kappa, material.temperature)
-        if properties.kappa != plain and law.remodels and not law.asks_kappa:
-            raise fault(f"the law {self.remodeling.law!r} has no kappa", f"{region}remodeling.kappa", properties.kappa)
-
-    def _check_turnover(self, region: str, properties: Properties) -> None:
-        turnover, material, r0 = self.remodeling.turnover, properties.material, properties.cells.end_to_end_length
-        if not turnover.is_on:
-            return
-        if not material.chain_density:
-            raise fault("needs chains: material.chain_density above 0", "remodeling.turnover", None)
-        longest = material.contour_length / r0
-        if CHAINS[material.chain].locks and turnover.deposition_stretch >= longest:
-            rule = f"must be smaller than {region}contour_length / end_to_end_length = {shown(longest)}"
-            raise fault(rule, "remodeling.turnover.deposition_stretch", turnover.deposition_stretch)
-
     def each_case(self) -> list[Scene]:
         """Of each load case a scene with its loads alone; where there are no cases, the scene itself."""
         found = []
@@ -479,35 +389,6 @@ class Scene(Table):
                 loads[name] = loads[name].model_copy(update={"value": loads[name].value * case.loads[name]})
             found.append(self.model_copy(update={"loads": loads, "cases": ()}))
         return found or [self]
-
-    def _check_cases(self) -> None:
-        """Shares of one whole and factors on loads that there are; what has no load cases is refused by name."""
-        for index, case in enumerate(self.cases):
-            for name, factor in case.loads.items():
-                if name not in self.loads:
-                    rule = "no such load; the scene has " + (", ".join(self.loads) or "none")
-                    raise fault(rule, f"cases[{index}].loads.{quoted(name)}", factor)
-        total = math.fsum(case.weight for case in self.cases)
-        if self.cases and abs(total - 1.0) > SUM_OF_WEIGHTS:
-            last = len(self.cases) - 1
-            rule = f"the weights of all cases sum to {total:.10g}; they must sum to 1"
-            raise fault(rule, f"cases[{last}].weight", self.cases[last].weight)
-        remodeling = self.remodeling
-        if remodeling.mean != "tensor" and not self.cases:
-            raise fault("needs [[cases]]", "remodeling.mean", remodeling.mean)
-        if MEANS_OF_CASES[remodeling.mean].of_targets and LAWS[remodeling.law].target is None:
-            able = ", ".join(repr(name) for name, law in LAWS.items() if law.target is not None)
-            raise fault(f"needs a remodeling.law with a target: {able}", "remodeling.mean", remodeling.mean)
-        if self.cases and self.geometry.is_loaded:
-            raise fault(
-                "not allowed with [[cases]]: the loaded body belongs to one set of loads; remodel-fenicsx unload "
-                "SCENE, with those alone, writes the scene of the unloaded one, to which [[cases]] may be added",
-                "geometry.is",
-                "loaded",
-            )
-        if self.cases[1:] and not COUPLINGS[remodeling.coupling].takes_cases:
-            able = ", ".join(repr(name) for name, kind in COUPLINGS.items() if kind.takes_cases)
-            raise fault(f"with [[cases]] must be one of: {able}", "remodeling.coupling", remodeling.coupling)
 
     def properties(self) -> dict[str, Properties]:
         """What holds in each region by its name, and under "" what holds beside them, where there may be anything."""
@@ -529,44 +410,11 @@ class Scene(Table):
         found = {name: properties.cells for name, properties in self.properties().items()}
         return {name: cells for name, cells in found.items() if cells.initial == MEASURED_CELLS}
 
-    def _check_load(self, name: str, load: Load) -> None:
-        step, key = self.time.step, f"loads.{name}"
-        for index, (time, factor) in enumerate(load.ramp):
-            if not self.time.is_equilibrium and time <= self.time.end and not self.time.is_hit(time):
-                raise fault(nearest_multiples(time, step, "time.step"), f"{key}.ramp[{index}][0]", time)
-            for case in self.each_case():
-                full, above = case.loads[name].value, self.load_kinds[name].above
-                if full * factor <= above:
-                    share = factor * full / load.value if load.value else factor
-                    words = f"with the factor {shown(share)} it is {full * factor:.6g}"
-                    raise fault(f"must be greater than {above:g} at every time; {words}", f"{key}.value", load.value)
-
-    def _check_output_times(self) -> None:
-        for index, time in enumerate(self.output.times):
-            if self.time.is_equilibrium:
-                raise fault(
-                    "not allowed with time.end = 'equilibrium', which has no times", f"output.times[{index}]", time
-                )
-            if time > self.time.end:
-                raise fault(f"must be at most time.end = {shown(self.time.end)}", f"output.times[{index}]", time)
-            if not self.time.is_hit(time):
-                rule = nearest_multiples(time, self.time.step, "time.step")
-                raise fault(rule, f"output.times[{index}]", time)
-
-    def _check_columns(self) -> None:
+    @property
+    def column_names(self) -> list[str]:
+        """Of all that a history of it may have; one is there twice where a region's name makes it."""
         always = columns_of(self.geometry, regions=self.regions)
-        known = dict.fromkeys([*columns_on_request(self.geometry), *(column.name for column in always)])
-        for name in self.output.columns:
-            if name == "time_error" and self.time.is_equilibrium:
-                rule = "is an error of steps; must be left out with time.end = 'equilibrium'"
-                raise fault(f"{name!r} {rule}", "output.columns", name)
-            if self.regions and name in self.geometry.columns_of_one_tissue:
-                raise fault(f"{name!r} is for bodies of one tissue; the scene has regions", "output.columns", name)
-            if name in (*TURNED_OVER, TURNOVER_POWER) and not self.remodeling.turnover.is_on:
-                raise fault(f"{name!r} changes only with remodeling.turnover, which is not set", "output.columns", name)
-            if name not in known:
-                rule = f"no such column on request; allowed for shape {self.geometry.name!r} are "
-                raise fault(rule + ", ".join(map(repr, known)), "output.columns", name)
+        return [*columns_on_request(self.geometry), *(column.name for column in always)]
 
     def columns(self, more: Iterable[str] = ()) -> tuple[Column, ...]:
         """Of its history, in the order of the file; with `more` of those on request."""
@@ -600,66 +448,6 @@ class Scene(Table):
         return self.supports.ends in self.geometry.ends_that_free_length or any(
             kinds[name].frees_length for name in self.loads
         )
-
-    def _check_natural(self) -> None:
-        """What goes with an opening angle; all else is refused by name."""
-        natural, shape = self.natural, self.geometry
-        if natural.is_of_the_mesh:
-            return
-        asked, value, none = "natural.opening_angle", natural.opening_angle, "0"
-        able = [name for name, kind in SHAPES.items() if kind.closes_from_a_sector]
-        if not natural.opening_angle:
-            asked, value, none = "natural.layers", len(natural.layers), "none"
-            able = [name for name, kind in SHAPES.items() if kind.has_a_wall]
-        needs: list[tuple[str, Any, list[str]]] = [
-            ("geometry.shape", shape.name, able),
-            ("mesh.formulation", self.formulation, ["displacement"]),
-        ]
-        if shape.closes_from_a_sector:  # the closing knows isotropic cells
-            needs.append(("cells.axes", self.cells.axes, ["cylindrical"]))
-            for name, properties in self.properties().items():
-                needs.append((f"{in_region(name)}cells.initial", properties.cells.initial, ["isotropic"]))
-        for key, has, possible in needs:
-            if has not in possible:
-                rule = f"must be {none} unless {key} is {' or '.join(map(repr, possible))}"
-                raise fault(rule, asked, value)
-
-    def _check_loaded_shape(self) -> None:
-        """Whose unloaded shape can be found."""
-        shape, cells = self.geometry, self.natural.cells
-        if cells == "equilibrium":
-            if not (shape.is_loaded and shape.unloads_by_numbers):
-                able = " or ".join(repr(name) for name, kind in SHAPES.items() if kind.unloads_by_numbers)
-                raise fault(f"needs geometry.is = 'loaded' of the shape {able}", "natural.cells", cells)
-            if not self.time.is_equilibrium:
-                raise fault("needs time.end = 'equilibrium'", "natural.cells", cells)
-        if not shape.is_loaded:
-            return
-        if not shape.unloads:
-            able = ", ".join(repr(name) for name, kind in SHAPES.items() if kind.unloads)
-            raise fault(f"allowed for the shapes {able}", "geometry.is", "loaded")
-        if self.supports.ends == "clamped":
-            raise fault(
-                "not allowed with supports.ends = 'clamped': the loaded tube would not have one radius",
-                "geometry.is",
-                "loaded",
-            )
-        if self.measured_cells:
-            key = f"{in_region(next(iter(self.measured_cells)))}cells.fibres"
-            raise fault(
-                f"not allowed with {key}: its rows belong to places, which unloading moves", "geometry.is", "loaded"
-            )
-
-    def _check_length(self) -> None:
-        """A length is prescribed or unknown."""
-        load = self.loads.get("elongation")
-        if self.has_free_length and load is not None and any(load.value * factor for _, factor in load.ramp):
-            rule = "must be 0 where the length is an unknown, with loads.axial_force or closed ends"
-            raise fault(rule, "loads.elongation.value", load.value)
-        if self.has_free_length and self.solver.method == "iterative":
-            names = ", ".join(repr(name) for name in (AUTO, *SOLVER_METHODS) if name != "iterative")
-            rule = f"allowed where the length is an unknown, with loads.axial_force or closed ends, are {names}"
-            raise fault(rule, "solver.method", self.solver.method)
 
     def summary(self) -> str:
         """Stiffness of network and matrix and the largest loads, in one unit and on one line."""
@@ -706,7 +494,7 @@ class Scene(Table):
         """Explicit steps of turnover that are longer than its time: content then swings about its rest."""
         turnover, step = self.remodeling.turnover, self.time.step
         chosen = self.time.is_equilibrium or self.time.tolerance is not None
-        if chosen or self.remodeling.coupling == "implicit" or step <= (turnover.time or math.inf):
+        if chosen or COUPLINGS[self.remodeling.coupling].solves_cells or step <= (turnover.time or math.inf):
             return []
         return [
             f"time.step = {step:g} is longer than remodeling.turnover.time = {turnover.time:g}: content and natural "
@@ -798,15 +586,6 @@ def _beside(values: dict[str, Any], folder: Path) -> dict[str, Any]:
     if isinstance(regions := values.get("regions"), Mapping):
         values = {**values, "regions": {name: placed(table) for name, table in regions.items()}}
     return values
-
-
-def _listed(fields: Any) -> tuple[str, ...]:
-    return () if isinstance(fields, bool) else tuple(fields)
-
-
-def in_region(name: str) -> str:
-    """Of a dotted key in a region, or in the whole body: what stands before."""
-    return f"regions.{name}." if name else ""
 
 
 def _words(region: str) -> str:

@@ -12,12 +12,11 @@ import math
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BeforeValidator, ConfigDict, Field, create_model, model_validator
-from pydantic.config import JsonDict
+from pydantic import AfterValidator, ConfigDict, Field, GetPydanticSchema, create_model, model_validator
 
 from remodel_fenicsx._lazy import resolved
 from remodel_fenicsx.fem.formulations import FORMULATIONS, NOT_LOCKING, STIFF_BULK
@@ -35,19 +34,21 @@ from remodel_fenicsx.fem.solver_methods import (
 from remodel_fenicsx.model.axes import AXES
 from remodel_fenicsx.model.chains import BOLTZMANN_CONSTANT, CHAINS
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
-from remodel_fenicsx.model.energy import MATRICES, REPULSIONS, TURNED_OVER, Tissue
+from remodel_fenicsx.model.energy import MATRICES, Matrix, REPULSIONS, TURNED_OVER, Tissue
 from remodel_fenicsx.model.laws import LAWS, MEANS_OF_CASES
 from remodel_fenicsx.model.spectral import PAIRINGS
-from remodel_fenicsx.schema.tables import OneOf, Table, allowed, fault, is_number, quoted, shown
+from remodel_fenicsx.schema.tables import IN_A_LIST, OneOf, Table, fault, named, quoted, refuse, shown
 from remodel_fenicsx.schema.times import is_multiple, same_time
 from remodel_fenicsx.schema.units import FORCE, FOUNDATION, LENGTH, NUMBER_DENSITY, STRESS, TEMPERATURE
 
+if TYPE_CHECKING:
+    from remodel_fenicsx.scene.scene import Scene
+
 STRESS_UNITS = {"Pa": 1.0, "kPa": 1.0e3, "MPa": 1.0e6}  # in Pa
 MEASURED_CELLS = "fibres"  # those of cells.fibres
-INITIAL_CELLS = ("random", "isotropic", "aligned", MEASURED_CELLS)
 MOST_STEPS = 1_000_000
+NAME = r"[A-Za-z][A-Za-z0-9_]{0,39}"  # of a region or a further load: part of the name of a column
 LARGEST_MESH = 10_000_000  # hexahedra; Gmsh, which is serial, needs about 10 GB for them
-NOT_NEGATIVE: JsonDict = {"type": "number", "minimum": 0}
 
 
 # ---------------------------------------------------------------- body and mesh
@@ -95,10 +96,17 @@ class Mesh(Table):
     def _formulation_has_the_element(self) -> Mesh:
         pair = self.element, self.degree
         if self.formulation != AUTO and not FORMULATIONS[self.formulation].has(*pair):
-            able = [name for name, formulation in FORMULATIONS.items() if formulation.has(*pair)]
-            rule = f"allowed for elements {self.element!r} of degree {self.degree} is {', '.join(map(repr, able))}"
+            able = named(FORMULATIONS, lambda formulation: formulation.has(*pair))
+            rule = f"allowed for elements {self.element!r} of degree {self.degree} is {able}"
             raise fault(rule, "formulation", self.formulation)
         return self
+
+    def check_with(self, scene: Scene, key: str) -> None:
+        """A formulation that takes W apart needs its parts."""
+        takes_parts = self.formulation != AUTO and FORMULATIONS[self.formulation].takes_parts
+        if takes_parts and not scene.material.tells_volume_apart:
+            rule = "needs a material.matrix with a known volumetric part, made as a Matrix"
+            raise fault(f"{rule}; {scene.material.matrix!r} has none", f"{key}.formulation", self.formulation)
 
 
 class Model(Table):
@@ -110,6 +118,11 @@ class Model(Table):
         + ". ".join(f"{name!r}: {kinematics.meaning}" for name, kinematics in KINEMATICS.items())
         + ". One that would be wrong for the scene is refused with the reason (docs/kinematics.md).",
     )
+
+    def check_with(self, scene: Scene, key: str) -> None:
+        """Every reduction has reasons for which it is refused."""
+        if self.kinematics != AUTO and (reasons := scene.objections(self.kinematics)):
+            raise fault("; ".join(reasons), f"{key}.kinematics", self.kinematics)
 
 
 class Support(Table):
@@ -156,6 +169,21 @@ class Supports(Table):
     def faces(self) -> dict[str, Support]:
         """Supports by name of the face."""
         return dict(self.__pydantic_extra__ or {})
+
+    def check_with(self, scene: Scene, key: str) -> None:
+        """What a shape can be held by."""
+        shape = scene.geometry
+        if self.ends not in shape.ends:
+            rule = f"allowed for shape {shape.name!r} is {', '.join(map(repr, shape.ends))}"
+            raise fault(rule, f"{key}.ends", self.ends)
+        for name, support in () if shape.holds_faces else self.faces.items():
+            place = f"{key}.{quoted(name)}"
+            if name not in shape.surrounded_faces:
+                springs = " or ".join(f"{key}.{face} of kind 'elastic'" for face in shape.surrounded_faces)
+                beside = f"; allowed beside is {springs}" if springs else ""
+                raise fault(f"a {shape.name} is held by {key}.ends{beside}", place, None)
+            if support.kind != "elastic":
+                raise fault("allowed here is 'elastic'", f"{place}.kind", support.kind)
 
 
 # ---------------------------------------------------------------- tissue and cells
@@ -222,6 +250,11 @@ class Material(Table):
     squared."""
 
     @property
+    def tells_volume_apart(self) -> bool:
+        """Whether the volumetric part of the matrix is known."""
+        return isinstance(MATRICES[self.matrix], Matrix)
+
+    @property
     def network_modulus(self) -> float:
         """c = omega k theta n_chn / (4 A_p), in stress_unit (1.568 Pa for the defaults)."""
         pascal = BOLTZMANN_CONSTANT * self.temperature * self.chain_density / (4 * self.persistence_length)
@@ -261,31 +294,6 @@ class Material(Table):
         """
         stresses = {"network modulus c =": self.network_modulus, "shear modulus mu =": self.lame_mu, **loads}
         return ", ".join(f"{words} {value:.4g} {self.stress_unit}" for words, value in stresses.items())
-
-
-def _initial_cells(value: Any) -> Any:
-    """A list of three lengths becomes a tuple of floats; names pass."""
-    if isinstance(value, (list, tuple)):
-        if len(value) != 3 or not all(is_number(length) and length >= 0 for length in value):
-            raise fault("must be three lengths [l1, l2, l3], each at least 0")
-        return tuple(float(length) for length in value)
-    if not isinstance(value, str) or value not in INITIAL_CELLS:
-        raise fault("allowed are " + ", ".join(map(repr, INITIAL_CELLS)) + " or three lengths [l1, l2, l3]")
-    return value
-
-
-def tables_of(name: str) -> BeforeValidator:
-    """A list of tables of this name as a tuple; anything else is a fault."""
-
-    def entries(value: Any) -> Any:
-        if not isinstance(value, (list, tuple)):
-            raise fault(f"must be a list of tables, each [[{name}]]")
-        return tuple(value)
-
-    return BeforeValidator(entries)
-
-
-POSITIVE: JsonDict = {"allowed": "a finite number greater than 0"}
 
 
 class Prestretch(Table):
@@ -360,8 +368,8 @@ class Natural(Table):
     """For a tube: how far a cut ring opens, as the angle of the missing sector in degrees (360 less the angle of the
     sector). Fung's opening angle, between the lines from the middle of the inner arc to its ends, is half of it. 0
     means that the tissue of the mesh is free of stress."""
-    layers: Annotated[tuple[NaturalLayer, ...], tables_of("natural.layers")] = Field(
-        default=(), json_schema_extra={"allowed": "a list of tables"}
+    layers: Annotated[tuple[NaturalLayer, ...], IN_A_LIST] = Field(
+        default=(), json_schema_extra={"allowed": "a list of tables, each [[natural.layers]]"}
     )
     """Parts of the wall that were stretched before they were joined, a table `[[natural.layers]]` each. A tube of such
     layers is closed so that it is in equilibrium without loads. A body of your own moves when it is let go."""
@@ -375,6 +383,34 @@ class Natural(Table):
     def is_of_the_mesh(self) -> bool:
         """Whether the mesh is free of stress."""
         return self.opening_angle == 0.0 and not self.layers
+
+    def check_with(self, scene: Scene, key: str) -> None:
+        """Which bodies have residual stress, with which cells; all else is refused by name."""
+        shape = scene.geometry
+        if self.cells == "equilibrium" and not (shape.is_loaded and shape.unloads_by_numbers):
+            able = scene.shapes_that(lambda kind: kind.unloads_by_numbers)
+            raise fault(f"needs geometry.is = 'loaded' of the shape {able}", f"{key}.cells", self.cells)
+        if self.cells == "equilibrium" and not scene.time.is_equilibrium:
+            raise fault("needs time.end = 'equilibrium'", f"{key}.cells", self.cells)
+        if self.is_of_the_mesh:
+            return
+        asked, value, none = f"{key}.opening_angle", self.opening_angle, "0"
+        able, is_able = scene.shapes_that(lambda kind: kind.closes_from_a_sector), shape.closes_from_a_sector
+        if not self.opening_angle:
+            asked, value, none = f"{key}.layers", len(self.layers), "none"
+            able, is_able = scene.shapes_that(lambda kind: kind.has_a_wall), shape.has_a_wall
+        needs = [
+            ("geometry.shape", is_able, able),
+            ("mesh.formulation", scene.formulation == "displacement", "'displacement'"),
+        ]
+        if shape.closes_from_a_sector:  # the closing knows isotropic cells
+            needs.append(("cells.axes", scene.cells.axes == "cylindrical", "'cylindrical'"))
+            for name, properties in scene.properties().items():
+                isotropic = properties.cells.initial == "isotropic"
+                needs.append((f"{in_region(name)}cells.initial", isotropic, "'isotropic'"))
+        for other, has, possible in needs:
+            if not has:
+                raise fault(f"must be {none} unless {other} is {possible.replace(', ', ' or ')}", asked, value)
 
     @model_validator(mode="after")
     def _layers_lie_apart(self) -> Natural:
@@ -392,6 +428,11 @@ class Natural(Table):
 
 
 SAME_DRAWS = 3  # antithetic seeds: over as many turns of l_1, l_2, l_3 the mean of A is isotropic in each element
+
+
+_Length = Annotated[float, Field(ge=0)]
+_Lengths = Annotated[tuple[_Length, _Length, _Length], IN_A_LIST]
+InitialCells = Literal["random", "isotropic", "aligned", "fibres"] | _Lengths
 
 
 class Cells(Table):
@@ -415,15 +456,9 @@ class Cells(Table):
     (1000, 3)
     """
 
-    initial: Annotated[str | tuple[float, float, float], BeforeValidator(_initial_cells)] = Field(
+    initial: InitialCells = Field(
         default="random",
-        json_schema_extra={
-            "allowed": "'random', 'isotropic', 'aligned', 'fibres' or three lengths [l1, l2, l3]",
-            "anyOf": [
-                {"enum": [*INITIAL_CELLS]},
-                {"type": "array", "items": NOT_NEGATIVE, "minItems": 3, "maxItems": 3},
-            ],
-        },
+        json_schema_extra={"allowed": "'random', 'isotropic', 'aligned', 'fibres' or three lengths [l1, l2, l3]"},
     )
     """Cell dimensions l_I at t = 0, with |l| = end_to_end_length. 'random': one draw per element, uniform on the
     positive octant of the sphere. 'isotropic': three equal ones. 'aligned': all of it along aligned_axis. 'fibres':
@@ -460,6 +495,12 @@ class Cells(Table):
             raise fault(rule, "initial", self.initial)
         return self
 
+    def check_with(self, scene: Scene, key: str) -> None:
+        """Which axes a shape has."""
+        if self.axes not in scene.geometry.axis_kinds:
+            names = ", ".join(map(repr, scene.geometry.axis_kinds))
+            raise fault(f"allowed for shape {scene.geometry.name!r} is {names}", f"{key}.axes", self.axes)
+
     def fault_of_length(self) -> str | None:
         """What keeps three lengths from being those of a chain; None if nothing does."""
         length = self.end_to_end_length if isinstance(self.initial, str) else math.hypot(*self.initial)
@@ -488,6 +529,11 @@ class Cells(Table):
         return np.tile(np.array(lengths), (number_of_elements, 1))
 
 
+def _nothing_is_missing(scene: Scene) -> str | None:
+    """Of scenes as they are."""
+    return None
+
+
 @dataclass(frozen=True)
 class CouplingKind:
     """How equilibrium and remodeling of one step are coupled, as scenes know it.
@@ -506,6 +552,10 @@ class CouplingKind:
         Whether it changes content and natural length of the collagen (`remodeling.turnover`).
     needs_a_target
         Whether it is for laws with a target alone (`Law.target`).
+    solves_cells
+        Whether cells are unknowns of the solve: then it takes steps of any length.
+    missing
+        What a scene lacks for it, from the scene, in words; None where nothing.
 
     Examples
     --------
@@ -530,11 +580,29 @@ class CouplingKind:
     needs_a_target: bool = False
     takes_cases: bool = False
     takes_turnover: bool = False
+    solves_cells: bool = False
+    missing: Callable[[Any], str | None] = _nothing_is_missing
 
     @property
     def make(self) -> Callable[..., Any]:
         """Makes the coupling of a state, a tissue, a remodeling pass and settings of the solver."""
         return resolved(self.coupling)
+
+
+def _missing_for_implicit(scene: Scene) -> str | None:
+    from remodel_fenicsx.model.implicit import refused  # six modules that most runs need not load
+
+    material, remodeling = scene.material, scene.remodeling
+    if scene.formulation != "displacement":
+        return "mesh.formulation = 'displacement': in the others the stress at a point depends on its whole element"
+    if not material.chain_density:
+        return "chains: material.chain_density above 0"
+    if scene.cases[1:]:
+        return "a scene without [[cases]]: it finds the cells for the stress of one load case"
+    if remodeling.has_set_point:
+        return "remodeling.exponent = 2 and remodeling.threshold = 0: derivatives of other targets are not known"
+    parts = LAWS[remodeling.law], DRIVERS[remodeling.driver], FRAMES[remodeling.frame]
+    return refused(*parts, MATRICES[material.matrix], REPULSIONS[material.repulsion])
 
 
 COUPLINGS = {
@@ -547,7 +615,7 @@ COUPLINGS = {
     "relaxed": CouplingKind(
         "as 'staggered', but only the share relaxation_factor of each change is made; one half is stable for every "
         "driver and frame except under weak loads, while 'staggered' over-corrects with 'pk2' and 'finger'",
-        "remodel_fenicsx.evolution.coupling:Relaxed",
+        "remodel_fenicsx.evolution.coupling:Staggered",
         makes_a_share=True,
         takes_cases=True,
         takes_turnover=True,
@@ -555,7 +623,7 @@ COUPLINGS = {
     "extrapolated": CouplingKind(
         "first remodel towards the stress of the middle of the step, extrapolated from the two steps before, then "
         "solve; of second order, for the law 'tensor'",
-        "remodel_fenicsx.evolution.extrapolated:Extrapolated",
+        "remodel_fenicsx.evolution.coupling:Extrapolated",
         needs_a_target=True,
         takes_cases=True,
         takes_turnover=True,
@@ -565,6 +633,8 @@ COUPLINGS = {
         "repulsion that does not depend on axes) and the laws of the paper",
         "remodel_fenicsx.evolution.implicit:Implicit",
         takes_turnover=True,
+        solves_cells=True,
+        missing=_missing_for_implicit,
     ),
 }
 """Couplings by the name that a scene gives them."""
@@ -698,38 +768,48 @@ class Remodeling(Table):
         return self.exponent != 2.0 or self.threshold != 0.0
 
     @model_validator(mode="after")
-    def _set_points_have_their_law(self) -> Remodeling:
+    def _parts_fit_together(self) -> Remodeling:
+        law, driver, coupling = LAWS[self.law], DRIVERS[self.driver], COUPLINGS[self.coupling]
         for key, plain in (("exponent", 2), ("threshold", 0)):
-            value = getattr(self, key)
-            if value != plain and LAWS[self.law] is not LAWS["tensor"]:
-                raise fault(f"must be {plain} unless remodeling.law is 'tensor'", key, value)
-        if self.threshold and not DRIVERS[self.driver].is_stress:
-            drivers = ", ".join(repr(name) for name, driver in DRIVERS.items() if driver.is_stress)
+            if getattr(self, key) != plain and law is not LAWS["tensor"]:
+                raise fault(f"must be {plain} unless remodeling.law is 'tensor'", key, getattr(self, key))
+        if self.threshold and not driver.is_stress:
+            drivers = named(DRIVERS, lambda driver: driver.is_stress)
             raise fault(f"must be 0 unless remodeling.driver is a stress: {drivers}", "threshold", self.threshold)
-        return self
-
-    @model_validator(mode="after")
-    def _turnover_fits(self) -> Remodeling:
-        if not self.turnover.is_on:
-            return self
-        if LAWS[self.law] is not LAWS["tensor"]:
+        if self.turnover.is_on and law is not LAWS["tensor"]:
             raise fault("needs remodeling.law = 'tensor'", "turnover", None)
-        if not COUPLINGS[self.coupling].takes_turnover:
-            allowed_ones = ", ".join(repr(name) for name, kind in COUPLINGS.items() if kind.takes_turnover)
-            raise fault(f"with remodeling.turnover must be one of: {allowed_ones}", "coupling", self.coupling)
+        if self.turnover.is_on and not coupling.takes_turnover:
+            able = named(COUPLINGS, lambda kind: kind.takes_turnover)
+            raise fault(f"with remodeling.turnover must be one of: {able}", "coupling", self.coupling)
+        if coupling.needs_a_target and law.target is None:
+            rule = f"needs a remodeling.law with a target that can be extrapolated: {_laws_with_a_target()}"
+            raise fault(rule, "coupling", self.coupling)
         return self
 
-    @model_validator(mode="after")
-    def _coupling_fits_the_law(self) -> Remodeling:
-        if COUPLINGS[self.coupling].needs_a_target and LAWS[self.law].target is None:
-            laws = ", ".join(repr(name) for name, law in LAWS.items() if law.target is not None)
-            raise fault(
-                f"needs a remodeling.law with a target that can be extrapolated: {laws}", "coupling", self.coupling
-            )
-        return self
+    def check_with(self, scene: Scene, key: str) -> None:
+        """What coupling and mean ask of the rest, and the end of a scene that goes to an equilibrium."""
+        coupling = COUPLINGS[self.coupling]
+        if (missing := coupling.missing(scene)) is not None:
+            raise fault(f"needs {missing}", f"{key}.coupling", self.coupling)
+        if self.mean != "tensor" and not scene.cases:
+            raise fault("needs [[cases]]", f"{key}.mean", self.mean)
+        if MEANS_OF_CASES[self.mean].of_targets and LAWS[self.law].target is None:
+            raise fault(f"needs a remodeling.law with a target: {_laws_with_a_target()}", f"{key}.mean", self.mean)
+        if scene.cases[1:] and not coupling.takes_cases:
+            able = named(COUPLINGS, lambda kind: kind.takes_cases)
+            raise fault(f"with [[cases]] must be one of: {able}", f"{key}.coupling", self.coupling)
+
+
+def _laws_with_a_target() -> str:
+    return named(LAWS, lambda law: law.target is not None)
 
 
 # ---------------------------------------------------------------- regions
+
+
+def in_region(name: str) -> str:
+    """Of a dotted key in a region, or in the whole body: what stands before."""
+    return f"regions.{name}." if name else ""
 
 
 class Properties(NamedTuple):
@@ -744,13 +824,37 @@ class Properties(NamedTuple):
         """The tissue of these parameters."""
         return self.material.tissue(self.cells.end_to_end_length)
 
+    def check_with(self, scene: Scene, region: str) -> None:
+        """What the keys of a region say together with those of the whole body."""
+        material, cells, law = self.material, self.cells, LAWS[scene.remodeling.law]
+        if CHAINS[material.chain].locks and cells.end_to_end_length >= material.contour_length:
+            rule = f"must be smaller than {region}material.contour_length = {shown(material.contour_length)}"
+            raise fault(rule, f"{region}cells.end_to_end_length", cells.end_to_end_length)
+        if (length := cells.fault_of_length()) is not None:
+            raise fault(length, f"{region}cells.initial", cells.initial)
+        if cells.initial == MEASURED_CELLS and cells.fibres is None:
+            raise fault("needs cells.fibres, the name of a file", f"{region}cells.initial", cells.initial)
+        if bool(material.chain_density) != bool(scene.material.chain_density):
+            rule = "must be above 0 in every region, or 0 in all of the body (material.chain_density)"
+            raise fault(rule, f"{region}material.chain_density", material.chain_density)
+        plain = scene.remodeling.speed(scene.remodeling.kappa, material.temperature)
+        if self.kappa != plain and law.remodels and not law.asks_kappa:
+            raise fault(f"the law {scene.remodeling.law!r} has no kappa", f"{region}remodeling.kappa", self.kappa)
+        self._check_turnover(scene.remodeling.turnover, region)
+
+    def _check_turnover(self, turnover: Turnover, region: str) -> None:
+        material, key = self.material, "remodeling.turnover"
+        if turnover.is_on and not material.chain_density:
+            raise fault("needs chains: material.chain_density above 0", key, None)
+        longest = material.contour_length / self.cells.end_to_end_length
+        if turnover.is_on and CHAINS[material.chain].locks and turnover.deposition_stretch >= longest:
+            rule = f"must be smaller than {region}contour_length / end_to_end_length = {shown(longest)}"
+            raise fault(rule, f"{key}.deposition_stretch", turnover.deposition_stretch)
+
 
 def _as_in(table: type[Table], name: str, key: str) -> Any:
     """A key of another table that may be left out: the value of that table holds then."""
     field = copy.copy(table.model_fields[name])
-    rule = re.sub(r"^(must be|allowed is|allowed are) ", "", allowed(field))
-    extra = field.json_schema_extra if isinstance(field.json_schema_extra, dict) else {}
-    field.json_schema_extra = extra | {"allowed": rule}
     field.default, field.description = None, f"As `{key}.{name}`, for this region. Default: that of the whole body."
     return field
 
@@ -771,7 +875,7 @@ class RegionMaterial(Table):
 class RegionCells(Table):
     """Keys of `[cells]` that differ in the region. Axes and seed hold for the whole body."""
 
-    initial: str | tuple[float, float, float] | None = _as_in(Cells, "initial", "cells")
+    initial: InitialCells | None = _as_in(Cells, "initial", "cells")
     fibres: str | None = _as_in(Cells, "fibres", "cells")
     fibres_sha256: str | None = _as_in(Cells, "fibres_sha256", "cells")
     aligned_axis: int | None = _as_in(Cells, "aligned_axis", "cells")
@@ -800,6 +904,19 @@ class Region(Table):
     cells: RegionCells = RegionCells()
     remodeling: RegionRemodeling = RegionRemodeling()
 
+    def check_with(self, scene: Scene, key: str) -> None:
+        """Its name, which is part of the names of columns."""
+        shape, name = scene.geometry, key.removeprefix("regions.")
+        if not shape.has_regions:
+            able = scene.shapes_that(lambda kind: kind.has_regions)
+            raise fault(f"a {shape.name} has no regions; shapes with regions: {able}", key, None)
+        if not re.fullmatch(NAME, name):
+            rule = "the name of a region must be a letter, then letters, digits and _, at most 40 in all"
+            raise fault(rule, key, None)
+        columns = [column for column in scene.column_names if column.endswith(f"_{name}")]
+        if twice := {column for column in columns if columns.count(column) > 1}:
+            raise fault(f"the column {min(twice)!r} has another meaning; choose another name", key, None)
+
     def over(self, others: Properties) -> Properties:
         """What holds in the region, its own keys over these."""
         return Properties(
@@ -816,20 +933,23 @@ def _set(table: Table) -> dict[str, Any]:
 # ---------------------------------------------------------------- loads and time
 
 
-def _ramp(value: Any) -> tuple[tuple[float, float], ...]:
-    """Pairs (time, factor) whose times increase; anything else is a fault that names the entry."""
-    if not isinstance(value, (list, tuple)) or not value:
-        raise fault("must be a list of pairs [time, factor], at least one")
-    for index, entry in enumerate(value):
-        if not isinstance(entry, (list, tuple)) or len(entry) != 2 or not all(map(is_number, entry)):
-            raise fault("must be a pair [time, factor] of finite numbers", f"[{index}]", entry)
-    for index, (time, _) in enumerate(value):
+def _later_and_later(ramp: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
+    """A fault names the entry."""
+    for index, (time, _) in enumerate(ramp):
         if time < 0:
             raise fault("must be at least 0, where the simulation starts", f"[{index}][0]", time)
-        if index and time <= value[index - 1][0]:
-            rule = f"must be later than the time {shown(value[index - 1][0])} of the entry before"
+        if index and time <= ramp[index - 1][0]:
+            rule = f"must be later than the time {shown(ramp[index - 1][0])} of the entry before"
             raise fault(rule, f"[{index}][0]", time)
-    return tuple((float(time), float(factor)) for time, factor in value)
+    return ramp
+
+
+Ramp = Annotated[
+    tuple[Annotated[tuple[float, float], IN_A_LIST], ...],
+    IN_A_LIST,
+    Field(min_length=1),
+    AfterValidator(_later_and_later),
+]
 
 
 class Load(Table):
@@ -845,9 +965,7 @@ class Load(Table):
     value: float
     """Full value, at factor 1. A force is in stress_unit times length squared, a pressure in stress_unit. An elongation
     has no unit and is above -1."""
-    ramp: Annotated[tuple[tuple[float, float], ...], BeforeValidator(_ramp)] = Field(
-        json_schema_extra={"allowed": "a list of pairs [time, factor] with increasing times"}
-    )
+    ramp: Ramp = Field(json_schema_extra={"allowed": "a list of pairs [time, factor] with increasing times"})
     """Factor on the value over time: pairs [time, factor] with increasing times. The factor is linear between pairs,
     and constant before the first and after the last. Times up to time.end must be multiples of time.step; with
     time.tolerance a step ends at each."""
@@ -863,6 +981,24 @@ class Load(Table):
             if getattr(self, given) is not None and getattr(self, missing) is None:
                 raise fault(f"missing; {given} = {shown(getattr(self, given))} needs it", missing, None)
         return self
+
+    def check_with(self, scene: Scene, key: str) -> None:
+        """Times at which steps end, values that the body can have, and a length that is prescribed or unknown."""
+        name = key.removeprefix("loads.")
+        kind = scene.load_kinds[name]
+        if name == "elongation" and scene.has_free_length and any(self.value * factor for _, factor in self.ramp):
+            rule = "must be 0 where the length is an unknown, with loads.axial_force or closed ends"
+            raise fault(rule, f"{key}.value", self.value)
+        for index, (time, factor) in enumerate(self.ramp):
+            if not scene.time.is_equilibrium and time <= scene.time.end:
+                scene.time.check_hit(time, f"{key}.ramp[{index}][0]")
+            for case in scene.each_case():
+                full = case.loads[name].value
+                if full * factor <= kind.above:
+                    share = factor * full / self.value if self.value else factor
+                    words = f"with the factor {shown(share)} it is {full * factor:.6g}"
+                    rule = f"must be greater than {kind.above:g} at every time; {words}"
+                    raise fault(rule, f"{key}.value", self.value)
 
     def factor(self, time: float) -> float:
         """Factor on the value at a time: piecewise linear, held before the first and after the last pair."""
@@ -882,6 +1018,9 @@ class Load(Table):
         return max((self.value * self.factor(time) for time in times), key=abs)
 
 
+SUM_OF_WEIGHTS = 1e-9  # how far from 1 the weights of load cases may sum: rounding, and 1/3 with ten digits
+
+
 class LoadCase(Table):
     """A load case of a cycle, such as diastole (docs/cycles.md): a share of the time and its loads.
 
@@ -897,6 +1036,17 @@ class LoadCase(Table):
     )
     """Factor on each load by its name, beside the factor of its ramp. Loads that are not named have 1."""
 
+    def check_with(self, scene: Scene, key: str) -> None:
+        """Shares of one whole and factors on loads that there are."""
+        for name in self.loads:
+            if name not in scene.loads:
+                rule = "no such load; the scene has " + (", ".join(scene.loads) or "none")
+                raise fault(rule, f"{key}.loads.{quoted(name)}", self.loads[name])
+        total = math.fsum(case.weight for case in scene.cases)
+        if self is scene.cases[-1] and abs(total - 1.0) > SUM_OF_WEIGHTS:
+            rule = f"the weights of all cases sum to {total:.10g}; they must sum to 1"
+            raise fault(rule, f"{key}.weight", self.weight)
+
 
 def faces_of(loads: Mapping[str, Any]) -> dict[str, str]:
     """Of the further loads among a scene's by name, tables as they were read or as they are."""
@@ -911,24 +1061,15 @@ EQUILIBRIUM = "equilibrium"
 """What `time.end` says where the way there is not asked for."""
 
 
-def _end(value: Any) -> Any:
-    """A time, or the word."""
-    if value == EQUILIBRIUM:
-        return value
-    if not is_number(value) or not value > 0:
-        raise fault(f"must be a finite number greater than 0, or {EQUILIBRIUM!r}")
-    return float(value)
+_End: Any = Annotated[float, Field(gt=0)] | Literal["equilibrium"]
 
 
 class Time(Table):
     """Simulated time, in the unit of 1/kappa. It starts at 0 with the unloaded body."""
 
     # a number for all who step through time; those who take the word ask `is_equilibrium` first
-    end: Annotated[Any, BeforeValidator(_end)] = Field(
-        json_schema_extra={
-            "allowed": "a finite number greater than 0, or 'equilibrium'",
-            "anyOf": [{"type": "number", "exclusiveMinimum": 0}, {"const": EQUILIBRIUM}],
-        }
+    end: Annotated[Any, GetPydanticSchema(lambda _, handler: handler(_End))] = Field(
+        json_schema_extra={"allowed": "a finite number greater than 0, or 'equilibrium'"}
     )
     """Last time, a whole number of steps; with a tolerance any time. 'equilibrium' goes at once to the state that
     remodeling comes to under the loads at the end of their ramps (docs/theory.md, Equilibrium at once)."""
@@ -951,9 +1092,37 @@ class Time(Table):
         if self.end / self.step > MOST_STEPS:
             rule = f"must be at least time.end / {MOST_STEPS} = {self.end / MOST_STEPS:.6g}"
             raise fault(rule, "step", self.step)
-        if not self.is_hit(self.end):
-            raise fault(nearest_multiples(self.end, self.step, "time.step"), "end", self.end)
+        self.check_hit(self.end, "end")
         return self
+
+    def is_hit(self, time: float) -> bool:
+        """Whether a step ends at a time, or may end there."""
+        return self.tolerance is not None or is_multiple(time, self.step)
+
+    def check_hit(self, time: float, key: str) -> None:
+        """Refuse a time at which no step ends."""
+        if not self.is_hit(time):
+            below = math.floor(time / self.step)
+            nearest = f"{below * self.step:.12g} and {(below + 1) * self.step:.12g}"
+            rule = f"must be a multiple of time.step = {shown(self.step)}; the nearest are {nearest}"
+            raise fault(rule, key, time)
+
+    def check_with(self, scene: Scene, key: str) -> None:
+        """An equilibrium of the cells that depends on no way there."""
+        if not self.is_equilibrium:
+            return
+        remodeling, laws = scene.remodeling, named(LAWS, lambda law: law.has_limit)
+        still = [f"{in_region(name)}remodeling.kappa" for name, one in scene.properties().items() if one.kappa == 0]
+        later = "set time.end to a late time"
+        reasons = {
+            f"remodeling.law = {remodeling.law!r} has no limit that is the same on every path; allowed are the laws "
+            + laws: not LAWS[remodeling.law].has_limit,
+            f"remodeling.threshold is above 0: where cells rest depends on the path; {later}": remodeling.threshold,
+            f"remodeling.exponent is not 2: derivatives of its target are not known; {later}": remodeling.has_set_point,
+            f"{', '.join(still)} = 0: the cells never change": still,
+            "needs chains: material.chain_density above 0": not scene.material.chain_density,
+        }
+        refuse(f"{key}.end", self.end, reasons)
 
     @property
     def is_equilibrium(self) -> bool:
@@ -964,10 +1133,6 @@ class Time(Table):
     def number_of_steps(self) -> int:
         """Number of steps from 0 to the end, the equilibrium is one; with a tolerance the run's own are others."""
         return 1 if self.is_equilibrium else round(self.end / self.step)
-
-    def is_hit(self, time: float) -> bool:
-        """Whether a step ends at a time, or may end there."""
-        return self.tolerance is not None or is_multiple(time, self.step)
 
     @property
     def chooses(self) -> bool:
@@ -985,27 +1150,19 @@ class Time(Table):
         return f"steps of an error below {self.tolerance:g} degrees"
 
 
-def nearest_multiples(time: float, step: float, name: str) -> str:
-    below = math.floor(time / step)
-    nearest = f"{below * step:.12g} and {(below + 1) * step:.12g}"
-    return f"must be a multiple of {name} = {shown(step)}; the nearest are {nearest}"
-
-
 # ---------------------------------------------------------------- solver and output
 
 
-def _petsc_options(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        for name, entry in value.items():
-            if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z]\w*", name):
-                raise fault("not a PETSc option; write its name without the leading '-'", quoted(str(name)), entry)
-            if name in ("snes_rtol", "snes_atol", "snes_stol"):
-                raise fault("has no effect; use solver.relative_tolerance, solver.absolute_tolerance", name, entry)
-            if not isinstance(entry, (str, bool)) and not is_number(entry):
-                raise fault("must be a string, a finite number, true or false", name, entry)
-            if refused := fault_of_option(name, entry):
-                raise fault(refused, name, entry)
-    return value
+def _are_options(options: dict[str, Any]) -> dict[str, Any]:
+    """A fault names the option."""
+    for name, value in options.items():
+        if not re.fullmatch(r"[A-Za-z]\w*", name):
+            raise fault("not a PETSc option; write its name without the leading '-'", quoted(name), value)
+        if name in ("snes_rtol", "snes_atol", "snes_stol"):
+            raise fault("has no effect; use solver.relative_tolerance, solver.absolute_tolerance", name, value)
+        if refused := fault_of_option(name, value):
+            raise fault(refused, name, value)
+    return options
 
 
 class Solver(Table):
@@ -1057,9 +1214,19 @@ class Solver(Table):
     """What to do at an equilibrium that the body would leave: one with more negative eigenvalues of the tangent than
     before. 'warn': say where, and go on. 'stop': look for it in every step, and end the run after the last stable step
     (exit code 3)."""
-    petsc_options: Annotated[dict[str, Any], BeforeValidator(_petsc_options)] = Field(default_factory=dict)
+    petsc_options: Annotated[dict[str, str | bool | int | float], AfterValidator(_are_options)] = Field(
+        default_factory=dict,
+        json_schema_extra={"allowed": "a table with a string, a finite number, true or false for each option"},
+    )
     """PETSc options that replace the method's, without the leading '-': snes_..., ksp_..., pc_... and mat_.... Options
     that run code or write files are refused. Options of the variable PETSC_OPTIONS are not looked at."""
+
+    def check_with(self, scene: Scene, key: str) -> None:
+        """Multigrid has no place for one more unknown."""
+        if scene.has_free_length and self.method == "iterative":
+            names = ", ".join(repr(name) for name in (AUTO, *SOLVER_METHODS) if name != self.method)
+            rule = f"allowed where the length is an unknown, with loads.axial_force or closed ends, are {names}"
+            raise fault(rule, f"{key}.method", self.method)
 
     @model_validator(mode="after")
     def _has_a_tolerance(self) -> Solver:
@@ -1074,34 +1241,16 @@ FIELDS_BY_NAME = (
 )  # fmt: skip
 """What `output.fields` may name (`results.fields`); "chains" are the lines of fields_chains.vtkhdf."""
 REGION = "region"  # the field of bodies with regions
+TURNOVER_POWER = "turnover_power"  # the column of bodies with turnover, beside means of what is turned over
 UNLOADED = "fibre_angle_unloaded"  # the field of bodies whose tissue is free of stress in another configuration
 CONSTANT_FIELDS = ("axis_c", "axis_a", "axis_r", "depth", "station")
 """What it may name beside: local axes of the elements, their depth and station, which do not change."""
+ALL_FIELDS = (*FIELDS_BY_NAME, *CONSTANT_FIELDS)
+_FieldName = Annotated[str, OneOf(ALL_FIELDS)]
 
 
-def _fields(value: Any) -> Any:
-    if isinstance(value, bool):
-        return value
-    if not isinstance(value, (list, tuple)) or not all(isinstance(name, str) for name in value):
-        raise fault("must be true, false or a list of names of fields")
-    for name in value:
-        if name not in (*FIELDS_BY_NAME, *CONSTANT_FIELDS):
-            allowed = ", ".join(map(repr, (*FIELDS_BY_NAME, *CONSTANT_FIELDS)))
-            raise fault(f"no such field; allowed are {allowed}", value=name)
-    return tuple(value)
-
-
-def _columns(value: Any) -> Any:
-    if not isinstance(value, (list, tuple)) or not all(isinstance(name, str) for name in value):
-        raise fault("must be a list of names of columns")
-    return tuple(dict.fromkeys(value))
-
-
-def _times(value: Any) -> Any:
-    if not isinstance(value, (list, tuple)) or not all(is_number(time) and time > 0 for time in value):
-        raise fault("must be a list of times above 0")
-    times = tuple(map(float, value))
-    if any(later <= time for time, later in zip(times, times[1:], strict=False)):
+def _increasing(times: tuple[float, ...]) -> tuple[float, ...]:
+    if any(later <= time for time, later in itertools.pairwise(times)):
         raise fault("times must increase")
     return times
 
@@ -1109,23 +1258,20 @@ def _times(value: Any) -> Any:
 class Output(Table):
     """What a run writes beside its history table."""
 
-    fields: Annotated[bool | tuple[str, ...], BeforeValidator(_fields)] = Field(
+    fields: bool | Annotated[tuple[_FieldName, ...], IN_A_LIST] = Field(
         default=True,
-        json_schema_extra={
-            "allowed": "true, false or a list of names of fields",
-            "anyOf": [{"type": "boolean"}, {"type": "array", "items": {"enum": [*FIELDS_BY_NAME, *CONSTANT_FIELDS]}}],
-        },
+        json_schema_extra={"allowed": "true, false or a list of: " + ", ".join(map(repr, ALL_FIELDS))},
     )
     """Fields to write for ParaView: true for all, false for none, or a list of names (docs/commands.md). 'chains'
     stands for the chain lines. Fields that are not asked for are not computed."""
-    columns: Annotated[tuple[str, ...], BeforeValidator(_columns)] = Field(
+    columns: Annotated[tuple[str, ...], IN_A_LIST, AfterValidator(lambda names: tuple(dict.fromkeys(names)))] = Field(
         default=(), json_schema_extra={"allowed": "a list of names of columns"}
     )
     """Columns of the history. Those that are there only on request ('pass_residual', 'negative_eigenvalues' and others,
     docs/commands.md) are added. Where any others are named, only those are measured, with time and loads."""
     every: int = Field(default=1, ge=1)
     """Write the fields of every n-th step, and of the last one."""
-    times: Annotated[tuple[float, ...], BeforeValidator(_times)] = Field(
+    times: Annotated[tuple[Annotated[float, Field(gt=0)], ...], IN_A_LIST, AfterValidator(_increasing)] = Field(
         default=(), json_schema_extra={"allowed": "a list of increasing times above 0"}
     )
     """Times up to time.end that have a row and fields in any case. They must be multiples of time.step; with
@@ -1136,3 +1282,36 @@ class Output(Table):
     """Number of steps between two checkpoints, from which a run can be resumed; 0 means only at the end. Without it
     time decides: at most 10 minutes are lost, and checkpoints cost less than 5 % of the run. There is always one at the
     end, however the run ends."""
+
+    def check_with(self, scene: Scene, key: str) -> None:
+        """Times, fields and columns that the run will have."""
+        for index, time in enumerate(self.times):
+            place = f"{key}.times[{index}]"
+            if scene.time.is_equilibrium:
+                raise fault("not allowed with time.end = 'equilibrium', which has no times", place, time)
+            if time > scene.time.end:
+                raise fault(f"must be at most time.end = {shown(scene.time.end)}", place, time)
+            scene.time.check_hit(time, place)
+        for field, reason in scene.lacking_fields.items():
+            if not isinstance(self.fields, bool) and field in self.fields:
+                raise fault(reason, f"{key}.fields", field)
+        for name in self.columns:
+            self._check_column(name, scene, f"{key}.columns")
+
+    def _check_column(self, name: str, scene: Scene, key: str) -> None:
+        shape, known = scene.geometry, dict.fromkeys(scene.column_names)
+        turns_over = scene.remodeling.turnover.is_on
+        reasons = {
+            "is an error of steps; must be left out with time.end = 'equilibrium'": (
+                name == "time_error" and scene.time.is_equilibrium
+            ),
+            "is for bodies of one tissue; the scene has regions": scene.regions and name in shape.columns_of_one_tissue,
+            "changes only with remodeling.turnover, which is not set": (
+                name in (*TURNED_OVER, TURNOVER_POWER) and not turns_over
+            ),
+        }
+        refuse(key, name, {f"{name!r} {reason}": holds for reason, holds in reasons.items()})
+        allowed = ", ".join(map(repr, known))
+        refuse(
+            key, name, {f"no such column on request; allowed for shape {shape.name!r} are {allowed}": name not in known}
+        )

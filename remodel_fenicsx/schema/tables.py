@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args, get_origin
 
 from pydantic import (
     BaseModel,
+    BeforeValidator,
     ConfigDict,
     Field,
     GetCoreSchemaHandler,
@@ -35,6 +36,8 @@ from remodel_fenicsx.errors import RemodelError
 LONGEST_VALUE = 60  # characters of a value in an error
 LONGEST_MESSAGE = 2000  # characters: all columns of a shape are a thousand
 PAGE_WIDTH = 98  # characters of a line of a page
+# annotation of a tuple: what is a list in TOML becomes one
+IN_A_LIST = BeforeValidator(lambda value: tuple(value) if isinstance(value, list) else value)
 _MISSING = object()
 
 
@@ -65,6 +68,8 @@ class Table(BaseModel):
 
     Attributes
     ----------
+    widened
+        Where parts have brought keys: the class without these, and they.
     renamed
         Of the outermost table: dotted keys of earlier versions, each with the one that has taken its place.
     further
@@ -73,6 +78,7 @@ class Table(BaseModel):
 
     renamed: ClassVar[Mapping[str, str]] = {}
     further: ClassVar[type[BaseModel] | None] = None
+    widened: ClassVar[Any] = None
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
@@ -92,6 +98,11 @@ class Table(BaseModel):
         if cls.further is not None:
             table["additionalProperties"] = handler(cls.further.__pydantic_core_schema__)
         return found
+
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        if self.widened is None:
+            return super().__reduce_ex__(protocol)
+        return _unpickled, (self.widened, self.__getstate__())
 
     if not TYPE_CHECKING:  # the type checker reads the arguments from the fields
 
@@ -203,13 +214,30 @@ def _widened(table: type[Table], own: tuple[tuple[str, Any], ...]) -> type[Table
         name: (float, Field(default=number.default, gt=number.above, description=number.meaning))
         for name, number in own
     }
-    return create_model(table.__name__, __base__=table, __doc__=table.__doc__, **fields)
+    wide = create_model(table.__name__, __base__=table, __doc__=table.__doc__, **fields)
+    wide.widened = table, own
+    return wide
+
+
+def _unpickled(widened: tuple[type[Table], tuple[tuple[str, Any], ...]], state: Any) -> Table:
+    """A table whose class is made, and so has no place from which it could be imported."""
+    kind = _widened(*widened)
+    made = kind.__new__(kind)
+    made.__setstate__(state)
+    return made
 
 
 def fault(rule: str, key: str = "", value: Any = _MISSING) -> PydanticCustomError:
     """Error to raise in a validator."""
     context = {"rule": rule, "key": key} | ({} if value is _MISSING else {"value": value})
     return PydanticCustomError("fault", "{rule}", context)
+
+
+def refuse(key: str, value: Any, reasons: Mapping[str, Any]) -> None:
+    """Raise the fault of the first reason that holds, if one does."""
+    for reason, holds in reasons.items():
+        if holds:
+            raise fault(reason, key, value)
 
 
 def named(registry: Mapping[str, Any], fits: Callable[[Any], Any]) -> str:
@@ -292,9 +320,10 @@ def locate(table: type[BaseModel], location: tuple[int | str, ...]) -> tuple[str
     while items:
         item = items.pop(0)
         if inside is None:
-            if isinstance(item, str) and (field is None or get_origin(field.annotation) is not dict):
-                break  # pydantic's name of a kind of value that the key may have
-            key = _joined(key, _step(item))
+            if isinstance(item, int) or (field is not None and get_origin(field.annotation) is dict):
+                key = _joined(key, _step(item))
+            if isinstance(item, str):
+                break  # what follows is pydantic's name of a kind of value that the key may have
             continue
         key, owner, field = _joined(key, _step(item)), inside, inside.model_fields.get(str(item))
         if field is None:

@@ -170,8 +170,6 @@ class Equilibrium:
         self.comm = mesh.comm
         self.tissue = on_mesh(tissue, mesh)
         self.parameters = Parameters(self.tissue, self.quadrature)
-        # asked on each rank whenever limits are reduced: the signal (SIGINT, SIGTERM) that should end the solve, or 0
-        self.stop_signal: Callable[[], int] = lambda: 0
         u, shares, loading = state.unknown, shares or [state.cells.ufl_cell], state.loading
         test, trial = ufl.TestFunction(u.function_space), ufl.TrialFunction(u.function_space)
         F = state.kinematics.elastic_gradient(u)
@@ -226,7 +224,7 @@ class Equilibrium:
         local: tuple[float, tuple[float, ...]] = (-np.inf, (np.nan,) * 3)
         if stretch.size:
             local = stretch.item(worst), tuple(self.quadrature.coordinates.reshape(-1, 3)[worst].tolist())
-        ranks = of_all_ranks(self.comm, (*local, smallest, self.stop_signal()))
+        ranks = of_all_ranks(self.comm, (*local, smallest, self.state.stop_signal()))
         largest, worst_point, _, _ = max(ranks, key=lambda rank: rank[0])
         extension = Extension(largest, min(rank[2] for rank in ranks), worst_point, max(rank[3] for rank in ranks))
         return Look(extension, stretch.reshape(shape), states)

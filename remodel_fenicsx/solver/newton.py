@@ -520,7 +520,7 @@ class GuardedNewton:
         dolfinx.fem.petsc.set_bc(residual, loading.boundary_conditions, x, -1.0)
         present = self._present
         if present.bounded:
-            present.inadmissible = over_ranks(equilibrium.comm, equilibrium.stop_signal(), MPI.MAX) > 0
+            present.inadmissible = over_ranks(equilibrium.comm, equilibrium.state.stop_signal(), MPI.MAX) > 0
         else:
             extension = self.limits.look().extension
             present.inadmissible = not extension.admissible or extension.stop_signal > 0

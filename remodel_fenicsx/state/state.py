@@ -231,6 +231,8 @@ class State:
         self._deformation_gradient = jit.expression(F, cells.quadrature.points)
         self.equilibrium_cells = CellField(cells.quadrature, "equilibrium_cell")
         self.others: Sequence[State] = ()
+        # asked on each rank in every solve: the signal (SIGINT, SIGTERM) that should end it, or 0
+        self.stop_signal: Callable[[], int] = lambda: 0
         self.settle_cells()
         solved = self.equilibrium_cells
         self._functions: dict[str, Any] = {}
@@ -470,7 +472,7 @@ class Earlier:
 
 
 # ---------------------------------------------------------------- the parameters of a tissue on a mesh as numbers
-# The parameters of a tissue on a mesh as numbers and arrays, made again only where one of them has changed.
+# Numbers and arrays are made again only where a parameter has changed.
 
 
 def on_mesh(tissue: Tissue, mesh: Any) -> Tissue:
@@ -505,13 +507,7 @@ class Parameters:
 
     def __init__(self, tissue: Tissue, quadrature: Quadrature):
         self.tissue, self.quadrature = tissue, quadrature
-        values: list[Any] = []
-
-        def found(name: str, value: Any) -> Any:
-            values.append(value)
-            return value
-
-        tissue.map(found)
+        values = list(tissue.parameters.values())
         self._largest: Remembered[Tissue] = Remembered(quadrature.mesh.comm, *values)
         self._at_points: Remembered[Tissue] = Remembered(None, *values)
 

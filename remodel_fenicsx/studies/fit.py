@@ -10,9 +10,9 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
-from functools import partial
 from html import escape
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -70,6 +70,7 @@ def _with_columns(scene: Scene, table: Measured) -> Scene:
 def _passive(scene: Scene, table: Measured, scales: Mapping[str, float]) -> Scene:
     """Cells that stay, and a step for each row; loads that the table has not keep their last value."""
     changes: dict[str, Any] = {"remodeling.law": "none", "remodeling.coupling": "staggered", "remodeling.turnover": {}}
+    changes |= {"remodeling.exponent": 2.0, "remodeling.threshold": 0.0}  # what says how to remodel goes with a law
     changes |= {"output.times": [], "output.fields": False, "output.columns": [*table.sd]}  # some need turnover
     changes |= {"time.step": 1.0, "time.end": float(table.rows), "time.tolerance": None}
     for name, load in scene.loads.items():
@@ -182,17 +183,21 @@ KNOWN_GROUPS: list[tuple[set[str], str]] = [
 class Problem:
     """Residuals over their standard deviations as a function of the logarithms of the unknowns."""
 
-    def __init__(self, scene: Scene, unknowns: Sequence[Unknown], tables: Sequence[Measured]):
+    def __init__(
+        self,
+        scene: Scene,
+        unknowns: Sequence[Unknown],
+        tables: Sequence[Measured],
+        known: Mapping[Point, Array] = MappingProxyType({}),
+    ):
         self.scene, self.unknowns, self.tables = scene, list(unknowns), list(tables)
-        self._known: dict[Point, Array] = {}
+        self._known, self._kept = dict(known), set(known)
         self._journal: Journal | None = None
 
     def keep(self, journal: Journal) -> None:
-        """From now on each evaluation is in the journal, and what that has is not evaluated again."""
-        known = journal.known()
-        for point in self._known.keys() - known.keys():
+        """From now on each evaluation is in the journal."""
+        for point in self._known.keys() - self._kept:
             journal.add(point, self._known[point])
-        self._known |= known
         self._journal = journal
 
     def scene_of(self, logarithms: Array) -> Scene:
@@ -294,7 +299,7 @@ def fit(
         unknowns, tables = read_measurements(Path(data), scene)
         mark = fingerprint(scene, unknowns, tables)
         place, journal = _place(folder, f"{scene.name}-fit", mark)
-        problem, first = Problem(scene, unknowns, tables), np.log([unknown.start for unknown in unknowns])
+        problem, first = Problem(scene, unknowns, tables, journal.known()), np.log([u.start for u in unknowns])
         try:
             at_start = problem.models(first)
         except StepFailure as failure:
@@ -311,7 +316,11 @@ def fit(
         stack.callback(line.end)
         for number in range(1, starts + 1):
             start = first + (random.uniform(-START_SPREAD, START_SPREAD, len(first)) if number > 1 else 0.0)
-            found.append(minimised(problem, start, partial(_show_misfit, show, f"start {number} of {starts}")))
+
+            def said(misfit: float, words: str = f"start {number} of {starts}, misfit") -> None:
+                show(f"{words} {misfit:.4g}")
+
+            found.append(minimised(problem, start, said))
             log.info("start %d: sum of squares %.6g, %d evaluations", number, 2 * found[-1].cost, found[-1].nfev)
         result = result_of(problem, found)
         if profiles:
@@ -320,10 +329,6 @@ def fit(
         write_whole(place / "scene.toml", result.scene.to_toml(f"fitted to {Path(data).name}").encode())
         result.write(place)
     return place, result
-
-
-def _show_misfit(show: Callable[[str], None], where: str, misfit: float) -> None:
-    show(f"{where}, misfit {misfit:.4g}")
 
 
 def _place(folder: Path | str | None, name: str, mark: str) -> tuple[Path, Journal]:

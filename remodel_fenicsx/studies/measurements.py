@@ -31,12 +31,8 @@ FROM_EDGE = 5e-4  # of a logarithm, from the end of a key's range: derivatives l
 
 
 # ---------------------------------------------------------------- the file as it is written
-def _allowed(rule: str) -> dict[str, Any]:
-    return {"allowed": rule}
-
-
 Positive = Annotated[float, Field(gt=0)]
-_Number = Annotated[Positive | None, Field(json_schema_extra=_allowed("a finite number greater than 0"))]
+_Number = Annotated[Positive | None, Field(json_schema_extra={"allowed": "a finite number greater than 0"})]
 
 
 class UnknownTable(Table):
@@ -69,9 +65,9 @@ class MeasuredTable(Table):
     file: str
     state: Literal["virgin", "history", "after"] = "virgin"
     time: _Number = None
-    sd: dict[str, Positive] = Field(default={}, json_schema_extra=_allowed("numbers greater than 0 by column"))
-    scale: dict[str, Literal["unknown"]] = Field(default={}, json_schema_extra=_allowed("'unknown' by column"))
-    units: dict[str, str] = Field(default={}, json_schema_extra=_allowed("units by column"))
+    sd: dict[str, Positive] = Field(default={}, json_schema_extra={"allowed": "numbers greater than 0 by column"})
+    scale: dict[str, Literal["unknown"]] = Field(default={}, json_schema_extra={"allowed": "'unknown' by column"})
+    units: dict[str, str] = Field(default={}, json_schema_extra={"allowed": "units by column"})
 
     @model_validator(mode="after")
     def _go_together(self) -> MeasuredTable:
@@ -84,10 +80,10 @@ class DataFile(Table):
     """DATA.toml."""
 
     unknowns: dict[str, UnknownTable] = Field(
-        min_length=1, json_schema_extra=_allowed('a table of keys, as "material.lame_mu" = { start = 10.0 }')
+        min_length=1, json_schema_extra={"allowed": 'a table of keys, as "material.lame_mu" = { start = 10.0 }'}
     )
     measured: tuple[MeasuredTable, ...] = Field(
-        min_length=1, strict=False, json_schema_extra=_allowed("tables [[measured]], each with a file")
+        min_length=1, strict=False, json_schema_extra={"allowed": "tables [[measured]], each with a file"}
     )
 
 

@@ -202,7 +202,8 @@ def as_file(figure: Figure, ending: str, about: About, colours: NDArray[np.float
     for key, value in notes["png"].items():
         texts.add_text(key, value)
     with Image.open(drawn) as full:
-        picture = with_palette(full.convert("RGB"), colours)
+        picture = full.convert("RGB")
+        picture = Palette(picture, colours)(picture)
         picture.save(small, "png", pnginfo=texts, optimize=True, dpi=(dpi, dpi))
     return small.getvalue()
 
@@ -251,11 +252,6 @@ class Palette:
         result = Image.fromarray(nearest[places].reshape(pixels.shape[:2]), mode="P")
         result.putpalette(self.colours.tobytes())
         return result
-
-
-def with_palette(picture: Image.Image, colours: NDArray[np.float64]) -> Image.Image:
-    """A picture in the 256 colours that are chosen for it, these (n, 3) in 0..1 among them."""
-    return Palette(picture, colours)(picture)
 
 
 def _cell(value: Any) -> str:

@@ -15,7 +15,7 @@ from remodel_fenicsx.results.fields import local_fields
 from remodel_fenicsx.results.vtkhdf import vtk_cells
 from remodel_fenicsx.running import with_files_kept
 from remodel_fenicsx.scene import Scene
-from remodel_fenicsx.simulation import build, checked_domain, with_choices
+from remodel_fenicsx.simulation import checked_domain, mesh_of, with_choices
 from remodel_fenicsx.system.files import TakenError, part_of
 from remodel_fenicsx.system.temporary import temporary_folder
 from remodel_fenicsx.unloading import unloaded
@@ -52,7 +52,7 @@ def _in_words(scene: Scene, found: Scene) -> str:
 def write_axes(scene: Scene, path: Path, comm: MPI.Intracomm = MPI.COMM_WORLD) -> str:
     """Write local axes, depth, station, thickness, and where the axes are undefined, by element. Collective."""
     scene = with_choices(scene)
-    domain, shape = checked_domain(build(scene, comm), scene), scene.geometry
+    domain, shape = checked_domain(mesh_of(scene, comm), scene), scene.geometry
     mesh = domain.mesh
     weight = KINEMATICS[scene.model.kinematics].on(mesh, shape).weight(mesh)
     quadrature = Quadrature(mesh, scene.mesh.degree, weight)

@@ -6,7 +6,6 @@ import logging
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -48,31 +47,27 @@ def stability(
         simulation = Simulation(scene, comm)
     scene = simulation.scene  # with the kinematics that was chosen
     place = chosen_folder(folder, f"{scene.name}-stability", comm)
-    steps, share = scene.time.number_of_steps, simulation.stepper.coupling.share
+    steps, share = scene.time.number_of_steps, simulation.stepper.remodeling.share
     chosen = {round(steps * (index + 1) / number) for index in range(number)}
     watcher = AmplificationWatcher(simulation.stepper, lambda step: step.number in chosen)
 
-    def say(*message: Any) -> None:
-        if comm.rank == 0:
-            log.info(*message)
-
     with ExitStack() as stack:
         stop = stack.enter_context(StopRequest())
-        simulation.stepper.stop_signal = lambda: stop.number or (PAUSE if stop.pause else 0)
+        simulation.state.stop_signal = lambda: stop.number or (PAUSE if stop.pause else 0)
         stack.enter_context(locked(place, comm, new=True))
         record = stack.enter_context(RunFolder(place, scene.to_toml("as analysed: all values"), comm.rank))
         stack.enter_context(open_log(place / "run.log", comm.rank, quiet=quiet, held=held))
         kinematics = scene.model.kinematics
-        say("analysing %s at %d of %d steps, kinematics %r", scene.name, len(chosen), steps, kinematics)
+        log.info("analysing %s at %d of %d steps, kinematics %r", scene.name, len(chosen), steps, kinematics)
         for unseen in unseen_by(scene):
-            say("%s", unseen)
+            log.info("%s", unseen)
         progress = stack.enter_context(Progress(steps, f"{scene.name} stability", -1 if quiet else comm.rank))
         try:
             for step in simulation.steps([watcher, record]):
                 progress.step(step.number, step.time, "", step.work.newton_iterations, None)
                 if step.number in chosen:
                     found = _factor(watcher.found[-1].reversing)
-                    say("time %g: a pass multiplies the worst small change by %.3g", step.time, found)
+                    log.info("time %g: a pass multiplies the worst small change by %.3g", step.time, found)
         finally:
             if comm.rank == 0 and watcher.found:  # of a run that ends early too
                 Analysis(scene, as_table(watcher, share), share).write(place)

@@ -545,7 +545,9 @@ class _TradeStudy(Study):
             reached = f"{len(self.results)} of {len(self.settings)} settings reached the end"
             raise TooFewRuns(f"{reached} within the budget of {self.budget:g} s", self.failed, self._advice())
         rows, notes = estimated(self.results)
-        return Trade(self.scene, rows, notes, [setting.name for setting in self.left], self.failed)
+        if self.left:
+            notes.append(f"left out, over the budget: {', '.join(setting.name for setting in self.left)}")
+        return Trade(self.scene, rows, notes, self.failed)
 
     def _advice(self) -> str:
         """What the cheapest settings that are left would take, if so many are left."""
@@ -613,7 +615,6 @@ class Trade(Answer):
     scene: Scene
     rows: list[Row]
     notes: list[str] = field(default_factory=list)
-    left_out: list[str] = field(default_factory=list)
     failed: dict[str, str] = field(default_factory=dict)
 
     name = "trade"
@@ -660,11 +661,6 @@ class Trade(Answer):
         if not good:
             return f"No setting is known to be within {WANTED:g} degree; the closest is {best.words}, {cost}."
         return f"The cheapest setting within {WANTED:g} degree is {best.words}, {cost}."
-
-    def in_words(self) -> str:
-        """The table, the verdict, what it rests on, and what was left out."""
-        left_out = f"\nleft out, over the budget: {', '.join(self.left_out)}" if self.left_out else ""
-        return super().in_words() + left_out
 
     def write(self, folder: Path) -> None:
         """Write the table, the picture, and a scene of each row."""

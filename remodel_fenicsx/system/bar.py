@@ -18,7 +18,7 @@ _MARGIN = 3
 class Bar(RichProgress):
     """A bar on stderr. What others print stands above it; what goes to a file stays there."""
 
-    def __init__(self, title: str, total: int, done: float):
+    def __init__(self, title: str, total: int | None, done: float):
         self._stderr = Console(stderr=True)
         super().__init__(
             _Cropped("title"),

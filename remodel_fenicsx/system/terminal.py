@@ -5,13 +5,13 @@ from __future__ import annotations
 import logging
 import math
 import os
-import shutil
 import sys
 import time as clock
 from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from io import TextIOWrapper
+from logging.handlers import MemoryHandler
 from pathlib import Path
 from statistics import median_low
 from typing import Any, cast
@@ -32,9 +32,8 @@ class Progress:
         self._total, self._title, self._done = total_steps, title, done
         self._silent, self._interval = comm_rank != 0, interval
         self._line_is_due = -math.inf
-        self._last: tuple[float, float] | None = (
-            None  # step and clock: of the first one of a process, which compiles, too
-        )
+        # step and clock: of the first one of a process, which compiles, too
+        self._last: tuple[float, float] | None = None
         self._paces: deque[float] = deque(maxlen=LAST_PACES)  # seconds a step
         self._pending: str | None = None  # the newest line that was not printed
         self._bar: Any = None  # `bar.Bar`, on a terminal
@@ -43,7 +42,7 @@ class Progress:
         if not self._silent and _is_terminal():
             from remodel_fenicsx.system.bar import Bar  # late: most runs have no terminal
 
-            self._bar = Bar(self._title, self._total, self._done)
+            self._bar = Bar(self._title, self._total or None, self._done)
             self._bar.start()
         return self
 
@@ -73,12 +72,15 @@ class Progress:
         at, newton, left = f"t = {time:g}", f"{newton_iterations} Newton", self._time_left(index)
         if self._bar is not None:  # what stands last is lost first where the terminal is narrow
             self._bar.show(index, count, _joined(at, newton, load_text), left)
-            return
-        self._pending = f"{self._title}: " + _joined(f"step {count}", at, load_text, newton, left)
-        now = clock.monotonic()
-        if index >= self._total or now >= self._line_is_due:
+        else:
+            self._say(_joined(f"step {count}", at, load_text, newton, left), at_once=index >= self._total)
+
+    def _say(self, text: str, at_once: bool) -> None:
+        """A line that stays, if it is time for one; the last one is said at the end."""
+        self._pending = f"{self._title}: {text}"
+        if at_once or clock.monotonic() >= self._line_is_due:
             announce(self._pending)
-            self._line_is_due, self._pending = now + self._interval, None
+            self._line_is_due, self._pending = clock.monotonic() + self._interval, None
 
     def message(self, text: str) -> None:
         """Print a line above the bar, or between the plain lines."""
@@ -103,6 +105,29 @@ def _joined(*parts: str) -> str:
     return ", ".join(filter(None, parts))
 
 
+class Line(Progress):
+    """What several runs do, on stderr: one line that changes on a terminal, else a plain line now and then."""
+
+    def __init__(self, title: str) -> None:
+        super().__init__(0, title, interval=LINE_EVERY)
+        self._begun = False
+
+    def show(self, text: str, at_once: bool = False) -> None:
+        """Show a line; where lines stay, only now and then unless it is wanted at once."""
+        if not self._begun:
+            self._begun = True
+            self.__enter__()
+        if self._bar is not None:
+            self._bar.show(0, "", text, "")
+        else:
+            self._say(text, at_once)
+
+    def end(self) -> None:
+        """Leave the last line as it is."""
+        self._pending = None
+        self.__exit__()
+
+
 def _is_terminal() -> bool:
     return sys.stderr is not None and sys.stderr.isatty() and os.environ.get("TERM", "dumb") not in ("dumb", "unknown")
 
@@ -113,37 +138,12 @@ def announce(line: str, end: str = "\n") -> None:
         print(line, end=end, file=sys.stderr, flush=True)
 
 
-class Line:
-    """What several runs do, on stderr: one line that changes on a terminal, else a plain line now and then."""
-
-    def __init__(self, title: str) -> None:
-        self._title = title
-        self._due, self._terminal, self._width = -math.inf, sys.stderr.isatty(), 0
-
-    def show(self, text: str, at_once: bool = False) -> None:
-        """Show a line; where lines stay, only now and then unless it is wanted at once."""
-        text = f"{self._title}: {text}"
-        if self._terminal:
-            text = text[: max(20, shutil.get_terminal_size().columns - 1)]
-            announce(f"\r{text:{self._width}}", end="")
-            self._width = len(text)
-        elif at_once or clock.monotonic() >= self._due:
-            announce(text)
-            self._due = clock.monotonic() + LINE_EVERY
-
-    def end(self) -> None:
-        """Leave the last line as it is."""
-        if self._width:
-            announce("")
-            self._width = 0
-
-
 @contextmanager
 def hold_log(comm_rank: int = 0, *, quiet: bool = True) -> Iterator[list[logging.LogRecord]]:
     """Collect what the package logs until there is a folder for it (`open_log`); the terminal gets its part at once."""
-    early = _Early()
+    early = MemoryHandler(sys.maxsize, flushLevel=sys.maxsize, flushOnClose=False)
     with _logged_to([early, _Screen(quiet)], comm_rank):
-        yield early.records
+        yield early.buffer
 
 
 @contextmanager
@@ -204,15 +204,6 @@ class _LogFile(logging.FileHandler):
     def handleError(self, record: logging.LogRecord) -> None:
         # called inside logging's own `except`: logging would print a traceback for every line and go on
         raise
-
-
-class _Early(logging.Handler):
-    def __init__(self) -> None:
-        super().__init__()
-        self.records: list[logging.LogRecord] = []
-
-    def emit(self, record: logging.LogRecord) -> None:
-        self.records.append(record)
 
 
 class _Screen(logging.Handler):

@@ -1,1 +1,84 @@
 """What looks on and warns, off the path of a step: each is a `Watcher`, and a run is the same without it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from remodel_fenicsx._lazy import resolved
+
+
+@dataclass(frozen=True)
+class WatcherKind:
+    """A watcher as runs know it.
+
+    Attributes
+    ----------
+    maker
+        Function of a scene and a stepper that gives a `Watcher`, or None where there is nothing to watch; or its dotted
+        name.
+    each_case
+        Whether it looks at solved states, whatever the cells do: each load case then has one of its own.
+
+    Examples
+    --------
+    A watcher of every run, which counts its steps:
+
+    >>> from remodel_fenicsx import Simulation, parts, preset_scene
+    >>> from remodel_fenicsx.extend import WATCHERS, WatcherKind
+    >>> class Counter(parts.Watcher):
+    ...     steps = 0
+    ...
+    ...     def committed(self, step):
+    ...         Counter.steps += 1
+    >>> WATCHERS["counter"] = WatcherKind(lambda scene, stepper: Counter())
+    >>> scene = preset_scene("kuhl-holzapfel-2007", "cube").with_values({"time.end": 3.0})
+    >>> for step in Simulation(scene).steps():
+    ...     pass
+    >>> Counter.steps
+    3
+    >>> del WATCHERS["counter"]
+    """
+
+    maker: Callable[[Any, Any], Any] | str
+    each_case: bool = False
+
+    def make(self, scene: Any, stepper: Any) -> Any:
+        """The watcher of a scene's stepper, or of another load case; None where there is nothing to watch.
+
+        Parameters
+        ----------
+        scene
+            The scene.
+        stepper
+            Its stepper, or another load case.
+        """
+        return resolved(self.maker)(scene, stepper)
+
+
+def _buckling(scene: Any, stepper: Any) -> Any:
+    """Of reduced bodies: a whole one buckles by itself."""
+    strut = scene.geometry.strut(scene.supports.ends) if stepper.state.kinematics.reduced else None
+    if strut is None:
+        return None
+    from remodel_fenicsx.watch.buckling import BucklingWarning
+
+    return BucklingWarning(stepper, strut)
+
+
+_WARNINGS = "remodel_fenicsx.watch.warnings:"
+
+WATCHERS = {
+    "over-correction": WatcherKind("remodel_fenicsx.watch.over_correction:OverCorrection.of"),
+    "locking": WatcherKind(_WARNINGS + "LockingWarning.of", each_case=True),
+    "buckling": WatcherKind(_buckling, each_case=True),
+    "volume": WatcherKind(_WARNINGS + "VolumeLoss.of", each_case=True),
+    "pressure-noise": WatcherKind(_WARNINGS + "PressureNoise.of"),
+    "weak-tension": WatcherKind(_WARNINGS + "WeakTension.of"),
+    "radial-chains": WatcherKind(_WARNINGS + "RadialChains.of"),
+    "fronts": WatcherKind(_WARNINGS + "FrontsInLayers.of"),
+    "much-growth": WatcherKind(_WARNINGS + "MuchGrowth.of"),
+    "growth": WatcherKind(_WARNINGS + "GrowthWithoutRest.of"),
+}
+"""By name, in the order in which they see a step."""

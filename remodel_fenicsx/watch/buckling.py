@@ -13,7 +13,7 @@ from remodel_fenicsx.body.reductions import Strut
 from remodel_fenicsx.evolution.stepper import Step, Stepper
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.energy import Tissue
-from remodel_fenicsx.state.state import Occasions, at_points
+from remodel_fenicsx.state.state import at_points
 from remodel_fenicsx.watch.warnings import WarnsOnce
 
 Array = NDArray[np.float64]
@@ -27,17 +27,13 @@ _SIGNS = {1: np.array([[1.0], [-1.0]]), 2: np.array([[1.0, 1.0], [1.0, -1.0], [-
 class BucklingWarning(WarnsOnce):
     """Says once that the whole body would buckle, where a reduced kinematics cannot."""
 
+    name = "buckling"
+
     def __init__(self, stepper: Stepper, strut: Strut):
-        super().__init__(stepper, "buckling")
+        super().__init__(stepper)
         self.strut = strut
-        self._occasions = Occasions(self.state, "buckling")
 
-    def solved(self, step: Step) -> None:
-        """Look, until it was said."""
-        if not self.said and self._occasions.due() and (found := self.in_words()):
-            self.find(found)
-
-    def in_words(self) -> str:
+    def look(self, step: Step | None = None) -> str:
         """What is too much in the present state; nothing where it is stable."""
         shares = {"thrust along z": self.thrust_share(), "suction": self.suction_share()}
         said = [

@@ -13,7 +13,7 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from remodel_fenicsx.evolution.stepper import Step, Stepper
+from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
 from remodel_fenicsx.fem.assembly import over_ranks
 from remodel_fenicsx.model import tensors
 from remodel_fenicsx.state.state import Earlier
@@ -57,17 +57,24 @@ class Swing:
 class OverCorrection(WarnsOnce):
     """Warns, once, when the cells swing to and fro from pass to pass so that results suffer."""
 
+    name = "over_correction"
+    initial = {"growing": 0, "sustained": 0} | {f"time_{age}": 0.0 for age in range(ORDER + 1)}
+
     def __init__(self, stepper: Stepper):
-        times = {f"time_{age}": 0.0 for age in range(ORDER + 1)}
-        super().__init__(stepper, "over_correction", {"growing": 0, "sustained": 0} | times)
+        super().__init__(stepper)
         self.swing: Swing | None = None
         # cells that belong to the stress of their own row, by a rule for any step, go nowhere too far
-        coupling = stepper.coupling
-        self._may_swing = not coupling.accumulates or coupling.longest < np.inf
+        traits = stepper.coupling.traits
+        self._may_swing = not traits.accumulates or traits.longest < np.inf
         # of the passes before, with the newest one
         cells = partial(self.quadrature.function, "", (6,))
         self._cells = Earlier(self.state, "over_correction_cells", cells, ORDER + 1)
         self._body = Earlier(self.state, "over_correction_body", self.state.unknown.copy, ORDER + 1)
+        self.rested = RestedCells(stepper, self) if stepper.remodeling.law.of_absolute_time else Watcher()
+
+    @classmethod
+    def of(cls, scene: Any, stepper: Any) -> OverCorrection | None:
+        return cls(stepper) if stepper.remodeling.law.remodels and not scene.time.is_equilibrium else None
 
     @property
     def structures(self) -> list[Array]:
@@ -79,28 +86,40 @@ class OverCorrection(WarnsOnce):
         for memory in (self._cells, self._body, self._numbers):
             memory.forget()
         self._keep(step, self._structure())
+        self.rested.started(step)
+
+    def due(self, step: Step) -> bool:
+        """A solved state says nothing: passes do."""
+        return False
 
     def completed(self, step: Step) -> None:
         """One pass more."""
-        structure = self._structure()
-        self.swing = None
+        structure, self.swing = self._structure(), None
         if self._cells.known > ORDER:
             cells, body = [structure, *self._cells.values], [self.state.unknown.x.array, *self._body.values]
-            self.swing = self._measured(cells, body, [step.time, *self.times])
+            times = [step.time, *self.times]
+            self.swing = swing = self._measured(cells, body, times)
             tells = not self._loads_jump(step) and not self._rested(cells) and self._evenly(step)
-            self._count("growing", tells and self.swing.cells_factor < GROWTH)
-            self._count("sustained", tells and self.swing.body_factor < SUSTAINED)
+            self._count("growing", tells and swing.cells_factor < GROWTH)
+            self._count("sustained", tells and swing.body_factor < SUSTAINED)
+            if not self.said and self._may_swing and self._suffers(swing):
+                self.find(self._in_words(swing, cells, times))
         self._keep(step, structure)
+        self.rested.completed(step)
+
+    def undone(self, step: Step) -> None:
+        super().undone(step)
+        self.rested.undone(step)
 
     def committed(self, step: Step) -> None:
-        """Warn."""
-        if self.said or self.swing is None or not self._may_swing:
-            return
-        next_one = self.swing.cells * abs(self.swing.cells_factor)  # as large as it will be after one pass more
+        super().committed(step)
+        self.rested.committed(step)
+
+    def _suffers(self, swing: Swing) -> bool:
+        """Whether a swing has begun or lasts, and is large."""
+        next_one = swing.cells * abs(swing.cells_factor)  # as large as it will be after one pass more
         begins = self._numbers["growing"] >= GROWING_PASSES and next_one >= CELL_TOLERANCE
-        lasts = self._numbers["sustained"] >= SUSTAINED_PASSES and self.swing.body >= BODY_TOLERANCE
-        if begins or lasts:
-            self.say(step, self._in_words(self.swing))
+        return begins or (self._numbers["sustained"] >= SUSTAINED_PASSES and swing.body >= BODY_TOLERANCE)
 
     def _count(self, name: str, once_more: bool) -> None:
         """Passes in a row."""
@@ -171,8 +190,9 @@ class OverCorrection(WarnsOnce):
         )
 
     # ------------------------------------------------------------ words
-    def _in_words(self, swing: Swing) -> str:
-        place = ", ".join(f"{coordinate:.4g}" for coordinate in self._place())
+    def _in_words(self, swing: Swing, cells: list[Array], times: list[float]) -> str:
+        change = np.linalg.norm(self._at_points(_difference(cells, times)), axis=-1)
+        place = ", ".join(f"{coordinate:.4g}" for coordinate in self.quadrature.place_of_largest(change))
         return (
             "the remodeling pass over-corrects: from pass to pass the cells swing to and fro. The structure tensor A "
             f"changes by {swing.cells:.2g} r0^2 (root mean square; most at {place}), the displacement by "
@@ -183,16 +203,11 @@ class OverCorrection(WarnsOnce):
 
     def _advice(self, factor: float) -> str:
         """A share of the pass with which the swing dies out: 1 - theta (1 - f) > -1."""
-        share = self.stepper.coupling.share
+        share = self.stepper.remodeling.share
         stable = 2 * share / (1 - factor)
         if share == 1.0 and stable > 0.5:
             return 'remodeling.coupling = "relaxed"'
         return f'remodeling.coupling = "relaxed" with a relaxation_factor below {min(stable, share):.2g}'
-
-    def _place(self) -> tuple[float, float, float]:
-        """Reference place of the largest swing of the cells."""
-        swing = self._at_points(_difference(self._cells.values, self.times))
-        return self.quadrature.place_of_largest(np.linalg.norm(swing, axis=-1))
 
 
 def _ratio(value: float, size: float) -> float:
@@ -203,12 +218,12 @@ def _ratio(value: float, size: float) -> float:
 class RestedCells(WarnsOnce):
     """Warns, once, when cells that had rested change in one pass as much as if they had remodeled all the time."""
 
+    name = "rested_cells"
+
     def __init__(self, stepper: Stepper, passes: OverCorrection):
-        super().__init__(stepper, "rested_cells")
+        super().__init__(stepper)
         self.passes = passes
         self._moved = Earlier(self.state, "rested_cells_moved", partial(self.quadrature.function, "", ()), 1)
-        # of the last pass: |change of A|^2 where it was made up for
-        self._squares: Array = np.zeros(self.quadrature.shape)
 
     def started(self, step: Step) -> None:
         """No pass yet."""
@@ -224,32 +239,25 @@ class RestedCells(WarnsOnce):
         nowhere = np.zeros(self.quadrature.shape, dtype=bool)  # where memory begins anew there is nothing to tell
         now = _differ(cells[0], cells[1]) if len(cells) > 1 else nowhere
         moved = self._moved.values[0].reshape(self.quadrature.shape) > 0 if self._moved.known else nowhere
-        self._squares = np.zeros(self.quadrature.shape)
-        if len(cells) > 2 and self._loaded_before():
-            resumed = now & moved & ~_differ(cells[1], cells[2])
-            self._squares = np.where(resumed, np.sum((cells[0] - cells[1]) ** 2, axis=-1), 0.0)
         self._moved.push((now | moved).astype(np.float64).ravel())
+        # a rest without loads is the loads', and no matter of steps
+        if len(cells) > 2 and any(self.stepper.load_values(self.passes.times[1]).values()):
+            resumed = now & moved & ~_differ(cells[1], cells[2])
+            # |change of A|^2 where it was made up for
+            self._judge(np.where(resumed, np.sum((cells[0] - cells[1]) ** 2, axis=-1), 0.0))
 
-    def _loaded_before(self) -> bool:
-        """Whether there was a load at the pass before: a rest without loads is the loads', and no matter of steps."""
-        return any(value != 0 for value in self.stepper.load_values(self.passes.times[1]).values())
-
-    def committed(self, step: Step) -> None:
-        """Warn."""
-        if self.said:
-            return
-        squares, r0 = self._squares, self.stepper.remodeling.parameters.largest().end_to_end_length
+    def _judge(self, squares: Array) -> None:
+        r0 = self.stepper.remodeling.parameters.largest().end_to_end_length
         change = np.sqrt(self.quadrature.mean(squares)) / r0**2
         if change < RESUMED_CHANGE:
             return
         share, place = self.quadrature.mean((squares > 0).astype(float)), self.quadrature.place_of_largest(squares)
-        self.say(
-            step,
+        self.find(
             "cells that had rested without tension remodel again, and the law catches up in one pass. In "
             f"{100 * share:.2g} % of the body the structure tensor A changes by {change:.2g} r0^2 (root mean square "
             f"over the body; most at {', '.join(f'{coordinate:.4g}' for coordinate in place)}). When cells rest "
             'depends on time.step, and so does the result; set remodeling.coupling = "relaxed", or a remodeling.law '
-            "that is a rate (docs/theory.md, Stability of the pass)",
+            "that is a rate (docs/theory.md, Stability of the pass)"
         )
 
 

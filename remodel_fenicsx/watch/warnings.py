@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import dolfinx.fem
 import dolfinx.la
@@ -19,7 +19,7 @@ from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
 from remodel_fenicsx.evolution.turnover import MUCH, Slowing
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.compat import geometry_dofmap
-from remodel_fenicsx.fem.formulations import NOT_LOCKING, STIFF_BULK
+from remodel_fenicsx.fem.formulations import FORMULATIONS, NOT_LOCKING, STIFF_BULK
 from remodel_fenicsx.model.energy import TURNED_OVER
 from remodel_fenicsx.model.tensors import cofactor
 from remodel_fenicsx.state.state import Numbers, Occasions, at_points
@@ -33,21 +33,102 @@ log = logging.getLogger(__name__)
 
 
 class WarnsOnce(Watcher):
-    """Says one thing about a run, once; resumed runs know whether it was said."""
+    """Says one thing about a run, once; resumed runs know whether it was said.
 
-    def __init__(self, stepper: Stepper, name: str, initial: Mapping[str, float] | None = None):
+    Parameters
+    ----------
+    stepper
+        Whose solved states are looked at.
+
+    Attributes
+    ----------
+    name
+        Of what is remembered of it in the state.
+    initial
+        Numbers of its own that are remembered from step to step, by name.
+    level
+        Of logging.
+
+    Examples
+    --------
+    >>> from remodel_fenicsx import Simulation, preset_scene
+    >>> from remodel_fenicsx.extend import WATCHERS, WarnsOnce, WatcherKind
+    >>> class Stretched(WarnsOnce):
+    ...     name = "stretched"
+    ...
+    ...     def look(self, step):
+    ...         return "the cube is long" if step.row["mean_stretch"] > 1.5 else ""
+    >>> WATCHERS["stretched"] = WatcherKind(Stretched.of)
+    >>> simulation = Simulation(preset_scene("kuhl-holzapfel-2007", "cube"))
+    >>> for step in simulation.steps():
+    ...     pass
+    >>> simulation.watchers[-1].said
+    True
+    >>> del WATCHERS["stretched"]
+    """
+
+    name = ""
+    initial: ClassVar[Mapping[str, float]] = {}
+    level = logging.WARNING
+
+    def __init__(self, stepper: Stepper):
         self.stepper, self.state = stepper, stepper.state
         self.quadrature = stepper.state.cells.quadrature
-        self._numbers = Numbers(stepper.state, name, {"said": 0} | dict(initial or {}))
+        self._numbers = Numbers(self.state, self.name, {"said": 0} | dict(self.initial))
+        self._occasions = Occasions(self.state, self.name)
         self._found = ""
+
+    @classmethod
+    def of(cls, scene: Any, stepper: Any) -> WarnsOnce | None:
+        """For a scene's stepper, or another load case (`WATCHERS`); None where there is nothing to watch.
+
+        Parameters
+        ----------
+        scene
+            The scene.
+        stepper
+            Its stepper, or the load case.
+        """
+        return cls(stepper)
 
     @property
     def said(self) -> bool:
         """Whether it was."""
         return bool(self._numbers["said"])
 
+    def due(self, step: Step) -> bool:
+        """Whether it is time to look: when loads have changed, and now and then without, for cells remodel.
+
+        Parameters
+        ----------
+        step
+            The step that is solved.
+        """
+        return self._occasions.due()
+
+    def look(self, step: Step) -> str:
+        """What is to be said of the solved state; nothing where all is well.
+
+        Parameters
+        ----------
+        step
+            The step that is solved.
+        """
+        return ""
+
+    def solved(self, step: Step) -> None:
+        """Look, until it was said."""
+        if not self.said and self.due(step) and (text := self.look(step)):
+            self.find(text)
+
     def find(self, text: str) -> None:
-        """In a solved state: it is said where the step is accepted, and else forgotten."""
+        """In a solved state: it is said where the step is accepted, and else forgotten.
+
+        Parameters
+        ----------
+        text
+            One line, without the time.
+        """
         self._numbers["said"], self._found = True, text
 
     def undone(self, step: Step) -> None:
@@ -56,15 +137,9 @@ class WarnsOnce(Watcher):
 
     def committed(self, step: Step) -> None:
         """Say what was found."""
-        if self._found:
-            self.say(step, self._found)
-            self._found = ""
-
-    def say(self, step: Step, text: str, level: int = logging.WARNING) -> None:
-        """Now, on the first rank, with the time of the step."""
-        self._numbers["said"] = True
-        if self.state.comm.rank == 0:
-            log.log(level, "%s: %s", step.moment, text)
+        if self._found and self.state.comm.rank == 0:
+            log.log(self.level, "%s: %s", step.moment, self._found)
+        self._found = ""
 
 
 # ---------------------------------------------------------------- elements that hold a body back
@@ -95,6 +170,13 @@ DIFFERENCE = 1e-4
 MOST_HELD = 0.99  # part of a motion that elements hold back, in the sum of a geometric series
 
 
+def remedy(scene: Any) -> str:
+    """What a scene may set whose elements lock, in words."""
+    if needs := scene.needs_all_points():
+        return f"set mesh.degree = 2 or a larger mesh.refinement, for {needs} needs mesh.formulation = 'displacement'"
+    return REMEDY
+
+
 class Missing(NamedTuple):
     """About which part of its way a body lacks: by changes of volume, and by changes of shape, inside elements."""
 
@@ -105,15 +187,21 @@ class Missing(NamedTuple):
 class LockingWarning(WarnsOnce):
     """Says once that elements hold the body back, as soon as a solved state shows it."""
 
+    name, initial = "locking", {"energy": 0, "vain": 0}
+
     def __init__(self, stepper: Stepper, locks: bool, remedy: str = REMEDY):
-        super().__init__(stepper, "locking", {"energy": 0, "vain": 0})
+        super().__init__(stepper)
         tissue = at_points(stepper.tissue, self.quadrature)
         shape = self.quadrature.shape
         self.stiffnesses = [self.quadrature.owned(v.reshape(shape)) for v in (tissue.lame_lambda, tissue.lame_mu)]
         self.locks, self.remedy = locks, remedy
         self.response = VolumeResponse(stepper, self.stiffnesses[0])
-        self.homogeneous = stepper.state.kinematics.homogeneous  # then there are no elements that could hold it back
-        self._occasions = Occasions(stepper.state, "locking")
+
+    @classmethod
+    def of(cls, scene: Any, stepper: Any) -> LockingWarning | None:
+        if stepper.state.kinematics.homogeneous:  # there are no elements that could hold it back
+            return None
+        return cls(stepper, FORMULATIONS[scene.mesh.formulation].locks, remedy(scene))
 
     def stiffness_ratio(self) -> float:
         """Largest lambda/mu in the body."""
@@ -185,16 +273,13 @@ class LockingWarning(WarnsOnce):
         whole, of_forces = state.comm.allreduce(local, MPI.SUM).tolist()
         return whole / 2, of_forces / 2
 
-    def solved(self, step: Step) -> None:
-        """Look, until it was said."""
-        if self.homogeneous or self.said or not self._occasions.due():
-            return
+    def look(self, step: Step) -> str:
+        """Whether the body lacks more of its way than is noticed."""
         energies = self.energies()
         if not self._are_news(*energies):
-            return
+            return ""
         missing = self._missing(*energies, WARNED_SHARE)
-        if sum(missing) > WARNED_SHARE:
-            self.find(self.in_words(missing))
+        return self.in_words(missing) if sum(missing) > WARNED_SHARE else ""
 
     def _are_news(self, energy: float, *vain: float) -> bool:
         """Whether energies differ from those of the last look."""
@@ -221,14 +306,21 @@ class LockingWarning(WarnsOnce):
 class PressureNoise(WarnsOnce):
     """Says once that the pressure inside elements, not that of the body, decides where the cells turn."""
 
+    name = "pressure_noise"
+
     def __init__(self, stepper: Stepper, remedy: str = REMEDY):
-        super().__init__(stepper, "pressure_noise")
+        super().__init__(stepper)
         self.remedy = remedy
         points = at_points(stepper.tissue, self.quadrature)
         lame = points.lame_lambda.reshape(self.quadrature.shape)
         self.stiffness = self.quadrature.owned(lame)
         self.ratio = self.quadrature.maximum(lame / points.lame_mu.reshape(self.quadrature.shape))
-        self._occasions = Occasions(stepper.state, "pressure_noise")
+
+    @classmethod
+    def of(cls, scene: Any, stepper: Any) -> PressureNoise | None:
+        remodeling, locks = stepper.remodeling, FORMULATIONS[scene.mesh.formulation].locks
+        turns = remodeling.law.remodels and remodeling.driver.is_stress and not stepper.state.kinematics.homogeneous
+        return cls(stepper, remedy(scene)) if locks and turns else None
 
     def degrees(self) -> float:
         """Mean over the body of the angle by which the noise turns the tensions of the present state."""
@@ -248,13 +340,11 @@ class PressureNoise(WarnsOnce):
         turned = np.degrees(np.arccos(np.clip(cosine / np.where(lengths > 0, lengths, 1.0), -1.0, 1.0)))
         return quadrature.integral(turned.reshape(stiffness.shape)) / quadrature.volume
 
-    def solved(self, step: Step) -> None:
-        """Look, until it was said."""
-        if self.ratio <= min(STIFF_BULK.values()) or self.said or not self._occasions.due():
-            return
-        if (turned := self.degrees()) <= TURNED_BY_NOISE:
-            return
-        self.find(
+    def look(self, step: Step) -> str:
+        """Whether it turns them by much."""
+        if self.ratio <= min(STIFF_BULK.values()) or (turned := self.degrees()) <= TURNED_BY_NOISE:
+            return ""
+        return (
             f"the pressure inside elements is noise, which turns the tensions that drive the cells by {turned:.2g} "
             f"degrees on the mean: fibre angles and radii are off (lambda/mu up to {self.ratio:.4g}); {self.remedy} "
             "(docs/locking.md)"
@@ -392,12 +482,21 @@ FRONT_ANGLE, FRONT_SHARE = 45.0, 0.5
 class VolumeLoss(WarnsOnce):
     """Warns, once, where the tissue loses much of its volume, and says at the end how much it has lost at most."""
 
-    def __init__(self, stepper: Stepper):
-        initial = {"mean": 1.0, "mean_time": 0.0, "least": 1.0, "least_time": 0.0}
-        super().__init__(stepper, "volume", initial | dict.fromkeys("xyz", 0.0))
+    name = "volume"
+    initial = {"mean": 1.0, "mean_time": 0.0, "least": 1.0, "least_time": 0.0} | dict.fromkeys("xyz", 0.0)
+
+    def due(self, step: Step) -> bool:
+        return super().due(step) or step.is_last
 
     def solved(self, step: Step) -> None:
-        """Look at J."""
+        """Look at J, also when it was said: the most that is lost is said at the end."""
+        if self.due(step):
+            self._measure(step)
+        numbers = self._numbers
+        if not self.said and (1 - numbers["mean"] >= MEAN_LOSS or numbers["least"] < LEAST_JACOBIAN):
+            self.find(f"{self._in_words()}; set a larger material.lame_lambda (docs/commands.md)")
+
+    def _measure(self, step: Step) -> None:
         numbers, look = self._numbers, self.stepper.coupling.equilibrium.look()
         jacobians = look.states[:, 1].reshape(look.stretches.shape)
         mean = self.quadrature.integral(jacobians) / self.quadrature.volume
@@ -414,14 +513,12 @@ class VolumeLoss(WarnsOnce):
 
     def committed(self, step: Step) -> None:
         """Say what there is to say."""
-        numbers = self._numbers
-        if not self.said and (1 - numbers["mean"] >= MEAN_LOSS or numbers["least"] < LEAST_JACOBIAN):
-            self.say(step, f"{self._in_words()}; set a larger material.lame_lambda (docs/commands.md)")
-        elif step.is_last and 1 - numbers["mean"] >= NOTED and self.state.comm.rank == 0:
+        if step.is_last and not self._found and 1 - self._numbers["mean"] >= NOTED and self.state.comm.rank == 0:
             log.info("%s", self._in_words())
+        super().committed(step)
 
     def _in_words(self) -> str:
-        found = {name: self._numbers[name] for name in self._numbers.initial}
+        found = {name: self._numbers[name] for name in self.initial}
         return (
             "the tissue has lost up to {lost:.2g} % of its volume at {x:.4g}, {y:.4g}, {z:.4g} (least J {least:.3g}, "
             "time {least_time:g}), {whole:.2g} % in all (mean J {mean:.3g}, time {mean_time:g})"
@@ -431,129 +528,148 @@ class VolumeLoss(WarnsOnce):
 class WeakTension(WarnsOnce):
     """Says at the end that stresses were never far above those that count as rounding: cells turned too slowly."""
 
-    def __init__(self, stepper: Stepper):
-        super().__init__(stepper, "weak_tension")
+    name = "weak_tension"
 
     def committed(self, step: Step) -> None:
-        """Look at the end."""
+        """Look at the end, when the pass of the last stress is made."""
         if step.is_last and not self.said and (weakness := self.stepper.remodeling.weakness()) > WEAK:
-            self.say(
-                step,
+            self.find(
                 f"the loads are weak: a tension of {weakness:.2g} times the largest stress of the body counts by half, "
-                "for smaller ones may be rounding; cells turned too slowly. Choose a unit or loads with larger strains",
+                "for smaller ones may be rounding; cells turned too slowly. Choose a unit or loads with larger strains"
             )
+        super().committed(step)
+
+
+class MuchGrowth(WarnsOnce):
+    """Says once that content or natural length have changed by much."""
+
+    name, level = "much_growth", NOTICE
+
+    @classmethod
+    def of(cls, scene: Any, stepper: Any) -> MuchGrowth | None:
+        return None if stepper.turnover is None else cls(stepper)
+
+    def look(self, step: Step) -> str:
+        """By how much they have."""
+        turnover = self.stepper.turnover
+        for name in TURNED_OVER:
+            factors = turnover.factors(name)
+            if self.quadrature.maximum(factors) > MUCH:
+                percent = 100 * self.quadrature.maximum(turnover.fastest_changes()) * turnover.settings.time
+                changed, place = name.replace("_", " "), _place(self.quadrature, factors)
+                return (
+                    f"{changed} has changed by more than a factor of {MUCH:g} at {place}; content or natural length "
+                    f"now change by up to {percent:.2g} % in remodeling.turnover.time (docs/turnover.md)"
+                )
+        return ""
 
 
 class GrowthWithoutRest(WarnsOnce):
     """Warns at the end where turnover goes on, and its rates do not fall as those do that come to rest (`Slowing`)."""
 
-    def __init__(self, stepper: Stepper, held_from: float):
-        super().__init__(stepper, "growth", {"noticed": 0} | Slowing.INITIAL)
-        self.held_from, self._slowing = held_from, Slowing(self._numbers)
-        self._text = self._notice = ""
+    name, initial = "growth", Slowing.INITIAL
 
-    def solved(self, step: Step) -> None:
-        """Look at the rates, and at what they have made."""
+    def __init__(self, stepper: Stepper, held_from: float):
+        super().__init__(stepper)
+        self.held_from, self._slowing = held_from, Slowing(self._numbers)
+
+    @classmethod
+    def of(cls, scene: Any, stepper: Any) -> GrowthWithoutRest | None:
+        return None if stepper.turnover is None else cls(stepper, scene.end_of_ramps)
+
+    def due(self, step: Step) -> bool:
+        return step.time > self.held_from
+
+    def look(self, step: Step) -> str:
+        """At the rates, while loads are held."""
         turnover, elapsed = self.stepper.turnover, step.time - self.held_from
         rates, period = turnover.fastest_changes(), turnover.settings.time
-        rate, self._text, self._notice = self.quadrature.maximum(rates), "", ""
-        change = f"by up to {100 * rate * period:.2g} % in remodeling.turnover.time"
-        for name in TURNED_OVER if not self._numbers["noticed"] else ():
-            factors = turnover.factors(name)
-            if self.quadrature.maximum(factors) > MUCH:
-                self._notice = (
-                    f"{name.replace('_', ' ')} has changed by more than a factor of {MUCH:g} at "
-                    f"{self._place(factors)}; content or natural length now change {change} (docs/turnover.md)"
-                )
-        goes_on = elapsed > 0 and self._slowing.goes_on(elapsed, rate)
+        rate = self.quadrature.maximum(rates)
+        goes_on = self._slowing.goes_on(elapsed, rate)
         if not (goes_on and step.is_last and elapsed >= LONG * period and rate * period >= FAR_FROM_REST):
-            return
-        self._text = (
-            f"the tissue has not come to rest: content or natural length change {change}, most at "
-            f"{self._place(rates)}, and since time {self.held_from + self._numbers['early_time']:g} the rates have "
-            "fallen no faster than 1/t. It goes on without bound (mechanobiological instability, docs/turnover.md), or "
-            "rests much later; with a larger remodeling.turnover.gain it rests sooner"
+            return ""
+        return (
+            "the tissue has not come to rest: content or natural length change by up to "
+            f"{100 * rate * period:.2g} % in remodeling.turnover.time, most at {_place(self.quadrature, rates)}, and "
+            f"since time {self.held_from + self._numbers['early_time']:g} the rates have fallen no faster than 1/t. It "
+            "goes on without bound (mechanobiological instability, docs/turnover.md), or rests much later; with a "
+            "larger remodeling.turnover.gain it rests sooner"
         )
-
-    def _place(self, values: Array) -> str:
-        """Where they are largest."""
-        return f"({', '.join(f'{c:.4g}' for c in self.quadrature.place_of_largest(values))})"
-
-    def committed(self, step: Step) -> None:
-        """Say it."""
-        if self._notice:
-            said = self.said
-            self.say(step, self._notice, NOTICE)
-            self._numbers["noticed"], self._numbers["said"] = 1, said
-        if self._text and not self.said:
-            self.say(step, self._text)
 
 
 class RadialChains(WarnsOnce):
     """Says once that more than half of the chains point out of the wall."""
 
+    name, level = "radial_chains", NOTICE
+
     def __init__(self, stepper: Stepper, radial_share: Callable[[Array, Array, Array], Array]):
-        super().__init__(stepper, "radial_chains", {"share": 0.0})
+        super().__init__(stepper)
         self.radial_share = radial_share
-        self._occasions = Occasions(stepper.state, "radial_chains")
 
-    def solved(self, step: Step) -> None:
-        """Measure from time to time, until it was said."""
-        if not self.said and (self._occasions.due() or step.is_last):
-            cells = self.state.cells
-            share = self.radial_share(cells.dimension_values, cells.axis_values, cells.local_axes.axes)
-            self._numbers["share"] = self.quadrature.mean(share)
+    @classmethod
+    def of(cls, scene: Any, stepper: Any) -> RadialChains:
+        return cls(stepper, scene.geometry.radial_share)
 
-    def committed(self, step: Step) -> None:
-        """Say it."""
-        if not self.said and self._numbers["share"] > RADIAL_SHARE:
-            self.say(
-                step,
-                f"more than half of the chains point out of the wall (radial_share {self._numbers['share']:.2g}); the "
-                "fibre angles are means over the other chains",
-                NOTICE,
-            )
+    def due(self, step: Step) -> bool:
+        return super().due(step) or step.is_last
+
+    def look(self, step: Step) -> str:
+        """Measure their share."""
+        cells = self.state.cells
+        share = self.quadrature.mean(
+            self.radial_share(cells.dimension_values, cells.axis_values, cells.local_axes.axes)
+        )
+        if not share > RADIAL_SHARE:
+            return ""
+        return (
+            f"more than half of the chains point out of the wall (radial_share {share:.2g}); the fibre angles are "
+            "means over the other chains"
+        )
 
 
-class FrontsInLayers(Watcher):
+class FrontsInLayers(WarnsOnce):
     """Warns at the end where a layer's mean fibre angle is one of two families, with a front between them."""
 
+    name = "fronts"
+
     def __init__(self, stepper: Stepper, shape: Shape):
-        self.state, self.shape, self._found = stepper.state, shape, list[tuple[str, float, float]]()
-        nodes = geometry_dofmap(self.state.cells.quadrature.mesh)
+        super().__init__(stepper)
+        self.shape = shape
+        nodes = geometry_dofmap(self.quadrature.mesh)
         depths = self.state.cells.local_axes.nodal_depth[nodes] if shape.angle_layers else np.zeros(nodes.shape)
         self._layers = {
             name: (depths.min(axis=1) <= share + 1e-6) & (depths.max(axis=1) >= share - 1e-6)
             for name, share in shape.angle_layers.items()
         }
 
-    def solved(self, step: Step) -> None:
-        """Look at the last state."""
-        self._found = []
-        if not step.is_last:
-            return
-        cells, quadrature = self.state.cells, self.state.cells.quadrature
+    @classmethod
+    def of(cls, scene: Any, stepper: Any) -> FrontsInLayers | None:
+        return cls(stepper, scene.geometry) if scene.geometry.angle_layers else None
+
+    def due(self, step: Step) -> bool:
+        return step.is_last
+
+    def look(self, step: Step) -> str:
+        """At the last state."""
+        cells, quadrature = self.state.cells, self.quadrature
         angles = self.shape.fibre_angle(cells.dimension_values, cells.axis_values, cells.local_axes.axes)
-        known = ~np.isnan(angles)
+        known, found = ~np.isnan(angles), []
         least = np.where(known, angles, np.inf).min(axis=1)
         most = np.where(known, angles, -np.inf).max(axis=1)
         has_front = most - least > FRONT_ANGLE
+        jump = "is a mean over elements in which the angle jumps from"
         for name, layer in self._layers.items():
             share = quadrature.mean(np.repeat(has_front[:, None], quadrature.shape[1], axis=1).astype(float), layer)
             if share > FRONT_SHARE:
                 inside = (layer & has_front)[:, None]
                 low = quadrature.minimum(np.where(inside, least[:, None], np.inf))
                 high = quadrature.maximum(np.where(inside, most[:, None], -np.inf))
-                self._found.append((name, low, high))
+                found.append(f"{name} {jump} {low:.3g} to {high:.3g} degrees")
+        if not found:
+            return ""
+        return f"{'; '.join(found)}. A front lies there, so the mean depends on the mesh; set a larger mesh.refinement"
 
-    def committed(self, step: Step) -> None:
-        """Say it."""
-        for name, low, high in self._found if self.state.comm.rank == 0 else ():
-            log.warning(
-                "time %g: %s is a mean over elements in which the angle jumps from %.3g to %.3g degrees. A front lies "
-                "there, so the mean depends on the mesh; set a larger mesh.refinement",
-                step.time,
-                name,
-                low,
-                high,
-            )
+
+def _place(quadrature: Any, values: Array) -> str:
+    """Where they are largest."""
+    return f"({', '.join(f'{c:.4g}' for c in quadrature.place_of_largest(values))})"

@@ -19,7 +19,7 @@ import ufl
 from mpi4py import MPI
 from pydantic import Field
 
-from remodel_fenicsx import Recording, Scene, SceneError, Simulation, run
+from remodel_fenicsx import Recording, Scene, SceneError, Simulation, parts, run
 from remodel_fenicsx.extend import (
     AXES,
     CHAINS,
@@ -57,7 +57,10 @@ from remodel_fenicsx.extend import (
     Shape,
     SolverMethod,
     Staggered,
+    WATCHERS,
     UnitCell,
+    WarnsOnce,
+    WatcherKind,
     angle_to_axis,
     axes_sum,
     form,
@@ -500,6 +503,31 @@ def test_a_coupling(monkeypatch: pytest.MonkeyPatch) -> None:
     isotropic = np.degrees(np.arccos(3**-0.5))
     np.testing.assert_allclose(angles[:3], isotropic, rtol=1e-12)
     assert angles[3] < isotropic - 5
+
+
+def test_a_watcher(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """One of every run, which warns once, and one of this run."""
+
+    class Long(WarnsOnce):
+        name = "long"
+
+        def look(self, step: Any) -> str:
+            return "the cube is long" if step.row["mean_stretch"] > 1.2 else ""
+
+    class Times(parts.Watcher):
+        def __init__(self) -> None:
+            self.seen: list[float] = []
+
+        def committed(self, step: Any) -> None:
+            self.seen.append(step.time)
+
+    monkeypatch.setitem(WATCHERS, "long", WatcherKind(Long.of))
+    times = Times()
+    folder = run(scene(), tmp_path / "run", MPI.COMM_SELF, watchers=[times])
+    rows = Recording(folder).history
+    assert times.seen == rows["time"][1:].tolist()
+    first = rows["time"][np.argmax(rows["mean_stretch"] > 1.2)]
+    assert (folder / "run.log").read_text().count(f"time {first:g}: the cube is long") == 1
 
 
 def test_a_kinematics(monkeypatch: pytest.MonkeyPatch) -> None:

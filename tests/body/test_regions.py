@@ -15,7 +15,7 @@ from remodel_fenicsx.body.domain import Domain, build_domain
 from remodel_fenicsx.body.gmsh_model import GeometryError
 from remodel_fenicsx.body.wall import shared_out
 from remodel_fenicsx.schema.settings import Mesh, Region
-from remodel_fenicsx.simulation import Simulation, build, checked_domain
+from remodel_fenicsx.simulation import Simulation, checked_domain, mesh_of
 
 SELF = MPI.COMM_SELF
 WALL = {"shape": "tube", "inner_radius": 1.0, "outer_radius": 3.0, "length": 2.0}
@@ -44,7 +44,7 @@ def test_no_element_is_in_two_layers(kinematics: str, element: str, degree: int)
     """Elements of a thin layer are thin, all layers together are the wall; as many elements as without them."""
     mesh = {"element": element, "degree": degree}
     scene = layered(mesh=mesh, model={"kinematics": kinematics})
-    domain, whole = build(scene, SELF), build(layered({}, mesh=mesh, model={"kinematics": kinematics}), SELF)
+    domain, whole = mesh_of(scene, SELF), mesh_of(layered({}, mesh=mesh, model={"kinematics": kinematics}), SELF)
     assert domain.number_of_elements == whole.number_of_elements and set(whole.regions) == {"body"}
     assert list(domain.regions) == ["intima", "media", "adventitia"], "from the lumen outwards"
     radii, ends = radii_of(domain), (1.0, 1.02, 1.7, 3.0)
@@ -69,8 +69,8 @@ def test_a_line_of_the_mesh_that_is_there_already_changes_nothing() -> None:
     halves = layered({"media": {"outer_radius": 2.0}, "adventitia": {"outer_radius": 3.0}})
     for kinematics in ("radial", "axisymmetric", "sector", "full"):
         change = {"model.kinematics": kinematics}
-        points, elements = build(halves.with_values(change), SELF).gather_mesh()
-        others, same = build(layered({}).with_values(change), SELF).gather_mesh()
+        points, elements = mesh_of(halves.with_values(change), SELF).gather_mesh()
+        others, same = mesh_of(layered({}).with_values(change), SELF).gather_mesh()
         assert points is not None and others is not None
         np.testing.assert_allclose(points[elements], others[same], rtol=0, atol=1e-15)
 

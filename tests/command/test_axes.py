@@ -11,7 +11,7 @@ import pytest
 from mpi4py import MPI
 
 from remodel_fenicsx import Recording, Scene, cli, run
-from remodel_fenicsx.results.revolve import BODY, revolve
+from remodel_fenicsx.results.whole_body import BODY, revolve
 from remodel_fenicsx.results.vtkhdf import check_file
 from remodel_fenicsx.schema.settings import CONSTANT_FIELDS
 

@@ -29,7 +29,7 @@ from remodel_fenicsx.results.vtkhdf import TransientGrid
 from remodel_fenicsx.running import resume, run
 from tests.conftest import mpirun
 from tests.forks import forked
-from tests.processes import session_members
+from tests.processes import members, wait_for_rows
 from tests.results.test_resume import (
     COUNTED,
     LONGER,
@@ -179,8 +179,8 @@ def kill_again_and_again(
 
 def kill_all(session: int) -> None:
     """mpirun's ranks too, which would go on for a while without it."""
-    while members := session_members(session):
-        for number in members:
+    while left := members(session):
+        for number in left:
             with suppress(ProcessLookupError):
                 os.kill(number, signal.SIGKILL)
         clock.sleep(0.01)
@@ -278,10 +278,7 @@ def test_one_and_two_ranks_by_turns_to_the_end(tmp_path: Path) -> None:
     assert start(tmp_path / "expected", tmp_path / "tube.toml", program=FOUR_LAYERS).wait() == 0
     for number, last in enumerate([30, 60, 90, 120]):
         process = start(tmp_path / "run", tmp_path / "tube.toml", 1 + number % 2, FOUR_LAYERS)
-        history = tmp_path / "run" / "history.csv"
-        while not history.exists() or len(history.read_text().splitlines()) < last:
-            clock.sleep(0.02)
-            assert process.poll() is None
+        wait_for_rows(process, tmp_path / "run", last)
         kill_all(process.pid)
         process.communicate()
     assert start(tmp_path / "run", tmp_path / "tube.toml", 2, FOUR_LAYERS).wait() == 0

@@ -156,14 +156,14 @@ README_SHORT = {  # a test's times, and numbers of runs, for those of the README
 }
 
 
-def test_the_examples_of_the_readme_run_and_its_other_commands_are_commands(
+def test_the_examples_of_the_readme_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """What stands before "More commands" is run, the rest is read by the parser: it takes minutes."""
+    """What stands before "More commands"; tests/house/test_documentation.py reads the rest, which takes minutes."""
     monkeypatch.chdir(tmp_path)
     for _, text in blocks(TUBE):
         keep(text)
-    text, more = (ROOT / "README.md").read_text(encoding="utf-8").split("## More commands")
+    text, _ = (ROOT / "README.md").read_text(encoding="utf-8").split("## More commands")
     for long, short in README_SHORT.items():
         assert long in text
         text = text.replace(long, short)
@@ -173,16 +173,6 @@ def test_the_examples_of_the_readme_run_and_its_other_commands_are_commands(
     for line in lines:
         obey(line, capsys)
     assert Path("results/artery/report.html").exists() and Path("tube/history.csv").exists()
-    (block,) = re.findall(r"^```sh\n(.*?)^```", more, re.MULTILINE | re.DOTALL)
-    commands = [words for line in block.splitlines()
-                if (words := shlex.split(re.sub(r" > .*|  #.*", "", line)))[1] == "remodel-fenicsx"]  # fmt: skip
-    others = ("mpirun ", "python3 demos/figures.py ", "tests/run ")
-    assert len(commands) == sum(
-        not line.startswith(tuple(f"./with-fenicsx {o}" for o in others)) for line in block.splitlines()
-    )
-    assert (ROOT / "demos" / "figures.py").exists()
-    for _, _, *words in commands:
-        cli.parser().parse_args(words)
 
 
 def test_output_that_was_not_printed_is_found() -> None:

@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -21,6 +20,7 @@ from remodel_fenicsx.results.recording import read_history
 from remodel_fenicsx.scene.scene import read_scene
 from tests.conftest import mpirun, slowly
 from tests.forks import COARSE, forked
+from tests.processes import wait_for_rows
 
 PROJECT = Path(__file__).parents[2]
 COMMAND = [sys.executable, "-m", "remodel_fenicsx.cli"]
@@ -351,11 +351,7 @@ def test_a_signal_ends_the_run_and_keeps_finished_steps(tmp_path: Path, number: 
     command = mpirun(ranks, *COMMAND, "run", str(demo("tendon")), "-o", str(folder))
     # in a group of its own, which gets the signal as a terminal gives it
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, process_group=0)
-    history = folder / "history.csv"
-    deadline = time.monotonic() + 200
-    while time.monotonic() < deadline and not (history.exists() and history.read_text().count("\n") > 3):
-        time.sleep(0.05)
-        assert process.poll() is None, process.communicate()[1]
+    wait_for_rows(process, folder, 4)
     os.killpg(process.pid, number)
     _, errors = process.communicate(timeout=200)
     if ranks == 1:
@@ -365,7 +361,7 @@ def test_a_signal_ends_the_run_and_keeps_finished_steps(tmp_path: Path, number: 
         assert process.returncode != 0  # mpirun's own code
     rows = read_history(folder)
     assert len(rows["time"]) >= 3 and rows["time"][-1] == len(rows["time"]) - 1
-    assert history.read_text().endswith("\n")
+    assert (folder / "history.csv").read_text().endswith("\n")
     with h5py.File(folder / "fields.vtkhdf") as file:
         assert file["VTKHDF/Steps"].attrs["NSteps"] >= len(rows["time"])
 
@@ -477,51 +473,10 @@ def test_an_old_dolfinx_is_exit_code_5(
 
 # ---------------------------------------------------------------- bad input and the small commands
 
-BAD_SETTINGS = """
-geometry.inner_radius=3.0 | geometry.inner_radius = 3.0
-geometry.inner_radius=-1.0 | geometry.inner_radius = -1.0
-geometry.outer_radius=0.5 | geometry.inner_radius = 1.0
-geometry.length=0 | geometry.length = 0
-geometry.length=nan | geometry.length = nan
-geometry.shape=sphere | geometry.shape = 'sphere'
-geometry.radius=1.0 | geometry.radius
-mesh.refinement=0 | mesh.refinement = 0
-mesh.refinement=1.5 | mesh.refinement = 1.5
-mesh.element=prism | mesh.element = 'prism'
-mesh.degree=3 | mesh.degree = 3
-model.kinematics=plane | model.kinematics = 'plane'
-material.lame_lambda=-1.0 | material.lame_lambda = -1.0
-material.lame_mu=0 | material.lame_mu = 0
-material.chain_density=-2e21 | material.chain_density = -2e+21
-material.contour_length=0.9 | cells.end_to_end_length = 1.0: must be smaller than material.contour_length = 0.9
-material.persistence_length=inf | material.persistence_length = inf
-material.energy_factor=2 | material.energy_factor = 2
-material.chain=spring | material.chain = 'spring'
-cells.initial=mixed | cells.initial = 'mixed'
-cells.initial=[1.0, 1.0, 1.0] | cells.initial
-cells.end_to_end_length=1.7 | cells.end_to_end_length = 1.7
-cells.seed=-1 | cells.seed = -1
-cells.seed="one" | cells.seed = 'one'
-loads.pressure.ramp=[[0.0, 0.0], [25.0, 1.0], [20.0, 0.5]] | loads.pressure.ramp[2][0] = 20.0
-loads.pressure.ramp=[] | loads.pressure.ramp
-loads.elongation.value=-1.5 | loads.elongation
-loads.force.value=1.0 | loads.force
-remodeling.kappa=-0.1 | remodeling.kappa = -0.1
-remodeling.driver=strain | remodeling.driver = 'strain'
-remodeling.law=eq12 | remodeling.law = 'eq12'
-remodeling.frame=eulerian | remodeling.frame = 'eulerian'
-time.end=0 | time.end = 0
-time.step=0.4 | loads
-time.step=-1.0 | time.step = -1.0
-solver.method=magic | solver.method = 'magic'
-solver.relative_tolerance=-1e-8 | solver.relative_tolerance
-output.every=0 | output.every = 0
-preset=paper | preset = 'paper'
-remodelling.kappa=0.1 | remodelling
-"""
+BAD_SETTINGS = (Path(__file__).parent / "bad_settings.txt").read_text()  # what is set, and how the line begins
 
 
-@pytest.mark.parametrize("line", BAD_SETTINGS.strip().splitlines())
+@pytest.mark.parametrize("line", BAD_SETTINGS.splitlines())
 def test_a_bad_scene_is_one_line_exit_code_2_and_nothing_written(
     line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

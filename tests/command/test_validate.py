@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -41,31 +42,14 @@ def written(tube: Path, tables: dict[str, Any]) -> Path:
     return path
 
 
-BAD: dict[str, tuple[dict[str, Any], str]] = {
-    "a face that is not there": ({"geometry": {"faces": {"inner": "lumen"}}}, "geometry.faces.inner = 'lumen'"),
-    "facets in two faces": ({"geometry": {"file": "twice.msh"}}, "geometry.faces."),
-    "a support of no face": ({"supports": {"wall": {"kind": "held"}}}, "supports.wall: the body has no such face"),
-    "a load on no face": (
-        {"loads": {"more": {"kind": "pressure", "face": "wall", "value": 1.0, "ramp": [[0.0, 1.0]]}}},
-        "loads.more.face = 'wall': the body has no such face",
-    ),
-    "free to move": (
-        {"supports": {"inlet": {"kind": "free"}, "outlet": {"kind": "free"}}},
-        "supports (inlet 'free', outlet 'free'): they leave the body free",
-    ),
-    "no region": ({"regions": {"media": {}}}, "regions.media: the mesh has no such region"),
-    "no fibres": ({"cells": {"fibres": "none.csv"}}, "none.csv': cannot be read"),
-    "another ending": ({"cells": {"fibres": "fibres.txt"}}, "fibres.txt': allowed are files"),
-    "no mesh": ({"cells": {"fibres": "broken.vtu"}}, "broken.vtu': "),
-    "too few fibres": ({"cells": {"fibres": "short.csv"}}, "has 1 rows without places"),
-    "fibres far away": ({"cells": {"fibres": "far.csv"}}, "nothing is measured within one element"),
-}
+BAD = tomllib.loads((Path(__file__).parent / "scenes_of_bad_files.toml").read_text())
 
 
 @pytest.mark.parametrize("case", BAD)
 def test_what_run_refuses_validate_refuses(tube: Path, case: str, capsys: pytest.CaptureFixture[str]) -> None:
     """The same line, exit code 2, and nothing is written."""
-    tables, words = BAD[case]
+    tables = dict(BAD[case])
+    words = tables.pop("said")
     scene, out = written(tube, tables), tube.parent / "out"
     before = {*tube.parent.iterdir()}
     assert cli.main(["validate", str(scene)]) == 2

@@ -61,8 +61,8 @@ def test_it_is_where_time_leads(driver: str) -> None:
     changes = {"driver": driver, "coupling": "relaxed" if driver == "finger" else "staggered"}
     at_once = Simulation(artery(remodeling=changes), SELF)
     row = solved(at_once)
-    coupling = at_once.stepper.coupling
-    assert isinstance(coupling, Homeostasis) and row["substeps"] == coupling.steps
+    way = at_once.rest
+    assert isinstance(way, Homeostasis) and row["substeps"] == way.steps
     assert row["pass_residual"] < 1e-8
     in_time = Simulation(
         artery(remodeling=changes, time={"end": 3000.0 if driver == "pk2" else 900.0, "step": 12.5}), SELF
@@ -132,7 +132,13 @@ def test_the_full_artery(driver: str, frame: str, inner: float, outer: float, an
 
 
 # ---------------------------------------------------------------- the way decides
-def tube_in_time(pressure: float, elongation: float, factors: list[tuple[float, float]], **tables: Any) -> Any:
+def tube_in_time(
+    pressure: float,
+    elongation: float,
+    factors: list[tuple[float, float]],
+    tolerance: float | None = None,
+    **tables: Any,
+) -> Any:
     """Of a tube on a ray, at once and in time to kappa t = 37: row, A at all points, simulation."""
     ramp = [list(pair) for pair in factors]
     base: dict[str, Any] = {
@@ -144,7 +150,8 @@ def tube_in_time(pressure: float, elongation: float, factors: list[tuple[float, 
         "output": {"fields": False},
     }
     found = []
-    for time in ({"end": "equilibrium"}, {"end": 1500.0, "tolerance": 0.5}):
+    at_once: dict[str, Any] = {"end": "equilibrium"} | ({"tolerance": tolerance} if tolerance else {})
+    for time in (at_once, {"end": 1500.0, "tolerance": 0.5}):
         simulation = Simulation(scene_from_dict(base | tables | {"time": time}), SELF)
         row = list(simulation.steps())[-1].row
         found.append((row, simulation.state.equilibrium_cells.structure_tensor(), simulation))
@@ -189,12 +196,13 @@ def test_a_step_that_leads_elsewhere_does_not_count() -> None:
 
 def test_a_front_rests_where_time_leaves_it(caplog: pytest.LogCaptureFixture) -> None:
     """Axial chains outside, circumferential ones inside: rows that lag by long steps put the front 0.08 further in."""
+    # with fixed steps of 0.05 and of 0.1 the axial share is 0.0961; the default tolerance leaves the front a point off
     caplog.set_level(logging.INFO)
     chains = {"chain_density": 2e22, "contour_length": 1.594, "persistence_length": 1.365}
     tables = {"material": {"lame_lambda": 600.0, "lame_mu": 3.0, **chains}, "mesh": {"degree": 2, "refinement": 2}}
     tables |= {"remodeling": {"law": "explicit", "frame": "spatial", "coupling": "staggered", "kappa": 0.025}}
     (at_once, cells, simulation), (in_time, others, _) = tube_in_time(
-        8.0, 0.3, [(0.0, 0.0), (25.0, 1.0)], **{**CAROTID, **tables}
+        8.0, 0.3, [(0.0, 0.0), (25.0, 1.0)], 0.5, **{**CAROTID, **tables}
     )
     axial = [
         simulation.quadrature.mean(A.reshape(*simulation.quadrature.shape, 3, 3)[..., 2, 2]) for A in (cells, others)
@@ -203,7 +211,7 @@ def test_a_front_rests_where_time_leaves_it(caplog: pytest.LogCaptureFixture) ->
     assert axial[0] / r0**2 == pytest.approx(axial[1] / r0**2, abs=0.025)  # a point of the mesh is 0.02 of the volume
     assert at_once["inner_radius"] == pytest.approx(in_time["inner_radius"], rel=2e-3)
     assert at_once["fibre_angle_outer"] > 85 and at_once["fibre_angle_inner"] < 5
-    assert "the cells have a front near 4.1" in caplog.text
+    assert "the cells have a front near 4.2" in caplog.text
 
 
 def test_cells_without_tension_stay_where_the_way_has_left_them(caplog: pytest.LogCaptureFixture) -> None:

@@ -101,7 +101,7 @@ def test_no_step_is_longer_than_the_fastest_region_allows() -> None:
     held = {"time.tolerance": 40.0, "time.end": 30.0}
     made = Simulation(scene(0.4, SECOND, "tensor", "extrapolated", **held), MPI.COMM_SELF)
     lengths = np.diff([0.0, *(step.time for step in made.steps())])
-    longest = made.stepper.coupling.longest / 0.4
+    longest = made.stepper.coupling.traits.longest / 0.4
     made.close()
     assert 0.5 * longest < lengths.max() <= longest * (1 + 1e-9)
 

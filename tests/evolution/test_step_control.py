@@ -268,7 +268,7 @@ def test_where_no_step_is_short_enough_the_run_goes_on_and_says_so(caplog: pytes
     lengths = [0.2, 0.4, float(np.sqrt(0.8))]
     steps, _ = marched(tube("staggered", 10.0, **{"cells.initial": lengths, "time.tolerance": 0.5}))
     errors = [step.time_error for step in steps]
-    assert errors[0] > 10.0 and np.median(errors) < 0.5 and len(steps) < 100
+    assert errors[0] > 10.0 and np.median(errors) < 0.5 and len(steps) < 110
     assert sum("does not fall to time.tolerance" in record.message for record in caplog.records) == 1
 
 
@@ -341,8 +341,8 @@ def test_steps_grow_to_twice_their_length_and_shrink_to_a_tenth() -> None:
     assert tried[0] == 25.0 and 0.1 / 1.05 - 1e-9 <= tried[1] / tried[0] < 0.11
 
 
-def test_a_step_that_was_too_long_is_shortened_by_a_fifth_and_then_by_half() -> None:
-    """However little was missing: what is tried once more must be worth it."""
+def test_a_step_whose_error_hardly_falls_is_not_tried_for_ever() -> None:
+    """However little is missing: half of the length with the same error, and shorter ones would not help."""
     tried: list[float] = []
 
     def hardly(start: float, length: float) -> float:
@@ -351,12 +351,11 @@ def test_a_step_that_was_too_long_is_shortened_by_a_fifth_and_then_by_half() -> 
         return 1.01 if length > 0.2 else 0.5
 
     controlled(hardly, 2.0, **{"time.step": 1.0, "loads.pressure.ramp": [[0.0, 1.0]]})
-    ratios = np.array(tried[1:]) / tried[:-1]
-    assert len(ratios) > 1 and ratios[0] <= 0.8 * 1.05 and ratios[1:].max() <= 0.5 * 1.05
+    assert 2 <= len(tried) <= 4 and max(np.array(tried[1:]) / tried[:-1]) <= 0.85 * 1.05
 
 
 def test_where_errors_do_not_fall_the_number_of_steps_is_bounded(caplog: pytest.LogCaptureFixture) -> None:
-    """An error that is the same however short the step: twenty in vain, longer ones, and ten after a time 0.7/kappa."""
+    """An error that is the same however short the step: twenty in vain in a time 1/kappa, and longer ones."""
     tried = 0
 
     def stays(start: float, length: float) -> float:
@@ -371,7 +370,7 @@ def test_where_errors_do_not_fall_the_number_of_steps_is_bounded(caplog: pytest.
     shortest = 1.0 / 360.0 / settings.kappa
     assert lengths.min() >= shortest / 1.05
     in_vain = int((lengths < 0.9).sum())
-    assert 20 <= in_vain <= 20 + 15 * (end - 25.0) * settings.kappa + 8
+    assert 20 <= in_vain <= 20 + 20 * (end - 25.0) * settings.kappa + 8
     assert len(times) < end + 150 and tried < 2 * len(times)
     said = [record.message for record in caplog.records if "does not fall to time.tolerance" in record.message]
     assert len(said) == 2 and "goes on" not in said[0] and "goes on with steps of 1.04" in said[1]
@@ -387,7 +386,6 @@ def test_rows_within_the_tolerance_are_not_said_to_be_above_it(caplog: pytest.Lo
 
     simulation.control.error.measure = measured  # type: ignore[method-assign,union-attr]
     list(simulation.steps())
-    assert simulation.control._numbers["goes_on"]  # type: ignore[union-attr]
     assert "does not fall" not in caplog.text
 
 

@@ -536,7 +536,7 @@ def test_a_twisted_bar_is_not_said_to_be_too_coarse() -> None:
     """
     scene = preset_scene("kuhl-holzapfel-2007", "cube").with_values({"mesh.refinement": 2, "material.chain_density": 0})
     simulation = Simulation(scene, MPI.COMM_SELF)
-    warning = next(watcher for watcher in simulation.warnings if isinstance(watcher, LockingWarning))
+    warning = next(watcher for watcher in simulation.watchers if isinstance(watcher, LockingWarning))
     x, unknown = simulation.domain.mesh.geometry.x, simulation.unknown
 
     def shape_energy(displacement: Any) -> float:

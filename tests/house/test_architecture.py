@@ -206,7 +206,7 @@ THINGS = (
     "a law towards a target, by rank", "any other law",
     "a pairing of values and dimensions", "initial axes of the cells", "a load", "a column of every shape",
     "a column of one shape", "a shape", "a kinematics", "a formulation", "a solver method", "a coupling",
-    "a key of a scene",
+    "a watcher", "a key of a scene",
 )  # fmt: skip
 
 

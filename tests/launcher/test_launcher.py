@@ -20,58 +20,13 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import slowly
+from tests.processes import GROUP, members
 
 PROJECT = Path(__file__).resolve().parents[2]
 LONG = 200  # seconds, for what takes a few on an idle machine
 SYSTEM_PATH = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
 
-MMDEBSTRAP = r"""#!/bin/bash
-# the arguments, one a line, then what STUB_BUILD asks for
-[ "$1" != --unshare-helper ] || { shift; printf '%s\n' "$*" >> "$RECORD/helper"; exec "$@"; }
-printf '%s\n' "$@" '----' >> "$RECORD/mmdebstrap"
-echo $$ > "$RECORD/pid"
-readlink /proc/$$/fd/* | grep '\.lock$' > "$RECORD/held"
-echo "I: downloading packages with apt..." >&2
-target=${!#}
-[ "$target" != - ] || target=$(mktemp -d)
-mkdir -p "$target"
-touch "$target/half"
-timeout 2 cat > /dev/null
-case ${STUB_BUILD:-} in
-    fail) echo "E: no such mirror" >&2; exit 1 ;;
-    killed) sleep 100 & echo $! > "$RECORD/orphan"; kill -KILL $$ ;;
-    held) touch "$RECORD/begun"; until [ -e "$RECORD/go" ]; do sleep 0.1; done ;;
-    hang) touch "$RECORD/begun"; sleep 300 ;;
-esac
-ln -s /usr /etc "$target"; mkdir -p "$target/var/lib/dpkg"; rm "$target/half"
-[ "${!#}" != - ] || tar -C "$target" -c .
-"""
-
-# Debian's minimal roots have no mount command; in C, because a start of the launcher calls it fifteen times
-MOUNT = r"""
-#include <stdio.h>
-#include <string.h>
-#include <sys/mount.h>
-int main(int number, char **words) {
-    if (!strcmp(words[1], "-t")) return mount("tmpfs", words[6], "tmpfs", 0, words[4]);
-    unsigned long flags = !strcmp(words[1], "--bind") ? MS_BIND : MS_BIND | MS_REC;
-    if (!strcmp(words[1], "-o")) flags = MS_REMOUNT | MS_BIND | MS_RDONLY;
-    if (mount(words[2], words[3], NULL, flags, NULL)) { perror(words[number - 1]); return 1; }
-    return 0;
-}
-"""
-
-ENGINE = r"""#!/bin/bash
-# the arguments of each call, a JSON list a line
-python3 -c 'import json, sys; print(json.dumps(sys.argv[1:]))' "$(basename "$0")" "$@" >> "$RECORD/engine"
-case "$STUB_ENGINE:$1" in
-    *:info) exit 0 ;;
-    none:*) exit 125 ;;
-    built:image) exit 0 ;;
-    *:image) exit 1 ;;
-    *) exit "${STUB_STATUS:-0}" ;;
-esac
-"""
+STAND_INS = Path(__file__).parent / "stand_ins"  # for programs that reach the network or mount
 
 
 def script(path: Path, text: str) -> None:
@@ -85,7 +40,7 @@ def mount_command() -> Path:
     """A program like mount(8), compiled once."""
     folder = Path(tempfile.mkdtemp())
     atexit.register(shutil.rmtree, folder)
-    subprocess.run(["gcc", "-x", "c", "-", "-o", folder / "mount"], input=MOUNT, text=True, check=True)
+    subprocess.run(["gcc", STAND_INS / "mount.c", "-o", folder / "mount"], check=True)
     return folder / "mount"
 
 
@@ -105,11 +60,12 @@ class Clone:
         self.launcher = self.folder / "with-fenicsx"
         self.packages = self.folder / "environment" / "debian-packages.txt"
         self.stubs = stubs
-        script(stubs / "mmdebstrap", MMDEBSTRAP)
+        stubs.mkdir()
+        shutil.copy(STAND_INS / "mmdebstrap", stubs)
         script(stubs / "newuidmap", "#!/bin/sh\nexit 1\n")
         script(stubs / "apt-get", '#!/bin/sh\necho "$*" >> "$RECORD/apt-get"; echo "E: no network" >&2; exit 100\n')
         for engine in ("docker", "podman"):
-            script(stubs / engine, ENGINE)
+            shutil.copy(STAND_INS / "engine", stubs / engine)
         if not shutil.which("mount", path=SYSTEM_PATH):
             (self.folder / "bin").mkdir()
             shutil.copy(mount_command(), self.folder / "bin" / "mount")
@@ -141,6 +97,16 @@ class Clone:
         process = self.start(*command, **options)
         out, err = process.communicate(send, timeout=LONG)
         return subprocess.CompletedProcess(command, process.returncode, out, err)
+
+    def building(self, way: str, **environment: str):
+        """A start whose build is under way, "held" until it may go on, or "hang"."""
+        process = self.start("echo", "first", environment=environment | {"STUB_BUILD": way})
+        wait_for((self.record / "begun").exists, "the build")
+        return process
+
+    def kill_builder(self) -> None:
+        """With all that it has started."""
+        os.killpg(os.getpgid(int((self.record / "pid").read_text())), signal.SIGKILL)
 
     def builds(self) -> list[list[str]]:
         record = self.record / "mmdebstrap"
@@ -256,25 +222,11 @@ def test_nothing_stays_mounted(ready):
 
 
 def test_another_python_does_not_reach_in(ready):
-    foreign = {
-        name: "/nowhere"
-        for name in (
-            "PYTHONPATH",
-            "PYTHONHOME",
-            "PYTHONWARNINGS",
-            "PYTHONINSPECT",
-            "PYTHONOPTIMIZE",
-            "PYTHONPLATLIBDIR",
-            "PYTHONDEVMODE",
-            "VIRTUAL_ENV",
-            "CONDA_PREFIX",
-            "LD_LIBRARY_PATH",
-            "CC",
-            "CFLAGS",
-            "PETSC_DIR",
-            "BASH_ENV",
-        )
-    }
+    foreign = dict.fromkeys(
+        "PYTHONPATH PYTHONHOME PYTHONWARNINGS PYTHONINSPECT PYTHONOPTIMIZE PYTHONPLATLIBDIR PYTHONDEVMODE "
+        "VIRTUAL_ENV CONDA_PREFIX LD_LIBRARY_PATH CC CFLAGS PETSC_DIR BASH_ENV".split(),
+        "/nowhere",
+    )
     fake = ready.stubs.parent / "conda"
     script(fake / "python3", "#!/bin/sh\nexit 99\n")
     result = ready.run(
@@ -318,20 +270,14 @@ def test_made_once_from_the_list(rooted):
     assert "trixie" in arguments
 
 
-RUN_OF_A_DEMO = r"""#!/bin/bash
-printf '%s\n' "$*" >> "$RECORD/demos"
-echo $$ > "$RECORD/demo-process"
-case ${STUB_DEMO:-} in fail) echo "no compiler" >&2; exit 3 ;; hang) exec sleep 300 ;; esac
-"""
-
-
 @pytest.fixture
 def with_demos(rooted):
     """A clone with two demos, and a stand-in for the command that runs them."""
     (rooted.folder / "demos").mkdir()
     for name in ("one", "two"):
         (rooted.folder / "demos" / f"{name}.toml").touch()
-    script(rooted.folder / "bin" / "remodel-fenicsx", RUN_OF_A_DEMO)
+    (rooted.folder / "bin").mkdir(exist_ok=True)
+    shutil.copy(STAND_INS / "remodel-fenicsx", rooted.folder / "bin")
     return rooted
 
 
@@ -378,8 +324,7 @@ def test_key_is_the_list_and_the_release(rooted):
 
 def test_two_clones_at_once_make_one(rooted, tmp_path):
     other = Clone(tmp_path / "other", cache=rooted.cache)
-    first = rooted.start("echo", "first", environment={"STUB_BUILD": "held"})
-    wait_for((rooted.record / "begun").exists, "the first build")
+    first = rooted.building("held")
     second = other.start("echo", "second")
     assert second.stderr.readline() == "with-fenicsx: another run is making the environment: waiting for it\n"
     (rooted.record / "go").touch()
@@ -391,8 +336,7 @@ def test_two_clones_at_once_make_one(rooted, tmp_path):
 
 @pytest.mark.parametrize("number, group", [(signal.SIGINT, True), (signal.SIGTERM, False), (signal.SIGHUP, False)])
 def test_build_ends_with_the_launcher(rooted, number, group):
-    process = rooted.start("true", environment={"STUB_BUILD": "hang"})
-    wait_for((rooted.record / "begun").exists, "the build")
+    process = rooted.building("hang")
     (os.killpg if group else os.kill)(process.pid, number)
     process.communicate(timeout=LONG)
     assert process.returncode == 128 + number
@@ -404,10 +348,7 @@ def test_build_ends_with_the_launcher(rooted, number, group):
 
 
 def test_killed_launcher_leaves_a_build_that_the_next_run_takes(rooted):
-    process = rooted.start(
-        "true", environment={"STUB_BUILD": "held"}, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    )
-    wait_for((rooted.record / "begun").exists, "the build")
+    process = rooted.building("held")
     process.kill()
     process.wait()
     after = rooted.start("echo", "after")
@@ -419,13 +360,10 @@ def test_killed_launcher_leaves_a_build_that_the_next_run_takes(rooted):
 
 
 def test_killed_build_is_never_used(rooted):
-    process = rooted.start(
-        "true", environment={"STUB_BUILD": "hang"}, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    )
-    wait_for((rooted.record / "begun").exists, "the build")
+    process = rooted.building("hang")
     process.kill()
     process.wait()
-    os.killpg(os.getpgid(int((rooted.record / "pid").read_text())), signal.SIGKILL)
+    rooted.kill_builder()
     (part,) = rooted.roots()
     assert part.endswith(".part")
     (rooted.cache / "remodel-fenicsx" / part / "left over").touch()
@@ -450,12 +388,10 @@ def a_user_builds(rooted, tmp_path) -> dict[str, str]:
 
 def killed_build(rooted, environment: dict[str, str]) -> Path:
     """Launcher and builder end by SIGKILL in the middle; the temporary folder that is left."""
-    silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    process = rooted.start("true", environment=environment | {"STUB_BUILD": "hang"}, **silent)
-    wait_for((rooted.record / "begun").exists, "the build")
+    process = rooted.building("hang", **environment)
     process.kill()
     process.wait()
-    os.killpg(os.getpgid(int((rooted.record / "pid").read_text())), signal.SIGKILL)
+    rooted.kill_builder()
     (lock,) = (rooted.cache / "remodel-fenicsx").glob("*.lock")
     wait_for(lambda: subprocess.run(["flock", "-n", lock, "true"]).returncode == 0, "the end of all that held the lock")
     (left,) = Path(environment["TMPDIR"]).glob("remodel-fenicsx-build-*")
@@ -491,8 +427,7 @@ def test_the_next_start_removes_what_a_killed_build_left(rooted, tmp_path, other
 
 def test_what_a_build_that_goes_on_needs_is_not_removed(rooted, tmp_path):
     environment = a_user_builds(rooted, tmp_path)
-    first = rooted.start("echo", "first", environment=environment | {"STUB_BUILD": "held"})
-    wait_for((rooted.record / "begun").exists, "the first build")
+    first = rooted.building("held", **environment)
     other = Clone(tmp_path / "other", cache=rooted.cache)
     other.packages.write_text(other.packages.read_text() + "one-more\n")
     a_user_builds(other, tmp_path / "other")
@@ -523,10 +458,10 @@ def test_processes_of_mapped_users_that_a_killed_build_left_are_ended(rooted, tm
     try:
         dead.stdout.readline()
         dead.wait()
-        assert group_lives(dead.pid)
+        assert members(dead.pid, GROUP)
         record.write_text(f"{dead.pid}\n{left}\n")
         assert rooted.run("true", environment=environment).returncode == 0
-        wait_for(lambda: not group_lives(dead.pid), "the end of the mapped users' processes")
+        wait_for(lambda: not members(dead.pid, GROUP), "the end of the mapped users' processes")
         assert other.poll() is None
     finally:
         other.kill()
@@ -534,25 +469,14 @@ def test_processes_of_mapped_users_that_a_killed_build_left_are_ended(rooted, tm
     assert list((tmp_path / "temporary").iterdir()) == []
 
 
-def group_lives(group: int) -> bool:
-    """Whether a process group has a process that is more than a zombie."""
-    for path in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            state, _, its_group = path.read_text().rpartition(")")[2].split()[:3]
-        except (FileNotFoundError, ProcessLookupError):  # it has ended meanwhile
-            continue
-        if int(its_group) == group and state != "Z":
-            return True
-    return False
-
-
 @pytest.mark.parametrize("way", ["fail", "terminated", "killed"])
 def test_a_build_that_ends_too_early_takes_its_temporary_folder_along(rooted, tmp_path, way):
     environment = a_user_builds(rooted, tmp_path)
-    process = rooted.start("true", environment=environment | {"STUB_BUILD": "hang" if way == "terminated" else way})
     if way == "terminated":
-        wait_for((rooted.record / "begun").exists, "the build")
+        process = rooted.building("hang", **environment)
         process.terminate()
+    else:
+        process = rooted.start("true", environment=environment | {"STUB_BUILD": way})
     process.communicate(timeout=LONG)
     assert process.returncode == {"fail": 5, "terminated": 143, "killed": 5}[way]
     if way == "killed":
@@ -568,9 +492,7 @@ def test_a_build_that_ends_too_early_takes_its_temporary_folder_along(rooted, tm
 def test_a_builder_that_is_killed_leaves_nothing(rooted, tmp_path, launcher, victim, as_user):
     """At once, or where nobody is left to remove it at the next start, which waits for nobody."""
     environment = a_user_builds(rooted, tmp_path) if as_user else {}
-    silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    process = rooted.start("true", environment=environment | {"STUB_BUILD": "hang"}, **silent)
-    wait_for((rooted.record / "begun").exists, "the build")
+    process = rooted.building("hang", **environment)
     builder = int((rooted.record / "pid").read_text())
     group = os.getpgid(builder)
     try:
@@ -578,13 +500,13 @@ def test_a_builder_that_is_killed_leaves_nothing(rooted, tmp_path, launcher, vic
             process.kill()
             process.wait()
         os.kill(group if victim == "leader" else builder, signal.SIGKILL)
-        wait_for(lambda: not group_lives(group), "the end of the whole group")
+        wait_for(lambda: not members(group, GROUP), "the end of the whole group")
         if launcher == "alive":
             assert process.wait(LONG) == 5
         else:
             assert rooted.run("true", environment=environment).returncode == 0
     finally:
-        if group_lives(group):
+        if members(group, GROUP):
             os.killpg(group, signal.SIGKILL)
     kept = {path.suffix for path in (rooted.cache / "remodel-fenicsx").iterdir()}
     assert kept == ({".lock", ".log"} if launcher == "alive" else {".lock", ".log", ""})
@@ -760,19 +682,7 @@ def test_no_namespaces(clone, way):
     ],
 )
 def test_native_version(clone, tmp_path, version, suite, usable):
-    for name in (
-        "dolfinx",
-        "mpi4py",
-        "petsc4py",
-        "gmsh",
-        "pydantic",
-        "pint",
-        "tomlkit",
-        "h5py",
-        "rich",
-        "scipy",
-        "meshio",
-    ):
+    for name in "dolfinx mpi4py petsc4py gmsh pydantic pint tomlkit h5py rich scipy meshio".split():
         script(tmp_path / "site" / name / "__init__.py", "raise SystemExit('the launcher must not import this')")
     script(
         tmp_path / "site" / f"fenics_dolfinx-{version}.dist-info" / "METADATA",

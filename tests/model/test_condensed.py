@@ -33,10 +33,10 @@ COMBINATIONS = [
     (law, repulsion, driver, frame)
     for (law, repulsion), driver, frame in product(
         [("tensor", "log"), ("tensor", "length"), ("explicit", "axes"), ("relaxation", "axes"), ("rate", "log")],
-        ("cauchy", "pk2", "finger"),
-        ("material", "spatial"),
+        [name for name, part in DRIVERS.items() if part.derivatives],
+        [name for name, part in FRAMES.items() if part.has_derivatives],
     )
-    if (driver, frame) != ("pk2", "spatial")
+    if frame == "material" or not DRIVERS[driver].material
 ]
 
 

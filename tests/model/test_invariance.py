@@ -7,6 +7,7 @@ n_I(0) -> Q n_I(0), which both are.
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import dolfinx.fem
@@ -26,8 +27,7 @@ from remodel_fenicsx.model import spectral
 from remodel_fenicsx.model.cells import angle_to_axis, structure_tensor
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES, material_frame, spatial_frame
 from remodel_fenicsx.schema.settings import Cells, Remodeling
-from remodel_fenicsx.state.state import State
-from remodel_fenicsx.state.state import UnitCells
+from remodel_fenicsx.state.state import State, UnitCells
 from tests import parts
 from tests.parts import cube
 
@@ -218,9 +218,15 @@ class Points:
         return updated.dimensions, updated.axes, spectral.positive_direction(values, drive.threshold)[1]
 
 
-@pytest.fixture(scope="module")
-def points() -> Points:
+@functools.cache
+def shared_points() -> Points:
+    """One mesh for all, also for the examples of hypothesis, which does not like fixtures."""
     return Points()
+
+
+@pytest.fixture(name="points")
+def the_points() -> Points:
+    return shared_points()
 
 
 def deformations(rng: np.random.Generator, size: float = 0.12) -> np.ndarray:
@@ -270,16 +276,6 @@ def test_the_pass_is_equivariant_in_both_frames(seed: int) -> None:
             np.testing.assert_allclose(turned_dimensions, dimensions, atol=1e-9)
             expected = turn @ structure_tensor(dimensions, axes) @ turn.T
             np.testing.assert_allclose(structure_tensor(turned_dimensions, turned_axes), expected, atol=1e-6)
-
-
-_shared: list[Points] = []
-
-
-def shared_points() -> Points:
-    """One mesh for all examples of hypothesis, which does not like fixtures."""
-    if not _shared:
-        _shared.append(Points())
-    return _shared[0]
 
 
 @given(seed=SEEDS)

@@ -137,8 +137,8 @@ def test_a_plot_shows_the_deformed_body(recorded: Recorded) -> None:
 @pytest.mark.parametrize(
     "options, words",
     [({"time": 2.5}, "no fields at time 2.5; recorded are 0, 1, 2"), ({"name": "stress"}, "no field 'stress'"),
-     ({"layers": 9}, "allowed is a whole number from 1 to 8"),
-     ({"elements": [True]}, "allowed is a mask of all 1536"), ({"cut": "all"}, "allowed are half, quarter")],
+     ({"layers": 9}, "allowed is a whole number from 1 to 8"), ({"elements": [True]}, "allowed is a mask of all 1536"),
+     ({"cut": "all"}, "allowed are half, quarter")],
 )  # fmt: skip
 def test_what_cannot_be_shown_is_one_line(recorded: Recorded, options: dict[str, Any], words: str) -> None:
     with pytest.raises(ValueError, match=words) as error:

@@ -163,7 +163,7 @@ def test_a_scene_of_another_kind_is_damage_of_the_folder(folder: Path) -> None:
 
 @pytest.mark.parametrize(("text", "said"), [
     ("time,force\n1.0,2.0\n2.0,", "ends in the middle of a row"),
-    ("time,force\n1.0,2.0\n2.0\n", "line 3: 1 values, but there are 2 columns"),
+    ("time,force\n1.0,2.0\n2.0\n", "line 3 has 1 values, but there are 2 columns"),
     ("time,force\n1.0,strong\n", "could not convert string to float: 'strong'"),
     ("a,b\n1,2\n", "is not the history of a run, it has no column 'time'"),
 ])  # fmt: skip

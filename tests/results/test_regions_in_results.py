@@ -10,7 +10,7 @@ import pytest
 from mpi4py import MPI
 
 from remodel_fenicsx import Recording, Scene, SceneError, Simulation, run
-from remodel_fenicsx.results.revolve import revolve
+from remodel_fenicsx.results.whole_body import revolve
 from remodel_fenicsx.running import resume
 from remodel_fenicsx.studies import sweep as study
 from tests.conftest import Cases, forked_children

@@ -17,7 +17,7 @@ import h5py
 import numpy as np
 import pytest
 
-from remodel_fenicsx.results.turned import chain_displacement, chain_lines
+from remodel_fenicsx.results.whole_body import chain_displacement, chain_lines
 from remodel_fenicsx.results.vtkhdf import LINE, StagedFile, TransientGrid, vtk_cells
 from tests.forks import forked
 

@@ -12,14 +12,14 @@ from typing import Any
 
 import pytest
 
-from remodel_fenicsx.body import Cube, Tendon, Tube
+from remodel_fenicsx.body import Cube, SHAPES, Tendon, Tube
 from remodel_fenicsx.model.chains import wormlike_stiffness
 from remodel_fenicsx.model.laws import LAWS
 from remodel_fenicsx.scene.presets import PRESET_NOTES, PRESETS
 from remodel_fenicsx.scene.reference import scene_reference
 from remodel_fenicsx.scene.scene import FORMAT, RENAMED, Scene, preset_scene, read_scene, scene_from_dict
 from remodel_fenicsx.schema.settings import Cells, Load, Material, Remodeling, Solver, Time
-from remodel_fenicsx.schema.tables import SceneError, description, is_table, sections
+from remodel_fenicsx.schema.tables import SceneError, allowed, description, is_table, locate, sections, shown
 
 ROOT = Path(__file__).resolve().parents[2]
 DEMOS = sorted((ROOT / "demos").glob("*.toml"))
@@ -51,425 +51,194 @@ def refusal(values: dict[str, Any]) -> str:
     return str(caught.value)
 
 
-# (base, changes, the one line)
-BAD_SCENES = [
-    # geometry
-    (
-        TUBE,
-        {"geometry.inner_radius": 3.0},
-        "geometry.inner_radius = 3.0: must be smaller than geometry.outer_radius = 3.0",
-    ),
-    (
-        TUBE,
-        {"geometry.inner_radius": 5},
-        "geometry.inner_radius = 5.0: must be smaller than geometry.outer_radius = 3.0",
-    ),
-    (TUBE, {"geometry.length": 0.0}, "geometry.length = 0.0: must be a finite number greater than 0"),
-    (TUBE, {"geometry.shape": "sphere"}, "geometry.shape = 'sphere': allowed are 'cube', 'tendon', 'tube', 'mesh'"),
-    (TUBE, {"geometry.shape": 1}, "geometry.shape = 1: allowed are 'cube', 'tendon', 'tube', 'mesh'"),
+NAN, INFINITE, HUGE = float("nan"), float("inf"), 10**400
+# values that a key never has: the line says what it allows
+WRONG_VALUES: dict[str, list[Any]] = {
+    "material.lame_mu": [-3.0, NAN, True, HUGE, [1.0]],
+    "material.lame_lambda": [-0.1],
+    "material.temperature": [INFINITE],
+    "material.energy_factor": [2, True],
+    "material.chain": ["rubber"],
+    "material.stress_unit": ["psi"],
+    "cells.seed": [-1, 1.5, True],
+    "cells.axes": ["polar"],
+    "cells.initial": ["raindrop", 1.0, [0.6, 0.8], [0.6, -0.8, 0.0]],
+    "cells.aligned_axis": [0],
+    "loads": [10.0],
+    "loads.pressure": [10.0],
+    "loads.pressure.ramp": [[], 25.0],
+    "remodeling.kappa": [-0.1],
+    "remodeling.rotation_time": [0.0],
+    "remodeling.pairing": ["rank"],
+    "remodeling.law": ["foo", 1],
+    "remodeling.driver": ["strain"],
+    "remodeling.frame": ["corotated"],
+    "remodeling.coupling": ["monolithic"],
+    "mesh.refinement": [0, 2.5],
+    "mesh.element": ["wedge"],
+    "mesh.degree": [3, True],
+    "time.end": [0.0, "soon"],
+    "time.step": [-1.0],
+    "solver.absolute_tolerance": [-1.0],
+    "solver.relative_tolerance": [1.0],
+    "solver.method": ["magic"],
+    "solver.petsc_options": ["-ksp_type cg"],
+    "output.fields": [1, ["stress"]],
+    "output.every": [0],
+    "material": [3],
+    "format": [0, "2", True],
+}
+
+
+@pytest.mark.parametrize(("key", "value"), [(key, value) for key in WRONG_VALUES for value in WRONG_VALUES[key]])
+def test_a_value_that_a_key_never_has(key: str, value: Any) -> None:
+    _, _, field = locate(Scene, tuple(key.split(".")))
+    assert field is not None
+    assert refusal(changed(TUBE, {key: value})) == f"{key} = {shown(value)}: {allowed(field)}"
+
+
+SHAPE = "geometry.shape: missing; allowed are " + ", ".join(map(repr, SHAPES))
+NO_SHAPE = "geometry.shape = {}: allowed are " + ", ".join(map(repr, SHAPES))
+RADIUS = "geometry.inner_radius = {}: .* geometry.outer_radius = 3.0"
+RAMP = "loads.pressure.ramp"
+PULLED = [[0.0, 0.0], [5.0, 1.0]]
+IMPLICIT = {"remodeling.coupling": "implicit"}
+RAY = {"cells": {"initial": "isotropic", "axes": "cylindrical"}, "model": {"kinematics": "radial"}}
+# (base, changes, how the one line begins: key, value, words of what is allowed)
+BAD_SCENES: list[tuple[dict[str, Any], dict[str, Any], str]] = [
+    # geometry; without a shape nothing else is judged: preset, loads and units depend on it
+    (TUBE, {"geometry.inner_radius": 3.0}, RADIUS.format(3.0)),
+    (TUBE, {"geometry.inner_radius": 5}, RADIUS.format(5.0)),
+    (TUBE, {"preset": PAPER, "geometry.inner_radius": 4.0}, RADIUS.format(4.0)),
+    (TUBE, {"geometry.length": 0.0}, "geometry.length = 0.0: must be a finite number greater than 0$"),
     (
         CUBE,
         {"geometry": {"shape": "tube", "inner_radius": 1.0, "outer_radius": 2.0}},
-        "geometry.length: missing; must be a finite number greater than 0",
+        "geometry.length: missing; .* 0$",
     ),
-    ({"time": {"end": 1.0}}, {}, "geometry.shape: missing; allowed are 'cube', 'tendon', 'tube', 'mesh'"),
-    (
-        {"time": {"end": 1.0}},
-        {"preset": PAPER},
-        "geometry.shape: missing; allowed are 'cube', 'tendon', 'tube', 'mesh'",
-    ),
-    (CUBE, {"geometry": {"side": 1.0}}, "geometry.shape: missing; allowed are 'cube', 'tendon', 'tube', 'mesh'"),
-    (CUBE, {"geometry": 3}, "geometry = 3: must be a table"),
-    (
-        CUBE,
-        {"geometry.radius": 3.0},
-        "geometry.radius = 3.0: unknown key; allowed are "
-        "geometry.is, geometry.shape, geometry.length_unit, geometry.side",
-    ),
-    # without a shape nothing else is judged: preset, loads and units depend on it
-    (CUBE, {"preset": PAPER, "geometry": {}}, "geometry.shape: missing; allowed are 'cube', 'tendon', 'tube', 'mesh'"),
-    ({}, {}, "geometry.shape: missing; allowed are 'cube', 'tendon', 'tube', 'mesh'"),
-    (
-        {"preset": PAPER, "geometry": {"shape": "heart"}},
-        {},
-        "geometry.shape = 'heart': allowed are 'cube', 'tendon', 'tube', 'mesh'",
-    ),
-    (
-        {"preset": PAPER, "geometry": {"shape": "heart"}, "loads": {"pressure": {"value": "100 mmHg"}}},
-        {},
-        "geometry.shape = 'heart': allowed are 'cube', 'tendon', 'tube', 'mesh'",
-    ),
-    ({"preset": PAPER, "geometry": 3}, {}, "geometry = 3: must be a table"),
+    (TUBE, {"geometry.shape": "sphere"}, NO_SHAPE.format("'sphere'")),
+    (TUBE, {"geometry.shape": 1}, NO_SHAPE.format(1)),
+    ({"preset": PAPER}, {"geometry": {"shape": "heart"}}, NO_SHAPE.format("'heart'")),
+    ({"loads": {"pressure": {"value": "100 mmHg"}}}, {"geometry": {"shape": "heart"}}, NO_SHAPE.format("'heart'")),
+    ({}, {}, SHAPE),
+    ({"time": {"end": 1.0}}, {"preset": PAPER}, SHAPE),
+    (CUBE, {"geometry": {"side": 1.0}}, SHAPE),
+    (CUBE, {"preset": PAPER, "geometry": {}}, SHAPE),
+    (CUBE, {"geometry": 3}, "geometry = 3: must be a table$"),
+    ({"preset": PAPER}, {"geometry": 3}, "geometry = 3: must be a table$"),
+    (CUBE, {"geometry.radius": 3.0}, "geometry.radius = 3.0: unknown key; allowed are geometry.is, geometry.shape, "),
+    (CUBE, {"geometry.side": 1e7}, "geometry.side = 10000000.0: .* allowed are 1e-06 to"),
+    (TUBE, {"geometry.length": 1e5}, "geometry.inner_radius = 1.0: .* too small beside one of 100000; allowed is"),
+    (TUBE, {"geometry.inner_radius": 2.9999}, "geometry.outer_radius = 3.0: .*0.0001 is too small beside one of 8;"),
     # unknown keys
     (
         TUBE,
-        {"geometry": {"shape": "tube", "inner_radus": 1.0, "outer_radius": 3.0, "length": 8.0}},
-        "geometry.inner_radus = 1.0: unknown key; did you mean geometry.inner_radius?",
+        {"geometry.inner_radus": 1.0},
+        "geometry.inner_radus = 1.0: unknown key; did you mean geometry.inner_radius",
     ),
-    (
-        CUBE,
-        {"time": {"ende": 3.0, "stepp": 1.0}},
-        "time.ende = 3.0: unknown key; did you mean time.end? (and 1 more fault)",
-    ),
-    (TUBE, {"cells.sed": 3}, "cells.sed = 3: unknown key; did you mean cells.seed?"),
-    (TUBE, {"kappa": 0.1}, "kappa = 0.1: unknown key; did you mean remodeling.kappa?"),
-    (TUBE, {"remodelling": {"kappa": 1.0}}, "remodelling = {kappa = 1.0}: unknown key; did you mean remodeling?"),
-    (
-        TUBE,
-        {"output.pictures!": True},
-        "output.'pictures!' = true: unknown key; allowed are output.fields, output.columns, output.every, "
-        "output.times, output.report, output.checkpoint",
-    ),
-    (TUBE, {"time.x\ny": 1}, "time.'x\\ny' = 1: unknown key; allowed are time.end, time.step, time.tolerance"),
-    # material
-    (CUBE, {"material.lame_mu": -3.0}, "material.lame_mu = -3.0: must be a finite number greater than 0"),
-    (CUBE, {"material.lame_lambda": -0.1}, "material.lame_lambda = -0.1: must be a finite number at least 0"),
-    (CUBE, {"material.lame_mu": float("nan")}, "material.lame_mu = nan: must be a finite number greater than 0"),
-    (
-        CUBE,
-        {"material.temperature": float("inf")},
-        "material.temperature = inf: must be a finite number greater than 0",
-    ),
-    (
-        CUBE,
-        {"material.lame_mu": "3.1"},
-        "material.lame_mu = '3.1': must be a finite number greater than 0, "
-        "or one with a unit of stress as in '2.4 kPa'",
-    ),
-    (CUBE, {"material.lame_mu": True}, "material.lame_mu = true: must be a finite number greater than 0"),
-    (
-        CUBE,
-        {"material.lame_mu": 10**400},
-        re.compile(r"material\.lame_mu = 10+\.\.\.: must be a finite number greater than 0"),
-    ),
-    (CUBE, {"material.lame_mu": [1.0]}, "material.lame_mu = [1.0]: must be a finite number greater than 0"),
-    (CUBE, {"material.energy_factor": 2}, "material.energy_factor = 2: allowed are 1, 4"),
-    (CUBE, {"material.energy_factor": True}, "material.energy_factor = true: allowed are 1, 4"),
-    (CUBE, {"material.chain": "rubber"}, "material.chain = 'rubber': allowed is 'wormlike'"),
-    (CUBE, {"material.stress_unit": "psi"}, "material.stress_unit = 'psi': allowed are 'Pa', 'kPa', 'MPa'"),
-    (CUBE, {"material": 3}, "material = 3: must be a table"),
-    (
-        CUBE,
-        {"material.lame_mu": -1.0, "material.lame_lambda": -1.0, "cells.seed": -1},
-        "material.lame_lambda = -1.0: must be a finite number at least 0 (and 2 more faults)",
-    ),
-    # cells
-    (
-        CUBE,
-        {"cells.end_to_end_length": 1.594},
-        "cells.end_to_end_length = 1.594: must be smaller than material.contour_length = 1.594",
-    ),
-    (
-        CUBE,
-        {"material.contour_length": 0.5},
-        "cells.end_to_end_length = 1.0: must be smaller than material.contour_length = 0.5",
-    ),
-    (CUBE, {"cells.seed": -1}, "cells.seed = -1: must be a whole number at least 0"),
-    (CUBE, {"cells.seed": 1.5}, "cells.seed = 1.5: must be a whole number at least 0"),
-    (CUBE, {"cells.seed": True}, "cells.seed = true: must be a whole number at least 0"),
-    (CUBE, {"cells.axes": "cylindrical"}, "cells.axes = 'cylindrical': allowed for shape 'cube' is 'global'"),
-    (CUBE, {"cells.axes": "polar"}, "cells.axes = 'polar': allowed are 'global', 'cylindrical', 'local'"),
-    (
-        CUBE,
-        {"cells.initial": "raindrop"},
-        "cells.initial = 'raindrop': allowed are 'random', 'isotropic', 'aligned', 'fibres' or three lengths "
-        "[l1, l2, l3]",
-    ),
-    (
-        CUBE,
-        {"cells.initial": 1.0},
-        "cells.initial = 1.0: allowed are 'random', 'isotropic', 'aligned', 'fibres' or three lengths [l1, l2, l3]",
-    ),
-    (
-        CUBE,
-        {"cells.initial": [0.6, 0.8]},
-        "cells.initial = [0.6, 0.8]: must be three lengths [l1, l2, l3], each at least 0",
-    ),
-    (
-        CUBE,
-        {"cells.initial": [0.6, -0.8, 0.0]},
-        "cells.initial = [0.6, -0.8, 0.0]: must be three lengths [l1, l2, l3], each at least 0",
-    ),
-    (
-        CUBE,
-        {"cells.initial": [1, 1, 1]},
-        "cells.initial = [1.0, 1.0, 1.0]: the root of the sum of squares is 1.732051, "
-        "it must be cells.end_to_end_length = 1.0",
-    ),
-    (CUBE, {"cells.aligned_axis": 0}, "cells.aligned_axis = 0: allowed are 1, 2, 3"),
+    (CUBE, {"time": {"ende": 3.0, "stepp": 1.0}}, r"time.ende = 3.0: .* did you mean time.end\? \(and 1 more fault\)$"),
+    (TUBE, {"cells.sed": 3}, r"cells.sed = 3: unknown key; did you mean cells.seed\?$"),
+    (TUBE, {"kappa": 0.1}, r"kappa = 0.1: unknown key; did you mean remodeling.kappa\?$"),
+    (TUBE, {"remodelling": {"kappa": 1.0}}, r"remodelling = \{kappa = 1.0\}: .* did you mean remodeling\?$"),
+    (TUBE, {"output.pictures!": True}, "output.'pictures!' = true: unknown key; allowed are output.fields, output.col"),
+    (TUBE, {"time.x\ny": 1}, r"time.'x\\ny' = 1: unknown key; allowed are time.end, time.step, time.tolerance$"),
+    # material and cells
+    (CUBE, {"material.lame_mu": "3.1"}, "material.lame_mu = '3.1': must be .* greater than 0, or .* unit of stress as"),
+    (CUBE, {"material.lame_mu": -1.0, "cells.seed": -1}, r"material.lame_mu = -1.0: .* 0 \(and 1 more fault\)$"),
+    (CUBE, {"cells.end_to_end_length": 1.594}, "cells.end_to_end_length = 1.594: .* material.contour_length = 1.594"),
+    (CUBE, {"material.contour_length": 0.5}, "cells.end_to_end_length = 1.0: .* material.contour_length = 0.5"),
+    (CUBE, {"cells.axes": "cylindrical"}, "cells.axes = 'cylindrical': allowed for shape 'cube' is 'global'$"),
+    (CUBE, {"cells.initial": [1, 1, 1]}, r"cells.initial = \[1.0, 1.0, 1.0\]: .* cells.end_to_end_length = 1.0$"),
     # loads
     (
         TUBE,
         {"loads.force": {"value": 1.0}},
-        "loads.force = {value = 1.0}: a tube has no such load; "
-        "allowed: loads.pressure, loads.elongation, loads.axial_force",
+        r"loads.force = \{value = 1.0\}: a tube has no such load; allowed: loads.pre",
     ),
-    (
-        CUBE,
-        {"loads.presure": {"value": 1.0}},
-        "loads.presure = {value = 1.0}: a cube has no such load; allowed: loads.force",
-    ),
-    (CUBE, {"loads.force": 10.0}, "loads.force = 10.0: must be a table with value, ramp"),
-    (CUBE, {"loads": 10.0}, "loads = 10.0: must be a table"),
-    (
-        CUBE,
-        {"loads.force": {"value": 1.0}},
-        "loads.force.ramp: missing; must be a list of pairs [time, factor] with increasing times",
-    ),
-    (
-        TUBE,
-        {"loads.pressure.value": "high"},
-        "loads.pressure.value = 'high': must be a finite number, or one with a unit of stress as in '2.4 kPa'",
-    ),
+    (CUBE, {"loads.presure": {}}, r"loads.presure = \{\}: a cube has no such load; allowed: loads.force$"),
+    (CUBE, {"loads.force": {"value": 1.0}}, "loads.force.ramp: missing; must be a list of pairs"),
+    (TUBE, {"loads.pressure.value": "high"}, "loads.pressure.value = 'high': must be a finite number, or .* of stress"),
+    (TUBE, {"loads.elongation": {"value": "much"}}, "loads.elongation.value = 'much': must be a finite number .and 1"),
+    (TUBE, {"loads.pressure.rmp": []}, r"loads.pressure.rmp = \[\]: unknown key; did you mean loads.pressure.ramp"),
+    (TUBE, {RAMP: [[0.0, 0.0], [1.0]]}, r"loads.pressure.ramp\[1\]\[1\]: missing; must be a list of pairs"),
+    (TUBE, {RAMP: [[0.0, 0.0, 1.0]]}, r"loads.pressure.ramp\[0\] = \[0.0, 0.0, 1.0\]: must be a list of pairs"),
+    (TUBE, {RAMP: [[0.0, "all"]]}, r"loads.pressure.ramp\[0\]\[1\] = 'all': must be a list of pairs"),
+    (TUBE, {RAMP: [[0.0, NAN]]}, r"loads.pressure.ramp\[0\]\[1\] = nan: must be a list of pairs"),
+    (TUBE, {RAMP: [[True, 1.0]]}, r"loads.pressure.ramp\[0\]\[0\] = true: must be a list of pairs"),
+    (TUBE, {RAMP: [[HUGE, 0.0]]}, r"loads.pressure.ramp\[0\]\[0\] = 10+\.\.\.: must be a list of pairs"),
+    (TUBE, {RAMP: [[0, 0], [5, 1], [4.0, 0]]}, r"loads.pressure.ramp\[2\]\[0\] = 4.0: must be later than the time 5.0"),
+    (TUBE, {RAMP: [[0, 0], [0.0, 1]]}, r"loads.pressure.ramp\[1\]\[0\] = 0.0: must be later than the time 0.0"),
+    (TUBE, {RAMP: [[-1.0, 0.0]]}, r"loads.pressure.ramp\[0\]\[0\] = -1.0: must be at least 0"),
     (
         TUBE,
-        {"loads.elongation": {"value": "much"}},
-        "loads.elongation.value = 'much': must be a finite number (and 1 more fault)",
+        {RAMP: [[0, 0], [2.5, 1]]},
+        r"loads.pressure.ramp\[1\]\[0\] = 2.5: .* time.step = 1.0; the nearest are 2 and 3$",
     ),
-    (TUBE, {"loads.pressure.rmp": []}, "loads.pressure.rmp = []: unknown key; did you mean loads.pressure.ramp?"),
-    (
-        TUBE,
-        {"loads.pressure.ramp": []},
-        "loads.pressure.ramp = []: must be a list of pairs [time, factor], at least one",
-    ),
-    (
-        TUBE,
-        {"loads.pressure.ramp": 25.0},
-        "loads.pressure.ramp = 25.0: must be a list of pairs [time, factor], at least one",
-    ),
-    (
-        TUBE,
-        {"loads.pressure.ramp": [[0.0, 0.0], [1.0]]},
-        "loads.pressure.ramp[1] = [1.0]: must be a pair [time, factor] of finite numbers",
-    ),
-    (
-        TUBE,
-        {"loads.pressure.ramp": [[0.0, 0.0, 1.0]]},
-        "loads.pressure.ramp[0] = [0.0, 0.0, 1.0]: must be a pair [time, factor] of finite numbers",
-    ),
-    (
-        TUBE,
-        {"loads.pressure.ramp": [[0.0, "all"]]},
-        "loads.pressure.ramp[0] = [0.0, 'all']: must be a pair [time, factor] of finite numbers",
-    ),
-    (
-        TUBE,
-        {"loads.pressure.ramp": [[0.0, float("nan")]]},
-        "loads.pressure.ramp[0] = [0.0, nan]: must be a pair [time, factor] of finite numbers",
-    ),
-    (
-        TUBE,
-        {"loads.pressure.ramp": [[0.0, 0.0], [5.0, 1.0], [4.0, 0.0]]},
-        "loads.pressure.ramp[2][0] = 4.0: must be later than the time 5.0 of the entry before",
-    ),
-    (
-        TUBE,
-        {"loads.pressure.ramp": [[0.0, 0.0], [0.0, 1.0]]},
-        "loads.pressure.ramp[1][0] = 0.0: must be later than the time 0.0 of the entry before",
-    ),
-    (
-        TUBE,
-        {"loads.pressure.ramp": [[-1.0, 0.0]]},
-        "loads.pressure.ramp[0][0] = -1.0: must be at least 0, where the simulation starts",
-    ),
-    (
-        TUBE,
-        {"loads.pressure.ramp": [[0.0, 0.0], [2.5, 1.0]]},
-        "loads.pressure.ramp[1][0] = 2.5: must be a multiple of time.step = 1.0; the nearest are 2 and 3",
-    ),
-    (
-        TUBE,
-        {"loads.elongation": {"value": -1.0, "ramp": [[0.0, 0.0], [5.0, 1.0]]}},
-        "loads.elongation.value = -1.0: must be greater than -1 at every time; with the factor 1.0 it is -1",
-    ),
-    (
-        TUBE,
-        {"loads.elongation": {"value": 0.5, "ramp": [[0.0, 0.0], [5.0, -3.0]]}},
-        "loads.elongation.value = 0.5: must be greater than -1 at every time; with the factor -3.0 it is -1.5",
-    ),
-    (
-        TUBE,
-        {"loads.pressure.ramp": [[0.0, 0.0], [True, 1.0]]},
-        "loads.pressure.ramp[1] = [true, 1.0]: must be a pair [time, factor] of finite numbers",
-    ),
-    (
-        TUBE,
-        {"loads.pressure.ramp": [[10**400, 0.0]]},
-        re.compile(r"loads\.pressure\.ramp\[0\] = \[10+\.\.\.: must be a pair \[time, factor\] of finite numbers"),
-    ),
+    (TUBE, {"preset": PAPER, "time.step": 2.0}, r"loads.pressure.ramp\[1\]\[0\] = 25.0: .* = 2.0; .* 24 and 26$"),
+    (TUBE, {"loads.elongation": {"value": -1.0, "ramp": PULLED}}, "loads.elongation.value = -1.0: .* greater than -1 "),
+    (TUBE, {"loads.elongation": {"value": 0.5, "ramp": [[0, 0], [5, -3]]}}, "loads.elongation.value = 0.5: .*is -1.5$"),
     # remodeling, model, mesh
-    (CUBE, {"remodeling.kappa": -0.1}, "remodeling.kappa = -0.1: must be a finite number at least 0"),
-    (CUBE, {"remodeling.rotation_time": 0.0}, "remodeling.rotation_time = 0.0: must be a finite number greater than 0"),
-    (CUBE, {"remodeling.pairing": "rank"}, "remodeling.pairing = 'rank': allowed are 'sorted', 'continuous'"),
     (
         CUBE,
-        {"remodeling.law": "foo"},
-        "remodeling.law = 'foo': allowed are 'explicit', 'rate', 'relaxation', 'tensor', 'rotation', 'none'",
+        IMPLICIT | {"remodeling.law": "rotation"},
+        "remodeling.coupling = 'implicit': needs a remodeling.law towards ",
     ),
     (
         CUBE,
-        {"remodeling.law": 1},
-        "remodeling.law = 1: allowed are 'explicit', 'rate', 'relaxation', 'tensor', 'rotation', 'none'",
-    ),
-    (CUBE, {"remodeling.driver": "strain"}, "remodeling.driver = 'strain': allowed are 'cauchy', 'pk2', 'finger'"),
-    (CUBE, {"remodeling.frame": "corotated"}, "remodeling.frame = 'corotated': allowed are 'material', 'spatial'"),
-    (
-        CUBE,
-        {"remodeling.coupling": "monolithic"},
-        "remodeling.coupling = 'monolithic': allowed are 'staggered', 'relaxed', 'extrapolated', 'implicit'",
+        IMPLICIT | {"material.repulsion": "axes"},
+        "remodeling.coupling = 'implicit': .* that does not depend on axes",
     ),
     (
         CUBE,
-        {"remodeling.coupling": "implicit", "remodeling.law": "rotation"},
-        "remodeling.coupling = 'implicit': needs a remodeling.law towards a target: 'explicit', 'rate', 'relaxation', "
-        "'tensor'",
+        IMPLICIT | {"mesh.formulation": "selective-integration"},
+        "remodeling.coupling = 'implicit': needs mesh.formulation = 'displacement'",
     ),
     (
         CUBE,
-        {"remodeling.coupling": "implicit", "remodeling.law": "tensor", "material.repulsion": "axes"},
-        "remodeling.coupling = 'implicit': needs a material.repulsion that does not depend on axes, "
-        "like its law: 'log', 'length'",
-    ),
-    (
-        CUBE,
-        {"remodeling.coupling": "implicit", "mesh.formulation": "selective-integration"},
-        "remodeling.coupling = 'implicit': needs mesh.formulation = 'displacement': in the others the stress at a "
-        "point depends on its whole element",
-    ),
-    (
-        CUBE,
-        {"remodeling.coupling": "implicit", "material.chain_density": 0.0},
-        "remodeling.coupling = 'implicit': needs chains: material.chain_density above 0",
+        IMPLICIT | {"material.chain_density": 0.0},
+        "remodeling.coupling = 'implicit': needs chains: material.chain",
     ),
     (CUBE, {"model.kinematics": "radial"}, "model.kinematics = 'radial': a cube has no such reduction; it has 'point'"),
-    (CUBE, {"geometry.side": 1e7}, "geometry.side = 10000000.0: a length of 1e+07 here; allowed are 1e-06 to 1e+06"),
-    (
-        TUBE,
-        {"geometry.length": 1e5},
-        "geometry.inner_radius = 1.0: a length of 1 is too small beside one of 100000; allowed is a ratio up to 10000",
-    ),
-    (
-        TUBE,
-        {"geometry.inner_radius": 2.9999},
-        "geometry.outer_radius = 3.0: a length of 0.0001 is too small beside one of 8; allowed is a ratio up to 10000",
-    ),
-    (
-        TUBE,
-        {"mesh.refinement": 19},
-        "mesh.refinement = 19: must be at most 18 for a tube: more makes over 1e+07 elements",
-    ),
-    (
-        TUBE | {"cells": {"initial": "isotropic", "axes": "cylindrical"}, "model": {"kinematics": "radial"}},
-        {"mesh.refinement": 10**7},
-        "mesh.refinement = 10000000: must be at most 1250000 for a tube: more makes over 1e+07 elements",
-    ),
-    (
-        CUBE,
-        {"mesh.refinement": 10**30},
-        re.compile("mesh.refinement = 10+: must be at most 215 for a cube: more makes over 1e.07 elements"),
-    ),
-    (CUBE, {"mesh.refinement": 0}, "mesh.refinement = 0: must be a whole number at least 1"),
-    (CUBE, {"mesh.refinement": 2.5}, "mesh.refinement = 2.5: must be a whole number at least 1"),
-    (CUBE, {"mesh.element": "wedge"}, "mesh.element = 'wedge': allowed are 'hexahedron', 'tetrahedron'"),
-    (CUBE, {"mesh.degree": 3}, "mesh.degree = 3: allowed are 1, 2"),
-    (CUBE, {"mesh.degree": True}, "mesh.degree = true: allowed are 1, 2"),
+    (TUBE, {"mesh.refinement": 19}, "mesh.refinement = 19: must be at most 18 for a tube"),
+    (TUBE | RAY, {"mesh.refinement": 10**7}, "mesh.refinement = 10000000: must be at most 1250000 for a tube"),
+    (CUBE, {"mesh.refinement": 10**30}, "mesh.refinement = 10+: must be at most 215 for a cube"),
     # time
-    ({"geometry": {"shape": "cube"}}, {}, "time: missing; must be a table with end"),
-    (CUBE, {"time": {"step": 1.0}}, "time.end: missing; must be a finite number greater than 0, or 'equilibrium'"),
-    (CUBE, {"time.end": 0.0}, "time.end = 0.0: must be a finite number greater than 0, or 'equilibrium'"),
-    (CUBE, {"time.step": -1.0}, "time.step = -1.0: must be a finite number greater than 0"),
-    (CUBE, {"time.step": 11.0}, "time.step = 11.0: must be at most time.end = 10.0"),
-    (CUBE, {"time.step": 3.0}, "time.end = 10.0: must be a multiple of time.step = 3.0; the nearest are 9 and 12"),
-    (CUBE, {"time.step": 1e-6}, "time.step = 1e-06: must be at least time.end / 1000000 = 1e-05"),
-    # solver and output
-    (CUBE, {"solver.absolute_tolerance": -1.0}, "solver.absolute_tolerance = -1.0: must be a finite number at least 0"),
+    ({"geometry": {"shape": "cube"}}, {}, "time: missing; must be a table with end$"),
+    (CUBE, {"time": {"step": 1.0}}, "time.end: missing; must be a finite number greater than 0, or 'equilibrium'$"),
+    (CUBE, {"time.step": 11.0}, "time.step = 11.0: must be at most time.end = 10.0$"),
+    (CUBE, {"time.step": 3.0}, "time.end = 10.0: must be a multiple of time.step = 3.0; the nearest are 9 and 12$"),
+    (CUBE, {"time.step": 1e-6}, "time.step = 1e-06: must be at least time.end / 1000000 = 1e-05$"),
+    # solver
     (
         CUBE,
         {"solver.relative_tolerance": 0.0},
-        "solver.relative_tolerance = 0.0: must be greater than 0 where absolute_tolerance is 0",
+        "solver.relative_tolerance = 0.0: must be greater than 0 where absolute",
     ),
-    (
-        CUBE,
-        {"solver.relative_tolerance": 1.0},
-        "solver.relative_tolerance = 1.0: must be a finite number at least 0 and less than 1",
-    ),
-    (
-        CUBE,
-        {"solver.method": "magic"},
-        "solver.method = 'magic': allowed are 'auto', 'direct', 'lagged', 'iterative'",
-    ),
-    (
-        CUBE,
-        {"solver.method": "exact"},
-        "solver.method = 'exact': was removed; take 'lagged', or 'direct' for a new tangent in every iteration",
-    ),
+    (CUBE, {"solver.method": "exact"}, "solver.method = 'exact': was removed; take 'lagged', or 'direct'"),
     (
         CUBE,
         {"solver.petsc_options": {"-ksp_type": "cg"}},
-        "solver.petsc_options.-ksp_type = 'cg': not a PETSc option; write its name without the leading '-'",
+        "solver.petsc_options.-ksp_type = 'cg': .* without the leading",
     ),
     (
         CUBE,
         {"solver.petsc_options": {"ksp_type": ["cg"]}},
-        "solver.petsc_options.ksp_type = ['cg']: must be a string, a finite number, true or false",
+        r"solver.petsc_options.ksp_type = \['cg'\]: .* a string, a fin",
     ),
-    (CUBE, {"solver.petsc_options": "-ksp_type cg"}, "solver.petsc_options = '-ksp_type cg': must be a table"),
-    (CUBE, {"output.fields": 1}, "output.fields = 1: must be true, false or a list of names of fields"),
-    (CUBE, {"output.every": 0}, "output.every = 0: must be a whole number at least 1"),
-    # format
-    (
-        CUBE,
-        {"format": 3, "new_table": {"key": 1}},
-        "format = 3: written by a newer version of remodel_fenicsx; this one reads formats up to 2",
-    ),
-    (CUBE, {"format": 0}, "format = 0: must be a whole number at least 1 and at most 2"),
-    (CUBE, {"format": "2"}, "format = '2': must be a whole number at least 1 and at most 2"),
-    (CUBE, {"format": True}, "format = true: must be a whole number at least 1 and at most 2"),
-    # name and preset
-    (
-        CUBE,
-        {"name": ""},
-        "name = '': must be a file name: letters, digits, spaces and . + - _, at most 100, " "a letter or digit first",
-    ),
-    (
-        CUBE,
-        {"name": "../up"},
-        "name = '../up': must be a file name: letters, digits, spaces and . + - _, at most 100, "
-        "a letter or digit first",
-    ),
-    (
-        CUBE,
-        {"name": "a\nb"},
-        "name = 'a\\nb': must be a file name: letters, digits, spaces and . + - _, at most 100, "
-        "a letter or digit first",
-    ),
-    (
-        CUBE,
-        {"preset": "kuhl-2007"},
-        "preset = 'kuhl-2007': allowed are 'kuhl-holzapfel-2007', 'consistent', 'sun-2002'",
-    ),
-    (CUBE, {"preset": 2007}, "preset = 2007: allowed are 'kuhl-holzapfel-2007', 'consistent', 'sun-2002'"),
-    (
-        TUBE,
-        {"preset": PAPER, "geometry.inner_radius": 4.0},
-        "geometry.inner_radius = 4.0: must be smaller than geometry.outer_radius = 3.0",
-    ),
-    (
-        TUBE,
-        {"preset": PAPER, "time.step": 2.0},
-        "loads.pressure.ramp[1][0] = 25.0: must be a multiple of time.step = 2.0; the nearest are 24 and 26",
-    ),
+    # format, name and preset
+    (CUBE, {"format": 3, "new_table": {"key": 1}}, "format = 3: written by a newer version of remodel_fenicsx"),
+    (CUBE, {"name": ""}, "name = '': must be a file name"),
+    (CUBE, {"name": "../up"}, "name = '../up': must be a file name"),
+    (CUBE, {"name": "a\nb"}, r"name = 'a\\nb': must be a file name"),
+    (CUBE, {"preset": "kuhl-2007"}, f"preset = 'kuhl-2007': allowed are {', '.join(map(repr, PRESETS))}$"),
+    (CUBE, {"preset": 2007}, "preset = 2007: allowed are '"),
 ]
 
 
 @pytest.mark.parametrize(("base", "changes", "line"), BAD_SCENES, ids=[str(bad[1])[:60] for bad in BAD_SCENES])
 def test_a_bad_scene_gives_one_line_with_key_value_and_what_is_allowed(base, changes, line):
     message = refusal(changed(base, changes))
-    assert "\n" not in message
-    if isinstance(line, re.Pattern):
-        assert line.fullmatch(message)
-    else:
-        assert message == line
+    assert "\n" not in message and re.match(line, message), message
 
 
 def test_the_bases_of_the_bad_scenes_are_good():
@@ -912,7 +681,6 @@ def test_a_preset_with_units_in_another_stress_unit(monkeypatch):
     assert "(3.0 decades) stiffer than" in stiff.with_values({"material.stress_unit": "Pa"}).warnings()[0]
 
 
-PULLED = {"value": 1.0, "ramp": [[0.0, 0.0], [1.0, 1.0]]}
 TRAPS = [
     ("tube", {"loads.pressure.value": 4800.0}, r"^loads.pressure.value: a stress of 4.8e\+03 Pa .*, 740 times \(2.9 "),
     ("tube", {"loads.pressure.value": -4800.0}, r"^loads.pressure.value: a stress of 4.8e\+03 Pa"),

@@ -328,10 +328,10 @@ def test_a_request_to_stop_that_is_taken_back_is_forgotten() -> None:
     made = held_cube()
     problem = made.problem()
     made.loading.set({"force": 1.0})
-    problem.stop_signal = lambda: 15
+    problem.state.stop_signal = lambda: 15
     with pytest.raises(Interrupted):
         problem.solve()
-    problem.stop_signal = lambda: 0
+    problem.state.stop_signal = lambda: 0
     assert problem.extension().stop_signal == 0
     assert problem.solve().newton_iterations > 1
 

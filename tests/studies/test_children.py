@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
+import subprocess
+import sys
+import time as clock
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from remodel_fenicsx.results.recording import steps_recorded
 from remodel_fenicsx.system.children import Worker, wait_for_one
 from tests.parts import pulled_cube
 
@@ -57,3 +62,75 @@ def test_what_is_at_work_is_stopped(tmp_path: Path) -> None:
     worker.begin(["run", str(scene), "-o", str(tmp_path / "run"), "-q"], tmp_path / "said.txt")
     worker.stop()
     assert worker.process.returncode in (128 + signal.SIGTERM, -signal.SIGTERM)
+
+
+# ---------------------------------------------------------------- the processes of a study
+COMMAND = "import sys; from remodel_fenicsx.cli import main; sys.exit(main(sys.argv[1:]))"
+ARTERY = Path(__file__).parents[2] / "demos" / "artery.toml"
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGUSR1, signal.SIGKILL])
+def test_a_stopped_study_ends_its_runs(number: int, tmp_path: Path) -> None:
+    """What it has recorded stays, without an answer."""
+    words = ["ensemble", str(ARTERY), "--jobs", "1", "-o", str(tmp_path / "runs")]
+    command = [sys.executable, "-c", COMMAND, *words]
+    with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        assert process.stderr.readline().startswith("artery ensemble: 0 % of ")
+        (child,) = children_of(process.pid)
+        process.send_signal(number)
+        said = "" if number == signal.SIGKILL else process.stderr.read()
+    expected = {signal.SIGTERM: 143, signal.SIGUSR1: 4, signal.SIGKILL: -signal.SIGKILL}
+    assert process.returncode == expected[signal.Signals(number)] and has_ended(child, 30.0)
+    kept = "; all that is recorded is kept, the same command goes on"
+    assert not said or said.splitlines()[-1].endswith(kept)
+    assert number == signal.SIGKILL or said
+    assert not (tmp_path / "runs" / "ensemble.csv").exists()
+    assert all(steps_recorded(history.parent) < 150 for history in (tmp_path / "runs").rglob("history.csv"))
+
+
+def children_of(number: int) -> list[int]:
+    """Process numbers of the children of a process."""
+    return [int(text) for text in Path(f"/proc/{number}/task/{number}/children").read_text().split()]
+
+
+def is_alive(number: int) -> bool:
+    """Whether a process runs; one that has ended and that nobody asks for does not."""
+    try:
+        return Path(f"/proc/{number}/stat").read_text().rsplit(")", 1)[1].split()[0] not in "ZX"
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
+def has_ended(number: int, seconds: float) -> bool:
+    """Whether a process ends within so many seconds."""
+    end = clock.monotonic() + seconds
+    while is_alive(number) and clock.monotonic() < end:
+        clock.sleep(0.05)
+    return not is_alive(number)
+
+
+def test_a_run_whose_command_is_killed_before_it_begins_does_not_begin(tmp_path: Path) -> None:
+    """setpriv, which asks for the signal of that death, comes too late here."""
+    late, messages = tmp_path / "setpriv", tmp_path / "messages"
+    late.write_text(f"#!/bin/sh\nsleep 0.3\nexec {shutil.which('setpriv')} \"$@\"\n")
+    late.chmod(0o755)
+    code = f"""
+import os, pathlib, signal
+from remodel_fenicsx.results.recording import steps_recorded
+from remodel_fenicsx.system.children import Worker, wait_for_one
+child = Worker()
+child.begin(["info"], pathlib.Path({str(messages)!r}))
+print(child.process.pid, flush=True)
+if {{killed}}:
+    os.kill(os.getpid(), signal.SIGKILL)
+wait_for_one([child], 100.0)
+child.poll()
+child.stop()
+"""
+    environment = os.environ | {"PATH": f"{tmp_path}:{os.environ['PATH']}"}
+    for killed in (True, False):
+        command = [sys.executable, "-c", code.replace("{killed}", str(killed))]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=100, env=environment)
+        assert has_ended(int(done.stdout), 10.0)
+        assert (messages.read_text() == "") == killed

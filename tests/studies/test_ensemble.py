@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import os
 import signal
 import subprocess
 from dataclasses import replace
@@ -178,28 +177,6 @@ def test_a_member_killed_before_its_scene_is_run_again(
         place, found = study.ensemble(short, seeds=2)
     assert (place, found.failed, found.seeds) == (member.folder.parent, {}, 2)
     assert not left & {path.name for path in member.folder.iterdir()}
-
-
-def test_a_signal_ends_all_runs(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path, out = tmp_path / "scene.toml", tmp_path / "out"
-    path.write_text(pulled_cube(5000.0).to_toml())
-    asked = Run.steps_done.fget
-    assert asked is not None
-
-    def then_stop(member: Run) -> int:
-        steps = asked(member)
-        if steps:
-            os.kill(os.getpid(), signal.SIGTERM)
-        return int(steps)
-
-    monkeypatch.setattr(Run, "steps_done", property(then_stop))
-    code = cli.main(["ensemble", str(path), "-o", str(out), "--seeds", "2", "--jobs", "1"])
-    assert code == 128 + signal.SIGTERM
-    assert "all that is recorded is kept, the same command goes on" in capsys.readouterr().err
-    members = runs_of(read_scene(path), out, 2)
-    assert any(asked(member) for member in members) and not any(member.is_complete() for member in members)
 
 
 def eight_seeds(last: float) -> study.Ensemble:

@@ -10,7 +10,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time as clock
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -28,11 +27,12 @@ from remodel_fenicsx import Recording, cli, run
 from remodel_fenicsx.body.shape import columns_of
 from remodel_fenicsx.pictures import bodies
 from remodel_fenicsx.results import vtkhdf
-from remodel_fenicsx.results.recording import RecordingError, steps_recorded
+from remodel_fenicsx.results.recording import RecordingError
 from remodel_fenicsx.scene.scene import Scene, SceneError, scene_from_dict
 from remodel_fenicsx.studies import page
 from remodel_fenicsx.studies.page import FigureError
 from remodel_fenicsx.studies.study import Run
+from tests.studies.test_children import children_of, is_alive
 
 PACKAGE = Path(remodel_fenicsx.__file__).parent
 DOCS = PACKAGE.parent / "docs"
@@ -225,86 +225,6 @@ def test_a_damaged_run_is_not_complete(damage: Callable[[Path], None], tmp_path:
     assert answers(tmp_path, scene) is not True
 
 
-COMMAND = "import sys; from remodel_fenicsx.cli import main; sys.exit(main(sys.argv[1:]))"
-
-
-def artery_under_way(tmp_path: Path) -> subprocess.Popen[str]:
-    """A study of the artery, once its first run has begun."""
-    command = [sys.executable, "-c", COMMAND, "ensemble", str(SCRIPT.with_name("artery.toml")), "--jobs", "1"]
-    command += ["-o", str(tmp_path / "runs")]
-    process = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True)
-    assert process.stderr is not None
-    assert process.stderr.readline().startswith("artery ensemble: 0 % of ")
-    return process
-
-
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGUSR1])
-def test_a_stopped_command_ends_its_runs(number: int, tmp_path: Path) -> None:
-    with artery_under_way(tmp_path) as process:
-        (worker,) = children_of(process.pid)
-        process.send_signal(number)
-        assert process.stderr is not None
-        rest = process.stderr.read()
-    assert process.returncode == (4 if number == signal.SIGUSR1 else 143) and not is_alive(worker)
-    said = "; all that is recorded is kept, the same command goes on"
-    assert rest.splitlines()[-1].endswith(said) and not (tmp_path / "runs" / "ensemble.csv").exists()
-    assert all(steps_recorded(history.parent) < 150 for history in (tmp_path / "runs").rglob("history.csv"))
-
-
-def children_of(number: int) -> list[int]:
-    """Process numbers of the children of a process."""
-    return [int(text) for text in Path(f"/proc/{number}/task/{number}/children").read_text().split()]
-
-
-def is_alive(number: int) -> bool:
-    """Whether a process runs; one that has ended and that nobody asks for does not."""
-    try:
-        return Path(f"/proc/{number}/stat").read_text().rsplit(")", 1)[1].split()[0] not in "ZX"
-    except (FileNotFoundError, ProcessLookupError):
-        return False
-
-
-def test_runs_do_not_outlive_a_killed_command(tmp_path: Path) -> None:
-    with artery_under_way(tmp_path) as process:
-        (worker,) = children_of(process.pid)
-        process.kill()
-    for _ in range(300):
-        if not is_alive(worker):
-            break
-        clock.sleep(0.1)
-    assert not is_alive(worker)
-
-
-def test_a_run_whose_command_is_killed_before_it_begins_does_not_begin(tmp_path: Path) -> None:
-    """setpriv, which asks for the signal of that death, comes too late here."""
-    late, messages = tmp_path / "setpriv", tmp_path / "messages"
-    late.write_text(f"#!/bin/sh\nsleep 0.3\nexec {shutil.which('setpriv')} \"$@\"\n")
-    late.chmod(0o755)
-    code = f"""
-import os, pathlib, signal
-from remodel_fenicsx.system.children import Worker, wait_for_one
-child = Worker()
-child.begin(["info"], pathlib.Path({str(messages)!r}))
-print(child.process.pid, flush=True)
-if {{killed}}:
-    os.kill(os.getpid(), signal.SIGKILL)
-wait_for_one([child], 100.0)
-child.poll()
-child.stop()
-"""
-    environment = os.environ | {"PATH": f"{tmp_path}:{os.environ['PATH']}"}
-    for killed in (True, False):
-        command = [sys.executable, "-c", code.replace("{killed}", str(killed))]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=100, env=environment)
-        child = int(done.stdout)
-        for _ in range(1000):
-            if not is_alive(child):
-                break
-            clock.sleep(0.01)
-        assert not is_alive(child)
-        assert (messages.read_text() == "") == killed
-
-
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_stopped_script_ends_its_runs(number: int, tmp_path: Path) -> None:
     command = [sys.executable, str(SCRIPT), "fig7", "--jobs", "1", "--runs", str(tmp_path / "runs")]
@@ -411,8 +331,6 @@ def test_panels_are_lettered_in_line_with_their_titles() -> None:
     assert boxes[0].x0 == pytest.approx(boxes[2].x0) and boxes[1].x0 == pytest.approx(boxes[3].x0)
     for axes, box in zip(panels, boxes, strict=True):
         assert box.x0 < axes.get_window_extent().x0 and box.y0 >= axes.get_window_extent().y1
-    label = panels[0].yaxis.label.get_window_extent(renderer)
-    assert boxes[0].x0 == pytest.approx(label.x0, abs=2)
 
 
 def test_valid_runs_are_used_again_and_own_figures_drawn_anew(drawn: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -493,7 +411,7 @@ def test_every_colour_of_the_scale_stays_as_it_is_in_the_palette() -> None:
     # beside them many other colours, among them the grey that Pillow alone takes for one of the scale
     others = np.concatenate([np.tile([[234, 234, 234]], (500, 1)), rng.integers(0, 256, (18_000, 3))]).astype(np.uint8)
     pixels = np.concatenate([scale, others[: 10_000 - len(scale)]]).reshape(100, 100, 3)
-    drawn = page.with_palette(Image.fromarray(pixels), bodies.scale_colours())
+    drawn = page.Palette(Image.fromarray(pixels), bodies.scale_colours())(Image.fromarray(pixels))
     assert drawn.mode == "P"
     found = np.asarray(drawn.convert("RGB")).reshape(-1, 3)
     np.testing.assert_array_equal(found[: len(scale)], scale)

@@ -105,9 +105,9 @@ def test_suction_makes_a_ring_oval() -> None:
     bears = 3 * YOUNG / (1 - POISSON**2) * 0.04**3 / 12
     with watched(slender("radial", -0.5 * bears, **thin)) as watcher:
         assert watcher.suction_share() == pytest.approx(0.5, rel=0.03)
-        assert watcher.in_words() == ""
+        assert watcher.look() == ""
     with watched(slender("radial", -1.1 * bears, **thin)) as watcher:
-        assert "its suction is about 1." in watcher.in_words()
+        assert "its suction is about 1." in watcher.look()
 
 
 # ---------------------------------------------------------------- against the whole body

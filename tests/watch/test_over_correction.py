@@ -106,7 +106,7 @@ class Scripted:
     def __init__(self, factor: float, size: float, **changes: Any):
         self.simulation = cube(1.0, loads__force__ramp=[[0.0, 1.0]], **changes)
         self.stepper: Stepper = self.simulation.stepper
-        (self.watcher,) = (watcher for watcher in self.simulation.warnings if isinstance(watcher, OverCorrection))
+        (self.watcher,) = (watcher for watcher in self.simulation.watchers if isinstance(watcher, OverCorrection))
         self.factor, self.size = factor, size
 
     def step(self, number: int) -> Step:
@@ -223,7 +223,7 @@ def test_cells_that_make_up_for_a_rest_are_warned_of(
 ) -> None:
     simulation = cube(10.0, remodeling__law=law, remodeling__kappa=0.1, time__end=14.0)
     with caplog.at_level(logging.WARNING, logger="remodel_fenicsx"):
-        simulation.warnings.insert(0, Shut(simulation, set(passes), points))
+        simulation.watchers.insert(0, Shut(simulation, set(passes), points))
         list(simulation.steps())
     assert caplog.text.count("cells that had rested") == bool(said)
     assert said in caplog.text

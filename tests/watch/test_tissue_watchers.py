@@ -91,7 +91,7 @@ def test_the_worst_point_alone_is_enough_for_a_warning(caplog: pytest.LogCapture
     assert int(lost) > 40  # of the worst point: the body as a whole has lost a few per cent
     simulation = Simulation(scene, SELF)
     rows = [step.row for step in simulation.steps()]
-    watcher = next(watcher for watcher in simulation.warnings if isinstance(watcher, VolumeLoss))
+    watcher = next(watcher for watcher in simulation.watchers if isinstance(watcher, VolumeLoss))
     assert min(row["min_jacobian"] for row in rows) == watcher._numbers["least"] < 0.6
     assert watcher._numbers["mean"] > 0.9 and 1.2 < watcher._numbers["x"] < 1.3
     simulation.close()
