@@ -6,13 +6,13 @@ Source: E. Kuhl, G. A. Holzapfel, J. Mater. Sci. 42 (2007) 8811-8823; docs/theor
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from remodel_fenicsx.body.reductions import AUTO, for_means
 from remodel_fenicsx.model.chains import BOLTZMANN_CONSTANT, CHAINS, Chain
-from remodel_fenicsx.schema.settings import Cells, Material, Remodeling, STRESS_UNITS
+from remodel_fenicsx.schema.settings import Cells, Material, Remodeling, STRESS_UNITS, in_region
 from remodel_fenicsx.schema.tables import fault, is_number, quoted
 from remodel_fenicsx.schema.toml import put
 
@@ -220,9 +220,9 @@ def profile_for(name: str, scene: Any) -> Profile:
     return (RANDOM_CELLS if scene.has_random_cells else PROFILES)[name]
 
 
-# ---------------------------------------------------------------- numbers that an experiment gives, in place of the
-# Numbers that an experiment gives, in place of the model's own: an initial stiffness for a density of chains, say.
-#  A scene may say either, never both; the scene as run has the model's own (docs/which_numbers.md).
+# ---------------------------------------------------------------- numbers that an experiment gives
+# An initial stiffness in place of a density of chains, say. A scene may say either, never both; the scene as run has
+# the model's own (docs/which_numbers.md).
 
 Values = Mapping[str, Any]
 Others = Callable[..., Any]  # value of a table's key (or a default), where it is one that can be counted with
@@ -273,6 +273,10 @@ class Experiment(NamedTuple):
     lowest: float
     own: Callable[[float, Others], float]
 
+    def said(self, part: Values) -> Any:
+        """Its value in what is said of a body or region."""
+        return _of(part, self.table, self.key)
+
 
 EXPERIMENTS = (  # in this order: the density asks for the contour length
     Experiment("material", "locking_stretch", "contour_length", 1.0, _contour_length),
@@ -281,53 +285,52 @@ EXPERIMENTS = (  # in this order: the density asks for the contour length
 )
 
 
-def check_exclusive(own: Values) -> None:
-    """Refuse a number of an experiment beside what it replaces."""
-    for name, part in _parts(own):
-        place = _place(name)
-        for table, key, replaces, *_ in EXPERIMENTS:
-            value = _of(part, table, key)
-            if value is not None and _of(part, table, replaces) is not None:
-                raise fault(
-                    f"{place}{table}.{replaces} is there too; one of them is enough", f"{place}{table}.{key}", value
-                )
-
-
-def with_own_numbers(values: Values) -> dict[str, Any]:
-    """The values with the model's own numbers in place of those of experiments."""
-    found = {**values}
-    for name, part in _parts(values):
-        for experiment in EXPERIMENTS:
-            part = _with_own_number(experiment, part, found)
-        if name is None:
-            found = {**found, **part}
-        else:
-            found["regions"] = {**found["regions"], name: part}
-    return found
-
-
-def without_replaced(values: dict[str, Any], changed: Iterable[str]) -> None:
-    """Take out of the values what changed numbers of experiments replace."""
-    changed = set(changed)
-    for name, part in _parts(values):
-        place = _place(name)
-        for table, key, replaces, *_ in EXPERIMENTS:
-            if f"{place}{table}.{key}" in changed and f"{place}{table}.{replaces}" not in changed:
-                part[table].pop(replaces, None)
-
-
-def _parts(values: Values) -> Iterator[tuple[Any, Any]]:
-    """What is said of the whole body, under None, and of each region by its name."""
-    yield None, values
+def parts_of(values: Values) -> Iterator[tuple[str, Values]]:
+    """What is said of the whole body, under "", and of each region by its name."""
+    yield "", values
     regions = values.get("regions")
     for name, region in regions.items() if isinstance(regions, Mapping) else ():
         if isinstance(region, Mapping):
             yield name, region
 
 
-def _place(name: Any) -> str:
-    """What stands before the keys of its tables."""
-    return "" if name is None else f"regions.{quoted(str(name))}."
+def with_part(values: Values, name: str, part: Values) -> dict[str, Any]:
+    """The values with what is said of the whole body, or of a region, replaced."""
+    return {**values, **(part if name == "" else {"regions": {**values["regions"], name: part}})}
+
+
+def check_exclusive(own: Values) -> None:
+    """Refuse a number of an experiment beside what it replaces."""
+    for name, part in parts_of(own):
+        for experiment in EXPERIMENTS:
+            value, key = experiment.said(part), f"{place_of(name)}{experiment.table}"
+            if value is not None and _of(part, experiment.table, experiment.replaces) is not None:
+                rule = f"{key}.{experiment.replaces} is there too; one of them is enough"
+                raise fault(rule, f"{key}.{experiment.key}", value)
+
+
+def with_own_numbers(values: Values) -> dict[str, Any]:
+    """The values with the model's own numbers in place of those of experiments."""
+    found = dict(values)
+    for name, part in parts_of(values):
+        for experiment in EXPERIMENTS:
+            part = _with_own_number(experiment, part, found)
+        found = with_part(found, name, part)
+    return found
+
+
+def without_replaced(values: Values, changed: Collection[str]) -> None:
+    """Take out of the values what changed numbers of experiments replace."""
+    for name, part in parts_of(values):
+        for table, key, replaces, *_ in EXPERIMENTS:
+            place = f"{place_of(name)}{table}"
+            if f"{place}.{key}" in changed and f"{place}.{replaces}" not in changed:
+                part[table].pop(replaces, None)
+
+
+def place_of(name: str) -> str:
+    """What stands before the keys of a region that may have any name."""
+    return in_region(name and quoted(str(name)))
 
 
 def _of(part: Values, table: str, key: str) -> Any:
@@ -336,9 +339,8 @@ def _of(part: Values, table: str, key: str) -> Any:
 
 
 def _with_own_number(experiment: Experiment, part: Values, body: Values) -> Values:
-    table, key, replaces, lowest, own = experiment
-    value = _of(part, table, key)
-    if not is_number(value) or value <= lowest:
+    value = experiment.said(part)
+    if not is_number(value) or value <= experiment.lowest:
         return part
 
     def others(table: str, key: str, default: Any = None) -> Any:
@@ -351,8 +353,8 @@ def _with_own_number(experiment: Experiment, part: Values, body: Values) -> Valu
         return found
 
     try:
-        number = own(value, others)
+        number = experiment.own(value, others)
     except (_NotThere, ValueError, OverflowError, ZeroDivisionError):
         return part
-    keys = {name: value for name, value in part[table].items() if name != key}
-    return {**part, table: {**keys, replaces: number}}
+    keys = {name: value for name, value in part[experiment.table].items() if name != experiment.key}
+    return {**part, experiment.table: {**keys, experiment.replaces: number}}

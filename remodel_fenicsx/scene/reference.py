@@ -46,7 +46,6 @@ def json_schema() -> Schema:
     """The JSON Schema (draft 2020-12) of a scene file of this version, what scripts have registered included."""
     schema = Scene.model_json_schema(schema_generator=_Keys)
     properties = schema["properties"]
-    properties["preset"]["enum"], properties["profile"]["enum"] = list(PRESETS), list(PROFILES)
     load = schema["$defs"]["Load"]["properties"]["value"]
     load["anyOf"] = [{"type": load.pop("type")}, schema_with_unit(STRESS)]
     loads = {name: kind.meaning for shape in SHAPES.values() for name, kind in shape.loads.items()}

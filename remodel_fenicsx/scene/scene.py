@@ -30,8 +30,11 @@ from remodel_fenicsx.scene.presets import (
     check_exclusive,
     default_method,
     nested,
+    parts_of,
+    place_of,
     profile_for,
     with_own_numbers,
+    with_part,
     without_replaced,
 )
 from remodel_fenicsx.schema.settings import (
@@ -62,6 +65,7 @@ from remodel_fenicsx.schema.settings import (
 from remodel_fenicsx.schema.tables import (
     IN_A_LIST,
     KeysOfParts,
+    OneOf,
     SceneError,
     Table,
     VariantOf,
@@ -211,35 +215,18 @@ class Scene(Table):
 
     renamed: ClassVar[Mapping[str, str]] = RENAMED
 
-    format: int = Field(
-        default=FORMAT,
-        ge=1,
-        le=FORMAT,
-        description="Number of the format of scenes. A scene as run has it; version 0.1.0 wrote none.",
-    )
+    format: int = Field(default=FORMAT, ge=1, le=FORMAT)
+    """Number of the format of scenes. A scene as run has it; version 0.1.0 wrote none."""
     name: Annotated[str, BeforeValidator(_name)] = Field(
-        default="scene",
-        description=("Name of the scene and of its results folder. Default: the name of the file without `.toml`."),
-        json_schema_extra={"allowed": "a file name without a path"},
+        default="scene", json_schema_extra={"allowed": "a file name without a path"}
     )
-    preset: str | None = Field(
-        default=None,
-        description=(
-            "A published model whose values hold where the scene says nothing, table by table (see the "
-            "presets below)."
-        ),
-        json_schema_extra={"allowed": "one of " + ", ".join(map(repr, PRESETS))},
-    )
-    profile: str | None = Field(
-        default=None,
-        description=(
-            "Chooses speed or accuracy: settings of mesh, kinematics and steps "
-            "(docs/speed_and_accuracy.md has their errors and costs). They replace those of the preset,"
-            " and the scene's own keys replace them. `--profile` on the command line replaces all of "
-            "these."
-        ),
-        json_schema_extra={"allowed": "one of " + ", ".join(map(repr, PROFILES))},
-    )
+    """Name of the scene and of its results folder. Default: the name of the file without `.toml`."""
+    preset: Annotated[str | None, OneOf(PRESETS)] = None
+    """A published model whose values hold where the scene says nothing, table by table (see the presets below)."""
+    profile: Annotated[str | None, OneOf(PROFILES)] = None
+    """Chooses speed or accuracy: settings of mesh, kinematics and steps (docs/speed_and_accuracy.md has their errors
+    and costs). They replace those of the preset, and the scene's own keys replace them. `--profile` on the command line
+    replaces all of these."""
     geometry: Annotated[SerializeAsAny[Shape], VariantOf(SHAPES, "shape")]
     mesh: Mesh = Mesh()
     model: Model = Model()
@@ -250,10 +237,9 @@ class Scene(Table):
     regions: dict[str, Region] = {}
     loads: dict[str, Load] = {}
     cases: Annotated[tuple[LoadCase, ...], IN_A_LIST] = Field(
-        default=(),
-        description="Load cases of a cycle, a table `[[cases]]` each. Without them the loads act all the time.",
-        json_schema_extra={"allowed": "a list of tables, each [[cases]]"},
+        default=(), json_schema_extra={"allowed": "a list of tables, each [[cases]]"}
     )
+    """Load cases of a cycle, a table `[[cases]]` each. Without them the loads act all the time."""
     remodeling: Annotated[SerializeAsAny[Remodeling], KeysOfParts({"law": LAWS})] = Remodeling()
     time: Time
     solver: Solver = Solver()
@@ -547,44 +533,26 @@ def _in_present_format(values: Mapping[str, Any]) -> dict[str, Any]:
 
 def _with_measured_cells(values: dict[str, Any]) -> dict[str, Any]:
     """cells.initial = 'fibres' wherever a file of fibres is given, in the whole body and in regions."""
-    regions = values.get("regions")
-    tables = {"": values, **{in_region(quoted(str(name))): table for name, table in _items(regions)}}
-    found = {}
-    for key, table in tables.items():
-        cells = table.get("cells") if isinstance(table, Mapping) else None
-        if not isinstance(table, Mapping) or not isinstance(cells, Mapping) or cells.get("fibres") is None:
+    for name, part in parts_of(values):
+        cells = part.get("cells")
+        if not isinstance(cells, Mapping) or cells.get("fibres") is None:
             continue
-        if cells.get("initial", MEASURED_CELLS) != MEASURED_CELLS:
-            rule = f"{key}cells.initial = {shown(cells['initial'])} is there too; one of them gives the cells"
-            raise fault(rule, f"{key}cells.fibres", cells["fibres"])
-        found[key] = {**table, "cells": {**cells, "initial": MEASURED_CELLS}}
-    values = found.get("", values)
-    if regions is None or not found:
-        return values
-    own = {name: found.get(in_region(quoted(str(name))), table) for name, table in _items(regions)}
-    return {**values, "regions": own if isinstance(regions, Mapping) else regions}
-
-
-def _items(table: Any) -> list[tuple[Any, Any]]:
-    return list(table.items()) if isinstance(table, Mapping) else []
+        if (said := cells.get("initial", MEASURED_CELLS)) != MEASURED_CELLS:
+            rule = f"{place_of(name)}cells.initial = {shown(said)} is there too; one of them gives the cells"
+            raise fault(rule, f"{place_of(name)}cells.fibres", cells["fibres"])
+        values = with_part(values, name, {**part, "cells": {**cells, "initial": MEASURED_CELLS}})
+    return values
 
 
 def _beside(values: dict[str, Any], folder: Path) -> dict[str, Any]:
     """The keys of a file in this folder, with the places of the files that they name."""
-
-    def placed(table: Any) -> Any:
-        cells: Any = table.get("cells") if isinstance(table, Mapping) else None
-        file = cells.get("fibres") if isinstance(cells, Mapping) else None
-        return (
-            {**table, "cells": {**cells, "fibres": str(folder.absolute() / file)}} if isinstance(file, str) else table
-        )
-
-    values = placed(values)
+    for name, part in parts_of(values):
+        cells = part.get("cells")
+        if isinstance(cells, Mapping) and isinstance(file := cells.get("fibres"), str):
+            values = with_part(values, name, {**part, "cells": {**cells, "fibres": str(folder.absolute() / file)}})
     geometry = values.get("geometry")
     if isinstance(geometry, Mapping) and isinstance(kind := geometry.get("shape"), str) and kind in SHAPES:
         values = {**values, "geometry": SHAPES[kind].with_files_from(geometry, folder)}
-    if isinstance(regions := values.get("regions"), Mapping):
-        values = {**values, "regions": {name: placed(table) for name, table in regions.items()}}
     return values
 
 

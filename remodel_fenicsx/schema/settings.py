@@ -970,7 +970,7 @@ class Load(Table):
     and constant before the first and after the last. Times up to time.end must be multiples of time.step; with
     time.tolerance a step ends at each."""
 
-    kind: Literal["pressure"] | None = Field(default=None, json_schema_extra={"allowed": "'pressure'"})
+    kind: Literal["pressure"] | None = None
     """For a further load of a body of your own: 'pressure' acts against the outward normal of the deformed face."""
     face: str | None = Field(default=None, min_length=1, json_schema_extra={"allowed": "the name of a face"})
     """For a further load of a body of your own: the face that it acts on."""

@@ -16,6 +16,7 @@ import sys
 import textwrap
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from types import NoneType
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args, get_origin
 
 from pydantic import (
@@ -147,7 +148,7 @@ class OneOf:
     def _check(self, value: Any) -> Any:
         if self.removed and value in self.removed:
             raise fault(self.removed[value])
-        if value not in self.choices:
+        if value is not None and value not in self.choices:
             raise ValueError("not registered")
         return value
 
@@ -425,7 +426,13 @@ def choices(field: FieldInfo) -> list[Any]:
     for entry in field.metadata:
         if isinstance(entry, OneOf):
             return entry.choices
-    return list(get_args(field.annotation)) if get_origin(field.annotation) is Literal else []
+    return list(get_args(_kind(field))) if get_origin(_kind(field)) is Literal else []
+
+
+def _kind(field: FieldInfo) -> Any:
+    """The annotation of a field that may be left out as that of one that may not."""
+    kinds = [kind for kind in get_args(field.annotation) if kind is not NoneType]
+    return kinds[0] if get_args(field.annotation) == (*kinds, NoneType) and len(kinds) == 1 else field.annotation
 
 
 def allowed(field: FieldInfo) -> str:
@@ -439,11 +446,10 @@ def allowed(field: FieldInfo) -> str:
         required = [name for name, inner in fields.items() if inner.is_required()]
         return "must be a table" + (f" with {', '.join(required)}" if required else "")
     nouns: dict[Any, str] = {float: "a finite number", int: "a whole number", bool: "true or false", str: "a string"}
-    noun = next(nouns[kind] for kind in (field.annotation, *get_args(field.annotation)) if kind in nouns)
     words = {"gt": "greater than", "ge": "at least", "lt": "less than", "le": "at most"}
     limits = [(word, getattr(entry, name, None)) for entry in field.metadata for name, word in words.items()]
     bounds = [f"{word} {limit}" for word, limit in limits if limit is not None]
-    return " ".join(filter(None, [f"must be {noun}", " and ".join(bounds)]))
+    return " ".join(filter(None, [f"must be {nouns[_kind(field)]}", " and ".join(bounds)]))
 
 
 def tables_in(field: FieldInfo) -> Iterator[tuple[str, str, type[BaseModel]]]:

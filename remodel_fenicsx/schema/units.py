@@ -33,7 +33,6 @@ LengthUnit = Annotated[
     Field(
         description="Unit of every length of the scene. It is needed only where lengths or forces are given with "
         "units; without it lengths are in any one unit.",
-        json_schema_extra={"allowed": "one of " + ", ".join(map(repr, LENGTH_UNITS))},
     ),
 ]
 

@@ -341,31 +341,31 @@ def test_a_name_is_not_cut_at_a_dot(file, name, tmp_path):
 
 # ---------------------------------------------------------------- overrides
 
+WORD, PATH = "must be a TOML value or a bare word$", "the key must be a dotted path, as in cells.seed=2$"
 BAD_OVERRIDES = [
-    ("cells.seed", "--set 'cells.seed': must be KEY=VALUE, as in cells.seed=2"),
-    ("=2", "--set '=2': the key must be a dotted path, as in cells.seed=2"),
-    ("cells..seed=2", "--set 'cells..seed=2': the key must be a dotted path, as in cells.seed=2"),
-    ("cells.seed=", "--set cells.seed = '': must be a TOML value or a bare word"),
-    ("cells.seed=two words", "--set cells.seed = 'two words': must be a TOML value or a bare word"),
-    ("cells.seed=1\ntime.end=2", "--set cells.seed = '1\\ntime.end=2': must be a TOML value or a bare word"),
-    ("cells.seed=two", "cells.seed = 'two': must be a whole number at least 0"),
-    ("cells.sed=2", "cells.sed = 2: unknown key; did you mean cells.seed?"),
-    ("cell.seed=2", "cell = {seed = 2}: unknown key; did you mean cells?"),
-    ("time.end.last=3", "time.end.last = 3: time.end = 100.0 is a value, not a table"),
-    ("mesh.refinement.x=3", "mesh.refinement = {x = 3}: must be a whole number at least 1"),
-    ("loads.pressure.value=3", "loads.pressure = {value = 3}: a cube has no such load; allowed: loads.force"),
-    ("time.end=nan", "time.end = nan: must be a finite number greater than 0, or 'equilibrium'"),
-    ("time=3", "time = 3: must be a table with end"),
-    ("cells.initial=[1,", "--set cells.initial = '[1,': must be a TOML value or a bare word"),
-    ("time.end=2007-01-01", "time.end = 2007-01-01: must be a finite number greater than 0, or 'equilibrium'"),
+    ("cells.seed", "--set 'cells.seed': must be KEY=VALUE, as in cells.seed=2$"),
+    ("=2", f"--set '=2': {PATH}"),
+    ("cells..seed=2", f"--set 'cells..seed=2': {PATH}"),
+    ("cells.seed=", f"--set cells.seed = '': {WORD}"),
+    ("cells.seed=two words", f"--set cells.seed = 'two words': {WORD}"),
+    ("cells.seed=1\ntime.end=2", rf"--set cells.seed = '1\\ntime.end=2': {WORD}"),
+    ("cells.initial=[1,", rf"--set cells.initial = '\[1,': {WORD}"),
+    ("cells.seed=two", "cells.seed = 'two': must be a whole number at least 0$"),
+    ("cells.sed=2", r"cells.sed = 2: unknown key; did you mean cells.seed\?$"),
+    ("cell.seed=2", r"cell = \{seed = 2\}: unknown key; did you mean cells\?$"),
+    ("time.end.last=3", "time.end.last = 3: time.end = 100.0 is a value, not a table$"),
+    ("mesh.refinement.x=3", r"mesh.refinement = \{x = 3\}: must be a whole number at least 1$"),
+    ("loads.pressure.value=3", r"loads.pressure = \{value = 3\}: a cube has no such load; allowed: loads.force$"),
+    ("time.end=nan", "time.end = nan: must be a finite number greater than 0, or 'equilibrium'$"),
+    ("time.end=2007-01-01", "time.end = 2007-01-01: must be a finite number greater than 0"),
+    ("time=3", "time = 3: must be a table with end$"),
 ]
 
 
 @pytest.mark.parametrize(("override", "line"), BAD_OVERRIDES)
 def test_a_bad_override_gives_one_line(override, line):
-    with pytest.raises(SceneError) as caught:
+    with pytest.raises(SceneError, match=f"^{line}"):
         read_scene(ROOT / "demos" / "cube.toml", [override])
-    assert str(caught.value) == line
 
 
 def test_overrides_lie_over_the_file_and_the_preset():
@@ -516,12 +516,9 @@ def test_without_a_preset_another_law_has_what_goes_with_it(law):
 
 
 def test_the_default_method_changes_no_preset():
-    scene = preset_scene("kuhl-holzapfel-2007", "tube")
-    assert (scene.material.repulsion, scene.remodeling.law, scene.remodeling.coupling) == (
-        "axes",
-        "explicit",
-        "staggered",
-    )
+    scene = preset_scene(PAPER, "tube")
+    method = scene.material.repulsion, scene.remodeling.law, scene.remodeling.coupling
+    assert method == ("axes", "explicit", "staggered")
 
 
 def test_the_network_modulus():

@@ -155,53 +155,47 @@ def test_validate_prints_stiffness_load_and_warnings(capsys):
 
 
 # ---------------------------------------------------------------- refusals
-
-STRESS_RULE = "must be a finite number, or one with a unit of stress as in '2.4 kPa'"
-LENGTH_RULE = "must be a finite number greater than 0, or one with a unit of length as in '5 mm'"
-NO_LENGTH_UNIT = "needs the scene's unit of length: set geometry.length_unit (m, cm, mm or um), or leave the unit out"
-POSITIVE = "must be a finite number greater than 0"
+# path, override, words of the one line after the key and its value
 REFUSALS = [
-    ("loads.pressure.value=100 mmhg", f"loads.pressure.value = '100 mmhg': 'mmhg' is no unit of stress; {STRESS_RULE}"),
-    ("loads.pressure.value=100 mm", f"loads.pressure.value = '100 mm': 'mm' is no unit of stress; {STRESS_RULE}"),
-    ("loads.pressure.value=100 N", f"loads.pressure.value = '100 N': 'N' is no unit of stress; {STRESS_RULE}"),
-    ("loads.pressure.value='100 %'", f"loads.pressure.value = '100 %': '%' is no unit of stress; {STRESS_RULE}"),
-    ("loads.pressure.value='4,8 Pa'", f"loads.pressure.value = '4,8 Pa': ',8 Pa' is no unit of stress; {STRESS_RULE}"),
-    ("loads.pressure.value='1e999 kPa'", f"loads.pressure.value = '1e999 kPa': too large a number; {STRESS_RULE}"),
-    ("loads.pressure.value='1e308 GPa'", f"loads.pressure.value = '1e308 GPa': too large a number; {STRESS_RULE}"),
-    ("loads.elongation.value=10 mm", "loads.elongation.value = '10 mm': must be a finite number, without a unit"),
-    ("geometry.length=8 mm", f"geometry.length = '8 mm': a unit of length {NO_LENGTH_UNIT}"),
-    ("geometry.length=8 kPa", f"geometry.length = '8 kPa': 'kPa' is no unit of length; {LENGTH_RULE}"),
-    ("solver.absolute_tolerance=1 N", f"solver.absolute_tolerance = '1 N': a unit of force {NO_LENGTH_UNIT}"),
-    ("material.contour_length=309 nm", f"material.contour_length = '309 nm': {POSITIVE}, without a unit"),
-    ("material.persistence_length=1 nm", f"material.persistence_length = '1 nm': {POSITIVE}, without a unit"),
-    ("cells.end_to_end_length=1 nm", f"cells.end_to_end_length = '1 nm': {POSITIVE}, without a unit"),
-    ("remodeling.kappa=1/day", "remodeling.kappa = '1/day': must be a finite number at least 0, without a unit"),
-    ("time.end=150 s", "time.end = '150 s': must be a finite number greater than 0, or 'equilibrium'"),
-    ("cells.seed=1 mm", "cells.seed = '1 mm': must be a whole number at least 0"),
-    ("geometry.length_unit=km", "geometry.length_unit = 'km': must be one of 'm', 'cm', 'mm', 'um'"),
-    ("geometry.length_unit=[1]", "geometry.length_unit = [1]: must be one of 'm', 'cm', 'mm', 'um'"),
-    ("material.temperature=-300 degC", "material.temperature = -26.85: must be a finite number greater than 0"),
+    *((ARTERY, f"loads.pressure.value={value} {unit}", f"'{unit}' is no unit of stress; must be a finite number, or")
+      for value, unit in ((100, "mmhg"), (100, "mm"), (100, "N"))),
+    (ARTERY, "loads.pressure.value='100 %'", "'%' is no unit of stress"),
+    (ARTERY, "loads.pressure.value='4,8 Pa'", "',8 Pa' is no unit of stress"),
+    (ARTERY, "loads.pressure.value='1e999 kPa'", "too large a number"),
+    (ARTERY, "loads.pressure.value='1e308 GPa'", "too large a number"),
+    (ARTERY, "geometry.length=8 mm", "a unit of length needs the scene's unit of length: set geometry.length_unit"),
+    (ARTERY, "geometry.length=8 kPa", "'kPa' is no unit of length; must be a finite number greater than 0, or one"),
+    (ARTERY, "solver.absolute_tolerance=1 N", "a unit of force needs the scene's unit of length"),
+    (TENDON, "loads.force.value=10 N", "a unit of force needs the scene's unit of length"),
+    *((ARTERY, f"{key}={value}", "must be a finite number.*, without a unit") for key, value in (
+        ("loads.elongation.value", "10 mm"), ("material.contour_length", "309 nm"), ("remodeling.kappa", "1/day"),
+        ("material.persistence_length", "1 nm"), ("cells.end_to_end_length", "1 nm"))),
+    (ARTERY, "time.end=150 s", "must be a finite number greater than 0, or 'equilibrium'"),
+    (ARTERY, "cells.seed=1 mm", "must be a whole number"),
+    (ARTERY, "geometry.length_unit=km", "allowed are 'm', 'cm', 'mm', 'um'"),
+    (ARTERY, "geometry.length_unit=[1]", "allowed are 'm', 'cm', 'mm', 'um'"),
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("override", "line"), REFUSALS)
-def test_a_bad_unit_gives_one_line(override, line):
-    assert refusal(ARTERY, override) == line
+@pytest.mark.parametrize(("path", "override", "words"), REFUSALS)
+def test_a_bad_unit_gives_one_line(path, override, words):
+    key, _, value = override.partition("=")
+    shown = value if value.startswith(("'", "[")) else f"'{value}'"
+    assert re.match(f"{re.escape(f'{key} = {shown}: ')}{words}", refusal(path, override))
 
 
-def test_a_force_needs_a_unit_of_length_and_a_unit_of_force():
-    line = f"loads.force.value = '10 N': a unit of force {NO_LENGTH_UNIT}"
-    assert refusal(TENDON, "loads.force.value=10 N") == line
-    rule = "must be a finite number, or one with a unit of force as in '300 mN'"
-    line = f"loads.force.value = '10 kPa': 'kPa' is no unit of force; {rule}"
-    assert refusal(TENDON, "loads.force.value=10 kPa", "geometry.length_unit=mm") == line
+def test_a_negative_temperature_is_said_in_kelvin():
+    assert refusal(ARTERY, "material.temperature=-300 degC").startswith("material.temperature = -26.85: must be ")
 
 
-def test_the_unit_of_the_scene_is_judged_before_values_in_it():
-    line = "material.stress_unit = 'psi': allowed are 'Pa', 'kPa', 'MPa'"
-    assert refusal(ARTERY, "material.stress_unit=psi", "material.lame_mu=3 kPa") == line
-    line = "geometry.length_unit = 'km': must be one of 'm', 'cm', 'mm', 'um'"
-    assert refusal(ARTERY, "geometry.length_unit=km", "geometry.length=8 mm") == line
+@pytest.mark.parametrize(("overrides", "key"), [
+    (["material.stress_unit=psi", "material.lame_mu=3 kPa"], "material.stress_unit = 'psi'"),
+    (["geometry.length_unit=km", "geometry.length=8 mm"], "geometry.length_unit = 'km'"),
+])  # fmt: skip
+def test_the_unit_of_the_scene_is_judged_before_values_in_it(overrides, key):
+    assert refusal(ARTERY, *overrides).startswith(f"{key}: allowed are '")
+    line = refusal(TENDON, "loads.force.value=10 kPa", "geometry.length_unit=mm")
+    assert line.startswith("loads.force.value = '10 kPa': 'kPa' is no unit of force; ")
 
 
 @settings(max_examples=100, deadline=None)
