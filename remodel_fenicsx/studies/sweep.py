@@ -28,7 +28,10 @@ Array = NDArray[np.float64]
 Number = int | float
 
 OF_THE_SOLVER = ("time", "seconds", "newton_iterations", "linear_iterations", "substeps")
-RULE = "must be KEY=a:b:n (n numbers from a to b) or KEY=a,b,..., as in natural.opening_angle=0:160:5"
+RULE = (
+    "must be KEY=a:b:n (n numbers from a to b) or KEY=a,b,..., as in natural.opening_angle=0:160:5; "
+    f"n is a whole number from 2 to {MOST_RUNS}"
+)
 RANGE_RULE = "must be KEY=a:b with --latin, as in loads.pressure.value=2:6"
 
 
@@ -67,24 +70,22 @@ def read_axes(texts: Sequence[str], are_ranges: bool = False) -> dict[str, list[
 
 
 def _axis(text: str, is_range: bool) -> tuple[str, list[Number]]:
-    key, equals, given = (part.strip() for part in text.partition("="))
-    refusal = f"sweep {shown(text)}: {RANGE_RULE if is_range else RULE}"
+    key, _, given = (part.strip() for part in text.partition("="))
     has_ends = ":" in given
     try:
         numbers = [_number(part) for part in given.split(":" if has_ends else ",")]
     except ValueError:
-        raise SceneError(refusal) from None
-    if not equals or not re.fullmatch(r"[\w-]+(\.[\w-]+)+", key):
-        raise SceneError(refusal)
+        numbers = []
     if is_range:
-        if not has_ends or len(numbers) != 2 or not numbers[0] < numbers[1]:
-            raise SceneError(refusal)
-        return key, numbers
-    if has_ends:
-        low, high, count = (*numbers, 0, 0, 0)[:3]
-        if len(numbers) != 3 or not isinstance(count, int) or not 2 <= count <= MOST_RUNS or low == high:
-            raise SceneError(f"{refusal}; n is a whole number from 2 to {MOST_RUNS}")
-        numbers = _spaced(low, high, count)
+        fits = has_ends and len(numbers) == 2 and numbers[0] < numbers[1]
+    elif has_ends:
+        fits = len(numbers) == 3 and numbers[0] != numbers[1] and numbers[2] in range(2, MOST_RUNS + 1)
+    else:
+        fits = len(numbers) > 0
+    if not fits or not re.fullmatch(r"[\w-]+(\.[\w-]+)+", key):
+        raise SceneError(f"sweep {shown(text)}: {RANGE_RULE if is_range else RULE}")
+    if has_ends and not is_range:
+        numbers = _spaced(numbers[0], numbers[1], int(numbers[2]))
     if len(set(numbers)) < len(numbers):
         raise SceneError(f"sweep {shown(text)}: a number is there twice")
     return key, numbers

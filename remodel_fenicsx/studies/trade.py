@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -213,8 +213,7 @@ RATIOS = (1.35, 40.0)  # of differences of one halving and the next that are tho
 ALIGNED = 0.5  # cosine of the angle between two differences, as vectors, that shrink along one way
 
 
-@dataclass(frozen=True)
-class SweepLimit:
+class SweepLimit(NamedTuple):
     """What a sweep of one factor tends to."""
 
     beyond: Array
@@ -287,8 +286,7 @@ class Row:
         return " ".join(self.result.setting.in_words().split())
 
 
-@dataclass(frozen=True)
-class _Guess:
+class _Guess(NamedTuple):
     """Of the exact result: what settings of one coupling tend to."""
 
     angles: Array
@@ -378,8 +376,7 @@ def _fineness(result: Result) -> tuple[float, ...]:
     return (result.setting.step or np.inf) / (refinement * degree**2), not result.setting.is_reduced
 
 
-@dataclass(frozen=True)
-class _Sweep:
+class _Sweep(NamedTuple):
     """Results that differ in one factor, each half of the one before, the finest last."""
 
     factor: str
