@@ -19,9 +19,9 @@ from remodel_fenicsx.model.turnover import TurnedOver, TurnoverRule, at_the_end
 
 
 # ---------------------------------------------------------------- the laws, for Newton's method
-# What cells a driving tensor makes at the end of a step, with the derivative. Everything is in the eigenbasis of C
-# . The tensor X lives where the law looks for its eigenvectors: in material space, or, for a spatial driver
-# and the frame `spatial`, in space. The cells themselves are those of `laws`.
+# What cells a driving tensor makes at the end of a step, with the derivative. Everything is in the eigenbasis of C. The
+# tensor X lives where the law looks for its eigenvectors: in material space, or, for a spatial driver and the frame
+# `spatial`, in space. The cells themselves are those of `laws`.
 
 Array = NDArray[np.float64]
 

@@ -148,6 +148,8 @@ class Law:
         `model.implicit.tensor_response`; a function, or its dotted name.
     over_corrects
         Whether the coupling "staggered" may leave a symmetric solution with it.
+    takes_set_points
+        Whether `target` takes the exponent and the threshold of a drive, and goes with turnover.
     parameters
         Numbers of its own, keys of `[remodeling]`: `speed` takes them by their names, and the drive has them.
     speed
@@ -186,6 +188,7 @@ class Law:
     asks_kappa: bool = False
     response: Callable[..., Any] | str | None = None
     over_corrects: bool = False
+    takes_set_points: bool = False
     parameters: Mapping[str, Parameter] = field(default=NO_PARAMETERS, compare=False)
     speed: Callable[..., float] | None = None
     compiled: str = ""
@@ -406,6 +409,7 @@ LAWS: dict[str, Law] = {
         keeps_symmetry=True,
         asks_kappa=True,
         response=f"{IMPLICIT}.tensor_response",
+        takes_set_points=True,
         compiled="TENSOR",
     ),
     "rotation": Law(rotation, share=turned_in_part),

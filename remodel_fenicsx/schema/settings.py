@@ -770,14 +770,15 @@ class Remodeling(Table):
     @model_validator(mode="after")
     def _parts_fit_together(self) -> Remodeling:
         law, driver, coupling = LAWS[self.law], DRIVERS[self.driver], COUPLINGS[self.coupling]
+        able = named(LAWS, lambda law: law.takes_set_points)
         for key, plain in (("exponent", 2), ("threshold", 0)):
-            if getattr(self, key) != plain and law is not LAWS["tensor"]:
-                raise fault(f"must be {plain} unless remodeling.law is 'tensor'", key, getattr(self, key))
+            if getattr(self, key) != plain and not law.takes_set_points:
+                raise fault(f"must be {plain} unless remodeling.law is {able}", key, getattr(self, key))
         if self.threshold and not driver.is_stress:
             drivers = named(DRIVERS, lambda driver: driver.is_stress)
             raise fault(f"must be 0 unless remodeling.driver is a stress: {drivers}", "threshold", self.threshold)
-        if self.turnover.is_on and law is not LAWS["tensor"]:
-            raise fault("needs remodeling.law = 'tensor'", "turnover", None)
+        if self.turnover.is_on and not law.takes_set_points:
+            raise fault(f"needs remodeling.law = {able}", "turnover", None)
         if self.turnover.is_on and not coupling.takes_turnover:
             able = named(COUPLINGS, lambda kind: kind.takes_turnover)
             raise fault(f"with remodeling.turnover must be one of: {able}", "coupling", self.coupling)
