@@ -11,16 +11,16 @@ import pytest
 
 MUTATE = Path(__file__).parents[1] / "mutate"
 SOURCE = "def double(x):\n    return 2 * x\n\n\ndef unused():\n    return 5\n"
-TEST = "from arithmetic import double\n\n\ndef test_double():\n    assert double(2) == 4\n"
+TEST = "from remodel_fenicsx.arithmetic import double\n\n\ndef test_double():\n    assert double(2) == 4\n"
 TABLE = """
-["arithmetic.py"]
-tests = ["test_arithmetic.py"]
-half = ['return 2 * x', 'return x / 2']
-square = ['2 * x', 'x ** x']
-unused = ['return 5', 'return 6']
-endless = ['    return 2 * x', '    while True: pass']
-crash = ['    return 2 * x', '    import os; os.abort()']
-nonsense = ['return 2 * x', 'return return']
+["test_arithmetic.py"]
+half = 'double: 2 * x => x / 2'
+square = 'arithmetic.double: 2*x => x ** x'
+unused = 'unused: 5 => 6'
+endless = 'double: return 2 * x => while True: pass'
+crash = 'double: return 2 * x => import os; os.abort()'
+nonsense = 'double: return 2 * x => return return'
+lines = ["double: return 2 * x => if x:\\n    return 3 * x\\nreturn 0", 'remodel_fenicsx/arithmetic.py: 5 => 7']
 """
 
 
@@ -29,8 +29,9 @@ def project(tmp_path: Path) -> Path:
     """A file, its test, and faults of every kind."""
     made = tmp_path / "project"
     (made / "tests").mkdir(parents=True)
-    (made / "table").mkdir()
-    (made / "arithmetic.py").write_text(SOURCE)
+    for name in ("table", "remodel_fenicsx"):
+        (made / name).mkdir()
+    (made / "remodel_fenicsx" / "arithmetic.py").write_text(SOURCE)
     (made / "tests" / "test_arithmetic.py").write_text(TEST)
     (made / "table" / "all.toml").write_text(TABLE)
     return made
@@ -47,8 +48,8 @@ def mutate(project: Path, *arguments: str) -> tuple[int, str]:
 
 
 def test_what_is_noticed_is_killed(project: Path) -> None:
-    status, said = mutate(project, "--only", "half", "--only", "crash")
-    assert status == 0 and "2 of 2 killed" in said
+    status, said = mutate(project, "--only", "half", "--only", "crash", "--only", "lines")
+    assert status == 0 and "3 of 3 killed" in said
     assert "FAILED tests/test_arithmetic.py::test_double" in said and "ended by signal 6" in said
 
 
@@ -77,24 +78,42 @@ def test_tests_that_fail_anyhow_are_no_proof(project: Path) -> None:
 
 
 @pytest.mark.parametrize(("old", "new", "words"), [
-    ("2 * x\n", "x + x\n", "half: arithmetic.py has its text 0 times: 'return 2 * x'"),
-    ("return 5", "return 2 * x", "half: arithmetic.py has its text 2 times: 'return 2 * x'"),
+    ("return 2 * x", "return x + x", "half: double has its text 0 times: '2 * x'"),
+    ("return 2 * x", "return 2 * x if x else 2 * x", "half: double has its text 2 times: '2 * x'"),
+    ("def double", "def twice", "half: double is 0 times there"),
+    ("def unused", "def double", "half: double is 2 times there: remodel_fenicsx/arithmetic.py:1, "),
 ])  # fmt: skip
 def test_a_table_that_has_rotted_is_refused(old: str, new: str, words: str, project: Path) -> None:
-    (project / "arithmetic.py").write_text(SOURCE.replace(old, new))
+    (project / "remodel_fenicsx" / "arithmetic.py").write_text(SOURCE.replace(old, new))
     for arguments in (["--list"], ["--only", "half"]):
         status, said = mutate(project, *arguments)
         assert status == 1 and words in said and "killed" not in said
 
 
+def test_a_fault_goes_with_its_function(project: Path) -> None:
+    """Into a class of another module, on lines of its own."""
+    moved = "class Twice:\n    def double(self, x):\n        return (\n            2\n            * x\n        )\n"
+    (project / "remodel_fenicsx" / "twice.py").write_text(moved)
+    (project / "remodel_fenicsx" / "arithmetic.py").write_text(
+        "from remodel_fenicsx.twice import Twice\n\n\ndef unused():\n    return 5\n"
+    )
+    (project / "tests" / "test_arithmetic.py").write_text(
+        TEST.replace("import double", "import Twice").replace("double(2)", "Twice().double(2)")
+    )
+    status, said = mutate(project, "--only", "half")
+    assert status == 0 and "1 of 1 killed" in said
+
+
 def test_a_test_that_is_not_there_is_refused(project: Path) -> None:
-    (project / "table" / "all.toml").write_text(TABLE.replace("x / 2']", 'x / 2\', "test_arithmetic.py::test_half"]'))
+    (project / "table" / "all.toml").write_text(
+        TABLE.replace('["test_arithmetic.py"]', '["test_arithmetic.py::test_half"]')
+    )
     status, said = mutate(project, "--list")
     assert status == 1 and "half: there is no tests/test_arithmetic.py::test_half" in said
 
 
 def test_the_table_fits_the_project() -> None:
-    """Every text occurs once, every test is there: who changes such a line changes its fault in tests/mutations too."""
+    """Every text occurs once, every test is there: who changes what a fault changes changes tests/mutations too."""
     done = subprocess.run([sys.executable, str(MUTATE), "--list"], capture_output=True, text=True, timeout=200)
     assert done.returncode == 0, done.stdout + done.stderr
     assert len(done.stdout.splitlines()) >= 40
