@@ -1,4 +1,4 @@
-"""Whether equilibria are stable, by signs from Newton's factors, and whether whole bodies of a reduction would buckle."""
+"""Whether equilibria are stable, by signs from Newton's factors; whether whole bodies of a reduction would buckle."""
 
 from __future__ import annotations
 
