@@ -58,40 +58,66 @@ class NoPredictor:
         """Nothing is remembered."""
 
 
-class Autoregressive:
-    """The next increment as a combination of the last three: d_n = sum_j a_j d_(n-j)."""
+class Remembering:
+    """Makes the next increment of the last ones, while loads go on at the same rates."""
 
-    def __init__(self, state: State):
-        self.state = state
-        self._increments = Earlier(state, "predictor_increment", state.unknown.copy, ORDER + FITTED)
+    def __init__(self, state: State, increment: str, numbers: str, count: int):
+        self.state, self._count = state, count
+        self._increments = Earlier(state, increment, state.unknown.copy, count)
         rates = {f"rate_{name}": 0.0 for name in state.loading.values}
-        durations = {f"duration_{age}": 0.0 for age in range(ORDER + FITTED)}  # of the increments, the newest first
-        self._numbers = Numbers(state, "predictor", {"time": 0.0} | durations | rates)
+        durations = {f"duration_{age}": 0.0 for age in range(count)}  # of the increments, the newest first
+        self._numbers = Numbers(state, numbers, {"time": 0.0} | durations | rates)
 
     def expected(self, step: LoadStep) -> Array | None:
         """The unknowns plus the next increment, with the values that supports and loads prescribe."""
-        if not self._increments.known or not _goes_on(step, self._numbers):
+        if not self._increments.known or not self._goes_on(step):
             return None
-        increments = self._as_of(step.duration)
-        increment = increments[0]
-        if len(increments) == ORDER + FITTED:
-            weighted = np.tensordot(self._weights(increments), np.array(increments[:ORDER]), axes=1)
-            increment = np.asarray(weighted, dtype=np.float64)
-        values: Array = self.state.unknown.x.array + increment
+        values: Array = self.state.unknown.x.array + self._increment(step)
         for condition in self.state.loading.boundary_conditions:
             condition.set(values)
         return values
 
     def solved(self, step: LoadStep, before: Array) -> None:
         """Remember the increment."""
-        increment = self.state.unknown.x.array - before
-        if self._numbers["time"] == step.time:  # solved once more: a coupling that iterates
-            self._increments.values[0][:] += increment
-            return
-        if not _goes_on(step, self._numbers):
-            self._increments.forget()
-        self._increments.push(increment)
-        _remember(step, self._numbers, ORDER + FITTED)
+        numbers, again = self._numbers, self._numbers["time"] == step.time  # solved once more: a coupling that iterates
+        goes_on = again or self._goes_on(step)
+        for earlier, value in self._found(before):
+            if again:
+                earlier.values[0][:] += value
+                continue
+            if not goes_on:
+                earlier.forget()
+            earlier.push(value)
+        if not again:
+            for age in reversed(range(1, self._count)):
+                numbers[f"duration_{age}"] = numbers[f"duration_{age - 1}"]
+            numbers["duration_0"], numbers["time"] = step.duration, step.time
+            for name, rate in step.rates.items():
+                numbers[f"rate_{name}"] = rate
+
+    def _increment(self, step: LoadStep) -> Array:
+        raise NotImplementedError
+
+    def _found(self, before: Array) -> list[tuple[Earlier, Array]]:
+        """What is remembered of a step, and where."""
+        return [(self._increments, self.state.unknown.x.array - before)]
+
+    def _goes_on(self, step: LoadStep) -> bool:
+        """Whether the rates are those of the last step."""
+        return all(_same(rate, self._numbers[f"rate_{name}"]) for name, rate in step.rates.items())
+
+
+class Autoregressive(Remembering):
+    """The next increment as a combination of the last three: d_n = sum_j a_j d_(n-j)."""
+
+    def __init__(self, state: State):
+        super().__init__(state, "predictor_increment", "predictor", ORDER + FITTED)
+
+    def _increment(self, step: LoadStep) -> Array:
+        increments = self._as_of(step.duration)
+        if len(increments) < ORDER + FITTED:
+            return increments[0]
+        return np.asarray(np.tensordot(self._weights(increments), np.array(increments[:ORDER]), axes=1))
 
     def _as_of(self, duration: float) -> list[Array]:
         """The increments as they would be over a step of that length, at their own speeds."""
@@ -111,47 +137,28 @@ class Autoregressive:
         return np.asarray(np.linalg.lstsq(matrix, right, rcond=INDEPENDENT)[0], dtype=np.float64)
 
 
-class Responsive:
+class Responsive(Remembering):
     """The next increment as that combination of the last ones that makes up what the step asks for."""
 
     def __init__(self, state: State):
-        self.state, self.quadrature = state, state.cells.quadrature
-        self._increments = Earlier(state, "responsive_increment", state.unknown.copy, ANSWERS)
-        components = (len(tensors.MANDEL),)
+        super().__init__(state, "responsive_increment", "responsive", ANSWERS)
+        self.quadrature, components = state.cells.quadrature, (len(tensors.MANDEL),)
         self._changes = Earlier(state, "responsive_change", lambda: self.quadrature.function("", components), ANSWERS)
-        rates = {f"rate_{name}": 0.0 for name in state.loading.values}
-        durations = {f"duration_{age}": 0.0 for age in range(ANSWERS)}  # the newest first
-        self._numbers = Numbers(state, "responsive", {"time": 0.0} | durations | rates)
         shares = self.quadrature.owned(self.quadrature.volumes).ravel()
         self._roots = np.repeat(np.sqrt(shares), *components)  # of the points' volumes
         self._asked: Array | None = None  # the change of the step under way
 
     def expected(self, step: LoadStep) -> Array | None:
-        """The unknowns plus the next increment, with the values that supports and loads prescribe."""
         self._asked = None
-        if not self._increments.known or not _goes_on(step, self._numbers):
-            return None
-        self._asked = self._change()
-        increment = self._weights(step, self._asked) @ np.array(self._increments.values)
-        values: Array = self.state.unknown.x.array + increment
-        for condition in self.state.loading.boundary_conditions:
-            condition.set(values)
-        return values
+        return super().expected(step)
 
-    def solved(self, step: LoadStep, before: Array) -> None:
-        """Remember the increment and what it answers."""
-        increment = self.state.unknown.x.array - before
+    def _increment(self, step: LoadStep) -> Array:
+        self._asked = self._change()
+        return np.asarray(self._weights(step, self._asked) @ np.array(self._increments.values))
+
+    def _found(self, before: Array) -> list[tuple[Earlier, Array]]:
         change, self._asked = self._change() if self._asked is None else self._asked, None
-        if self._numbers["time"] == step.time:  # solved once more: a coupling that iterates
-            self._increments.values[0][:] += increment
-            self._changes.values[0][:] += change
-            return
-        if not _goes_on(step, self._numbers):
-            self._increments.forget()
-            self._changes.forget()
-        self._increments.push(increment)
-        self._changes.push(change)
-        _remember(step, self._numbers, ANSWERS)
+        return [*super()._found(before), (self._changes, change)]
 
     def _change(self) -> Array:
         """Of the structure tensors since the last solved state, Mandel components after each other."""
@@ -176,22 +183,8 @@ class Responsive:
         return np.asarray(np.linalg.solve(matrix, right), dtype=np.float64)
 
 
-def _goes_on(step: LoadStep, known: Numbers) -> bool:
-    """Whether the rates are those of the last step."""
-    return all(_same(rate, known[f"rate_{name}"]) for name, rate in step.rates.items())
-
-
-def _remember(step: LoadStep, known: Numbers, count: int) -> None:
-    """The step's time, rates and length, with the lengths of those before."""
-    for age in reversed(range(1, count)):
-        known[f"duration_{age}"] = known[f"duration_{age - 1}"]
-    known["time"], known["duration_0"] = step.time, step.duration
-    for name, rate in step.rates.items():
-        known[f"rate_{name}"] = rate
-
-
-def _same(first: float, second: float) -> bool:
-    return abs(first - second) <= SAME_RATE * max(abs(first), abs(second))
+def _same(one: float, other: float) -> bool:
+    return abs(one - other) <= SAME_RATE * max(abs(one), abs(other))
 
 
 PREDICTORS: dict[str, Callable[[State], Predictor]] = {

@@ -19,10 +19,15 @@ from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.schema.settings import Solver
 from remodel_fenicsx.solver.equilibrium import Equilibrium, Extension
-from remodel_fenicsx.solver.newton import MANY, POSSIBLE_JUMP, Counted, GuardedNewton, Solution, SolveFailure
+from remodel_fenicsx.solver.newton import POSSIBLE_JUMP, Counted, GuardedNewton, Solution, SolveFailure
 from remodel_fenicsx.solver.diagnosis import BIFURCATION, LIMIT_POINT, SEVERAL_SOLUTIONS, Refusal, diagnosed
 from remodel_fenicsx.state.state import Numbers, State
 
+FAR = 2.0
+"""`Solution.reach` from which on a way is looked at again in parts. The paper's bodies have at most 1.25, a tube
+without chains that comes near its largest pressure in one step 2.9, a jump over a limit point 3.9 and more."""
+# Iterations, or tangents of a whole step: chains near their contour length make ends nearer too, but within 11
+NEAR, MANY = 0.5, 12
 SLOPE_SHARE = 1e-3  # of the bounded part: over it the slope of the residual is taken
 SAME_SOLUTION = (
     1e-4  # of the way to them: by what two solutions may differ that are one; of other branches it is a good part
@@ -45,15 +50,14 @@ class Work(Counted):
     residual: float = 0.0  # of the last solution, in the unit of force
     tangents: int = 0  # that were assembled
     extension: Extension | None = None  # of the last solution, where it was looked at with the cells of the row
-    is_far: bool = False  # whether the last solution is (`Solution.is_far`)
+    last: Solution | None = None
     held_points: int = 0  # points whose cells do not belong to their stress, of the coupling "implicit"
 
     def add(self, done: Solution | SolveFailure | Work) -> None:
         """Count a solve, or the work of a step that was taken back."""
         self.count(done)
         if isinstance(done, Solution):
-            self.residual, self.extension = done.residual, done.extension
-            self.is_far = done.is_far
+            self.residual, self.extension, self.last = done.residual, done.extension, done
 
 
 class StepFailure(RemodelError, RuntimeError):
@@ -157,7 +161,9 @@ class Change:
                 work.add(failed)
                 part = self._halved(part, done, failed, work)
             else:
-                if self._is_far(solution, before, part) and self._looks():
+                expected = 0.0 if self._direction is None else part * self._size(self._direction)
+                moved = self._size(self.newton.unknown.x.array - before)
+                if self.is_another_branch(solution, moved, expected) and self._looks():
                     solved, self.newton.unknown.x.array[:] = self.newton.unknown.x.array.copy(), before
                     if part / 2 >= self._smallest:
                         log.debug(
@@ -210,11 +216,9 @@ class Change:
         """After a step: look into one that has ended far from its tangent or from the step before."""
         unknown, jumps = self.newton.unknown.x.array, self._jumps
         moved, last = self._size(unknown - before), jumps["moved"]
-        least = POSSIBLE_JUMP * self.newton.equilibrium.state.loading.domain.size
         again = jumps["time"] == self.time  # solved once more, with other cells: that is no step of its own
-        strayed = work.substeps == 1 and work.tangents > MANY
-        is_far = work.is_far or strayed or (not again and last > 0.0 and moved > max(least, FASTER * last))
-        looked = is_far and self._looks()
+        tangents, expected = work.tangents if work.substeps == 1 else 0, 0.0 if again else last
+        looked = self.is_another_branch(work.last, moved, expected, tangents) and self._looks()
         if looked:
             self.confirm(before, work)
             moved = self._size(unknown - before)
@@ -253,11 +257,15 @@ class Change:
     def _smallest(self) -> float:
         return 2.0**-self.maximum_halvings
 
-    def _is_far(self, solution: Solution, before: NDArray[np.float64], part: float) -> bool:
-        """Whether a part ends far from where its tangent, or the part before, points to."""
-        if solution.is_far or not solution.reach or self._direction is None:
-            return solution.is_far
-        return self._size(self.newton.unknown.x.array - before) > FASTER * part * self._size(self._direction)
+    def is_another_branch(self, solution: Solution | None, moved: float, expected: float, tangents: int = 0) -> bool:
+        """Whether a solve may have ended there: far from its tangent, late, or much further than was expected."""
+        # `expected`: what the way before lets expect, 0 where there is none; `tangents`: of a whole step
+        least = POSSIBLE_JUMP * self.newton.equilibrium.state.loading.domain.size
+        if tangents > MANY or 0.0 < expected < moved / FASTER and moved > least:
+            return True
+        if solution is None:
+            return False
+        return solution.reach > FAR or (0.0 < solution.reach < NEAR and solution.newton_iterations > MANY)
 
     def _size(self, change: NDArray[np.float64]) -> float:
         """Largest change of an unknown, over all ranks."""

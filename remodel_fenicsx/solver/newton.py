@@ -181,12 +181,6 @@ log = logging.getLogger(__name__)
 
 LINE_SEARCH_HALVINGS = 20  # of one Newton step, before the solve is given up
 POSSIBLE_JUMP = 1e-3  # of the body's size: displacements that may be a jump; 1 % of the radius of a tube of this length
-FAR = 2.0
-"""`Solution.reach` from which on a way is looked at again in parts. The paper's bodies have at most 1.25, a tube
-without chains that comes near its largest pressure in one step 2.9, a jump over a limit point 3.9 and more."""
-
-# Iterations, or tangents of a whole step: chains near their contour length make ends nearer too, but within 11
-NEAR, MANY = 0.5, 12
 
 
 class Counted:
@@ -213,11 +207,6 @@ class Solution(Counted):
     tangents: int = 0
     extension: Extension | None = None
     reach: float = 0.0
-
-    @property
-    def is_far(self) -> bool:
-        """Whether it may lie on another branch."""
-        return self.reach > FAR or (0.0 < self.reach < NEAR and self.newton_iterations > MANY)
 
 
 class SolveFailure(Counted, RuntimeError):

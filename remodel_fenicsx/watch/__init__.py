@@ -57,22 +57,12 @@ class WatcherKind:
         return resolved(self.maker)(scene, stepper)
 
 
-def _buckling(scene: Any, stepper: Any) -> Any:
-    """Of reduced bodies: a whole one buckles by itself."""
-    strut = scene.geometry.strut(scene.supports.ends) if stepper.state.kinematics.reduced else None
-    if strut is None:
-        return None
-    from remodel_fenicsx.watch.buckling import BucklingWarning
-
-    return BucklingWarning(stepper, strut)
-
-
 _WARNINGS = "remodel_fenicsx.watch.warnings:"
 
 WATCHERS = {
     "over-correction": WatcherKind("remodel_fenicsx.watch.over_correction:OverCorrection.of"),
     "locking": WatcherKind(_WARNINGS + "LockingWarning.of", each_case=True),
-    "buckling": WatcherKind(_buckling, each_case=True),
+    "buckling": WatcherKind("remodel_fenicsx.watch.stability:BucklingWarning.of", each_case=True),
     "volume": WatcherKind(_WARNINGS + "VolumeLoss.of", each_case=True),
     "pressure-noise": WatcherKind(_WARNINGS + "PressureNoise.of"),
     "weak-tension": WatcherKind(_WARNINGS + "WeakTension.of"),

@@ -230,7 +230,7 @@ def test_the_printed_law_imports_no_other_coupling() -> None:
     imported = done.stdout.split()
     assert "remodel_fenicsx.evolution.coupling" in imported
     others = {"evolution.implicit", "model.implicit", "evolution.homeostasis",
-              "evolution.time_steps", "kernels.tensor", "watch.buckling", "system.terminal"}  # fmt: skip
+              "evolution.time_steps", "kernels.tensor", "system.terminal"}  # fmt: skip
     assert all(importlib.util.find_spec(f"remodel_fenicsx.{name}") for name in others)
     assert not {name.removeprefix("remodel_fenicsx.") for name in imported} & others
 

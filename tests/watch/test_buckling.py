@@ -16,7 +16,7 @@ from remodel_fenicsx import Scene, Simulation
 from remodel_fenicsx.body.reductions import choice, expected_thrust, explained
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.studies.stability import stability, unseen_by
-from remodel_fenicsx.watch.buckling import BucklingWarning
+from remodel_fenicsx.watch.stability import BucklingWarning
 from tests.parts import tube
 
 MU, LAME = 3.103, 27.293
