@@ -14,7 +14,7 @@ from pydantic import BeforeValidator, Field, model_validator
 from pydantic.config import JsonDict
 
 from remodel_fenicsx.body import mesh_file
-from remodel_fenicsx.body.shape import Column, LoadKind
+from remodel_fenicsx.body.shape import Column, FromFile, LoadKind, Unloads, WithRegions
 from remodel_fenicsx.body.gmsh_model import LARGEST_LENGTH, SMALLEST_LENGTH
 from remodel_fenicsx.body.mesh_file import ENDINGS, MeshFile, MeshFileError, TAGS, read_mesh
 from remodel_fenicsx.body.wall import WalledMesh
@@ -70,7 +70,7 @@ def _with_ends(supports: Mapping[str, Support]) -> dict[str, Support]:
     return {"inlet": Support(), "outlet": Support()} | dict(supports)
 
 
-class MeshBody(WalledMesh):
+class MeshBody(WalledMesh, WithRegions, Unloads, FromFile):
     """A body of your own from a mesh file: a vessel with an inner and an outer face and ends.
 
     The file is data: it is read, and never run. Its elements are tetrahedra or hexahedra,
@@ -111,10 +111,7 @@ class MeshBody(WalledMesh):
         *WalledMesh.columns_on_request,
     )
     face_names: ClassVar[tuple[str, ...]] = ROLES
-    has_regions: ClassVar[bool] = True
-    holds_faces: ClassVar[bool] = True
-    refines: ClassVar[bool] = False
-    unloads: ClassVar[bool] = True
+    supported_faces: ClassVar[tuple[str, ...] | None] = None
 
     shape: Literal["mesh"] = Field(default="mesh", description="Which body it is.")
     file: Annotated[str, BeforeValidator(_file)] = Field(
@@ -414,9 +411,7 @@ class MeshBody(WalledMesh):
             words = f"mean thickness of the wall {domain.thickness:.6g}{unit}, with plane faces"
             log.info("%s%s", words, f"; length from inlet to outlet {length:.6g}{unit}" if length else "")
         for name, support in _with_ends(supports).items():
-            moves = ("elongation", length) if name == "outlet" else None
+            moves = ("elongation", length) if name == "outlet" and "elongation" in loads else None
             add_support(loading, name, support, GUIDE * modulus / domain.thickness, moves)
-        if "elongation" not in loading.values:
-            loading.leave_out("elongation")
         for name, face in faces_of(loads).items():
             loading.add_follower_pressure(name, face)

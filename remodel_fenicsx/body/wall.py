@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Mapping
+from abc import abstractmethod
+from collections.abc import Callable, Collection, Mapping
 from functools import partial
 from typing import Any, ClassVar, NamedTuple, TYPE_CHECKING
 
@@ -12,10 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from remodel_fenicsx.body.gmsh_model import length_fault
-from remodel_fenicsx.body.shape import Column, Shape
+from remodel_fenicsx.body.shape import Column, Shape, Unloads, WithRegions
 from remodel_fenicsx.model.axes import LocalAxes
 from remodel_fenicsx.model.cells import pitch_angle, radial_share
-from remodel_fenicsx.schema.settings import CONSTANT_FIELDS, Region
+from remodel_fenicsx.model.energy import Tissue
+from remodel_fenicsx.schema.settings import CONSTANT_FIELDS, Natural, Region
 from remodel_fenicsx.schema.tables import fault, shown
 
 if TYPE_CHECKING:
@@ -187,7 +189,16 @@ def _of(mean: AngleOf, name: str, m: Any) -> float:
 
 
 class Walled(Shape):
-    """A body with a wall: angles are those in it."""
+    """A body with a wall: angles are those in it, and a scene may give it `natural.layers`.
+
+    Its keyword arguments are the keys of `[geometry]`, as of every `Shape`.
+
+    Examples
+    --------
+    >>> from remodel_fenicsx.extend import SHAPES, Walled
+    >>> [name for name, shape in SHAPES.items() if issubclass(shape, Walled)]
+    ['tube', 'mesh']
+    """
 
     columns_on_request: ClassVar[tuple[Column, ...]] = (
         Column(
@@ -203,7 +214,6 @@ class Walled(Shape):
         "fibre_angle_middle": 0.5,
         "fibre_angle_outer": 1.0,
     }
-    has_a_wall: ClassVar[bool] = True
     depth_in_words: ClassVar[tuple[str, str, str]] = ("through the wall", "inside", "outside")
     angle_in_words: ClassVar[tuple[str, str]] = ("around", "along")
 
@@ -214,6 +224,22 @@ class Walled(Shape):
     def radial_share(self, dimensions: Array, axes: Array, local: Array) -> Array:
         """Share of the chains across the wall, A_rr / tr A, (...,)."""
         return radial_share(dimensions, axes, local)
+
+
+class RoundWall(Walled, WithRegions, Unloads):
+    """A wall between two radii that numbers describe: regions are layers that fill it, it may close from a sector."""
+
+    @abstractmethod
+    def layers_of_tissue(self, natural: Natural, regions: Mapping[str, Region], tissues: Mapping[str, Tissue]) -> Any:
+        """Where tissue or prestretch change (`model.residual_stress.Layer`), from the lumen outwards."""
+
+    @abstractmethod
+    def section_shares(self, regions: Mapping[str, Region]) -> dict[str, float]:
+        """Share of every section across z that is in a region, by its name; "" is what is beside them."""
+
+    def fills(self, regions: Collection[str]) -> bool:
+        """The outermost ends at the outer radius."""
+        return bool(regions)
 
 
 MEANS_ON_A_MESH: dict[str, tuple[str, AngleOf]] = {

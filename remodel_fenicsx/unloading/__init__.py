@@ -9,6 +9,7 @@ from pathlib import Path
 
 from mpi4py import MPI
 
+from remodel_fenicsx.body.wall import RoundWall
 from remodel_fenicsx.scene import Scene, SceneError
 from remodel_fenicsx.unloading.search import NoUnloadedShape
 from remodel_fenicsx.system.temporary import temporary_folder
@@ -68,7 +69,7 @@ def unloaded(scene: Scene, comm: MPI.Intracomm = MPI.COMM_WORLD, folder: Path | 
     """
     if not scene.geometry.is_loaded:
         return scene
-    if scene.geometry.unloads_by_numbers:
+    if isinstance(scene.geometry, RoundWall):
         from remodel_fenicsx.unloading.search import unloaded_tube
 
         return unloaded_tube(scene, comm)
