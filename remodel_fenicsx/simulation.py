@@ -294,7 +294,7 @@ def from_natural(
     kinematics: Any, scene: Scene, quadrature: Quadrature, domain: Domain, local_axes: LocalAxes
 ) -> NaturalConfiguration:
     """The kinematics of a body whose tissue is free of stress in another configuration than the mesh's."""
-    from remodel_fenicsx.body.natural import gradient, prestretch
+    from remodel_fenicsx.body.wall import gradient, prestretch
     from remodel_fenicsx.model.residual_stress import closing
 
     natural, shape, found = scene.natural, scene.geometry, None

@@ -21,6 +21,7 @@ import numpy as np
 import ufl
 from mpi4py import MPI
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.fem import jit
@@ -210,7 +211,6 @@ LEAST_TANGENT = 0.1  # share of the axial field that lies in the wall: below, it
 # of the volume: 13 forks, coarse and fine, with one element through the wall or two, had 0.03 % at most, in the crotch;
 # with half of the outer face named inner it was 0.7 % (a thick wall, fine) to 43 % (one element)
 MOST_UNDEFINED = 0.01
-AT_ONCE = 1_000_000  # distances that are compared at a time
 
 
 class UndefinedAxes(SceneError):
@@ -297,19 +297,12 @@ def _fill(axes: Array, known: NDArray[np.bool_], quadrature: Quadrature) -> None
     places, candidates = quadrature.owned(quadrature.coordinates)[good], quadrature.owned(axes)[good]
     answers = []
     for part in asked:
-        index, distance = _nearest(part, places)
-        answers.append((distance, candidates[index] if len(candidates) else np.zeros((len(part), 3, 3))))
+        if len(candidates):
+            distance, index = cKDTree(places).query(part)
+            answers.append((distance, candidates[index]))
+        else:
+            answers.append((np.full(len(part), np.inf), np.zeros((len(part), 3, 3))))
     mine = [answers] if comm.size == 1 else comm.alltoall([[answer] for answer in answers])
     distances = np.stack([answer[0][0] for answer in mine])
     choices = np.stack([answer[0][1] for answer in mine])
     axes[~known] = choices[distances.argmin(axis=0), np.arange(len(wanted))]
-
-
-def _nearest(places: Array, candidates: Array) -> tuple[NDArray[np.int64], Array]:
-    """Number of the candidate (m, 3) nearest to each place (n, 3), and its distance; infinite where there is none."""
-    index, least = np.zeros(len(places), dtype=np.int64), np.full(len(places), np.inf)
-    rows = max(1, AT_ONCE // max(1, len(candidates)))
-    for start in range(0, len(places) if len(candidates) else 0, rows):
-        distances = np.linalg.norm(places[start : start + rows, None] - candidates, axis=-1)
-        index[start : start + rows], least[start : start + rows] = distances.argmin(axis=1), distances.min(axis=1)
-    return index, least

@@ -33,7 +33,15 @@ from remodel_fenicsx.body.reductions import (
     unmeasured_cells,
 )
 from remodel_fenicsx.body.shape import Array, Column, End, LoadKind, check_lengths
-from remodel_fenicsx.body.wall import AngleOf, RoundWall, Wall, angle_columns, angle_columns_on_request, check_layers
+from remodel_fenicsx.body.wall import (
+    AngleOf,
+    RoundWall,
+    Wall,
+    angle_columns,
+    angle_columns_on_request,
+    check_layers,
+    tube_layers,
+)
 from remodel_fenicsx.model.cells import cylindrical_axes, structure_tensor
 from remodel_fenicsx.model.energy import TURNED_OVER, Tissue
 from remodel_fenicsx.schema.settings import Load, Mesh, Natural, Region, Support
@@ -381,8 +389,6 @@ class Tube(RoundWall):
 
     def layers_of_tissue(self, natural: Natural, regions: Mapping[str, Region], tissues: Mapping[str, Tissue]) -> Any:
         """Where tissue or prestretch change."""
-        from remodel_fenicsx.body.natural import tube_layers
-
         return tube_layers(_wall(self, max(1, len(regions)), regions), natural, tissues)
 
     @model_validator(mode="after")
