@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import basix
@@ -42,36 +41,16 @@ SQUARE_TO_RADIAL = 10.0
 TINY = 1e-12  # of a squared length of about one: no direction is divided by zero
 
 
-@dataclass(frozen=True, eq=False)
-class AxisFields:
-    """Continuous functions on the mesh, of its degree."""
-
-    radial: Any
-    axial: Any
-    from_inner: Any
-    from_outer: Any
-    from_inlet: Any
-    from_outlet: Any
-
-
-def axis_fields(
-    domain: Domain, quadrature: Quadrature, inlets: Sequence[str] = ("inlet",), outlets: Sequence[str] = ("outlet",)
-) -> AxisFields:
-    """Find them. Collective."""
+def _fields(domain: Domain, quadrature: Quadrature, inlets: Sequence[str], outlets: Sequence[str]) -> list[Any]:
+    """Radial and axial direction, lengths from inner and outer face, inlet and outlet: functions. Collective."""
     mesh, degree = domain.mesh, quadrature.element_degree
     inner, outer, starts, ends = (facets_of(domain, names) for names in (["inner"], ["outer"], inlets, outlets))
     thickness = 2 * quadrature.volume / (area(mesh, inner) + area(mesh, outer))
     dx = ufl.Measure("dx", domain=mesh, metadata={"quadrature_degree": 2 * degree})
     radial = _radial(mesh, degree, dx, inner, outer, thickness)
     axial = _axial(radial, dx, starts, ends, thickness)
-    return AxisFields(
-        radial,
-        axial,
-        _length(radial, dx, inner, 1.0),
-        _length(radial, dx, outer, -1.0),
-        _potential(axial, dx, starts, 1.0),
-        _potential(axial, dx, ends, -1.0),
-    )
+    through = [_length(radial, dx, inner, 1.0), _length(radial, dx, outer, -1.0)]
+    return [radial, axial, *through, _potential(axial, dx, starts, 1.0), _potential(axial, dx, ends, -1.0)]
 
 
 def _radial(mesh: Any, degree: int, dx: Any, inner: Facets, outer: Facets, thickness: float) -> Any:
@@ -202,7 +181,7 @@ def area(mesh: Any, facets: Facets) -> float:
 
 
 # ---------------------------------------------------------------- local axes, depth and station at the points of any
-# Local axes, depth and station at the points of any body, from the fields of `axis_fields`.
+# Local axes, depth and station at the points of any body, from the fields of `_fields`.
 
 log = logging.getLogger(__name__)
 
@@ -225,11 +204,10 @@ def found_axes(
     if missing:
         raise UndefinedAxes(f"geometry.faces: the local axes of a wall need a face {', '.join(map(repr, missing))}")
     try:
-        fields = axis_fields(domain, quadrature, inlets, outlets)
+        radial, axial, *lengths = _fields(domain, quadrature, inlets, outlets)
     except SolveStopped as stopped:
         raise UndefinedAxes(f"geometry.faces: the local axes were not found: {stopped}") from stopped
-    lengths = (fields.from_inner, fields.from_outer, fields.from_inlet, fields.from_outlet)
-    values = _at_points([*fields.radial, *fields.axial, *lengths], quadrature)
+    values = _at_points([*radial, *axial, *lengths], quadrature)
     axes, known = _axes(values[..., :3], values[..., 3:6])
     share = quadrature.mean((~known).astype(np.float64))
     if share > 0:
@@ -244,7 +222,7 @@ def found_axes(
             log.info("the local axes are %s; those of the nearest point are used there", words)
         _fill(axes, known, quadrature)
     depth, station = (_share(values[..., k], values[..., k + 1]) for k in (6, 8))
-    nodal = _share(*(_at_nodes(length) for length in (fields.from_inner, fields.from_outer)))
+    nodal = _share(*(_at_nodes(length) for length in lengths[:2]))
     makers = (lambda: axes), (lambda: depth), (lambda: station), (lambda: nodal)
     return LocalAxes(quadrature.coordinates, *makers, values[..., 6] + values[..., 7], ~known)
 

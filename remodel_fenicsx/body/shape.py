@@ -161,6 +161,11 @@ def columns_of_region(name: str) -> tuple[Column, Column]:
 
 
 # ---------------------------------------------------------------- which a history has
+def _of_work(name: str, meaning: str) -> Column:
+    """What the solver did in the step."""
+    return Column(name, "", meaning, lambda m: getattr(m.step.work, name), by_case=False)
+
+
 FIRST_COLUMN = Column("time", "time", "time of the scene", lambda m: m.step.time, by_case=False)
 COLUMNS: dict[str, Column] = {
     column.name: column
@@ -192,26 +197,10 @@ COLUMNS: dict[str, Column] = {
             lambda m: m.step.remodeling_power,
             after_pass=True,
         ),
-        Column(
-            "newton_iterations",
-            "",
-            "Newton iterations of the step, with those of failed attempts",
-            lambda m: m.step.work.newton_iterations,
-            by_case=False,
-        ),
-        Column(
-            "linear_iterations",
-            "",
-            "iterations of the linear solver in the step, with those of failed attempts",
-            lambda m: m.step.work.linear_iterations,
-            by_case=False,
-        ),
-        Column(
-            "substeps",
-            "",
-            "number of solves that made up the step; 1 where it was solved in one piece, as in the paper",
-            lambda m: m.step.work.substeps,
-            by_case=False,
+        _of_work("newton_iterations", "Newton iterations of the step, with those of failed attempts"),
+        _of_work("linear_iterations", "iterations of the linear solver in the step, with those of failed attempts"),
+        _of_work(
+            "substeps", "number of solves that made up the step; 1 where it was solved in one piece, as in the paper"
         ),
         Column("seconds", "s", "wall time of the step", lambda m: m.step.seconds, after_pass=True),
     )
@@ -248,12 +237,8 @@ COLUMNS_ON_REQUEST: dict[str, Column] = {
             lambda m: m.step.negative_eigenvalues,
             by_case=False,
         ),
-        Column(
-            "held_points",
-            "",
-            "number of points at which the coupling 'implicit' found no cells that fit their own stress",
-            lambda m: m.step.work.held_points,
-            by_case=False,
+        _of_work(
+            "held_points", "number of points at which the coupling 'implicit' found no cells that fit their own stress"
         ),
         Column(
             "asleep_share",

@@ -14,6 +14,7 @@ from mpi4py import MPI
 from remodel_fenicsx import Scene, SceneError, Simulation, read_scene
 from remodel_fenicsx.extend import SHAPES
 from remodel_fenicsx.parts import Tube
+from tests.command.test_run import run
 
 FOLDER = Path(__file__).parents[2] / "demos" / "extensions"
 ELASTIC = {"remodeling.law": "none", "remodeling.coupling": "staggered", "material.chain_density": 0.0, "time.end": 4.0}
@@ -87,3 +88,16 @@ def test_the_cells_of_a_sheet_turn_to_the_larger_force(scene: Any) -> None:
     _, rows = simulated(scene("sheet"))
     assert rows[-1]["fibre_angle"] < rows[0]["fibre_angle"] - 4
     assert "largest force_x over its area 5 Pa" in scene("sheet").summary()
+
+
+@pytest.mark.parametrize(("name", "column"), [("torsion", "shear_stress"), ("sheet", "cauchy_stress_x")])
+def test_the_command_line_knows_it(name: str, column: str, tmp_path: Path) -> None:
+    """`validate` and `run` with the script; without it the scene is refused in one line."""
+    scene, script = str(FOLDER / f"{name}.toml"), ["--with", str(FOLDER / f"{name}.py")]
+    assert run("validate", scene, *script).returncode == 0
+    short = ["--set", "time.end=4.0", "--no-report", "-o", str(tmp_path / "run")]
+    done = run("run", scene, *script, *short)
+    assert done.returncode == 0, done.stderr
+    assert column in (tmp_path / "run" / "history.csv").read_text().splitlines()[0].split(",")
+    refused = run("validate", scene)
+    assert refused.returncode == 2 and len(refused.stderr.strip().splitlines()) == 1
