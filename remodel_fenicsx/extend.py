@@ -57,7 +57,9 @@ from typing import TYPE_CHECKING
 
 from remodel_fenicsx._lazy import on_demand
 from remodel_fenicsx.body import SHAPES, LoadKind, Shape
-from remodel_fenicsx.body.shape import COLUMNS, COLUMNS_ON_REQUEST, Column, uniaxial_columns
+from remodel_fenicsx.body.cube import box_domain
+from remodel_fenicsx.body.shape import COLUMNS, COLUMNS_ON_REQUEST, Column, End, WithRegions, uniaxial_columns
+from remodel_fenicsx.body.wall import Walled
 from remodel_fenicsx.body.reductions import Reduction
 from remodel_fenicsx.fem.formulations import FORMULATIONS, Formulation, Selective
 from remodel_fenicsx.fem.kinematics import KINEMATICS, FullKinematics, Kinematics
@@ -116,6 +118,7 @@ __all__ = [
     "Dimension",
     "Drive",
     "Driver",
+    "End",
     "EveryTangent",
     "FORCE",
     "FORMULATIONS",
@@ -155,8 +158,11 @@ __all__ = [
     "WATCHERS",
     "WarnsOnce",
     "WatcherKind",
+    "Walled",
+    "WithRegions",
     "angle_to_axis",
     "axes_sum",
+    "box_domain",
     "form",
     "linear_map",
     "ln",

@@ -15,6 +15,7 @@ from mpi4py import MPI
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.loading import Loading, LoadValues
 from remodel_fenicsx.body.reductions import AUTO, choice, explained, only_for_means
+from remodel_fenicsx.body.wall import RoundWall
 from remodel_fenicsx.evolution.coupling import Maker
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher, times
 from remodel_fenicsx.fem.formulations import FORMULATIONS
@@ -282,7 +283,7 @@ def on_mesh_alone(scene: Scene, domain: Domain) -> Any:
 def unloaded_state(scene: Scene, unknown: Any, kinematics: Any, cells: UnitCells, domain: Domain) -> State:
     """Unknowns of the body with its supports, and with loads that are zero."""
     shape, loading = scene.geometry, Loading(domain, unknown, kinematics)
-    shape.support(loading, scene.supports.ends)
+    shape.support(loading, scene.supports.ends, scene.loads)
     matrices = [one.material for one in scene.properties().values()]
     modulus = max(material.lame_lambda + 2 * material.lame_mu for material in matrices)
     shape.hold_faces(loading, scene.supports.faces, modulus, scene.loads)
@@ -293,7 +294,7 @@ def from_natural(
     kinematics: Any, scene: Scene, quadrature: Quadrature, domain: Domain, local_axes: LocalAxes
 ) -> NaturalConfiguration:
     """The kinematics of a body whose tissue is free of stress in another configuration than the mesh's."""
-    from remodel_fenicsx.body.natural import gradient, prestretch
+    from remodel_fenicsx.body.wall import gradient, prestretch
     from remodel_fenicsx.model.residual_stress import closing
 
     natural, shape, found = scene.natural, scene.geometry, None
@@ -301,7 +302,7 @@ def from_natural(
         if layer.region is not None and layer.region not in domain.regions:
             known = ", ".join(map(repr, domain.regions))
             raise SceneError(f"natural.layers[{index}].region = {layer.region!r}: no such region; there are {known}")
-    if shape.closes_from_a_sector:
+    if isinstance(shape, RoundWall):
         tissues = {name: properties.tissue for name, properties in scene.properties().items()}
         try:
             found = closing(shape.layers_of_tissue(natural, scene.regions, tissues), natural.opening_angle)
@@ -421,7 +422,7 @@ def checked_domain(domain: Domain, scene: Scene) -> Domain:
     for name in scene.regions:
         if name not in domain.regions:
             raise SceneError(f"regions.{name}: the mesh has no such region; it has {', '.join(domain.regions)}")
-    if scene.regions and shape.is_filled_by_regions and (others := set(domain.regions) - set(scene.regions)):
+    if isinstance(shape, RoundWall) and scene.regions and (others := set(domain.regions) - set(scene.regions)):
         raise SceneError(f"regions.{min(others)}: missing; it is a region of the mesh")
     needed = () if KINEMATICS[scene.model.kinematics].reduced else shape.face_names
     missing = [face for face in needed if face not in domain.faces]

@@ -104,11 +104,6 @@ class Membrane(Prism):
 
     shape: Literal["membrane"] = Field(default="membrane", description="Which body it is.")
 
-    @property
-    def loaded_area(self) -> float:
-        """Of the right side."""
-        return 16.0
-
     def hold(self, loading: Any) -> None:
         """Clamped on the left, without strain along z."""
         for face, component in (("x0", 0), ("x0", 1), ("z0", 2), ("z1", 2)):

@@ -19,7 +19,7 @@ from mpi4py import MPI
 import remodel_fenicsx
 from remodel_fenicsx import Scene, cli, extend, parts
 from docs.making.pages import markdown
-from remodel_fenicsx.body.shape import COLUMNS_ON_REQUEST, Column, Shape, columns_of
+from remodel_fenicsx.body.shape import COLUMNS_ON_REQUEST, Column, Shape, WithRegions, columns_of
 from remodel_fenicsx.scene.presets import PRESETS, PROFILES
 from remodel_fenicsx.schema.tables import Table, description, sections
 
@@ -180,7 +180,7 @@ def _arguments(parser: argparse.ArgumentParser) -> Iterator[str]:
 # ---------------------------------------------------------------- columns
 def of_shape(kind: type[Shape]) -> tuple[list[Column], list[Column]]:
     """Columns that a shape always has, and those of its own that it has on request."""
-    regions = ["NAME"] if kind.has_regions else []
+    regions = ["NAME"] if issubclass(kind, WithRegions) else []
     always = columns_of(kind, loads=(), regions=regions)
     known = {column.name for column in always}
     of_loads = [column for column in columns_of(kind, regions=regions) if column.name not in known]

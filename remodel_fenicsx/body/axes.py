@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import basix
@@ -21,6 +20,7 @@ import numpy as np
 import ufl
 from mpi4py import MPI
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.fem import jit
@@ -41,36 +41,16 @@ SQUARE_TO_RADIAL = 10.0
 TINY = 1e-12  # of a squared length of about one: no direction is divided by zero
 
 
-@dataclass(frozen=True, eq=False)
-class AxisFields:
-    """Continuous functions on the mesh, of its degree."""
-
-    radial: Any
-    axial: Any
-    from_inner: Any
-    from_outer: Any
-    from_inlet: Any
-    from_outlet: Any
-
-
-def axis_fields(
-    domain: Domain, quadrature: Quadrature, inlets: Sequence[str] = ("inlet",), outlets: Sequence[str] = ("outlet",)
-) -> AxisFields:
-    """Find them. Collective."""
+def _fields(domain: Domain, quadrature: Quadrature, inlets: Sequence[str], outlets: Sequence[str]) -> list[Any]:
+    """Radial and axial direction, lengths from inner and outer face, inlet and outlet: functions. Collective."""
     mesh, degree = domain.mesh, quadrature.element_degree
     inner, outer, starts, ends = (facets_of(domain, names) for names in (["inner"], ["outer"], inlets, outlets))
     thickness = 2 * quadrature.volume / (area(mesh, inner) + area(mesh, outer))
     dx = ufl.Measure("dx", domain=mesh, metadata={"quadrature_degree": 2 * degree})
     radial = _radial(mesh, degree, dx, inner, outer, thickness)
     axial = _axial(radial, dx, starts, ends, thickness)
-    return AxisFields(
-        radial,
-        axial,
-        _length(radial, dx, inner, 1.0),
-        _length(radial, dx, outer, -1.0),
-        _potential(axial, dx, starts, 1.0),
-        _potential(axial, dx, ends, -1.0),
-    )
+    through = [_length(radial, dx, inner, 1.0), _length(radial, dx, outer, -1.0)]
+    return [radial, axial, *through, _potential(axial, dx, starts, 1.0), _potential(axial, dx, ends, -1.0)]
 
 
 def _radial(mesh: Any, degree: int, dx: Any, inner: Facets, outer: Facets, thickness: float) -> Any:
@@ -201,7 +181,7 @@ def area(mesh: Any, facets: Facets) -> float:
 
 
 # ---------------------------------------------------------------- local axes, depth and station at the points of any
-# Local axes, depth and station at the points of any body, from the fields of `axis_fields`.
+# Local axes, depth and station at the points of any body, from the fields of `_fields`.
 
 log = logging.getLogger(__name__)
 
@@ -210,7 +190,6 @@ LEAST_TANGENT = 0.1  # share of the axial field that lies in the wall: below, it
 # of the volume: 13 forks, coarse and fine, with one element through the wall or two, had 0.03 % at most, in the crotch;
 # with half of the outer face named inner it was 0.7 % (a thick wall, fine) to 43 % (one element)
 MOST_UNDEFINED = 0.01
-AT_ONCE = 1_000_000  # distances that are compared at a time
 
 
 class UndefinedAxes(SceneError):
@@ -225,11 +204,10 @@ def found_axes(
     if missing:
         raise UndefinedAxes(f"geometry.faces: the local axes of a wall need a face {', '.join(map(repr, missing))}")
     try:
-        fields = axis_fields(domain, quadrature, inlets, outlets)
+        radial, axial, *lengths = _fields(domain, quadrature, inlets, outlets)
     except SolveStopped as stopped:
         raise UndefinedAxes(f"geometry.faces: the local axes were not found: {stopped}") from stopped
-    lengths = (fields.from_inner, fields.from_outer, fields.from_inlet, fields.from_outlet)
-    values = _at_points([*fields.radial, *fields.axial, *lengths], quadrature)
+    values = _at_points([*radial, *axial, *lengths], quadrature)
     axes, known = _axes(values[..., :3], values[..., 3:6])
     share = quadrature.mean((~known).astype(np.float64))
     if share > 0:
@@ -244,7 +222,7 @@ def found_axes(
             log.info("the local axes are %s; those of the nearest point are used there", words)
         _fill(axes, known, quadrature)
     depth, station = (_share(values[..., k], values[..., k + 1]) for k in (6, 8))
-    nodal = _share(*(_at_nodes(length) for length in (fields.from_inner, fields.from_outer)))
+    nodal = _share(*(_at_nodes(length) for length in lengths[:2]))
     makers = (lambda: axes), (lambda: depth), (lambda: station), (lambda: nodal)
     return LocalAxes(quadrature.coordinates, *makers, values[..., 6] + values[..., 7], ~known)
 
@@ -297,19 +275,12 @@ def _fill(axes: Array, known: NDArray[np.bool_], quadrature: Quadrature) -> None
     places, candidates = quadrature.owned(quadrature.coordinates)[good], quadrature.owned(axes)[good]
     answers = []
     for part in asked:
-        index, distance = _nearest(part, places)
-        answers.append((distance, candidates[index] if len(candidates) else np.zeros((len(part), 3, 3))))
+        if len(candidates):
+            distance, index = cKDTree(places).query(part)
+            answers.append((distance, candidates[index]))
+        else:
+            answers.append((np.full(len(part), np.inf), np.zeros((len(part), 3, 3))))
     mine = [answers] if comm.size == 1 else comm.alltoall([[answer] for answer in answers])
     distances = np.stack([answer[0][0] for answer in mine])
     choices = np.stack([answer[0][1] for answer in mine])
     axes[~known] = choices[distances.argmin(axis=0), np.arange(len(wanted))]
-
-
-def _nearest(places: Array, candidates: Array) -> tuple[NDArray[np.int64], Array]:
-    """Number of the candidate (m, 3) nearest to each place (n, 3), and its distance; infinite where there is none."""
-    index, least = np.zeros(len(places), dtype=np.int64), np.full(len(places), np.inf)
-    rows = max(1, AT_ONCE // max(1, len(candidates)))
-    for start in range(0, len(places) if len(candidates) else 0, rows):
-        distances = np.linalg.norm(places[start : start + rows, None] - candidates, axis=-1)
-        index[start : start + rows], least[start : start + rows] = distances.argmin(axis=1), distances.min(axis=1)
-    return index, least

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import numpy as np
@@ -47,6 +48,7 @@ class Cube(Shape):
             "total force along z on the top; its direction stays (a dead load)",
             FORCE,
             reductions=("point",),
+            area=lambda shape: shape.section_area,
         )
     }
     columns: ClassVar[tuple[Column, ...]] = uniaxial_columns("z1", "side")
@@ -78,12 +80,7 @@ class Cube(Shape):
 
     def build(self, mesh: Mesh, comm: MPI.Intracomm | None = None) -> Domain:
         """The cube [0, side]^3; with refinement 1 the paper's single element."""
-        from remodel_fenicsx.body.domain import build_domain
-
-        def draw() -> None:
-            draw_cube(self.side, mesh.refinement, mesh.element, mesh.degree)
-
-        return build_domain(draw, self.name, {"side": self.side}, comm)
+        return box_domain(self.name, {"side": self.side}, 3 * (self.side,), (1, 1, 1), mesh, comm)
 
     def hold(self, loading: Loading) -> None:
         """Symmetry planes x = y = z = 0."""
@@ -91,12 +88,54 @@ class Cube(Shape):
             loading.hold_face(face, component)
 
 
-def draw_cube(side: float, refinement: int = 1, element: str = "hexahedron", degree: int = 1) -> None:
-    """Draw and mesh the cube in the current Gmsh model."""
-    n = refinement
-    corners = model.points(side * np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]))
-    y0, x1, y1, x0 = (model.line(corners[i], corners[(i + 1) % 4], n) for i in range(4))
-    section = model.block([y0, x1, y1, x0], corners, element)
-    sides = {"x0": x0, "x1": x1, "y0": y0, "y1": y1}
-    model.extrude([section], side, n, element, sides, ends=("z0", "z1"))
-    model.raise_degree(degree, np.zeros_like)
+def box_domain(
+    shape: str,
+    dimensions: dict[str, float],
+    lengths: Sequence[float],
+    counts: Sequence[int],
+    mesh: Mesh,
+    comm: MPI.Intracomm | None = None,
+) -> Domain:
+    """A block from the origin along x, y and z, with the faces x0, x1, y0, y1, z0 and z1, meshed by Gmsh. Collective.
+
+    Parameters
+    ----------
+    shape
+        Name of the shape that it is a mesh of.
+    dimensions
+        The shape's dimensions by name, for `Domain`.
+    lengths
+        Along x, y and z, (3,), in the unit of length.
+    counts
+        Elements along x, y and z with refinement 1.
+    mesh
+        Settings of the elements.
+    comm
+        MPI communicator; default: all ranks.
+
+    Returns
+    -------
+    Domain
+        The mesh with its faces.
+
+    Examples
+    --------
+    >>> from remodel_fenicsx import parts
+    >>> from remodel_fenicsx.extend import box_domain
+    >>> sheet = box_domain("sheet", {"width": 2.0}, (2.0, 2.0, 0.5), (4, 4, 1), parts.Mesh(refinement=2))
+    >>> sheet.number_of_elements, sheet.dimensions
+    (128, {'width': 2.0})
+    """
+    from remodel_fenicsx.body.domain import build_domain
+
+    x, y, z = (mesh.refinement * count for count in counts)
+
+    def draw() -> None:
+        corners = model.points(np.array(lengths[:2]) * np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]))
+        y0, x1, y1, x0 = (model.line(corners[i], corners[(i + 1) % 4], n) for i, n in enumerate((x, y, x, y)))
+        section = model.block([y0, x1, y1, x0], corners, mesh.element)
+        sides = {"x0": x0, "x1": x1, "y0": y0, "y1": y1}
+        model.extrude([section], lengths[2], z, mesh.element, sides, ends=("z0", "z1"))
+        model.raise_degree(mesh.degree, np.zeros_like)
+
+    return build_domain(draw, shape, dimensions, comm)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import dolfinx.fem
 import numpy as np
 import ufl
 from mpi4py import MPI
+from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from remodel_fenicsx.body.domain import Domain
@@ -16,6 +17,7 @@ from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.kinematics import FullKinematics, Kinematics, field_degree
 from remodel_fenicsx.schema.tables import SceneError
 
+Array = NDArray[np.float64]
 LoadValues = dict[str, float]
 
 
@@ -64,6 +66,7 @@ class Loading:
         self.boundary_conditions: list[Any] = []
         self.values: LoadValues = {}
         self._magnitudes: dict[str, list[tuple[Any, Any]]] = {}  # constant, and its value at magnitude 1
+        self._setters: dict[str, list[Callable[[float], None]]] = {}
         self._terms: list[Callable[[Any, Any], Any]] = []
         self._potentials: list[Callable[[Any], Any]] = []
         self._begins: dict[int, str] = {}  # where the strain is one number: the face from which it is counted
@@ -141,8 +144,7 @@ class Loading:
         SceneError
             Of kinematics that are not those of a mesh in three dimensions.
         """
-        if not self.kinematics.three_dimensional:
-            raise SceneError(f"model.kinematics = {self.kinematics.name!r}: allowed for facets that are held is 'full'")
+        self._check_three_dimensional("facets that are held")
         value = dolfinx.fem.Constant(self.domain.mesh, np.zeros(3, dtype=PETSc.ScalarType))
         dofs = dolfinx.fem.locate_dofs_topological(self.space, self.domain.mesh.topology.dim - 1, facets)
         self.boundary_conditions.append(dolfinx.fem.dirichletbc(value, dofs, self.space))
@@ -162,10 +164,8 @@ class Loading:
         component
             0, 1 or 2: x, y or z.
         """
-        traction = self.magnitude(name, 1.0 / self.area(face))
-        direction = ufl.as_vector([1.0 if i == component else 0.0 for i in range(3)])
-        measure = self.surface_measure(face)
-        self.add_term(lambda u, v: -traction * ufl.inner(direction, v) * self.weight * measure)
+        traction, measure = self.magnitude(name, 1.0 / self.area(face)), self.surface_measure(face)
+        self.add_term(lambda u, v: -traction * v[component] * self.weight * measure)
 
     def add_follower_pressure(self, name: str, face: str) -> None:
         """A pressure on the deformed face, against its outward normal: p cof(F) N . v, with the exact linearisation.
@@ -240,6 +240,55 @@ class Loading:
         else:
             self._prescribe_face(face, component, self.magnitude(name, length))
 
+    def add_prescribed_displacement(
+        self,
+        name: str,
+        face: str,
+        displacement: Callable[[float, Array], Array],
+        components: Sequence[int] = (0, 1, 2),
+    ) -> None:
+        """u = displacement(magnitude, places) on a face: any function of the magnitude, a rotation say.
+
+        Parameters
+        ----------
+        name
+            Of the load; `set` gives it a magnitude by this name.
+        face
+            Its name, of `Domain.faces`.
+        displacement
+            Function of the magnitude and of reference places (n, 3) that returns displacements (n, 3).
+        components
+            Those that are prescribed, of 0, 1 and 2: x, y and z; the others are free.
+
+        Raises
+        ------
+        SceneError
+            Of kinematics that are not those of a mesh in three dimensions.
+        """
+        self._check_three_dimensional("displacements that are prescribed")
+        facets = self.domain.facet_tags.find(self.domain.faces[face])
+        for component in components:
+            subspace = self.kinematics.subspace(self.space, component)
+            collapsed, _ = subspace.collapse()
+            dofs = dolfinx.fem.locate_dofs_topological((subspace, collapsed), 2, facets)
+            value: Any = dolfinx.fem.Function(collapsed)
+            self.boundary_conditions.append(dolfinx.fem.dirichletbc(value, dofs, subspace))
+            self.follow(name, _setter(value, dofs[1], component, displacement))
+
+    def follow(self, name: str, setter: Callable[[float], None]) -> None:
+        """From now on call a function with each new magnitude of a load: what follows it in a way of its own.
+
+        Parameters
+        ----------
+        name
+            Of the load.
+        setter
+            Called with its magnitude, now with zero.
+        """
+        self._setters.setdefault(name, []).append(setter)
+        self.values[name] = 0.0
+        setter(0.0)
+
     def add_term(self, term: Callable[[Any, Any], Any]) -> None:
         """Any other load, as a term of the residual: minus its virtual work.
 
@@ -264,12 +313,7 @@ class Loading:
 
     def constants(self, name: str) -> list[tuple[Any, Any]]:
         """The Constants of a load, each with its value at magnitude 1."""
-        return list(self._magnitudes[name])
-
-    def leave_out(self, name: str) -> None:
-        """A load that these kinematics lack and no scene asks for: it has a magnitude, zero, and does nothing."""
-        self._magnitudes.setdefault(name, [])
-        self.values[name] = 0.0
+        return list(self._magnitudes.get(name, ()))
 
     def surface_measure(self, face: str) -> Any:
         """Measure over a named face of the mesh; times `weight` it is one over the body's face."""
@@ -312,8 +356,12 @@ class Loading:
             If a name is not a load of this body.
         """
         for name, value in values.items():
-            for constant, scale in self._magnitudes[name]:
+            if name not in self.values:
+                raise KeyError(name)
+            for constant, scale in self._magnitudes.get(name, ()):
                 constant.value = value * scale
+            for setter in self._setters.get(name, ()):
+                setter(float(value))
             self.values[name] = float(value)
 
     def area(self, face: str) -> float:
@@ -332,6 +380,10 @@ class Loading:
         self._magnitudes.setdefault(name, []).append((constant, scale))
         self.values[name] = 0.0
 
+    def _check_three_dimensional(self, what: str) -> None:
+        if not self.kinematics.three_dimensional:
+            raise SceneError(f"model.kinematics = {self.kinematics.name!r}: allowed for {what} is 'full'")
+
     def _prescribe_strain(self, component: int, value: Any) -> None:
         number, _ = self.kinematics.uniform_unknown(self.space, component)
         self.boundary_conditions.append(dolfinx.fem.dirichletbc(value, number.dofmap.list.flatten(), number))
@@ -343,3 +395,13 @@ class Loading:
         facets = self.domain.facet_tags.find(self.domain.faces[face])
         dofs = dolfinx.fem.locate_dofs_topological(subspace, self.domain.mesh.topology.dim - 1, facets)
         self.boundary_conditions.append(dolfinx.fem.dirichletbc(value, dofs, subspace))
+
+
+def _setter(value: Any, dofs: Any, component: int, displacement: Callable[[float, Array], Array]) -> Any:
+    """Gives one component of the values on a face to a function of its own space."""
+    places = value.function_space.tabulate_dof_coordinates()[dofs]
+
+    def set_values(magnitude: float) -> None:
+        value.x.array[dofs] = displacement(magnitude, places)[:, component]
+
+    return set_values

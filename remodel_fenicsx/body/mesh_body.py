@@ -13,10 +13,9 @@ import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 from pydantic.config import JsonDict
 
-from remodel_fenicsx.body import mesh_file
-from remodel_fenicsx.body.shape import Column, LoadKind
+from remodel_fenicsx.body.shape import Column, FromFile, LoadKind, Unloads, WithRegions
 from remodel_fenicsx.body.gmsh_model import LARGEST_LENGTH, SMALLEST_LENGTH
-from remodel_fenicsx.body.mesh_file import ENDINGS, MeshFile, MeshFileError, TAGS, read_mesh
+from remodel_fenicsx.body.mesh_file import ENDINGS, MeshFile, MeshFileError, TAGS, distinct, read_mesh
 from remodel_fenicsx.body.wall import WalledMesh
 from remodel_fenicsx.schema.settings import LARGEST_MESH, Load, Mesh, Support, faces_of
 from remodel_fenicsx.schema.tables import SceneError, fault, shown
@@ -66,11 +65,26 @@ def _text(value: Any) -> str | None:
     return value if isinstance(value, str) else None
 
 
+def _numbers(kind: str, name: str, entries: Names, names: Mapping[str, int], there: set[int]) -> list[int]:
+    """Numbers in the file of what a scene gives as a face or a region, by name or number."""
+    found, word = [], {"face": "face", "region": "volume"}[kind]
+    for entry in entries:
+        number = names.get(entry, 0) if isinstance(entry, str) else entry
+        if number not in there:
+            listed = [*map(repr, names), *(str(other) for other in sorted(there - set(names.values())))]
+            rule = f"the file has no such {word}; it has {', '.join(listed) or 'none'}"
+            if number in names.values():
+                rule = f"this {word} of the file has no elements"
+            raise SceneError(f"geometry.{kind}s.{name} = {shown(entry)}: {rule}")
+        found.append(int(number))
+    return found
+
+
 def _with_ends(supports: Mapping[str, Support]) -> dict[str, Support]:
     return {"inlet": Support(), "outlet": Support()} | dict(supports)
 
 
-class MeshBody(WalledMesh):
+class MeshBody(WalledMesh, WithRegions, Unloads, FromFile):
     """A body of your own from a mesh file: a vessel with an inner and an outer face and ends.
 
     The file is data: it is read, and never run. Its elements are tetrahedra or hexahedra,
@@ -111,10 +125,7 @@ class MeshBody(WalledMesh):
         *WalledMesh.columns_on_request,
     )
     face_names: ClassVar[tuple[str, ...]] = ROLES
-    has_regions: ClassVar[bool] = True
-    holds_faces: ClassVar[bool] = True
-    refines: ClassVar[bool] = False
-    unloads: ClassVar[bool] = True
+    supported_faces: ClassVar[tuple[str, ...] | None] = None
 
     shape: Literal["mesh"] = Field(default="mesh", description="Which body it is.")
     file: Annotated[str, BeforeValidator(_file)] = Field(
@@ -289,21 +300,9 @@ class MeshBody(WalledMesh):
         """Numbers of the file's groups by name of the face, further named faces of the file under their own."""
         from remodel_fenicsx.body.mesh_faces import again, groups_inside
 
-        names, there = file.names[2], sorted(set(mesh_file.distinct(file.facet_groups)) - {0})
-        listed = ", ".join([*map(repr, names), *(str(number) for number in there if number not in names.values())])
-        groups: dict[str, tuple[int, ...]] = {}
-        for face in dict.fromkeys([*ROLES, *self.faces]):
-            numbers = []
-            for entry in self.faces.get(face, (face,)):
-                number = names.get(entry) if isinstance(entry, str) else entry
-                if isinstance(entry, str) and number is not None and number not in there:
-                    raise SceneError(f"geometry.faces.{face} = {shown(entry)}: this face of the file has no elements")
-                if number is None or number not in there:
-                    rule = f"the file has no such face; it has {listed or 'none'}"
-                    raise SceneError(f"geometry.faces.{face} = {shown(entry)}: {rule}")
-                numbers.append(int(number))
-            if numbers:
-                groups[face] = tuple(numbers)
+        names, there = file.names[2], set(distinct(file.facet_groups)) - {0}
+        asked = {face: self.faces.get(face, (face,)) for face in dict.fromkeys([*ROLES, *self.faces])}
+        groups = {face: tuple(_numbers("face", face, entries, names, there)) for face, entries in asked.items()}
         taken = {number for numbers in groups.values() for number in numbers}
         others = {name: number for name, number in names.items() if number in there and number not in taken}
         left = groups_inside(file) if others else set()
@@ -320,7 +319,7 @@ class MeshBody(WalledMesh):
         return groups
 
     def _regions(self, file: MeshFile) -> dict[str, int]:
-        numbers = mesh_file.distinct(file.cell_groups)
+        numbers = distinct(file.cell_groups)
         if 0 in numbers and len(numbers) > 1:
             lost = file.cell_numbers[file.cell_groups == 0]
             raise self._fault(
@@ -346,14 +345,7 @@ class MeshBody(WalledMesh):
 
     def _volumes(self, file: MeshFile, region: str, entries: Names) -> list[int]:
         """Numbers of the volumes that a region has in the file."""
-        there, names = set(mesh_file.distinct(file.cell_groups)) - {0}, file.names[3]
-        numbers = [names.get(entry, 0) if isinstance(entry, str) else entry for entry in entries]
-        for entry, number in zip(entries, numbers, strict=True):
-            if number not in there:
-                listed = [*map(repr, names), *(str(other) for other in sorted(there - set(names.values())))]
-                rule = f"the file has no such volume; it has {', '.join(listed) or 'none'}"
-                raise SceneError(f"geometry.regions.{region} = {shown(entry)}: {rule}")
-        return [int(number) for number in numbers]
+        return _numbers("region", region, entries, file.names[3], set(distinct(file.cell_groups)) - {0})
 
     def _say(self, file: MeshFile, boundary: Boundary) -> None:
         from remodel_fenicsx.body.mesh_faces import through_the_wall
@@ -414,9 +406,7 @@ class MeshBody(WalledMesh):
             words = f"mean thickness of the wall {domain.thickness:.6g}{unit}, with plane faces"
             log.info("%s%s", words, f"; length from inlet to outlet {length:.6g}{unit}" if length else "")
         for name, support in _with_ends(supports).items():
-            moves = ("elongation", length) if name == "outlet" else None
+            moves = ("elongation", length) if name == "outlet" and "elongation" in loads else None
             add_support(loading, name, support, GUIDE * modulus / domain.thickness, moves)
-        if "elongation" not in loading.values:
-            loading.leave_out("elongation")
         for name, face in faces_of(loads).items():
             loading.add_follower_pressure(name, face)

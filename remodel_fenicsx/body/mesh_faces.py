@@ -189,15 +189,12 @@ def cap_volume(points: Array, rim: Integers) -> float:
 
 def components(rows: Integers, nodes: int) -> Integers:
     """Number of the connected part of each row, which share nodes; (rows,)."""
-    label = np.arange(nodes)
-    while True:
-        least = label[rows].min(axis=1)
-        new = label.copy()
-        np.minimum.at(new, rows, least[:, None])
-        new = new[new]  # what a label has been joined to: so many rounds as the logarithm of the way
-        if np.array_equal(new, label):
-            return np.asarray(label[rows[:, 0]])
-        label = new
+    from scipy.sparse import coo_array, csgraph
+
+    first = np.repeat(rows[:, :1], rows.shape[1], axis=1)
+    shared = coo_array((np.ones(rows.size), (first.ravel(), rows.ravel())), shape=(nodes, nodes))
+    _, label = csgraph.connected_components(shared, directed=False)
+    return np.asarray(label[rows[:, 0]], dtype=np.int64)
 
 
 # ---------------------------------------------------------------- inside

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from remodel_fenicsx.body.mesh_domain import MeshDomain
 
 log = logging.getLogger(__name__)
+Density = Callable[[Any], Any]
 
 GUIDE = (
     1000.0  # default stiffness over (lambda + 2 mu) / thickness: radii of the paper's tube within 2e-5 of exact ones
@@ -30,68 +31,52 @@ STILL = 1e-8  # smallest eigenvalue over the largest below which nothing holds a
 def add_support(
     loading: Loading, face: str, support: Support, stiffness: float, moves: tuple[str, float] | None
 ) -> None:
-    """Hold a face."""
-    _HOLD[support.kind](loading, face, support, support.stiffness or stiffness, moves)
+    """Hold a face, which a load may move along its normal: its name, and how far at magnitude 1."""
+    if support.kind == "held":  # u = d N
+        domain: MeshDomain = loading.domain  # type: ignore[assignment]
+        for part, facets in domain.facets_of_parts(face):
+            loading.hold_facets(facets, *((moves[0], moves[1] * part.normal) if moves else ()))
+    elif support.kind in _DENSITIES:
+        density = _DENSITIES[support.kind](loading, face, support, moves)
+        half, measure = loading.constant((support.stiffness or stiffness) / 2), loading.surface_measure(face)
+        loading.add_potential(lambda u: half * density(loading.kinematics.displacement(u)) * loading.weight * measure)
 
 
-def _guided(loading: Loading, face: str, support: Support, stiffness: float, moves: tuple[str, float] | None) -> None:
-    """k/2 ((u . N - d)^2 + (u . c)^2)."""
+def _guided(loading: Loading, face: str, support: Support, moves: tuple[str, float] | None) -> Density:
+    """(u . N - d)^2 + (u . c)^2."""
     import ufl
 
+    sliding = _sliding(loading, face, support, moves)
     normal, centre = _of_parts(loading, face, "normal"), _of_parts(loading, face, "centre")
     around = ufl.cross(normal, ufl.SpatialCoordinate(loading.domain.mesh) - centre)
     # a Constant: a number in the kernel would be another kernel for each mesh
     squared = ufl.inner(around, around) + loading.constant(1e-24 * loading.domain.size**2)
-    way = loading.magnitude(*moves) if moves else 0.0
-    _add(loading, face, stiffness, lambda u: (ufl.inner(u, normal) - way) ** 2 + ufl.inner(u, around) ** 2 / squared)
+    return lambda u: sliding(u) + ufl.inner(u, around) ** 2 / squared
 
 
-def _sliding(loading: Loading, face: str, support: Support, stiffness: float, moves: tuple[str, float] | None) -> None:
-    """k/2 (u . N - d)^2."""
+def _sliding(loading: Loading, face: str, support: Support, moves: tuple[str, float] | None) -> Density:
+    """(u . N - d)^2."""
     import ufl
 
     normal = _of_parts(loading, face, "normal")
     way = loading.magnitude(*moves) if moves else 0.0
-    _add(loading, face, stiffness, lambda u: (ufl.inner(u, normal) - way) ** 2)
+    return lambda u: (ufl.inner(u, normal) - way) ** 2
 
 
-def _elastic(loading: Loading, face: str, support: Support, stiffness: float, moves: tuple[str, float] | None) -> None:
-    """k/2 ((u . N)^2 + s |u - (u . N) N|^2), N of the place."""
+def _elastic(loading: Loading, face: str, support: Support, moves: tuple[str, float] | None) -> Density:
+    """(u . N)^2 + s |u - (u . N) N|^2, N of the place."""
     import ufl
 
-    share = loading.constant(support.tangential)
-    normal = ufl.FacetNormal(loading.domain.mesh)
-
-    def density(u: Any) -> Any:
-        along = ufl.inner(u, normal)
-        return share * ufl.inner(u, u) + (1 - share) * along**2
-
-    _add(loading, face, stiffness, density)
+    share, normal = loading.constant(support.tangential), ufl.FacetNormal(loading.domain.mesh)
+    return lambda u: share * ufl.inner(u, u) + (1 - share) * ufl.inner(u, normal) ** 2
 
 
-def _held(loading: Loading, face: str, support: Support, stiffness: float, moves: tuple[str, float] | None) -> None:
-    """u = d N."""
-    domain: MeshDomain = loading.domain  # type: ignore[assignment]
-    for part, facets in domain.facets_of_parts(face):
-        loading.hold_facets(facets, *((moves[0], moves[1] * part.normal) if moves else ()))
-
-
-def _free(loading: Loading, face: str, support: Support, stiffness: float, moves: tuple[str, float] | None) -> None:
-    """Nothing."""
-
-
-_HOLD: dict[str, Callable[[Loading, str, Support, float, tuple[str, float] | None], None]] = {
+# what a face's springs store over half of their stiffness, by the kind of support
+_DENSITIES: dict[str, Callable[[Loading, str, Support, tuple[str, float] | None], Density]] = {
     "guided": _guided,
     "sliding": _sliding,
-    "held": _held,
     "elastic": _elastic,
-    "free": _free,
 }
-
-
-def _add(loading: Loading, face: str, stiffness: float, density: Callable[[Any], Any]) -> None:
-    half, measure = loading.constant(stiffness / 2), loading.surface_measure(face)
-    loading.add_potential(lambda u: half * density(loading.kinematics.displacement(u)) * loading.weight * measure)
 
 
 def _of_parts(loading: Loading, face: str, name: str) -> Any:

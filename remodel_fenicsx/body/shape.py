@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Container, Iterable, Mapping, 
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar, Literal, TYPE_CHECKING
+from typing import Any, ClassVar, Literal, NamedTuple, TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,8 +26,7 @@ from remodel_fenicsx.body.reductions import (
 )
 from remodel_fenicsx.model.axes import LocalAxes
 from remodel_fenicsx.model.cells import angle_to_axis
-from remodel_fenicsx.model.energy import Tissue
-from remodel_fenicsx.schema.settings import TURNOVER_POWER, Load, Mesh, Natural, Region, Support, faces_of, in_region
+from remodel_fenicsx.schema.settings import TURNOVER_POWER, Load, Mesh, Region, Support, faces_of, in_region
 from remodel_fenicsx.schema.tables import Table, fault, refuse
 from remodel_fenicsx.schema.units import Dimension, LengthUnit
 
@@ -65,6 +64,8 @@ class Column:
         Whether it is the largest or smallest value of the body: of random cells it goes with their number.
     by_case
         Whether it has another value in each load case: what belongs to the cells or to the step as a whole has not.
+    of_one_tissue
+        Whether a body with regions has it not.
 
     Examples
     --------
@@ -87,6 +88,7 @@ class Column:
     after_pass: bool = False
     extreme: bool = False
     by_case: bool = True
+    of_one_tissue: bool = False
 
     def of_case(self, number: int) -> Column:
         """The same of another load case; the first one is 1.
@@ -159,6 +161,11 @@ def columns_of_region(name: str) -> tuple[Column, Column]:
 
 
 # ---------------------------------------------------------------- which a history has
+def _of_work(name: str, meaning: str) -> Column:
+    """What the solver did in the step."""
+    return Column(name, "", meaning, lambda m: getattr(m.step.work, name), by_case=False)
+
+
 FIRST_COLUMN = Column("time", "time", "time of the scene", lambda m: m.step.time, by_case=False)
 COLUMNS: dict[str, Column] = {
     column.name: column
@@ -190,26 +197,10 @@ COLUMNS: dict[str, Column] = {
             lambda m: m.step.remodeling_power,
             after_pass=True,
         ),
-        Column(
-            "newton_iterations",
-            "",
-            "Newton iterations of the step, with those of failed attempts",
-            lambda m: m.step.work.newton_iterations,
-            by_case=False,
-        ),
-        Column(
-            "linear_iterations",
-            "",
-            "iterations of the linear solver in the step, with those of failed attempts",
-            lambda m: m.step.work.linear_iterations,
-            by_case=False,
-        ),
-        Column(
-            "substeps",
-            "",
-            "number of solves that made up the step; 1 where it was solved in one piece, as in the paper",
-            lambda m: m.step.work.substeps,
-            by_case=False,
+        _of_work("newton_iterations", "Newton iterations of the step, with those of failed attempts"),
+        _of_work("linear_iterations", "iterations of the linear solver in the step, with those of failed attempts"),
+        _of_work(
+            "substeps", "number of solves that made up the step; 1 where it was solved in one piece, as in the paper"
         ),
         Column("seconds", "s", "wall time of the step", lambda m: m.step.seconds, after_pass=True),
     )
@@ -246,12 +237,8 @@ COLUMNS_ON_REQUEST: dict[str, Column] = {
             lambda m: m.step.negative_eigenvalues,
             by_case=False,
         ),
-        Column(
-            "held_points",
-            "",
-            "number of points at which the coupling 'implicit' found no cells that fit their own stress",
-            lambda m: m.step.work.held_points,
-            by_case=False,
+        _of_work(
+            "held_points", "number of points at which the coupling 'implicit' found no cells that fit their own stress"
         ),
         Column(
             "asleep_share",
@@ -378,6 +365,8 @@ class LoadKind:
         What its column shows; default: the load's magnitude.
     frees_length
         Whether the body's length is an unknown where a scene has it. Elsewhere its column is there on request.
+    area
+        Of a force: the reference area that carries it, from the shape.
     doubtful
         Magnitude from which on a value is hardly meant, and what may have been.
 
@@ -408,6 +397,7 @@ class LoadKind:
     reductions: tuple[str, ...] = ()
     value: Callable[[Any], float] | None = None
     frees_length: bool = False
+    area: Callable[[Any], float] | None = None
     doubtful: tuple[float, str] | None = None
 
     def column_name(self, name: str) -> str:
@@ -417,7 +407,29 @@ class LoadKind:
     def make_column(self, name: str) -> Column:
         """Its column, for the load of this name."""
         unit = self.dimension.name if self.dimension else ""
-        return Column(self.column_name(name), unit, self.meaning, self.value or (lambda m: float(m.step.loads[name])))
+        value = self.value or (lambda m: float(m.step.loads.get(name, 0.0)))
+        return Column(self.column_name(name), unit, self.meaning, value)
+
+
+class End(NamedTuple):
+    """A way to hold a body.
+
+    Attributes
+    ----------
+    hold
+        Function of shape and loading.
+    frees_length
+        Whether the body's length is an unknown then.
+
+    Examples
+    --------
+    >>> from remodel_fenicsx.parts import Tube
+    >>> {name: end.frees_length for name, end in Tube.ends.items()}
+    {'free': False, 'clamped': False, 'closed': True}
+    """
+
+    hold: Callable[[Any, Loading], None]
+    frees_length: bool = False
 
 
 _is: Any = {  # a word of Python
@@ -457,9 +469,7 @@ class Shape(_Is):  # type: ignore[misc]
         What is cheaper than the displacement in three dimensions and exact for some scenes, by name of the kinematics,
         the cheapest first.
     ends
-        How the body may be held, by what `supports.ends` says: functions of shape and loading.
-    ends_that_free_length
-        Those of `ends` with which the body's length is an unknown.
+        How the body may be held, by what `supports.ends` says: an `End` each.
     depth_in_words
         What `depth` goes through, where it is 0 and where it is 1.
     angle_in_words
@@ -468,26 +478,8 @@ class Shape(_Is):  # type: ignore[misc]
         Of `settings.CONSTANT_FIELDS`, those that `output.fields = true` stands for too.
     defaults
         Defaults of other tables that this shape changes, under the keys of preset and scene.
-    holds_faces
-        Whether `[supports.NAME]` says how each face is held (`hold_faces`).
-    surrounded_faces
-        Faces of other bodies that `[supports.NAME]` may put on springs, as in what surrounds the body.
-    columns_of_one_tissue
-        Names of columns that a body with regions has not.
-    refines
-        Whether `[mesh]` decides on its elements.
-    has_regions
-        Whether a scene may give the body `[regions.NAME]`, named parts with tissue of their own.
-    is_filled_by_regions
-        Whether the regions of a scene, where it has some, are all of the body.
-    closes_from_a_sector
-        Whether a scene may give the body `natural.opening_angle`; `layers_of_tissue` says of which layers it closes.
-    has_a_wall
-        Whether a scene may give it `natural.layers`.
-    unloads
-        Whether a scene may give its loaded shape, `geometry.is = "loaded"`.
-    unloads_by_numbers
-        Whether a few numbers are all of the unloaded shape.
+    supported_faces
+        Faces that `[supports.NAME]` may put on springs, as in what surrounds the body; None: any face, held in any way.
 
     Raises
     ------
@@ -526,35 +518,31 @@ class Shape(_Is):  # type: ignore[misc]
     number_of_elements: ClassVar[int]
     face_names: ClassVar[tuple[str, ...]] = ()
     reductions: ClassVar[dict[str, Reduction]] = {}
-    ends: ClassVar[dict[str, Callable[[Any, Loading], None]]] = {"free": lambda shape, loading: shape.hold(loading)}
-    ends_that_free_length: ClassVar[tuple[str, ...]] = ()
+    ends: ClassVar[dict[str, End]] = {"free": End(lambda shape, loading: shape.hold(loading))}
     depth_in_words: ClassVar[tuple[str, str, str]] = ("along the body", "bottom", "top")
     angle_in_words: ClassVar[tuple[str, str]] = ("along the load", "across")
     constant_fields: ClassVar[tuple[str, ...]] = ()
     defaults: ClassVar[dict[str, Any]] = {}
-    holds_faces: ClassVar[bool] = False
-    surrounded_faces: ClassVar[tuple[str, ...]] = ()
-    columns_of_one_tissue: ClassVar[tuple[str, ...]] = ()
-    refines: ClassVar[bool] = True
-    has_regions: ClassVar[bool] = False
-    closes_from_a_sector: ClassVar[bool] = False
-    has_a_wall: ClassVar[bool] = False
-    unloads: ClassVar[bool] = False
-    unloads_by_numbers: ClassVar[bool] = False
-    is_filled_by_regions: ClassVar[bool] = False
+    supported_faces: ClassVar[tuple[str, ...] | None] = ()
 
     shape: str = Field(description="Which body it is.")
     length_unit: LengthUnit = None
+
+    @classmethod
+    def is_a(cls, kind: str) -> bool:
+        """Whether a class of this name, `WithRegions` say, is among its own: tables of settings cannot import them.
+
+        Parameters
+        ----------
+        kind
+            Its name.
+        """
+        return any(base.__name__ == kind for base in cls.__mro__)
 
     @property
     def is_loaded(self) -> bool:
         """Whether the geometry is that under the loads."""
         return bool(getattr(self, "is") == "loaded")
-
-    @property
-    def loaded_area(self) -> float:
-        """Reference area that carries a force, in the scene's unit of length squared; here the section's."""
-        return self.section_area
 
     @property
     def axial_length(self) -> float:
@@ -624,10 +612,6 @@ class Shape(_Is):  # type: ignore[misc]
             lambda: self.depth(domain.mesh.geometry.x),
         )
 
-    def layers_of_tissue(self, natural: Natural, regions: Mapping[str, Region], tissues: Mapping[str, Tissue]) -> Any:
-        """Of a body that closes from a sector: its layers (`model.closing.Layer`), from the lumen outwards."""
-        raise NotImplementedError(f"a {self.name} does not close")
-
     @property
     def name(self) -> str:
         """The shape's name."""
@@ -653,25 +637,8 @@ class Shape(_Is):  # type: ignore[misc]
         """
 
     def build_with(self, regions: Mapping[str, Region], mesh: Mesh, comm: MPI.Intracomm | None = None) -> Domain:
-        """Mesh the body with the regions of a scene, the names of `Domain.regions` among them. Collective.
-
-        Here they come with the mesh (`build`), or there are none; a shape whose regions the scene draws overrides it.
-        """
+        """Mesh the body with the regions of a scene, where the scene draws them. Collective."""
         return self.build(mesh, comm)
-
-    def check_regions(self, regions: Mapping[str, Region], mesh: Mesh) -> None:
-        """Refuse what the regions of a scene ask of the body and it cannot have: raise a `fault` that names the key.
-
-        Here they come with the mesh: no radius says where they end.
-        """
-        for name, region in regions.items():
-            if region.outer_radius is not None:
-                rule = f"the regions of a {self.name} come with its mesh; only layers of a tube have an outer radius"
-                raise fault(rule, f"regions.{name}.outer_radius", region.outer_radius)
-
-    def section_shares(self, regions: Mapping[str, Region]) -> dict[str, float]:
-        """Share of every section across z that is in a region, by its name; "" is what is beside them."""
-        return {"": 1.0}
 
     def region_depths(self, regions: Mapping[str, Region]) -> dict[str, tuple[float, float]]:
         """Where regions that lie one behind the other begin and end in `depth`; empty where they do not."""
@@ -687,33 +654,34 @@ class Shape(_Is):  # type: ignore[misc]
             Of the body; its conditions are added to it.
         """
 
-    def support(self, loading: Loading, ends: str = "free") -> None:
-        """Hold the body and add every load that it knows, each zero.
+    def support(self, loading: Loading, ends: str = "free", loads: Collection[str] | None = None) -> None:
+        """Hold the body and add loads, each zero.
 
         Parameters
         ----------
         loading
-            Of the body or of its reduction, which has planes of symmetry of its own and may lack a load.
+            Of the body or of its reduction, which has planes of symmetry of its own.
         ends
             Of `Shape.ends`.
+        loads
+            Names of those that there are; default: all that the body knows and the kinematics has.
         """
-        self.ends[ends](self, loading)
+        self.ends[ends].hold(self, loading)
         kinematics = loading.kinematics
         for face, component in kinematics.symmetry_planes.items():
             loading.hold_face(face, component)
         for name, kind in self.loads.items():
-            if kinematics.reduced and kinematics.name not in kind.reductions:
-                loading.leave_out(name)
-            else:
+            known = not kinematics.reduced or kinematics.name in kind.reductions
+            if name in loads if loads is not None else known:
                 kind.add(self, loading, name)
 
     def fills(self, regions: Collection[str]) -> bool:
         """Whether these regions of a scene, by name, are all of the body."""
-        return self.is_filled_by_regions and bool(regions)
+        return False
 
     @classmethod
     def loads_on(cls, faces: Mapping[str, str]) -> dict[str, LoadKind]:
-        """All loads by name: its own, and those that a scene puts on faces, where the shape `holds_faces`.
+        """All loads by name: its own, and those that a scene puts on faces, where any may be held and loaded.
 
         Parameters
         ----------
@@ -741,7 +709,7 @@ class Shape(_Is):  # type: ignore[misc]
     def hold_faces(
         self, loading: Loading, supports: Mapping[str, Support], modulus: float, loads: Mapping[str, Load]
     ) -> None:
-        """Hold faces as `[supports.NAME]` says, where the shape `holds_faces`.
+        """Hold faces as `[supports.NAME]` says.
 
         Parameters
         ----------
@@ -772,12 +740,15 @@ class Shape(_Is):  # type: ignore[misc]
     def check_with(self, scene: Any, key: str) -> None:
         """Mesh and regions that the shape can have; where it is the loaded one, whether the unloaded can be found."""
         self.check_size(scene.mesh)
-        self.check_regions(scene.regions, scene.mesh)
+        if isinstance(self, WithRegions):
+            self.check_regions(scene.regions, scene.mesh)
         if not self.is_loaded:
             return
         measured = [f"{in_region(name)}cells.fibres" for name in scene.measured_cells]
         reasons = {
-            f"allowed for the shapes {scene.shapes_that(lambda kind: kind.unloads)}": not self.unloads,
+            f"allowed for the shapes {scene.shapes_that(lambda kind: kind.is_a('Unloads'))}": not isinstance(
+                self, Unloads
+            ),
             "not allowed with supports.ends = 'clamped': the loaded tube would not have one radius": (
                 scene.supports.ends == "clamped"
             ),
@@ -809,6 +780,48 @@ class Shape(_Is):  # type: ignore[misc]
     def radial_share(self, dimensions: Array, axes: Array, local: Array) -> Array:
         """Share of the chains, by squared length, that `fibre_angle` does not see, (...,); parameters as there."""
         return np.zeros(dimensions.shape[:-1])
+
+
+# ---------------------------------------------------------------- what some bodies can
+class WithRegions(Shape):
+    """A body to which a scene may give `[regions.NAME]`, parts with tissue of their own; here they come with its mesh.
+
+    Its keyword arguments are the keys of `[geometry]`, as of every `Shape`.
+
+    Examples
+    --------
+    >>> from remodel_fenicsx.extend import SHAPES, WithRegions
+    >>> [name for name, shape in SHAPES.items() if issubclass(shape, WithRegions)]
+    ['tube', 'mesh']
+    """
+
+    def check_regions(self, regions: Mapping[str, Region], mesh: Mesh) -> None:
+        """Refuse what the regions of a scene ask of the body and it cannot have, with the key.
+
+        Parameters
+        ----------
+        regions
+            By name.
+        mesh
+            Settings of the elements.
+
+        Raises
+        ------
+        SceneError
+            One line that names the key.
+        """
+        for name, region in regions.items():
+            if region.outer_radius is not None:
+                rule = f"the regions of a {self.name} come with its mesh; only layers of a tube have an outer radius"
+                raise fault(rule, f"regions.{name}.outer_radius", region.outer_radius)
+
+
+class Unloads(Shape):
+    """A body whose loaded shape a scene may give, `geometry.is = "loaded"`."""
+
+
+class FromFile(Shape):
+    """A body whose elements are those of a file: `[mesh]` may divide them, and decides on nothing else."""
 
 
 def check_lengths(shape: Shape, lengths: dict[str, float]) -> None:

@@ -58,6 +58,7 @@ class Tendon(Shape):
             "total force along z on the top; its direction stays (a dead load)",
             FORCE,
             reductions=("point",),
+            area=lambda shape: shape.section_area,
         )
     }
     columns: ClassVar[tuple[Column, ...]] = uniaxial_columns("top", "length")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import logging
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -32,8 +32,16 @@ from remodel_fenicsx.body.reductions import (
     symmetric_planes,
     unmeasured_cells,
 )
-from remodel_fenicsx.body.shape import Array, Column, LoadKind, check_lengths
-from remodel_fenicsx.body.wall import AngleOf, Wall, Walled, angle_columns, angle_columns_on_request, check_layers
+from remodel_fenicsx.body.shape import Array, Column, End, LoadKind, check_lengths
+from remodel_fenicsx.body.wall import (
+    AngleOf,
+    RoundWall,
+    Wall,
+    angle_columns,
+    angle_columns_on_request,
+    check_layers,
+    tube_layers,
+)
 from remodel_fenicsx.model.cells import cylindrical_axes, structure_tensor
 from remodel_fenicsx.model.energy import TURNED_OVER, Tissue
 from remodel_fenicsx.schema.settings import Load, Mesh, Natural, Region, Support
@@ -232,15 +240,15 @@ def _add_pressure(loading: Loading, name: str) -> None:
 def _elongation(m: Any) -> float:
     """As prescribed, or as found where the length is an unknown."""
     strain = getattr(m.state.kinematics, "strain_of_length", None)
-    return float(m.step.loads["elongation"]) if strain is None else float(strain(m.state.unknown))
+    return float(m.step.loads.get("elongation", 0.0)) if strain is None else float(strain(m.state.unknown))
 
 
 def _axial_force(m: Any) -> float:
-    return float(m.end_force("inner").of_the_wall(m.state.loading.values["pressure"]))
+    return float(m.end_force("inner").of_the_wall(m.state.loading.values.get("pressure", 0.0)))
 
 
 def _reduced_axial_force(m: Any) -> float:
-    return float(m.end_force("inner").reduced(m.state.loading.values["pressure"]))
+    return float(m.end_force("inner").reduced(m.state.loading.values.get("pressure", 0.0)))
 
 
 def _opening_angle(m: Any) -> float:
@@ -270,7 +278,7 @@ def _opening_angle(m: Any) -> float:
         return float("nan")
 
 
-class Tube(Walled):
+class Tube(RoundWall):
     """A thick-walled tube about z under inner pressure and axial elongation: the artery of the paper's Fig. 7.
 
     Its ends stay in their planes; they are free to move radially, clamped, or closed by caps (`supports.ends`). Inner
@@ -320,6 +328,7 @@ class Tube(Walled):
             reductions=("radial", "axisymmetric", "sector"),
             frees_length=True,
             value=_axial_force,
+            area=lambda shape: shape.section_area,
         ),
     }
     columns: ClassVar[tuple[Column, ...]] = (
@@ -344,27 +353,21 @@ class Tube(Walled):
             "angle by which the unloaded tube would open if it were cut along its length now: the missing sector",
             _opening_angle,
             by_case=False,
+            of_one_tissue=True,
         ),
         *angle_columns_on_request(MEANS),
-        *Walled.columns_on_request,
+        *RoundWall.columns_on_request,
     )
     axis_kinds: ClassVar[tuple[str, ...]] = ("global", "cylindrical")
     number_of_elements: ClassVar[int] = 1536
     face_names: ClassVar[tuple[str, ...]] = ("bottom", "top", "inner", "outer")
     reductions: ClassVar[dict[str, Reduction]] = REDUCTIONS
-    ends: ClassVar[dict[str, Callable[[Any, Loading], None]]] = {
-        "free": lambda shape, loading: shape.hold(loading),
-        "clamped": lambda shape, loading: shape.clamp(loading),
-        "closed": lambda shape, loading: shape.close(loading),
+    ends: ClassVar[dict[str, End]] = {
+        "free": End(lambda shape, loading: shape.hold(loading)),
+        "clamped": End(lambda shape, loading: shape.clamp(loading)),
+        "closed": End(lambda shape, loading: shape.close(loading), frees_length=True),
     }
-    surrounded_faces: ClassVar[tuple[str, ...]] = ("outer",)
-    ends_that_free_length: ClassVar[tuple[str, ...]] = ("closed",)
-    columns_of_one_tissue: ClassVar[tuple[str, ...]] = ("opening_angle",)
-    has_regions: ClassVar[bool] = True
-    closes_from_a_sector: ClassVar[bool] = True
-    unloads: ClassVar[bool] = True
-    unloads_by_numbers: ClassVar[bool] = True
-    is_filled_by_regions: ClassVar[bool] = True
+    supported_faces: ClassVar[tuple[str, ...] | None] = ("outer",)
     # with global axes a tube of isotropic cells would not stay round in the first step
     defaults: ClassVar[dict[str, Any]] = {"cells": {"axes": "cylindrical"}}
 
@@ -386,8 +389,6 @@ class Tube(Walled):
 
     def layers_of_tissue(self, natural: Natural, regions: Mapping[str, Region], tissues: Mapping[str, Tissue]) -> Any:
         """Where tissue or prestretch change."""
-        from remodel_fenicsx.body.natural import tube_layers
-
         return tube_layers(_wall(self, max(1, len(regions)), regions), natural, tissues)
 
     @model_validator(mode="after")
@@ -422,6 +423,12 @@ class Tube(Walled):
         wall = _wall(self, max(1, len(regions)), regions)
         places = [(radius - wall.radii[0]) / (wall.radii[-1] - wall.radii[0]) for radius in wall.radii]
         return dict(zip(wall.names, itertools.pairwise(places), strict=True)) if regions else {}
+
+    def support(self, loading: Loading, ends: str = "free", loads: Collection[str] | None = None) -> None:
+        """The ends stay in their planes, at the distance that an elongation, or the free length, gives them."""
+        super().support(loading, ends, loads)
+        if "elongation" not in loading.values:
+            loading.hold_face("top", 2)
 
     def hold(self, loading: Loading) -> None:
         """u_z = 0 at the bottom, the rigid motions held at three of its nodes."""

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Mapping
+from abc import abstractmethod
+from collections.abc import Callable, Collection, Mapping
 from functools import partial
 from typing import Any, ClassVar, NamedTuple, TYPE_CHECKING
 
@@ -12,10 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from remodel_fenicsx.body.gmsh_model import length_fault
-from remodel_fenicsx.body.shape import Column, Shape
+from remodel_fenicsx.body.shape import Column, Shape, Unloads, WithRegions
 from remodel_fenicsx.model.axes import LocalAxes
 from remodel_fenicsx.model.cells import pitch_angle, radial_share
-from remodel_fenicsx.schema.settings import CONSTANT_FIELDS, Region
+from remodel_fenicsx.model.energy import Tissue
+from remodel_fenicsx.schema.settings import CONSTANT_FIELDS, Natural, Region
 from remodel_fenicsx.schema.tables import fault, shown
 
 if TYPE_CHECKING:
@@ -109,6 +111,52 @@ def check_layers(inner_radius: float, outer_radius: float, elements: int, region
             raise fault(f"the layer is {found[1]}", key, radius)
 
 
+# ---------------------------------------------------------------- tissue that is free of stress elsewhere than the mesh
+# G leads from where the tissue is free of stress to the mesh.
+
+
+def tube_layers(wall: Wall, natural: Natural, tissues: Mapping[str, Tissue]) -> list[Any]:
+    """Of a round wall: where tissue or prestretch change."""
+    from remodel_fenicsx.model.residual_stress import UNSTRETCHED, Layer
+
+    inner, outer = wall.radii[0], wall.radii[-1]
+    edges = set(wall.radii)
+    for layer in natural.layers:
+        edges |= {inner + share * (outer - inner) for share in layer.share}
+    apart = [a for a, b in itertools.pairwise(sorted(edges)) if b - a > 1e-9 * outer] + [outer]
+    found = []
+    for low, high in itertools.pairwise(apart):
+        middle = (low + high) / 2
+        region = wall.names[int(np.searchsorted(wall.radii[1:-1], middle))]
+        share = (middle - inner) / (outer - inner)
+        of_layer = [
+            layer.prestretch.stretches
+            for layer in natural.layers
+            if (layer.share[0] <= share < layer.share[1] if layer.region is None else layer.region == region)
+        ]
+        found.append(Layer((low, high), tissues[region if region in tissues else ""], (*of_layer, UNSTRETCHED)[0]))
+    return found
+
+
+def prestretch(natural: Natural, local_axes: LocalAxes, domain: Domain) -> Array:
+    """Circumferential, axial and radial stretch of the layers at the points, (elements, points, 3)."""
+    depth = local_axes.depth
+    found = np.ones((*depth.shape, 3))
+    for layer in natural.layers:
+        if layer.region is not None:
+            found[domain.element_region == domain.regions[layer.region]] = layer.prestretch.stretches
+        else:
+            low, high = layer.share
+            found[(depth >= low) & ((depth < high) | (high == 1.0))] = layer.prestretch.stretches
+    return found
+
+
+def gradient(stretches: Array, axes: Array) -> Array:
+    """G (..., 3, 3) of stretches (..., 3) along axes, rows (..., 3, 3)."""
+    found: Array = np.swapaxes(axes, -1, -2) @ (stretches[..., None] * axes)
+    return found
+
+
 # ---------------------------------------------------------------- bodies with a wall between an inner and an outer
 # Bodies with a wall between an inner and an outer face: what is measured in it, and its local axes on any mesh.
 
@@ -187,7 +235,16 @@ def _of(mean: AngleOf, name: str, m: Any) -> float:
 
 
 class Walled(Shape):
-    """A body with a wall: angles are those in it."""
+    """A body with a wall: angles are those in it, and a scene may give it `natural.layers`.
+
+    Its keyword arguments are the keys of `[geometry]`, as of every `Shape`.
+
+    Examples
+    --------
+    >>> from remodel_fenicsx.extend import SHAPES, Walled
+    >>> [name for name, shape in SHAPES.items() if issubclass(shape, Walled)]
+    ['tube', 'mesh']
+    """
 
     columns_on_request: ClassVar[tuple[Column, ...]] = (
         Column(
@@ -203,7 +260,6 @@ class Walled(Shape):
         "fibre_angle_middle": 0.5,
         "fibre_angle_outer": 1.0,
     }
-    has_a_wall: ClassVar[bool] = True
     depth_in_words: ClassVar[tuple[str, str, str]] = ("through the wall", "inside", "outside")
     angle_in_words: ClassVar[tuple[str, str]] = ("around", "along")
 
@@ -214,6 +270,22 @@ class Walled(Shape):
     def radial_share(self, dimensions: Array, axes: Array, local: Array) -> Array:
         """Share of the chains across the wall, A_rr / tr A, (...,)."""
         return radial_share(dimensions, axes, local)
+
+
+class RoundWall(Walled, WithRegions, Unloads):
+    """A wall between two radii that numbers describe: regions are layers that fill it, it may close from a sector."""
+
+    @abstractmethod
+    def layers_of_tissue(self, natural: Natural, regions: Mapping[str, Region], tissues: Mapping[str, Tissue]) -> Any:
+        """Where tissue or prestretch change (`model.residual_stress.Layer`), from the lumen outwards."""
+
+    @abstractmethod
+    def section_shares(self, regions: Mapping[str, Region]) -> dict[str, float]:
+        """Share of every section across z that is in a region, by its name; "" is what is beside them."""
+
+    def fills(self, regions: Collection[str]) -> bool:
+        """The outermost ends at the outer radius."""
+        return bool(regions)
 
 
 MEANS_ON_A_MESH: dict[str, tuple[str, AngleOf]] = {

@@ -120,7 +120,8 @@ def restore_state(state: State, checkpoint: Checkpoint | None) -> None:
         log.info("not in the checkpoint, so they begin anew: %s", ", ".join(missing))
     for mark, case in state.cases().items():
         case.numbers |= with_mark(numbers, mark)
-        case.loading.set(with_mark(header.loads, mark))
+        kept = with_mark(header.loads, mark)
+        case.loading.set({name: kept.get(name, 0.0) for name in case.loading.values})
 
 
 def _check(state: State, domain: Domain, checkpoint: Checkpoint, mesh: dict[str, Array]) -> None:
@@ -128,9 +129,9 @@ def _check(state: State, domain: Domain, checkpoint: Checkpoint, mesh: dict[str,
     here, there, counts = state.functions(), checkpoint.functions, _counts(state)
     if any(name not in there and name not in counts for name in here):
         raise CheckpointError(f"the checkpoint has the functions {', '.join(there)}, this run has {', '.join(here)}")
-    loads = sorted(checkpoint.loads)
+    loads = sorted(name for name, value in checkpoint.loads.items() if value)  # earlier versions kept all, zero or not
     own = sorted(marked({mark: case.loading.values for mark, case in state.cases().items()}))
-    if loads != own:
+    if not set(loads) <= set(own):
         raise CheckpointError(f"the checkpoint has the loads {loads}, this run has {own}")
     for name in [name for name in here if name in there]:
         shape = checkpoint.arrays[f"function/{name}"].shape

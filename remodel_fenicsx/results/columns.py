@@ -22,7 +22,7 @@ from remodel_fenicsx.fem import compat, jit
 from remodel_fenicsx.fem.assembly import over_ranks
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.results.fields import NodalGather
-from remodel_fenicsx.solver.equilibrium import Equilibrium
+from remodel_fenicsx.solver.equilibrium import Equilibrium, PointStresses
 
 Array = NDArray[np.float64]
 NO_LUMEN = 1e-9  # of the body's size cubed: what a flat inner face encloses by rounding
@@ -146,6 +146,23 @@ class Measurement:
         return nodes + self.displacement
 
     @cached_property
+    def F(self) -> Array:  # noqa: N802
+        """Deformation gradient at all points, (elements, points, 3, 3)."""
+        return self.state.deformation_gradient().reshape(*self.quadrature.shape, 3, 3)
+
+    @cached_property
+    def stress(self) -> Array:
+        """Cauchy stress at all points, (elements, points, 3, 3), with what formulation and repulsion add."""
+
+        def compiled() -> tuple[PointStresses, Any]:
+            stresses = PointStresses(self.state, self.observer.stepper.tissue)
+            return stresses, jit.expression(stresses.ufl.cauchy, self.quadrature.points)
+
+        stresses, expression = self.tool("cauchy stress", compiled)
+        stresses.refresh()
+        return self.quadrature.evaluate(expression, (3, 3))
+
+    @cached_property
     def fibre_angle(self) -> Array:
         """Reference fibre angle at all points (elements, points), degrees; NaN where there is none."""
         cells = self.state.cells
@@ -162,9 +179,8 @@ class Measurement:
     def fibre_angle_deformed(self) -> Array:
         """Of the cells in the deformed body, at all points (elements, points), degrees."""
         cells = self.state.cells
-        F = self.state.deformation_gradient().reshape(*self.quadrature.shape, 3, 3)
-        axes = self.state.elastic_axes(cells.axis_values, F)
-        return self.observer.shape.fibre_angle(cells.dimension_values, axes, cells.local_axes.deformed(F))
+        axes = self.state.elastic_axes(cells.axis_values, self.F)
+        return self.observer.shape.fibre_angle(cells.dimension_values, axes, cells.local_axes.deformed(self.F))
 
     @cached_property
     def radial_share(self) -> Array:
@@ -186,8 +202,7 @@ class Measurement:
     @cached_property
     def axial_stretch(self) -> Array:
         """Volume mean of F_zz in each local element, (elements,)."""
-        F = self.state.deformation_gradient()
-        return self.quadrature.element_mean(F[:, 2, 2].reshape(self.quadrature.shape))
+        return self.quadrature.element_mean(self.F[..., 2, 2])
 
     def face_mean(self, face: str, nodal_values: Array, deformed: bool = False) -> float:
         """Mean of nodal values (nodes,) over a named face, by its reference or its deformed area.

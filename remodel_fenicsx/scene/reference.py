@@ -10,6 +10,7 @@ from pydantic import BaseModel
 from pydantic.json_schema import GenerateJsonSchema
 
 from remodel_fenicsx.body import LoadKind, SHAPES, Shape
+from remodel_fenicsx.body.shape import WithRegions
 from remodel_fenicsx.scene.presets import PRESETS, PRESET_NOTES, PROFILES, RANDOM_CELLS
 from remodel_fenicsx.scene.scene import FORMAT, Scene
 from remodel_fenicsx.schema.settings import Supports
@@ -63,17 +64,17 @@ def json_schema() -> Schema:
 def _of_shape(item: tuple[str, type[Shape]]) -> Schema:
     """What a shape decides: its loads, its supports, its axes, and which keys of its geometry must be there."""
     name, shape = item
-    on_face = {"required": ["kind", "face", "value", "ramp"]} if shape.holds_faces else False
-    known = [*Supports.model_fields, *shape.surrounded_faces]
+    on_face = {"required": ["kind", "face", "value", "ramp"]} if shape.supported_faces is None else False
+    known = [*Supports.model_fields, *(shape.supported_faces or ())]
     tables = {
         "loads": {
             "properties": {load: _load(kind) for load, kind in shape.loads.items()},
             "additionalProperties": on_face,
         },
         "supports": {"properties": {"ends": {"enum": list(shape.ends)}}}
-        | ({} if shape.holds_faces else {"propertyNames": {"enum": known}}),
+        | ({} if shape.supported_faces is None else {"propertyNames": {"enum": known}}),
         "cells": {"properties": {"axes": {"enum": list(shape.axis_kinds)}}},
-        "regions": {} if shape.has_regions else {"maxProperties": 0},
+        "regions": {} if issubclass(shape, WithRegions) else {"maxProperties": 0},
     }
     chosen = {"properties": {"geometry": {"properties": {"shape": {"const": name}}}}}
     without_preset = {"if": {"not": {"required": ["preset"]}}, "then": {"properties": {"geometry": _required(shape)}}}

@@ -17,7 +17,8 @@ from pydantic import BaseModel, BeforeValidator, Field, ModelWrapValidatorHandle
 
 from remodel_fenicsx.body import LoadKind, SHAPES, Shape
 from remodel_fenicsx.body.reductions import AUTO, check_number, choice, objections
-from remodel_fenicsx.body.shape import Column, columns_of, columns_on_request
+from remodel_fenicsx.body.shape import Column, FromFile, columns_of, columns_on_request
+from remodel_fenicsx.body.wall import RoundWall
 from remodel_fenicsx.fem.formulations import FORMULATIONS, NOT_LOCKING
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.model.chains import CHAINS
@@ -107,8 +108,8 @@ def chain_stress(material: Material, end_to_end_length: float) -> float:
 
 def largest_stress(kind: LoadKind, value: float, geometry: Shape) -> float | None:
     """Of a load: a stress itself, or a force over its area; None of an elongation."""
-    if kind.dimension == FORCE:
-        return value / geometry.loaded_area
+    if kind.dimension == FORCE and kind.area is not None:
+        return value / kind.area(geometry)
     return value if kind.dimension == STRESS else None
 
 
@@ -280,7 +281,7 @@ class Scene(Table):
     def _tables_fit_together(self) -> Scene:
         for key, table in self._tables():
             table.check_with(self, key)
-        if self.geometry.refines:
+        if not isinstance(self.geometry, FromFile):
             check_number(self)
         return self
 
@@ -380,7 +381,7 @@ class Scene(Table):
         """What holds in each region by its name, and under "" what holds beside them, where there may be anything."""
         body = Properties(self.material, self.cells, self.remodeling.kappa)
         found = {"": body} | {name: region.over(body) for name, region in self.regions.items()}
-        if self.regions and self.geometry.is_filled_by_regions:
+        if self.regions and isinstance(self.geometry, RoundWall):
             del found[""]
         speed = self.remodeling.speed
         return {name: one._replace(kappa=speed(one.kappa, one.material.temperature)) for name, one in found.items()}
@@ -430,8 +431,8 @@ class Scene(Table):
     @property
     def has_free_length(self) -> bool:
         """Whether the body's length is an unknown."""
-        kinds = self.load_kinds
-        return self.supports.ends in self.geometry.ends_that_free_length or any(
+        kinds, shape = self.load_kinds, self.geometry
+        return (self.supports.ends in shape.ends and shape.ends[self.supports.ends].frees_length) or any(
             kinds[name].frees_length for name in self.loads
         )
 
@@ -466,7 +467,7 @@ class Scene(Table):
         if not (self.geometry.is_loaded and turns and self.natural.cells == AS_GIVEN):
             return []
         way = "let all loads act in the first step to have a row with it"
-        if self.geometry.unloads_by_numbers:
+        if isinstance(self.geometry, RoundWall):
             way = (
                 "natural.cells = 'equilibrium' with time.end = 'equilibrium' takes it for that of cells that have come "
                 f"to rest; or {way}"
@@ -604,7 +605,7 @@ def _check_load_names(shape: str, loads: Any) -> None:
     kind = SHAPES[shape]
     names = kind.loads
     for name, load in loads.items() if isinstance(loads, Mapping) else ():
-        if kind.holds_faces and isinstance(load, Mapping) and ("kind" in load or "face" in load):
+        if kind.supported_faces is None and isinstance(load, Mapping) and ("kind" in load or "face" in load):
             _check_load_on_face(kind, str(name), load)
         elif name not in names:
             key, listed = f"loads.{quoted(str(name))}", ", ".join(f"loads.{known}" for known in names)

@@ -176,10 +176,12 @@ class Supports(Table):
         if self.ends not in shape.ends:
             rule = f"allowed for shape {shape.name!r} is {', '.join(map(repr, shape.ends))}"
             raise fault(rule, f"{key}.ends", self.ends)
-        for name, support in () if shape.holds_faces else self.faces.items():
+        if (faces := shape.supported_faces) is None:
+            return
+        for name, support in self.faces.items():
             place = f"{key}.{quoted(name)}"
-            if name not in shape.surrounded_faces:
-                springs = " or ".join(f"{key}.{face} of kind 'elastic'" for face in shape.surrounded_faces)
+            if name not in faces:
+                springs = " or ".join(f"{key}.{face} of kind 'elastic'" for face in faces)
                 beside = f"; allowed beside is {springs}" if springs else ""
                 raise fault(f"a {shape.name} is held by {key}.ends{beside}", place, None)
             if support.kind != "elastic":
@@ -387,23 +389,23 @@ class Natural(Table):
     def check_with(self, scene: Scene, key: str) -> None:
         """Which bodies have residual stress, with which cells; all else is refused by name."""
         shape = scene.geometry
-        if self.cells == "equilibrium" and not (shape.is_loaded and shape.unloads_by_numbers):
-            able = scene.shapes_that(lambda kind: kind.unloads_by_numbers)
+        if self.cells == "equilibrium" and not (shape.is_loaded and shape.is_a("RoundWall")):
+            able = scene.shapes_that(lambda kind: kind.is_a("RoundWall"))
             raise fault(f"needs geometry.is = 'loaded' of the shape {able}", f"{key}.cells", self.cells)
         if self.cells == "equilibrium" and not scene.time.is_equilibrium:
             raise fault("needs time.end = 'equilibrium'", f"{key}.cells", self.cells)
         if self.is_of_the_mesh:
             return
         asked, value, none = f"{key}.opening_angle", self.opening_angle, "0"
-        able, is_able = scene.shapes_that(lambda kind: kind.closes_from_a_sector), shape.closes_from_a_sector
+        able, is_able = scene.shapes_that(lambda kind: kind.is_a("RoundWall")), shape.is_a("RoundWall")
         if not self.opening_angle:
             asked, value, none = f"{key}.layers", len(self.layers), "none"
-            able, is_able = scene.shapes_that(lambda kind: kind.has_a_wall), shape.has_a_wall
+            able, is_able = scene.shapes_that(lambda kind: kind.is_a("Walled")), shape.is_a("Walled")
         needs = [
             ("geometry.shape", is_able, able),
             ("mesh.formulation", scene.formulation == "displacement", "'displacement'"),
         ]
-        if shape.closes_from_a_sector:  # the closing knows isotropic cells
+        if shape.is_a("RoundWall"):  # the closing knows isotropic cells
             needs.append(("cells.axes", scene.cells.axes == "cylindrical", "'cylindrical'"))
             for name, properties in scene.properties().items():
                 isotropic = properties.cells.initial == "isotropic"
@@ -908,8 +910,8 @@ class Region(Table):
     def check_with(self, scene: Scene, key: str) -> None:
         """Its name, which is part of the names of columns."""
         shape, name = scene.geometry, key.removeprefix("regions.")
-        if not shape.has_regions:
-            able = scene.shapes_that(lambda kind: kind.has_regions)
+        if not shape.is_a("WithRegions"):
+            able = scene.shapes_that(lambda kind: kind.is_a("WithRegions"))
             raise fault(f"a {shape.name} has no regions; shapes with regions: {able}", key, None)
         if not re.fullmatch(NAME, name):
             rule = "the name of a region must be a letter, then letters, digits and _, at most 40 in all"
@@ -1306,7 +1308,8 @@ class Output(Table):
             "is an error of steps; must be left out with time.end = 'equilibrium'": (
                 name == "time_error" and scene.time.is_equilibrium
             ),
-            "is for bodies of one tissue; the scene has regions": scene.regions and name in shape.columns_of_one_tissue,
+            "is for bodies of one tissue; the scene has regions": scene.regions
+            and any(column.of_one_tissue for column in shape.columns_on_request if column.name == name),
             "changes only with remodeling.turnover, which is not set": (
                 name in (*TURNED_OVER, TURNOVER_POWER) and not turns_over
             ),

@@ -16,7 +16,7 @@ from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from remodel_fenicsx.body.reductions import AUTO, choice, is_for_means, objections, step_cost
-from remodel_fenicsx.body.shape import PROFILE
+from remodel_fenicsx.body.shape import FromFile, PROFILE
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.model.laws import LAWS
 from remodel_fenicsx.results.recording import RecordingError
@@ -174,7 +174,7 @@ def _profiles(base: Scene) -> list[Setting | None]:
 def _known(base: Scene, values: Mapping[str, Any]) -> Mapping[str, Any]:
     """Without those of a mesh that means nothing, or is given."""
     homogeneous = KINEMATICS[values.get(KINEMATIC, base.model.kinematics)].homogeneous
-    if base.geometry.refines and not homogeneous:
+    if not isinstance(base.geometry, FromFile) and not homogeneous:
         return values
     return {key: value for key, value in values.items() if not key.startswith("mesh.")}
 

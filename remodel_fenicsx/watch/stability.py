@@ -229,7 +229,11 @@ class BucklingWarning(WarnsOnce):
         force = self._integral(stress) / self._length()
         if self.strut.radii is None:
             return -force
-        return self.state.loading.values["pressure"] * np.pi * self._radii()[0] ** 2 - force
+        return self._pressure * np.pi * self._radii()[0] ** 2 - force
+
+    @property
+    def _pressure(self) -> float:
+        return self.state.loading.values.get("pressure", 0.0)
 
     def euler_load(self) -> float:
         """Of the present body."""
@@ -244,13 +248,13 @@ class BucklingWarning(WarnsOnce):
 
     def suction_share(self) -> float:
         """Pressure below zero over that at which the wall turns oval, a ring in plane strain."""
-        if self.strut.radii is None or self.state.loading.values["pressure"] >= 0:
+        if self.strut.radii is None or self._pressure >= 0:
             return 0.0
         (inner, outer), H = self._radii(), self._moduli()
         modulus = H[AROUND, AROUND] - H[AROUND, ACROSS] ** 2 / H[ACROSS, ACROSS]
         area = np.pi * (outer**2 - inner**2)
         stiffness = self._integral(modulus) / (self._length() * area) * (outer - inner) ** 3 / 12
-        return float(-self.state.loading.values["pressure"] * inner / (3 * stiffness / ((inner + outer) / 2) ** 2))
+        return float(-self._pressure * inner / (3 * stiffness / ((inner + outer) / 2) ** 2))
 
     # ------------------------------------------------------------ the present state
     def _gradients(self) -> Array:

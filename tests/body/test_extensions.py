@@ -11,7 +11,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
-import basix.ufl
 import dolfinx
 import numpy as np
 import pytest
@@ -63,6 +62,7 @@ from remodel_fenicsx.extend import (
     WatcherKind,
     angle_to_axis,
     axes_sum,
+    box_domain,
     form,
     markdown_reference,
     neo_hookean,
@@ -397,10 +397,15 @@ def test_a_column(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
 
 class Bar(Shape):
-    """A bar of rectangular cross-section along z, of cubes of a chosen size, meshed by dolfinx alone."""
+    """A bar of rectangular cross-section along z."""
 
     loads: ClassVar[dict[str, LoadKind]] = {
-        "force": LoadKind(lambda shape, loading, name: loading.add_dead_force(name, "z1", 2), "force on the top", FORCE)
+        "force": LoadKind(
+            lambda shape, loading, name: loading.add_dead_force(name, "z1", 2),
+            "force on the top",
+            FORCE,
+            area=lambda shape: shape.width * shape.depth,
+        )
     }
     columns: ClassVar[tuple[Column, ...]] = (
         *uniaxial_columns("z1", "length"),
@@ -414,32 +419,11 @@ class Bar(Shape):
     depth: Annotated[float, LENGTH] = Field(default=2.0, gt=0, description="Length along y.")
     length: Annotated[float, LENGTH] = Field(default=4.0, gt=0, description="Length along z.")
 
-    @property
-    def loaded_area(self) -> float:
-        """Of the top."""
-        return self.width * self.depth
-
     def build(self, mesh: Any, comm: Any = None) -> Domain:
-        """Bricks in rows, which rank 0 numbers. Their element is that of Gmsh's meshes: so are the kernels."""
-        comm = comm or MPI.COMM_WORLD
-        size = np.array([self.width, self.depth, self.length])
-        counts = mesh.refinement * np.array([1, 2, 2])
-        number = np.arange(np.prod(counts + 1)).reshape(counts + 1)
-        low, high, here = slice(None, -1), slice(1, None), slice(None) if comm.rank == 0 else slice(0)
-        corners = [number[x, y, z].ravel() for z in (low, high) for y in (low, high) for x in (low, high)]
-        nodes = np.stack(np.unravel_index(number.ravel(), number.shape), axis=1) * size / counts
-        equal = basix.LagrangeVariant.equispaced
-        element = ufl.Mesh(basix.ufl.element("Lagrange", "hexahedron", 1, shape=(3,), lagrange_variant=equal))
-        box = dolfinx.mesh.create_mesh(comm, cells=np.stack(corners, axis=1)[here], x=nodes[here], e=element)
-        facets, values = [], []
-        for tag, (axis, place) in enumerate(((axis, end) for axis in range(3) for end in (0.0, size[axis])), start=1):
-            found = dolfinx.mesh.locate_entities_boundary(box, 2, lambda x: np.isclose(x[axis], place))
-            facets.append(found)
-            values.append(np.full(len(found), tag, dtype=np.int32))
-        order = np.argsort(np.concatenate(facets))
-        tags = dolfinx.mesh.meshtags(box, 2, np.concatenate(facets)[order], np.concatenate(values)[order])
-        dimensions = {"width": self.width, "depth": self.depth, "length": self.length}
-        return Domain(box, tags, {name: tag for tag, name in enumerate(self.face_names, start=1)}, "bar", dimensions)
+        """Of plane faces, whatever degree the scene asks for."""
+        sides = {"width": self.width, "depth": self.depth, "length": self.length}
+        flat = mesh.model_copy(update={"degree": 1})
+        return box_domain("bar", sides, [*sides.values()], (1, 2, 2), flat, comm)
 
     def hold(self, loading: Any) -> None:
         """Three planes of symmetry."""

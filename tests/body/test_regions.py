@@ -13,6 +13,7 @@ from remodel_fenicsx import Scene, SceneError
 from remodel_fenicsx.body import SHAPES, Tube
 from remodel_fenicsx.body.domain import Domain, build_domain
 from remodel_fenicsx.body.gmsh_model import GeometryError
+from remodel_fenicsx.body.shape import WithRegions
 from remodel_fenicsx.body.wall import shared_out
 from remodel_fenicsx.schema.settings import Mesh, Region
 from remodel_fenicsx.simulation import Simulation, checked_domain, mesh_of
@@ -110,12 +111,13 @@ def test_a_body_without_regions_refuses_them_by_name() -> None:
 
 def test_an_outer_radius_where_no_layer_is_is_refused() -> None:
     """Also by shapes of scripts that have regions and say no more about them."""
-    cube = SHAPES["cube"](side=1.0)
-    cube.check_regions({"core": Region()}, Mesh())
+    mesh = SHAPES["mesh"](file="vessel.msh")
+    assert isinstance(mesh, WithRegions)
+    mesh.check_regions({"core": Region()}, Mesh())
     with pytest.raises(
-        PydanticCustomError, match="the regions of a cube come with its mesh; only layers of a tube have"
+        PydanticCustomError, match="the regions of a mesh come with its mesh; only layers of a tube have"
     ):
-        cube.check_regions({"core": Region(outer_radius=1.0)}, Mesh())
+        mesh.check_regions({"core": Region(outer_radius=1.0)}, Mesh())
 
 
 def test_radii_of_layers_take_units_and_are_read_back(tmp_path: Any) -> None:

@@ -12,6 +12,7 @@ from remodel_fenicsx import cli
 
 ROOT = Path(__file__).parents[2]
 PUBLIC = {"remodel_fenicsx", "remodel_fenicsx.parts", "remodel_fenicsx.extend"}
+EXTENSIONS = [str(path.relative_to(ROOT)) for path in sorted((ROOT / "demos" / "extensions").glob("*.py"))]
 
 
 def imported(source: str) -> list[str]:
@@ -35,7 +36,15 @@ def test_a_demo_needs_one_import(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["README.md", "CONTRIBUTING.md", "docs/commands.md", "demos/figures.py", "tests/body/test_extensions.py"]
+    "name",
+    [
+        "README.md",
+        "CONTRIBUTING.md",
+        "docs/commands.md",
+        "demos/figures.py",
+        "tests/body/test_extensions.py",
+        *EXTENSIONS,
+    ],
 )
 def test_what_users_are_shown_imports_public_names(name: str) -> None:
     text = (ROOT / name).read_text(encoding="utf-8")

@@ -44,7 +44,7 @@ def test_the_initial_stiffness_is_what_a_run_shows(factor: int) -> None:
         simulation.close()
     lame_lambda, mu = scene.material.lame_lambda, scene.material.lame_mu
     matrix = mu * (3 * lame_lambda + 2 * mu) / (lame_lambda + mu)
-    strain = 1e-4 / scene.geometry.loaded_area / (matrix + 50.0)
+    strain = 1e-4 / scene.geometry.section_area / (matrix + 50.0)
     assert stretch - 1 == pytest.approx(strain, rel=1e-4)
 
 

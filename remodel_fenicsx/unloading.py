@@ -1,10 +1,10 @@
-"""The search for an unloaded body: of a tube by its numbers, of a mesh by its nodes; what is said without one."""
+"""A scene whose geometry is the loaded one, as a scene of the unloaded body that its loads bring there."""
 
 from __future__ import annotations
 
 import contextlib
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -22,6 +22,7 @@ from remodel_fenicsx.body.mesh_domain import gmsh_text
 from remodel_fenicsx.body.mesh_faces import jacobian_determinants
 from remodel_fenicsx.body.mesh_file import MeshFile
 from remodel_fenicsx.errors import RemodelError, SOLVE_FAILED
+from remodel_fenicsx.body.wall import RoundWall
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.assembly import assemble_matrix, create_matrix, over_ranks, second_derivative
 from remodel_fenicsx.model.residual_stress import Loads, closing
@@ -32,14 +33,73 @@ from remodel_fenicsx.schema.settings import AS_GIVEN, EQUILIBRIUM, Natural
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.solver.equilibrium import mandel_vector
+from remodel_fenicsx.system.temporary import temporary_folder
 from remodel_fenicsx.system.terminal import unsaid
+
+log = logging.getLogger(__name__)
+
+
+@contextlib.contextmanager
+def as_unloaded(scene: Scene, comm: MPI.Intracomm) -> Iterator[Scene]:
+    """The scene itself, or that of its unloaded body, whose mesh is there as long as this context. Collective."""
+    if not scene.geometry.is_loaded:
+        yield scene
+        return
+    for line in scene.turned_away() if comm.rank == 0 else ():
+        log.warning("%s", line)
+    with temporary_folder() as folder:
+        yield unloaded(scene, comm, comm.bcast(folder))
+
+
+def unloaded(scene: Scene, comm: MPI.Intracomm = MPI.COMM_WORLD, folder: Path | None = None) -> Scene:
+    """The scene of the body that the loads, at the end of their ramps, bring to the geometry of this one. Collective.
+
+    Parameters
+    ----------
+    scene
+        With `geometry.is = "loaded"`; another is given back.
+    comm
+        MPI communicator.
+    folder
+        Where the mesh of an own body is written, on rank 0.
+
+    Returns
+    -------
+    Scene
+        With the geometry of the unloaded body in place of the loaded one.
+
+    Raises
+    ------
+    SceneError
+        If the body has no numbers or nodes to be found, or an own body no folder.
+    NoUnloadedShape
+        If none is found.
+
+    Examples
+    --------
+    A tube that is measured under its pressure:
+
+    >>> from remodel_fenicsx import preset_scene, unloaded
+    >>> tube = preset_scene("kuhl-holzapfel-2007", "tube")
+    >>> seen = tube.with_values({"geometry.is": "loaded", "model.kinematics": "radial", "cells.axes": "cylindrical",
+    ...                          "cells.initial": "isotropic", "loads.pressure.value": 0.5})
+    >>> found = unloaded(seen).geometry
+    >>> round(found.inner_radius, 3), round(found.outer_radius, 3)  # 1 and 3 are under pressure and elongation
+    (0.968, 3.101)
+    """
+    if not scene.geometry.is_loaded:
+        return scene
+    if isinstance(scene.geometry, RoundWall):
+        return unloaded_tube(scene, comm)
+    if folder is None:
+        raise SceneError("geometry.is = 'loaded': a folder is needed for the unloaded mesh")
+    return unloaded_mesh(scene, comm, folder)
 
 
 # ---------------------------------------------------------------- what is said where there is no unloaded shape, and
 # What is said where there is no unloaded shape, and the shares of the loads in which it is looked for.
 
 Found = TypeVar("Found")
-log = logging.getLogger(__name__)
 
 SHARES = (0.25, 0.5, 0.75, 1.0)  # of the loads, where they cannot be taken in one piece
 
