@@ -61,8 +61,8 @@ class Simulation:
     ----------
     domain, unknown, quadrature, cells, loading, state, tissue, stepper, observer
         The parts, each usable by itself (see demos/).
-    control
-        Chooses the steps, where the scene has a tolerance.
+    control, rest
+        Chooses the steps, where the scene has a tolerance; goes on until the cells rest, where its end is that.
     watchers
         Who follows its steps, in their order: the stability of equilibria, the observer, and those of
         `extend.WATCHERS`; what they remember is part of the state.

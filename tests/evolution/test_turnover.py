@@ -99,7 +99,7 @@ def test_the_equilibrium_is_that_rest(caplog: pytest.LogCaptureFixture) -> None:
     for name, expected in (("content", (3.9, 2.9, 2.2)), ("natural_length", (1.43, 1.31, 1.22))):
         values = turnover._values(name).ravel()[order]
         assert values[[0, len(values) // 2, -1]] == pytest.approx(expected, rel=0.03)
-    assert simulation.stepper.coupling.steps < 40
+    assert simulation.rest.steps < 40
     assert 40.0 * np.abs(turnover.rates()).max() < 2e-4
     assert not [record for record in caplog.records if record.levelname == "WARNING"]
     simulation.close()
