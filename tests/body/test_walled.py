@@ -50,7 +50,7 @@ class WalledTube(WalledMesh):
         loading.hold_node((-1.0, 0.0, 0.0), 1)
         loading.hold_node((0.0, 1.0, 0.0), 0)
 
-    def support(self, loading: Any, ends: str = "free") -> None:
+    def support(self, loading: Any, ends: str = "free", loads: Any = None) -> None:
         """As the tube."""
         self.hold(loading)
         loading.add_follower_pressure("pressure", "inner")
